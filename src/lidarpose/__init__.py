@@ -1,0 +1,46 @@
+"""lidarpose: 3D human pose from LiDAR.
+
+    import lidarpose
+    pose = lidarpose.load().predict(points)                       # one person, (n, 3) metres, z up
+    people = lidarpose.predict("sweep.pcd", boxes="boxes.json")   # everybody in a sweep
+
+Names are loaded when first used: importing the package costs no torch and no numba.
+"""
+
+from importlib import import_module
+
+from lidarpose._version import __version__
+
+# public name -> where it lives
+_HOMES = {
+    "load": "lidarpose.infer.predictor",
+    "Predictor": "lidarpose.infer.predictor",
+    "predict": "lidarpose.infer.files",
+    "PersonPose": "lidarpose.infer.results",
+    "Poses": "lidarpose.infer.results",
+    "cast_rays": "lidarpose.lidar.raycast",
+    "sensor": "lidarpose.lidar.sensor",
+    "Sensor": "lidarpose.lidar.sensor",
+    "sample_poses": "lidarpose.body.motion",
+    "read_points": "lidarpose.data.formats",
+    "read_boxes": "lidarpose.data.boxes",
+    "Box": "lidarpose.sample",
+    "Pose": "lidarpose.sample",
+    "Sample": "lidarpose.sample",
+    "Skeleton": "lidarpose.skeleton",
+    "skeleton": "lidarpose.skeleton",
+    "LidarPoseError": "lidarpose.errors",
+    "InputError": "lidarpose.errors",
+}
+
+__all__ = ["__version__", *_HOMES]
+
+
+def __getattr__(name: str):
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
+    raise AttributeError(f"module 'lidarpose' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,3 @@
+from lidarpose.cli import main
+
+raise SystemExit(main())

@@ -1,0 +1,75 @@
+"""Poses after captured motion: a mixture of Gaussians over the angles of a pose, fitted by tools/fit_motion.py.
+
+Its features (27, degrees) are `ANGLES` with each shoulder's three angles replaced by the rotation vector from a
+hanging arm, which is smooth where arms usually are. The mixture was fitted to subjects 2 and 5 of the CMU Graphics
+Lab Motion Capture Database (mocap.cs.cmu.edu, NSF EIA-0196217); no pose of it is stored.
+"""
+
+from functools import cache
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+from lidarpose.body.activities import ANGLES
+from lidarpose.body.angles import angles_from_rotations, shoulder_angles, shoulder_matrix
+from lidarpose.body.retarget import rotation_vector
+from lidarpose.geometry import axis_angle_to_matrix
+
+_SHOULDERS = tuple(
+    (slice(ANGLES.index(f"{side}_raise"), ANGLES.index(f"{side}_raise") + 3), sign)
+    for side, sign in (("left", 1.0), ("right", -1.0))
+)
+_LOWER = np.tril_indices(len(ANGLES))
+
+
+def captured_angles(rng: np.random.Generator, n: int) -> np.ndarray:
+    """n poses drawn from the mixture: angles (n, 27), degrees, in the order of `ANGLES`; limits are not applied."""
+    if not n:
+        return np.zeros((0, len(ANGLES)))
+    cumulative, means, roots = _mixture()
+    component = np.searchsorted(cumulative, rng.random(n))
+    normal = rng.standard_normal((n, len(ANGLES)))
+    return from_features(means[component] + (roots[component] @ normal[..., None])[..., 0])
+
+
+def to_features(rotations: np.ndarray) -> np.ndarray:
+    """Local rotations (n, 24, 3, 3) -> the mixture's features (n, 27)."""
+    features = angles_from_rotations(rotations)
+    for part, sign in _SHOULDERS:
+        turn = shoulder_matrix(features[:, part], sign) @ _hanging(sign).T
+        features[:, part] = np.degrees(rotation_vector(turn))
+    return features
+
+
+def from_features(features: np.ndarray) -> np.ndarray:
+    """The mixture's features (n, 27) -> angles (n, 27), degrees."""
+    angles = np.array(features, float)
+    for part, sign in _SHOULDERS:
+        angles[:, part] = shoulder_angles(axis_angle_to_matrix(np.radians(angles[:, part])) @ _hanging(sign), sign)
+    return angles
+
+
+def save_mixture(path: str | Path, weights: np.ndarray, means: np.ndarray, covariances: np.ndarray) -> None:
+    """Writes weights (K,), means (K, 27) and covariances (K, 27, 27), the last as their Cholesky factors."""
+    roots = np.linalg.cholesky(covariances)[:, *_LOWER]
+    np.savez_compressed(
+        path, weights=weights.astype(np.float32), means=means.astype(np.float16), roots=roots.astype(np.float16)
+    )
+
+
+def _hanging(sign: float) -> np.ndarray:
+    return shoulder_matrix(np.zeros((1, 3)), sign)[0]
+
+
+@cache
+def _mixture() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cumulative weights (K,), means (K, 27) and Cholesky factors (K, 27, 27), degrees."""
+    with resources.files(__package__).joinpath("assets/motion_prior.npz").open("rb") as file:
+        stored = dict(np.load(file, allow_pickle=False))
+    weights = stored["weights"].astype(float)
+    roots = np.zeros((len(weights), len(ANGLES), len(ANGLES)))
+    roots[:, *_LOWER] = stored["roots"]
+    cumulative = np.cumsum(weights / weights.sum())
+    cumulative[-1] = 1.0
+    return cumulative, stored["means"].astype(float), roots

@@ -1,0 +1,111 @@
+"""The compiled inner loops of `rig`: importing this module needs numba. Reference twins live in `rig`.
+
+All arrays are float32 and C-contiguous. Every kernel works on one core without the interpreter lock, so threads can
+pose people side by side; `pose_person` and `normals_of_person` may be called from other compiled code.
+"""
+
+import numba
+import numpy as np
+
+_HEAD = 15
+_JOINTS = 24
+# float32 sums may be reordered and fused: differences stay at rounding level, vector units are used
+_jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp"})
+
+
+@_jit
+def pose_person(rest_vertices, rest_joints, rotations, translation, parents, weight_index, weight, vertices, joints):
+    """One person: rest_vertices (V, 3), rest_joints (26, 3), rotations (24, 3, 3), translation (3,) -> fills
+    vertices (V, 3) and joints (26, 3)."""
+    # rows of [G | p - G rest]: what a bone does to a point of the rest pose
+    motion = np.empty((_JOINTS, 12), np.float32)
+    for j in range(_JOINTS):
+        p = parents[j]
+        for a in range(3):
+            if p < 0:
+                joints[j, a] = translation[a]
+                for b in range(3):
+                    motion[j, 4 * a + b] = rotations[j, a, b]
+            else:
+                joints[j, a] = motion[p, 4 * a + 3]
+                for c in range(3):
+                    joints[j, a] += motion[p, 4 * a + c] * rest_joints[j, c]
+                for b in range(3):
+                    motion[j, 4 * a + b] = (
+                        motion[p, 4 * a] * rotations[j, 0, b]
+                        + motion[p, 4 * a + 1] * rotations[j, 1, b]
+                        + motion[p, 4 * a + 2] * rotations[j, 2, b]
+                    )
+        for a in range(3):
+            motion[j, 4 * a + 3] = joints[j, a] - (
+                motion[j, 4 * a] * rest_joints[j, 0]
+                + motion[j, 4 * a + 1] * rest_joints[j, 1]
+                + motion[j, 4 * a + 2] * rest_joints[j, 2]
+            )
+    for k in range(_JOINTS, rest_joints.shape[0]):
+        for a in range(3):
+            joints[k, a] = (
+                motion[_HEAD, 4 * a] * rest_joints[k, 0]
+                + motion[_HEAD, 4 * a + 1] * rest_joints[k, 1]
+                + motion[_HEAD, 4 * a + 2] * rest_joints[k, 2]
+                + motion[_HEAD, 4 * a + 3]
+            )
+    for v in range(rest_vertices.shape[0]):
+        x, y, z = rest_vertices[v, 0], rest_vertices[v, 1], rest_vertices[v, 2]
+        px, py, pz = np.float32(0), np.float32(0), np.float32(0)
+        for k in range(weight_index.shape[1]):
+            w = weight[v, k]
+            if w == 0:
+                break
+            m = motion[weight_index[v, k]]
+            px += w * (m[0] * x + m[1] * y + m[2] * z + m[3])
+            py += w * (m[4] * x + m[5] * y + m[6] * z + m[7])
+            pz += w * (m[8] * x + m[9] * y + m[10] * z + m[11])
+        vertices[v, 0] = px
+        vertices[v, 1] = py
+        vertices[v, 2] = pz
+
+
+@_jit
+def pose_people(rest_vertices, rest_joints, rotations, translation, parents, weight_index, weight, vertices, joints):
+    """`pose_person` for n people one after the other; each array with n in front."""
+    for i in range(rotations.shape[0]):
+        pose_person(
+            rest_vertices[i],
+            rest_joints[i],
+            rotations[i],
+            translation[i],
+            parents,
+            weight_index,
+            weight,
+            vertices[i],
+            joints[i],
+        )
+
+
+@_jit
+def normals_of_person(faces, vertices, normals):
+    """Fills normals (V, 3) with the unit normals of one mesh: faces (F, 3), vertices (V, 3)."""
+    normals[:] = 0
+    for f in range(faces.shape[0]):
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        ax, ay, az = vertices[i, 0], vertices[i, 1], vertices[i, 2]
+        bx, by, bz = vertices[j, 0] - ax, vertices[j, 1] - ay, vertices[j, 2] - az
+        cx, cy, cz = vertices[k, 0] - ax, vertices[k, 1] - ay, vertices[k, 2] - az
+        nx, ny, nz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
+        for v in (i, j, k):
+            normals[v, 0] += nx
+            normals[v, 1] += ny
+            normals[v, 2] += nz
+    for v in range(normals.shape[0]):
+        size = np.sqrt(normals[v, 0] ** 2 + normals[v, 1] ** 2 + normals[v, 2] ** 2)
+        scale = np.float32(1) / max(size, np.float32(1e-20))
+        for a in range(3):
+            normals[v, a] *= scale
+
+
+@_jit
+def normals_of_people(faces, vertices, normals):
+    """`normals_of_person` for n people: vertices and normals (n, V, 3)."""
+    for i in range(vertices.shape[0]):
+        normals_of_person(faces, vertices[i], normals[i])

@@ -1,0 +1,166 @@
+"""Reading a user's file and writing results so that a crash never leaves half a file.
+
+Every failure that the user can cause is an `InputError` of one line that names the file and the remedy.
+"""
+
+import difflib
+import errno
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from itertools import count
+from pathlib import Path
+
+from lidarpose.errors import InputError
+
+# part of a temporary file's name beside the process id, so that threads of one process never share a name
+_serial = count()
+
+# a name of a file may have 255 bytes on the usual file systems, of which the temporary name needs some itself
+_MAX_KEPT_NAME = 100
+
+_REMEDIES = {
+    errno.ENOSPC: "free some space or write to another disk",
+    errno.EDQUOT: "free some of your quota or write to another disk",
+    errno.EROFS: "the disk is read-only: write to another folder",
+    errno.EACCES: "allow writing there or choose another folder",
+    errno.EPERM: "allow writing there or choose another folder",
+    errno.ENOTDIR: "a part of the path is a file: choose another folder",
+    errno.EEXIST: "a part of the path is a file: choose another folder",
+    errno.ENAMETOOLONG: "choose a shorter name",
+}
+
+
+def file_error(path: object, problem: object) -> InputError:
+    """The error `PATH: PROBLEM` on one line that any terminal can print."""
+    text = " ".join(f"{path or repr(path)}: {problem}".splitlines())
+    text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    return InputError(text.encode("utf-8", "backslashreplace").decode())
+
+
+def read_bytes(path: str | os.PathLike, *, expected: str) -> bytes:
+    """The content of a regular, non-empty file; `expected` says what it should be ("a JSON file", ...).
+
+    Raises InputError for a missing, empty or unreadable file, a folder, a device or a pipe.
+    """
+    try:
+        # a bare number would be taken for an open file's handle
+        path = os.fspath(path)
+        mode = os.stat(path).st_mode
+        if stat.S_ISDIR(mode):
+            raise file_error(path, f"expected {expected}, got a folder; name one file in it")
+        if not stat.S_ISREG(mode):
+            raise file_error(path, f"expected {expected}, got a device or pipe; save it as a file first")
+        with open(path, "rb") as file:
+            data = file.read()
+    except InputError:
+        raise
+    except FileNotFoundError:
+        raise file_error(path, f"no such file; expected {expected}{_nearest(path)}") from None
+    except OSError as error:
+        raise file_error(path, f"cannot be read ({error.strerror or error}); check the path and its rights") from None
+    except MemoryError:
+        raise file_error(path, "does not fit in memory; split it first") from None
+    except (TypeError, ValueError) as error:
+        raise file_error(repr(path), f"expected the path of {expected} ({error})") from None
+    if not data:
+        raise file_error(path, f"is empty; expected {expected}: was it copied completely?")
+    return data
+
+
+def _nearest(path: str | os.PathLike) -> str:
+    """What to do about a missing file: the nearest name in its folder, or that the folder itself is missing."""
+    folder, name = os.path.split(os.path.abspath(os.fsdecode(path)))
+    try:
+        names = os.listdir(folder)
+    except OSError:
+        return f"; the folder {folder} does not exist either"
+    near = difflib.get_close_matches(name, names, n=1, cutoff=0.7)
+    return f"; did you mean {near[0]}?" if near else "; check the path"
+
+
+@contextmanager
+def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
+    """Yields a temporary path in the folder of `path`; it becomes `path` when the block ends well.
+
+    The temporary name ends in the last part of `path`'s name, suffix included, so that libraries which choose a
+    format by the suffix work. Any exception in the block removes the temporary file, and the folders made for it,
+    and leaves an older file at `path` as it was. A link is followed. Missing parent folders are created.
+
+    Raises InputError where the folder cannot be written, is full, or `path` is a folder or a device.
+    """
+    try:
+        target = Path(os.path.realpath(path))
+    except (OSError, TypeError, ValueError) as error:
+        raise file_error(repr(path), f"expected the path of a file to write ({error})") from None
+    with suppress(OSError):
+        mode = target.stat().st_mode
+        if stat.S_ISDIR(mode):
+            raise file_error(path, "is a folder; give the name of a file to write")
+        # replacing a device such as /dev/null by a file would break the machine when run as root
+        if not stat.S_ISREG(mode):
+            raise file_error(path, "is a device or pipe; give the name of a file to write")
+
+    made: list[Path] = []
+    temporary = target.parent / f".{os.getpid()}-{next(_serial)}-{target.name[-_MAX_KEPT_NAME:]}"
+    try:
+        for folder in (*reversed(target.parent.parents), target.parent):
+            if not folder.is_dir():
+                folder.mkdir(exist_ok=True)
+                made.append(folder)
+        # made at once, so that a folder without write access is known before hours of work go into the block
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+    except OSError as error:
+        _remove(temporary, made)
+        raise _write_error(path, target.parent, error) from None
+    try:
+        yield temporary
+        with open(temporary, "r+b") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, target)
+    except BaseException as error:
+        _remove(temporary, made)
+        if isinstance(error, OSError) and _is_about(error, temporary):
+            raise _write_error(path, target.parent, error) from None
+        raise
+    _sync_folder(target.parent)
+
+
+def write_atomic(path: str | os.PathLike, data: bytes | str) -> None:
+    """Writes `data` (text as UTF-8) to `path` in one step: readers see the old content or the new, never a part.
+
+    Creates missing parent folders. Raises InputError as `atomic_path` does.
+    """
+    content = data.encode("utf-8") if isinstance(data, str) else data
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.write(content)
+
+
+def _is_about(error: OSError, temporary: Path) -> bool:
+    """Whether an error of the block came from writing the temporary file, not from something else it did."""
+    names = {os.fsdecode(n) for n in (error.filename, error.filename2) if isinstance(n, str | bytes | os.PathLike)}
+    return str(temporary) in names or error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
+
+
+def _write_error(path: object, folder: Path, error: OSError) -> InputError:
+    remedy = _REMEDIES.get(error.errno, "choose another folder")
+    return file_error(path, f"cannot write into the folder {folder} ({error.strerror or error}); {remedy}")
+
+
+def _remove(temporary: Path, made: list[Path]) -> None:
+    with suppress(OSError):
+        temporary.unlink()
+    for folder in reversed(made):
+        with suppress(OSError):
+            folder.rmdir()
+
+
+def _sync_folder(folder: Path) -> None:
+    """Makes the new name itself survive a power cut, where the system can (not on Windows)."""
+    with suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

@@ -1,0 +1,99 @@
+"""Rotations, spherical coordinates, up axes and similarity alignment, in numpy.
+
+Frames are right-handed, x forward, y left, z up; lengths in metres, angles in radians. Rotation matrices act on
+column vectors: `rotated = R @ v`, for rows `points @ R.T`.
+"""
+
+import numpy as np
+
+from lidarpose.errors import unknown_name
+
+
+def axis_angle_to_matrix(vector: np.ndarray) -> np.ndarray:
+    """Rodrigues' formula. vector (..., 3): axis times angle in radians. Returns (..., 3, 3)."""
+    vector = np.asarray(vector, float)
+    angle = np.linalg.norm(vector, axis=-1)[..., None, None]
+    x, y, z = np.moveaxis(vector / np.maximum(angle[..., 0], 1e-12), -1, 0)
+    o = np.zeros_like(x)
+    cross = np.stack([np.stack([o, -z, y], -1), np.stack([z, o, -x], -1), np.stack([-y, x, o], -1)], -2)
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
+
+
+def rotation_about(axis: str, angle: np.ndarray | float) -> np.ndarray:
+    """Rotation by `angle` (...) radians about the axis "x", "y" or "z", right-handed. Returns (..., 3, 3)."""
+    angle = np.asarray(angle, float)
+    c, s = np.cos(angle), np.sin(angle)
+    i = "xyz".index(axis)
+    j, k = (i + 1) % 3, (i + 2) % 3
+    matrix = np.zeros(angle.shape + (3, 3))
+    matrix[..., i, i] = 1
+    matrix[..., j, j] = matrix[..., k, k] = c
+    matrix[..., k, j] = s
+    matrix[..., j, k] = -s
+    return matrix
+
+
+def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The smallest rotation that turns direction a onto direction b. a, b (..., 3), any length > 0. (..., 3, 3)."""
+    a, b = unit(a), unit(b)
+    c = (a * b).sum(-1)
+    axis = np.cross(a, b)
+    s = np.linalg.norm(axis, axis=-1)
+    # opposite directions: any axis across a will do
+    across = np.cross(a, np.where(np.abs(a[..., :1]) < 0.9, [1.0, 0, 0], [0, 1.0, 0]))
+    axis = np.where((s < 1e-9)[..., None], unit(across), axis / np.maximum(s, 1e-12)[..., None])
+    return axis_angle_to_matrix(axis * np.arctan2(s, c)[..., None])
+
+
+def unit(vector: np.ndarray) -> np.ndarray:
+    """vector (..., 3) scaled to length 1; a zero vector stays zero."""
+    vector = np.asarray(vector, float)
+    return vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-12)
+
+
+def to_spherical(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """points (..., 3) -> range (...) m, azimuth (...) rad in [-pi, pi], elevation (...) rad above the xy plane."""
+    points = np.asarray(points, float)
+    x, y, z = np.moveaxis(points, -1, 0)
+    return np.linalg.norm(points, axis=-1), np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
+
+
+def from_spherical(distance: np.ndarray, azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
+    """The inverse of `to_spherical`; the three broadcast. Returns (..., 3) m."""
+    horizontal = distance * np.cos(elevation)
+    x, y, z = np.broadcast_arrays(
+        horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), distance * np.sin(elevation)
+    )
+    return np.stack([x, y, z], -1)
+
+
+# rows are the house's x, y, z in coordinates of an input whose up axis is the key: right-handed, forward kept
+# where the convention has a usual one (y up: z towards the viewer, as in graphics; x up: z forward)
+UP_AXES = {
+    "z": np.eye(3),
+    "y": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
+    "x": np.array([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]]),
+}
+
+
+def rotation_from_up(up: str) -> np.ndarray:
+    """R_house_input (3, 3): turns coordinates of an input whose up axis is `up` into the house's (z up)."""
+    if up not in UP_AXES:
+        raise unknown_name("up axis", up, UP_AXES)
+    return UP_AXES[up]
+
+
+def similarity_align(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """`source` moved onto `target` by the best rotation, translation and scale (Umeyama 1991).
+
+    source, target (..., J, 3) m. Returns (..., J, 3), the least-squares similarity of each set; reflections excluded.
+    """
+    source, target = np.asarray(source, float), np.asarray(target, float)
+    source_mean, target_mean = source.mean(-2, keepdims=True), target.mean(-2, keepdims=True)
+    s, t = source - source_mean, target - target_mean
+    u, d, vt = np.linalg.svd(np.swapaxes(t, -1, -2) @ s)
+    sign = np.ones(d.shape)
+    sign[..., -1] = np.where(np.linalg.det(u @ vt) < 0, -1.0, 1.0)
+    rotation = (u * sign[..., None, :]) @ vt
+    scale = (d * sign).sum(-1) / np.maximum((s**2).sum((-1, -2)), 1e-12)
+    return scale[..., None, None] * s @ np.swapaxes(rotation, -1, -2) + target_mean

@@ -1,0 +1,147 @@
+"""What a prediction returns: one person (`PersonPose`) or all people of a call (`Poses`); JSON, files, pictures."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from lidarpose.sample import Box, Pose
+from lidarpose.skeleton import Skeleton
+
+SCHEMA = "lidarpose.poses/1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PersonPose:
+    """One person's pose in the input's own frame.
+
+    pose: None where there are too few points; points (n, 3) m: what it was read from; warnings: lines for the user.
+    """
+
+    pose: Pose | None
+    skeleton: Skeleton
+    points: np.ndarray
+    id: str | int | None = None
+    box: Box | None = None
+    warnings: tuple[str, ...] = ()
+    model: dict = field(default_factory=dict)
+
+    @property
+    def joints(self) -> np.ndarray | None:
+        """(J, 3) m, or None."""
+        return None if self.pose is None else self.pose.joints
+
+    @property
+    def confidence(self) -> np.ndarray | None:
+        """(J,): probability that the joint is within 10 cm."""
+        return None if self.pose is None else self.pose.confidence
+
+    @property
+    def spread(self) -> np.ndarray | None:
+        """(J,) m: expected distance between the joint and the truth."""
+        return None if self.pose is None else self.pose.spread
+
+    @property
+    def num_points(self) -> int:
+        return len(self.points)
+
+    def to_dict(self) -> dict:
+        """The entry of this person under "people"."""
+        box = self.box
+        return {
+            "id": self.id,
+            "box": None
+            if box is None
+            else {"center": box.center.tolist(), "size": box.size.tolist(), "yaw": float(box.yaw)},
+            "num_points": self.num_points,
+            "joints": None if self.pose is None else _rounded(self.pose.joints, 4),
+            "confidence": [] if self.pose is None else _rounded(self.pose.confidence, 3),
+            "spread": [] if self.pose is None else _rounded(self.pose.spread, 4),
+            "warnings": list(self.warnings),
+        }
+
+    def alone(self) -> "Poses":
+        """The same person as the only one of a call."""
+        return Poses(people=(self,), skeleton=self.skeleton, model=self.model)
+
+    def to_json(self) -> str:
+        """A document of the schema lidarpose.poses/1 with this one person."""
+        return self.alone().to_json()
+
+    def save(self, path: str | Path) -> None:
+        """Writes `to_json` to a file, whole or not at all."""
+        self.alone().save(path)
+
+    def picture(self, path: str | Path | None = None) -> bytes:
+        """The person from the front and the side, as PNG; also written to `path` where given."""
+        return self.alone().picture(path)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Poses(Sequence):
+    """The people of one call, in the order of the boxes or arrays. A sequence of `PersonPose`.
+
+    warnings concern the whole input; timing_ms: what took how long.
+    """
+
+    people: tuple[PersonPose, ...]
+    skeleton: Skeleton
+    source: str | None = None
+    model: dict = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    timing_ms: dict[str, float] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.people)
+
+    def __getitem__(self, index):
+        return self.people[index]
+
+    def to_dict(self) -> dict:
+        """The document of the schema lidarpose.poses/1; "warnings" beside it concern the whole input."""
+        return {
+            "schema": SCHEMA,
+            "source": self.source,
+            "frame": "input",
+            "unit": "m",
+            "skeleton": {
+                "name": self.skeleton.name,
+                "joints": list(self.skeleton.joints),
+                "bones": [list(bone) for bone in self.skeleton.bones],
+            },
+            "model": self.model,
+            "people": [person.to_dict() for person in self.people],
+            "warnings": list(self.warnings),
+            "timing_ms": {name: round(value, 2) for name, value in self.timing_ms.items()},
+        }
+
+    def to_json(self) -> str:
+        """`to_dict` as JSON, people and joints a line each."""
+        document = self.to_dict()
+        people = document.pop("people")
+        timing = document.pop("timing_ms")
+        head = ",\n".join(f" {json.dumps(key)}: {json.dumps(value)}" for key, value in document.items())
+        rows = ",\n".join("  " + json.dumps(person) for person in people)
+        body = f"[\n{rows}\n ]" if people else "[]"
+        return f'{{\n{head},\n "people": {body},\n "timing_ms": {json.dumps(timing)}\n}}\n'
+
+    def save(self, path: str | Path) -> None:
+        """Writes `to_json` to a file, whole or not at all."""
+        from lidarpose.data.files import write_atomic
+
+        write_atomic(path, self.to_json())
+
+    def picture(self, path: str | Path | None = None, *, title: str = "") -> bytes:
+        """Everybody from the front and the side on one PNG; also written to `path` where given."""
+        from lidarpose.view.picture import Panel, draw_people
+
+        panels = [
+            Panel(points=p.points, pose=p.pose, label="" if p.id is None else str(p.id), box=p.box) for p in self.people
+        ]
+        return draw_people(panels, path, title=title or (self.source or ""))
+
+
+def _rounded(values: np.ndarray, digits: int) -> list:
+    return np.round(np.asarray(values, float), digits).tolist()

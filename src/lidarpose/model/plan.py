@@ -1,0 +1,187 @@
+"""From points to integer tables: voxels at three sizes, their parents, and a padded layout. Numpy only.
+
+Legend: B people, M points of all people one after the other, F / M / C in names: fine, mid, coarse level.
+
+The grid's origin is the person's own center, never the cloud's minimum: one stray point cannot move the voxels of the
+others (the released DAPT code subtracts the minimum). A parent is the child's index shifted right, as in its pooling.
+"""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+# half width of the window around the center that reaches the network, metres: arm span plus a step
+WINDOW = 2.0
+# bits an axis of a voxel index: 2 * WINDOW / 0.04 m < 2 ** 7
+_BITS = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class Level:
+    """Voxels of one size, padded to the most a person has.
+
+    position (B, N, 3) float32 m: mean of the points inside, in the person's frame; log_count (B, N) float32: log of the
+    number of points; valid (B, N) bool; parent (B, N) int64: index into the next coarser level (0 where padded).
+    """
+
+    position: np.ndarray
+    log_count: np.ndarray
+    valid: np.ndarray
+    parent: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """All that the network reads of a batch of people, as arrays.
+
+    deviation (B, F, 3) m: standard deviation of the points inside each fine voxel; offset (B, F, 3): mean of the points
+    from the voxel's center, in voxels; view (B, 5): unit vector to the sensor, log of the range in metres, 1 if the
+    sensor's position is known (else all zero); point_voxel (M,): row of the padded (B * F) fine level of every point,
+    -1 for a point outside the window or thinned away.
+    """
+
+    fine: Level
+    mid: Level
+    coarse: Level
+    deviation: np.ndarray
+    offset: np.ndarray
+    view: np.ndarray
+    point_voxel: np.ndarray
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays by dotted name ("fine.position"), for tensors, ONNX inputs and tests."""
+        out = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Level):
+                out |= {f"{field.name}.{f.name}": getattr(value, f.name) for f in fields(value)}
+            else:
+                out[field.name] = value
+        return out
+
+
+def plan(
+    points: np.ndarray,
+    lengths: np.ndarray,
+    *,
+    grid: float,
+    max_voxels: int,
+    view: np.ndarray | None = None,
+    rng: np.random.Generator | None = None,
+) -> Plan:
+    """Voxels of people whose points (M, 3) m stand one after the other, `lengths` (B,) points each, person's frame.
+
+    grid: edge of a fine voxel in metres; the mid and coarse ones are 2 and 4 times as wide. A person of more than
+    `max_voxels` fine voxels keeps that many: random ones with `rng`, evenly spread ones without. Every person of at
+    least one point inside the window has at least one voxel at every level; one of none has only padding.
+    """
+    people = len(lengths)
+    person = np.repeat(np.arange(people), lengths)
+    cell = np.floor(points / grid).astype(np.int64) + (1 << (_BITS - 1))
+    inside = (np.abs(points) < WINDOW).all(1)
+    kept = np.flatnonzero(inside)
+    cell, person = cell[kept], person[kept]
+    key = ((person << _BITS | cell[:, 0]) << _BITS | cell[:, 1]) << _BITS | cell[:, 2]
+    voxel_key, voxel_of_point, count = np.unique(key, return_inverse=True, return_counts=True)
+
+    chosen = _thin(voxel_key >> (3 * _BITS), people, max_voxels, rng)
+    if chosen is not None:
+        new = np.full(len(voxel_key), -1)
+        new[chosen] = np.arange(len(chosen))
+        voxel_key, count = voxel_key[chosen], count[chosen]
+        voxel_of_point = new[voxel_of_point]
+        left = voxel_of_point >= 0
+        kept, voxel_of_point = kept[left], voxel_of_point[left]
+
+    xyz = points[kept].astype(np.float64)
+    mean = _segment_sum(voxel_of_point, xyz, len(voxel_key)) / count[:, None]
+    square = _segment_sum(voxel_of_point, xyz**2, len(voxel_key)) / count[:, None]
+    deviation = np.sqrt(np.maximum(square - mean**2, 0))
+    offset = mean / grid - np.floor(mean / grid) - 0.5
+
+    mid_key, mid_of_fine = np.unique(_parent(voxel_key), return_inverse=True)
+    coarse_key, coarse_of_mid = np.unique(_parent(mid_key), return_inverse=True)
+    mid_sum, mid_count = _pool(mid_of_fine, mean * count[:, None], count, len(mid_key))
+    coarse_sum, coarse_count = _pool(coarse_of_mid, mid_sum, mid_count, len(coarse_key))
+
+    fine_slots, mid_slots, coarse_slots = (_Slots(k >> (3 * _BITS), people) for k in (voxel_key, mid_key, coarse_key))
+    point_voxel = np.full(len(points), -1)
+    point_voxel[kept] = fine_slots.row[voxel_of_point]
+    return Plan(
+        fine=_level(fine_slots, mean, count, mid_slots.slot[mid_of_fine]),
+        mid=_level(mid_slots, mid_sum / mid_count[:, None], mid_count, coarse_slots.slot[coarse_of_mid]),
+        coarse=_level(
+            coarse_slots, coarse_sum / coarse_count[:, None], coarse_count, np.zeros(len(coarse_key), np.int64)
+        ),
+        deviation=fine_slots.pad(deviation.astype(np.float32)),
+        offset=fine_slots.pad(offset.astype(np.float32)),
+        view=np.zeros((people, 5), np.float32) if view is None else view.astype(np.float32),
+        point_voxel=point_voxel,
+    )
+
+
+def view_features(center: np.ndarray, sensor_origin: np.ndarray | None) -> np.ndarray:
+    """(5,) for `Plan.view`: unit vector from `center` to the sensor, log range, known; zeros for None."""
+    if sensor_origin is None:
+        return np.zeros(5, np.float32)
+    toward = np.asarray(sensor_origin, float) - center
+    distance = max(float(np.linalg.norm(toward)), 0.1)
+    return np.array([*(toward / distance), np.log(distance), 1.0], np.float32)
+
+
+class _Slots:
+    """Where the sorted rows of one level go in the padded block."""
+
+    def __init__(self, person: np.ndarray, people: int):
+        lengths = np.bincount(person, minlength=people)
+        start = np.cumsum(lengths) - lengths
+        self.shape = (people, max(int(lengths.max(initial=0)), 1))
+        self.slot = np.arange(len(person)) - start[person]
+        self.row = person * self.shape[1] + self.slot
+
+    def pad(self, values: np.ndarray) -> np.ndarray:
+        out = np.zeros((self.shape[0] * self.shape[1],) + values.shape[1:], values.dtype)
+        out[self.row] = values
+        return out.reshape(self.shape + values.shape[1:])
+
+
+def _level(slots: _Slots, mean: np.ndarray, count: np.ndarray, parent: np.ndarray) -> Level:
+    return Level(
+        position=slots.pad(mean.astype(np.float32)),
+        log_count=slots.pad(np.log(count).astype(np.float32)),
+        valid=slots.pad(np.ones(len(count), bool)),
+        parent=slots.pad(parent),
+    )
+
+
+def _parent(key: np.ndarray) -> np.ndarray:
+    """Keys of voxels twice as wide: every axis' index shifted right by one, the person kept."""
+    axis = (1 << _BITS) - 1
+    x, y, z = key >> (2 * _BITS) & axis, key >> _BITS & axis, key & axis
+    return ((key >> (3 * _BITS) << _BITS | x >> 1) << _BITS | y >> 1) << _BITS | z >> 1
+
+
+def _pool(parent: np.ndarray, total: np.ndarray, count: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    return _segment_sum(parent, total, size), np.bincount(parent, count, size)
+
+
+def _segment_sum(segment: np.ndarray, values: np.ndarray, size: int) -> np.ndarray:
+    return np.stack([np.bincount(segment, values[:, k], size) for k in range(values.shape[1])], 1)
+
+
+def _thin(person: np.ndarray, people: int, most: int, rng: np.random.Generator | None) -> np.ndarray | None:
+    """Indices of the voxels to keep, in order, or None where nobody has more than `most`."""
+    lengths = np.bincount(person, minlength=people)
+    if lengths.max(initial=0) <= most:
+        return None
+    start = np.cumsum(lengths) - lengths
+    keep = []
+    for b in range(people):
+        if lengths[b] <= most:
+            pick = np.arange(lengths[b])
+        elif rng is None:
+            pick = np.arange(most) * lengths[b] // most
+        else:
+            pick = np.sort(rng.choice(lengths[b], most, replace=False))
+        keep.append(start[b] + pick)
+    return np.concatenate(keep)

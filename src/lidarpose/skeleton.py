@@ -1,0 +1,124 @@
+"""Named joints: the one place that knows which number a joint has.
+
+Every skeleton is a tree of named joints. Two skeletons that share a name share the joint's definition, so maps
+between them are made by name. `BODY26` is the superset that the network speaks: SMPL's 24 joints, nose and head centre.
+
+Definitions (all points are carried rigidly by the bone whose name stands in brackets):
+    SMPL names      the joint centres of SMPL's kinematic tree: the pelvis lies about 9.5 cm above the middle of the
+                    hips, the hips about 15 cm and the shoulders about 37 cm apart on a mean adult
+    head            the joint at the base of the skull, as in SMPL [head]
+    nose            the tip of the nose [head]
+    head_center     the middle of the head, half way between the ears [head]
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from lidarpose.errors import InputError, unknown_name
+
+
+@dataclass(frozen=True, kw_only=True)
+class Skeleton:
+    """A tree of named joints.
+
+    `parents[j]` is the index of joint j's parent, -1 for the root; parents precede children. `extra_bones` are pairs
+    of indices that are drawn besides the tree's own bones.
+    """
+
+    name: str
+    joints: tuple[str, ...]
+    parents: tuple[int, ...]
+    extra_bones: tuple[tuple[int, int], ...] = ()
+
+    def __post_init__(self):
+        if len(set(self.joints)) != len(self.joints):
+            raise InputError(f"skeleton {self.name}: joint names must be unique, got {list(self.joints)}")
+        if len(self.parents) != len(self.joints):
+            raise InputError(f"skeleton {self.name}: {len(self.joints)} joints but {len(self.parents)} parents")
+        for j, p in enumerate(self.parents):
+            if not -1 <= p < j:
+                raise InputError(f"skeleton {self.name}: parents precede children, but joint {j} has parent {p}")
+
+    def __len__(self) -> int:
+        return len(self.joints)
+
+    def index(self, joint: str) -> int:
+        """The index of a named joint."""
+        try:
+            return self.joints.index(joint)
+        except ValueError:
+            raise unknown_name(f"joint of {self.name}", joint, self.joints) from None
+
+    @cached_property
+    def bones(self) -> tuple[tuple[int, int], ...]:
+        """Pairs (parent, child) to draw, `extra_bones` last."""
+        return tuple((p, j) for j, p in enumerate(self.parents) if p >= 0) + self.extra_bones
+
+    @cached_property
+    def flip(self) -> tuple[int, ...]:
+        """`flip[j]` is the joint that j becomes in a mirror: left and right exchanged, by name."""
+        return tuple(self.index(_mirrored(name)) for name in self.joints)
+
+    def map_to(self, other: "Skeleton") -> np.ndarray:
+        """(len(other),) int: for each joint of `other` its index here. Raises where a joint is missing."""
+        missing = [name for name in other.joints if name not in self.joints]
+        if missing:
+            raise InputError(f"skeleton {self.name} has no {', '.join(missing)}, which {other.name} needs")
+        return np.array([self.index(name) for name in other.joints])
+
+
+def _mirrored(name: str) -> str:
+    for side, across in (("left_", "right_"), ("right_", "left_")):
+        if name.startswith(side):
+            return across + name.removeprefix(side)
+    return name
+
+
+def _tree(name: str, edges: str, extra: str = "") -> Skeleton:
+    """A skeleton from words `joint<parent`, the root without `<`; `extra` are words `joint<joint`."""
+    pairs = [word.partition("<") for word in edges.split()]
+    joints = tuple(joint for joint, _, _ in pairs)
+    parents = tuple(joints.index(parent) if parent else -1 for _, _, parent in pairs)
+    drawn = tuple((joints.index(b), joints.index(a)) for a, _, b in (w.partition("<") for w in extra.split()))
+    return Skeleton(name=name, joints=joints, parents=parents, extra_bones=drawn)
+
+
+_SMPL = """pelvis left_hip<pelvis right_hip<pelvis spine1<pelvis left_knee<left_hip right_knee<right_hip
+spine2<spine1 left_ankle<left_knee right_ankle<right_knee spine3<spine2 left_foot<left_ankle right_foot<right_ankle
+neck<spine3 left_collar<spine3 right_collar<spine3 head<neck left_shoulder<left_collar right_shoulder<right_collar
+left_elbow<left_shoulder right_elbow<right_shoulder left_wrist<left_elbow right_wrist<right_elbow
+left_hand<left_wrist right_hand<right_wrist"""
+
+# SMPL's kinematic tree (Loper et al. 2015), joints in its published order
+SMPL24 = _tree("smpl24", _SMPL)
+
+# SMPL's tree and the two head points that Waymo labels: what the bundled networks predict
+BODY26 = _tree("body26", _SMPL + " nose<head head_center<head")
+
+# the subset of SMPL's joints that the paper pre-trains on; the joints and order of HumanM3
+HUMAN15 = _tree(
+    "human15",
+    """pelvis left_hip<pelvis right_hip<pelvis left_knee<left_hip right_knee<right_hip left_ankle<left_knee
+    right_ankle<right_knee neck<pelvis head<neck left_shoulder<neck right_shoulder<neck left_elbow<left_shoulder
+    right_elbow<right_shoulder left_wrist<left_elbow right_wrist<right_elbow""",
+)
+
+# Waymo's 14 laser keypoints, in the order of its own keypoint tables
+WAYMO14 = _tree(
+    "waymo14",
+    """nose left_shoulder<nose right_shoulder<nose left_elbow<left_shoulder right_elbow<right_shoulder
+    left_wrist<left_elbow right_wrist<right_elbow left_hip<left_shoulder right_hip<right_shoulder left_knee<left_hip
+    right_knee<right_hip left_ankle<left_knee right_ankle<right_knee head_center<nose""",
+    extra="right_shoulder<left_shoulder right_hip<left_hip",
+)
+
+SKELETONS = {s.name: s for s in (SMPL24, HUMAN15, WAYMO14, BODY26)}
+
+
+def skeleton(name: str) -> Skeleton:
+    """A named skeleton: smpl24, human15, waymo14 or body26."""
+    if name not in SKELETONS:
+        raise unknown_name("skeleton", name, SKELETONS)
+    return SKELETONS[name]

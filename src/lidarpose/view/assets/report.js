@@ -1,0 +1,272 @@
+"use strict";
+// Turnable 3D views on 2D canvases. The house's frame: x forward, y left, z up; millimetres about the person's middle.
+// A view looks from azimuth `turn` and elevation `tilt` at the person; depth grows towards the viewer.
+(() => {
+  const data = JSON.parse(document.getElementById("data").textContent);
+  const dark = matchMedia("(prefers-color-scheme: dark)");
+  const calm = matchMedia("(prefers-reduced-motion: reduce)");
+  const toggles = Object.fromEntries(["points", "pose", "truth", "spin"].map((id) => [id, document.getElementById(id)]));
+  const SHADES = 7, SHADE_SPAN = 350;   // steps of the points' gray, mm about the middle over which it runs
+  const EYE = 6500;                     // mm from the person to the eye: a mild perspective
+  const GRID = 500, REACH = 1000;       // mm: a square of the ground, how far it runs at least
+  const SPIN = 0.00035;                 // rad per millisecond
+  const START = {turn: 0.5, tilt: 0.16, zoom: 1};
+  let color = {};
+
+  function readColors() {
+    const style = getComputedStyle(document.documentElement);
+    const get = (name) => style.getPropertyValue("--" + name).trim();
+    color = Object.fromEntries(["truth", "ground", "halo", "ink", "faint", "card"].map((n) => [n, get(n)]));
+    Object.assign(color, {l: get("left"), r: get("right"), c: get("center")});
+    const rgb = (hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16));
+    const near = rgb(get("near")), far = rgb(get("far"));
+    color.shade = Array.from({length: SHADES}, (_, i) => {
+      const t = i / (SHADES - 1);
+      return "rgb(" + near.map((n, k) => Math.round(n * t + far[k] * (1 - t))).join(",") + ")";
+    });
+  }
+
+  // what a person spans: the ground below, the middle to look at, the radius to fit
+  function bounds(person) {
+    const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+    const values = [[], [], []];
+    for (let i = 0; i < person.points.length; i++) values[i % 3].push(person.points[i]);
+    for (let k = 0; k < 3; k++) {
+      const sorted = values[k].sort((a, b) => a - b), n = sorted.length;   // the outermost percent may lie outside
+      if (n) { low[k] = sorted[Math.floor(n * 0.01)]; high[k] = sorted[Math.ceil(n * 0.99) - 1]; }
+    }
+    for (const pose of [person.pose, person.truth]) for (const joint of pose ? pose.joints : []) {
+      if (joint) for (let k = 0; k < 3; k++) { low[k] = Math.min(low[k], joint[k]); high[k] = Math.max(high[k], joint[k]); }
+    }
+    if (!isFinite(low[0])) return null;
+    const center = low.map((v, k) => (v + high[k]) / 2);
+    const tall = Math.max(high[2] - low[2], 1500), wide = Math.max(Math.hypot(high[0] - low[0], high[1] - low[1]), 800);
+    return {center, ground: low[2], tall: Math.min(tall, 5000), wide: Math.min(wide, 5000)};
+  }
+
+  function makeView(canvas) {
+    const person = data.people[+canvas.dataset.person];
+    const span = bounds(person), front = person.facing === null ? 0 : person.facing;
+    const view = {canvas, person, span, ...START, turn: front + START.turn, touched: false, visible: true, hover: null};
+    const fingers = new Map();
+    let pinch = 0;
+    view.reset = () => Object.assign(view, START, {turn: front + START.turn, touched: false, hover: null});
+    const touch = () => { view.touched = true; ask(view); };
+    const zoom = (factor) => { view.zoom = Math.min(6, Math.max(0.4, view.zoom * factor)); touch(); };
+    const gap = () => { const [a, b] = [...fingers.values()]; return Math.hypot(a.x - b.x, a.y - b.y); };
+
+    canvas.addEventListener("pointerdown", (e) => {
+      canvas.setPointerCapture(e.pointerId);
+      fingers.set(e.pointerId, {x: e.clientX, y: e.clientY});
+      if (fingers.size === 2) pinch = gap();
+      touch();
+    });
+    canvas.addEventListener("pointermove", (e) => {
+      const last = fingers.get(e.pointerId);
+      const box = canvas.getBoundingClientRect();
+      view.hover = e.pointerType === "mouse" && !last ? {x: e.clientX - box.left, y: e.clientY - box.top} : null;
+      if (last && fingers.size === 1) {
+        view.turn -= (e.clientX - last.x) * 0.009;
+        view.tilt = Math.min(1.5, Math.max(-0.3, view.tilt + (e.clientY - last.y) * 0.007));
+      }
+      if (last) fingers.set(e.pointerId, {x: e.clientX, y: e.clientY});
+      if (fingers.size === 2) { const now = gap(); zoom(now / (pinch || now)); pinch = now; }
+      ask(view);
+    });
+    for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (e) => fingers.delete(e.pointerId));
+    canvas.addEventListener("pointerleave", () => { view.hover = null; ask(view); });
+    // the wheel zooms a view that was clicked; over any other it goes on scrolling the page
+    canvas.addEventListener("wheel", (e) => {
+      if (document.activeElement !== canvas && !e.ctrlKey) return;
+      e.preventDefault();
+      zoom(Math.exp(-e.deltaY * (e.deltaMode ? 0.03 : 0.0015)));
+    }, {passive: false});
+    canvas.addEventListener("dblclick", () => { view.reset(); ask(view); });
+    canvas.addEventListener("keydown", (e) => {
+      const act = {
+        ArrowLeft: () => { view.turn += 0.12; }, ArrowRight: () => { view.turn -= 0.12; },
+        ArrowUp: () => { view.tilt = Math.max(-0.3, view.tilt - 0.08); },
+        ArrowDown: () => { view.tilt = Math.min(1.5, view.tilt + 0.08); },
+        "+": () => zoom(1.15), "-": () => zoom(1 / 1.15), "0": view.reset,
+      }[e.key];
+      if (!act) return;
+      e.preventDefault();
+      touch();
+      act();
+    });
+    return view;
+  }
+
+  function draw(view) {
+    const {canvas, person, span} = view, pen = canvas.getContext("2d");
+    const ratio = Math.min(devicePixelRatio || 1, 2), width = canvas.clientWidth, height = canvas.clientHeight;
+    if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
+      canvas.width = Math.round(width * ratio);
+      canvas.height = Math.round(height * ratio);
+    }
+    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+    pen.clearRect(0, 0, width, height);
+    if (!span) {
+      pen.fillStyle = color.faint;
+      pen.font = "13px system-ui, sans-serif";
+      pen.textAlign = "center";
+      pen.fillText("no points", width / 2, height / 2);
+      return;
+    }
+    const ct = Math.cos(view.turn), st = Math.sin(view.turn), ce = Math.cos(view.tilt), se = Math.sin(view.tilt);
+    const scale = view.zoom * Math.min(height * 0.8 / span.tall, width * 0.86 / span.wide);
+    const [mx, my, mz] = span.center;
+    // (x, y, z) mm -> [pixels right, pixels down, mm towards the viewer]
+    const place = (x, y, z) => {
+      const dx = x - mx, dy = y - my, dz = z - mz;
+      const toward = ct * dx + st * dy, depth = ce * toward + se * dz;
+      const size = scale * EYE / Math.max(EYE - depth, 300);
+      return [width / 2 + (ct * dy - st * dx) * size, height * 0.475 - (ce * dz - se * toward) * size, depth];
+    };
+    const line = (a, b) => { pen.beginPath(); pen.moveTo(a[0], a[1]); pen.lineTo(b[0], b[1]); pen.stroke(); };
+    pen.lineCap = "round";
+    drawGround(view, pen, place, line);
+    if (toggles.points.checked) drawPoints(view, pen, place);
+    if (toggles.truth.checked && person.truth) {
+      const at = person.truth.joints.map((j) => j && place(...j));
+      pen.strokeStyle = color.truth;
+      pen.lineWidth = 1.6;
+      pen.setLineDash([5, 4]);
+      for (const [a, b] of data.skeletons[person.truth.skeleton].bones) if (at[a] && at[b]) line(at[a], at[b]);
+      pen.setLineDash([]);
+    }
+    if (toggles.pose.checked && person.pose) drawPose(view, pen, place, line);
+  }
+
+  function drawGround(view, pen, place, line) {
+    const {center: [mx, my], ground, wide} = view.span;
+    const half = Math.ceil(Math.max(REACH, wide / 2 + 200) / GRID) * GRID;
+    pen.strokeStyle = color.ground;
+    pen.lineWidth = 1;
+    for (let k = -half; k <= half; k += GRID) {
+      line(place(mx + k, my - half, ground), place(mx + k, my + half, ground));
+      line(place(mx - half, my + k, ground), place(mx + half, my + k, ground));
+    }
+    const facing = view.person.facing;
+    if (facing === null) return;
+    const c = Math.cos(facing), s = Math.sin(facing);
+    const spot = (forward, left) => place(mx + c * forward - s * left, my + s * forward + c * left, ground);
+    const ends = [spot(250, 0), spot(620, 0), spot(760, 0), spot(600, 75), spot(600, -75)];
+    pen.strokeStyle = pen.fillStyle = color.faint;
+    pen.lineWidth = 2;
+    line(ends[0], ends[1]);
+    pen.beginPath();
+    for (const k of [2, 3, 4]) pen.lineTo(ends[k][0], ends[k][1]);
+    pen.fill();
+  }
+
+  function drawPoints(view, pen, place) {
+    const p = view.person.points, shades = Array.from({length: SHADES}, () => []);
+    for (let i = 0; i < p.length; i += 3) {
+      const at = place(p[i], p[i + 1], p[i + 2]);
+      const shade = Math.floor((at[2] / SHADE_SPAN + 1) / 2 * SHADES);
+      shades[Math.min(SHADES - 1, Math.max(0, shade))].push(at);
+    }
+    const size = Math.min(4, Math.max(1.6, 34 / Math.sqrt(p.length / 3 + 1))) * Math.min(2, Math.sqrt(view.zoom));
+    shades.forEach((points, i) => {
+      pen.fillStyle = color.shade[i];
+      for (const [x, y] of points) pen.fillRect(x - size / 2, y - size / 2, size, size);
+    });
+  }
+
+  function drawPose(view, pen, place, line) {
+    const {pose, truth} = view.person, skeleton = data.skeletons[pose.skeleton];
+    const at = pose.joints.map((j) => j && place(...j));
+    const sure = pose.confidence || pose.joints.map(() => 1);
+    const ink = (c) => 0.2 + 0.8 * c;
+    const bones = skeleton.bones.filter(([a, b]) => at[a] && at[b]);
+    bones.sort((p, q) => at[p[0]][2] + at[p[1]][2] - at[q[0]][2] - at[q[1]][2]);   // far ones first
+    for (const [a, b, side] of bones) {
+      const mid = [(at[a][0] + at[b][0]) / 2, (at[a][1] + at[b][1]) / 2];
+      pen.strokeStyle = color.halo;
+      pen.globalAlpha = 0.7 * Math.min(sure[a], sure[b]);
+      pen.lineWidth = 6;
+      line(at[a], at[b]);
+      pen.strokeStyle = color[side];
+      pen.lineCap = "butt";
+      for (const [end, c] of [[at[a], sure[a]], [at[b], sure[b]]]) {   // each half as sure as its own joint
+        pen.globalAlpha = ink(c);
+        pen.lineWidth = 2 + 2 * c;
+        line(end, mid);
+      }
+      pen.lineCap = "round";
+    }
+    at.forEach((spot, j) => {
+      if (!spot) return;
+      pen.globalAlpha = ink(sure[j]);
+      pen.fillStyle = color[skeleton.sides[j]];
+      pen.beginPath();
+      pen.arc(spot[0], spot[1], 3.1, 0, 2 * Math.PI);
+      pen.fill();
+    });
+    pen.globalAlpha = 1;
+    if (view.hover) drawHover(view, pen, at, pose, truth, skeleton);
+  }
+
+  // names the joint under the pointer, its confidence and its error
+  function drawHover(view, pen, at, pose, truth, skeleton) {
+    let best = -1, nearest = 14;
+    at.forEach((spot, j) => {
+      const gap = spot ? Math.hypot(spot[0] - view.hover.x, spot[1] - view.hover.y) : Infinity;
+      if (gap < nearest) { nearest = gap; best = j; }
+    });
+    if (best < 0) return;
+    const name = skeleton.joints[best], words = [name.replaceAll("_", " ")];
+    if (pose.confidence) words.push("confidence " + pose.confidence[best].toFixed(2));
+    const other = truth ? truth.joints[data.skeletons[truth.skeleton].joints.indexOf(name)] : null;
+    if (other) words.push("off by " + Math.round(Math.hypot(...other.map((v, k) => v - pose.joints[best][k]))) + " mm");
+    const text = words.join(" · ");
+    pen.font = "12px system-ui, sans-serif";
+    pen.textAlign = "left";
+    const wide = pen.measureText(text).width + 14;
+    const x = Math.min(Math.max(at[best][0] + 10, 4), Math.max(4, view.canvas.clientWidth - wide - 4));
+    const y = Math.max(at[best][1] - 30, 4);
+    pen.fillStyle = color.ink;
+    pen.fillRect(x, y, wide, 22);
+    pen.fillStyle = color.card;
+    pen.fillText(text, x + 7, y + 15);
+  }
+
+  // only what changed and can be seen is drawn
+  const views = [...document.querySelectorAll("canvas[data-person]")].map(makeView);
+  const waiting = new Set(views);
+  let last = null, running = false;
+  const spins = (view) => toggles.spin.checked && !calm.matches && !view.touched && view.visible && view.span;
+
+  function frame(now) {
+    const step = last === null ? 0 : Math.min(now - last, 100);
+    last = now;
+    for (const view of views) {
+      if (spins(view)) { view.turn += step * SPIN; waiting.add(view); }
+      if (waiting.has(view) && view.visible) { waiting.delete(view); draw(view); }
+    }
+    running = views.some(spins);
+    if (running) requestAnimationFrame(frame); else last = null;
+  }
+  function wake() { if (!running) { running = true; requestAnimationFrame(frame); } }
+  function ask(view) { waiting.add(view); wake(); }
+  function askAll() { views.forEach(ask); }
+
+  for (const toggle of Object.values(toggles)) toggle.addEventListener("change", askAll);
+  dark.addEventListener("change", () => { readColors(); askAll(); });
+  calm.addEventListener("change", askAll);
+  const observer = new IntersectionObserver((entries) => {
+    for (const entry of entries) {
+      const view = views.find((v) => v.canvas === entry.target);
+      view.visible = entry.isIntersecting;
+      if (view.visible) ask(view);
+    }
+  });
+  const resized = new ResizeObserver((entries) => {
+    for (const entry of entries) ask(views.find((v) => v.canvas === entry.target));
+  });
+  for (const view of views) { observer.observe(view.canvas); resized.observe(view.canvas); }
+  readColors();
+  views.forEach(draw);
+  wake();
+})();

@@ -1,0 +1,123 @@
+"""What both the picture and the report need of a person: where the person looks, the views, the sides, the words."""
+
+import numpy as np
+
+from lidarpose.errors import InputError
+from lidarpose.sample import Pose
+from lidarpose.skeleton import Skeleton
+
+MIN_POINTS = 5  # with fewer points the predictor answers with no pose
+
+
+def check_person(person, kind: str) -> None:
+    """Raises InputError unless `person` has points (n, 3) and poses of one person: joints (J, 3) or None."""
+    if person.points.ndim != 2 or person.points.shape[1] != 3:
+        raise InputError(f"{kind}.points must be (n, 3) metres, got {person.points.shape}")
+    for name in ("pose", "truth"):
+        pose = getattr(person, name)
+        if pose is not None and pose.joints.ndim != 2:
+            raise InputError(
+                f"{kind}.{name} must hold one person, joints ({len(pose.skeleton)}, 3), got {pose.joints.shape}: "
+                "draw people one by one"
+            )
+
+
+def facing(pose: Pose | None) -> np.ndarray | None:
+    """Where a person looks, on the ground: (3,) of length 1 with z = 0.
+
+    Taken from the left-right axis of hips and shoulders, by name. None without a pose, or where the axis is unknown
+    or stands upright, as of somebody who lies on the side.
+    """
+    if pose is None:
+        return None
+    names = pose.skeleton.joints
+    axis = np.zeros(3)
+    for joint in ("hip", "shoulder"):
+        if f"left_{joint}" in names and f"right_{joint}" in names:
+            across = pose.joints[names.index(f"left_{joint}")] - pose.joints[names.index(f"right_{joint}")]
+            if np.isfinite(across).all():
+                axis = axis + across
+    length = np.hypot(axis[0], axis[1])
+    if length < 0.3 * np.linalg.norm(axis) or length < 0.02:
+        return None
+    return np.array([axis[1], -axis[0], 0.0]) / length
+
+
+def project(points: np.ndarray, *, seen_from: np.ndarray) -> np.ndarray:
+    """points (..., 3) m as somebody sees them who looks level at them: (..., 3) m = (right, up, towards the viewer).
+
+    seen_from (3,) is the level unit direction from the points to the viewer. Seen from where a person looks to, the
+    person's left side is on the picture's right.
+    """
+    x, y, _ = seen_from
+    return np.asarray(points, float) @ np.array([[-y, x, 0.0], [0, 0, 1], [x, y, 0]]).T
+
+
+def view_directions(forward: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """The two `seen_from` of a person who looks `forward`: the front, and the person's right (so that the person
+    looks to the picture's right). Without a direction: from +x and from -y."""
+    x, y, _ = (1.0, 0.0, 0.0) if forward is None else forward
+    return np.array([x, y, 0.0]), np.array([y, -x, 0.0])
+
+
+def side(joint: str) -> str:
+    """ "left", "right" or "center", by the joint's name."""
+    return next((s for s in ("left", "right") if joint.startswith(s + "_")), "center")
+
+
+def bone_sides(skeleton: Skeleton) -> list[str]:
+    """The side of each of `skeleton.bones`: the child's, center for a bone from one side to the other."""
+    sides = [side(name) for name in skeleton.joints]
+    return ["center" if {sides[a], sides[b]} == {"left", "right"} else sides[b] for a, b in skeleton.bones]
+
+
+def confidences(pose: Pose) -> np.ndarray:
+    """(J,) in [0, 1]; 1 where the pose knows none."""
+    if pose.confidence is None:
+        return np.ones(len(pose.skeleton))
+    return np.clip(np.nan_to_num(np.asarray(pose.confidence, float)), 0, 1)
+
+
+def is_known(pose: Pose | None) -> bool:
+    """Whether there is a pose with at least one finite joint."""
+    return pose is not None and bool(np.isfinite(pose.joints).all(-1).any())
+
+
+def describe(person) -> str:
+    """The line under a person: number of points, distance from the origin, mean confidence."""
+    count = len(person.points)
+    words = [f"{count:,} point{'' if count == 1 else 's'}"]
+    distance = getattr(person, "distance", None)
+    if distance is None:
+        at = middle(person)
+        distance = None if at is None else float(np.linalg.norm(at))
+    if distance is not None:
+        words.append(f"{distance:.1f} m")
+    if is_known(person.pose) and person.pose.confidence is not None:
+        words.append(f"confidence {confidences(person.pose).mean():.2f}")
+    return " · ".join(words)
+
+
+def missing_pose(person) -> str:
+    """What to say where there is nothing predicted: empty if there is a pose, or nobody could expect one."""
+    if is_known(person.pose):
+        return ""
+    if len(person.points) < MIN_POINTS:
+        return f"no pose: under {MIN_POINTS} points"
+    return "" if person.pose is None else "no pose"
+
+
+def thinned(count: int, limit: int) -> np.ndarray:
+    """Indices of at most `limit` of `count` points, evenly spread and the same each time."""
+    return np.arange(count) if count <= limit else np.linspace(0, count - 1, limit).round().astype(int)
+
+
+def middle(person) -> np.ndarray | None:
+    """A point (3,) in the person: of the points, else of a skeleton; None where there is nothing."""
+    clouds = [person.points] + [pose.joints for pose in (person.pose, person.truth) if pose is not None]
+    for cloud in clouds:
+        cloud = np.asarray(cloud, float)
+        cloud = cloud[np.isfinite(cloud).all(-1)]
+        if len(cloud):
+            return np.median(cloud, axis=0)
+    return None

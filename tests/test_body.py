@@ -1,0 +1,272 @@
+"""The shipped body: its mesh, its joints, its shapes, and how a pose moves it."""
+
+from importlib import resources
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpose.body import person
+from lidarpose.body.person import MAX_CLOTHING, clothing, sample_people
+from lidarpose.body.rig import (
+    forward_kinematics,
+    load_rig,
+    pose_bodies,
+    pose_bodies_reference,
+    vertex_normals,
+    vertex_normals_reference,
+)
+from lidarpose.errors import InputError
+from lidarpose.geometry import axis_angle_to_matrix, rotation_about
+from lidarpose.skeleton import BODY26, SMPL24
+
+J = BODY26.index
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return load_rig()
+
+
+@pytest.fixture(scope="module")
+def mean_adult(rig):
+    return rig.rest(rig.coefficients[rig.age >= 18].mean(0, keepdims=True))
+
+
+@pytest.fixture(scope="module")
+def some(rig):
+    return rig.rest(sample_people(np.random.default_rng(1), 6).coefficients)
+
+
+def volume(rig, vertices):
+    a, b, c = np.moveaxis(vertices[:, rig.faces].astype(float), 2, 0)
+    return (np.cross(a, b) * c).sum((1, 2)) / 6
+
+
+def random_rotations(seed, n, spread=0.6):
+    return axis_angle_to_matrix(np.random.default_rng(seed).normal(0, spread, (n, 24, 3)))
+
+
+def posed(rig, rest, **flexed):
+    """`rest` with named joints turned: joint=(axis, degrees)."""
+    rotations = np.broadcast_to(np.eye(3), (len(rest.vertices), 24, 3, 3)).copy()
+    for joint, (axis, degrees) in flexed.items():
+        rotations[:, SMPL24.index(joint)] = rotation_about(axis, np.radians(degrees))
+    return pose_bodies(rig, rest, rotations, np.zeros((len(rotations), 3)))
+
+
+def test_asset_is_small_and_arrays_are_read_only(rig):
+    assert len(resources.files("lidarpose.body").joinpath("assets/body.npz").read_bytes()) <= 400_000
+    assert load_rig() is rig
+    with pytest.raises(ValueError, match="read-only"):
+        rig.template[0] = 0
+
+
+def test_mesh_is_one_closed_surface_wound_outwards(rig):
+    edges = np.concatenate([rig.faces[:, [0, 1]], rig.faces[:, [1, 2]], rig.faces[:, [2, 0]]])
+    count = len(rig.template)
+    directed = edges[:, 0].astype(np.int64) * count + edges[:, 1]
+    reverse = edges[:, 1].astype(np.int64) * count + edges[:, 0]
+    assert len(np.unique(directed)) == len(directed), "two faces run along an edge in the same direction"
+    assert set(directed.tolist()) == set(reverse.tolist()), "an edge has a face on one side only"
+    assert sorted(np.unique(rig.faces)) == list(range(count))
+    # a closed surface in one piece without handles, hence Euler's 2
+    assert count - len(edges) // 2 + len(rig.faces) == 2
+    assert 2000 <= len(rig.faces) <= 3000
+
+
+def test_every_shape_has_the_volume_of_a_person(rig):
+    liters = volume(rig, rig.rest(rig.coefficients).vertices) * 1e3
+    bmi = liters * 0.98 / rig.height**2
+    assert np.abs(bmi / rig.bmi - 1).max() < 0.12
+
+
+def test_weights_and_parts(rig):
+    np.testing.assert_allclose(rig.weight.sum(1), 1, atol=1e-6)
+    assert (np.diff(rig.weight, axis=1) <= 0).all(), "the kernel stops at the first zero"
+    np.testing.assert_allclose(rig.dense_weight.sum(1), 1, atol=1e-6)
+    assert set(rig.face_part) <= set(range(1, 25))
+    middle = rig.template[rig.faces].mean(1)
+    for name in SMPL24.joints:
+        here = middle[rig.face_part == 1 + SMPL24.index(name)]
+        assert len(here) >= 8, name
+        if name.startswith(("left_", "right_")):
+            side = 1 if name.startswith("left_") else -1
+            assert (side * here[:, 1] > -0.01).all(), name
+        nearest = np.linalg.norm(here.mean(0) - rig.joint_template[:24], axis=-1)
+        assert nearest[SMPL24.index(name)] < 0.28, name
+    assert middle[rig.face_part == 1 + J("head"), 2].min() > middle[rig.face_part == 1 + J("spine2"), 2].max()
+    assert middle[rig.face_part == 1 + J("left_hand"), 1].min() > 0.5
+
+
+def test_pivots_are_those_of_smpl(mean_adult):
+    at = dict(zip(BODY26.joints, mean_adult.joints[0], strict=True))
+    apart = lambda a, b: np.linalg.norm(at[a] - at[b])  # noqa: E731
+    assert np.abs(at["pelvis"]).max() == 0
+    assert np.linalg.norm((at["left_hip"] + at["right_hip"]) / 2) == pytest.approx(0.095, abs=0.01)
+    assert apart("left_hip", "right_hip") == pytest.approx(0.15, abs=0.01)
+    assert apart("left_shoulder", "right_shoulder") == pytest.approx(0.37, abs=0.01)
+    heights = [at[j][2] for j in ("left_foot", "left_ankle", "left_knee", "left_hip", "pelvis", "spine1", "spine2")]
+    heights += [at[j][2] for j in ("spine3", "left_collar", "neck", "head", "head_center")]
+    assert (np.diff(heights) > 0).all()
+
+
+def test_rest_pose_is_a_t_pose_that_faces_x(rig, mean_adult):
+    joints = mean_adult.joints[0]
+    for side, sign in (("left", 1), ("right", -1)):
+        arm = joints[[J(f"{side}_{j}") for j in ("shoulder", "elbow", "wrist", "hand")]]
+        assert np.abs(np.diff(arm[:, [0, 2]], axis=0)).max() < 2e-3
+        assert (sign * np.diff(arm[:, 1]) > 0.05).all()
+        leg = joints[[J(f"{side}_{j}") for j in ("knee", "ankle")]]
+        assert np.abs(np.diff(leg[:, 1])) < 2e-3
+        foot = joints[J(f"{side}_foot")] - joints[J(f"{side}_ankle")]
+        assert foot[0] > 0.1 and abs(foot[1]) < 2e-3
+    assert joints[J("nose"), 0] > joints[J("head_center"), 0] + 0.08
+    # palms down: hands are flat, wider along x than thick along z
+    hand = mean_adult.vertices[0][rig.dense_weight[:, [J("left_wrist"), J("left_hand")]].sum(1) > 0.9]
+    assert np.ptp(hand[:, 0]) > 1.3 * np.ptp(hand[:, 2])
+
+
+def test_left_mirrors_right(rig, some):
+    mirrored = some.joints[:, BODY26.flip] * [1, -1, 1]
+    assert np.abs(mirrored - some.joints).max() < 0.01
+    faces = rig.faces
+    for vertices in some.vertices:
+        other = vertices * np.float32([1, -1, 1])
+        middle = np.concatenate([vertices, vertices[faces].mean(1)])
+        gap = np.linalg.norm(other[:, None] - middle, axis=-1).min(1)
+        # to the nearest corner or middle of a face, so a few cm where faces are large
+        assert np.median(gap) < 0.012 and gap.max() < 0.06
+
+
+def test_soles_are_flat_and_heights_are_real(rig):
+    rest = rig.rest(rig.coefficients)
+    np.testing.assert_allclose(np.ptp(rest.vertices[..., 2], axis=1), rig.height, atol=0.02)
+    feet = {s: rig.dense_weight[:, [J(f"{s}_ankle"), J(f"{s}_foot")]].sum(1) > 0.5 for s in ("left", "right")}
+    for side in feet.values():
+        foot = rest.vertices[:, side]
+        assert np.abs(foot[..., 2].min(1) - rest.lowest).max() < 0.012
+        # heel and ball both touch the ground
+        for half in (foot[..., 0] < 0.0, foot[..., 0] > 0.08):
+            lowest = np.where(half, foot[..., 2], np.inf).min(1)
+            assert (lowest - rest.lowest).max() < 0.03
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 2**31), st.floats(0, 1.5))
+def test_fast_pose_equals_reference(seed, spread):
+    rig = load_rig()
+    rng = np.random.default_rng(seed)
+    rest = rig.rest(sample_people(rng, 3).coefficients)
+    rotations, move = random_rotations(seed, 3, spread), rng.normal(0, 5, (3, 3))
+    fast, slow = (f(rig, rest, rotations, move) for f in (pose_bodies, pose_bodies_reference))
+    for a, b in zip(fast, slow, strict=True):
+        assert a.dtype == b.dtype == np.float32
+        np.testing.assert_allclose(a, b, atol=1e-5)
+    normals = vertex_normals(rig.faces, fast[0])
+    # float32 sums of slivers' cross products: directions agree to a fraction of a degree
+    assert ((normals * vertex_normals_reference(rig.faces, fast[0])).sum(-1) > 1 - 1e-4).all()
+
+
+def test_identity_is_the_rest_pose(rig, some):
+    vertices, joints = posed(rig, some)
+    np.testing.assert_allclose(vertices, some.vertices, atol=1e-6)
+    np.testing.assert_allclose(joints, some.joints, atol=1e-6)
+
+
+def test_root_turns_the_body_rigidly_about_the_pelvis(rig, some):
+    rotations, move = random_rotations(5, 6), np.random.default_rng(5).normal(0, 3, (6, 3))
+    turn = rotation_about("z", 1.1) @ rotation_about("x", 0.4)
+    turned = rotations.copy()
+    turned[:, 0] = turn @ rotations[:, 0]
+    before = pose_bodies(rig, some, rotations, np.zeros((6, 3)))
+    after = pose_bodies(rig, some, turned, move)
+    for a, b in zip(before, after, strict=True):
+        np.testing.assert_allclose(a @ turn.T + move[:, None], b, atol=1e-5)
+
+
+def test_bones_keep_their_length_and_joints_follow_forward_kinematics(rig, some):
+    rotations = random_rotations(7, 6, 1.0)
+    _, joints = pose_bodies(rig, some, rotations, np.ones((6, 3)))
+    _, expected = forward_kinematics(SMPL24.parents, some.joints[:, :24], rotations, np.ones((6, 3)))
+    np.testing.assert_allclose(joints[:, :24], expected, atol=1e-5)
+    a, b = np.array(BODY26.bones).T
+    length = [np.linalg.norm(j[:, a] - j[:, b], axis=-1) for j in (joints, some.joints)]
+    np.testing.assert_allclose(*length, atol=1e-5)
+
+
+def test_signs_of_rotations(rig, mean_adult):
+    rest = mean_adult.joints[0]
+    _, (sitting,) = posed(rig, mean_adult, left_hip=("y", -90), left_knee=("y", 90))
+    assert sitting[J("left_knee"), 0] > rest[J("left_hip"), 0] + 0.3
+    assert sitting[J("left_ankle"), 2] < sitting[J("left_knee"), 2] - 0.3
+    _, (hanging,) = posed(rig, mean_adult, left_shoulder=("x", -80), right_shoulder=("x", 80))
+    assert hanging[J("left_wrist"), 2] < 0.1 and hanging[J("right_wrist"), 2] < 0.1
+    _, (bent,) = posed(rig, mean_adult, left_elbow=("z", -90), right_elbow=("z", 90))
+    assert bent[J("left_wrist"), 0] > 0.2 and bent[J("right_wrist"), 0] > 0.2
+
+
+@pytest.mark.parametrize("flexed", [dict(left_hip=("y", -90), left_knee=("y", 90)), dict(left_shoulder=("x", -80))])
+def test_flexing_keeps_most_of_the_volume(rig, some, flexed):
+    vertices, _ = posed(rig, some, **flexed)
+    assert (np.abs(volume(rig, vertices) / volume(rig, some.vertices) - 1) < 0.06).all()
+
+
+def test_normals_point_outwards(rig, some):
+    normals = vertex_normals(rig.faces, some.vertices)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-5)
+    assert (volume(rig, some.vertices + 0.005 * normals) > 1.05 * volume(rig, some.vertices)).all()
+
+
+def test_people_are_those_of_a_street():
+    people = sample_people(np.random.default_rng(3), 4000)
+    adult = people.age >= 18
+    assert 0.09 < 1 - adult.mean() < 0.15
+    for sex, height in (("male", 1.74), ("female", 1.615)):
+        here = adult & (people.sex == sex)
+        assert 0.40 < here.mean() < 0.48
+        assert people.height[here].mean() == pytest.approx(height, abs=0.02)
+        low, middle, high = np.percentile(people.bmi[here], [5, 50, 95])
+        assert 17 < low < 20 and 23 < middle < 26 and 29 < high < 36
+    assert 0.9 < people.height.min() and people.height.max() < 2.1
+    assert len(np.unique(people.coefficients, axis=0)) == 4000
+    rest = load_rig().rest(people.coefficients[:200])
+    np.testing.assert_allclose(np.ptp(rest.vertices[..., 2], axis=1), people.height[:200], atol=0.02)
+
+
+def test_people_and_clothes_repeat_with_the_seed(rig):
+    again = [sample_people(np.random.default_rng(9), 5) for _ in range(2)]
+    np.testing.assert_array_equal(again[0].coefficients, again[1].coefficients)
+    worn = [clothing(np.random.default_rng(9), rig, 5) for _ in range(2)]
+    np.testing.assert_array_equal(*worn)
+
+
+def test_clothes(rig):
+    worn = clothing(np.random.default_rng(4), rig, 400)
+    assert worn.shape == (400, len(rig.template)) and worn.dtype == np.float32
+    assert worn.min() >= 0 and worn.max() <= MAX_CLOTHING
+    dense = rig.dense_weight
+    torso = dense[:, [J(j) for j in ("pelvis", "spine1", "spine2", "spine3")]].sum(1) > 0.9
+    means = worn[:, torso].mean(1)
+    assert 0.012 < means.mean() < 0.02
+    assert (means < 0.006).mean() > 0.03 and (means > 0.024).mean() > 0.05
+    hands = dense[:, [J("left_hand"), J("right_hand")]].sum(1) > 0.9
+    face = (dense[:, J("head")] > 0.9) & (rig.template[:, 0] > rig.joint_template[J("head_center"), 0] + 0.07)
+    assert worn[:, hands].mean() < 0.001 and worn[:, face].mean() < 0.004
+    # smooth: across an edge the cloth changes by far less than its thickness
+    step = np.abs(worn[:, rig.faces[:, 0]] - worn[:, rig.faces[:, 1]])
+    assert np.median(step) < 0.002
+
+
+def test_wrong_shapes_are_explained(rig, some):
+    with pytest.raises(InputError, match=r"must be \(n, \d+\)"):
+        rig.rest(np.zeros((2, 3)))
+    with pytest.raises(InputError, match="6 bodies need rotations"):
+        pose_bodies(rig, some, np.zeros((5, 24, 3, 3)), np.zeros((6, 3)))
+
+
+def test_neighbors_share_sex(rig):
+    weight, near = person._table()
+    assert (rig.sex[near] == rig.sex[:, None]).all()
+    assert weight.sum() == pytest.approx(1)

@@ -1,0 +1,173 @@
+"""Writing in one step: the old content or the new one, nothing left behind, one line when the disk refuses."""
+
+import errno
+import os
+import stat
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpose.data import files
+from lidarpose.data.files import atomic_path, file_error, read_bytes, write_atomic
+from lidarpose.errors import InputError
+
+
+def tree(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+@settings(max_examples=30, deadline=None)
+@given(data=st.binary() | st.text())
+def test_round_trip(tmp_path_factory, data):
+    folder = tmp_path_factory.mktemp("files")
+    path = folder / "deep" / "er" / "a.json"
+    for content in (b"the older content", data):
+        write_atomic(path, content)
+    assert path.read_bytes() == (data.encode() if isinstance(data, str) else data)
+    assert tree(folder) == ["deep", "deep/er", "deep/er/a.json"]
+    if data:
+        assert read_bytes(path, expected="a test") == path.read_bytes()
+
+
+def test_relative_path(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_atomic("a.txt", "new")
+    assert tree(tmp_path) == ["a.txt"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="modes are POSIX's")
+def test_new_files_have_the_usual_mode(tmp_path):
+    write_atomic(tmp_path / "a.txt", "new")
+    (tmp_path / "b.txt").write_text("plain")
+    assert stat.S_IMODE((tmp_path / "a.txt").stat().st_mode) == stat.S_IMODE((tmp_path / "b.txt").stat().st_mode)
+
+
+def test_other_libraries_see_the_suffix(tmp_path):
+    path = tmp_path / "a.npz"
+    with atomic_path(path) as temporary:
+        assert temporary.parent == tmp_path and temporary.suffix == ".npz" and temporary != path
+        np.savez(temporary, points=np.ones(3))
+        assert not path.exists()
+    assert np.load(path)["points"].tolist() == [1, 1, 1]
+    assert tree(tmp_path) == ["a.npz"]
+
+
+def test_long_names(tmp_path):
+    path = tmp_path / ("a" * 250 + ".png")
+    write_atomic(path, b"x")
+    assert path.read_bytes() == b"x"
+
+
+def test_names_that_the_disk_refuses(tmp_path):
+    with pytest.raises(InputError, match="choose a shorter name"):
+        write_atomic(tmp_path / ("a" * 300), "x")
+    with pytest.raises(InputError, match="^'': is a folder"):
+        write_atomic("", "x")
+    assert tree(tmp_path) == []
+
+
+def test_nested_and_simultaneous_paths_differ(tmp_path):
+    with atomic_path(tmp_path / "a.txt") as one, atomic_path(tmp_path / "a.txt") as two:
+        assert one != two
+        one.write_text("one")
+        two.write_text("two")
+    assert (tmp_path / "a.txt").read_text() == "one"
+    assert tree(tmp_path) == ["a.txt"]
+
+
+@pytest.mark.parametrize(
+    "error", [RuntimeError("boom"), KeyboardInterrupt(), SystemExit(1), OSError(errno.EIO, "far away")]
+)
+def test_failure_leaves_the_old_file_and_nothing_else(tmp_path, error):
+    write_atomic(tmp_path / "a.txt", "old")
+    for path in (tmp_path / "a.txt", tmp_path / "made" / "for" / "b.txt"):
+        with pytest.raises(type(error)) as caught, atomic_path(path) as temporary:
+            temporary.write_text("half of the n")
+            raise error
+        assert caught.value is error
+    assert tree(tmp_path) == ["a.txt"] and (tmp_path / "a.txt").read_text() == "old"
+
+
+def test_failure_keeps_folders_that_others_use(tmp_path):
+    with pytest.raises(RuntimeError), atomic_path(tmp_path / "made" / "a.txt") as temporary:
+        (temporary.parent / "other.txt").write_text("mine")
+        raise RuntimeError
+    assert tree(tmp_path) == ["made", "made/other.txt"]
+
+
+@pytest.mark.parametrize("number", ["ENOSPC", "EDQUOT", "EROFS"])
+@pytest.mark.parametrize("call", ["mkdir", "open", "write", "fsync", "replace"])
+def test_disk_that_refuses(tmp_path, monkeypatch, call, number):
+    number = getattr(errno, number)
+    error = OSError(number, os.strerror(number))
+
+    def refuse(*_, **__):
+        raise error
+
+    if call == "mkdir":
+        monkeypatch.setattr(files.Path, "mkdir", refuse)
+    elif call != "write":
+        monkeypatch.setattr(files.os, call, refuse)
+    path = tmp_path / "made" / "a.txt"
+    with pytest.raises(InputError) as caught, atomic_path(path):
+        if call == "write":
+            refuse()
+    monkeypatch.undo()
+    message = str(caught.value)
+    assert message.isprintable() and str(path.parent) in message and os.strerror(number) in message
+    assert any(word in message for word in ("free some", "read-only"))
+    assert tree(tmp_path) == []
+
+
+def test_file_as_parent_folder(tmp_path):
+    (tmp_path / "file").write_text("x")
+    for path in (tmp_path / "file" / "a.txt", tmp_path / "file" / "deeper" / "a.txt"):
+        with pytest.raises(InputError, match="is a file: choose another folder") as caught:
+            write_atomic(path, "x")
+        assert str(path.parent) in str(caught.value) and "\n" not in str(caught.value)
+    assert tree(tmp_path) == ["file"]
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")
+def test_folder_without_write_access(tmp_path):
+    tmp_path.chmod(0o500)
+    for path in (tmp_path / "a.txt", tmp_path / "made" / "a.txt"):
+        with pytest.raises(InputError, match="Permission denied.*choose another folder"):
+            write_atomic(path, "x")
+
+
+@pytest.mark.parametrize("bad", [3, None, "a\0b"])
+def test_not_a_path(bad):
+    with pytest.raises(InputError, match="expected the path of a file to write"):
+        write_atomic(bad, "x")
+
+
+def test_folder_as_target(tmp_path):
+    with pytest.raises(InputError, match="is a folder; give the name of a file"):
+        write_atomic(tmp_path, "x")
+    assert tree(tmp_path) == []
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes with names are POSIX's")
+def test_pipes_and_devices_are_never_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="device or pipe"):
+        write_atomic(tmp_path / "pipe", "x")
+    assert stat.S_ISFIFO((tmp_path / "pipe").stat().st_mode) and tree(tmp_path) == ["pipe"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links need rights elsewhere")
+def test_links_are_followed(tmp_path):
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "a.txt").write_text("old")
+    (tmp_path / "link.txt").symlink_to(tmp_path / "there" / "a.txt")
+    write_atomic(tmp_path / "link.txt", "new")
+    assert (tmp_path / "link.txt").is_symlink() and (tmp_path / "there" / "a.txt").read_text() == "new"
+
+
+def test_messages_are_printable_lines():
+    message = str(file_error("a\nb\x1b[31m\udcff.pcd", "one\r\ntwo\tthree\x00"))
+    assert message.isprintable() and message.encode()
+    assert message.startswith("a b") and "one two" in message

@@ -1,0 +1,540 @@
+"""Every format of points: round trips, other writers' files, and one line for each bad input."""
+
+import gzip
+import io
+import json
+import os
+import struct
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from lidarpose.data.boxes import read_boxes
+from lidarpose.data.formats import SUFFIXES, Cloud, read_points
+from lidarpose.errors import InputError
+
+REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "real"
+
+POINTS = np.array([[1.5, -2.25, 0.125, 7], [10, 20, -1, 8], [3, 4, 5, 9]], np.float32)
+
+float32_points = hnp.arrays(
+    np.float32,
+    st.tuples(st.integers(1, 20), st.just(4)),
+    elements=st.floats(-1e6, 1e6, width=32, allow_subnormal=False),
+)
+float64_points = hnp.arrays(
+    np.float64, st.tuples(st.integers(1, 20), st.just(3)), elements=st.floats(-1e7, 1e7, allow_subnormal=False)
+)
+
+
+# ---- writers: small and literal, so that they share nothing with the reader
+
+
+def pcd_header(fields="x y z i", size="4 4 4 4", kind="F F F F", count="1 1 1 1", points=3, data="binary"):
+    return (
+        f"# .PCD v0.7\nVERSION 0.7\nFIELDS {fields}\nSIZE {size}\nTYPE {kind}\nCOUNT {count}\nWIDTH {points}\n"
+        f"HEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {points}\nDATA {data}\n"
+    ).encode()
+
+
+def ply_header(points=3, form="binary_little_endian", kind="float", names="x y z i", before="", after="", newline="\n"):
+    lines = [
+        "ply",
+        f"format {form} 1.0",
+        "comment made by a test",
+        *before.split("\n")[:-1],
+        f"element vertex {points}",
+    ]
+    lines += [f"property {kind} {name}" for name in names.split()] + after.split("\n")[:-1] + ["end_header", ""]
+    return newline.join(lines).encode()
+
+
+def npy(array, **options):
+    file = io.BytesIO()
+    np.save(file, array, **options)
+    return file.getvalue()
+
+
+def npz(**arrays):
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    return file.getvalue()
+
+
+def npy_header(shape, descr="<f4"):
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"shape": shape, "fortran_order": False, "descr": descr})
+    return file.getvalue()
+
+
+def zipped(name, content):
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr(name, content)
+    return file.getvalue()
+
+
+def read(folder, name, content, **options) -> Cloud:
+    path = folder / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return read_points(path, **options)
+
+
+def same(cloud, expected=POINTS, fields=None, *, rtol=0.0):
+    assert cloud.points.dtype == np.float64 and cloud.points.flags.c_contiguous
+    np.testing.assert_allclose(cloud.points, np.asarray(expected, float)[:, :3], rtol=rtol, atol=0)
+    assert fields is None or cloud.fields == fields
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("clouds")
+
+
+# ---- round trips
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
+@settings(max_examples=40, deadline=None)
+@given(points=float32_points)
+def test_pcd_of_pypcd4(folder, encoding, points):
+    pypcd4 = pytest.importorskip("pypcd4")
+    path = folder / f"{encoding}.pcd"
+    pypcd4.PointCloud.from_xyzi_points(points).save(path, encoding=pypcd4.Encoding(encoding))
+    cloud = read_points(path)
+    assert cloud.fields == ("x", "y", "z", "intensity") and cloud.num_dropped == 0 and cloud.warnings == ()
+    # pypcd4 writes ten decimals in text
+    np.testing.assert_allclose(cloud.points, points[:, :3], rtol=0, atol=1e-10 if encoding == "ascii" else 0)
+
+
+@pytest.mark.parametrize("encoding", ["binary", "binary_compressed"])
+def test_pcd_of_pypcd4_with_mixed_types_and_order(folder, encoding):
+    pypcd4 = pytest.importorskip("pypcd4")
+    rng = np.random.default_rng(0)
+    xyz = rng.normal(size=(3, 500)) + [[5e5], [5e6], [0]]
+    ring = np.repeat(np.arange(5, dtype=np.uint8), 100)
+    columns = [ring, xyz[2], xyz[0], ring.astype(np.int16), xyz[1]]
+    types = (np.uint8, np.float64, np.float64, np.int16, np.float64)
+    path = folder / f"mixed_{encoding}.pcd"
+    made = pypcd4.PointCloud.from_points(columns, ("ring", "z", "x", "tag", "y"), types)
+    made.save(path, encoding=pypcd4.Encoding(encoding))
+    same(read_points(path), xyz.T, ("ring", "z", "x", "tag", "y"))
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary"])
+@settings(max_examples=40, deadline=None)
+@given(points=float32_points)
+def test_ply_of_trimesh(folder, encoding, points):
+    trimesh = pytest.importorskip("trimesh")
+    path = folder / f"{encoding}.ply"
+    path.write_bytes(trimesh.PointCloud(points[:, :3]).export(file_type="ply", encoding=encoding))
+    # trimesh writes eight decimals in text
+    np.testing.assert_allclose(read_points(path).points, points[:, :3], rtol=0, atol=1e-8 if encoding == "ascii" else 0)
+
+
+def test_ply_mesh_with_faces(folder):
+    trimesh = pytest.importorskip("trimesh")
+    box = trimesh.creation.box()
+    for encoding in ("ascii", "binary"):
+        same(read(folder, "box.ply", box.export(file_type="ply", encoding=encoding)), box.vertices)
+
+
+@settings(max_examples=40, deadline=None)
+@given(points=float32_points, order=st.sampled_from("<>"), newline=st.sampled_from(["\n", "\r\n", "\r"]))
+def test_ply_binary_orders_and_line_ends(folder, points, order, newline):
+    # the first byte of the rows may be one of a line end
+    points[0, 0] = np.frombuffer(b"\n\r\n?", order + "f4")[0]
+    form = {"<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    content = ply_header(len(points), form, newline=newline) + points.astype(order + "f4").tobytes()
+    same(read(folder, "order.ply", content), points, ("x", "y", "z", "i"))
+
+
+@settings(max_examples=40, deadline=None)
+@given(points=float32_points)
+def test_bin_kitti(folder, points):
+    same(read(folder, "kitti.bin", points.tobytes(), columns=4), points, ("x", "y", "z", "intensity"))
+
+
+@settings(max_examples=40, deadline=None)
+@given(points=float64_points, fortran=st.booleans())
+def test_npy_and_npz_keep_every_bit(folder, points, fortran):
+    points = np.asfortranarray(points) if fortran else points
+    same(read(folder, "a.npy", npy(points)), points)
+    same(read(folder, "a.npz", npz(points=points, labels=np.zeros((9, 3)))), points)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    points=float64_points,
+    separator=st.sampled_from([",", ", ", ";", " ; ", " ", "   ", "\t", " \t "]),
+    header=st.sampled_from([None, "{}X{}y{}Z", "{}x{}y{}z", '{}"x"{}"y"{}"z"']),
+    newline=st.sampled_from(["\n", "\r\n", "\r"]),
+    decimal=st.sampled_from(".,"),
+    comment=st.booleans(),
+)
+def test_text_of_any_style(folder, points, separator, header, newline, decimal, comment):
+    if separator.strip(" ") == ",":
+        decimal = "."
+    lines = [separator.join(repr(float(v)) for v in row).replace(".", decimal) for row in points]
+    if header:
+        lines.insert(0, header.format("", separator, separator))
+    if comment:
+        lines.insert(0, "# made by a test, of x y z")
+        lines.insert(3, "  # and another")
+        lines.append("")
+    cloud = read(folder, "a.csv", newline.join(lines) + newline)
+    # pandas may round the last bit otherwise than repr
+    same(cloud, points, rtol=1e-15)
+    assert cloud.warnings == ()
+
+
+@pytest.mark.parametrize("dtype", ["float16", "float32", "float64", "int8", "int64", "uint16", ">f4", ">f8", ">i4"])
+def test_number_types_of_numpy(folder, dtype):
+    points = np.arange(12).reshape(4, 3).astype(dtype)
+    same(read(folder, "a.npy", npy(points)), points)
+    records = np.zeros(4, [("i", "u1"), ("Z", dtype), ("y", dtype), ("X", dtype)])
+    records["X"], records["y"], records["Z"] = points.T
+    same(read(folder, "a.npy", npy(records)), points, ("i", "Z", "y", "X"))
+
+
+# ---- what the formats allow
+
+
+def test_pcd_variants(folder):
+    rows = POINTS.tobytes()
+    same(read(folder, "A.PCD", pcd_header() + rows), fields=("x", "y", "z", "i"))
+    same(read(folder, "a.pcd", pcd_header().replace(b"\n", b"\r\n") + rows))
+    # an old version without COUNT and POINTS, an organised cloud, and rows after the last
+    old = b"VERSION .5\nFIELDS x y z i\nSIZE 4 4 4 4\nTYPE F F F F\nWIDTH 3\nHEIGHT 1\nDATA binary\n"
+    same(read(folder, "a.pcd", old + rows + b"more"))
+    # padding fields named _ twice, and a field of several values
+    padded = np.zeros(3, [("p", "u1", 4), ("x", "f4"), ("y", "f4"), ("q", "u1"), ("z", "f4"), ("h", "f4", 3)])
+    padded["x"], padded["y"], padded["z"] = POINTS.T[:3]
+    header = pcd_header("_ x y _ z h", "1 4 4 1 4 4", "U F F U F F", "4 1 1 1 1 3")
+    same(read(folder, "a.pcd", header + padded.tobytes()))
+    text = b"1 2 3 4 1.5 -2.25 0 0.125 9 9 9\n 1 2 3 4\t10 20  0 -1 nan 9 9 \n0 0 0 0 3 4 0 5 9 9 9"
+    same(read(folder, "a.pcd", header.replace(b"DATA binary", b"DATA ascii") + text))
+    one = pcd_header(points=1, data="ascii") + b"1.5 -2.25 0.125 0\n"
+    same(read(folder, "a.pcd", one), POINTS[:1])
+
+
+def test_ply_variants(folder):
+    rows = POINTS.tobytes()
+    before = "element camera 2\nproperty double a\nproperty uchar b\n"
+    same(read(folder, "a.ply", ply_header(before=before) + bytes(18) + rows))
+    text = "".join(f"{x} {y} {z} {i}\n" for x, y, z, i in POINTS.tolist())
+    same(read(folder, "a.ply", ply_header(form="ascii", before=before).decode() + "1 2\n3 4\n" + text))
+    # faces of several sizes after the points
+    faces = "element face 2\nproperty list uchar int vertex_indices\n"
+    body = struct.pack("<B3i", 3, 0, 1, 2) + struct.pack("<B4i", 4, 0, 1, 2, 0)
+    same(read(folder, "a.ply", ply_header(after=faces) + rows + body))
+    same(read(folder, "a.ply", ply_header(form="ascii", after=faces).decode() + text + "3 0 1 2\n4 0 1 2 0\n"))
+    twice = POINTS.astype("<f8").tobytes()
+    same(read(folder, "a.ply", ply_header(kind="double", names="X Y Z i") + twice), fields=("X", "Y", "Z", "i"))
+
+
+def test_bin_columns(folder):
+    rng = np.random.default_rng(0)
+    metres = rng.normal(scale=20, size=(8, 3)).astype(np.float32)
+    ring = np.arange(8, dtype=np.float32)[:, None]
+    nuscenes = np.hstack([metres, metres[:, :1], ring])
+    fields = ("x", "y", "z", "intensity", "ring")
+    # 7 rows of 5 do not divide by 4; 8 rows of 5 are also 10 rows of 4, and only the beams tell
+    for rows in (7, 8):
+        cloud = read(folder, "a.bin", nuscenes[:rows].tobytes())
+        same(cloud, nuscenes[:rows], fields)
+        assert len(cloud.warnings) == 1 and "columns=4" in cloud.warnings[0]
+    # the converse: 10 rows of KITTI's 4 are also 8 rows of 5
+    kitti = rng.normal(scale=20, size=(10, 4)).astype(np.float32)
+    cloud = read(folder, "a.bin", kitti.tobytes())
+    same(cloud, kitti)
+    assert cloud.warnings == ()
+    for name, options in (("sweep.pcd.bin", {}), ("a.bin", {"columns": 5})):
+        cloud = read(folder, name, nuscenes.tobytes(), **options)
+        same(cloud, nuscenes, fields)
+        assert cloud.warnings == ()
+    same(read(folder, "a.bin", metres.tobytes(), columns=3), metres, ("x", "y", "z"))
+    same(read(folder, "a.bin", nuscenes[:, [0, 1, 2, 3, 4, 0]].tobytes(), columns=6), metres)
+
+
+def test_npz_choices(folder):
+    other = POINTS + 1
+    same(read(folder, "a.npz", npz(xyz=other, points=POINTS)))
+    same(read(folder, "a.npz", npz(other=other, xyz=POINTS)))
+    same(read(folder, "a.npz", npz(cloud=POINTS, labels=np.zeros(3), name=np.array("me"))))
+    file = io.BytesIO()
+    np.savez_compressed(file, points=POINTS)
+    same(read(folder, "a.npz", file.getvalue()))
+
+
+def test_text_variants(folder):
+    same(read(folder, "a.xyz", "\ufeff1.5 -2.25 .125 7\n1e1 +20 -1 8\n\n3 4 5 9 # the last\n"))
+    same(read(folder, "a.txt", "//X,Y,Z,Intensity\n1.5,-2.25,0.125,7\n10,20,-1,8\n3,4,5,9"))
+    same(read(folder, "a.csv", "time,z,label,y,x\n0,0.125,a b,-2.25,1.5\n0,-1,c,20,10\n0,5,,4,3\n"))
+    # the order that a comment tells counts: numpy.savetxt writes its header so
+    cloud = read(folder, "a.txt", "# i z y x\n7 0.125 -2.25 1.5\n8 -1 20 10\n9 5 4 3\n")
+    same(cloud, fields=("i", "z", "y", "x"))
+    # the row numbers that pandas writes have no name
+    same(read(folder, "a.csv", ",x,y,z\n0,1.5,-2.25,0.125\n1,10,20,-1\n2,3,4,5\n"), fields=("", "x", "y", "z"))
+    cloud = read(folder, "a.txt", "# a comment\n1.5 -2.25 0.125 7 0\n10 20 -1 8 0\n3 4 5 9 0\n")
+    same(cloud, fields=("x", "y", "z", "column_4", "column_5"))
+    same(read(folder, "a.csv", "x\ty\tz\tname of it\n1.5\t-2.25\t0.125\tme too\n10\t20\t-1\t\n3\t4\t5\tb\n"))
+
+
+def test_map_coordinates_keep_their_millimetres(folder):
+    points = np.array([[500000.001, 5000000.002, 100.003], [500001.0, 5000001.0, 99.999]])
+    text = "\n".join(" ".join(map(str, row)) for row in points.tolist())
+    same(read(folder, "utm.xyz", text), points, rtol=1e-15)
+    same(read(folder, "utm.pcd", pcd_header("x y z", "8 8 8", "F F F", "1 1 1", 2) + points.tobytes()), points)
+    same(read(folder, "utm.ply", ply_header(2, kind="double", names="x y z") + points.tobytes()), points)
+
+
+def test_not_finite_rows_are_dropped_and_counted(folder):
+    points = POINTS.copy()
+    points[0, 1], points[1, 3] = np.nan, np.inf  # the second row has finite coordinates
+    contents = {
+        "a.pcd": pcd_header() + points.tobytes(),
+        "a.ply": ply_header() + points.tobytes(),
+        "a.bin": points.tobytes(),
+        "a.npy": npy(points),
+        "a.csv": "x,y,z\n1,,2\n10,20,-1\n3,4,5\n",
+        "a.xyz": "1 nan 2\n10 20 -1\n3 4 5\n",
+    }
+    for name, content in contents.items():
+        cloud = read(folder, name, content)
+        same(cloud, POINTS[1:])
+        assert cloud.num_dropped == 1 and len(cloud.warnings) == 1 and "1 of 3" in cloud.warnings[0]
+    for value in ("inf", "-inf", "NA", "null", "-nan", "1e999"):
+        assert read(folder, "a.csv", f"1,2,3\n1,{value},2\n").num_dropped == 1, value
+
+
+# ---- bad inputs: (name of the file, content, words that the message must have)
+
+ROWS = POINTS.tobytes()
+HUGE = 10**12
+PNG = b"\x89PNG\r\n\x1a\n" + bytes(40)
+TEXT = "1 2 3\n4 5 6\n"
+COMPRESSED = pcd_header(data="binary_compressed")
+OBJECTS = npy(np.array([[1, 2, "a"]], dtype=object), allow_pickle=True)
+BAD = {
+    "empty": ("a.pcd", b"", ["empty"]),
+    "unknown suffix": ("a.las2", ROWS, ["'.las2'", *SUFFIXES]),
+    "no suffix": ("cloud", ROWS, ["suffix ''", ".pcd"]),
+    "gzip as pcd": ("a.pcd", gzip.compress(pcd_header() + ROWS), ["gzip-compressed", "unpack it first"]),
+    "gzip by suffix": ("a.pcd.gz", gzip.compress(pcd_header() + ROWS), ["gzip-compressed", "unpack it first"]),
+    "zip as ply": ("a.ply", zipped("a.ply", b"ply\n"), ["zip", "unpack it first"]),
+    "png as pcd": ("a.pcd", PNG, ["PNG"]),
+    "png as bin": ("a.bin", PNG, ["PNG"]),
+    "png as txt": ("a.txt", PNG, ["PNG"]),
+    "web page": ("a.ply", b"<!DOCTYPE html><html>", ["web page"]),
+    "git lfs": ("a.pcd", b"version https://git-lfs.github.com/spec/v1\n", ["git lfs pull"]),
+    "ply as pcd": ("a.pcd", ply_header() + ROWS, [".ply"]),
+    "npy as bin": ("a.bin", npy(POINTS), [".npy"]),
+    "npy as npz": ("a.npz", npy(POINTS), [".npy"]),
+    "npz as npy": ("a.npy", npz(points=POINTS), ["rename it to .npz"]),
+    "zip as npz": ("a.npz", zipped("a.txt", TEXT), ["zip archive"]),
+    "text as bin": ("a.bin", TEXT * 4, ["text", ".txt"]),
+    "text as pcd": ("a.pcd", TEXT, ["PCD header"]),
+    "text as npy": ("a.npy", TEXT, [".npy header"]),
+    "text as ply": ("a.ply", TEXT, ["PLY header"]),
+    "text as npz": ("a.npz", TEXT, [".npz"]),
+    "pcd without data": ("a.pcd", pcd_header()[:60], ["DATA"]),
+    "pcd without fields": ("a.pcd", b"VERSION .7\nPOINTS 3\nDATA ascii\n1 2 3\n", ["x, y and z"]),
+    "pcd without xyz": ("a.pcd", pcd_header("a b c d") + ROWS, ["x, y and z", "a b c d"]),
+    "pcd cut off": ("a.pcd", pcd_header() + ROWS[:-1], ["cut off", "48", "47"]),
+    "pcd of 10^12": ("a.pcd", pcd_header(points=HUGE) + ROWS, ["cut off", "1000000000000"]),
+    "pcd ascii of 10^12": ("a.pcd", pcd_header(points=HUGE, data="ascii") + b"1 2 3 4\n", ["cut off"]),
+    "pcd ascii cut off": ("a.pcd", pcd_header(data="ascii") + b"1.5 2.5 3.5 4\n1 2 3 4\n", ["cut off", "got 2"]),
+    "pcd ascii words": ("a.pcd", pcd_header(data="ascii") + b"1 2 3 4\n1 b 3 4\n1 2 3 4\n", ["'1 b 3 4'", "line 2"]),
+    "pcd ascii of bytes": ("a.pcd", pcd_header(data="ascii") + b"\xff\xfe\xfd" * 9, ["UTF-"]),
+    "pcd compressed 10^12": ("a.pcd", pcd_header(points=HUGE, data="binary_compressed") + bytes(40), ["10"]),
+    "pcd compressed cut off": ("a.pcd", COMPRESSED + struct.pack("<II", 40, 48) + bytes(9), ["cut off"]),
+    "pcd compressed no sizes": ("a.pcd", COMPRESSED + b"\x01", ["cut off"]),
+    "pcd compressed damaged": ("a.pcd", COMPRESSED + struct.pack("<II", 9, 48) + b"\xff" * 9, ["a.pcd"]),
+    "pcd compressed bomb": ("a.pcd", COMPRESSED + struct.pack("<II", 1, 2**32 - 1) + b"\x00", ["4294967295"]),
+    "pcd negative count": ("a.pcd", pcd_header(points=-3) + ROWS, ["POINTS", "'-3'"]),
+    "pcd float16": ("a.pcd", pcd_header(size="2 2 2 2") + ROWS, ["TYPE", "'f2'"]),
+    "pcd sizes missing": ("a.pcd", pcd_header(size="4 4") + ROWS, ["2 sizes"]),
+    "pcd x of two": ("a.pcd", pcd_header(count="2 1 1 1") + ROWS * 2, ["COUNT 1"]),
+    "pcd encoding": ("a.pcd", pcd_header(data="zstd") + ROWS, ["'zstd'", "binary_compressed"]),
+    "pcd no points": ("a.pcd", pcd_header(points=0), ["has no points"]),
+    "pcd all nan": ("a.pcd", pcd_header() + np.full((3, 4), np.nan, "f4").tobytes(), ["NaN", "all 3"]),
+    "ply cut off": ("a.ply", ply_header() + ROWS[:-1], ["cut off"]),
+    "ply of 10^12": ("a.ply", ply_header(HUGE) + ROWS, ["cut off", "1000000000000"]),
+    "ply ascii of 10^12": ("a.ply", ply_header(HUGE, "ascii") + b"1 2 3 4\n", ["cut off"]),
+    "ply ascii cut off": ("a.ply", ply_header(3, "ascii") + b"1 2 3 4\n1 2 3 4\n", ["cut off"]),
+    "ply lines before of 10^17": (
+        "a.ply",
+        ply_header(form="ascii", before=f"element u {10**17}\nproperty int a\n") + b"1\n",
+        ["cut off"],
+    ),
+    "ply without end": ("a.ply", ply_header()[:50], ["end_header"]),
+    "ply without vertex": ("a.ply", b"ply\nformat ascii 1.0\nelement face 1\nend_header\n1\n", ["'vertex'"]),
+    "ply without xyz": ("a.ply", ply_header(names="a b c d") + ROWS, ["x, y and z"]),
+    "ply without format": ("a.ply", b"ply\nelement vertex 1\nproperty float x\nend_header\n1\n", ["format"]),
+    "ply odd line": ("a.ply", b"ply\nformat ascii 1.0\nwhat is this\nend_header\n", ["'what is this'"]),
+    "ply list": ("a.ply", ply_header(kind="list uchar int") + ROWS, ["list uchar int"]),
+    "ply list before": ("a.ply", ply_header(before="element f 1\nproperty list uchar int a\n") + ROWS, ["list"]),
+    "ply no points": ("a.ply", ply_header(0), ["has no points"]),
+    "ply odd count": ("a.ply", ply_header("many") + ROWS, ["'many'"]),
+    "bin odd size": ("a.bin", ROWS[:-1], ["47 bytes", "cut off"]),
+    "bin of three": ("a.bin", np.ones((7, 3), "f4").tobytes(), ["84 bytes", "columns=3"]),
+    "bin garbage": ("a.bin", np.random.default_rng(0).bytes(4000), ["beyond"]),
+    "bin all nan": ("a.bin", np.full((3, 4), np.nan, "f4").tobytes(), ["NaN"]),
+    "npy objects": ("a.npy", OBJECTS, ["dtype object"]),
+    "npz objects": ("a.npz", npz(points=np.array([[1, 2, "a"]], dtype=object)), ["dtype object"]),
+    "npy cut off": ("a.npy", npy(POINTS)[:-1], ["cut off"]),
+    "npy header cut off": ("a.npy", npy(POINTS)[:20], ["header"]),
+    "npy of 10^12": ("a.npy", npy_header((HUGE, 3)), ["cut off"]),
+    "npy of 10^40": ("a.npy", npy_header((10**40, 3)), ["cut off"]),
+    "npy negative": ("a.npy", npy_header((-1, 3)) + ROWS, ["(-1, 3)"]),
+    "npy flat": ("a.npy", npy(POINTS.ravel()), ["(12,)", "(n, 3+)"]),
+    "npy two columns": ("a.npy", npy(np.ones((9, 2))), ["(9, 2)"]),
+    "npy transposed": ("a.npy", npy(np.ones((2, 3)).T[:, :2]), ["points.T"]),
+    "npy batch": ("a.npy", npy(np.ones((2, 5, 4))), ["(2, 5, 4)", "reshape(-1, 4)"]),
+    "npy words": ("a.npy", npy(np.array([["a", "b", "c"]])), ["<U1"]),
+    "npy complex": ("a.npy", npy(np.ones((2, 3), complex)), ["complex128"]),
+    "npy booleans": ("a.npy", npy(np.ones((2, 3), bool)), ["bool"]),
+    "npy no points": ("a.npy", npy(np.ones((0, 3))), ["has no points"]),
+    "npy records without xyz": ("a.npy", npy(np.zeros(3, [("a", "f4"), ("b", "f4")])), ["x, y and z"]),
+    "npy all inf": ("a.npy", npy(np.full((3, 3), np.inf)), ["infinity"]),
+    "npz cut off": ("a.npz", npz(points=POINTS)[:-30], [".npz", "cut off"]),
+    "npz damaged": ("a.npz", npz(points=POINTS).replace(ROWS[:8], ROWS[8:16]), [".npz", "damaged"]),
+    "npy of python": ("a.npy", npy(POINTS).replace(b"}", b"("), ["damaged"]),
+    "npz of two": ("a.npz", npz(a=POINTS, b=POINTS), ["'points'", "a, b"]),
+    "npz of none": ("a.npz", npz(a=np.ones(3)), ["'points'", "got a"]),
+    "npz of words": ("a.npz", npz(a=np.array("me")), ["'points'", "got a"]),
+    "npz of 10^12": ("a.npz", zipped("points.npy", npy_header((HUGE, 3))), ["cut off"]),
+    "txt of words": ("a.txt", "hello world this is\nsome text\n", ["'hello world this is'", "line 1"]),
+    "txt of two columns": ("a.txt", "1 2\n3 4\n", ["got 2 on line 1"]),
+    "txt of comments": ("a.txt", "# nothing\n\n# here\n", ["has no points"]),
+    "csv header alone": ("a.csv", "x,y,z\n", ["has no points"]),
+    "csv other header": ("a.csv", "# by me\nlon,lat,height\n1,2,3\n", ["'lon,lat,height'", "line 2"]),
+    "csv word below": ("a.csv", "# by me\nx,y,z\n1,2,3\n# odd\n1,oops,3\n", ["'1,oops,3'", "line 5"]),
+    "csv of short rows": ("a.csv", "x,y,z\n1,2\n3,4\n", ["'1,2'", "line 2"]),
+    "csv open quote": ("a.csv", 'x,y,z\n1,2,"3\n', ["rows of numbers"]),
+    "csv all missing": ("a.csv", "x,y,z\n,,\nNA,1,2\n", ["NaN", "all 2"]),
+    "txt utf-16": ("a.txt", TEXT.encode("utf-16"), ["UTF-16", "UTF-8"]),
+    "txt latin-1": ("a.txt", b"# \xe4\n1 2 3\n", ["UTF-8"]),
+    "txt zeros": ("a.txt", b"1 2 3\n\x00\x00\n", ["zero bytes"]),
+    "xyz of bytes": ("a.xyz", bytes(range(128, 256)), ["UTF-8"]),
+    "odd name": ("a\nb.pcd", b"", ["empty"]),
+}
+
+
+def one_line(error, *names):
+    message = str(error)
+    assert isinstance(error, InputError)
+    assert message.isprintable() and len(message) < 600
+    for name in names:
+        assert name in message, message
+    assert "Traceback" not in message and "Error:" not in message, message
+    assert error.__cause__ is None and (error.__context__ is None or error.__suppress_context__)
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_one_line(tmp_path, case):
+    name, content, words = BAD[case]
+    with pytest.raises(InputError) as caught:
+        read(tmp_path, name, content)
+    if name.isprintable():
+        assert str(caught.value).startswith(f"{tmp_path / name}: ")
+    one_line(caught.value, *words)
+
+
+def test_bad_paths(tmp_path):
+    (tmp_path / "sweep_1.pcd").write_bytes(b"x")
+    (tmp_path / "folder.pcd").mkdir()
+    cases = {
+        tmp_path / "sweep_2.pcd": ["no such file", "did you mean sweep_1.pcd"],
+        tmp_path / "gone" / "a.pcd": ["no such file", f"the folder {tmp_path / 'gone'} does not exist"],
+        tmp_path / "folder.pcd": ["folder"],
+        tmp_path / "sweep_1.pcd" / "a.pcd": ["cannot be read"],
+        tmp_path / ("a" * 300 + ".pcd"): ["cannot be read"],
+        "a\0.pcd": ["expected the path"],
+        3.5: ["expected the path"],
+        None: ["expected the path"],
+    }
+    if hasattr(os, "mkfifo"):
+        os.mkfifo(tmp_path / "pipe.pcd")
+        cases[tmp_path / "pipe.pcd"] = ["pipe"]
+    for path, words in cases.items():
+        with pytest.raises(InputError) as caught:
+            read_points(path)
+        one_line(caught.value, *words)
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may read everything")
+def test_unreadable_file(tmp_path):
+    path = tmp_path / "a.pcd"
+    path.write_bytes(b"x")
+    path.chmod(0)
+    with pytest.raises(InputError, match="cannot be read.*rights"):
+        read_points(path)
+
+
+@pytest.mark.parametrize("columns", [0, 2, -4, True, 4.0, "4"])
+def test_bad_columns(tmp_path, columns):
+    with pytest.raises(InputError, match="columns must be a whole number of at least 3"):
+        read(tmp_path, "a.bin", ROWS, columns=columns)
+
+
+@settings(max_examples=300, deadline=None)
+@given(data=st.data())
+def test_damaged_files_read_or_fail_in_one_line(folder, data):
+    """Any file with bytes cut off, changed or inserted gives points or an InputError, nothing else."""
+    text = "x,y,z,i\n" + "".join(f"{x},{y},{z},{i}\n" for x, y, z, i in POINTS.tolist())
+    good = {
+        "a.pcd": pcd_header() + ROWS,
+        "b.pcd": pcd_header(data="ascii") + text[8:].replace(",", " ").encode(),
+        "c.pcd": COMPRESSED + struct.pack("<II", 50, 48) + b"\x1f" + ROWS[:32] + b"\x0f" + ROWS[32:],
+        "a.ply": ply_header() + ROWS,
+        "b.ply": ply_header(form="ascii") + text[8:].replace(",", " ").encode(),
+        "a.npy": npy(POINTS),
+        "a.npz": npz(points=POINTS),
+        "a.bin": ROWS,
+        "a.csv": text.encode(),
+    }
+    name = data.draw(st.sampled_from(sorted(good)))
+    content = bytearray(good[name])
+    assert len(read(folder, name, bytes(content)).points) == 3
+    at = data.draw(st.integers(0, len(content) - 1))
+    kind = data.draw(st.sampled_from(["cut", "change", "insert"]))
+    odd = data.draw(st.one_of(st.binary(min_size=1, max_size=6), st.sampled_from([b"9" * 25, b"\n", b" ", b"-", b","])))
+    if kind == "cut":
+        del content[at:]
+    else:
+        content[at : at + (len(odd) if kind == "change" else 0)] = odd
+    try:
+        cloud = read(folder, name, bytes(content))
+    except InputError as error:
+        assert str(error).isprintable()
+    else:
+        assert cloud.points.ndim == 2 and cloud.points.shape[1] == 3 and np.isfinite(cloud.points).all()
+
+
+def test_import_loads_no_heavy_library():
+    heavy = {"pandas", "trimesh", "pypcd4", "lzf", "torch"}
+    code = f"import sys, lidarpose.data.formats; print(sorted({heavy} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="the real sweeps are not on this machine")
+@pytest.mark.parametrize("name", ["sweep_0.pcd", "sweep_1.bin", "sweep_2.ply"])
+def test_real_sweeps(name):
+    cloud = read_points(REAL / name)
+    labels = REAL / f"{name[:7]}.json"
+    assert cloud.num_dropped == 0 and cloud.warnings == () and cloud.fields == ("x", "y", "z", "intensity")
+    expected = [person["num_points"] for person in json.loads(labels.read_text())["people"]]
+    found = [int(box.contains(cloud.points).sum()) for box in read_boxes(labels)]
+    many = [(a, b) for a, b in zip(found, expected, strict=True) if b >= 50]
+    assert len(many) == 3
+    assert all(abs(a - b) <= 3 for a, b in many)

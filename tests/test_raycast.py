@@ -1,0 +1,341 @@
+import concurrent.futures
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from lidarpose.errors import InputError
+from lidarpose.geometry import rotation_about
+from lidarpose.lidar.raycast import cast_ray_list, cast_rays, cast_window, find_window, scan
+from lidarpose.lidar.raycast_reference import cast_ray_list_reference, cast_rays_reference
+from lidarpose.lidar.sensor import SENSORS, Sensor, Window, sensor
+
+PARITY = Path(__file__).parent / "parity" / "raycast.npz"
+FULL_TURN = np.linspace(-np.pi, np.pi, 41)
+# no beam in the horizontal plane, where made-up meshes have edges
+ALL_ELEVATIONS = np.linspace(-1.5, 1.5, 24)
+
+
+def sphere(rings: int = 16, radius: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """A closed mesh: rings of 2 * rings vertices and two poles."""
+    around = 2 * rings
+    polar = np.pi * np.arange(1, rings) / rings
+    angle = np.pi * np.arange(around) / rings
+    grid = np.stack(
+        np.broadcast_arrays(
+            np.sin(polar)[:, None] * np.cos(angle), np.sin(polar)[:, None] * np.sin(angle), np.cos(polar)[:, None]
+        ),
+        -1,
+    ).reshape(-1, 3)
+    vertices = radius * np.concatenate([grid, [[0, 0, 1], [0, 0, -1]]])
+    top, bottom = len(grid), len(grid) + 1
+    faces = []
+    for j in range(around):
+        k = (j + 1) % around
+        faces.append((top, j, k))
+        faces.append((bottom, (rings - 2) * around + k, (rings - 2) * around + j))
+        for i in range(rings - 2):
+            a, b = i * around, (i + 1) * around
+            faces += [(a + j, b + j, b + k), (a + j, b + k, a + k)]
+    return vertices, np.array(faces)
+
+
+def body(rng: np.random.Generator, rings: int = 12) -> tuple[np.ndarray, np.ndarray]:
+    """A closed, bumpy, self-hiding mesh of a person's size around the origin."""
+    vertices, faces = sphere(rings)
+    bumps = 1 + 0.3 * np.sin(vertices @ rng.normal(0, 4, (3, 3))).sum(1, keepdims=True) / 3
+    return vertices * bumps * [0.3, 0.4, 0.9], faces
+
+
+def soup(rng: np.random.Generator, count: int, spread: float, size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Loose triangles around the sensor."""
+    vertices = rng.normal(0, spread, (count, 1, 3)) + rng.normal(0, size, (count, 3, 3))
+    return vertices.reshape(-1, 3), np.arange(3 * count).reshape(count, 3)
+
+
+def join(*meshes):
+    sizes = np.cumsum([0] + [len(v) for v, _ in meshes])
+    return np.concatenate([v for v, _ in meshes]), np.concatenate(
+        [f + n for (_, f), n in zip(meshes, sizes, strict=False)]
+    )
+
+
+def ground(half: float, z: float, x: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    corners = np.array([[x - half, -half, z], [x + half, -half, z], [x + half, half, z], [x - half, half, z]])
+    return corners, np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def assert_same(got, want, *, ties: float = 1e-5):
+    """Same hits, same ranges; other faces only at ties."""
+    distance, face = got
+    expected, expected_face = want
+    assert distance.dtype == np.float32 and face.dtype == np.int32 and distance.shape == expected.shape
+    hit = np.isfinite(expected)
+    assert (np.isfinite(distance) & ~hit).sum() == 0, "extra hits"
+    assert (~np.isfinite(distance) & hit).sum() == 0, "missed hits"
+    assert ((face >= 0) == hit).all()
+    error = np.abs(distance[hit] - expected[hit])
+    assert (error <= 1e-4).all(), f"ranges differ by up to {error.max()} m"
+    other = face[hit] != expected_face[hit]
+    assert (error[other] <= ties).all()
+    assert other.mean() < 0.01 if other.size > 200 else other.sum() <= 2
+
+
+@pytest.mark.parametrize("scene", range(6))
+def test_same_as_embree(scene):
+    data = np.load(PARITY)
+    vertices, azimuth, elevation = (data[f"{scene}_{name}"] for name in ("vertices", "azimuth", "elevation"))
+    want = data[f"{scene}_range"], data[f"{scene}_face"]
+    assert_same(cast_rays(vertices, data["faces"], azimuth, elevation), want)
+    a, e = np.meshgrid(azimuth, elevation, indexing="ij")
+    rays = np.stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)], -1).reshape(-1, 3)
+    distance, face = cast_ray_list(vertices, data["faces"], rays)
+    assert_same((distance.reshape(a.shape), face.reshape(a.shape)), want)
+
+
+@pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.parametrize("distance, azimuth", [(2.5, np.pi), (8.0, -np.pi + 1e-3), (20.0, 0.7)])
+def test_window_same_as_reference(name, distance, azimuth):
+    s = sensor(name)
+    rng = np.random.default_rng(3)
+    person = body(rng)
+    # turned, since the slow twin may lose a ray that runs along an edge
+    person = person[0] @ rotation_about("z", 0.1234).T, person[1]
+    there = np.array([np.cos(azimuth), np.sin(azimuth), 0]) * distance + [0, 0, 0.9 - s.height]
+    vertices, faces = join((person[0] + there, person[1]), (ground(1.0, 0)[0] + there - [0, 0, 0.9], ground(1, 0)[1]))
+    window = find_window(vertices, s)
+    got = cast_window(vertices.astype(np.float32), faces.astype(np.int32), s, window)
+    azimuths, rings = s.azimuths(window), slice(window.row0, window.row0 + window.rows)
+    e = np.broadcast_to(s.elevations[rings], azimuths.shape)
+    rays = np.stack([np.cos(azimuths) * np.cos(e), np.sin(azimuths) * np.cos(e), np.sin(e)], -1).reshape(-1, 3)
+    pick = np.arange(len(rays))
+    if len(rays) > 3000:
+        pick = rng.permutation(len(rays))[:3000]
+    want = cast_ray_list_reference(vertices.astype(np.float32), faces, rays[pick])
+    assert_same((got[0].reshape(-1)[pick], got[1].reshape(-1)[pick]), want)
+    if s.azimuth_offsets is None:
+        assert_same(got, cast_rays(vertices.astype(np.float32), faces, azimuths[:, 0], s.elevations[rings]))
+    if distance < 10:
+        assert (got[1] >= 0).sum() > 20
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        soup(np.random.default_rng(0), 60, 3.0, 1.0),
+        soup(np.random.default_rng(1), 60, 0.5, 2.0),
+        soup(np.random.default_rng(2), 200, 2.0, 0.2),
+        soup(np.random.default_rng(3), 10, 0.1, 30.0),
+        ground(30.0, -1.7),
+        ground(30.0, 0.3),
+        ground(2.0, -1.2, x=-6.0),
+        join(ground(5.0, -1.0), body(np.random.default_rng(4))),
+        sphere(6, radius=3.0),
+    ],
+    ids=["soup", "near", "small", "wide", "ground", "ceiling", "quad behind", "inside a body", "inside a sphere"],
+)
+def test_any_mesh_all_round_same_as_reference(mesh):
+    # tilted by an odd angle, so that no beam runs along an edge
+    turn = np.linalg.qr(np.random.default_rng(9).normal(size=(3, 3)))[0]
+    for vertices in (mesh[0], mesh[0] @ turn + 1e-3):
+        azimuth = FULL_TURN[:-1] + 0.0123
+        want = cast_rays_reference(vertices, mesh[1], azimuth, ALL_ELEVATIONS)
+        assert (want[1] >= 0).any()
+        assert_same(cast_rays(vertices, mesh[1], azimuth, ALL_ELEVATIONS), want)
+        rays = np.random.default_rng(5).normal(size=(800, 3))
+        assert_same(cast_ray_list(vertices, mesh[1], rays), cast_ray_list_reference(vertices, mesh[1], rays))
+
+
+@settings(deadline=None, max_examples=60)
+@given(seed=st.integers(0, 2**32 - 1), spread=st.floats(0.05, 20), size=st.floats(0.01, 10), count=st.integers(1, 40))
+def test_random_soups_same_as_reference(seed, spread, size, count):
+    rng = np.random.default_rng(seed)
+    mesh = soup(rng, count, spread, size)
+    azimuth, elevation = rng.uniform(-7, 7, 19), rng.uniform(-1.57, 1.57, 17)
+    assert_same(cast_rays(*mesh, azimuth, elevation), cast_rays_reference(*mesh, azimuth, elevation))
+    rays = rng.normal(size=(60, 3))
+    assert_same(cast_ray_list(*mesh, rays), cast_ray_list_reference(*mesh, rays))
+
+
+COORDINATE = st.one_of(st.sampled_from([0.0, 1.0, -1.0, 1e-30, 5e-324, -5e-324]), st.floats(-1e3, 1e3, width=32))
+
+
+@settings(deadline=None, max_examples=80)
+@example(
+    vertices=[(0.0, 1.0, 0.0), (0.0, 0.0, 5e-324), (1.0, 0.0, 0.0)],
+    faces=[(0, 1, 2)],
+    azimuth=[0.0],
+    elevation=[3.8742073780626264e-22],
+)  # through the sensor
+@given(
+    vertices=st.lists(st.tuples(COORDINATE, COORDINATE, COORDINATE), min_size=3, max_size=8),
+    faces=st.lists(st.tuples(*[st.integers(0, 7)] * 3), max_size=6),
+    azimuth=st.lists(st.floats(-10, 10), max_size=5),
+    elevation=st.lists(st.floats(-np.pi / 2, np.pi / 2), max_size=5),
+)
+def test_degenerate_meshes_give_sane_results(vertices, faces, azimuth, elevation):
+    faces = np.array(faces, int).reshape(-1, 3) % len(vertices)
+    distance, face = cast_rays(np.array(vertices), faces, azimuth, elevation)
+    assert distance.shape == face.shape == (len(azimuth), len(elevation))
+    assert not np.isnan(distance).any() and (distance > 0).all()
+    assert ((face >= 0) == np.isfinite(distance)).all() and (face < max(1, len(faces))).all()
+    rays = [v for v in vertices if np.linalg.norm(v) > 0]
+    distance, face = cast_ray_list(np.array(vertices), faces, np.array(rays).reshape(-1, 3))
+    assert not np.isnan(distance).any() and (distance > 0).all() and ((face >= 0) == np.isfinite(distance)).all()
+
+
+def test_closed_meshes_have_no_holes():
+    vertices, faces = sphere(24)
+    azimuth, elevation = np.linspace(-0.13, 0.13, 700), np.linspace(-0.13, 0.13, 600)
+    # the disc of a sphere of radius 1 at 5 m is 0.2 rad wide: all beams hit; then once more with beams on vertices
+    for shift in ([5, 0, 0], [-5, 0, 0], [0.3, 4.9, 0.1]):
+        turned = azimuth + np.arctan2(shift[1], shift[0])
+        assert (cast_rays(vertices * 1.02 + shift, faces, turned, elevation)[1] >= 0).all()
+    moved = vertices + [5, 0, 0]
+    azimuth = np.unique(np.arctan2(moved[:, 1], moved[:, 0]))
+    elevation = np.unique(np.arctan2(moved[:, 2], np.hypot(moved[:, 0], moved[:, 1])))
+    _, face = cast_rays(moved, faces, azimuth[np.abs(azimuth) < 0.13], elevation[np.abs(elevation) < 0.13])
+    assert (face >= 0).all() and face.size > 10_000
+
+
+@pytest.mark.parametrize("shift", [(0, 0, 0), (0.3, 0.2, 0.1), (0.7, -0.6, 0.0)])
+def test_no_holes_from_inside(shift):
+    vertices, faces = sphere(12)
+    azimuth, elevation = np.linspace(-np.pi, np.pi, 700), np.linspace(-np.pi / 2, np.pi / 2, 301)
+    distance, _ = cast_rays(vertices + shift, faces, azimuth, elevation)
+    assert np.isfinite(distance).all() and distance.max() < 2.1
+    # half planes through edges and vertices
+    azimuth = np.arctan2(vertices[:, 1] + shift[1], vertices[:, 0] + shift[0])
+    assert np.isfinite(cast_rays(vertices + shift, faces, azimuth, elevation)[0]).all()
+    directions = np.random.default_rng(0).normal(size=(20_000, 3))
+    assert np.isfinite(cast_ray_list(vertices + shift, faces, directions)[0]).all()
+    # rays through the vertices themselves
+    assert np.isfinite(cast_ray_list(vertices + shift, faces, vertices + shift)[0]).all()
+
+
+def test_any_order_of_angles():
+    rng = np.random.default_rng(1)
+    vertices, faces = soup(rng, 50, 3, 1)
+    azimuth, elevation = FULL_TURN[:-1] + 0.01, ALL_ELEVATIONS
+    a, e = rng.permutation(len(azimuth)), rng.permutation(len(elevation))
+    distance, face = cast_rays(vertices, faces, azimuth, elevation)
+    again, face_again = cast_rays(vertices, faces, azimuth[a] + 2 * np.pi * rng.integers(-2, 3, len(a)), elevation[e])
+    assert (face_again == face[a][:, e]).all() and (face >= 0).any()
+    assert again[face_again >= 0] == pytest.approx(distance[a][:, e][face_again >= 0], abs=1e-5)
+    twice, _ = cast_rays(vertices, faces, np.repeat(azimuth, 2), np.repeat(elevation, 3))
+    assert (twice == np.repeat(np.repeat(distance, 2, 0), 3, 1)).all()
+
+
+def test_empty_input_gives_empty_output():
+    vertices, faces = ground(1, -1)
+    none = np.zeros((0, 3))
+    assert cast_rays(vertices, faces, [], [0.1])[0].shape == (0, 1)
+    assert cast_rays(vertices, faces, [0.1], [])[1].shape == (1, 0)
+    for mesh in ((vertices, none.astype(int)), (none, none.astype(int))):
+        assert np.isinf(cast_rays(*mesh, [0.0, 1.0], [0.0])[0]).all()
+        assert cast_ray_list(*mesh, np.eye(3))[1].tolist() == [-1, -1, -1]
+        assert len(scan(*mesh, sensor("vlp-16")).points) == 0
+    assert cast_ray_list(vertices, faces, none)[0].shape == (0,)
+    nothing = Window(column0=3, columns=0, row0=2, rows=5)
+    assert cast_window(vertices, faces, sensor("vlp-16"), nothing)[0].shape == (0, 5)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"vertices": np.full((4, 3), np.nan)}, "vertices must be finite and below 1e.09 m, but 4 of 4"),
+        ({"vertices": np.zeros((4, 2))}, r"vertices must be \(n, 3\)"),
+        ({"vertices": "mesh.ply"}, "vertices must be an"),
+        ({"faces": np.array([[0, 1, 4]])}, "faces must index the 4 vertices"),
+        ({"faces": np.array([[0, -1, 2]])}, "faces must index the 4 vertices"),
+        ({"faces": np.zeros((1, 4), int)}, r"faces must be \(F, 3\) integers"),
+        ({"faces": np.zeros((1, 3))}, r"faces must be \(F, 3\) integers"),
+        ({"azimuth": [np.inf]}, "azimuth must be a list of finite angles"),
+        ({"azimuth": [[0.1]]}, "azimuth must be a list"),
+        ({"elevation": [-10.0, 10.0]}, "degrees"),
+    ],
+)
+def test_bad_input_says_what_is_wrong(change, message):
+    vertices, faces = ground(1, -1)
+    good = {"vertices": vertices, "faces": faces, "azimuth": [0.1], "elevation": [0.1]}
+    with pytest.raises(InputError, match=message):
+        cast_rays(**{**good, **change})
+
+
+def test_bad_rays_and_margins():
+    with pytest.raises(InputError, match="number 1 is zero"):
+        cast_ray_list(*ground(1, -1), [[1, 0, 0], [0, 0, 0]])
+    with pytest.raises(InputError, match="margin"):
+        scan(*ground(1, -1), sensor("vlp-16"), margin=np.nan)
+
+
+def test_scan_points_lie_on_the_faces_in_the_beams():
+    s = sensor("pandar64")
+    person = body(np.random.default_rng(2))
+    # over the seam
+    vertices, faces = join((person[0] + [-6, 0.05, -0.9], person[1]), ground(2.0, -1.8, x=-6.0))
+    hits = scan(vertices, faces, s, window_vertices=vertices[: len(person[0])])
+    assert len(hits.points) > 100 and hits.points.dtype == np.float32
+    corners = vertices[faces[hits.face]]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    assert np.abs(((hits.points - corners[:, 0]) * normal).sum(1)).max() < 1e-5
+    window = Window(column0=hits.column0, columns=hits.columns, row0=hits.row0, rows=hits.rows)
+    assert window == find_window(vertices[: len(person[0])], s)
+    azimuth = s.azimuths(window)[hits.column, hits.ring - hits.row0]
+    seen = np.arctan2(hits.points[:, 1], hits.points[:, 0])
+    assert np.abs(np.angle(np.exp(1j * (seen - azimuth)))).max() < 1e-6
+    elevation = np.arctan2(hits.points[:, 2], np.hypot(hits.points[:, 0], hits.points[:, 1]))
+    assert elevation == pytest.approx(s.elevations[hits.ring], abs=1e-6)
+    order = hits.column.astype(int) * s.rows + hits.ring
+    assert (np.diff(order) > 0).all()
+    distance, face = cast_window(vertices, faces, s, window)
+    assert (face[hits.column, hits.ring - hits.row0] == hits.face).all() and len(hits.face) == (face >= 0).sum()
+    assert np.linalg.norm(hits.points, axis=1) == pytest.approx(distance[distance < np.inf], abs=1e-5)
+
+
+def test_nothing_of_the_body_is_seen_outside_its_window():
+    s = sensor("vlp-32c")
+    person = body(np.random.default_rng(5))
+    vertices = person[0] + [4, 3, -0.8]
+    tight, wide = scan(vertices, person[1], s), scan(vertices, person[1], s, margin=0.2)
+    assert len(tight.points) == len(wide.points) and wide.columns > tight.columns and wide.rows >= tight.rows
+    assert (tight.points == wide.points).mean() > 0.5 and np.abs(tight.points - wide.points).max() < 1e-5
+
+
+def test_scan_keeps_the_range_limits_and_hides_what_is_behind():
+    far, near = ground(1.0, 0), ground(1.0, 0)
+    up = np.array([[0, 0, 1], [0, 1, 0], [1, 0, 0]])
+    vertices, faces = join((far[0] @ up + [10, 0, 0], far[1]), (near[0] @ up * 0.2 + [3, 0, 0], near[1]))
+    s = replace(sensor("vlp-16"), range_max=9.0)
+    assert set(scan(vertices, faces, sensor("vlp-16")).face) == {0, 1, 2, 3}
+    only = scan(vertices, faces, s)
+    assert set(only.face) == {2, 3} and np.linalg.norm(only.points, axis=1).max() < 3.1
+    # the near surface is too near to return, and hides the far one all the same
+    assert len(scan(vertices, faces, replace(s, range_min=4.0, range_max=20.0)).points) + len(only.points) == len(
+        scan(vertices, faces, sensor("vlp-16")).points
+    )
+
+
+def test_input_is_not_changed_and_threads_agree():
+    s = sensor("os1-128")
+    vertices, faces = join(body(np.random.default_rng(6)), ground(2, -0.9))
+    vertices = (vertices + [5, 1, -0.5]).astype(np.float32)
+    kept = vertices.copy()
+    first = scan(vertices, faces, s)
+    with concurrent.futures.ThreadPoolExecutor(4) as pool:
+        for other in pool.map(lambda _: scan(vertices, faces, s), range(16)):
+            assert (other.points == first.points).all() and (other.face == first.face).all()
+    assert (vertices == kept).all()
+
+
+def test_all_round_window_casts_a_room():
+    vertices, faces = sphere(8, radius=4.0)
+    s = Sensor(name="coarse", elevations=np.linspace(-1.2, 1.2, 30), azimuth_step=2 * np.pi / 360)
+    hits = scan(vertices, faces, s)
+    assert (hits.columns, hits.rows, len(hits.points)) == (360, 30, 360 * 30)
+    radius = np.linalg.norm(hits.points, axis=1)
+    assert 3.8 < radius.min() and radius.max() < 4.01

@@ -1,0 +1,105 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from lidarpose.errors import InputError
+from lidarpose.lidar.sensor import SENSORS, Sensor, Window, sensor
+
+ROWS = {
+    "dapt64": 64, "vlp-16": 16, "vlp-32c": 32, "hdl-32e": 32, "hdl-64e": 64, "os1-64": 64, "os1-128": 128,
+    "os0-128": 128, "waymo-top": 64, "pandar64": 64, "av2": 64,
+}  # fmt: skip
+
+
+def test_presets_are_what_their_names_say():
+    assert {name: s.rows for name, s in SENSORS.items()} == ROWS
+    for name, s in SENSORS.items():
+        assert s.name == name and sensor(name) is s
+        assert s.columns * s.azimuth_step == pytest.approx(2 * np.pi)
+        assert np.degrees(np.abs(s.elevations)).max() < 46
+    assert np.degrees(sensor("dapt64").elevations[[0, -1]]) == pytest.approx([-10, 10])
+    assert sensor("dapt64").height == 0.5
+    assert np.degrees(sensor("waymo-top").elevations[[0, -1]]) == pytest.approx([-17.6, 2.4])
+    assert np.degrees(sensor("hdl-32e").elevations).round(2)[[0, 23, 31]].tolist() == [-30.67, 0, 10.67]
+    # two equal tables, one upside down
+    assert sensor("av2").elevations == pytest.approx(-sensor("av2").elevations[::-1])
+
+
+def test_unknown_name_lists_the_nearest():
+    with pytest.raises(InputError, match="did you mean vlp-32c"):
+        sensor("vlp32c")
+
+
+def test_a_sensor_is_frozen():
+    s = sensor("vlp-16")
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        s.height = 2.0
+    with pytest.raises(ValueError):
+        s.elevations[0] = 0
+    assert dataclasses.replace(s, height=2.0).height == 2.0
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"elevations": np.array([0.1, 0.0])}, "ascend"),
+        ({"elevations": np.array([-25.0, 15.0])}, "degrees"),
+        ({"elevations": np.array([])}, "at least one ring"),
+        ({"elevations": np.array([0.0, np.nan])}, "finite"),
+        ({"azimuth_step": 0.1}, "divide 2 pi"),
+        ({"azimuth_step": -np.pi}, "divide 2 pi"),
+        ({"azimuth_offsets": np.zeros(3)}, "one a ring"),
+        ({"range_min": 5.0, "range_max": 4.0}, "min < max"),
+        ({"dropout": 1.0}, "dropout"),
+        ({"range_sigma": -0.1}, "range_sigma"),
+        ({"height": np.nan}, "height must be a finite number"),
+    ],
+)
+def test_bad_sensors_say_what_is_wrong(change, message):
+    good = {"name": "x", "elevations": np.array([-0.1, 0.1]), "azimuth_step": np.pi / 180}
+    Sensor(**good)
+    with pytest.raises(InputError, match=message):
+        Sensor(**{**good, **change})
+
+
+def test_offsets_of_whole_columns_do_not_move_beams():
+    s = dataclasses.replace(sensor("os1-128"), azimuth_offsets=np.radians(1.40625) * np.tile([3, 1, -1, -3], 32))
+    assert len(s.shift_groups) == 1 and not s.azimuth_shifts.any()
+
+
+def test_shift_groups_hold_each_ring_once():
+    s = sensor("pandar64")
+    assert np.sort(np.concatenate([rings for _, rings in s.shift_groups])).tolist() == list(range(64))
+    assert np.abs(s.azimuth_shifts).max() <= s.azimuth_step / 2
+    for shift, rings in s.shift_groups:
+        turned = (s.azimuth_offsets[rings] - shift) / s.azimuth_step
+        assert turned == pytest.approx(np.round(turned), abs=1e-3)
+
+
+def test_window_holds_the_beams_between_the_bounds_and_no_others():
+    s = sensor("vlp-32c")
+    azimuths = s.azimuth_start + np.arange(s.columns) * s.azimuth_step
+    inside = (azimuths >= 0.1) & (azimuths <= 0.2)
+    rings = (s.elevations >= -0.1) & (s.elevations <= 0.05)
+    w = s.window(0.1, 0.2, -0.1, 0.05)
+    assert np.flatnonzero(inside).tolist() == list(range(w.column0, w.column0 + w.columns))
+    assert np.flatnonzero(rings).tolist() == list(range(w.row0, w.row0 + w.rows))
+    assert s.azimuths(w)[:, 0] == pytest.approx(azimuths[inside])
+
+
+def test_window_over_the_seam_and_all_round():
+    s = sensor("dapt64")
+    w = s.window(np.pi - 0.01, np.pi + 0.01, -1, 1)
+    # -pi and +pi are one column
+    assert w.columns == 9 and w.column0 + 4 == s.columns and (w.row0, w.rows) == (0, 64)
+    assert s.window(-4, 4, -1, 1) == Window(column0=0, columns=2649, row0=0, rows=64)
+    assert s.window(0, 1e-6, 0, 1e-6).columns in (0, 1) and s.window(0, 1, 0.5, 0.6).rows == 0
+
+
+def test_ground_frame():
+    s = dataclasses.replace(sensor("os1-128"), height=2.0, tilt=np.radians(30))
+    # the ground where the tilted x axis meets it
+    ahead = s.T_sensor_from_ground @ [2 / np.tan(np.radians(30)), 0, 0, 1]
+    assert ahead[:3] == pytest.approx([4, 0, 0])
+    assert s.T_sensor_from_ground @ [0, 0, 2, 1] == pytest.approx([0, 0, 0, 1])

@@ -1,0 +1,369 @@
+"""Pictures and reports: what is where, who is seen from where, and files that stand alone."""
+
+import io
+import json
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpose.errors import InputError
+from lidarpose.geometry import rotation_about
+from lidarpose.sample import Box, Pose
+from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14, Skeleton
+from lidarpose.view.person import bone_sides, describe, facing, project, side, thinned, view_directions
+from lidarpose.view.picture import MAX_PEOPLE, Panel, draw_people
+from lidarpose.view.report import MAX_POINTS, ReportPerson, render_report, write_report
+
+BLUE, ORANGE = (0x00, 0x72, 0xB2), (0xE0, 0x70, 0x00)
+
+# a T-pose that faces +x, metres: left is +y
+_T_POSE = {
+    "pelvis": (0, 0, 0.95), "spine1": (0, 0, 1.06), "spine2": (0, 0, 1.18), "spine3": (0, 0, 1.28),
+    "neck": (0, 0, 1.45), "head": (0.02, 0, 1.54), "nose": (0.14, 0, 1.6), "head_center": (0.04, 0, 1.62),
+    "hip": (0, 0.08, 0.87), "knee": (0.01, 0.1, 0.48), "ankle": (-0.02, 0.1, 0.08), "foot": (0.1, 0.12, 0.03),
+    "collar": (0, 0.07, 1.38), "shoulder": (0, 0.18, 1.4), "elbow": (0, 0.43, 1.4), "wrist": (0, 0.68, 1.4),
+    "hand": (0, 0.77, 1.4),
+}  # fmt: skip
+
+
+def t_pose(*, yaw=0.0, at=(8.0, 3.0, -1.0), skeleton=BODY26, confidence=0.9):
+    sign = {"left": 1, "right": -1, "center": 1}
+    rest = [np.array(_T_POSE[re.sub("left_|right_", "", j)]) * (1, sign[side(j)], 1) for j in skeleton.joints]
+    joints = np.array(rest) @ rotation_about("z", yaw).T + at
+    return Pose(joints=joints, skeleton=skeleton, confidence=np.full(len(skeleton), confidence))
+
+
+def cloud(pose, *, count=200, seed=0):
+    rng = np.random.default_rng(seed)
+    bones = np.array(pose.skeleton.bones)[rng.integers(len(pose.skeleton.bones), size=count)]
+    t = rng.uniform(size=(count, 1))
+    joints = pose.joints
+    return (joints[bones[:, 0]] * t + joints[bones[:, 1]] * (1 - t) + rng.normal(0, 0.03, (count, 3))).astype("f4")
+
+
+def person(kind=Panel, *, count=200, label="somebody", **pose):
+    pose = t_pose(**pose)
+    return kind(points=cloud(pose, count=count), pose=pose, truth=t_pose(), label=label)
+
+
+def decoded(png):
+    """(height, width, 3) uint8."""
+    from matplotlib.image import imread
+
+    return (imread(io.BytesIO(png), format="png")[..., :3] * 255).round().astype(int)
+
+
+def pixels(image, color):
+    """(k, 2) rows and columns of the pixels of nearly that color."""
+    return np.argwhere(np.abs(image - color).max(-1) <= 12)
+
+
+@pytest.mark.parametrize("skeleton", [SMPL24, HUMAN15, WAYMO14, BODY26], ids=lambda s: s.name)
+@pytest.mark.parametrize(
+    ("yaw", "expected"), [(0, (1, 0, 0)), (np.pi / 2, (0, 1, 0)), (np.pi, (-1, 0, 0)), (-np.pi / 2, (0, -1, 0))]
+)
+def test_facing_follows_the_body(skeleton, yaw, expected):
+    np.testing.assert_allclose(facing(t_pose(yaw=yaw, skeleton=skeleton)), expected, atol=1e-9)
+
+
+def test_facing_is_unknown_where_nothing_tells_it():
+    pose = t_pose()
+    on_the_side = Pose(joints=pose.joints @ rotation_about("x", np.pi / 2).T, skeleton=BODY26)
+    assert facing(None) is None
+    assert facing(on_the_side) is None
+    assert facing(Pose(joints=np.full((26, 3), np.nan), skeleton=BODY26)) is None
+
+
+def test_facing_needs_only_one_pair_of_joints():
+    pose = t_pose(yaw=1.0)
+    joints = pose.joints.copy()
+    joints[BODY26.index("left_hip")] = np.nan
+    np.testing.assert_allclose(facing(Pose(joints=joints, skeleton=BODY26)), (np.cos(1), np.sin(1), 0), atol=1e-9)
+
+
+@given(yaw=st.floats(-np.pi, np.pi), seed=st.integers(0, 99))
+def test_front_view_is_face_to_face_and_the_side_view_looks_right(yaw, seed):
+    pose = t_pose(yaw=yaw)
+    front, from_right = view_directions(facing(pose))
+    joint = {name: pose.joints[i] for i, name in enumerate(BODY26.joints)}
+    seen = {name: project(at, seen_from=front) for name, at in joint.items()}
+    assert seen["left_wrist"][0] > seen["right_wrist"][0] + 1  # the person's left on the picture's right
+    assert seen["nose"][2] > seen["head"][2] + 0.05  # the nose towards the viewer
+    seen = {name: project(at, seen_from=from_right) for name, at in joint.items()}
+    assert seen["nose"][0] > seen["head"][0] + 0.05
+    assert seen["right_wrist"][2] > seen["left_wrist"][2] + 1
+    # a projection is rigid and keeps what is up
+    points = np.random.default_rng(seed).normal(size=(5, 3))
+    moved = project(points, seen_from=front)
+    np.testing.assert_allclose(np.linalg.norm(moved, axis=1), np.linalg.norm(points, axis=1))
+    np.testing.assert_allclose(moved[:, 1], points[:, 2])
+
+
+def test_sides_of_bones():
+    named = dict(zip(WAYMO14.bones, bone_sides(WAYMO14), strict=True))
+    at = WAYMO14.index
+    assert named[at("nose"), at("left_shoulder")] == "left"
+    assert named[at("right_knee"), at("right_ankle")] == "right"
+    assert named[at("left_hip"), at("right_hip")] == "center"
+
+
+@given(count=st.integers(0, 500), limit=st.integers(1, 200))
+def test_thinned_keeps_distinct_points_in_order(count, limit):
+    index = thinned(count, limit)
+    assert len(index) == min(count, limit)
+    assert (np.diff(index) > 0).all() and (index < count).all()
+
+
+def test_picture_has_left_in_blue_on_the_right_of_the_front_view(tmp_path):
+    # the person looks at the frame's +y; points are left out so that only the skeleton has colors
+    panel = Panel(points=np.zeros((0, 3)), pose=t_pose(yaw=np.pi / 2, confidence=1.0), label="a")
+    png = draw_people([panel], tmp_path / "sheet.png")
+    assert (tmp_path / "sheet.png").read_bytes() == png
+    image = decoded(png)[70:]  # below the legend
+    blue, orange = pixels(image, BLUE), pixels(image, ORANGE)
+    half = image.shape[1] // 2
+    assert len(blue) > 200 and len(orange) > 200
+    front_blue, front_orange = (c[c[:, 1] < half, 1] for c in (blue, orange))
+    assert np.median(front_blue) > np.median(front_orange) + 30
+    # seen from the right, the right leg covers the left one
+    assert (orange[:, 1] > half).sum() > (blue[:, 1] > half).sum()
+
+
+def test_an_unsure_pose_is_fainter():
+    def ink(confidence):
+        panel = Panel(points=np.zeros((0, 3)), pose=t_pose(confidence=confidence))
+        return (255 - decoded(draw_people([panel]))[70:]).sum()
+
+    assert ink(0.05) < 0.7 * ink(1.0)
+
+
+def test_parts_color_the_points():
+    pose = t_pose()
+    points = cloud(pose)
+    part = np.full(len(points), 1 + SMPL24.index("left_knee"), np.uint8)
+    plain, colored = (decoded(draw_people([Panel(points=points, part=p)])) for p in (None, part))
+    saturated = [(np.ptp(image[70:], axis=-1) > 60).sum() for image in (plain, colored)]
+    assert saturated[0] == 0 and saturated[1] > 300
+
+
+@pytest.mark.parametrize(
+    "panel",
+    [
+        Panel(points=np.zeros((0, 3))),
+        Panel(points=np.zeros((0, 3)), truth=t_pose()),
+        Panel(points=np.ones((1, 3)), label="$x^$ \\frac <b>\n" + "long " * 99),
+        Panel(points=np.full((9, 3), np.nan), pose=Pose(joints=np.full((26, 3), np.nan), skeleton=BODY26)),
+        Panel(points=cloud(t_pose()) * [1, 1, 0.001], box=Box(center=(8, 3, 0), size=(1, 1, 2), yaw=0.3)),
+        Panel(points=np.array([[0, 0, 0], [900, -900, 900.0]] * 5), pose=t_pose(at=(0, 0, 0))),
+        Panel(points=cloud(t_pose(skeleton=WAYMO14)), pose=t_pose(skeleton=WAYMO14), truth=t_pose(skeleton=HUMAN15)),
+    ],
+)
+def test_odd_people_are_drawn(panel):
+    image = decoded(draw_people([panel], title="odd"))
+    assert (image < 128).any()
+
+
+def test_what_is_said_under_a_person():
+    panel = Panel(points=np.tile([3.0, 4, 0], (1500, 1)), pose=t_pose(confidence=0.5))
+    assert describe(panel) == "1,500 points · 5.0 m · confidence 0.50"
+    assert describe(Panel(points=np.zeros((1, 3)), distance=12.34)) == "1 point · 12.3 m"
+    assert describe(Panel(points=np.zeros((0, 3)))) == "0 points"
+
+
+def test_only_the_first_sixty_people_fit():
+    people = [Panel(points=np.ones((1, 3)) * i, label=str(i)) for i in range(MAX_PEOPLE + 1)]
+    full, over = decoded(draw_people(people[:-1], title="t")), decoded(draw_people(people, title="t"))
+    assert over.shape == full.shape
+    assert (over[60:] == full[60:]).all() and (over[:60] != full[:60]).any()  # they differ by the note
+    assert decoded(draw_people([])).shape[1] > 200
+
+
+def test_picture_is_the_same_each_time_and_changes_nothing():
+    panel = person(count=MAX_PEOPLE)
+    before = panel.points.copy(), panel.pose.joints.copy()
+    assert draw_people([panel], title="a") == draw_people([panel], title="a")
+    np.testing.assert_array_equal(before[0], panel.points)
+    np.testing.assert_array_equal(before[1], panel.pose.joints)
+
+
+def test_picture_ignores_the_settings_of_the_user():
+    from matplotlib import rc_context
+
+    panel = person()
+    plain = draw_people([panel], title="a")
+    with rc_context({"savefig.bbox": "tight", "savefig.dpi": 50, "font.size": 30, "figure.facecolor": "black"}):
+        assert draw_people([panel], title="a") == plain
+
+
+def test_importing_is_light_and_drawing_leaves_pyplot_alone():
+    code = (
+        "import sys, numpy as np; from lidarpose.view import picture, report; assert 'matplotlib' not in sys.modules;"
+        "picture.draw_people([picture.Panel(points=np.ones((9, 3)))]);"
+        "assert 'matplotlib.pyplot' not in sys.modules and 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
+
+
+@pytest.mark.parametrize("kind", [Panel, ReportPerson])
+def test_wrong_shapes_are_refused(kind):
+    many = Pose(joints=np.zeros((2, 26, 3)), skeleton=BODY26)
+    with pytest.raises(InputError, match=r"points must be \(n, 3\) metres, got \(5, 2\)"):
+        kind(label="a", points=np.zeros((5, 2)))
+    with pytest.raises(InputError, match=r"pose must hold one person, joints \(26, 3\), got \(2, 26, 3\)"):
+        kind(label="a", points=np.zeros((5, 3)), pose=many)
+    with pytest.raises(InputError, match="part must be"):
+        Panel(points=np.zeros((5, 3)), part=np.zeros(4, int))
+
+
+VOID = {"meta", "input", "br", "link", "img"}
+
+
+class Reader(HTMLParser):
+    """Reads a page strictly: tags nest, and what matters is kept."""
+
+    def __init__(self, text):
+        super().__init__(convert_charrefs=True)
+        self.open, self.tags, self.attributes, self.texts = [], [], [], {}
+        self.feed(text)
+        self.close()
+        assert not self.open, f"not closed: {self.open}"
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.attributes += [(tag, *a) for a in attrs]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, text):
+        key = self.open[-1] if self.open else ""
+        self.texts.setdefault(key, []).append(text)
+
+    def data(self):
+        assert ("script", "id", "data") in self.attributes
+        return json.loads(self.texts["script"][0])
+
+
+EVIL = "</script><script>alert('\"%%DATA%%&amp;"
+
+
+def evil_report():
+    people = [person(ReportPerson, label=EVIL), ReportPerson(label="b", points=np.zeros((0, 3)), caption=EVIL)]
+    return render_report(people, title=EVIL, summary=[{EVIL: EVIL}])
+
+
+def test_report_escapes_what_callers_say():
+    page = Reader(evil_report())
+    assert page.tags.count("script") == 2
+    assert page.tags.count("canvas") == 2
+    for tag in ("title", "h1", "strong", "th", "td"):
+        assert EVIL in page.texts[tag], tag
+    assert EVIL in page.texts["span"]
+    assert ("canvas", "aria-label", f"3D view of {EVIL}") in page.attributes
+
+
+def test_report_data_cannot_end_its_element():
+    name = "</script><!--<script>"
+    pose = Pose(joints=np.zeros((1, 3)), skeleton=Skeleton(name=name, joints=(name,), parents=(-1,)))
+    page = Reader(render_report([ReportPerson(label="", points=np.ones((9, 3)), pose=pose)], title="t", summary=[]))
+    assert page.data()["skeletons"][name]["joints"] == [name]
+
+
+def test_report_loads_nothing():
+    text = evil_report()
+    assert not re.search(r"https?:|//\w+\.|@import|url\(|\bsrc=|<link|fetch\(|XMLHttpRequest|import\(", text)
+    assert "default-src 'none'" in text
+
+
+def test_report_holds_the_data():
+    one = person(ReportPerson, yaw=1.25)
+    joints = one.pose.joints.copy()
+    joints[3] = np.nan
+    one = ReportPerson(label="x", points=one.points, pose=Pose(joints=joints, skeleton=BODY26), truth=one.truth)
+    data = Reader(render_report([one], title="t", summary=[])).data()
+    (got,) = data["people"]
+    center = np.median(one.points.astype(float), axis=0)
+    np.testing.assert_allclose(np.reshape(got["points"], (-1, 3)) / 1000 + center, one.points, atol=6e-4)
+    assert got["pose"]["joints"][3] is None and "confidence" not in got["pose"]
+    np.testing.assert_allclose(np.array(got["pose"]["joints"][:3]) / 1000 + center, joints[:3], atol=6e-4)
+    assert got["facing"] == pytest.approx(1.25, abs=1e-3)
+    assert got["truth"]["confidence"] == [0.9] * 26
+    skeleton = data["skeletons"]["body26"]
+    assert tuple(skeleton["joints"]) == BODY26.joints
+    assert [tuple(b[:2]) for b in skeleton["bones"]] == list(BODY26.bones)
+    assert {s for *_, s in skeleton["bones"]} == set(skeleton["sides"]) == set("lrc")
+
+
+def test_report_of_twelve_people_is_small_and_the_same_each_time():
+    people = [person(ReportPerson, count=1000, label=str(i), yaw=i) for i in range(12)]
+    text = render_report(people, title="t", summary=[])
+    assert len(text.encode()) < 500_000
+    assert text == render_report(people, title="t", summary=[])
+    assert len(Reader(text).data()["people"][0]["points"]) == 3000
+
+
+def test_report_thins_what_is_too_much():
+    people = [person(ReportPerson, count=MAX_POINTS)] * 2
+    text = render_report(people, title="t", summary=[])
+    assert len(text.encode()) < 1_500_000
+    assert "30,000 of 60,000 points drawn" in text
+
+
+def test_report_of_odd_people():
+    nothing = Pose(joints=np.full((26, 3), np.nan), skeleton=BODY26)
+    people = [
+        ReportPerson(label="none", points=np.zeros((0, 3))),
+        ReportPerson(label="few", points=np.zeros((4, 3))),
+        ReportPerson(label="nan", points=np.full((9, 3), np.nan), pose=nothing, truth=nothing),
+    ]
+    text = render_report(people, title="t", summary=[])
+    data = Reader(text).data()
+    assert [len(p["points"]) for p in data["people"]] == [0, 12, 0]
+    assert all(p["pose"] is None and p["facing"] is None for p in data["people"])
+    assert text.count("no pose: under 5 points") == 2
+    assert "no people" in render_report([], title="t", summary=[])
+
+
+def test_summary_table():
+    rows = [
+        {"set": "near", "people": 1873, "MPJPE mm": 63.412, "PCK": np.float32(0.5), "ok": True},
+        {"set": "far", "people": np.int64(2), "MPJPE mm": 103.25, "extra": "x"},
+        {"set": "none", "people": 0, "MPJPE mm": float("nan"), "PCK": None},
+    ]
+    text = render_report([], title="t", summary=rows)
+    page = Reader(text)
+    assert page.texts["th"] == ["set", "people", "MPJPE mm", "PCK", "ok", "extra"]
+    cells = np.reshape(page.texts["td"], (3, 6)).tolist()
+    assert cells[0] == ["near", "1873", "63.4", "0.500", "yes", "–"]
+    assert cells[1] == ["far", "2", "103.2", "–", "–", "x"]
+    assert cells[2] == ["none", "0", "–", "–", "–", "–"]
+    assert text.count('<td class="number">') == 9
+
+
+@settings(max_examples=20, deadline=None)
+@given(label=st.text(max_size=40))
+def test_any_label_is_readable_again(label):
+    page = Reader(render_report([ReportPerson(label=label, points=np.ones((1, 3)))], title="t", summary=[]))
+    shown = "".join(page.texts.get("strong", []))
+    assert shown == label or any(not c.isprintable() for c in label)
+
+
+def test_a_label_from_a_strange_file_name(tmp_path):
+    label = "a\udc80\x00b"
+    assert draw_people([Panel(points=np.ones((9, 3)), label=label)], title=label)
+    write_report(tmp_path / "a.html", [ReportPerson(label=label, points=np.ones((9, 3)))], title="t", summary=[])
+    assert "a?" in (tmp_path / "a.html").read_text(encoding="utf-8")
+
+
+def test_write_report(tmp_path):
+    path = tmp_path / "report.html"
+    write_report(path, [person(ReportPerson)], title="t", summary=[{"a": 1}])
+    assert path.read_text(encoding="utf-8") == render_report([person(ReportPerson)], title="t", summary=[{"a": 1}])

@@ -1,0 +1,77 @@
+"""Fits the part of the pose prior that comes from captured motion: a mixture of Gaussians over the angles of a pose.
+
+    python tools/fit_motion.py CLIPS.npz --subjects 002 005 --out src/lidarpose/body/assets/motion_prior.npz
+
+CLIPS.npz is laid out as `lidarpose.body.clips` says. Only the mixture's parameters are kept, never a pose.
+"""
+
+import argparse
+
+import numpy as np
+
+from lidarpose.body.captured import save_mixture, to_features
+from lidarpose.body.clips import load_clips
+from lidarpose.body.retarget import retarget_positions, without_yaw
+
+_ITERATIONS = 60
+_RIDGE = 3.0**2  # degrees squared added to every variance: a pose is known no better, and none is stored exactly
+_SHRINK = 0.1  # share of the pooled covariance in each component's
+
+
+def fit_mixture(features: np.ndarray, components: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """features (n, D) -> weights (K,), means (K, D), covariances (K, D, D), by expectation and maximisation."""
+    n, width = features.shape
+    means = features[_spread_seeds(features, components, rng)]
+    pooled = np.cov(features.T) + _RIDGE * np.eye(width)
+    covariances = np.repeat(pooled[None] / components ** (2 / width), components, 0)
+    weights = np.full(components, 1 / components)
+    for _ in range(_ITERATIONS):
+        score = np.stack(
+            [np.log(w) + _log_gauss(features, m, c) for w, m, c in zip(weights, means, covariances, strict=True)], 1
+        )
+        share = np.exp(score - score.max(1, keepdims=True))
+        share /= share.sum(1, keepdims=True)
+        count = share.sum(0) + 1e-6
+        weights, means = count / count.sum(), (share.T @ features) / count[:, None]
+        within = np.zeros((width, width))
+        for k in range(components):
+            offset = features - means[k]
+            covariances[k] = (share[:, k, None] * offset).T @ offset
+            within += covariances[k] / n
+            covariances[k] /= count[k]
+        covariances = (1 - _SHRINK) * covariances + _SHRINK * within + _RIDGE * np.eye(width)
+    return weights, means, covariances
+
+
+def _spread_seeds(features: np.ndarray, count: int, rng: np.random.Generator) -> list[int]:
+    """Indices of rows far from each other: each drawn with odds of its squared distance from those before."""
+    seeds = [int(rng.integers(len(features)))]
+    distance = np.full(len(features), np.inf)
+    while len(seeds) < count:
+        distance = np.minimum(distance, ((features - features[seeds[-1]]) ** 2).sum(1))
+        seeds.append(int(rng.choice(len(features), p=distance / distance.sum())))
+    return seeds
+
+
+def _log_gauss(features: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    root = np.linalg.cholesky(covariance)
+    white = np.linalg.solve(root, (features - mean).T)
+    return -0.5 * (white**2).sum(0) - np.log(np.diag(root)).sum()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("clips")
+    parser.add_argument("--subjects", nargs="+", required=True, help="prefixes of clip names, such as 002")
+    parser.add_argument("--components", type=int, default=24)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", required=True)
+    args = parser.parse_args()
+    joints = load_clips(args.clips).of(args.subjects).joints
+    features = to_features(without_yaw(retarget_positions(joints)))
+    save_mixture(args.out, *fit_mixture(features, args.components, np.random.default_rng(args.seed)))
+    print(f"{args.out}: {args.components} components from {len(features)} poses")
+
+
+if __name__ == "__main__":
+    main()
