@@ -2,8 +2,8 @@
 
 Paper: A_{m-1} = MDE_m(A_m, f_m). An anchor is a learned vector a joint; a module lets the anchors look at each other
 and at the voxels of one density level, from the coarsest to the finest. Deviations: pre-norm; the bottleneck is read
-too (the released code begins one level above it); voxel features carry position, point count and the view of the sensor,
-so that what an anchor gathers depends on density in fact; all levels share one width, so no alignment MLP.
+too (the released code begins one level above it); voxel features carry position, point count and the view of the
+sensor, so that what an anchor gathers depends on density in fact; all levels share one width, so no alignment MLP.
 """
 
 from torch import Tensor, nn

@@ -18,8 +18,9 @@ class SceneConfig:
     """How scenes are drawn. Probabilities unless a unit is named; `hard` scales all that makes a person hard to see.
 
     name; distance: nearest and farthest, m; median_points: of the law of point counts, 0 = distance uniform as in the
-    paper; slope: standard deviation of the ground's tilt, rad; mask: laser-level mask; keep: least share of patches it keeps; occluder: something coherent in front; clutter: things near the person,
-    a second person among them; noise: stray points; crop_jitter: error of the crop box, m.
+    paper; slope: standard deviation of the ground's tilt, rad; mask: laser-level mask; keep:
+    least share of patches it keeps; occluder: something coherent in front; clutter: things near the person, a second
+    person among them; noise: stray points; crop_jitter: error of the crop box, m.
     """
 
     name: str
