@@ -1,0 +1,149 @@
+"""How far off the network is on synthetic people whose poses come from captured motion that it never saw.
+
+    python benchmarks/heldout.py --motion cmu_motion.npz --subjects 006,007
+    python benchmarks/heldout.py --motion cmu_motion.npz --weights runs/tiny/model.safetensors --json scores.json
+
+Full difficulty of the scene preset `wild` (occluders, masks, clutter, noise, jittered crop boxes, ten sensors), at
+least 50 points a person, centered from the points alone: no box, no root joint. MPJPE on the 15 joints of human15.
+"""
+
+import argparse
+import json
+import time
+
+import numpy as np
+
+from lidarpose.evaluate.metrics import auroc, calibration_error, mpjpe, pa_mpjpe
+from lidarpose.infer.predictor import load
+from lidarpose.skeleton import HUMAN15, SMPL24, WAYMO14
+from lidarpose.synth.bodies import PoseBank
+from lidarpose.synth.generate import Generator, SyntheticPerson
+from lidarpose.synth.scene import scene_config
+
+# never a seed of a training run, which count from 0
+SEED = 90_001
+HIT = 0.1
+PAIRED = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
+
+
+def people(bank: PoseBank, count: int, least: int, seed: int) -> list[SyntheticPerson]:
+    """The first `count` people of the seed with at least `least` points."""
+    generator = Generator(scene=scene_config("wild"), bank=bank, captured=1.0)
+    found: list[SyntheticPerson] = []
+    index = 0
+    while len(found) < count:
+        person = generator.person(seed, index)
+        index += 1
+        if len(person.sample.points) >= least:
+            found.append(person)
+    return found
+
+
+def facing(joints: np.ndarray) -> np.ndarray:
+    """joints (n, 15, 3) -> (n,) rad: where the hips and shoulders face."""
+    at = HUMAN15.index
+    left = joints[:, at("left_hip")] - joints[:, at("right_hip")]
+    left = left + joints[:, at("left_shoulder")] - joints[:, at("right_shoulder")]
+    return np.arctan2(-left[:, 0], left[:, 1])
+
+
+def score(predicted, found: list[SyntheticPerson]) -> dict:
+    """Figures in millimetres or shares."""
+    pred = np.stack([p.pose.to(HUMAN15).joints for p in predicted])
+    true = np.stack([p.sample.pose.to(HUMAN15).joints for p in found])
+    facts = [p.facts for p in found]
+    count = np.array([len(p.sample.points) for p in found])
+    plain = np.array([f.plain for f in facts])
+    visible = np.array([f.visible for f in facts])
+    clutter = np.array([f.clutter for f in facts])
+    turn = np.abs((facing(pred) - facing(true) + np.pi) % (2 * np.pi) - np.pi)
+    error = np.linalg.norm(pred - true, axis=-1)
+    confidence = np.stack([p.pose.to(HUMAN15).confidence for p in predicted])
+    spread = np.stack([p.pose.to(HUMAN15).spread for p in predicted])
+    where = {
+        "all": np.ones(len(found), bool),
+        "upright, whole, uncluttered": plain,
+        "under half visible": visible < 0.5,
+        "clutter over 10 %": clutter > 0.1,
+        "50-100 points": count < 100,
+        "100-400 points": (count >= 100) & (count < 400),
+        "400 points and more": count >= 400,
+    }
+    where |= {name: np.array([f.sensor == name for f in facts]) for name in sorted({f.sensor for f in facts})}
+    groups = {
+        name: {
+            "people": int(mask.sum()),
+            "mpjpe": round(mpjpe(pred[mask], true[mask]), 1),
+            "pa_mpjpe": round(pa_mpjpe(pred[mask], true[mask]), 1),
+            "facing_45": round(float((turn[mask] < np.pi / 4).mean()), 3),
+        }
+        for name, mask in where.items()
+        if mask.any()
+    }
+    joints = {"head": ("head",), "neck": ("neck",), "pelvis": ("pelvis",)}
+    joints |= {name: (f"left_{name}", f"right_{name}") for name in PAIRED}
+    return {
+        "groups": groups,
+        "joints": {
+            name: round(float(error[:, [HUMAN15.index(m) for m in members]].mean() * 1e3), 1)
+            for name, members in joints.items()
+        },
+        "mpjpe_smpl24": round(_whole(predicted, found, SMPL24), 1),
+        "mpjpe_waymo14": round(_whole(predicted, found, WAYMO14), 1),
+        "calibration_error": round(calibration_error(confidence.ravel(), error.ravel() < HIT), 3),
+        "auroc": round(auroc(confidence.ravel(), error.ravel() < HIT), 3),
+        "spread_over_error": round(float(spread.mean() / error.mean()), 3),
+    }
+
+
+def _whole(predicted, found: list[SyntheticPerson], skeleton) -> float:
+    pred = np.stack([p.pose.to(skeleton).joints for p in predicted])
+    return mpjpe(pred, np.stack([p.sample.pose.to(skeleton).joints for p in found]))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--motion", required=True, help="npz of clips, see lidarpose.body.clips")
+    parser.add_argument("--subjects", default="006,007", help="subjects kept out of training")
+    parser.add_argument("--weights", default="tiny")
+    parser.add_argument("--people", type=int, default=1000)
+    parser.add_argument("--least", type=int, default=50, help="fewest points a person")
+    parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--json", help="also write the figures to this file")
+    options = parser.parse_args()
+
+    bank = PoseBank.from_clips(options.motion, tuple(options.subjects.split(",")))
+    found = people(bank, options.people, options.least, options.seed)
+    model = load(options.weights)
+    clouds = [p.sample.points for p in found]
+    results = {}
+    for name, origin in (("sensor known", (0.0, 0.0, 0.0)), ("sensor unknown", None)):
+        started = time.perf_counter()
+        predicted = model.predict(clouds, sensor_origin=origin, skeleton="body26")
+        results[name] = score(predicted, found)
+        results[name]["ms_a_person"] = round((time.perf_counter() - started) * 1e3 / len(found), 2)
+    results["mean pose, true facing"] = {"mpjpe": round(_floor(found), 1)}
+    for name, result in results.items():
+        print(f"--- {name}")
+        for group, figures in result.get("groups", {}).items():
+            print(f"{group:<30}", "  ".join(f"{key} {value}" for key, value in figures.items()))
+        print({key: value for key, value in result.items() if key != "groups"})
+    if options.json:
+        with open(options.json, "w") as file:
+            json.dump(
+                {"people": len(found), "seed": options.seed, "subjects": options.subjects} | results, file, indent=1
+            )
+
+
+def _floor(found: list[SyntheticPerson]) -> float:
+    """MPJPE of the mean pose, turned to where each person truly faces, about the center of their points."""
+    true = np.stack([p.sample.pose.to(HUMAN15).joints - p.sample.center for p in found])
+    yaw = facing(true)
+    c, s, o, i = np.cos(yaw), np.sin(yaw), np.zeros(len(yaw)), np.ones(len(yaw))
+    R_world_person = np.stack([np.stack([c, -s, o], -1), np.stack([s, c, o], -1), np.stack([o, o, i], -1)], -2)
+    own = true @ R_world_person
+    return mpjpe(own.mean(0) @ np.swapaxes(R_world_person, -1, -2), true)
+
+
+if __name__ == "__main__":
+    main()
