@@ -4,6 +4,7 @@ import gzip
 import io
 import json
 import os
+import random
 import struct
 import subprocess
 import sys
@@ -223,6 +224,25 @@ def test_pcd_variants(folder):
     same(read(folder, "a.pcd", header.replace(b"DATA binary", b"DATA ascii") + text))
     one = pcd_header(points=1, data="ascii") + b"1.5 -2.25 0.125 0\n"
     same(read(folder, "a.pcd", one), POINTS[:1])
+    # a field without values, lower-case types, blank lines, more rows than told, signed nan as printf writes it
+    odd = pcd_header("e X Y Z", "4 4 4 4", "f f f u", "0 1 1 1", points=2, data="ascii")
+    cloud = read(folder, "a.pcd", odd + b"\n-nan nan 3\n\n10  20\t5\n7 7 7\n")
+    same(cloud, [[10, 20, 5]], ("e", "X", "Y", "Z"))
+    assert cloud.num_dropped == 1
+
+
+def test_pcd_leaves_the_global_random_state_alone(folder):
+    random.seed(0)
+    state = random.getstate()
+    read(folder, "a.pcd", pcd_header("x y z _") + ROWS)
+    assert random.getstate() == state
+
+
+def test_ascii_has_the_digits_of_the_text_not_of_the_type(folder):
+    text = b"500000.001 5000000.002 100.003\n"
+    expected = [[500000.001, 5000000.002, 100.003]]
+    same(read(folder, "a.pcd", pcd_header("x y z", "4 4 4", "F F F", "1 1 1", 1, "ascii") + text), expected)
+    same(read(folder, "a.ply", ply_header(1, "ascii", names="x y z") + text), expected)
 
 
 def test_ply_variants(folder):
@@ -236,6 +256,13 @@ def test_ply_variants(folder):
     body = struct.pack("<B3i", 3, 0, 1, 2) + struct.pack("<B4i", 4, 0, 1, 2, 0)
     same(read(folder, "a.ply", ply_header(after=faces) + rows + body))
     same(read(folder, "a.ply", ply_header(form="ascii", after=faces).decode() + text + "3 0 1 2\n4 0 1 2 0\n"))
+    # names that mean normals and texture elsewhere, and one name twice
+    for names in ("x y z nx ny nz u v", "x y z a a a red green"):
+        eight = np.hstack([POINTS, POINTS]).astype("f4").tobytes()
+        same(read(folder, "a.ply", ply_header(names=names) + eight))
+    cloud = read(folder, "a.ply", ply_header(2, "ascii", names="x y z") + b"\n-nan nan inf\r\n 3\t4  5 \n")
+    same(cloud, POINTS[2:])
+    assert cloud.num_dropped == 1
     twice = POINTS.astype("<f8").tobytes()
     same(read(folder, "a.ply", ply_header(kind="double", names="X Y Z i") + twice), fields=("X", "Y", "Z", "i"))
 
@@ -264,6 +291,12 @@ def test_bin_columns(folder):
     same(read(folder, "a.bin", nuscenes[:, [0, 1, 2, 3, 4, 0]].tobytes(), columns=6), metres)
 
 
+def test_bin_of_printable_bytes(folder):
+    points = np.full((2, 4), 837282, np.float32)
+    assert points.tobytes().isascii() and points.tobytes().decode().isprintable()
+    same(read(folder, "a.bin", points.tobytes()), points)
+
+
 def test_npz_choices(folder):
     other = POINTS + 1
     same(read(folder, "a.npz", npz(xyz=other, points=POINTS)))
@@ -286,6 +319,15 @@ def test_text_variants(folder):
     cloud = read(folder, "a.txt", "# a comment\n1.5 -2.25 0.125 7 0\n10 20 -1 8 0\n3 4 5 9 0\n")
     same(cloud, fields=("x", "y", "z", "column_4", "column_5"))
     same(read(folder, "a.csv", "x\ty\tz\tname of it\n1.5\t-2.25\t0.125\tme too\n10\t20\t-1\t\n3\t4\t5\tb\n"))
+
+
+def test_decimal_commas_that_only_later_lines_show(folder):
+    expected = [[1e-05, 1, 2], [0.5, 1, 2.25]]
+    for content in ("1e-05;1;2\n0,5;1;2,25\n", "x;y;z\n1e-05;1;2\n0,5;1;2,25\n", "1e-05 1 2\n0,5 1 2,25\n"):
+        same(read(folder, "a.csv", content), expected)
+    # a comma within words is none
+    same(read(folder, "a.csv", "x\ty\tz\tname\n1e-05\t1\t2\tno 1,5\n0.5\t1\t2.25\tb\n"), expected)
+    same(read(folder, "a.csv", "x;y;z;name\n1e-05;1;2;a,1\n0.5;1;2.25;b\n"), expected)
 
 
 def test_map_coordinates_keep_their_millimetres(folder):
@@ -353,6 +395,14 @@ BAD = {
     "pcd ascii of 10^12": ("a.pcd", pcd_header(points=HUGE, data="ascii") + b"1 2 3 4\n", ["cut off"]),
     "pcd ascii cut off": ("a.pcd", pcd_header(data="ascii") + b"1.5 2.5 3.5 4\n1 2 3 4\n", ["cut off", "got 2"]),
     "pcd ascii words": ("a.pcd", pcd_header(data="ascii") + b"1 2 3 4\n1 b 3 4\n1 2 3 4\n", ["'1 b 3 4'", "line 2"]),
+    "pcd ascii stops": (
+        "a.pcd",
+        pcd_header(data="ascii") + b"1 2 3 4\n" * 2 + b"1 2 3,5 4\n",
+        ["'1 2 3,5 4'", "line 3"],
+    ),
+    "pcd ascii short": ("a.pcd", pcd_header(data="ascii") + b"1 2\n" * 9, ["'1 2'", "line 1"]),
+    "pcd ascii comment": ("a.pcd", pcd_header(data="ascii") + b"1 2 3 4\n# 2 3 4\n1 2 3 4\n", ["'# 2 3 4'", "line 2"]),
+    "pcd ascii count": ("a.pcd", pcd_header(count=f"1 1 1 {HUGE}", data="ascii") + b"1 2 3 4\n" * 3, [str(HUGE + 3)]),
     "pcd ascii of bytes": ("a.pcd", pcd_header(data="ascii") + b"\xff\xfe\xfd" * 9, ["UTF-"]),
     "pcd compressed 10^12": ("a.pcd", pcd_header(points=HUGE, data="binary_compressed") + bytes(40), ["10"]),
     "pcd compressed cut off": ("a.pcd", COMPRESSED + struct.pack("<II", 40, 48) + bytes(9), ["cut off"]),
@@ -370,6 +420,10 @@ BAD = {
     "ply of 10^12": ("a.ply", ply_header(HUGE) + ROWS, ["cut off", "1000000000000"]),
     "ply ascii of 10^12": ("a.ply", ply_header(HUGE, "ascii") + b"1 2 3 4\n", ["cut off"]),
     "ply ascii cut off": ("a.ply", ply_header(3, "ascii") + b"1 2 3 4\n1 2 3 4\n", ["cut off"]),
+    "ply ascii words": ("a.ply", ply_header(2, "ascii") + b"1 2 3 4\n1 b 3 4\n", ["'1 b 3 4'", "line 2"]),
+    "ply ascii all words": ("a.ply", ply_header(2, "ascii") + b"1 b 3 4\n" * 2, ["'1 b 3 4'", "line 1"]),
+    "ply ascii stops": ("a.ply", ply_header(2, "ascii") + b"1 2 3 4\n1 2 3,5 4\n", ["'1 2 3,5 4'", "line 2"]),
+    "ply ascii short": ("a.ply", ply_header(2, "ascii") + b"1 2\n" * 2, ["'1 2'", "line 1"]),
     "ply lines before of 10^17": (
         "a.ply",
         ply_header(form="ascii", before=f"element u {10**17}\nproperty int a\n") + b"1\n",
