@@ -4,6 +4,7 @@ All are frozen, keyword-only and validated when built. Lengths in metres, angles
 """
 
 from dataclasses import dataclass, replace
+from numbers import Real
 
 import numpy as np
 
@@ -59,14 +60,18 @@ class Box:
 
     def __post_init__(self):
         for name in ("center", "size"):
-            value = np.asarray(getattr(self, name), float)
+            given = getattr(self, name)
+            try:
+                value = np.array(given, float)
+            except (TypeError, ValueError):
+                raise InputError(f"Box.{name} must be three finite numbers in metres, got {given!r}") from None
             if value.shape != (3,) or not np.isfinite(value).all():
                 raise InputError(f"Box.{name} must be three finite numbers in metres, got {value.tolist()}")
             object.__setattr__(self, name, value)
         if (self.size <= 0).any():
             raise InputError(f"Box.size must be positive (length, width, height), got {self.size.tolist()}")
-        if not np.isfinite(self.yaw):
-            raise InputError(f"Box.yaw must be a finite number in radians, got {self.yaw}")
+        if not isinstance(self.yaw, Real) or not np.isfinite(self.yaw):
+            raise InputError(f"Box.yaw must be a finite number in radians, got {self.yaw!r}")
 
     def contains(self, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """points (n, 3) m -> (n,) bool: inside the box grown by `margin` m on each side."""
@@ -118,6 +123,9 @@ def center_of(points: np.ndarray) -> np.ndarray:
     cells = np.floor(np.asarray(points, float) / _CENTER_CELL).astype(np.int64)
     low = cells.min(0)
     span = cells.max(0) - low + 1
+    if span.astype(float).prod() > 2.0**62:
+        # strays kilometres away: one number a cell would overflow
+        return (np.median(np.unique(cells, axis=0), axis=0) + 0.5) * _CENTER_CELL
     # one number a cell: far faster to make unique than rows
     number = np.unique(((cells[:, 0] - low[0]) * span[1] + cells[:, 1] - low[1]) * span[2] + cells[:, 2] - low[2])
     x, rest = np.divmod(number, span[1] * span[2])

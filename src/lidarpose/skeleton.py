@@ -38,8 +38,14 @@ class Skeleton:
         if len(self.parents) != len(self.joints):
             raise InputError(f"skeleton {self.name}: {len(self.joints)} joints but {len(self.parents)} parents")
         for j, p in enumerate(self.parents):
-            if not -1 <= p < j:
-                raise InputError(f"skeleton {self.name}: parents precede children, but joint {j} has parent {p}")
+            if not (0 <= p < j or j == 0 and p == -1):
+                raise InputError(
+                    f"skeleton {self.name}: joint 0 is the root (-1) and parents precede children, "
+                    f"but joint {j} has parent {p}"
+                )
+        for pair in self.extra_bones:
+            if not all(0 <= j < len(self.joints) for j in pair):
+                raise InputError(f"skeleton {self.name}: extra bone {pair} is not within its {len(self.joints)} joints")
 
     def __len__(self) -> int:
         return len(self.joints)

@@ -98,6 +98,14 @@ def _header(path: str | Path, file) -> Header:
             raise InputError(
                 f"{path}: unknown setting {sorted(extra)[0]} in its configuration: written by a newer version?"
             )
-        return Header(version=header["version"], config=NetworkConfig(**header["config"]), card=header["card"])
+        config = _config(path, header["config"])
+        return Header(version=header["version"], config=config, card=header["card"])
     except (KeyError, TypeError, json.JSONDecodeError) as error:
         raise InputError(f"{path}: its header cannot be read ({type(error).__name__}: {error})") from None
+
+
+def _config(path: str | Path, entries: dict) -> NetworkConfig:
+    try:
+        return NetworkConfig(**entries)
+    except InputError as error:
+        raise InputError(f"{path}: its configuration does not fit: {error}") from None

@@ -10,6 +10,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from lidarpose.errors import InputError
+
 # half width of the window around the center that reaches the network, metres: arm span plus a step
 WINDOW = 2.0
 # bits an axis of a voxel index: 2 * WINDOW / 0.04 m < 2 ** 7
@@ -74,13 +76,15 @@ def plan(
     grid: edge of a fine voxel in metres; the mid and coarse ones are 2 and 4 times as wide. A person of more than
     `max_voxels` fine voxels keeps that many: random ones with `rng`, evenly spread ones without. Every person of at
     least one point inside the window has at least one voxel at every level; one of none has only padding.
+    Twin: `plan_reference`. Raises InputError for a grid too fine for the voxel index.
     """
+    if WINDOW / grid > 1 << (_BITS - 1):
+        raise InputError(f"grid must be at least {WINDOW / (1 << (_BITS - 1)):.4f} m, got {grid}")
     people = len(lengths)
-    person = np.repeat(np.arange(people), lengths)
-    cell = np.floor(points / grid).astype(np.int64) + (1 << (_BITS - 1))
     inside = (np.abs(points) < WINDOW).all(1)
     kept = np.flatnonzero(inside)
-    cell, person = cell[kept], person[kept]
+    person = np.repeat(np.arange(people), lengths)[kept]
+    cell = np.floor(points[kept] / grid).astype(np.int64) + (1 << (_BITS - 1))
     key = ((person << _BITS | cell[:, 0]) << _BITS | cell[:, 1]) << _BITS | cell[:, 2]
     voxel_key, voxel_of_point, count = np.unique(key, return_inverse=True, return_counts=True)
 

@@ -3,6 +3,7 @@
 from dataclasses import asdict, dataclass
 
 from lidarpose.errors import InputError, unknown_name
+from lidarpose.skeleton import skeleton
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,9 +21,20 @@ class NetworkConfig:
     parts: int = 25
 
     def __post_init__(self):
+        for name in ("channels", "heads", "max_voxels", "parts"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < 1:
+                raise InputError(f"{name} must be a whole number of at least 1, got {value!r}")
         if self.channels % self.heads:
             raise InputError(f"channels must divide by heads, got {self.channels} and {self.heads}")
-        object.__setattr__(self, "blocks", tuple(self.blocks))
+        blocks = self.blocks
+        counts = list(blocks) if isinstance(blocks, list | tuple) else []
+        if len(counts) != 3 or not all(isinstance(count, int) and count >= 0 for count in counts):
+            raise InputError(f"blocks must be three whole numbers (mid encoder, coarse, mid decoder), got {blocks!r}")
+        if not isinstance(self.grid, int | float) or not self.grid > 0:
+            raise InputError(f"grid must be a positive number of metres, got {self.grid!r}")
+        skeleton(self.skeleton)
+        object.__setattr__(self, "blocks", tuple(counts))
 
     def to_dict(self) -> dict:
         return asdict(self)

@@ -79,6 +79,13 @@ def _majority(tables: Plan, part: np.ndarray, parts: int) -> np.ndarray:
     return np.where(tables.fine.valid, most, -1)
 
 
+def generator_of(recipe: Pretrain) -> Generator:
+    """The people a recipe learns from. Raises InputError for an unknown scene and for clips that cannot be read."""
+    scene = scene_config(recipe.scene)
+    bank = PoseBank.from_clips(recipe.motion, recipe.subjects) if recipe.motion else None
+    return Generator(scene=scene, bank=bank, captured=recipe.captured if bank is not None else 0.0, measure=False)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Chunks(IterableDataset):
     """The chunks of a run from `start` to `stop`, each a list of `BATCHES` batches of arrays."""
@@ -91,14 +98,7 @@ class Chunks(IterableDataset):
     def __iter__(self):
         worker = get_worker_info()
         first, stride = (0, 1) if worker is None else (worker.id, worker.num_workers)
-        recipe = self.recipe
-        bank = PoseBank.from_clips(recipe.motion, recipe.subjects) if recipe.motion else None
-        generator = Generator(
-            scene=scene_config(recipe.scene),
-            bank=bank,
-            captured=recipe.captured if bank is not None else 0.0,
-            measure=False,
-        )
+        generator = generator_of(self.recipe)
         for chunk in range(self.start + first, self.stop, stride):
             yield self._chunk(generator, chunk)
 

@@ -20,7 +20,7 @@ from lidarpose.model.batch import Batch, Targets
 from lidarpose.model.checkpoint import save_checkpoint
 from lidarpose.model.network import PoseNet
 from lidarpose.model.presets import preset
-from lidarpose.train.feed import BATCHES, loader
+from lidarpose.train.feed import BATCHES, generator_of, loader
 from lidarpose.train.losses import losses, total
 from lidarpose.train.optimize import average, optimizers, rate_factor
 from lidarpose.train.recipes import Pretrain
@@ -62,22 +62,29 @@ def pretrain(recipe: Pretrain, folder: str | Path, *, resume: bool = False, comm
             bar.update(size)
             bar.set_postfix(mpjpe_mm=f"{means['mpjpe'] * 1e3:.0f}")
             if time.monotonic() - saved > SAVE_EVERY or chunk == chunks:
-                save_state(folder / STATE, network, mean, made, {"chunk": chunk, "seconds": elapsed})
+                # the state last: killed between the two, a run goes on from the older one and writes both again
                 _save_model(folder, recipe, mean, chunk * size, elapsed, command)
+                save_state(folder / STATE, network, mean, made, {"chunk": chunk, "seconds": elapsed})
                 saved = time.monotonic()
     return folder / MODEL
 
 
 def _begin(recipe: Pretrain, folder: Path, resume: bool):
+    # here, not in a worker, whose errors come wrapped in a traceback
+    generator_of(recipe)
     torch.manual_seed(recipe.seed)
     network = PoseNet(preset(recipe.size))
     mean = {name: value.detach().clone() for name, value in network.named_parameters()}
     made = optimizers(network, recipe)
     config = {"schema": "lidarpose.run/1", "version": __version__, "recipe": recipe.to_dict()}
     if resume:
-        if not (folder / STATE).is_file():
-            raise InputError(f"{folder}: nothing to resume, it has no {STATE}: leave --resume away to start a run")
+        if not (folder / CONFIG).is_file():
+            raise InputError(f"{folder}: nothing to resume, it has no {CONFIG}: leave --resume away to start a run")
         _same_recipe(folder / CONFIG, config["recipe"])
+        if not (folder / STATE).is_file():
+            # killed before its first state was saved: it begins again
+            _cut_log(folder / LOG, 0)
+            return network, mean, made, 0, 0.0
         progress = load_state(folder / STATE, network, mean, made)
         _cut_log(folder / LOG, progress["chunk"] * BATCHES * recipe.batch)
         return network, mean, made, progress["chunk"], progress["seconds"]
@@ -90,7 +97,12 @@ def _begin(recipe: Pretrain, folder: Path, resume: bool):
 
 
 def _same_recipe(path: Path, recipe: dict) -> None:
-    stored = json.loads(path.read_text())["recipe"]
+    try:
+        stored = dict(json.loads(path.read_text())["recipe"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{path}: expected the recipe of a run, but it is damaged ({error}): start a new run"
+        ) from None
     # length and workers change no person; the schedule follows the new length
     for name in recipe:
         if name not in ("people", "workers") and json.loads(json.dumps(recipe[name])) != stored.get(name):
@@ -102,7 +114,9 @@ def _same_recipe(path: Path, recipe: dict) -> None:
 def _cut_log(path: Path, people: int) -> None:
     """Lines behind the saved state belong to steps that will be taken again."""
     if path.exists():
-        kept = [line for line in path.read_text().splitlines() if line and json.loads(line)["people"] <= people]
+        # a kill may leave half a line at the end
+        whole = [line for line in path.read_text().splitlines() if line.endswith("}")]
+        kept = [line for line in whole if json.loads(line)["people"] <= people]
         write_atomic(path, "".join(line + "\n" for line in kept))
 
 

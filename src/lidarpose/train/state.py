@@ -35,9 +35,14 @@ def load_state(
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
     except (SafetensorError, OSError, ValueError, KeyError) as error:
         raise InputError(f"{path}: expected the state of a run, but it is damaged ({error}): start a new run") from None
-    network.load_state_dict(_part(tensors, "network."))
-    for name, value in _part(tensors, "mean.").items():
-        mean[name].copy_(value)
+    stored_mean = _part(tensors, "mean.")
+    try:
+        network.load_state_dict(_part(tensors, "network."))
+        for name, value in mean.items():
+            value.copy_(stored_mean[name])
+    except (RuntimeError, KeyError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"{path}: the state is not of this network ({reason}): start a new run") from None
     for k, optimizer in enumerate(optimizers):
         memory: dict[int, dict[str, Tensor]] = {}
         for name, value in _part(tensors, f"optimizer.{k}.").items():

@@ -1,0 +1,260 @@
+"""The network as a function of one person, its heads, and the frames in which it is trained."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpose.errors import InputError
+from lidarpose.geometry import rotation_about
+from lidarpose.model.batch import Batch, Targets
+from lidarpose.model.heads import BIN, BINS, DECODE, WINDOW, bin_centers, decode, encode
+from lidarpose.model.network import PoseNet
+from lidarpose.model.plan import plan, view_features
+from lidarpose.model.presets import NetworkConfig, preset
+from lidarpose.synth.generate import Generator, SyntheticPerson
+from lidarpose.synth.scene import SCENES
+from lidarpose.train.feed import MAX_VOXELS, collate, example
+from lidarpose.train.losses import SIGMA, losses, total
+
+TINY = preset("tiny")
+
+
+@cache
+def network():
+    """Random weights everywhere: fresh layers of zeros would hide what they read."""
+    torch.manual_seed(0)
+    made = PoseNet(TINY).eval()
+    with torch.no_grad():
+        for value in made.parameters():
+            value += 0.05 * torch.randn_like(value)
+    return made
+
+
+def person(n, seed=0):
+    rng = np.random.default_rng(seed)
+    return (rng.normal(0, [0.2, 0.2, 0.5], (n, 3))).astype(np.float32)
+
+
+def batch_of(clouds, max_voxels=TINY.max_voxels, known=True):
+    origin = np.array([-8.0, 1, 1]) if known else None
+    view = np.stack([view_features(np.full(3, k), origin) for k in range(len(clouds))])
+    lengths = np.array([len(c) for c in clouds])
+    return Batch.from_plan(plan(np.concatenate(clouds), lengths, grid=TINY.grid, max_voxels=max_voxels, view=view))
+
+
+@torch.inference_mode()
+def run(clouds, **kwargs):
+    return network()(batch_of(clouds, **kwargs))
+
+
+def of_person(out, k):
+    return [t[k] for t in (out.joints(), out.vote, out.heatmap, out.confidence, out.log_spread, *out.level_joints)]
+
+
+def assert_close(a, b, atol=1e-5):
+    for x, y in zip(a, b, strict=True):
+        torch.testing.assert_close(x, y, atol=atol, rtol=1e-5)
+
+
+@pytest.mark.parametrize("n", [1, 2, 17, 300])
+def test_batch_mates_and_padding_do_not_matter(n):
+    # the view of person k depends on k: the one under test stays number 0
+    one = person(n, 1)
+    alone = run([one])
+    among = run([one, person(3000, 2), person(5, 3), person(0)])
+    assert_close(of_person(alone, 0), of_person(among, 0))
+    width = int(alone.part.shape[1])
+    torch.testing.assert_close(alone.part[0], among.part[0, :width], atol=1e-5, rtol=1e-5)
+
+
+def test_the_order_of_points_does_not_matter():
+    one = person(400, 4)
+    assert_close(of_person(run([one]), 0), of_person(run([np.random.default_rng(0).permutation(one)]), 0))
+
+
+def test_the_result_depends_on_points_density_and_view():
+    one = person(300, 5)
+    base = of_person(run([one]), 0)[1]
+    moved = one.copy()
+    moved[:30] += 0.2
+    for other in (run([moved]), run([np.concatenate([one, one[:100].repeat(5, 0)])]), run([one], known=False)):
+        assert (of_person(other, 0)[1] - base).abs().max() > 1e-4
+
+
+@pytest.mark.parametrize("clouds", [[0], [0, 0], [0, 40, 0]])
+def test_people_without_points_give_finite_numbers(clouds):
+    out = run([person(n) for n in clouds])
+    for value in (out.joints(), out.heatmap, out.part, out.confidence, out.log_spread, *out.level_joints):
+        assert torch.isfinite(value).all()
+
+
+@pytest.mark.parametrize("n", [1, 2, 5000])
+def test_gradients_are_finite(n):
+    model = PoseNet(TINY)
+    batch = batch_of([person(n)])
+    targets = Targets(
+        joints=torch.randn(1, 26, 3) * 0.3, part=torch.where(batch.fine.valid, torch.tensor(3), torch.tensor(-1))
+    )
+    value = total(losses(model(batch), targets))
+    value.backward()
+    assert torch.isfinite(value)
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None and torch.isfinite(parameter.grad).all(), name
+
+
+def test_size_and_shapes():
+    assert sum(p.numel() for p in network().parameters()) == 348_218
+    # a full cube of 8 x 8 x 8 fine voxels: 512, thinned to 384, in 64 and in 8
+    axis = (np.arange(8) + 0.5) * TINY.grid
+    cube = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3)
+    batch = batch_of([cube, cube[:3]])
+    assert [level.valid.shape[1] for level in (batch.fine, batch.mid, batch.coarse)] == [384, 64, 8]
+    whole = batch_of([cube], max_voxels=512)
+    torch.testing.assert_close(whole.coarse.log_count.exp(), torch.full((1, 8), 64.0))
+    out = run([cube, cube[:3]])
+    assert out.vote.shape == out.joints().shape == (2, 26, 3)
+    assert out.heatmap.shape == (2, 26, 3, 24)
+    assert out.part.shape == (2, 384, 25)
+    assert out.confidence.shape == out.log_spread.shape == (2, 26)
+    assert [tuple(j.shape) for j in out.level_joints] == [(2, 26, 3)] * 2
+
+
+def test_an_untrained_network_puts_joints_among_the_points():
+    cloud = person(500, 6) + np.array([0.4, -0.3, 0.2], np.float32)
+    torch.manual_seed(1)
+    vote = PoseNet(TINY)(batch_of([cloud])).vote[0].detach().numpy()
+    assert (vote > cloud.min(0)).all() and (vote < cloud.max(0)).all()
+
+
+def test_configurations():
+    with pytest.raises(InputError, match="channels must divide by heads, got 64 and 5"):
+        NetworkConfig(size="odd", channels=64, heads=5, blocks=(1, 1, 1))
+    with pytest.raises(InputError, match="unknown network size 'huge'"):
+        preset("huge")
+    assert NetworkConfig(**TINY.to_dict()) == TINY
+    assert isinstance(NetworkConfig(size="x", channels=8, heads=2, blocks=[1, 0, 1]).blocks, tuple)
+
+
+# --- heatmaps
+
+# the target is 1.2 bins wide: so far inside the window its flank is not cut
+REACH = WINDOW - (DECODE + 1) * BIN
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.lists(st.floats(-REACH, REACH), min_size=1, max_size=9))
+def test_a_clean_heatmap_decodes_to_a_tenth_of_a_bin(offsets):
+    offset = torch.tensor(offsets)
+    heatmap = encode(offset, SIGMA)
+    torch.testing.assert_close(heatmap.sum(-1), torch.ones(len(offsets)))
+    assert (decode(heatmap.log()) - offset).abs().max() < 0.1 * BIN
+
+
+def test_at_the_window_s_edge_the_decoded_offset_stays_inside_and_in_order():
+    offset = torch.linspace(-WINDOW, WINDOW, 200)
+    decoded = decode(encode(offset, SIGMA).log())
+    assert (decoded.abs() < WINDOW).all() and (decoded - offset).abs().max() < 1.2 * BIN
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.floats(-0.5, 0.5))
+def test_heatmaps_mirror(offset):
+    there, back = encode(torch.tensor([offset, -offset]), SIGMA)
+    torch.testing.assert_close(there, back.flip(-1), atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(bin_centers(), -bin_centers().flip(-1), atol=1e-6, rtol=0)
+
+
+def decode_slowly(logits):
+    """One heatmap at a time, in plain numbers: mean of the bins about the mode."""
+    mode = max(range(BINS), key=lambda w: logits[w])
+    near = [w for w in range(BINS) if abs(w - mode) <= DECODE]
+    weight = {w: np.exp(logits[w] - logits[mode]) for w in near}
+    return sum(weight[w] * (-WINDOW + (w + 0.5) * BIN) for w in near) / sum(weight.values())
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0.1, 8))
+def test_decoding_against_its_slow_twin(seed, sharp):
+    logits = np.random.default_rng(seed).normal(0, sharp, (2, 3, BINS))
+    slow = [[decode_slowly(row.tolist()) for row in block] for block in logits]
+    torch.testing.assert_close(decode(torch.tensor(logits)), torch.tensor(slow), atol=1e-5, rtol=0, check_dtype=False)
+
+
+def test_two_peaks_decode_to_the_higher_one_not_between():
+    both = torch.log(0.6 * encode(torch.tensor(0.2), SIGMA) + 0.4 * encode(torch.tensor(-0.2), SIGMA))
+    assert decode(both).item() == pytest.approx(0.2, abs=0.1 * BIN)
+
+
+# --- from a sample to a batch
+
+
+@cache
+def people(count=12):
+    maker = Generator(scene=SCENES["wild"], measure=False)
+    return tuple(maker.person(3, index) for index in range(count))
+
+
+def test_points_and_joints_move_together():
+    kinds = set()
+    for k, known in enumerate(people()):
+        shown = example(known, np.random.default_rng(k))
+        # between a joint and a point lies what lies between them in the sensor's frame
+        np.testing.assert_allclose(
+            shown.points[0] - shown.joints, known.sample.points[0] - known.sample.pose.joints, atol=1e-5
+        )
+        np.testing.assert_array_equal(shown.part, known.sample.part)
+        assert np.abs(np.median(shown.points, axis=0)).max() < 1.0
+        kinds.add(bool(shown.view[4]))
+        if shown.view[4]:
+            # the person's frame has the sensor's axes, and the view leads back to the sensor
+            sensor = shown.view[:3] * np.exp(shown.view[3])
+            np.testing.assert_allclose(shown.joints - sensor, known.sample.pose.joints, atol=1e-3)
+        else:
+            assert not shown.view.any()
+    assert kinds == {True, False}
+
+
+def turned(known, yaw):
+    rotation = rotation_about("z", yaw)
+    sample = known.sample
+    pose = replace(sample.pose, joints=(sample.pose.joints @ rotation.T).astype(np.float32))
+    points = (sample.points @ rotation.T).astype(np.float32)
+    moved = replace(sample, points=points, pose=pose, center=rotation @ sample.center)
+    return SyntheticPerson(sample=moved, facts=None), rotation
+
+
+@pytest.mark.parametrize("yaw", [0.3, np.pi / 2, -2.5])
+def test_a_turned_person_is_the_turned_example(yaw):
+    """Targets turn with the points and with the view: only the error of the pelvis' guess stays as it was drawn."""
+    for k, known in enumerate(people()):
+        other, rotation = turned(known, yaw)
+        a, b = (example(p, np.random.default_rng(k)) for p in (known, other))
+        shift = b.joints[0] - rotation @ a.joints[0]
+        np.testing.assert_allclose(b.points, a.points @ rotation.T + shift, atol=2e-5)
+        np.testing.assert_allclose(b.joints, a.joints @ rotation.T + shift, atol=2e-5)
+        assert np.linalg.norm(shift) < 0.5
+        sensor_a, sensor_b = (e.view[:3] * np.exp(e.view[3]) for e in (a, b))
+        np.testing.assert_allclose(sensor_b, sensor_a @ rotation.T + shift * a.view[4], atol=1e-4)
+
+
+def test_collated_targets_are_the_examples_and_the_majority_of_parts():
+    shown = [example(known, np.random.default_rng(k)) for k, known in enumerate(people())]
+    arrays = collate(shown, TINY, np.random.default_rng(0))
+    assert arrays["fine.valid"].shape[1] <= MAX_VOXELS and "point_voxel" not in arrays
+    assert (arrays["part"][~arrays["fine.valid"]] == -1).all()
+    assert ((arrays["part"] >= 0) == arrays["fine.valid"]).all()
+    for b, one in enumerate(shown):
+        np.testing.assert_array_equal(arrays["joints"][b], one.joints)
+        np.testing.assert_array_equal(arrays["view"][b], one.view)
+        cell = np.floor(one.points / TINY.grid).astype(int)
+        for n in np.flatnonzero(arrays["fine.valid"][b]):
+            center = np.floor(arrays["fine.position"][b, n] / TINY.grid - arrays["offset"][b, n]).astype(int)
+            mine = one.part[(cell == center).all(1)]
+            if len(mine):
+                votes = np.bincount(mine, minlength=25)
+                assert votes[arrays["part"][b, n]] == votes.max()

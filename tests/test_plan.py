@@ -1,0 +1,177 @@
+"""Voxels, levels and padding against a twin of dictionaries."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpose.errors import InputError
+from lidarpose.model.plan import WINDOW, plan, view_features
+from lidarpose.model.plan_reference import plan_reference
+
+seeds = st.integers(0, 2**32 - 1)
+people = st.lists(st.integers(0, 90), min_size=1, max_size=4)
+GRID = 0.06
+
+
+def crowd(seed, lengths, spread=0.5, dtype=np.float32):
+    """Points of people, some of them outside the window."""
+    rng = np.random.default_rng(seed)
+    points = rng.normal(0, spread, (sum(lengths), 3))
+    # as a scan of a surface: many points share a voxel
+    points = np.where(rng.random(len(points))[:, None] < 0.5, np.round(points, 1), points)
+    return (points + rng.normal(0, 0.01, points.shape)).astype(dtype), np.array(lengths, int)
+
+
+def assert_plans_agree(a, b, atol=2e-6):
+    left, right = a.arrays(), b.arrays()
+    assert left.keys() == right.keys()
+    for name, value in left.items():
+        other = right[name]
+        assert value.shape == other.shape and value.dtype == other.dtype, name
+        if name == "deviation":
+            # a difference of squares: the root of its rounding is what is left at one point a voxel
+            np.testing.assert_allclose(value, other, atol=1e-6, err_msg=name)
+        elif name == "offset":
+            # a mean on the border of two cells may be rounded to either
+            gap = np.abs(value - other)
+            assert np.minimum(gap, np.abs(1 - gap)).max(initial=0) < 1e-4, name
+        elif value.dtype.kind == "f":
+            np.testing.assert_allclose(value, other, atol=atol, err_msg=name)
+        else:
+            np.testing.assert_array_equal(value, other, err_msg=name)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seeds, people, st.sampled_from([0.03, 0.06, 0.11]), st.sampled_from([1, 7, 40, 384]), st.booleans())
+def test_the_plan_is_what_its_twin_says(seed, lengths, grid, most, random):
+    points, lengths = crowd(seed, lengths, spread=np.random.default_rng(seed).choice([0.1, 0.5, 1.2]))
+    view = np.random.default_rng(seed).normal(size=(len(lengths), 5))
+    rngs = [np.random.default_rng(seed) if random else None for _ in range(2)]
+    kwargs = {"grid": grid, "max_voxels": most, "view": view}
+    assert_plans_agree(
+        plan(points, lengths, rng=rngs[0], **kwargs), plan_reference(points, lengths, rng=rngs[1], **kwargs)
+    )
+
+
+@settings(max_examples=40, deadline=None)
+@given(seeds, people)
+def test_levels_hang_together(seed, lengths):
+    points, lengths = crowd(seed, lengths)
+    tables = plan(points, lengths, grid=GRID, max_voxels=30)
+    for level, above in ((tables.fine, tables.mid), (tables.mid, tables.coarse)):
+        counts = np.where(level.valid, np.exp(level.log_count), 0)
+        for b in range(len(lengths)):
+            parent = level.parent[b][level.valid[b]]
+            # every parent has a child, and counts and means go up whole
+            assert set(parent) == set(np.flatnonzero(above.valid[b]))
+            for k in np.flatnonzero(above.valid[b]):
+                mine = level.valid[b] & (level.parent[b] == k)
+                assert np.exp(above.log_count[b, k]) == pytest.approx(counts[b, mine].sum(), rel=1e-5)
+                mean = (level.position[b, mine] * counts[b, mine, None]).sum(0) / counts[b, mine].sum()
+                np.testing.assert_allclose(above.position[b, k], mean, atol=1e-5)
+            # padding stands behind
+            assert (np.diff(level.valid[b].astype(int)) <= 0).all()
+    for name, value in tables.arrays().items():
+        if name.startswith("fine.") or name in ("deviation", "offset"):
+            assert not value[~tables.fine.valid].any(), name
+
+
+@settings(max_examples=40, deadline=None)
+@given(seeds)
+def test_the_order_of_points_does_not_matter(seed):
+    points, lengths = crowd(seed, [50, 80])
+    rng = np.random.default_rng(seed)
+    order = np.concatenate([rng.permutation(50), 50 + rng.permutation(80)])
+    a = plan(points, lengths, grid=GRID, max_voxels=30)
+    b = plan(points[order], lengths, grid=GRID, max_voxels=30)
+    np.testing.assert_array_equal(a.point_voxel[order], b.point_voxel)
+    for name, value in a.arrays().items():
+        if name != "point_voxel":
+            np.testing.assert_allclose(value, b.arrays()[name], atol=1e-6, err_msg=name)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seeds, people)
+def test_batch_mates_do_not_matter(seed, lengths):
+    points, lengths = crowd(seed, lengths)
+    together = plan(points, lengths, grid=GRID, max_voxels=30).arrays()
+    for b, end in enumerate(np.cumsum(lengths)):
+        alone = plan(points[end - lengths[b] : end], lengths[b : b + 1], grid=GRID, max_voxels=30).arrays()
+        for name, value in alone.items():
+            if name in ("view", "point_voxel"):
+                continue
+            width = value.shape[1]
+            np.testing.assert_array_equal(together[name][b, :width], value[0], err_msg=name)
+            assert not together[name][b, width:].any()
+
+
+def test_points_find_their_own_voxel():
+    points, lengths = crowd(3, [200, 150], spread=0.9)
+    tables = plan(points, lengths, grid=GRID, max_voxels=384)
+    inside = (np.abs(points) < WINDOW).all(1)
+    np.testing.assert_array_equal(tables.point_voxel >= 0, inside)
+    row = tables.fine.position.reshape(-1, 3)[tables.point_voxel[inside]]
+    assert np.abs(row - points[inside]).max() < GRID
+    owner = tables.point_voxel[inside] // tables.fine.valid.shape[1]
+    np.testing.assert_array_equal(owner, np.repeat([0, 1], lengths)[inside])
+
+
+def test_nobody_empty_people_and_one_point():
+    none = plan(np.zeros((0, 3), np.float32), np.zeros(2, int), grid=GRID, max_voxels=9)
+    assert none.fine.valid.shape == (2, 1) and not none.fine.valid.any() and not none.coarse.valid.any()
+    point = np.array([[0.07, -0.01, 0.5]], np.float32)
+    one = plan(point, np.array([0, 1, 0]), grid=GRID, max_voxels=9)
+    np.testing.assert_array_equal(one.fine.valid[:, 0], [False, True, False])
+    for level in (one.fine, one.mid, one.coarse):
+        np.testing.assert_allclose(level.position[1, 0], point[0], atol=1e-7)
+        assert level.log_count[1, 0] == 0
+    np.testing.assert_allclose(one.offset[1, 0], point[0] / GRID - [1, -1, 8] - 0.5, atol=1e-4)
+    assert not one.deviation.any()
+    outside = plan(point + 5, np.array([1]), grid=GRID, max_voxels=9)
+    assert not outside.fine.valid.any() and outside.point_voxel.tolist() == [-1]
+
+
+def test_strays_of_any_size_stay_outside_without_a_warning():
+    points = np.array(
+        [[0, 0, 0], [1e30, 0, 0], [np.nan, 0, 0], [0, -np.inf, 0], [2.0, 0, 0], [-1.9999, 0, 0]], np.float32
+    )
+    tables = plan(points, np.array([6]), grid=GRID, max_voxels=9)
+    np.testing.assert_array_equal(tables.point_voxel >= 0, [True, False, False, False, False, True])
+
+
+def test_a_grid_too_fine_for_the_index_is_refused():
+    points = np.array([[-1.99, 0, 0], [1.99, 1.99, -1.99]])
+    assert plan(points, np.array([2]), grid=WINDOW / 128, max_voxels=9).fine.valid.sum() == 2
+    with pytest.raises(InputError, match="grid must be at least"):
+        plan(points, np.array([2]), grid=0.01, max_voxels=9)
+
+
+@pytest.mark.parametrize("random", [False, True])
+def test_thinning_spares_the_small_and_spreads_over_the_large(random):
+    small, large = crowd(1, [20])[0], crowd(2, [3000], spread=0.5)[0]
+    rng = np.random.default_rng(0) if random else None
+    tables = plan(np.concatenate([small, large]), np.array([20, 3000]), grid=GRID, max_voxels=100, rng=rng)
+    assert tables.fine.valid[1].sum() == 100 and tables.fine.valid.shape == (2, 100)
+    assert tables.fine.valid[0].sum() == plan(small, np.array([20]), grid=GRID, max_voxels=100).fine.valid.sum()
+    # what is kept covers the person, not one end of them
+    np.testing.assert_allclose(tables.fine.position[1].mean(0), large.mean(0), atol=0.2)
+    np.testing.assert_allclose(tables.fine.position[1].std(0), large.std(0), rtol=0.4)
+
+
+def test_inputs_stay_as_they_are():
+    points, lengths = crowd(5, [100, 300])
+    kept = points.copy(), lengths.copy()
+    plan(points, lengths, grid=GRID, max_voxels=30, rng=np.random.default_rng(0))
+    np.testing.assert_array_equal(points, kept[0])
+    np.testing.assert_array_equal(lengths, kept[1])
+
+
+def test_the_view_points_to_the_sensor():
+    center, origin = np.array([3.0, 4.0, -1.0]), np.array([0.0, 0, -1])
+    view = view_features(center, origin)
+    assert view.dtype == np.float32
+    np.testing.assert_allclose(center + view[:3] * np.exp(view[3]), origin, atol=1e-5)
+    assert view[4] == 1 and np.exp(view[3]) == pytest.approx(5, rel=1e-5)
+    np.testing.assert_array_equal(view_features(center, None), np.zeros(5))
+    assert np.isfinite(view_features(center, center)).all()

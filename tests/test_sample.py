@@ -1,0 +1,171 @@
+"""Sample, Pose, Box, and the center of a cloud."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpose.errors import InputError
+from lidarpose.sample import Box, Pose, Sample, center_of
+from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14
+
+quick = settings(max_examples=60, deadline=None)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def contains_slowly(box, points, margin):
+    """Corner by corner: a point is inside where it lies between the box's three pairs of faces."""
+    forward = np.array([np.cos(box.yaw), np.sin(box.yaw), 0])
+    left = np.array([-np.sin(box.yaw), np.cos(box.yaw), 0])
+    up = np.array([0, 0, 1])
+    out = []
+    for point in points:
+        inside = True
+        for axis, size in zip((forward, left, up), box.size, strict=True):
+            along = axis @ point - axis @ box.center
+            inside &= -size / 2 - margin <= along <= size / 2 + margin
+        out.append(inside)
+    return np.array(out, bool)
+
+
+@quick
+@given(seeds, st.floats(-7, 7), st.floats(0, 0.5))
+def test_a_box_holds_what_its_slow_twin_says(seed, yaw, margin):
+    rng = np.random.default_rng(seed)
+    box = Box(center=rng.normal(0, 3, 3), size=rng.uniform(0.2, 2, 3), yaw=yaw)
+    points = box.center + rng.uniform(-1.5, 1.5, (200, 3))
+    np.testing.assert_array_equal(box.contains(points, margin), contains_slowly(box, points, margin))
+    # further columns, as intensity, are ignored
+    wide = np.column_stack([points, rng.normal(size=(200, 2))])
+    np.testing.assert_array_equal(box.contains(wide, margin), box.contains(points, margin))
+
+
+def test_a_box_turns_with_its_yaw():
+    box = Box(center=[0, 0, 0], size=[4, 1, 2], yaw=np.pi / 2)
+    np.testing.assert_array_equal(
+        box.contains(np.array([[0, 1.9, 0], [1.9, 0, 0], [0.4, 0, 0.9]])), [True, False, True]
+    )
+    assert box.contains(np.zeros((0, 3))).shape == (0,)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"center": [0, 0]}, "center must be three finite"),
+        ({"center": [0, 0, np.nan]}, "center must be three finite"),
+        ({"center": ["a", "b", "c"]}, "center must be three finite"),
+        ({"center": None}, "center must be three finite"),
+        ({"size": [1, 1, 0]}, "size must be positive"),
+        ({"size": [1, -1, 1]}, "size must be positive"),
+        ({"size": [[1, 1, 1]]}, "size must be three finite"),
+        ({"size": [1, [2, 3], 1]}, "size must be three finite"),
+        ({"yaw": np.inf}, "yaw must be a finite"),
+        ({"yaw": "north"}, "yaw must be a finite"),
+        ({"yaw": None}, "yaw must be a finite"),
+        ({"yaw": [0.1]}, "yaw must be a finite"),
+    ],
+)
+def test_boxes_that_are_none(change, message):
+    with pytest.raises(InputError, match=message) as caught:
+        Box(**{"center": [0, 0, 0], "size": [1, 1, 2], "yaw": 0.0} | change)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_box_keeps_its_own_numbers():
+    center = np.zeros(3)
+    box = Box(center=center, size=[1, 1, 1])
+    center[0] = 5
+    np.testing.assert_array_equal(box.center, 0)
+
+
+def pose(skeleton=BODY26, shape=(), **more):
+    joints = np.random.default_rng(0).normal(size=(*shape, len(skeleton), 3))
+    return Pose(joints=joints, skeleton=skeleton, **more)
+
+
+@pytest.mark.parametrize("shape", [(), (2,), (3, 4)])
+@pytest.mark.parametrize("other", [SMPL24, HUMAN15, WAYMO14, BODY26], ids=lambda s: s.name)
+def test_a_pose_in_another_skeleton_keeps_each_joint_by_name(shape, other):
+    rng = np.random.default_rng(1)
+    confidence, spread = rng.random((2, *shape, 26))
+    full = pose(shape=shape, confidence=confidence, spread=spread, frame="sensor")
+    part = full.to(other)
+    assert part.skeleton is other and part.frame == "sensor"
+    assert part.joints.shape == (*shape, len(other), 3)
+    for name in other.joints:
+        i, j = BODY26.index(name), other.index(name)
+        np.testing.assert_array_equal(part.joints[..., j, :], full.joints[..., i, :])
+        np.testing.assert_array_equal(part.confidence[..., j], confidence[..., i])
+        np.testing.assert_array_equal(part.spread[..., j], spread[..., i])
+    assert pose(shape=shape).to(other).confidence is None
+
+
+def test_a_pose_of_the_wrong_shape_is_refused():
+    with pytest.raises(InputError, match=r"must be \(\.\.\., 26, 3\), got \(24, 3\)"):
+        Pose(joints=np.zeros((24, 3)), skeleton=BODY26)
+    with pytest.raises(InputError, match="must be"):
+        Pose(joints=np.zeros(3), skeleton=BODY26)
+    with pytest.raises(InputError, match="confidence must be"):
+        pose(confidence=np.zeros(25))
+    with pytest.raises(InputError, match="spread must be"):
+        pose(shape=(2,), spread=np.zeros(26))
+    with pytest.raises(InputError, match="smpl24 has no nose"):
+        pose(SMPL24).to(WAYMO14)
+
+
+def test_a_sample_is_checked_when_built():
+    good = {"points": np.zeros((4, 3), np.float32), "center": np.zeros(3)}
+    Sample(**good)
+    Sample(points=np.zeros((0, 3), np.float32), center=np.zeros(3), part=np.zeros(0, np.uint8))
+    for change, message in [
+        ({"points": np.zeros((4, 3))}, "float32"),
+        ({"points": np.zeros((4, 4), np.float32)}, r"\(n, 3\)"),
+        ({"points": np.zeros(3, np.float32)}, r"\(n, 3\)"),
+        ({"center": np.zeros((1, 3))}, "center"),
+        ({"part": np.zeros(3, np.uint8)}, "part must be"),
+        ({"ring": np.zeros((4, 1), int)}, "ring must be"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            Sample(**good | change)
+    with pytest.raises(AttributeError):
+        Sample(**good).center = np.ones(3)
+
+
+def cloud(rng, n=150):
+    """Points well inside their 10 cm cells, so that rounding never moves one to the next cell."""
+    cells = rng.integers(-15, 15, (n, 3))
+    return (cells + rng.uniform(0.1, 0.9, (n, 3))) * 0.1
+
+
+@quick
+@given(seeds)
+def test_the_center_ignores_density_and_order_and_moves_with_the_cloud(seed):
+    rng = np.random.default_rng(seed)
+    points = cloud(rng)
+    center = center_of(points)
+    # a part of the body seen more densely
+    np.testing.assert_allclose(center_of(np.concatenate([points, points[:40].repeat(30, 0)])), center, atol=1e-12)
+    np.testing.assert_allclose(center_of(rng.permutation(points)), center, atol=1e-12)
+    shift = rng.integers(-400, 400, 3) * 0.1
+    np.testing.assert_allclose(center_of(points + shift), center + shift, atol=1e-9)
+
+
+@quick
+@given(seeds)
+def test_the_center_is_the_median_of_cells_written_with_a_set(seed):
+    points = cloud(np.random.default_rng(seed), 60)
+    cells = {tuple(int(np.floor(c / 0.1)) for c in point) for point in points}
+    expected = [(np.median([cell[k] for cell in cells]) + 0.5) * 0.1 for k in range(3)]
+    np.testing.assert_allclose(center_of(points), expected, atol=1e-9)
+
+
+def test_a_few_strays_hardly_move_the_center_however_far_they_are():
+    rng = np.random.default_rng(0)
+    points = cloud(rng)
+    for far in (10.0, 1e3, 1e6, 1e9):
+        strays = np.array([[far, far, far], [-far, far, -far]])
+        assert np.abs(center_of(np.concatenate([points, strays])) - center_of(points)).max() <= 0.1 + 1e-9
+
+
+def test_the_center_of_one_point_is_its_cell():
+    np.testing.assert_allclose(center_of(np.array([[0.26, -0.01, 10.04]])), [0.25, -0.05, 10.05])

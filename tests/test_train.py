@@ -1,0 +1,472 @@
+"""Losses, schedule, and runs that can be killed and taken up again."""
+
+import json
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from lidarpose.cli import main
+from lidarpose.errors import InputError
+from lidarpose.model.batch import Batch, Targets
+from lidarpose.model.checkpoint import load_checkpoint
+from lidarpose.model.heads import BINS, WINDOW, Outputs, encode
+from lidarpose.model.network import PoseNet
+from lidarpose.model.presets import preset
+from lidarpose.synth.generate import Generator
+from lidarpose.synth.scene import SCENES
+from lidarpose.train import loop
+from lidarpose.train.feed import BATCHES, collate, example, loader
+from lidarpose.train.losses import CONFIDENCE, HEATMAP, SIGMA, SPREAD, VOTE, losses, total
+from lidarpose.train.optimize import COOL, WARMUP, average, optimizers, rate_factor
+from lidarpose.train.recipes import Pretrain
+
+# three chunks of four batches
+RECIPE = Pretrain(scene="paper", people=3 * 4 * 4, batch=4, workers=0, seed=5)
+TINY = preset("tiny")
+
+
+# --- losses
+
+
+def outputs(vote, *, heatmap=None, confidence=0.0, log_spread=0.0):
+    people, joints = vote.shape[:2]
+    if heatmap is None:
+        heatmap = encode(torch.zeros(people, joints, 3), SIGMA).log()
+    return Outputs(
+        vote=vote,
+        heatmap=heatmap,
+        part=torch.zeros(people, 4, 25),
+        confidence=torch.full((people, joints), float(confidence)),
+        log_spread=torch.full((people, joints), float(log_spread)),
+        level_joints=(vote, vote),
+    )
+
+
+def targets(joints):
+    return Targets(joints=joints, part=torch.tensor([[1, 2, 0, -1]] * len(joints)))
+
+
+def truth(people=3):
+    return torch.randn(people, 26, 3, generator=torch.Generator().manual_seed(0)) * 0.4
+
+
+def test_exact_joints_cost_nothing():
+    terms = losses(outputs(truth()), targets(truth()))
+    assert terms["vote"] == 0 and terms["level"] == 0
+    # the heatmap has no bin at zero: what is left of its decoding is half a millimetre an axis
+    assert terms["mpjpe"] < 2e-3
+    assert total(terms).item() == pytest.approx(sum(v.item() for n, v in terms.items() if n != "mpjpe"), rel=1e-5)
+
+
+def test_the_vote_costs_its_distance():
+    shift = torch.tensor([0.3, 0.0, -0.4])
+    assert losses(outputs(truth() + shift), targets(truth()))["vote"].item() == pytest.approx(VOTE * 0.5, rel=1e-4)
+
+
+def test_gradients_at_exact_joints_are_finite():
+    vote = truth().requires_grad_()
+    total(losses(outputs(vote), targets(truth()))).backward()
+    assert torch.isfinite(vote.grad).all()
+
+
+def test_the_heatmap_is_learned_about_the_vote_and_only_within_reach():
+    joints = truth()
+    far = joints.clone()
+    far[0] += WINDOW + 0.1
+    heatmap = encode(torch.zeros(3, 26, 3), SIGMA).log().requires_grad_()
+    losses(outputs(far, heatmap=heatmap), targets(joints))["heatmap"].backward()
+    # the right heatmap is the optimum, and one out of reach is not pulled at all
+    assert heatmap.grad.abs().max() < 1e-6
+    wrong = torch.zeros(3, 26, 3, BINS, requires_grad=True)
+    losses(outputs(far, heatmap=wrong), targets(joints))["heatmap"].backward()
+    assert wrong.grad[0].abs().max() == 0 and wrong.grad[1:].abs().min() > 0
+    entropy = -(encode(torch.tensor(0.0), SIGMA) * encode(torch.tensor(0.0), SIGMA).log()).sum()
+    best = losses(outputs(joints), targets(joints))["heatmap"]
+    assert best.item() == pytest.approx(HEATMAP * entropy.item(), rel=1e-4)
+
+
+def spoiled(seed=1):
+    """Votes whose errors are on both sides of ten centimetres, and those errors."""
+    shift = torch.randn(40, 26, 3, generator=torch.Generator().manual_seed(seed)) * 0.07
+    joints = truth(40)
+    made = outputs(joints + shift)
+    return joints, made, (made.joints() - joints).norm(dim=-1)
+
+
+def test_confidence_is_best_at_the_probability_of_a_hit():
+    joints, made, error = spoiled()
+    rate = (error < 0.1).float().mean()
+    assert 0.1 < rate < 0.9
+    logit = torch.logit(rate)
+    at = {d: losses(replace(made, confidence=made.confidence * 0 + logit + d), targets(joints)) for d in (-0.2, 0, 0.2)}
+    assert at[0]["confidence"] < min(at[-0.2]["confidence"], at[0.2]["confidence"])
+    confidence = (made.confidence * 0 + logit).requires_grad_()
+    losses(replace(made, confidence=confidence), targets(joints))["confidence"].backward()
+    assert abs(confidence.grad.sum()) < 1e-5 * CONFIDENCE
+
+
+def test_spread_is_best_at_the_expected_distance():
+    joints, made, error = spoiled()
+    log_spread = (made.log_spread * 0 + error.mean().log()).requires_grad_()
+    losses(replace(made, log_spread=log_spread), targets(joints))["spread"].backward()
+    assert abs(log_spread.grad.sum()) < 1e-5 * SPREAD
+    for other in (0.8, 1.25):
+        there = losses(replace(made, log_spread=log_spread + np.log(other)), targets(joints))["spread"]
+        assert there > losses(replace(made, log_spread=log_spread), targets(joints))["spread"]
+
+
+def test_confidence_and_spread_never_pull_at_the_joints():
+    joints, made, _ = spoiled()
+    vote = made.vote.clone().requires_grad_()
+    terms = losses(replace(made, vote=vote), targets(joints))
+    assert not (terms["confidence"] + terms["spread"] + terms["heatmap"]).requires_grad
+    assert terms["vote"].requires_grad and terms["joints"].requires_grad
+
+
+def test_padding_has_no_part():
+    made = outputs(truth())
+    part = torch.zeros(3, 4, 25)
+    part[:, 3, 7] = 50.0
+    a, b = (losses(replace(made, part=p), targets(truth()))["part"] for p in (torch.zeros(3, 4, 25), part))
+    assert a == b
+
+
+# --- schedule and optimizers
+
+
+def test_the_rate_rises_stays_and_falls_to_nothing():
+    done = np.linspace(0, 1, 2001)
+    factor = np.array([rate_factor(d) for d in done])
+    assert (factor >= 0).all() and (factor <= 1).all() and factor[0] > 0 and factor[-1] == 0
+    rise, fall = done < WARMUP, done > 1 - COOL
+    assert (np.diff(factor[rise]) >= 0).all() and (np.diff(factor[fall]) < 0).all()
+    np.testing.assert_array_equal(factor[~rise & ~fall], 1)
+    assert np.abs(np.diff(factor)).max() < 0.03
+    assert rate_factor(1.5) == 0
+
+
+def test_every_weight_is_learned_once():
+    network = PoseNet(TINY)
+    made = optimizers(network, RECIPE)
+    grouped = [id(p) for o in made for group in o.param_groups for p in group["params"]]
+    assert sorted(grouped) == sorted(id(p) for p in network.parameters())
+    hidden = {id(p) for group in made[1].param_groups for p in group["params"]}
+    names = {name for name, value in network.named_parameters() if id(value) in hidden}
+    assert "bottleneck.0.attention.query.weight" in names
+    assert not any(name.startswith(("anchors", "part", "vote.offset", "joint.heatmap")) for name in names)
+    assert all(dict(network.named_parameters())[name].ndim == 2 for name in names)
+    assert len(optimizers(network, replace(RECIPE, muon_rate=0.0))) == 1
+
+
+def test_the_mean_of_the_weights_follows_them():
+    network = torch.nn.Linear(1, 1)
+    mean = {name: torch.zeros_like(value) for name, value in network.named_parameters()}
+    average(mean, network, 0)
+    torch.testing.assert_close(mean["weight"], network.weight.detach() * 0.9)
+    for step in range(1, 60):
+        average(mean, network, step)
+    torch.testing.assert_close(mean["weight"], network.weight.detach(), rtol=1e-3, atol=1e-6)
+
+
+# --- batches
+
+
+def assert_same_chunks(a, b):
+    for left, right in zip(a, b, strict=True):
+        for x, y in zip(left, right, strict=True):
+            assert x.keys() == y.keys()
+            for name in x:
+                np.testing.assert_array_equal(np.asarray(x[name]), np.asarray(y[name]), err_msg=name)
+
+
+def chunks(recipe, start=0, stop=3):
+    return list(loader(recipe, TINY, start=start, stop=stop))
+
+
+def test_chunks_are_the_same_from_any_start():
+    whole = chunks(RECIPE)
+    assert len(whole) == 3 and all(len(batches) == BATCHES for batches in whole)
+    assert_same_chunks(whole[1:], chunks(RECIPE, start=1))
+    assert_same_chunks(whole[2:], chunks(RECIPE, start=2))
+    joints = np.concatenate([b["joints"] for batches in whole for b in batches])
+    assert len(np.unique(joints[:, 5], axis=0)) == len(joints) == RECIPE.people
+
+
+def test_difficulty_rises_over_the_first_share_of_the_run(monkeypatch):
+    asked = []
+    original = Generator.person
+
+    def person(self, seed, index, *, hard):
+        asked.append((index, hard))
+        return original(self, seed, index, hard=hard)
+
+    monkeypatch.setattr(Generator, "person", person)
+    chunks(replace(RECIPE, easy=0.5, batch=8, people=96))
+    index, hard = np.array(asked).T
+    np.testing.assert_array_equal(index, np.arange(96))
+    ceiling = np.minimum(index / 48, 1)
+    assert hard[0] == 0 and (hard <= ceiling).all()
+    # below the ceiling every difficulty goes on being seen, the harder ones more often: its mean is two thirds
+    assert (hard[1:] / ceiling[1:]).mean() == pytest.approx(2 / 3, abs=0.08) and hard[48:].min() < 0.35
+
+
+def test_easier_people_are_seen_better():
+    generator = Generator(scene=SCENES["wild"])
+    easy, full = (np.mean([generator.person(1, k, hard=h).facts.visible for k in range(64)]) for h in (0.0, 1.0))
+    assert easy > full + 0.03
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_workers_change_nothing(workers):
+    assert_same_chunks(chunks(RECIPE), chunks(replace(RECIPE, workers=workers)))
+
+
+def test_recipes():
+    for change, message in [
+        ({"people": 0}, "people must be at least 1"),
+        ({"batch": 0}, "batch must be at least 1"),
+        ({"motion": "clips.npz"}, "no subjects"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            Pretrain(**change)
+    assert Pretrain(subjects=["a"]) == Pretrain(subjects=("a",))
+
+
+# --- runs
+
+
+def log_of(folder):
+    lines = [json.loads(line) for line in (folder / loop.LOG).read_text().splitlines()]
+    for line in lines:
+        assert line.pop("seconds") >= 0
+    return lines
+
+
+def assert_same_run(a, b):
+    left, right = log_of(a), log_of(b)
+    assert [line["people"] for line in left] == [line["people"] for line in right] == [16, 32, 48]
+    for x, y in zip(left, right, strict=True):
+        assert x == pytest.approx(y, abs=2e-4)
+    for name in (loop.MODEL, loop.STATE):
+        one, other = load_file(a / name), load_file(b / name)
+        assert one.keys() == other.keys()
+        for key in one:
+            torch.testing.assert_close(one[key], other[key], atol=1e-5, rtol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run") / "whole"
+    assert loop.pretrain(RECIPE, folder) == folder / loop.MODEL
+    return folder
+
+
+class Killed(BaseException):
+    """As a signal would: nothing catches it."""
+
+
+def killed_at(monkeypatch, name, call, *, save_every=-1.0):
+    """Lets the named function of the loop be called `call` times, then kills the run."""
+    original, calls = getattr(loop, name), [0]
+
+    def counted(*args, **kwargs):
+        calls[0] += 1
+        if calls[0] > call:
+            raise Killed
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr(loop, name, counted)
+    monkeypatch.setattr(loop, "SAVE_EVERY", save_every)
+
+
+def broken(monkeypatch, folder, *args, recipe=RECIPE, **kwargs):
+    with monkeypatch.context() as patch:
+        killed_at(patch, *args, **kwargs)
+        with pytest.raises(Killed):
+            loop.pretrain(recipe, folder)
+
+
+def test_an_unbroken_run(unbroken):
+    assert sorted(p.name for p in unbroken.iterdir()) == sorted([loop.CONFIG, loop.LOG, loop.STATE, loop.MODEL])
+    config = json.loads((unbroken / loop.CONFIG).read_text())
+    assert config["schema"] == "lidarpose.run/1" and config["recipe"] == json.loads(json.dumps(RECIPE.to_dict()))
+    _, header = load_checkpoint(unbroken / loop.MODEL)
+    assert header.card["people_seen"] == 48 and header.card["recipe"]["seed"] == 5
+    lines = log_of(unbroken)
+    assert lines[-1]["vote"] < lines[0]["vote"]
+
+
+@pytest.mark.parametrize(
+    "name, call, saved",
+    [
+        ("_step", 2, 0),  # before the first chunk is done: nothing saved yet
+        ("_step", 4 + 2, 1),  # within the second chunk
+        ("save_state", 1, 1),  # the second chunk is in the log but not in the state
+        ("_save_model", 1, 1),
+        ("save_state", 2, 2),
+    ],
+)
+def test_a_killed_run_goes_on_to_the_same_end(monkeypatch, tmp_path, unbroken, name, call, saved):
+    folder = tmp_path / "run"
+    broken(monkeypatch, folder, name, call)
+    assert (folder / loop.STATE).exists() == bool(saved)
+    loop.pretrain(RECIPE, folder, resume=True)
+    assert_same_run(folder, unbroken)
+
+
+def test_half_a_line_in_the_log_is_no_obstacle(monkeypatch, tmp_path, unbroken):
+    folder = tmp_path / "run"
+    broken(monkeypatch, folder, "_step", 4)
+    with open(folder / loop.LOG, "a") as log:
+        log.write('{"people": 32, "sec')
+    loop.pretrain(RECIPE, folder, resume=True)
+    assert_same_run(folder, unbroken)
+
+
+def test_a_finished_run_stays_as_it_is(tmp_path, unbroken):
+    before = {p.name: p.read_bytes() for p in unbroken.iterdir()}
+    assert loop.pretrain(RECIPE, unbroken, resume=True) == unbroken / loop.MODEL
+    assert before == {p.name: p.read_bytes() for p in unbroken.iterdir()}
+    with pytest.raises(InputError, match="expected a new or empty folder"):
+        loop.pretrain(RECIPE, unbroken)
+    assert before == {p.name: p.read_bytes() for p in unbroken.iterdir()}
+
+
+@pytest.mark.parametrize("change", [{"seed": 6}, {"batch": 16}, {"rate": 1e-3}, {"scene": "wild"}, {"muon_rate": 0.0}])
+def test_a_run_keeps_its_recipe(unbroken, change):
+    with pytest.raises(InputError, match=f"the run has {next(iter(change))} = .* a run keeps its recipe"):
+        loop.pretrain(replace(RECIPE, **change), unbroken, resume=True)
+
+
+def test_a_run_may_become_longer(monkeypatch, tmp_path):
+    folder = tmp_path / "run"
+    broken(monkeypatch, folder, "_step", 4)
+    loop.pretrain(replace(RECIPE, people=32, workers=1), folder, resume=True)
+    assert [line["people"] for line in log_of(folder)] == [16, 32]
+
+
+def test_nothing_to_resume(tmp_path):
+    with pytest.raises(InputError, match="nothing to resume"):
+        loop.pretrain(RECIPE, tmp_path, resume=True)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"scene": "moon"}, "unknown scene 'moon'"),
+        ({"size": "huge"}, "unknown network size 'huge'"),
+        ({"motion": "/no/clips.npz", "subjects": ("a",)}, "no such file"),
+    ],
+)
+def test_a_recipe_that_cannot_be_is_one_line_and_leaves_no_folder(tmp_path, workers, change, message):
+    with pytest.raises(InputError, match=message) as caught:
+        loop.pretrain(replace(RECIPE, workers=workers, **change), tmp_path / "run")
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "run").exists()
+
+
+def copied(unbroken, folder):
+    folder.mkdir()
+    for path in unbroken.iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+    return folder
+
+
+@pytest.mark.parametrize("name", [loop.STATE, loop.CONFIG])
+@pytest.mark.parametrize("content", [b"", b"rubbish", b"{}", b"[1]", None])
+def test_a_damaged_run_says_so(tmp_path, unbroken, name, content):
+    folder = copied(unbroken, tmp_path / "run")
+    whole = (folder / name).read_bytes()
+    (folder / name).write_bytes(whole[: len(whole) // 2] if content is None else content)
+    with pytest.raises(InputError, match="damaged") as caught:
+        loop.pretrain(RECIPE, folder, resume=True)
+    assert "\n" not in str(caught.value) and str(folder / name) in str(caught.value)
+
+
+def test_the_state_of_another_network_is_refused(tmp_path, unbroken):
+    folder = copied(unbroken, tmp_path / "run")
+    (folder / loop.STATE).write_bytes((folder / loop.MODEL).read_bytes())
+    with pytest.raises(InputError, match="damaged"):
+        loop.pretrain(RECIPE, folder, resume=True)
+    other = replace(TINY, channels=32)
+    network = PoseNet(other)
+    mean = dict(network.named_parameters())
+    loop.save_state(folder / loop.STATE, network, mean, optimizers(network, RECIPE), {"chunk": 1, "seconds": 0.0})
+    with pytest.raises(InputError, match="not of this network") as caught:
+        loop.pretrain(RECIPE, folder, resume=True)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_last_good_state(monkeypatch, tmp_path, unbroken):
+    folder, calls = tmp_path / "run", [0]
+
+    def poisoned(*args):
+        calls[0] += 1
+        terms = losses(*args)
+        return terms | {"vote": terms["vote"] * float("nan")} if calls[0] > 5 else terms
+
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "losses", poisoned)
+        patch.setattr(loop, "SAVE_EVERY", -1.0)
+        with pytest.raises(InputError, match="the loss is not finite at people 16: lower --rate"):
+            loop.pretrain(RECIPE, folder)
+    assert [line["people"] for line in log_of(folder)] == [16]
+    assert all(torch.isfinite(value).all() for value in load_file(folder / loop.STATE).values())
+    # the state is as good as new
+    loop.pretrain(RECIPE, folder, resume=True)
+    assert_same_run(folder, unbroken)
+
+
+def test_an_absurd_rate_stops_the_run(tmp_path):
+    with pytest.raises(InputError, match="not finite at people 0"):
+        loop.pretrain(replace(RECIPE, rate=1e30), tmp_path / "run")
+
+
+def test_the_command_line_trains_and_goes_on(tmp_path, capsys):
+    folder = tmp_path / "run"
+    words = ["pretrain", str(folder), "--people", "8", "--batch", "2", "--scene", "paper", "--workers", "0"]
+    assert not main(words)
+    assert str(folder / loop.MODEL) in capsys.readouterr().out
+    assert load_checkpoint(folder / loop.MODEL)[1].card["command"].startswith("lidarpose pretrain run --scene paper")
+    assert main(words) == 2
+    assert not main([*words, "--resume"])
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@cache
+def eight():
+    maker = Generator(scene=SCENES["wild"].eased(0.2), measure=False)
+    rng = np.random.default_rng(0)
+    return collate([example(maker.person(1, k), rng) for k in range(8)], TINY, None)
+
+
+def overfitted(steps):
+    torch.manual_seed(0)
+    network = PoseNet(TINY)
+    made = optimizers(network, RECIPE)
+    arrays = eight()
+    wanted = Targets(joints=torch.as_tensor(arrays["joints"]), part=torch.as_tensor(arrays["part"]))
+    for step in range(steps):
+        factor = rate_factor(step / steps)
+        for optimizer in made:
+            for group in optimizer.param_groups:
+                group["lr"] = (RECIPE.muon_rate if isinstance(optimizer, torch.optim.Muon) else RECIPE.rate) * factor
+            optimizer.zero_grad()
+        terms = losses(network(Batch.from_arrays(arrays)), wanted)
+        total(terms).backward()
+        for optimizer in made:
+            optimizer.step()
+    return terms
+
+
+@pytest.mark.slow
+def test_eight_people_are_learned_by_heart():
+    terms = overfitted(100)
+    assert terms["mpjpe"] < 0.03
+    assert terms["part"] < 0.25 * 0.5
