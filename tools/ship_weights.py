@@ -1,7 +1,7 @@
 """Makes a run's model a bundled checkpoint: float16, its card completed with what it scores.
 
-    python benchmarks/heldout.py --motion cmu_motion.npz --weights RUN/model.safetensors --json scores.json
-    python tools/ship_weights.py RUN/model.safetensors scores.json src/lidarpose/model/weights/tiny.safetensors
+python benchmarks/heldout.py --motion cmu_motion.npz --weights RUN/model.safetensors --json scores.json
+python tools/ship_weights.py RUN/model.safetensors scores.json src/lidarpose/model/weights/tiny.safetensors
 """
 
 import argparse

@@ -28,7 +28,7 @@ _HOMES = {
     "Pose": "lidarpose.sample",
     "Sample": "lidarpose.sample",
     "Skeleton": "lidarpose.skeleton",
-    "skeleton": "lidarpose.skeleton",
+    "SKELETONS": "lidarpose.skeleton",
     "LidarPoseError": "lidarpose.errors",
     "InputError": "lidarpose.errors",
 }

@@ -3,32 +3,57 @@
 import argparse
 import os
 import sys
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 from lidarpose._version import __version__
 from lidarpose.errors import InputError, LidarPoseError
 
+# options whose value may start with a minus sign, which argparse would take for another option
+_SIGNED = ("--sensor-origin",)
+# people named by a warning that several share
+_MOST_NAMED = 3
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs one command. Returns 0, or 2 after one line on stderr where the input is at fault."""
-    options = _parser().parse_args(arguments)
+    options = _parser().parse_args(_joined(sys.argv[1:] if arguments is None else arguments))
     try:
         options.run(options)
-    except LidarPoseError as error:
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        # whoever read our output has enough; keep python from complaining at exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (LidarPoseError, OSError) as error:
         print(f"lidarpose: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("lidarpose: stopped", file=sys.stderr)
         return 130
-    except BrokenPipeError:
-        # whoever read our output has enough; keep python from complaining at exit
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0
 
 
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str):
+        """One line, as for every other wrong input."""
+        self.exit(2, f"lidarpose: error: {message}; see {self.prog} --help\n")
+
+
+def _joined(arguments: list[str]) -> list[str]:
+    """`--sensor-origin -1,0,2` as `--sensor-origin=-1,0,2`."""
+    joined: list[str] = []
+    for argument in arguments:
+        if joined and joined[-1] in _SIGNED and argument.startswith("-") and argument[1:2] in tuple("0123456789."):
+            joined[-1] += f"={argument}"
+        else:
+            joined.append(argument)
+    return joined
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="lidarpose", description="3D human pose from LiDAR.")
+    parser = _Parser(prog="lidarpose", description="3D human pose from LiDAR.")
     parser.add_argument("--version", action="version", version=f"lidarpose {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
 
@@ -86,8 +111,8 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _predict(options: argparse.Namespace) -> None:
+    from lidarpose.data.files import atomic_path
     from lidarpose.infer.files import predict
-    from lidarpose.infer.predictor import load
 
     poses = predict(
         options.file,
@@ -97,35 +122,42 @@ def _predict(options: argparse.Namespace) -> None:
         skeleton=options.skeleton,
         up=options.up,
         columns=options.columns,
-        model=lambda: load(options.weights),
-        progress=sys.stderr.isatty(),
+        model=options.weights,
+        progress=sys.stderr is not None and sys.stderr.isatty(),
     )
-    for warning in poses.warnings:
-        print(f"lidarpose: warning: {warning}", file=sys.stderr)
+    file = Path(options.file)
+    to_stdout = options.out == "-"
+    stem = Path("." if to_stdout else options.out) / file.stem
+    outputs: dict[str, bytes] = {}
+    if not to_stdout:
+        outputs[f"{stem}.poses.json"] = poses.to_json().encode()
+    if options.picture:
+        outputs[f"{stem}.poses.png"] = poses.picture(title=file.name)
+    # all of them or none
+    with ExitStack() as stack:
+        for path, content in outputs.items():
+            stack.enter_context(atomic_path(path)).write_bytes(content)
+    if to_stdout:
+        print(poses.to_json(), end="")
+    for line in _warnings(poses):
+        print(f"lidarpose: warning: {line}", file=sys.stderr)
+    seen = sum(person.pose is not None for person in poses)
+    where = f" -> {' and '.join(outputs)}" if outputs else ""
+    print(f"{seen} of {len(poses)} people, {poses.timing_ms['per_person']:.0f} ms each{where}", file=sys.stderr)
+
+
+def _warnings(poses) -> list[str]:
+    """The input's warnings, and each of the people's once with the ids of those it is about."""
+    shared: dict[str, list[str]] = {}
     for person in poses:
         for warning in person.warnings:
-            print(f"lidarpose: warning: person {person.id}: {warning}", file=sys.stderr)
-    if options.out == "-":
-        sys.stdout.write(poses.to_json())
-        if not options.picture:
-            return
-    folder = Path("." if options.out == "-" else options.out)
-    stem = Path(options.file).stem
-    # drawn before anything is written: a failure leaves nothing half done
-    picture = poses.picture(title=Path(options.file).name) if options.picture else None
-    written = []
-    if options.out != "-":
-        written.append(folder / f"{stem}.poses.json")
-        poses.save(written[-1])
-    if picture is not None:
-        from lidarpose.data.files import write_atomic
-
-        written.append(folder / f"{stem}.poses.png")
-        write_atomic(written[-1], picture)
-    seen = sum(person.pose is not None for person in poses)
-    where = " and ".join(map(str, written))
-    milliseconds = poses.timing_ms["per_person"]
-    print(f"{seen} of {len(poses)} people, {milliseconds:.0f} ms each -> {where}", file=sys.stderr)
+            shared.setdefault(warning, []).append(str(person.id))
+    lines = list(poses.warnings)
+    for warning, ids in shared.items():
+        more = f" and {len(ids) - _MOST_NAMED} more" if len(ids) > _MOST_NAMED else ""
+        who = "person" if len(ids) == 1 else "people"
+        lines.append(f"{who} {', '.join(ids[:_MOST_NAMED])}{more}: {warning}")
+    return lines
 
 
 def _demo(options: argparse.Namespace) -> None:

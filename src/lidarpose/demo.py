@@ -1,13 +1,15 @@
 """`lidarpose demo`: people that three LiDARs see, predicted with the bundled weights, beside the truth."""
 
 import time
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from lidarpose.errors import MissingExtra
-from lidarpose.infer.predictor import load
+from lidarpose.data.files import atomic_path
+from lidarpose.errors import InputError, MissingExtra
+from lidarpose.infer.predictor import Predictor, load
 from lidarpose.skeleton import SMPL24
 
 SENSORS = ("vlp-32c", "os1-128", "hdl-64e")
@@ -17,23 +19,39 @@ _HARD = 0.4
 
 
 def run(folder: str | Path, *, seed: int, weights: str = "tiny") -> None:
-    """Synthesizes, predicts, prints a table, and writes index.html and a PNG a sensor to `folder`."""
+    """Synthesizes, predicts, prints a table, and writes index.html and a PNG a sensor to `folder`, all or none.
+
+    Raises MissingExtra without numba; InputError for a negative seed or a folder that cannot be written.
+    """
+    if seed < 0:
+        raise InputError(f"expected a seed of at least 0, got {seed}")
     try:
         from lidarpose.synth.generate import Generator
         from lidarpose.synth.scene import scene_config
     except MissingExtra:
         raise MissingExtra("the demo synthesizes people and", "synth") from None
+    folder = Path(folder)
+    names = ["index.html", *(f"{name}.png" for name in SENSORS)]
+    # opened before the work, so that a folder without write access is known at once
+    with ExitStack() as stack:
+        files = {name: stack.enter_context(atomic_path(folder / name)) for name in names}
+        model = load(weights)
+        print("synthesizing people (the first time compiles the ray caster: some ten seconds) ...", flush=True)
+        scene = scene_config("wild").eased(_HARD)
+        people = []
+        for k, name in enumerate(SENSORS):
+            generator = Generator(scene=replace(scene, sensors=(name,), distance=(3.0, 20.0)))
+            people += [generator.person(seed, k * PEOPLE_EACH + i) for i in range(PEOPLE_EACH)]
+        rows = _report(model, people, files)
+    print(_table(rows))
+    print(f"open {folder / 'index.html'} to turn the people in 3D; pictures: {folder}/*.png")
+
+
+def _report(model: Predictor, people: list, files: dict[str, Path]) -> list[dict]:
+    """Predicts synthetic people, writes the report and the pictures to `files` by name. Returns the table's rows."""
     from lidarpose.view.picture import Panel, draw_people
     from lidarpose.view.report import ReportPerson, write_report
 
-    folder = Path(folder)
-    print("synthesizing people (the first time compiles the ray caster: some ten seconds) ...", flush=True)
-    scene = scene_config("wild").eased(_HARD)
-    people = []
-    for k, name in enumerate(SENSORS):
-        generator = Generator(scene=replace(scene, sensors=(name,), distance=(3.0, 20.0)))
-        people += [generator.person(seed, k * PEOPLE_EACH + i) for i in range(PEOPLE_EACH)]
-    model = load(weights)
     clouds = [person.sample.points for person in people]
     # the sensor of a sample is the origin of its frame; the first call warms the network up
     model.predict(clouds[:2], sensor_origin=(0, 0, 0))
@@ -64,11 +82,10 @@ def run(folder: str | Path, *, seed: int, weights: str = "tiny") -> None:
         )
     for k, name in enumerate(SENSORS):
         shown = panels[k * PEOPLE_EACH : (k + 1) * PEOPLE_EACH]
-        draw_people(shown, folder / f"{name}.png", title=f"{name}: predicted, and the truth dashed")
+        files[f"{name}.png"].write_bytes(draw_people(shown, title=f"{name}: predicted, and the truth dashed"))
     title = "lidarpose demo: synthesized people, predicted and true"
-    write_report(folder / "index.html", cards, title=title, summary=rows)
-    print(_table(rows))
-    print(f"open {folder / 'index.html'} to turn the people in 3D; pictures: {folder}/*.png")
+    write_report(files["index.html"], cards, title=title, summary=rows)
+    return rows
 
 
 def _table(rows: list[dict]) -> str:

@@ -2,9 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -12,13 +10,15 @@ from lidarpose.data.boxes import read_boxes
 from lidarpose.data.formats import Cloud, read_points
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_from_up
-from lidarpose.infer.people import lies, unit_warning
+from lidarpose.infer.people import MIN_POINTS, as_origin, flat_axis, lies, unit_warning
 from lidarpose.infer.predictor import Predictor, load
 from lidarpose.infer.results import PersonPose, Poses
-from lidarpose.sample import Box, Pose
+from lidarpose.sample import Box
 
 # a file of less than this across is taken for a crop, m
 CROP_SIZE = 4.0
+# no LiDAR sees a person from farther away, m
+_FARTHEST_PERSON = 500.0
 
 
 def predict(
@@ -30,109 +30,138 @@ def predict(
     skeleton: str = "smpl24",
     up: str = "z",
     columns: int | None = None,
-    model: Predictor | Callable[[], Predictor] = load,
+    model: Predictor | str | os.PathLike = "tiny",
     progress: bool = False,
 ) -> Poses:
     """Poses of the people in a point file, in the file's own frame.
 
-    boxes: a JSON file or its content, see `data.boxes`; crop: the file is one person already. With neither, a file of
-    less than 4 m across is taken as a crop and anything else asks for boxes. sensor_origin: (x, y, z) m in the file's
-    frame, or "unknown"; None means 0, 0, 0 with boxes and unknown for a crop. up: the file's up axis; columns: values
-    a row of a .bin; model: a predictor, or what makes one once the input has proved
-    readable. Raises InputError, one line that says what to do.
+    boxes: a JSON file, its content (see `data.boxes`) or a list of `Box`, their length and width level, their height
+    and yaw along and about the up axis; crop: the file is one person already. With neither, a file of less than 4 m
+    across is taken as a crop and anything else asks for boxes. sensor_origin: (x, y, z) m in the file's frame, or
+    "unknown"; None means 0, 0, 0 with boxes and unknown for a crop. up: the file's up axis; columns: values a row of a
+    .bin; model: a predictor, or what `load` takes. Raises InputError, one line that says what to do.
     """
     if boxes is not None and crop:
         raise InputError("expected boxes or a crop, got both: a crop is one person already, so leave the boxes away")
     started = time.perf_counter()
     R_house_input = rotation_from_up(up)
+    origin = np.zeros(3) if sensor_origin is None and boxes is not None else as_origin(sensor_origin)
+    found = None if boxes is None else _boxes(boxes)
     cloud = read_points(path, columns=columns)
     read = time.perf_counter()
-    found = None if boxes is None else read_boxes(boxes)
-    if found is None and not crop:
-        _check_crop_size(path, cloud)
-    origin = _origin(sensor_origin, known=found is not None)
     points = cloud.points @ R_house_input.T
     if found is None:
+        if not crop:
+            _check_crop_size(path, points)
         clouds = [points]
     else:
         housed = [replace(box, center=R_house_input @ box.center) for box in found]
         clouds = [points[box.contains(points)] for box in housed]
-    model = model if isinstance(model, Predictor) else model()
+    warnings = list(cloud.warnings)
+    if origin is not None and found and (warning := _origin_warning(origin, found)):
+        warnings.append(warning)
+        origin = None
+    # loaded once the input has proved readable
+    predictor = model if isinstance(model, Predictor) else load(model)
     loaded = time.perf_counter()
-    raw = model.predict(
+    raw = predictor.predict(
         clouds, sensor_origin=None if origin is None else R_house_input @ origin, skeleton=skeleton, progress=progress
     )
     done = time.perf_counter()
-    people = [_in_input(person, R_house_input) for person in raw]
-    people = [_named(person, i, found, cloud) for i, person in enumerate(people)]
-    warnings = _input_warnings(raw, found, up) + (() if found is None else cloud.warnings)
+    if found:
+        warnings += _box_warnings(raw, found, cloud)
+    if warning := _axis_warning(raw, cloud, up):
+        warnings.append(warning)
+    people = [_in_input(person, R_house_input, up) for person in raw]
+    if found is None:
+        # a crop's warnings are its person's
+        people = [replace(people[0], id=0, warnings=(*cloud.warnings, *people[0].warnings))]
+        warnings = warnings[len(cloud.warnings) :]
+    else:
+        people = [
+            replace(person, id=i if box.id is None else box.id, box=box)
+            for i, (person, box) in enumerate(zip(people, found, strict=True))
+        ]
+    seen = sum(person.pose is not None for person in people)
     return Poses(
         people=tuple(people),
         skeleton=raw.skeleton,
-        source=os.fspath(path) if isinstance(path, str) else str(Path(path)),
+        source=os.fsdecode(path),
         model=raw.model,
-        warnings=warnings,
+        warnings=tuple(warnings),
         timing_ms={
             "read": (read - started) * 1e3,
             "load": (loaded - read) * 1e3,
             "predict": (done - loaded) * 1e3,
-            "per_person": (done - loaded) * 1e3 / max(len(people), 1),
+            "per_person": (done - loaded) * 1e3 / max(seen, 1),
         },
+        up=up,
     )
 
 
-def _check_crop_size(path, cloud: Cloud) -> None:
-    size = float(np.ptp(cloud.points, axis=0).max())
-    if size < CROP_SIZE:
+def _boxes(given: object) -> list[Box]:
+    if isinstance(given, list) and given and all(isinstance(box, Box) for box in given):
+        return given
+    return read_boxes(given)
+
+
+def _check_crop_size(path: object, points: np.ndarray) -> None:
+    """Raises InputError for a file, z up, that is too large for one person."""
+    size = np.ptp(points, axis=0)
+    if size.max() < CROP_SIZE:
         return
-    hint = f"; {unit}" if (unit := unit_warning(size, what="it")) and size < 5000 and len(cloud.points) < 20_000 else ""
+    unit = unit_warning(size, what="it")
     raise InputError(
-        f"{path}: is {size:,.1f} m across, so more than one person; expected --boxes BOXES.json with the people in it, "
-        f"or --crop if it is one person all the same{hint}"
+        f"{os.fsdecode(path)}: expected one person, less than {CROP_SIZE:.0f} m across, got {size.max():,.1f} m: "
+        "give the people's boxes (--boxes BOXES.json), or say that it is a crop all the same (--crop)"
+        + (f"; {unit}" if unit else "")
     )
 
 
-def _origin(given, *, known: bool) -> np.ndarray | None:
-    """The sensor's place in the input's frame, None = unknown."""
-    if given is None:
-        return np.zeros(3) if known else None
-    if isinstance(given, str):
-        if given == "unknown":
-            return None
-        given = given.split(",")
-    try:
-        origin = np.array([float(value) for value in given])
-    except (TypeError, ValueError):
-        origin = np.zeros(0)
-    if origin.shape != (3,) or not np.isfinite(origin).all():
-        raise InputError(f"sensor origin: expected x,y,z in metres or unknown, got {','.join(map(str, given))!r}")
-    return origin
+def _origin_warning(origin: np.ndarray, boxes: list[Box]) -> str | None:
+    distance = float(np.median([np.linalg.norm(box.center - origin) for box in boxes]))
+    if distance < _FARTHEST_PERSON:
+        return None
+    at = ",".join(f"{value:g}" for value in origin)
+    return (
+        f"the sensor at {at} is {distance:,.0f} m from the people, so its place is taken as unknown: "
+        "give it in the file's own frame and in metres (--sensor-origin)"
+    )
 
 
-def _in_input(person: PersonPose, R_house_input: np.ndarray) -> PersonPose:
-    pose: Pose | None = person.pose
-    if pose is not None:
-        pose = replace(pose, joints=pose.joints @ R_house_input)
-    return replace(person, pose=pose, points=person.points @ R_house_input)
-
-
-def _named(person: PersonPose, index: int, boxes: list[Box] | None, cloud: Cloud) -> PersonPose:
-    if boxes is None:
-        return replace(person, id=index, warnings=(*cloud.warnings, *person.warnings))
-    box = boxes[index]
-    return replace(person, id=index if box.id is None else box.id, box=box)
-
-
-def _input_warnings(people: Poses, boxes: list[Box] | None, up: str) -> tuple[str, ...]:
-    """What is likely wrong with units or axes, judged by all people together. `people` in the house's frame."""
+def _box_warnings(people: Poses, boxes: list[Box], cloud: Cloud) -> list[str]:
+    """What is likely wrong with units or frames, judged by all boxes together."""
     warnings = []
-    if boxes:
-        tallest = float(np.median([box.size.max() for box in boxes]))
-        if warning := unit_warning(tallest, what="a person's box"):
-            warnings.append(warning)
-    poses = [person.pose for person in people if person.pose is not None]
-    if poses and all(map(lies, poses)):
-        others = " or ".join(f"--up {axis}" for axis in "zyx" if axis != up)
-        who = "the person lies" if len(poses) == 1 else f"all {len(poses)} people lie"
-        warnings.append(f"{who} down: if that is wrong, {up} is not the input's up axis: try {others}")
-    return tuple(warnings)
+    if warning := unit_warning(np.median([box.size for box in boxes], axis=0), what="a person's box"):
+        warnings.append(warning)
+    if all(person.num_points < MIN_POINTS for person in people):
+        low, high = cloud.points.min(0), cloud.points.max(0)
+        centers = np.array([box.center for box in boxes])
+        warnings.append(
+            f"no box holds {MIN_POINTS} points: expected boxes and points in one frame and in metres; points reach "
+            f"from {_place(low)} to {_place(high)}, centers of boxes from {_place(centers.min(0))} to "
+            f"{_place(centers.max(0))}"
+        )
+    return warnings
+
+
+def _place(point: np.ndarray) -> str:
+    return "(" + ", ".join(f"{value:.1f}" for value in point) + ")"
+
+
+def _axis_warning(people: Poses, cloud: Cloud, up: str) -> str | None:
+    """What is likely wrong with the axes. `people` in the house's frame."""
+    flat = flat_axis(cloud.points)
+    if flat is not None and flat != up:
+        return f"the points extend least along {flat}, so {up} is hardly the input's up axis: try --up {flat}"
+    found = [person for person in people if person.pose is not None]
+    if not found or not all(lies(person.pose, person.points) for person in found):
+        return None
+    others = " or ".join(f"--up {axis}" for axis in "zyx" if axis != up)
+    who = "the person lies" if len(found) == 1 else f"all {len(found)} people lie"
+    return f"{who} down: if that is wrong, {up} is not the input's up axis: try {others}"
+
+
+def _in_input(person: PersonPose, R_house_input: np.ndarray, up: str) -> PersonPose:
+    pose = person.pose and replace(person.pose, joints=person.pose.joints @ R_house_input)
+    return replace(person, pose=pose, points=person.points @ R_house_input, up=up)

@@ -1,4 +1,6 @@
-"""From a user's cloud to one person's points: checks, the center of the person, what looks wrong about the input."""
+"""From a user's cloud to one person's points: checks, where the person may stand, what looks wrong about the input."""
+
+import os
 
 import numpy as np
 
@@ -12,21 +14,51 @@ _TRUNK = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 MIN_POINTS = 5
 # a person of more points is thinned: no sensor sees so many, and no voxel needs them
 MAX_POINTS = 50_000
+# no coordinate on Earth is larger, m; arithmetic on what is would overflow
+_FARTHEST = 1e9
 
-# a crop wider than this holds more than a person, so the person is looked for in it, m
-_TIGHT = 1.7
-# the person is looked for with a column of this radius, in cells of this size, m
-_RADIUS, _CELL = 0.4, 0.1
-# a person's share of a column: from above the ground to a raised arm, m
+# a crop wider than this may hold more than a person, so people are looked for in it, m
+_TIGHT = 2.0
+# they are looked for at most this far from the middle of the crop, in cells of this size, m
+_SEARCH, _CELL = 10.0, 0.1
+# from above the ground to a raised arm, m
 _ABOVE_GROUND, _REACH = 0.25, 2.3
+# in cells: a trunk fits in the column, and around a person the ring is emptier than beside a wall
+_COLUMN, _RING = (0.0, 2.0), (3.5, 5.0)
+# what fills a ring speaks against a column half as much as what fills the column speaks for it
+_RING_WEIGHT = 0.5
+# columns a crop, m from one to the next, and m around each that a person takes
+_COLUMNS, _APART, _AROUND = 3, 0.6, 0.75
+
+# bounds of what a person measures in other units, taken for metres
+_LARGEST_IN_CENTIMETRES, _SMALLEST_IN_OTHER_UNITS, _LARGEST_IN_KILOMETRES = 500, 20, 0.02
+# a person with the ground around is at most so many times as wide as tall
+_WIDEST = 4
+# points of a whole person that lies spread at least so far along, m, and so many times as far as upwards: so spread 97
+# of 100 synthetic people who were laid down, and none that stood
+_LONG, _LONG_TO_TALL = 0.25, 1.5
+# a sweep's extent leaves out the farthest percents; level, it is so long, m, and so many times what it is upright
+_MOST, _STREET, _FLATTER = (10, 90), 10.0, 3.0
 
 
 def as_points(points: object, what: str = "points") -> np.ndarray:
     """Anything array-like (n, 3+) as (n, 3) float64. Raises InputError for another shape or type; n = 0 is legal."""
+    if isinstance(points, str | os.PathLike):
+        raise InputError(f"{what} must be an (n, 3) array, got a path: use lidarpose.predict({str(points)!r})")
+    if hasattr(points, "detach"):
+        # a torch tensor that may sit on a device, in a graph, or in bfloat16, which numpy lacks
+        points = points.detach().cpu().double()
     try:
         array = np.asarray(points)
     except (ValueError, TypeError) as error:
         raise InputError(f"{what} must be an (n, 3) array of numbers, got rows of unequal length ({error})") from None
+    if array.shape == (0,):
+        return np.empty((0, 3))
+    if array.dtype == object:
+        raise InputError(
+            f"{what} must be an (n, 3) array of numbers, got {type(points).__name__} of objects, shape {array.shape}: "
+            "give many people as a list of arrays"
+        )
     if array.dtype.kind not in "fiu":
         raise InputError(f"{what} must be an (n, 3) array of numbers, got {array.dtype} of shape {array.shape}")
     if array.ndim != 2 or array.shape[1] < 3:
@@ -34,13 +66,28 @@ def as_points(points: object, what: str = "points") -> np.ndarray:
     return array[:, :3].astype(np.float64)
 
 
+def as_origin(given: object) -> np.ndarray | None:
+    """The sensor's place (3,) m from three numbers or "x,y,z"; None, also for "unknown". Raises InputError."""
+    if given is None or isinstance(given, str) and given.strip() == "unknown":
+        return None
+    try:
+        values = given.split(",") if isinstance(given, str) else given
+        origin = np.array([float(value) for value in values])
+    except (TypeError, ValueError):
+        origin = np.zeros(0)
+    if origin.shape != (3,) or not (np.abs(origin) < _FARTHEST).all():
+        raise InputError(f"sensor origin: expected x,y,z in metres or unknown, got {given!r}")
+    return origin
+
+
 def clean(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """points (n, 3) without NaN and infinite rows and at most `MAX_POINTS`, and a warning for each thing done."""
+    """points (n, 3) without NaN, infinite and absurd rows and at most `MAX_POINTS`, and a note for each thing done."""
     notes = []
-    finite = np.isfinite(points).all(1)
-    if not finite.all():
-        notes.append(f"dropped {int((~finite).sum())} of {len(points)} points that were NaN or infinite")
-        points = points[finite]
+    usable = (np.abs(points) < _FARTHEST).all(1)
+    if not usable.all():
+        dropped = int((~usable).sum())
+        notes.append(f"dropped {dropped} of {len(points)} points that were NaN, infinite or beyond {_FARTHEST:g} m")
+        points = points[usable]
     if len(points) > MAX_POINTS:
         notes.append(
             f"thinned from {len(points)} to {MAX_POINTS} points: crop closer to the person if there are others"
@@ -49,47 +96,95 @@ def clean(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
     return points, notes
 
 
-def find_center(points: np.ndarray) -> np.ndarray:
-    """points (n, 3) m, z up, n >= 1 -> (3,) m: the middle of the person in a crop that may hold ground and clutter.
+def candidates(points: np.ndarray) -> list[np.ndarray]:
+    """points (n, 3) m, z up, n >= 1 -> clouds (k, 3) that may be the person, the first being all of them.
 
-    A crop of a person's width is all person. In a wider one the person is the upright column that fills most height
-    above the local ground; nothing else that is as tall as a person and as slim is told apart from one.
+    A crop of a person's width is all person. In a wider one, with ground and clutter, every upright column that fills
+    many heights and has room around it may be one too; which it is, the network's confidence tells.
     """
     if (np.ptp(points[:, :2], axis=0) < _TIGHT).all():
-        return center_of(points)
-    ground = np.percentile(points[:, 2], 2)
-    up = points[(points[:, 2] > ground + _ABOVE_GROUND) & (points[:, 2] < ground + _REACH)]
-    if len(up) < MIN_POINTS:
-        return center_of(points)
-    cells = np.unique(np.floor(up / _CELL).astype(np.int64), axis=0)
-    places = np.unique(cells[:, :2], axis=0)
-    # a cell counts once a height, however many of its neighbours are filled at that height
-    near = ((places[:, None] - cells[None, :, :2]) ** 2).sum(-1) <= (_RADIUS / 2 / _CELL) ** 2
-    heights = [len(np.unique(cells[row, 2])) for row in near]
-    place = (places[int(np.argmax(heights))] + 0.5) * _CELL
-    around = up[np.hypot(*(up[:, :2] - place).T) < _RADIUS]
-    return center_of(around if len(around) >= MIN_POINTS else up)
+        return [points]
+    near = points[(np.abs(points - np.median(points, axis=0))[:, :2] < _SEARCH).all(1)]
+    if len(near) < MIN_POINTS:
+        return [points]
+    ground = np.percentile(near[:, 2], 2)
+    upper = near[(near[:, 2] > ground + _ABOVE_GROUND) & (near[:, 2] < ground + _REACH)]
+    if len(upper) < MIN_POINTS:
+        return [points]
+    corner = upper.min(0)
+    cells = ((upper - corner) / _CELL).astype(int)
+    grid = np.zeros(cells.max(0) + 1, bool)
+    grid[tuple(cells.T)] = True
+    score = _heights(grid, *_COLUMN) - _RING_WEIGHT * _heights(grid, *_RING)
+    places = np.argwhere(grid.any(2))
+    score = score[tuple(places.T)]
+    places = corner[:2] + (places + 0.5) * _CELL
+    found = [points]
+    for _ in range(_COLUMNS):
+        best = int(np.argmax(score))
+        if np.isneginf(score[best]):
+            break
+        inside = upper[_distance(upper, places[best]) < _AROUND / 2]
+        middle = center_of(inside)[:2] if len(inside) else places[best]
+        # without the trees above
+        cloud = points[(_distance(points, middle) < _AROUND) & (points[:, 2] < ground + _REACH)]
+        if len(cloud) >= MIN_POINTS:
+            found.append(cloud)
+        score[_distance(places, places[best]) < _APART] = -np.inf
+    return found
 
 
-def unit_warning(height: float, *, what: str) -> str | None:
-    """What is likely wrong where a person's extent `height` (largest of the three axes) is no person's in metres."""
-    if height > 1000:
-        cause = "millimetres"
-        factor = 1000
-    elif height > 50:
-        cause = "centimetres"
-        factor = 100
-    elif height > 4:
+def _heights(grid: np.ndarray, near: float, far: float) -> np.ndarray:
+    """grid (X, Y, Z) bool -> (X, Y): at how many heights any cell `near` to `far` cells away is filled."""
+    reach = int(far)
+    x, y, _ = grid.shape
+    padded = np.pad(grid, ((reach, reach), (reach, reach), (0, 0)))
+    filled = np.zeros_like(grid)
+    for i in range(2 * reach + 1):
+        for j in range(2 * reach + 1):
+            if near <= np.hypot(i - reach, j - reach) <= far:
+                filled |= padded[i : i + x, j : j + y]
+    return filled.sum(2)
+
+
+def _distance(points: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """(n,) m: horizontal distance of points (n, 2+) from place (2,)."""
+    return np.hypot(points[:, 0] - place[0], points[:, 1] - place[1])
+
+
+def unit_warning(size: np.ndarray, *, what: str) -> str | None:
+    """What is likely wrong where a person's extent `size` (3,), z up, is no person's in metres."""
+    tall, largest = float(size[2]), float(size.max())
+    if 0 < largest < _LARGEST_IN_KILOMETRES:
+        return f"{what} is {largest:.2g} m in size: are the units kilometres? multiply all coordinates by 1000"
+    # a few returns may all lie at one height, and a whole street is large, but far wider than tall
+    if tall < _SMALLEST_IN_OTHER_UNITS or tall < largest / _WIDEST:
         return None
-    elif height < 0.02:
-        return f"{what} is {height:.2g} m tall: are the units kilometres? expected metres"
-    else:
-        return None
-    return f"{what} is {height:,.0f} m tall: are the units {cause}? divide all coordinates by {factor}"
+    unit, factor = ("millimetres", 1000) if tall > _LARGEST_IN_CENTIMETRES else ("centimetres", 100)
+    return f"{what} is {tall:,.0f} m tall: are the units {unit}? divide all coordinates by {factor}"
 
 
-def lies(pose: Pose) -> bool:
-    """The trunk of a pose, z up, is nearer to level than to upright."""
+def lies(pose: Pose, points: np.ndarray) -> bool:
+    """The trunk of a pose, z up, is nearer to level than to upright, or its points (n, 3) m are.
+
+    A network that has seen few people lie draws a person standing in points that lie.
+    """
+    if len(points) and (np.ptp(points[:, :2], axis=0) < _TIGHT).all():
+        spread = points.std(0)
+        if spread[:2].max() > max(_LONG, _LONG_TO_TALL * spread[2]):
+            return True
     at = {name: pose.joints[pose.skeleton.index(name)] for name in _TRUNK}
     trunk = at["left_shoulder"] + at["right_shoulder"] - at["left_hip"] - at["right_hip"]
     return bool(abs(trunk[2]) < np.sin(np.radians(35)) * np.linalg.norm(trunk))
+
+
+def flat_axis(points: np.ndarray) -> str | None:
+    """points (n, 3) m of a whole sweep -> the axis that they hardly extend along, "x", "y" or "z": its up axis.
+
+    None where no axis stands out, as in a small room.
+    """
+    low, high = np.percentile(points, _MOST, axis=0)
+    spread = high - low
+    axis = int(np.argmin(spread))
+    others = np.delete(spread, axis)
+    return "xyz"[axis] if others.min() > max(_STREET, _FLATTER * spread[axis]) else None

@@ -1,5 +1,6 @@
-"""`load` a network and `predict` poses of clouds: any float type, one or many, empty ones too."""
+"""`load` a network and `predict` poses of clouds: any number type, one or many, empty ones too."""
 
+import os
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
@@ -8,14 +9,14 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from lidarpose.errors import unknown_name
-from lidarpose.infer.people import MIN_POINTS, as_points, clean, find_center, unit_warning
+from lidarpose.errors import InputError, unknown_name
+from lidarpose.infer.people import MIN_POINTS, as_origin, as_points, candidates, clean, unit_warning
 from lidarpose.infer.results import PersonPose, Poses
 from lidarpose.model.batch import Batch
 from lidarpose.model.checkpoint import Header, load_checkpoint
 from lidarpose.model.network import PoseNet
 from lidarpose.model.plan import WINDOW, plan, view_features
-from lidarpose.sample import Pose
+from lidarpose.sample import Pose, center_of
 from lidarpose.skeleton import skeleton as skeleton_of
 
 BUNDLED = ("tiny",)
@@ -32,15 +33,23 @@ def bundled_path(name: str = "tiny") -> Path:
     return Path(str(resources.files("lidarpose.model") / "weights" / f"{name}.safetensors"))
 
 
-def load(weights: str | Path = "tiny", *, device: str = "cpu") -> "Predictor":
+def load(weights: str | os.PathLike = "tiny", *, device: str = "cpu") -> "Predictor":
     """The bundled network, or the checkpoint at a path, ready to predict.
 
-    Raises InputError for an unknown name or a file that is no checkpoint.
+    Raises InputError for an unknown name, a file that is no checkpoint, or a device that is not there.
     """
-    name = str(weights)
-    is_path = "/" in name or "\\" in name or name.endswith(".safetensors")
-    network, header = load_checkpoint(weights if is_path else bundled_path(name))
-    return Predictor(network, header, name=Path(name).stem, device=device)
+    name = os.fspath(weights)
+    is_path = not isinstance(weights, str) or "/" in name or name.endswith(".safetensors") or os.path.isfile(name)
+    path = weights if is_path and name not in BUNDLED else bundled_path(name)
+    network, header = load_checkpoint(path)
+    try:
+        return Predictor(network, header, name=Path(name).stem, device=device)
+    except (RuntimeError, AssertionError) as error:
+        # torch raises either for an unknown or a missing device
+        reason = str(error).partition("\n")[0]
+        raise InputError(
+            f"device {device!r} cannot be used ({reason}); expected cpu, or cuda where torch has it"
+        ) from None
 
 
 class Predictor:
@@ -56,21 +65,21 @@ class Predictor:
         self,
         points,
         *,
-        sensor_origin: np.ndarray | tuple[float, float, float] | None = None,
+        sensor_origin: np.ndarray | tuple[float, float, float] | str | None = None,
         skeleton: str = "smpl24",
         progress: bool = False,
     ) -> PersonPose | Poses:
         """One cloud (n, 3+) -> `PersonPose`; a list of clouds -> `Poses`, in their order.
 
         points: x, y, z in metres, z up, any frame, each cloud one person, ground and clutter allowed; more columns are
-        ignored. sensor_origin (3,) m: where the sensor stood in that frame, None = unknown. A cloud of under 5 points
-        gets a result without joints and a warning. Raises InputError for arrays of another shape or type.
+        ignored. sensor_origin (3,) m: where the sensor stood in that frame, None or "unknown" if that is not known. A
+        cloud of under 5 points gets a result without joints and a warning. Raises InputError for arrays of another
+        shape or type.
         """
         wanted = skeleton_of(skeleton)
         self.network.skeleton.map_to(wanted)
-        single = not _is_many(points)
-        origin = None if sensor_origin is None else np.asarray(sensor_origin, float)
-        if single:
+        origin = as_origin(sensor_origin)
+        if not _is_many(points):
             return self._people([as_points(points)], origin, wanted, False)[0]
         clouds = [as_points(cloud, f"points[{i}]") for i, cloud in enumerate(points)]
         people = self._people(clouds, origin, wanted, progress)
@@ -82,30 +91,34 @@ class Predictor:
             PersonPose(pose=None, skeleton=wanted, points=points, warnings=tuple(notes), model=self.model)
             for points, notes in cleaned
         ]
-        usable = []
+        clouds, owner = [], []
         for i, (points, _) in enumerate(cleaned):
-            size = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
-            warning = unit_warning(size, what="the person") if len(points) >= MIN_POINTS else None
-            if warning:
-                results[i] = _warned(results[i], warning)
             if len(points) < MIN_POINTS:
-                results[i] = _warned(results[i], f"no pose: {len(points)} points, at least {MIN_POINTS} are needed")
-            else:
-                usable.append(i)
-        starts = range(0, len(usable), _BATCH)
+                results[i] = _warned(results[i], f"no pose: under {MIN_POINTS} points")
+                continue
+            if warning := unit_warning(np.ptp(points, axis=0), what="the person"):
+                results[i] = _warned(results[i], warning)
+            found = candidates(points)
+            clouds += found
+            owner += [i] * len(found)
+        best: dict[int, Pose] = {}
+        starts = range(0, len(clouds), _BATCH)
         for start in tqdm(starts, unit=" batches", delay=1, disable=not progress, leave=False):
-            rows = usable[start : start + _BATCH]
-            poses = self._poses([cleaned[i][0] for i in rows], origin)
-            for i, pose in zip(rows, poses, strict=True):
-                if pose is None:
-                    note = f"no pose: under {MIN_POINTS} points within {WINDOW:.0f} m of the person's middle"
-                    results[i] = _warned(results[i], note)
-                else:
-                    results[i] = replace(results[i], pose=pose.to(wanted))
+            part = slice(start, start + _BATCH)
+            for i, pose in zip(owner[part], self._poses(clouds[part], origin), strict=True):
+                if pose is not None and (i not in best or pose.confidence.mean() > best[i].confidence.mean()):
+                    best[i] = pose
+        for i in sorted(set(owner)):
+            if i in best:
+                results[i] = replace(results[i], pose=best[i].to(wanted))
+            else:
+                note = f"no pose: under {MIN_POINTS} points within {WINDOW:.0f} m of the person's middle"
+                results[i] = _warned(results[i], note)
         return results
 
     def _poses(self, clouds: list[np.ndarray], origin: np.ndarray | None) -> list[Pose | None]:
-        centers = np.stack([find_center(points) for points in clouds])
+        """The pose of each cloud (n, 3) m, None where too little of it is near its middle."""
+        centers = np.stack([center_of(points) for points in clouds])
         pelvis = self.network.skeleton.index("pelvis")
         for last in range(PASSES):
             joints, confidence, spread = self.outputs(clouds, centers, origin)
@@ -146,8 +159,15 @@ class Predictor:
 def _is_many(points) -> bool:
     """A list of clouds, rather than one cloud, be it written as a list of rows."""
     if isinstance(points, list | tuple):
-        return len(points) == 0 or np.ndim(points[0]) != 1
-    return np.ndim(points) == 3
+        return len(points) == 0 or not _is_row(points[0])
+    return getattr(points, "ndim", 0) == 3
+
+
+def _is_row(value) -> bool:
+    """One point: a flat list or array. Anything ragged is none."""
+    if isinstance(value, list | tuple):
+        return not any(isinstance(entry, list | tuple) or getattr(entry, "ndim", 0) for entry in value)
+    return getattr(value, "ndim", 0) == 1
 
 
 def _warned(person: PersonPose, warning: str) -> PersonPose:

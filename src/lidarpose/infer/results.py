@@ -2,11 +2,12 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from lidarpose.geometry import rotation_from_up
 from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import Skeleton
 
@@ -17,7 +18,8 @@ SCHEMA = "lidarpose.poses/1"
 class PersonPose:
     """One person's pose in the input's own frame.
 
-    pose: None where there are too few points; points (n, 3) m: what it was read from; warnings: lines for the user.
+    pose: None where there are too few points; points (n, 3) m: what it was read from; warnings: lines for the user;
+    up: the frame's up axis, which pictures need.
     """
 
     pose: Pose | None
@@ -27,6 +29,7 @@ class PersonPose:
     box: Box | None = None
     warnings: tuple[str, ...] = ()
     model: dict = field(default_factory=dict)
+    up: str = "z"
 
     @property
     def joints(self) -> np.ndarray | None:
@@ -64,7 +67,7 @@ class PersonPose:
 
     def alone(self) -> "Poses":
         """The same person as the only one of a call."""
-        return Poses(people=(self,), skeleton=self.skeleton, model=self.model)
+        return Poses(people=(self,), skeleton=self.skeleton, model=self.model, up=self.up)
 
     def to_json(self) -> str:
         """A document of the schema lidarpose.poses/1 with this one person."""
@@ -83,7 +86,7 @@ class PersonPose:
 class Poses(Sequence):
     """The people of one call, in the order of the boxes or arrays. A sequence of `PersonPose`.
 
-    warnings concern the whole input; timing_ms: what took how long.
+    warnings concern the whole input; timing_ms: what took how long; up: the frame's up axis, which pictures need.
     """
 
     people: tuple[PersonPose, ...]
@@ -92,6 +95,7 @@ class Poses(Sequence):
     model: dict = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     timing_ms: dict[str, float] = field(default_factory=dict)
+    up: str = "z"
 
     def __len__(self) -> int:
         return len(self.people)
@@ -137,10 +141,23 @@ class Poses(Sequence):
         """Everybody from the front and the side on one PNG; also written to `path` where given."""
         from lidarpose.view.picture import Panel, draw_people
 
+        upright = [_upright(person, self.up) for person in self.people]
         panels = [
-            Panel(points=p.points, pose=p.pose, label="" if p.id is None else str(p.id), box=p.box) for p in self.people
+            Panel(points=p.points, pose=p.pose, label="" if p.id is None else str(p.id), box=p.box) for p in upright
         ]
         return draw_people(panels, path, title=title or (self.source or ""))
+
+
+def _upright(person: PersonPose, up: str) -> PersonPose:
+    """The person with z up, as pictures are drawn."""
+    R_house_input = rotation_from_up(up)
+    pose, box = person.pose, person.box
+    return replace(
+        person,
+        points=person.points @ R_house_input.T,
+        pose=pose and replace(pose, joints=pose.joints @ R_house_input.T),
+        box=box and replace(box, center=R_house_input @ box.center),
+    )
 
 
 def _rounded(values: np.ndarray, digits: int) -> list:

@@ -7,6 +7,7 @@ A chunk is sorted by voxels before it is cut into batches: padding is what a sma
 from dataclasses import dataclass
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from lidarpose.model.plan import Plan, plan, view_features
@@ -100,7 +101,10 @@ class Chunks(IterableDataset):
         first, stride = (0, 1) if worker is None else (worker.id, worker.num_workers)
         generator = generator_of(self.recipe)
         for chunk in range(self.start + first, self.stop, stride):
-            yield self._chunk(generator, chunk)
+            # products of a few thousand numbers: threads of BLAS only get in each other's way
+            with threadpool_limits(limits=1, user_api="blas"):
+                batches = self._chunk(generator, chunk)
+            yield batches
 
     def _chunk(self, generator: Generator, chunk: int) -> list[dict[str, np.ndarray]]:
         recipe = self.recipe

@@ -1,0 +1,377 @@
+"""The command line: what it writes, and one line with exit code 2 for whatever is wrong."""
+
+import gzip
+import json
+import os
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidarpose.cli import main
+from lidarpose.synth.generate import Generator
+from lidarpose.synth.scene import scene_config
+
+EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("[0-9]*.py"))
+
+
+@pytest.fixture(scope="module")
+def points():
+    return Generator(scene=scene_config("wild").eased(0.0)).person(3, 5).sample.points
+
+
+@pytest.fixture
+def crop(tmp_path, points):
+    path = tmp_path / "crop.npy"
+    np.save(path, points)
+    return path
+
+
+@pytest.fixture
+def boxes(tmp_path, points):
+    low, high = points.min(0), points.max(0)
+    box = {"center": ((low + high) / 2).tolist(), "size": (high - low + 0.1).tolist(), "yaw": 0.0, "id": "a"}
+    return write(tmp_path / "boxes.json", json.dumps({"people": [box]}))
+
+
+@pytest.fixture
+def out(tmp_path):
+    return tmp_path / "out"
+
+
+def write(path, content):
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path
+
+
+def run(*arguments):
+    """The exit code, whether the command returns it or argparse raises it."""
+    try:
+        return main([str(argument) for argument in arguments])
+    except SystemExit as exit:
+        return exit.code
+
+
+def one_line(capsys):
+    """The only line that a failure may leave, on stderr."""
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("lidarpose: error: ") and captured.err.count("\n") == 1, captured.err
+    return captured.err
+
+
+# ---- what works
+
+
+def _pcd(points):
+    rows = "\n".join(" ".join(map(str, row)) for row in points.tolist())
+    head = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\n"
+    return (head + "VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {0}\nDATA ascii\n").format(len(points)) + rows + "\n"
+
+
+def _ply(points):
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty float x\nproperty float y\n"
+    return (head + "property float z\nend_header\n").format(len(points)).encode() + points.astype("<f4").tobytes()
+
+
+def _bin(points, columns):
+    return np.column_stack([points, np.full((len(points), columns - 3), 0.5)]).astype("<f4").tobytes()
+
+
+def _text(points, separator, header=""):
+    return header + "\n".join(separator.join(map(str, row)) for row in points.tolist())
+
+
+FORMATS = {
+    "a.pcd": (_pcd, []),
+    "a.ply": (_ply, []),
+    "a.PLY": (_ply, []),
+    "a.bin": (lambda p: _bin(p, 4), ["--columns", 4]),
+    "b.bin": (lambda p: _bin(p, 5), ["--columns", 5]),
+    "a.pcd.bin": (lambda p: _bin(p, 5), []),
+    "a.csv": (lambda p: _text(p, ",", "x,y,z\n"), []),
+    "a.xyz": (lambda p: _text(p, " "), []),
+    "a.txt": (lambda p: _text(p, "\t", "# x y z\n"), []),
+}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_gives_the_same_pose(tmp_path, out, crop, points, name):
+    content, options = FORMATS[name]
+    file = write(tmp_path / name, content(points))
+    assert run("predict", crop, "--out", out) == 0
+    assert run("predict", file, "--out", out, *options) == 0
+    a, b = (json.loads((out / f"{stem}.poses.json").read_text()) for stem in ("crop", file.stem))
+    np.testing.assert_allclose(a["people"][0]["joints"], b["people"][0]["joints"], atol=1e-3)
+    assert b["source"] == str(file)
+
+
+def test_npz(tmp_path, out, points):
+    np.savez(tmp_path / "a.npz", points=points, label=np.arange(3))
+    assert run("predict", tmp_path / "a.npz", "--crop", "--out", out) == 0
+
+
+def test_boxes_picture_and_skeleton(crop, boxes, out, capsys):
+    words = ["--picture", "--skeleton", "waymo14", "--sensor-origin", "-1.5,0,2"]
+    assert run("predict", crop, "--boxes", boxes, "--out", out, *words) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["crop.poses.json", "crop.poses.png"]
+    document = json.loads((out / "crop.poses.json").read_text())
+    assert document["people"][0]["id"] == "a" and len(document["people"][0]["joints"]) == 14
+    assert (out / "crop.poses.png").read_bytes().startswith(b"\x89PNG")
+    assert "1 of 1 people" in capsys.readouterr().err
+
+
+def test_the_default_folder_is_the_current_one(crop, tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    assert run("predict", crop) == 0
+    assert [path.name for path in (tmp_path / "here").iterdir()] == ["crop.poses.json"]
+
+
+def test_a_dash_prints_nothing_but_json(crop, tmp_path, monkeypatch, capsys):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    assert run("predict", crop, "--out", "-") == 0
+    assert json.loads(capsys.readouterr().out)["schema"] == "lidarpose.poses/1"
+    assert not list((tmp_path / "here").iterdir())
+    assert run("predict", crop, "--out", "-", "--picture") == 0
+    assert json.loads(capsys.readouterr().out)["people"]
+    assert [path.name for path in (tmp_path / "here").iterdir()] == ["crop.poses.png"]
+
+
+def test_people_without_a_pose_share_a_warning_line(crop, tmp_path, out, capsys):
+    empty = [{"center": [90 + i, 0, 0], "size": [1, 1, 1], "id": f"p{i}"} for i in range(5)]
+    assert run("predict", crop, "--boxes", write(tmp_path / "b.json", json.dumps(empty)), "--out", out) == 0
+    err = capsys.readouterr().err
+    assert "warning: people p0, p1, p2 and 2 more: no pose: under 5 points\n" in err
+    assert "warning: no box holds 5 points" in err and "0 of 5 people" in err
+    people = json.loads((out / "crop.poses.json").read_text())["people"]
+    assert [person["joints"] for person in people] == [None] * 5 and people[0]["warnings"]
+
+
+def test_nobody_in_the_boxes(crop, tmp_path, out):
+    assert run("predict", crop, "--boxes", write(tmp_path / "b.json", '{"people": []}'), "--out", out, "--picture") == 0
+    assert json.loads((out / "crop.poses.json").read_text())["people"] == []
+
+
+def test_nan_points_are_dropped_with_a_warning(tmp_path, out, points, capsys):
+    np.save(tmp_path / "a.npy", np.concatenate([points, np.full((3, 3), np.nan)]))
+    assert run("predict", tmp_path / "a.npy", "--out", out) == 0
+    assert f"dropped 3 of {len(points) + 3} points" in capsys.readouterr().err
+    assert "dropped 3" in json.loads((out / "a.poses.json").read_text())["people"][0]["warnings"][0]
+
+
+def test_a_crop_of_few_points_is_no_error(tmp_path, out, capsys):
+    assert run("predict", write(tmp_path / "a.xyz", "0 0 0\n0 0 1\n"), "--out", out) == 0
+    assert "person 0: no pose: under 5 points" in capsys.readouterr().err
+
+
+def test_info(capsys):
+    assert run("info") == 0
+    text = capsys.readouterr().out
+    for word in ("lidarpose ", "torch ", "device ", "tiny", "MB", "parameters", "trained"):
+        assert word in text
+
+
+def test_an_older_result_is_replaced_and_no_other_file_stays(crop, out):
+    out.mkdir()
+    write(out / "crop.poses.json", "old")
+    assert run("predict", crop, "--out", out) == 0
+    assert [path.name for path in out.iterdir()] == ["crop.poses.json"]
+    assert json.loads((out / "crop.poses.json").read_text())
+
+
+# ---- what is wrong with a file: (name, content, words of the error)
+
+BAD_FILES = {
+    "empty": ("a.pcd", b"", "is empty"),
+    "unknown suffix": ("a.obj", b"o x\nv 0 0 0\n", ".pcd .ply"),
+    "no suffix": ("a", b"1 2 3\n", ".pcd .ply"),
+    "gzip renamed": ("a.bin", gzip.compress(b"x" * 400), "gzip"),
+    "gzip as npy": ("a.npy", gzip.compress(b"x" * 400), "gzip"),
+    "wrong magic npy": ("a.npy", b"hello world, no array", "NumPy"),
+    "wrong magic ply": ("a.ply", b"plx\nformat ascii 1.0\n", ".ply"),
+    "ply as pcd": ("a.pcd", _ply(np.zeros((3, 3))), "rename it to .ply"),
+    "truncated ply": ("a.ply", _ply(np.zeros((99, 3)))[:-40], "cut off"),
+    "truncated pcd": ("a.pcd", _pcd(np.zeros((99, 3)))[:-300], "cut off"),
+    "truncated bin": ("a.bin", b"\0" * 1001, "float32"),
+    "all NaN": ("a.xyz", "nan nan nan\n" * 9, "finite"),
+    "no xyz": ("a.csv", "a,b,c\n1,2,3\n", "x, y, z"),
+    "two columns": ("a.txt", "1 2\n3 4\n", "3 columns"),
+    "a word": ("a.txt", "1 2 3\n4 five 6\n", "five"),
+    "a picture": ("a.xyz", b"\x89PNG\r\n\x1a\n" + b"\0" * 99, "PNG"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_FILES)
+def test_a_bad_file_is_one_line(tmp_path, out, capsys, case):
+    name, content, words = BAD_FILES[case]
+    file = write(tmp_path / name, content)
+    assert run("predict", file, "--crop", "--out", out) == 2
+    line = one_line(capsys)
+    assert words in line and str(file) in line
+    assert not out.exists()
+
+
+BAD_ARRAYS = {
+    "two columns": (np.zeros((9, 2)), "(9, 2)"),
+    "flat": (np.zeros(9), "(9,)"),
+    "stack": (np.zeros((2, 9, 3)), "(2, 9, 3)"),
+    "texts": (np.array([["a", "b", "c"]]), "<U1"),
+    "objects": (np.array([{"x": 1}]), "object"),
+    "none": (np.zeros((0, 3)), "no points"),
+    "NaN": (np.full((9, 3), np.nan), "finite"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_ARRAYS)
+def test_a_bad_array_is_one_line(tmp_path, out, capsys, case):
+    array, words = BAD_ARRAYS[case]
+    np.save(tmp_path / "a.npy", array, allow_pickle=True)
+    assert run("predict", tmp_path / "a.npy", "--crop", "--out", out) == 2
+    assert words in one_line(capsys) and not out.exists()
+
+
+# ---- what is wrong with boxes: (content, words of the error)
+
+BAD_BOXES = {
+    "empty": ("", "is empty"),
+    "no JSON": ("{people: []}", "line 1"),
+    "no people": ('{"boxes": []}', '"people"'),
+    "a number": ("5", "people"),
+    "no center": ('{"people": [{"size": [1, 1, 1]}]}', 'people[0]: expected the key "center"'),
+    "no size": ('{"people": [{"center": [1, 1, 1]}]}', 'people[0]: expected the key "size"'),
+    "negative size": ('[{"center": [1, 1, 1], "size": [1, -1, 1]}]', "people[0].size"),
+    "a text": ('[{"center": [1, "1", 1], "size": [1, 1, 1]}]', "people[0].center"),
+    "two numbers": ('[{"center": [1, 1], "size": [1, 1, 1]}]', "people[0].center"),
+    "NaN": ('[{"center": [1, NaN, 1], "size": [1, 1, 1]}]', "people[0].center"),
+    "yaw text": ('[{"center": [1, 1, 1], "size": [1, 1, 1], "yaw": "x"}]', "people[0].yaw"),
+    "degrees": ('[{"center": [1, 1, 1], "size": [1, 1, 1], "yaw": 90}]', "degrees"),
+    "second": ('[{"center": [1, 1, 1], "size": [1, 1, 1]}, 4]', "people[1]"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_BOXES)
+def test_bad_boxes_are_one_line(crop, tmp_path, out, capsys, case):
+    content, words = BAD_BOXES[case]
+    file = write(tmp_path / "bad.json", content)
+    assert run("predict", crop, "--boxes", file, "--out", out) == 2
+    line = one_line(capsys)
+    assert words in line and str(file) in line
+    assert not out.exists()
+
+
+# ---- what is wrong with the command: (words of it, words of the error)
+
+BAD_COMMANDS = {
+    "no command": ("", "COMMAND"),
+    "unknown command": ("predikt CROP", "predikt"),
+    "no file": ("predict", "file"),
+    "missing file": ("predict DIR/crob.npy", "did you mean crop.npy"),
+    "a folder": ("predict DIR", "got a folder"),
+    "boxes missing": ("predict CROP --boxes DIR/no.json", "no.json: no such file"),
+    "boxes a folder": ("predict CROP --boxes DIR", "got a folder"),
+    "both": ("predict CROP --crop --boxes BOXES", "got both"),
+    "up": ("predict CROP --up w", "z, y, x"),
+    "skeleton": ("predict CROP --skeleton smpl42", "did you mean smpl24"),
+    "origin": ("predict CROP --sensor-origin 1,2", "x,y,z"),
+    "signed origin": ("predict CROP --sensor-origin -1,a,2", "x,y,z"),
+    "columns": ("predict CROP --columns 2", "columns"),
+    "columns text": ("predict CROP --columns four", "four"),
+    "weights": ("predict CROP --weights tyni", "did you mean tiny"),
+    "weights file": ("predict CROP --weights CROP", "safetensors"),
+    "weights missing": ("predict CROP --weights no/such.safetensors", "does not exist"),
+    "unknown option": ("predict CROP --picure", "--picure"),
+    "demo seed": ("demo --seed -1 --out DIR/d", "seed"),
+    "demo weights": ("demo --weights tyni --out DIR/d", "did you mean tiny"),
+    "demo into a file": ("demo --out CROP", "cannot write"),
+    "out is a file": ("predict CROP --out CROP", "cannot write"),
+    "out below a file": ("predict CROP --out CROP/deep", "cannot write"),
+    "out in a place of no files": ("predict CROP --out /proc/nothing", "cannot write"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_COMMANDS)
+def test_a_bad_command_is_one_line(crop, boxes, tmp_path, capsys, monkeypatch, case):
+    words, expected = BAD_COMMANDS[case]
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.iterdir())
+    names = {"DIR": tmp_path, "CROP": crop, "BOXES": boxes}
+    for name, path in names.items():
+        words = words.replace(name, str(path)) if name != "COMMAND" else words
+    assert run(*words.split()) == 2
+    assert expected in one_line(capsys)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_file_of_several_people_asks_for_boxes(tmp_path, out, points, capsys):
+    np.save(tmp_path / "a.npy", np.concatenate([points, points + 9]))
+    assert run("predict", tmp_path / "a.npy", "--out", out) == 2
+    line = one_line(capsys)
+    assert "--boxes" in line and "--crop" in line
+
+
+def test_a_picture_that_cannot_be_written_leaves_no_json(crop, out, capsys):
+    (out / "crop.poses.png").mkdir(parents=True)
+    assert run("predict", crop, "--out", out, "--picture") == 2
+    assert "crop.poses.png" in one_line(capsys)
+    assert [path.name for path in out.iterdir()] == ["crop.poses.png"]
+
+
+# ---- as a program
+
+
+def program(code, *, cwd=None):
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=cwd, timeout=120)
+
+
+def test_a_reader_that_has_enough_is_no_error(crop):
+    code = f"import sys; from lidarpose.cli import main; sys.exit(main(['predict', {str(crop)!r}, '--out', '-']))"
+    # buffered, so that the pipe is found broken only at the last moment
+    settings = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "env": {**os.environ, "PYTHONUNBUFFERED": ""}}
+    child = subprocess.Popen([sys.executable, "-c", code], text=True, **settings)
+    child.stdout.close()
+    assert "Traceback" not in (err := child.stderr.read()) and "Exception ignored" not in err
+    child.stderr.close()
+    assert child.wait(60) == 0
+
+
+def test_without_numba_predict_works_and_demo_names_the_extra(crop, tmp_path):
+    done = program(
+        "import sys; sys.modules['numba'] = None\n"
+        "from lidarpose.cli import main\n"
+        f"assert main(['predict', {str(crop)!r}, '--picture']) == 0\n"
+        "sys.exit(main(['demo']))",
+        cwd=tmp_path,
+    )
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert done.stderr.splitlines()[-1].endswith("pip install 'lidarpose[synth]'")
+    assert not (tmp_path / "lidarpose-demo").exists() and (tmp_path / "crop.poses.png").exists()
+
+
+def test_python_m_is_the_same_program(crop, tmp_path):
+    done = subprocess.run([sys.executable, "-m", "lidarpose", "--version"], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0 and done.stdout.startswith("lidarpose ")
+    done = subprocess.run([sys.executable, "-m", "lidarpose", "predict", "no.pcd"], capture_output=True, text=True)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+
+
+def test_demo(out, capsys):
+    assert run("demo", "--out", out) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["hdl-64e.png", "index.html", "os1-128.png", "vlp-32c.png"]
+    lines = capsys.readouterr().out.splitlines()
+    head = next(i for i, line in enumerate(lines) if line.startswith("LiDAR"))
+    for word in ("points", "distance", "MPJPE", "ms a person"):
+        assert word in lines[head]
+    assert len(lines) == head + 1 + 12 + 1
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+def test_examples_run(example, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(example), run_name="__main__")
+    assert any(path.suffix == ".png" for path in tmp_path.iterdir())
+    assert "wrote" in capsys.readouterr().out

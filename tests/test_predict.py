@@ -1,0 +1,555 @@
+"""`predict` from Python: arrays, files, boxes, and what is told about odd inputs."""
+
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import lidarpose
+from lidarpose.data.boxes import read_boxes
+from lidarpose.errors import InputError
+from lidarpose.geometry import UP_AXES, rotation_about
+from lidarpose.infer.people import MAX_POINTS, as_origin, as_points, candidates, flat_axis, lies, unit_warning
+from lidarpose.lidar.sensor import sensor
+from lidarpose.sample import Box
+from lidarpose.skeleton import SKELETONS
+from lidarpose.synth.generate import Generator
+from lidarpose.synth.scene import scene_config
+
+REAL = Path(__file__).parents[2] / "shared" / "data" / "real"
+
+
+@pytest.fixture(scope="module")
+def model():
+    return lidarpose.load()
+
+
+@pytest.fixture(scope="module")
+def standing():
+    """A synthetic person who stands, whole and uncluttered, in the sensor's frame."""
+    scene = replace(scene_config("wild").eased(0.0), sensors=("os1-128",), distance=(4.0, 8.0))
+    generator = Generator(scene=scene)
+    people = (generator.person(11, i) for i in range(64))
+    return next(person for person in people if person.facts.plain)
+
+
+@pytest.fixture(scope="module")
+def points(standing):
+    return standing.sample.points
+
+
+def box_around(cloud, margin=0.05, **more):
+    low, high = cloud.min(0), cloud.max(0)
+    return {"center": ((low + high) / 2).tolist(), "size": (high - low + 2 * margin).tolist(), **more}
+
+
+def height(pose, joint):
+    return pose.joints[pose.skeleton.index(joint), 2]
+
+
+# ---- one array
+
+
+def test_an_easy_person_stands_on_their_feet(model, standing):
+    pose = model.predict(standing.sample.points)
+    assert pose.joints.shape == (24, 3) and pose.confidence.shape == pose.spread.shape == (24,)
+    assert height(pose, "head") > height(pose, "pelvis") > max(height(pose, "left_ankle"), height(pose, "right_ankle"))
+    assert (pose.confidence >= 0).all() and (pose.confidence <= 1).all() and (pose.spread > 0).all()
+    truth = standing.sample.pose.to(pose.skeleton)
+    assert np.linalg.norm(pose.joints - truth.joints, axis=1).mean() < 0.3
+    assert pose.warnings == () and pose.num_points == len(standing.sample.points)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        lambda p: p.astype(np.float64),
+        lambda p: p.astype(">f4"),
+        lambda p: p.tolist(),
+        lambda p: [tuple(row) for row in p],
+        lambda p: list(p),
+        lambda p: np.asfortranarray(p),
+        lambda p: np.repeat(p, 2, axis=0)[::2],
+        lambda p: np.column_stack([p, np.arange(len(p))]),
+        lambda p: torch.from_numpy(p.copy()),
+        lambda p: torch.from_numpy(p.copy()).requires_grad_(),
+    ],
+    ids="float64 big-endian rows tuples row-arrays fortran strided four-columns torch torch-grad".split(),
+)
+def test_every_kind_of_array_is_the_same_person(model, points, kind):
+    np.testing.assert_allclose(model.predict(kind(points)).joints, model.predict(points).joints, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.int16, np.int64, np.uint8, torch.bfloat16])
+def test_coarse_numbers_are_taken(model, points, kind):
+    near = points - points.min(0)
+    cloud = torch.from_numpy(near).to(kind) if kind is torch.bfloat16 else near.astype(kind)
+    assert np.isfinite(model.predict(cloud).joints).all()
+
+
+def test_the_input_is_left_alone(model, points):
+    cloud = np.column_stack([points, np.full(len(points), np.nan)])
+    cloud[3, 0] = np.nan
+    before = cloud.copy()
+    cloud.flags.writeable = False
+    model.predict(cloud)
+    np.testing.assert_array_equal(cloud, before)
+
+
+@pytest.mark.parametrize(
+    "bad, words",
+    [
+        (np.zeros((4, 2)), "shape (4, 2)"),
+        (np.zeros(3), "shape (3,)"),
+        (np.zeros((2, 2, 2, 3)), "shape (2, 2, 2, 3)"),
+        (np.array([[1, 2, "a"]]), "<U"),
+        (np.array([[1, 2, 3]], object), "objects"),
+        (np.array([[True, False, True]]), "bool"),
+        (np.array([[1j, 2, 3]]), "complex"),
+        (np.zeros(4, [("x", "f4"), ("y", "f4"), ("z", "f4")]), "(4,)"),
+        ([[1, 2, 3], [1, 2]], "unequal"),
+        ([[[1, 2, 3], [1, 2]]], "points[0]"),
+        ([np.zeros((9, 3)), np.zeros((9, 2))], "points[1]"),
+        ([None], "points[0]"),
+        ({"points": 1}, "dict"),
+        (None, "NoneType"),
+        (5, "shape ()"),
+        ("sweep.pcd", "lidarpose.predict('sweep.pcd')"),
+        (Path("sweep.pcd"), "lidarpose.predict('sweep.pcd')"),
+    ],
+)
+def test_a_wrong_array_is_told_in_one_line(model, bad, words):
+    with pytest.raises(InputError) as raised:
+        model.predict(bad)
+    assert words in str(raised.value) and "\n" not in str(raised.value) and "points" in str(raised.value)
+
+
+def test_nan_and_absurd_points_are_dropped_and_counted(model, points):
+    cloud = np.concatenate([points, np.array([[np.nan, 0, 0], [0, np.inf, 0], [0, 0, 1e300]])])
+    pose = model.predict(cloud)
+    assert pose.warnings == (f"dropped 3 of {len(cloud)} points that were NaN, infinite or beyond 1e+09 m",)
+    np.testing.assert_allclose(pose.joints, model.predict(points).joints, atol=1e-4)
+    nothing = model.predict(np.full((9, 3), np.nan))
+    assert nothing.joints is None and len(nothing.warnings) == 2
+
+
+@pytest.mark.parametrize("count", [0, 1, 4])
+def test_too_few_points_are_no_pose(model, points, count):
+    pose = model.predict(points[:count])
+    assert pose.joints is None and pose.confidence is None and pose.spread is None
+    assert pose.warnings == ("no pose: under 5 points",)
+    assert json.loads(pose.to_json())["people"][0]["joints"] is None
+
+
+@pytest.mark.parametrize("cloud", [np.zeros((5, 3)), np.zeros((9, 3)), np.eye(3)[[0] * 9] * 1e8])
+def test_points_on_one_spot_do_not_break(model, cloud):
+    assert np.isfinite(model.predict(cloud).joints).all()
+
+
+# ---- many
+
+
+def test_many_are_as_one_by_one(model, points, standing):
+    other = points @ rotation_about("z", 2.0).T.astype(np.float32) + np.float32(4)
+    people = model.predict([points, other[:3], other], skeleton="human15")
+    assert [person.joints is None for person in people] == [False, True, False]
+    assert people.skeleton.name == people[0].skeleton.name == "human15"
+    for person, cloud in zip(people, (points, None, other), strict=True):
+        if cloud is not None:
+            np.testing.assert_allclose(
+                person.joints, model.predict(cloud, skeleton="human15").joints, atol=1e-3, rtol=1e-4
+            )
+
+
+def test_lists_of_none_and_stacks(model, points):
+    assert len(model.predict([])) == 0 and json.loads(model.predict([]).to_json())["people"] == []
+    assert len(model.predict((points, points))) == len(model.predict(np.stack([points] * 2))) == 2
+    assert len(model.predict([points.tolist()])) == len(model.predict([torch.from_numpy(points.copy())])) == 1
+    assert [person.joints for person in model.predict([points[:0], [], np.zeros((0, 3))])] == [None] * 3
+
+
+# ---- a crop with more in it than a person
+
+
+def cluttered(points, seed=0):
+    """The person off the middle of a crop 3.9 m wide, with ground, a wall, a post and a tree above."""
+    rng = np.random.default_rng(seed)
+    low = points.min(0)
+    middle = np.append(np.median(points[:, :2], axis=0), low[2])
+    u = rng.random((3, 4000))
+    ground = np.column_stack([u[0] * 3.9 - 1.2, u[1] * 3.9 - 1.4, 0.02 * u[2]])
+    wall = np.column_stack([u[0] * 2.5 - 0.5, 2.2 + 0.1 * u[1], 2.2 * u[2]])
+    post = np.column_stack([2.0 + 0.1 * u[0], 0.1 * u[1], 2.4 * u[2]])[:500]
+    tree = np.column_stack([u[0] - 0.5, u[1] - 0.5, 2.5 + u[2]])[:500]
+    return np.concatenate([points, middle + ground, middle + wall, middle + post, middle + tree])
+
+
+def test_a_person_among_clutter_is_one_of_the_candidates(points):
+    clouds = candidates(cluttered(points))
+    assert 2 <= len(clouds) <= 4 and len(clouds[0]) == len(points) + 9000
+    own = {tuple(row) for row in points}
+    shares = [sum(tuple(row) in own for row in cloud.astype(np.float32)) / len(points) for cloud in clouds[1:]]
+    assert max(shares) > 0.95
+    assert all(np.ptp(cloud, axis=0).max() < 2.5 for cloud in clouds[1:])
+
+
+def test_a_person_among_clutter_is_found(model, standing, points):
+    pose = model.predict(cluttered(points))
+    pelvis = standing.sample.pose.joints[0]
+    assert np.linalg.norm(pose.joints[0] - pelvis) < 0.4
+
+
+def test_a_crop_of_a_persons_width_is_all_person(points):
+    arms_out = np.concatenate([points, np.median(points, axis=0) + [[0.95, 0, 0.4], [-0.95, 0, 0.4]]])
+    assert [len(cloud) for cloud in candidates(arms_out)] == [len(arms_out)]
+
+
+@pytest.mark.parametrize("wide, least", [(4.0, 4), (20.0, 4), (300.0, 1)])
+def test_the_search_is_quick(wide, least):
+    cloud = np.random.default_rng(0).random((50_000, 3)) * (wide, wide, 2.5)
+    started = time.process_time()
+    assert len(candidates(cloud)) >= least
+    assert time.process_time() - started < 0.6
+
+
+def test_the_search_survives_strays_and_flat_crops():
+    rng = np.random.default_rng(0)
+    stray = np.concatenate([rng.random((50, 3)), [[1e8, -1e8, 1e8]]])
+    assert len(candidates(stray)[0]) == 51
+    assert len(candidates(rng.random((50, 3)) * (4, 4, 0.1))) == 1
+    assert len(candidates(np.array([[0.0, 0, 0], [1e8, 0, 0]]))) == 1
+
+
+def test_a_million_points_are_thinned_with_a_note(model, points):
+    rng = np.random.default_rng(0)
+    cloud = points[rng.integers(len(points), size=1_000_000)] + rng.normal(0, 0.005, (1_000_000, 3))
+    started = time.process_time()
+    pose = model.predict(cloud)
+    assert time.process_time() - started < 6
+    assert pose.joints is not None and pose.num_points == MAX_POINTS
+    assert pose.warnings[0].startswith(f"thinned from 1000000 to {MAX_POINTS} points")
+
+
+def test_map_coordinates_cost_no_accuracy(model, points):
+    offset = np.array([5e5, 5e6, 300.0])
+    moved = model.predict(points.astype(float) + offset)
+    assert np.abs(moved.joints - offset - model.predict(points).joints).max() < 0.03
+
+
+# ---- units, axes, the sensor's place
+
+
+@pytest.mark.parametrize(
+    "factor, unit", [(1000, "millimetres"), (100, "centimetres"), (0.001, "kilometres"), (1, None), (1.3, None)]
+)
+@pytest.mark.parametrize("tall", [0.9, 1.75])
+def test_units_are_named(factor, unit, tall):
+    warning = unit_warning(np.array([0.5, 0.6, tall]) * factor, what="it")
+    assert warning is None if unit is None else unit in warning
+
+
+def test_flat_or_wide_clouds_are_not_taken_for_units():
+    assert unit_warning(np.array([0.4, 0.3, 0.0]), what="it") is None
+    assert unit_warning(np.array([150.0, 200.0, 33.0]), what="it") is None
+    assert unit_warning(np.zeros(3), what="it") is None
+
+
+def test_a_cloud_in_millimetres_is_warned_about(model, points):
+    pose = model.predict(points * 1000)
+    assert any("millimetres" in warning for warning in pose.warnings)
+
+
+@pytest.mark.parametrize("given", [5, "1,2", "1,2,x", (1, 2, np.nan), "", [1, 2, 3, 4], "nowhere", object()])
+def test_a_wrong_sensor_origin_is_told(given):
+    with pytest.raises(InputError, match="expected x,y,z in metres or unknown"):
+        as_origin(given)
+
+
+def test_sensor_origins():
+    assert as_origin(None) is None and as_origin("unknown") is None
+    for given in ("1,-2,3e0", (1, -2, 3), np.array([1, -2, 3]), ["1", "-2", 3]):
+        np.testing.assert_array_equal(as_origin(given), [1, -2, 3])
+
+
+def test_the_sensors_place_reaches_the_network(model, points):
+    known, unknown = model.predict(points, sensor_origin=(0, 0, 0)), model.predict(points)
+    assert not np.allclose(known.joints, unknown.joints, atol=1e-6)
+    np.testing.assert_array_equal(unknown.joints, model.predict(points, sensor_origin="unknown").joints)
+
+
+def test_lying(standing, points):
+    pose, none = standing.sample.pose, np.zeros((0, 3))
+    assert not lies(pose, points) and not lies(pose, none)
+    assert lies(pose, points[:, [0, 2, 1]]) and lies(pose, points[:, [2, 1, 0]])
+    # one ring of a far person, and a street
+    assert not lies(pose, points[:, :3] * (1, 1, 0)) and not lies(pose, cluttered(points))
+    laid = replace(pose, joints=pose.joints @ rotation_about("x", np.pi / 2).T)
+    assert lies(laid, points) and lies(laid.to(SKELETONS["waymo14"]), none)
+    assert not lies(pose.to(SKELETONS["waymo14"]), none)
+
+
+def test_the_flat_axis_of_a_sweep_is_its_up_axis(points):
+    rng = np.random.default_rng(0)
+    street = rng.normal(0, 1, (2000, 3)) * (40, 15, 1.5)
+    for axis, shift in (("z", 0), ("x", 1), ("y", 2)):
+        assert flat_axis(np.roll(street, shift, axis=1)) == axis
+    assert flat_axis(rng.normal(0, 1, (2000, 3)) * (3, 3, 0.5)) is None and flat_axis(points) is None
+    assert flat_axis(rng.random((2000, 3)) * (60, 12, 15)) is None
+
+
+# ---- files
+
+
+@pytest.fixture
+def sweep(tmp_path, points):
+    """A file of two people 5 m apart, their clouds, and their boxes."""
+    there = (points + np.array([0, 5, 0])).astype(np.float32)
+    path = tmp_path / "sweep.npy"
+    np.save(path, np.concatenate([points, there]))
+    return path, (points, there), [box_around(points, id="a"), box_around(there, track=7, category="PEDESTRIAN")]
+
+
+def test_boxes_keep_their_order_and_ids(model, sweep):
+    path, clouds, boxes = sweep
+    people = lidarpose.predict(path, boxes={"people": boxes[::-1]}, model=model)
+    assert [person.id for person in people] == [7, "a"]
+    assert [person.num_points for person in people] == [len(cloud) for cloud in clouds]
+    for person, cloud in zip(people, clouds[::-1], strict=True):
+        alone = model.predict(cloud, sensor_origin=(0, 0, 0))
+        np.testing.assert_allclose(person.joints, alone.joints, atol=1e-3)
+    document = json.loads(people.to_json())
+    assert document["people"][0]["box"]["center"] == pytest.approx(boxes[1]["center"])
+    assert document["source"] == str(path) and set(document["timing_ms"]) == {"read", "load", "predict", "per_person"}
+
+
+def test_boxes_come_as_file_dict_list_or_objects(model, sweep, tmp_path):
+    path, _, boxes = sweep
+    file = tmp_path / "boxes.json"
+    file.write_text(json.dumps({"people": boxes}))
+    results = [
+        lidarpose.predict(path, boxes=given, model=model)
+        for given in (file, str(file), {"people": boxes}, boxes, read_boxes(boxes))
+    ]
+    for result in results[1:]:
+        np.testing.assert_array_equal(result[1].joints, results[0][1].joints)
+
+
+@pytest.mark.parametrize("turn", [np.pi, -np.pi, 2 * np.pi])
+def test_the_heading_of_a_box_never_reaches_the_pose(model, sweep, turn):
+    path, _, (box, _) = sweep
+    poses = [
+        lidarpose.predict(path, boxes=[{**box, "size": [0.9, 0.8, 2.2], "yaw": yaw}], model=model)[0]
+        for yaw in (0.3, 0.3 + turn)
+    ]
+    np.testing.assert_array_equal(poses[0].joints, poses[1].joints)
+
+
+def test_any_box_of_the_same_points_gives_the_same_pose(model, sweep):
+    path, (cloud, _), (box, _) = sweep
+    poses = [
+        lidarpose.predict(path, boxes=[{"center": box["center"], "size": size, "yaw": yaw}], model=model)[0]
+        for size, yaw in (([2.5, 2.5, 2.5], 0.0), ([2.6, 3.1, 4], 1.1), ([3, 2.6, 3], -2.7))
+    ]
+    assert all(pose.num_points == len(cloud) for pose in poses)
+    for pose in poses[1:]:
+        np.testing.assert_array_equal(pose.joints, poses[0].joints)
+
+
+def test_an_empty_box_is_no_harm_to_the_others(model, sweep):
+    path, _, boxes = sweep
+    nowhere = {"center": [0, 0, 50], "size": [1, 1, 1]}
+    people = lidarpose.predict(path, boxes=[boxes[0], nowhere, boxes[1]], model=model)
+    assert [person.joints is None for person in people] == [False, True, False]
+    assert people[1].id == 1 and people[1].warnings == ("no pose: under 5 points",) and people.warnings == ()
+
+
+def test_nobody_is_a_legal_answer(model, sweep):
+    people = lidarpose.predict(sweep[0], boxes={"people": []}, model=model)
+    assert len(people) == 0 and people.warnings == () and len(people.picture()) > 1000
+
+
+def test_boxes_that_miss_the_cloud_are_told(model, sweep):
+    path, _, boxes = sweep
+    far = [{**box, "center": [value * 1000 for value in box["center"]]} for box in boxes]
+    people = lidarpose.predict(path, boxes=far, model=model)
+    assert any(warning.startswith("no box holds 5 points: expected") for warning in people.warnings)
+
+
+def test_boxes_and_points_in_millimetres_are_told(model, sweep, tmp_path):
+    path, clouds, boxes = sweep
+    np.save(tmp_path / "mm.npy", np.concatenate(clouds) * 1000)
+    large = [{**box, **{k: [v * 1000 for v in box[k]] for k in ("center", "size")}} for box in boxes]
+    people = lidarpose.predict(tmp_path / "mm.npy", boxes=large, model=model)
+    assert any("a person's box" in warning and "millimetres" in warning for warning in people.warnings)
+
+
+def test_a_sensor_that_cannot_have_seen_the_people_is_unknown(model, sweep, tmp_path):
+    path, clouds, boxes = sweep
+    offset = np.array([5e5, 5e6, 0])
+    np.save(tmp_path / "utm.npy", np.concatenate(clouds).astype(float) + offset)
+    moved = [{**box, "center": (offset + box["center"]).tolist()} for box in boxes]
+    people = lidarpose.predict(tmp_path / "utm.npy", boxes=moved, model=model)
+    assert any("taken as unknown" in warning for warning in people.warnings)
+    blind = lidarpose.predict(path, boxes=boxes, sensor_origin="unknown", model=model)
+    assert np.abs(people[0].joints - offset - blind[0].joints).max() < 0.03
+    given = lidarpose.predict(tmp_path / "utm.npy", boxes=moved, sensor_origin=offset, model=model)
+    assert given.warnings == ()
+
+
+def test_the_size_of_a_file_decides_without_flags(model, sweep, tmp_path, points):
+    np.save(tmp_path / "crop.npy", points)
+    with pytest.raises(InputError, match=r"less than 4 m across, got .*--boxes.*--crop"):
+        lidarpose.predict(sweep[0], model=model)
+    people = lidarpose.predict(tmp_path / "crop.npy", model=model)
+    assert len(people) == 1 and people[0].id == 0 and people[0].box is None
+    # unknown is the default for a crop, 0,0,0 for boxes
+    np.testing.assert_allclose(people[0].joints, model.predict(points).joints, atol=1e-4)
+    assert len(lidarpose.predict(sweep[0], crop=True, model=model)) == 1
+    with pytest.raises(InputError, match="got both"):
+        lidarpose.predict(sweep[0], crop=True, boxes=[], model=model)
+
+
+def test_a_crop_in_other_units_is_told_by_name(model, tmp_path, points):
+    np.save(tmp_path / "mm.npy", points * 1000)
+    with pytest.raises(InputError, match="millimetres"):
+        lidarpose.predict(tmp_path / "mm.npy", model=model)
+    people = lidarpose.predict(tmp_path / "mm.npy", crop=True, model=model)
+    assert any("millimetres" in warning for warning in people[0].warnings)
+
+
+@pytest.mark.parametrize("up", ["y", "x"])
+def test_other_up_axes_give_the_same_person_in_the_files_frame(model, sweep, tmp_path, up):
+    path, clouds, boxes = sweep
+    R_input_house = UP_AXES[up].T
+    turned = tmp_path / "turned.npy"
+    np.save(turned, np.concatenate(clouds) @ R_input_house.T)
+    boxes = [{**box, "yaw": 0.1, "size": [1.5, 1.5, 2.5]} for box in boxes]
+    moved = [{**box, "center": (R_input_house @ box["center"]).tolist()} for box in boxes]
+    plain = lidarpose.predict(path, boxes=boxes, model=model)
+    other = lidarpose.predict(turned, boxes=moved, up=up, model=model)
+    for a, b in zip(plain, other, strict=True):
+        np.testing.assert_allclose(a.joints @ R_input_house.T, b.joints, atol=2e-3)
+        np.testing.assert_allclose(b.box.center, R_input_house @ a.box.center)
+    assert other.warnings == ()
+    origin = R_input_house @ [1.0, 2, 3]
+    a = lidarpose.predict(path, boxes=boxes, sensor_origin=(1, 2, 3), model=model)
+    b = lidarpose.predict(turned, boxes=moved, up=up, sensor_origin=origin, model=model)
+    np.testing.assert_allclose(a[0].joints @ R_input_house.T, b[0].joints, atol=2e-3)
+
+
+def test_pictures_stand_upright_whatever_the_axes(model, tmp_path, points, monkeypatch):
+    import lidarpose.view.picture as picture
+
+    drawn = {}
+    monkeypatch.setattr(picture, "draw_people", lambda panels, path=None, *, title="": drawn.update(panel=panels[0]))
+    for up in "zyx":
+        np.save(tmp_path / "crop.npy", points @ UP_AXES[up])
+        person = lidarpose.predict(tmp_path / "crop.npy", up=up, model=model)[0]
+        person.picture()
+        np.testing.assert_allclose(drawn["panel"].points, points, atol=1e-4)
+        assert height(drawn["panel"].pose, "head") > height(drawn["panel"].pose, "pelvis")
+
+
+def test_people_that_all_lie_raise_the_question_of_the_axis(model, tmp_path, points):
+    np.save(tmp_path / "crop.npy", points)
+    assert lidarpose.predict(tmp_path / "crop.npy", model=model).warnings == ()
+    np.save(tmp_path / "crop.npy", points @ UP_AXES["y"])
+    (warning,) = lidarpose.predict(tmp_path / "crop.npy", model=model).warnings
+    assert warning == "the person lies down: if that is wrong, z is not the input's up axis: try --up y or --up x"
+    assert lidarpose.predict(tmp_path / "crop.npy", up="y", model=model).warnings == ()
+
+
+def test_a_sweep_of_another_up_axis_is_told(model, tmp_path, points):
+    street = np.random.default_rng(0).normal(0, 1, (9000, 3)) * (40, 15, 0.5)
+    np.save(tmp_path / "sweep.npy", np.concatenate([points, street]) @ UP_AXES["x"])
+    box = {"center": (np.median(points, axis=0) @ UP_AXES["x"]).tolist(), "size": [0.8, 0.8, 2]}
+    (warning,) = lidarpose.predict(tmp_path / "sweep.npy", boxes=[box], model=model).warnings
+    assert warning.endswith("try --up x")
+    assert lidarpose.predict(tmp_path / "sweep.npy", boxes=[box], up="x", model=model).warnings == ()
+
+
+# ---- loading, results
+
+
+def test_load_takes_names_and_paths(model, points, tmp_path, monkeypatch):
+    from lidarpose.infer.predictor import bundled_path
+
+    copy = tmp_path / "mine.safetensors"
+    copy.write_bytes(bundled_path("tiny").read_bytes())
+    (tmp_path / "odd.name").write_bytes(copy.read_bytes())
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tiny").mkdir()
+    for given in (copy, str(copy), "mine.safetensors", Path("odd.name"), "odd.name", "tiny"):
+        np.testing.assert_array_equal(lidarpose.load(given).predict(points).joints, model.predict(points).joints)
+
+
+@pytest.mark.parametrize(
+    "given, words",
+    [
+        ("tinny", "did you mean tiny"),
+        ("no/such.safetensors", "does not exist"),
+        (Path("nothing"), "does not exist"),
+        (".safetensors", "does not exist"),
+        (__file__, "safetensors file"),
+        (Path(__file__).parent, "is a directory"),
+    ],
+)
+def test_load_tells_what_is_wrong(given, words):
+    with pytest.raises(InputError) as raised:
+        lidarpose.load(given)
+    assert words in str(raised.value) and "\n" not in str(raised.value)
+
+
+def test_a_missing_device_is_told():
+    with pytest.raises(InputError, match="device 'warp'"):
+        lidarpose.load(device="warp")
+
+
+@pytest.mark.parametrize("name", ["smpl24", "human15", "waymo14"])
+def test_results_follow_the_schema(model, points, tmp_path, name):
+    pose = model.predict(points, skeleton=name)
+    pose.save(tmp_path / "new" / "pose.json")
+    document = json.loads((tmp_path / "new" / "pose.json").read_text())
+    joints = list(SKELETONS[name].joints)
+    assert document["schema"] == "lidarpose.poses/1" and document["frame"] == "input" and document["unit"] == "m"
+    assert document["skeleton"]["name"] == name and document["skeleton"]["joints"] == joints
+    assert all(0 <= i < len(joints) and 0 <= j < len(joints) for i, j in document["skeleton"]["bones"])
+    assert set(document["model"]) == {"name", "version"}
+    (person,) = document["people"]
+    assert list(person) == ["id", "box", "num_points", "joints", "confidence", "spread", "warnings"]
+    np.testing.assert_allclose(person["joints"], pose.joints, atol=1e-4)
+    assert len(person["confidence"]) == len(person["spread"]) == len(joints)
+    assert pose.picture(tmp_path / "pose.png") == (tmp_path / "pose.png").read_bytes()
+
+
+def test_unknown_names_list_the_known_ones(model, points, tmp_path):
+    with pytest.raises(InputError, match="human15"):
+        model.predict(points, skeleton="human17")
+    np.save(tmp_path / "crop.npy", points)
+    with pytest.raises(InputError, match="z, y, x"):
+        lidarpose.predict(tmp_path / "crop.npy", up="up", model=model)
+
+
+def test_box_objects_of_the_package_are_public():
+    box = lidarpose.Box(center=[0, 0, 0], size=[1, 1, 2])
+    assert isinstance(box, Box) and as_points([[0, 0, 0]]).shape == (1, 3) and sensor("os1-128").name == "os1-128"
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason=f"the real sweeps are not at {REAL}")
+@pytest.mark.parametrize("name", ["sweep_0.pcd", "sweep_1.bin", "sweep_2.ply"])
+def test_real_sweeps(model, name):
+    path = REAL / name
+    boxes = json.loads(path.with_suffix(".json").read_text())
+    people = lidarpose.predict(path, boxes=path.with_suffix(".json"), model=model)
+    assert [person.id for person in people] == [box["track"] for box in boxes["people"]]
+    assert people.warnings == ()
+    for person, box in zip(people, boxes["people"], strict=True):
+        assert abs(person.num_points - box["num_points"]) <= max(2, 0.05 * box["num_points"])
+        assert (person.joints is None) == (person.num_points < 5)
+        if person.num_points >= 50:
+            assert np.linalg.norm(person.joints[0] - box["center"]) < 0.6
+            assert height(person, "head") > height(person, "pelvis") > height(person, "left_ankle")

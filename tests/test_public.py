@@ -1,0 +1,128 @@
+"""The public names, what importing them costs, and which room may import which."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import lidarpose
+
+SOURCE = Path(lidarpose.__file__).parent
+MODULES = sorted(SOURCE.rglob("*.py"))
+
+# the house from the ground up: a room imports its own floor and those below
+FLOORS = (
+    {"skeleton", "geometry", "sample", "errors", "_version"},
+    {"body", "lidar", "synth", "data"},
+    {"model"},
+    {"train", "evaluate"},
+    {"infer", "view", "demo", "cli", "__init__", "__main__"},
+)
+NO_TORCH = ({"torch", "safetensors"}, FLOORS[0] | FLOORS[1])
+STRANGERS = {("synth", "model"), ("model", "synth")}
+# writes files whole or not at all: of use on every floor
+FOR_ALL = "lidarpose.data.files"
+
+
+def loaded_by(code):
+    """Which of the heavy libraries a program loads."""
+    heavy = ("torch", "numba", "numpy", "pandas", "matplotlib", "trimesh", "pypcd4")
+    tail = f"\nimport sys; print(*[name for name in {heavy} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code + tail], capture_output=True, text=True, timeout=60, check=True)
+    return set(done.stdout.split("\n")[-2].split())
+
+
+def test_import_and_help_load_nothing_heavy():
+    assert loaded_by("import lidarpose; dir(lidarpose)") == set()
+    code = "from lidarpose.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass"
+    assert loaded_by(code) == set()
+    assert loaded_by(code.replace("'--help'", "'predict', '--help'")) == set()
+
+
+def test_help_answers_at_once():
+    # 0.3 s of processor time by contract; children of a busy machine get some room
+    import resource
+
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run([sys.executable, "-m", "lidarpose", "--help"], capture_output=True, timeout=60, check=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert (after.ru_utime + after.ru_stime) - (before.ru_utime + before.ru_stime) < 0.5
+
+
+def test_reading_and_casting_need_no_torch():
+    assert "torch" not in loaded_by("import lidarpose; lidarpose.read_points, lidarpose.read_boxes, lidarpose.Sample")
+    assert "torch" not in loaded_by("import lidarpose; lidarpose.cast_rays, lidarpose.sample_poses")
+    assert "numba" not in loaded_by("import lidarpose; lidarpose.load, lidarpose.predict, lidarpose.Poses")
+
+
+@pytest.mark.parametrize("name", lidarpose.__all__)
+def test_every_public_name_is_there(name):
+    assert getattr(lidarpose, name) is not None and name in dir(lidarpose)
+
+
+def test_unknown_names_are_attribute_errors():
+    with pytest.raises(AttributeError, match="no attribute 'pose'"):
+        lidarpose.pose  # noqa: B018
+    assert not hasattr(lidarpose, "__wrapped__")
+
+
+def test_no_public_name_is_hidden_by_a_module():
+    rooms = {path.stem for path in SOURCE.glob("*.py")} | {path.name for path in SOURCE.iterdir() if path.is_dir()}
+    assert not rooms & set(lidarpose.__all__)
+
+
+# ---- the floors
+
+
+def room(module):
+    """ "lidarpose.model.plan" -> "model"."""
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 else "__init__"
+
+
+def floor(name):
+    return next(i for i, rooms in enumerate(FLOORS) if name in rooms)
+
+
+def imports(path):
+    """All modules that a file imports, those inside functions too."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            # `from lidarpose import x` may mean the module x
+            if node.module == "lidarpose":
+                yield from (f"lidarpose.{alias.name}" for alias in node.names)
+            else:
+                yield node.module
+
+
+def where(path):
+    return path.relative_to(SOURCE).parts[0].removesuffix(".py")
+
+
+def test_every_room_has_a_floor():
+    assert {where(path) for path in MODULES} <= set().union(*FLOORS)
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(SOURCE)))
+def test_imports_go_downwards(path):
+    here = where(path)
+    for name in imports(path):
+        if name.split(".")[0] in NO_TORCH[0]:
+            assert here not in NO_TORCH[1], f"{here} imports {name}"
+        if name.split(".")[0] != "lidarpose" or name == FOR_ALL:
+            continue
+        there = room(name)
+        assert floor(there) <= floor(here), f"{here} imports {name}, which is a floor above"
+        assert (here, there) not in STRANGERS, f"{here} imports {name}"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(SOURCE)))
+def test_numba_is_imported_by_its_own_files_only(path):
+    # so that everything but synthesis works without the extra
+    if any(name.split(".")[0] == "numba" for name in imports(path)):
+        assert path.stem in ("raycast_kernels", "rig_numba")
