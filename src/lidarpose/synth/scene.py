@@ -130,8 +130,11 @@ def draw_height(device: Sensor, distance: float, tall: float, *, rng: np.random.
     low, high = distance * np.tan(device.elevations[[0, -1]])
     if rng.random() < cut:
         return float(height)
-    # feet at -height above `low`, head at tall - height below `high`; the feet win where both cannot be had
-    return float(max(min(height, -low), tall - high)) if high - low > tall else float(-(low + high) / 2 + tall / 2)
+    if high - low <= tall:
+        # taller than the fan: the middle of the fan looks at the middle of the person
+        return float(tall / 2 - (low + high) / 2)
+    # feet, at -height, not below the fan; head, at tall - height, not above it
+    return float(np.clip(height, tall - high, -low))
 
 
 def ground(config: SceneConfig, rng: np.random.Generator) -> Mesh:
