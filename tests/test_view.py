@@ -367,3 +367,8 @@ def test_write_report(tmp_path):
     path = tmp_path / "report.html"
     write_report(path, [person(ReportPerson)], title="t", summary=[{"a": 1}])
     assert path.read_text(encoding="utf-8") == render_report([person(ReportPerson)], title="t", summary=[{"a": 1}])
+
+
+def test_a_name_that_the_font_lacks_is_no_warning(recwarn):
+    draw_people([Panel(points=np.zeros((3, 3)), label="人")], title="点云.pcd")
+    assert not recwarn.list

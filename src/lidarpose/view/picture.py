@@ -5,6 +5,7 @@ touched; matplotlib is imported only when something is drawn.
 """
 
 import io
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -109,7 +110,10 @@ def draw_people(panels: list[Panel], path: str | Path | None = None, *, title: s
         _text(ax, width / 2, _MARGIN + card_height / 2, "no people", size=11, color=_FAINT, ha="center")
 
     buffer = io.BytesIO()
-    canvas.print_png(buffer, metadata={"Software": None})  # print_figure would follow the user's savefig settings
+    with warnings.catch_warnings():
+        # a file name in a script that the font lacks becomes boxes on the sheet; nothing the user need be told
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+        canvas.print_png(buffer, metadata={"Software": None})  # print_figure would follow the user's savefig settings
     data = buffer.getvalue()
     if path is not None:
         from lidarpose.data.files import write_atomic
