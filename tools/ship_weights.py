@@ -15,6 +15,7 @@ def main() -> None:
     parser.add_argument("model")
     parser.add_argument("scores")
     parser.add_argument("out")
+    parser.add_argument("--note", help="what the command does not tell of the training")
     options = parser.parse_args()
     network, header = load_checkpoint(options.model)
     with open(options.scores) as file:
@@ -25,7 +26,8 @@ def main() -> None:
             figures = scores[condition]["groups"][group]
             told[f"{condition}, {group}"] = f"MPJPE {figures['mpjpe']} mm of {figures['people']} people"
     told["measured on"] = f"benchmarks/heldout.py, subjects {scores['subjects']}, seed {scores['seed']}, human15"
-    save_checkpoint(options.out, network, card=header.card | {"scores": told}, half=True)
+    note = {"note": options.note} if options.note else {}
+    save_checkpoint(options.out, network, card=header.card | note | {"scores": told}, half=True)
 
 
 if __name__ == "__main__":

@@ -28,5 +28,6 @@ def lines() -> list[str]:
             f"  trained  {card.get('command', 'unknown')}",
             f"           {card.get('people_seen', 0):,} people, {card.get('hours', 0)} hours",
         ]
+        out += [f"           {card['note']}"] if "note" in card else []
         out += [f"  score    {key}: {value}" for key, value in card.get("scores", {}).items()]
     return out
