@@ -342,7 +342,7 @@ def test_summary_table():
     page = Reader(text)
     assert page.texts["th"] == ["set", "people", "MPJPE mm", "PCK", "ok", "extra"]
     cells = np.reshape(page.texts["td"], (3, 6)).tolist()
-    assert cells[0] == ["near", "1873", "63.4", "0.500", "yes", "–"]
+    assert cells[0] == ["near", "1873", "63.4", "0.5", "yes", "–"]
     assert cells[1] == ["far", "2", "103.2", "–", "–", "x"]
     assert cells[2] == ["none", "0", "–", "–", "–", "–"]
     assert text.count('<td class="number">') == 9
@@ -372,3 +372,9 @@ def test_write_report(tmp_path):
 def test_a_name_that_the_font_lacks_is_no_warning(recwarn):
     draw_people([Panel(points=np.zeros((3, 3)), label="人")], title="点云.pcd")
     assert not recwarn.list
+
+
+def test_numbers_of_a_table_end_without_needless_zeros():
+    page = render_report([], title="t", summary=[{"a": 8.6, "b": 3.0, "c": 0.1234}, {"a": 20.0, "b": 4.0, "c": 12.5}])
+    cells = re.findall(r'<td class="number">([^<]*)</td>', page)
+    assert cells == ["8.6", "3", "0.12", "20.0", "4", "12.50"]

@@ -148,10 +148,11 @@ def _is_missing(value: object) -> bool:
 
 
 def _decimals(values: list) -> int:
-    """So many that the column's largest number shows four digits, at most three."""
+    """So many that the column's largest number shows four digits, at most three, and none that only adds zeros."""
     values = [abs(float(v)) for v in values if not isinstance(v, Integral)]
     largest = max(values, default=0.0)
-    return int(np.clip(3 - math.floor(math.log10(largest)), 0, 3)) if largest > 0 else 3
+    most = int(np.clip(3 - math.floor(math.log10(largest)), 0, 3)) if largest > 0 else 3
+    return next((d for d in range(most) if all(round(v, d) == round(v, most) for v in values)), most)
 
 
 def _table(rows: list[dict]) -> str:
