@@ -14,6 +14,7 @@ import time
 import numpy as np
 
 from lidarpose.evaluate.metrics import auroc, calibration_error, mpjpe, pa_mpjpe
+from lidarpose.geometry import rotation_about
 from lidarpose.infer.predictor import load
 from lidarpose.skeleton import HUMAN15, SMPL24, WAYMO14
 from lidarpose.synth.bodies import PoseBank
@@ -138,9 +139,7 @@ def main() -> None:
 def _floor(found: list[SyntheticPerson]) -> float:
     """MPJPE of the mean pose, turned to where each person truly faces, about the center of their points."""
     true = np.stack([p.sample.pose.to(HUMAN15).joints - p.sample.center for p in found])
-    yaw = facing(true)
-    c, s, o, i = np.cos(yaw), np.sin(yaw), np.zeros(len(yaw)), np.ones(len(yaw))
-    R_world_person = np.stack([np.stack([c, -s, o], -1), np.stack([s, c, o], -1), np.stack([o, o, i], -1)], -2)
+    R_world_person = rotation_about("z", facing(true))
     own = true @ R_world_person
     return mpjpe(own.mean(0) @ np.swapaxes(R_world_person, -1, -2), true)
 

@@ -470,3 +470,9 @@ def test_eight_people_are_learned_by_heart():
     terms = overfitted(100)
     assert terms["mpjpe"] < 0.03
     assert terms["part"] < 0.25 * 0.5
+
+
+@pytest.mark.parametrize("field", ["people", "rate", "captured", "seed", "workers"])
+def test_a_recipe_refuses_negative_numbers(field):
+    with pytest.raises(InputError, match=f"^{field} must be at least [01], got -1$"):
+        Pretrain(**{field: -1})

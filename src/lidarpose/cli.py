@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from lidarpose._version import __version__
-from lidarpose.errors import InputError, LidarPoseError
+from lidarpose.errors import LidarPoseError
 
 # options whose value may start with a minus sign, which argparse would take for another option
 _SIGNED = ("--sensor-origin",)
@@ -180,9 +180,6 @@ def _pretrain(options: argparse.Namespace) -> None:
     changes = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     if options.subjects is not None:
         changes["subjects"] = tuple(options.subjects.split(","))
-    if any(isinstance(value, int | float) and value < 0 for value in changes.values()):
-        name = next(n for n, v in changes.items() if isinstance(v, int | float) and v < 0)
-        raise InputError(f"--{name} must not be negative, got {changes[name]}")
     words = [f"--{name} {','.join(value) if isinstance(value, tuple) else value}" for name, value in changes.items()]
     command = " ".join(["lidarpose pretrain", Path(options.folder).name, *words])
     path = pretrain(replace(default(), **changes), options.folder, resume=options.resume, command=command)

@@ -64,17 +64,6 @@ _MAGIC = {
     ".npz": re.compile(rb"PK\x03\x04.{26}[^/]{1,200}?\.npy", re.DOTALL),
 }
 
-_PCD_TYPES = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
-_PLY_TYPES = {
-    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
-    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
-    **{"int64": "i8", "uint64": "u8", "float": "f4", "double": "f8", "float16": "f2", "float32": "f4", "float64": "f8"},
-}
-_PLY_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
-
-# what stands in text for a value that is not there, in the usual exports
-_MISSING = ("", "na", "n/a", "nan", "-nan", "+nan", "null", "none", "<na>")
-
 
 @dataclass(frozen=True, kw_only=True)
 class Cloud:

@@ -29,9 +29,10 @@ class Pretrain:
     workers: int = 1
 
     def __post_init__(self):
-        for name in ("people", "batch"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
+        least = {"people": 1, "batch": 1, "rate": 0, "muon_rate": 0, "easy": 0, "captured": 0, "seed": 0, "workers": 0}
+        for name, bound in least.items():
+            if not getattr(self, name) >= bound:
+                raise InputError(f"{name} must be at least {bound}, got {getattr(self, name)}")
         if self.motion and not self.subjects:
             raise InputError("clips are given but no subjects to learn from: say --subjects 002,005 or the like")
         object.__setattr__(self, "subjects", tuple(self.subjects))
