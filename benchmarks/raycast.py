@@ -1,24 +1,36 @@
 """How long one cast of a body takes, beside the slow twin and, where installed, Embree and Open3D.
 
-    python benchmarks/raycast.py [--rounds 5] [--sensor dapt64] [--rings 60]
+    python benchmarks/raycast.py [--rounds 5] [--sensor dapt64] [--rings 60] [--plot docs/raycast.png]
 
 30 scenes from one seed: 5 distances x 6 closed meshes, each with a ground quad. The ways take turns, one scene each,
-so that a busy machine slows all alike: read the ratios. A cast is `scan`: window, cast and packed points; the others
-get the window's rays ready made. The slow twin casts a sample of the rays and is scaled up.
+so that a busy machine slows all alike: read the ratios. A cast is `scan`: window, cast and packed points, with faces
+of both sides or with the backs of the body culled; the others get the window's rays ready made. "open3d" goes by a
+legacy mesh, as the released code of the paper does, "open3d direct" hands its tensors over; each builds its tree for
+every body. The slow twin casts a sample of the rays and is scaled up. All on one thread.
+
+    pip install embreex open3d-cpu matplotlib    # optional; Open3D also wants libusb-1.0-0 and libgl1 of the system
 """
 
 import argparse
+import os
 import time
+
+# before numpy and Open3D start their threads
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
-from lidarpose.lidar.raycast import cast_window, find_window, scan
+from lidarpose.lidar.raycast import find_window, scan
+from lidarpose.lidar.raycast_people import scan_people
 from lidarpose.lidar.raycast_reference import cast_ray_list_reference
 from lidarpose.lidar.sensor import sensor as named_sensor
 
 DISTANCES = (4.0, 7.0, 10.0, 15.0, 20.0)
 MESHES = 6
 REFERENCE_RAYS = 16
+# of the meshes of the plot: 4 * rings * (rings - 1) triangles
+RINGS = (18, 25, 42, 60, 90)
+REFERENCE = "slow twin"
 
 
 def blob(rng, rings):
@@ -42,7 +54,7 @@ def blob(rng, rings):
 
 
 def scenes(sensor, rings):
-    """Lists of (distance, vertices, faces, the body's vertex count)."""
+    """Lists of (distance, vertices, faces, the body's vertex count); the ground's two faces are the last."""
     made = []
     for m in range(MESHES):
         for distance in DISTANCES:
@@ -63,14 +75,26 @@ def rays_of(sensor, window):
     return np.stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)], -1).reshape(-1, 3)
 
 
+def own_ways(sensor):
+    """Name -> function(vertices, faces, rays, body, closed)."""
+
+    def two_sided(vertices, faces, rays, body, closed):
+        return scan(vertices, faces, sensor, window_vertices=vertices[:body])
+
+    def culled(vertices, faces, rays, body, closed):
+        return scan(vertices, faces, sensor, window_vertices=vertices[:body], cull=closed)
+
+    return {"scan": two_sided, "scan, culled": culled}
+
+
 def other_ways():
-    """Name -> function(vertices, faces, rays); each builds its tree and casts, as a new body needs."""
+    """Name -> function(vertices, faces, rays, ...); each builds its tree and casts, as a new body needs."""
     ways = {}
     try:
         from embreex import rtcore_scene
         from embreex.mesh_construction import TriangleMesh
 
-        def embree(vertices, faces, rays):
+        def embree(vertices, faces, rays, *_):
             scene = rtcore_scene.EmbreeScene()
             TriangleMesh(scene, vertices[faces])
             return scene.run(np.zeros_like(rays, dtype=np.float32), rays.astype(np.float32))
@@ -81,15 +105,83 @@ def other_ways():
     try:
         import open3d
 
-        def open3d_cast(vertices, faces, rays):
-            scene = open3d.t.geometry.RaycastingScene(nthreads=1)
-            scene.add_triangles(open3d.core.Tensor(vertices), open3d.core.Tensor(faces.astype(np.uint32)))
+        def cast(scene, rays):
             return scene.cast_rays(open3d.core.Tensor(np.concatenate([0 * rays, rays], 1).astype(np.float32)), 1)
 
-        ways["open3d"] = open3d_cast
+        def by_legacy_mesh(vertices, faces, rays, *_):
+            mesh = open3d.geometry.TriangleMesh(
+                open3d.utility.Vector3dVector(vertices.astype(float)), open3d.utility.Vector3iVector(faces)
+            )
+            scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+            scene.add_triangles(open3d.t.geometry.TriangleMesh.from_legacy(mesh))
+            return cast(scene, rays)
+
+        def by_tensors(vertices, faces, rays, *_):
+            scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+            scene.add_triangles(open3d.core.Tensor(vertices), open3d.core.Tensor(faces.astype(np.uint32)))
+            return cast(scene, rays)
+
+        ways["open3d"], ways["open3d direct"] = by_legacy_mesh, by_tensors
     except ImportError:
         pass
     return ways
+
+
+def measure(made, sensor, ways, rounds, *, reference=False):
+    """Way -> least seconds of each scene (scenes,), and the number of hits of each."""
+    best = {way: np.full(len(made), np.inf) for way in (*ways, *([REFERENCE] if reference else []))}
+    hits = np.zeros(len(made))
+    rng = np.random.default_rng(0)
+    for turn in range(rounds + 1):  # the first turn warms up
+        for i, (_, vertices, faces, body) in enumerate(made):
+            rays = rays_of(sensor, find_window(vertices[:body], sensor))
+            closed = np.arange(len(faces)) < len(faces) - 2
+            hits[i] = len(scan(vertices, faces, sensor, window_vertices=vertices[:body]).points)
+            for name, way in ways.items():
+                start = time.perf_counter()
+                way(vertices, faces, rays, body, closed)
+                if turn:
+                    best[name][i] = min(best[name][i], time.perf_counter() - start)
+            if reference and turn == 1:
+                sample = rays[rng.permutation(len(rays))[:REFERENCE_RAYS]]
+                start = time.perf_counter()
+                cast_ray_list_reference(vertices, faces, sample)
+                best[REFERENCE][i] = (time.perf_counter() - start) * len(rays) / max(1, len(sample))
+    return best, hits
+
+
+def threads(made, sensor, rounds):
+    """People a second of `scan_people`, culled, on one thread and on two."""
+    vertices = np.stack([scene[1] for scene in made] * 4)
+    body, faces = made[0][3], made[0][2]
+    extra = vertices[:, body:], faces[-2:] - body
+    closed = np.arange(len(faces)) < len(faces) - 2
+    least = {1: np.inf, 2: np.inf}
+    for _ in range(rounds + 1):
+        for count in least:
+            start = time.perf_counter()
+            scan_people(vertices[:, :body], faces[:-2], sensor, extra=extra, cull=closed, threads=count)
+            least[count] = min(least[count], time.perf_counter() - start)
+    return {count: len(vertices) / seconds for count, seconds in least.items()}
+
+
+def plot(path, sensor, by_distance, by_count):
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True, layout="constrained")
+    for axis, series in ((left, by_distance), (right, by_count)):
+        for way in next(iter(series.values())):
+            values = [series[x][way] * 1e3 for x in series]
+            axis.plot(list(series), values, marker="o", ms=4, label=way)
+        axis.set_yscale("log")
+        axis.grid(True, which="both", lw=0.3)
+    left.set(xlabel="distance, m", ylabel="ms a person, one thread", title=f"{sensor.name}, 14,160 triangles")
+    right.set(xlabel="triangles", xscale="log", title="mean over 4 to 20 m")
+    right.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    figure.savefig(path, dpi=80)
 
 
 def main():
@@ -97,46 +189,43 @@ def main():
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--sensor", default="dapt64")
     parser.add_argument("--rings", type=int, default=60, help="of the meshes: 60 are 14,160 triangles, 25 are 2,400")
+    parser.add_argument("--plot", help="also draw cost by distance and by number of triangles to this PNG")
     arguments = parser.parse_args()
-    sensor, ways = named_sensor(arguments.sensor), other_ways()
+    sensor = named_sensor(arguments.sensor)
+    ways = {**own_ways(sensor), **other_ways()}
     made = scenes(sensor, arguments.rings)
-    best = {way: np.full(len(made), np.inf) for way in ("scan", "cast_window", *ways, "reference")}
-    hits = np.zeros(len(made))
-    rng = np.random.default_rng(0)
-    for turn in range(arguments.rounds + 1):  # the first turn warms up
-        for i, (_, vertices, faces, body) in enumerate(made):
-            window = find_window(vertices[:body], sensor)
-            rays = rays_of(sensor, window)
-
-            def clock(way, function, i=i, turn=turn):
-                start = time.perf_counter()
-                result = function()
-                if turn:
-                    best[way][i] = min(best[way][i], time.perf_counter() - start)
-                return result
-
-            hits[i] = len(
-                clock("scan", lambda: scan(vertices, faces, sensor, window_vertices=vertices[:body])).points  # noqa: B023
-            )
-            clock("cast_window", lambda: cast_window(vertices, faces, sensor, window))  # noqa: B023
-            for name, way in ways.items():
-                clock(name, lambda: way(vertices, faces, rays))  # noqa: B023
-            if turn == 1:
-                sample = rays[rng.permutation(len(rays))[:REFERENCE_RAYS]]
-                clock("reference", lambda: cast_ray_list_reference(vertices, faces, sample))  # noqa: B023
-                best["reference"][i] *= len(rays) / max(1, len(sample))
+    best, hits = measure(made, sensor, ways, arguments.rounds, reference=True)
     distances = np.array([scene[0] for scene in made])
     print(f"{sensor.name}, {len(made[0][2]):,} triangles, best of {arguments.rounds}; ms a cast by distance")
-    print(f"{'way':12s}" + "".join(f"{d:9.0f} m" for d in DISTANCES) + f"{'mean':>11s}{'casts/s':>10s}{'x scan':>10s}")
+    print(
+        f"{'way':14s}"
+        + "".join(f"{d:9.0f} m" for d in DISTANCES)
+        + f"{'mean':>11s}{'casts/s':>10s}{'x scan':>10s}{'x culled':>10s}"
+    )
     for way, seconds in best.items():
         by_distance = [seconds[distances == d].mean() * 1e3 for d in DISTANCES]
         mean = seconds.mean()
         print(
-            f"{way:12s}"
+            f"{way:14s}"
             + "".join(f"{ms:11.3f}" for ms in by_distance)
-            + f"{mean * 1e3:11.3f}{1 / mean:10,.0f}{mean / best['scan'].mean():10.1f}"
+            + f"{mean * 1e3:11.3f}{1 / mean:10,.0f}"
+            + "".join(f"{mean / best[own].mean():10.1f}" for own in ("scan", "scan, culled"))
         )
-    print(f"{'hits':12s}" + "".join(f"{hits[distances == d].mean():11.0f}" for d in DISTANCES))
+    print(f"{'hits':14s}" + "".join(f"{hits[distances == d].mean():11.0f}" for d in DISTANCES))
+    rates = threads(made, sensor, arguments.rounds)
+    print(
+        f"scan_people, culled: {rates[1]:,.0f} people/s on 1 thread, {rates[2]:,.0f} on 2, x{rates[2] / rates[1]:.2f}"
+    )
+    if arguments.plot:
+        drawn = {way: best[way] for way in ways}
+        by_distance = {d: {way: drawn[way][distances == d].mean() for way in ways} for d in DISTANCES}
+        by_count = {}
+        for rings in RINGS:
+            found, _ = measure(scenes(sensor, rings), sensor, ways, max(1, arguments.rounds // 2))
+            by_count[4 * rings * (rings - 1)] = {way: seconds.mean() for way, seconds in found.items()}
+        for count, series in by_count.items():
+            print(f"{count:7,} triangles: " + ", ".join(f"{way} {ms * 1e3:.3f} ms" for way, ms in series.items()))
+        plot(arguments.plot, sensor, by_distance, by_count)
 
 
 if __name__ == "__main__":

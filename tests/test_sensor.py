@@ -13,9 +13,11 @@ ROWS = {
 
 
 def test_presets_are_what_their_names_say():
-    assert {name: s.rows for name, s in SENSORS.items()} == ROWS
+    assert {name: s.rows for name, s in SENSORS.items() if isinstance(s, Sensor)} == ROWS
     for name, s in SENSORS.items():
         assert s.name == name and sensor(name) is s
+        if not isinstance(s, Sensor):
+            continue
         assert s.columns * s.azimuth_step == pytest.approx(2 * np.pi)
         assert np.degrees(np.abs(s.elevations)).max() < 46
     assert np.degrees(sensor("dapt64").elevations[[0, -1]]) == pytest.approx([-10, 10])

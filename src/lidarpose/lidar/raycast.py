@@ -15,21 +15,37 @@ How a sector of columns (at most a quarter turn) is cast:
        closed mesh has no holes and no beam is counted twice. The largest I wins.
 Vertices beside or behind the sensor have no Y and Z: edges that end there are crossed in x, y, z instead.
 
+What turns its back to the sensor is behind something of the same mesh if the mesh is closed: `cull` leaves it out,
+which changes nothing but the time. A closed mesh that may hold the sensor is not culled.
+
 Letters: V vertices, F faces, C columns, R rows of a window, A azimuths, E elevations, N rays, n hits.
 """
 
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from lidarpose.errors import InputError
-from lidarpose.lidar.raycast_kernels import bounds, collect, raster, ray_list
+from lidarpose.lidar.heads import scan_heads
+from lidarpose.lidar.raycast_input import (
+    as_angles,
+    as_culled,
+    as_faces,
+    as_mesh,
+    as_points,
+    as_times,
+    as_vertices,
+    check_faces,
+    check_margin,
+    read_only,
+)
+from lidarpose.lidar.raycast_kernels import raster
+from lidarpose.lidar.raycast_rays import ray_list
+from lidarpose.lidar.raycast_scan import BAD_FACES, BAD_VERTICES, SECTOR, Beams, bounds, cast_grid, scan_checked
 from lidarpose.lidar.sensor import Sensor, Window
 
-# a sector spans at most this much azimuth, so that tan(a) stays near 1
-_SECTOR = np.radians(92.0)
-# beyond any scene, and its powers are still finite
-_FARTHEST = 1e9
+_BEAMS: WeakKeyDictionary[Sensor, Beams] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,8 +76,8 @@ def cast_rays(
     order, |elevation| <= pi/2. Returns range (A, E) float32 m, inf where nothing is hit, and face (A, E) int32, -1
     where nothing is hit. Meshes may be open, degenerate, or surround the sensor. Raises InputError.
     """
-    vertices, faces = _mesh(vertices, faces)
-    azimuth, elevation = _angles("azimuth", azimuth), _angles("elevation", elevation)
+    vertices, faces = as_mesh(vertices, faces)
+    azimuth, elevation = as_angles("azimuth", azimuth), as_angles("elevation", elevation)
     if (np.abs(elevation) > np.pi / 2).any():
         raise InputError(
             f"elevation must be within +-pi/2 rad, got up to {np.abs(elevation).max():.4g}: are they degrees?"
@@ -81,25 +97,28 @@ def cast_rays(
             center = start + ahead[-1] / 2
             relative = ahead - ahead[-1] / 2
             scale[picked] = 1 / np.cos(relative)
-            raster(vertices, faces, center, np.tan(relative), np.cos(relative), table, picked, rows, inverse_x, face)
+            raster(
+                vertices, faces, as_culled(None, faces), center, np.tan(relative), np.cos(relative), table,
+                picked, rows, inverse_x, face,
+            )  # fmt: skip
     return _ranges(inverse_x, scale, 1 / np.cos(elevation)), face
 
 
 def cast_window(
-    vertices: np.ndarray, faces: np.ndarray, sensor: Sensor, window: Window
+    vertices: np.ndarray, faces: np.ndarray, sensor: Sensor, window: Window, *, cull: bool | np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """The nearest hits of a window of a spinning sensor's beams.
 
-    vertices (V, 3) m in the sensor's frame, faces (F, 3). Returns range (C, R) float32 m, inf for no hit, and face
-    (C, R) int32, -1 for no hit: C, R are window.columns, window.rows. The sensor's range limits are not applied.
+    vertices (V, 3) m in the sensor's frame, faces (F, 3); cull: as in `scan`. Returns range (C, R) float32 m, inf for
+    no hit, and face (C, R) int32, -1 for no hit: C, R are window.columns, window.rows. The sensor's range limits are
+    not applied; all beams leave from the origin, whatever its origin_heights. Raises InputError.
     """
-    vertices, faces = _mesh(vertices, faces)
-    inverse_x, face, scale = _cast(vertices, faces, sensor, window)
-    lift = 1 / np.cos(sensor.elevations[window.row0 : window.row0 + window.rows])
-    if scale.shape[1] == 1:
-        return _ranges(inverse_x, scale[:, 0], lift), face
-    with np.errstate(divide="ignore"):
-        return (scale * lift / inverse_x).astype(np.float32), face
+    vertices, faces = as_mesh(vertices, faces)
+    inverse_x, face, scale = cast_grid(
+        vertices, faces, as_culled(cull, faces), beams_of(sensor),
+        window.column0, window.columns, window.row0, window.rows,
+    )  # fmt: skip
+    return _ranges(inverse_x, scale, 1 / np.cos(sensor.elevations[window.row0 : window.row0 + window.rows])), face
 
 
 def scan(
@@ -109,32 +128,84 @@ def scan(
     *,
     window_vertices: np.ndarray | None = None,
     margin: float = 0.0,
+    cull: bool | np.ndarray | None = None,
 ) -> Hits:
     """What the sensor sees inside the smallest window of beams that holds a body. Paper: Eq. 3.
 
     vertices (V, 3) m in the sensor's frame, faces (F, 3): the body, and whatever may hide it or stand behind it.
     window_vertices (M, 3): the body alone (all vertices if not given); margin rad widens the window on each side.
-    A beam whose nearest hit is outside the sensor's range limits returns nothing. Nothing is random. Raises InputError.
+    cull: the faces, all (True) or a mask (F,), of closed meshes whose faces are counter-clockwise seen from outside
+    (see `is_closed`): the same hits at two thirds of the cost. Other faces count from both sides.
+    A beam whose nearest hit is outside the sensor's range limits returns nothing. Nothing is random. The heads of a
+    sensor with several origins are cast one by one. Raises InputError.
     """
-    vertices, faces = _mesh(vertices, faces)
-    window = find_window(vertices if window_vertices is None else window_vertices, sensor, margin=margin)
-    inverse_x, face, scale = _cast(vertices, faces, sensor, window)
-    shift = sensor.azimuth_shifts[window.row0 : window.row0 + window.rows]
-    tangents = sensor.tangents[window.row0 : window.row0 + window.rows]
-    first = sensor.azimuth_start + window.column0 * sensor.azimuth_step
-    points, face, column, ring = collect(
-        inverse_x, face, scale, first, sensor.azimuth_step, shift, tangents, sensor.range_min, sensor.range_max
+    if sensor.heads:
+        return scan_heads(
+            lambda v, head, w: scan(v, faces, head, window_vertices=w, margin=margin, cull=cull),
+            vertices,
+            sensor,
+            window_vertices,
+        )
+    given = vertices, faces, window_vertices
+    vertices, faces = as_vertices("vertices", vertices), as_faces(faces, len(vertices))
+    window_vertices = vertices if window_vertices is None else as_vertices("window_vertices", window_vertices)
+    check_margin(margin)
+    (hits, window), fault = scan_checked(
+        vertices, faces, as_culled(cull, faces), window_vertices, beams_of(sensor), float(margin)
     )
+    if fault == BAD_VERTICES:
+        as_points("vertices", given[0])
+        as_points("window_vertices", given[2])
+    elif fault == BAD_FACES:
+        as_mesh(*given[:2])
+    points, face, column, ring = hits
+    column0, columns, row0, rows = window
     return Hits(
-        points=points,
-        face=face,
-        column=column,
-        ring=ring + np.int32(window.row0),
-        columns=window.columns,
-        rows=window.rows,
-        column0=window.column0,
-        row0=window.row0,
+        points=points, face=face, column=column, ring=ring, columns=columns, rows=rows, column0=column0, row0=row0
     )
+
+
+def beams_of(sensor: Sensor) -> Beams:
+    """A sensor for the compiled code of `raycast_scan`; made once."""
+    beams = _BEAMS.get(sensor)
+    if beams is None:
+        groups = sensor.shift_groups
+        sector = min(max(1, int(SECTOR / sensor.azimuth_step)), sensor.columns)
+        half_steps = np.arange(sector) / 2 * sensor.azimuth_step
+        arrays = {
+            "elevations": sensor.elevations,
+            "tangents": sensor.tangents,
+            "shifts": sensor.azimuth_shifts,
+            "group_shift": np.array([shift for shift, _ in groups]),
+            "group_ring": np.concatenate([rings for _, rings in groups]),
+            "group_start": np.cumsum([0] + [len(rings) for _, rings in groups]),
+            "half_tan": np.tan(half_steps),
+            "half_cos": np.cos(half_steps),
+        }
+        beams = _BEAMS[sensor] = Beams(
+            **{name: read_only(values) for name, values in arrays.items()},
+            sector=sector,
+            start=float(sensor.azimuth_start),
+            step=float(sensor.azimuth_step),
+            columns=sensor.columns,
+            nearest=float(sensor.range_min),
+            farthest=float(sensor.range_max),
+        )
+    return beams
+
+
+def is_closed(faces: np.ndarray) -> bool:
+    """Whether every edge joins exactly two faces (F, 3), which run along it in opposite directions.
+
+    Such a mesh has an inside. Whether its faces look outwards, as `cull` needs, is for the caller to know.
+    """
+    faces = np.asarray(faces)
+    check_faces(faces)
+    a = faces.astype(np.int64)
+    b = np.roll(a, -1, axis=1)
+    most = int(a.max(initial=0)) + 1
+    there, back = np.sort((a * most + b).reshape(-1)), np.sort((b * most + a).reshape(-1))
+    return len(a) > 0 and bool((a != b).all() and (np.diff(there) > 0).all() and (there == back).all())
 
 
 def find_window(vertices: np.ndarray, sensor: Sensor, *, margin: float = 0.0) -> Window:
@@ -142,56 +213,44 @@ def find_window(vertices: np.ndarray, sensor: Sensor, *, margin: float = 0.0) ->
 
     Paper: Eq. 3 (no margin). A body around the sensor gets the whole turn. Raises InputError.
     """
-    vertices = _points("vertices", vertices)
-    if not np.isfinite(margin):
-        raise InputError(f"margin must be a finite angle in radians, got {margin}")
+    vertices = as_points("vertices", vertices)
+    check_margin(margin)
     if not len(vertices):
         return Window(column0=0, columns=0, row0=0, rows=0)
     center, left, right, low, high = bounds(vertices)
     return sensor.window(center + left - margin, center + right + margin, low - margin, high + margin)
 
 
-def cast_ray_list(vertices: np.ndarray, faces: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def cast_ray_list(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    directions: np.ndarray,
+    *,
+    moved: np.ndarray | None = None,
+    time: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
     """The nearest hits of any rays from the origin: for scan patterns without columns, such as rosettes.
 
-    vertices (V, 3) m, faces (F, 3), directions (N, 3) of any length > 0. Returns range (N,) float32 m, inf for no
-    hit, and face (N,) int32, -1 for no hit. Faces count from both sides. Raises InputError.
+    vertices (V, 3) m at time 0, faces (F, 3), directions (N, 3) of any length > 0. moved (V, 3) m: where the vertices
+    are at time 1 (None: where they were); they move on straight lines, and a ray meets the triangles as they stand
+    at its own time (N,) in [0, 1]. Returns range (N,) float32 m, inf for no hit, and face (N,) int32, -1 for no hit.
+    Faces count from both sides. Raises InputError.
     """
-    vertices, faces = _mesh(vertices, faces)
-    directions = _points("directions", directions)
+    vertices, faces = as_mesh(vertices, faces)
+    directions = as_points("directions", directions)
     length = np.linalg.norm(directions, axis=1)
     if (length == 0).any():
         raise InputError(f"directions must be longer than 0, but number {int(np.argmin(length))} is zero")
-    return ray_list(vertices, faces, directions / length[:, None])
-
-
-def _points(name: str, values: np.ndarray) -> np.ndarray:
-    try:
-        values = np.ascontiguousarray(values, np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} must be an (n, 3) array of numbers, got {type(values).__name__}") from None
-    if values.ndim != 2 or values.shape[1] != 3:
-        raise InputError(f"{name} must be (n, 3), got {values.shape}")
-    if values.size and not (values.max() < _FARTHEST and values.min() > -_FARTHEST):
-        bad = int((~(np.abs(values) < _FARTHEST).all(1)).sum())
-        raise InputError(f"{name} must be finite and below {_FARTHEST:.0e} m, but {bad} of {len(values)} are not")
-    return values
-
-
-def _mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    vertices, faces = _points("vertices", vertices), np.asarray(faces)
-    if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
-        raise InputError(f"faces must be (F, 3) integers, got {faces.shape} {faces.dtype}")
-    if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
-        raise InputError(f"faces must index the {len(vertices)} vertices from 0, got {faces.min()} to {faces.max()}")
-    return vertices, np.ascontiguousarray(faces, np.int32)
-
-
-def _angles(name: str, values: np.ndarray) -> np.ndarray:
-    values = np.asarray(values, np.float64)
-    if values.ndim != 1 or not np.isfinite(values).all():
-        raise InputError(f"{name} must be a list of finite angles in radians, got shape {values.shape}")
-    return values
+    if time is not None:
+        time = as_times(time, len(directions))
+    if moved is None:
+        return ray_list(vertices, faces, directions / length[:, None], None, None)
+    if time is None:
+        raise InputError("moved vertices need the rays' times: pass time (N,) in [0, 1]")
+    moved = as_points("moved", moved)
+    if moved.shape != vertices.shape:
+        raise InputError(f"moved must hold the vertices once more, {vertices.shape}, got {moved.shape}")
+    return ray_list(vertices, faces, directions / length[:, None], moved - vertices, time)
 
 
 def _sectors(turned: np.ndarray) -> list[np.ndarray]:
@@ -201,7 +260,7 @@ def _sectors(turned: np.ndarray) -> list[np.ndarray]:
     ahead = np.mod(turned[order] - turned[order[0]], 2 * np.pi)
     sectors, start = [], 0
     while start < len(order):
-        stop = int(np.searchsorted(ahead, ahead[start] + _SECTOR, side="right"))
+        stop = int(np.searchsorted(ahead, ahead[start] + SECTOR, side="right"))
         sectors.append(order[start:stop])
         start = stop
     return sectors
@@ -211,33 +270,3 @@ def _ranges(inverse_x: np.ndarray, scale: np.ndarray, lift: np.ndarray) -> np.nd
     """1/x in the sectors' frames -> range (C, R) float32: x / (cos a cos e)."""
     with np.errstate(divide="ignore"):
         return (scale[:, None] * lift / inverse_x).astype(np.float32)
-
-
-def _cast(
-    vertices: np.ndarray, faces: np.ndarray, sensor: Sensor, window: Window
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """1/x (C, R) in the sectors' frames, face (C, R) and 1/cos(a) of the beams (C, 1) or (C, R)."""
-    inverse_x = np.zeros((window.columns, window.rows))
-    face = np.full((window.columns, window.rows), -1, np.int32)
-    groups = sensor.shift_groups
-    scale = np.ones((window.columns, 1 if len(groups) == 1 else window.rows))
-    per_sector = max(1, int(_SECTOR / sensor.azimuth_step))
-    for shift, rings in groups:
-        rings = rings[(rings >= window.row0) & (rings < window.row0 + window.rows)]
-        if not len(rings):
-            continue
-        table = sensor.tangents[rings]
-        rows = rings - window.row0
-        for start in range(0, window.columns, per_sector):
-            columns = np.arange(start, min(start + per_sector, window.columns))
-            middle = (columns[0] + columns[-1]) / 2
-            center = sensor.azimuth_start + (window.column0 + middle) * sensor.azimuth_step + shift
-            relative = (columns - middle) * sensor.azimuth_step
-            cosine = np.cos(relative)
-            secant = 1 / cosine[:, None]
-            if len(groups) == 1:
-                scale[columns] = secant
-            else:
-                scale[columns[:, None], rows] = secant
-            raster(vertices, faces, center, np.tan(relative), cosine, table, columns, rows, inverse_x, face)
-    return inverse_x, face, scale

@@ -1,6 +1,11 @@
 """The compiled loops of `raycast`, which explains the algorithm and the letters. No Python object crosses them: they
 run outside the interpreter's lock and may be called from many threads.
+
+Loops over vertices, faces and pairs read flat arrays by unsigned numbers: only then does the compiler know the step
+between elements, and that no index is negative, and use the processor's vectors. That halves the time.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,32 +17,51 @@ except ImportError as error:  # pragma: no cover - numba is an optional extra
     raise MissingExtra("casting rays", "synth") from error
 
 # vertices with |y/x| or |z/x| above this are not projected: beyond it float64 loses more than 14 - 2 digits
-_STEEP = 100.0
+STEEP = 100.0
 # triangles wider than this in Y are not dropped by row; narrower ones by a bound that follows from it, see `raster`
 _NARROW = 0.04
 _SAG = 1 / np.cos(_NARROW / 2) - 1
 # slack of the row bounds against rounding; crossings are good to 1e-13
-_ROUNDING = 1e-9
+ROUNDING = 1e-9
 _TABLE_BINS = 8192
 # what is less than this ahead of the sensor's axis, m, counts as behind it, and what is nearer is not hit
-_AXIS = 1e-9
+AXIS = 1e-9
 _LOW = 0xFFFFFFFF
+# of a vertex's column and rows in its key
+_BITS = 21
+_MASK = (1 << _BITS) - 1
+# pairs of triangle and column that are worked on at a time, to stay near the processor
+_BLOCK = 1024
+# far above what rounding does to a triangle's orientation
+_EDGE_ON = 1e-9
 
-_compiled = njit(nogil=True, cache=True, error_model="numpy")
+compiled = njit(nogil=True, cache=True, error_model="numpy")
 
 
-@_compiled
-def _table(values):
+class Table(NamedTuple):
     """Sorted values with an inf behind them, and their look-up table: no value before `lut[bin(t)]` reaches t.
 
     bin() is monotone in floating point, so a value in an earlier bin than t's is certainly < t. `single`: no bin
     holds two values, so one comparison finishes the search.
     """
+
+    values: np.ndarray
+    lut: np.ndarray
+    low: float
+    scale: float
+    bins: float
+    single: bool
+
+
+@compiled
+def _table(values):
     n = len(values)
     span = values[n - 1] - values[0]
     gap = span
     for i in range(n - 1):
-        gap = min(gap, values[i + 1] - values[i])
+        # rings may share an elevation
+        if values[i + 1] > values[i]:
+            gap = min(gap, values[i + 1] - values[i])
     bins = 1
     if gap > 0 and span > 0:
         bins = int(min(1.05 * span / gap + 2, _TABLE_BINS))
@@ -54,121 +78,269 @@ def _table(values):
     padded = np.empty(n + 1)
     padded[:n] = values
     padded[n] = np.inf
-    return padded, lut, scale, float(bins), single
+    return Table(padded, lut, values[0], scale, float(bins), single)
 
 
-@_compiled
-def _find(t, padded, lut, scale, bins, single):
+@compiled
+def _find(t, table):
     """The number of values below t, which may be inf."""
-    i = np.uintp(lut[np.uintp(min(max((t - padded[0]) * scale, 0.0), bins))])
-    if single:
-        return i + np.uintp(padded[i] < t)
-    while padded[i] < t:
-        i += np.uintp(1)
+    i = _find_single(t, table.values, table.lut, table.low, table.scale, table.bins)
+    if not table.single:
+        while table.values[i] < t:
+            i += np.uintp(1)
     return i
 
 
-@_compiled
-def _find_all(t, padded, lut, scale, bins, single, found):
-    """found[i] = the number of values below t[i]: `_find` without branches, for the processor's vectors."""
-    low = padded[0]
-    for i in range(len(t)):
-        first = np.uintp(lut[np.uintp(min(max((t[i] - low) * scale, 0.0), bins))])
-        found[i] = np.int32(first) + np.int32(padded[first] < t[i])
-    if not single:
-        for i in range(len(t)):
-            while padded[found[i]] < t[i]:
-                found[i] += 1
+@compiled
+def _find_single(t, values, lut, low, scale, bins):
+    """`_find` if no bin holds two values, else at most that: without branches, for the processor's vectors."""
+    i = np.uintp(lut[np.uintp(np.int32(min(max((t - low) * scale, 0.0), bins)))])
+    return i + np.uintp(values[i] < t)
 
 
-@_compiled
-def raster(vertices, faces, center, column_tan, column_cos, row_tan, column_index, row_index, inverse_x, face):
+@compiled
+def _projected(vertices, c, s, P):
+    """Fills P (V, 4) with Y, Z, I, T of vertices turned by an angle of cosine c and sine s.
+
+    Returns how many are not ahead; theirs mean nothing.
+    """
+    given, P, beside = vertices.reshape(-1), P.reshape(-1), 0
+    for i in range(len(vertices)):
+        east, north, z = given[np.uintp(3 * i)], given[np.uintp(3 * i + 1)], given[np.uintp(3 * i + 2)]
+        x = c * east + s * north
+        y = c * north - s * east
+        ahead = (x > AXIS) & (x * STEEP > abs(y)) & (x * STEEP > abs(z))
+        beside += not ahead
+        inverse = 1 / (x if ahead else 1.0)
+        right, up = y * inverse, z * inverse
+        P[np.uintp(4 * i)] = right
+        P[np.uintp(4 * i + 1)] = up
+        P[np.uintp(4 * i + 2)] = inverse
+        P[np.uintp(4 * i + 3)] = up / np.sqrt(1 + right * right)
+    return beside
+
+
+@compiled
+def _keys(P, columns, rows):
+    """(V,): column << 2 * _BITS | lower row << _BITS | upper row of vertices P (V * 4), in tables of columns and rows.
+
+    The upper row may be too high, never too low.
+    """
+    count = len(P) // 4
+    keys, bins = np.empty(count, np.int64), np.empty(2 * count, np.int32)
+    line, lut_c, low_c, scale_c, bins_c = columns.values, columns.lut, columns.low, columns.scale, columns.bins
+    row, lut_r, low_r, scale_r, bins_r = rows.values, rows.lut, rows.low, rows.scale, rows.bins
+    # an arc of a great circle of azimuth width D rises at most by 1 / cos(D / 2) over its higher end
+    for i in range(count):
+        t = P[np.uintp(4 * i + 3)]
+        down = t + min(t, 0.0) * _SAG - ROUNDING
+        bins[np.uintp(2 * i)] = np.int32(min(max((P[np.uintp(4 * i)] - low_c) * scale_c, 0.0), bins_c))
+        bins[np.uintp(2 * i + 1)] = np.int32(min(max((down - low_r) * scale_r, 0.0), bins_r))
+    last = np.uintp(len(row) - 1)
+    for i in range(count):
+        y, t = P[np.uintp(4 * i)], P[np.uintp(4 * i + 3)]
+        up, down = t + max(t, 0.0) * _SAG + ROUNDING, t + min(t, 0.0) * _SAG - ROUNDING
+        column = np.uintp(lut_c[np.uintp(bins[np.uintp(2 * i)])])
+        lower = np.uintp(lut_r[np.uintp(bins[np.uintp(2 * i + 1)])])
+        column, lower = column + np.uintp(line[column] < y), lower + np.uintp(row[lower] < down)
+        upper = lower + np.uintp(row[lower] < up)
+        upper = last if row[upper] < up else upper
+        keys[i] = np.int64(column) << 2 * _BITS | np.int64(lower) << _BITS | np.int64(upper)
+    if columns.single and rows.single:
+        return keys
+    for i in range(count):
+        t = P[4 * i + 3]
+        up, down = t + max(t, 0.0) * _SAG + ROUNDING, t + min(t, 0.0) * _SAG - ROUNDING
+        column, lower, upper = _find(P[4 * i], columns), _find(down, rows), _find(up, rows)
+        keys[i] = np.int64(column) << 2 * _BITS | np.int64(lower) << _BITS | np.int64(upper)
+    return keys
+
+
+@compiled
+def _reaching(faces, keys, columns):
+    """The faces that cross a column and may reach a row, ascending; none is left out that does."""
+    count = len(columns.values) - 1
+    widest = 0.0
+    for k in range(count - 1):
+        widest = max(widest, columns.values[k + 1] - columns.values[k])
+    # so many columns apart, or beyond the first or last, may be too wide to be dropped by row
+    narrow = min(int(_NARROW / widest) - 1, count) if widest > 0 else 0
+    corners = faces.reshape(-1)
+    crossing, n = np.empty(len(faces) + 1, np.int32), np.uintp(0)
+    for f in range(len(faces)):
+        a = keys[np.uintp(corners[np.uintp(3 * f)])]
+        b = keys[np.uintp(corners[np.uintp(3 * f + 1)])]
+        d = keys[np.uintp(corners[np.uintp(3 * f + 2)])]
+        crossing[n] = f
+        n += np.uintp((a ^ b | b ^ d) >> 2 * _BITS != 0)
+    reaching, kept = crossing, np.uintp(0)
+    for m in range(n):
+        f = 3 * np.int64(crossing[m])
+        a = keys[np.uintp(corners[np.uintp(f)])]
+        b = keys[np.uintp(corners[np.uintp(f + 1)])]
+        d = keys[np.uintp(corners[np.uintp(f + 2)])]
+        first, last = min(a, b, d) >> 2 * _BITS, max(a, b, d) >> 2 * _BITS
+        lower = min(a >> _BITS & _MASK, b >> _BITS & _MASK, d >> _BITS & _MASK)
+        upper = max(a & _MASK, b & _MASK, d & _MASK)
+        reaching[kept] = crossing[m]
+        kept += np.uintp((lower < upper) | (last - first >= narrow) | (first == 0) | (last == count))
+    return reaching[:kept]
+
+
+@compiled
+def _picked(wanted):
+    """The numbers of those wanted."""
+    picked = np.empty(len(wanted) + 1, np.int32)
+    n = np.uintp(0)
+    for i in range(len(wanted)):
+        picked[n] = i
+        n += np.uintp(wanted[i])
+    return picked[:n]
+
+
+@compiled
+def raster(vertices, faces, culled, center, column_tan, column_cos, row_tan, column_index, row_index, inverse_x, face):
     """Casts columns of tan, cos(azimuth - center), sorted, within +-46 deg, and rows of tan(elevation), sorted.
 
     Writes 1/x in the frame that looks along `center`, and the face, at [column_index, row_index] of the two grids
-    wherever a hit is nearer than what they hold.
+    wherever a hit is nearer than what they hold. culled (F,): faces of closed meshes, which may be left out where
+    they turn their backs; empty: none.
     """
-    count = len(vertices)
     c, s = np.cos(center), np.sin(center)
-    # what is read together is kept together: Y, Z, I of a vertex; its column, lower and upper row
-    P, B = np.empty((count, 4)), np.empty((count, 4), np.int32)
-    up, down, right = np.empty(count), np.empty(count), np.empty(count)
-    ahead = np.empty(count, np.bool_)
-    beside = 0
-    for i in range(count):
-        x = c * vertices[i, 0] + s * vertices[i, 1]
-        y = c * vertices[i, 1] - s * vertices[i, 0]
-        z = vertices[i, 2]
-        projected = (x > _AXIS) & (x * _STEEP > abs(y)) & (x * _STEEP > abs(z))
-        beside += not projected
-        ahead[i] = projected
-        inverse = 1 / (x if projected else 1.0)
-        right[i] = y * inverse
-        P[i, 0] = y * inverse
-        P[i, 1] = z * inverse
-        P[i, 2] = inverse
-        # an arc of a great circle of azimuth width D rises at most by 1 / cos(D / 2) over its higher end
-        t = z * inverse / np.sqrt(1 + right[i] * right[i])
-        up[i] = t + max(t, 0.0) * _SAG + _ROUNDING
-        down[i] = t + min(t, 0.0) * _SAG - _ROUNDING
-    padded_c, lut_c, scale_c, bins_c, single_c = _table(column_tan)
-    padded_r, lut_r, scale_r, bins_r, single_r = _table(row_tan)
-    _find_all(right, padded_c, lut_c, scale_c, bins_c, single_c, B[:, 0])
-    _find_all(down, padded_r, lut_r, scale_r, bins_r, single_r, B[:, 1])
-    _find_all(up, padded_r, lut_r, scale_r, bins_r, single_r, B[:, 2])
-
-    kept = np.empty(len(faces) + 1, np.int32)
-    n = np.uintp(0)
-    for f in range(len(faces)):
-        a, b, d = np.uintp(faces[f, 0]), np.uintp(faces[f, 1]), np.uintp(faces[f, 2])
-        crosses = (B[a, 0] != B[b, 0]) | (B[b, 0] != B[d, 0])
-        reaches = min(B[a, 1], B[b, 1], B[d, 1]) < max(B[a, 2], B[b, 2], B[d, 2])
-        wide = max(P[a, 0], P[b, 0], P[d, 0]) - min(P[a, 0], P[b, 0], P[d, 0]) > _NARROW
-        kept[n] = f
-        n += np.uintp(crosses & (reaches | wide))
-    for m in range(n):
-        f = kept[m]
+    # what is read together is kept together
+    P = np.empty((len(vertices), 4))
+    beside, flat = _projected(vertices, c, s, P), P.reshape(-1)
+    columns, rows = _table(column_tan), _table(row_tan)
+    keys = _keys(flat, columns, rows)
+    ahead = _ahead(vertices, c, s) if beside else np.empty(0, np.bool_)
+    kept = _reaching(faces, keys, columns)
+    if len(culled) and not (beside and _may_surround(faces, culled, ahead)):
+        kept = _front(faces, culled, flat, kept)
+    lines = np.empty(2 * len(column_tan))
+    lines[::2], lines[1::2] = column_tan, column_cos
+    pairs = np.empty(8 * (_BLOCK + len(column_tan)), np.int32)
+    n = 0
+    for f in kept:
         a, b, d = np.int64(faces[f, 0]), np.int64(faces[f, 1]), np.int64(faces[f, 2])
         if beside and not (ahead[a] and ahead[b] and ahead[d]):
             continue
-        # sorted from right to left, by keys of column and vertex
-        a, b, d = a | np.int64(B[a, 0]) << 32, b | np.int64(B[b, 0]) << 32, d | np.int64(B[d, 0]) << 32
+        # sorted from right to left, by column and vertex
+        a, b, d = a | keys[a] >> 2 * _BITS << 32, b | keys[b] >> 2 * _BITS << 32, d | keys[d] >> 2 * _BITS << 32
         first, last = min(a, b, d), max(a, b, d)
         middle = a ^ b ^ d ^ first ^ last
-        turn = np.uintp(middle >> 32)
-        a, b, d = np.uintp(first & _LOW), np.uintp(middle & _LOW), np.uintp(last & _LOW)
-        for k in range(np.uintp(first >> 32), np.uintp(last >> 32)):
-            line = column_tan[k]
-            u = (line - P[a, 0]) / (P[d, 0] - P[a, 0])
-            t0, i0 = (P[a, 1] + u * (P[d, 1] - P[a, 1])) * column_cos[k], P[a, 2] + u * (P[d, 2] - P[a, 2])
-            p, q = a if k < turn else b, b if k < turn else d
-            u = (line - P[p, 0]) / (P[q, 0] - P[p, 0])
-            t1, i1 = (P[p, 1] + u * (P[q, 1] - P[p, 1])) * column_cos[k], P[p, 2] + u * (P[q, 2] - P[p, 2])
-            end = max(t0, t1)
-            r = _find(min(t0, t1), padded_r, lut_r, scale_r, bins_r, single_r)
-            while padded_r[r] < end:
-                value = i0 + (padded_r[r] - t0) / (t1 - t0) * (i1 - i0)
-                column, row = np.uintp(column_index[k]), np.uintp(row_index[r])
-                if value > inverse_x[column, row]:
-                    inverse_x[column, row] = value
-                    face[column, row] = f
-                r += np.uintp(1)
+        turn = middle >> 32
+        a, b, d = first & _LOW, middle & _LOW, last & _LOW
+        for k in range(first >> 32, last >> 32):
+            pairs[np.uintp(n)], pairs[np.uintp(n + 1)] = a, d
+            pairs[np.uintp(n + 2)], pairs[np.uintp(n + 3)] = a if k < turn else b, b if k < turn else d
+            pairs[np.uintp(n + 4)], pairs[np.uintp(n + 5)] = k, f
+            n += 8
+        if n >= 8 * _BLOCK:
+            _fill(pairs[:n], flat, lines, rows, column_index, row_index, inverse_x, face)
+            n = 0
+    _fill(pairs[:n], flat, lines, rows, column_index, row_index, inverse_x, face)
     if beside:
         _raster_beside(
-            vertices, faces, c, s, ahead, P, B, column_tan, column_cos, padded_r,
-            lut_r, scale_r, bins_r, single_r, column_index, row_index, inverse_x, face,
+            vertices, faces, c, s, ahead, P, keys, column_tan, column_cos, rows, column_index, row_index,
+            inverse_x, face,
         )  # fmt: skip
 
 
-@_compiled
+@compiled
+def _fill(pairs, P, lines, rows, column_index, row_index, inverse_x, face):
+    """Casts the beams between the crossings of triangles with columns.
+
+    pairs (n * 8): of each, the ends of either edge that crosses the column, a, d and p, q, the column and the face;
+    P (V * 4); lines (C * 2): tan and cos of the columns.
+    """
+    count = len(pairs) // 8
+    ends, start = np.empty(4 * count), np.empty(count, np.int32)
+    for m in range(count):
+        a, d = 4 * np.int64(pairs[np.uintp(8 * m)]), 4 * np.int64(pairs[np.uintp(8 * m + 1)])
+        p, q = 4 * np.int64(pairs[np.uintp(8 * m + 2)]), 4 * np.int64(pairs[np.uintp(8 * m + 3)])
+        k = 2 * np.int64(pairs[np.uintp(8 * m + 4)])
+        line, cosine = lines[np.uintp(k)], lines[np.uintp(k + 1)]
+        ay, az, ai = P[np.uintp(a)], P[np.uintp(a + 1)], P[np.uintp(a + 2)]
+        py, pz, pi = P[np.uintp(p)], P[np.uintp(p + 1)], P[np.uintp(p + 2)]
+        u = (line - ay) / (P[np.uintp(d)] - ay)
+        ends[np.uintp(4 * m)] = (az + u * (P[np.uintp(d + 1)] - az)) * cosine
+        ends[np.uintp(4 * m + 1)] = ai + u * (P[np.uintp(d + 2)] - ai)
+        u = (line - py) / (P[np.uintp(q)] - py)
+        ends[np.uintp(4 * m + 2)] = (pz + u * (P[np.uintp(q + 1)] - pz)) * cosine
+        ends[np.uintp(4 * m + 3)] = pi + u * (P[np.uintp(q + 2)] - pi)
+    values, lut, low, scale, bins = rows.values, rows.lut, rows.low, rows.scale, rows.bins
+    for m in range(count):
+        lower = min(ends[np.uintp(4 * m)], ends[np.uintp(4 * m + 2)])
+        start[m] = np.int32(_find_single(lower, values, lut, low, scale, bins))
+    if not rows.single:
+        for m in range(count):
+            start[m] = np.int32(_find(min(ends[4 * m], ends[4 * m + 2]), rows))
+    met = np.empty(count, np.bool_)
+    for m in range(count):
+        met[m] = values[np.uintp(start[m])] < max(ends[np.uintp(4 * m)], ends[np.uintp(4 * m + 2)])
+    for m in _picked(met):
+        t0, i0, t1, i1 = ends[4 * m], ends[4 * m + 1], ends[4 * m + 2], ends[4 * m + 3]
+        end, column = max(t0, t1), np.uintp(column_index[pairs[8 * m + 4]])
+        r = np.uintp(start[m])
+        while values[r] < end:
+            value = i0 + (values[r] - t0) / (t1 - t0) * (i1 - i0)
+            row = np.uintp(row_index[r])
+            if value > inverse_x[column, row]:
+                inverse_x[column, row] = value
+                face[column, row] = pairs[8 * m + 5]
+            r += np.uintp(1)
+
+
+@compiled
+def _ahead(vertices, c, s):
+    """(V,) bool: which vertices are projected by `_projected`."""
+    ahead = np.empty(len(vertices), np.bool_)
+    for i in range(len(vertices)):
+        x = c * vertices[i, 0] + s * vertices[i, 1]
+        y = c * vertices[i, 1] - s * vertices[i, 0]
+        ahead[i] = (x > AXIS) & (x * STEEP > abs(y)) & (x * STEEP > abs(vertices[i, 2]))
+    return ahead
+
+
+@compiled
+def _may_surround(faces, culled, ahead):
+    """Whether a closed mesh may hold the sensor: one that does has vertices behind any plane through it."""
+    for f in range(len(faces)):
+        if culled[f] and not (ahead[faces[f, 0]] and ahead[faces[f, 1]] and ahead[faces[f, 2]]):
+            return True
+    return False
+
+
+@compiled
+def _front(faces, culled, P, kept):
+    """Those of `kept` that are not culled, or not for certain seen from behind. P (V * 4)."""
+    front, corners = np.empty(len(kept), np.bool_), faces.reshape(-1)
+    for m in range(len(kept)):
+        f = 3 * np.int64(kept[m])
+        a, b = 4 * np.int64(corners[np.uintp(f)]), 4 * np.int64(corners[np.uintp(f + 1)])
+        d = 4 * np.int64(corners[np.uintp(f + 2)])
+        y, z = P[np.uintp(a)], P[np.uintp(a + 1)]
+        # counter-clockwise in Y to the left, Z up, is clockwise as the sensor sees it; edge-on ones stay
+        one = (P[np.uintp(b)] - y) * (P[np.uintp(d + 1)] - z)
+        other = (P[np.uintp(d)] - y) * (P[np.uintp(b + 1)] - z)
+        front[m] = one - other <= _EDGE_ON * (abs(one) + abs(other))
+    for m in range(len(kept)):
+        front[m] |= not culled[kept[m]]
+    picked = _picked(front)
+    for m in range(len(picked)):
+        picked[m] = kept[picked[m]]
+    return picked
+
+
+@compiled
 def _raster_beside(
-    vertices, faces, c, s, ahead, P, B, column_tan, column_cos, row_tan,
-    lut_r, scale_r, bins_r, single_r, column_index, row_index, inverse_x, face,
+    vertices, faces, c, s, ahead, P, keys, column_tan, column_cos, table, column_index, row_index, inverse_x, face
 ):  # fmt: skip
     """The part of `raster` for triangles with a vertex that is not `ahead`: slower, right for any triangle.
 
     Crossings of edges between vertices ahead are computed as in `raster`, so the two fit without holes.
     """
+    row_tan = table.values
     columns, rows = len(column_tan), len(row_tan) - 1
     x, y, z = np.empty(3), np.empty(3), np.empty(3)
     left = np.empty(3, np.bool_)
@@ -182,8 +354,8 @@ def _raster_beside(
             x[j] = c * vertices[i, 0] + s * vertices[i, 1]
             y[j] = c * vertices[i, 1] - s * vertices[i, 0]
             z[j] = vertices[i, 2]
-            first += (B[i, 0] > 0) if ahead[i] else (y[j] - column_tan[0] * x[j] > 0)
-            last += (B[i, 0] > columns - 1) if ahead[i] else (y[j] - column_tan[columns - 1] * x[j] > 0)
+            first += ((keys[i] >> 2 * _BITS) > 0) if ahead[i] else (y[j] - column_tan[0] * x[j] > 0)
+            last += ((keys[i] >> 2 * _BITS) > columns - 1) if ahead[i] else (y[j] - column_tan[columns - 1] * x[j] > 0)
         # a vertex's side changes at most once over the columns
         if first == last and (first == 0 or first == 3) or max(x[0], x[1], x[2]) <= 0:
             continue
@@ -191,7 +363,7 @@ def _raster_beside(
             total = 0
             for j in range(3):
                 i = faces[f, j]
-                left[j] = (k < B[i, 0]) if ahead[i] else (y[j] - column_tan[k] * x[j] > 0)
+                left[j] = (k < (keys[i] >> 2 * _BITS)) if ahead[i] else (y[j] - column_tan[k] * x[j] > 0)
                 total += left[j]
             if total == 0 or total == 3:
                 continue
@@ -218,15 +390,15 @@ def _raster_beside(
                     u = before / (before - after)
                     end_x[e] = x[p] + u * (x[q] - x[p])
                     end_z[e] = z[p] + u * (z[q] - z[p])
-                    if end_x[e] > _AXIS:
+                    if end_x[e] > AXIS:
                         end_i[e] = 1 / end_x[e]
                         end_t[e] = end_z[e] * end_i[e] * column_cos[k]
-            if end_x[0] <= _AXIS and end_x[1] <= _AXIS:
+            if end_x[0] <= AXIS and end_x[1] <= AXIS:
                 continue
-            near, far = (0, 1) if end_x[0] > _AXIS else (1, 0)
-            r = np.int64(_find(end_t[near], row_tan, lut_r, scale_r, bins_r, single_r))
-            if end_x[far] > _AXIS:
-                stop = np.int64(_find(end_t[far], row_tan, lut_r, scale_r, bins_r, single_r))
+            near, far = (0, 1) if end_x[0] > AXIS else (1, 0)
+            r = np.int64(_find(end_t[near], table))
+            if end_x[far] > AXIS:
+                stop = np.int64(_find(end_t[far], table))
                 if stop < r:
                     r, stop = stop, r
                 while r < stop:
@@ -248,165 +420,7 @@ def _raster_beside(
             area = end_x[near] * end_z[far] - end_x[far] * end_z[near]
             while r < stop:
                 value = (dz - row_tan[r] / column_cos[k] * dx) / area
-                if value > inverse_x[column_index[k], row_index[r]] and value * _AXIS < 1 + abs(row_tan[r]):
+                if value > inverse_x[column_index[k], row_index[r]] and value * AXIS < 1 + abs(row_tan[r]):
                     inverse_x[column_index[k], row_index[r]] = value
                     face[column_index[k], row_index[r]] = f
                 r += 1
-
-
-# without NaN in them, minima and maxima may be taken in any order
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"nnan", "nsz"})
-def bounds(vertices):
-    """Mean azimuth, and the vertices' least and greatest azimuth relative to it and elevation, rad."""
-    east = north = 0.0
-    for i in range(len(vertices)):
-        east += vertices[i, 0]
-        north += vertices[i, 1]
-    center = np.arctan2(north, east)
-    c, s = np.cos(center), np.sin(center)
-    left, right, low, high, ahead = np.inf, -np.inf, np.inf, -np.inf, np.inf
-    for i in range(len(vertices)):
-        x = c * vertices[i, 0] + s * vertices[i, 1]
-        y = c * vertices[i, 1] - s * vertices[i, 0]
-        ahead = min(ahead, x * _STEEP - abs(y), x - _AXIS)
-        inverse = 1 / (x if x > _AXIS else 1.0)
-        # squared, with its sign
-        slope = vertices[i, 2] * abs(vertices[i, 2]) / (x * x + y * y if x > _AXIS else 1.0)
-        left, right = min(left, y * inverse), max(right, y * inverse)
-        low, high = min(low, slope), max(high, slope)
-    if ahead > 0:
-        low, high = np.sign(low) * np.sqrt(abs(low)), np.sign(high) * np.sqrt(abs(high))
-        return center, np.arctan(left), np.arctan(right), np.arctan(low), np.arctan(high)
-    left, right, low, high = np.inf, -np.inf, np.inf, -np.inf
-    for i in range(len(vertices)):
-        x = c * vertices[i, 0] + s * vertices[i, 1]
-        y = c * vertices[i, 1] - s * vertices[i, 0]
-        azimuth = np.arctan2(y, x)
-        elevation = np.arctan2(vertices[i, 2], np.sqrt(x * x + y * y))
-        left, right = min(left, azimuth), max(right, azimuth)
-        low, high = min(low, elevation), max(high, elevation)
-    if right - left >= np.pi:
-        # around the sensor: between vertices, faces may reach over the zenith and behind
-        return center, -np.pi, np.pi, -np.pi / 2, np.pi / 2
-    return center, left, right, low, high
-
-
-@_compiled
-def collect(inverse_x, face, scale, first, step, shift, row_tan, range_min, range_max):
-    """The hits of a window, packed: points (n, 3), face, column and row (n,)."""
-    columns, rows = inverse_x.shape
-    n = 0
-    for k in range(columns):
-        for r in range(rows):
-            n += inverse_x[k, r] > 0
-    points = np.empty((n, 3), np.float32)
-    hit, column, row = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int32)
-    lift = np.sqrt(1 + row_tan * row_tan)
-    per_ring = scale.shape[1] > 1
-    n = 0
-    for k in range(columns):
-        azimuth = first + k * step + (0.0 if per_ring else shift[0])
-        c, s = np.cos(azimuth), np.sin(azimuth)
-        for r in range(rows):
-            if inverse_x[k, r] <= 0:
-                continue
-            if per_ring:
-                c, s = np.cos(azimuth + shift[r]), np.sin(azimuth + shift[r])
-            horizontal = scale[k, r if per_ring else 0] / inverse_x[k, r]
-            distance = horizontal * lift[r]
-            if distance < range_min or distance > range_max:
-                continue
-            points[n, 0] = horizontal * c
-            points[n, 1] = horizontal * s
-            points[n, 2] = horizontal * row_tan[r]
-            hit[n] = face[k, r]
-            column[n] = k
-            row[n] = r
-            n += 1
-    return points[:n], hit[:n], column[:n], row[:n]
-
-
-@_compiled
-def ray_list(vertices, faces, directions):
-    """Range (N,) float32 and face (N,) of unit directions (N, 3): rays are binned on the six sides of a cube."""
-    count = len(directions)
-    best = np.full(count, np.inf)
-    face = np.full(count, -1, np.int32)
-    cube = np.empty(count, np.int8)
-    for i in range(count):
-        axis = 0
-        for j in range(1, 3):
-            if abs(directions[i, j]) > abs(directions[i, axis]):
-                axis = j
-        cube[i] = 2 * axis + (directions[i, axis] < 0)
-    u, v, cell = np.empty(count), np.empty(count), np.empty(count, np.int64)
-    w, p, q = np.empty(3), np.empty(3), np.empty(3)
-    for side in range(6):
-        axis, sign = side // 2, 1.0 - 2.0 * (side % 2)
-        across, along = (axis + 1) % 3, (axis + 2) % 3
-        n = 0
-        u0, u1, v0, v1 = np.inf, -np.inf, np.inf, -np.inf
-        for i in range(count):
-            if cube[i] == side:
-                u[i] = directions[i, across] / (sign * directions[i, axis])
-                v[i] = directions[i, along] / (sign * directions[i, axis])
-                u0, u1, v0, v1 = min(u0, u[i]), max(u1, u[i]), min(v0, v[i]), max(v1, v[i])
-                n += 1
-        if n == 0:
-            continue
-        grid = int(min(max(np.sqrt(n / 2.0), 1.0), 256.0))
-        scale_u, scale_v = grid / max(u1 - u0, 1e-9), grid / max(v1 - v0, 1e-9)
-        start = np.zeros(grid * grid + 1, np.int64)
-        for i in range(count):
-            if cube[i] == side:
-                a, b = min(int((u[i] - u0) * scale_u), grid - 1), min(int((v[i] - v0) * scale_v), grid - 1)
-                cell[i] = a * grid + b
-                start[cell[i] + 1] += 1
-        for b in range(grid * grid):
-            start[b + 1] += start[b]
-        order, filled = np.empty(n, np.int64), start.copy()
-        for i in range(count):
-            if cube[i] == side:
-                order[filled[cell[i]]] = i
-                filled[cell[i]] += 1
-        for f in range(len(faces)):
-            ahead = True
-            low_u, high_u, low_v, high_v = np.inf, -np.inf, np.inf, -np.inf
-            for j in range(3):
-                i = faces[f, j]
-                w[j] = sign * vertices[i, axis]
-                p[j], q[j] = vertices[i, across], vertices[i, along]
-                ahead &= (w[j] > _AXIS) & (w[j] * _STEEP > abs(p[j])) & (w[j] * _STEEP > abs(q[j]))
-                inverse = 1 / (w[j] if w[j] > _AXIS else 1.0)
-                low_u, high_u = min(low_u, p[j] * inverse), max(high_u, p[j] * inverse)
-                low_v, high_v = min(low_v, q[j] * inverse), max(high_v, q[j] * inverse)
-            if max(w[0], w[1], w[2]) <= 0:
-                continue
-            if not ahead:
-                low_u, high_u, low_v, high_v = u0, u1, v0, v1
-            low_u, high_u, low_v, high_v = low_u - _ROUNDING, high_u + _ROUNDING, low_v - _ROUNDING, high_v + _ROUNDING
-            if high_u < u0 or low_u > u1 or high_v < v0 or low_v > v1:
-                continue
-            a0 = int(min(max((low_u - u0) * scale_u, 0.0), grid - 1.0))
-            a1 = int(min(max((high_u - u0) * scale_u, 0.0), grid - 1.0))
-            b0 = int(min(max((low_v - v0) * scale_v, 0.0), grid - 1.0))
-            b1 = int(min(max((high_v - v0) * scale_v, 0.0), grid - 1.0))
-            for a in range(a0, a1 + 1):
-                for m in range(start[a * grid + b0], start[a * grid + b1 + 1]):
-                    i = order[m]
-                    # the corners as seen along the ray (Woop, Benthin and Wald 2013): equal for all triangles of a
-                    # corner, and an edge's function changes just its sign when the edge is turned, so no ray slips
-                    # between triangles
-                    x0, x1, x2 = p[0] - u[i] * w[0], p[1] - u[i] * w[1], p[2] - u[i] * w[2]
-                    y0, y1, y2 = q[0] - v[i] * w[0], q[1] - v[i] * w[1], q[2] - v[i] * w[2]
-                    e0, e1, e2 = x2 * y1 - y2 * x1, x0 * y2 - y0 * x2, x1 * y0 - y1 * x0
-                    if (e0 >= 0 and e1 >= 0 and e2 >= 0) or (e0 <= 0 and e1 <= 0 and e2 <= 0):
-                        total = e0 + e1 + e2
-                        if total != 0:
-                            depth = (e0 * w[0] + e1 * w[1] + e2 * w[2]) / total
-                            if _AXIS < depth < best[i]:
-                                best[i] = depth
-                                face[i] = f
-    for i in range(count):
-        best[i] /= abs(directions[i, cube[i] // 2])
-    return best.astype(np.float32), face

@@ -18,19 +18,30 @@ def cast_rays_reference(
 
 
 def cast_ray_list_reference(
-    vertices: np.ndarray, faces: np.ndarray, directions: np.ndarray
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    directions: np.ndarray,
+    *,
+    moved: np.ndarray | None = None,
+    time: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """As `raycast.cast_ray_list`: range (N,) float32 m and face (N,) int32 of rays along directions (N, 3)."""
-    a, b, c = np.moveaxis(np.asarray(vertices, float)[np.asarray(faces)], 1, 0)
+    corners = np.asarray(vertices, float)[np.asarray(faces)]
     directions = np.asarray(directions, float)
     directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     distance = np.full(len(directions), np.inf, np.float32)
     face = np.full(len(directions), -1, np.int32)
-    if not len(a):
+    if not len(corners):
         return distance, face
-    along, up = b - a, c - a
     for start in range(0, len(directions), _RAYS_AT_ONCE):
-        d = directions[start : start + _RAYS_AT_ONCE, None]
+        rays = slice(start, start + _RAYS_AT_ONCE)
+        d = directions[rays, None]
+        at_time = corners[None]
+        if moved is not None:
+            later = np.asarray(moved, float)[np.asarray(faces)]
+            at_time = corners + np.asarray(time, float)[rays, None, None, None] * (later - corners)
+        a, b, c = np.moveaxis(at_time, 2, 0)
+        along, up = b - a, c - a
         across = np.cross(d, up)
         volume = (across * along).sum(-1)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -41,7 +52,23 @@ def cast_ray_list_reference(
             hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (volume != 0)
         t = np.where(hit, t, np.inf)
         nearest = t.argmin(1)
-        rays = slice(start, start + _RAYS_AT_ONCE)
         distance[rays] = t[np.arange(len(t)), nearest]
         face[rays] = np.where(np.isfinite(distance[rays]), nearest, -1)
     return distance, face
+
+
+def merge_echoes_reference(
+    distance: np.ndarray, face: np.ndarray, weights: np.ndarray, *, pulse: float, range_max: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """As `divergence` merges the sub-beams (N, K) of beams: range (N,) float32 m and face (N,) int32."""
+    merged, merged_face = np.full(len(distance), np.inf, np.float32), np.full(len(distance), -1, np.int32)
+    for i, one in enumerate(distance):
+        met = np.flatnonzero(np.isfinite(one))
+        met = met[np.argsort(one[met], kind="stable")]
+        echoes = np.split(met, np.flatnonzero(np.diff(one[met]) > pulse) + 1)
+        power = [(weights[echo] / one[echo] ** 2).sum() for echo in echoes]
+        if max(power) * range_max**2 >= 1:
+            echo = echoes[int(np.argmax(power))]
+            merged[i] = np.average(one[echo], weights=weights[echo] / one[echo] ** 2)
+            merged_face[i] = face[i, echo[0]]
+    return merged, merged_face

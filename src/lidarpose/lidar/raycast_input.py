@@ -1,0 +1,110 @@
+"""What the casters accept: checks of their arguments, each with an InputError that says what is wrong."""
+
+import numpy as np
+
+from lidarpose.errors import InputError
+
+# beyond any scene, m, and its powers are still finite
+FARTHEST = 1e9
+_NO_FACES = np.zeros(0, bool)
+_NO_FACES.setflags(write=False)
+
+
+def as_points(name: str, values: np.ndarray) -> np.ndarray:
+    """(n, 3) float64, C-contiguous, finite."""
+    try:
+        values = np.ascontiguousarray(values, np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must be an (n, 3) array of numbers, got {type(values).__name__}") from None
+    if values.ndim != 2 or values.shape[1] != 3:
+        raise InputError(f"{name} must be (n, 3), got {values.shape}")
+    if values.size and not (values.max() < FARTHEST and values.min() > -FARTHEST):
+        bad = int((~(np.abs(values) < FARTHEST).all(1)).sum())
+        raise InputError(f"{name} must be finite and below {FARTHEST:.0e} m, but {bad} of {len(values)} are not")
+    return values
+
+
+def as_vertices(name: str, values: np.ndarray) -> np.ndarray:
+    """(n, 3) float32 or float64, C-contiguous, read-only; the values are not looked at."""
+    if not isinstance(values, np.ndarray) or values.dtype not in (np.float32, np.float64) or values.ndim != 2:
+        values = as_points(name, values)
+    elif values.shape[1] != 3:
+        raise InputError(f"{name} must be (n, 3), got {values.shape}")
+    return read_only(values)
+
+
+def as_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """vertices (V, 3) float64 and faces (F, 3) int32 that index them, C-contiguous, read-only."""
+    vertices = as_points("vertices", vertices)
+    faces = as_faces(faces, len(vertices))
+    if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
+        raise _out_of_range(faces, len(vertices))
+    return read_only(vertices), faces
+
+
+def as_faces(faces: np.ndarray, count: int) -> np.ndarray:
+    """faces (F, 3) as int32, C-contiguous, read-only. Those that were int32 are not looked at."""
+    faces = np.asarray(faces)
+    check_faces(faces)
+    if faces.dtype != np.int32:
+        if faces.size and (faces.min() < 0 or faces.max() >= count):
+            raise _out_of_range(faces, count)
+        faces = faces.astype(np.int32)
+    return read_only(faces)
+
+
+def check_faces(faces: np.ndarray) -> None:
+    """faces are (F, 3) integers."""
+    if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
+        raise InputError(f"faces must be (F, 3) integers, got {faces.shape} {faces.dtype}")
+
+
+def _out_of_range(faces: np.ndarray, count: int) -> InputError:
+    return InputError(f"faces must index the {count} vertices from 0, got {faces.min()} to {faces.max()}")
+
+
+def as_culled(cull: bool | np.ndarray | None, faces: np.ndarray) -> np.ndarray:
+    """(F,) bool, empty for none, read-only."""
+    if cull is None or cull is False:
+        return _NO_FACES
+    cull = np.asarray(cull)
+    if cull.ndim == 0 and cull.dtype == bool:
+        return read_only(np.full(len(faces), cull))
+    if cull.shape != (len(faces),) or cull.dtype != bool:
+        raise InputError(f"cull must be True, False or ({len(faces)},) bool, one a face, got {cull.shape} {cull.dtype}")
+    return read_only(cull)
+
+
+def read_only(values: np.ndarray) -> np.ndarray:
+    """The values, C-contiguous, in a form of which compiled code needs to know but one."""
+    values = np.ascontiguousarray(values).view()
+    values.flags.writeable = False
+    return values
+
+
+def check_margin(margin: float) -> None:
+    """margin rad is a finite angle."""
+    if not np.isfinite(margin):
+        raise InputError(f"margin must be a finite angle in radians, got {margin}")
+
+
+def as_times(time: np.ndarray, count: int) -> np.ndarray:
+    """(count,) float64 in [0, 1]."""
+    try:
+        time = np.ascontiguousarray(time, np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"time must be ({count},) numbers, one a ray, got {type(time).__name__}") from None
+    if time.shape != (count,):
+        raise InputError(f"time must be ({count},), one a ray, got {time.shape}")
+    if not ((time >= 0) & (time <= 1)).all():
+        bad = np.flatnonzero(~((time >= 0) & (time <= 1)))[0]
+        raise InputError(f"time must be within 0 and 1, the ends of the motion, got {time[bad]} for ray {bad}")
+    return time
+
+
+def as_angles(name: str, values: np.ndarray) -> np.ndarray:
+    """(n,) float64, finite."""
+    values = np.asarray(values, np.float64)
+    if values.ndim != 1 or not np.isfinite(values).all():
+        raise InputError(f"{name} must be a list of finite angles in radians, got shape {values.shape}")
+    return values

@@ -1,0 +1,113 @@
+"""The compiled loop of `raycast.cast_ray_list`: any rays from the origin, against triangles that may move."""
+
+import numpy as np
+
+from lidarpose.lidar.raycast_kernels import AXIS, ROUNDING, STEEP, compiled
+
+# about two rays a cell, and no more cells than this along a side
+_MOST_CELLS = 256.0
+
+
+@compiled
+def ray_list(vertices, faces, directions, shift, time):
+    """Range (N,) float32 and face (N,) of unit directions (N, 3): rays are binned on the six sides of a cube.
+
+    shift (V, 3): how far the vertices move from time 0 to 1, time (N,) of the rays; both None if nothing moves.
+    """
+    count = len(directions)
+    best = np.full(count, np.inf)
+    face = np.full(count, -1, np.int32)
+    cube = np.empty(count, np.int8)
+    for i in range(count):
+        axis = 0
+        for j in range(1, 3):
+            if abs(directions[i, j]) > abs(directions[i, axis]):
+                axis = j
+        cube[i] = 2 * axis + (directions[i, axis] < 0)
+    u, v, cell = np.empty(count), np.empty(count), np.empty(count, np.int64)
+    w, p, q = np.empty(3), np.empty(3), np.empty(3)
+    dw, dp, dq = np.zeros(3), np.zeros(3), np.zeros(3)
+    for side in range(6):
+        axis, sign = side // 2, 1.0 - 2.0 * (side % 2)
+        across, along = (axis + 1) % 3, (axis + 2) % 3
+        n = 0
+        u0, u1, v0, v1 = np.inf, -np.inf, np.inf, -np.inf
+        for i in range(count):
+            if cube[i] == side:
+                u[i] = directions[i, across] / (sign * directions[i, axis])
+                v[i] = directions[i, along] / (sign * directions[i, axis])
+                u0, u1, v0, v1 = min(u0, u[i]), max(u1, u[i]), min(v0, v[i]), max(v1, v[i])
+                n += 1
+        if n == 0:
+            continue
+        grid = int(min(max(np.sqrt(n / 2.0), 1.0), _MOST_CELLS))
+        scale_u, scale_v = grid / max(u1 - u0, 1e-9), grid / max(v1 - v0, 1e-9)
+        start = np.zeros(grid * grid + 1, np.int64)
+        for i in range(count):
+            if cube[i] == side:
+                a, b = min(int((u[i] - u0) * scale_u), grid - 1), min(int((v[i] - v0) * scale_v), grid - 1)
+                cell[i] = a * grid + b
+                start[cell[i] + 1] += 1
+        for b in range(grid * grid):
+            start[b + 1] += start[b]
+        order, filled = np.empty(n, np.int64), start.copy()
+        for i in range(count):
+            if cube[i] == side:
+                order[filled[cell[i]]] = i
+                filled[cell[i]] += 1
+        for f in range(len(faces)):
+            ahead, front = True, -np.inf
+            low_u, high_u, low_v, high_v = np.inf, -np.inf, np.inf, -np.inf
+            for j in range(3):
+                i = faces[f, j]
+                w[j] = sign * vertices[i, axis]
+                p[j], q[j] = vertices[i, across], vertices[i, along]
+                if shift is not None:
+                    dw[j] = sign * shift[i, axis]
+                    dp[j], dq[j] = shift[i, across], shift[i, along]
+                # what moves along a line that is all ahead moves along a line on the cube's side: its ends bound it
+                for end in range(1 if shift is None else 2):
+                    w_end, p_end, q_end = w[j] + end * dw[j], p[j] + end * dp[j], q[j] + end * dq[j]
+                    front = max(front, w_end)
+                    ahead &= (w_end > AXIS) & (w_end * STEEP > abs(p_end)) & (w_end * STEEP > abs(q_end))
+                    inverse = 1 / (w_end if w_end > AXIS else 1.0)
+                    low_u, high_u = min(low_u, p_end * inverse), max(high_u, p_end * inverse)
+                    low_v, high_v = min(low_v, q_end * inverse), max(high_v, q_end * inverse)
+            if front <= 0:
+                continue
+            if not ahead:
+                low_u, high_u, low_v, high_v = u0, u1, v0, v1
+            low_u, high_u, low_v, high_v = low_u - ROUNDING, high_u + ROUNDING, low_v - ROUNDING, high_v + ROUNDING
+            if high_u < u0 or low_u > u1 or high_v < v0 or low_v > v1:
+                continue
+            a0 = int(min(max((low_u - u0) * scale_u, 0.0), grid - 1.0))
+            a1 = int(min(max((high_u - u0) * scale_u, 0.0), grid - 1.0))
+            b0 = int(min(max((low_v - v0) * scale_v, 0.0), grid - 1.0))
+            b1 = int(min(max((high_v - v0) * scale_v, 0.0), grid - 1.0))
+            w0, w1, w2 = w[0], w[1], w[2]
+            p0, p1, p2 = p[0], p[1], p[2]
+            q0, q1, q2 = q[0], q[1], q[2]
+            for a in range(a0, a1 + 1):
+                for m in range(start[a * grid + b0], start[a * grid + b1 + 1]):
+                    i = order[m]
+                    if shift is not None:
+                        t = time[i]
+                        w0, w1, w2 = w[0] + t * dw[0], w[1] + t * dw[1], w[2] + t * dw[2]
+                        p0, p1, p2 = p[0] + t * dp[0], p[1] + t * dp[1], p[2] + t * dp[2]
+                        q0, q1, q2 = q[0] + t * dq[0], q[1] + t * dq[1], q[2] + t * dq[2]
+                    # the corners as seen along the ray (Woop, Benthin and Wald 2013): equal for all triangles of a
+                    # corner, and an edge's function changes just its sign when the edge is turned, so no ray slips
+                    # between triangles
+                    x0, x1, x2 = p0 - u[i] * w0, p1 - u[i] * w1, p2 - u[i] * w2
+                    y0, y1, y2 = q0 - v[i] * w0, q1 - v[i] * w1, q2 - v[i] * w2
+                    e0, e1, e2 = x2 * y1 - y2 * x1, x0 * y2 - y0 * x2, x1 * y0 - y1 * x0
+                    if (e0 >= 0 and e1 >= 0 and e2 >= 0) or (e0 <= 0 and e1 <= 0 and e2 <= 0):
+                        total = e0 + e1 + e2
+                        if total != 0:
+                            depth = (e0 * w0 + e1 * w1 + e2 * w2) / total
+                            if AXIS < depth < best[i]:
+                                best[i] = depth
+                                face[i] = f
+    for i in range(count):
+        best[i] /= abs(directions[i, cube[i] // 2])
+    return best.astype(np.float32), face

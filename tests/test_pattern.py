@@ -1,0 +1,156 @@
+"""Rosettes and depth cameras: what they send, and what of it comes back from a body that moves."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpose.errors import InputError
+from lidarpose.lidar.pattern import PATTERNS, RayPattern
+from lidarpose.lidar.pattern_scan import scan_pattern
+from lidarpose.lidar.raycast_reference import cast_ray_list_reference
+from lidarpose.lidar.sensor import sensor
+from lidarpose.synth.mesh import box
+
+BY_NAME = {p.name: p for p in PATTERNS}
+
+
+@pytest.mark.parametrize("name", BY_NAME)
+def test_rays_are_sorted_unit_and_inside_the_field_of_view(name):
+    pattern = BY_NAME[name]
+    for number in (0, pattern.frames - 1):
+        rays = pattern.frame(number)
+        np.testing.assert_allclose(np.linalg.norm(rays.directions, axis=1), 1, atol=1e-12)
+        assert (np.diff(rays.azimuth) >= 0).all()
+        assert rays.time.min() >= 0 and rays.time.max() <= 1
+        # the beams' own angular precision is 0.15 deg
+        slack = np.radians(0.2)
+        assert rays.azimuth.min() >= pattern.azimuths[0] - slack and rays.azimuth.max() <= pattern.azimuths[1] + slack
+        assert rays.elevation.min() >= pattern.elevations[0] - slack
+        assert rays.elevation.max() <= pattern.elevations[1] + slack
+        # the field of view is filled to its edges
+        assert np.ptp(rays.elevation) > 0.95 * (pattern.elevations[1] - pattern.elevations[0])
+        assert np.ptp(rays.azimuth) > 0.95 * (pattern.azimuths[1] - pattern.azimuths[0])
+        np.testing.assert_allclose(np.arctan2(rays.directions[:, 1], rays.directions[:, 0]), rays.azimuth, atol=1e-12)
+        np.testing.assert_allclose(np.arcsin(rays.directions[:, 2]), rays.elevation, atol=1e-9)
+        with pytest.raises(ValueError, match="read-only"):
+            rays.directions[0] = 0
+
+
+@pytest.mark.parametrize(
+    ("name", "rate"),
+    [("livox-mid40", 100e3), ("livox-mid100", 300e3), ("livox-avia", 240e3), ("livox-mid360", 200e3)],
+)
+def test_rosettes_send_what_their_makers_say_and_never_twice_alike(name, rate):
+    pattern = BY_NAME[name]
+    first, second = pattern.frame(0), pattern.frame(1)
+    assert len(first.azimuth) == rate * pattern.duration
+    assert pattern.frame(pattern.frames) is pattern.frame(0)
+    # most rays of the second frame are farther than a tenth of a degree from all of the first
+    sample = second.directions[:: len(second.directions) // 300]
+    nearest = np.arccos(np.clip(sample @ first.directions.T, -1, 1).max(1))
+    assert np.mean(nearest > np.radians(0.1)) > 0.3
+    # and the frames together fill what one leaves open
+    edges = [np.linspace(*pattern.azimuths, 25), np.linspace(*pattern.elevations, 25)]
+    filled = []
+    for frames in (1, pattern.frames):
+        rays = [pattern.frame(k) for k in range(frames)]
+        azimuth = np.concatenate([r.azimuth for r in rays])
+        elevation = np.concatenate([r.elevation for r in rays])
+        filled.append((np.histogram2d(azimuth, elevation, edges)[0] > 0).mean())
+    assert filled[1] >= filled[0] and filled[1] > 0.7
+
+
+def test_a_rosette_is_densest_in_its_middle():
+    rays = BY_NAME["livox-mid40"].frame(2)
+    off = np.degrees(np.arccos(rays.directions[:, 0]))
+    inner, outer = ((off < 5).sum() / 5**2, ((off > 10) & (off < 15)).sum() / (15**2 - 10**2))
+    assert inner > 1.5 * outer
+
+
+def brute(vertices, faces, pattern, frame, moved, steps=None):
+    """All rays of the frame against the triangles as each ray finds them."""
+    rays = pattern.frame(frame)
+    distance = np.full(len(rays.time), np.inf)
+    for t in np.unique(rays.time):
+        at = np.flatnonzero(rays.time == t)
+        there = vertices + t * (moved - vertices)
+        distance[at] = cast_ray_list_reference(there, faces, rays.directions[at])[0]
+    return distance
+
+
+def small(name, count):
+    """A pattern with every so manyth ray: brute force is slow."""
+    whole = BY_NAME[name]
+
+    def rays(number):
+        azimuth, elevation, time, line = whole.rays(number)
+        keep = slice(None, None, max(1, len(azimuth) // count))
+        # few times, so that the twin casts few scenes
+        return azimuth[keep], elevation[keep], np.round(time[keep] * 8) / 8, line[keep]
+
+    return RayPattern(
+        name=name, rays=rays, frames=2, duration=0.1, azimuths=whole.azimuths, elevations=whole.elevations
+    )
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.sampled_from(["livox-mid360", "livox-avia"]), st.floats(-np.pi, np.pi), st.integers(0, 2**32 - 1))
+def test_nothing_is_lost_at_the_window_s_edge_or_the_seam(name, azimuth, seed):
+    rng = np.random.default_rng(seed)
+    pattern = small(name, 6000)
+    place = rng.uniform(1.5, 6) * np.array([np.cos(azimuth), np.sin(azimuth), 0]) + [0, 0, rng.uniform(-0.8, 1)]
+    mesh = box(np.array([0.5, 0.7, 1.7])).moved(place, rng.uniform(-3, 3))
+    moved = mesh.vertices + rng.normal(0, 0.15, 3).astype(np.float32)
+    hits = scan_pattern(mesh.vertices, mesh.faces, pattern, 1, moved=moved)
+    expected = brute(mesh.vertices, mesh.faces, pattern, 1, moved)
+    expected[~((expected >= pattern.range_min) & (expected <= pattern.range_max))] = np.inf
+    seen = np.flatnonzero(np.isfinite(expected))
+    # rays that touch an edge may fall on either side of it
+    assert len(np.setxor1d(hits.column, seen)) <= 0.01 * len(seen) + 1
+    both = np.isin(hits.column, seen)
+    np.testing.assert_allclose(
+        np.linalg.norm(hits.points[both], axis=1), expected[hits.column[both]], atol=1e-4, rtol=1e-5
+    )
+    np.testing.assert_array_equal(hits.ring, pattern.frame(1).line[hits.column])
+
+
+def test_a_body_that_moves_is_smeared():
+    pattern = sensor("livox-avia")
+    mesh = box(np.array([0.4, 0.4, 1.7])).moved(np.array([5.0, 0, -0.8]))
+    still = scan_pattern(mesh.vertices, mesh.faces, pattern, 0)
+    walked = scan_pattern(mesh.vertices, mesh.faces, pattern, 0, moved=mesh.vertices + np.float32([0, 0.15, 0]))
+    assert len(still.points) > 100
+    assert np.ptp(still.points[:, 1]) < 0.41 and 0.5 < np.ptp(walked.points[:, 1]) < 0.56
+
+
+def test_a_body_out_of_sight_gives_no_points():
+    mesh = box(np.array([0.4, 0.4, 1.7])).moved(np.array([-5.0, 0, -0.8]))
+    for name in ("livox-avia", "depth-camera"):
+        hits = scan_pattern(mesh.vertices, mesh.faces, sensor(name), 0)
+        assert hits.points.shape == (0, 3) and hits.points.dtype == np.float32 and len(hits.ring) == 0
+
+
+def test_range_limits_hold():
+    camera = sensor("depth-camera")
+    counts = []
+    for distance in (0.2, 2.0, 9.0):
+        mesh = box(np.array([0.01, 0.4, 0.4])).moved(np.array([distance, 0, -0.2]))
+        counts.append(len(scan_pattern(mesh.vertices, mesh.faces, camera, 0).points))
+    assert counts[0] == counts[2] == 0 and counts[1] > 500
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"frames": 0},
+        {"azimuths": (1.0, -1.0)},
+        {"elevations": (0.0, np.nan)},
+        {"range_min": 5.0, "range_max": 1.0},
+        {"dropout": 1.0},
+    ],
+)
+def test_impossible_patterns_are_refused(wrong):
+    given = {"name": "x", "rays": BY_NAME["livox-mid40"].rays, "frames": 1, "duration": 0.1}
+    with pytest.raises(InputError, match="RayPattern"):
+        RayPattern(**{**given, "azimuths": (-1.0, 1.0), "elevations": (-1.0, 1.0), **wrong})
