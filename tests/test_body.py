@@ -259,6 +259,29 @@ def test_clothes(rig):
     assert np.median(step) < 0.002
 
 
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 2**31), st.integers(1, 3))
+def test_fast_folds_equal_reference(seed, n):
+    rng, rig = np.random.default_rng(seed), load_rig()
+    direction = rng.normal(0, 3, (n, 4, 3)).astype(np.float32)
+    phase = rng.random((n, 4)).astype(np.float32)
+    fast = rng.uniform(0, 0.03, (n, len(rig.template))).astype(np.float32)
+    slow = fast.copy()
+    person._fold(rig.template, direction, phase, fast)
+    person._fold_reference(rig.template, direction, phase, slow)
+    np.testing.assert_allclose(fast, slow, atol=1e-6)
+
+
+def test_folds_are_wider_than_15_cm(rig):
+    """A quarter of the shortest wave away, the cloth is still much as thick: no spikes between neighbours."""
+    worn = clothing(np.random.default_rng(11), rig, 60)
+    trunk = np.flatnonzero(rig.dense_weight[:, [J(j) for j in ("spine1", "spine2", "spine3")]].sum(1) > 0.9)
+    apart = np.linalg.norm(rig.template[trunk, None] - rig.template[None, trunk], axis=-1)
+    near = (apart > 0) & (apart < 0.025)
+    a, b = np.nonzero(near)
+    assert np.abs(worn[:, trunk[a]] - worn[:, trunk[b]]).mean() < 0.15 * worn[:, trunk].mean()
+
+
 def test_wrong_shapes_are_explained(rig, some):
     with pytest.raises(InputError, match=r"must be \(n, \d+\)"):
         rig.rest(np.zeros((2, 3)))

@@ -12,6 +12,11 @@ _SIDES = (("left", 1.0), ("right", -1.0))
 
 # scapulohumeral rhythm: over 45 degrees of elevation the collar takes part of the arm's angle
 _COLLAR_FROM, _COLLAR_SHARE = 45.0, 0.15
+_SHOULDERS = np.array([_J["left_shoulder"], _J["right_shoulder"]])
+_COLLAR_LIFTS = 3 * np.array([_J["left_collar"], _J["right_collar"]]) + 1
+_LIFT_SIGNS = np.array([1, -1], np.float32)
+_RAISED_OUT = np.array([[_A[f"{side}_raise"], _A[f"{side}_out"]] for side, _ in _SIDES])
+_INWARD = np.array([_A[f"{side}_in"] for side, _ in _SIDES])
 _LIFT_STEPS = 6  # fixed-point steps that take the collar's share out of the upper arm
 
 
@@ -19,13 +24,15 @@ def rotations_from_angles(angles: np.ndarray) -> np.ndarray:
     """angles (n, 27) degrees in the order of `ANGLES` -> local rotations (n, 24, 3, 3) float32."""
     angles = np.asarray(angles, np.float32)
     euler = angles @ _TO_EULER + _AT_ZERO
-    for side, sign in _SIDES:
-        arm = angles[:, [_A[f"{side}_raise"], _A[f"{side}_out"]]]
-        euler[:, 3 * _J[f"{side}_collar"] + 1] += sign * _lift(arm)
+    euler[:, _COLLAR_LIFTS] += _LIFT_SIGNS * _lift(angles[:, _RAISED_OUT])
     rotations = _from_euler(np.radians(euler.reshape(len(angles), 24, 3)))
-    for side, _ in _SIDES:
-        j = _J[f"{side}_shoulder"]
-        rotations[:, j] = rotations[:, j] @ rotation_about("y", np.radians(angles[:, _A[f"{side}_in"]]))
+    inward = np.radians(angles[:, _INWARD])
+    turn = np.zeros((len(angles), 2, 3, 3), np.float32)
+    turn[..., 0, 0] = turn[..., 2, 2] = np.cos(inward)
+    turn[..., 0, 2] = np.sin(inward)
+    turn[..., 2, 0] = -turn[..., 0, 2]
+    turn[..., 1, 1] = 1
+    rotations[:, _SHOULDERS] = rotations[:, _SHOULDERS] @ turn
     return rotations
 
 
@@ -76,7 +83,7 @@ def shoulder_matrix(arm: np.ndarray, sign: float) -> np.ndarray:
 
 
 def _lift(arm: np.ndarray) -> np.ndarray:
-    """The collar's turn (n,) degrees upwards, for an arm's raise and out (n, 2) degrees."""
+    """The collar's turn (...) degrees upwards, for an arm's raise and out (..., 2) degrees."""
     elevation = np.degrees(np.arccos(np.clip(np.cos(np.radians(arm)).prod(-1), -1, 1)))
     return _COLLAR_SHARE * np.clip(elevation - _COLLAR_FROM, 0, None)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.body.activities import ANGLES
+from lidarpose.body.activities import ANGLES, ARM_ANGLES
 from lidarpose.body.angles import angles_from_rotations, shoulder_angles, shoulder_matrix
 from lidarpose.body.retarget import rotation_vector
 from lidarpose.geometry import axis_angle_to_matrix
@@ -20,17 +20,29 @@ _SHOULDERS = tuple(
     (slice(ANGLES.index(f"{side}_raise"), ANGLES.index(f"{side}_raise") + 3), sign)
     for side, sign in (("left", 1.0), ("right", -1.0))
 )
+# deviations are drawn this much smaller than fitted: the fit's ridge and few components make it wider than the motion
+_SPREAD = 0.75
+# an arm is another pose's this often: one subject's poses then cover another's better
+_OTHER_ARM = 0.4
+_ARMS = tuple(
+    [i for i, name in enumerate(ANGLES) if name in {f"{side}_{a}" for a in ARM_ANGLES}] for side in ("left", "right")
+)
 _LOWER = np.tril_indices(len(ANGLES))
 
 
 def captured_angles(rng: np.random.Generator, n: int) -> np.ndarray:
-    """n poses drawn from the mixture: angles (n, 27), degrees, in the order of `ANGLES`; limits are not applied."""
+    """n pairs of poses of one component of the mixture: angles (n, 2, 27), degrees, in the order of `ANGLES`; limits
+    are not applied. The first of a pair is distributed as the mixture; to move is to go towards the second."""
     if not n:
-        return np.zeros((0, len(ANGLES)))
+        return np.zeros((0, 2, len(ANGLES)))
     cumulative, means, roots = _mixture()
     component = np.searchsorted(cumulative, rng.random(n))
-    normal = rng.standard_normal((n, len(ANGLES)))
-    return from_features(means[component] + (roots[component] @ normal[..., None])[..., 0])
+    normal = rng.standard_normal((n, 2, len(ANGLES)))
+    features = means[component, None] + _SPREAD * normal @ np.swapaxes(roots[component], -1, -2)
+    for shift, arm in enumerate(_ARMS, 1):
+        rows = np.flatnonzero(rng.random(n) < _OTHER_ARM)
+        features[np.ix_(rows, (0, 1), arm)] = features[np.ix_((rows + shift) % n, (0, 1), arm)]
+    return from_features(features.reshape(-1, len(ANGLES))).reshape(n, 2, len(ANGLES))
 
 
 def to_features(rotations: np.ndarray) -> np.ndarray:

@@ -2,14 +2,16 @@
 
 A pose is 27 angles (`ANGLES`, degrees, the same sign on both sides of the body), made from a few latents: a kind of
 activity, a kind of arm for each side, where between the two ends of its range the activity stands, noise, and for
-gaits a phase. The angles are kept inside the joints' ranges, arms are pushed out of the trunk, left and right are
-exchanged in half of the poses, and one matrix product turns the angles into Euler angles of the 24 bones.
+gaits a phase; `latents` says how they go on in time. The angles are kept inside the joints' ranges, left and right are
+exchanged in half of the poses, arms are pushed out of the trunk, standing people are set on both feet and balanced
+(`balance`), one matrix product turns the angles into Euler angles of the 24 bones, and bodies that pass through
+themselves (`solid`) are replaced by spare ones.
 
 Frame of the result: x forward, y left, z up, facing +x, in the rest pose of `rig` (T-pose, every bone's axes along
 the body's).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,7 +20,7 @@ from lidarpose.body.activities import (
     ARM_ANGLES,
     ARM_NAMES,
     ARMS,
-    ARMS_OF_KIND,
+    CAPTURED_ARMS,
     KINDS,
     LIMITS,
     OWN_ARMS,
@@ -26,68 +28,191 @@ from lidarpose.body.activities import (
     TABLE,
 )
 from lidarpose.body.angles import mirror_angles, rotations_from_angles
-from lidarpose.body.captured import captured_angles
-from lidarpose.body.gait import gait_angles
-from lidarpose.body.retarget import mean_adult_joints, without_yaw
+from lidarpose.body.balance import settled
+from lidarpose.body.contact import pinned, sole_points, walked
+from lidarpose.body.gait import GAITS, strides
+from lidarpose.body.latents import Latents, draw_latents
+from lidarpose.body.retarget import heading, mean_adult_joints, without_yaw
+from lidarpose.body.solid import body_frames, capsule_ends, depths, undersides
 from lidarpose.errors import InputError, unknown_name
+from lidarpose.geometry import rotation_about
 from lidarpose.skeleton import SMPL24
 
 _A = {name: i for i, name in enumerate(ANGLES)}
 _ARM = {side: slice(_A[f"{side}_raise"], _A[f"{side}_elbow"] + 1) for side in ("left", "right")}
-_CAPTURED = KINDS.index("captured")
-_GAITS = tuple(KINDS.index(name) for name in ("walk", "run"))
-
-# how often both arms do the same thing, and how far a paired arm strays from the other, as a share of its range
-_PAIRED_ARMS, _PAIR_SPREAD = 0.45, 0.15
+_BOTH_ARMS = np.r_[_ARM["left"], _ARM["right"]]
+_ARM_LIMITS = LIMITS[:, _ARM["left"]]
+_CAPTURED, _RUN, _CYCLE, _FALL = (KINDS.index(name) for name in ("captured", "run", "cycle", "fall"))
+_NO_LEG = np.array([not name.endswith(("hip", "knee", "ankle")) for name in ANGLES])
+_GAIT = np.array([GAITS.index(name) if name in GAITS else -1 for name in KINDS])
+_GOING = tuple(KINDS.index(name) for name in (*GAITS, "cycle"))
+_STILL_UP = 0.15  # clips of falls begin early in them
+# what a turn of a bicycle's cranks makes, m: least, and how much more (city gears)
+_GEAR = (3.2, 1.8)
+_HIPS_DOWN = 0.095  # m from the pelvis down to the hips' middle
+_MOMENT = 0.05  # s: bodies roll over the ground in steps of at most this
+# bodies whose parts are deeper in each other than this, m, are refused; clips are looked at every so many seconds
+_TOUCH, _LOOK_EVERY = 0.02, 0.2
+# share of the poses of a kind that are, measured; of a clip's some moment is, as if it were so many poses
+_OFTEN = {
+    "idle": 0.08, "walk": 0.04, "run": 0.09, "sit": 0.20, "crouch": 0.30, "bend": 0.10, "kneel": 0.22, "step": 0.08,
+    "push": 0.03, "lie": 0.06, "sport": 0.05, "captured": 0.26,
+}  # fmt: skip
+_TANGLED, _LONGER = np.array([_OFTEN.get(name, 0.01) for name in KINDS]), 2.5
+# people drawn to stand in for the refused: shares of all, of poses and of clips, and at least so many
+_SPARES, _CLIP_SPARES, _LEAST_SPARES = 0.3, 0.8, 3
 
 
 @dataclass(frozen=True, kw_only=True)
 class PosePrior:
-    """Drawn poses. rotations (n, 24, 3, 3) float32, local, facing +x; kind (n,) indices into `KINDS`."""
+    """Drawn poses. rotations (n, 24, 3, 3) float32, local, facing +x; kind (n,) indices into `KINDS`; moved
+    (n, 24, 3, 3) float32 the local rotations dt seconds later, step (n, 3) float32 m the way of the root until then,
+    both in the axes of `rotations`. With dt = 0 nothing has moved."""
 
     rotations: np.ndarray
     kind: np.ndarray
+    moved: np.ndarray
+    step: np.ndarray
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Latents:
-    """Everything random about n poses; moving `phase` alone makes a gait walk on."""
+class DrawnClips:
+    """People in motion. rotations (n, F, 24, 3, 3) float32, local, the first frame facing +x; translation (n, F, 3)
+    float32 m, the way of the pelvis since the first frame on flat ground (z: on the mean adult); clearance (n, F)
+    float32 m, how far the lowest point is above the ground (`contact.stand`); kind (n,) indices into `KINDS`."""
 
-    kind: np.ndarray  # (n,) into KINDS
-    arm: np.ndarray  # (n, 2) into ARM_NAMES, left and right; 0 = the activity's own
-    where: np.ndarray  # (n, 3) in [0, 1]: place in the range of the activity and of either arm
-    noise: np.ndarray  # (n, 27) in [-1, 1]
-    phase: np.ndarray  # (n,) in [0, 1): 0 is the left heel's strike
-    style: np.ndarray  # (n, 8) in [0, 1]: the gait's parameters
-    mirror: np.ndarray  # (n,) bool
-    captured: np.ndarray  # (m, 27) degrees: the angles of the m poses whose kind is "captured"
+    rotations: np.ndarray
+    translation: np.ndarray
+    clearance: np.ndarray
+    kind: np.ndarray
 
 
-def sample_rotations(rng: np.random.Generator, n: int, *, mix: dict[str, float] | None = None) -> PosePrior:
-    """n poses from the prior.
+def sample_rotations(
+    rng: np.random.Generator, n: int, *, mix: dict[str, float] | None = None, dt: float = 0.0
+) -> PosePrior:
+    """n poses from the prior, and with dt > 0 what they are dt seconds later.
 
     mix gives the shares of the kinds (names of `KINDS`, any positive weights); by default people as a sensor beside
-    a road or at work sees them. The root leans and tilts but has no yaw (`retarget.heading` is 0).
-    Raises InputError for a negative n or a mix with unknown names or without weight.
+    a road or at work sees them. The root leans and tilts but has no yaw (`retarget.heading` is 0). The poses do not
+    depend on dt. Raises InputError for a negative n or dt or a mix with unknown names or without weight.
     """
     if n < 0:
         raise InputError(f"n must be 0 or more poses, got {n}")
-    latents = _draw(rng, n, _shares(mix))
-    return PosePrior(rotations=without_yaw(rotations_from_angles(_angles(latents))), kind=latents.kind)
+    if not 0 <= dt < np.inf:
+        raise InputError(f"dt must be seconds, 0 or more, got {dt}")
+    latents, rotations = _drawn(rng, n, _shares(mix), np.zeros(1))
+    if dt == 0:
+        rotations = without_yaw(rotations[:, 0])
+        return PosePrior(rotations=rotations, kind=latents.kind, moved=rotations, step=np.zeros((n, 3), np.float32))
+    motion = _motion(latents, np.linspace(0, dt, 1 + int(np.ceil(dt / _MOMENT))))
+    return PosePrior(
+        rotations=motion.rotations[:, 0], kind=latents.kind, moved=motion.rotations[:, -1], step=motion.way[:, -1]
+    )
 
 
-def clip(rng: np.random.Generator, frames: int, hz: float, *, kind: str = "walk") -> np.ndarray:
-    """One person walking or running on: rotations (frames, 24, 3, 3) float32, `hz` frames a second, facing +x."""
-    if kind not in ("walk", "run"):
-        raise unknown_name("gait", kind, ("walk", "run"))
-    if frames < 0 or hz <= 0:
-        raise InputError(f"a clip needs frames >= 0 and hz > 0, got {frames} and {hz}")
-    one = _draw(rng, 1, _shares({kind: 1.0}))
-    # strides a second: comfortable walking 0.75-1.05 (Perry), running 1.2-1.5
-    cadence = {"walk": 0.75 + 0.3 * one.style[0, 0], "run": 1.2 + 0.3 * one.style[0, 0]}[kind]
-    many = {name: np.repeat(value, frames, 0) for name, value in vars(one).items()}
-    phase = (one.phase + np.arange(frames) * cadence / hz) % 1
-    return rotations_from_angles(_angles(replace(_Latents(**many), phase=phase)))
+def sample_clips(
+    rng: np.random.Generator, n: int, *, frames: int, hz: float = 10.0, mix: dict[str, float] | None = None
+) -> DrawnClips:
+    """n people who go on with what they do, `frames` moments at `hz` a second; mix as in `sample_rotations`.
+
+    Raises InputError for a negative n or frames, hz <= 0, or a wrong mix.
+    """
+    if n < 0 or frames < 0 or not 0 < hz < np.inf:
+        raise InputError(f"clips need n >= 0, frames >= 0 and hz > 0, got {n}, {frames} and {hz}")
+    last = max(0, frames - 1) / hz
+    latents, _ = _drawn(rng, n, _shares(mix), np.arange(0, last + _LOOK_EVERY, _LOOK_EVERY))
+    between = max(1, int(np.ceil(1 / (hz * _MOMENT))))
+    motion = _motion(latents, np.linspace(0, last, max(0, frames - 1) * between + 1))
+    rotations, way, clearance = (
+        value[:, ::between][:, :frames] for value in (motion.rotations, motion.way, motion.clearance)
+    )
+    return DrawnClips(rotations=rotations, translation=way, clearance=clearance, kind=latents.kind)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stride:
+    """angles (n, 27) degrees; pace (n,) m a stride or a turn of the cranks, 0 for who does not go; height (n,) m of the
+    hips above the ground, 0 for who does not walk."""
+
+    angles: np.ndarray
+    pace: np.ndarray
+    height: np.ndarray
+
+
+def _drawn(rng: np.random.Generator, n: int, shares: np.ndarray, times: np.ndarray) -> tuple[Latents, np.ndarray]:
+    """n people who do not pass through themselves at times (T,) s, the kinds in the shares (K,); and their rotations
+    (n, T, 24, 3, 3) with the yaw they have.
+
+    Spares are drawn along, of the kinds that are often refused; each stands in for somebody who is. Where there are
+    too few of them, the last stay as they are.
+    """
+    tangled = 1 - (1 - _TANGLED) ** (1 if len(times) == 1 else _LONGER)
+    missed = shares * tangled / (1 - tangled)
+    spare = int(np.ceil(n * (_SPARES if len(times) == 1 else _CLIP_SPARES))) + _LEAST_SPARES if n else 0
+    kind = np.concatenate([rng.choice(len(KINDS), k, p=p) for k, p in ((n, shares), (spare, missed / missed.sum()))])
+    latents = draw_latents(rng, kind)
+    if len(times) > 1:
+        latents.where[kind == _FALL, 0] *= _STILL_UP
+    rotations = _poses(latents, times)[0]
+    touches = _depth(rotations) > _TOUCH
+    chosen, refused, free = np.arange(n), np.flatnonzero(touches[:n]), n + np.flatnonzero(~touches[n:])
+    chosen[refused[: len(free)]] = free[: len(refused)]
+    return latents.take(chosen), rotations[chosen]
+
+
+def _depth(rotations: np.ndarray) -> np.ndarray:
+    """rotations (n, T, 24, 3, 3) -> (n,) m: how deep each body's parts are in each other at the worst moment."""
+    ends = capsule_ends(*body_frames(rotations.reshape(-1, 24, 3, 3)))
+    return depths(ends).max(1).reshape(rotations.shape[:2]).max(1, initial=-np.inf)
+
+
+def _poses(latents: Latents, times: np.ndarray) -> tuple[np.ndarray, _Stride]:
+    """Rotations (n, T, 24, 3, 3) at times (T,) s with the yaw they have, and what strides say (n T)."""
+    moments = len(times)
+    many = latents if moments == 1 and times[0] == 0 else latents.repeated(moments).at(np.tile(times, len(latents)))
+    stride = _angles(many)
+    angles = settled(_freed(stride.angles, moments), many.kind)
+    return rotations_from_angles(angles).reshape(len(latents), moments, 24, 3, 3), stride
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Motion:
+    """rotations (n, T, 24, 3, 3), way (n, T, 3) m and clearance (n, T) m: see `DrawnClips`."""
+
+    rotations: np.ndarray
+    way: np.ndarray
+    clearance: np.ndarray
+
+
+def _motion(latents: Latents, times: np.ndarray) -> _Motion:
+    """The people at times (T,) s, facing +x at the first, which is 0."""
+    n, moments = len(latents), len(times)
+    rotations, stride = _poses(latents, times)
+    turn = rotation_about("z", -heading(rotations[:, 0])).astype(np.float32)
+    rotations[:, :, 0] = turn[:, None] @ rotations[:, :, 0]
+    if moments == 1:
+        return _Motion(rotations=rotations, way=np.zeros((n, 1, 3), np.float32), clearance=np.zeros((n, 1), np.float32))
+    flat = rotations.reshape(-1, 24, 3, 3)
+    balls = undersides(capsule_ends(*body_frames(flat)))
+    points = np.concatenate([sole_points(flat).reshape(len(flat), 8, 3), balls], 1)
+    points = points.reshape(n, moments, points.shape[1], 3)
+    way = pinned(points)
+    goes = np.isin(latents.kind, _GOING)
+    if goes.any():
+        course = latents.course(times)[goes]
+        pace = stride.pace.reshape(n, moments)[goes]
+        ahead = walked(pace, latents.strides(np.broadcast_to(times, (n, moments)))[goes], course)
+        way[goes, :, :2] = ahead @ np.swapaxes(turn[goes, :2, :2], -1, -2)
+        rotations[goes, :, 0] = rotation_about("z", course).astype(np.float32) @ rotations[goes, :, 0]
+    low = points[..., 2].min(2)
+    # a runner's hips go on between two steps, a cyclist's stay where they are
+    hips = stride.height.reshape(n, moments) + _HIPS_DOWN * flat[:, 0, 2, 2].reshape(n, moments)
+    runs, cycles = latents.kind == _RUN, latents.kind == _CYCLE
+    clearance = np.where(runs[:, None], np.maximum(hips + low, 0), 0)
+    clearance[cycles] = low[cycles] - low[cycles].min(1, keepdims=True)
+    height = clearance - low
+    way[..., 2] = height - height[:, :1]
+    return _Motion(rotations=rotations, way=way.astype(np.float32), clearance=clearance.astype(np.float32))
 
 
 def sample_poses(n: int, seed: int) -> np.ndarray:
@@ -112,45 +237,24 @@ def _shares(mix: dict[str, float] | None) -> np.ndarray:
     return shares / shares.sum()
 
 
-def _pick(rng: np.random.Generator, cumulative: np.ndarray) -> np.ndarray:
-    """One index for each row of cumulative shares (n, K)."""
-    return (rng.random((len(cumulative), 1)) >= cumulative[:, :-1]).sum(1)
-
-
-def _draw(rng: np.random.Generator, n: int, shares: np.ndarray) -> _Latents:
-    kind = rng.choice(len(KINDS), n, p=shares)
-    odds = np.cumsum(ARMS_OF_KIND, 1)[kind]
-    arm = np.stack([_pick(rng, odds), _pick(rng, odds)], 1)
-    where = rng.random((n, 3))
-    paired = rng.random(n) < _PAIRED_ARMS
-    arm[paired, 1] = arm[paired, 0]
-    stray = where[:, 1] + _PAIR_SPREAD * rng.uniform(-1, 1, n)
-    where[paired, 2] = np.clip(stray, 0, 1)[paired]
-    # the sum of two uniform numbers: most near the middle, none far out
-    noise = rng.uniform(-0.5, 0.5, (2, n, len(ANGLES))).sum(0)
-    return _Latents(
-        kind=kind,
-        arm=arm,
-        where=where,
-        noise=noise,
-        phase=rng.random(n),
-        style=rng.random((n, 8)),
-        mirror=rng.random(n) < 0.5,
-        captured=captured_angles(rng, int((kind == _CAPTURED).sum())),
-    )
-
-
-def _angles(latents: _Latents) -> np.ndarray:
-    """The poses' angles (n, 27), degrees, inside the joints' ranges."""
+def _angles(latents: Latents) -> _Stride:
+    """The poses' angles (n, 27), degrees, inside the joints' ranges; arms may be in the trunk."""
     kind = latents.kind
     start, end, spread = TABLE.start[kind], TABLE.end[kind], TABLE.spread[kind]
-    angles = start + latents.where[:, :1] * (end - start) + spread * latents.noise
-    for gait in _GAITS:
-        rows = np.flatnonzero(kind == gait)
-        if len(rows):
-            angles[rows] += gait_angles(KINDS[gait], latents.phase[rows], latents.style[rows])
+    # the cranks of a bicycle move the legs alone
+    place = np.where((kind == _CYCLE)[:, None] & _NO_LEG, latents.style[:, 1:2], latents.where[:, :1])
+    angles = start + place * (end - start) + spread * latents.noise
+    pace, height = np.zeros((2, len(kind)))
+    rows = np.flatnonzero(_GAIT[kind] >= 0)
+    if len(rows):
+        made = strides(_GAIT[kind[rows]], latents.phase[rows], latents.style[rows], angles[rows])
+        angles[rows], pace[rows], height[rows] = made.angles, made.pace, made.height
+    rows = kind == _CYCLE
+    pace[rows] = _GEAR[0] + _GEAR[1] * latents.style[rows, 0]
 
-    angles[kind == _CAPTURED] = latents.captured
+    captured = np.zeros_like(angles)
+    captured[latents.from_capture] = latents.captured[:, 0]
+    angles[kind == _CAPTURED] = captured[kind == _CAPTURED]
 
     # the table gives thighs from the vertical and feet from the floor: turn both into angles of the joints
     for side in ("left", "right"):
@@ -164,10 +268,11 @@ def _angles(latents: _Latents) -> np.ndarray:
         start, end, spread = (table[latents.arm[rows, column]] for table in ARMS)
         where = latents.where[rows, 1 + column, None]
         angles[rows, part] = start + where * (end - start) + spread * latents.noise[rows, part]
+        rows = np.flatnonzero(latents.arm[:, column] == CAPTURED_ARMS)
+        angles[rows, part] = captured[rows, part]
     angles = np.clip(angles, LIMITS[0], LIMITS[1])
-    for side in ("left", "right"):
-        _push_arm_out(angles[:, _ARM[side]])
-    return np.where(latents.mirror[:, None], mirror_angles(angles), angles)
+    angles = np.where(latents.mirror[:, None], mirror_angles(angles), angles)
+    return _Stride(angles=angles, pace=pace, height=height)
 
 
 # the trunk as an arm sees it from its shoulder, m, mean adult: an upright ellipse around the spine, half its depth and
@@ -175,36 +280,42 @@ def _angles(latents: _Latents) -> np.ndarray:
 _TRUNK_DEPTH, _TRUNK_WIDTH, _SHOULDER = 0.15, 0.17, 0.18
 _UPPER_ARM, _FOREARM = 0.27, 0.25
 # shoulder angles (ARM_ANGLES) added at each of the tries to free an arm
-_FREE_ARM, _TRIES = np.array([12.0, 4.0, -12.0, 0.0]), 5
+_FREE_ARM, _TRIES = np.array([16.0, 6.0, -16.0, 0.0]), 3
 
 
-def _push_arm_out(arm: np.ndarray) -> None:
-    """Moves arms (n, 4), in place, forwards, outwards and out of their inward turn until forearms leave the trunk."""
+def _freed(angles: np.ndarray, moments: int) -> np.ndarray:
+    """angles (n * moments, 27) with arms moved forwards, outwards and out of their inward turn until the forearms of
+    each person's first moment leave the trunk; all moments by as much."""
+    arm = angles[::moments, _BOTH_ARMS].reshape(-1, 4)
     rows = np.arange(len(arm))
+    added = np.zeros_like(arm)
     for _ in range(_TRIES):
-        rows = rows[_in_trunk(arm[rows])]
+        rows = rows[_in_trunk(np.clip(arm[rows] + added[rows], *_ARM_LIMITS))]
         if not len(rows):
             break
         behind = arm[rows, :1] < -20  # hands on the back go further back
-        arm[rows] += np.where(behind, _FREE_ARM * [-0.5, 1.5, -1, 0], _FREE_ARM)
-    np.clip(arm, *(limit[_ARM["left"]] for limit in LIMITS), out=arm)
+        added[rows] += np.where(behind, _FREE_ARM * [-0.5, 1.5, -1, 0], _FREE_ARM)
+    angles[:, _BOTH_ARMS] = np.clip(
+        angles[:, _BOTH_ARMS] + np.repeat(added.reshape(-1, 8), moments, 0), *np.tile(_ARM_LIMITS, 2)
+    )
+    return angles
+
+
+_REACHES = np.array([0.5, 1.0, 1.25])[:, None]  # of the forearm: its middle, the wrist, the hand
 
 
 def _in_trunk(arm: np.ndarray) -> np.ndarray:
     """arm (n, 4) degrees -> (n,) bool: the forearm's middle or the hand is inside the trunk. In left-arm signs."""
-    raised, out, inward, elbow = np.radians(arm.T)
-    cr, sr, co, so, ci, si = np.cos(raised), np.sin(raised), np.cos(out), np.sin(out), np.cos(inward), np.sin(inward)
+    rad = np.radians(arm)
+    (cr, co, ci, ce), (sr, so, si, se) = np.cos(rad).T, np.sin(rad).T
     # columns of R_y(-raised) R_x(out - 90) R_y(inward): the arm's y runs along it, its x is the way the elbow bends
-    along = np.stack([sr * co, so, -cr * co], -1)
-    forward = np.stack([cr * ci + sr * so * si, -co * si, sr * ci - cr * so * si], -1)
-    bones = np.sin(elbow)[:, None] * forward + np.cos(elbow)[:, None] * along
-    inside = np.zeros(len(arm), bool)
-    for share in (0.5, 1.0, 1.25):
-        x, y, z = (_UPPER_ARM * along + share * _FOREARM * bones).T
-        # over the shoulders there is no trunk; the arm starts at its side
-        inside |= ((x / _TRUNK_DEPTH) ** 2 + ((y + _SHOULDER) / _TRUNK_WIDTH) ** 2 < 1) & (z < 0.02)
-    return inside
+    crso, srso = cr * so, sr * so
+    x = _UPPER_ARM * sr * co + _FOREARM * _REACHES * (se * (cr * ci + srso * si) + ce * sr * co)
+    y = _UPPER_ARM * so + _FOREARM * _REACHES * (ce * so - se * co * si)
+    z = -_UPPER_ARM * cr * co + _FOREARM * _REACHES * (se * (sr * ci - crso * si) - ce * cr * co)
+    # over the shoulders there is no trunk; the arm starts at its side
+    return (((x / _TRUNK_DEPTH) ** 2 + ((y + _SHOULDER) / _TRUNK_WIDTH) ** 2 < 1) & (z < 0.02)).any(0)
 
 
-__all__ = ["ANGLES", "ARM_ANGLES", "ARM_NAMES", "KINDS", "PosePrior", "clip", "mirror_angles"]
-__all__ += ["rotations_from_angles", "sample_poses", "sample_rotations"]
+__all__ = ["ANGLES", "ARM_ANGLES", "ARM_NAMES", "KINDS", "DrawnClips", "PosePrior", "mirror_angles"]
+__all__ += ["rotations_from_angles", "sample_clips", "sample_clips", "sample_poses", "sample_rotations"]

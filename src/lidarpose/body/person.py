@@ -104,7 +104,7 @@ def clothing(rng: np.random.Generator, rig: Rig, n: int) -> np.ndarray:
     Smooth over the body. A torso's mean is about 1.5 cm; a tenth of the people wear next to nothing, a tenth bulky
     coats; hands and faces stay bare but for a few gloves.
     """
-    dense, scalp, place = _regions(rig)
+    dense, scalp, place = _regions()
     strength = _outfit(rng, n)
     offset = strength @ dense.T
     hair = rng.uniform(0.0, 0.03, (n, 1)) + rng.choice([0.0, 0.012], (n, 1), p=[0.8, 0.2])
@@ -112,16 +112,37 @@ def clothing(rng: np.random.Generator, rig: Rig, n: int) -> np.ndarray:
     # folds: a few waves of 15 to 60 cm length that thicken and thin the cloth by about a quarter
     waves = 4
     direction = rng.normal(size=(n, waves, 3))
-    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-    direction *= 2 * np.pi / rng.uniform(0.15, 0.6, (n, waves, 1))
-    phase = rng.uniform(0, 2 * np.pi, (n, waves, 1))
-    fold = np.sin((direction @ place.T + phase).astype(np.float32)).sum(1)
-    offset *= 1 + np.float32(0.18) * fold
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True) * rng.uniform(0.15, 0.6, (n, waves, 1))
+    phase = rng.random((n, waves))
+    _fold(place, direction.astype(np.float32), phase.astype(np.float32), offset)
     return np.clip(offset, 0, MAX_CLOTHING)
 
 
-def _regions(rig: Rig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+# how much a wave of folds thickens cloth
+_FOLD = np.float32(0.18)
+
+
+def _fold(place: np.ndarray, direction: np.ndarray, phase: np.ndarray, offset: np.ndarray) -> None:
+    """Thickens offset (n, V) in place by waves; see `rig_numba.folds_of_people`."""
+    try:
+        from lidarpose.body.rig_numba import folds_of_people
+    except ImportError:
+        _fold_reference(place, direction, phase, offset)
+    else:
+        folds_of_people(place, direction, phase, _FOLD, offset)
+
+
+def _fold_reference(place: np.ndarray, direction: np.ndarray, phase: np.ndarray, offset: np.ndarray) -> None:
+    """`_fold` in numpy."""
+    turns = direction @ place.T + phase[..., None]
+    u = turns - np.floor(turns) - np.float32(0.5)
+    offset *= 1 + _FOLD * (8 * u * (1 - 2 * np.abs(u))).sum(1)
+
+
+@cache
+def _regions() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Dense weights (V, 24), hair's share of each vertex (V,), and the mean body's vertices (V, 3)."""
+    rig = load_rig()
     dense = rig.dense_weight
     from_center = rig.template - rig.joint_template[BODY26.index("head_center")]
     # hair: above and behind a plane that rises forwards from below the ears to the brow, 4 cm of transition

@@ -17,12 +17,29 @@ from lidarpose.skeleton import SMPL24
 
 # bend (sine of the angle between the bones) under which a hinge's normal counts for nothing, and over which for all
 _BEND_FADE = (0.10, 0.35)
+# how much more bend the other way round is taken for a joint stretched too far: a hip turns less than a shoulder
+_KNEE_OVERSTRETCH, _ELBOW_OVERSTRETCH = 0.25, 0.07
 # collars nearer to each other than this share of the shoulders' distance are taken for a single point
 _LEAST_COLLAR_WIDTH = 0.15
 _ADULT = 18  # years
+# bones under this have no direction, m
+SHORTEST_BONE = 1e-4
 
 _LIMB = ("collar", "shoulder", "elbow", "wrist", "hand", "hip", "knee", "ankle", "foot")
 _J = {name: i for i, name in enumerate(SMPL24.joints)}
+# the lines whose directions the frames are made of
+_CHAINS = ("collar shoulder elbow wrist hand", "hip knee ankle foot")
+_LINES = (
+    ("spine3", "neck"),
+    ("right_hip", "left_hip"),
+    ("right_shoulder", "left_shoulder"),
+    *(
+        (f"{side}_{a}", f"{side}_{b}")
+        for side in ("left", "right")
+        for chain in map(str.split, _CHAINS)
+        for a, b in zip(chain, chain[1:], strict=False)
+    ),
+)
 
 
 def retarget_positions(joints: np.ndarray, rest: np.ndarray | None = None) -> np.ndarray:
@@ -32,13 +49,17 @@ def retarget_positions(joints: np.ndarray, rest: np.ndarray | None = None) -> np
     joints of the T-pose to be turned, by default the mean adult's. Returns (n, 24, 3, 3) float32. The heading of the
     source stays in the root (`without_yaw` removes it). The twist of the head about the neck and of a straight limb
     cannot be seen in positions: they follow the parent (a straight leg follows its foot).
-    Raises InputError for another shape or for values that are not finite.
+    Raises InputError for another shape, for values that are not finite and for limbs without length.
     """
     joints = np.asarray(joints, float)
     if joints.ndim != 3 or joints.shape[1:] != (24, 3):
         raise InputError(f"joints must be (n, 24, 3), SMPL's joints in metres, got {joints.shape}")
     if not np.isfinite(joints).all():
         raise InputError("joints must be finite numbers; drop or fill the missing ones before retargeting")
+    length, which = shortest_bone(joints)
+    if (length <= SHORTEST_BONE).any():
+        first = int(np.argmax(length <= SHORTEST_BONE))
+        raise InputError(f"{which[first]} has no length in frame {first}: a bone without length has no direction")
     if rest is None:
         rest = mean_adult_joints()
     rest = np.asarray(rest, float)[None]
@@ -65,6 +86,13 @@ def retarget_positions(joints: np.ndarray, rest: np.ndarray | None = None) -> np
     parents = np.array(SMPL24.parents[1:])
     local[:, 1:] = np.swapaxes(turn[:, parents], -1, -2) @ turn[:, 1:]
     return local.astype(np.float32)
+
+
+def shortest_bone(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of joints (n, 24, 3): the length (n,) m of the shortest line that retargeting needs, and which (n,) it is."""
+    lengths = np.stack([np.linalg.norm(_bone(joints, a, b), axis=-1) for a, b in _LINES])
+    which = lengths.argmin(0)
+    return lengths.min(0), np.array([f"{a} -> {b}" for a, b in _LINES])[which]
 
 
 def heading(rotations: np.ndarray) -> np.ndarray:
@@ -162,14 +190,26 @@ def _swing(parent: np.ndarray, start: str, end: str, joints: np.ndarray, rest: n
     return rotation_between(_carried(parent, _bone(rest, start, end)), _bone(joints, start, end)) @ parent
 
 
-def _hinge(first: np.ndarray, second: np.ndarray, straight: np.ndarray) -> np.ndarray:
-    """The axis (n, 3) about which `second` is bent from `first`, faded to `straight` where the joint is straight."""
-    normal = np.cross(unit(first), unit(second))
+def _hinge(first: np.ndarray, second: np.ndarray, straight: np.ndarray, overstretch: float) -> np.ndarray:
+    """The axis (n, 3) about which `second` is bent from `first`, `straight` where the joint is straight.
+
+    A small bend the other way round than `straight` is a joint stretched too far; a larger one, over `overstretch`
+    (a sine) more, is a limb that is turned that far. In between the axis turns over without a jump.
+    """
+    first, second, straight = unit(first), unit(second), unit(straight)
+    normal = np.cross(first, second)
+    # the sine falls again beyond a right angle, where the bend is as plain as can be
+    bend = np.where((first * second).sum(-1) > 0, np.linalg.norm(normal, axis=-1), 1.0)[:, None]
+    normal = unit(normal)
+    against = np.clip(-(normal * straight).sum(-1, keepdims=True), 0, 1)
     low, high = _BEND_FADE
-    weight = np.clip((np.linalg.norm(normal, axis=-1, keepdims=True) - low) / (high - low), 0, 1)
-    # a bend the wrong way is a joint stretched a little too far, unless it is large
-    normal = unit(normal) * np.where((normal * straight).sum(-1, keepdims=True) < 0, -np.sign(0.99 - weight), 1.0)
-    return weight * normal + (1 - weight) * unit(straight)
+    weight = np.clip((bend - low - overstretch * against) / (high - low), 0, 1)
+    # evenly from one to the other; where they are opposite, about the limb
+    about = np.cross(straight, normal)
+    sine = np.linalg.norm(about, axis=-1, keepdims=True)
+    angle = np.arctan2(sine, (straight * normal).sum(-1, keepdims=True))
+    about = np.where(sine > 1e-6, unit(about), first)
+    return (axis_angle_to_matrix(weight * angle * about) @ straight[..., None])[..., 0]
 
 
 def _leg(side: str, pelvis: np.ndarray, joints: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -180,9 +220,9 @@ def _leg(side: str, pelvis: np.ndarray, joints: np.ndarray, rest: np.ndarray) ->
     left = np.array([[0.0, 1.0, 0.0]])
     from_pelvis = _swing(pelvis, names[0], names[1], joints, rest) @ left[0]
     from_foot = np.cross(unit(bones[2]), unit(bones[1]))  # short where the foot is stretched along the shank
-    axis = _hinge(bones[0], bones[1], from_pelvis + 2 * from_foot)
+    axis = _hinge(bones[0], bones[1], from_pelvis + 2 * from_foot, _KNEE_OVERSTRETCH)
     thigh, shank = (_turn(bones[k], axis, rests[k], left) for k in (0, 1))
-    return thigh, shank, _turn(bones[2], axis, rests[2], left)
+    return thigh, shank, _swing(shank, names[2], names[3], joints, rest)
 
 
 def _arm(side: str, sign: float, collar: np.ndarray, joints: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -192,8 +232,9 @@ def _arm(side: str, sign: float, collar: np.ndarray, joints: np.ndarray, rest: n
     rests = [_bone(rest, a, b) for a, b in zip(names[:-1], names[1:], strict=True)]
     down = np.array([[0.0, 0.0, -sign]])
     from_collar = _swing(collar, names[0], names[1], joints, rest) @ down[0]
-    axis = _hinge(bones[0], bones[1], from_collar)
-    return tuple(_turn(bones[k], axis, rests[k], down) for k in range(3))
+    axis = _hinge(bones[0], bones[1], from_collar, _ELBOW_OVERSTRETCH)
+    arm, forearm = (_turn(bones[k], axis, rests[k], down) for k in (0, 1))
+    return arm, forearm, _swing(forearm, names[2], names[3], joints, rest)
 
 
 def rotation_vector(matrix: np.ndarray) -> np.ndarray:

@@ -109,3 +109,38 @@ def normals_of_people(faces, vertices, normals):
     """`normals_of_person` for n people: vertices and normals (n, V, 3)."""
     for i in range(vertices.shape[0]):
         normals_of_person(faces, vertices[i], normals[i])
+
+
+@_jit
+def dress_people(faces, vertices, offset, low, high):
+    """Moves vertices (n, V, 3) by offset (n, V) m along their normals, in place, and fills low and high (n, 3) with
+    their least and greatest x, y, z afterwards."""
+    normals = np.empty(vertices.shape[1:], np.float32)
+    for i in range(vertices.shape[0]):
+        normals_of_person(faces, vertices[i], normals)
+        for a in range(3):
+            low[i, a], high[i, a] = np.inf, -np.inf
+        for v in range(vertices.shape[1]):
+            for a in range(3):
+                value = vertices[i, v, a] + offset[i, v] * normals[v, a]
+                vertices[i, v, a] = value
+                low[i, a], high[i, a] = min(low[i, a], value), max(high[i, a], value)
+
+
+@_jit
+def folds_of_people(place, direction, phase, share, offset):
+    """Multiplies offset (n, V) in place by 1 + share times the sum of a person's waves at place (V, 3): W waves along
+    direction (n, W, 3), turns a metre, begun at phase (n, W) turns. A wave is made of parabolas, much like a sine."""
+    for i in range(offset.shape[0]):
+        for v in range(offset.shape[1]):
+            total = np.float32(0)
+            for w in range(direction.shape[1]):
+                t = (
+                    direction[i, w, 0] * place[v, 0]
+                    + direction[i, w, 1] * place[v, 1]
+                    + direction[i, w, 2] * place[v, 2]
+                    + phase[i, w]
+                )
+                u = t - np.floor(t) - np.float32(0.5)
+                total += np.float32(8) * u * (np.float32(1) - np.float32(2) * abs(u))
+            offset[i, v] *= np.float32(1) + share * total

@@ -1,0 +1,216 @@
+"""Tiny files of motion in the layouts of others, written from poses of our body, for the tests of their readers."""
+
+import json
+
+import numpy as np
+
+from lidarpose.body import motion, retarget, rig
+from lidarpose.geometry import UP_AXES, rotation_about
+from lidarpose.skeleton import SMPL24
+
+J = {name: i for i, name in enumerate(SMPL24.joints)}
+C = UP_AXES["y"]
+
+
+def a_clip(frames=6, seed=0):
+    """Rotations (F, 24, 3, 3) of several poses that face anywhere, and a walk of the pelvis (F, 3) m, z up."""
+    rng = np.random.default_rng(seed)
+    rotations = motion.sample_rotations(rng, frames, mix={"walk": 2, "idle": 2, "run": 1}).rotations.astype(float)
+    rotations[:, 0] = rotation_about("z", rng.uniform(-3, 3, frames)) @ rotations[:, 0]
+    way = np.cumsum(rng.uniform(-0.1, 0.1, (frames, 3)), 0) + [1.0, 2.0, 0.95]
+    return rotations, way
+
+
+def joints_of(rotations, translation):
+    """(F, 24, 3) m of the mean adult."""
+    rest = retarget.mean_adult_joints()[None]
+    return rig.forward_kinematics(SMPL24.parents, rest, np.asarray(rotations, float), np.asarray(translation, float))[1]
+
+
+def to_smpl(rotations, up="z"):
+    """Our rotations as SMPL's axis-angles (F, 72) in a world whose axis `up` is upwards."""
+    local = C.T @ rotations @ C
+    local[:, 0] = UP_AXES[up].T @ rotations[:, 0] @ C
+    return retarget.rotation_vector(local.reshape(-1, 3, 3)).reshape(-1, 72)
+
+
+def write_amass(path, rotations, translation, *, width=156, rate="mocap_framerate", fps=60.0, drop=(), **changes):
+    poses = np.zeros((len(rotations), width))
+    pose = to_smpl(rotations)[:, : width if width == 72 else 66]
+    poses[:, : pose.shape[1]] = pose
+    poses[:, 72:] = 0.3  # fingers
+    content = dict(poses=poses, trans=translation, betas=np.zeros(16), gender=np.array("male"), dmpls=np.zeros(8))
+    content |= {rate: np.float64(fps)} | changes
+    np.savez(path, **{k: v for k, v in content.items() if k not in drop})
+    return path
+
+
+def write_pose_json(folder, rotations, translation, *, up="z", first=1):
+    folder.mkdir(parents=True, exist_ok=True)
+    for k, (pose, trans) in enumerate(zip(to_smpl(rotations, up), translation @ UP_AXES[up], strict=True)):
+        content = {"beta": [0.0] * 10, "pose": pose.tolist(), "trans": trans.tolist()}
+        (folder / f"{first + k:06d}.json").write_text(json.dumps(content))
+    return folder
+
+
+# what other skeletons call SMPL's joints
+CMU_NAMES = dict(pelvis="Hips", spine1="LowerBack", spine2="Spine", spine3="Spine1", neck="Neck", head="Head") | {
+    f"{side}_{joint}": side.title() + name
+    for side in ("left", "right")
+    for joint, name in dict(
+        hip="UpLeg", knee="Leg", ankle="Foot", foot="ToeBase", collar="Shoulder", shoulder="Arm", elbow="ForeArm",
+        wrist="Hand", hand="HandIndex1",
+    ).items()
+}  # fmt: skip
+MIXAMO_NAMES = {
+    k: f"mixamorig:{v.replace('Spine', 'Back').replace('LowerBack', 'Spine')}" for k, v in CMU_NAMES.items()
+}
+ROKOKO_NAMES = CMU_NAMES | {
+    f"{side}_{joint}": side.title() + name
+    for side in ("left", "right")
+    for joint, name in dict(hip="Thigh", knee="Shin", foot="Toe", hand="Finger2").items()
+}
+BLENDER_NAMES = CMU_NAMES | {
+    f"{side}_{joint}": f"{name}.{side[0].upper()}"
+    for side in ("left", "right")
+    for joint, name in dict(
+        hip="thigh", knee="shin", ankle="foot", foot="toe", collar="shoulder", shoulder="upper_arm", elbow="forearm",
+        wrist="hand", hand="f_middle.01",
+    ).items()
+}  # fmt: skip
+SMPL_NAMES = {name: name for name in SMPL24.joints}
+UNREAL_NAMES = CMU_NAMES | {
+    f"{side}_{joint}": f"{name}_{side[0]}"
+    for side in ("left", "right")
+    for joint, name in dict(
+        hip="thigh", knee="calf", ankle="foot", foot="ball", collar="clavicle", shoulder="upperarm", elbow="lowerarm",
+        wrist="hand", hand="middle_01",
+    ).items()
+}  # fmt: skip
+
+
+def bvh_text(rotations, translation, *, names=SMPL_NAMES, order="ZXY", unit=0.01, up="y", fps=30.0, drop=()):
+    """A BVH of the mean adult: `unit` metres a number, rotations in channels of this order; joints in `drop` (with all
+    below them) are left out."""
+    world = UP_AXES[up]
+    rest = retarget.mean_adult_joints() @ C / unit
+    local = C.T @ rotations @ C
+    local[:, 0] = world.T @ rotations[:, 0] @ C
+    euler = [np.degrees(to_euler(local[:, j], order)) for j in range(24)]
+    at = translation @ world / unit
+    lines, columns = ["HIERARCHY"], []
+
+    def joint(j, depth):
+        pad = "\t" * depth
+        lines.append(f"{pad}{'JOINT' if depth else 'ROOT'} {names[SMPL24.joints[j]]}")
+        lines.append(pad + "{")
+        offset = rest[j] - rest[SMPL24.parents[j]] if depth else np.zeros(3)
+        lines.append(f"{pad}\tOFFSET " + " ".join(f"{v:.6f}" for v in offset))
+        turns = " ".join(f"{axis}rotation" for axis in order)
+        if depth:
+            lines.append(f"{pad}\tCHANNELS 3 {turns}")
+        else:
+            lines.append(f"{pad}\tCHANNELS 6 Xposition Yposition Zposition {turns}")
+            columns.append(at)
+        columns.append(euler[j])
+        children = [k for k in range(24) if SMPL24.parents[k] == j and SMPL24.joints[k] not in drop]
+        for child in children:
+            joint(child, depth + 1)
+        if not children:
+            lines.extend([f"{pad}\tEnd Site", pad + "\t{", f"{pad}\t\tOFFSET 0 0 0", pad + "\t}"])
+        lines.append(pad + "}")
+
+    joint(0, 0)
+    lines += ["MOTION", f"Frames: {len(rotations)}", f"Frame Time: {1 / fps:.8f}"]
+    lines += [" ".join(f"{v:.6f}" for v in row) for row in np.concatenate(columns, 1)]
+    return "\n".join(lines) + "\n"
+
+
+def to_euler(matrix, order):
+    """Angles (F, 3) whose rotations about the axes `order`, multiplied in this order, are matrix (F, 3, 3)."""
+    i, j, k = ("XYZ".index(axis) for axis in order)
+    sign = 1.0 if (j - i) % 3 == 1 else -1.0
+    second = np.arcsin(np.clip(sign * matrix[:, i, k], -1, 1))
+    first = np.arctan2(-sign * matrix[:, j, k], matrix[:, k, k])
+    third = np.arctan2(-sign * matrix[:, i, j], matrix[:, i, i])
+    return np.stack([first, second, third], -1)
+
+
+# CMU's bones: parent, the joint at the start (whose rotation it has), the joint at the end; `dof` where it turns
+_ASF = [("lowerback", "root", "pelvis", "spine1"), ("upperback", "lowerback", "spine1", "spine2"),
+        ("midback", "upperback", "spine2", "spine3"), ("thorax", "midback", "spine3", "neck"),
+        ("lowerneck", "thorax", "neck", "head"), ("upperneck", "lowerneck", "head", None)]  # fmt: skip
+for _s, _l in (("left", "l"), ("right", "r")):
+    _ASF += [
+        (f"{_l}hipjoint", "root", "pelvis", f"{_s}_hip"),
+        (f"{_l}femur", f"{_l}hipjoint", f"{_s}_hip", f"{_s}_knee"),
+        (f"{_l}tibia", f"{_l}femur", f"{_s}_knee", f"{_s}_ankle"),
+        (f"{_l}foot", f"{_l}tibia", f"{_s}_ankle", f"{_s}_foot"),
+        (f"{_l}inner", "midback", "spine3", f"{_s}_collar"),
+        (f"{_l}clavicle", f"{_l}inner", f"{_s}_collar", f"{_s}_shoulder"),
+        (f"{_l}humerus", f"{_l}clavicle", f"{_s}_shoulder", f"{_s}_elbow"),
+        (f"{_l}radius", f"{_l}humerus", f"{_s}_elbow", f"{_s}_wrist"),
+        (f"{_l}hand", f"{_l}radius", f"{_s}_wrist", f"{_s}_hand"),
+    ]  # fmt: skip
+ASF_ENDS = {bone: end for bone, _, _, end in _ASF if end}
+
+
+def asf_text(*, length=0.45, seed=0, angle="deg"):
+    """The mean adult as CMU's skeleton: y up, every bone's axes turned at random."""
+    rng = np.random.default_rng(seed)
+    scale = length / 0.0254
+    rest = retarget.mean_adult_joints() @ C
+    axes = {}
+    lines = ["# test", ":version 1.10", ":name test", ":units", "  mass 1.0", f"  length {length}", f"  angle {angle}"]
+    lines += [":documentation", "  none", ":root", "   order TX TY TZ RX RY RZ", "   axis XYZ", "   position 0 0 0"]
+    lines += ["   orientation 0 0 0", ":bonedata"]
+    for k, (bone, _, start, end) in enumerate(_ASF, 1):
+        way = (rest[J[end]] - rest[J[start]] if end else np.array([0, 0.02, 0])) * scale
+        size = np.linalg.norm(way)
+        axes[bone] = rng.uniform(-170, 170, 3)
+        shown = axes[bone] if angle == "deg" else np.radians(axes[bone])
+        lines += ["  begin", f"     id {k}", f"     name {bone}"]
+        lines += ["     direction " + " ".join(f"{v:.8f}" for v in way / size), f"     length {size:.8f}"]
+        lines += ["     axis " + " ".join(f"{v:.8f}" for v in shown) + "  XYZ"]
+        if _turns(bone, start):
+            lines += [
+                "    dof rx ry rz",
+                "    limits (-160.0 20.0)",
+                "           (-70.0 70.0)",
+                "           (-60.0 70.0)",
+            ]
+        lines += ["  end"]
+    lines += [":hierarchy", "  begin"]
+    for parent in dict.fromkeys(p for _, p, _, _ in _ASF):
+        lines += [f"    {parent} " + " ".join(bone for bone, p, _, _ in _ASF if p == parent)]
+    return "\n".join([*lines, "  end"]) + "\n", axes
+
+
+def amc_text(rotations, translation, axes, *, length=0.45):
+    local = C.T @ rotations @ C
+    at = translation @ C * length / 0.0254
+    columns = {"root": np.concatenate([at, np.degrees(_xyz(local[:, 0]))], 1)}
+    for bone, _, start, _ in _ASF:
+        if _turns(bone, start):
+            a = _from_xyz(np.radians(axes[bone]))
+            turn = local[:, J[start]] if bone not in ("linner", "rinner") else local[:, J["spine3"]]
+            columns[bone] = np.degrees(_xyz(a.T @ turn @ a))
+    lines = ["#!OML:ASF test", ":FULLY-SPECIFIED", ":DEGREES"]
+    for f in range(len(rotations)):
+        lines.append(str(f + 1))
+        lines += [f"{bone} " + " ".join(f"{v:.7f}" for v in value[f]) for bone, value in columns.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _turns(bone, start):
+    """Bones that start at the pelvis go with the root."""
+    return start != "pelvis"
+
+
+def _xyz(matrix):
+    """Angles (F, 3) about x, y, z of rotations R_z R_y R_x."""
+    return to_euler(matrix, "ZYX")[:, ::-1]
+
+
+def _from_xyz(angles):
+    return rotation_about("z", angles[2]) @ rotation_about("y", angles[1]) @ rotation_about("x", angles[0])

@@ -1,0 +1,284 @@
+"""SMPL files: the published equations on a synthetic model file, frames, part labels, and what is refused."""
+
+import pickle
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpose.body.rig import load_rig, pose_bodies
+from lidarpose.body.smpl import load_body
+from lidarpose.body.smpl_rig import rig_of
+from lidarpose.errors import InputError
+from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about
+from lidarpose.skeleton import BODY26, SMPL24
+
+J = BODY26.index
+R_HOUSE_SMPL = UP_AXES["y"]
+HEAD, LEFT_WRIST, RIGHT_WRIST = (J(name) for name in ("head", "left_wrist", "right_wrist"))
+# the joints beyond SMPL's 22: of SMPL-H 15 a hand, of SMPL-X jaw and eyes before them
+_HANDS = [LEFT_WRIST, 22, 23, LEFT_WRIST, 25, 26, LEFT_WRIST, 28, 29, LEFT_WRIST, 31, 32, LEFT_WRIST, 34, 35]
+
+
+def tree(joints: int) -> list[int]:
+    if joints == 24:
+        return list(SMPL24.parents)
+    extra = joints - 52
+    left = [p if p == LEFT_WRIST else p + extra for p in _HANDS]
+    right = [RIGHT_WRIST if p == LEFT_WRIST else p + 15 for p in left]
+    return list(SMPL24.parents[:22]) + [HEAD] * extra + left + right
+
+
+def synthetic(joints: int = 24, shapes: int = 10, seed: int = 0) -> dict:
+    """A model in SMPL's layout and frame: the shipped body's mesh, everything else drawn at random."""
+    rng, rig = np.random.default_rng(seed), load_rig()
+    template = rig.template.astype(float) @ R_HOUSE_SMPL + [0, 0.1, 0]
+    count = len(template)
+    weights = np.zeros((count, joints))
+    weights[:, :22] = rig.dense_weight[:, :22]
+    for hand, start in ((22, 22 + (joints == 55) * 3), (23, 23 if joints == 24 else joints - 15)):
+        fingers = [start] if joints == 24 else list(range(start, start + 15))
+        weights[:, fingers] += rig.dense_weight[:, hand, None] / len(fingers)
+    if joints == 55:
+        for face in (22, 23, 24):
+            weights[:, face] += 0.02 * weights[:, HEAD]
+        weights[:, HEAD] *= 0.94
+    weights /= weights.sum(1, keepdims=True)
+    # joints: means of the vertices they move, so within the body
+    regressor = np.where(weights > 0.2, weights, 0) + 1e-6 * weights
+    regressor /= regressor.sum(0)
+    parents = np.array(tree(joints), np.int64)
+    parents[0] = 2**32 - 1
+    return {
+        "v_template": template,
+        "shapedirs": rng.normal(0, 0.01, (count, 3, shapes)),
+        "posedirs": rng.normal(0, 0.002, (count, 3, 9 * (joints - 1))),
+        "J_regressor": regressor.T.copy(),
+        "weights": weights,
+        "kintree_table": np.stack([parents, np.arange(joints)]).astype(np.uint32),
+        "f": rig.faces.astype(np.uint32),
+        "bs_style": "lbs",
+    }
+
+
+@pytest.fixture(scope="module")
+def bodies(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("smpl")
+    found = {}
+    for joints, shapes in ((24, 10), (52, 16), (55, 20)):
+        model = synthetic(joints, shapes)
+        path = folder / f"{joints}.npz"
+        np.savez(path, **model)
+        found[joints] = (load_body(path), model)
+    return found
+
+
+@pytest.fixture
+def body(bodies):
+    return bodies[24][0]
+
+
+def published(model, betas, rotations, translation):
+    """Loper et al. 2015, Eqs. 2-10, with dense sums and 4 x 4 matrices, one person."""
+    number = len(model["weights"][0])
+    parents = [int(p) if p < number else -1 for p in model["kintree_table"][0]]
+    shaped = model["v_template"] + np.einsum("vcb,b->vc", model["shapedirs"][..., : len(betas)], betas)
+    joints = np.einsum("jv,vc->jc", model["J_regressor"], shaped)
+    feature = np.concatenate([(r - np.eye(3)).ravel() for r in rotations[1:]])
+    posed = shaped + np.einsum("vcp,p->vc", model["posedirs"], feature)
+    world = []
+    for j, parent in enumerate(parents):
+        local = np.eye(4)
+        local[:3, :3] = rotations[j]
+        local[:3, 3] = joints[j] - (joints[parent] if parent >= 0 else 0)
+        world.append(local if parent < 0 else world[parent] @ local)
+    relative = []
+    for j, g in enumerate(world):
+        away = np.eye(4)
+        away[:3, 3] = -joints[j]
+        relative.append(g @ away)
+    skin = np.einsum("vj,jab->vab", model["weights"], np.stack(relative))
+    homogeneous = np.concatenate([posed, np.ones((len(posed), 1))], 1)
+    vertices = np.einsum("vab,vb->va", skin, homogeneous)[:, :3]
+    return vertices + translation, np.stack([g[:3, 3] for g in world]) + translation
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.sampled_from([24, 52, 55]), st.integers(0, 10**6), st.integers(0, 10))
+def test_poses_are_those_of_the_published_equations(bodies, joints, seed, coefficients):
+    body, model = bodies[joints]
+    rng = np.random.default_rng(seed)
+    betas, turns = rng.normal(size=(2, coefficients)), rng.normal(0, 0.7, (2, joints, 3))
+    move = rng.normal(0, 3, (2, 3))
+    vertices, found = body.pose(betas, turns, move)
+    same = body.pose(betas, axis_angle_to_matrix(turns), move)
+    np.testing.assert_allclose(same[0], vertices, atol=1e-12)
+    for i in range(2):
+        expected = published(model, betas[i], axis_angle_to_matrix(turns[i]), move[i])
+        np.testing.assert_allclose(vertices[i], expected[0], atol=1e-6)
+        np.testing.assert_allclose(found[i], expected[1], atol=1e-6)
+
+
+def test_expressions_are_no_shapes(bodies):
+    # half of an old SMPL-X's coefficients are of the face's expression
+    assert [bodies[j][0].shape_count for j in (24, 52, 55)] == [10, 16, 10]
+    assert not bodies[24][0].weights.flags.writeable
+
+
+def test_24_rotations_pose_the_larger_models(bodies):
+    """The hands' rotations turn all fingers at their bases; fingers, jaw and eyes rest otherwise."""
+    rng = np.random.default_rng(3)
+    turns = rng.normal(0, 0.5, (2, 24, 3))
+    for joints in (52, 55):
+        body, _ = bodies[joints]
+        whole = np.zeros((2, joints, 3))
+        whole[:, :22] = turns[:, :22]
+        for wrist, hand in ((LEFT_WRIST, 22), (RIGHT_WRIST, 23)):
+            whole[:, np.flatnonzero(np.array(tree(joints)) == wrist)] = turns[:, hand, None]
+        for a, b in zip(body.pose(np.zeros((2, 3)), turns), body.pose(np.zeros((2, 3)), whole), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_house_frame(bodies):
+    rng = np.random.default_rng(4)
+    turns, move = axis_angle_to_matrix(rng.normal(0, 0.5, (3, 24, 3))), rng.normal(0, 3, (3, 3))
+    for joints in (24, 55):
+        body, _ = bodies[joints]
+        betas = rng.normal(size=(3, 10))
+        vertices, joints26 = body.pose_house(betas, turns, move)
+        assert vertices.dtype == joints26.dtype == np.float32 and joints26.shape == (3, 26, 3)
+        np.testing.assert_allclose(joints26[:, 0], move, atol=1e-6)
+        there, at = body.pose(betas, R_HOUSE_SMPL.T @ turns @ R_HOUSE_SMPL)
+        np.testing.assert_allclose(vertices, (there - at[:, :1]) @ R_HOUSE_SMPL.T + move[:, None], atol=1e-5)
+        np.testing.assert_allclose(
+            joints26[:, :22], (at[:, :22] - at[:, :1]) @ R_HOUSE_SMPL.T + move[:, None], atol=1e-5
+        )
+        # nose and middle of the head ride on the head
+        still, rest = body.pose_house(betas, np.broadcast_to(np.eye(3), (3, 24, 3, 3)), np.zeros((3, 3)))
+        apart = [np.linalg.norm(j[:, J("nose")] - j[:, J("head_center")], axis=-1) for j in (rest, joints26)]
+        np.testing.assert_allclose(*apart, atol=1e-5)
+        assert (rest[:, J("nose"), 0] > rest[:, J("head_center"), 0] + 0.05).all()
+        _, mean = body.pose_house(np.zeros((1, 0)), np.eye(3) + np.zeros((1, 24, 1, 1)), np.zeros((1, 3)))
+        assert abs(mean[0, J("head_center"), 1]) < 0.01
+        assert (rest[:, J("left_hand"), 1] > 0.4).all() and (rest[:, J("left_foot"), 2] < -0.6).all()
+    # facing +x, the left at +y, the head up
+    turn = rotation_about("z", np.pi / 2)
+    turns = np.broadcast_to(np.eye(3), (1, 24, 3, 3)).copy()
+    turns[0, 0] = turn
+    turned, _ = body.pose_house(betas[:1], turns, np.zeros((1, 3)))
+    np.testing.assert_allclose(turned[0], still[0] @ turn.T, atol=1e-5)
+
+
+def test_as_a_rig_it_poses_the_same_but_for_pose_shapes(tmp_path):
+    for joints in (24, 55):
+        model = synthetic(joints)
+        model["posedirs"] *= 0
+        path = tmp_path / f"{joints}.npz"
+        np.savez(path, **model)
+        body = load_body(path)
+        rig = rig_of(body, np.random.default_rng(0), people=12)
+        rng = np.random.default_rng(5)
+        turns, move = axis_angle_to_matrix(rng.normal(0, 0.4, (12, 24, 3))), rng.normal(size=(12, 3))
+        turns[:, 22:] = np.eye(3)
+        vertices, at = pose_bodies(rig, rig.rest(rig.coefficients), turns, move)
+        expected, expected_at = body.pose_house(rig.coefficients, turns, move)
+        np.testing.assert_allclose(at, expected_at, atol=3e-5)
+        # four weights a vertex at most
+        assert np.percentile(np.abs(vertices - expected), 99) < 2e-3
+        assert (rig.face_part == body.face_part).all() and set(rig.face_part) == set(range(1, 25))
+        assert (np.diff(rig.weight, axis=1) <= 0).all() and np.abs(rig.coefficients).max() <= 2.5
+        assert 1.3 < np.median(rig.height) < 2.2 and 10 < np.median(rig.bmi) < 40
+    with pytest.raises(InputError, match="1 or more"):
+        rig_of(body, rng, people=0)
+
+
+def test_part_labels(bodies):
+    rig = load_rig()
+    for joints in (24, 52, 55):
+        body, _ = bodies[joints]
+        # the shipped body's are from its weights before they were rounded and its mesh made smaller
+        assert (body.face_part == rig.face_part).mean() > 0.94
+        assert body.face_part.dtype == np.uint8
+
+
+def test_a_pickle_gives_the_same_body(tmp_path, body):
+    model = synthetic()
+    path = tmp_path / "model.pkl"
+    path.write_bytes(pickle.dumps(model, 2))
+    same = load_body(path)
+    for name in ("template", "shapes", "pose_shapes", "weights", "regressor", "parents", "faces", "face_part"):
+        np.testing.assert_array_equal(getattr(same, name), getattr(body, name))
+
+
+WRONG = [
+    ({"weights": None}, "no body of the SMPL family: weights missing; it has J_regressor"),
+    ({"v_template": np.zeros((5, 2))}, r"needs v_template \(V, 3\), .* got \(5, 2\)"),
+    ({"v_template": np.full((1206, 3), np.nan)}, "v_template has values that are no numbers"),
+    ({"weights": np.zeros((5, 24))}, r"weights must be \(\d+, 24\) .* got \(5, 24\)"),
+    ({"weights": np.zeros((0, 24))}, r"weights must be"),
+    ({"shapedirs": np.zeros((5, 3, 10))}, r"shapedirs must be \(V, 3, S\) .* got \(5, 3, 10\)"),
+    ({"posedirs": np.zeros((5, 3, 207))}, r"posedirs must be \(\d+, 3, 207\)"),
+    ({"J_regressor": np.zeros((24, 5))}, r"J_regressor must be \(24, \d+\) .* got \(24, 5\)"),
+    ({"J_regressor": "a text"}, "J_regressor must be an array of numbers"),
+    ({"kintree_table": np.zeros((2, 20))}, r"20 joints"),
+    ({"kintree_table": np.zeros((2, 24))}, "must begin with SMPL's joints"),
+    ({"kintree_table": np.full((2, 24), 0.5)}, "must begin with SMPL's joints"),
+    ({"kintree_table": np.stack([np.arange(24) - 1, np.arange(24)])}, "must begin with SMPL's joints"),
+    ({"f": np.array([[0, 1, 10**6]])}, "f must be whole numbers of vertices, 0 to"),
+    ({"f": np.array([[0, 1, -1]])}, "f must be whole numbers of vertices, 0 to"),
+    ({"f": np.zeros((0, 3))}, r"f must be \(F, 3\)"),
+]
+
+
+@pytest.mark.parametrize(("change", "line"), WRONG, ids=[f"{next(iter(c))}-{i}" for i, (c, _) in enumerate(WRONG)])
+def test_wrong_models_are_explained_in_one_line(tmp_path, change, line):
+    model = {key: value for key, value in (synthetic() | change).items() if value is not None}
+    np.savez(tmp_path / "m.npz", **model)
+    (tmp_path / "m.pkl").write_bytes(pickle.dumps(model))
+    for name in ("m.npz", "m.pkl"):
+        with pytest.raises(InputError, match=line) as caught:
+            load_body(tmp_path / name)
+        assert "\n" not in str(caught.value) and name in str(caught.value)
+
+
+def test_weights_must_be_weights(tmp_path):
+    for change in (lambda w: w * 2, lambda w: w - 0.5, lambda w: np.roll(w, 3, 1) * 0):
+        model = synthetic()
+        np.savez(tmp_path / "m.npz", **model | {"weights": change(model["weights"])})
+        with pytest.raises(InputError, match="sum to 1"):
+            load_body(tmp_path / "m.npz")
+
+
+def test_wrong_files(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        load_body(tmp_path / "none.npz")
+    path = tmp_path / "m.npz"
+    path.write_bytes(b"PK\x03\x04 broken")
+    with pytest.raises(InputError, match="as plain numbers"):
+        load_body(path)
+    np.savez(path, **synthetic() | {"J_regressor": np.array([{}, {}], dtype=object)})
+    with pytest.raises(InputError, match="as plain numbers"):
+        load_body(path)
+    np.save(tmp_path / "m.npy", np.zeros(3))
+    with pytest.raises(InputError, match="expected a body of the SMPL family"):
+        load_body(tmp_path / "m.npy")
+    (tmp_path / "m.pkl").write_bytes(pickle.dumps([1]))
+    with pytest.raises(InputError, match="a dict of SMPL's arrays, got list"):
+        load_body(tmp_path / "m.pkl")
+
+
+def test_wrong_calls(body):
+    eye = np.broadcast_to(np.eye(3), (2, 24, 3, 3))
+    with pytest.raises(InputError, match=r"betas must be finite, \(n, up to 10\)"):
+        body.pose(np.zeros((2, 11)), eye)
+    with pytest.raises(InputError, match="betas must be finite"):
+        body.pose(np.full((2, 3), np.nan), eye)
+    with pytest.raises(InputError, match="rotations must be finite"):
+        body.pose(np.zeros((2, 3)), eye[:1])
+    with pytest.raises(InputError, match="rotations must be finite"):
+        body.pose(np.zeros((2, 3)), np.zeros((2, 21, 3)))
+    with pytest.raises(InputError, match="rotations must be finite"):
+        body.pose(np.zeros((2, 3)), np.zeros((2, 24, 4)))
+    with pytest.raises(InputError, match=r"translation must be \(2, 3\)"):
+        body.pose(np.zeros((2, 3)), eye, np.zeros(3))
