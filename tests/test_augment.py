@@ -7,6 +7,10 @@ from hypothesis import strategies as st
 
 from lidarpose.data import augment
 from lidarpose.geometry import unit
+from lidarpose.sample import Box
+from lidarpose.synth.mask import direction_mask
+from lidarpose.synth.mesh import Mesh
+from lidarpose.synth.spoil import range_errors, spoil, spoil_points
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -23,6 +27,12 @@ def calls(points, ring, part, normals):
     return {
         "range_noise": lambda rng: augment.range_noise(points, ring, sigma=0.02, bias=0.006, rng=rng),
         "grazing_keep": lambda rng: augment.grazing_keep(points, normals, strength=0.8, rng=rng),
+        "one_sided_noise": lambda rng: augment.one_sided_noise(points, most=0.02, rng=rng),
+        "weak_keep": lambda rng: augment.weak_keep(points, normals, strength=0.9, range_max=30.0, rng=rng),
+        "random_keep": lambda rng: augment.random_keep(len(points), share=0.2, rng=rng),
+        "reference_clusters": lambda rng: augment.reference_clusters(points.mean(0), rng=rng),
+        "half_space_keep": lambda rng: augment.half_space_keep(points, most=0.9, rng=rng),
+        "direction_mask": lambda rng: direction_mask(points, keep=0.6, rng=rng),
         "noise_clusters": lambda rng: augment.noise_clusters(points.mean(0), most=150, rng=rng),
         "part_removal": lambda rng: augment.part_removal(part, rng=rng),
         "jitter": lambda rng: augment.jitter(points, sigma=0.01, clip=0.02, rng=rng),
@@ -41,7 +51,7 @@ def test_inputs_stay_as_they_are_and_the_generator_decides(name):
     assert first.shape != other.shape or (first != other).any()
 
 
-@pytest.mark.parametrize("name", ["range_noise", "grazing_keep", "part_removal", "jitter"])
+@pytest.mark.parametrize("name", sorted(set(calls(*seen(1))) - {"noise_clusters", "reference_clusters"}))
 def test_no_points_are_legal(name):
     call = calls(*(a[:0] for a in seen(1)))[name]
     assert len(call(np.random.default_rng(0))) == 0
@@ -135,3 +145,232 @@ def test_jitter_is_normal_and_cut():
     cut = augment.jitter(points, sigma=0.05, clip=0.02, rng=np.random.default_rng(8))
     assert np.abs(cut).max() == 0.02
     assert (np.abs(cut) == 0.02).mean() == pytest.approx(0.689, abs=0.02)
+
+
+def test_one_sided_noise_is_the_released_code_s():
+    points = seen(20000)[0]
+    moved = augment.one_sided_noise(points, most=0.02, rng=np.random.default_rng(9))
+    error = np.linalg.norm(moved, axis=1) - np.linalg.norm(points, axis=1)
+    np.testing.assert_allclose(unit(moved), unit(points), atol=1e-12)
+    assert error.min() >= -1e-12 and error.max() < 0.02
+    assert error.mean() == pytest.approx(0.01, rel=0.03)
+
+
+# --- what is lost
+
+
+def facing(points, degrees):
+    """Normals that the beams of points (n, 3) meet at `degrees` off the perpendicular."""
+    beam = unit(points)
+    angle = np.radians(degrees)
+    return np.cos(angle) * beam + np.sin(angle) * unit(np.cross(beam, [0, 0, 1]))
+
+
+def test_weak_returns_follow_the_range_equation():
+    near, far = np.array([[5.0, 0, 0]]), np.array([[60.0, 0, 0]])
+    assert augment.weak_loss(far, facing(far, 0), range_max=120)[0] == pytest.approx(0.5)
+    assert augment.weak_loss(near, facing(near, 60), range_max=120)[0] < 1e-3
+    # the same power: four times as far is a sixteenth, as is a cosine of a sixteenth
+    slanted = augment.weak_loss(near * 4, facing(near, np.degrees(np.arccos(1 / 16))), range_max=100)
+    assert slanted[0] == pytest.approx(augment.weak_loss(near * 16, facing(near, 0), range_max=100)[0])
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(0.5, 80), st.floats(0, 89), st.floats(0.5, 80), st.floats(0, 89))
+def test_farther_and_more_grazing_is_weaker(r, a, more, turn):
+    point = np.array([[r, 0, 0]])
+    loss = augment.weak_loss(point, facing(point, a), range_max=100)
+    assert 0 <= loss[0] <= 1
+    assert augment.weak_loss(point * (1 + more / r), facing(point, a), range_max=100)[0] >= loss[0]
+    assert augment.weak_loss(point, facing(point, min(a + turn, 90)), range_max=100)[0] >= loss[0] - 1e-12
+
+
+def test_weak_keep_loses_at_its_strength():
+    points = np.tile([[50.0, 0, 0]], (20000, 1))
+    kept = augment.weak_keep(points, facing(points, 0), strength=0.6, range_max=100, rng=np.random.default_rng(10))
+    assert kept.mean() == pytest.approx(1 - 0.6 * 0.5, abs=0.015)
+    assert augment.weak_keep(points, facing(points, 90), strength=0.0, range_max=1, rng=np.random.default_rng(1)).all()
+
+
+def test_random_keep_loses_its_share():
+    assert augment.random_keep(20000, share=0.3, rng=np.random.default_rng(11)).mean() == pytest.approx(0.7, abs=0.015)
+    assert augment.random_keep(50, share=0.0, rng=np.random.default_rng(11)).all()
+
+
+# --- the compiled twin
+
+
+def surface(seed, n=300):
+    """A mesh of random triangles about 8 m away, and points on n of its faces with their rings."""
+    rng = np.random.default_rng(seed)
+    corners = np.array([8.0, 1, 0]) + rng.normal(0, 0.5, (40, 3, 3))
+    mesh = Mesh(corners.reshape(-1, 3).astype(np.float32), np.arange(120, dtype=np.int32).reshape(40, 3))
+    face = rng.integers(0, 40, n).astype(np.int32)
+    weight = rng.dirichlet(np.ones(3), n)
+    points = (mesh.vertices[mesh.faces[face]] * weight[..., None]).sum(1).astype(np.float32)
+    return mesh, face, points, rng.integers(0, 64, n).astype(np.int32)
+
+
+def normals_of(mesh, face):
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces[face]].astype(float), 1, 0)
+    return unit(np.cross(b - a, c - a))
+
+
+@settings(max_examples=60, deadline=None)
+@given(seeds, st.floats(0, 0.9), st.floats(0, 1), st.floats(1, 300))
+def test_the_compiled_twin_agrees_draw_by_draw(seed, dropout, weak, range_max):
+    mesh, face, points, _ = surface(seed)
+    rng = np.random.default_rng(seed)
+    keep, chance = rng.random(len(points)) < 0.8, rng.random(len(points))
+    error = rng.normal(0, 0.03, len(points))
+    slow, slow_kept = augment.spoil_reference(
+        *(points.astype(float), normals_of(mesh, face), keep, error, chance),
+        dropout=dropout,
+        weak=weak,
+        range_max=range_max,
+    )
+    fast, fast_kept = spoil_points(
+        *(points, face, mesh.vertices, mesh.faces, keep, error, chance, dropout, weak, augment.REACH * range_max)
+    )
+    np.testing.assert_array_equal(fast_kept, slow_kept)
+    np.testing.assert_allclose(fast, slow, atol=2e-6)
+
+
+def test_spoiling_nothing_changes_nothing():
+    mesh, face, points, ring = surface(1)
+    copy = points.copy()
+    moved, kept = spoil(
+        *(points, face, mesh.vertices, mesh.faces, ring),
+        **dict(sigma=0.0, bias=0.0, dropout=0.0, weak=0.0, range_max=1.0, rng=np.random.default_rng(0)),
+    )
+    np.testing.assert_array_equal(kept, np.arange(len(points)))
+    np.testing.assert_allclose(moved, copy, atol=1e-6)
+    np.testing.assert_array_equal(points, copy)
+    none = spoil(
+        *(points[:0], face[:0], mesh.vertices, mesh.faces, ring[:0]),
+        **dict(sigma=0.1, bias=0.1, dropout=0.5, weak=1.0, range_max=9.0, one_sided=0.1, rng=np.random.default_rng(0)),
+    )
+    assert none[0].shape == (0, 3) and none[1].shape == (0,)
+
+
+def test_spoiled_ranges_have_the_law_of_the_sensor():
+    mesh, face, points, ring = surface(2, n=20000)
+    calm = dict(dropout=0.0, weak=0.0, range_max=100.0)
+
+    def error(**noise):
+        moved, _ = spoil(
+            *(points, face, mesh.vertices, mesh.faces, ring), **calm, **noise, rng=np.random.default_rng(3)
+        )
+        return np.linalg.norm(moved.astype(float), axis=1) - np.linalg.norm(points.astype(float), axis=1)
+
+    own = error(sigma=0.02, bias=0.0)
+    assert own.std() == pytest.approx(0.02, rel=0.03) and abs(own.mean()) < 6e-4
+    shared = error(sigma=0.0, bias=0.01)
+    np.testing.assert_allclose(shared, np.array([shared[ring == r].mean() for r in range(64)])[ring], atol=2e-6)
+    outwards = error(sigma=0.0, bias=0.0, one_sided=0.02)
+    assert outwards.min() > -2e-6 and outwards.max() < 0.0201
+    assert outwards.mean() == pytest.approx(0.01, rel=0.03)
+
+
+def test_a_surface_without_area_returns_nothing_where_weak_returns_are_lost():
+    vertices = np.full((3, 3), 5.0, np.float32)
+    face, faces = np.zeros(40, np.int32), np.array([[0, 1, 2]], np.int32)
+    points = np.full((40, 3), 5.0, np.float32)
+    moved, _ = spoil_points(
+        points, face, vertices, faces, np.ones(40, bool), np.zeros(40), np.full(40, 0.99), 0.0, 1.0, 50.0
+    )
+    assert len(moved) == 0
+
+
+def test_a_ring_s_error_is_drawn_once():
+    ring = np.array([3, 0, 3, 1])
+    normals = np.arange(8, dtype=np.float32)
+    np.testing.assert_allclose(range_errors(ring, normals, 0.0, 2.0), 2.0 * (4 + ring))
+    np.testing.assert_allclose(range_errors(ring, normals, 1.0, 0.0), normals[:4])
+
+
+# --- stray points, cuts, masks without a grid
+
+
+def test_reference_clusters_have_the_released_code_s_law():
+    center = np.array([3.0, -7, 0.5])
+    draws = [augment.reference_clusters(center, rng=np.random.default_rng(seed)) for seed in range(300)]
+    sizes = np.array([len(d) for d in draws])
+    assert sizes.mean() == pytest.approx(149, rel=0.06) and sizes.max() > 200
+    assert all((np.abs(d - center) <= np.array([0.7, 0.7, 1.1])).all() for d in draws)
+    # uniform in radius and polar angle: half of a cluster lies within half its radius, far more than of a ball
+    lone = [d for d in draws if 40 < len(d)]
+    spread = np.concatenate([np.linalg.norm(d[:20] - np.median(d[:20], 0), axis=1) for d in lone])
+    assert np.median(spread) < 0.19 and spread.max() > 0.25
+
+
+@settings(max_examples=60, deadline=None)
+@given(seeds, st.floats(0, 0.9), st.integers(1, 200))
+def test_a_half_space_leaves_most_of_the_extent(seed, most, n):
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(n, 3))
+    keep = augment.half_space_keep(points, most=most, rng=rng)
+    assert keep.shape == (n,) and keep.any()
+    if most == 0:
+        assert keep.all()
+
+
+def test_a_half_space_cuts_a_straight_edge():
+    # a ball: the centers of both sides of a plane lie on its normal
+    points = unit(np.random.default_rng(0).normal(size=(4000, 3)))
+    keep = augment.half_space_keep(points, most=0.9, rng=np.random.default_rng(12))
+    assert 0.05 < (~keep).mean() < 0.95
+    # the kept and the lost are separated by a plane: the line between their centers
+    line = points[keep].mean(0) - points[~keep].mean(0)
+    along = points @ unit(line)
+    assert along[~keep].max() - along[keep].min() < 0.12
+
+
+@settings(max_examples=80, deadline=None)
+@given(seeds, st.floats(0, 0.9), st.floats(-3, 3))
+def test_a_cut_box_lies_inside_the_box_and_loses_one_side(seed, most, yaw):
+    whole = Box(center=[4.0, 1, 0.2], size=[0.7, 0.9, 1.8], yaw=yaw, id="x")
+    cut = augment.cut_box(whole, most=most, rng=np.random.default_rng(seed))
+    lost = 1 - cut.size / whole.size
+    assert (lost >= -1e-12).all() and (lost > 1e-12).sum() <= 1 and lost.max() <= most + 1e-12
+    assert cut.yaw == whole.yaw and cut.id == "x"
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    c, s = np.cos(yaw), np.sin(yaw)
+    corners = cut.center + (signs * cut.size / 2) @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    assert whole.contains(corners, margin=1e-9).all()
+    # all other sides stay where they are
+    touching = [whole.contains(corners[k : k + 1], margin=-1e-6)[0] for k in range(8)]
+    assert not all(touching)
+
+
+def test_cuts_of_boxes_take_feet_heads_and_sides():
+    whole = Box(center=[4.0, 1, 0.2], size=[0.7, 0.9, 1.8], yaw=0.3)
+    rng = np.random.default_rng(5)
+    cuts = [augment.cut_box(whole, rng=rng) for _ in range(600)]
+    raised = np.mean([c.center[2] > 0.2 + 1e-9 for c in cuts])
+    lowered = np.mean([c.center[2] < 0.2 - 1e-9 for c in cuts])
+    assert raised == pytest.approx(1 / 3, abs=0.06) and lowered == pytest.approx(1 / 6, abs=0.05)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seeds, st.floats(0, 1), st.floats(-np.pi, np.pi))
+def test_the_mask_without_a_grid_keeps_its_share_in_patches(seed, keep, azimuth):
+    rng = np.random.default_rng(seed)
+    angle = azimuth + rng.uniform(-0.1, 0.1, 4000)
+    up = rng.uniform(-0.3, 0.3, 4000)
+    beams = np.stack([np.cos(angle) * np.cos(up), np.sin(angle) * np.cos(up), np.sin(up)], 1) * 7
+    kept = direction_mask(beams, keep=keep, rng=rng)
+    # 8 x 24 patches of equal numbers of beams, but for the rim
+    assert kept.mean() == pytest.approx(keep, abs=0.06)
+    if 0.2 < keep < 0.8:
+        # neighbours share their fate far more often than strangers
+        order = np.lexsort((up, (angle / 0.012).astype(int)))
+        same = (kept[order][1:] == kept[order][:-1]).mean()
+        assert same > keep**2 + (1 - keep) ** 2 + 0.15
+
+
+def test_the_mask_without_a_grid_takes_single_beams_and_lines():
+    rng = np.random.default_rng(0)
+    assert direction_mask(np.array([[1.0, 0, 0]]), keep=1.0, rng=rng).all()
+    line = np.column_stack([np.ones(500), np.linspace(-0.2, 0.2, 500), np.zeros(500)])
+    assert direction_mask(line, keep=0.5, rng=rng).mean() == pytest.approx(0.5, abs=0.05)

@@ -1,58 +1,43 @@
 """(seed, i) -> one person as a LiDAR sees them: body, clothes, scene, cast, faults, crop.
 
 Person i of a seed is the same whatever was asked for before and whoever asks: poses and shapes are drawn for blocks of
-`BLOCK` people (vectorised, from the block's own generator), everything else from the person's own generator.
+`BLOCK` people (vectorized, from the block's own generator), everything else from the person's own generator.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 
 import numpy as np
 
 from lidarpose.data import augment
 from lidarpose.errors import InputError
-from lidarpose.lidar.raycast import scan
+from lidarpose.lidar.pattern import RayPattern
 from lidarpose.lidar.sensor import Sensor, sensor
-from lidarpose.sample import Box, Pose, Sample, center_of
+from lidarpose.sample import Pose, Sample
 from lidarpose.skeleton import BODY26
+from lidarpose.synth.actor import Actor, draw_actor
 from lidarpose.synth.bodies import Bodies, PoseBank, draw_bodies
-from lidarpose.synth.mask import laser_mask
-from lidarpose.synth.mesh import Mesh, union
-from lidarpose.synth.scene import SceneConfig, draw_distance, draw_height, ground, occluder, surroundings
+from lidarpose.synth.crop import draw_box
+from lidarpose.synth.crop_kernels import center_of_cells, crop_points
+from lidarpose.synth.facts import Facts, facts_of
+from lidarpose.synth.look import Conditions, Layer, Returns, count_alone, draw_conditions, look
+from lidarpose.synth.placing import Place, draw_place
+from lidarpose.synth.props import Prop, draw_props
+from lidarpose.synth.scene import SceneConfig
+from lidarpose.synth.surroundings import ground, occluder, surroundings
 
 # people whose poses and shapes are drawn together
-BLOCK = 64
-# a person of fewer returns is drawn again, at most so many times, each time easier to see
+BLOCK = 256
+# a person of fewer returns is drawn again, so often at most, each time easier to see
 LEAST_POINTS = 15
 _TRIES = 8
-# beams beyond the person's own silhouette that are cast, m: the crop may reach there
-_AROUND = 0.3
-# spread of the error that all points of a ring share, m
-_RING_BIAS = 0.006
-
-
-@dataclass(frozen=True, kw_only=True)
-class Facts:
-    """What is known of a synthetic person besides the sample. sensor; distance m; visible: share of the returns of the
-    body alone that occluders, masks and the crop left; height_seen: share of the body's height between its lowest
-    and highest return; clutter: share of the points that are neither body nor ground; upright: stands or walks."""
-
-    sensor: str
-    distance: float
-    visible: float
-    height_seen: float
-    clutter: float
-    upright: bool
-
-    @property
-    def plain(self) -> bool:
-        """Upright, whole and uncluttered."""
-        return self.upright and self.visible > 0.8 and self.height_seen > 0.85 and self.clutter < 0.05
+# frames of a clip
+CLIP_FRAMES = 16
 
 
 @dataclass(frozen=True, kw_only=True)
 class SyntheticPerson:
-    """A sample with its true pose (body26, the sensor's frame) and parts, and the facts about it if asked for."""
+    """A sample with its true pose (body26, the level frame at the sensor) and parts, and the facts if asked for."""
 
     sample: Sample
     facts: Facts | None
@@ -71,190 +56,187 @@ class Generator:
     def __post_init__(self):
         if self.captured and self.bank is None:
             raise InputError("Generator.captured needs a bank of captured poses, got none")
+        if not 0 <= self.captured <= 1:
+            raise InputError(f"Generator.captured must be a share in [0, 1], got {self.captured}")
+        moving = any(isinstance(sensor(name), RayPattern) for name in self.scene.sensors)
         # neighbours share a block; two suffice for a reader that crosses from one to the next
-        drawn = lru_cache(maxsize=2)(partial(draw_bodies, self.bank, self.captured, BLOCK))
+        drawn = lru_cache(maxsize=2)(partial(draw_bodies, self.bank, self.captured, BLOCK, moving=moving))
         object.__setattr__(self, "_bodies", drawn)
 
     def person(self, seed: int, index: int, *, hard: float | None = None) -> SyntheticPerson:
         """Person `index` of `seed`, at the scene's difficulty or at `hard` in [0, 1]."""
         rng = np.random.default_rng([seed, 1, index])
+        bodies = self._bodies(seed, index // BLOCK)
+        return self._observed(Actor.of_block(bodies, index % BLOCK), bodies, index % BLOCK, rng, hard)[0]
+
+    def clip(
+        self, seed: int, index: int, *, frames: int = CLIP_FRAMES, hard: float | None = None
+    ) -> list[SyntheticPerson]:
+        """Clip `index` of `seed`: one person who moves, `frames` samples at 10 Hz; things and sensor stay where they
+        are. Frames in which nothing of the person is seen have samples without points."""
+        if frames < 1:
+            raise InputError(f"a clip needs frames of 1 or more, got {frames}")
+        rng = np.random.default_rng([seed, 3, index])
+        actor = draw_actor(self.bank, self.captured, frames, rng)
+        return self._observed(actor, self._bodies(seed, index // BLOCK), index % BLOCK, rng, hard)
+
+    def _observed(
+        self, actor: Actor, bodies: Bodies, row: int, rng: np.random.Generator, hard: float | None
+    ) -> list[SyntheticPerson]:
+        """The actor's frames; all is drawn anew, each time easier to see, while hardly anything of them is seen. Others
+        come from `bodies`. After the last try the best one counts, if it has any points at all."""
         scene = self.scene if hard is None else self.scene.eased(hard)
-        return observe(scene, self._bodies(seed, index // BLOCK), index % BLOCK, rng, measure=self.measure)
-
-
-def observe(
-    config: SceneConfig, bodies: Bodies, row: int, rng: np.random.Generator, *, measure: bool = True
-) -> SyntheticPerson:
-    """Body `row` of a block, placed, cast, spoiled and cropped; drawn anew while hardly anything of it is seen."""
-    for attempt in range(_TRIES):
-        eased = config.eased(config.hard * (1 - attempt / _TRIES))
-        device = sensor(config.sensors[rng.integers(len(config.sensors))])
-        placed = _place(eased, bodies, row, device, attempt, rng)
-        cast = _cast(eased, bodies, row, placed, device, rng)
-        sample = _crop(eased, bodies.vertices[row], placed, cast, device, rng)
-        if sample is not None:
-            facts = _facts(sample, bodies, placed, device) if measure else None
-            return SyntheticPerson(sample=sample, facts=facts)
-    raise InputError(f"scene {config.name}: no draw of {_TRIES} left {LEAST_POINTS} points on a person")
+        best, most = None, 0.0
+        for attempt in range(_TRIES):
+            eased = scene.eased(scene.hard * (1 - attempt / (_TRIES - 1))) if attempt else scene
+            stage = _draw_stage(eased, actor, bodies, row, 0.8**attempt, rng)
+            seen = [_sample(eased, stage, actor, frame, rng) for frame in range(actor.frames)]
+            # of the middle frame: half of a clip's frames have more
+            points = float(np.median([np.count_nonzero(sample.part) for sample in seen]))
+            if points > most:
+                best, most = (eased, stage, seen), points
+            if points >= LEAST_POINTS:
+                break
+        if best is None:
+            raise InputError(f"scene {scene.name}: no draw of {_TRIES} left a point on a person; is it out of range?")
+        eased, stage, seen = best
+        facts = [None] * len(seen)
+        if self.measure:
+            facts = [_facts(eased, sample, stage, actor, frame) for frame, sample in enumerate(seen)]
+        return [SyntheticPerson(sample=s, facts=f) for s, f in zip(seen, facts, strict=True)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Placed:
-    """A body in the sensor's frame: vertices (V, 3), joints (26, 3), feet (3,) m, yaw rad, distance and tall m."""
+class _Stage:
+    """What stays while a person moves: sensor, place, things (level frame), what they carry."""
 
-    vertices: np.ndarray
-    joints: np.ndarray
-    feet: np.ndarray
-    yaw: float
-    distance: float
-    tall: float
+    device: Sensor | RayPattern
+    place: Place
+    conditions: Conditions
+    things: list[Layer]
+    props: list[Prop]
+
+    @property
+    def lifted(self) -> Place:
+        """Where the body is: above the ground by what it stands on."""
+        lift = max((prop.lift for prop in self.props), default=0.0)
+        return replace(self.place, feet=self.place.feet + [0, 0, lift]) if lift else self.place
 
 
-def _place(config: SceneConfig, bodies: Bodies, row: int, device: Sensor, attempt: int, rng) -> _Placed:
+def _draw_stage(
+    config: SceneConfig, actor: Actor, bodies: Bodies, row: int, nearer: float, rng: np.random.Generator
+) -> _Stage:
     """Paper: section "Scene sampling". A person too far to be seen comes nearer with every attempt."""
-    distance = max(draw_distance(config, device, rng) * 0.8**attempt, config.distance[0])
-    azimuth, yaw = rng.uniform(-np.pi, np.pi, 2)
-    tall = float(bodies.vertices[row, :, 2].max())
-    height = device.height if config.name == "paper" else draw_height(device, distance, tall, rng=rng)
-    feet = np.array([distance * np.cos(azimuth), distance * np.sin(azimuth), -height])
-    return _Placed(
-        vertices=_turned(bodies.vertices[row], yaw) + feet,
-        joints=_turned(bodies.joints[row], yaw) + feet,
-        feet=feet,
-        yaw=yaw,
-        distance=distance,
-        tall=tall,
+    device = sensor(config.sensors[rng.integers(len(config.sensors))])
+    low, high = actor.extent[0]
+    tall, wide = high[2], max(-low[0], -low[1], high[0], high[1])
+    place = draw_place(config, device, tall, wide, nearer, rng)
+    things = [ground(config, place.feet, rng), *surroundings(config, place.feet, wide, rng)]
+    front = occluder(config, place.feet, tall, rng)
+    if front is not None:
+        things.append(front)
+    layers = [Layer.still(thing) for thing in things]
+    if rng.random() < config.company * config.hard:
+        layers.append(_company(bodies, row, place, rng))
+    props = []
+    if rng.random() < config.carry * config.hard:
+        props = draw_props(rng, kind=actor.kind, joints=actor.joints[0])
+    return _Stage(
+        device=device, place=place, conditions=draw_conditions(config, device, rng), things=layers, props=props
     )
 
 
-def _turned(points: np.ndarray, yaw: float) -> np.ndarray:
-    c, s = np.cos(yaw), np.sin(yaw)
-    return points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+# a second person: how often before the first one, as seen by the sensor; else beside
+_BEFORE = 0.3
+_BESIDE, _NEARER = (0.4, 1.0), (0.4, 2.5)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Cast:
-    """Points (n, 3) m with their faults, ring (n,), part (n,), 0 for all that is not body."""
-
-    points: np.ndarray
-    ring: np.ndarray
-    part: np.ndarray
-
-
-def _cast(config: SceneConfig, bodies: Bodies, row: int, placed: _Placed, device: Sensor, rng) -> _Cast:
-    body = Mesh(placed.vertices, bodies.faces)
-    meshes = [body, ground(config, rng).moved(placed.feet)]
-    wide = float(np.abs(placed.vertices[:, :2] - placed.feet[:2]).max())
-    others = surroundings(config, placed.feet, wide, rng)
-    if rng.random() < config.clutter * config.hard / 3:
-        others.append(_passer_by(bodies, row, placed, rng))
-    thing = occluder(config, placed.feet, placed.tall, rng)
-    scene = union(meshes + others + ([] if thing is None else [thing]))
-    around = np.arctan(_AROUND / placed.distance) if config.name != "paper" else 0.0
-    hits = scan(scene.vertices, scene.faces, device, window_vertices=placed.vertices, margin=around)
-    # the body's faces come first
-    on_body = hits.face < len(bodies.faces)
-    part = np.zeros(len(on_body), np.uint8)
-    part[on_body] = bodies.face_part[hits.face[on_body]]
-    keep = rng.random(len(part)) >= device.dropout
-    keep &= augment.grazing_keep(
-        hits.points, _normals(scene, hits.face), strength=rng.uniform(0, 0.9) * (config.name != "paper"), rng=rng
-    )
-    if rng.random() < (config.mask if config.name == "paper" else config.mask * config.hard):
-        share = config.keep if config.name == "paper" else rng.uniform(config.keep, 1)
-        keep &= laser_mask(hits.columns, hits.rows, keep=share, rng=rng)[hits.column, hits.ring - hits.row0]
-    points = augment.range_noise(
-        hits.points[keep].astype(np.float64),
-        hits.ring[keep],
-        sigma=device.range_sigma * rng.uniform(0.5, 1.5),
-        bias=_RING_BIAS * rng.random(),
-        rng=rng,
-    )
-    return _Cast(points=points, ring=hits.ring[keep], part=part[keep])
-
-
-def _passer_by(bodies: Bodies, row: int, placed: _Placed, rng) -> Mesh:
-    """Another body of the block, an arm's length away."""
+def _company(bodies: Bodies, row: int, place: Place, rng: np.random.Generator) -> Layer:
+    """Another body of the block, an arm's length away or between the sensor and the person."""
     other = (row + rng.integers(1, len(bodies.vertices))) % len(bodies.vertices)
-    angle, gap = rng.uniform(-np.pi, np.pi), rng.uniform(0.45, 1.0)
-    shift = placed.feet + gap * np.array([np.cos(angle), np.sin(angle), 0])
-    return Mesh(_turned(bodies.vertices[other], rng.uniform(-np.pi, np.pi)) + shift, bodies.faces)
+    before, gap, angle, aside, yaw = rng.random(5)
+    ahead = place.feet[:2] / max(np.hypot(*place.feet[:2]), 1e-6)
+    if before < _BEFORE:
+        # not nearer to the sensor than a third of the way
+        near = min(_NEARER[0] + gap * (_NEARER[1] - _NEARER[0]), 0.67 * place.distance)
+        shift = -near * ahead + (aside - 0.5) * np.array([-ahead[1], ahead[0]])
+    else:
+        reach = _BESIDE[0] + gap * (_BESIDE[1] - _BESIDE[0])
+        shift = reach * np.array([np.cos(2 * np.pi * angle), np.sin(2 * np.pi * angle)])
+    there = Place(feet=place.feet + [*shift, 0], yaw=2 * np.pi * yaw, distance=place.distance, R_sensor_level=None)
+    return Layer(vertices=there.of_body(bodies.vertices[other]), faces=bodies.faces)
 
 
-def _normals(scene: Mesh, face: np.ndarray) -> np.ndarray:
-    a, b, c = np.moveaxis(scene.vertices[scene.faces[face]], 1, 0)
-    normal = np.cross(b - a, c - a)
-    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+def _sample(config: SceneConfig, stage: _Stage, actor: Actor, frame: int, rng: np.random.Generator) -> Sample:
+    layers = _layers(stage, actor, frame)
+    returns = look(layers, stage.device, stage.place, stage.conditions, config, rng, frame=frame)
+    return _crop(config, stage, actor, frame, returns, rng)
 
 
-def _crop(config: SceneConfig, body: np.ndarray, placed: _Placed, cast: _Cast, device: Sensor, rng) -> Sample | None:
-    """The points in a box as a detector draws it; None where too few of them are the person's."""
-    box = _box(config, body, placed, rng)
-    points, ring, part = cast.points, cast.ring, cast.part
-    if rng.random() < config.noise * (1 if config.name == "paper" else config.hard):
-        stray = augment.noise_clusters(box.center, most=min(150, 20 + len(points) // 2), rng=rng)
-        points = np.concatenate([points, stray])
-        ring = np.concatenate([ring, np.zeros(len(stray), ring.dtype)])
-        part = np.concatenate([part, np.zeros(len(stray), np.uint8)])
-    inside = box.contains(points)
-    if rng.random() < 0.1 * config.hard:
-        inside &= augment.part_removal(part, rng=rng)
-    points, ring, part = points[inside].astype(np.float32), ring[inside], part[inside]
-    if np.count_nonzero(part) < LEAST_POINTS:
-        return None
+def _layers(stage: _Stage, actor: Actor, frame: int) -> list[Layer]:
+    """The body first, then what it carries, then the rest."""
+    place, moving = stage.lifted, isinstance(stage.device, RayPattern) and stage.device.duration > 0
+    joints = actor.joints[frame]
+    moved_vertices = moved_joints = None
+    if moving:
+        moved_vertices, moved_joints = actor.moved(frame)
+        moved_vertices = place.of_body(moved_vertices)
+    layers = [
+        Layer(
+            vertices=place.of_body(actor.vertices[frame]),
+            faces=actor.faces,
+            moved=moved_vertices,
+            part=actor.face_part,
+        )
+    ]
+    for prop in stage.props:
+        mesh = prop.place(joints)
+        moved = place.of_body(prop.place(moved_joints).vertices) if moving else None
+        part = prop.face_part
+        layers.append(Layer(vertices=place.of_body(mesh.vertices), faces=mesh.faces, moved=moved, part=part))
+    return layers + stage.things
+
+
+def _crop(
+    config: SceneConfig, stage: _Stage, actor: Actor, frame: int, returns: Returns, rng: np.random.Generator
+) -> Sample:
+    """The points in a box as a detector draws it."""
+    faults, hard = config.faults, config.hard
+    box = draw_box(config.crop, hard, actor.extent[frame], stage.lifted, rng, heading=actor.heading[frame])
+    points, ring, part = returns.points, returns.ring, returns.part
+    stray, missing = rng.random(2)
+    if stray < faults.stray * hard:
+        if faults.released:
+            blobs = augment.reference_clusters(box.center, rng=rng)
+        else:
+            blobs = augment.noise_clusters(box.center, most=min(faults.most_stray, 20 + len(points) // 2), rng=rng)
+        points = np.concatenate([points, blobs.astype(np.float32)])
+        ring = np.concatenate([ring, np.zeros(len(blobs), ring.dtype)])
+        part = np.concatenate([part, np.zeros(len(blobs), np.uint8)])
+    points, ring, part = crop_points(points, ring, part, box)
+    if missing < faults.missing * hard:
+        kept = augment.part_removal(part, rng=rng)
+        points, ring, part = points[kept], ring[kept], part[kept]
     return Sample(
         points=points,
-        center=center_of(points),
+        center=center_of_cells(points) if len(points) else box.center,
         part=part,
         ring=ring,
-        pose=Pose(joints=placed.joints.astype(np.float32), skeleton=BODY26, frame="sensor"),
+        pose=Pose(joints=stage.lifted.of_body(actor.joints[frame]), skeleton=BODY26, frame="sensor"),
         box=box,
-        source=f"synth/{config.name}/{device.name}",
+        source=f"synth/{config.name}/{stage.device.name}",
     )
 
 
-# points this close to the soles count as ground, not as clutter, m
-_GROUND = 0.1
-
-
-def _facts(sample: Sample, bodies: Bodies, placed: _Placed, device: Sensor) -> Facts:
-    alone = len(scan(placed.vertices, bodies.faces, device).points)
-    seen = sample.points[sample.part > 0]
-    clutter = (sample.part == 0) & (sample.points[:, 2] > placed.feet[2] + _GROUND)
-    return Facts(
-        sensor=device.name,
-        distance=placed.distance,
-        visible=min(len(seen) / max(alone, 1), 1.0),
-        height_seen=float(np.ptp(seen[:, 2])) / max(float(np.ptp(placed.vertices[:, 2])), 1e-6),
-        clutter=float(clutter.mean()),
-        upright=_upright(placed.joints),
+def _facts(config: SceneConfig, sample: Sample, stage: _Stage, actor: Actor, frame: int) -> Facts:
+    body = _layers(stage, actor, frame)[0]
+    low, high = actor.extent[frame]
+    return facts_of(
+        sample,
+        sensor=stage.device.name,
+        kind=actor.kind,
+        distance=float(np.hypot(*sample.pose.joints[0, :2])),
+        alone=count_alone(body, stage.device, stage.place, stage.conditions, config, frame),
+        soles=float(stage.place.feet[2]),
+        tall=high[2] - low[2],
     )
-
-
-def _box(config: SceneConfig, body: np.ndarray, placed: _Placed, rng) -> Box:
-    """The person's extent along their own heading, with the errors of a detector's box: center, size, yaw; its bottom
-    now above the soles, now in the ground. One in eight is loose, as a crop drawn by hand."""
-    low, high = body.min(0), body.max(0)
-    error = config.crop_jitter
-    grown = rng.uniform(0.0, 0.2, 3) * (error > 0) + 0.05
-    if error and rng.random() < 0.125:
-        grown = grown + rng.uniform(0.1, 0.8)
-    middle = (low + high) / 2 + rng.normal(0, error, 3) * [1, 1, 0.5]
-    return Box(
-        center=_turned(middle[None], placed.yaw)[0] + placed.feet,
-        size=np.maximum(high - low + grown, 0.4),
-        yaw=placed.yaw + rng.normal(0, error),
-    )
-
-
-def _upright(joints: np.ndarray) -> bool:
-    """Stands or walks: trunk within 35 degrees of upright, and a knee at least at three quarters of its leg's reach."""
-    pelvis, neck = joints[BODY26.index("pelvis")], joints[BODY26.index("neck")]
-    if (neck - pelvis)[2] < np.cos(np.radians(35)) * np.linalg.norm(neck - pelvis):
-        return False
-    for side in ("left", "right"):
-        hip, knee, ankle = (joints[BODY26.index(f"{side}_{name}")] for name in ("hip", "knee", "ankle"))
-        leg = np.linalg.norm(hip - knee) + np.linalg.norm(knee - ankle)
-        if (hip - ankle)[2] > 0.8 * leg:
-            return True
-    return False

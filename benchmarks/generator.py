@@ -1,0 +1,76 @@
+"""How many people a second the generator makes, from pose to packed points, and in how much memory.
+
+    python benchmarks/generator.py [--people 2048] [--rounds 3] [--scenes paper wild]
+
+Each scene is timed in one process, then in two at once that make other people of the same seed; the rounds take
+turns. Figures are people a second of wall time, the best round; "x one" is the two processes' rate over the one's.
+Times are of one core each: BLAS and numba are held to one thread. The first block of each process warms up.
+"""
+
+import argparse
+import multiprocessing
+import os
+import resource
+import time
+
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
+
+from lidarpose.synth.generate import BLOCK, Generator  # noqa: E402 - after the threads are held
+from lidarpose.synth.scene import scene_config  # noqa: E402
+
+
+def work(scene, first, people, ready, go, out):
+    generator = Generator(scene=scene_config(scene), measure=False)
+    for index in range(BLOCK):
+        generator.person(0, index)
+    ready.release()
+    go.wait()
+    start = time.perf_counter()
+    points = sum(len(generator.person(0, index).sample.points) for index in range(first, first + people))
+    stop = time.perf_counter()
+    # kilobytes on Linux
+    out.put((start, stop, points, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024))
+
+
+def rate(scene, people, processes):
+    """People a second of all processes together, mean points a person, the largest process in MiB."""
+    context = multiprocessing.get_context("spawn")
+    ready, go, out = context.Semaphore(0), context.Event(), context.Queue()
+    started = [
+        context.Process(target=work, args=(scene, BLOCK + k * people, people, ready, go, out)) for k in range(processes)
+    ]
+    for process in started:
+        process.start()
+    for _ in started:
+        ready.acquire()
+    go.set()
+    done = [out.get() for _ in started]
+    for process in started:
+        process.join()
+    # the clock is the machine's, the same for all processes
+    seconds = max(d[1] for d in done) - min(d[0] for d in done)
+    return processes * people / seconds, sum(d[2] for d in done) / (processes * people), max(d[3] for d in done)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--people", type=int, default=2048, help="a process")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--scenes", nargs="+", default=["paper", "wild"])
+    arguments = parser.parse_args()
+    best = {}
+    for _ in range(arguments.rounds):
+        for scene in arguments.scenes:
+            for processes in (1, 2):
+                found = rate(scene, arguments.people, processes)
+                if found[0] > best.get((scene, processes), (0,))[0]:
+                    best[scene, processes] = found
+    print(f"{'scene':10s}{'one core':>12s}{'ms':>8s}{'two cores':>12s}{'x one':>8s}{'points':>9s}{'MiB':>7s}")
+    for scene in arguments.scenes:
+        (one, points, memory), (two, _, _) = best[scene, 1], best[scene, 2]
+        print(f"{scene:10s}{one:10,.0f}/s{1e3 / one:8.2f}{two:10,.0f}/s{two / one:8.2f}{points:9.0f}{memory:7.0f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,275 @@
+"""Whole street scenes: people who walk among houses, parked cars, trees and street furniture, seen in full turns.
+
+Layout, in the street's own frame: x along the street, y across it, z = 0 the road. A road between two pavements one
+kerb higher, house fronts, hedges or fences behind them, cars parked at the kerbs, furniture along them. The sensor
+stands on the road or a pavement; the street's frame is turned at random about it. Everything depends on (seed, index)
+alone. Letters: P people, F frames, n points of a frame.
+"""
+
+from dataclasses import dataclass
+from math import pi
+
+import numpy as np
+
+from lidarpose.data.augment import REACH
+from lidarpose.errors import InputError
+from lidarpose.geometry import rotation_about
+from lidarpose.lidar.pattern import RayPattern
+from lidarpose.lidar.pattern_scan import scan_pattern
+from lidarpose.lidar.raycast import Hits, scan
+from lidarpose.lidar.sensor import Sensor
+from lidarpose.lidar.sensor import sensor as named_sensor
+from lidarpose.sample import Box, Pose, Sample, center_of
+from lidarpose.skeleton import BODY26
+from lidarpose.synth.actor import Actor, draw_actor
+from lidarpose.synth.mesh import Mesh, union
+from lidarpose.synth.spoil import range_errors, spoil_points
+from lidarpose.synth.street_scenery import RAIL, Plan, draw_plan, scenery
+
+# people start within these distances of the sensor, m, and keep apart from it and from each other by so much
+_NEAREST, _FARTHEST, _APART = 2.5, 28.0, 0.75
+_PLACE_TRIES = 200
+# what people do in streets, of `body.activities.KINDS`, and how often another is drawn for it
+_STREET_KINDS = ("walk", "idle", "run", "push", "step")
+_KIND_TRIES = 12
+# share of what is weak that is lost, and the standard deviation of a ring's own range error, m
+_WEAK, _RING_BIAS = 0.6, 0.008
+# no LiDAR has more
+_MOST_RINGS = 256
+# what a label's box adds to the body's extent, m
+_BOX_ROOM = 0.1
+# errors of a detector's box in `samples`: center m, size m, yaw rad
+_OFF, _GROWN, _TURNED = 0.06, (0.0, 0.2), 0.08
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreetFrame:
+    """One turn of the sensor. points (n, 3) float32 m; ring (n,); person (n,) int16: index into `boxes`, -1 = none;
+    part (n,) uint8 as in `Sample`; boxes: of all P people, seen or not, their ids the track ids; joints (P, 26, 3)
+    float32 m, body26. All in the level frame at the sensor."""
+
+    points: np.ndarray
+    ring: np.ndarray
+    person: np.ndarray
+    part: np.ndarray
+    boxes: tuple[Box, ...]
+    joints: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Street:
+    """A scene over time: frames at 10 Hz, the sensor's name and its height above the road, m."""
+
+    frames: tuple[StreetFrame, ...]
+    sensor: str
+    height: float
+
+
+def street(
+    seed: int, index: int, *, sensor: str = "os1-128", people: tuple[int, int] = (3, 8), frames: int = 1
+) -> Street:
+    """Street `index` of `seed` with `people` (least, most) in it, `frames` turns at 10 Hz. Raises InputError."""
+    least, most = people
+    if not 1 <= least <= most:
+        raise InputError(f"people must be (least, most) with 1 <= least <= most, got {tuple(people)}")
+    if frames < 1:
+        raise InputError(f"a street needs frames of 1 or more, got {frames}")
+    device = named_sensor(sensor)
+    rng = np.random.default_rng([seed, 4, index])
+    plan = draw_plan(device, rng)
+    still = union(scenery(plan, rng)).moved((0, 0, 0), plan.turn)
+    walkers = _draw_walkers(plan, int(rng.integers(least, most + 1)), frames, rng)
+    ring_error = rng.standard_normal(_MOST_RINGS, np.float32)
+    seen = tuple(_look(device, still, walkers, frame, ring_error, rng) for frame in range(frames))
+    return Street(frames=seen, sensor=device.name, height=plan.height)
+
+
+# --- the people
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Walker:
+    """Somebody's frames, where they start (3,) m in the level frame at the sensor, and which way they turned, rad."""
+
+    actor: Actor
+    start: np.ndarray
+    yaw: float
+
+    def placed(self, points: np.ndarray) -> np.ndarray:
+        """Points (n, 3) of the actor's own frame in the level frame at the sensor."""
+        return points @ rotation_about("z", self.yaw).T.astype(np.float32) + self.start.astype(np.float32)
+
+    def path(self) -> np.ndarray:
+        """(F, 2) m: where the pelvis is."""
+        return np.stack([self.placed(joints[:1])[0, :2] for joints in self.actor.joints])
+
+
+def _draw_walkers(plan: Plan, count: int, frames: int, rng: np.random.Generator) -> list[_Walker]:
+    """People on the pavements and on the road, apart from each other at all times; fewer where there is no room.
+
+    Who walks too far to stay on one surface in any of the first half of the tries may leave it in the others.
+    """
+    walkers: list[_Walker] = []
+    paths: list[np.ndarray] = []
+    for _ in range(count):
+        actor = _passer_by(frames, rng)
+        for attempt in range(_PLACE_TRIES):
+            walker, stays = _placed(plan, actor, rng)
+            path = walker.path()
+            if np.linalg.norm(path, axis=1).min() < _NEAREST - 1:
+                continue
+            if (stays or 2 * attempt > _PLACE_TRIES) and all(
+                np.linalg.norm(path - other, axis=1).min() > _APART for other in paths
+            ):
+                walkers.append(walker)
+                paths.append(path)
+                break
+    return walkers
+
+
+def _passer_by(frames: int, rng: np.random.Generator) -> Actor:
+    """Somebody who does what people do in streets: nobody sits without a seat."""
+    for _ in range(_KIND_TRIES):
+        actor = draw_actor(None, 0.0, frames, rng)
+        if actor.kind in _STREET_KINDS:
+            break
+    return actor
+
+
+def _placed(plan: Plan, actor: Actor, rng: np.random.Generator) -> tuple[_Walker, bool]:
+    """The actor somewhere, and whether they stay on one surface and out of the rows at the kerbs."""
+    where, far, across, way, lean = rng.random(5)
+    turn = rotation_about("z", plan.turn)
+    x = (1 if far < 0.5 or plan.ahead else -1) * (_NEAREST - 1 + (_FARTHEST - _NEAREST) * abs(2 * far - 1) ** 1.5)
+    if where < 0.8:
+        # along a pavement, between the furniture and the fronts
+        side = 1 if where < 0.4 else -1
+        low, high = plan.road + RAIL + 0.5, plan.front - 0.3
+        y, z = side * (low + across * (high - low)), plan.kerb
+        yaw = (0.0 if way < 0.5 else pi) + 0.3 * (lean - 0.5)
+        bounds = sorted((side * low, side * high))
+    else:
+        # across the road, beyond the parked cars
+        bounds, z = [-(plan.road - 2.2), plan.road - 2.2], 0.0
+        y = bounds[0] + across * (bounds[1] - bounds[0])
+        yaw = (pi / 2 if way < 0.5 else -pi / 2) + 1.2 * (lean - 0.5)
+    start = turn @ np.array([x, y - plan.sensor_y, z - plan.height])
+    walker = _Walker(actor=actor, start=start, yaw=float(yaw + plan.turn))
+    path = walker.path() @ turn[:2, :2]
+    inside = (path[:, 1] + plan.sensor_y > bounds[0] - 0.1) & (path[:, 1] + plan.sensor_y < bounds[1] + 0.1)
+    return walker, bool(inside.all())
+
+
+# --- a turn of the sensor
+
+
+def _look(
+    device: Sensor | RayPattern,
+    still: Mesh,
+    walkers: list[_Walker],
+    frame: int,
+    ring_error: np.ndarray,
+    rng: np.random.Generator,
+) -> StreetFrame:
+    bodies = [walker.placed(walker.actor.vertices[frame]) for walker in walkers]
+    joints = [walker.placed(walker.actor.joints[frame]) for walker in walkers]
+    faces = [walker.actor.faces for walker in walkers]
+    scene = union([Mesh(v, f) for v, f in zip(bodies, faces, strict=True)] + [still])
+    R_sensor_level = rotation_about("y", -device.tilt).astype(np.float32)
+    vertices = scene.vertices @ R_sensor_level.T
+    if isinstance(device, Sensor):
+        hits = scan(vertices, scene.faces, device)
+    else:
+        hits = _pattern_hits(device, vertices, scene, walkers, frame, R_sensor_level)
+    # the bodies' faces come first, one after the other
+    owner = np.repeat(np.arange(len(walkers), dtype=np.int16), [len(f) for f in faces])
+    face_part = np.concatenate([walker.actor.face_part for walker in walkers] or [np.zeros(0, np.uint8)])
+    count, people = len(hits.face), len(owner)
+    normals = np.concatenate([rng.standard_normal(count, np.float32), ring_error])
+    points, kept = spoil_points(
+        hits.points,
+        hits.face,
+        vertices,
+        scene.faces,
+        np.ones(count, np.bool_),
+        range_errors(hits.ring, normals, device.range_sigma, _RING_BIAS),
+        rng.random(count, np.float32),
+        device.dropout,
+        _WEAK,
+        REACH * device.range_max,
+    )
+    face = hits.face[kept]
+    of_person = face < people
+    person, part = np.full(len(face), -1, np.int16), np.zeros(len(face), np.uint8)
+    person[of_person], part[of_person] = owner[face[of_person]], face_part[face[of_person]]
+    return StreetFrame(
+        points=points @ R_sensor_level,
+        ring=hits.ring[kept],
+        person=person,
+        part=part,
+        boxes=tuple(_box(w, v, frame, track) for track, (w, v) in enumerate(zip(walkers, bodies, strict=True))),
+        joints=np.array(joints, np.float32).reshape(-1, len(BODY26), 3),
+    )
+
+
+def _box(walker: _Walker, vertices: np.ndarray, frame: int, track: int) -> Box:
+    """Around a body (V, 3), along its heading."""
+    yaw = walker.yaw + walker.actor.heading[frame]
+    local = vertices.astype(float) @ rotation_about("z", yaw)
+    low, high = local.min(0), local.max(0)
+    center = rotation_about("z", yaw) @ ((low + high) / 2)
+    return Box(center=center, size=high - low + _BOX_ROOM, yaw=float((yaw + pi) % (2 * pi) - pi), id=track)
+
+
+def _pattern_hits(
+    device: RayPattern,
+    vertices: np.ndarray,
+    scene: Mesh,
+    walkers: list[_Walker],
+    frame: int,
+    R_sensor_level: np.ndarray,
+) -> Hits:
+    """What a rosette sees while the people move on; vertices (V, 3) are the scene's in the sensor's frame."""
+    later = [walker.placed(walker.actor.moved(frame)[0].astype(np.float32)) for walker in walkers]
+    moved = scene.vertices.copy()
+    start = 0
+    for there in later:
+        moved[start : start + len(there)] = there
+        start += len(there)
+    moved = moved @ R_sensor_level.T
+    return scan_pattern(vertices, scene.faces, device, frame % device.frames, moved=moved)
+
+
+# --- people of a street as samples
+
+
+def samples(scene: Street, rng: np.random.Generator, *, least: int = 15) -> list[tuple[int, Sample]]:
+    """(frame, sample) of all people of whom `least` points or more are seen, cropped by boxes with a detector's errors.
+
+    The box's id is the track id; frame_id is "frame/track".
+    """
+    found = []
+    for number, frame in enumerate(scene.frames):
+        for track, truth in enumerate(frame.boxes):
+            off, grown, turned = rng.normal(0, _OFF, 3), rng.uniform(*_GROWN, 3), rng.normal(0, _TURNED)
+            crop = Box(
+                center=truth.center + off * [1, 1, 0.5], size=truth.size + grown, yaw=truth.yaw + turned, id=truth.id
+            )
+            inside = crop.contains(frame.points)
+            own = inside & (frame.person == track)
+            if np.count_nonzero(own) < least:
+                continue
+            points = frame.points[inside]
+            sample = Sample(
+                points=points,
+                center=center_of(points),
+                # another person in the crop is not this body
+                part=np.where(own, frame.part, 0)[inside].astype(np.uint8),
+                ring=frame.ring[inside],
+                pose=Pose(joints=frame.joints[track], skeleton=BODY26, frame="sensor"),
+                box=crop,
+                source=f"synth/street/{scene.sensor}",
+                frame_id=f"{number}/{track}",
+            )
+            found.append((number, sample))
+    return found

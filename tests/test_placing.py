@@ -1,0 +1,98 @@
+"""Where people stand before sensors: inside the field of view, at distances that give real point counts."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpose.lidar.sensor import SENSORS, Sensor, sensor
+from lidarpose.synth.placing import draw_distance, draw_height, draw_place
+from lidarpose.synth.scene import SCENES
+
+WILD = SCENES["wild"]
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_distances_keep_their_range(name):
+    config, rng = SCENES[name], np.random.default_rng(0)
+    for device in map(sensor, config.sensors):
+        drawn = np.array([draw_distance(config, device, rng) for _ in range(300)])
+        assert drawn.min() >= config.distance[0] and drawn.max() <= config.distance[1]
+        if config.median_points == 0:
+            assert drawn.mean() == pytest.approx(np.mean(config.distance), abs=1) and np.ptp(drawn) > 14
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(2, 40), st.floats(0.4, 2.1), st.floats(-0.3, 0.3), st.floats(-3, 3))
+def test_a_sensor_is_mounted_so_that_the_person_fits(seed, distance, tall, pitch, ahead):
+    device = sensor("os1-128")
+    height = draw_height(device, distance, tall, rng=np.random.default_rng(seed), cut=0.0, pitch=pitch, ahead=ahead)
+    low, high = distance * np.tan(device.elevations[[0, -1]] - pitch * np.cos(ahead))
+    if high - low > tall:
+        # the head may be cut only where the feet would be
+        assert -height >= low - 1e-9
+        assert tall - height <= max(high, low + tall) + 1e-9
+    else:
+        assert -height + tall / 2 == pytest.approx((low + high) / 2)
+
+
+@pytest.mark.parametrize("name", sorted(SENSORS))
+def test_hardly_anybody_is_cut_by_the_field_of_view(name):
+    """At most about 5 percent stick out where there is room for them."""
+    device, rng = sensor(name), np.random.default_rng(3)
+    body = np.array([[x, y, z] for x in (-0.2, 0.2) for y in (-0.3, 0.3) for z in (0.0, 0.9, 1.7)], np.float32)
+    cut = total = 0
+    for _ in range(400):
+        place = draw_place(replace(WILD, distance=(6.0, 40.0)), device, 1.7, 0.3, 1.0, rng)
+        points = place.to_sensor(place.of_body(body)).astype(float)
+        azimuth = np.arctan2(points[:, 1], points[:, 0])
+        elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+        low, high = device.elevations[0], device.elevations[-1]
+        if place.distance * (np.tan(high) - np.tan(low)) < 2.2:
+            continue
+        inside = (elevation > low - 0.02) & (elevation < high + 0.02)
+        if not isinstance(device, Sensor):
+            inside &= (azimuth > device.azimuths[0] - 0.02) & (azimuth < device.azimuths[1] + 0.02)
+        cut += not inside.all()
+        total += 1
+    assert total > 100 and cut / total < 0.09
+
+
+def test_the_paper_s_sensor_keeps_its_height_and_level():
+    rng = np.random.default_rng(1)
+    azimuths = []
+    for _ in range(200):
+        place = draw_place(SCENES["paper"], sensor("dapt64"), 1.7, 0.3, 1.0, rng)
+        assert place.feet[2] == -0.5 and place.R_sensor_level is None
+        assert np.hypot(*place.feet[:2]) == pytest.approx(place.distance)
+        azimuths.append(np.arctan2(place.feet[1], place.feet[0]))
+    assert {int(a) for a in np.floor(np.array(azimuths) / (np.pi / 4))} == set(range(-4, 4))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_frames_go_there_and_back(seed):
+    rng = np.random.default_rng(seed)
+    place = draw_place(WILD, sensor("os1-128"), 1.7, 0.3, 1.0, rng)
+    points = rng.normal(0, 3, (20, 3))
+    np.testing.assert_allclose(place.to_level(place.to_sensor(points)), points, atol=1e-12)
+    np.testing.assert_allclose(
+        np.linalg.norm(place.to_sensor(points), axis=1), np.linalg.norm(points, axis=1), atol=1e-12
+    )
+    # a step along a body's x is a step along its yaw
+    step = place.of_body(np.array([[1.0, 0, 0]])) - place.of_body(np.zeros((1, 3)))
+    np.testing.assert_allclose(step[0], [np.cos(place.yaw), np.sin(place.yaw), 0], atol=1e-12)
+
+
+def test_a_tilted_sensor_looks_down_ahead():
+    device = replace(sensor("os1-128"), tilt=np.radians(45.0))
+    rng = np.random.default_rng(2)
+    elevations = []
+    for _ in range(100):
+        place = draw_place(replace(WILD, mount=1e-6), device, 1.7, 0.3, 1.0, rng)
+        assert abs(np.arctan2(place.feet[1], place.feet[0])) <= np.radians(50) + 1e-9
+        middle = place.to_sensor((place.feet + [0, 0, 0.85])[None])[0]
+        elevations.append(np.arctan2(middle[2], np.hypot(middle[0], middle[1])))
+    assert np.mean(np.abs(elevations) < np.radians(24)) > 0.9

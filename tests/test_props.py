@@ -1,0 +1,317 @@
+"""What people carry, use and wear: closed meshes, attached where they belong, for any pose and for the next one."""
+
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpose.body.activities import KINDS
+from lidarpose.body.person import sample_people
+from lidarpose.body.rig import load_rig
+from lidarpose.geometry import rotation_about
+from lidarpose.skeleton import BODY26
+from lidarpose.synth import prop_meshes
+from lidarpose.synth.bodies import draw_bodies
+from lidarpose.synth.garments import girth
+from lidarpose.synth.props import draw_props
+
+J = {name: i for i, name in enumerate(BODY26.joints)}
+HANDS = [J["left_hand"], J["right_hand"]]
+THINGS = {
+    "bag", "shoulder bag", "rucksack", "phone", "ball", "box", "stick", "umbrella", "suitcase", "pram", "trolley",
+    "chair", "wheelchair", "bicycle",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def bodies():
+    return draw_bodies(None, 0.0, 600, 5, 0, moving=False)
+
+
+@pytest.fixture(scope="module")
+def drawn(bodies):
+    """name -> (prop, its person's row), the people of the block asked a few times."""
+    found: dict[str, list] = {}
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        for row, kind in enumerate(bodies.kinds):
+            for prop in draw_props(rng, kind=kind, joints=bodies.joints[row]):
+                found.setdefault(prop.name, []).append((prop, row))
+    return found
+
+
+def edges_match(faces):
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    directed = {tuple(e) for e in edges.tolist()}
+    return len(directed) == len(edges) and directed == {(b, a) for a, b in directed}
+
+
+def volumes(mesh):
+    """The volume of each piece: negative where its faces look inwards."""
+    piece = np.arange(len(mesh.vertices))
+    for _ in range(len(piece)):
+        least = piece.copy()
+        for k in range(3):
+            np.minimum.at(least, mesh.faces[:, k], piece[mesh.faces].min(1))
+        if (least == piece).all():
+            break
+        piece = least
+    corners = mesh.vertices.astype(float)
+    found = []
+    for one in np.unique(piece):
+        faces = mesh.faces[piece[mesh.faces[:, 0]] == one]
+        a, b, c = np.moveaxis(corners[faces] - corners[piece == one].mean(0), 1, 0)
+        found.append((np.cross(a, b) * c).sum() / 6)
+    return found
+
+
+MESHES = {
+    **{name: getattr(prop_meshes, name)() for name in (
+        "unit_box", "tube", "bag", "pack", "ball", "umbrella", "suitcase", "pram", "cart", "chair", "bench",
+        "wheelchair", "bicycle")},
+    "cap": prop_meshes.hat(0.0), "brim": prop_meshes.hat(0.5), "rim": prop_meshes.rim(0.3, 0.02, sides=11),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_meshes_are_closed_look_outwards_and_have_few_faces(name):
+    mesh = MESHES[name]
+    assert edges_match(mesh.faces) and mesh.faces.max() == len(mesh.vertices) - 1
+    assert min(volumes(mesh)) > 0
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces].astype(float), 1, 0)
+    assert len(mesh.faces) <= (300 if name in ("wheelchair", "bicycle") else 160)
+    assert mesh.vertices.dtype == np.float32 and mesh.faces.dtype == np.int32
+    # no doubled vertices in place, no faces without area
+    assert np.linalg.norm(np.cross(b - a, c - a), axis=-1).min() > 1e-7
+
+
+def test_every_thing_is_drawn_and_is_within_reach(drawn, bodies):
+    assert THINGS | {"skirt", "hat"} == set(drawn)
+    for name, props in drawn.items():
+        for prop, row in props[:40]:
+            mesh = prop.place(bodies.joints[row])
+            assert np.isfinite(mesh.vertices).all() and mesh.vertices.dtype == np.float32, name
+            # nothing in the ground, and something of it near the body
+            assert mesh.vertices[:, 2].min() > -prop.lift - 0.03, name
+            gap = np.linalg.norm(mesh.vertices[:, None] - bodies.vertices[row][None, ::7], axis=-1).min()
+            assert gap < (0.6 if name == "chair" else 0.3), name
+            assert len(mesh.faces) <= 310 and (prop.face_part is None) == (name in THINGS)
+            if name != "skirt":
+                assert min(volumes(mesh)) > 0, f"{name}: a piece is inside out"
+
+
+def test_shares(bodies):
+    rng, joints = np.random.default_rng(1), bodies.joints
+    walkers = [r for r, kind in enumerate(bodies.kinds) if kind in ("walk", "idle")]
+    carries = [bool({p.name for p in draw_props(rng, kind="walk", joints=joints[r])} & THINGS) for r in walkers * 5]
+    assert 0.30 < np.mean(carries) < 0.42
+    for kind in KINDS:
+        counts = [len(draw_props(rng, kind=kind, joints=joints[r])) for r in range(100)]
+        assert max(counts) <= 4 and (kind != "lie" or max(counts) == 0), kind
+    assert all(any(p.name == "bicycle" for p in draw_props(rng, kind="cycle", joints=joints[0])) for _ in range(9))
+
+
+def test_draws_repeat_and_leave_the_pose_alone(bodies):
+    before = bodies.joints.copy()
+    for row in range(60):
+        kind, joints = bodies.kinds[row], bodies.joints[row]
+        first, again = (draw_props(np.random.default_rng(row), kind=kind, joints=joints) for _ in range(2))
+        assert [p.name for p in first] == [p.name for p in again]
+        for a, b in zip(first, again, strict=True):
+            np.testing.assert_array_equal(a.place(joints).vertices, b.place(joints).vertices)
+    np.testing.assert_array_equal(bodies.joints, before)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.floats(-np.pi, np.pi), st.floats(-5, 5), st.floats(-3, 3), st.integers(0, 39))
+def test_what_is_carried_goes_along(drawn, bodies, yaw, x, ground, pick):
+    """Turned, moved and raised with its person."""
+    turn, move = rotation_about("z", yaw), np.array([x, -x, ground])
+    for name, props in drawn.items():
+        prop, row = props[pick % len(props)]
+        if name == "ball":
+            continue  # round: its facets keep their place
+        joints = bodies.joints[row]
+        there = (joints @ turn.T + move).astype(np.float32)
+        expected = prop.place(joints).vertices @ turn.T + move
+        np.testing.assert_allclose(prop.place(there, ground).vertices, expected, atol=2e-4, err_msg=name)
+
+
+def test_the_next_pose_moves_the_thing(drawn, bodies):
+    for name in ("bag", "stick", "umbrella", "suitcase", "phone"):
+        prop, row = drawn[name][0]
+        joints = bodies.joints[row].copy()
+        before = prop.place(joints).vertices
+        joints[HANDS] += np.float32([0.05, 0.02, 0.03])
+        after = prop.place(joints).vertices
+        step = (after - before).max(0)
+        assert step[0] > 0.02 and np.isfinite(after).all(), name
+
+
+def test_bags_hang_straight_down_whatever_the_forearm_does(drawn, bodies):
+    for prop, row in drawn["bag"][:40]:
+        joints = bodies.joints[row].copy()
+        mesh = prop.place(joints)
+        hand = joints[HANDS][np.linalg.norm(joints[HANDS, :2] - mesh.vertices[:, :2].mean(0), axis=-1).argmin()]
+        np.testing.assert_allclose(mesh.vertices[:, :2].mean(0), hand[:2], atol=0.02)
+        assert 0 <= hand[2] - mesh.vertices[:, 2].max() + 1e-4 < 0.05
+        # another forearm, the same hand
+        joints[[J["left_elbow"], J["right_elbow"], J["left_wrist"], J["right_wrist"]]] += np.float32([0.1, 0, 0.2])
+        np.testing.assert_array_equal(prop.place(joints).vertices, mesh.vertices)
+
+
+def test_sticks_and_shafts_pass_through_a_hand(drawn, bodies):
+    for name, radius in (("stick", 0.02), ("umbrella", 0.03)):
+        for prop, row in drawn[name][:20]:
+            vertices = prop.place(bodies.joints[row]).vertices
+            low, high = vertices[:5].mean(0), vertices[5:10].mean(0)
+            if name == "umbrella":
+                low, high = vertices[:4].mean(0), vertices[4:8].mean(0)
+            along = (high - low) / np.linalg.norm(high - low)
+            off = bodies.joints[row][HANDS] - low
+            away = np.linalg.norm(off - (off @ along)[:, None] * along, axis=-1).min()
+            assert away < radius, name
+            if name == "stick":
+                assert abs(vertices[:, 2].min()) < 0.02
+
+
+def test_rucksacks_touch_the_back(drawn, bodies):
+    rig = load_rig()
+    trunk = rig.dense_weight[:, [J[n] for n in ("spine1", "spine2", "spine3")]].sum(1) > 0.6
+    gaps = []
+    for prop, row in drawn["rucksack"]:
+        if bodies.kinds[row] not in ("walk", "idle", "step", "run"):
+            continue
+        rest, placed = prop.mesh.vertices, prop.place(bodies.joints[row]).vertices
+        fit = np.linalg.lstsq(np.c_[rest, np.ones(len(rest))], placed, rcond=None)[0]
+        inside = (bodies.vertices[row][trunk] - fit[3]) @ np.linalg.inv(fit[:3])
+        behind = inside[(np.abs(inside[:, 1]) < 0.45) & (inside[:, 2] > 0) & (inside[:, 2] < 1)]
+        gaps.append(-behind[:, 0].min() * np.linalg.norm(fit[0]))
+    # how deep the skin is in the pack, m
+    assert len(gaps) > 30 and -0.02 < np.median(gaps) < 0.03
+    assert np.percentile(gaps, 5) > -0.05 and np.percentile(gaps, 95) < 0.10
+
+
+def test_seats_are_under_the_thighs(drawn, bodies):
+    rig = load_rig()
+    thigh = rig.dense_weight[:, [J["left_hip"], J["right_hip"], J["pelvis"]]].sum(1) > 0.8
+    for name, seat in (("chair", 1.0), ("wheelchair", 0.5)):
+        for prop, row in drawn[name][:30]:
+            joints, vertices = bodies.joints[row], prop.place(bodies.joints[row]).vertices
+            assert vertices[:, 2].min() == pytest.approx(-prop.lift, abs=0.03)
+            left = joints[J["left_hip"]] - joints[J["right_hip"]]
+            ahead = np.array([left[1], -left[0]]) / np.linalg.norm(left[:2])
+            skin = bodies.vertices[row][thigh]
+            along = (skin[:, :2] - (joints[J["left_hip"], :2] + joints[J["right_hip"], :2]) / 2) @ ahead
+            lowest = skin[(along > -0.12) & (along < 0.2), 2].min()
+            # the row of the mesh that tells where its seat is
+            rest = np.c_[prop.mesh.vertices, np.ones(len(vertices))]
+            fit = np.linalg.lstsq(rest, vertices, rcond=None)[0]
+            assert abs(seat * fit[2, 2] + fit[3, 2] - lowest) < 0.06, name
+
+
+def test_cyclists_sit_hold_and_pedal(drawn, bodies):
+    held = []
+    for prop, row in drawn["bicycle"]:
+        joints, vertices = bodies.joints[row], prop.place(bodies.joints[row]).vertices
+        assert vertices[:, 2].min() == pytest.approx(-prop.lift, abs=0.03)
+        assert prop.lift == pytest.approx(0.1)
+        for hand in HANDS:
+            held.append(np.linalg.norm(vertices - joints[hand], axis=-1).min())
+        feet = [np.linalg.norm(vertices - joints[J[f]], axis=-1).min() for f in ("left_foot", "right_foot")]
+        assert min(feet) < 0.2
+    # hands' joints are knuckles; a few cyclists wave
+    assert np.median(held) < 0.2
+
+
+def test_prams_are_held_at_their_handles(drawn, bodies):
+    for name in ("pram", "trolley"):
+        for prop, row in drawn[name]:
+            joints, vertices = bodies.joints[row], prop.place(bodies.joints[row]).vertices
+            assert vertices[:, 2].min() == pytest.approx(0, abs=0.04)
+            assert np.linalg.norm(vertices[:, None] - joints[HANDS], axis=-1).min() < 0.3
+
+
+def test_girths_are_those_of_the_skin():
+    rig = load_rig()
+    people = rig.rest(sample_people(np.random.default_rng(7), 200).coefficients)
+    trunk = rig.dense_weight[:, [J[n] for n in ("pelvis", "spine1", "spine2", "spine3", "left_hip", "right_hip")]].sum(
+        1
+    )
+    off = {"back": [], "hip_side": [], "hip_front": [], "hip_back": []}
+    for vertices, joints in zip(people.vertices[:, trunk > 0.5], people.joints, strict=True):
+        points, spine = joints.tolist(), joints[J["spine3"]]
+        middle = joints[[J["left_hip"], J["right_hip"]]].mean(0)
+        back = vertices[(np.abs(vertices[:, 2] - spine[2] + 0.05) < 0.1) & (np.abs(vertices[:, 1]) < 0.1)]
+        hips = vertices[np.abs(vertices[:, 2] - middle[2] - 0.03) < 0.08]
+        side = vertices[np.abs(vertices[:, 2] - middle[2]) < 0.06]
+        off["back"].append(spine[0] - back[:, 0].min() - girth(points, "back"))
+        off["hip_side"].append(side[:, 1].max() - girth(points, "hip_side"))
+        off["hip_front"].append(hips[:, 0].max() - middle[0] - girth(points, "hip_front"))
+        off["hip_back"].append(middle[0] - hips[:, 0].min() - girth(points, "hip_back"))
+    for name, values in off.items():
+        assert np.abs(values).mean() < 0.01 and np.abs(values).max() < 0.04, name
+
+
+def inside_share(prop, vertices, joints, legs):
+    """Share of the legs' vertices between the hips and the hem that a skirt's rings go around."""
+    rings = prop.place(joints).vertices.reshape(4, 14, 3)
+    points = vertices[legs]
+    points = points[(points[:, 2] < rings[1, :, 2].min()) & (points[:, 2] > rings[3, :, 2].max())]
+    inside = []
+    for x, y, z in points:
+        outline = []
+        for column in rings[1:].transpose(1, 0, 2):
+            order = np.argsort(column[:, 2])
+            outline.append([np.interp(z, column[order, 2], column[order, a]) for a in (0, 1)])
+        a = np.array(outline) - [x, y]
+        b = np.roll(a, -1, 0)
+        angle = np.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], (a * b).sum(1)).sum()
+        inside.append(abs(angle) > np.pi)
+    return np.mean(inside) if inside else 1.0
+
+
+def test_skirts_bridge_the_legs_and_hold_them(drawn, bodies):
+    rig = load_rig()
+    legs = rig.dense_weight[:, [J[n] for n in ("left_hip", "right_hip", "left_knee", "right_knee")]].sum(1) > 0.7
+    legs = np.flatnonzero(legs)[::4]
+    shares = [inside_share(p, bodies.vertices[r], bodies.joints[r], legs) for p, r in drawn["skirt"][:40]]
+    assert np.mean(shares) > 0.95 and np.percentile(shares, 10) > 0.8
+    for prop, _ in drawn["skirt"]:
+        assert set(prop.face_part) <= {1 + J[n] for n in ("pelvis", "left_hip", "right_hip", "left_knee", "right_knee")}
+        assert len(prop.face_part) == len(prop.mesh.faces) and prop.part > 0
+    prop, row = drawn["skirt"][0]
+    vertices = prop.place(bodies.joints[row]).vertices
+    middle = vertices[prop.mesh.faces].mean(1)
+    left = bodies.joints[row][J["left_hip"]] - bodies.joints[row][J["right_hip"]]
+    on_left = (middle - bodies.joints[row][J["pelvis"]]) @ left > 0
+    thighs = np.isin(prop.face_part, [1 + J["left_hip"], 1 + J["right_hip"]])
+    assert ((prop.face_part == 1 + J["left_hip"]) == on_left)[thighs].mean() > 0.8
+
+
+def test_hats_sit_on_the_head(drawn, bodies):
+    head = load_rig().dense_weight[:, J["head"]] > 0.8
+    for prop, row in drawn["hat"][:40]:
+        assert set(prop.face_part) == {1 + J["head"]}
+        hat, skin = prop.place(bodies.joints[row]).vertices, bodies.vertices[row][head]
+        crown = np.linalg.norm(skin - hat.mean(0), axis=-1).min()
+        assert crown < 0.16
+        up = bodies.joints[row][J["head_center"]] - bodies.joints[row][J["head"]]
+        up /= np.linalg.norm(up)
+        top = (hat @ up).max() - (skin @ up).max()
+        assert -0.02 < top < 0.08
+
+
+def test_drawing_and_placing_costs_little(bodies):
+    rng = np.random.default_rng(0)
+    best = np.inf
+    for _ in range(3):
+        start = time.process_time()
+        for row, kind in enumerate(bodies.kinds):
+            for prop in draw_props(rng, kind=kind, joints=bodies.joints[row]):
+                prop.place(bodies.joints[row])
+        best = min(best, (time.process_time() - start) / len(bodies.kinds))
+    # 25 microseconds on the machine of docs/log.md; others are slower
+    assert best < 200e-6

@@ -1,0 +1,148 @@
+"""What is drawn around a person: where it stands, how often, and what it hides."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpose.lidar.raycast import cast_rays
+from lidarpose.synth.mesh import prism, union
+from lidarpose.synth.scene import SCENES
+from lidarpose.synth.surroundings import ground, occluder, surroundings
+
+RNG = np.random.default_rng
+FEET = np.array([8.0, 3.0, -1.5])
+ALWAYS = replace(SCENES["wild"], clutter=1.0, occluder=1.0)
+places = st.tuples(st.floats(1.5, 40), st.floats(-np.pi, np.pi), st.floats(0.4, 3))
+
+
+def feet_at(place):
+    distance, azimuth, height = place
+    return np.array([distance * np.cos(azimuth), distance * np.sin(azimuth), -height])
+
+
+def test_easy_scenes_hold_nothing_but_the_person():
+    easy, rng = SCENES["wild"].eased(0.0), RNG(2)
+    assert all(occluder(easy, FEET, 1.7, rng) is None for _ in range(50))
+    assert all(surroundings(easy, FEET, 0.4, rng) == [] for _ in range(50))
+    assert all(len(ground(easy, FEET, rng).faces) == 2 for _ in range(50))
+
+
+@pytest.mark.parametrize("hard", [0.5, 1.0])
+def test_how_often_is_the_configuration_s_and_the_dial_s(hard):
+    wild, rng = SCENES["wild"].eased(hard), RNG(3)
+    before = np.mean([occluder(wild, FEET, 1.7, rng) is not None for _ in range(1500)])
+    assert before == pytest.approx(wild.occluder * hard, abs=0.04)
+    beside = np.mean([len(surroundings(wild, FEET, 0.4, rng)) > 0 for _ in range(1500)])
+    assert beside == pytest.approx(wild.clutter * hard, abs=0.05)
+
+
+def test_the_generator_alone_decides():
+    for call in (lambda rng: ground(ALWAYS, FEET, rng), lambda rng: occluder(ALWAYS, FEET, 1.7, rng)):
+        for seed in range(30):
+            a, b = call(RNG(seed)), call(RNG(seed))
+            np.testing.assert_array_equal(a.vertices, b.vertices)
+            np.testing.assert_array_equal(a.faces, b.faces)
+    assert len({len(surroundings(ALWAYS, FEET, 0.4, RNG(seed))) for seed in range(60)}) == 3
+
+
+def gap_to(mesh, feet):
+    """Horizontal distance from the feet to the nearest point of a mesh's triangles."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k], :2].astype(float) - feet[:2] for k in range(3))
+    share = np.linspace(0, 1, 60)[:, None, None]
+    return min(np.linalg.norm(u + share * (v - u), axis=-1).min() for u, v in ((a, b), (b, c), (c, a)))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), places, st.floats(0.3, 1.0))
+def test_things_stand_on_the_ground_near_the_person_and_not_in_the_sensor(seed, place, radius):
+    feet = feet_at(place)
+    for mesh in surroundings(ALWAYS, feet, radius, RNG(seed)):
+        assert np.isfinite(mesh.vertices).all() and mesh.faces.max() < len(mesh.vertices)
+        assert mesh.vertices[:, 2].min() >= feet[2] - 1e-4
+        assert gap_to(mesh, feet) < radius + 0.9
+        assert len(mesh.faces) <= 160
+
+
+def test_most_things_leave_the_person_room():
+    rng, gaps, kinds = RNG(5), [], set()
+    for _ in range(300):
+        for mesh in surroundings(ALWAYS, FEET, 0.4, rng):
+            gaps.append(gap_to(mesh, FEET))
+            kinds.add((len(mesh.vertices), len(mesh.faces)))
+    # luggage touches, all else keeps off but for what is turned aside
+    assert np.mean(np.array(gaps) < 0.35) < 0.25
+    assert np.mean(np.array(gaps) < 0.9) > 0.7
+    assert len(kinds) > 15
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.integers(0, 2**32 - 1), places, st.floats(0.9, 2.0))
+def test_occluders_stand_between_sensor_and_person_on_the_ground(seed, place, tall):
+    feet = feet_at(place)
+    mesh = occluder(ALWAYS, feet, tall, RNG(seed))
+    ahead = mesh.vertices[:, :2] @ feet[:2] / (feet[:2] @ feet[:2])
+    assert 0.0 < ahead.min() and ahead.max() < 1.35
+    assert 0.3 < np.median(ahead) < 1.1
+    assert mesh.vertices[:, 2].min() == pytest.approx(feet[2], abs=0.13)
+
+
+def test_occluders_hide_something_and_seldom_all():
+    rng, hidden = RNG(7), []
+    for _ in range(200):
+        feet = feet_at((rng.uniform(3, 20), rng.uniform(-3, 3), rng.uniform(0.5, 2)))
+        person = prism(0.22, 1.7).moved(feet)
+        heading, wide = np.arctan2(feet[1], feet[0]), np.arctan(0.25 / np.hypot(*feet[:2]))
+        azimuth = heading + np.linspace(-wide, wide, 24)
+        elevation = np.linspace(*np.arctan((feet[2] + np.array([0, 1.7])) / np.hypot(*feet[:2])), 30)
+        scene = union([person, occluder(ALWAYS, feet, 1.7, rng)])
+        _, face = cast_rays(scene.vertices, scene.faces, azimuth, elevation)
+        alone = (cast_rays(person.vertices, person.faces, azimuth, elevation)[1] >= 0).sum()
+        hidden.append(1 - ((face >= 0) & (face < len(person.faces))).sum() / alone)
+    hidden = np.array(hidden)
+    assert np.mean(hidden < 0.05) < 0.25 and np.mean(hidden > 0.9) < 0.08
+    assert 0.2 < np.median(hidden) < 0.55
+
+
+# --- the ground
+
+
+@pytest.mark.parametrize("name", ["paper", "reference"])
+def test_the_paper_s_ground_is_a_tilted_square(name):
+    rng, tilts = RNG(1), []
+    for _ in range(500):
+        corners = ground(SCENES[name], FEET, rng).vertices.astype(float) - FEET
+        assert len(corners) == 4
+        np.testing.assert_allclose(np.abs(corners[:, :2]), 1.0, atol=1e-5)
+        np.testing.assert_allclose(corners.mean(0), 0, atol=1e-5)
+        normal = np.cross(corners[1] - corners[0], corners[3] - corners[0])
+        tilts.append(np.arccos(normal[2] / np.linalg.norm(normal)))
+    # the absolute value of a normal law of 5 degrees
+    assert np.degrees(np.mean(tilts)) == pytest.approx(5 * np.sqrt(2 / np.pi), abs=0.4)
+
+
+def height_at(mesh, at):
+    """Height of the mesh's highest point over (x, y), by a beam from above."""
+    lifted = mesh.vertices - np.array([*at, mesh.vertices[:, 2].max() + 1], np.float32)
+    distance, _ = cast_rays(lifted, mesh.faces, np.zeros(1), np.array([-np.pi / 2]))
+    return float(mesh.vertices[:, 2].max() + 1 - distance[0, 0])
+
+
+def test_wild_grounds_are_of_every_kind_and_carry_the_feet():
+    rng, sizes, heights = RNG(6), [], []
+    for _ in range(300):
+        mesh = ground(ALWAYS, FEET, rng)
+        sizes.append(len(mesh.faces))
+        heights.append(height_at(mesh, FEET[:2] + [1e-3, 2e-3]) - FEET[2])
+        assert np.abs(mesh.vertices[:, :2] - FEET[:2]).max() < 3 * np.sqrt(2) + 0.2
+        assert np.abs(mesh.vertices[:, 2] - FEET[2]).max() < 1.5
+    sizes, heights = np.array(sizes), np.array(heights)
+    kinds = {"flat": sizes == 2, "kerb": sizes == 6, "grass": (sizes > 40) & (sizes < 83), "rough": sizes > 90}
+    shares = {name: kind.mean() for name, kind in kinds.items()}
+    assert shares["kerb"] == pytest.approx(0.35, abs=0.09) and shares["rough"] == pytest.approx(0.45, abs=0.09)
+    assert shares["grass"] == pytest.approx(0.15, abs=0.07) and shares["flat"] > 0
+    # nobody floats or sinks; grass reaches up
+    assert np.abs(heights[~kinds["grass"]]).max() < 0.08
+    assert np.abs(heights).max() < 0.25
