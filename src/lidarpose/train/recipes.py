@@ -12,7 +12,8 @@ class Pretrain:
     size: of the network; scene: see `synth.scene`; people: how many are seen in all; batch: people a step; rate: peak
     learning rate of AdamW, the hidden matrices learn by Muon at `muon_rate`; easy: share of the run over which the
     difficulty rises from nothing to full; captured: share of poses from captured motion, where clips are given;
-    motion: an npz of clips or none; subjects: those of its clips to learn from; workers: generator processes.
+    motion: a file or folder of captured motion or none; subjects: those of its clips to learn from, none: all;
+    workers: generator processes.
     """
 
     size: str = "tiny"
@@ -33,8 +34,6 @@ class Pretrain:
         for name, bound in least.items():
             if not getattr(self, name) >= bound:
                 raise InputError(f"{name} must be at least {bound}, got {getattr(self, name)}")
-        if self.motion and not self.subjects:
-            raise InputError("clips are given but no subjects to learn from: say --subjects 002,005 or the like")
         object.__setattr__(self, "subjects", tuple(self.subjects))
 
     def to_dict(self) -> dict:

@@ -10,9 +10,12 @@ MIN_POINTS = 5  # with fewer points the predictor answers with no pose
 
 
 def check_person(person, kind: str) -> None:
-    """Raises InputError unless `person` has points (n, 3) and poses of one person: joints (J, 3) or None."""
+    """Raises InputError unless `person` has points (n, 3), part (n,) or None, and poses of one person: joints (J, 3) or
+    None."""
     if person.points.ndim != 2 or person.points.shape[1] != 3:
         raise InputError(f"{kind}.points must be (n, 3) metres, got {person.points.shape}")
+    if person.part is not None and person.part.shape != (len(person.points),):
+        raise InputError(f"{kind}.part must be ({len(person.points)},), one a point, got {person.part.shape}")
     for name in ("pose", "truth"):
         pose = getattr(person, name)
         if pose is not None and pose.joints.ndim != 2:

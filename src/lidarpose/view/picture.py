@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.errors import InputError
 from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import SMPL24
 from lidarpose.view.person import (
@@ -72,8 +71,6 @@ class Panel:
 
     def __post_init__(self):
         check_person(self, "Panel")
-        if self.part is not None and self.part.shape != (len(self.points),):
-            raise InputError(f"Panel.part must be ({len(self.points)},), one a point, got {self.part.shape}")
 
 
 def draw_people(panels: list[Panel], path: str | Path | None = None, *, title: str = "") -> bytes:
@@ -150,6 +147,9 @@ def _header(ax, panels: list[Panel], shown: list[Panel], *, title: str, at: tupl
     if any(is_known(p.truth) for p in shown):
         handles.append(Line2D([], [], color=_TRUTH, lw=1.2, ls=(0, (3, 1.6)), label="true"))
     dot = {"ls": "", "marker": "o", "ms": 4}
+    if any(p.part is not None and (p.part > 0).any() for p in shown):
+        for name, (_, color) in _PART_SHADES.items():
+            handles.append(Line2D([], [], color=color, label=f"{name} part", **dot))
     if any(p.part is not None and (p.part == 0).any() for p in shown):
         handles.append(Line2D([], [], color=_NOT_BODY, label="not body", **dot))
     if any(p.part is None and len(p.points) for p in shown):

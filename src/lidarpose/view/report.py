@@ -12,7 +12,7 @@ import numpy as np
 
 from lidarpose._version import __version__
 from lidarpose.sample import Pose
-from lidarpose.skeleton import Skeleton
+from lidarpose.skeleton import SMPL24, Skeleton
 from lidarpose.view.person import (
     bone_sides,
     check_person,
@@ -35,13 +35,15 @@ _SCHEMA = 1
 class ReportPerson:
     """One person of a report: points (n, 3) m, z up, n = 0 is legal; pose and truth of one person, joints (J, 3) m in
     the points' frame; caption is a line of the caller's (sensor, distance, error), by default the number of points,
-    the distance from the frame's origin and the mean confidence. Raises InputError on a wrong shape."""
+    the distance from the frame's origin and the mean confidence; part (n,) int, 0 = not body, 1 + j = the bone of
+    SMPL-24's joint j, colors the points by side. Raises InputError on a wrong shape."""
 
     label: str
     points: np.ndarray
     pose: Pose | None = None
     truth: Pose | None = None
     caption: str = ""
+    part: np.ndarray | None = None
 
     def __post_init__(self):
         check_person(self, "ReportPerson")
@@ -100,16 +102,24 @@ def _person_data(person: ReportPerson, limit: int) -> dict:
     center = middle(person)
     center = np.zeros(3) if center is None else center
     points = np.asarray(person.points, float)
-    points = points[np.isfinite(points).all(-1)]
-    points = points[thinned(len(points), limit)]
+    kept = np.flatnonzero(np.isfinite(points).all(-1))
+    kept = kept[thinned(len(kept), limit)]
+    points = points[kept]
     forward = facing(person.pose)
     forward = facing(person.truth) if forward is None else forward
-    return {
+    data = {
         "points": np.rint((points - center) * 1000).astype(int).ravel().tolist(),
         "facing": None if forward is None else round(math.atan2(forward[1], forward[0]), 4),
         "pose": _pose_data(person.pose, center),
         "truth": _pose_data(person.truth, center),
     }
+    if person.part is not None:
+        data["sides"] = "".join(_PART_SIDES[np.clip(person.part[kept], 0, len(SMPL24))])
+    return data
+
+
+# a letter a part: n = not body, else the body side's
+_PART_SIDES = np.array(["n"] + [side(joint)[0] for joint in SMPL24.joints])
 
 
 def _pose_data(pose: Pose | None, center: np.ndarray) -> dict | None:

@@ -17,7 +17,7 @@
     const style = getComputedStyle(document.documentElement);
     const get = (name) => style.getPropertyValue("--" + name).trim();
     color = Object.fromEntries(["truth", "ground", "halo", "ink", "faint", "card"].map((n) => [n, get(n)]));
-    Object.assign(color, {l: get("left"), r: get("right"), c: get("center")});
+    Object.assign(color, {l: get("left"), r: get("right"), c: get("center"), n: get("stray")});
     const rgb = (hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16));
     const near = rgb(get("near")), far = rgb(get("far"));
     color.shade = Array.from({length: SHADES}, (_, i) => {
@@ -161,17 +161,23 @@
   }
 
   function drawPoints(view, pen, place) {
-    const p = view.person.points, shades = Array.from({length: SHADES}, () => []);
+    const {points: p, sides} = view.person, shades = Array.from({length: SHADES}, () => []);
     for (let i = 0; i < p.length; i += 3) {
       const at = place(p[i], p[i + 1], p[i + 2]);
       const shade = Math.floor((at[2] / SHADE_SPAN + 1) / 2 * SHADES);
+      if (sides) at[2] = sides[i / 3];
       shades[Math.min(SHADES - 1, Math.max(0, shade))].push(at);
     }
     const size = Math.min(4, Math.max(1.6, 34 / Math.sqrt(p.length / 3 + 1))) * Math.min(2, Math.sqrt(view.zoom));
     shades.forEach((points, i) => {
       pen.fillStyle = color.shade[i];
-      for (const [x, y] of points) pen.fillRect(x - size / 2, y - size / 2, size, size);
+      if (sides) pen.globalAlpha = 0.35 + 0.45 * i / (SHADES - 1);   // the farther the fainter
+      for (const [x, y, side] of points) {
+        if (sides) pen.fillStyle = color[side];
+        pen.fillRect(x - size / 2, y - size / 2, size, size);
+      }
     });
+    pen.globalAlpha = 1;
   }
 
   function drawPose(view, pen, place, line) {
@@ -266,6 +272,10 @@
     for (const entry of entries) ask(views.find((v) => v.canvas === entry.target));
   });
   for (const view of views) { observer.observe(view.canvas); resized.observe(view.canvas); }
+  // what nobody has needs no legend
+  for (const words of document.querySelectorAll("[data-if]")) {
+    words.hidden = !data.people.some((person) => person[words.dataset.if]);
+  }
   readColors();
   views.forEach(draw);
   wake();

@@ -1,0 +1,356 @@
+"""Datasets of people as Parquet shards: a folder with dataset.json and numbered .parquet files.
+
+Any reader of Parquet opens them (pandas, DuckDB, Hugging Face datasets, Ray, ...). A row of people-*.parquet is one
+person in one frame; columns (`PEOPLE`):
+
+    index, frame, track     number of the person, clip or street in the dataset; frame of it; person in a street
+    points                  x, y, z of all points one after the other, m: reshape to (n, 3); the level frame at the
+                            sensor, x forward, y left, z up
+    part, ring              one a point: 0 = not body, 1 + j = the bone of SMPL-24's joint j; the beam
+    joints                  x, y, z of the joints named in dataset.json, m
+    center                  origin of the person's own frame, found from the points
+    box_center, box_size, box_yaw    a detector's box: m, m, rad
+    source, frame_id        as in `Sample`
+    sensor, kind, ...       what is known besides, see `synth.facts.Facts`; null where it was not measured
+
+Streets have frames-*.parquet beside them (`FRAMES`): whole turns of the sensor, with the person of every point, and
+of everybody in the street, seen or not, track (P,), box (P, 7: center, size, yaw) and joints (P, J, 3), flattened.
+"""
+
+import json
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidarpose._version import __version__
+from lidarpose.data.files import atomic_path, file_error, read_bytes, write_atomic
+from lidarpose.errors import InputError, MissingExtra
+from lidarpose.sample import Box, Pose, Sample
+from lidarpose.skeleton import BODY26, skeleton
+from lidarpose.synth.facts import Facts
+
+SCHEMA = 1
+CARD = "dataset.json"
+# rows that are compressed together: what a writer and a reader must hold. A turn of 128 rings has up to 260,000 points
+_ROW_GROUP = {"people": 500, "frames": 4}
+# a fact more is a column more, which older shards have not
+_FACTS = {fact.name: {str: "string", float: "float32", bool: "bool", int: "int32"}[fact.type] for fact in fields(Facts)}
+
+# column -> type, of a value or of the values of a list
+_PEOPLE = {
+    "index": "int64",
+    "frame": "int32",
+    "track": "int32",
+    "points": ["float32"],
+    "part": ["uint8"],
+    "ring": ["int32"],
+    "joints": ["float32"],
+    "center": ["float64"],
+    "box_center": ["float64"],
+    "box_size": ["float64"],
+    "box_yaw": "float64",
+    "source": "string",
+    "frame_id": "string",
+    **_FACTS,
+}
+_FRAMES = {
+    "index": "int64",
+    "frame": "int32",
+    "sensor": "string",
+    "points": ["float32"],
+    "ring": ["int32"],
+    "person": ["int16"],
+    "part": ["uint8"],
+    "track": ["int16"],
+    "box": ["float64"],
+    "joints": ["float32"],
+}
+TABLES = {"people": _PEOPLE, "frames": _FRAMES}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Card:
+    """What dataset.json says: settings, all that decides the content; count of persons, clips or streets; per_shard;
+    tables; skeleton's name; version of the package that wrote it."""
+
+    settings: dict[str, Any]
+    count: int
+    per_shard: int
+    tables: tuple[str, ...]
+    skeleton: str = BODY26.name
+    version: str = __version__
+
+    @property
+    def shards(self) -> int:
+        """How many shards a table has."""
+        return -(-self.count // self.per_shard)
+
+    def size(self, shard: int) -> int:
+        """How many persons, clips or streets a shard holds."""
+        return min(self.per_shard, self.count - shard * self.per_shard)
+
+    def to_json(self) -> str:
+        named = {
+            "schema": SCHEMA,
+            "version": self.version,
+            "count": self.count,
+            "per_shard": self.per_shard,
+            "tables": list(self.tables),
+            "unit": "m",
+            "frame": "level frame at the sensor: x forward, y left, z up",
+            "skeleton": self.skeleton,
+            "joints": list(skeleton(self.skeleton).joints),
+            "settings": self.settings,
+        }
+        return json.dumps(named, indent=2) + "\n"
+
+
+def read_card(folder: str | Path) -> Card:
+    """The card of a dataset's folder. Raises InputError where it is missing, damaged or of another schema."""
+    path = Path(folder) / CARD
+    if not path.is_file():
+        raise file_error(folder, f"is no dataset: {CARD} is missing; write one with lidarpose synth --out FOLDER")
+    try:
+        found = json.loads(read_bytes(path, expected="a dataset's card"))
+        if found["schema"] != SCHEMA:
+            raise file_error(
+                path,
+                f"is of schema {found['schema']!r}, this lidarpose reads {SCHEMA}: "
+                f"install lidarpose {found.get('version', 'of the version that wrote it')}",
+            )
+        card = Card(
+            settings=dict(found["settings"]),
+            count=int(found["count"]),
+            per_shard=int(found["per_shard"]),
+            tables=tuple(found["tables"]),
+            skeleton=str(found["skeleton"]),
+            version=str(found["version"]),
+        )
+    except InputError:
+        raise
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        problem = f"{error} is missing" if isinstance(error, KeyError) else error
+        raise file_error(path, f"is not a dataset's card ({problem})") from None
+    if card.count < 1 or card.per_shard < 1 or not set(card.tables) <= set(TABLES):
+        raise file_error(path, "is not a dataset's card: count, per_shard or tables make no sense")
+    skeleton(card.skeleton)
+    return card
+
+
+def write_card(folder: str | Path, card: Card) -> None:
+    """Writes dataset.json, whole or not at all."""
+    write_atomic(Path(folder) / CARD, card.to_json())
+
+
+def shard_path(folder: str | Path, table: str, shard: int) -> Path:
+    return Path(folder) / f"{table}-{shard:05d}.parquet"
+
+
+def person_row(
+    sample: Sample, *, index: int, frame: int = 0, track: int = 0, facts: object | None = None
+) -> dict[str, Any]:
+    """A row of the people table. The sample needs pose (body26), part, ring and box."""
+    known = asdict(facts) if is_dataclass(facts) else {}
+    return {
+        "index": index,
+        "frame": frame,
+        "track": track,
+        "points": sample.points.ravel(),
+        "part": sample.part,
+        "ring": sample.ring,
+        "joints": np.asarray(sample.pose.joints, np.float32).ravel(),
+        "center": sample.center,
+        "box_center": sample.box.center,
+        "box_size": sample.box.size,
+        "box_yaw": float(sample.box.yaw),
+        "source": sample.source,
+        "frame_id": sample.frame_id,
+        **{name: known.get(name) for name in _FACTS},
+    }
+
+
+def sample_of(row: dict[str, Any], skeleton_name: str = BODY26.name) -> Sample:
+    """The sample of a row, as `read_rows` gives it."""
+    return Sample(
+        points=row["points"].reshape(-1, 3),
+        center=row["center"],
+        part=row["part"],
+        ring=row["ring"],
+        pose=Pose(joints=row["joints"].reshape(-1, 3), skeleton=skeleton(skeleton_name), frame="sensor"),
+        box=Box(center=row["box_center"], size=row["box_size"], yaw=row["box_yaw"]),
+        source=row["source"],
+        frame_id=row["frame_id"],
+    )
+
+
+def write_shard(path: str | Path, table: str, rows: Iterable[dict[str, Any]]) -> None:
+    """Writes the rows of a table ("people", "frames"), whole or not at all; the same rows give the same bytes.
+
+    Raises InputError where the folder cannot be written, MissingExtra without pyarrow.
+    """
+    with shard_writer(path, table) as add:
+        for row in rows:
+            add(row)
+
+
+@contextmanager
+def shard_writer(path: str | Path, table: str) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """As `write_shard`, for rows that come one by one: yields what adds a row. Holds a row group of them at a time."""
+    pa, parquet = _pyarrow()
+    schema, waiting = _schema(pa, table), []
+
+    def write() -> None:
+        arrays = [_column(pa, [row[name] for row in waiting], kind) for name, kind in TABLES[table].items()]
+        writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=_ROW_GROUP[table])
+        waiting.clear()
+
+    def add(row: dict[str, Any]) -> None:
+        waiting.append(row)
+        if len(waiting) == _ROW_GROUP[table]:
+            write()
+
+    # a flipped bit in points would pass unnoticed
+    options = {"compression": "zstd", "use_dictionary": False, "write_page_checksum": True}
+    with atomic_path(path) as temporary, parquet.ParquetWriter(temporary, schema, **options) as writer:
+        yield add
+        if waiting:
+            write()
+
+
+def _column(pa, values: list, kind: str | list[str]):
+    if isinstance(kind, str):
+        return pa.array(values, _type(pa, kind))
+    flat = [np.asarray(v, kind[0]).ravel() for v in values]
+    offsets = np.zeros(len(flat) + 1, np.int32)
+    np.cumsum([len(v) for v in flat], out=offsets[1:])
+    joined = np.concatenate(flat) if flat else np.zeros(0, kind[0])
+    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(joined))
+
+
+def _type(pa, kind: str | list[str]):
+    if isinstance(kind, list):
+        return pa.list_(_type(pa, kind[0]))
+    return pa.bool_() if kind == "bool" else getattr(pa, kind)()
+
+
+def _schema(pa, table: str):
+    return pa.schema([(name, _type(pa, kind)) for name, kind in TABLES[table].items()])
+
+
+def rows_of_shard(path: str | Path) -> int | None:
+    """How many rows a shard says it holds; None where it is missing or damaged."""
+    _, parquet = _pyarrow()
+    try:
+        return parquet.ParquetFile(path).metadata.num_rows
+    except Exception:
+        # pyarrow raises many kinds for damaged files; what matters is that it is to be written again
+        return None
+
+
+def read_rows(path: str | Path, table: str) -> Iterator[dict[str, Any]]:
+    """The rows of a shard, list columns as numpy arrays. Raises InputError for a damaged file or other columns."""
+    pa, parquet = _pyarrow()
+    try:
+        with parquet.ParquetFile(path, page_checksum_verification=True) as file:
+            there = [name for name in TABLES[table] if name in file.schema_arrow.names]
+            optional = _FACTS if table == "people" else ()
+            missing = [name for name in TABLES[table] if name not in there and name not in optional]
+            if missing:
+                raise file_error(path, f"is no shard of {table}: the columns {', '.join(missing)} are missing")
+            for batch in file.iter_batches(batch_size=_ROW_GROUP[table], columns=there):
+                yield from _rows(batch, table)
+    except InputError:
+        raise
+    except (pa.ArrowException, OSError, ValueError, TypeError, AttributeError, MemoryError) as error:
+        raise file_error(path, f"cannot be read as Parquet ({error}); delete it and make it again") from None
+
+
+def _rows(batch, table: str) -> Iterator[dict[str, Any]]:
+    columns: dict[str, Any] = {}
+    for name, kind in TABLES[table].items():
+        if name not in batch.schema.names:
+            columns[name] = [None] * batch.num_rows
+            continue
+        column = batch.column(batch.schema.get_field_index(name))
+        if isinstance(kind, str):
+            columns[name] = column.to_pylist()
+        else:
+            flat = column.flatten().to_numpy(zero_copy_only=False).astype(kind[0], copy=False)
+            ends = np.asarray(column.offsets)
+            columns[name] = [flat[a:b] for a, b in zip(ends[:-1] - ends[0], ends[1:] - ends[0], strict=True)]
+    for k in range(batch.num_rows):
+        yield {name: values[k] for name, values in columns.items()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dataset:
+    """A folder of shards, read as it is iterated: its samples in order. card: what dataset.json says."""
+
+    folder: Path
+    card: Card
+
+    def rows(self, table: str = "people", shards: range | None = None) -> Iterator[dict[str, Any]]:
+        """The rows of a table, of some shards or of all; see `TABLES`."""
+        for shard in range(self.card.shards) if shards is None else shards:
+            path = shard_path(self.folder, table, shard)
+            if not path.is_file():
+                raise file_error(path, "is missing: the dataset is not finished; run the same lidarpose synth again")
+            yield from read_rows(path, table)
+
+    def rows_of(self, table: str, shard: int) -> int:
+        """How many rows a shard has. Raises InputError where it is missing or damaged."""
+        path = shard_path(self.folder, table, shard)
+        rows = rows_of_shard(path)
+        if rows is None:
+            problem = "is damaged" if path.exists() else "is missing: the dataset is not finished"
+            raise file_error(path, f"{problem}; run the same lidarpose synth again")
+        return rows
+
+    def __iter__(self) -> Iterator[Sample]:
+        return (self.sample(row) for row in self.rows())
+
+    def sample(self, row: dict[str, Any]) -> Sample:
+        """The sample of a row of "people"; of streets its box's id is the track. Raises InputError for a row that is
+        none."""
+        try:
+            sample = sample_of(row, self.card.skeleton)
+            if "frames" in self.card.tables:
+                sample = replace(sample, box=replace(sample.box, id=row["track"]))
+            return sample
+        except (ValueError, TypeError, AttributeError) as error:
+            raise file_error(self.folder, f"row {row['index']} is no sample ({error}); write it again") from None
+
+
+def open_dataset(folder: str | Path) -> Dataset:
+    """A dataset that `lidarpose synth` wrote. Raises InputError where it is none, MissingExtra without pyarrow."""
+    _pyarrow()
+    return Dataset(folder=Path(folder), card=read_card(folder))
+
+
+def _pyarrow():
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise MissingExtra("Parquet shards", "synth") from None
+    return pyarrow, pyarrow.parquet
+
+
+def check_settings(folder: str | Path, found: Card, wanted: Card) -> None:
+    """Raises InputError that names the settings in which a dataset differs from what is wanted."""
+    old, new = (
+        {"count": c.count, "per_shard": c.per_shard, "version": c.version, **c.settings} for c in (found, wanted)
+    )
+    differ = [
+        f"{name} {json.dumps(old.get(name))} there, {json.dumps(new.get(name))} asked for"
+        for name in sorted(old | new)
+        if old.get(name) != new.get(name)
+    ]
+    if differ:
+        raise InputError(
+            f"{folder} holds a dataset of other settings: {'; '.join(differ)}; give another folder or the same settings"
+        )

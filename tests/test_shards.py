@@ -1,0 +1,225 @@
+"""Parquet shards: what goes in comes out, for us and for pandas, and damage is told."""
+
+import json
+from dataclasses import fields, replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from pyarrow import parquet
+
+from lidarpose.data import shards
+from lidarpose.data.shards import (
+    Card,
+    open_dataset,
+    person_row,
+    read_card,
+    read_rows,
+    sample_of,
+    write_card,
+    write_shard,
+)
+from lidarpose.errors import InputError
+from lidarpose.sample import Box, Pose, Sample
+from lidarpose.skeleton import BODY26
+from lidarpose.synth.facts import Facts
+
+FACTS = Facts(sensor="os1-64", kind="walk", distance=7.5, visible=0.5, height_seen=0.9, clutter=0.1, upright=True)
+
+
+def sample(rng, count):
+    return Sample(
+        points=rng.normal(0, 1, (count, 3)).astype(np.float32),
+        center=rng.normal(0, 1, 3),
+        part=rng.integers(0, 25, count).astype(np.uint8),
+        ring=rng.integers(0, 64, count).astype(np.int32),
+        pose=Pose(joints=rng.normal(0, 1, (26, 3)).astype(np.float32), skeleton=BODY26, frame="sensor"),
+        box=Box(center=rng.normal(0, 1, 3), size=rng.uniform(0.4, 2, 3), yaw=float(rng.normal())),
+        source="synth/wild/os1-64",
+        frame_id="3/1",
+    )
+
+
+@pytest.fixture
+def people():
+    rng = np.random.default_rng(0)
+    return [sample(rng, count) for count in (30, 0, 1, 500)]
+
+
+@pytest.fixture
+def folder(tmp_path, people):
+    write_card(tmp_path, Card(settings={"what": "people"}, count=4, per_shard=3, tables=("people",)))
+    rows = [person_row(p, index=k, frame=k % 2, facts=FACTS if k else None) for k, p in enumerate(people)]
+    write_shard(tmp_path / "people-00000.parquet", "people", rows[:3])
+    write_shard(tmp_path / "people-00001.parquet", "people", rows[3:])
+    return tmp_path
+
+
+def test_samples_come_back_as_they_were(folder, people):
+    dataset = open_dataset(folder)
+    found = list(dataset)
+    assert len(found) == 4 and dataset.card.shards == 2
+    for a, b in zip(found, people, strict=True):
+        for name in ("points", "part", "ring", "center"):
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+            assert getattr(a, name).dtype == getattr(b, name).dtype
+        np.testing.assert_array_equal(a.pose.joints, b.pose.joints)
+        np.testing.assert_array_equal(a.box.center, b.box.center)
+        np.testing.assert_array_equal(a.box.size, b.box.size)
+        assert (a.box.yaw, a.source, a.frame_id) == (b.box.yaw, b.source, b.frame_id)
+    rows = list(dataset.rows())
+    assert [row["index"] for row in rows] == [0, 1, 2, 3] and rows[0]["distance"] is None
+    assert (rows[2]["kind"], rows[2]["distance"], rows[2]["upright"]) == ("walk", 7.5, True)
+
+
+def test_pandas_reads_them(folder, people):
+    table = pd.concat([pd.read_parquet(path) for path in sorted(folder.glob("*.parquet"))])
+    assert list(table.columns) == list(shards.TABLES["people"])
+    np.testing.assert_array_equal(table["points"].iloc[3].reshape(-1, 3), people[3].points)
+    assert table["sensor"].tolist()[1:] == ["os1-64"] * 3
+    card = json.loads((folder / "dataset.json").read_text())
+    assert card["joints"] == list(BODY26.joints) and card["unit"] == "m" and card["schema"] == 1
+
+
+def test_the_same_rows_give_the_same_bytes(tmp_path, people):
+    rows = [person_row(p, index=k) for k, p in enumerate(people)]
+    for name in ("a", "b"):
+        write_shard(tmp_path / name, "people", rows)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_whole_turns_come_back(tmp_path):
+    rng = np.random.default_rng(1)
+    row = {
+        "index": 5, "frame": 2, "sensor": "av2", "points": rng.normal(size=30).astype(np.float32),
+        "ring": np.arange(10, dtype=np.int32), "person": np.full(10, -1, np.int16), "part": np.zeros(10, np.uint8),
+        "track": [0, 1], "box": rng.normal(size=(2, 7)), "joints": rng.normal(size=(2, 26, 3)).astype(np.float32),
+    }  # fmt: skip
+    write_shard(tmp_path / "f.parquet", "frames", [row, row])
+    found = list(read_rows(tmp_path / "f.parquet", "frames"))
+    assert len(found) == 2 and found[1]["index"] == 5
+    np.testing.assert_array_equal(found[1]["points"], row["points"])
+    assert found[0]["person"].dtype == np.int16
+    np.testing.assert_array_equal(found[1]["box"].reshape(-1, 7), row["box"])
+    np.testing.assert_array_equal(found[1]["joints"].reshape(-1, 26, 3), row["joints"])
+    with pytest.raises(InputError, match="no shard of people: the columns center"):
+        list(read_rows(tmp_path / "f.parquet", "people"))
+
+
+def test_damaged_and_missing_shards_are_named(folder):
+    path = folder / "people-00001.parquet"
+    whole = path.read_bytes()
+    assert shards.rows_of_shard(path) == 1
+    for broken in (b"", b"PAR1", whole[: len(whole) // 2], b"\0" * len(whole)):
+        path.write_bytes(broken)
+        assert shards.rows_of_shard(path) is None
+        with pytest.raises(InputError, match="people-00001.*cannot be read as Parquet") as caught:
+            list(open_dataset(folder))
+        assert "\n" not in str(caught.value)
+    path.unlink()
+    with pytest.raises(InputError, match="people-00001.* is missing: the dataset is not finished"):
+        list(open_dataset(folder))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (None, "dataset.json is missing"),
+        ("{", "not a dataset's card"),
+        ("[]", "not a dataset's card"),
+        ({"schema": 2}, "is of schema 2, this lidarpose reads 1: install lidarpose [0-9]"),
+        ({"count": 0}, "make no sense"),
+        ({"tables": ["cars"]}, "make no sense"),
+        ({"skeleton": "cat"}, "unknown skeleton"),
+    ],
+)
+def test_a_wrong_card_is_told(folder, change, message):
+    path = folder / "dataset.json"
+    if change is None:
+        path.unlink()
+    elif isinstance(change, str):
+        path.write_text(change)
+    else:
+        path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(InputError, match=message):
+        open_dataset(folder)
+
+
+def test_a_flipped_bit_among_the_points_is_told(folder, people):
+    path = folder / "people-00001.parquet"
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 3
+    content[middle] ^= 4
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="people-00001.*cannot be read as Parquet"):
+        list(open_dataset(folder))
+
+
+def test_facts_are_all_kept():
+    kept = [name for name in shards.TABLES["people"] if name in Facts.__dataclass_fields__]
+    assert kept == list(Facts.__dataclass_fields__)
+
+
+def test_settings_that_differ_are_named(folder):
+    found = read_card(folder)
+    shards.check_settings(folder, found, found)
+    with pytest.raises(InputError, match="count 4 there, 9 asked for; seed null there, 3 asked for") as caught:
+        shards.check_settings(folder, found, replace(found, count=9, settings=found.settings | {"seed": 3}))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_row_is_enough_for_a_sample(people):
+    row = person_row(people[0], index=0)
+    np.testing.assert_array_equal(sample_of(row).points, people[0].points)
+
+
+def test_rows_that_come_one_by_one_are_written_in_groups(tmp_path, people, monkeypatch):
+    monkeypatch.setattr(shards, "_ROW_GROUP", {"people": 2, "frames": 2})
+    path = tmp_path / "people-00000.parquet"
+    written = []
+
+    def rows():
+        for k in range(7):
+            temporary = [p for p in tmp_path.iterdir() if p != path]
+            written.append(sum(p.stat().st_size for p in temporary))
+            yield person_row(people[3], index=k)
+
+    write_shard(path, "people", rows())
+    # what was given is on the disk long before the last row comes: memory does not grow with the shard
+    assert written[5] > written[3] > written[1] and list(tmp_path.iterdir()) == [path]
+    with parquet.ParquetFile(path) as file:
+        assert [file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)] == [2, 2, 2, 1]
+    assert [row["index"] for row in read_rows(path, "people")] == list(range(7))
+
+
+def test_an_error_between_rows_leaves_no_file(tmp_path, people):
+    def rows():
+        yield person_row(people[0], index=0)
+        raise KeyError("no more")
+
+    with pytest.raises(KeyError):
+        write_shard(tmp_path / "a.parquet", "people", rows())
+    assert not list(tmp_path.iterdir())
+
+
+def test_every_fact_is_a_column_and_older_shards_may_lack_one(tmp_path, people):
+    path = tmp_path / "a.parquet"
+    write_shard(path, "people", [person_row(people[0], index=0, facts=FACTS)])
+    row = next(read_rows(path, "people"))
+    for fact in fields(Facts):
+        assert row[fact.name] == pytest.approx(getattr(FACTS, fact.name))
+    parquet.write_table(parquet.read_table(path).drop_columns(["kind"]), path)
+    row = next(read_rows(path, "people"))
+    assert row["kind"] is None and row["sensor"] == "os1-64"
+
+
+@pytest.mark.parametrize("column", ["points", "part"])
+def test_a_column_of_another_type_is_one_line(tmp_path, people, column):
+    path = tmp_path / "a.parquet"
+    write_shard(path, "people", [person_row(people[0], index=0)])
+    table = parquet.read_table(path)
+    place = table.schema.get_field_index(column)
+    parquet.write_table(table.set_column(place, column, [["a text"]]), path)
+    with pytest.raises(InputError, match="a.parquet: cannot be read as Parquet") as caught:
+        list(read_rows(path, "people"))
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,73 @@
+"""`lidarpose view`: people of a dataset on a sheet and on a page."""
+
+import re
+
+import pytest
+
+from lidarpose.cli import main
+from lidarpose.synth import write
+from lidarpose.synth.write import Job, write_dataset
+
+PNG = b"\x89PNG\r\n"
+
+
+@pytest.fixture
+def dataset(tmp_path, monkeypatch):
+    monkeypatch.setattr(write, "PER_SHARD", {"people": 8, "clips": 1, "streets": 1})
+    write_dataset(Job(what="people", count=20, sensors=("os1-64",)), tmp_path / "streetlife")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_sheet_and_a_page_in_the_current_folder(dataset, capsys):
+    assert main(["view", "streetlife", "-n", "6"]) == 0
+    assert capsys.readouterr().out.strip() == "streetlife.png"
+    assert (dataset / "streetlife.png").read_bytes().startswith(PNG)
+    assert main(["view", "streetlife", "-n", "40", "--html", "--out", "x/page.html"]) == 0
+    page = (dataset / "x" / "page.html").read_text()
+    assert page.count("os1-64") >= 20 and "streetlife: 20 people, scene wild" in page
+
+
+def test_people_are_spread_over_the_dataset(dataset):
+    from lidarpose.data.shards import open_dataset
+    from lidarpose.view.sheet import _spread
+
+    rows = _spread(open_dataset("streetlife"), 6)
+    index = [row["index"] for row in rows]
+    assert len(index) == 6 == len(set(index)) and {k // 8 for k in index} == {0, 1, 2}
+    assert len(_spread(open_dataset("streetlife"), 1)) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["none"], "is no dataset: dataset.json is missing"),
+        (["streetlife", "-n", "0"], "expected 1 to"),
+        (["streetlife", "--out", "streetlife"], "is a folder"),
+    ],
+)
+def test_what_cannot_be_drawn_is_told_in_one_line(dataset, capsys, arguments, message):
+    assert main(["view", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+def test_an_unfinished_dataset_is_drawn_as_far_as_it_is(dataset, capsys):
+    (dataset / "streetlife" / "people-00000.parquet").unlink()
+    assert main(["view", "streetlife", "-n", "40", "--html"]) == 0
+    page = (dataset / "streetlife.html").read_text()
+    assert "2 of 3 shards written so far" in page and "#8 os1-64" in page and "#7 os1-64" not in page
+    for path in (dataset / "streetlife").glob("*.parquet"):
+        path.unlink()
+    capsys.readouterr()
+    assert main(["view", "streetlife"]) == 2
+    assert "holds no shard yet" in capsys.readouterr().err
+
+
+def test_the_table_and_the_cards_of_a_page_tell_the_same_distance(dataset):
+    assert main(["view", "streetlife", "-n", "20", "--html"]) == 0
+    page = (dataset / "streetlife.html").read_text()
+    number = r"<td class=\"number\">"
+    table = re.findall(rf"<tr><td>#\d+ os1-64</td>{number}\d+</td><td>\w+</td>{number}([\d.]+)</td>", page)
+    cards = re.findall(r"points · ([\d.]+) m<", page)
+    assert len(cards) == 20 and cards == table

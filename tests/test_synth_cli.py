@@ -1,0 +1,276 @@
+"""`lidarpose synth` and its datasets in torch: the same bytes and the same people however they are made."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from torch.utils.data import DataLoader
+
+from lidarpose.cli import main
+from lidarpose.data.shards import open_dataset
+from lidarpose.errors import InputError
+from lidarpose.lidar.tables import listing
+from lidarpose.synth import write
+from lidarpose.synth.scene import scene_config
+from lidarpose.synth.write import Job, write_dataset
+from lidarpose.train.people import ShardPeople, SyntheticPeople
+
+COUNT, PER_SHARD = 60, 10
+WORDS = ["-n", str(COUNT), "--per-shard", str(PER_SHARD), "--sensor", "os1-64,vlp-16", "--seed", "5"]
+
+
+def synth(out, *words):
+    return main(["synth", "--out", str(out), *map(str, words)])
+
+
+def content(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def one_line(capsys):
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.startswith("lidarpose: error: "), captured.err
+    assert captured.err.count("\n") == 1, captured.err
+    return captured.err
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("synth") / "people"
+    assert synth(folder, *WORDS) == 0
+    return folder
+
+
+def test_a_dataset_holds_the_generators_people(dataset):
+    scene = scene_config("wild")
+    assert sorted(content(dataset)) == ["dataset.json", *(f"people-{k:05d}.parquet" for k in range(6))]
+    rows = list(open_dataset(dataset).rows())
+    assert [row["index"] for row in rows] == list(range(COUNT))
+    assert {row["sensor"] for row in rows} == {"os1-64", "vlp-16"}
+    from dataclasses import replace
+
+    made = SyntheticPeople(scene=replace(scene, sensors=("os1-64", "vlp-16")), seed=5, start=17, stop=18)
+    np.testing.assert_array_equal(next(iter(made)).points, rows[17]["points"].reshape(-1, 3))
+
+
+def command(out, *words):
+    settings = {"stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+    return subprocess.Popen([sys.executable, "-m", "lidarpose", "synth", "--out", str(out), *WORDS, *words], **settings)
+
+
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_killed_at_any_time_the_same_command_goes_on(dataset, tmp_path, workers):
+    out = tmp_path / "killed"
+    child = command(out, "--workers", workers)
+    # some but not all: killed as soon as the first shard is there
+    until = time.monotonic() + 60
+    while not list(out.glob("people-*.parquet")) and child.poll() is None and time.monotonic() < until:
+        time.sleep(0.002)
+    os.kill(child.pid, signal.SIGKILL)
+    child.communicate()
+    left = content(out)
+    assert "dataset.json" in left and len([name for name in left if name.startswith("people")]) < 6
+    # what a writer leaves that is killed in the middle of a shard; no process has so high a number
+    (out / ".99999999-3-people-00004.parquet").write_bytes(b"PAR1")
+    (out / "people-00002.parquet").write_bytes(b"PAR1 half a shard")
+    assert synth(out, *WORDS) == 0
+    until = time.monotonic() + 10
+    while content(out) != content(dataset) and time.monotonic() < until:
+        # the killed one's worker may have been in the middle of a file
+        time.sleep(0.2)
+        assert synth(out, *WORDS) == 0
+    assert content(out) == content(dataset)
+
+
+def test_workers_give_the_same_bytes(dataset, tmp_path, capsys):
+    assert synth(tmp_path / "two", *WORDS, "--workers", 2) == 0
+    assert content(tmp_path / "two") == content(dataset)
+    assert "60 people made -> " in capsys.readouterr().err
+    assert synth(tmp_path / "two", *WORDS, "--workers", 2) == 0
+    assert "0 people made, 60 were there" in capsys.readouterr().err
+
+
+def test_other_settings_are_refused_by_name(dataset, capsys):
+    before = content(dataset)
+    words = [*WORDS[:-2], "--seed", "6", "--hard", "0.5"]
+    assert synth(dataset, *words) == 2
+    line = one_line(capsys)
+    assert "hard 1.0 there, 0.5 asked for; seed 5 there, 6 asked for" in line and "count" not in line
+    assert content(dataset) == before
+
+
+def test_clips_have_frames(tmp_path):
+    assert synth(tmp_path / "clips", "-n", 2, "--clips", "--sensor", "os1-64") == 0
+    rows = list(open_dataset(tmp_path / "clips").rows())
+    assert [(row["index"], row["frame"]) for row in rows] == [(clip, frame) for clip in (0, 1) for frame in range(16)]
+    joints = np.array([row["joints"].reshape(-1, 3) for row in rows[:16]])
+    step = np.linalg.norm(np.diff(joints, axis=0), axis=-1)
+    assert step.max() < 1.5
+
+
+BAD = {
+    "none": (["-n", "0"], "at least 1 of people, got 0"),
+    "negative": (["-n", "-3"], "got -3"),
+    "sensor": (["-n", "5", "--sensor", "os1-129"], "did you mean os1-128"),
+    "no sensor": (["-n", "5", "--sensor", ","], "expected the names of sensors"),
+    "table": (["-n", "5", "--sensor", "none.json"], "none.json: no such file"),
+    "scene": (["-n", "5", "--scene", "wilt"], "did you mean wild"),
+    "hard": (["-n", "5", "--hard", "2"], "between 0"),
+    "hard nan": (["-n", "5", "--hard", "nan"], "between 0"),
+    "seed": (["-n", "5", "--seed", "-1"], "seed"),
+    "workers": (["-n", "5", "--workers", "0"], "worker"),
+    "motion": (["-n", "5", "--motion", "none.npz"], "none.npz"),
+    "subjects": (["-n", "5", "--subjects", "a"], "--motion"),
+    "both": (["-n", "5", "--clips", "--scenes"], "not allowed with"),
+    "shard": (["-n", "5", "--per-shard", "0"], "a shard, got 0"),
+    "captured": (["-n", "5", "--captured", "0.3"], "--motion"),
+    "share": (["-n", "5", "--motion", "none.npz", "--captured", "1.5"], "between 0 and 1, got 1.5"),
+    "far too many": (["-n", "1000000000000"], "give a larger --per-shard"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_command_is_one_line_and_leaves_nothing(tmp_path, capsys, monkeypatch, case):
+    words, message = BAD[case]
+    monkeypatch.chdir(tmp_path)
+    try:
+        code = synth("out", *words)
+    except SystemExit as exit:
+        code = exit.code
+    assert code == 2 and message in one_line(capsys)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_is_none_or_another_ones_is_refused(tmp_path, capsys):
+    file = tmp_path / "file"
+    file.write_text("mine")
+    for out, message in ((file, "is a file"), (file / "deep", "is a file"), (tmp_path, "holds other files")):
+        assert synth(out, "-n", 5) == 2
+        assert message in one_line(capsys)
+    assert synth("/proc/nothing", "-n", 5) == 2
+    assert "cannot write" in one_line(capsys)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"] and file.read_text() == "mine"
+
+
+def test_a_full_disk_is_one_line_and_leaves_no_half_shard(tmp_path):
+    resource = pytest.importorskip("resource")
+    limit = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (20000, {resource.RLIM_INFINITY}))"
+    code = f"{limit}; from lidarpose.cli import main; raise SystemExit(main())"
+    words = ["synth", "--out", str(tmp_path / "full"), *WORDS[:2], "--per-shard", str(COUNT)]
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.startswith("lidarpose: error: ") and done.stderr.count("\n") == 1, done.stderr
+    assert "people-00000.parquet" in done.stderr
+    assert [path.name for path in (tmp_path / "full").iterdir()] == ["dataset.json"]
+
+
+def test_a_sensor_s_file_counts_by_content(tmp_path, capsys):
+    for place in ("a", "b"):
+        (tmp_path / place).mkdir()
+        (tmp_path / place / "mine.json").write_text("[-10, -5, 0, 5, 10]")
+    words = ["-n", 3, "--sensor"]
+    assert synth(tmp_path / "d", *words, tmp_path / "a" / "mine.json") == 0
+    assert str(tmp_path) not in (tmp_path / "d" / "dataset.json").read_text()
+    # moved elsewhere it is the same sensor, changed it is another one
+    assert synth(tmp_path / "d", *words, tmp_path / "b" / "mine.json") == 0
+    capsys.readouterr()
+    (tmp_path / "b" / "mine.json").write_text("[-10, -5, 0, 5, 11]")
+    assert synth(tmp_path / "d", *words, tmp_path / "b" / "mine.json") == 2
+    assert "tables" in one_line(capsys)
+
+
+def test_streets_hold_everybody_of_a_turn(tmp_path, monkeypatch):
+    monkeypatch.setattr(write, "STREET_FRAMES", 2)
+    assert synth(tmp_path / "s", "-n", 1, "--scenes", "--sensor", "vlp-16") == 0
+    data = open_dataset(tmp_path / "s")
+    assert "scene" not in data.card.settings
+    frames = list(data.rows("frames"))
+    for row, sample in zip(data.rows(), data, strict=True):
+        frame = frames[row["frame"]]
+        assert sample.box.id == row["track"] and sample.box.id in frame["track"]
+        joints = frame["joints"].reshape(len(frame["track"]), -1, 3)[sample.box.id]
+        np.testing.assert_array_equal(joints, sample.pose.joints)
+        # the label's box, not the one with a detector's errors, holds the whole person
+        center, size = np.split(frame["box"].reshape(-1, 7)[sample.box.id][:6], 2)
+        assert np.linalg.norm(center - sample.box.center) < 0.5 and (size > 0.2).all()
+        own = frame["points"].reshape(-1, 3)[frame["person"] == sample.box.id]
+        assert np.linalg.norm(own.mean(0) - center) < 0.6
+
+
+def test_sensors_are_listed(capsys):
+    assert main(["sensors"]) == 0
+    assert capsys.readouterr().out.splitlines() == listing()
+
+
+def test_synth_needs_no_torch(tmp_path):
+    code = "import sys; from lidarpose.cli import main; main(); raise SystemExit('torch' in sys.modules)"
+    words = ["synth", "--out", str(tmp_path / "a"), "-n", "2"]
+    assert subprocess.run([sys.executable, "-c", code, *words], capture_output=True).returncode == 0
+
+
+# ---- people for torch
+
+SCENE = scene_config("wild").eased(0.5)
+
+
+def clouds(data, **settings):
+    return [sample.points for batch in DataLoader(data, collate_fn=list, **settings) for sample in batch]
+
+
+@pytest.mark.parametrize("workers", [2, 3])
+@pytest.mark.parametrize("batch", [1, 4])
+def test_people_are_the_same_in_any_number_of_workers(workers, batch):
+    data = SyntheticPeople(scene=SCENE, seed=2, start=60, stop=70, batch=batch)
+    alone = [sample.points for sample in data]
+    assert len(alone) == 10
+    found = clouds(data, batch_size=batch, num_workers=workers)
+    assert len(found) == 10
+    for a, b in zip(found, alone, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("workers", [0, 2, 3])
+def test_shards_give_the_same_people_in_any_number_of_workers(dataset, workers):
+    expected = [sample.points for sample in open_dataset(dataset)]
+    found = clouds(ShardPeople(folder=dataset, batch=7), batch_size=7, num_workers=workers)
+    assert len(found) == COUNT
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_people_go_on_without_end_and_settings_are_checked():
+    people = iter(SyntheticPeople(scene=SCENE, seed=2))
+    assert len([next(people) for _ in range(3)]) == 3
+    for wrong in ({"seed": -1}, {"start": 5, "stop": 2}, {"batch": 0}, {"hard": 3.0}, {"captured": 0.5}):
+        with pytest.raises(InputError):
+            SyntheticPeople(**{"scene": SCENE, "seed": 0} | wrong)
+    with pytest.raises(InputError, match="is no dataset"):
+        ShardPeople(folder="none")
+
+
+# --- streets
+
+
+def test_streets_hold_whole_turns_and_the_people_in_them(tmp_path, monkeypatch):
+    monkeypatch.setattr(write, "STREET_FRAMES", 2)
+    write_dataset(Job(what="streets", count=1, sensors=("vlp-16",)), tmp_path / "s")
+    dataset = open_dataset(tmp_path / "s")
+    frames = list(dataset.rows("frames"))
+    assert [frame["frame"] for frame in frames] == [0, 1] and frames[0]["sensor"] == "vlp-16"
+    assert len(frames[0]["points"]) == 3 * len(frames[0]["person"]) > 10_000
+    people = list(dataset.rows())
+    assert people and {row["frame"] for row in people} <= {0, 1}
+    for row in people:
+        turn = frames[row["frame"]]
+        own = turn["points"].reshape(-1, 3)[turn["person"] == row["track"]]
+        # the person's points of the turn are about the person's joints
+        assert np.linalg.norm(own.mean(0) - row["joints"].reshape(-1, 3).mean(0)) < 0.5
+
+
+def test_streets_take_no_scene():
+    with pytest.raises(InputError, match="of their own"):
+        Job(what="streets", count=1, scene="paper")
