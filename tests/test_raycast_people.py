@@ -174,6 +174,22 @@ def test_culling_leaves_out_what_it_may():
     )
 
 
+@pytest.mark.parametrize("shift", [(5, 0, 0), (-5, 0.3, 0), (0.2, 4.9, 0.1)])
+def test_culled_meshes_have_no_holes(shift):
+    # beams far denser than the mesh, over the whole of it and past its rim
+    s = Sensor(name="dense", elevations=np.linspace(-0.23, 0.25, 500), azimuth_step=2 * np.pi / 8000, range_min=0.0)
+    vertices, faces = sphere(16)
+    both, culled = (
+        scan(vertices + shift, faces, s, margin=0.01),
+        scan(vertices + shift, faces, s, margin=0.01, cull=True),
+    )
+    assert np.array_equal(both.column, culled.column) and np.array_equal(both.ring, culled.ring)
+    assert len(culled.face) > 100_000 and np.abs(both.points - culled.points).max() < 1e-5
+    rows = np.bincount(culled.column)
+    for column in (np.argmax(rows), np.argmax(rows) + 40):
+        assert (np.diff(culled.ring[culled.column == column]) == 1).all()
+
+
 def test_culled_people_and_windows():
     s = sensor("dapt64")
     vertices = people(9, s.height)

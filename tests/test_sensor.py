@@ -1,14 +1,16 @@
 import dataclasses
+import json
 
 import numpy as np
 import pytest
 
 from lidarpose.errors import InputError
 from lidarpose.lidar.sensor import SENSORS, Sensor, Window, sensor
+from lidarpose.lidar.tables import load_sensor
 
 ROWS = {
     "dapt64": 64, "vlp-16": 16, "vlp-32c": 32, "hdl-32e": 32, "hdl-64e": 64, "os1-64": 64, "os1-128": 128,
-    "os0-128": 128, "waymo-top": 64, "pandar64": 64, "av2": 64,
+    "os0-128": 128, "os2-128": 128, "waymo-top": 64, "pandar64": 64, "av2": 64,
 }  # fmt: skip
 
 
@@ -105,3 +107,44 @@ def test_ground_frame():
     ahead = s.T_sensor_from_ground @ [2 / np.tan(np.radians(30)), 0, 0, 1]
     assert ahead[:3] == pytest.approx([4, 0, 0])
     assert s.T_sensor_from_ground @ [0, 0, 2, 1] == pytest.approx([0, 0, 0, 1])
+
+
+def test_user_tables_that_go_wrong_are_told_in_one_line(tmp_path):
+    def refused(name, content, message):
+        path = tmp_path / name
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        with pytest.raises(InputError, match=message) as caught:
+            sensor(path)
+        assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+
+    refused("a.json", '{"elevations_deg": [1, 2], "height": 1' + "0" * 400 + "}", "height must be a list of numbers")
+    refused("b.json", '{"elevations_deg": [1, 2], "tilt_deg": "down"}', "tilt_deg must be a number")
+    refused("c.json", "[1, 2, NaN]", "number 2 is not finite")
+    refused("d.json", "[" * 100_000, "is not JSON")
+    refused("e.csv", '"' + "9" * 200_000 + '"', "is not CSV")
+    refused("f.csv", b"1\n" * 2**23 + b"1\n", "is it a recording")
+    refused("g.csv", b"", "is empty")
+    refused("h.json", '{"beam_altitude_angles": [1, 2], "lidar_mode": "0x10"}', "columns must be a whole number")
+
+
+def test_ouster_files_of_all_ages_say_their_columns(tmp_path):
+    angles, path = [16.6, 0.5, -16.6], tmp_path / "os.json"
+    for content, columns in (
+        ({"beam_altitude_angles": angles, "lidar_mode": "2048x10"}, 2048),
+        ({"beam_intrinsics": {"beam_altitude_angles": angles}, "config_params": {"lidar_mode": "512x20"}}, 512),
+        ({"beam_intrinsics": {"beam_altitude_angles": angles}, "lidar_data_format": {"columns_per_frame": 1024}}, 1024),
+        ({"beam_altitude_angles": angles, "lidar_mode": "\u00b2x10"}, 1800),
+    ):
+        path.write_text(json.dumps(content))
+        found = load_sensor(path)
+        assert found.columns == columns and found.rows == 3
+        assert np.degrees(found.elevations) == pytest.approx(sorted(angles))
+
+
+def test_csv_files_of_any_line_end_are_read(tmp_path):
+    for number, end in enumerate(("\n", "\r\n", "\r")):
+        path = tmp_path / f"{number}.csv"
+        path.write_bytes(end.join(["\ufeffChannel,Elevation,Azimuth", "1,10,1.0", "2,-10,-1.0", ""]).encode())
+        found = load_sensor(path)
+        assert np.degrees(found.elevations) == pytest.approx([-10, 10])
+        assert abs(np.degrees(found.azimuth_offsets[0] - found.azimuth_offsets[1])) == pytest.approx(2)

@@ -57,6 +57,11 @@ class RayPattern:
             low, high = getattr(self, name)
             if not (np.isfinite([low, high]).all() and low < high):
                 raise InputError(f"RayPattern.{name} must be (lowest, highest) rad, got ({low}, {high})")
+        for name in ("duration", "range_min", "range_max", "range_sigma", "dropout", "height", "tilt"):
+            if not np.isfinite(getattr(self, name)):
+                raise InputError(f"RayPattern.{name} must be a finite number, got {getattr(self, name)}")
+        if self.duration < 0:
+            raise InputError(f"RayPattern.duration must be 0 s or more, got {self.duration}")
         if not 0 <= self.range_min < self.range_max:
             raise InputError(f"RayPattern ranges must be 0 <= min < max, got {self.range_min} and {self.range_max} m")
         if self.range_sigma < 0 or not 0 <= self.dropout < 1:
@@ -91,9 +96,9 @@ class RayPattern:
 # --- how the rays of known sensors run
 #
 # Livox publishes four seconds of each pattern as a table of angles (scan_mode/*.csv of Livox-SDK's
-# livox_laser_simulation). The constants below were fitted to those tables: two turning wedges follow the Mid-40's to
-# 0.001 deg and the Avia's to 0.001 deg, the Mid-360's form follows its to 0.15 deg, the beam's own angular precision.
-# The Mid-40's agree with those of Brazeal, Wilkinson and Hochmair (Sensors 2021, 21, 4722).
+# livox_laser_simulation). The constants below were fitted to those tables. Two turning wedges follow the Mid-40's and
+# the Avia's to 0.001 deg; the Mid-40's constants agree with those of Brazeal, Wilkinson and Hochmair (Sensors 2021, 21,
+# 4722). The Mid-360's form follows its table to 0.09 deg, 0.37 at worst; its beams are precise to 0.15 deg.
 
 # frames that are kept of a pattern that never repeats
 _KEPT = 16
@@ -169,13 +174,13 @@ def _avia(frame: int):
 # times a second while the elevation swings down and up again ten times.
 _MID360_MIRROR, _MID360_HEAD = 10_945, 10_345
 _MID360_STARTS = np.radians([90.65, 91.21])
-_MID360_LEAN = np.radians(124.16)
+_MID360_LEAN = np.radians(124.164)
 # how the head bends the beam, deg as a vector across it: parts that turn m times the head's lag behind the mirror
-_MID360_BEND = {1: 24.987, 3: 1.918, 5: 0.078, -1: -1.121, -3: 0.136}
+_MID360_BEND = {1: 24.987, 2: 0.073, 3: 1.918, 5: 0.078, -1: -1.121, -2: 0.073, -3: 0.136}
 # four lasers, so many spacings off the middle; their picture turns and stretches: deg, parts that turn a times the
 # mirror and b times the lag
 _MID360_LASERS = np.array([1.5, 0.5, -0.5, -1.5])
-_MID360_FAN = {(0, 0): 1.880, (0, 1): 0.162, (2, -2): -0.368, (2, -1): -0.161}
+_MID360_FAN = {(0, 0): 1.880, (0, 1): 0.162, (0, 2): 0.030, (2, -2): -0.368, (2, -1): -0.161, (2, -4): -0.058}
 
 
 def _mid360(frame: int):
@@ -213,7 +218,8 @@ def _half(degrees: float) -> tuple[float, float]:
     return -np.radians(degrees) / 2, np.radians(degrees) / 2
 
 
-# Fields of view, rates and ranges are the makers'; ranges for targets of 80 percent, heights of usual mounts.
+# Rates and ranges are the makers', for targets of 80 percent; fields of view too, widened by up to 0.2 deg to what the
+# patterns fill; heights of usual mounts.
 PATTERNS = (
     RayPattern(
         name="livox-mid40",
@@ -242,7 +248,7 @@ PATTERNS = (
         rays=_avia,
         frames=_KEPT,
         duration=0.1,
-        azimuths=_half(70.4),
+        azimuths=_half(70.6),
         elevations=_half(77.2),
         range_min=1.0,
         range_max=320.0,
@@ -254,11 +260,12 @@ PATTERNS = (
         frames=_KEPT,
         duration=0.1,
         azimuths=(-np.pi, np.pi),
-        elevations=(np.radians(-7.0), np.radians(52.0)),
+        elevations=(np.radians(-7.2), np.radians(52.0)),
         range_max=70.0,
         height=0.5,
     ),
-    # as structured-light and time-of-flight cameras have it; its noise grows with the square of the range in truth
+    # fields of view and ranges of usual structured-light and time-of-flight cameras, a quarter of their pixels. Noise
+    # is one figure here, that of 2 to 4 m; a structured-light camera's grows with the square of the range.
     RayPattern(
         name="depth-camera",
         rays=_pinhole,

@@ -135,8 +135,9 @@ def scan(
     vertices (V, 3) m in the sensor's frame, faces (F, 3): the body, and whatever may hide it or stand behind it.
     window_vertices (M, 3): the body alone (all vertices if not given); margin rad widens the window on each side.
     cull: the faces, all (True) or a mask (F,), of closed meshes whose faces are counter-clockwise seen from outside
-    (see `is_closed`): the same hits at two thirds of the cost. Other faces count from both sides.
-    A beam whose nearest hit is outside the sensor's range limits returns nothing. Nothing is random. The heads of a
+    (see `is_closed`): the same hits, sooner. Other faces count from both sides.
+    A beam whose nearest hit is outside the sensor's range limits returns nothing. A sensor inside a mesh sees it from
+    inside. Nothing is random. The heads of a
     sensor with several origins are cast one by one. Raises InputError.
     """
     if sensor.heads:

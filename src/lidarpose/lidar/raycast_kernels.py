@@ -29,7 +29,8 @@ AXIS = 1e-9
 _LOW = 0xFFFFFFFF
 # of a vertex's column and rows in its key
 _BITS = 21
-_MASK = (1 << _BITS) - 1
+_OPEN_BIT = 2 * _BITS
+_MASK, _COLUMNS, _OPEN = (1 << _BITS) - 1, (1 << _BITS) - 1 << _BITS, 1 << _OPEN_BIT
 # pairs of triangle and column that are worked on at a time, to stay near the processor
 _BLOCK = 1024
 # far above what rounding does to a triangle's orientation
@@ -99,12 +100,16 @@ def _find_single(t, values, lut, low, scale, bins):
 
 
 @compiled
-def _projected(vertices, c, s, P):
-    """Fills P (V, 4) with Y, Z, I, T of vertices turned by an angle of cosine c and sine s.
+def _projected(vertices, c, s, columns, rows, P, bins):
+    """Fills P (V * 4) with Y, Z, I, T of vertices turned by an angle of cosine c and sine s, and bins (V * 2): where
+    to look for the first column right of each, and the first row above the least that its triangles may reach.
 
     Returns how many are not ahead; theirs mean nothing.
     """
-    given, P, beside = vertices.reshape(-1), P.reshape(-1), 0
+    given, beside = vertices.reshape(-1), 0
+    low_c, scale_c, bins_c, low_r, scale_r, bins_r = (
+        columns.low, columns.scale, columns.bins, rows.low, rows.scale, rows.bins,
+    )  # fmt: skip
     for i in range(len(vertices)):
         east, north, z = given[np.uintp(3 * i)], given[np.uintp(3 * i + 1)], given[np.uintp(3 * i + 2)]
         x = c * east + s * north
@@ -113,78 +118,81 @@ def _projected(vertices, c, s, P):
         beside += not ahead
         inverse = 1 / (x if ahead else 1.0)
         right, up = y * inverse, z * inverse
+        t = up / np.sqrt(1 + right * right)
         P[np.uintp(4 * i)] = right
         P[np.uintp(4 * i + 1)] = up
         P[np.uintp(4 * i + 2)] = inverse
-        P[np.uintp(4 * i + 3)] = up / np.sqrt(1 + right * right)
+        P[np.uintp(4 * i + 3)] = t
+        bins[np.uintp(2 * i)] = np.int32(min(max((right - low_c) * scale_c, 0.0), bins_c))
+        bins[np.uintp(2 * i + 1)] = np.int32(min(max((_least(t) - low_r) * scale_r, 0.0), bins_r))
     return beside
 
 
 @compiled
-def _keys(P, columns, rows):
-    """(V,): column << 2 * _BITS | lower row << _BITS | upper row of vertices P (V * 4), in tables of columns and rows.
+def _least(t):
+    """The least T that an edge from a vertex at t may reach: an arc of a great circle of azimuth width D rises at most
+    by 1 / cos(D / 2) over its higher end."""
+    return t + min(t, 0.0) * _SAG - ROUNDING
 
-    The upper row may be too high, never too low.
+
+@compiled
+def _most(t):
+    return t + max(t, 0.0) * _SAG + ROUNDING
+
+
+@compiled
+def _keys(P, bins, columns, rows):
+    """(V,) of vertices P (V * 4): _OPEN if there is a row between what a vertex's edges may reach at least and at most,
+    | first column right of it << _BITS | first row above the least.
+
+    So a triangle whose keys have equal rows and are not open reaches no row, but if it is wide.
     """
-    count = len(P) // 4
-    keys, bins = np.empty(count, np.int64), np.empty(2 * count, np.int32)
-    line, lut_c, low_c, scale_c, bins_c = columns.values, columns.lut, columns.low, columns.scale, columns.bins
-    row, lut_r, low_r, scale_r, bins_r = rows.values, rows.lut, rows.low, rows.scale, rows.bins
-    # an arc of a great circle of azimuth width D rises at most by 1 / cos(D / 2) over its higher end
-    for i in range(count):
-        t = P[np.uintp(4 * i + 3)]
-        down = t + min(t, 0.0) * _SAG - ROUNDING
-        bins[np.uintp(2 * i)] = np.int32(min(max((P[np.uintp(4 * i)] - low_c) * scale_c, 0.0), bins_c))
-        bins[np.uintp(2 * i + 1)] = np.int32(min(max((down - low_r) * scale_r, 0.0), bins_r))
-    last = np.uintp(len(row) - 1)
+    count = len(bins) // 2
+    keys = np.empty(count, np.int64)
+    line, row, lut_c, lut_r, end = columns.values, rows.values, columns.lut, rows.lut, np.uintp(len(columns.values) - 1)
     for i in range(count):
         y, t = P[np.uintp(4 * i)], P[np.uintp(4 * i + 3)]
-        up, down = t + max(t, 0.0) * _SAG + ROUNDING, t + min(t, 0.0) * _SAG - ROUNDING
         column = np.uintp(lut_c[np.uintp(bins[np.uintp(2 * i)])])
         lower = np.uintp(lut_r[np.uintp(bins[np.uintp(2 * i + 1)])])
-        column, lower = column + np.uintp(line[column] < y), lower + np.uintp(row[lower] < down)
-        upper = lower + np.uintp(row[lower] < up)
-        upper = last if row[upper] < up else upper
-        keys[i] = np.int64(column) << 2 * _BITS | np.int64(lower) << _BITS | np.int64(upper)
+        column, lower = column + np.uintp(line[column] < y), lower + np.uintp(row[lower] < _least(t))
+        # whoever reaches beyond the columns may be wide
+        reaches = (row[lower] < _most(t)) | (column == 0) | (column == end)
+        keys[i] = np.int64(reaches) << _OPEN_BIT | np.int64(column) << _BITS | np.int64(lower)
     if columns.single and rows.single:
         return keys
     for i in range(count):
-        t = P[4 * i + 3]
-        up, down = t + max(t, 0.0) * _SAG + ROUNDING, t + min(t, 0.0) * _SAG - ROUNDING
-        column, lower, upper = _find(P[4 * i], columns), _find(down, rows), _find(up, rows)
-        keys[i] = np.int64(column) << 2 * _BITS | np.int64(lower) << _BITS | np.int64(upper)
+        y, t = P[4 * i], P[4 * i + 3]
+        column, lower = _find(y, columns), _find(_least(t), rows)
+        reaches = row[lower] < _most(t) or column == 0 or column == end
+        keys[i] = np.int64(reaches) << _OPEN_BIT | np.int64(column) << _BITS | np.int64(lower)
     return keys
+
+
+@compiled
+def _column(key):
+    return (key & _COLUMNS) >> _BITS
 
 
 @compiled
 def _reaching(faces, keys, columns):
     """The faces that cross a column and may reach a row, ascending; none is left out that does."""
-    count = len(columns.values) - 1
     widest = 0.0
-    for k in range(count - 1):
+    for k in range(len(columns.values) - 2):
         widest = max(widest, columns.values[k + 1] - columns.values[k])
-    # so many columns apart, or beyond the first or last, may be too wide to be dropped by row
-    narrow = min(int(_NARROW / widest) - 1, count) if widest > 0 else 0
-    corners = faces.reshape(-1)
-    crossing, n = np.empty(len(faces) + 1, np.int32), np.uintp(0)
+    # what is in one block of so many bits of columns is not too wide to be dropped by row
+    block = _BITS
+    while widest * 2.0 ** (block - _BITS + 1) <= _NARROW and block < _OPEN_BIT:
+        block += 1
+    kept_if = _MASK | -1 << block
+    corners, kept, n = faces.reshape(-1), np.empty(len(faces) + 1, np.int32), np.uintp(0)
     for f in range(len(faces)):
         a = keys[np.uintp(corners[np.uintp(3 * f)])]
         b = keys[np.uintp(corners[np.uintp(3 * f + 1)])]
         d = keys[np.uintp(corners[np.uintp(3 * f + 2)])]
-        crossing[n] = f
-        n += np.uintp((a ^ b | b ^ d) >> 2 * _BITS != 0)
-    reaching, kept = crossing, np.uintp(0)
-    for m in range(n):
-        f = 3 * np.int64(crossing[m])
-        a = keys[np.uintp(corners[np.uintp(f)])]
-        b = keys[np.uintp(corners[np.uintp(f + 1)])]
-        d = keys[np.uintp(corners[np.uintp(f + 2)])]
-        first, last = min(a, b, d) >> 2 * _BITS, max(a, b, d) >> 2 * _BITS
-        lower = min(a >> _BITS & _MASK, b >> _BITS & _MASK, d >> _BITS & _MASK)
-        upper = max(a & _MASK, b & _MASK, d & _MASK)
-        reaching[kept] = crossing[m]
-        kept += np.uintp((lower < upper) | (last - first >= narrow) | (first == 0) | (last == count))
-    return reaching[:kept]
+        differ = a ^ b | b ^ d
+        kept[n] = f
+        n += np.uintp((differ & _COLUMNS != 0) & ((differ & kept_if) | (a & _OPEN) != 0))
+    return kept[:n]
 
 
 @compiled
@@ -208,14 +216,14 @@ def raster(vertices, faces, culled, center, column_tan, column_cos, row_tan, col
     """
     c, s = np.cos(center), np.sin(center)
     # what is read together is kept together
-    P = np.empty((len(vertices), 4))
-    beside, flat = _projected(vertices, c, s, P), P.reshape(-1)
+    P, bins = np.empty(4 * len(vertices)), np.empty(2 * len(vertices), np.int32)
     columns, rows = _table(column_tan), _table(row_tan)
-    keys = _keys(flat, columns, rows)
+    beside = _projected(vertices, c, s, columns, rows, P, bins)
+    keys = _keys(P, bins, columns, rows)
     ahead = _ahead(vertices, c, s) if beside else np.empty(0, np.bool_)
     kept = _reaching(faces, keys, columns)
     if len(culled) and not (beside and _may_surround(faces, culled, ahead)):
-        kept = _front(faces, culled, flat, kept)
+        kept = _front(faces, culled, P, kept)
     lines = np.empty(2 * len(column_tan))
     lines[::2], lines[1::2] = column_tan, column_cos
     pairs = np.empty(8 * (_BLOCK + len(column_tan)), np.int32)
@@ -225,7 +233,7 @@ def raster(vertices, faces, culled, center, column_tan, column_cos, row_tan, col
         if beside and not (ahead[a] and ahead[b] and ahead[d]):
             continue
         # sorted from right to left, by column and vertex
-        a, b, d = a | keys[a] >> 2 * _BITS << 32, b | keys[b] >> 2 * _BITS << 32, d | keys[d] >> 2 * _BITS << 32
+        a, b, d = a | _column(keys[a]) << 32, b | _column(keys[b]) << 32, d | _column(keys[d]) << 32
         first, last = min(a, b, d), max(a, b, d)
         middle = a ^ b ^ d ^ first ^ last
         turn = middle >> 32
@@ -236,9 +244,9 @@ def raster(vertices, faces, culled, center, column_tan, column_cos, row_tan, col
             pairs[np.uintp(n + 4)], pairs[np.uintp(n + 5)] = k, f
             n += 8
         if n >= 8 * _BLOCK:
-            _fill(pairs[:n], flat, lines, rows, column_index, row_index, inverse_x, face)
+            _fill(pairs[:n], P, lines, rows, column_index, row_index, inverse_x, face)
             n = 0
-    _fill(pairs[:n], flat, lines, rows, column_index, row_index, inverse_x, face)
+    _fill(pairs[:n], P, lines, rows, column_index, row_index, inverse_x, face)
     if beside:
         _raster_beside(
             vertices, faces, c, s, ahead, P, keys, column_tan, column_cos, rows, column_index, row_index,
@@ -354,8 +362,8 @@ def _raster_beside(
             x[j] = c * vertices[i, 0] + s * vertices[i, 1]
             y[j] = c * vertices[i, 1] - s * vertices[i, 0]
             z[j] = vertices[i, 2]
-            first += ((keys[i] >> 2 * _BITS) > 0) if ahead[i] else (y[j] - column_tan[0] * x[j] > 0)
-            last += ((keys[i] >> 2 * _BITS) > columns - 1) if ahead[i] else (y[j] - column_tan[columns - 1] * x[j] > 0)
+            first += (_column(keys[i]) > 0) if ahead[i] else (y[j] - column_tan[0] * x[j] > 0)
+            last += (_column(keys[i]) > columns - 1) if ahead[i] else (y[j] - column_tan[columns - 1] * x[j] > 0)
         # a vertex's side changes at most once over the columns
         if first == last and (first == 0 or first == 3) or max(x[0], x[1], x[2]) <= 0:
             continue
@@ -363,7 +371,7 @@ def _raster_beside(
             total = 0
             for j in range(3):
                 i = faces[f, j]
-                left[j] = (k < (keys[i] >> 2 * _BITS)) if ahead[i] else (y[j] - column_tan[k] * x[j] > 0)
+                left[j] = (k < _column(keys[i])) if ahead[i] else (y[j] - column_tan[k] * x[j] > 0)
                 total += left[j]
             if total == 0 or total == 3:
                 continue
@@ -378,15 +386,15 @@ def _raster_beside(
                     p, q = q, p
                 a, b = faces[f, p], faces[f, q]
                 if ahead[a] and ahead[b]:
-                    u = (column_tan[k] - P[a, 0]) / (P[b, 0] - P[a, 0])
-                    end_i[e] = P[a, 2] + u * (P[b, 2] - P[a, 2])
-                    end_t[e] = (P[a, 1] + u * (P[b, 1] - P[a, 1])) * column_cos[k]
+                    u = (column_tan[k] - P[4 * a]) / (P[4 * b] - P[4 * a])
+                    end_i[e] = P[4 * a + 2] + u * (P[4 * b + 2] - P[4 * a + 2])
+                    end_t[e] = (P[4 * a + 1] + u * (P[4 * b + 1] - P[4 * a + 1])) * column_cos[k]
                     end_x[e] = 1 / end_i[e]
-                    end_z[e] = (P[a, 1] + u * (P[b, 1] - P[a, 1])) * end_x[e]
+                    end_z[e] = (P[4 * a + 1] + u * (P[4 * b + 1] - P[4 * a + 1])) * end_x[e]
                 else:
                     # of the sign that the side was found by, or an edge in the column's plane might cross nowhere
-                    before = (P[a, 0] - column_tan[k]) * x[p] if ahead[a] else y[p] - column_tan[k] * x[p]
-                    after = (P[b, 0] - column_tan[k]) * x[q] if ahead[b] else y[q] - column_tan[k] * x[q]
+                    before = (P[4 * a] - column_tan[k]) * x[p] if ahead[a] else y[p] - column_tan[k] * x[p]
+                    after = (P[4 * b] - column_tan[k]) * x[q] if ahead[b] else y[q] - column_tan[k] * x[q]
                     u = before / (before - after)
                     end_x[e] = x[p] + u * (x[q] - x[p])
                     end_z[e] = z[p] + u * (z[q] - z[p])

@@ -11,8 +11,9 @@ from lidarpose.lidar.raycast_input import as_culled, as_mesh, as_points, check_m
 from lidarpose.lidar.raycast_scan import scan_chunk
 from lidarpose.lidar.sensor import Sensor
 
-# shares of the work per thread: people differ in cost by their distance
-_SHARES = 4
+# shares of the work per thread, as people differ in cost by their distance; and at most so many people in a share,
+# whose hits then fit in memory that is used again
+_SHARES, _MOST = 4, 16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,13 +83,13 @@ def scan_people(
         raise InputError(f"threads must be at least 1, got {threads}")
     culled, beams = as_culled(cull, faces), beams_of(sensor)
     people = len(vertices)
-    chunks = 1 if threads == 1 else min(people, _SHARES * threads)
+    chunks = max(-(-people // _MOST), min(people, _SHARES * threads if threads > 1 else 1))
     bounds = [people * i // max(1, chunks) for i in range(chunks + 1)]
 
     def cast(i: int):
         return scan_chunk(vertices, extra_vertices, faces, culled, beams, float(margin), bounds[i], bounds[i + 1])
 
-    if chunks <= 1:
+    if threads == 1 or chunks <= 1:
         done = [cast(i) for i in range(chunks)]
     else:
         with ThreadPoolExecutor(threads) as pool:

@@ -4,8 +4,8 @@ import numpy as np
 
 from lidarpose.lidar.raycast_kernels import AXIS, ROUNDING, STEEP, compiled
 
-# about two rays a cell, and no more cells than this along a side
-_MOST_CELLS = 256.0
+# most cells hold no ray, so most triangles meet none; and no more cells than this along a side
+_CELLS_A_RAY, _MOST_CELLS = 4.0, 256.0
 
 
 @compiled
@@ -27,6 +27,7 @@ def ray_list(vertices, faces, directions, shift, time):
     u, v, cell = np.empty(count), np.empty(count), np.empty(count, np.int64)
     w, p, q = np.empty(3), np.empty(3), np.empty(3)
     dw, dp, dq = np.zeros(3), np.zeros(3), np.zeros(3)
+    cells, touching = np.empty(4 * len(vertices), np.int32), np.empty(len(faces) + 1, np.int32)
     for side in range(6):
         axis, sign = side // 2, 1.0 - 2.0 * (side % 2)
         across, along = (axis + 1) % 3, (axis + 2) % 3
@@ -40,7 +41,7 @@ def ray_list(vertices, faces, directions, shift, time):
                 n += 1
         if n == 0:
             continue
-        grid = int(min(max(np.sqrt(n / 2.0), 1.0), _MOST_CELLS))
+        grid = int(min(max(np.sqrt(_CELLS_A_RAY * n), 1.0), _MOST_CELLS))
         scale_u, scale_v = grid / max(u1 - u0, 1e-9), grid / max(v1 - v0, 1e-9)
         start = np.zeros(grid * grid + 1, np.int64)
         for i in range(count):
@@ -55,35 +56,23 @@ def ray_list(vertices, faces, directions, shift, time):
             if cube[i] == side:
                 order[filled[cell[i]]] = i
                 filled[cell[i]] += 1
-        for f in range(len(faces)):
-            ahead, front = True, -np.inf
-            low_u, high_u, low_v, high_v = np.inf, -np.inf, np.inf, -np.inf
+        _cells(vertices, shift, axis, sign, u0, v0, scale_u, scale_v, grid, cells)
+        for m in range(_touching(faces, cells, start, grid, touching)):
+            f = touching[m]
+            i0, i1, i2 = 4 * np.int64(faces[f, 0]), 4 * np.int64(faces[f, 1]), 4 * np.int64(faces[f, 2])
+            a0, b0, a1, b1 = _block(cells, i0, i1, i2, grid)
+            front = -np.inf
             for j in range(3):
                 i = faces[f, j]
                 w[j] = sign * vertices[i, axis]
                 p[j], q[j] = vertices[i, across], vertices[i, along]
+                front = max(front, w[j])
                 if shift is not None:
                     dw[j] = sign * shift[i, axis]
                     dp[j], dq[j] = shift[i, across], shift[i, along]
-                # what moves along a line that is all ahead moves along a line on the cube's side: its ends bound it
-                for end in range(1 if shift is None else 2):
-                    w_end, p_end, q_end = w[j] + end * dw[j], p[j] + end * dp[j], q[j] + end * dq[j]
-                    front = max(front, w_end)
-                    ahead &= (w_end > AXIS) & (w_end * STEEP > abs(p_end)) & (w_end * STEEP > abs(q_end))
-                    inverse = 1 / (w_end if w_end > AXIS else 1.0)
-                    low_u, high_u = min(low_u, p_end * inverse), max(high_u, p_end * inverse)
-                    low_v, high_v = min(low_v, q_end * inverse), max(high_v, q_end * inverse)
+                    front = max(front, w[j] + dw[j])
             if front <= 0:
                 continue
-            if not ahead:
-                low_u, high_u, low_v, high_v = u0, u1, v0, v1
-            low_u, high_u, low_v, high_v = low_u - ROUNDING, high_u + ROUNDING, low_v - ROUNDING, high_v + ROUNDING
-            if high_u < u0 or low_u > u1 or high_v < v0 or low_v > v1:
-                continue
-            a0 = int(min(max((low_u - u0) * scale_u, 0.0), grid - 1.0))
-            a1 = int(min(max((high_u - u0) * scale_u, 0.0), grid - 1.0))
-            b0 = int(min(max((low_v - v0) * scale_v, 0.0), grid - 1.0))
-            b1 = int(min(max((high_v - v0) * scale_v, 0.0), grid - 1.0))
             w0, w1, w2 = w[0], w[1], w[2]
             p0, p1, p2 = p[0], p[1], p[2]
             q0, q1, q2 = q[0], q[1], q[2]
@@ -111,3 +100,66 @@ def ray_list(vertices, faces, directions, shift, time):
     for i in range(count):
         best[i] /= abs(directions[i, cube[i] // 2])
     return best.astype(np.float32), face
+
+
+@compiled
+def _cells(vertices, shift, axis, sign, u0, v0, scale_u, scale_v, grid, cells):
+    """Fills cells (V * 4) with the cells of a side of the cube that a vertex is in from time 0 to 1: first and last
+    along u, v, interleaved as u, v, u, v; -1 or `grid` beyond the side's rays, all cells if it is not ahead."""
+    across, along = (axis + 1) % 3, (axis + 2) % 3
+    for i in range(len(vertices)):
+        w, p, q = sign * vertices[i, axis], vertices[i, across], vertices[i, along]
+        ahead = (w > AXIS) & (w * STEEP > abs(p)) & (w * STEEP > abs(q))
+        inverse = 1 / (w if ahead else 1.0)
+        low_u, low_v = p * inverse, q * inverse
+        high_u, high_v = low_u, low_v
+        if shift is not None:
+            # what moves along a line that is all ahead moves along a line on the cube's side: its ends bound it
+            w, p, q = w + sign * shift[i, axis], p + shift[i, across], q + shift[i, along]
+            also = (w > AXIS) & (w * STEEP > abs(p)) & (w * STEEP > abs(q))
+            inverse = 1 / (w if also else 1.0)
+            low_u, high_u = min(low_u, p * inverse), max(high_u, p * inverse)
+            low_v, high_v = min(low_v, q * inverse), max(high_v, q * inverse)
+            ahead &= also
+        low_u, high_u, low_v, high_v = low_u - ROUNDING, high_u + ROUNDING, low_v - ROUNDING, high_v + ROUNDING
+        cells[4 * i] = np.int32(min(max((low_u - u0) * scale_u, -1.0), float(grid))) if ahead else -1
+        cells[4 * i + 1] = np.int32(min(max((low_v - v0) * scale_v, -1.0), float(grid))) if ahead else -1
+        cells[4 * i + 2] = np.int32(min(max((high_u - u0) * scale_u, -1.0), float(grid))) if ahead else grid
+        cells[4 * i + 3] = np.int32(min(max((high_v - v0) * scale_v, -1.0), float(grid))) if ahead else grid
+
+
+@compiled
+def _block(cells, i0, i1, i2, grid):
+    """First cells along u and v, and the last ones, of a triangle whose corners' cells are at i0, i1, i2."""
+    a0 = max(min(cells[np.uintp(i0)], cells[np.uintp(i1)], cells[np.uintp(i2)]), 0)
+    b0 = max(min(cells[np.uintp(i0 + 1)], cells[np.uintp(i1 + 1)], cells[np.uintp(i2 + 1)]), 0)
+    a1 = min(max(cells[np.uintp(i0 + 2)], cells[np.uintp(i1 + 2)], cells[np.uintp(i2 + 2)]), grid - 1)
+    b1 = min(max(cells[np.uintp(i0 + 3)], cells[np.uintp(i1 + 3)], cells[np.uintp(i2 + 3)]), grid - 1)
+    return a0, b0, a1, b1
+
+
+@compiled
+def _touching(faces, cells, start, grid, touching):
+    """Fills `touching` with the faces that have rays in their cells, ascending; returns how many.
+
+    start (grid * grid + 1,): how many rays are in earlier cells.
+    """
+    # how many rays are in cells before both a and b
+    wide = grid + 1
+    before = np.zeros(wide * wide, np.int32)
+    for a in range(grid):
+        for b in range(grid):
+            inside = start[a * grid + b + 1] - start[a * grid]
+            before[(a + 1) * wide + b + 1] = before[a * wide + b + 1] + inside
+    n = np.uintp(0)
+    for f in range(len(faces)):
+        i0, i1, i2 = 4 * np.int64(faces[f, 0]), 4 * np.int64(faces[f, 1]), 4 * np.int64(faces[f, 2])
+        a0, b0, a1, b1 = _block(cells, i0, i1, i2, grid)
+        # a block that ends before it starts is all beyond the rays
+        low, high, left, right = a0 * wide, max(a1 + 1, a0) * wide, b0, max(b1 + 1, b0)
+        low, high = min(low, wide * grid), min(high, wide * grid)
+        left, right = min(left, grid), min(right, grid)
+        rays = before[high + right] - before[low + right] - before[high + left] + before[low + left]
+        touching[n] = f
+        n += np.uintp(rays > 0)
+    return n

@@ -4,6 +4,7 @@ A sensor's columns lie `azimuth_step` apart and start at azimuth -pi; its rings 
 frame: x forward, y left, z up, the origin is where the beams meet.
 """
 
+import os
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
@@ -218,7 +219,7 @@ SENSORS: dict[str, Sensor | RayPattern] = {
         ),
         # Velodyne VLP-16 manual: 16 rings 2 deg apart; 0.2 deg at 10 Hz; +-3 cm
         Sensor(name="vlp-16", elevations=np.radians(np.arange(-15.0, 16, 2)), azimuth_step=_turn(1800), height=0.7),
-        # +-3 cm; 0.2 deg at 10 Hz. Its lasers' azimuth offsets are of whole or half degrees.
+        # +-3 cm; 0.2 deg at 10 Hz. Its lasers stand 1.4 and 4.2 deg to either side: 7 and 21 whole columns.
         Sensor(
             name="vlp-32c",
             elevations=_VLP_32C,
@@ -237,7 +238,8 @@ SENSORS: dict[str, Sensor | RayPattern] = {
             height=1.8,
         ),
         # Velodyne HDL-64E manual: upper block 1/3 deg apart from +2 down, lower block 1/2 deg apart to -24.33;
-        # 0.1728 deg at 10 Hz. Nominal: each unit has its own table, and its two blocks have origins 10 cm apart.
+        # 0.1728 deg at 10 Hz. Nominal: each unit has its own table (one published calibration, an S2.1's, reaches from
+        # -24.8 to +5.0 deg), and its two blocks have origins 10 cm apart.
         Sensor(
             name="hdl-64e",
             elevations=np.radians(np.concatenate([np.linspace(-24.33, -8.83, 32), np.linspace(-8.83 + 0.5, 2, 32)])),
@@ -246,8 +248,8 @@ SENSORS: dict[str, Sensor | RayPattern] = {
             range_max=120.0,
             height=1.73,
         ),
-        # Ouster OS1 and OS0, uniform. Beams of a column leave in four azimuth groups 8 columns of 2048 apart: whole
-        # columns, so they shift when a beam fires, not where it points. Real units deviate by some 0.01 deg.
+        # Ouster OS1, OS0 and OS2, uniform. Beams of a column leave in four azimuth groups 8 columns of 2048 apart:
+        # whole columns, so they shift when a beam fires, not where it points. Real units deviate by some 0.01 deg.
         Sensor(
             name="os1-64",
             elevations=np.radians(np.linspace(-22.5, 22.5, 64)),
@@ -269,6 +271,14 @@ SENSORS: dict[str, Sensor | RayPattern] = {
             range_min=0.3,
             range_max=50.0,
             height=1.5,
+        ),
+        Sensor(
+            name="os2-128",
+            elevations=np.radians(np.linspace(-11.25, 11.25, 128)),
+            azimuth_step=_turn(2048),
+            range_min=1.0,
+            range_max=240.0,
+            height=1.8,
         ),
         # Hesai's default correction file; 0.2 deg at 10 Hz
         Sensor(
@@ -297,9 +307,10 @@ SENSORS: dict[str, Sensor | RayPattern] = {
 }
 
 
-def sensor(name: str) -> Sensor | RayPattern:
-    """A named sensor, or that of a file (`tables.load_sensor`); an unknown name raises an InputError that lists the
-    nearest ones."""
+def sensor(name: str | os.PathLike) -> Sensor | RayPattern:
+    """A named sensor, or that of a .json or .csv file (`tables.load_sensor`), which is read once; an unknown name
+    raises an InputError that lists the nearest ones."""
+    name = os.fspath(name) if isinstance(name, os.PathLike) else str(name)
     if name in SENSORS:
         return SENSORS[name]
     if name.lower().endswith((".json", ".csv")):

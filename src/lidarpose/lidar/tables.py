@@ -2,7 +2,8 @@
 
 Files, angles in degrees, in any order of lasers (they are sorted by elevation, their offsets with them):
 
-    JSON of an Ouster sensor     beam_altitude_angles, beam_azimuth_angles, lidar_mode; at the top or in sections
+    JSON of an Ouster sensor     beam_altitude_angles, beam_azimuth_angles, lidar_mode; at the top or, as newer
+                                 firmware writes it, in sections (beam_intrinsics, config_params, ...)
     JSON list                    elevations
     JSON object                  elevations_deg, and optionally azimuth_offsets_deg, columns, range_min, range_max,
                                  range_sigma, dropout, height, tilt_deg, name
@@ -11,8 +12,10 @@ Files, angles in degrees, in any order of lasers (they are sorted by elevation, 
 """
 
 import csv
-import io
 import json
+import math
+import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -25,13 +28,18 @@ from lidarpose.lidar.sensor import SENSORS, Sensor
 # columns a turn where a file does not say: 0.2 degrees
 _COLUMNS = 1800
 _EXPECTED = "a sensor's table (.json, .csv)"
+# tables take some kilobytes
+_MOST_BYTES = 2**24
 _OWN_KEYS = ("range_min", "range_max", "range_sigma", "dropout", "height")
 
 
 def load_sensor(path: str | Path) -> Sensor:
     """The sensor that a file describes; forms of files above. Raises InputError that says what is wrong."""
-    path = Path(path)
-    text = read_bytes(path, expected=_EXPECTED).decode("utf-8-sig", "replace")
+    data = read_bytes(path, expected=_EXPECTED)
+    path = Path(os.fsdecode(path))
+    if len(data) > _MOST_BYTES:
+        raise file_error(path, f"has {len(data) / 2**20:.0f} MiB, too much for {_EXPECTED}: is it a recording?")
+    text = data.decode("utf-8-sig", "replace")
     fields = _from_json(path, text) if path.suffix.lower() == ".json" else _from_csv(path, text)
     elevations = _numbers(path, "elevations", fields.pop("elevations"))
     offsets = fields.pop("offsets", None)
@@ -68,9 +76,18 @@ def _numbers(path: Path, name: str, values: object) -> np.ndarray:
         numbers = np.array(values, float)
     except (TypeError, ValueError, OverflowError):
         raise file_error(path, f"{name} must be a list of numbers in degrees") from None
-    if numbers.ndim != 1 or not np.isfinite(numbers).all():
+    if numbers.ndim != 1:
         raise file_error(path, f"{name} must be a list of finite numbers in degrees, got shape {numbers.shape}")
+    if not np.isfinite(numbers).all():
+        wrong = int(np.argmin(np.isfinite(numbers)))
+        raise file_error(path, f"{name} must be a list of finite numbers in degrees, but number {wrong} is not finite")
     return numbers
+
+
+def _number(path: Path, name: str, value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise file_error(path, f"{name} must be a number, got {value!r}")
+    return float(_numbers(path, name, [value])[0])
 
 
 def _from_json(path: Path, text: str) -> dict:
@@ -85,26 +102,25 @@ def _from_json(path: Path, text: str) -> dict:
             fields = {"elevations": found["elevations_deg"], "offsets": found.get("azimuth_offsets_deg")}
             fields |= {key: found[key] for key in (*_OWN_KEYS, "columns", "name") if key in found}
             for key in _OWN_KEYS:
-                if key in fields and (isinstance(fields[key], bool) or not isinstance(fields[key], int | float)):
-                    raise file_error(path, f"{key} must be a number, got {fields[key]!r}")
+                if key in fields:
+                    fields[key] = _number(path, key, fields[key])
             if "tilt_deg" in found:
-                fields["tilt"] = float(np.radians(_numbers(path, "tilt_deg", [found["tilt_deg"]])[0]))
+                fields["tilt"] = math.radians(_number(path, "tilt_deg", found["tilt_deg"]))
             return fields
         # newer metadata has sections
         sections = [found, *(value for value in found.values() if isinstance(value, dict))]
         beams = next((s for s in sections if "beam_altitude_angles" in s), None)
         if beams is not None:
             fields = {"elevations": beams["beam_altitude_angles"], "offsets": beams.get("beam_azimuth_angles")}
-            mode = next((s["lidar_mode"] for s in sections if isinstance(s.get("lidar_mode"), str)), "")
-            if mode.partition("x")[0].isdigit():
-                fields["columns"] = int(mode.partition("x")[0])
-            return fields
+            modes = [str(s[key]) for key in ("lidar_mode", "columns_per_frame") for s in sections if key in s]
+            columns = next((digits[0] for mode in modes if (digits := re.match("[0-9]{1,6}", mode))), None)
+            return fields if columns is None else fields | {"columns": int(columns)}
     raise file_error(path, "holds no beams; expected beam_altitude_angles, elevations_deg or a list of degrees")
 
 
 def _from_csv(path: Path, text: str) -> dict:
     try:
-        rows = [[cell.strip() for cell in row] for row in csv.reader(io.StringIO(text)) if any(c.strip() for c in row)]
+        rows = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines()) if any(c.strip() for c in row)]
     except csv.Error as error:
         raise file_error(path, f"is not CSV ({error})") from None
     rows = [row for row in rows if not row[0].startswith("#")]
@@ -139,19 +155,27 @@ def _is_number(text: str) -> bool:
     return True
 
 
+# where the beams of a sensor come from: its maker's table, a paper, or the maker's field of view in equal steps
+_SOURCES = {"dapt64": "paper", "waymo-top": "nominal", "hdl-64e": "nominal", "av2": "maker", "depth-camera": "typical"}
+
+
 def listing() -> list[str]:
-    """Lines of a table of the sensors that ship: name, beams, field of view, ranges, usual height."""
-    rows = [("sensor", "beams", "azimuth", "elevation deg", "range m", "height m")]
+    """Lines of a table of the sensors that ship: name, kind, beams (rings x columns, or rays a frame), field of view,
+    ranges, usual height, and where its beams come from."""
+    rows = [("sensor", "kind", "beams", "azimuth", "elevation deg", "range m", "height m", "source")]
     for name in sorted(SENSORS):
         device = SENSORS[name]
         low, high = np.degrees([device.elevations[0], device.elevations[-1]])
         if isinstance(device, RayPattern):
             count = len(device.frame(0).azimuth)
+            kind = "rosette" if device.duration else "camera"
             beams = f"{count:,} in {device.duration * 1e3:.0f} ms" if device.duration else f"{count:,} pixels"
             wide = np.degrees(device.azimuths[1] - device.azimuths[0])
         else:
-            beams, wide = f"{device.rows} x {device.columns}", 360.0
+            kind, beams, wide = "spinning", f"{device.rows} x {device.columns}", 360.0
+        source = _SOURCES.get(name, "nominal" if name.startswith("os") else "maker")
         ranges = f"{device.range_min:g}-{device.range_max:g}"
-        rows.append((name, beams, f"{wide:.4g}", f"{low:+.1f} to {high:+.1f}", ranges, f"{device.height:g}"))
+        elevation = f"{low:+.1f} to {high:+.1f}"
+        rows.append((name, kind, beams, f"{wide:.4g}", elevation, ranges, f"{device.height:g}", source))
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
     return ["  ".join(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
