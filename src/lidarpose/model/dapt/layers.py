@@ -1,0 +1,253 @@
+"""The backbone's bricks on rows of voxels: submanifold convolution, attention in patches, blocks, pooling, exchange.
+
+Legend: B people, M voxels of all people at a level, T taps, P pairs of neighbours, H heads, D channels a head, C
+channels, J joints, N voxels a person at most.
+
+Modules bear the names of the released weights, so that these load by name.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+# of the released code's batch norms
+_EPS, _MOMENTUM = 1e-3, 0.01
+
+
+@dataclass(frozen=True, kw_only=True)
+class NeighbourTensors:
+    """`tables.Neighbours` as tensors; counts are plain numbers."""
+
+    source: Tensor | None
+    target: Tensor | None
+    counts: tuple[int, ...]
+    table: Tensor | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevelTensors:
+    """`tables.Level` as tensors; sequence is None where rows already stand patch after patch."""
+
+    near: NeighbourTensors
+    parent: Tensor | None
+    children: Tensor | None
+    slots: Tensor
+    valid: Tensor
+    sequence: Tensor | None
+    patch_lengths: tuple[int, ...]
+    patch_slots: Tensor | None
+    patch_mask: Tensor | None
+    patch_place: Tensor | None
+
+
+class RowNorm(nn.BatchNorm1d):
+    """Batch norm over rows (M, C); one row alone has no variance and is normed by the running statistics."""
+
+    def __init__(self, channels: int, eps: float = _EPS, momentum: float = _MOMENTUM):
+        super().__init__(channels, eps=eps, momentum=momentum)
+
+    def forward(self, rows: Tensor) -> Tensor:
+        if self.training and rows.shape[0] > 1:
+            return super().forward(rows)
+        return F.batch_norm(rows, self.running_mean, self.running_var, self.weight, self.bias, eps=self.eps)
+
+
+class DropPath(nn.Module):
+    """In training drops a branch of each row with a probability, and scales the others up to keep the mean."""
+
+    def __init__(self, probability: float):
+        super().__init__()
+        self.probability = probability
+
+    def forward(self, rows: Tensor) -> Tensor:
+        if not self.training or self.probability == 0:
+            return rows
+        keep = 1 - self.probability
+        return rows * (torch.rand_like(rows[:, :1]) < keep) / keep
+
+
+class SubmanifoldConvolution(nn.Module):
+    """A convolution that computes at occupied cells only and reads occupied cells only.
+
+    out[p] = sum over taps k of weight[:, k] @ rows[p + k - middle] + bias. weight (C', k, k, k, C) over x, y, z.
+    """
+
+    def __init__(self, channels: int, out_channels: int, kernel: int, *, bias: bool):
+        super().__init__()
+        self.weight = nn.Parameter(torch.empty(out_channels, kernel, kernel, kernel, channels))
+        self.bias = nn.Parameter(torch.zeros(out_channels)) if bias else None
+        bound = (kernel**3 * channels) ** -0.5
+        nn.init.uniform_(self.weight, -bound, bound)
+
+    def forward(self, rows: Tensor, near: NeighbourTensors) -> Tensor:
+        """rows (M, C) -> (M, C')."""
+        # unbound once: slicing tap after tap would give each slice's gradient the size of the whole weight
+        weights = self.weight.flatten(1, 3).unbind(1)
+        out = F.linear(rows, weights[len(weights) // 2], self.bias)
+        if near.table is not None:
+            # the row after the last is zero: an empty cell; the table has none for the middle tap, done above
+            read = F.pad(rows, (0, 0, 0, 1))[near.table.flatten()].view(rows.shape[0], -1)
+            return out + F.linear(read, self.weight.flatten(1))
+        for weight, source, target in zip(
+            weights, near.source.split(near.counts), near.target.split(near.counts), strict=True
+        ):
+            if source.shape[0]:
+                out = out.index_add_(0, target, F.linear(rows.index_select(0, source), weight))
+        return out
+
+
+class PatchAttention(nn.Module):
+    """Attention among the voxels of a patch: full attention of a person who is no larger than the patch."""
+
+    def __init__(self, channels: int, heads: int):
+        super().__init__()
+        self.heads = heads
+        self.qkv = nn.Linear(channels, 3 * channels)
+        self.proj = nn.Linear(channels, channels)
+
+    def forward(self, rows: Tensor, level: LevelTensors, order: int) -> Tensor:
+        """rows (M, C) -> (M, C), patches along the `order`-th curve."""
+        qkv = self.qkv(rows)
+        if level.patch_slots is not None:
+            order = order % level.patch_slots.shape[0]
+            blocks = qkv[level.patch_slots[order]].unflatten(-1, (3, self.heads, -1))
+            mixed = self._attend(blocks, level.patch_mask).flatten(0, 1)[level.patch_place[order]]
+            return self.proj(mixed)
+        if level.sequence is not None:
+            sequence = level.sequence[order % level.sequence.shape[0]]
+            qkv = qkv[sequence]
+        qkv = qkv.unflatten(-1, (3, self.heads, -1))
+        lengths = level.patch_lengths
+        if len(set(lengths)) == 1:
+            mixed = self._attend(qkv.unflatten(0, (len(lengths), -1)), None).flatten(0, 1)
+        else:
+            mixed = torch.cat([self._attend(patch[None], None)[0] for patch in qkv.split(lengths)])
+        if level.sequence is not None:
+            mixed = torch.empty_like(mixed).index_copy(0, sequence, mixed)
+        return self.proj(mixed)
+
+    @staticmethod
+    def _attend(qkv: Tensor, mask: Tensor | None) -> Tensor:
+        """qkv (Q, K, 3, H, D), mask (Q, 1, 1, K) True = to be read -> (Q, K, H * D)."""
+        query, key, value = qkv.permute(2, 0, 3, 1, 4)
+        mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=mask)
+        return mixed.transpose(1, 2).flatten(2)
+
+
+class Perceptron(nn.Module):
+    """Linear, GELU, Linear."""
+
+    def __init__(self, channels: int, hidden: int, out_channels: int):
+        super().__init__()
+        self.fc1 = nn.Linear(channels, hidden)
+        self.fc2 = nn.Linear(hidden, out_channels)
+
+    def forward(self, rows: Tensor) -> Tensor:
+        return self.fc2(F.gelu(self.fc1(rows)))
+
+
+class Block(nn.Module):
+    """Convolution as position encoding, attention and feed-forward, each a residual branch; pre-norm.
+
+    The released code loses the sum at a block's end: the next block's convolution reads the last branch alone. `legacy`
+    does the same.
+    """
+
+    def __init__(self, channels: int, heads: int, mlp_ratio: int, drop_path: float, order: int):
+        super().__init__()
+        self.order = order
+        self.cpe = nn.Sequential(
+            SubmanifoldConvolution(channels, channels, 3, bias=True),
+            nn.Linear(channels, channels),
+            nn.LayerNorm(channels),
+        )
+        self.norm1 = nn.Sequential(nn.LayerNorm(channels))
+        self.attn = PatchAttention(channels, heads)
+        self.norm2 = nn.Sequential(nn.LayerNorm(channels))
+        self.mlp = nn.Sequential(Perceptron(channels, mlp_ratio * channels, channels))
+        self.drop_path = DropPath(drop_path)
+
+    def forward(self, rows: Tensor, stale: Tensor, level: LevelTensors) -> tuple[Tensor, Tensor]:
+        """rows (M, C) and what the convolution reads (M, C): the rows, or the stale branch -> rows, last branch."""
+        convolution, mix, norm = self.cpe
+        rows = rows + norm(mix(convolution(stale, level.near)))
+        rows = rows + self.drop_path(self.attn(self.norm1(rows), level, self.order))
+        branch = self.drop_path(self.mlp(self.norm2(rows)))
+        return rows + branch, branch
+
+
+class Stage(nn.Module):
+    """The blocks of one level and the way to it: `down` from the finer level or `up` from the coarser one."""
+
+    def __init__(self, blocks: list[Block], *, down: nn.Module | None = None, up: nn.Module | None = None):
+        super().__init__()
+        if down is not None:
+            self.down = down
+        if up is not None:
+            self.up = up
+        for k, block in enumerate(blocks):
+            self.add_module(f"block{k}", block)
+        self.depth = len(blocks)
+
+    def blocks(self, rows: Tensor, stale: Tensor, level: LevelTensors, *, legacy: bool) -> Tensor:
+        """rows (M, C) -> (M, C); `stale` is what the first convolution reads in the legacy flow."""
+        for k in range(self.depth):
+            block = getattr(self, f"block{k}")
+            rows, stale = block(rows, stale if legacy else rows, level)
+        return rows
+
+
+class Pooling(nn.Module):
+    """Rows of a level to the voxels of the next: Linear, the maximum of the children, norm, GELU."""
+
+    def __init__(self, channels: int, out_channels: int):
+        super().__init__()
+        self.proj = nn.Linear(channels, out_channels)
+        self.norm = nn.Sequential(RowNorm(out_channels))
+
+    def forward(self, rows: Tensor, children: Tensor) -> Tensor:
+        return F.gelu(self.norm(self.proj(rows)[children].amax(1)))
+
+
+class Unpooling(nn.Module):
+    """Rows of the coarser level, brought to their children, plus the encoder's rows of this level."""
+
+    def __init__(self, channels: int, skip_channels: int, out_channels: int):
+        super().__init__()
+        self.proj = nn.Sequential(nn.Linear(channels, out_channels), RowNorm(out_channels), nn.GELU())
+        self.proj_skip = nn.Sequential(nn.Linear(skip_channels, out_channels), RowNorm(out_channels), nn.GELU())
+
+    def forward(self, coarse: Tensor, skip: Tensor, parent: Tensor) -> tuple[Tensor, Tensor]:
+        """The sum (M, C), and the skip alone, which is what the released code's first convolution reads."""
+        skip = self.proj_skip(skip)
+        return skip + self.proj(coarse)[parent], skip
+
+
+class Exchange(nn.Module):
+    """Multi-density exchange: anchors (B, J, A) look at each other, then at the voxels of one level.
+
+    Paper: A_{m-1} = MDE_m(A_m, f_m). A stock post-norm decoder layer, anchors as its targets, voxels as its memory;
+    one-way, the voxels never see the anchors. As in the released code and unlike the paper's words, widths are aligned
+    by Linear and norm where they differ, and the coarsest level is not read.
+    """
+
+    def __init__(self, channels: int, voxel_channels: int, out_channels: int, heads: int, dropout: float):
+        super().__init__()
+        self.fc_in = _aligned(channels, voxel_channels)
+        self.transformer = nn.TransformerDecoderLayer(
+            voxel_channels, heads, 4 * voxel_channels, dropout, batch_first=True
+        )
+        self.fc_out = _aligned(voxel_channels, out_channels)
+
+    def forward(self, anchors: Tensor, rows: Tensor, level: LevelTensors) -> Tensor:
+        anchors = self.fc_in(anchors)
+        anchors = self.transformer(anchors, rows[level.slots], memory_key_padding_mask=~level.valid)
+        return self.fc_out(anchors)
+
+
+def _aligned(channels: int, out_channels: int) -> nn.Module:
+    if channels == out_channels:
+        return nn.Identity()
+    return nn.Sequential(nn.Linear(channels, out_channels), nn.LayerNorm(out_channels))

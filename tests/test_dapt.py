@@ -1,0 +1,783 @@
+"""The paper's network against the outputs of the authors' code, and its own promises."""
+
+import itertools
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from torch.nn import functional as F
+
+from lidarpose.errors import InputError
+from lidarpose.model import decode
+from lidarpose.model.dapt.config import CONFIGS, WAYMO_JOINTS, DaptConfig, named_config
+from lidarpose.model.dapt.layers import DropPath, PatchAttention, RowNorm, Stage, SubmanifoldConvolution
+from lidarpose.model.dapt.network import DaptBatch, DaptNet
+from lidarpose.model.dapt.released import import_dapt
+from lidarpose.model.dapt.tables import LAYOUTS, build_tables
+from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14
+
+PARITY = Path(__file__).parent / "parity"
+WEIGHTS = PARITY / "dapt_tiny.safetensors"
+ORACLE = np.load(PARITY / "dapt_tiny.npz")
+CLOUDS = np.split(ORACLE["points"], np.cumsum(ORACLE["counts"])[:-1])
+POINT_FEATURES = np.split(ORACLE["point_feat_last"].astype(np.float32), np.cumsum(ORACLE["counts"])[:-1])
+TINY = DaptConfig(
+    name="tiny",
+    joints=BODY26.joints,
+    bins=(44, 44, 44),
+    ranges=((-1.1, 1.1),) * 3,
+    encoder_depths=(1, 1, 2),
+    encoder_channels=(16, 16, 32),
+    encoder_heads=(1, 1, 2),
+    decoder_depths=(2, 1),
+    decoder_channels=(16, 16),
+    decoder_heads=(1, 2),
+    anchor_channels=(16, 24, 16),
+    strides=(2, 2),
+    grid=0.02,
+    patch=512,
+    parts=25,
+    coordinates=True,
+    auxiliary=True,
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def released():
+    return import_dapt(WEIGHTS)
+
+
+def network(config=TINY, seed=0):
+    torch.manual_seed(seed)
+    net = DaptNet(config).eval()
+    # norms and anchors as training would leave them: all different
+    for name, value in net.state_dict().items():
+        if value.is_floating_point() and ("running" in name or "keypoint_embedding" in name):
+            value.copy_(torch.rand_like(value) + 0.5)
+    return net
+
+
+def person(n, seed=0, size=(0.2, 0.3, 0.6)):
+    return np.random.default_rng(seed).normal(0, size, (n, 3)).astype(np.float32)
+
+
+def run(net, clouds, layout="ragged"):
+    with torch.inference_mode():
+        return net(net.batch(clouds, layout=layout))
+
+
+def assert_outputs(one, other, atol=1e-5):
+    assert one.keys() == other.keys()
+    for name in one:
+        np.testing.assert_allclose(one[name], other[name], rtol=1e-5, atol=atol, err_msg=name)
+
+
+# ---- parity
+
+
+def assert_parity(out, people):
+    for name in ("anchors", "logits_x", "logits_y", "logits_z"):
+        np.testing.assert_allclose(out[name], ORACLE[name][people], rtol=0, atol=1e-5, err_msg=name)
+    # relative to the joints' size: some coordinates are near zero
+    assert np.abs(out["inter"] - ORACLE["inter"][people]).max() < 1e-4 * np.abs(ORACLE["inter"][people]).max()
+    config = named_config("waymo")
+    for k, axis in enumerate("xyz"):
+        logits = out[f"logits_{axis}"]
+        assert (logits.argmax(-1) == ORACLE["argmax"][people, :, k]).all()
+        dark = decode.dark(logits, low=config.low[k], step=config.step[k])
+        np.testing.assert_allclose(dark, ORACLE["dark"][people, :, k], rtol=0, atol=1e-4)
+    want = np.concatenate([POINT_FEATURES[k] for k in people])
+    # half a unit in the last place of the float16 that they were stored in
+    assert (np.abs(out["point_feat_last"] - want) <= np.maximum(np.abs(want) * 2**-11, 2**-24) + 2e-6).all()
+
+
+def test_a_batch_equals_the_authors_code(released):
+    assert_parity(released.outputs(CLOUDS), np.arange(5))
+
+
+@pytest.mark.parametrize("k", range(5))
+def test_a_person_alone_equals_the_authors_code(released, k):
+    assert_parity(released.outputs([CLOUDS[k]]), np.array([k]))
+
+
+def test_the_accelerators_layout_equals_the_authors_code(released):
+    out = run(released, CLOUDS, "padded")
+    for name in ("anchors", "logits_x", "logits_y", "logits_z", "inter"):
+        np.testing.assert_allclose(getattr(out, name), ORACLE[name], rtol=0, atol=1e-5, err_msg=name)
+
+
+def test_the_released_flow_is_needed_for_released_weights(released):
+    corrected = DaptNet(replace(released.config, legacy=False)).eval()
+    corrected.load_state_dict(released.state_dict())
+    # the same voxels for both, so that nothing but the flow differs
+    batch = released.batch(CLOUDS)
+    with torch.inference_mode():
+        old, new = released(batch), corrected(batch)
+    for name in ("anchors", "inter", "logits_z", "points"):
+        assert (getattr(old, name) - getattr(new, name)).abs().max() > 1e-2, name
+
+
+def test_the_corrected_flow_is_blocks_one_after_the_other():
+    net = network()
+    batch = net.batch([person(300), person(50, 1)])
+    stage, level = net.backbone.enc.enc2, batch.levels[2]
+    assert isinstance(stage, Stage) and stage.depth == 2
+    rows = torch.randn(len(level.slots[level.valid]), 32)
+    with torch.inference_mode():
+        middle, branch = stage.block0(rows, rows, level)
+        corrected = stage.block1(middle, middle, level)[0]
+        stale = stage.block1(middle, branch, level)[0]
+        torch.testing.assert_close(stage.blocks(rows, rows, level, legacy=False), corrected)
+        torch.testing.assert_close(stage.blocks(rows, rows, level, legacy=True), stale)
+    assert (corrected - stale).abs().max() > 1e-2
+
+
+# ---- what may not matter
+
+
+@pytest.mark.parametrize("config", [TINY, replace(TINY, legacy=True)], ids=["corrected", "legacy"])
+@pytest.mark.parametrize("n", [1, 2, 40, 700])
+def test_batch_mates_do_not_matter(config, n):
+    net, one = network(config), person(n)
+    alone = net.outputs([one])
+    among = net.outputs([person(900, 1), person(0), one, person(3, 2)])
+    rows = slice(900, 900 + n)
+    among = {
+        name: values[rows] if name in ("point_feat_last", "parts") else values[2:3] for name, values in among.items()
+    }
+    assert_outputs(alone, among)
+
+
+@pytest.mark.parametrize("n", [60, 900])
+def test_the_order_of_points_does_not_matter(n):
+    # some voxels have several points
+    net, one = network(), person(n, size=0.05 if n < 100 else 0.2)
+    order = np.random.default_rng(0).permutation(n)
+    straight, shuffled = net.outputs([one]), net.outputs([one[order]])
+    for name in ("point_feat_last", "parts"):
+        straight[name] = straight[name][order]
+    assert_outputs(straight, shuffled)
+    assert build_tables([one], net.config).features.shape[0] < n
+
+
+def test_the_form_of_the_input_does_not_matter(released):
+    want = released.outputs(CLOUDS[:2])
+    assert_outputs(want, released.outputs([cloud.astype(np.float64) for cloud in CLOUDS[:2]]))
+    wide = [np.concatenate([cloud, cloud], 1)[:, 3:] for cloud in CLOUDS[:2]]
+    assert not wide[0].flags.contiguous
+    assert_outputs(want, released.outputs([np.asfortranarray(wide[0]), wide[1]]))
+    halved = [cloud.astype(np.float16) for cloud in CLOUDS[:2]]
+    assert_outputs(released.outputs(halved), released.outputs([cloud.astype(np.float32) for cloud in halved]))
+    assert released.outputs([np.zeros((2, 3), int)])["inter"].shape == (1, 14, 3)
+
+
+def test_outputs_leave_the_network_as_it_was():
+    net = network().train()
+    before = {name: value.clone() for name, value in net.state_dict().items()}
+    first = net.outputs([person(100)])
+    assert net.training and all(torch.equal(before[name], value) for name, value in net.state_dict().items())
+    assert_outputs(first, net.outputs([person(100)]))
+    assert not net.eval().training and net.outputs([person(9)]) and not net.training
+
+
+# ---- what matters
+
+
+def test_the_points_matter():
+    net, one = network(), person(300)
+    base = net.outputs([one])
+    moved = one.copy()
+    moved[:30] += 0.2
+    assert np.abs(net.outputs([moved])["anchors"] - base["anchors"]).max() > 1e-3
+    parts = base["parts"]
+    assert np.abs(parts - parts[0]).max() > 1e-2
+
+
+@pytest.mark.parametrize("sizes", [[0], [0, 0], [0, 40, 0], [1], []])
+def test_people_of_few_points(sizes):
+    for config in (TINY, replace(TINY, legacy=True)):
+        net = network(config)
+        out = net.outputs([person(n, k) for k, n in enumerate(sizes)])
+        joints = {"anchors", "logits_x", "logits_y", "logits_z", "inter", "coordinates"}
+        assert out.keys() == joints | {"point_feat_last", "parts"}
+        for name, values in out.items():
+            assert np.isfinite(values).all() and len(values) == (len(sizes) if name in joints else sum(sizes)), name
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_half_types(dtype, layout):
+    net = network()
+    clouds = [person(200), person(0), person(700, 1)]
+    want = run(net, clouds, layout)
+    out = run(network().to(dtype), clouds, layout)
+    loose = 0.02 if dtype == torch.float16 else 0.15
+    assert (out.anchors.float() - want.anchors).abs().max() < loose and out.anchors.dtype == dtype
+    assert torch.isfinite(out.joints()).all()
+
+
+# ---- training
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("n", [1, 2, 5000])
+def test_gradients_are_finite(n, layout):
+    net = network().train()
+    out = net(net.batch([person(n)], layout=layout, rng=np.random.default_rng(0)))
+    total = out.joints().square().sum() + out.coordinates.square().sum() + out.inter.square().sum()
+    total = total + F.cross_entropy(out.parts, torch.full((len(out.parts),), 3))
+    total.backward()
+    assert torch.isfinite(total)
+    for name, parameter in net.named_parameters():
+        assert parameter.grad is not None and torch.isfinite(parameter.grad).all(), name
+    if n > 2:
+        still = [name for name, p in net.named_parameters() if p.grad.abs().max() == 0]
+        assert still == []
+
+
+def test_both_layouts_have_the_same_gradients():
+    grads = []
+    for layout in LAYOUTS:
+        net = network(replace(TINY, patch=128))
+        out = net(net.batch([person(300), person(20, 1)], layout=layout))
+        (out.joints().sum() + out.parts.square().mean()).backward()
+        grads.append({name: p.grad for name, p in net.named_parameters() if p.grad is not None})
+    assert grads[0].keys() == grads[1].keys()
+    for name, grad in grads[0].items():
+        torch.testing.assert_close(grad, grads[1][name], rtol=1e-3, atol=1e-4, msg=name)
+
+
+def test_a_network_learns_where_a_joint_is():
+    torch.manual_seed(0)
+    config = replace(TINY, encoder_depths=(1, 1, 1), decoder_depths=(1, 1), drop_path=0.0, anchor_dropout=0.0)
+    net = DaptNet(config).train()
+    optimizer = torch.optim.AdamW(net.parameters(), 3e-3)
+    clouds = [person(60, k, 0.1) + np.float32([0.1 * k, 0, 0]) for k in range(4)]
+    batch = net.batch(clouds)
+    goal = torch.tensor([[0.1 * k, 0.3, -0.5] for k in range(4)])[:, None].expand(-1, 26, -1)
+    errors = []
+    for _ in range(40):
+        out = net(batch)
+        bins = [((goal[..., k] - out.low[k]) / out.step[k]).round().long() for k in range(3)]
+        heatmaps = (out.logits_x, out.logits_y, out.logits_z)
+        loss = sum(F.cross_entropy(h.flatten(0, 1), b.flatten()) for h, b in zip(heatmaps, bins, strict=True))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        errors.append((out.joints() - goal).norm(dim=-1).mean().item())
+    assert errors[-1] < 0.1 < 0.4 < errors[0]
+
+
+def test_joints_are_the_windowed_mean():
+    net = network()
+    out = run(net, [person(100), person(30, 1)])
+    for k, name in enumerate(("logits_x", "logits_y", "logits_z")):
+        # sharpened, and with broad peaks at the edges too
+        logits = getattr(out, name).numpy() * 30
+        index = np.arange(logits.shape[-1])
+        for joint, at in enumerate((0, 1, len(index) - 2)):
+            logits[0, joint] = -0.2 * (index - at) ** 2
+        sharp = replace(out, **{name: torch.from_numpy(logits)})
+        want = decode.window(logits, low=net.config.low[k], step=net.config.step[k])
+        np.testing.assert_allclose(sharp.joints()[..., k], want, rtol=0, atol=1e-5)
+    bare = run(network(replace(TINY, bins=(), ranges=())), [person(9)])
+    assert bare.logits_x is None and torch.equal(bare.joints(), bare.coordinates)
+
+
+def test_drop_path_keeps_the_mean_and_drops_whole_rows():
+    drop, rows = DropPath(0.3).train(), torch.ones(20_000, 2)
+    torch.manual_seed(0)
+    dropped = drop(rows)
+    assert abs(float(dropped.mean()) - 1) < 0.02 and abs(float((dropped[:, 0] == 0).float().mean()) - 0.3) < 0.02
+    assert torch.equal(dropped[:, 0], dropped[:, 1]) and torch.equal(drop.eval()(rows), rows)
+    rates = [m.probability for m in DaptNet(TINY).backbone.enc.modules() if isinstance(m, DropPath)]
+    np.testing.assert_allclose(rates, [0, 0.1, 0.2, 0.3])
+    decoder = DaptNet(TINY).backbone.dec
+    rates = [
+        [m.probability for m in stage.modules() if isinstance(m, DropPath)] for stage in (decoder.dec0, decoder.dec1)
+    ]
+    np.testing.assert_allclose(sum(rates, []), [0.15, 0, 0.3])
+
+
+def test_norms_are_the_authors():
+    norms = [m for m in DaptNet(TINY).modules() if isinstance(m, torch.nn.BatchNorm1d)]
+    # the stem, a pooling each, two an unpooling; the part head has torch's defaults
+    assert [(m.eps, m.momentum) for m in norms] == [(1e-3, 0.01)] * 7 + [(1e-5, 0.1)]
+
+
+def test_one_row_alone_is_normed_by_what_was_learnt():
+    norm = RowNorm(4).train()
+    norm.running_mean.fill_(2)
+    before = norm.running_mean.clone()
+    torch.testing.assert_close(norm(torch.full((1, 4), 2.0)), torch.zeros(1, 4))
+    assert torch.equal(norm.running_mean, before)
+    torch.testing.assert_close(norm(torch.randn(50, 4)).mean(0), torch.zeros(4), atol=1e-5, rtol=0)
+    assert not torch.equal(norm.running_mean, before)
+
+
+# ---- tables
+
+
+def cells_of(cloud, config):
+    cells = np.floor(np.asarray(cloud, np.float32) / config.grid).astype(int)
+    return cells - cells.min(0) if config.legacy else cells
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_tables_against_dictionaries(legacy):
+    config = replace(TINY, legacy=legacy)
+    clouds = [person(150, size=0.1), person(1, 1), person(80, 2, 0.04)]
+    tables = build_tables(clouds, config)
+    points = np.concatenate(clouds)
+    assert (tables.features == points[tables.kept]).all()
+    cells = [cells_of(cloud, config) for cloud in clouds]
+    people = [list(dict.fromkeys(map(tuple, c))) for c in cells]
+    # level 0: one row a cell, every point in its own
+    found = [(b, *cell) for b, c in enumerate(cells) for cell in c.tolist()]
+    row_of = {}
+    for point, row in enumerate(tables.point_voxel):
+        assert row_of.setdefault(found[point], row) == row
+    assert len(row_of) == len(tables.features) == len(set(row_of.values())) == sum(map(len, people))
+    assert all(row_of[found[index]] == row for row, index in enumerate(tables.kept))
+
+    for depth, level in enumerate(tables.levels):
+        cell_of = {row: cell for cell, row in row_of.items()}
+        assert level.lengths.tolist() == [sum(cell[0] == b for cell in row_of) for b in range(3)]
+        for b in range(3):
+            rows = level.slots[b]
+            assert {cell_of[row][0] for row in rows} == {b} and len(set(rows)) == level.lengths[b] == level.valid[
+                b
+            ].sum()
+        assert_neighbours(level.near, row_of, 1)
+        if depth == 0:
+            assert_neighbours(tables.stem, row_of, 2)
+        if depth == len(tables.levels) - 1:
+            assert level.parent is None and level.children is None
+            break
+        above = {}
+        for cell, row in row_of.items():
+            above.setdefault((cell[0], *(x >> 1 for x in cell[1:])), []).append(row)
+        coarser = {}
+        for cell, rows in above.items():
+            assert len({level.parent[row] for row in rows}) == 1
+            coarser[cell] = level.parent[rows[0]]
+            assert set(level.children[coarser[cell]]) == set(rows)
+        row_of = coarser
+
+
+def assert_neighbours(near, row_of, reach):
+    steps = list(itertools.product(range(-reach, reach + 1), repeat=3))
+    want = {
+        (tap, row, row_of[other])
+        for tap, step in enumerate(steps)
+        for cell, row in row_of.items()
+        if any(step) and (other := (cell[0], *(c + s for c, s in zip(cell[1:], step, strict=True)))) in row_of
+    }
+    taps = np.repeat(np.arange(len(steps)), near.counts)
+    assert set(zip(taps.tolist(), near.target.tolist(), near.source.tolist(), strict=True)) == want
+    assert len(near.source) == len(want)
+
+
+def test_of_several_points_the_nearest_to_the_middle_is_kept_or_a_random_one():
+    cloud = np.float32([[0.001, 0.001, 0.001], [0.011, 0.009, 0.01], [0.019, 0.019, 0.019]])
+    assert build_tables([cloud], TINY).kept.tolist() == [1]
+    drawn = {build_tables([cloud], TINY, rng=np.random.default_rng(seed)).kept[0] for seed in range(30)}
+    assert drawn == {0, 1, 2}
+    again = [build_tables([person(400)], TINY, rng=np.random.default_rng(5)) for _ in range(2)]
+    assert (again[0].kept == again[1].kept).all()
+
+
+def test_cells_at_the_edge_of_what_can_be_counted_meet_nobody():
+    # the first and last cell of each axis: a step beyond wraps to no other cell
+    reach = TINY.grid * (1 << 15)
+    corners = np.array(list(itertools.product((-reach, reach - TINY.grid / 2), repeat=3)))
+    tables = build_tables([corners, corners], TINY)
+    assert [level.lengths.tolist() for level in tables.levels] == [[8, 8]] * 3
+    assert len(tables.stem.source) == 0 and all(len(level.near.source) == 0 for level in tables.levels)
+
+
+def test_a_stray_point_moves_no_voxel_but_in_the_released_code():
+    cloud = np.float32([[0.021, 0.001, 0.001], [0.061, 0.001, 0.001]])
+    for legacy, same in ((False, True), (True, False)):
+        config = replace(TINY, legacy=legacy)
+        stray = np.concatenate([cloud, np.float32([[-0.999, 0.001, 0.001]])])
+        parents = [build_tables([c], config).levels[0].lengths.tolist() for c in (cloud, stray)]
+        assert parents == [[2], [3]]
+        coarse = [build_tables([c], config).levels[1].lengths[0] for c in (cloud, stray)]
+        assert (coarse[1] - coarse[0] == 1) == same or not same
+    # the released grid begins at the stray point: what shared a parent may no longer
+    near = np.float32([[0.001, 0, 0], [0.021, 0, 0]])
+    stray = np.float32([[-0.339, 0, 0]])
+    for legacy, shared in ((False, True), (True, False)):
+        level = build_tables([np.concatenate([near, stray])], replace(TINY, legacy=legacy)).levels[0]
+        rows = build_tables([np.concatenate([near, stray])], replace(TINY, legacy=legacy)).point_voxel
+        assert (level.parent[rows[0]] == level.parent[rows[1]]) == shared
+
+
+def test_bad_clouds():
+    net = network()
+    for cloud, message in (
+        (np.zeros((4, 4)), r"cloud 1: expected numbers of shape \(n, 3\), x y z in metres, got float64 of \(4, 4\)"),
+        (np.zeros((4, 3), bool), "got bool of"),
+        (np.array([["a", "b", "c"]]), "expected numbers of shape"),
+        (np.full((4, 3), np.nan), "must be finite"),
+        (np.full((4, 3), 1e6), "within 655 m of their person"),
+    ):
+        with pytest.raises(InputError, match=message):
+            net.outputs([person(3), cloud])
+    with pytest.raises(InputError, match="a batch holds 1 to 4095 people, got 0"):
+        build_tables([], TINY)
+    with pytest.raises(InputError, match="unknown layout 'padd': did you mean padded"):
+        build_tables([person(3)], TINY, layout="padd")
+
+
+# ---- convolution
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("kernel", [3, 5])
+def test_convolution_equals_a_dense_one(kernel, layout):
+    rng = np.random.default_rng(0)
+    side = 7
+    occupied = np.argwhere(rng.random((side, side, side)) < 0.4)
+    tables = build_tables([(occupied + 0.5) * TINY.grid, (occupied[:20] + 0.5) * TINY.grid], TINY, layout=layout)
+    batch = DaptBatch.from_tables(tables)
+    near = batch.levels[0].near if kernel == 3 else batch.stem
+    torch.manual_seed(0)
+    conv = SubmanifoldConvolution(5, 4, kernel, bias=True)
+    torch.nn.init.normal_(conv.bias)
+    cells = torch.from_numpy(np.concatenate([occupied, occupied[:20]])[tables.kept]).T
+    owner = torch.from_numpy((tables.kept >= len(occupied)).astype(int))
+    rows = torch.randn(cells.shape[1], 5, requires_grad=True)
+    grid = torch.zeros(2, side, side, side, 5).index_put((owner, *cells), rows)
+    dense = F.conv3d(grid.permute(0, 4, 1, 2, 3), conv.weight.permute(0, 4, 1, 2, 3), conv.bias, padding=kernel // 2)
+    want = dense.permute(0, 2, 3, 4, 1)[(owner, *cells)]
+    got = conv(rows, near)
+    torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-5)
+    inputs = (rows, conv.weight, conv.bias)
+    scale = torch.randn_like(want)
+    for a, b in zip(
+        torch.autograd.grad((got * scale).sum(), inputs), torch.autograd.grad((want * scale).sum(), inputs), strict=True
+    ):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
+
+
+# ---- patches
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_a_large_cloud_is_cut_into_patches(legacy):
+    config = replace(TINY, legacy=legacy)
+    cloud = person(3400, size=0.3)
+    net = network(config)
+    tables = build_tables([cloud, person(40, 1)], config)
+    level = tables.levels[0]
+    assert level.lengths[0] > 3000 and level.sequence.shape[0] == 4
+    assert level.patch_lengths.tolist() == [512] * (level.lengths[0] // 512) + [
+        level.lengths[0] % 512,
+        level.lengths[1],
+    ]
+    ends = np.cumsum(level.patch_lengths)[:-1]
+    for sequence in level.sequence:
+        assert sorted(sequence) == list(range(len(sequence)))
+        # patches are compact, and nobody's points are lent to somebody else
+        for rows in np.split(sequence, ends):
+            assert len(set(rows < level.lengths[0])) == 1
+        spread = np.mean([tables.features[rows].std(0).mean() for rows in np.split(sequence, ends)[:-1]])
+        assert spread < 0.8 * tables.features[: level.lengths[0]].std(0).mean()
+    assert len({tuple(sequence) for sequence in level.sequence}) == 4
+
+    out = net.outputs([cloud])
+    assert_outputs(out, net.outputs([cloud]), atol=0)
+    assert_outputs(
+        out,
+        net.outputs([np.random.default_rng(1).permutation(cloud)])
+        | {name: out[name] for name in ("point_feat_last", "parts")},
+    )
+    whole = network(replace(config, patch=4096)).outputs([cloud])
+    assert np.abs(whole["point_feat_last"] - out["point_feat_last"]).max() > 1e-3
+
+
+@pytest.mark.parametrize("patch, lengths", [(64, [64, 64]), (128, [128]), (100, [100, 28]), (127, [127, 1])])
+def test_the_last_patch_is_what_is_left(patch, lengths):
+    # 128 cells in a row
+    row = np.zeros((128, 3))
+    row[:, 0] = (np.arange(128) + 0.5) * TINY.grid
+    net = network(replace(TINY, patch=patch))
+    assert build_tables([row], net.config).levels[0].patch_lengths.tolist() == lengths
+    for layout in LAYOUTS:
+        assert torch.isfinite(run(net, [row], layout).anchors).all()
+
+
+def test_patches_agree_in_both_layouts_and_spare_the_small():
+    net = network(replace(TINY, patch=100))
+    clouds = [person(700), person(30, 1), person(100, 2), person(0)]
+    ragged, padded = run(net, clouds), run(net, clouds, "padded")
+    for name in ("anchors", "points", "inter", "logits_x", "parts"):
+        torch.testing.assert_close(getattr(ragged, name), getattr(padded, name), rtol=1e-4, atol=1e-5, msg=name)
+    # somebody of no more than a patch has exact full attention, whoever else is there
+    small = network(replace(TINY, patch=4096)).outputs(clouds[1:2])
+    np.testing.assert_allclose(padded.anchors[1].numpy(), small["anchors"][0], rtol=1e-4, atol=1e-5)
+
+
+def test_attention_equals_its_formula():
+    torch.manual_seed(0)
+    attention = PatchAttention(32, 2).eval()
+    tables = build_tables([person(70), person(9, 1)], replace(TINY, patch=32))
+    level = DaptBatch.from_tables(tables).levels[0]
+    rows = torch.randn(int(sum(level.patch_lengths)), 32)
+    for order in range(4):
+        sequence = torch.from_numpy(tables.levels[0].sequence[order])
+        want = torch.empty_like(rows)
+        for patch in sequence.split(level.patch_lengths):
+            query, key, value = attention.qkv(rows[patch]).view(-1, 3, 2, 16).unbind(1)
+            weight = torch.einsum("ihd,jhd->hij", query, key).div(4).softmax(-1)
+            want[patch] = torch.einsum("hij,jhd->ihd", weight, value).flatten(1)
+        torch.testing.assert_close(attention(rows, level, order), attention.proj(want), rtol=1e-4, atol=1e-5)
+
+
+def test_tables_and_decoders_need_no_torch():
+    code = "import sys, lidarpose.model.decode, lidarpose.model.dapt.tables; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
+
+
+def test_curves_are_shuffled_in_training_only():
+    cloud = person(900)
+    straight = build_tables([cloud], TINY).levels[0].sequence
+    rng = np.random.default_rng(0)
+    seen = {build_tables([cloud], TINY, rng=rng).levels[0].sequence[0].tobytes() for _ in range(20)}
+    # which point a voxel keeps is random, its place on a curve is not
+    assert seen == {sequence.tobytes() for sequence in straight}
+
+
+# ---- configurations
+
+
+def parameters(config):
+    with torch.device("meta"):
+        return sum(p.numel() for p in DaptNet(config).parameters())
+
+
+def test_sizes():
+    counts = {name: parameters(config) for name, config in CONFIGS.items()}
+    assert counts == {
+        "paper": 50_513_310,
+        # the authors' own count is 50.40 M
+        "waymo": 50_403_794,
+        "humanm3": 50_436_033,
+        "lidarhuman26m": 50_472_828,
+        "sloper4d": 50_426_388,
+        "pretrain": 50_073_148,
+    }
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_configurations_survive_json(name):
+    config = named_config(name)
+    assert DaptConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+
+
+def test_joints_of_the_released_networks_by_name():
+    # the authors' order: rows 1 to 13 and 15 of Waymo's table of keypoints
+    limbs = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+    both = [f"{side}_{limb}" for side in ("left", "right") for limb in limbs]
+    assert list(WAYMO_JOINTS) == ["nose", *both, "head_center"] and WAYMO_JOINTS != WAYMO14.joints
+    for name, skeleton in (
+        ("waymo", WAYMO14),
+        ("humanm3", HUMAN15),
+        ("pretrain", HUMAN15),
+        ("lidarhuman26m", SMPL24),
+        ("sloper4d", SMPL24),
+        ("paper", BODY26),
+        ("paper", WAYMO14),
+    ):
+        config = named_config(name)
+        assert [config.joints[k] for k in config.order_in(skeleton)] == list(skeleton.joints)
+    # the subset that the authors took of SMPL's joints
+    subset = [0, 1, 2, 4, 5, 7, 8, 12, 15, 16, 17, 18, 19, 20, 21]
+    assert named_config("pretrain").joints == tuple(SMPL24.joints[k] for k in subset)
+    with pytest.raises(InputError, match="the network waymo has no pelvis.*which smpl24 needs"):
+        named_config("waymo").order_in(SMPL24)
+
+
+def test_bins_of_the_released_networks():
+    widths = {name: config.step.round(6).tolist() for name, config in CONFIGS.items() if config.bins}
+    assert widths == {
+        "paper": [0.01] * 3,
+        "waymo": [0.025] * 3,
+        "humanm3": [0.01] * 3,
+        "lidarhuman26m": [0.01] * 3,
+        "sloper4d": [0.02] * 3,
+    }
+    assert named_config("waymo").low.tolist() == [-0.9, -0.9, -1.5]
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"encoder_depths": (1,)}, "encoder_depths must be 2 whole numbers"),
+        ({"encoder_channels": (16, 16)}, "encoder_channels must be 3 whole numbers"),
+        ({"decoder_heads": (1, 0)}, "decoder_heads must be 2 whole numbers"),
+        ({"encoder_heads": (3, 1, 1)}, "encoder_channels must divide by encoder_heads"),
+        ({"anchor_heads": 5}, "decoder_channels must divide by anchor_heads"),
+        ({"patch": 0}, "patch must be a whole number"),
+        ({"grid": -0.01}, "grid must be a positive number"),
+        ({"strides": (2, 3)}, "strides must be 2, 4 or 8"),
+        ({"orders": ("z", "spiral")}, "unknown curve 'spiral'"),
+        ({"orders": ()}, "at least one curve"),
+        ({"drop_path": 1.0}, "drop_path must be a probability"),
+        ({"joints": ("nose", "nose")}, "joints must be joint names, each once"),
+        ({"joints": ("noze",)}, "unknown joint of body26 'noze': did you mean nose"),
+        ({"bins": (44, 44)}, "bins must be three"),
+        ({"ranges": ((1.0, -1.0),) * 3}, "ranges must be three pairs"),
+        ({"bins": (), "ranges": (), "coordinates": False}, "it would predict nothing"),
+        ({"parts": 1}, "parts must be 0"),
+        ({"legacy": 1}, "legacy must be true or false"),
+    ],
+)
+def test_bad_configurations(change, message):
+    with pytest.raises(InputError, match=message):
+        replace(TINY, **change)
+
+
+def test_wider_strides():
+    net = network(replace(TINY, strides=(4, 8)))
+    lengths = [level.lengths[0] for level in build_tables([person(500)], net.config).levels]
+    cells = cells_of(person(500), net.config)
+    assert lengths == [len(np.unique(cells >> shift, axis=0)) for shift in (0, 2, 5)]
+    assert np.isfinite(net.outputs([person(500)])["inter"]).all()
+
+
+# ---- the authors' files
+
+
+def header():
+    from safetensors import safe_open
+
+    with safe_open(WEIGHTS, "pt") as file:
+        return json.loads(file.metadata()["config"])
+
+
+def test_import_by_header_by_dict_and_by_configuration(released, tmp_path):
+    want = released.outputs(CLOUDS[1:2])
+    assert not released.training and released.config.legacy and released.config.joints == WAYMO_JOINTS
+    assert_outputs(want, import_dapt(str(WEIGHTS), header()).outputs(CLOUDS[1:2]), atol=0)
+    assert_outputs(want, import_dapt(WEIGHTS, released.config).outputs(CLOUDS[1:2]), atol=0)
+    own = released.config.to_dict()
+    prefixed = {f"module.{name}": value.clone() for name, value in load_file(WEIGHTS).items()}
+    save_file(prefixed, tmp_path / "wrapped.safetensors", {"config": json.dumps(own)})
+    assert_outputs(want, import_dapt(tmp_path / "wrapped.safetensors").outputs(CLOUDS[1:2]), atol=0)
+    assert not import_dapt(WEIGHTS, own | {"legacy": False}).config.legacy
+
+
+def test_import_by_name(tmp_path):
+    config = named_config("pretrain")
+    tensors = {name: value.contiguous() for name, value in DaptNet(config).state_dict().items()}
+    # the names of the authors' pre-training heads
+    assert {"heads.query.fc.fc2.weight", "heads.feat.fc.3.weight", "heads.feat.fc.1.running_mean"} <= tensors.keys()
+    save_file(tensors, tmp_path / "pretrain.safetensors")
+    out = import_dapt(tmp_path / "pretrain.safetensors", "pretrain").outputs([CLOUDS[1]])
+    assert out["coordinates"].shape == (1, 15, 3) and out["parts"].shape == (57, 25) and "logits_x" not in out
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (
+            lambda t: t.pop("backbone.enc.enc3.block1.cpe.0.weight"),
+            "tensor backbone.enc.enc3.block1.cpe.0.weight is missing",
+        ),
+        (lambda t: t.update({"heads.other.weight": torch.zeros(3)}), "unknown tensor heads.other.weight"),
+        (
+            lambda t: t.update({"backbone.keypoint_embedding": torch.zeros(15, 64)}),
+            r"tensor backbone.keypoint_embedding should be \(14, 64\) by the configuration released, got \(15, 64\)",
+        ),
+        (
+            lambda t: t["heads.query.fcs.0.fc1.bias"].fill_(np.nan),
+            "tensor heads.query.fcs.0.fc1.bias has values that are",
+        ),
+        (
+            lambda t: t["heads.query.coord_range"].mul_(2),
+            "tensor heads.query.coord_range says .*-1.8, 1.8.*the configuration released \\[\\[-0.9",
+        ),
+        (lambda t: t.clear(), "tensor .* is missing"),
+    ],
+)
+def test_import_of_tensors_that_do_not_fit(tmp_path, change, message):
+    tensors = load_file(WEIGHTS)
+    change(tensors)
+    save_file(tensors, tmp_path / "bad.safetensors", {"config": json.dumps(header())})
+    with pytest.raises(InputError, match=message) as caught:
+        import_dapt(tmp_path / "bad.safetensors")
+    assert "bad.safetensors: " in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "config, message",
+    [
+        ("waymoo", "unknown DAPT configuration 'waymoo': did you mean waymo"),
+        (
+            "waymo",
+            "tensor backbone.enc.enc0.block1.* is missing, which the configuration waymo has: name the configuration",
+        ),
+        ({"enc_depths": [1, 1]}, "does not fit: encoder_channels must be 2"),
+        ({"widths": 3}, "unknown setting of the network 'widths'"),
+        ({"name": "x"}, "needs the entry 'joints'"),
+        ([1], "should be a dict, a name or a DaptConfig, got list"),
+    ],
+)
+def test_import_with_a_wrong_configuration(config, message):
+    with pytest.raises(InputError, match=message):
+        import_dapt(WEIGHTS, config)
+
+
+@pytest.mark.parametrize(
+    "entries, message",
+    [
+        ({"in_channels": 6}, "in_channels must be 3"),
+        ({"dec_kp_mixer": "linear"}, "dec_kp_mixer must be 'attn'"),
+        ({"num_keypoints": 17}, "num_keypoints must be 14, 15 or 24"),
+        ({"enc_patch_size": [1024, 512, 1024, 1024, 1024]}, "one number throughout"),
+        ({"grid": 7}, "grid must be .*of the heatmaps, got 7"),
+    ],
+)
+def test_import_of_another_network_of_theirs(entries, message):
+    with pytest.raises(InputError, match=message):
+        import_dapt(WEIGHTS, header() | entries)
+
+
+def test_import_of_files_that_are_none(tmp_path):
+    pickle = tmp_path / "dapt.pth"
+    pickle.write_bytes(b"\x80\x04.")
+    with pytest.raises(InputError, match=r"dapt.pth: .* pickle.*weights_only=True.*safetensors"):
+        import_dapt(pickle)
+    with pytest.raises(InputError, match="no such file: check the path"):
+        import_dapt(tmp_path / "none.safetensors")
+    with pytest.raises(InputError, match="is a folder"):
+        import_dapt(tmp_path)
+    whole = WEIGHTS.read_bytes()
+    for content in (whole[: len(whole) // 2], whole[:100], b"", b"not a file of tensors at all"):
+        (tmp_path / "cut.safetensors").write_bytes(content)
+        with pytest.raises(InputError, match="cut.safetensors: .*damaged.*get it again"):
+            import_dapt(tmp_path / "cut.safetensors")
+    for entry, message in (
+        ({}, "its header has no configuration: name one of paper, waymo"),
+        ({"config": "{"}, "not JSON"),
+    ):
+        save_file(load_file(WEIGHTS), tmp_path / "bare.safetensors", entry)
+        with pytest.raises(InputError, match=message):
+            import_dapt(tmp_path / "bare.safetensors")

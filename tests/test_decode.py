@@ -1,0 +1,148 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lidarpose.errors import InputError
+from lidarpose.model import decode
+from lidarpose.model.dapt.config import named_config
+
+ORACLE = np.load(Path(__file__).parent / "parity" / "dapt_tiny.npz")
+WAYMO = named_config("waymo")
+
+
+def gaussian(at, bins, sigma=2.0):
+    """Logits whose softmax is a Gaussian about `at`, in bins."""
+    return -0.5 * ((np.arange(bins) - np.asarray(at)[..., None]) / sigma) ** 2
+
+
+def blur_reference(logits):
+    """The released code's blur, bin after bin."""
+    taps = np.exp(-0.5 * (np.arange(-5, 6) / 2.0) ** 2)
+    taps /= taps.sum()
+    return np.array(
+        [
+            sum(taps[k] * logits[i + k - 5] for k in range(11) if 0 <= i + k - 5 < len(logits))
+            for i in range(len(logits))
+        ]
+    )
+
+
+def dark_reference(logits):
+    """One heatmap -> index of the refined peak, step after step."""
+    mode = int(np.argmax(logits))
+    heights = np.log(np.clip(blur_reference(logits), 1e-3, 50))
+    heights = [heights[0]] * 2 + list(heights) + [heights[-1]] * 2
+    at = mode + 2
+    slope = 0.5 * (heights[at + 1] - heights[at - 1])
+    curvature = 1e-9 + 0.25 * (heights[at + 2] - 2 * heights[at] + heights[at - 2])
+    offset = slope / curvature
+    return mode if abs(offset) > 0.5 else mode - offset
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_the_released_decoders(axis):
+    logits = ORACLE[f"logits_{'xyz'[axis]}"]
+    low, step = WAYMO.low[axis], WAYMO.step[axis]
+    index = ORACLE["argmax"][..., axis]
+    lo, hi = WAYMO.ranges[axis]
+    # the released formula, spelled out
+    np.testing.assert_allclose(
+        decode.argmax(logits, low=low, step=step), index / logits.shape[-1] * (hi - lo) + lo, rtol=0, atol=1e-12
+    )
+    assert (np.rint((decode.argmax(logits, low=low, step=step) - low) / step) == index).all()
+    np.testing.assert_allclose(decode.dark(logits, low=low, step=step), ORACLE["dark"][..., axis], rtol=0, atol=1e-4)
+    # so tight a test of dark means something only where it moves the peak
+    assert (
+        np.abs(decode.dark(logits, low=low, step=step) - decode.argmax(logits, low=low, step=step)).max() > 0.2 * step
+    )
+
+
+@given(st.lists(st.integers(-40, 120), min_size=1, max_size=40))
+def test_dark_is_its_slow_twin(halves):
+    logits = np.array(halves) / 2
+    got = decode.dark(logits, low=0.0, step=1.0)
+    np.testing.assert_allclose(got, dark_reference(logits), rtol=0, atol=1e-6)
+
+
+@given(st.integers(1, 40), st.data())
+def test_window_does_not_lean_near_an_edge(bins, data):
+    at = data.draw(st.floats(0, bins - 1))
+    # a peak in the middle of a bin is found exactly, wherever it stands; any peak to a third of a bin
+    middle = round(at)
+    assert decode.window(gaussian(middle, bins), low=0.0, step=1.0) == pytest.approx(middle, abs=1e-9)
+    assert decode.window(gaussian(at, bins), low=0.0, step=1.0) == pytest.approx(at, abs=0.51)
+    inside = min(at, bins - 1 - at) >= decode.REACH + 1
+    if inside:
+        assert decode.window(gaussian(at, bins), low=0.0, step=1.0) == pytest.approx(at, abs=0.35)
+
+
+def test_window_is_better_than_the_peak():
+    at = np.random.default_rng(0).uniform(5, 66, 500)
+    error = [
+        np.abs(decoder(gaussian(at, 72), low=0.0, step=1.0) - at).mean() for decoder in (decode.argmax, decode.window)
+    ]
+    assert error[1] < 0.6 * error[0]
+
+
+def test_window_keeps_to_one_of_two_peaks():
+    two = np.logaddexp(gaussian(20, 72) + 0.1, gaussian(50, 72))
+    assert decode.window(two, low=0.0, step=1.0) == pytest.approx(20, abs=0.01)
+
+
+def test_reach_is_the_width_of_the_window():
+    logits = np.array([0.0, 0.0, 3.0, 1.0, 2.0, -50.0, -50.0])
+    assert decode.window(logits, low=0.0, step=1.0, reach=0) == 2
+    weight = np.exp(logits[1:4])
+    assert decode.window(logits, low=0.0, step=1.0, reach=1) == pytest.approx((weight * [1, 2, 3]).sum() / weight.sum())
+    # two bins before the mode is the edge: wider windows are no wider
+    wide = decode.window(logits, low=0.0, step=1.0, reach=2)
+    assert (
+        wide == decode.window(logits, low=0.0, step=1.0, reach=5) != decode.window(logits, low=0.0, step=1.0, reach=1)
+    )
+
+
+@pytest.mark.parametrize("name", decode.DECODERS)
+def test_both_conventions_of_bins(name):
+    logits = gaussian(np.array([[10.0, 3.0], [0.0, 23.0]]), 24)
+    find = decode.decoder(name)
+    index = find(logits, low=0.0, step=1.0)
+    assert index.shape == (2, 2)
+    # bins at their left edges: 24 of them in [-0.36, 0.36); bins known by their middles
+    np.testing.assert_allclose(find(logits, low=-0.36, step=0.03), -0.36 + index * 0.03, atol=1e-12)
+    middles = (np.arange(24) + 0.5) * 0.03 - 0.36
+    np.testing.assert_allclose(find(logits, low=middles[0], step=0.03)[0, 0], middles[10], atol=1e-9)
+    # an array of lows, one an axis
+    low = np.array([1.0, 5.0])
+    np.testing.assert_allclose(find(logits, low=low, step=np.array([1.0, 2.0])), low + index * [1, 2], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", decode.DECODERS)
+@pytest.mark.parametrize("bins", [1, 2, 3])
+def test_few_bins(name, bins):
+    logits = np.zeros((4, bins))
+    logits[:, -1] = 1
+    assert np.isfinite(decode.decoder(name)(logits, low=0.0, step=1.0)).all()
+    assert decode.decoder(name)(np.zeros((0, 14, bins)), low=0.0, step=1.0).shape == (0, 14)
+
+
+def test_half_floats_and_far_logits_are_fine():
+    logits = (gaussian([30.0, 2.0], 72) * 50).astype(np.float16)
+    for find in decode.DECODERS.values():
+        np.testing.assert_allclose(find(logits, low=0.0, step=1.0), [30, 2], atol=0.01)
+
+
+def test_out_of_range():
+    logits = gaussian(np.array([[0.0, 1.0], [70.0, 71.0]]), 72)
+    assert decode.out_of_range(logits).tolist() == [[True, False], [False, True]]
+
+
+def test_bad_input():
+    with pytest.raises(InputError, match="unknown decoder 'darc': did you mean dark"):
+        decode.decoder("darc")
+    for logits in (np.zeros((3, 0)), np.float64(1)):
+        for find in (*decode.DECODERS.values(), lambda x, **_: decode.out_of_range(x)):
+            with pytest.raises(InputError, match="at least one bin"):
+                find(logits, low=0.0, step=1.0)
