@@ -39,7 +39,7 @@ def test_tables_are_read_in_any_order_of_lasers(tmp_path, name, content):
     np.testing.assert_allclose(np.degrees(found.elevations), sorted(ANGLES))
     assert found.name == name[0] and found.columns == (512 if name == "d.json" else 1800)
     if name in ("c.json", "f.csv"):
-        offsets = {"c.json": [-4.2, -1.4, 1.4, 4.2], "f.csv": [4.0, 3.0, 2.0, 1.0]}[name]
+        offsets = {"c.json": [4.2, 1.4, -1.4, -4.2], "f.csv": [-4.0, -3.0, -2.0, -1.0]}[name]
         np.testing.assert_allclose(np.degrees(found.azimuth_offsets), offsets)
     # the same through the name, as on the command line
     np.testing.assert_array_equal(sensor(str(tmp_path / name)).elevations, found.elevations)

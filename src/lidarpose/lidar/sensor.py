@@ -182,14 +182,14 @@ _VLP_32C = _degrees(
     -0.667 -0.333 0 0.333 0.667 1 1.333 1.667 2.333 3.333 4.667 7 10.333 15"""
 )
 
-# Hesai's default correction of the Pandar64, lowest laser first: elevation and azimuth offset
+# Hesai's default correction of the Pandar64, lowest laser first: elevation, and azimuth offset, there clockwise
 _PANDAR64 = _degrees(
     """-24.897 -18.889 -13.93 -12.974 -12.006 -11.032 -9.885 -9.06 -8.059 -7.063 -6.061 -5.898 -5.726 -5.565 -5.391
     -5.229 -5.057 -4.892 -4.72 -4.558 -4.385 -4.221 -4.05 -3.884 -3.712 -3.548 -3.375 -3.21 -3.04 -2.873 -2.7 -2.536
     -2.365 -2.198 -2.028 -1.86 -1.688 -1.522 -1.351 -1.184 -1.013 -0.845 -0.675 -0.508 -0.337 -0.169 0 0.169 0.337
     0.508 0.675 0.846 1.013 1.184 1.351 1.522 1.688 1.86 2.028 3.04 5.057 8.059 11.032 14.882"""
 )
-_PANDAR64_OFFSETS = _degrees("-1.042 " * 10 + "-3.125 -5.208 5.208 3.125 1.042 -1.042 " * 8 + "-1.042 " * 6)
+_PANDAR64_OFFSETS = -_degrees("-1.042 " * 10 + "-3.125 -5.208 5.208 3.125 1.042 -1.042 " * 8 + "-1.042 " * 6)
 
 _AV2_ORDER = np.argsort(np.concatenate([_VLP_32C, -_VLP_32C]), kind="stable")
 

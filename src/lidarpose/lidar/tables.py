@@ -1,14 +1,15 @@
 """A sensor's table of beams from the user's file, and the list of the sensors that ship.
 
-Files, angles in degrees, in any order of lasers (they are sorted by elevation, their offsets with them):
+Files, angles in degrees, in any order of lasers (they are sorted by elevation, their offsets with them). Makers count
+azimuths clockwise as seen from above, this package counter-clockwise, and so do azimuth_offset(s):
 
     JSON of an Ouster sensor     beam_altitude_angles, beam_azimuth_angles, lidar_mode; at the top or, as newer
                                  firmware writes it, in sections (beam_intrinsics, config_params, ...)
     JSON list                    elevations
     JSON object                  elevations_deg, and optionally azimuth_offsets_deg, columns, range_min, range_max,
                                  range_sigma, dropout, height, tilt_deg, name
-    CSV                          a column of elevations, or columns with a header: elevation, azimuth (as in Hesai's
-                                 correction files), others are ignored
+    CSV                          a column of elevations, or columns with a header: elevation and azimuth_offset, or
+                                 azimuth (clockwise, as in Hesai's correction files), others are ignored
 """
 
 import csv
@@ -42,7 +43,7 @@ def load_sensor(path: str | Path) -> Sensor:
     text = data.decode("utf-8-sig", "replace")
     fields = _from_json(path, text) if path.suffix.lower() == ".json" else _from_csv(path, text)
     elevations = _numbers(path, "elevations", fields.pop("elevations"))
-    offsets = fields.pop("offsets", None)
+    offsets, clockwise = fields.pop("offsets", None), fields.pop("clockwise", False)
     if not len(elevations):
         raise file_error(path, "holds no elevations; expected one a laser, in degrees")
     if np.abs(elevations).max() >= 90:
@@ -55,7 +56,7 @@ def load_sensor(path: str | Path) -> Sensor:
         offsets = _numbers(path, "azimuth offsets", offsets)
         if offsets.shape != elevations.shape:
             raise file_error(path, f"has {len(elevations)} elevations and {len(offsets)} azimuth offsets")
-        offsets = np.radians(offsets[order])
+        offsets = np.radians(-offsets[order] if clockwise else offsets[order])
     columns = fields.pop("columns", _COLUMNS)
     if isinstance(columns, bool) or not isinstance(columns, int) or not 1 <= columns <= 100_000:
         raise file_error(path, f"columns must be a whole number of columns a turn, got {columns!r}")
@@ -112,6 +113,7 @@ def _from_json(path: Path, text: str) -> dict:
         beams = next((s for s in sections if "beam_altitude_angles" in s), None)
         if beams is not None:
             fields = {"elevations": beams["beam_altitude_angles"], "offsets": beams.get("beam_azimuth_angles")}
+            fields["clockwise"] = True
             modes = [str(s[key]) for key in ("lidar_mode", "columns_per_frame") for s in sections if key in s]
             columns = next((digits[0] for mode in modes if (digits := re.match("[0-9]{1,6}", mode))), None)
             return fields if columns is None else fields | {"columns": int(columns)}
@@ -142,6 +144,7 @@ def _from_csv(path: Path, text: str) -> dict:
         fields = {"elevations": [float(row[up]) for row in rows]}
         if off is not None:
             fields["offsets"] = [float(row[off]) for row in rows]
+            fields["clockwise"] = "offset" not in header[off]
     except (ValueError, IndexError):
         raise file_error(path, "must hold a number of degrees in every row") from None
     return fields
