@@ -4,7 +4,7 @@ PIP = .venv/bin/python -m pip install --quiet --disable-pip-version-check --cons
 
 .PHONY: demo test lint clean
 
-demo: .venv/all
+demo: .venv/synth
 	.venv/bin/lidarpose demo
 
 test: .venv/test
@@ -14,12 +14,15 @@ lint: .venv/test
 	$(PIP) ruff
 	.venv/bin/ruff check . && .venv/bin/ruff format --check .
 
-.venv/all: pyproject.toml constraints.txt
+.venv/bin/python:
 	$(PYTHON) -m venv .venv
-	$(PIP) --editable '.[all]'
+
+# predicting and the demo need no torch: the install is far smaller without
+.venv/synth: pyproject.toml constraints.txt | .venv/bin/python
+	$(PIP) --editable '.[synth]'
 	touch $@
 
-.venv/test: .venv/all
+.venv/test: pyproject.toml constraints.txt | .venv/bin/python
 	$(PIP) --editable '.[all,test]'
 	touch $@
 

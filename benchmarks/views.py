@@ -11,6 +11,7 @@ import argparse
 import heldout
 import numpy as np
 
+from lidarpose.data.views import MIRROR
 from lidarpose.evaluate.metrics import mpjpe
 from lidarpose.geometry import rotation_about
 from lidarpose.infer.predictor import load
@@ -20,7 +21,6 @@ from lidarpose.synth.bodies import PoseBank
 TURNS = 4
 # how much more a surer view counts
 POWER = 8
-MIRROR = np.diag([1.0, -1.0, 1.0])
 
 
 def main() -> None:

@@ -1,6 +1,7 @@
 """Weights on disk: there and back, and one line for every fault."""
 
 import json
+from pathlib import Path
 
 import pytest
 import torch
@@ -9,9 +10,13 @@ from safetensors.torch import load_file, save_file
 
 from lidarpose._version import __version__
 from lidarpose.errors import InputError
-from lidarpose.model.checkpoint import SCHEMA, load_checkpoint, read_header, save_checkpoint
+from lidarpose.model.checkpoint import import_released, load_checkpoint, save_checkpoint
+from lidarpose.model.dapt.config import DaptConfig
+from lidarpose.model.dapt.network import DaptNet
+from lidarpose.model.header import SCHEMA, Header, parameter_count, read_header
 from lidarpose.model.network import PoseNet
 from lidarpose.model.presets import preset
+from lidarpose.skeleton import HUMAN15
 
 CARD = {"command": "lidarpose pretrain run", "people_seen": 12, "scores": {"mpjpe": 0.1}}
 
@@ -36,7 +41,9 @@ def test_there_and_back(network, tmp_path, half):
     loaded, header = load_checkpoint(path)
     assert not loaded.training and header.card == CARD and header.version == __version__
     assert header.config == network.config == loaded.config
-    assert read_header(path) == header
+    assert read_header(path) == header and header.network == "pose" and header.skeleton.name == "body26"
+    count = sum(value.numel() for value in network.parameters())
+    assert parameter_count(path) == count
     for name, value in network.state_dict().items():
         other = loaded.state_dict()[name]
         assert other.dtype == torch.float32
@@ -46,7 +53,7 @@ def test_there_and_back(network, tmp_path, half):
         else:
             torch.testing.assert_close(other, value, rtol=0, atol=0)
     size = path.stat().st_size
-    assert (2 if half else 4) * 348_218 < size < (2 if half else 4) * 348_218 + 20_000
+    assert (2 if half else 4) * count < size < (2 if half else 4) * count + 20_000
 
 
 def test_saving_leaves_the_network_and_an_older_file_in_peace(network, stored, tmp_path):
@@ -58,9 +65,9 @@ def test_saving_leaves_the_network_and_an_older_file_in_peace(network, stored, t
     assert path.read_bytes() == stored.read_bytes() and list(tmp_path.iterdir()) == [path]
 
 
-def assert_one_line(path, *parts):
+def assert_one_line(path, *parts, read=load_checkpoint):
     with pytest.raises(InputError) as caught:
-        load_checkpoint(path)
+        read(path)
     message = str(caught.value)
     assert "\n" not in message and str(path) in message
     for part in parts:
@@ -69,23 +76,39 @@ def assert_one_line(path, *parts):
 
 def test_no_such_file_and_a_folder(tmp_path):
     assert_one_line(tmp_path / "none.safetensors", "does not exist")
-    assert_one_line(tmp_path, "is a directory")
+    assert_one_line(tmp_path, "is a folder")
 
 
-@pytest.mark.parametrize("keep", [0, 4, 100, 5000, -1])
-def test_a_truncated_file(stored, tmp_path, keep):
+@pytest.mark.parametrize("keep", [0, 4, 8, 100, 5000, -1])
+def test_a_truncated_file_names_the_byte(stored, tmp_path, keep):
     path = tmp_path / "cut.safetensors"
     path.write_bytes(stored.read_bytes()[:keep])
-    assert_one_line(path, "damaged or something else")
+    size, whole = path.stat().st_size, stored.stat().st_size
+    assert_one_line(path, f"ends at byte {size:,}", "get it again", *([f"says {whole:,}"] if size > 20_000 else []))
+
+
+def test_a_file_with_more_behind_it(stored, tmp_path):
+    path = tmp_path / "long.safetensors"
+    path.write_bytes(stored.read_bytes() + b"more")
+    assert_one_line(path, f"says {stored.stat().st_size:,}")
+
+
+def test_a_broken_header_names_the_byte(stored, tmp_path):
+    path = tmp_path / "bad.safetensors"
+    content = bytearray(stored.read_bytes())
+    content[1000:1004] = b"\x00}}{"
+    path.write_bytes(content)
+    assert_one_line(path, "at byte 1,000", "get the file again")
 
 
 @pytest.mark.parametrize(
-    "content", [b"hello world, this is text", b"\x80\x02}q\x00.", b"\x1f\x8b" + bytes(50), bytes(64)]
+    "content",
+    [b"hello world, this is text", b"\x80\x02}q\x00(X\x01\x00\x00\x00aK\x01u.", b"\x1f\x8b" + bytes(50), bytes(64)],
 )
 def test_another_kind_of_file(tmp_path, content):
     path = tmp_path / "other.safetensors"
     path.write_bytes(content)
-    assert_one_line(path, "damaged or something else")
+    assert_one_line(path, "something else", "name a checkpoint")
 
 
 def test_somebody_else_s_safetensors(tmp_path):
@@ -112,27 +135,48 @@ def test_a_missing_an_extra_and_a_misshapen_tensor(stored, tmp_path):
     without = rewritten(stored, path, tensors=lambda t: {k: v for k, v in t.items() if k != "vote.query.bias"})
     assert_one_line(without, "tensor vote.query.bias is missing", "tiny")
     assert_one_line(rewritten(stored, path, tensors=lambda t: t | {"more": torch.zeros(1)}), "unknown tensor more")
-    wrong = rewritten(stored, path, tensors=lambda t: t | {"part.weight": torch.zeros(24, 64)})
-    assert_one_line(wrong, "part.weight should be (25, 64), got (24, 64)")
+    wrong = rewritten(stored, path, tensors=lambda t: t | {"part.weight": torch.zeros(24, 48)})
+    assert_one_line(wrong, "part.weight should be (25, 48) by its configuration, got (24, 48)")
+
+
+@pytest.mark.parametrize("value", [torch.full((25,), torch.nan), torch.zeros(25, dtype=torch.int32)])
+def test_a_tensor_that_is_no_finite_float(stored, tmp_path, value):
+    path = rewritten(stored, tmp_path / "x.safetensors", tensors=lambda t: t | {"part.bias": value})
+    assert_one_line(path, "tensor part.bias", "not finite or no floats")
 
 
 @pytest.mark.parametrize(
     "header, part",
     [
-        (lambda h: h | {"schema": "lidarpose.checkpoint/9"}, "expected schema lidarpose.checkpoint/1, got"),
+        (
+            lambda h: h | {"schema": "lidarpose.checkpoint/9", "version": "7.1"},
+            "use the lidarpose version that wrote it",
+        ),
+        (
+            lambda h: h | {"schema": "lidarpose.checkpoint/9", "version": "7.1"},
+            "got lidarpose.checkpoint/9 of lidarpose 7.1",
+        ),
+        (
+            lambda h: h | {"schema": "lidarpose.checkpoint/1", "version": "0.1.0"},
+            "use lidarpose 0.1.0 for it, or train",
+        ),
         (lambda h: {k: v for k, v in h.items() if k != "schema"}, "'schema'"),
         (lambda h: {k: v for k, v in h.items() if k != "card"}, "'card'"),
+        (lambda h: {k: v for k, v in h.items() if k != "network"}, "'network'"),
+        (lambda h: h | {"network": "pointnet"}, "unknown kind of network 'pointnet'"),
+        (lambda h: h | {"network": "dapt"}, "unknown setting blocks"),
+        (lambda h: h | {"card": 5}, "cannot be read"),
         (lambda h: h | {"config": h["config"] | {"rotary": True}}, "unknown setting rotary"),
         (lambda h: h | {"config": {"size": "tiny"}}, "channels"),
         (lambda h: h | {"config": 5}, "cannot be read"),
-        (lambda h: h | {"config": h["config"] | {"channels": 64.0}}, "channels must be a whole number"),
-        (lambda h: h | {"config": h["config"] | {"channels": "64"}}, "channels must be a whole number"),
-        (lambda h: h | {"config": h["config"] | {"heads": 0}}, "heads must be a whole number"),
-        (lambda h: h | {"config": h["config"] | {"channels": -64}}, "channels must be a whole number"),
-        (lambda h: h | {"config": h["config"] | {"heads": 5}}, "channels must divide by heads"),
+        (lambda h: h | {"config": h["config"] | {"channels": 64.0}}, "channels must be three whole numbers"),
+        (lambda h: h | {"config": h["config"] | {"channels": [64, -1, 64]}}, "channels must be three whole numbers"),
+        (lambda h: h | {"config": h["config"] | {"head_channels": 0}}, "head_channels must be a whole number"),
+        (lambda h: h | {"config": h["config"] | {"head_channels": 5}}, "must divide by head_channels"),
         (lambda h: h | {"config": h["config"] | {"blocks": [1, 1]}}, "blocks must be three whole numbers"),
         (lambda h: h | {"config": h["config"] | {"blocks": 3}}, "blocks must be three whole numbers"),
         (lambda h: h | {"config": h["config"] | {"grid": -1}}, "grid must be a positive number"),
+        (lambda h: h | {"config": h["config"] | {"heatmap": "round"}}, "unknown heatmap 'round'"),
         (lambda h: h | {"config": h["config"] | {"skeleton": "body27"}}, "unknown skeleton 'body27'"),
         (lambda h: [h], "cannot be read"),
         (lambda h: "{", "cannot be read"),
@@ -140,5 +184,63 @@ def test_a_missing_an_extra_and_a_misshapen_tensor(stored, tmp_path):
     ],
 )
 def test_a_header_that_does_not_fit(stored, tmp_path, header, part):
-    assert SCHEMA == "lidarpose.checkpoint/1"
-    assert_one_line(rewritten(stored, tmp_path / "x.safetensors", header=header), part)
+    assert SCHEMA == "lidarpose.checkpoint/2"
+    path = rewritten(stored, tmp_path / "x.safetensors", header=header)
+    assert_one_line(path, part)
+    assert_one_line(path, part, read=read_header)
+
+
+# ---- the paper's network
+
+SMALL = {
+    "encoder_depths": (1, 1),
+    "encoder_channels": (16, 16),
+    "encoder_heads": (2, 2),
+    "decoder_depths": (1,),
+    "decoder_channels": (16,),
+    "decoder_heads": (2,),
+    "anchor_channels": (16, 16),
+    "strides": (4,),
+    "grid": 0.04,
+}
+TINY_DAPT = Path(__file__).parent / "parity" / "dapt_tiny.safetensors"
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_the_papers_network_there_and_back(tmp_path, half):
+    torch.manual_seed(1)
+    config = DaptConfig(
+        name="mine", joints=("left_hip", *HUMAN15.joints[:1], *HUMAN15.joints[2:]), coordinates=True, **SMALL
+    )
+    network = DaptNet(config)
+    path = tmp_path / "dapt.safetensors"
+    save_checkpoint(path, network, card=CARD, half=half)
+    loaded, header = load_checkpoint(path)
+    assert isinstance(loaded, DaptNet) and not loaded.training
+    assert header.network == "dapt" and header.config == config and header.skeleton is HUMAN15
+    for name, value in network.state_dict().items():
+        other = loaded.state_dict()[name]
+        assert other.dtype == value.dtype
+        torch.testing.assert_close(other, value.half().to(value.dtype) if half else value, rtol=0, atol=0)
+
+
+def test_joints_that_make_up_no_skeleton():
+    header = Header(config=DaptConfig(name="legs", joints=("left_knee", "right_knee"), coordinates=True), card={})
+    with pytest.raises(InputError, match="the network legs predicts left_knee, right_knee"):
+        _ = header.skeleton
+
+
+def test_released_weights_come_in(tmp_path):
+    out = tmp_path / "in.safetensors"
+    header = import_released(TINY_DAPT, out)
+    loaded, again = load_checkpoint(out)
+    assert again == header and header.card["command"] == "lidarpose import dapt_tiny.safetensors"
+    released = load_file(TINY_DAPT)
+    for name, value in loaded.state_dict().items():
+        torch.testing.assert_close(value, released[name].to(value.dtype), rtol=0, atol=0)
+
+
+def test_a_refused_import_writes_nothing(tmp_path, stored):
+    with pytest.raises(InputError, match="is missing"):
+        import_released(stored, tmp_path / "in.safetensors", config="waymo")
+    assert list(tmp_path.iterdir()) == []

@@ -15,6 +15,7 @@ from lidarpose.cli import main
 from lidarpose.synth.generate import Generator
 from lidarpose.synth.scene import scene_config
 
+DAPT = Path(__file__).parent / "parity" / "dapt_tiny.safetensors"
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("[0-9]*.py"))
 
 
@@ -172,8 +173,62 @@ def test_a_crop_of_few_points_is_no_error(tmp_path, out, capsys):
 def test_info(capsys):
     assert run("info") == 0
     text = capsys.readouterr().out
-    for word in ("lidarpose ", "torch ", "device ", "tiny", "MB", "parameters", "trained"):
+    for word in ("lidarpose ", "ONNX Runtime ", "torch ", "device ", "tiny", "MB", "parameters", "trained"):
         assert word in text
+
+
+def test_backends_and_decoders(crop, out):
+    joints = {}
+    for words in (["--backend", "onnx"], ["--backend", "torch"], ["--decode", "argmax"], ["--decode", "dark"], []):
+        assert run("predict", crop, "--out", out, *words) == 0
+        document = json.loads((out / "crop.poses.json").read_text())
+        joints[tuple(words)] = np.array(document["people"][0]["joints"])
+        model = document["model"]
+        assert model["backend"] == ("torch" if "torch" in words else "onnx")
+        assert model["decode"] == (words[1] if "--decode" in words else "window")
+    np.testing.assert_allclose(joints["--backend", "torch"], joints[()], atol=1.1e-4)
+    np.testing.assert_array_equal(joints["--backend", "onnx"], joints[()])
+    assert not np.array_equal(joints["--decode", "argmax"], joints[()])
+
+
+@pytest.mark.parametrize(
+    "words, name, format, out",
+    [
+        ([], "tiny", "onnx", "tiny.onnx"),
+        (["tiny", "--format", "torch"], "tiny", "torch", "tiny.pt2"),
+        (["runs/mine.safetensors", "--out", "deep/a.bin"], "mine", "onnx", "deep/a.bin"),
+    ],
+)
+def test_export_names_its_file(tmp_path, monkeypatch, capsys, words, name, format, out):
+    # what it writes is tested elsewhere: making it takes long
+    def export(weights, out, *, format):
+        called.append((Path(weights).stem, format, str(out)))
+        Path(out).parent.mkdir(exist_ok=True)
+        Path(out).write_bytes(bytes(1_500_000))
+
+    called = []
+    monkeypatch.setattr("lidarpose.model.export.export", export)
+    monkeypatch.chdir(tmp_path)
+    assert run("export", *words) == 0
+    assert called == [(name, format, out)]
+    assert f"{name}.safetensors -> {out} (1.50 MB)" in capsys.readouterr().err
+
+
+def test_released_weights_are_imported_and_predict(crop, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run("import", DAPT, "mine.safetensors") == 0
+    assert "joints of waymo14 -> mine.safetensors" in capsys.readouterr().err
+    assert run("predict", crop, "--weights", "mine.safetensors") == 0
+    document = json.loads((tmp_path / "crop.poses.json").read_text())
+    assert document["skeleton"]["name"] == "waymo14" and len(document["people"][0]["joints"]) == 14
+    capsys.readouterr()
+    assert run("predict", crop, "--weights", "mine.safetensors", "--skeleton", "smpl24", "--out", "new") == 2
+    assert "waymo14 has no pelvis" in one_line(capsys)
+    assert run("export", "mine.safetensors") == 2
+    assert "is not offered as onnx" in one_line(capsys)
+    assert run("import", "mine.safetensors", "again.safetensors", "--config", "waymo") == 2
+    assert "tensor " in one_line(capsys)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["crop.npy", "crop.poses.json", "mine.safetensors"]
 
 
 def test_an_older_result_is_replaced_and_no_other_file_stays(crop, out):
@@ -284,6 +339,19 @@ BAD_COMMANDS = {
     "weights": ("predict CROP --weights tyni", "did you mean tiny"),
     "weights file": ("predict CROP --weights CROP", "safetensors"),
     "weights missing": ("predict CROP --weights no/such.safetensors", "does not exist"),
+    "backend": ("predict CROP --backend tensorrt", "known are onnx, torch"),
+    "decoder": ("predict CROP --decode mean", "unknown decoder 'mean'"),
+    "device": ("predict CROP --device warp", "device 'warp' cannot be used"),
+    "device of onnx": ("predict CROP --device cuda --backend onnx", "needs the backend torch"),
+    "onnx missing": ("predict CROP --weights no/such.onnx", "no such file"),
+    "onnx file": ("predict CROP --weights BOXES --backend onnx", "something else"),
+    "export what": ("export tyni", "did you mean tiny"),
+    "export how": ("export --format tflite --out DIR/x", "known are onnx, torch"),
+    "export nothing": ("export no/such.safetensors --out DIR/x", "does not exist"),
+    "import nothing": ("import no/such.safetensors DIR/x", "there is no such file"),
+    "import a pickle": ("import weights.pth DIR/x", "got a pickle"),
+    "import as": ("import DAPT DIR/x --config kitti", "waymo"),
+    "import without an out": ("import DAPT", "OUT"),
     "unknown option": ("predict CROP --picure", "--picure"),
     "demo seed": ("demo --seed -1 --out DIR/d", "seed"),
     "demo weights": ("demo --weights tyni --out DIR/d", "did you mean tiny"),
@@ -299,7 +367,7 @@ def test_a_bad_command_is_one_line(crop, boxes, tmp_path, capsys, monkeypatch, c
     words, expected = BAD_COMMANDS[case]
     monkeypatch.chdir(tmp_path)
     before = sorted(tmp_path.iterdir())
-    names = {"DIR": tmp_path, "CROP": crop, "BOXES": boxes}
+    names = {"DIR": tmp_path, "CROP": crop, "BOXES": boxes, "DAPT": DAPT}
     for name, path in names.items():
         words = words.replace(name, str(path)) if name != "COMMAND" else words
     assert run(*words.split()) == 2

@@ -484,7 +484,8 @@ def test_load_takes_names_and_paths(model, points, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "tiny").mkdir()
     for given in (copy, str(copy), "mine.safetensors", Path("odd.name"), "odd.name", "tiny"):
-        np.testing.assert_array_equal(lidarpose.load(given).predict(points).joints, model.predict(points).joints)
+        found = lidarpose.load(given).predict(points)
+        np.testing.assert_allclose(found.joints, model.predict(points).joints, atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -494,8 +495,8 @@ def test_load_takes_names_and_paths(model, points, tmp_path, monkeypatch):
         ("no/such.safetensors", "does not exist"),
         (Path("nothing"), "does not exist"),
         (".safetensors", "does not exist"),
-        (__file__, "safetensors file"),
-        (Path(__file__).parent, "is a directory"),
+        (__file__, "expected a checkpoint (.safetensors), but the file is something else"),
+        (Path(__file__).parent, "is a folder"),
     ],
 )
 def test_load_tells_what_is_wrong(given, words):
@@ -518,11 +519,22 @@ def test_results_follow_the_schema(model, points, tmp_path, name):
     assert document["schema"] == "lidarpose.poses/1" and document["frame"] == "input" and document["unit"] == "m"
     assert document["skeleton"]["name"] == name and document["skeleton"]["joints"] == joints
     assert all(0 <= i < len(joints) and 0 <= j < len(joints) for i, j in document["skeleton"]["bones"])
-    assert set(document["model"]) == {"name", "version"}
+    assert set(document["model"]) == {"name", "version", "backend", "decode"}
     (person,) = document["people"]
-    assert list(person) == ["id", "box", "num_points", "joints", "confidence", "spread", "warnings"]
+    assert list(person) == [
+        "id",
+        "box",
+        "num_points",
+        "joints",
+        "confidence",
+        "spread",
+        "visible",
+        "out_of_range",
+        "warnings",
+    ]
     np.testing.assert_allclose(person["joints"], pose.joints, atol=1e-4)
-    assert len(person["confidence"]) == len(person["spread"]) == len(joints)
+    assert len(person["confidence"]) == len(person["spread"]) == len(person["visible"]) == len(joints)
+    assert set(person["out_of_range"]) <= set(joints)
     assert pose.picture(tmp_path / "pose.png") == (tmp_path / "pose.png").read_bytes()
 
 

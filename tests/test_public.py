@@ -54,7 +54,8 @@ def test_help_answers_at_once():
 def test_reading_and_casting_need_no_torch():
     assert "torch" not in loaded_by("import lidarpose; lidarpose.read_points, lidarpose.read_boxes, lidarpose.Sample")
     assert "torch" not in loaded_by("import lidarpose; lidarpose.cast_rays, lidarpose.sample_poses")
-    assert "numba" not in loaded_by("import lidarpose; lidarpose.load, lidarpose.predict, lidarpose.Poses")
+    heavy = loaded_by("import lidarpose; lidarpose.load, lidarpose.predict, lidarpose.Poses")
+    assert heavy <= {"numpy"}
 
 
 @pytest.mark.parametrize("name", lidarpose.__all__)

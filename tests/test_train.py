@@ -13,9 +13,9 @@ from lidarpose.cli import main
 from lidarpose.errors import InputError
 from lidarpose.model.batch import Batch, Targets
 from lidarpose.model.checkpoint import load_checkpoint
-from lidarpose.model.heads import BINS, WINDOW, Outputs, encode
+from lidarpose.model.heads import REACH, Outputs, encode
 from lidarpose.model.network import PoseNet
-from lidarpose.model.presets import preset
+from lidarpose.model.presets import BIN, preset
 from lidarpose.synth.generate import Generator
 from lidarpose.synth.scene import SCENES
 from lidarpose.train import loop
@@ -24,9 +24,11 @@ from lidarpose.train.losses import CONFIDENCE, HEATMAP, SIGMA, SPREAD, VOTE, los
 from lidarpose.train.optimize import COOL, WARMUP, average, optimizers, rate_factor
 from lidarpose.train.recipes import Pretrain
 
-# three chunks of four batches
-RECIPE = Pretrain(scene="paper", people=3 * 4 * 4, batch=4, workers=0, seed=5)
+# three chunks of `BATCHES` batches
+RECIPE = Pretrain(scene="paper", people=3 * BATCHES * 2, batch=2, workers=0, seed=5)
 TINY = preset("tiny")
+WINDOW = REACH["window"]
+BINS = round(2 * WINDOW / BIN)
 
 
 # --- losses
@@ -35,19 +37,21 @@ TINY = preset("tiny")
 def outputs(vote, *, heatmap=None, confidence=0.0, log_spread=0.0):
     people, joints = vote.shape[:2]
     if heatmap is None:
-        heatmap = encode(torch.zeros(people, joints, 3), SIGMA).log()
+        heatmap = encode(torch.zeros(people, joints, 3), SIGMA, BINS).log()
     return Outputs(
         vote=vote,
         heatmap=heatmap,
         part=torch.zeros(people, 4, 25),
         confidence=torch.full((people, joints), float(confidence)),
         log_spread=torch.full((people, joints), float(log_spread)),
+        visible=torch.zeros(people, joints),
         level_joints=(vote, vote),
     )
 
 
 def targets(joints):
-    return Targets(joints=joints, part=torch.tensor([[1, 2, 0, -1]] * len(joints)))
+    known = torch.ones(joints.shape[:2], dtype=torch.bool)
+    return Targets(joints=joints, known=known, visible=known, part=torch.tensor([[1, 2, 0, -1]] * len(joints)))
 
 
 def truth(people=3):
@@ -77,14 +81,14 @@ def test_the_heatmap_is_learned_about_the_vote_and_only_within_reach():
     joints = truth()
     far = joints.clone()
     far[0] += WINDOW + 0.1
-    heatmap = encode(torch.zeros(3, 26, 3), SIGMA).log().requires_grad_()
+    heatmap = encode(torch.zeros(3, 26, 3), SIGMA, BINS).log().requires_grad_()
     losses(outputs(far, heatmap=heatmap), targets(joints))["heatmap"].backward()
     # the right heatmap is the optimum, and one out of reach is not pulled at all
     assert heatmap.grad.abs().max() < 1e-6
     wrong = torch.zeros(3, 26, 3, BINS, requires_grad=True)
     losses(outputs(far, heatmap=wrong), targets(joints))["heatmap"].backward()
     assert wrong.grad[0].abs().max() == 0 and wrong.grad[1:].abs().min() > 0
-    entropy = -(encode(torch.tensor(0.0), SIGMA) * encode(torch.tensor(0.0), SIGMA).log()).sum()
+    entropy = -(encode(torch.tensor(0.0), SIGMA, BINS) * encode(torch.tensor(0.0), SIGMA, BINS).log()).sum()
     best = losses(outputs(joints), targets(joints))["heatmap"]
     assert best.item() == pytest.approx(HEATMAP * entropy.item(), rel=1e-4)
 
@@ -135,6 +139,34 @@ def test_padding_has_no_part():
     assert a == b
 
 
+def test_joints_whose_truth_is_unknown_teach_nothing():
+    joints, made, _ = spoiled()
+    aims = targets(joints)
+    known = aims.known.clone()
+    known[:, 5] = False
+    known[3] = False
+    lost = joints.clone()
+    lost[~known] = float("nan")
+    told = losses(made, replace(aims, known=known))
+    blind = losses(made, replace(aims, joints=lost, known=known))
+    for name, value in told.items():
+        assert value == blind[name] and torch.isfinite(value), name
+    assert told["vote"] != losses(made, aims)["vote"]
+    nobody = losses(made, replace(aims, known=known & False))
+    assert nobody["vote"] == nobody["joints"] == nobody["heatmap"] == 0
+    vote = made.vote.clone().requires_grad_()
+    total(losses(replace(made, vote=vote), replace(aims, joints=lost, known=known))).backward()
+    assert torch.isfinite(vote.grad).all() and not vote.grad[~known].any() and vote.grad[known].any()
+
+
+def test_visibility_is_learned():
+    aims = targets(truth())
+    aims = replace(aims, visible=aims.visible & (torch.arange(26) % 2 == 0))
+    visible = torch.zeros(3, 26, requires_grad=True)
+    losses(replace(outputs(truth()), visible=visible), aims)["visible"].backward()
+    assert (visible.grad[:, ::2] < 0).all() and (visible.grad[:, 1::2] > 0).all()
+
+
 # --- schedule and optimizers
 
 
@@ -156,8 +188,8 @@ def test_every_weight_is_learned_once():
     assert sorted(grouped) == sorted(id(p) for p in network.parameters())
     hidden = {id(p) for group in made[1].param_groups for p in group["params"]}
     names = {name for name, value in network.named_parameters() if id(value) in hidden}
-    assert "bottleneck.0.attention.query.weight" in names
-    assert not any(name.startswith(("anchors", "part", "vote.offset", "joint.heatmap")) for name in names)
+    assert "bottleneck.blocks.0.attention.query.weight" in names
+    assert not any(name.startswith(("anchors", "part", "stem.voxel", "joint.heatmap")) for name in names)
     assert all(dict(network.named_parameters())[name].ndim == 2 for name in names)
     assert len(optimizers(network, replace(RECIPE, muon_rate=0.0))) == 1
 
@@ -205,7 +237,7 @@ def test_difficulty_rises_over_the_first_share_of_the_run(monkeypatch):
         return original(self, seed, index, hard=hard)
 
     monkeypatch.setattr(Generator, "person", person)
-    chunks(replace(RECIPE, easy=0.5, batch=8, people=96))
+    chunks(replace(RECIPE, easy=0.5, batch=4, people=96))
     index, hard = np.array(asked).T
     np.testing.assert_array_equal(index, np.arange(96))
     ceiling = np.minimum(index / 48, 1)
@@ -303,7 +335,7 @@ def test_an_unbroken_run(unbroken):
     "name, call, saved",
     [
         ("_step", 2, 0),  # before the first chunk is done: nothing saved yet
-        ("_step", 4 + 2, 1),  # within the second chunk
+        ("_step", BATCHES + 2, 1),  # within the second chunk
         ("save_state", 1, 1),  # the second chunk is in the log but not in the state
         ("_save_model", 1, 1),
         ("save_state", 2, 2),
@@ -319,7 +351,7 @@ def test_a_killed_run_goes_on_to_the_same_end(monkeypatch, tmp_path, unbroken, n
 
 def test_half_a_line_in_the_log_is_no_obstacle(monkeypatch, tmp_path, unbroken):
     folder = tmp_path / "run"
-    broken(monkeypatch, folder, "_step", 4)
+    broken(monkeypatch, folder, "_step", BATCHES)
     with open(folder / loop.LOG, "a") as log:
         log.write('{"people": 32, "sec')
     loop.pretrain(RECIPE, folder, resume=True)
@@ -343,7 +375,7 @@ def test_a_run_keeps_its_recipe(unbroken, change):
 
 def test_a_run_may_become_longer(monkeypatch, tmp_path):
     folder = tmp_path / "run"
-    broken(monkeypatch, folder, "_step", 4)
+    broken(monkeypatch, folder, "_step", BATCHES)
     loop.pretrain(replace(RECIPE, people=32, workers=1), folder, resume=True)
     assert [line["people"] for line in log_of(folder)] == [16, 32]
 
@@ -393,7 +425,7 @@ def test_the_state_of_another_network_is_refused(tmp_path, unbroken):
     (folder / loop.STATE).write_bytes((folder / loop.MODEL).read_bytes())
     with pytest.raises(InputError, match="damaged"):
         loop.pretrain(RECIPE, folder, resume=True)
-    other = replace(TINY, channels=32)
+    other = replace(TINY, channels=(32, 32, 32))
     network = PoseNet(other)
     mean = dict(network.named_parameters())
     loop.save_state(folder / loop.STATE, network, mean, optimizers(network, RECIPE), {"chunk": 1, "seconds": 0.0})
@@ -408,7 +440,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_last_good_state(m
     def poisoned(*args):
         calls[0] += 1
         terms = losses(*args)
-        return terms | {"vote": terms["vote"] * float("nan")} if calls[0] > 5 else terms
+        return terms | {"vote": terms["vote"] * float("nan")} if calls[0] > BATCHES + 1 else terms
 
     with monkeypatch.context() as patch:
         patch.setattr(loop, "losses", poisoned)

@@ -1,4 +1,4 @@
-"""Makes a run's model a bundled checkpoint: float16, its card completed with what it scores.
+"""Makes a run's model a bundled checkpoint: float16, its card completed with what it scores; and its ONNX twin beside.
 
 python benchmarks/heldout.py --motion cmu_motion.npz --weights RUN/model.safetensors --json scores.json
 python tools/ship_weights.py RUN/model.safetensors scores.json src/lidarpose/model/weights/tiny.safetensors
@@ -6,8 +6,12 @@ python tools/ship_weights.py RUN/model.safetensors scores.json src/lidarpose/mod
 
 import argparse
 import json
+import tempfile
+from pathlib import Path
 
+from lidarpose.data.files import write_atomic
 from lidarpose.model.checkpoint import load_checkpoint, save_checkpoint
+from lidarpose.model.export import export
 
 
 def main() -> None:
@@ -27,7 +31,14 @@ def main() -> None:
             told[f"{condition}, {group}"] = f"MPJPE {figures['mpjpe']} mm of {figures['people']} people"
     told["measured on"] = f"benchmarks/heldout.py, subjects {scores['subjects']}, seed {scores['seed']}, human15"
     note = {"note": options.note} if options.note else {}
-    save_checkpoint(options.out, network, card=header.card | note | {"scores": told}, half=True)
+    out = Path(options.out)
+    # both or none: twins of different weights would not load
+    with tempfile.TemporaryDirectory() as folder:
+        made = Path(folder) / out.name
+        save_checkpoint(made, network, card=header.card | note | {"scores": told}, half=True)
+        export(made, made.with_suffix(".onnx"))
+        for path in (out, out.with_suffix(".onnx")):
+            write_atomic(path, (made.parent / path.name).read_bytes())
 
 
 if __name__ == "__main__":

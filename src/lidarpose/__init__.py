@@ -4,18 +4,21 @@
     pose = lidarpose.load().predict(points)                       # one person, (n, 3) metres, z up
     people = lidarpose.predict("sweep.pcd", boxes="boxes.json")   # everybody in a sweep
 
-Names are loaded when first used: importing the package costs no torch and no numba.
+Names are loaded when first used: importing the package costs no torch and no numba, and predicting needs neither.
 """
 
 from importlib import import_module
 
 from lidarpose._version import __version__
+from lidarpose.errors import missing_extra
 
 # public name -> where it lives
 _HOMES = {
     "load": "lidarpose.infer.predictor",
     "Predictor": "lidarpose.infer.predictor",
     "predict": "lidarpose.infer.files",
+    "export": "lidarpose.model.export",
+    "import_dapt": "lidarpose.model.dapt.released",
     "PersonPose": "lidarpose.infer.results",
     "Poses": "lidarpose.infer.results",
     "cast_rays": "lidarpose.lidar.raycast",
@@ -38,7 +41,10 @@ __all__ = ["__version__", *_HOMES]
 
 def __getattr__(name: str):
     if name in _HOMES:
-        return getattr(import_module(_HOMES[name]), name)
+        try:
+            return getattr(import_module(_HOMES[name]), name)
+        except ModuleNotFoundError as error:
+            raise missing_extra(error, f"lidarpose.{name}", "export" if name == "export" else None) from None
     raise AttributeError(f"module 'lidarpose' has no attribute {name!r}")
 
 

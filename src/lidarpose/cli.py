@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from lidarpose._version import __version__
-from lidarpose.errors import LidarPoseError
+from lidarpose.errors import LidarPoseError, missing_extra
 
 # options whose value may start with a minus sign, which argparse would take for another option
 _SIGNED = ("--sensor-origin",)
@@ -27,13 +27,23 @@ def main(arguments: list[str] | None = None) -> int:
     except BrokenPipeError:
         # whoever read our output has enough; keep python from complaining at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except ModuleNotFoundError as error:
+        extra = "export" if options.command == "export" else None
+        told = missing_extra(error, f"`lidarpose {options.command}`", extra)
+        if not isinstance(told, LidarPoseError):
+            raise
+        return _failed(told)
     except (LidarPoseError, OSError) as error:
-        print(f"lidarpose: error: {error}", file=sys.stderr)
-        return 2
+        return _failed(error)
     except KeyboardInterrupt:
         print("lidarpose: stopped", file=sys.stderr)
         return 130
     return 0
+
+
+def _failed(error: Exception) -> int:
+    print(f"lidarpose: error: {error}", file=sys.stderr)
+    return 2
 
 
 class _Parser(argparse.ArgumentParser):
@@ -56,7 +66,7 @@ def _joined(arguments: list[str]) -> list[str]:
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="lidarpose", description="3D human pose from LiDAR.")
     parser.add_argument("--version", action="version", version=f"lidarpose {__version__}")
-    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    commands = parser.add_subparsers(title="commands", dest="command", required=True, metavar="COMMAND")
 
     predict = commands.add_parser(
         "predict",
@@ -70,12 +80,25 @@ def _parser() -> argparse.ArgumentParser:
     predict.add_argument(
         "--sensor-origin", metavar="X,Y,Z", help="where the sensor stood, or unknown (with boxes: 0,0,0; crop: unknown)"
     )
-    predict.add_argument("--skeleton", default="smpl24", metavar="NAME", help="smpl24 (default), human15, waymo14")
+    predict.add_argument(
+        "--skeleton", metavar="NAME", help="smpl24, human15, waymo14 or body26 (default smpl24, or the network's own)"
+    )
     predict.add_argument("--up", default="z", metavar="AXIS", help="the file's up axis: z (default), y or x")
     predict.add_argument("--columns", type=int, metavar="N", help="values a row of a .bin: 4 KITTI, 5 nuScenes")
     predict.add_argument("--out", default=".", metavar="DIR", help="folder for the results; - prints the JSON")
     predict.add_argument("--picture", action="store_true", help="also draw STEM.poses.png")
-    predict.add_argument("--weights", default="tiny", metavar="NAME|FILE", help="bundled weights or a checkpoint")
+    predict.add_argument(
+        "--weights", default="tiny", metavar="NAME|FILE", help="bundled weights, a checkpoint or an exported .onnx"
+    )
+    predict.add_argument(
+        "--backend",
+        metavar="NAME",
+        help="onnx or torch (default onnx for bundled weights and .onnx, torch for .safetensors and other devices)",
+    )
+    predict.add_argument("--device", default="cpu", metavar="NAME", help="cpu (default), or cuda with torch")
+    predict.add_argument(
+        "--decode", default="window", metavar="NAME", help="how heatmaps are read: window (default), argmax or dark"
+    )
 
     demo = commands.add_parser(
         "demo", help="people seen by three LiDARs, true and predicted", description="Writes a report to turn in 3D."
@@ -109,6 +132,27 @@ def _parser() -> argparse.ArgumentParser:
     several.add_argument("--clips", action="store_true", help="clips of 16 frames at 10 Hz instead of single people")
     several.add_argument("--scenes", action="store_true", help="whole streets of several walking people")
 
+    prepare = commands.add_parser(
+        "prepare",
+        help="write a real dataset's people as Parquet shards",
+        description="Reads the raw files of a public dataset and writes OUT/dataset.json and Parquet shards. Stopped or "
+        "killed, the same command goes on.",
+    )
+    prepare.set_defaults(run=_prepare)
+    prepare.add_argument(
+        "dataset", metavar="NAME", help="humanm3, lidarhuman26m, sloper4d, waymo, lipd, freemotion or noisemotion"
+    )
+    prepare.add_argument("root", metavar="RAW", help="the folder of its raw files")
+    prepare.add_argument("out", metavar="OUT", help="a new folder, or that of a run that was stopped")
+    prepare.add_argument("--split", metavar="NAME", help="only people of train, val or test")
+    prepare.add_argument(
+        "--split-by", metavar="NAME", help="a published split (default: RAW/train.txt and test.txt, else the usual one)"
+    )
+    prepare.add_argument(
+        "--smpl", metavar="FILE|DIR", help="your SMPL model, for lidarhuman26m, sloper4d, freemotion, noisemotion"
+    )
+    prepare.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1)")
+
     sensors = commands.add_parser("sensors", help="the simulated sensors", description="Lists the sensors by name.")
     sensors.set_defaults(run=_sensors)
 
@@ -124,6 +168,29 @@ def _parser() -> argparse.ArgumentParser:
     info = commands.add_parser("info", help="versions, device, bundled weights and what they score")
     info.set_defaults(run=_info)
 
+    export = commands.add_parser(
+        "export",
+        help="weights as ONNX or as a torch.export program",
+        description="Writes a checkpoint as one file of another format, for any number of people and points.",
+    )
+    export.set_defaults(run=_export)
+    export.add_argument("weights", nargs="?", default="tiny", metavar="NAME|FILE", help="default tiny")
+    export.add_argument("--format", default="onnx", metavar="NAME", help="onnx (default) or torch (a .pt2 program)")
+    export.add_argument("--out", metavar="FILE", help="default STEM.onnx or STEM.pt2, in the current folder")
+
+    take = commands.add_parser(
+        "import",
+        help="released DAPT weights as a checkpoint",
+        description="Writes the weights that DAPT's authors released, as safetensors, as a checkpoint that predict "
+        "takes.",
+    )
+    take.set_defaults(run=_import)
+    take.add_argument("file", help="their .safetensors")
+    take.add_argument("out", metavar="OUT", help="the checkpoint to write (.safetensors)")
+    take.add_argument(
+        "--config", metavar="NAME", help="waymo, humanm3, lidarhuman26m, sloper4d or pretrain (default: as FILE says)"
+    )
+
     pretrain = commands.add_parser(
         "pretrain",
         help="train a network on synthesized people",
@@ -132,9 +199,10 @@ def _parser() -> argparse.ArgumentParser:
     pretrain.set_defaults(run=_pretrain)
     pretrain.add_argument("folder", metavar="RUN", help="a new folder; with --resume that of a run that was stopped")
     pretrain.add_argument("--resume", action="store_true", help="go on with a run that was stopped")
-    pretrain.add_argument("--size", metavar="NAME", help="of the network: tiny")
+    pretrain.add_argument("--size", metavar="NAME", help="of the network: tiny (default), small or base")
     pretrain.add_argument("--scene", metavar="NAME", help="wild or paper")
     pretrain.add_argument("--people", type=int, metavar="N", help="people seen in all")
+    pretrain.add_argument("--easy", type=float, metavar="SHARE", help="of the run in which difficulty rises to full")
     pretrain.add_argument("--batch", type=int, metavar="N", help="people a step")
     pretrain.add_argument("--rate", type=float, metavar="R", help="peak learning rate")
     pretrain.add_argument("--motion", metavar="FILE", help="captured motion to take poses from")
@@ -150,7 +218,9 @@ def _parser() -> argparse.ArgumentParser:
 def _predict(options: argparse.Namespace) -> None:
     from lidarpose.data.files import atomic_path
     from lidarpose.infer.files import predict
+    from lidarpose.infer.predictor import load
 
+    choices = {"backend": options.backend, "device": options.device, "decode": options.decode}
     poses = predict(
         options.file,
         boxes=options.boxes,
@@ -159,7 +229,8 @@ def _predict(options: argparse.Namespace) -> None:
         skeleton=options.skeleton,
         up=options.up,
         columns=options.columns,
-        model=options.weights,
+        # loaded once the input has proved readable
+        model=lambda: load(options.weights, **choices),
         progress=sys.stderr is not None and sys.stderr.isatty(),
     )
     file = Path(options.file)
@@ -263,11 +334,45 @@ def _info(options: argparse.Namespace) -> None:
     print("\n".join(lines()))
 
 
+def _prepare(options: argparse.Namespace) -> None:
+    from lidarpose.data.prepare import prepare
+    from lidarpose.data.summary import lines_of
+
+    summary = prepare(
+        options.dataset,
+        options.root,
+        options.out,
+        split=options.split,
+        split_by=options.split_by,
+        smpl=options.smpl,
+        workers=options.workers,
+    )
+    for line in lines_of(summary):
+        print(line, file=sys.stderr)
+
+
+def _export(options: argparse.Namespace) -> None:
+    from lidarpose.infer.predictor import weights_path
+    from lidarpose.model.export import FORMATS, export
+
+    path = weights_path(options.weights)
+    out = options.out or path.stem + FORMATS.get(options.format, "")
+    export(path, out, format=options.format)
+    print(f"{path.name} -> {out} ({Path(out).stat().st_size / 1e6:.2f} MB)", file=sys.stderr)
+
+
+def _import(options: argparse.Namespace) -> None:
+    from lidarpose.model.checkpoint import import_released
+
+    header = import_released(options.file, options.out, config=options.config)
+    print(f"{header.config.name}, joints of {header.skeleton.name} -> {options.out}", file=sys.stderr)
+
+
 def _pretrain(options: argparse.Namespace) -> None:
     from lidarpose.train.loop import pretrain
     from lidarpose.train.recipes import default
 
-    names = ("size", "scene", "people", "batch", "rate", "motion", "captured", "seed", "workers")
+    names = ("size", "scene", "people", "easy", "batch", "rate", "motion", "captured", "seed", "workers")
     changes = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     if options.subjects is not None:
         changes["subjects"] = tuple(options.subjects.split(","))

@@ -10,7 +10,6 @@ import numpy as np
 from lidarpose.data.files import atomic_path
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.infer.predictor import Predictor, load
-from lidarpose.skeleton import SMPL24
 
 SENSORS = ("vlp-32c", "os1-128", "hdl-64e")
 PEOPLE_EACH = 4
@@ -61,7 +60,7 @@ def _report(model: Predictor, people: list, files: dict[str, Path]) -> list[dict
 
     rows, panels, cards = [], [], []
     for person, pose in zip(people, poses, strict=True):
-        truth = person.sample.pose.to(SMPL24)
+        truth = person.sample.pose.to(pose.skeleton)
         error = float(np.linalg.norm(pose.joints - truth.joints, axis=-1).mean() * 1e3)
         facts = person.facts
         label = f"{facts.sensor}, {facts.distance:.1f} m"

@@ -19,6 +19,27 @@ class MissingExtra(LidarPoseError, ImportError):
         super().__init__(f"{what} needs an optional dependency: pip install 'lidarpose[{extra}]'")
 
 
+# what a base install lacks, and the extra that brings it
+_EXTRA_OF = {
+    "torch": "train",
+    "accelerate": "train",
+    "numba": "synth",
+    "threadpoolctl": "synth",
+    "pyarrow": "synth",
+    "onnx": "export",
+    "onnxscript": "export",
+}
+
+
+def missing_extra(error: ModuleNotFoundError, what: str, extra: str | None = None) -> ImportError:
+    """The error to raise for a module that was not found: `MissingExtra` where an extra brings it, else `error`.
+
+    extra: the one to name where several bring the module.
+    """
+    brings = _EXTRA_OF.get((error.name or "").partition(".")[0])
+    return error if brings is None else MissingExtra(what, extra or brings)
+
+
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> InputError:
     """The error for a name that is not in a closed list, with the nearest names first."""
     known = list(known)

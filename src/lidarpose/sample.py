@@ -11,19 +11,26 @@ import numpy as np
 from lidarpose.errors import InputError
 from lidarpose.skeleton import Skeleton
 
+# what a pose may say of each joint
+_PER_JOINT = ("confidence", "spread", "visible", "in_range")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Pose:
     """Joints in space, of one person or of many.
 
     joints (..., J, 3) m; confidence (..., J) in [0, 1], the probability that the joint is within 10 cm;
-    spread (..., J) m, the expected distance between the joint and the truth; frame names the frame of the joints.
+    spread (..., J) m, the expected distance between the joint and the truth; visible (..., J) in [0, 1], the
+    probability that the sensor sees the joint; in_range (..., J) bool, False where the joint may lie farther out than
+    it says, since it was found at the end of what the network can tell; frame names the frame of the joints.
     """
 
     joints: np.ndarray
     skeleton: Skeleton
     confidence: np.ndarray | None = None
     spread: np.ndarray | None = None
+    visible: np.ndarray | None = None
+    in_range: np.ndarray | None = None
     frame: str = "input"
 
     def __post_init__(self):
@@ -32,21 +39,19 @@ class Pose:
             raise InputError(
                 f"Pose.joints of {self.skeleton.name} must be (..., {count}, 3), got {tuple(self.joints.shape)}"
             )
-        for name in ("confidence", "spread"):
+        for name in _PER_JOINT:
             value = getattr(self, name)
             if value is not None and value.shape != self.joints.shape[:-1]:
                 raise InputError(f"Pose.{name} must be {self.joints.shape[:-1]}, one a joint, got {value.shape}")
+        if self.in_range is not None and self.in_range.dtype != bool:
+            raise InputError(f"Pose.in_range must be true or false for each joint, got {self.in_range.dtype}")
 
     def to(self, skeleton: Skeleton) -> "Pose":
         """The same pose with the joints of another skeleton, picked by name."""
         pick = self.skeleton.map_to(skeleton)
-        return replace(
-            self,
-            joints=self.joints[..., pick, :],
-            skeleton=skeleton,
-            confidence=None if self.confidence is None else self.confidence[..., pick],
-            spread=None if self.spread is None else self.spread[..., pick],
-        )
+        values = {name: getattr(self, name) for name in _PER_JOINT}
+        picked = {name: None if value is None else value[..., pick] for name, value in values.items()}
+        return replace(self, joints=self.joints[..., pick, :], skeleton=skeleton, **picked)
 
 
 @dataclass(frozen=True, kw_only=True)

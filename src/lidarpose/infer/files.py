@@ -2,6 +2,7 @@
 
 import os
 import time
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -27,10 +28,10 @@ def predict(
     boxes: str | os.PathLike | dict | list | None = None,
     crop: bool = False,
     sensor_origin: tuple[float, float, float] | str | None = None,
-    skeleton: str = "smpl24",
+    skeleton: str | None = None,
     up: str = "z",
     columns: int | None = None,
-    model: Predictor | str | os.PathLike = "tiny",
+    model: Predictor | str | os.PathLike | Callable[[], Predictor] = "tiny",
     progress: bool = False,
 ) -> Poses:
     """Poses of the people in a point file, in the file's own frame.
@@ -38,8 +39,10 @@ def predict(
     boxes: a JSON file, its content (see `data.boxes`) or a list of `Box`, their length and width level, their height
     and yaw along and about the up axis; crop: the file is one person already. With neither, a file of less than 4 m
     across is taken as a crop and anything else asks for boxes. sensor_origin: (x, y, z) m in the file's frame, or
-    "unknown"; None means 0, 0, 0 with boxes and unknown for a crop. up: the file's up axis; columns: values a row of a
-    .bin; model: a predictor, or what `load` takes. Raises InputError, one line that says what to do.
+    "unknown"; None means 0, 0, 0 with boxes and unknown for a crop. skeleton: a name, or None for smpl24, or for the
+    network's own where it has other joints. up: the file's up axis; columns: values a row of a .bin; model: a
+    predictor, what `load` takes, or a function that gives the predictor when it is needed. Raises InputError, one line
+    that says what to do.
     """
     if boxes is not None and crop:
         raise InputError("expected boxes or a crop, got both: a crop is one person already, so leave the boxes away")
@@ -62,7 +65,7 @@ def predict(
         warnings.append(warning)
         origin = None
     # loaded once the input has proved readable
-    predictor = model if isinstance(model, Predictor) else load(model)
+    predictor = model if isinstance(model, Predictor) else model() if callable(model) else load(model)
     loaded = time.perf_counter()
     raw = predictor.predict(
         clouds, sensor_origin=None if origin is None else R_house_input @ origin, skeleton=skeleton, progress=progress

@@ -1,33 +1,51 @@
 """What is installed: `lidarpose info`."""
 
 import platform
-
-import torch
+from importlib import metadata
+from importlib.util import find_spec
 
 from lidarpose._version import __version__
 from lidarpose.infer.predictor import BUNDLED, bundled_path
-from lidarpose.model.checkpoint import load_checkpoint
+from lidarpose.model.header import parameter_count, read_header
+from lidarpose.model.onnx_file import usable_threads
 
 
 def lines() -> list[str]:
-    """Version, torch, device, and of each bundled checkpoint its size, parameters, training and score."""
-    device = torch.cuda.get_device_name() if torch.cuda.is_available() else f"cpu, {torch.get_num_threads()} threads"
+    """Versions, backends, device, and of each bundled checkpoint its size, parameters, training and score."""
+    import onnxruntime
+
     out = [
         f"lidarpose  {__version__}",
         f"python     {platform.python_version()}",
-        f"torch      {torch.__version__}",
-        f"device     {device}",
+        f"onnx       ONNX Runtime {onnxruntime.__version__}, cpu, {usable_threads()} threads: the default backend",
+        _torch_line(),
     ]
     for name in BUNDLED:
         path = bundled_path(name)
-        network, header = load_checkpoint(path)
-        parameters = sum(value.numel() for value in network.parameters())
+        header = read_header(path)
         card = header.card
+        exported = bundled_path(name, ".onnx").stat().st_size / 1e6
         out += [
-            f"weights    {name}: {path.stat().st_size / 1e6:.2f} MB, {parameters:,} parameters",
+            f"weights    {name}: {path.stat().st_size / 1e6:.2f} MB, {parameter_count(path):,} parameters, "
+            f"as ONNX {exported:.2f} MB",
             f"  trained  {card.get('command', 'unknown')}",
             f"           {card.get('people_seen', 0):,} people, {card.get('hours', 0)} hours",
         ]
         out += [f"           {card['note']}"] if "note" in card else []
         out += [f"  score    {key}: {value}" for key, value in card.get("scores", {}).items()]
     return out
+
+
+def _torch_line() -> str:
+    if find_spec("torch") is None:
+        return "torch      not installed, which training and --device need: pip install 'lidarpose[train]'"
+    try:
+        # found is not yet usable: libraries of it may be missing
+        import torch
+
+        device = (
+            torch.cuda.get_device_name() if torch.cuda.is_available() else f"cpu, {torch.get_num_threads()} threads"
+        )
+    except (ImportError, OSError, RuntimeError) as error:
+        return f"torch      {metadata.version('torch')}, which cannot be used ({' '.join(str(error).split())[:120]})"
+    return f"torch      {torch.__version__}, device {device}"

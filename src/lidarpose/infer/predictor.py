@@ -6,78 +6,136 @@ from importlib import resources
 from pathlib import Path
 
 import numpy as np
-import torch
-from tqdm import tqdm
 
-from lidarpose.errors import InputError, unknown_name
+from lidarpose.data.files import file_error
+from lidarpose.errors import InputError, missing_extra, unknown_name
+from lidarpose.infer.backend import Backend, Estimates, OnnxBackend, estimates, exported_beside
 from lidarpose.infer.people import MIN_POINTS, as_origin, as_points, candidates, clean, unit_warning
 from lidarpose.infer.results import PersonPose, Poses
-from lidarpose.model.batch import Batch
-from lidarpose.model.checkpoint import Header, load_checkpoint
-from lidarpose.model.network import PoseNet
-from lidarpose.model.plan import WINDOW, plan, view_features
+from lidarpose.model.decode import decoder
+from lidarpose.model.header import read_header
+from lidarpose.model.plan import WINDOW, view_features
 from lidarpose.sample import Pose, center_of
+from lidarpose.skeleton import SMPL24, Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
 
 BUNDLED = ("tiny",)
-# people a forward pass
-_BATCH = 64
+BACKENDS = ("onnx", "torch")
 # passes: the second is centered on the pelvis that the first one found
 PASSES = 2
+# to which a found center is rounded, m: backends differ by less than a micrometre, and a point on the border of a voxel
+# must not fall on another side for that
+_CENTER_STEP = 0.01
+# joints named by a warning
+_MOST_NAMED = 3
 
 
-def bundled_path(name: str = "tiny") -> Path:
-    """Where the package keeps a bundled checkpoint."""
+def bundled_path(name: str = "tiny", suffix: str = ".safetensors") -> Path:
+    """Where the package keeps a bundled checkpoint, or with the suffix .onnx its exported twin."""
     if name not in BUNDLED:
         raise unknown_name("bundled weights", name, BUNDLED)
-    return Path(str(resources.files("lidarpose.model") / "weights" / f"{name}.safetensors"))
+    return Path(str(resources.files("lidarpose.model") / "weights" / f"{name}{suffix}"))
 
 
-def load(weights: str | os.PathLike = "tiny", *, device: str = "cpu") -> "Predictor":
-    """The bundled network, or the checkpoint at a path, ready to predict.
-
-    Raises InputError for an unknown name, a file that is no checkpoint, or a device that is not there.
-    """
+def weights_path(weights: str | os.PathLike) -> Path:
+    """The file that a name of bundled weights or a path means. Raises InputError for an unknown name."""
     name = os.fspath(weights)
-    is_path = not isinstance(weights, str) or "/" in name or name.endswith(".safetensors") or os.path.isfile(name)
-    path = weights if is_path and name not in BUNDLED else bundled_path(name)
-    network, header = load_checkpoint(path)
+    is_path = not isinstance(weights, str) or "/" in name or name.endswith((".safetensors", ".onnx"))
+    is_path = name not in BUNDLED and (is_path or os.path.isfile(name))
+    return Path(name) if is_path else bundled_path(name)
+
+
+def load(
+    weights: str | os.PathLike = "tiny",
+    *,
+    device: str = "cpu",
+    backend: str | None = None,
+    decode: str = "window",
+    compile: bool = False,
+    threads: int | None = None,
+) -> "Predictor":
+    """The bundled network, or the checkpoint or exported file at a path, ready to predict.
+
+    backend: "onnx" (ONNX Runtime, on the CPU) or "torch"; None takes onnx for bundled weights and .onnx files, torch
+    for other paths and devices. decode: how heatmaps are read, "window" (the mean about the mode), "argmax" or "dark"
+    (the released DAPT code's); where two peaks are equally high, rounding decides. compile: by `torch.compile`, backend
+    torch only. threads: of ONNX Runtime, None for all processors. Raises InputError for an unknown name, a file that is
+    no checkpoint, or a device that is not there; MissingExtra where torch is needed and not installed.
+    """
+    decoder(decode)
+    if backend is not None and backend not in BACKENDS:
+        raise unknown_name("backend", backend, BACKENDS)
+    path = weights_path(weights)
+    bundled = os.fspath(weights) in BUNDLED
+    exported = path.suffix.lower() == ".onnx"
+    if backend is None:
+        elsewhere = device != "cpu" or compile
+        backend = "onnx" if exported or bundled and not elsewhere else "torch"
+    if backend == "torch":
+        if exported:
+            raise file_error(path, "torch runs a .safetensors file, not .onnx: name the one that it was made from")
+        chosen = _torch_backend(path, device, compile)
+    else:
+        if device != "cpu" or compile:
+            asked = "torch.compile" if compile else f"device {device!r}"
+            raise InputError(f"{asked} needs the backend torch and a .safetensors file, got the backend onnx")
+        if bundled:
+            path = path.with_suffix(".onnx")
+        chosen = OnnxBackend(path, threads=threads) if bundled or exported else exported_beside(path, threads=threads)
+    return Predictor(chosen, name=path.stem, decode=decode)
+
+
+def _torch_backend(path: Path, device: str, compile: bool) -> Backend:
+    # what is wrong with the file is told even where torch is not installed, and at once
+    read_header(path)
     try:
-        return Predictor(network, header, name=Path(name).stem, device=device)
-    except (RuntimeError, AssertionError) as error:
-        # torch raises either for an unknown or a missing device
-        reason = str(error).partition("\n")[0]
-        raise InputError(
-            f"device {device!r} cannot be used ({reason}); expected cpu, or cuda where torch has it"
-        ) from None
+        from lidarpose.infer.backend_torch import torch_backend
+    except ModuleNotFoundError as error:
+        raise missing_extra(error, f"running {path.name} with torch") from None
+    return torch_backend(path, device=device, compile=compile)
 
 
 class Predictor:
-    """A network ready to use. `predict` is kind; `outputs` is raw."""
+    """A network ready to use. `predict` is kind; `outputs` is raw. model: what results tell of it."""
 
-    def __init__(self, network: PoseNet, header: Header, *, name: str, device: str = "cpu"):
-        self.network = network.to(device).eval()
-        self.header = header
-        self.device = device
-        self.model = {"name": name, "version": header.version}
+    def __init__(self, backend: Backend, *, name: str, decode: str = "window"):
+        self.backend = backend
+        self.header = backend.header
+        self.skeleton = backend.header.skeleton
+        self.model = {"name": name, "version": self.header.version, "backend": backend.name, "decode": decode}
+        self._decoder = decoder(decode)
+        # the middle of a person: the pelvis, or half way between the hips where the skeleton has none
+        root = ("pelvis",) if "pelvis" in self.skeleton.joints else ("left_hip", "right_hip")
+        self._root = [self.skeleton.index(joint) for joint in root]
+
+    def in_skeleton(self, name: str | None) -> Skeleton:
+        """A skeleton by name; None is smpl24 where the network has its joints, else the network's own.
+
+        Raises InputError for an unknown name, or one of a joint that the network lacks.
+        """
+        own = self.skeleton
+        if name is None:
+            return SMPL24 if set(SMPL24.joints) <= set(own.joints) else own
+        wanted = skeleton_of(name)
+        own.map_to(wanted)
+        return wanted
 
     def predict(
         self,
         points,
         *,
         sensor_origin: np.ndarray | tuple[float, float, float] | str | None = None,
-        skeleton: str = "smpl24",
+        skeleton: str | None = None,
         progress: bool = False,
     ) -> PersonPose | Poses:
         """One cloud (n, 3+) -> `PersonPose`; a list of clouds -> `Poses`, in their order.
 
         points: x, y, z in metres, z up, any frame, each cloud one person, ground and clutter allowed; more columns are
-        ignored. sensor_origin (3,) m: where the sensor stood in that frame, None or "unknown" if that is not known. A
-        cloud of under 5 points gets a result without joints and a warning. Raises InputError for arrays of another
-        shape or type.
+        ignored. sensor_origin (3,) m: where the sensor stood in that frame, None or "unknown" if that is not known.
+        skeleton: see `in_skeleton`. A cloud of under 5 points gets a result without joints and a warning. Raises
+        InputError for arrays of another shape or type.
         """
-        wanted = skeleton_of(skeleton)
-        self.network.skeleton.map_to(wanted)
+        wanted = self.in_skeleton(skeleton)
         origin = as_origin(sensor_origin)
         if not _is_many(points):
             return self._people([as_points(points)], origin, wanted, False)[0]
@@ -102,15 +160,17 @@ class Predictor:
             clouds += found
             owner += [i] * len(found)
         best: dict[int, Pose] = {}
-        starts = range(0, len(clouds), _BATCH)
-        for start in tqdm(starts, unit=" batches", delay=1, disable=not progress, leave=False):
-            part = slice(start, start + _BATCH)
+        batch = self.backend.batch
+        for start in _shown(range(0, len(clouds), batch), progress):
+            part = slice(start, start + batch)
             for i, pose in zip(owner[part], self._poses(clouds[part], origin), strict=True):
-                if pose is not None and (i not in best or pose.confidence.mean() > best[i].confidence.mean()):
+                if pose is not None and (i not in best or _surer(pose, best[i])):
                     best[i] = pose
         for i in sorted(set(owner)):
             if i in best:
                 results[i] = replace(results[i], pose=best[i].to(wanted))
+                if names := results[i].out_of_range:
+                    results[i] = _warned(results[i], _range_warning(names))
             else:
                 note = f"no pose: under {MIN_POINTS} points within {WINDOW:.0f} m of the person's middle"
                 results[i] = _warned(results[i], note)
@@ -119,41 +179,49 @@ class Predictor:
     def _poses(self, clouds: list[np.ndarray], origin: np.ndarray | None) -> list[Pose | None]:
         """The pose of each cloud (n, 3) m, None where too little of it is near its middle."""
         centers = np.stack([center_of(points) for points in clouds])
-        pelvis = self.network.skeleton.index("pelvis")
         for last in range(PASSES):
-            joints, confidence, spread = self.outputs(clouds, centers, origin)
+            found = self.outputs(clouds, centers, origin)
             if last < PASSES - 1:
-                centers = centers + np.clip(joints[:, pelvis], -WINDOW / 2, WINDOW / 2)
+                root = np.clip(found.joints[:, self._root].mean(1), -WINDOW / 2, WINDOW / 2)
+                # an answer that is no number stays one
+                centers = centers + np.round(root / _CENTER_STEP) * _CENTER_STEP
         poses = []
         for k, points in enumerate(clouds):
             near = (np.abs(points - centers[k]) < WINDOW).all(1).sum()
-            pose = Pose(
-                joints=joints[k] + centers[k],
-                skeleton=self.network.skeleton,
-                confidence=confidence[k],
-                spread=spread[k],
-            )
-            poses.append(pose if near >= MIN_POINTS and np.isfinite(joints[k]).all() else None)
+            if near < MIN_POINTS or not np.isfinite(found.joints[k]).all():
+                poses.append(None)
+                continue
+            values = {name: getattr(found, name) for name in ("confidence", "spread", "visible", "in_range")}
+            told = {name: None if value is None else value[k] for name, value in values.items()}
+            poses.append(Pose(joints=found.joints[k] + centers[k], skeleton=self.skeleton, **told))
         return poses
 
-    @torch.inference_mode()
-    def outputs(
-        self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Joints (B, J, 3) m about centers (B, 3), confidence (B, J) and spread (B, J) m of clouds (n, 3) m."""
-        tables = plan(
-            np.concatenate([points - center for points, center in zip(clouds, centers, strict=True)]),
-            np.array([len(points) for points in clouds]),
-            grid=self.network.config.grid,
-            max_voxels=self.network.config.max_voxels,
-            view=np.stack([view_features(center, origin) for center in centers]),
-        )
-        out = self.network(Batch.from_plan(tables, self.device))
-        return (
-            out.joints().cpu().numpy().astype(float),
-            out.confidence.sigmoid().cpu().numpy().astype(float),
-            out.log_spread.exp().cpu().numpy().astype(float),
-        )
+    def outputs(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Estimates:
+        """What the network says of clouds (n, 3) m seen about centers (B, 3), from a sensor at origin (3,) or None."""
+        view = np.stack([view_features(center, origin) for center in centers])
+        about = [points - center for points, center in zip(clouds, centers, strict=True)]
+        return estimates(self.backend.run(about, view), self._decoder)
+
+
+def _shown(starts: range, progress: bool):
+    """The same with a progress bar, if it takes longer than a second."""
+    if not progress:
+        return starts
+    from tqdm import tqdm
+
+    return tqdm(starts, unit=" batches", delay=1, leave=False)
+
+
+def _surer(pose: Pose, best: Pose) -> bool:
+    """A network that does not tell its confidence has its first answer, that of the whole cloud, taken."""
+    return pose.confidence is not None and pose.confidence.mean() > best.confidence.mean()
+
+
+def _range_warning(names: list[str]) -> str:
+    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+    return (
+        f"at the end of the heatmap's range, so perhaps farther out than given: {', '.join(names[:_MOST_NAMED])}{more}"
+    )
 
 
 def _is_many(points) -> bool:

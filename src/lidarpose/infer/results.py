@@ -47,6 +47,23 @@ class PersonPose:
         return None if self.pose is None else self.pose.spread
 
     @property
+    def visible(self) -> np.ndarray | None:
+        """(J,): probability that the sensor sees the joint; None where the network does not say."""
+        return None if self.pose is None else self.pose.visible
+
+    @property
+    def in_range(self) -> np.ndarray | None:
+        """(J,) bool: False where the joint may lie farther out than it says; None where the network does not say."""
+        return None if self.pose is None else self.pose.in_range
+
+    @property
+    def out_of_range(self) -> list[str]:
+        """Names of the joints that are not `in_range`."""
+        if self.in_range is None:
+            return []
+        return [name for name, inside in zip(self.skeleton.joints, self.in_range, strict=True) if not inside]
+
+    @property
     def num_points(self) -> int:
         return len(self.points)
 
@@ -59,9 +76,11 @@ class PersonPose:
             if box is None
             else {"center": box.center.tolist(), "size": box.size.tolist(), "yaw": float(box.yaw)},
             "num_points": self.num_points,
-            "joints": None if self.pose is None else _rounded(self.pose.joints, 4),
-            "confidence": [] if self.pose is None else _rounded(self.pose.confidence, 3),
-            "spread": [] if self.pose is None else _rounded(self.pose.spread, 4),
+            "joints": None if self.pose is None else _rounded(self.joints, 4),
+            "confidence": _rounded(self.confidence, 3),
+            "spread": _rounded(self.spread, 4),
+            "visible": _rounded(self.visible, 3),
+            "out_of_range": self.out_of_range,
             "warnings": list(self.warnings),
         }
 
@@ -160,5 +179,6 @@ def _upright(person: PersonPose, up: str) -> PersonPose:
     )
 
 
-def _rounded(values: np.ndarray, digits: int) -> list:
-    return np.round(np.asarray(values, float), digits).tolist()
+def _rounded(values: np.ndarray | None, digits: int) -> list:
+    """Nothing for what is not known."""
+    return [] if values is None else np.round(np.asarray(values, float), digits).tolist()

@@ -10,12 +10,14 @@ from lidarpose.model.plan import Plan
 
 @dataclass(frozen=True, kw_only=True)
 class LevelTensors:
-    """One level of `plan.Level` as tensors: position (B, N, 3), log_count (B, N), valid (B, N), parent (B, N)."""
+    """One level of `plan.Level` as tensors: position (B, N, 3), log_count (B, N), valid (B, N), parent (B, N), and
+    neighbours (B, N, 27) where the network convolves."""
 
     position: torch.Tensor
     log_count: torch.Tensor
     valid: torch.Tensor
     parent: torch.Tensor
+    neighbours: torch.Tensor | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +46,7 @@ class Batch:
                 log_count=tensor(f"{name}.log_count"),
                 valid=tensor(f"{name}.valid"),
                 parent=tensor(f"{name}.parent"),
+                neighbours=tensor(f"{name}.neighbours") if f"{name}.neighbours" in arrays else None,
             )
 
         return cls(
@@ -58,8 +61,20 @@ class Batch:
 
 @dataclass(frozen=True, kw_only=True)
 class Targets:
-    """What training compares with: joints (B, J, 3) m in the person's frame; part (B, F) int64, the majority part of
-    each fine voxel's points, -1 where padded or unknown."""
+    """What training compares with.
+
+    joints (B, J, 3) m in the person's frame; known (B, J) bool: false where the truth is not known, for a dataset that
+    labels some of the skeleton's joints; visible (B, J) bool: some point lies near the joint, see `feed.seen`; part
+    (B, F) int64, the majority part of each fine voxel's points, -1 where padded or unknown.
+    """
 
     joints: torch.Tensor
+    known: torch.Tensor
+    visible: torch.Tensor
     part: torch.Tensor
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, np.ndarray], device: torch.device | str = "cpu") -> "Targets":
+        return cls(
+            **{name: torch.as_tensor(arrays[name]).to(device) for name in ("joints", "known", "visible", "part")}
+        )

@@ -1,111 +1,99 @@
-"""Weights on disk: one safetensors file that describes itself.
+"""Weights on disk: one safetensors file that describes itself (see `header`).
 
-The header's entry "lidarpose" is JSON: schema, package version, the network's configuration, and "card": what it was
-trained with (command, seed, people seen) and what it scores. Loading is strict: every tensor must be there, no other.
+Loading is strict: every tensor must be there, no other, each of its shape and finite.
 """
 
-import json
-from dataclasses import dataclass, fields
+from __future__ import annotations
+
+import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_bytes
 
-from lidarpose._version import __version__
-from lidarpose.data.files import write_atomic
-from lidarpose.errors import InputError
+from lidarpose.data.files import file_error, write_atomic
+from lidarpose.model.header import ENTRY, Header, opened, parse_header
 from lidarpose.model.network import PoseNet
-from lidarpose.model.presets import NetworkConfig
 
-SCHEMA = "lidarpose.checkpoint/1"
+if TYPE_CHECKING:
+    from lidarpose.model.dapt.network import DaptNet
 
-
-@dataclass(frozen=True, kw_only=True)
-class Header:
-    """What a checkpoint says of itself. card: plain JSON values."""
-
-    version: str
-    config: NetworkConfig
-    card: dict
+_FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 
 
-def save_checkpoint(path: str | Path, network: PoseNet, *, card: dict, half: bool = False) -> None:
+def save_checkpoint(path: str | os.PathLike, network: PoseNet | DaptNet, *, card: dict, half: bool = False) -> None:
     """Writes the network's weights and its card, whole or not at all; `half` stores them as float16."""
+    header = Header(config=network.config, card=card).to_json()
     dtype = torch.float16 if half else torch.float32
-    tensors = {name: value.detach().to("cpu", dtype).contiguous() for name, value in network.state_dict().items()}
-    header = {"schema": SCHEMA, "version": __version__, "config": network.config.to_dict(), "card": card}
-    write_atomic(path, to_bytes(tensors, metadata={"lidarpose": json.dumps(header)}))
+    tensors = {
+        # counters stay whole numbers
+        name: value.detach().to("cpu", dtype if value.is_floating_point() else value.dtype).contiguous()
+        for name, value in network.state_dict().items()
+    }
+    write_atomic(path, to_bytes(tensors, metadata={ENTRY: header}))
 
 
-def read_header(path: str | Path) -> Header:
-    """The header alone. Raises InputError where the file is not a checkpoint of this package."""
-    with _opened(path) as file:
-        return _header(path, file)
-
-
-def load_checkpoint(path: str | Path) -> tuple[PoseNet, Header]:
+def load_checkpoint(path: str | os.PathLike) -> tuple[PoseNet | DaptNet, Header]:
     """The network in evaluation mode, float32 on the CPU, and its header.
 
     Raises InputError that names the file and the tensor for anything that does not fit.
     """
-    with _opened(path) as file:
-        header = _header(path, file)
-        network = PoseNet(header.config)
+    with opened(path, framework="pt") as file:
+        header = parse_header(path, (file.metadata() or {}).get(ENTRY))
+        network = build(header)
+        name = header.config.size if header.network == "pose" else header.config.name
         wanted = network.state_dict()
         stored = set(file.keys())
-        for name, value in wanted.items():
-            if name not in stored:
-                raise InputError(f"{path}: tensor {name} is missing, so it is no whole {header.config.size} network")
-            shape = tuple(file.get_slice(name).get_shape())
+        loaded = {}
+        for key, value in wanted.items():
+            if key not in stored:
+                raise file_error(path, f"tensor {key} is missing, so it is no whole {name} network: get the file again")
+            shape = tuple(file.get_slice(key).get_shape())
             if shape != tuple(value.shape):
-                raise InputError(f"{path}: tensor {name} should be {tuple(value.shape)}, got {shape}")
+                raise file_error(
+                    path,
+                    f"tensor {key} should be {tuple(value.shape)} by its configuration, got {shape}: get the file "
+                    f"again, or use the lidarpose version that wrote it ({header.version})",
+                )
+            tensor = file.get_tensor(key)
+            if value.is_floating_point() and (tensor.dtype not in _FLOATS or not tensor.isfinite().all()):
+                raise file_error(
+                    path, f"tensor {key} holds numbers that are not finite or no floats: get the file again"
+                )
+            loaded[key] = tensor.to(value.dtype)
         extra = sorted(stored - set(wanted))
         if extra:
-            raise InputError(f"{path}: unknown tensor {extra[0]}: written by another version ({header.version})?")
-        network.load_state_dict({name: file.get_tensor(name).float() for name in wanted})
+            raise file_error(
+                path,
+                f"unknown tensor {extra[0]}, which no {name} network has: use the lidarpose version that wrote it "
+                f"({header.version})",
+            )
+    network.load_state_dict(loaded)
     return network.eval(), header
 
 
-def _opened(path: str | Path):
-    path = Path(path)
-    if not path.is_file():
-        what = "is a directory" if path.is_dir() else "does not exist"
-        raise InputError(f"{path}: expected a checkpoint (.safetensors), but it {what}")
-    try:
-        return safe_open(str(path), framework="pt")
-    except (SafetensorError, OSError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(
-            f"{path}: expected a safetensors file, but it is damaged or something else ({reason})"
-        ) from None
+def build(header: Header) -> PoseNet | DaptNet:
+    """A network of the header's kind and configuration, its weights random."""
+    if header.network == "pose":
+        return PoseNet(header.config)
+    from lidarpose.model.dapt.network import DaptNet
+
+    return DaptNet(header.config)
 
 
-def _header(path: str | Path, file) -> Header:
-    raw = (file.metadata() or {}).get("lidarpose")
-    if raw is None:
-        raise InputError(
-            f"{path}: a safetensors file, but not a checkpoint of lidarpose (its header has no entry for it)"
-        )
-    try:
-        header = json.loads(raw)
-        schema = header["schema"]
-        if schema != SCHEMA:
-            raise InputError(f"{path}: expected schema {SCHEMA}, got {schema}: use the lidarpose version that wrote it")
-        known = {field.name for field in fields(NetworkConfig)}
-        extra = set(header["config"]) - known
-        if extra:
-            raise InputError(
-                f"{path}: unknown setting {sorted(extra)[0]} in its configuration: written by a newer version?"
-            )
-        config = _config(path, header["config"])
-        return Header(version=header["version"], config=config, card=header["card"])
-    except (KeyError, TypeError, json.JSONDecodeError) as error:
-        raise InputError(f"{path}: its header cannot be read ({type(error).__name__}: {error})") from None
+def import_released(source: str | os.PathLike, out: str | os.PathLike, *, config: str | None = None) -> Header:
+    """Writes the authors' weights at `source` as a checkpoint of this package; config: as `import_dapt` takes it.
 
+    Raises InputError, one line that names the file and the tensor, for all that does not fit; then nothing is written.
+    """
+    from lidarpose.model.dapt.released import import_dapt
 
-def _config(path: str | Path, entries: dict) -> NetworkConfig:
-    try:
-        return NetworkConfig(**entries)
-    except InputError as error:
-        raise InputError(f"{path}: its configuration does not fit: {error}") from None
+    network = import_dapt(source, config)
+    named = "" if config is None else f" --config {config}"
+    card = {
+        "command": f"lidarpose import {Path(source).name}{named}",
+        "note": "released DAPT weights; confidence and spread are read off its heatmaps and not calibrated",
+    }
+    save_checkpoint(out, network, card=card)
+    return Header(config=network.config, card=card)

@@ -23,13 +23,15 @@ class Level:
     """Voxels of one size, padded to the most a person has.
 
     position (B, N, 3) float32 m: mean of the points inside, in the person's frame; log_count (B, N) float32: log of the
-    number of points; valid (B, N) bool; parent (B, N) int64: index into the next coarser level (0 where padded).
+    number of points; valid (B, N) bool; parent (B, N) int64: index into the next coarser level (0 where padded);
+    neighbours (B, N, 27) int64, where asked for: rows of the 3 x 3 x 3 cells around, N where there is no voxel.
     """
 
     position: np.ndarray
     log_count: np.ndarray
     valid: np.ndarray
     parent: np.ndarray
+    neighbours: np.ndarray | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +58,8 @@ class Plan:
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, Level):
-                out |= {f"{field.name}.{f.name}": getattr(value, f.name) for f in fields(value)}
+                tables = {f"{field.name}.{f.name}": getattr(value, f.name) for f in fields(value)}
+                out |= {name: table for name, table in tables.items() if table is not None}
             else:
                 out[field.name] = value
         return out
@@ -70,12 +73,14 @@ def plan(
     max_voxels: int,
     view: np.ndarray | None = None,
     rng: np.random.Generator | None = None,
+    neighbours: bool = False,
 ) -> Plan:
     """Voxels of people whose points (M, 3) m stand one after the other, `lengths` (B,) points each, person's frame.
 
     grid: edge of a fine voxel in metres; the mid and coarse ones are 2 and 4 times as wide. A person of more than
     `max_voxels` fine voxels keeps that many: random ones with `rng`, evenly spread ones without. Every person of at
-    least one point inside the window has at least one voxel at every level; one of none has only padding.
+    least one point inside the window has at least one voxel at every level; one of none has only padding. neighbours:
+    also make the tables of the mid and coarse level that convolutions read.
     Twin: `plan_reference`. Raises InputError for a grid too fine for the voxel index.
     """
     if WINDOW / grid > 1 << (_BITS - 1):
@@ -101,7 +106,8 @@ def plan(
     mean = _segment_sum(voxel_of_point, xyz, len(voxel_key)) / count[:, None]
     square = _segment_sum(voxel_of_point, xyz**2, len(voxel_key)) / count[:, None]
     deviation = np.sqrt(np.maximum(square - mean**2, 0))
-    offset = mean / grid - np.floor(mean / grid) - 0.5
+    # from the voxel's own cell: a mean on its border may round into the next one
+    offset = mean / grid - _cells(voxel_key) - 0.5
 
     mid_key, mid_of_fine = np.unique(_parent(voxel_key), return_inverse=True)
     coarse_key, coarse_of_mid = np.unique(_parent(mid_key), return_inverse=True)
@@ -113,9 +119,19 @@ def plan(
     point_voxel[kept] = fine_slots.row[voxel_of_point]
     return Plan(
         fine=_level(fine_slots, mean, count, mid_slots.slot[mid_of_fine]),
-        mid=_level(mid_slots, mid_sum / mid_count[:, None], mid_count, coarse_slots.slot[coarse_of_mid]),
+        mid=_level(
+            mid_slots,
+            mid_sum / mid_count[:, None],
+            mid_count,
+            coarse_slots.slot[coarse_of_mid],
+            _neighbours(mid_key, mid_slots) if neighbours else None,
+        ),
         coarse=_level(
-            coarse_slots, coarse_sum / coarse_count[:, None], coarse_count, np.zeros(len(coarse_key), np.int64)
+            coarse_slots,
+            coarse_sum / coarse_count[:, None],
+            coarse_count,
+            np.zeros(len(coarse_key), np.int64),
+            _neighbours(coarse_key, coarse_slots) if neighbours else None,
         ),
         deviation=fine_slots.pad(deviation.astype(np.float32)),
         offset=fine_slots.pad(offset.astype(np.float32)),
@@ -143,19 +159,36 @@ class _Slots:
         self.slot = np.arange(len(person)) - start[person]
         self.row = person * self.shape[1] + self.slot
 
-    def pad(self, values: np.ndarray) -> np.ndarray:
-        out = np.zeros((self.shape[0] * self.shape[1],) + values.shape[1:], values.dtype)
+    def pad(self, values: np.ndarray, fill: int = 0) -> np.ndarray:
+        out = np.full((self.shape[0] * self.shape[1],) + values.shape[1:], fill, values.dtype)
         out[self.row] = values
         return out.reshape(self.shape + values.shape[1:])
 
 
-def _level(slots: _Slots, mean: np.ndarray, count: np.ndarray, parent: np.ndarray) -> Level:
+def _level(
+    slots: _Slots, mean: np.ndarray, count: np.ndarray, parent: np.ndarray, neighbours: np.ndarray | None = None
+) -> Level:
     return Level(
         position=slots.pad(mean.astype(np.float32)),
         log_count=slots.pad(np.log(count).astype(np.float32)),
         valid=slots.pad(np.ones(len(count), bool)),
         parent=slots.pad(parent),
+        neighbours=None if neighbours is None else slots.pad(neighbours, slots.shape[1]),
     )
+
+
+def _cells(key: np.ndarray) -> np.ndarray:
+    """(V, 3) int: the cell of each fine voxel, that of the origin's corner being 0."""
+    return np.stack([key >> shift & (1 << _BITS) - 1 for shift in (2 * _BITS, _BITS, 0)], 1) - (1 << (_BITS - 1))
+
+
+def _neighbours(key: np.ndarray, slots: _Slots) -> np.ndarray:
+    """(V, 27) int: slots of the voxels around each, x slowest; the padded width where there is none."""
+    # cells reach neither end of their bits: no step runs over into another axis
+    steps = np.array([[-1], [0], [1]]) * np.array([1 << (2 * _BITS), 1 << _BITS, 1])
+    wanted = key[:, None] + (steps[:, None, None, 0] + steps[:, None, 1] + steps[:, 2]).ravel()
+    place = np.minimum(np.searchsorted(key, wanted), max(len(key) - 1, 0))
+    return np.where(key[place] == wanted, slots.slot[place], slots.shape[1]) if len(key) else wanted
 
 
 def _parent(key: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ def plan_reference(
     max_voxels: int,
     view: np.ndarray | None = None,
     rng: np.random.Generator | None = None,
+    neighbours: bool = False,
 ) -> Plan:
     """The same arguments and result as `plan.plan`; with `rng` it draws the same numbers."""
     fine, mid, coarse = [], [], []
@@ -43,8 +44,8 @@ def plan_reference(
             point_voxel[members] = b * shape[1] + n
     return Plan(
         fine=_level(points, fine, mid),
-        mid=_level(points, mid, coarse),
-        coarse=_level(points, coarse, None),
+        mid=_level(points, mid, coarse, neighbours),
+        coarse=_level(points, coarse, None, neighbours),
         deviation=deviation,
         offset=offset,
         view=np.zeros((len(lengths), 5), np.float32) if view is None else view.astype(np.float32),
@@ -72,7 +73,7 @@ def _parent(cell: Cell) -> Cell:
     return tuple(x // 2 for x in cell)
 
 
-def _level(points: np.ndarray, people: list[dict], parents: list[dict] | None) -> Level:
+def _level(points: np.ndarray, people: list[dict], parents: list[dict] | None, neighbours: bool = False) -> Level:
     shape = (len(people), max([1, *map(len, people)]))
     position, log_count = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)
     valid, parent = np.zeros(shape, bool), np.zeros(shape, np.int64)
@@ -83,4 +84,16 @@ def _level(points: np.ndarray, people: list[dict], parents: list[dict] | None) -
             valid[b, n] = True
             if parents is not None:
                 parent[b, n] = list(parents[b]).index(_parent(cell))
-    return Level(position=position, log_count=log_count, valid=valid, parent=parent)
+    around = _around(people, shape) if neighbours else None
+    return Level(position=position, log_count=log_count, valid=valid, parent=parent, neighbours=around)
+
+
+def _around(people: list[dict], shape: tuple[int, int]) -> np.ndarray:
+    """Rows of the 27 cells around each voxel."""
+    rows = np.full((*shape, 27), shape[1])
+    for b, voxels in enumerate(people):
+        number = {cell: n for n, cell in enumerate(voxels)}
+        for (x, y, z), n in number.items():
+            cells = [(x + i, y + j, z + k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)]
+            rows[b, n] = [number.get(cell, shape[1]) for cell in cells]
+    return rows

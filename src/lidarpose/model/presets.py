@@ -5,43 +5,68 @@ from dataclasses import asdict, dataclass
 from lidarpose.errors import InputError, unknown_name
 from lidarpose.skeleton import skeleton
 
+# heatmaps in a window about each joint's vote; over the whole person, as the paper's; or votes alone
+HEATMAPS = ("window", "full", "none")
+# width of a heatmap's bin, m
+BIN = 0.03
+
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkConfig:
-    """Widths and depths. grid: edge of a fine voxel in metres (mid and coarse: 2 and 4 times); max_voxels: fine voxels
-    a person at the most; blocks: attention blocks (mid encoder, coarse, mid decoder); parts: body parts and 0."""
+    """Widths and depths.
+
+    channels: of the fine, mid and coarse level; head_channels: a head of attention; blocks: attention blocks (mid
+    encoder, coarse, mid decoder); grid: edge of a fine voxel in metres (mid and coarse: 2 and 4 times); max_voxels:
+    fine voxels a person at the most; parts: body parts and 0; heatmap: one of `HEATMAPS`; convolution: submanifold
+    convolutions before the blocks of the mid and coarse level.
+    """
 
     size: str
-    channels: int
-    heads: int
+    channels: tuple[int, int, int]
+    head_channels: int
     blocks: tuple[int, int, int]
     grid: float = 0.06
     max_voxels: int = 384
     skeleton: str = "body26"
     parts: int = 25
+    heatmap: str = "window"
+    convolution: bool = False
 
     def __post_init__(self):
-        for name in ("channels", "heads", "max_voxels", "parts"):
+        for name in ("head_channels", "max_voxels", "parts"):
             value = getattr(self, name)
             if not isinstance(value, int) or value < 1:
                 raise InputError(f"{name} must be a whole number of at least 1, got {value!r}")
-        if self.channels % self.heads:
-            raise InputError(f"channels must divide by heads, got {self.channels} and {self.heads}")
-        blocks = self.blocks
-        counts = list(blocks) if isinstance(blocks, list | tuple) else []
-        if len(counts) != 3 or not all(isinstance(count, int) and count >= 0 for count in counts):
-            raise InputError(f"blocks must be three whole numbers (mid encoder, coarse, mid decoder), got {blocks!r}")
+        for name, least in (("channels", 1), ("blocks", 0)):
+            value = getattr(self, name)
+            counts = tuple(value) if isinstance(value, list | tuple) else ()
+            if len(counts) != 3 or not all(isinstance(count, int) and count >= least for count in counts):
+                levels = "fine, mid, coarse" if name == "channels" else "mid encoder, coarse, mid decoder"
+                raise InputError(f"{name} must be three whole numbers ({levels}), got {value!r}")
+            object.__setattr__(self, name, counts)
+        if any(width % self.head_channels for width in self.channels[1:]):
+            raise InputError(
+                f"channels of the mid and coarse level must divide by head_channels, got {self.channels} "
+                f"and {self.head_channels}"
+            )
         if not isinstance(self.grid, int | float) or not self.grid > 0:
             raise InputError(f"grid must be a positive number of metres, got {self.grid!r}")
+        if self.heatmap not in HEATMAPS:
+            raise unknown_name("heatmap", self.heatmap, HEATMAPS)
+        if not isinstance(self.convolution, bool):
+            raise InputError(f"convolution must be true or false, got {self.convolution!r}")
         skeleton(self.skeleton)
-        object.__setattr__(self, "blocks", tuple(counts))
 
     def to_dict(self) -> dict:
         return asdict(self)
 
 
 SIZES = {
-    "tiny": NetworkConfig(size="tiny", channels=64, heads=4, blocks=(1, 1, 1)),
+    "tiny": NetworkConfig(size="tiny", channels=(48, 64, 96), head_channels=32, blocks=(1, 1, 1)),
+    "small": NetworkConfig(size="small", channels=(64, 96, 144), head_channels=24, blocks=(2, 2, 2)),
+    "base": NetworkConfig(
+        size="base", channels=(96, 192, 288), head_channels=24, blocks=(2, 3, 2), grid=0.04, max_voxels=512
+    ),
 }
 
 

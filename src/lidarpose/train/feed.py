@@ -19,11 +19,13 @@ from lidarpose.synth.scene import scene_config
 from lidarpose.train.recipes import Pretrain
 
 # batches a chunk
-BATCHES = 4
+BATCHES = 8
 # half of the people are centered as a user's cloud is, half about a guess of the pelvis, as in a second pass
 _REFINED, _PELVIS_ERROR = 0.5, 0.06
 # how often the sensor's place is kept from the network
 _BLIND = 0.3
+# a joint of which the body's surface is seen within this distance is visible, m: hips lie 12 cm deep
+SEEN = 0.18
 # most fine voxels a person in training
 MAX_VOXELS = 224
 
@@ -54,7 +56,7 @@ def example(person: SyntheticPerson, rng: np.random.Generator) -> Example:
 
 
 def collate(examples: list[Example], config: NetworkConfig, rng: np.random.Generator | None) -> dict[str, np.ndarray]:
-    """Examples as the arrays of a plan, and the targets "joints" (B, 26, 3) and "part" (B, F), -1 where padded."""
+    """Examples as the arrays of a plan, and the arrays of `Targets`."""
     tables = plan(
         np.concatenate([e.points for e in examples]),
         np.array([len(e.points) for e in examples]),
@@ -62,14 +64,25 @@ def collate(examples: list[Example], config: NetworkConfig, rng: np.random.Gener
         max_voxels=MAX_VOXELS,
         view=np.stack([e.view for e in examples]),
         rng=rng,
+        neighbours=config.convolution,
     )
     part = np.concatenate([e.part for e in examples])
     arrays = tables.arrays()
     del arrays["point_voxel"]
     return arrays | {
         "joints": np.stack([e.joints for e in examples]),
+        "known": np.ones((len(examples), len(BODY26)), bool),
+        "visible": np.stack([seen(e.joints, e.points[e.part > 0]) for e in examples]),
         "part": _majority(tables, part, config.parts),
     }
+
+
+def seen(joints: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """joints (J, 3) m, points (n, 3) m on the body -> (J,) bool: some point lies within `SEEN` of the joint."""
+    if not len(points):
+        return np.zeros(len(joints), bool)
+    square = (joints**2).sum(1)[:, None] + (points**2).sum(1) - 2 * joints @ points.T
+    return square.min(1) < SEEN**2
 
 
 def _majority(tables: Plan, part: np.ndarray, parts: int) -> np.ndarray:

@@ -22,6 +22,7 @@ from lidarpose.model.network import PoseNet
 from lidarpose.model.presets import preset
 from lidarpose.train.feed import BATCHES, generator_of, loader
 from lidarpose.train.losses import losses, total
+from lidarpose.train.muon import Muon
 from lidarpose.train.optimize import average, optimizers, rate_factor
 from lidarpose.train.recipes import Pretrain
 from lidarpose.train.state import load_state, save_state
@@ -124,11 +125,11 @@ def _step(network, mean, made, recipe: Pretrain, arrays: dict, chunk: int, k: in
     step = chunk * BATCHES + k
     factor = rate_factor(step / (chunks * BATCHES))
     for optimizer in made:
-        rate = recipe.muon_rate if isinstance(optimizer, torch.optim.Muon) else recipe.rate
+        rate = recipe.muon_rate if isinstance(optimizer, Muon) else recipe.rate
         for group in optimizer.param_groups:
             group["lr"] = rate * factor
         optimizer.zero_grad(set_to_none=True)
-    targets = Targets(joints=torch.as_tensor(arrays["joints"]), part=torch.as_tensor(arrays["part"]))
+    targets = Targets.from_arrays(arrays)
     terms = losses(network(Batch.from_arrays(arrays)), targets)
     total(terms).backward()
     torch.nn.utils.clip_grad_norm_(network.parameters(), CLIP)

@@ -3,6 +3,7 @@
 import torch
 from torch import nn
 
+from lidarpose.train.muon import Muon
 from lidarpose.train.recipes import Pretrain
 
 WARMUP = 0.02
@@ -14,15 +15,15 @@ WEIGHT_DECAY = 0.01
 
 def optimizers(network: nn.Module, recipe: Pretrain) -> list[torch.optim.Optimizer]:
     """Muon for the hidden matrices, AdamW for vectors, embeddings and the layers that end in metres or logits."""
-    ends = ("anchors", "stem.0", "place", "anchor_view", "level_joints", "vote.offset", "vote.residual", "part")
-    ends += ("joint.heatmap", "joint.certainty")
+    ends = ("anchors", "stem.voxel", "stem.view", "place", "anchor_view", "level_joints", "vote.residual")
+    ends += ("part", "joint.heatmap", "joint.certainty")
     hidden, other = [], []
     for name, value in network.named_parameters():
         is_end = value.ndim != 2 or any(end in name for end in ends)
         (other if is_end or not recipe.muon_rate else hidden).append(value)
     made = [torch.optim.AdamW(other, lr=recipe.rate, betas=(0.9, 0.98), weight_decay=WEIGHT_DECAY, fused=True)]
     if hidden:
-        made.append(torch.optim.Muon(hidden, lr=recipe.muon_rate, weight_decay=WEIGHT_DECAY, momentum=0.95))
+        made.append(Muon(hidden, lr=recipe.muon_rate, weight_decay=WEIGHT_DECAY, momentum=0.95))
     return made
 
 

@@ -1,0 +1,88 @@
+"""Whether a joint's confidence, spread and visibility can be taken at their word, on held-out synthetic people.
+
+    python benchmarks/calibration.py --motion cmu_motion.npz --out docs/reliability.png
+
+The people of benchmarks/heldout.py under another seed. Confidence says how likely a joint is within 10 cm, `visible`
+how likely a point of the body lies within 18 cm of it, `spread` how far off it is on average. Expected calibration
+error is over ten equal bins; the plot shows them, with the share of joints in each.
+"""
+
+import argparse
+
+import heldout
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from lidarpose.evaluate.metrics import auroc, calibration_error
+from lidarpose.infer.predictor import load
+from lidarpose.skeleton import BODY26
+from lidarpose.synth.bodies import PoseBank
+from lidarpose.train.feed import seen
+
+BINS = 10
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--motion", required=True)
+    parser.add_argument("--subjects", default="006,007")
+    parser.add_argument("--people", type=int, default=1000)
+    parser.add_argument("--weights", default="tiny")
+    parser.add_argument("--out", help="PNG of the reliability plot")
+    options = parser.parse_args()
+    bank = PoseBank.from_clips(options.motion, tuple(options.subjects.split(",")))
+    found = heldout.people(bank, options.people, 50, heldout.SEED + 9)
+    model = load(options.weights)
+    predicted = model.predict([p.sample.points for p in found], sensor_origin=(0, 0, 0), skeleton="body26")
+    true = np.stack([p.sample.pose.to(BODY26).joints for p in found])
+    error = np.linalg.norm(np.stack([p.joints for p in predicted]) - true, axis=-1)
+    body = [p.sample.points[p.sample.part > 0].astype(float) for p in found]
+    visible = np.stack([seen(joints, points) for joints, points in zip(true, body, strict=True)])
+    confidence = np.stack([p.confidence for p in predicted])
+    spread = np.stack([p.spread for p in predicted])
+    told = np.stack([p.pose.visible for p in predicted])
+    hit = error < heldout.HIT
+    curves = {
+        "confidence: within 10 cm": (confidence.ravel(), hit.ravel()),
+        "visible: a point within 18 cm": (told.ravel(), visible.ravel()),
+    }
+    for name, (stated, truth) in curves.items():
+        print(f"{name}: ECE {calibration_error(stated, truth):.3f}, AUROC {auroc(stated, truth):.3f}")
+    stated, off = spread.mean() * 1e3, error.mean() * 1e3
+    print(f"spread: {stated:.1f} mm stated, {off:.1f} mm true, rank correlation {_rank(spread, error):.2f}")
+    for low, high in ((0, 0.05), (0.05, 0.1), (0.1, 0.2), (0.2, np.inf)):
+        there = (spread >= low) & (spread < high)
+        if there.any():
+            off = error[there].mean() * 1e3
+            print(f"  spread {low:.2f} to {high:.2f} m: {there.mean():6.1%} of joints, {off:6.1f} mm off")
+    if options.out:
+        _plot(curves, options.out)
+
+
+def _rank(a: np.ndarray, b: np.ndarray) -> float:
+    """Spearman's correlation."""
+    a, b = (np.argsort(np.argsort(x.ravel())) for x in (a, b))
+    return float(np.corrcoef(a, b)[0, 1])
+
+
+def _plot(curves: dict, path: str) -> None:
+    figure = Figure(figsize=(7.6, 3.6), dpi=80, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    for axes, (name, (stated, truth)) in zip(figure.subplots(1, 2), curves.items(), strict=True):
+        index = np.minimum((stated * BINS).astype(int), BINS - 1)
+        count = np.bincount(index, minlength=BINS)
+        some = count > 0
+        mean = np.bincount(index, stated, BINS)[some] / count[some]
+        share = np.bincount(index, truth, BINS)[some] / count[some]
+        axes.bar((np.arange(BINS) + 0.5) / BINS, count / count.sum(), 0.09, color="#d8dee6", label="share of joints")
+        axes.plot([0, 1], [0, 1], color="#888888", linewidth=0.8)
+        axes.plot(mean, share, "o-", color="#1f5f99", markersize=4, label="true share")
+        axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="stated", title=name)
+        axes.title.set_fontsize(10)
+        axes.legend(fontsize=8, loc="upper left", frameon=False)
+    canvas.print_png(path)
+
+
+if __name__ == "__main__":
+    main()

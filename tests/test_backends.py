@@ -1,0 +1,500 @@
+"""Two backends, one answer; and everything that needs no torch works without it."""
+
+import json
+import re
+import subprocess
+import sys
+import textwrap
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import lidarpose
+from lidarpose.errors import InputError, MissingExtra
+from lidarpose.infer.backend import Raw, estimates
+from lidarpose.infer.predictor import Predictor, bundled_path, load
+from lidarpose.model import decode, heads
+from lidarpose.model.checkpoint import import_released, load_checkpoint, save_checkpoint
+from lidarpose.model.dapt.config import DaptConfig
+from lidarpose.model.dapt.network import DaptNet
+from lidarpose.model.header import Header, digest, read_header
+from lidarpose.model.onnx_file import usable_threads
+from lidarpose.model.presets import BIN, NetworkConfig
+from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14
+
+DAPT = Path(__file__).parent / "parity" / "dapt_tiny.safetensors"
+CROP = """
+import numpy as np
+np.save("crop.npy", np.random.default_rng(0).normal(0, (0.15, 0.15, 0.4), (300, 3)))
+"""
+
+
+def blob(count, seed=0):
+    """Points about as wide and tall as a person."""
+    return np.random.default_rng(seed).normal(0, (0.15, 0.15, 0.4), (count, 3)) + (4.0, -3.0, 1.0)
+
+
+@pytest.fixture(scope="module")
+def models():
+    return {name: load(backend=name, threads=1 if name == "onnx" else None) for name in ("onnx", "torch")}
+
+
+# ---- one answer
+
+
+def test_backends_agree_on_people_of_all_sizes(models):
+    sizes = np.geomspace(1, 5000, 200).round().astype(int)
+    clouds = [blob(size, seed) for seed, size in enumerate(sizes)]
+    # together with others of about their size: rows are padded to the largest
+    for start in range(0, 200, 10):
+        group = clouds[start : start + 10]
+        centers = np.stack([cloud.mean(0) for cloud in group])
+        origin = np.zeros(3) if start % 20 else None
+        ours, due = (models[name].outputs(group, centers, origin) for name in ("onnx", "torch"))
+        assert np.abs(ours.joints - due.joints).max() < 1e-4
+        np.testing.assert_array_equal(ours.in_range, due.in_range)
+        for name in ("confidence", "spread", "visible"):
+            np.testing.assert_allclose(getattr(ours, name), getattr(due, name), rtol=1e-4, atol=1e-5)
+        assert np.ptp(due.joints) > 0.1
+
+
+def test_backends_agree_to_the_end(models):
+    # the second pass is centered on what the first one found: differences must not grow
+    clouds = [blob(size, seed) for seed, size in enumerate((5, 6, 9, 17, 40, 99, 300, 1200, 5000) * 4)]
+    ours, due = (models[name].predict(clouds, sensor_origin=(0, 0, 0)) for name in ("onnx", "torch"))
+    for a, b in zip(ours, due, strict=True):
+        assert np.abs(a.joints - b.joints).max() < 1e-4 and a.warnings == b.warnings
+    assert (ours.model["backend"], due.model["backend"]) == ("onnx", "torch")
+
+
+def test_the_bundled_twins_are_of_one_network():
+    model = load()
+    assert model.backend.source == digest(bundled_path())
+    assert model.header == read_header(bundled_path())
+
+
+def test_a_batch_is_as_one_by_one(models):
+    clouds = [blob(40), blob(900, 1), blob(7, 2)]
+    for model in models.values():
+        together = model.predict(clouds)
+        for cloud, person in zip(clouds, together, strict=True):
+            np.testing.assert_allclose(person.joints, model.predict(cloud).joints, atol=1e-4)
+
+
+def test_compiling_is_asked_for(models, monkeypatch):
+    asked = []
+    monkeypatch.setattr(torch, "compile", lambda module, **settings: asked.append(settings) or module)
+    compiled = load(compile=True)
+    assert compiled.backend.name == "torch" and asked == []
+    for count in (300, 60):
+        np.testing.assert_array_equal(compiled.predict(blob(count)).joints, models["torch"].predict(blob(count)).joints)
+    assert asked == [{"dynamic": True}]
+
+
+@pytest.mark.slow
+def test_compiled_is_the_same(models):
+    compiled = load(compile=True)
+    for count in (300, 60, 5):
+        due = models["torch"].predict(blob(count)).joints
+        np.testing.assert_allclose(compiled.predict(blob(count)).joints, due, atol=1e-4)
+
+
+def test_a_failed_compilation_is_one_line(monkeypatch):
+    def compile(module, **settings):
+        def run(*tensors):
+            raise torch._dynamo.exc.TorchDynamoException("no\ncompiler")
+
+        return run
+
+    monkeypatch.setattr(torch, "compile", compile)
+    with pytest.raises(InputError, match="torch.compile failed .no compiler.: leave compile away"):
+        load(compile=True).predict(blob(30))
+
+
+# ---- from raw outputs to joints
+
+
+@pytest.mark.parametrize("kind", heads.REACH)
+def test_numpy_and_torch_decode_alike(kind):
+    bins = round(2 * heads.REACH[kind] / BIN)
+    rng = np.random.default_rng(0)
+    logits = rng.normal(0, 3, (50, 26, 3, bins)).astype(np.float32)
+    logits[..., 0] += 4 * (rng.random((50, 26, 3)) < 0.2)
+    raw = raw_of(logits)
+    found = estimates(raw, decode.window)
+    due = raw.vote + heads.decode(torch.from_numpy(logits)).numpy()
+    np.testing.assert_allclose(found.joints, due, atol=2e-6)
+    ends = (logits.argmax(-1) % (bins - 1) == 0).any(-1)
+    np.testing.assert_array_equal(found.in_range, ~ends)
+    assert 0.1 < ends.mean() < 0.9
+
+
+def raw_of(logits, **more):
+    """What a network says whose heatmaps are `logits` (B, J, 3, W)."""
+    rng = np.random.default_rng(1)
+    shape = logits.shape[:2]
+    names = ("confidence", "log_spread", "visible")
+    outputs = {name: rng.normal(size=shape).astype(np.float32) for name in names}
+    outputs["vote"] = rng.normal(size=(*shape, 3)).astype(np.float32)
+    return Raw.from_pose(outputs | {"heatmap": logits} | more)
+
+
+def test_decoders_differ_and_each_is_taken(models):
+    cloud = blob(400)
+    center = cloud.mean(0)
+    raw = models["onnx"].backend.run([cloud - center], np.zeros((1, 5), np.float32))
+    found = {}
+    for name in ("window", "argmax", "dark"):
+        model = load(decode=name, threads=1)
+        found[name] = model.outputs([cloud], center[None], None).joints
+        np.testing.assert_allclose(found[name], estimates(raw, decode.decoder(name)).joints, atol=1e-6)
+        assert model.predict(cloud).model["decode"] == name
+    # a peak's bin and what is refined about it are less than the window apart
+    assert 0 < np.abs(found["window"] - found["argmax"]).max() < 4 * BIN
+    assert 0 < np.abs(found["dark"] - found["argmax"]).max() <= BIN
+    np.testing.assert_array_equal(found["window"], load(threads=1).outputs([cloud], center[None], None).joints)
+
+
+def test_extreme_outputs_stay_in_their_ranges():
+    huge = np.array([[-1e4, 1e4, 0.0]], np.float32)
+    logits = np.zeros((1, 3, 3, 24), np.float32)
+    logits[..., 5] = 1e4
+    found = estimates(raw_of(logits, confidence=huge, log_spread=huge, visible=huge), decode.window)
+    np.testing.assert_array_equal(found.confidence, [[0, 1, 0.5]])
+    np.testing.assert_array_equal(found.visible, [[0, 1, 0.5]])
+    assert np.isfinite(found.spread).all() and (found.spread >= 0).all() and np.isfinite(found.joints).all()
+
+
+def test_a_network_without_heatmaps_knows_no_range():
+    raw = raw_of(np.zeros((2, 26, 3, 0), np.float32))
+    found = estimates(raw, decode.window)
+    np.testing.assert_array_equal(found.joints, raw.vote)
+    assert found.in_range is None and found.confidence.shape == (2, 26)
+
+
+def test_confidence_read_off_heatmaps():
+    # bins of 2 cm; three quarters of the first joint's weight at bin 50, a quarter 30 cm off; the second is sure
+    logits = np.full((1, 2, 100), -1e4, np.float32)
+    logits[0, :, 50] = 0
+    logits[0, 0, 65] = -np.log(3)
+    sure = np.full((1, 2, 100), -1e4, np.float32)
+    sure[..., 50] = 0
+    raw = Raw(vote=np.zeros((1, 2, 3)), heatmaps=(logits, sure, sure), low=np.full(3, -1.0), step=np.full(3, 0.02))
+    found = estimates(raw, decode.window)
+    np.testing.assert_allclose(found.joints, 0, atol=1e-9)
+    np.testing.assert_allclose(found.confidence, [[0.75, 1]], atol=1e-6)
+    np.testing.assert_allclose(found.spread, [[0.15, 0]], atol=1e-6)
+    assert found.visible is None and found.in_range.all()
+
+
+class Scripted:
+    """A backend that says what it is told: joints are its heatmaps' peaks."""
+
+    name, batch = "scripted", 64
+
+    def __init__(self, mode, joints=None):
+        self.mode = mode
+        self.header = Header(
+            config=NetworkConfig(size="x", channels=(4, 4, 4), head_channels=4, blocks=(0, 0, 0)), card={}
+        )
+        self.joints = joints
+        self.centers = []
+
+    def run(self, clouds, view):
+        self.centers.append(np.stack([-cloud.mean(0) for cloud in clouds]))
+        logits = np.zeros((len(clouds), 26, 3, 24), np.float32)
+        np.put_along_axis(logits, np.broadcast_to(self.mode, logits.shape[:3])[..., None], 9.0, -1)
+        votes = np.zeros((len(clouds), 26, 3), np.float32) if self.joints is None else self.joints
+        return raw_of(logits, vote=np.broadcast_to(votes, logits.shape[:3]))
+
+
+def test_joints_at_the_end_of_the_range_are_named():
+    mode = np.full((26, 3), 10)
+    for joint, axis, end in (
+        ("left_wrist", 0, 0),
+        ("head", 2, 23),
+        ("nose", 1, 0),
+        ("neck", 1, 23),
+        ("left_hand", 0, 0),
+    ):
+        mode[BODY26.index(joint), axis] = end
+    pose = Predictor(Scripted(mode), name="x").predict(blob(30))
+    assert set(pose.out_of_range) == {"neck", "head", "left_wrist", "left_hand"}
+    np.testing.assert_array_equal(pose.in_range, [joint not in pose.out_of_range for joint in pose.skeleton.joints])
+    (warning,) = pose.warnings
+    assert warning.startswith("at the end of the heatmap's range") and warning.endswith(" and 1 more")
+    entry = json.loads(pose.to_json())["people"][0]
+    assert entry["out_of_range"] == pose.out_of_range and len(entry["visible"]) == 24
+    assert all(0 <= value <= 1 for value in entry["visible"])
+    # asked for joints that are all in range, nothing is said
+    pose = Predictor(Scripted(np.where(mode == 10, 10, [[10]])), name="x").predict(blob(30))
+    assert pose.warnings == () and pose.out_of_range == [] and pose.in_range.all()
+
+
+def test_a_person_without_joints_has_nothing_to_tell(models):
+    pose = models["onnx"].predict(blob(3))
+    assert pose.visible is None and pose.in_range is None and pose.out_of_range == []
+    entry = json.loads(pose.to_json())["people"][0]
+    assert entry["joints"] is None and entry["visible"] == entry["out_of_range"] == entry["confidence"] == []
+
+
+def test_the_second_pass_is_centered_on_the_pelvis_to_a_centimetre():
+    found = np.zeros((26, 3), np.float32)
+    found[0] = 0.1234, -0.0567, 0.301
+    scripted = Scripted(np.full((26, 3), 11), found)
+    Predictor(scripted, name="x").predict(blob(30))
+    first, second = scripted.centers
+    moved = second - first
+    # a bin's middle is half a bin from the vote
+    np.testing.assert_allclose(moved, np.round((found[:1] - BIN / 2) / 0.01) * 0.01, atol=1e-6)
+
+
+# ---- which backend
+
+
+def test_backends_are_chosen(tmp_path):
+    path = tmp_path / "mine.safetensors"
+    path.write_bytes(bundled_path().read_bytes())
+    (tmp_path / "mine.onnx").write_bytes(bundled_path(suffix=".onnx").read_bytes())
+    chosen = {
+        "onnx": [{}, {"weights": tmp_path / "mine.onnx"}, {"weights": str(path), "backend": "onnx"}, {"device": "cpu"}],
+        "torch": [{"backend": "torch"}, {"weights": path}, {"compile": True}, {"weights": str(path)}],
+    }
+    for name, calls in chosen.items():
+        for call in calls:
+            model = load(**call)
+            assert model.backend.name == model.model["backend"] == name, call
+            assert model.model["name"] == ("mine" if "weights" in call else "tiny")
+
+
+BAD = {
+    "backend": ({"backend": "tensorrt"}, "unknown backend 'tensorrt': known are onnx, torch"),
+    "decoder": ({"decode": "mean"}, "unknown decoder 'mean'"),
+    "weights": ({"weights": "tyni"}, "did you mean tiny"),
+    "threads": ({"threads": 0}, "threads must be a whole number"),
+    "onnx elsewhere": ({"backend": "onnx", "device": "cuda"}, "device 'cuda' needs the backend torch"),
+    "onnx compiled": ({"backend": "onnx", "compile": True}, "torch.compile needs the backend torch"),
+    "onnx file elsewhere": ({"weights": bundled_path(suffix=".onnx"), "device": "cuda"}, "needs the backend torch"),
+    "onnx file by torch": ({"weights": bundled_path(suffix=".onnx"), "backend": "torch"}, "torch runs a .safetensors"),
+    "device": ({"device": "hal9000"}, "device 'hal9000' cannot be used"),
+    "missing": ({"weights": "no/such.onnx"}, "no such file"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_wrong_choice_is_one_line(case):
+    settings, words = BAD[case]
+    with pytest.raises(InputError) as raised:
+        load(**settings)
+    assert words in str(raised.value) and "\n" not in str(raised.value)
+
+
+def test_threads():
+    assert 1 <= usable_threads() <= 8
+    assert load(threads=3).backend.session.get_session_options().intra_op_num_threads == 3
+    assert load().backend.session.get_session_options().intra_op_num_threads == usable_threads()
+
+
+# ---- the paper's network
+
+
+@pytest.fixture(scope="module")
+def released(tmp_path_factory):
+    path = tmp_path_factory.mktemp("dapt") / "released.safetensors"
+    import_released(DAPT, path)
+    return path
+
+
+def test_a_released_network_predicts_its_own_skeleton(released):
+    model = load(released)
+    assert model.backend.name == "torch" and model.skeleton is WAYMO14
+    people = model.predict([blob(80), blob(3), blob(20, 1)])
+    assert people.skeleton is WAYMO14 and [person.joints is None for person in people] == [False, True, False]
+    pose = people[0]
+    assert pose.joints.shape == (14, 3) and pose.visible is None
+    assert (pose.confidence >= 0).all() and (pose.confidence <= 1).all() and (pose.spread > 0).all()
+    assert json.loads(pose.to_json())["people"][0]["visible"] == []
+    with pytest.raises(InputError, match="waymo14 has no pelvis, .* which smpl24 needs"):
+        model.predict(blob(80), skeleton="smpl24")
+
+
+def test_a_released_networks_joints_are_brought_in_order(released):
+    network, header = load_checkpoint(released)
+    cloud = blob(60) - blob(60).mean(0)
+    out = network.outputs([cloud])
+    found = load(released).outputs([cloud], np.zeros((1, 3)), None)
+    for joint in WAYMO14.joints:
+        theirs = network.config.joints.index(joint)
+        for axis, name in enumerate("xyz"):
+            due = decode.window(
+                out[f"logits_{name}"][0, theirs], low=network.config.low[axis], step=network.config.step[axis]
+            )
+            assert found.joints[0, WAYMO14.index(joint), axis] == pytest.approx(due, abs=1e-6)
+    assert header.config.joints != WAYMO14.joints
+
+
+def test_a_released_network_is_centered_on_the_hips(released, monkeypatch):
+    model = load(released)
+    real, seen = model.outputs, []
+
+    def outputs(clouds, centers, origin):
+        found = real(clouds, centers, origin)
+        seen.append((centers, found.joints))
+        return found
+
+    monkeypatch.setattr(model, "outputs", outputs)
+    model.predict(blob(200))
+    (first, joints), (second, _) = seen
+    hips = joints[:, [WAYMO14.index("left_hip"), WAYMO14.index("right_hip")]].mean(1)
+    np.testing.assert_allclose(second - first, hips, atol=0.00501)
+
+
+def test_strays_do_not_reach_a_released_network(released):
+    model = load(released)
+    cloud = blob(100)
+    strays = np.concatenate([cloud, cloud[:1] + (0, 0, 900.0)])
+    due = model.outputs([cloud], cloud.mean(0)[None], None)
+    found = model.outputs([strays], cloud.mean(0)[None], None)
+    np.testing.assert_allclose(found.joints, due.joints, atol=1e-6)
+
+
+def test_a_network_that_only_regresses(tmp_path):
+    torch.manual_seed(0)
+    small = {"encoder_depths": (1, 1), "encoder_channels": (16, 16), "encoder_heads": (2, 2), "decoder_depths": (1,)}
+    small |= {"decoder_channels": (16,), "decoder_heads": (2,), "anchor_channels": (16, 16), "strides": (4,)}
+    config = DaptConfig(name="regress", joints=HUMAN15.joints, coordinates=True, grid=0.05, **small)
+    save_checkpoint(tmp_path / "a.safetensors", DaptNet(config), card={})
+    pose = load(tmp_path / "a.safetensors").predict(blob(50))
+    assert pose.skeleton is HUMAN15 and pose.joints.shape == (15, 3)
+    assert pose.confidence is None and pose.spread is None and pose.in_range is None and pose.out_of_range == []
+    assert json.loads(pose.to_json())["people"][0]["confidence"] == []
+    pose.picture(tmp_path / "a.png")
+
+
+def test_what_a_released_network_cannot_do_is_one_line(released, tmp_path):
+    for settings, words in (({"backend": "onnx"}, "does not run as ONNX"), ({"compile": True}, "is not offered")):
+        with pytest.raises(InputError, match=words):
+            load(released, **settings)
+    with pytest.raises(InputError, match="is not offered as onnx"):
+        lidarpose.export(released, tmp_path / "x.onnx")
+    assert list(tmp_path.iterdir()) == []
+
+
+# ---- without torch
+
+
+def without(modules, code, cwd):
+    """Runs a program in which modules cannot be imported."""
+    block = "import sys\n" + "".join(f"sys.modules[{name!r}] = None\n" for name in modules)
+    return subprocess.run(
+        [sys.executable, "-c", block + textwrap.dedent(code)], capture_output=True, text=True, cwd=cwd, timeout=120
+    )
+
+
+EXTRAS = ("torch", "accelerate", "onnx", "onnxscript", "numba", "threadpoolctl", "pyarrow")
+
+
+def test_the_base_install_predicts_and_informs(tmp_path):
+    done = without(
+        EXTRAS,
+        CROP
+        + """
+from lidarpose.cli import main
+assert main(["predict", "crop.npy", "--crop", "--picture", "--decode", "dark"]) == 0
+assert main(["info"]) == 0
+import lidarpose
+assert lidarpose.load().predict(np.load("crop.npy")).joints.shape == (24, 3)
+""",
+        tmp_path,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "not installed" in done.stdout and "ONNX Runtime" in done.stdout and "tiny" in done.stdout
+    assert {path.name for path in tmp_path.iterdir()} == {"crop.npy", "crop.poses.json", "crop.poses.png"}
+
+
+LACKING = {
+    "backend": (["predict", "crop.npy", "--backend", "torch"], "train"),
+    "device": (["predict", "crop.npy", "--device", "cuda"], "train"),
+    "weights": (["predict", "crop.npy", "--weights", str(bundled_path())], "train"),
+    "export": (["export", "--out", "x.onnx"], "export"),
+    "import": (["import", "x.safetensors", "y.safetensors"], "train"),
+    "pretrain": (["pretrain", "run"], "(train|synth)"),
+    "demo": (["demo"], "synth"),
+}
+
+
+def test_what_needs_an_extra_names_it_in_one_line(tmp_path):
+    done = without(
+        EXTRAS,
+        CROP
+        + f"""
+from lidarpose.cli import main
+for name, (words, _) in {LACKING!r}.items():
+    print(name, file=sys.stderr)
+    assert main(words) == 2, name
+import lidarpose
+for call in (lambda: lidarpose.export, lambda: lidarpose.import_dapt, lambda: lidarpose.load(backend="torch")):
+    try:
+        call()
+    except lidarpose.LidarPoseError as error:
+        print(error)
+""",
+        tmp_path,
+    )
+    assert done.returncode == 0, done.stderr
+    lines = done.stderr.splitlines()
+    assert lines[::2] == list(LACKING) and [path.name for path in tmp_path.iterdir()] == ["crop.npy"]
+    for line, (_, extra) in zip(lines[1::2], LACKING.values(), strict=True):
+        assert re.fullmatch(rf"lidarpose: error: .*: pip install 'lidarpose\[{extra}\]'", line), line
+    found = [re.search(r"(.*) needs .*\[(.*)\]", line).groups() for line in done.stdout.splitlines()]
+    assert found[:2] == [("lidarpose.export", "export"), ("lidarpose.import_dapt", "train")]
+    assert found[2] == ("running tiny.safetensors with torch", "train")
+
+
+def test_a_bad_file_is_told_before_torch_is_asked_for(tmp_path):
+    (tmp_path / "bad.safetensors").write_bytes(b"no weights at all")
+    done = without(["torch"], "import lidarpose\nlidarpose.load('bad.safetensors')", tmp_path)
+    assert "something else" in done.stderr and "MissingExtra" not in done.stderr
+
+
+def test_predicting_loads_nothing_that_it_does_not_need(tmp_path):
+    heavy = ("torch", "numba", "pandas", "matplotlib", "trimesh", "pypcd4", "tqdm", "onnx", "scipy", "sympy")
+    done = without(
+        (),
+        CROP
+        + f"""
+from lidarpose.cli import main
+main(["predict", "crop.npy", "--crop"])
+print(*[name for name in {heavy} if name in sys.modules])
+""",
+        tmp_path,
+    )
+    assert done.stdout.strip() == "", done.stderr
+
+
+def test_the_demo_and_the_generator_need_no_torch(tmp_path):
+    code = "import lidarpose.demo, lidarpose.synth.generate, lidarpose.synth.write, lidarpose.view.report"
+    assert without(["torch"], code, tmp_path).returncode == 0
+
+
+def test_missing_extra_leaves_other_modules_alone():
+    from lidarpose.errors import missing_extra
+
+    error = ModuleNotFoundError("No module named 'lidarpose.nothing'", name="lidarpose.nothing")
+    assert missing_extra(error, "this") is error
+    assert isinstance(missing_extra(ModuleNotFoundError(name="torch.nn"), "this"), MissingExtra)
+
+
+def test_poses_of_another_skeleton_keep_what_is_known(models):
+    pose = models["onnx"].predict(blob(300), skeleton="body26").pose
+    picked = pose.to(SMPL24)
+    pick = BODY26.map_to(SMPL24)
+    for name in ("confidence", "spread", "visible", "in_range"):
+        np.testing.assert_array_equal(getattr(picked, name), getattr(pose, name)[pick])
+    with pytest.raises(InputError, match="Pose.visible must be"):
+        replace(pose, visible=pose.visible[:3])
+    with pytest.raises(InputError, match="in_range must be true or false"):
+        replace(pose, in_range=pose.visible)

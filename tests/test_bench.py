@@ -1,0 +1,82 @@
+"""The frozen benchmark: nothing may ever change it, and what it says of itself is so."""
+
+import hashlib
+from functools import cache
+
+import numpy as np
+import pytest
+
+from lidarpose.errors import InputError
+from lidarpose.evaluate import bench as module
+from lidarpose.evaluate.bench import SHA256, bench_path, errors, facing, floors, load_bench, rows_by, swapped
+from lidarpose.geometry import rotation_about
+from lidarpose.sample import Box
+from lidarpose.skeleton import BODY26
+
+
+@cache
+def bench():
+    return load_bench()
+
+
+def test_the_file_is_the_frozen_one():
+    data = bench_path().read_bytes()
+    assert hashlib.sha256(data).hexdigest() == SHA256
+    assert SHA256.startswith("8abcafc6628c") and len(data) < 12e6
+
+
+def test_parts_are_equal():
+    people, columns = bench().people, bench().columns
+    assert len(people) == 2000 and [len(rows) for rows in bench().clips] == [16] * 60
+    for name, values in (("condition", 5), ("poses", 2), ("sensor", 8)):
+        found, counts = np.unique(columns[name][people], return_counts=True)
+        assert len(found) == values and (counts == 2000 // values).all()
+        assert set(columns[name][np.concatenate(bench().clips)]) == set(found)
+    assert columns["num_points"][people].min() >= 20
+    assert columns["distance"][people].min() >= 1.9 and columns["distance"][people].max() <= 40.1
+    for rows in bench().clips:
+        assert (columns["frame"][rows] == np.arange(16)).all() and len(set(columns["sensor"][rows])) == 1
+
+
+def test_points_lie_in_their_box_and_bodies_about_their_joints():
+    for row in bench().people[::37]:
+        points, joints, box = bench().points[row], bench().joints[row], bench().columns["box"][row]
+        box = Box(center=box[:3], size=box[3:6], yaw=box[6])
+        assert box.contains(points, margin=0.002).mean() > 0.8
+        nearest = np.linalg.norm(points[:, None] - joints, axis=-1).min(1)
+        assert np.median(nearest) < 0.5
+
+
+def test_a_damaged_file_is_told(monkeypatch, tmp_path):
+    damaged = tmp_path / "b.parquet"
+    damaged.write_bytes(bench_path().read_bytes()[:-1])
+    monkeypatch.setattr(module, "bench_path", lambda: damaged)
+    with pytest.raises(InputError, match="is not lidarpose-bench-1 as it was frozen"):
+        load_bench()
+
+
+def test_floors_know_no_points():
+    found = floors(bench())
+    people = bench().people
+    true, plain = (errors(bench(), found[name])[people].mean() for name in ("mean pose, true facing", "mean pose"))
+    assert 0.2 < true < plain < 0.45
+    assert not swapped(bench(), found["mean pose, true facing"])[people].any()
+    turned = swapped(bench(), found["mean pose"])[people]
+    assert 0.4 < turned.mean() < 0.6
+    assert errors(bench(), bench().joints).max() == 0
+
+
+def test_facing_turns_with_the_person():
+    joints = bench().joints[bench().people[:50]]
+    turn = facing(joints @ rotation_about("z", 0.7).T) - facing(joints)
+    np.testing.assert_allclose(np.cos(turn), np.cos(0.7), atol=1e-5)
+    mirrored = joints[:, list(BODY26.flip)]
+    np.testing.assert_allclose(np.cos(facing(mirrored) - facing(joints)), -1, atol=1e-5)
+
+
+def test_every_person_is_in_one_row_of_each_table():
+    for title, groups in rows_by(bench()).items():
+        rows = np.concatenate(list(groups.values()))
+        assert len(set(rows)) == len(rows), title
+        if title != "plain":
+            assert len(rows) >= 1999, title

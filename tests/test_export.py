@@ -1,0 +1,254 @@
+"""Networks as files that run elsewhere: the same answers at other sizes, and one line for every fault."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+import lidarpose
+from lidarpose.errors import InputError, LidarPoseError, MissingExtra
+from lidarpose.infer.backend import OnnxBackend, exported_beside
+from lidarpose.infer.backend_torch import TorchBackend
+from lidarpose.model import export as exporting
+from lidarpose.model.checkpoint import load_checkpoint, save_checkpoint
+from lidarpose.model.export import PlanModule, check, export
+from lidarpose.model.header import digest, read_header
+from lidarpose.model.network import PoseNet
+from lidarpose.model.onnx_file import OUTPUTS, expected_inputs, network_inputs, open_onnx, plan_people
+from lidarpose.model.presets import NetworkConfig
+
+CARD = {"command": "none", "note": "random"}
+# every kind of layer, few of each: what is traced takes as long as there are layers
+SMALL = NetworkConfig(size="small", channels=(16, 32, 32), head_channels=16, blocks=(0, 1, 0), convolution=True)
+
+
+def stored_network(path, config, seed=0):
+    torch.manual_seed(seed)
+    network = PoseNet(config)
+    with torch.no_grad():
+        # untrained outputs hardly differ from joint to joint, which would hide a mix-up
+        for parameter in network.parameters():
+            parameter += 0.1 * torch.randn_like(parameter)
+    save_checkpoint(path, network, card=CARD, half=True)
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A checkpoint, its ONNX file and its program."""
+    folder = tmp_path_factory.mktemp("export")
+    path = stored_network(folder / "net.safetensors", SMALL)
+    export(path, folder / "net.onnx")
+    export(path, folder / "net.pt2", format="torch")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def program(folder):
+    """What a user of the program has: the module, and what its file tells."""
+    told = {"lidarpose": ""}
+    module = torch.export.load(folder / "net.pt2", extra_files=told).module()
+    return module, json.loads(told["lidarpose"])
+
+
+def people(*sizes, seed=1):
+    rng = np.random.default_rng(seed)
+    clouds = [rng.normal(0, (0.2, 0.2, 0.5), (size, 3)) for size in sizes]
+    view = rng.normal(size=(len(sizes), 5)).astype(np.float32)
+    return clouds, view
+
+
+SIZES = [(1,), (5000, 1, 20, 0), (0,), (40, 40), (3, 700, 90, 8, 15, 2, 1)]
+
+
+@pytest.mark.parametrize("sizes", SIZES, ids=str)
+def test_onnx_gives_what_torch_gives(folder, sizes):
+    clouds, view = people(*sizes)
+    network, header = load_checkpoint(folder / "net.safetensors")
+    ours = OnnxBackend(folder / "net.onnx", threads=1).run(clouds, view)
+    due = TorchBackend(network, header).run(clouds, view)
+    for name in ("vote", "confidence", "log_spread", "visible", "low", "step"):
+        np.testing.assert_allclose(getattr(ours, name), getattr(due, name), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(ours.heatmaps, due.heatmaps, rtol=1e-4, atol=1e-4)
+    assert np.ptp(due.heatmaps[0]) > 0.1
+
+
+@pytest.mark.parametrize("sizes", SIZES, ids=str)
+def test_a_program_of_torch_runs_at_other_sizes(folder, program, sizes):
+    clouds, view = people(*sizes)
+    network, header = load_checkpoint(folder / "net.safetensors")
+    arrays = network_inputs(plan_people(clouds, view, header.config))
+    tensors = [torch.as_tensor(array) for array in arrays.values()]
+    with torch.inference_mode():
+        due = PlanModule(network, tuple(arrays))(*tensors)
+        for ours, theirs in zip(program[0](*tensors), due, strict=True):
+            torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
+
+
+def test_the_files_tell_what_they_are(folder, program):
+    session, header, source = open_onnx(folder / "net.onnx", threads=1)
+    assert header == read_header(folder / "net.safetensors") and header.config == SMALL
+    assert source == digest(folder / "net.safetensors")
+    assert [value.name for value in session.get_inputs()] == expected_inputs(SMALL)
+    assert "in_mid_neighbours" in expected_inputs(SMALL)
+    assert [value.name for value in session.get_outputs()] == list(OUTPUTS)
+    shapes = {value.name: value.shape for value in [*session.get_inputs(), *session.get_outputs()]}
+    assert shapes["in_fine_position"] == ["people", "fine_rows", 3] and shapes["in_view"] == ["people", 5]
+    assert shapes["in_mid_neighbours"] == ["people", "mid_rows", 27] and shapes["part"] == ["people", "fine_rows", 25]
+    assert program[1]["config"]["size"] == "small"
+
+
+@pytest.mark.parametrize("name", ["net.onnx", "net.pt2"])
+def test_no_path_of_this_machine_is_in_a_file(folder, name):
+    content = (folder / name).read_bytes()
+    assert b"lidarpose/model/network.py" not in content and str(folder).encode() not in content
+
+
+def test_an_exported_file_is_a_model_of_its_own(folder, capfd):
+    model = lidarpose.load(folder / "net.onnx")
+    assert model.backend.name == "onnx" and model.model["name"] == "net"
+    beside = lidarpose.load(folder / "net.safetensors", backend="onnx")
+    (cloud,), _ = people(300)
+    np.testing.assert_array_equal(model.predict(cloud).joints, beside.predict(cloud).joints)
+    due = lidarpose.load(folder / "net.safetensors").predict(cloud)
+    assert np.abs(model.predict(cloud).joints - due.joints).max() < 1e-4
+    assert capfd.readouterr() == ("", "")
+
+
+# ---- what is wrong with a file
+
+
+def assert_one_line(path, *parts, read=OnnxBackend):
+    with pytest.raises(InputError) as caught:
+        read(path)
+    message = str(caught.value)
+    assert "\n" not in message and str(path) in message, message
+    for part in parts:
+        assert part in message
+
+
+def changed(folder, path, change):
+    """The exported file, its protocol buffer changed in place."""
+    model = onnx.load(folder / "net.onnx")
+    change(model)
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+def with_entry(key, value):
+    def change(model):
+        for entry in [entry for entry in model.metadata_props if entry.key == key]:
+            model.metadata_props.remove(entry)
+        if value is not None:
+            model.metadata_props.add(key=key, value=value)
+
+    return change
+
+
+@pytest.mark.parametrize("keep", [1, 50, 20_000, -1, -3000])
+def test_a_truncated_onnx_file(folder, tmp_path, keep, capfd):
+    path = tmp_path / "cut.onnx"
+    content = (folder / "net.onnx").read_bytes()
+    path.write_bytes(content[:keep])
+    assert_one_line(path)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("content", [b"hello world, this is text", bytes(64), b"\x80\x02}q\x00."])
+def test_another_kind_of_file(tmp_path, content, capfd):
+    path = tmp_path / "other.onnx"
+    path.write_bytes(content)
+    assert_one_line(path)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_no_file_an_empty_one_and_a_folder(tmp_path):
+    (tmp_path / "empty.onnx").write_bytes(b"")
+    assert_one_line(tmp_path / "empty.onnx", "is empty")
+    assert_one_line(tmp_path / "none.onnx", "no such file")
+    assert_one_line(tmp_path, "got a folder")
+
+
+def test_another_program_s_onnx_and_another_version_s(folder, tmp_path):
+    path = tmp_path / "x.onnx"
+    assert_one_line(changed(folder, path, with_entry("lidarpose", None)), "not a checkpoint of lidarpose")
+    entry = json.loads(read_header(folder / "net.safetensors").to_json())
+    older = json.dumps(entry | {"schema": "lidarpose.checkpoint/1"})
+    assert_one_line(changed(folder, path, with_entry("lidarpose", older)), "expected schema lidarpose.checkpoint/2")
+    assert_one_line(changed(folder, path, with_entry("lidarpose", "{")), "cannot be read")
+    other = json.dumps(entry | {"config": entry["config"] | {"convolution": False}})
+    assert_one_line(changed(folder, path, with_entry("lidarpose", other)), "input in_coarse_neighbours is unknown")
+    fewer = changed(folder, path, lambda model: model.graph.output.remove(model.graph.output[-1]))
+    assert_one_line(fewer, "output visible is missing")
+
+
+def test_the_twin_beside_a_checkpoint(folder, tmp_path):
+    path = tmp_path / "net.safetensors"
+    path.write_bytes((folder / "net.safetensors").read_bytes())
+    assert_one_line(path, "net.onnx beside it, which does not exist", "lidarpose export", read=exported_beside)
+    (tmp_path / "net.onnx").write_bytes((folder / "net.onnx").read_bytes())
+    assert exported_beside(path).header == read_header(path)
+    stored_network(path, SMALL, seed=3)
+    with pytest.raises(InputError, match="other weights than net.safetensors beside it: make it with"):
+        exported_beside(path)
+
+
+# ---- what is wrong with an export
+
+
+def test_what_cannot_be_exported_is_one_line(folder, tmp_path):
+    out = tmp_path / "out.onnx"
+    with pytest.raises(InputError, match="unknown format 'tflite': known are onnx, torch"):
+        export(folder / "net.safetensors", out, format="tflite")
+    with pytest.raises(InputError, match="does not exist"):
+        export(tmp_path / "none.safetensors", out)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_onnx_the_extra_is_named(folder, tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "onnxscript", None)
+    with pytest.raises(MissingExtra, match=r"pip install 'lidarpose\[export\]'"):
+        export(folder / "net.safetensors", tmp_path / "out.onnx")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_wrong_export_is_not_written(folder, tmp_path, monkeypatch):
+    network, _ = load_checkpoint(folder / "net.safetensors")
+    other, _ = load_checkpoint(stored_network(tmp_path / "other.safetensors", SMALL, seed=5))
+    content = (folder / "net.onnx").read_bytes()
+    monkeypatch.setattr(exporting, "onnx_bytes", lambda network, metadata: content)
+    export(folder / "net.safetensors", tmp_path / "same.onnx")
+    with pytest.raises(LidarPoseError, match="vote is off by .* nothing was written"):
+        export(tmp_path / "other.safetensors", tmp_path / "out.onnx")
+    assert not (tmp_path / "out.onnx").exists()
+
+    def run(network, change):
+        return lambda arrays: [
+            change(v.detach().numpy())
+            for v in PlanModule(network, tuple(arrays))(*map(torch.as_tensor, arrays.values()))
+        ]
+
+    check(network, run(network, lambda value: value + 1e-5))
+    for change in (lambda value: value * np.nan, lambda value: value[:0], lambda value: value + 0.01):
+        with pytest.raises(LidarPoseError, match="is off by"):
+            check(network, run(network, change))
+    with pytest.raises(LidarPoseError, match="is off by"):
+        check(network, run(other, lambda value: value))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "change", [{"heatmap": "full"}, {"heatmap": "none"}, {"convolution": False, "blocks": (2, 1, 1)}]
+)
+def test_every_kind_of_network_is_exported(tmp_path, change):
+    path = stored_network(tmp_path / "net.safetensors", replace(SMALL, **change))
+    export(path, tmp_path / "net.onnx")
+    export(path, tmp_path / "net.pt2", format="torch")
+    (cloud,), _ = people(300)
+    due = lidarpose.load(path).predict(cloud)
+    ours = lidarpose.load(path, backend="onnx").predict(cloud)
+    assert np.abs(ours.joints - due.joints).max() < 1e-4
+    assert (ours.in_range is None) == (change.get("heatmap") == "none")
