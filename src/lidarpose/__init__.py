@@ -45,8 +45,11 @@ def __getattr__(name: str):
             return getattr(import_module(_HOMES[name]), name)
         except ModuleNotFoundError as error:
             raise missing_extra(error, f"lidarpose.{name}", "export" if name == "export" else None) from None
+    if name == "metrics":
+        # a module of its own, for `lidarpose.metrics.mpjpe`
+        return import_module("lidarpose.metrics")
     raise AttributeError(f"module 'lidarpose' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return sorted([*__all__, "metrics"])

@@ -1,0 +1,81 @@
+"""Metrics of 3D human pose on plain arrays, of anyone's predictions.
+
+    from lidarpose import metrics
+    metrics.mpjpe(pred, true, visible)          # (n, J, 3), (n, J, 3) m, (n, J) -> mm
+    metrics.pck(pred, true, visible)            # PCK-3, percent
+    table = metrics.joint_errors(pred, true)    # (n, J) mm, for groups, slices and intervals
+    metrics.by_group(table, "human15")["wrists"]
+    metrics.interval(table, np.random.default_rng(0), clusters=sequence)
+
+Metres in; millimetres or percent out. docs/metrics.md defines every figure.
+"""
+
+from lidarpose.evaluate.bootstrap import Interval, interval, paired_interval
+from lidarpose.evaluate.groups import GROUPS, by_group, joint_groups
+from lidarpose.evaluate.metrics import (
+    LEAST_ALIGNED,
+    TORSO,
+    acceleration_error,
+    aligned_errors,
+    auroc,
+    calibration_error,
+    joint_errors,
+    joint_hits,
+    mpjpe,
+    pa_mpjpe,
+    pck,
+)
+from lidarpose.evaluate.scores import AVERAGES, Score, mean
+from lidarpose.evaluate.slices import DISTANCE_EDGES, OCCLUSION_EDGES, POINT_EDGES, Slice, by_span
+from lidarpose.evaluate.waymo import (
+    OKS_THRESHOLDS,
+    PCK_THRESHOLDS,
+    PENALTY,
+    Pem,
+    box_hits,
+    oks,
+    oks_ap,
+    oks_hits,
+    oks_sigmas,
+    pck_box,
+    pem,
+)
+
+__all__ = [
+    "AVERAGES",
+    "DISTANCE_EDGES",
+    "GROUPS",
+    "Interval",
+    "LEAST_ALIGNED",
+    "OCCLUSION_EDGES",
+    "OKS_THRESHOLDS",
+    "PCK_THRESHOLDS",
+    "PENALTY",
+    "POINT_EDGES",
+    "Pem",
+    "Score",
+    "Slice",
+    "TORSO",
+    "acceleration_error",
+    "aligned_errors",
+    "auroc",
+    "box_hits",
+    "by_group",
+    "by_span",
+    "calibration_error",
+    "interval",
+    "joint_errors",
+    "joint_groups",
+    "joint_hits",
+    "mean",
+    "mpjpe",
+    "oks",
+    "oks_ap",
+    "oks_hits",
+    "oks_sigmas",
+    "pa_mpjpe",
+    "paired_interval",
+    "pck",
+    "pck_box",
+    "pem",
+]

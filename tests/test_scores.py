@@ -1,0 +1,233 @@
+"""Joint groups, slices, bootstrap intervals of tables."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpose import metrics
+from lidarpose.errors import InputError
+from lidarpose.evaluate import bootstrap
+from lidarpose.skeleton import HUMAN15, SKELETONS, WAYMO14
+
+quick = settings(max_examples=40, deadline=None)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def drawn(seed, n=30, joints=14, labelled=0.6):
+    rng = np.random.default_rng(seed)
+    return np.where(rng.random((n, joints)) < labelled, rng.gamma(2, 30, (n, joints)), np.nan)
+
+
+def slow_mean(table, average):
+    rows = [[v for v in row if not np.isnan(v)] for row in table]
+    rows = [row for row in rows if row]
+    if not rows:
+        return np.nan
+    return np.mean([np.mean(row) for row in rows]) if average == "person" else np.mean([v for row in rows for v in row])
+
+
+# ---- groups
+
+
+@pytest.mark.parametrize("name", SKELETONS)
+def test_each_joint_has_one_group(name):
+    groups = metrics.joint_groups(name)
+    assert list(groups)[-1] == "all" and len(groups["all"]) == len(SKELETONS[name])
+    together = np.concatenate([index for group, index in groups.items() if group != "all"])
+    assert sorted(together) == list(range(len(SKELETONS[name])))
+    # both sides or none
+    for index in groups.values():
+        assert {SKELETONS[name].flip[j] for j in index} == set(index)
+
+
+def test_the_groups_of_the_paper():
+    groups = {name: [WAYMO14.joints[j] for j in index] for name, index in metrics.joint_groups(WAYMO14).items()}
+    assert list(groups) == ["head", "shoulders", "elbows", "wrists", "hips", "knees", "ankles", "all"]
+    assert set(groups["head"]) == {"nose", "head_center"} and groups["knees"] == ["left_knee", "right_knee"]
+
+
+@quick
+@given(seeds, st.sampled_from(metrics.AVERAGES))
+def test_by_group_against_a_loop(seed, average):
+    table = drawn(seed, n=6, labelled=0.25)
+    for name, score in metrics.by_group(table, "waymo14", average).items():
+        part = table[:, metrics.joint_groups(WAYMO14)[name]]
+        assert score == pytest.approx(slow_mean(part, average), nan_ok=True)
+        assert score.people == sum(not np.isnan(row).all() for row in part) == 6 - score.skipped
+        assert score.joints == (~np.isnan(part)).sum()
+
+
+def test_own_groups_and_groups_of_nobody():
+    table = drawn(0, joints=15)
+    table[:, HUMAN15.index("left_wrist")] = table[:, HUMAN15.index("right_wrist")] = np.nan
+    scores = metrics.by_group(table, HUMAN15)
+    assert np.isnan(scores["wrists"]) and (scores["wrists"].people, scores["wrists"].skipped) == (0, 30)
+    assert np.isfinite(scores["all"])
+    legs = metrics.by_group(table, HUMAN15, groups={"left leg": ("left_hip", "left_knee", "left_ankle")})
+    assert list(legs) == ["left leg", "all"] and legs["left leg"].joints < scores["all"].joints
+
+
+def test_a_table_of_another_skeleton_is_refused():
+    with pytest.raises(InputError, match="human15 has 15 columns, one a joint, got 14"):
+        metrics.by_group(drawn(0), "human15")
+    with pytest.raises(InputError, match="unknown skeleton 'waymo'"):
+        metrics.by_group(drawn(0), "waymo")
+
+
+def test_tables_are_checked():
+    with pytest.raises(InputError, match=r"\(people, joints\) or \(people,\), got \(1, 2, 3\)"):
+        metrics.mean(np.zeros((1, 2, 3)))
+    with pytest.raises(InputError, match="got infinity"):
+        metrics.mean([np.inf])
+    with pytest.raises(InputError, match="rows of equal length"):
+        metrics.mean([[1, 2], [3]])
+    with pytest.raises(InputError, match='empty is for average="person"'):
+        metrics.mean([1.0], "joint", empty=0.0)
+
+
+# ---- slices
+
+
+@quick
+@given(seeds, st.sampled_from(metrics.AVERAGES))
+def test_by_span_against_a_loop(seed, average):
+    rng = np.random.default_rng(seed)
+    table = drawn(seed, labelled=0.2)
+    distance = np.round(rng.uniform(-2, 45, 30))
+    distance[:3] = [np.nan, 10, 40]
+    edges = (0, 10, 20, 40)
+    slices = metrics.by_span(table, distance, edges, average)
+    seen = 0
+    for name, low, high in (("0 to 10", 0, 10), ("10 to 20", 10, 20), ("20 to 40", 20, 40.1)):
+        rows = table[[low <= d < high for d in distance]]
+        score = slices[name].score
+        assert score == pytest.approx(slow_mean(rows, average), nan_ok=True)
+        assert score.people + score.skipped == len(rows) and slices[name].interval is None
+        seen += len(rows)
+    assert list(slices)[-1] == "elsewhere"
+    assert slices["elsewhere"].score.people + slices["elsewhere"].score.skipped == 30 - seen > 0
+
+
+def test_the_edges_of_reports_hold_everybody():
+    table = np.arange(5.0)
+    slices = metrics.by_span(table, [0, 3, 10, 39, 1000], metrics.DISTANCE_EDGES)
+    assert {name: s.score.people for name, s in slices.items()} == {
+        "0 to 10": 2,
+        "10 to 20": 1,
+        "20 to 30": 0,
+        "30 and more": 2,
+    }
+    assert np.isnan(slices["20 to 30"].score)
+    slices = metrics.by_span(table, [0, 49, 50, 400, 10**6], metrics.POINT_EDGES)
+    assert [s.score.people for s in slices.values()] == [2, 1, 0, 0, 2]
+    slices = metrics.by_span(table, [0, 0.05, 0.1, 0.6, 1.0], metrics.OCCLUSION_EDGES)
+    assert [s.score.people for s in slices.values()] == [2, 1, 0, 2]
+
+
+def test_slices_carry_intervals_of_their_own_people():
+    table, distance, sequence = drawn(1), np.repeat([5.0, 15.0], 15), np.arange(30) // 5
+    slices = metrics.by_span(table, distance, (0, 10, 20), rng=np.random.default_rng(0), clusters=sequence)
+    near, far = slices["0 to 10"], slices["10 to 20"]
+    assert near.interval.units == far.interval.units == 3
+    assert near.interval == metrics.interval(table[:15], np.random.default_rng(0), clusters=sequence[:15])
+    for part in (near, far):
+        assert part.interval.low <= part.score <= part.interval.high
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"values": np.zeros(29)}, r"values of slices must be \(30,\), one a person, got \(29,\)"),
+        ({"edges": (0, 0, 1)}, "two or more rising numbers"),
+        ({"edges": (0,)}, "two or more rising numbers"),
+        ({"values": ["near"] * 30}, "must be numbers"),
+        ({"clusters": np.zeros(3)}, r"clusters must be \(30,\)"),
+    ],
+)
+def test_wrong_slices_get_one_line(change, message):
+    with pytest.raises(InputError, match=message):
+        metrics.by_span(**({"table": drawn(0), "values": np.ones(30), "edges": (0, 2)} | change))
+
+
+# ---- intervals
+
+
+def slow_means(table, rng, average, clusters, repeats):
+    """As the bootstrap reads: draw whole clusters, put their people together, take the mean."""
+    rows = [row for row in range(len(table)) if not np.isnan(table[row]).all()]
+    names = sorted({clusters[row] for row in rows})
+    members = [[row for row in rows if clusters[row] == name] for name in names]
+    means = []
+    for _ in range(repeats):
+        drawn = [row for k in rng.integers(len(names), size=len(names)) for row in members[k]]
+        means.append(slow_mean(table[drawn], average))
+    return means
+
+
+@quick
+@given(seeds, st.sampled_from(metrics.AVERAGES), st.booleans())
+def test_draws_against_a_loop(seed, average, clustered):
+    table = drawn(seed, n=12, joints=3, labelled=0.4)
+    table[0] = 1.0
+    clusters = np.random.default_rng(seed).integers(4, size=12) if clustered else np.arange(12)
+    fast, units = bootstrap.draw_means(
+        table, np.random.default_rng(seed), average, clusters=clusters if clustered else None, repeats=20
+    )
+    np.testing.assert_allclose(fast, slow_means(table, np.random.default_rng(seed), average, clusters, 20))
+    assert units == len({c for c, row in zip(clusters, table, strict=True) if not np.isnan(row).all()})
+
+
+def test_draws_do_not_depend_on_how_many_are_held_at_once(monkeypatch):
+    table = drawn(2)
+    whole = metrics.interval(table, np.random.default_rng(0))
+    monkeypatch.setattr(bootstrap, "_BLOCK", 100)
+    assert metrics.interval(table, np.random.default_rng(0)) == whole
+    assert metrics.interval(table, np.random.default_rng(1)) != whole
+
+
+def test_intervals_are_as_wide_as_theory_says():
+    values = np.random.default_rng(0).normal(100, 20, 400)
+    found = metrics.interval(values, np.random.default_rng(0))
+    half = 1.96 * values.std() / 20
+    assert found.low == pytest.approx(values.mean() - half, abs=0.3)
+    assert found.high == pytest.approx(values.mean() + half, abs=0.3)
+    narrow = metrics.interval(values, np.random.default_rng(0), level=0.5)
+    assert found.low < narrow.low < narrow.high < found.high
+
+
+def test_sequences_make_intervals_wider():
+    rng = np.random.default_rng(0)
+    sequence = np.repeat(np.arange(20), 50)
+    values = rng.normal(100, 20, 20)[sequence] + rng.normal(0, 2, 1000)
+    people = metrics.interval(values, np.random.default_rng(0))
+    whole = metrics.interval(values, np.random.default_rng(0), clusters=sequence)
+    assert whole.units == 20 and people.units == 1000
+    # 50 frames that say the same make it about sqrt(50) times as wide
+    assert 5 < (whole.high - whole.low) / (people.high - people.low) < 9
+    names = np.array([f"seq{k}" for k in sequence])
+    assert metrics.interval(values, np.random.default_rng(0), clusters=names).units == 20
+
+
+def test_what_is_hard_for_both_does_not_widen_a_comparison():
+    first = np.random.default_rng(0).normal(100, 30, 300)
+    second = first - 2 + np.random.default_rng(1).normal(0, 1, 300)
+    found = metrics.paired_interval(first, second, np.random.default_rng(0))
+    assert found.low < (first - second).mean() < found.high < found.low + 0.3
+    alone = metrics.interval(first, np.random.default_rng(0))
+    assert alone.high - alone.low > 5
+    with pytest.raises(InputError, match="same joints labelled"):
+        metrics.paired_interval(first, np.where(first > 100, np.nan, second), np.random.default_rng(0))
+
+
+def test_intervals_of_nobody_and_wrong_options():
+    empty = metrics.interval(np.full((4, 3), np.nan), np.random.default_rng(0))
+    assert np.isnan([empty.low, empty.high]).all() and empty.units == 0
+    with pytest.raises(InputError, match="numpy.random.Generator"):
+        metrics.interval([1.0, 2], 0)
+    with pytest.raises(InputError, match=r"clusters must be \(2,\)"):
+        metrics.interval([1.0, 2], np.random.default_rng(0), clusters=[0])
+    with pytest.raises(InputError, match="level must lie between"):
+        metrics.interval([1.0, 2], np.random.default_rng(0), level=95)
+    with pytest.raises(InputError, match="repeats must be"):
+        metrics.interval([1.0, 2], np.random.default_rng(0), repeats=0)
