@@ -135,8 +135,8 @@ def _parser() -> argparse.ArgumentParser:
     prepare = commands.add_parser(
         "prepare",
         help="write a real dataset's people as Parquet shards",
-        description="Reads the raw files of a public dataset and writes OUT/dataset.json and Parquet shards. Stopped or "
-        "killed, the same command goes on.",
+        description="Reads the raw files of a public dataset and writes OUT/dataset.json and Parquet shards. Stopped "
+        "or killed, the same command goes on.",
     )
     prepare.set_defaults(run=_prepare)
     prepare.add_argument(

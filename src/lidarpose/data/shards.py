@@ -13,6 +13,18 @@ person in one frame; columns (`PEOPLE`):
     source, frame_id        as in `Sample`
     sensor, kind, ...       what is known besides, see `synth.facts.Facts`; null where it was not measured
 
+Datasets of real people, which `lidarpose prepare` wrote, have a part of the raw files (a sequence, a file) in each
+shard: labelled-*.parquet (columns as above where they mean the same, see `columns.TABLES`; index numbers the part) with
+
+    sequence, time, split   of the raw dataset; s since the sequence's beginning; train, val, test or null
+    track                   text; the person in the sequence
+    joints                  NaN where a joint is not labelled
+    joint_labels            one a joint: 0 not labelled, 1 hidden or uncertain, 2 seen
+    center_trans, ...       other origins that published protocols use, m; null where there is none
+    distance                of the center from the sensor, m; null where nobody knows the sensor's place
+
+and skipped-*.parquet: what was left out, `reason` and `where`.
+
 Streets have frames-*.parquet beside them (`FRAMES`): whole turns of the sensor, with the person of every point, and
 of everybody in the street, seen or not, track (P,), box (P, 7: center, size, yaw) and joints (P, J, 3), flattened.
 """
@@ -20,62 +32,33 @@ of everybody in the street, seen or not, track (P,), box (P, 7: center, size, ya
 import json
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lidarpose._version import __version__
+from lidarpose.data.columns import FACTS, TABLES, arrays_of, pyarrow, rows_of, schema_of
 from lidarpose.data.files import atomic_path, file_error, read_bytes, write_atomic
-from lidarpose.errors import InputError, MissingExtra
+from lidarpose.data.labelled import item_of
+from lidarpose.data.readers.items import Item
+from lidarpose.errors import InputError
 from lidarpose.sample import Box, Pose, Sample
 from lidarpose.skeleton import BODY26, skeleton
-from lidarpose.synth.facts import Facts
 
 SCHEMA = 1
 CARD = "dataset.json"
+SENSOR_FRAME = "level frame at the sensor: x forward, y left, z up"
 # rows that are compressed together: what a writer and a reader must hold. A turn of 128 rings has up to 260,000 points
-_ROW_GROUP = {"people": 500, "frames": 4}
-# a fact more is a column more, which older shards have not
-_FACTS = {fact.name: {str: "string", float: "float32", bool: "bool", int: "int32"}[fact.type] for fact in fields(Facts)}
-
-# column -> type, of a value or of the values of a list
-_PEOPLE = {
-    "index": "int64",
-    "frame": "int32",
-    "track": "int32",
-    "points": ["float32"],
-    "part": ["uint8"],
-    "ring": ["int32"],
-    "joints": ["float32"],
-    "center": ["float64"],
-    "box_center": ["float64"],
-    "box_size": ["float64"],
-    "box_yaw": "float64",
-    "source": "string",
-    "frame_id": "string",
-    **_FACTS,
-}
-_FRAMES = {
-    "index": "int64",
-    "frame": "int32",
-    "sensor": "string",
-    "points": ["float32"],
-    "ring": ["int32"],
-    "person": ["int16"],
-    "part": ["uint8"],
-    "track": ["int16"],
-    "box": ["float64"],
-    "joints": ["float32"],
-}
-TABLES = {"people": _PEOPLE, "frames": _FRAMES}
+_ROW_GROUP = {"people": 500, "frames": 4, "labelled": 500, "skipped": 5000}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Card:
-    """What dataset.json says: settings, all that decides the content; count of persons, clips or streets; per_shard;
-    tables; skeleton's name; version of the package that wrote it."""
+    """What dataset.json says: settings, all that decides the content; count of persons, clips, streets or parts;
+    per_shard; tables; skeleton's name; version of the package that wrote it; frame of points and joints; about: of a
+    real dataset, its licence, quirks and parts; summary: what a finished one holds."""
 
     settings: dict[str, Any]
     count: int
@@ -83,6 +66,19 @@ class Card:
     tables: tuple[str, ...]
     skeleton: str = BODY26.name
     version: str = __version__
+    frame: str = SENSOR_FRAME
+    about: dict[str, Any] = field(default_factory=dict)
+    summary: dict[str, Any] | None = None
+
+    @property
+    def people(self) -> str:
+        """The table of people: "people" of synthetic ones, "labelled" of real ones."""
+        return "labelled" if "labelled" in self.tables else "people"
+
+    @property
+    def writer(self) -> str:
+        """The command that writes such a dataset."""
+        return "lidarpose prepare" if self.people == "labelled" else "lidarpose synth"
 
     @property
     def shards(self) -> int:
@@ -101,11 +97,15 @@ class Card:
             "per_shard": self.per_shard,
             "tables": list(self.tables),
             "unit": "m",
-            "frame": "level frame at the sensor: x forward, y left, z up",
+            "frame": self.frame,
             "skeleton": self.skeleton,
             "joints": list(skeleton(self.skeleton).joints),
             "settings": self.settings,
         }
+        if self.about:
+            named["about"] = self.about
+        if self.summary is not None:
+            named["summary"] = self.summary
         return json.dumps(named, indent=2) + "\n"
 
 
@@ -113,7 +113,7 @@ def read_card(folder: str | Path) -> Card:
     """The card of a dataset's folder. Raises InputError where it is missing, damaged or of another schema."""
     path = Path(folder) / CARD
     if not path.is_file():
-        raise file_error(folder, f"is no dataset: {CARD} is missing; write one with lidarpose synth --out FOLDER")
+        raise file_error(folder, f"is no dataset: {CARD} is missing; write one with lidarpose synth or prepare")
     try:
         found = json.loads(read_bytes(path, expected="a dataset's card"))
         if found["schema"] != SCHEMA:
@@ -129,6 +129,9 @@ def read_card(folder: str | Path) -> Card:
             tables=tuple(found["tables"]),
             skeleton=str(found["skeleton"]),
             version=str(found["version"]),
+            frame=str(found.get("frame", SENSOR_FRAME)),
+            about=dict(found.get("about", {})),
+            summary=None if found.get("summary") is None else dict(found["summary"]),
         )
     except InputError:
         raise
@@ -169,7 +172,7 @@ def person_row(
         "box_yaw": float(sample.box.yaw),
         "source": sample.source,
         "frame_id": sample.frame_id,
-        **{name: known.get(name) for name in _FACTS},
+        **{name: known.get(name) for name in FACTS},
     }
 
 
@@ -200,12 +203,12 @@ def write_shard(path: str | Path, table: str, rows: Iterable[dict[str, Any]]) ->
 @contextmanager
 def shard_writer(path: str | Path, table: str) -> Iterator[Callable[[dict[str, Any]], None]]:
     """As `write_shard`, for rows that come one by one: yields what adds a row. Holds a row group of them at a time."""
-    pa, parquet = _pyarrow()
-    schema, waiting = _schema(pa, table), []
+    pa, parquet = pyarrow()
+    schema, waiting = schema_of(pa, table), []
 
     def write() -> None:
-        arrays = [_column(pa, [row[name] for row in waiting], kind) for name, kind in TABLES[table].items()]
-        writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=_ROW_GROUP[table])
+        found = pa.Table.from_arrays(arrays_of(pa, table, waiting), schema=schema)
+        writer.write_table(found, row_group_size=_ROW_GROUP[table])
         waiting.clear()
 
     def add(row: dict[str, Any]) -> None:
@@ -221,29 +224,9 @@ def shard_writer(path: str | Path, table: str) -> Iterator[Callable[[dict[str, A
             write()
 
 
-def _column(pa, values: list, kind: str | list[str]):
-    if isinstance(kind, str):
-        return pa.array(values, _type(pa, kind))
-    flat = [np.asarray(v, kind[0]).ravel() for v in values]
-    offsets = np.zeros(len(flat) + 1, np.int32)
-    np.cumsum([len(v) for v in flat], out=offsets[1:])
-    joined = np.concatenate(flat) if flat else np.zeros(0, kind[0])
-    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(joined))
-
-
-def _type(pa, kind: str | list[str]):
-    if isinstance(kind, list):
-        return pa.list_(_type(pa, kind[0]))
-    return pa.bool_() if kind == "bool" else getattr(pa, kind)()
-
-
-def _schema(pa, table: str):
-    return pa.schema([(name, _type(pa, kind)) for name, kind in TABLES[table].items()])
-
-
 def rows_of_shard(path: str | Path) -> int | None:
     """How many rows a shard says it holds; None where it is missing or damaged."""
-    _, parquet = _pyarrow()
+    _, parquet = pyarrow()
     try:
         return parquet.ParquetFile(path).metadata.num_rows
     except Exception:
@@ -251,39 +234,26 @@ def rows_of_shard(path: str | Path) -> int | None:
         return None
 
 
-def read_rows(path: str | Path, table: str) -> Iterator[dict[str, Any]]:
-    """The rows of a shard, list columns as numpy arrays. Raises InputError for a damaged file or other columns."""
-    pa, parquet = _pyarrow()
+def read_rows(path: str | Path, table: str, columns: tuple[str, ...] | None = None) -> Iterator[dict[str, Any]]:
+    """The rows of a shard, list columns as numpy arrays; of `columns` alone where they are named, the others None.
+
+    Raises InputError for a damaged file or other columns.
+    """
+    pa, parquet = pyarrow()
     try:
         with parquet.ParquetFile(path, page_checksum_verification=True) as file:
             there = [name for name in TABLES[table] if name in file.schema_arrow.names]
-            optional = _FACTS if table == "people" else ()
+            optional = FACTS if table == "people" else ()
             missing = [name for name in TABLES[table] if name not in there and name not in optional]
             if missing:
                 raise file_error(path, f"is no shard of {table}: the columns {', '.join(missing)} are missing")
-            for batch in file.iter_batches(batch_size=_ROW_GROUP[table], columns=there):
-                yield from _rows(batch, table)
+            wanted = there if columns is None else [name for name in there if name in columns]
+            for batch in file.iter_batches(batch_size=_ROW_GROUP[table], columns=wanted):
+                yield from rows_of(batch, table)
     except InputError:
         raise
     except (pa.ArrowException, OSError, ValueError, TypeError, AttributeError, MemoryError) as error:
         raise file_error(path, f"cannot be read as Parquet ({error}); delete it and make it again") from None
-
-
-def _rows(batch, table: str) -> Iterator[dict[str, Any]]:
-    columns: dict[str, Any] = {}
-    for name, kind in TABLES[table].items():
-        if name not in batch.schema.names:
-            columns[name] = [None] * batch.num_rows
-            continue
-        column = batch.column(batch.schema.get_field_index(name))
-        if isinstance(kind, str):
-            columns[name] = column.to_pylist()
-        else:
-            flat = column.flatten().to_numpy(zero_copy_only=False).astype(kind[0], copy=False)
-            ends = np.asarray(column.offsets)
-            columns[name] = [flat[a:b] for a, b in zip(ends[:-1] - ends[0], ends[1:] - ends[0], strict=True)]
-    for k in range(batch.num_rows):
-        yield {name: values[k] for name, values in columns.items()}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -293,12 +263,15 @@ class Dataset:
     folder: Path
     card: Card
 
-    def rows(self, table: str = "people", shards: range | None = None) -> Iterator[dict[str, Any]]:
-        """The rows of a table, of some shards or of all; see `TABLES`."""
+    def rows(self, table: str | None = None, shards: range | None = None) -> Iterator[dict[str, Any]]:
+        """The rows of a table, of some shards or of all; see `TABLES`. By default those of people."""
+        table = table or self.card.people
         for shard in range(self.card.shards) if shards is None else shards:
             path = shard_path(self.folder, table, shard)
             if not path.is_file():
-                raise file_error(path, "is missing: the dataset is not finished; run the same lidarpose synth again")
+                raise file_error(
+                    path, f"is missing: the dataset is not finished; run the same {self.card.writer} again"
+                )
             yield from read_rows(path, table)
 
     def rows_of(self, table: str, shard: int) -> int:
@@ -307,37 +280,55 @@ class Dataset:
         rows = rows_of_shard(path)
         if rows is None:
             problem = "is damaged" if path.exists() else "is missing: the dataset is not finished"
-            raise file_error(path, f"{problem}; run the same lidarpose synth again")
+            raise file_error(path, f"{problem}; run the same {self.card.writer} again")
         return rows
 
     def __iter__(self) -> Iterator[Sample]:
         return (self.sample(row) for row in self.rows())
 
     def sample(self, row: dict[str, Any]) -> Sample:
-        """The sample of a row of "people"; of streets its box's id is the track. Raises InputError for a row that is
-        none."""
+        """The sample of a row of people; of streets and of real people its box's id is the track. Raises InputError
+        for a row that is none."""
+        if self.card.people == "labelled":
+            return self.item(row).sample
         try:
             sample = sample_of(row, self.card.skeleton)
             if "frames" in self.card.tables:
                 sample = replace(sample, box=replace(sample.box, id=row["track"]))
             return sample
         except (ValueError, TypeError, AttributeError) as error:
-            raise file_error(self.folder, f"row {row['index']} is no sample ({error}); write it again") from None
+            raise self._no_sample(row, error) from None
+
+    def items(self, split: str | None = None) -> Iterator[Item]:
+        """The people of a real dataset with what was labelled, all or those of a split ("train", "val", "test").
+
+        Raises InputError for a dataset of synthetic people, and for a split that nobody is in.
+        """
+        if self.card.people != "labelled":
+            raise file_error(self.folder, "holds synthetic people; items are of datasets that lidarpose prepare wrote")
+        none = True
+        for row in self.rows():
+            if split is None or row["split"] == split:
+                none = False
+                yield self.item(row)
+        if none and split is not None:
+            raise file_error(self.folder, f"has nobody in the split {split!r}; prepare says which splits it has")
+
+    def item(self, row: dict[str, Any]) -> Item:
+        """The item of a row of "labelled". Raises InputError for a row that is none."""
+        try:
+            return item_of(row, self.card.skeleton)
+        except (ValueError, TypeError, AttributeError, KeyError) as error:
+            raise self._no_sample(row, error) from None
+
+    def _no_sample(self, row: dict[str, Any], error: Exception) -> InputError:
+        return file_error(self.folder, f"row {row['index']} is no sample ({error}); write it again")
 
 
 def open_dataset(folder: str | Path) -> Dataset:
-    """A dataset that `lidarpose synth` wrote. Raises InputError where it is none, MissingExtra without pyarrow."""
-    _pyarrow()
+    """A dataset that `lidarpose synth` or `prepare` wrote. Raises InputError for none, MissingExtra without pyarrow."""
+    pyarrow()
     return Dataset(folder=Path(folder), card=read_card(folder))
-
-
-def _pyarrow():
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise MissingExtra("Parquet shards", "synth") from None
-    return pyarrow, pyarrow.parquet
 
 
 def check_settings(folder: str | Path, found: Card, wanted: Card) -> None:

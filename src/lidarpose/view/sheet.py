@@ -40,7 +40,7 @@ def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out
 
 def _written(dataset: Dataset) -> list[int]:
     """Numbers of the shards of people that are there."""
-    return [k for k in range(dataset.card.shards) if shard_path(dataset.folder, "people", k).is_file()]
+    return [k for k in range(dataset.card.shards) if shard_path(dataset.folder, dataset.card.people, k).is_file()]
 
 
 def _spread(dataset: Dataset, count: int) -> list[dict]:
@@ -48,7 +48,7 @@ def _spread(dataset: Dataset, count: int) -> list[dict]:
     there = _written(dataset)
     if not there:
         raise file_error(dataset.folder, "holds no shard yet; wait for the first one, or run lidarpose synth again")
-    sizes = [dataset.rows_of("people", shard) for shard in there]
+    sizes = [dataset.rows_of(dataset.card.people, shard) for shard in there]
     total = sum(sizes)
     count = min(count, total)
     # each in the middle of an equal share of the rows
@@ -57,7 +57,7 @@ def _spread(dataset: Dataset, count: int) -> list[dict]:
     for shard, size in zip(there, sizes, strict=True):
         here = {w - first for w in wanted if first <= w < first + size}
         if here:
-            found = dataset.rows("people", range(shard, shard + 1))
+            found = dataset.rows(dataset.card.people, range(shard, shard + 1))
             rows += [row for k, row in enumerate(found) if k in here]
         first += size
     return rows
@@ -70,20 +70,24 @@ def _label(row: dict, dataset: Dataset) -> str:
         words.append(f"frame {row['frame']}")
     if "frames" in dataset.card.tables:
         words.append(f"track {row['track']}")
-    return " ".join([*words, row["sensor"] or row["source"].rpartition("/")[2]])
+    return " ".join([*words, row.get("sensor") or row["source"].rpartition("/")[2]])
 
 
 def _panel(row: dict, dataset: Dataset) -> Panel:
     sample = dataset.sample(row)
     return Panel(
-        points=sample.points, truth=sample.pose, part=sample.part, label=_label(row, dataset), distance=row["distance"]
+        points=sample.points,
+        truth=sample.pose,
+        part=sample.part,
+        label=_label(row, dataset),
+        distance=row.get("distance"),
     )
 
 
 def _card(row: dict, dataset: Dataset) -> ReportPerson:
     sample = dataset.sample(row)
     caption = f"{len(sample.points):,} points"
-    if row["distance"] is not None:
+    if row.get("distance") is not None:
         # as in the table above
         caption += f" · {row['distance']:.1f} m"
     return ReportPerson(
@@ -93,7 +97,7 @@ def _card(row: dict, dataset: Dataset) -> ReportPerson:
 
 def _line(row: dict, dataset: Dataset) -> dict:
     line = {"person": _label(row, dataset), "points": len(row["points"]) // 3}
-    if row["distance"] is not None:
+    if row.get("distance") is not None:
         line |= {
             "does": row["kind"],
             "distance m": round(row["distance"], 1),

@@ -1,0 +1,222 @@
+"""`lidarpose prepare`: the raw files of a real dataset into the Parquet shards that synthetic people come in.
+
+One shard a part (a sequence, a segment, a file), with what was skipped and why beside it. A part that is whole is not
+read again: to have a repaired file read, delete its two shards and run the same command.
+"""
+
+import hashlib
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from functools import cached_property
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from lidarpose.data.files import file_error
+from lidarpose.data.jobs import clean_folder, make_shards, open_folder
+from lidarpose.data.labelled import labelled_row
+from lidarpose.data.readers.items import Item, Reader, Skipped
+from lidarpose.data.shards import CARD, SENSOR_FRAME, Card, open_dataset, shard_path, shard_writer, write_card
+from lidarpose.data.split_rules import SplitRule, split_rule
+from lidarpose.data.summary import summarize
+from lidarpose.errors import InputError, unknown_name
+
+# dataset -> module and class of its reader, and whether that takes the user's SMPL
+READERS: dict[str, tuple[str, str, bool]] = {
+    "humanm3": ("humanm3", "HumanM3", False),
+    "lidarhuman26m": ("lidarhuman26m", "LidarHuman26M", True),
+    "sloper4d": ("sloper4d", "Sloper4D", True),
+    "waymo": ("waymo", "Waymo", False),
+    "lipd": ("corpora", "Lipd", False),
+    "freemotion": ("corpora", "FreeMotion", True),
+    "noisemotion": ("corpora", "NoiseMotion", True),
+}
+# tables of such a dataset; the people's last, since a part is whole once they are there
+_TABLES = ("skipped", "labelled")
+# how many people between two tellings of progress
+_TOLD = 200
+
+
+def reader(name: str, smpl: str | Path | None = None) -> Reader:
+    """The reader of a dataset, by its name in `READERS`. smpl: the user's SMPL model, a file or a folder of them.
+
+    Raises InputError for an unknown name, where SMPL is needed and not given or cannot be read, and where it is given
+    and not needed.
+    """
+    if name not in READERS:
+        raise unknown_name("dataset", name, READERS)
+    module, kind, takes_smpl = READERS[name]
+    make = getattr(import_module(f"lidarpose.data.readers.{module}"), kind)
+    if not takes_smpl:
+        if smpl is not None:
+            raise InputError(f"{name} has joints of its own: leave the SMPL model out")
+        return make()
+    return make(smpl=smpl)
+
+
+def prepare(
+    name: str,
+    root: str | Path,
+    out: str | Path,
+    *,
+    split: str | None = None,
+    split_by: str | None = None,
+    smpl: str | Path | None = None,
+    workers: int = 1,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Writes a dataset's people as Parquet shards into `out`, or what is missing of them, and returns the summary.
+
+    name: one of `READERS`; root: the folder of its raw files; split: only people of that split ("train", "val",
+    "test"), by default all; split_by: the published split to go by, by default the user's own train.txt and test.txt in
+    `root`, else the dataset's usual one; smpl: the user's SMPL model, a file or a folder of one for each gender;
+    workers: processes; progress: draw a bar on a terminal.
+
+    The summary, also in out/dataset.json: people, skipped by reason with an example each, people by split and source,
+    parts, and warnings. Raises InputError, one line, for a wrong root, name, split or SMPL model and for a folder that
+    holds something else; MissingExtra without pyarrow.
+    """
+    if workers < 1:
+        raise InputError(f"expected at least 1 worker, got {workers}")
+    root, out = Path(root), Path(out)
+    source = reader(name, smpl)
+    if not root.is_dir():
+        raise file_error(root, f"is no folder; expected the raw files of {name}")
+    parts = list(source.parts(root))
+    rule = split_rule(name, root, split_by)
+    absent = rule.absent(parts) if rule is not None else {}
+    parts = _of_split(name, parts, rule, split)
+    about = getattr(source, "about", {})
+    card = _card(name, source, parts, rule, split, about)
+    missing = open_folder(out, card)
+    clean_folder(out)
+    # the summary of a run that is not over would be wrong
+    if missing or not (out / CARD).is_file():
+        write_card(out, card)
+    make = PartWriter(
+        name=name,
+        smpl=None if smpl is None else str(smpl),
+        root=root,
+        out=out,
+        parts=tuple(parts),
+        rule=rule,
+        only=split,
+        sensor_known=bool(about.get("sensor_known", True)),
+    )
+    with ExitStack() as stack:
+        bar = _bar(stack, len(parts), len(missing)) if progress else None
+        people = 0
+        for shards, more in make_shards(make, missing, workers=workers):
+            people += more
+            if bar is not None:
+                bar.set_postfix_str(f"{people:,} people", refresh=False)
+                bar.update(shards)
+    clean_folder(out)
+    summary = summarize(open_dataset(out), parts=parts, absent=absent, rule=rule)
+    write_card(out, replace(card, summary=summary))
+    return summary
+
+
+def _of_split(name: str, parts: list[str], rule: SplitRule | None, split: str | None) -> list[str]:
+    """The parts in which people of the split may be. Raises InputError where there are none."""
+    if split is None:
+        return parts
+    if rule is None:
+        raise InputError(f"{name} has no split to choose {split!r} from: put train.txt and test.txt into its folder")
+    if split not in rule.sets:
+        raise unknown_name(f"split of {name} by {rule.name}", split, rule.sets)
+    kept = [part for part in parts if not rule.by_part or rule.of_part(part) == split]
+    if not kept:
+        raise InputError(f"none of the {len(parts)} parts of {name} is in {split!r} by {rule.name}: {rule.source}")
+    return kept
+
+
+def _card(
+    name: str, source: Reader, parts: list[str], rule: SplitRule | None, split: str | None, about: dict[str, Any]
+) -> Card:
+    # the names themselves would fill the line that says what differs
+    digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
+    settings: dict[str, Any] = {"what": "parts", "dataset": name, "parts": digest}
+    settings |= {"split": split, "split_by": None if rule is None else rule.name}
+    if rule is not None and rule.name == "own":
+        settings["lists"] = hashlib.sha256(repr(sorted(rule.sets.items())).encode()).hexdigest()[:12]
+    told = {key: value for key, value in about.items() if key not in ("frame", "settings")}
+    if rule is not None:
+        told["split"] = f"{rule.name}: {rule.source}" + (f"; LEAKS: {rule.leaks}" if rule.leaks else "")
+    return Card(
+        settings=settings | about.get("settings", {}),
+        count=len(parts),
+        per_shard=1,
+        tables=_TABLES,
+        skeleton=source.skeleton,
+        frame=about.get("frame", SENSOR_FRAME),
+        about=told | {"parts": parts},
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartWriter:
+    """Reads parts of a dataset and writes their shards: called with a part's number, yields counts of people as they
+    are done. only: the split to keep, None for all; the rest as in `prepare`. May be pickled."""
+
+    name: str
+    smpl: str | None
+    root: Path
+    out: Path
+    parts: tuple[str, ...]
+    rule: SplitRule | None
+    only: str | None
+    sensor_known: bool
+
+    @cached_property
+    def _reader(self) -> Reader:
+        return reader(self.name, self.smpl)
+
+    def __call__(self, number: int) -> Iterator[int]:
+        people, waiting = 0, 0
+        with ExitStack() as stack:
+            add = {
+                table: stack.enter_context(shard_writer(shard_path(self.out, table, number), table))
+                for table in reversed(_TABLES)
+            }
+            for found, split in self._found(self.parts[number]):
+                if isinstance(found, Skipped):
+                    add["skipped"]({"index": number, "reason": found.reason, "where": found.where})
+                elif self.only in (None, split):
+                    row = labelled_row(found, index=number, split=split, sensor_known=self.sensor_known)
+                    add["labelled"](row)
+                    people, waiting = people + 1, waiting + 1
+                if waiting == _TOLD:
+                    yield waiting
+                    waiting = 0
+        yield waiting
+
+    def _found(self, part: str) -> Iterator[tuple[Item | Skipped, str | None]]:
+        """Everybody in a part, with the split."""
+        found = self._read(part)
+        if self.rule is None or self.rule.by_part:
+            split = None if self.rule is None else self.rule.of_part(part)
+            yield from ((one, split) for one in found)
+            return
+        everyone = list(found)
+        splits = iter(self.rule.of_chunks(part, sum(isinstance(one, Item) for one in everyone)))
+        for one in everyone:
+            yield one, next(splits) if isinstance(one, Item) else None
+
+    def _read(self, part: str) -> Iterator[Item | Skipped]:
+        """As the reader, but a part that turns out to be unreadable ends there, which is counted."""
+        try:
+            yield from self._reader.read(self.root, part)
+        except InputError as error:
+            yield Skipped(reason="the rest of a part cannot be read", where=f"{part}: {error}")
+
+
+def _bar(stack: ExitStack, total: int, missing: int):
+    if sys.stderr is None or not sys.stderr.isatty():
+        return None
+    from tqdm import tqdm
+
+    # what stood there before is not this run's speed
+    return stack.enter_context(tqdm(total=total, initial=total - missing, unit=" parts", smoothing=0.1))

@@ -1,0 +1,129 @@
+"""LiDARHuman26M (LiDARCap, Li et al. 2022): one person, 12 to 24 m away, seen by a LiDAR that stands still.
+
+    ROOT/labels/3d/pose/7/000001.json       beta (10), pose (72) rad, trans (3) m: SMPL, neutral
+    ROOT/labels/3d/segment/7/000001.ply     the person's points, m, in the LiDAR's frame, as pose and trans
+
+Joints are SMPL's, so the user's SMPL file is needed. Source: the dataset's page, AutoCONFIG/Neighborhood-enhanced-
+LidarCap sample/gen_dataset.py.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from lidarpose.data.files import file_error
+from lidarpose.data.readers.items import SEEN, Item, Skipped
+from lidarpose.data.readers.raw import numbered, numbers, read_cloud, read_json, wrong_root
+from lidarpose.data.readers.smpl_joints import SmplJoints
+from lidarpose.errors import InputError
+from lidarpose.sample import Pose, Sample, center_of
+from lidarpose.skeleton import SMPL24
+
+# frames a second of the LiDAR
+_FPS = 10.0
+_POSE, _SEGMENT = "labels/3d/pose", "labels/3d/segment"
+_EXPECTED = f"{_POSE}/5/000001.json and {_SEGMENT}/5/000001.ply"
+_GET = "www.lidarhumanmotion.net/lidarcap"
+
+
+class LidarHuman26M:
+    """Reads LiDARHuman26M. A part is a sequence. smpl: the user's SMPL model, see `SmplJoints`."""
+
+    name = "lidarhuman26m"
+    skeleton = SMPL24.name
+
+    def __init__(self, *, smpl: str | Path | None = None):
+        self._smpl = SmplJoints(smpl, self.name)
+        self.about = {
+            "frame": "the LiDAR's own, as in the release: it stands still, z up as far as it was mounted level",
+            "settings": {"smpl": self._smpl.digests[self._smpl.kind("neutral")]},
+            "licence": "asked for on the dataset's page; treat it as non-commercial research, no redistribution",
+            "get": _GET,
+            "notes": [
+                "Joints are SMPL's with the labelled betas, neutral body for everybody. LiDARCap's own figures are of "
+                "betas = 0 and joints relative to the pelvis: not the same joints.",
+                "center_trans is SMPL's trans: the released DAPT evaluation centers on it. The pelvis is about 0.24 m "
+                "from it, at a place that betas decide.",
+                "All joints count as seen; the labels come from suits, not from what the LiDAR saw.",
+                "There are no boxes. time is the frame's number at 10 Hz.",
+                "train.txt and test.txt are not in the release; the published ids are used where they are missing, and "
+                "the blank line at their end is no sequence.",
+            ],
+        }
+
+    def parts(self, root: Path) -> list[str]:
+        """The sequences, by number. Raises InputError where poses or clouds are missing altogether."""
+        for name in (_POSE, _SEGMENT):
+            if not (root / name).is_dir():
+                raise wrong_root(root, "LiDARHuman26M", _EXPECTED, f"got no {name}", _GET)
+        names = {path.name for folder in (_POSE, _SEGMENT) for path in (root / folder).iterdir() if path.is_dir()}
+        if not names:
+            raise wrong_root(root, "LiDARHuman26M", _EXPECTED, f"got no sequence in {_POSE}", _GET)
+        return sorted(names, key=lambda name: (int(name) if name.isdecimal() else -1, name))
+
+    def read(self, root: Path, part: str) -> Iterator[Item | Skipped]:
+        """The person of a sequence, frame by frame."""
+        poses, clouds = numbered(root / _POSE / part, ".json"), numbered(root / _SEGMENT / part, ".ply")
+        first = min(poses, default=0)
+        labels, wrong = {}, {}
+        for frame, paths in poses.items():
+            try:
+                labels[frame] = _labels(paths[0])
+            except InputError as error:
+                wrong[frame] = str(error)
+        joints = {}
+        if labels:
+            betas, pose, trans = (np.stack(rows) for rows in zip(*labels.values(), strict=True))
+            joints = dict(zip(labels, self._smpl(betas, pose, trans), strict=True))
+        for frame in sorted(poses.keys() | clouds.keys()):
+            where = f"{part}/{frame:06d}"
+            if frame in wrong:
+                yield Skipped(reason="labels cannot be read", where=wrong[frame])
+            elif frame not in poses:
+                yield Skipped(reason="cloud without labels", where=where)
+            elif frame not in clouds:
+                yield Skipped(reason="labels without a cloud", where=where)
+            elif len(poses[frame]) + len(clouds[frame]) > 2:
+                names = ", ".join(path.name for path in [*poses[frame], *clouds[frame]])
+                yield Skipped(reason="several files of one frame", where=f"{where}: {names}")
+            else:
+                yield _item(clouds[frame][0], joints[frame], labels[frame][2], part, frame, (frame - first) / _FPS)
+
+
+def _labels(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """betas (10,), pose (72,) rad and trans (3,) m."""
+    content = read_json(path, "SMPL's beta, pose and trans")
+    missing = [key for key in ("beta", "pose", "trans") if key not in content]
+    if missing:
+        raise file_error(path, f"expected beta, pose and trans, got no {', '.join(missing)}")
+    beta, pose, trans = (
+        numbers(path, content[key], (size,), key) for key, size in (("beta", 10), ("pose", 72), ("trans", 3))
+    )
+    return beta, pose, trans
+
+
+def _item(path: Path, joints: np.ndarray, trans: np.ndarray, part: str, frame: int, time: float) -> Item | Skipped:
+    try:
+        points = read_cloud(path)
+    except InputError as error:
+        return Skipped(reason="cloud cannot be read", where=str(error))
+    if not len(points):
+        return Skipped(reason="empty cloud", where=f"{part}/{path.stem}")
+    points = points.astype(np.float32)
+    sample = Sample(
+        points=points,
+        center=center_of(points),
+        pose=Pose(joints=joints.astype(np.float32), skeleton=SMPL24, frame="sensor"),
+        source="lidarhuman26m",
+        frame_id=f"{part}/{path.stem}",
+    )
+    return Item(
+        sample=sample,
+        joint_labels=np.full(len(SMPL24), SEEN, np.uint8),
+        sequence=part,
+        frame=frame,
+        track="0",
+        time=time,
+        centers={"trans": trans},
+    )

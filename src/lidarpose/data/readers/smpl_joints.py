@@ -1,0 +1,96 @@
+"""SMPL's 24 joints from its parameters, by the user's own model files: what datasets without joints need."""
+
+import hashlib
+import re
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from lidarpose.body.rig import forward_kinematics
+from lidarpose.body.smpl import SmplBody, load_body
+from lidarpose.data.files import file_error, read_bytes
+from lidarpose.errors import InputError
+from lidarpose.geometry import axis_angle_to_matrix
+from lidarpose.skeleton import SMPL24
+
+# what the published files are called: SMPL_MALE.pkl, basicmodel_m_lbs_10_207_0_v1.1.0.pkl, basicModel_f_lbs_...
+_NAMES = {
+    "neutral": r"smpl_neutral|basicmodel_neutral_lbs.*",
+    "male": r"smpl_male|basicmodel_m_lbs.*",
+    "female": r"smpl_female|basicmodel_f_lbs.*",
+}
+_GET = (
+    "register at smpl.is.tue.mpg.de, download SMPL for Python v1.1.0, which has the neutral body, "
+    "and give --smpl with its .pkl or .npz, or with a folder of SMPL_NEUTRAL, SMPL_MALE and SMPL_FEMALE"
+)
+
+
+class SmplJoints:
+    """The joints of SMPL bodies in any pose. Models are read when first needed.
+
+    path: the user's SMPL, one file for everybody, or a folder with a file for each gender, by their published names.
+    Raises InputError where it is None, missing, or a folder without a neutral body; the dataset's name is told.
+    """
+
+    def __init__(self, path: str | Path | None, dataset: str):
+        if path is None:
+            raise InputError(f"{dataset} has SMPL poses and no joints, so it needs SMPL's own file: {_GET}")
+        self.files = {"any": Path(path)}
+        if Path(path).is_dir():
+            self.files = _in_folder(Path(path))
+            if "neutral" not in self.files:
+                there = ", ".join(sorted(p.name for p in Path(path).iterdir())[:6]) or "nothing"
+                raise file_error(path, f"expected SMPL_NEUTRAL.pkl or .npz, got {there}: {_GET}")
+        elif not Path(path).is_file():
+            raise file_error(path, f"no such file; expected SMPL's own: {_GET}")
+        self._models: dict[str, _Model] = {}
+
+    def kind(self, gender: str) -> str:
+        """Which model a gender gets: "any" where one file is for everybody, else its own, else the neutral one."""
+        return "any" if "any" in self.files else gender if gender in self.files else "neutral"
+
+    def __call__(self, betas: np.ndarray, pose: np.ndarray, trans: np.ndarray, gender: str = "neutral") -> np.ndarray:
+        """Joints (n, 24, 3) float64 m. betas (n or 1, <= 300); pose (n, 72) axis-angles rad, the root first; trans
+        (n, 3) m, added to everything, so that the pelvis is at its rest position plus trans."""
+        kind = self.kind(gender)
+        if kind not in self._models:
+            self._models[kind] = _Model(self.files[kind])
+        return self._models[kind].joints(betas, pose, trans)
+
+    @cached_property
+    def digests(self) -> dict[str, str]:
+        """By kind, what tells one file from another."""
+        return {
+            kind: hashlib.sha256(read_bytes(path, expected="SMPL")).hexdigest()[:12]
+            for kind, path in self.files.items()
+        }
+
+
+class _Model:
+    """A body's joints at rest, linear in betas."""
+
+    def __init__(self, path: Path):
+        body: SmplBody = load_body(path)
+        if len(body.parents) != len(SMPL24):
+            raise file_error(path, f"expected SMPL, with 24 joints, got {len(body.parents)} (SMPL+H, SMPL-X?): {_GET}")
+        self.path = path
+        self.rest = body.regressor @ body.template
+        self.shapes = np.einsum("jv,vcs->jcs", body.regressor, body.shapes, optimize=True)
+
+    def joints(self, betas: np.ndarray, pose: np.ndarray, trans: np.ndarray) -> np.ndarray:
+        count = betas.shape[-1]
+        if count > self.shapes.shape[-1]:
+            raise file_error(self.path, f"has {self.shapes.shape[-1]} shapes, the labels {count}: give the full model")
+        rest = self.rest + np.moveaxis(self.shapes[..., :count] @ betas.T, -1, 0)
+        turns = axis_angle_to_matrix(pose.reshape(len(pose), -1, 3))
+        return forward_kinematics(SMPL24.parents, rest, turns, rest[:, 0] + trans)[1]
+
+
+def _in_folder(folder: Path) -> dict[str, Path]:
+    found: dict[str, Path] = {}
+    for path in sorted(folder.iterdir()):
+        for gender, names in _NAMES.items():
+            if path.suffix.lower() in (".pkl", ".npz") and re.fullmatch(names, path.stem.lower()):
+                found.setdefault(gender, path)
+    return found

@@ -1,0 +1,269 @@
+"""Waymo Open Dataset, Perception: people with laser keypoints. Version 2 as Parquet; version 1.4 is in `waymo_v1`.
+
+    ROOT/{training,validation}/COMPONENT/SEGMENT.parquet
+
+Six of the components are read: lidar_hkp and lidar_box (keypoints and boxes), lidar and lidar_pose (range images of
+five lasers, two returns each, and where the car was when a pixel of the top laser was measured), lidar_calibration and
+vehicle_pose. They are joined on their key columns. See docs/waymo.md for the frames of reference and the quirks.
+Source: waymo-research/waymo-open-dataset src/waymo_open_dataset/v2.
+"""
+
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidarpose.data.files import file_error
+from lidarpose.data.readers.items import Item, Reader, Skipped
+from lidarpose.data.readers.raw import wrong_root
+from lidarpose.data.readers.waymo_frames import (
+    BAD_IMAGE,
+    BAD_LABEL,
+    MARGIN,
+    Calibration,
+    Frame,
+    Person,
+    about,
+    person,
+    transform,
+)
+from lidarpose.data.readers.waymo_parquet import (
+    LASER,
+    OBJECT,
+    SEGMENT,
+    TIME,
+    FrameKey,
+    LaserKey,
+    count_rows,
+    images,
+    laser_keys,
+    table,
+)
+from lidarpose.data.readers.waymo_v1 import SPLITS, WaymoV1
+from lidarpose.errors import InputError
+from lidarpose.skeleton import WAYMO14
+
+COMPONENTS = ("lidar_hkp", "lidar_box", "lidar_calibration", "vehicle_pose", "lidar", "lidar_pose")
+_BUCKET = "gs://waymo_open_dataset_v_2_0_1"
+_EXPECTED = "{training,validation}/COMPONENT/SEGMENT.parquet or {training,validation}/SEGMENT.tfrecord"
+
+_KEYPOINTS = "[LiDARHumanKeypointsComponent].lidar_keypoints[*]"
+_KEYPOINT_COLUMNS = tuple(
+    f"{_KEYPOINTS}.{name}"
+    for name in ("type", *(f"keypoint_3d.location_m.{x}" for x in "xyz"), "keypoint_3d.visibility.is_occluded")
+)
+_BOX_COLUMNS = tuple(
+    f"[LiDARBoxComponent].box.{name}"
+    for name in (*(f"{of}.{x}" for of in ("center", "size") for x in "xyz"), "heading")
+)
+_BOX_TYPE, _BOX_COUNT = "[LiDARBoxComponent].type", "[LiDARBoxComponent].num_lidar_points_in_box"
+_EXTRINSIC = "[LiDARCalibrationComponent].extrinsic.transform"
+_BEAMS = "[LiDARCalibrationComponent].beam_inclination"
+_VEHICLE_POSE = "[VehiclePoseComponent].world_from_vehicle.transform"
+_RETURNS = ("[LiDARComponent].range_image_return1", "[LiDARComponent].range_image_return2")
+_PIXEL_POSES = "[LiDARPoseComponent].range_image_return1"
+
+
+class Waymo:
+    """Reads whichever version is there. margin: how far around the labelled box points are taken, m on each side."""
+
+    name = "waymo"
+    skeleton = WAYMO14.name
+
+    def __init__(self, *, margin: float = MARGIN):
+        self.about = about(margin)
+        self._v1, self._v2 = WaymoV1(margin=margin), WaymoV2(margin=margin)
+
+    def parts(self, root: Path) -> list[str]:
+        """Segments of version 2 ("training/SEGMENT") or files of version 1 ("training/FILE.tfrecord"). Raises
+        InputError where there are both, neither, or a component is missing."""
+        return self._version(root).parts(root)
+
+    def read(self, root: Path, part: str) -> Iterator[Item | Skipped]:
+        """Everybody with keypoints in a part, frame by frame."""
+        return (self._v1 if part.endswith(".tfrecord") else self._v2).read(root, part)
+
+    def _version(self, root: Path) -> Reader:
+        old = next((path for split in SPLITS for path in sorted((root / split).glob("*.tfrecord"))), None)
+        new = next((root / split / name for split in _splits(root) for name in _components(root / split)), None)
+        if old is not None and new is not None:
+            mixed = f"{old.relative_to(root)} is of version 1, {new.relative_to(root)} of version 2"
+            raise file_error(root, f"mixes versions of Waymo: {mixed}; keep each in a folder of its own")
+        if old is not None:
+            return self._v1
+        if new is not None:
+            return self._v2
+        there = ", ".join(sorted(path.name for path in root.glob("*"))[:6]) or "nothing"
+        if root.name in SPLITS or _components(root):
+            there += f"; the root is likely {root.absolute().parent}"
+        if any((root / "individual_files" / split).is_dir() for split in SPLITS):
+            there += f"; the root is likely {root / 'individual_files'}"
+        raise wrong_root(root, "Waymo", _EXPECTED, f"got {there}", self.about["get"])
+
+
+class WaymoV2:
+    """Reads version 2. A part is a segment that has keypoints, in one of the splits."""
+
+    name = "waymo"
+    skeleton = WAYMO14.name
+
+    def __init__(self, *, margin: float = MARGIN):
+        self.margin = margin
+        self.about = about(margin)
+
+    def parts(self, root: Path) -> list[str]:
+        """As of `Waymo`. A segment without keypoints needs no other files."""
+        found = []
+        for split in _splits(root):
+            missing = [name for name in COMPONENTS if not any((root / split / name).glob("*.parquet"))]
+            if missing:
+                fetch = f"gcloud storage cp -r {_urls(split, missing)} {shlex.quote(f'{root / split}/')}"
+                raise file_error(root / split, f"lacks {', '.join(missing)}; fetch with: {fetch}")
+            # a damaged file is a part too: reading it tells
+            labels = sorted((root / split / "lidar_hkp").glob("*.parquet"))
+            segments = [path.stem for path in labels if count_rows(path) != 0]
+            for name in COMPONENTS:
+                _check_complete(root / split / name, split, segments)
+            found += [f"{split}/{segment}" for segment in segments]
+        if not found:
+            raise file_error(root, "has no segment with laser keypoints: only some have any; fetch all of lidar_hkp")
+        return sorted(found)
+
+    def read(self, root: Path, part: str) -> Iterator[Item | Skipped]:
+        """Everybody with keypoints in a segment, in the order of time, then of track. Raises InputError where the
+        labels cannot be read; where the range images cannot, everybody is skipped."""
+        split, _, segment = part.partition("/")
+        files = {name: root / split / name / f"{segment}.parquet" for name in COMPONENTS}
+        frames = _frames(files, self.margin)
+        try:
+            _add_images(files, frames)
+        except InputError as error:
+            for frame in frames.values():
+                frame.fail(BAD_IMAGE, str(error))
+        for key in sorted(frames):
+            yield from frames[key].found()
+
+
+def _components(folder: Path) -> list[str]:
+    return [name for name in COMPONENTS if (folder / name).is_dir()]
+
+
+def _splits(root: Path) -> list[str]:
+    """The splits of which any component is there."""
+    return [split for split in SPLITS if _components(root / split)]
+
+
+def _check_complete(folder: Path, split: str, segments: list[str]) -> None:
+    missing = [segment for segment in segments if not (folder / f"{segment}.parquet").is_file()]
+    if missing:
+        fetch = f"gcloud storage cp {_urls(split, [folder.name])}/{missing[0]}.parquet {shlex.quote(f'{folder}/')}"
+        raise file_error(
+            folder,
+            f"lacks {len(missing)} of the {len(segments)} segments with keypoints; fetch the first with: {fetch} "
+            "(or take what you do not want out of lidar_hkp)",
+        )
+
+
+def _urls(split: str, components: list[str]) -> str:
+    names = components[0] if len(components) == 1 else f"{{{','.join(components)}}}"
+    return f"{_BUCKET}/{split}/{names}"
+
+
+def _frames(files: dict[str, Path], margin: float) -> dict[FrameKey, Frame]:
+    """The frames that have keypoints, with boxes, calibrations and poses joined to them."""
+    labels = table(files["lidar_hkp"], (SEGMENT, TIME, OBJECT, *_KEYPOINT_COLUMNS))
+    keys = {_object_key(row) for row in labels}
+    boxes = {
+        key: row
+        for row in table(files["lidar_box"], (SEGMENT, TIME, OBJECT, *_BOX_COLUMNS, _BOX_TYPE), (_BOX_COUNT,))
+        if (key := _object_key(row)) in keys
+    }
+    poses, starts = {}, {}
+    for row in table(files["vehicle_pose"], (SEGMENT, TIME, _VEHICLE_POSE)):
+        segment, time = row[SEGMENT], row[TIME]
+        poses[segment, time] = row[_VEHICLE_POSE]
+        starts[segment] = min(time, starts.get(segment, time))
+    calibrations = _calibrations(files["lidar_calibration"])
+    people: dict[FrameKey, list[Person]] = {}
+    for row in labels:
+        people.setdefault((row[SEGMENT], row[TIME]), []).append(_person(row, boxes.get(_object_key(row))))
+    return {
+        (segment, time): Frame(
+            sequence=segment,
+            timestamp=time,
+            start=starts.get(segment, time),
+            people=found,
+            calibrations=calibrations.get(segment, {}),
+            T_world_vehicle=_vehicle_pose(files["vehicle_pose"], poses.get((segment, time))),
+            margin=margin,
+        )
+        for (segment, time), found in people.items()
+    }
+
+
+def _object_key(row: dict[str, Any]) -> tuple[str, int, str]:
+    return row[SEGMENT], row[TIME], row[OBJECT]
+
+
+def _vehicle_pose(path: Path, values: list[float] | None) -> np.ndarray | None:
+    try:
+        return None if values is None else transform(values, "a pose")
+    except InputError as error:
+        raise file_error(path, error) from None
+
+
+def _calibrations(path: Path) -> dict[str, dict[int, Calibration]]:
+    """Segment -> laser -> its calibration."""
+    found: dict[str, dict[int, Calibration]] = {}
+    columns = (SEGMENT, LASER, _EXTRINSIC)
+    optional = (f"{_BEAMS}.values", f"{_BEAMS}.min", f"{_BEAMS}.max")
+    for row in table(path, columns, optional):
+        values, low, high = (row[name] for name in optional)
+        if not values and (low is None or high is None):
+            raise file_error(path, f"has no beam inclinations of laser {row[LASER]}")
+        try:
+            extrinsic = transform(row[_EXTRINSIC], f"the extrinsic of laser {row[LASER]}")
+        except InputError as error:
+            raise file_error(path, error) from None
+        found.setdefault(row[SEGMENT], {})[row[LASER]] = Calibration(
+            laser=row[LASER],
+            T_vehicle_laser=extrinsic,
+            inclinations=np.array(values, float) if values else None,
+            low=low,
+            high=high,
+        )
+    return found
+
+
+def _person(label: dict[str, Any], box: dict[str, Any] | None) -> Person:
+    kinds, *places, hidden = (label[name] or [] for name in _KEYPOINT_COLUMNS)
+    if len({len(kinds), len(hidden), *map(len, places)}) > 1:
+        return Person(track=label[OBJECT], problem=(BAD_LABEL, "its lists have different lengths"))
+    keypoints = zip(kinds, np.array(places, float).T, hidden, strict=True)
+    if box is None:
+        return person(label[OBJECT], keypoints, None)
+    values = np.array([box[name] for name in _BOX_COLUMNS], float)
+    return person(label[OBJECT], keypoints, values, box[_BOX_TYPE], box[_BOX_COUNT])
+
+
+def _add_images(files: dict[str, Path], frames: dict[FrameKey, Frame]) -> None:
+    """Adds the range images to their frames, one row at a time."""
+    wanted = {key for key, frame in frames.items() if frame.wanted}
+    if not wanted:
+        return
+    posed = laser_keys(files["lidar_pose"], wanted)
+    poses = images(files["lidar_pose"], (_PIXEL_POSES,), wanted)
+    # both files usually have their frames in the same order, then there is never more than one in it
+    waiting: dict[LaserKey, np.ndarray | None] = {}
+    for key, returns in images(files["lidar"], _RETURNS, wanted):
+        while key in posed and key not in waiting:
+            found, (image,) = next(poses, (key, [None]))
+            waiting[found] = image
+        pixel_poses, frame = waiting.pop(key, None), frames[key[:2]]
+        for which, image in enumerate(returns, 1):
+            if image is not None and not image.size:
+                frame.fail(BAD_IMAGE, f"the values of laser {key[2]} do not fit their shape")
+            elif image is not None:
+                frame.add(key[2], which, image[..., 0], pixel_poses)

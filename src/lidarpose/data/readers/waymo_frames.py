@@ -1,0 +1,270 @@
+"""Waymo's frames, whatever files they come from: range images to points, keypoints and boxes to people.
+
+Frames of reference: a laser's own (x along its azimuth 0, z up); the vehicle's (x forward, y left, z up) at the time of
+the frame's pose, in which boxes and keypoints are labelled; the world's. Lengths in metres, angles in radians. H rows
+and W columns of a range image, n points, J = 14 joints.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from lidarpose.data.readers.items import HIDDEN, SEEN, UNLABELED, Item, Skipped
+from lidarpose.errors import InputError
+from lidarpose.geometry import from_spherical
+from lidarpose.sample import Box, Pose, Sample, center_of
+from lidarpose.skeleton import WAYMO14
+
+LASERS = {"TOP": 1, "FRONT": 2, "SIDE_LEFT": 3, "SIDE_RIGHT": 4, "REAR": 5}
+TOP = LASERS["TOP"]
+# how far outside the labelled box points are still taken, m on each side
+MARGIN = 0.2
+
+# KeypointType -> the joint of WAYMO14; 19, the forehead, is of cameras
+_JOINTS = {
+    kind: WAYMO14.index(name)
+    for first, side in ((5, "left"), (13, "right"))
+    for kind, name in enumerate((f"{side}_{joint}" for joint in "shoulder elbow wrist hip knee ankle".split()), first)
+} | {1: WAYMO14.index("nose"), 20: WAYMO14.index("head_center")}
+_KINDS = {1: "vehicle", 2: "pedestrian", 3: "sign", 4: "cyclist"}
+
+# why somebody is left out: the same words for both versions of the dataset
+NO_BOX = "keypoints without a box"
+NO_JOINTS = "no joint is labelled"
+NO_POINTS = "no points in the box"
+NO_IMAGE = "no range image of the frame"
+NO_PIXEL_POSES = "no pixel poses of the top laser"
+NO_VEHICLE_POSE = "no vehicle pose of the frame"
+BAD_LABEL = "label of another form"
+BAD_IMAGE = "range image cannot be read"
+BAD_FRAME = "frame cannot be read"
+# the words of `lidarpose prepare`
+BAD_REST = "the rest of a part cannot be read"
+
+
+def about(margin: float) -> dict[str, Any]:
+    """What is recorded with a prepared dataset: the frame of its points, its licence, its quirks."""
+    return {
+        "frame": "the vehicle's axes (x forward, y left, z up) about the top laser, m",
+        "settings": {"box_margin_m": margin},
+        "licence": "Waymo Dataset License Agreement for Non-Commercial Use (waymo.com/open/terms): no redistribution",
+        "get": "waymo.com/open/download (a Google account), then gcloud storage cp",
+        "notes": [
+            f"Points are those in the labelled box and {margin:g} m around it, of all five lasers and both returns; "
+            "the released DAPT code takes the box alone. center_box, the box's center, is what it centers on.",
+            "The top laser's points of both returns are moved by the pose of their pixel to the frame's; the released "
+            "DAPT code moves those of return 1 alone. The other lasers have no pixel poses.",
+            "Beams are listed from the lowest, rows of range images from the highest: reversed here. ring is the row "
+            "of the top laser counted from the lowest, -1 for the other four.",
+            "frame is the frame's timestamp in us, time is since the first of its segment.",
+            "joint_labels: 2 clearly visible, 1 occluded or uncertain, 0 not labelled.",
+        ],
+    }
+
+
+def transform(values: Iterable[float] | None, what: str) -> np.ndarray:
+    """16 numbers, row by row -> T (4, 4), a rotation and a shift. Raises InputError for anything else."""
+    matrix = np.array([] if values is None else values, float)
+    if matrix.shape != (16,) or not np.isfinite(matrix).all():
+        raise InputError(f"{what} must be 16 numbers, a 4 x 4 transform, got {matrix.size}")
+    matrix = matrix.reshape(4, 4)
+    if abs(np.linalg.det(matrix[:3, :3]) - 1) > 0.01 or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise InputError(f"{what} must be a rotation and a shift, got a matrix that is none")
+    return matrix
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Calibration:
+    """A laser. T_vehicle_laser (4, 4); inclinations (H,) rad, the lowest beam first as on disk, or None: H beams that
+    divide low to high evenly."""
+
+    laser: int
+    T_vehicle_laser: np.ndarray
+    inclinations: np.ndarray | None
+    low: float
+    high: float
+
+    def rows(self, height: int) -> np.ndarray:
+        """(H,) rad: the inclination of each row of a range image. Row 0 is the last beam of the table: its order is
+        reversed. Raises InputError where the table has another length."""
+        if self.inclinations is None:
+            beams = self.low + (np.arange(height) + 0.5) / height * (self.high - self.low)
+        else:
+            beams = np.asarray(self.inclinations, float)
+        if len(beams) != height or not np.isfinite(beams).all():
+            raise InputError(f"laser {self.laser} has {len(beams)} inclinations, its range image {height} rows")
+        return beams[::-1]
+
+
+def points_of_image(
+    image: np.ndarray,
+    calibration: Calibration,
+    pixel_poses: np.ndarray | None = None,
+    T_world_vehicle: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """A range image (H, W) m -> points (n, 3) float64 m in the vehicle's frame, and their rows (n,).
+
+    Pixels without a return are 0. pixel_poses (H, W, 6): roll, pitch, yaw, x, y, z of the vehicle in the world when the
+    pixel was measured, which moves points to where the vehicle's frame was at T_world_vehicle (4, 4). Both returns of a
+    laser share the poses. Raises InputError where sizes do not fit.
+    """
+    height, width = image.shape
+    # NaN and infinity are no returns either
+    row, column = np.nonzero((image > 0) & (image < np.inf))
+    T = calibration.T_vehicle_laser
+    # columns divide the turn of the vehicle's axes, not of the laser's own
+    turned = np.arctan2(T[1, 0], T[0, 0])
+    azimuth = ((width - column - 0.5) / width * 2 - 1) * np.pi - turned
+    points = from_spherical(image[row, column].astype(float), azimuth, calibration.rows(height)[row])
+    points = points @ T[:3, :3].T + T[:3, 3]
+    if pixel_poses is None:
+        return points, row
+    if pixel_poses.shape != (height, width, 6):
+        raise InputError(f"pixel poses are {pixel_poses.shape}, of a range image {height} x {width}")
+    roll, pitch, yaw, *shift = pixel_poses[row, column].astype(float).T
+    x, y, z = points.T
+    # about x, then y, then z
+    y, z = _turned(y, z, roll)
+    z, x = _turned(z, x, pitch)
+    x, y = _turned(x, y, yaw)
+    world = np.stack([x + shift[0], y + shift[1], z + shift[2]])
+    return np.linalg.solve(T_world_vehicle[:3, :3], world - T_world_vehicle[:3, 3, None]).T, row
+
+
+def _turned(a: np.ndarray, b: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    c, s = np.cos(angle), np.sin(angle)
+    return c * a - s * b, s * a + c * b
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Person:
+    """Somebody with keypoints in one frame, in the vehicle's frame. joints (14, 3) m, NaN where not labelled, and their
+    labels (14,); kind: Waymo's type of the box; counted: points in the box by the label; problem: why they are left
+    out, and what else to say of it."""
+
+    track: str
+    joints: np.ndarray | None = None
+    labels: np.ndarray | None = None
+    box: Box | None = None
+    kind: int = 0
+    counted: int | None = None
+    problem: tuple[str, str] | None = None
+
+
+def person(
+    track: str,
+    keypoints: Iterable[tuple[int, tuple[float, float, float], bool]],
+    box: tuple[float, ...] | None,
+    kind: int = 0,
+    counted: int | None = None,
+) -> Person:
+    """Somebody by their labels. keypoints: (type, x y z, whether occluded) each, in any order, types that the skeleton
+    lacks ignored; box: center, size (length, width, height) and heading, 7 numbers."""
+    joints, labels = np.full((len(WAYMO14), 3), np.nan), np.full(len(WAYMO14), UNLABELED, np.uint8)
+    for found, place, hidden in keypoints:
+        if found in _JOINTS and np.isfinite(place).all():
+            joints[_JOINTS[found]] = place
+            labels[_JOINTS[found]] = HIDDEN if hidden else SEEN
+    if box is None:
+        return Person(track=track, problem=(NO_BOX, ""))
+    if (labels == UNLABELED).all():
+        return Person(track=track, problem=(NO_JOINTS, ""))
+    try:
+        of = Box(center=box[:3], size=box[3:6], yaw=box[6], id=track)
+    except InputError as error:
+        return Person(track=track, problem=(BAD_LABEL, str(error)))
+    return Person(track=track, joints=joints, labels=labels, box=of, kind=kind, counted=counted)
+
+
+@dataclass(kw_only=True, eq=False)
+class Frame:
+    """A frame and the people labelled in it, to which range images are added one by one, in any order.
+
+    sequence, timestamp (us) and start, that of the sequence's first frame; calibrations by laser; T_world_vehicle
+    (4, 4) or None where it is missing; margin m around the boxes.
+    """
+
+    sequence: str
+    timestamp: int
+    start: int
+    people: list[Person]
+    calibrations: dict[int, Calibration]
+    T_world_vehicle: np.ndarray | None
+    margin: float = MARGIN
+    _problem: tuple[str, str] | None = None
+    _seen: set[tuple[int, int]] = field(default_factory=set)
+    _crops: dict[int, list] = field(default_factory=dict)
+
+    @property
+    def wanted(self) -> bool:
+        """Whether anybody's points are looked for."""
+        return self._problem is None and any(one.problem is None for one in self.people)
+
+    def fail(self, reason: str, why: str = "") -> None:
+        """Leaves out everybody in the frame."""
+        self._problem = self._problem or (reason, why)
+
+    def add(self, laser: int, which: int, image: np.ndarray, pixel_poses: np.ndarray | None) -> None:
+        """A laser's return number `which`: range image (H, W) m and its pixels' poses (H, W, 6), None for none."""
+        if not self.wanted or (laser, which) in self._seen:
+            return
+        self._seen.add((laser, which))
+        try:
+            if self.T_world_vehicle is None:
+                return self.fail(NO_VEHICLE_POSE)
+            if laser == TOP and pixel_poses is None:
+                return self.fail(NO_PIXEL_POSES)
+            if laser not in self.calibrations:
+                return self.fail(BAD_IMAGE, f"laser {laser} has no calibration")
+            points, row = points_of_image(image, self.calibrations[laser], pixel_poses, self.T_world_vehicle)
+        except InputError as error:
+            return self.fail(BAD_IMAGE, str(error))
+        # the lowest beam is ring 0; only the top laser's rows are told
+        ring = len(image) - 1 - row if laser == TOP else np.full(len(row), -1)
+        for k, one in enumerate(self.people):
+            if one.problem is None:
+                inside = one.box.contains(points, self.margin)
+                self._crops.setdefault(k, []).append(((laser, which), points[inside], ring[inside]))
+
+    def found(self) -> Iterator[Item | Skipped]:
+        """Everybody, in the order of their tracks, once all images are there."""
+        if self.wanted and not any(laser == TOP for laser, _ in self._seen):
+            self.fail(NO_IMAGE)
+        for k, one in sorted(enumerate(self.people), key=lambda pair: pair[1].track):
+            where = f"{self.sequence}/{self.timestamp}/{one.track}"
+            problem = one.problem or self._problem
+            if problem is None:
+                crops = sorted(self._crops[k], key=lambda crop: crop[0])
+                points, ring = (np.concatenate([crop[k] for crop in crops]) for k in (1, 2))
+                if len(points):
+                    yield self._item(one, points, ring)
+                    continue
+                problem = (NO_POINTS, "" if one.counted is None else f"the label counts {one.counted}")
+            reason, why = problem
+            yield Skipped(reason=reason, where=f"{where}: {why}" if why else where)
+
+    def _item(self, one: Person, points: np.ndarray, ring: np.ndarray) -> Item:
+        # the sensor is at the origin
+        origin = self.calibrations[TOP].T_vehicle_laser[:3, 3]
+        points = (points - origin).astype(np.float32)
+        box = Box(center=one.box.center - origin, size=one.box.size, yaw=one.box.yaw, id=one.track)
+        sample = Sample(
+            points=points,
+            center=center_of(points),
+            ring=ring.astype(np.int32),
+            pose=Pose(joints=(one.joints - origin).astype(np.float32), skeleton=WAYMO14, frame="sensor"),
+            box=box,
+            source=f"waymo/{_KINDS.get(one.kind, 'unknown')}",
+            frame_id=f"{self.sequence}/{self.timestamp}",
+        )
+        return Item(
+            sample=sample,
+            joint_labels=one.labels,
+            sequence=self.sequence,
+            frame=self.timestamp,
+            track=one.track,
+            time=(self.timestamp - self.start) / 1e6,
+            centers={"box": box.center},
+        )

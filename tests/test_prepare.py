@@ -1,0 +1,415 @@
+"""`prepare`: real datasets as shards, restartable and in any number of processes; splits, summary, wrong input."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import dataset_files as files
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpose.data import jobs
+from lidarpose.data.labelled import item_of, labelled_row, labels_of
+from lidarpose.data.prepare import READERS, PartWriter, prepare
+from lidarpose.data.readers.items import HIDDEN, SEEN, UNLABELED, Item
+from lidarpose.data.shards import open_dataset, read_rows, write_shard
+from lidarpose.data.split_rules import SplitRule, split_rule
+from lidarpose.data.summary import lines_of
+from lidarpose.errors import InputError
+from lidarpose.sample import Box, Pose, Sample, center_of
+from lidarpose.skeleton import HUMAN15, WAYMO14
+
+
+@pytest.fixture(scope="module")
+def smpl(tmp_path_factory):
+    return files.write_smpl(tmp_path_factory.mktemp("smpl") / "SMPL_NEUTRAL.npz")
+
+
+@pytest.fixture(scope="module")
+def raw(tmp_path_factory, smpl):
+    """HumanM3 and what must come out."""
+    root = tmp_path_factory.mktemp("humanm3")
+    truth = files.write_humanm3(root, smpl, sequences=("train/a", "train/b/seg0", "test/c"))
+    return root, truth
+
+
+@pytest.fixture(scope="module")
+def prepared(raw, tmp_path_factory):
+    out = tmp_path_factory.mktemp("prepared") / "humanm3"
+    return out, prepare("humanm3", raw[0], out)
+
+
+def content(folder):
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+# --- what is written
+
+
+def test_items_come_back_from_the_shards(raw, prepared):
+    out, summary = prepared
+    dataset = open_dataset(out)
+    items = list(dataset.items())
+    assert summary["people"] == len(items) == len(raw[1])
+    for item in items:
+        joints = raw[1][item.sequence, item.frame, item.track]
+        assert np.abs(item.sample.pose.joints - joints).max() < 1e-3
+        assert item.sample.pose.skeleton is HUMAN15 and item.sample.box.id == item.track
+        np.testing.assert_allclose(item.centers["joints_box"], item.sample.box.center)
+        np.testing.assert_array_equal(item.sample.center, center_of(item.sample.points))
+        assert item.joint_labels.dtype == np.uint8 and (item.joint_labels == SEEN).all()
+    for sample, item in zip(dataset, items, strict=True):
+        np.testing.assert_array_equal(sample.points, item.sample.points)
+    tests = list(dataset.items("test"))
+    assert {item.sequence for item in tests} == {"test/c"} and len(tests) == 6
+    with pytest.raises(InputError, match="nobody in the split 'val'"):
+        list(dataset.items("val"))
+
+
+def test_pandas_reads_them(prepared):
+    out, _ = prepared
+    table = pd.concat([pd.read_parquet(path) for path in sorted(out.glob("labelled-*.parquet"))])
+    assert len(table) == 18 and set(table["split"]) == {"train", "test"}
+    assert table["center_trans"].isna().all() and table["distance"].isna().all() and table["part"].isna().all()
+    assert table["joints"].iloc[0].reshape(-1, 3).shape == (15, 3)
+    assert (table["index"].to_numpy() == np.repeat([0, 1, 2], 6)).all()
+    card = json.loads((out / "dataset.json").read_text())
+    assert card["about"]["sensor_known"] is False and card["about"]["parts"] == ["test/c", "train/a", "train/b/seg0"]
+    assert card["frame"].startswith("world") and card["joints"] == list(HUMAN15.joints)
+    assert card["summary"]["people"] == 18 and "non-commercial" in card["about"]["licence"]
+
+
+def test_datasets_of_smpl_have_its_trans_and_distances(tmp_path, smpl):
+    root = tmp_path / "raw"
+    truth = files.write_sloper4d(root, smpl)
+    summary = prepare("sloper4d", root, tmp_path / "out", smpl=smpl, progress=False)
+    rows = list(open_dataset(tmp_path / "out").rows())
+    assert len(rows) == len(truth) == summary["people"]
+    for row in rows:
+        assert row["distance"] == pytest.approx(np.linalg.norm(row["center"]), rel=1e-6)
+        assert row["center_trans"] is not None and row["center_box"] is None and row["box_center"] is None
+    assert summary["splits"] == {"test": 3, "train": 3} and summary["frames"] == 6
+    assert summary["sources"] == {"sloper4d/opt_pose, male": 6}
+    assert summary["skipped"] == {"labels without a cloud": 2}
+    assert summary["trunk"][2] > 0.7 and summary["joints"] == {"seen": 144, "hidden": 0, "unlabelled": 0}
+    # the list names sequences that are not in this release
+    assert any("of train by lidar-hmr seq003_street_002" in line for line in summary["warnings"])
+    lines = lines_of(summary)
+    assert lines[0] == "6 people in 6 frames (test 3, train 3)" and lines[1].startswith("skipped 2: labels without")
+    shutil.copy(smpl, tmp_path / "SMPL_MALE.npz")
+    shutil.copy(smpl, tmp_path / "SMPL_NEUTRAL.npz")
+    with pytest.raises(InputError, match="other settings: smpl "):
+        prepare("sloper4d", root, tmp_path / "out", smpl=tmp_path)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10**6), st.integers(0, 30), st.booleans(), st.booleans())
+def test_any_item_comes_back_as_it_was(tmp_path_factory, seed, count, boxed, rings):
+    rng = np.random.default_rng(seed)
+    joints = rng.normal(0, 1, (14, 3)).astype(np.float32)
+    labels = rng.integers(0, 3, 14).astype(np.uint8)
+    joints[labels == UNLABELED] = np.nan
+    assert (labels_of(joints, HIDDEN) > 0).tolist() == (labels > 0).tolist()
+    sample = Sample(
+        points=rng.normal(0, 1, (count, 3)).astype(np.float32),
+        center=rng.normal(0, 1, 3),
+        ring=rng.integers(0, 64, count).astype(np.int32) if rings else None,
+        pose=Pose(joints=joints, skeleton=WAYMO14, frame="sensor"),
+        box=Box(center=rng.normal(0, 1, 3), size=rng.uniform(0.1, 2, 3), yaw=0.25, id="ab") if boxed else None,
+        source="waymo",
+        frame_id="f",
+    )
+    centers = {"box": sample.box.center} if boxed else {}
+    item = Item(
+        sample=sample, joint_labels=labels, sequence="s", frame=1_550_083_467_346_370, track="ab", time=1.5,
+        centers=centers,
+    )  # fmt: skip
+    path = tmp_path_factory.mktemp("item") / "a.parquet"
+    other = replace(item, time=float("nan"), centers={"trans": np.ones(3)})
+    write_shard(path, "labelled", [labelled_row(item, index=0, split="val"), labelled_row(other, index=0)])
+    rows = list(read_rows(path, "labelled"))
+    found = item_of(rows[0], "waymo14")
+    for a, b in ((found.sample.points, sample.points), (found.sample.pose.joints, joints), (found.joint_labels, labels),
+                 (found.sample.center, sample.center)):  # fmt: skip
+        np.testing.assert_array_equal(a, b)
+        assert a.dtype == b.dtype
+    assert (found.sample.ring is None) == (not rings) and (not rings or (found.sample.ring == sample.ring).all())
+    assert found.sample.part is None and (found.sample.box is None) == (not boxed)
+    assert found.centers.keys() == centers.keys() and (found.frame, found.track) == (item.frame, "ab")
+    if boxed:
+        np.testing.assert_array_equal(found.sample.box.size, sample.box.size)
+        assert found.sample.box.yaw == 0.25 and found.sample.box.id == "ab"
+    second = item_of(rows[1], "waymo14")
+    assert np.isnan(second.time) and rows[1]["split"] is None and second.centers.keys() == {"trans"}
+
+
+def test_only_columns_that_have_a_place_are_written(raw):
+    item = next(one for one in _reader().read(raw[0], "train/a"))
+    with pytest.raises(InputError, match="names trans, box, joints_box, got mean"):
+        labelled_row(replace(item, centers={"mean": np.zeros(3)}), index=0)
+
+
+def _reader():
+    from lidarpose.data.prepare import reader
+
+    return reader("humanm3")
+
+
+# --- stopped, killed, in several processes
+
+
+def test_several_processes_write_the_same_bytes(raw, prepared, tmp_path):
+    summary = prepare("humanm3", raw[0], tmp_path / "out", workers=2)
+    assert content(tmp_path / "out") == content(prepared[0]) and summary == prepared[1]
+
+
+def test_what_is_whole_is_not_read_again(raw, prepared, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    shutil.copytree(prepared[0], out)
+    (out / "labelled-00001.parquet").unlink()
+    (out / "skipped-00002.parquet").write_bytes(b"PAR1")
+    (out / f".{_gone()}-3-labelled-00001.parquet").write_bytes(b"half")
+    read = []
+    whole = PartWriter.__call__
+    monkeypatch.setattr(PartWriter, "__call__", lambda self, number: read.append(number) or whole(self, number))
+    summary = prepare("humanm3", raw[0], out)
+    assert read == [1, 2] and content(out) == content(prepared[0]) and summary == prepared[1]
+    prepare("humanm3", raw[0], out)
+    assert read == [1, 2]
+
+
+def _gone():
+    """The number of a process that is no more."""
+    done = subprocess.Popen([sys.executable, "-c", ""])
+    done.wait()
+    return done.pid
+
+
+def test_a_stopped_run_goes_on_and_has_no_summary_before(raw, prepared, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+
+    def stop(self, number):
+        if number == 1:
+            raise KeyboardInterrupt
+        return whole(self, number)
+
+    whole = PartWriter.__call__
+    with monkeypatch.context() as patch:
+        patch.setattr(PartWriter, "__call__", stop)
+        with pytest.raises(KeyboardInterrupt):
+            prepare("humanm3", raw[0], out)
+    assert sorted(path.name for path in out.iterdir()) == [
+        "dataset.json", "labelled-00000.parquet", "skipped-00000.parquet"
+    ]  # fmt: skip
+    dataset = open_dataset(out)
+    assert dataset.card.summary is None
+    with pytest.raises(InputError, match="not finished; run the same lidarpose prepare again"):
+        list(dataset)
+    prepare("humanm3", raw[0], out)
+    assert content(out) == content(prepared[0])
+    # nor does one that was whole and is not any more
+    (out / "labelled-00001.parquet").unlink()
+    with monkeypatch.context() as patch:
+        patch.setattr(PartWriter, "__call__", stop)
+        with pytest.raises(KeyboardInterrupt):
+            prepare("humanm3", raw[0], out)
+    assert open_dataset(out).card.summary is None
+
+
+class Slow:
+    """Makes shards that take for ever, and tells so."""
+
+    def __init__(self, folder):
+        self.folder = folder
+
+    def __call__(self, shard):
+        (self.folder / f"begun-{shard}").write_text(str(os.getpid()))
+        while True:
+            time.sleep(0.05)
+            yield 1
+
+
+def test_workers_end_when_the_run_is_stopped(tmp_path):
+    made = jobs.make_shards(Slow(tmp_path), [0, 1], workers=2)
+    for _, people in made:
+        if people and len(list(tmp_path.iterdir())) == 2:
+            break
+    made.close()
+    for path in tmp_path.iterdir():
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(path.read_text()), 0)
+
+
+# --- splits
+
+
+def test_a_user_s_own_lists_win_and_blank_lines_are_no_sequence(tmp_path, smpl):
+    root = tmp_path / "raw"
+    files.write_lidarhuman26m(root, smpl, sequences=("5", "7", "9"), frames=1)
+    assert split_rule("lidarhuman26m", root).of_part("7") == "test"
+    (root / "train.txt").write_text("7\n9\n\n")
+    with pytest.raises(InputError, match="has train.txt and no test.txt"):
+        prepare("lidarhuman26m", root, tmp_path / "out", smpl=smpl)
+    (root / "test.txt").write_text("5\n")
+    summary = prepare("lidarhuman26m", root, tmp_path / "own", smpl=smpl)
+    assert summary["splits"] == {"test": 1, "train": 2}
+    assert {item.sequence for item in open_dataset(tmp_path / "own").items("test")} == {"5"}
+    # unless the published one is asked for by name
+    summary = prepare("lidarhuman26m", root, tmp_path / "named", smpl=smpl, split_by="official")
+    assert summary["splits"] == {"none": 1, "test": 1, "train": 1}
+    (root / "train.txt").write_text("7\n")
+    with pytest.raises(InputError, match="other settings: lists "):
+        prepare("lidarhuman26m", root, tmp_path / "own", smpl=smpl)
+    (root / "test.txt").write_text("7\n")
+    with pytest.raises(InputError, match="test.txt: names 7, which is in train.txt too"):
+        prepare("lidarhuman26m", root, tmp_path / "out", smpl=smpl)
+    (root / "test.txt").write_text("\n")
+    with pytest.raises(InputError, match="test.txt: names no sequence"):
+        prepare("lidarhuman26m", root, tmp_path / "out", smpl=smpl)
+
+
+def test_one_split_alone(raw, tmp_path):
+    summary = prepare("humanm3", raw[0], tmp_path / "out", split="test")
+    assert summary["splits"] == {"test": 6} and [part["part"] for part in summary["parts"]] == ["test/c"]
+    with pytest.raises(InputError, match="other settings: count 1 there, 2 asked for"):
+        prepare("humanm3", raw[0], tmp_path / "out", split="train")
+    with pytest.raises(InputError, match="unknown split of humanm3 by official 'tset': did you mean test"):
+        prepare("humanm3", raw[0], tmp_path / "no", split="tset")
+    with pytest.raises(InputError, match="unknown split of humanm3 'dapt'"):
+        prepare("humanm3", raw[0], tmp_path / "no", split_by="dapt")
+    assert not (tmp_path / "no").exists()
+
+
+def test_the_split_in_chunks_leaks_and_says_so(tmp_path, smpl):
+    root = tmp_path / "raw"
+    files.write_sloper4d(root, smpl, sequences=("seq009_running_002",), frames=101, without=(3,))
+    summary = prepare("sloper4d", root, tmp_path / "out", smpl=smpl, split_by="dapt")
+    # 100 frames with clouds are 7 chunks, the last of 4
+    assert summary["splits"]["train"] + summary["splits"]["test"] == 100 and summary["splits"]["train"] in (64, 52)
+    assert any("dapt leaks" in line for line in summary["warnings"])
+    splits = [row["split"] for row in open_dataset(tmp_path / "out").rows()]
+    assert all(len(set(splits[k : k + 16])) == 1 for k in range(0, 100, 16))
+    tests = prepare("sloper4d", root, tmp_path / "test", smpl=smpl, split_by="dapt", split="test")
+    assert tests["people"] == splits.count("test") and tests["skipped"] == summary["skipped"]
+
+
+@given(st.integers(0, 3000), st.text(max_size=5))
+def test_chunks_are_drawn_by_the_part_s_name_alone(people, part):
+    rule = SplitRule(name="x", source="", rule="chunks", length=16, share=0.7)
+    splits = rule.of_chunks(part, people)
+    assert splits == rule.of_chunks(part, people) and len(splits) == people
+    chunks = [splits[k : k + 16] for k in range(0, people, 16)]
+    assert all(len(set(chunk)) == 1 for chunk in chunks)
+    assert sum(chunk[0] == "train" for chunk in chunks) == int(0.7 * len(chunks))
+
+
+def test_published_splits_are_apart_and_name_their_source(tmp_path):
+    seen = 0
+    for name in READERS:
+        rule = split_rule(name, tmp_path)
+        if rule is None:
+            continue
+        seen += 1
+        # Waymo keeps the labels of its test folder to itself
+        held_out = rule.sets["val" if name == "waymo" else "test"]
+        assert rule.source and rule.sets["train"] and held_out
+        assert not set(rule.sets["train"]) & set(held_out)
+    assert seen >= 4 and split_rule("sloper4d", tmp_path).name == "lidar-hmr"
+    assert split_rule("sloper4d", tmp_path, "dapt").leaks
+    assert len(split_rule("lidarhuman26m", tmp_path).sets["train"]) == 19
+
+
+# --- wrong input
+
+
+def one_line(caught):
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_wrong_calls_are_one_line_and_write_nothing(raw, tmp_path, smpl):
+    out = tmp_path / "out"
+    wrong = (
+        (("humanm3", tmp_path / "none", out), {}, "none: is no folder; expected the raw files of humanm3"),
+        (("humanm3", raw[0], out), {"workers": 0}, "at least 1 worker"),
+        (("human3m", raw[0], out), {}, "unknown dataset 'human3m': did you mean humanm3"),
+        (("lidarhuman26m", raw[0], out), {"smpl": smpl}, "is not the root of LiDARHuman26M"),
+        (("lidarhuman26m", raw[0], out), {}, "register at smpl.is.tue.mpg.de"),
+        (("lipd", raw[0], out), {"split": "test"}, "lipd is not|is not the root of lipd"),
+    )
+    for arguments, options, message in wrong:
+        with pytest.raises(InputError, match=message) as caught:
+            prepare(*arguments, **options)
+        one_line(caught)
+    assert not out.exists()
+
+
+def test_a_folder_of_something_else_is_left_alone(raw, tmp_path):
+    (tmp_path / "mine.txt").write_text("x")
+    with pytest.raises(InputError, match="holds other files and no dataset.json"):
+        prepare("humanm3", raw[0], tmp_path)
+    with pytest.raises(InputError, match="is a file"):
+        prepare("humanm3", raw[0], tmp_path / "mine.txt")
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_a_corrupted_part_is_counted_and_the_rest_goes_on(tmp_path, smpl):
+    root = tmp_path / "raw"
+    files.write_sloper4d(root, smpl)
+    path = root / "seq002_football_001/seq002_football_001_labels.pkl"
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    summary = prepare("sloper4d", root, tmp_path / "out", smpl=smpl)
+    assert summary["people"] == 3 and summary["skipped"]["the rest of a part cannot be read"] == 1
+    assert "seq002_football_001_labels.pkl" in summary["skipped_first"]["the rest of a part cannot be read"]
+    assert any(line == "nobody in seq002_football_001" for line in summary["warnings"])
+    assert any("skipped 1: the rest of a part" in line for line in lines_of(summary))
+    # repaired: without its shards it is read again
+    path.write_bytes(whole)
+    for shard in (tmp_path / "out").glob("*-00000.parquet"):
+        shard.unlink()
+    assert prepare("sloper4d", root, tmp_path / "out", smpl=smpl)["people"] == 6
+
+
+def test_people_who_do_not_stand_and_labels_of_others_are_told(tmp_path, smpl):
+    root = tmp_path / "raw"
+    files.write_lidarhuman26m(root, smpl, sequences=("5",))
+    for path in (root / "labels/3d/pose/5").iterdir():
+        found = json.loads(path.read_text())
+        found["trans"] = [found["trans"][0] + 4, *found["trans"][1:]]
+        found["pose"][:3] = [0, 0, 0]  # SMPL's own up, y
+        path.write_text(json.dumps(found))
+    warnings = prepare("lidarhuman26m", root, tmp_path / "out", smpl=smpl)["warnings"]
+    assert any("people stand along" in line for line in warnings)
+    assert any("labels and clouds of different releases" in line for line in warnings)
+
+
+def test_nobody_at_all_is_told(tmp_path, smpl):
+    root = tmp_path / "raw"
+    files.write_humanm3(root, smpl, sequences=("train/a",), frames=2)
+    for path in root.glob("**/*.pcd"):
+        path.unlink()
+    summary = prepare("humanm3", root, tmp_path / "out")
+    assert summary["people"] == 0 and summary["skipped"] == {"labels without a cloud": 4}
+    assert any("nobody in it" in line for line in summary["warnings"])
+    assert list(open_dataset(tmp_path / "out")) == []
+
+
+def test_synthetic_datasets_have_no_items(tmp_path, people_dataset):
+    with pytest.raises(InputError, match="holds synthetic people"):
+        list(open_dataset(people_dataset).items())
+
+
+@pytest.fixture
+def people_dataset(tmp_path):
+    from lidarpose.data.shards import Card, write_card
+
+    write_card(tmp_path, Card(settings={"what": "people"}, count=1, per_shard=1, tables=("people",)))
+    return tmp_path

@@ -1,0 +1,429 @@
+"""Readers of real datasets: joints come out where they went in, quirks, and what is wrong is named and counted."""
+
+import json
+import pickle
+from collections import Counter
+
+import dataset_files as files
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpose.body.smpl import load_body
+from lidarpose.data.prepare import READERS, reader
+from lidarpose.data.readers.items import SEEN, UNLABELED, Item, Skipped
+from lidarpose.data.readers.raw import numbered, numbers
+from lidarpose.data.readers.sloper4d import _heading
+from lidarpose.data.readers.smpl_joints import SmplJoints
+from lidarpose.errors import InputError
+from lidarpose.geometry import axis_angle_to_matrix, rotation_about
+from lidarpose.sample import center_of
+
+WRITERS = {
+    "humanm3": files.write_humanm3,
+    "lidarhuman26m": files.write_lidarhuman26m,
+    "sloper4d": files.write_sloper4d,
+    "lipd": files.write_lipd,
+    "freemotion": files.write_freemotion,
+    "noisemotion": lambda root, smpl: files.write_freemotion(root, smpl, name="FreeMotion_train.pkl", noise=True),
+}
+
+
+@pytest.fixture(scope="module")
+def smpl(tmp_path_factory):
+    return files.write_smpl(tmp_path_factory.mktemp("smpl") / "SMPL_NEUTRAL.npz")
+
+
+def made(name, smpl):
+    return reader(name, smpl if READERS[name][2] else None)
+
+
+def everything(name, root, smpl):
+    """(items, skipped) of all parts."""
+    source = made(name, smpl)
+    found = [one for part in source.parts(root) for one in source.read(root, part)]
+    return [x for x in found if isinstance(x, Item)], [x for x in found if isinstance(x, Skipped)]
+
+
+def check(items, truth):
+    """Everybody who went in comes out, once, to 1 mm."""
+    found = {(item.sequence, item.frame, item.track): item for item in items}
+    assert len(found) == len(items) and found.keys() == truth.keys()
+    for key, joints in truth.items():
+        item = found[key]
+        assert np.abs(item.sample.pose.joints - joints).max() < 1e-3, key
+        points = item.sample.points
+        assert np.median(np.linalg.norm(points[:, None] - joints, axis=-1).min(1)) < 0.3
+        np.testing.assert_array_equal(item.sample.center, center_of(points))
+
+
+def reasons(skipped):
+    return Counter(one.reason for one in skipped)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_joints_come_out_where_they_went_in(name, tmp_path, smpl):
+    truth = WRITERS[name](tmp_path, smpl)
+    items, _ = everything(name, tmp_path, smpl)
+    check(items, truth)
+    source = made(name, smpl)
+    assert {len(item.joint_labels) for item in items} == {len(items[0].sample.pose.skeleton)}
+    assert all(item.sample.pose.skeleton.name == source.skeleton for item in items)
+    assert source.about["licence"] and source.about["get"] and source.about["notes"]
+    # the same again, in the same order
+    again, _ = everything(name, tmp_path, smpl)
+    for a, b in zip(items, again, strict=True):
+        np.testing.assert_array_equal(a.sample.points, b.sample.points)
+
+
+# --- HumanM3
+
+
+def test_humanm3_files_of_any_number_of_digits(tmp_path, smpl):
+    truth = files.write_humanm3(tmp_path, smpl, sequences=("basketball2",), digits=0, first=9)
+    items, skipped = everything("humanm3", tmp_path, smpl)
+    check(items, truth)
+    assert not skipped and [item.time for item in items[::2]] == pytest.approx([0.0, 0.1, 0.2])
+    # people in the order of their numbers, not of their names
+    assert [item.track for item in items[:2]] == ["2", "10"]
+
+
+def test_humanm3_boxes_are_of_the_joints_and_crop_the_points(tmp_path, smpl):
+    files.write_humanm3(tmp_path, smpl)
+    items, _ = everything("humanm3", tmp_path, smpl)
+    for item in items:
+        joints, box = item.sample.pose.joints, item.sample.box
+        np.testing.assert_allclose(box.size, np.ptp(joints, 0) + 0.4, atol=1e-5)
+        np.testing.assert_array_equal(item.centers["joints_box"], box.center)
+        assert box.contains(item.sample.points, 0.3001).all() and len(item.sample.points) >= 150
+
+
+def test_humanm3_s_database_has_everybody_once(tmp_path, smpl):
+    truth = files.write_humanm3(tmp_path, smpl)
+    files.write_humanm3_database(tmp_path, truth)
+    folders, _ = everything("humanm3", tmp_path, smpl)
+    for labels in tmp_path.glob("**/pose_calib/*"):
+        labels.unlink()
+    for folder in tmp_path.glob("**/pose_calib"):
+        folder.rmdir()
+    source = made("humanm3", smpl)
+    assert source.parts(tmp_path) == ["train.pkl"]
+    items = list(source.read(tmp_path, "train.pkl"))
+    assert len(items) == len(folders) == len(truth)
+    for a, b in zip(sorted(items, key=lambda item: item.sequence), folders, strict=True):
+        np.testing.assert_array_equal(a.sample.points, b.sample.points)
+        np.testing.assert_array_equal(a.sample.pose.joints, b.sample.pose.joints)
+        assert (a.sequence, a.frame) == (b.sequence, b.frame)
+    (tmp_path / "train.pkl").unlink()
+    with pytest.raises(InputError, match="got .*plaza/seg0 without pose_calib"):
+        source.parts(tmp_path)
+
+
+def test_humanm3_s_database_alone_is_a_root(tmp_path, smpl):
+    truth = files.write_humanm3(tmp_path / "x", smpl, frames=1)
+    files.write_humanm3_database(tmp_path, truth)
+    view = pickle.loads((tmp_path / "train.pkl").read_bytes())["db"]
+    for k, camera in enumerate(view[0]["info"]):
+        camera["joints_3d_vis"] = camera["joints_3d_vis"].copy()
+        camera["joints_3d_vis"][0, 5] = 0
+        camera["joints_3d_vis"][1, 6] = k == 2
+    view.append({"pcd": None, "info": [{"joints_3d": [[1, 2]]}]})
+    view.append({"pcd": "nowhere/000001.pcd", "info": view[0]["info"]})
+    (tmp_path / "only").mkdir()
+    (tmp_path / "only/test.pkl").write_bytes(pickle.dumps({"db": view}))
+    for sequence in {key[0] for key in truth}:
+        target = tmp_path / "only" / sequence / "pointcloud"
+        target.mkdir(parents=True)
+        for path in (tmp_path / "x" / sequence / "pointcloud").iterdir():
+            path.rename(target / path.name)
+    found = list(made("humanm3", smpl).read(tmp_path / "only", "test.pkl"))
+    items = [one for one in found if isinstance(one, Item)]
+    # one camera that sees a joint is enough
+    assert [int((item.joint_labels == UNLABELED).sum()) for item in items] == [1, 0, 0, 0]
+    assert np.isnan(items[0].sample.pose.joints[5]).all()
+    assert [one.reason for one in found if isinstance(one, Skipped)] == [
+        "entry of another form", "labels without a cloud"
+    ]  # fmt: skip
+
+
+def test_humanm3_skips_are_counted_and_named(tmp_path, smpl):
+    files.write_humanm3(tmp_path, smpl, sequences=("train/a",), frames=8, first=0)
+    here = tmp_path / "train/a"
+    (here / "pointcloud/000000.pcd").write_bytes((here / "pointcloud/000000.pcd").read_bytes()[:300])
+    (here / "pointcloud/000001.pcd").unlink()
+    (here / "pose_calib/0002.json").unlink()
+    (here / "pose_calib/0003.json").write_text("{")
+    (here / "pose_calib/4.json").write_text("{}")
+    content = json.loads((here / "pose_calib/0005.json").read_text())
+    content["2"] = content["2"][:14]
+    content["10"] = (np.array(content["10"]) + 500).tolist()
+    (here / "pose_calib/0005.json").write_text(json.dumps(content))
+    (here / "pose_calib/0006.json").write_text("{}")
+    items, skipped = everything("humanm3", tmp_path, smpl)
+    assert {item.frame for item in items} == {7}
+    assert reasons(skipped) == {
+        "cloud cannot be read": 2, "labels without a cloud": 2, "cloud without labels": 1, "labels cannot be read": 1,
+        "several files of one frame": 1, "not 15 joints": 1, "no points in the box": 1, "frame without people": 1,
+    }  # fmt: skip
+    assert any("000000.pcd" in one.where and "cut off" in one.where for one in skipped)
+    assert all("\n" not in one.where for one in skipped)
+
+
+# --- LiDARHuman26M
+
+
+def test_lidarhuman26m_labels_and_clouds_are_paired_by_number(tmp_path, smpl):
+    truth = files.write_lidarhuman26m(tmp_path, smpl, sequences=("7",), frames=6)
+    pose, segment = tmp_path / "labels/3d/pose/7", tmp_path / "labels/3d/segment/7"
+    (pose / "000002.json").unlink()
+    (segment / "000003.ply").unlink()
+    (segment / "000004.ply").write_bytes((segment / "000004.ply").read_bytes()[:200])
+    files.write_ply(segment / "000005.ply", np.zeros((0, 3)))
+    content = json.loads((pose / "000006.json").read_text())
+    (pose / "000006.json").write_text(json.dumps({k: v for k, v in content.items() if k != "beta"}))
+    (segment / "notes.txt").write_text("mine")
+    items, skipped = everything("lidarhuman26m", tmp_path, smpl)
+    check(items, {key: value for key, value in truth.items() if key[1] == 1})
+    assert reasons(skipped) == {
+        "cloud without labels": 1, "labels without a cloud": 1, "cloud cannot be read": 1, "empty cloud": 1,
+        "labels cannot be read": 1,
+    }  # fmt: skip
+    assert any("no beta" in one.where and "000006.json" in one.where for one in skipped)
+
+
+def test_lidarhuman26m_s_trans_is_a_center(tmp_path, smpl):
+    files.write_lidarhuman26m(tmp_path, smpl)
+    items, _ = everything("lidarhuman26m", tmp_path, smpl)
+    for item in items:
+        path = tmp_path / f"labels/3d/pose/{item.sequence}/{item.frame:06d}.json"
+        assert item.centers["trans"].tolist() == json.loads(path.read_text())["trans"]
+        apart = np.linalg.norm(item.centers["trans"] - item.sample.pose.joints[0])
+        assert 0.01 < apart < 0.5 and (item.joint_labels == SEEN).all()
+    assert [item.sequence for item in items] == ["5"] * 3 + ["7"] * 3 and items[1].time == pytest.approx(0.1)
+
+
+# --- SLOPER4D
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(-3, 3), st.floats(-1.2, 1.2), st.floats(-1.2, 1.2))
+def test_heading_is_where_x_points_from_above(yaw, pitch, roll):
+    matrix = rotation_about("z", yaw) @ rotation_about("y", pitch) @ rotation_about("x", roll)
+    half = [axis_angle_to_matrix(np.array(v)) for v in ([0, 0, yaw], [0, pitch, 0], [roll, 0, 0])]
+    np.testing.assert_allclose(half[0] @ half[1] @ half[2], matrix, atol=1e-12)
+    if 1 + np.trace(matrix) < 1e-3:
+        return
+    found = _heading(np.stack([files.quaternion(matrix), -files.quaternion(matrix)]))
+    np.testing.assert_allclose(np.exp(1j * found), np.exp(1j * yaw), atol=1e-6)
+
+
+def test_heading_of_no_rotation_is_nan():
+    assert np.isnan(_heading(np.array([[0.0, 0, 0, 0], [0, 0, 0, 2], [np.nan, 0, 0, 1]]))).all()
+
+
+def test_sloper4d_reads_refined_poses_and_else_the_others(tmp_path, smpl):
+    for refined, which in ((True, "opt_pose"), (False, "pose")):
+        root = tmp_path / which
+        truth = files.write_sloper4d(root, smpl, refined=refined, total=3, frames=5)
+        items, skipped = everything("sloper4d", root, smpl)
+        # frames 3 and 4 are beyond total_frames
+        check(items, {key: value for key, value in truth.items() if key[1] < 115})
+        assert {item.sample.source for item in items} == {f"sloper4d/{which}, male"}
+        assert reasons(skipped) == {"labels without a cloud": 2, "frame beyond total_frames": 4}
+        assert [item.time for item in items[:2]] == pytest.approx([0.0, 0.1], abs=1e-6)
+
+
+def test_sloper4d_is_level_and_about_the_sensor(tmp_path, smpl):
+    files.write_sloper4d(tmp_path, smpl)
+    items, _ = everything("sloper4d", tmp_path, smpl)
+    for item in items:
+        # the head is above the feet, whatever the sensor's tilt, and the person some metres away
+        joints = item.sample.pose.joints
+        assert joints[15, 2] > joints[[10, 11], 2].max() + 0.8
+        assert 1 < np.linalg.norm(item.sample.center) < 8
+
+
+def test_sloper4d_takes_the_gender_s_own_body(tmp_path):
+    for k, gender in enumerate(("NEUTRAL", "MALE")):
+        files.write_smpl(tmp_path / f"SMPL_{gender}.npz", seed=k)
+    root = tmp_path / "data"
+    truth = files.write_sloper4d(root, tmp_path / "SMPL_MALE.npz", sequences=("seq002",), gender="male")
+    truth |= files.write_sloper4d(root, tmp_path / "SMPL_NEUTRAL.npz", sequences=("seq003_",), gender="female")
+    items, _ = everything("sloper4d", root, tmp_path)
+    check(items, truth)
+    assert {item.sample.source.partition(", ")[2] for item in items} == {
+        "male by the male body", "female by the neutral body"
+    }  # fmt: skip
+    (tmp_path / "SMPL_NEUTRAL.npz").unlink()
+    with pytest.raises(InputError, match="expected SMPL_NEUTRAL"):
+        reader("sloper4d", tmp_path)
+
+
+def test_sloper4d_of_two_releases_in_one_folder(tmp_path, smpl):
+    for release in ("v0", "v1"):
+        files.write_sloper4d(tmp_path / release, smpl, sequences=("seq003_street_002",))
+    with pytest.raises(InputError, match="has seq003_street_002_labels.pkl twice"):
+        made("sloper4d", smpl).parts(tmp_path)
+    # a sequence's own folder is a root, too
+    assert made("sloper4d", smpl).parts(tmp_path / "v1/seq003_street_002") == ["seq003_street_002"]
+
+
+def write_labels(root, content):
+    root.mkdir(parents=True, exist_ok=True)
+    (root / "seq001_labels.pkl").write_bytes(pickle.dumps(content))
+
+
+def test_sloper4d_skips_are_counted(tmp_path, smpl):
+    content, truth = files.sloper4d_labels(smpl, "seq001", frames=7, without=())
+    person = content["second_person"]
+    person["point_clouds"][0] = np.zeros((0, 3))
+    person["point_clouds"][1] = []
+    person["point_clouds"][2] = np.full((5, 3), np.nan)
+    person["opt_pose"][3, 5] = np.nan
+    person["opt_pose"], person["opt_trans"] = person["opt_pose"][:6], person["opt_trans"][:6]
+    content["first_person"]["lidar_traj"][4, 4:8] = 0
+    person["point_clouds"].append(person["point_clouds"][5][:9])
+    person["point_frame"] = [*person["point_frame"], 7777]
+    person["point_clouds"][5] = person["point_clouds"][5][:9]
+    write_labels(tmp_path, content)
+    items, skipped = everything("sloper4d", tmp_path, smpl)
+    # nine points are kept: protocols leave them out later
+    assert [(item.frame, len(item.sample.points)) for item in items] == [(125, 9)]
+    assert reasons(skipped) == {
+        "empty cloud": 2, "cloud cannot be read": 1, "cloud without a pose": 2, "cloud without the LiDAR's place": 1,
+        "cloud of a frame without labels": 1,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: [], "expected labels of SLOPER4D 1.0, with second_person, got others"),
+        (lambda c: {"SMPL_info": {}, "RGB_frames": {}}, "a release before 1.0"),
+        (lambda c: c | {"frame_num": None}, "frame_num is missing"),
+        (lambda c: c | {"first_person": {}}, "lidar_traj is missing"),
+        (lambda c: c | {"first_person": {"lidar_traj": np.zeros((3, 8))}}, r"lidar_traj must be \(-1, 9\)"),
+        (lambda c: c | {"second_person": {"beta": 1}}, "no pose and trans"),
+        (lambda c: c | {"second_person": c["second_person"] | {"opt_trans": np.zeros((2, 3))}}, "4 frames and opt_tra"),
+        (lambda c: c | {"second_person": c["second_person"] | {"point_frame": [1]}}, "3 point_clouds of 1 frames"),
+        (lambda c: c | {"second_person": c["second_person"] | {"point_clouds": None}}, "another release"),
+        (lambda c: c | {"second_person": c["second_person"] | {"beta": "tall"}}, "beta must be numbers"),
+        (lambda c: c | {"extra": Counter}, "Counter"),
+    ],
+)
+def test_sloper4d_labels_that_are_wrong_are_one_line(tmp_path, smpl, change, message):
+    write_labels(tmp_path, change(files.sloper4d_labels(smpl, "seq001")[0]))
+    with pytest.raises(InputError, match=message) as caught:
+        everything("sloper4d", tmp_path, smpl)
+    assert "seq001_labels.pkl: " in str(caught.value) and "\n" not in str(caught.value)
+
+
+# --- corpora
+
+
+def test_lipd_places_joints_by_the_points_and_says_how(tmp_path, smpl):
+    files.write_lipd(tmp_path, smpl)
+    items, skipped = everything("lipd", tmp_path, smpl)
+    assert [item.sample.source for item in items] == [
+        "lipd/gt_joint + trans", "lipd/gt_joint + trans + mean", "lipd/gt_joint"
+    ]  # fmt: skip
+    assert reasons(skipped) == {"joints are not where the points are": 1}
+
+
+def test_entries_without_a_field_are_skipped_with_it(tmp_path, smpl):
+    files.write_freemotion(tmp_path, smpl, frames=5)
+    entries = pickle.loads((tmp_path / "fm_test2.pkl").read_bytes())
+    del entries[0]["shape"], entries[1]["T_2"], entries[2]["pc_3"]
+    entries[3] = 5
+    entries[4]["gt"] = np.zeros(71)
+    (tmp_path / "fm_test2.pkl").write_bytes(pickle.dumps(entries))
+    items, skipped = everything("freemotion", tmp_path, smpl)
+    assert reasons(skipped) == {"no shape": 1, "no T_2": 1, "entry of another form": 2} and len(items) == 4
+    entries = [{"seq_path": "a", "gt_joint": np.zeros((24, 3)), "pc": "x/y.bin"}, {"gt_joint": np.zeros((24, 3))}]
+    (tmp_path / "fm_test2.pkl").write_bytes(pickle.dumps(entries))
+    items, skipped = everything("lipd", tmp_path, smpl)
+    assert not items and "y.bin is not in" in skipped[0].where and skipped[1].reason == "no pc"
+
+
+def test_noisemotion_without_poses_says_how_they_are_made(tmp_path, smpl):
+    (tmp_path / "pc_1/train/run1").mkdir(parents=True)
+    with pytest.raises(InputError, match="SURREAL's: run the authors' dataloader_NoiseMotion.py") as caught:
+        made("noisemotion", smpl).parts(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+# --- roots, SMPL and what readers share
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_wrong_root_is_one_line_that_says_what_is_expected_and_where_to_get_it(name, tmp_path, smpl):
+    (tmp_path / "other").mkdir()
+    with pytest.raises(InputError, match="is not the root of .*expected .* got .* get it at ") as caught:
+        made(name, smpl).parts(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_component_is_named(tmp_path, smpl):
+    (tmp_path / "labels/3d/pose/5").mkdir(parents=True)
+    with pytest.raises(InputError, match="got no labels/3d/segment"):
+        made("lidarhuman26m", smpl).parts(tmp_path)
+    (tmp_path / "labels/3d/segment").mkdir(parents=True)
+    assert made("lidarhuman26m", smpl).parts(tmp_path) == ["5"]
+
+
+def test_smpl_where_it_is_needed(tmp_path, smpl):
+    for name in ("lidarhuman26m", "sloper4d", "freemotion"):
+        with pytest.raises(InputError, match=f"{name} has SMPL poses.*register at smpl.is.tue.mpg.de"):
+            reader(name)
+    with pytest.raises(InputError, match="no such file; expected SMPL's own"):
+        reader("sloper4d", tmp_path / "none.pkl")
+    with pytest.raises(InputError, match="leave the SMPL model out"):
+        reader("humanm3", smpl)
+    with pytest.raises(InputError, match="unknown dataset 'humanm4': did you mean humanm3"):
+        reader("humanm4")
+    np.savez(tmp_path / "x.npz", **files.synthetic(52, 16))
+    with pytest.raises(InputError, match="24 joints, got 52"):
+        SmplJoints(tmp_path / "x.npz", "x")(np.zeros((1, 10)), np.zeros((1, 72)), np.zeros((1, 3)))
+    np.savez(tmp_path / "y.npz", **files.synthetic(24, 4))
+    with pytest.raises(InputError, match="has 4 shapes, the labels 10"):
+        SmplJoints(tmp_path / "y.npz", "x")(np.zeros((1, 10)), np.zeros((1, 72)), np.zeros((1, 3)))
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 10**6), st.integers(1, 4))
+def test_joints_alone_are_the_body_s(smpl, seed, people):
+    rng = np.random.default_rng(seed)
+    betas, pose, trans = rng.normal(size=(people, 10)), rng.normal(0, 0.8, (people, 72)), rng.normal(size=(people, 3))
+    expected = load_body(smpl).pose(betas, pose, trans)[1]
+    np.testing.assert_allclose(SmplJoints(smpl, "x")(betas, pose, trans), expected, atol=1e-6)
+
+
+def test_published_names_of_smpl_are_known(tmp_path):
+    names = ("basicModel_f_lbs_10_207_0_v1.0.0", "basicmodel_m_lbs_10_207_0_v1.1.0", "SMPL_NEUTRAL", "other")
+    for name in names:
+        (tmp_path / f"{name}.pkl").write_bytes(b"x")
+    found = SmplJoints(tmp_path, "x")
+    assert {kind: path.stem for kind, path in found.files.items()} == {
+        "female": names[0], "male": names[1], "neutral": names[2]
+    }  # fmt: skip
+    assert [found.kind(g) for g in ("male", "female", "robot")] == ["male", "female", "neutral"]
+
+
+@given(st.lists(st.lists(st.floats(), max_size=4), max_size=4), st.sampled_from([(-1, 3), (2, 2), (3,)]))
+def test_numbers_are_of_the_shape_asked_for_or_an_input_error(value, shape):
+    try:
+        found = numbers("f", value, shape, "it")
+    except InputError as error:
+        assert "\n" not in str(error)
+    else:
+        assert found.ndim == len(shape) and np.isfinite(found).all() and found.dtype == float
+        assert all(n in (-1, m) for n, m in zip(shape, found.shape, strict=True))
+
+
+def test_numbered_files_by_number(tmp_path):
+    for name in ("10.json", "9.json", "0009.json", "a.json", "8.txt", "x9.json"):
+        (tmp_path / name).write_text("")
+    found = {n: [p.name for p in paths] for n, paths in numbered(tmp_path, ".json").items()}
+    assert found == {9: ["0009.json", "9.json"], 10: ["10.json"]} and list(found) == [9, 10]
+    assert numbered(tmp_path / "none", ".json") == {}

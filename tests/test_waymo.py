@@ -1,0 +1,667 @@
+"""Waymo, both versions: points of every laser and return come out where they went in; joins, quirks, wrong input."""
+
+import itertools
+import re
+import shutil
+import tracemalloc
+import zlib
+from collections import Counter
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import waymo_files as files
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpose.data.prepare import prepare, reader
+from lidarpose.data.readers import waymo_parquet
+from lidarpose.data.readers.items import HIDDEN, SEEN, UNLABELED, Item, Skipped
+from lidarpose.data.readers.protobuf import Message
+from lidarpose.data.readers.tfrecord import crc32c, masked_checksum, records
+from lidarpose.data.readers.waymo import COMPONENTS, Waymo, WaymoV1, WaymoV2
+from lidarpose.data.readers.waymo_frames import MARGIN, Calibration, Frame, person, points_of_image, transform
+from lidarpose.data.shards import open_dataset
+from lidarpose.errors import InputError
+from lidarpose.geometry import rotation_about
+
+SEGMENT = "10017090168044687777_6380_000_6400_000"
+TFRECORD = f"training/segment-{SEGMENT}_with_camera_labels.tfrecord"
+TOP = files.LASERS[1].E[:3, 3]
+
+
+@pytest.fixture(scope="module")
+def v2(tmp_path_factory):
+    root = tmp_path_factory.mktemp("v2")
+    files.write_v2(root)
+    return root
+
+
+@pytest.fixture(scope="module")
+def v1(tmp_path_factory):
+    root = tmp_path_factory.mktemp("v1")
+    files.write_v1(root)
+    return root
+
+
+@pytest.fixture
+def copy(v2, tmp_path):
+    """A copy of version 2 to be damaged."""
+    return shutil.copytree(v2, tmp_path / "raw")
+
+
+def component(root, name, split="training"):
+    return root / split / name / f"{SEGMENT}.parquet"
+
+
+def everything(root, source=None):
+    """(items, skipped) of all parts."""
+    source = source or Waymo()
+    found = [one for part in source.parts(root) for one in source.read(root, part)]
+    return [x for x in found if isinstance(x, Item)], [x for x in found if isinstance(x, Skipped)]
+
+
+def truth():
+    """(time, track) -> Someone, of those who must come out."""
+    return {(f.time, one.track): one for f in files.scene() for one in f.people if one.points}
+
+
+def check(items):
+    """Everybody who went in comes out, once: points of each laser and return, rows, joints and labels, to 1 mm."""
+    want = truth()
+    assert [(item.frame, item.track) for item in items] == sorted(want)
+    for item in items:
+        one, sample = want[item.frame, item.track], item.sample
+        ring = [39 - rows if laser == 1 else rows * 0 - 1 for (laser, _), (_, rows) in sorted(one.points.items())]
+        np.testing.assert_array_equal(sample.ring, np.concatenate(ring))
+        start = 0
+        for (laser, which), (points, _) in sorted(one.points.items()):
+            got = sample.points[start : start + len(points)]
+            assert len(points) and np.abs(got - (points - TOP)).max() < 1e-3, (laser, which)
+            start += len(points)
+        np.testing.assert_allclose(sample.pose.joints, one.joints - TOP, atol=1e-3)
+        np.testing.assert_array_equal(item.joint_labels, one.labels)
+        np.testing.assert_allclose(sample.box.center, np.array(one.box[:3]) - TOP, atol=1e-9)
+        np.testing.assert_allclose([*sample.box.size, sample.box.yaw], one.box[3:], atol=1e-9)
+        np.testing.assert_array_equal(item.centers["box"], sample.box.center)
+        assert sample.source == {2: "waymo/pedestrian", 4: "waymo/cyclist"}[one.kind]
+        assert item.sequence == SEGMENT and item.time == pytest.approx((item.frame - 1_550_083_467_346_370) / 1e6)
+
+
+def same(a, b):
+    assert len(a) == len(b)
+    for x, y in zip(a, b, strict=True):
+        assert (x.sequence, x.frame, x.track, x.time) == (y.sequence, y.frame, y.track, y.time)
+        np.testing.assert_allclose(x.sample.points, y.sample.points, atol=1e-6)
+        np.testing.assert_array_equal(x.sample.ring, y.sample.ring)
+        np.testing.assert_array_equal(x.sample.pose.joints, y.sample.pose.joints)
+        np.testing.assert_array_equal(x.joint_labels, y.joint_labels)
+
+
+# --- end to end
+
+
+def test_version_2_comes_out_where_it_went_in(v2):
+    source = reader("waymo")
+    assert source.parts(v2) == [f"training/{SEGMENT}"] and source.skeleton == "waymo14"
+    items, skipped = everything(v2, source)
+    check(items)
+    assert [(one.reason, one.where.split("/")[-1]) for one in skipped] == [
+        ("keypoints without a box", "ped-boxless"),
+        ("no points in the box", "ped-far: the label counts 123"),
+        ("no joint is labelled", "ped-unlabeled"),
+    ]
+    assert source.about["settings"] == {"box_margin_m": 0.2} and source.about["licence"] and source.about["notes"]
+    labels = Counter(int(label) for item in items for label in item.joint_labels)
+    assert labels == {SEEN: 2 * (14 + 9), HIDDEN: 6, UNLABELED: 4}
+
+
+@pytest.mark.parametrize(
+    "kinds",
+    [
+        {"wide": True, "index": False},
+        {"shuffled": True, "group": 1000},
+        {"shuffled": True, "wide": True, "group": 1},
+        {"group": 1000},
+    ],
+    ids=str,
+)
+def test_version_2_of_any_width_and_order_is_the_same(v2, tmp_path, kinds):
+    files.write_v2(tmp_path, **kinds)
+    items, skipped = everything(tmp_path)
+    check(items)
+    want, also = everything(v2)
+    same(items, want)
+    assert skipped == also
+
+
+def test_version_1_is_the_same_as_version_2(v1, v2):
+    source = Waymo()
+    assert source.parts(v1) == [TFRECORD]
+    items, skipped = everything(v1, source)
+    check(items)
+    want, also = everything(v2)
+    same(items, want)
+    assert skipped == also
+
+
+def test_rows_and_joins_are_of_one_segment(v2, tmp_path):
+    # the same times and tracks in another segment, whose people are elsewhere
+    later = files.scene()[1:]
+    files.write_v2(tmp_path)
+    files.write_v2(tmp_path, segment="9999_0_000_20_000", split="validation", frames=later)
+    for name in COMPONENTS:
+        both = [tmp_path / "training" / name / f"{SEGMENT}.parquet"]
+        both += [tmp_path / "validation" / name / "9999_0_000_20_000.parquet"]
+        tables = [pq.read_table(path) for path in both]
+        pq.write_table(pa.concat_tables(tables), both[0])
+    source = Waymo()
+    assert source.parts(tmp_path) == [f"training/{SEGMENT}", "validation/9999_0_000_20_000"]
+    items, _ = everything(tmp_path, source)
+    found = Counter((item.sequence, item.frame, item.time) for item in items)
+    start, second = (frame.time for frame in files.scene()[:2])
+    assert found == {(SEGMENT, start, 0.0): 2, (SEGMENT, second, 0.5): 2, ("9999_0_000_20_000", second, 0.0): 4}
+    check([item for item in items if item.sequence == SEGMENT])
+
+
+def test_the_margin_is_around_the_box(v2):
+    tight, _ = everything(v2, WaymoV2(margin=-0.1))
+    wide, _ = everything(v2, Waymo(margin=0.2))
+    for a, b in zip(tight, wide, strict=True):
+        inside = b.sample.box.contains(b.sample.points, -0.1)
+        np.testing.assert_array_equal(a.sample.points, b.sample.points[inside])
+        assert 0 < inside.sum() < len(inside)
+    assert MARGIN == 0.2 and WaymoV1(margin=0.3).about["settings"] == {"box_margin_m": 0.3}
+
+
+def test_prepare_writes_waymo_and_counts_a_corrupted_segment(v2, tmp_path):
+    raw = shutil.copytree(v2, tmp_path / "raw")
+    files.write_v2(raw, segment="damaged", frames=files.scene()[:1])
+    path = raw / "training/lidar_hkp/damaged.parquet"
+    path.write_bytes(path.read_bytes()[:-50])
+    summary = prepare("waymo", raw, tmp_path / "out", progress=False)
+    assert summary["people"] == 4 and summary["skipped"]["the rest of a part cannot be read"] == 1
+    assert "damaged" in summary["skipped_first"]["the rest of a part cannot be read"]
+    dataset = open_dataset(tmp_path / "out")
+    assert dataset.card.settings["box_margin_m"] == 0.2
+    check([item for item in dataset.items()])
+
+
+# --- range images to points, by hand
+
+
+def top(T=None, **given):
+    given = {"laser": 1, "inclinations": np.array([-0.3, -0.1, 0.2]), "low": 0.0, "high": 0.0} | given
+    return Calibration(T_vehicle_laser=np.eye(4) if T is None else T, **given)
+
+
+def test_rows_begin_with_the_last_beam_and_columns_behind_the_car():
+    image = np.full((3, 4), 2.0)
+    points, row = points_of_image(image, top())
+    elevation = np.arcsin(points[:, 2] / 2)
+    np.testing.assert_allclose(elevation, np.repeat([0.2, -0.1, -0.3], 4))
+    np.testing.assert_allclose(np.degrees(np.arctan2(points[:, 1], points[:, 0])), [135, 45, -45, -135] * 3)
+    np.testing.assert_array_equal(row, np.repeat([0, 1, 2], 4))
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.5, -2.6])
+def test_columns_divide_the_turn_of_the_car_however_the_laser_is_turned(yaw):
+    T = np.eye(4)
+    T[:3, :3] = rotation_about("z", yaw)
+    T[:3, 3] = 1.0, 2.0, 3.0
+    points, _ = points_of_image(np.full((3, 4), 2.0), top(T))
+    points -= [1.0, 2.0, 3.0]
+    np.testing.assert_allclose(np.degrees(np.arctan2(points[:, 1], points[:, 0])), [135, 45, -45, -135] * 3)
+
+
+def test_even_beams_divide_their_range_in_its_middles():
+    calibration = top(inclinations=None, low=-0.4, high=0.2)
+    np.testing.assert_allclose(calibration.rows(3), [0.1, -0.1, -0.3])
+
+
+def test_pixel_poses_turn_about_x_then_y_then_z_and_end_in_the_frame():
+    image = np.zeros((3, 4))
+    image[1, 1] = 2.0
+    before, _ = points_of_image(image, top())
+    poses = np.zeros((3, 4, 6))
+    poses[1, 1] = 0.3, -0.2, 1.1, 5.0, 6.0, 7.0
+    turned = rotation_about("z", 1.1) @ rotation_about("y", -0.2) @ rotation_about("x", 0.3)
+    T = files.rigid(4.0, 6.5, 7.0, 1.0)
+    after, _ = points_of_image(image, top(), poses, T)
+    want = np.linalg.inv(T) @ [*(turned @ before[0] + [5, 6, 7]), 1]
+    np.testing.assert_allclose(after[0], want[:3], atol=1e-12)
+
+
+def test_only_finite_positive_ranges_are_returns():
+    image = np.array([[0.0, -1.0, np.nan, np.inf], [1.0, 2.0, 0.0, 3.0], [0.0] * 4])
+    points, row = points_of_image(image, top())
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), [1, 2, 3])
+    assert row.tolist() == [1, 1, 1]
+
+
+def test_the_scene_tells_wrong_readings_apart():
+    """What `check` would see of each mistake: none moves everything by less than a few centimetres."""
+    frame, laser = files.scene()[1], files.LASERS[1]
+    for which in (1, 2):
+        image = frame.images[1, which][..., 0]
+        of = top(laser.E, inclinations=laser.beams)
+        right, _ = points_of_image(image, of, frame.poses, frame.pose)
+        near = (image > 0) & (image < 25)
+        keep = near[image > 0]
+        assert keep.sum() > 100
+        wrong = [
+            points_of_image(image, of)[0],
+            points_of_image(image, top(laser.E, inclinations=laser.beams[::-1]), frame.poses, frame.pose)[0],
+            points_of_image(image[:, ::-1], of, frame.poses[:, ::-1], frame.pose)[0],
+            points_of_image(image, top(files.rigid(*TOP, 0.0), inclinations=laser.beams), frame.poses, frame.pose)[0],
+            points_of_image(image, top(laser.E, inclinations=None, low=-0.42, high=0.13), frame.poses, frame.pose)[0],
+        ]
+        for other in wrong:
+            assert np.median(np.linalg.norm(other[keep] - right[keep], axis=1)) > 0.02
+
+
+@pytest.mark.parametrize(
+    "image, calibration, poses, problem",
+    [
+        (np.ones((4, 5)), top(), None, "laser 1 has 3 inclinations, its range image 4 rows"),
+        (np.ones((3, 5)), top(), np.zeros((3, 4, 6)), r"pixel poses are \(3, 4, 6\), of a range image 3 x 5"),
+    ],
+)
+def test_sizes_that_do_not_fit_are_refused(image, calibration, poses, problem):
+    with pytest.raises(InputError, match=problem):
+        points_of_image(image, calibration, poses, np.eye(4))
+
+
+@pytest.mark.parametrize(
+    "values",
+    [None, [1.0] * 12, [float("nan")] * 16, [2.0 * x for x in np.eye(4).ravel()], np.diag([1, 1, -1, 1]).ravel()],
+)
+def test_matrices_that_are_no_transforms_are_refused(values):
+    with pytest.raises(InputError, match="the extrinsic must be"):
+        transform(values, "the extrinsic")
+
+
+# --- labels and frames
+
+
+def test_keypoints_by_type_in_any_order():
+    found = person("a", [(20, (1, 2, 3), True), (5, (4, 5, 6), False), (19, (7, 8, 9), False)], (0, 0, 0, 1, 1, 2, 0.5))
+    names = ["head_center", "left_shoulder"]
+    index = [files.WAYMO14.index(name) for name in names]
+    np.testing.assert_array_equal(found.joints[index], [[1, 2, 3], [4, 5, 6]])
+    assert found.labels[index].tolist() == [HIDDEN, SEEN] and (found.labels > 0).sum() == 2
+    assert person("a", [(5, (np.nan, 0, 0), False)], (0, 0, 0, 1, 1, 2, 0.5)).problem == ("no joint is labelled", "")
+
+
+def test_a_box_that_is_none_is_told():
+    found = person("a", [(5, (0, 0, 0), False)], (0, 0, 0, 1, 1, 0, 0.5))
+    assert found.problem[0] == "label of another form" and "size" in found.problem[1]
+
+
+def one_frame(**given):
+    somebody = person("a", [(5, (2.0, 0, 0), False)], (2.0, 0, 0, 1, 3, 4, 0.0))
+    settings = {"sequence": "s", "timestamp": 7, "start": 5, "people": [somebody], "calibrations": {1: top()}}
+    return Frame(**{**settings, "T_world_vehicle": np.eye(4), **given})
+
+
+@pytest.mark.parametrize(
+    "given, laser, poses, reason",
+    [
+        ({}, None, None, "no range image of the frame"),
+        ({}, 1, None, "no pixel poses of the top laser"),
+        ({"T_world_vehicle": None}, 1, np.zeros((3, 4, 6)), "no vehicle pose of the frame"),
+        ({"calibrations": {}}, 1, np.zeros((3, 4, 6)), "range image cannot be read"),
+        ({}, 1, np.zeros((3, 5, 6)), "range image cannot be read"),
+    ],
+)
+def test_a_frame_that_lacks_something_is_skipped(given, laser, poses, reason):
+    frame = one_frame(**given)
+    if laser is not None:
+        frame.add(laser, 1, np.full((3, 4), 2.0), poses)
+    (found,) = frame.found()
+    assert found.reason == reason and found.where.startswith("s/7/a")
+
+
+def test_images_added_in_any_order_are_the_same_and_twice_is_once():
+    results = []
+    for order in itertools.permutations([(1, 1), (1, 2), (2, 1)]):
+        frame = one_frame(calibrations={1: top(), 2: top(laser=2)})
+        for laser, which in (*order, order[0]):
+            image = np.full((3, 4), 2.0 + 0.1 * which)
+            frame.add(laser, which, image, np.zeros((3, 4, 6)) if laser == 1 else None)
+        (item,) = frame.found()
+        results.append(item.sample)
+    assert len(results[0].points) and set(results[0].ring.tolist()) == {-1, 0, 1, 2}
+    for sample in results[1:]:
+        np.testing.assert_array_equal(sample.points, results[0].points)
+        np.testing.assert_array_equal(sample.ring, results[0].ring)
+
+
+# --- version 2: wrong input, memory
+
+
+def rewritten(path, change):
+    """Writes a table anew after `change` of its rows."""
+    table = pq.read_table(path)
+    pq.write_table(pa.Table.from_pylist(change(table.to_pylist()), schema=table.schema), path)
+
+
+def test_a_missing_component_is_told_with_the_command_that_fetches_it(copy):
+    shutil.rmtree(copy / "training/lidar_pose")
+    shutil.rmtree(copy / "training/vehicle_pose")
+    with pytest.raises(InputError) as caught:
+        Waymo().parts(copy)
+    line = str(caught.value)
+    url = r"gs://waymo_open_dataset_v_2_0_1/training/{vehicle_pose,lidar_pose}"
+    assert f"lacks vehicle_pose, lidar_pose; fetch with: gcloud storage cp -r {url} {copy}/training/" in line
+    assert "\n" not in line
+
+
+def test_a_missing_file_of_a_segment_is_told(copy):
+    component(copy, "lidar").rename(copy / "training/lidar/other.parquet")
+    command = f"cp gs://waymo_open_dataset_v_2_0_1/training/lidar/{SEGMENT}.parquet"
+    with pytest.raises(InputError, match=f"lacks 1 of the 1 segments with keypoints; .*{re.escape(command)}"):
+        Waymo().parts(copy)
+
+
+def test_segments_without_keypoints_need_no_other_files(copy):
+    table = pq.read_table(component(copy, "lidar_hkp"))
+    pq.write_table(table.slice(0, 0), copy / "training/lidar_hkp/nobody.parquet")
+    assert Waymo().parts(copy) == [f"training/{SEGMENT}"]
+    component(copy, "lidar_hkp").unlink()
+    with pytest.raises(InputError, match="has no segment with laser keypoints"):
+        Waymo().parts(copy)
+
+
+def test_mixed_versions_are_told(copy):
+    files.write_v1(copy, split="validation", frames=files.scene()[:1])
+    with pytest.raises(
+        InputError, match=r"mixes versions of Waymo: validation/.*\.tfrecord is of version 1, training/"
+    ):
+        Waymo().parts(copy)
+
+
+def test_wrong_roots_are_told(copy, tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="is not the root of Waymo: expected .* got nothing; get it at waymo.com"):
+        Waymo().parts(tmp_path / "empty")
+    for wrong in (copy / "training", copy / "training/lidar"):
+        with pytest.raises(InputError, match="is not the root of Waymo"):
+            Waymo().parts(wrong)
+    with pytest.raises(InputError, match=f"the root is likely {copy}"):
+        Waymo().parts(copy / "training")
+    (tmp_path / "v1/individual_files/training").mkdir(parents=True)
+    with pytest.raises(InputError, match="the root is likely .*individual_files"):
+        Waymo().parts(tmp_path / "v1")
+
+
+@pytest.mark.parametrize("name", ["lidar", "lidar_pose"])
+@pytest.mark.parametrize("damage", ["cut", "flip"])
+def test_damaged_range_images_skip_everybody_by_name(copy, name, damage):
+    path = component(copy, name)
+    data = bytearray(path.read_bytes())
+    if damage == "flip":
+        data[4:2000] = bytes(1996)
+    path.write_bytes(data[: len(data) // 2] if damage == "cut" else data)
+    items, skipped = everything(copy)
+    found = Counter(one.reason for one in skipped)
+    assert not items and found["range image cannot be read"] == 5 and found["no joint is labelled"] == 1
+    where = next(one.where for one in skipped if one.reason == "range image cannot be read")
+    assert f"{name}/{SEGMENT}.parquet: cannot be read as Parquet" in where and "\n" not in where
+
+
+def test_damaged_labels_are_one_line(copy):
+    component(copy, "lidar_box").write_bytes(b"PAR1 no table")
+    with pytest.raises(InputError, match=r"lidar_box/.*: cannot be read as Parquet .*; fetch it again$"):
+        everything(copy)
+
+
+@pytest.mark.parametrize("name", COMPONENTS)
+def test_files_of_another_component_are_told(copy, name):
+    other = "lidar_box" if name != "lidar_box" else "lidar_hkp"
+    shutil.copy(component(copy, other), component(copy, name))
+    if name in ("lidar", "lidar_pose"):
+        _, skipped = everything(copy)
+        assert any(f"{name}/{SEGMENT}.parquet: has no column" in one.where for one in skipped)
+    else:
+        with pytest.raises(InputError, match=f"{name}/.*: has no column"):
+            everything(copy)
+
+
+def test_an_unknown_laser_is_told(tmp_path):
+    files.write_v2(tmp_path, wide=True)
+    rewritten(component(tmp_path, "lidar_calibration"), lambda rows: [row | {"key.laser_name": "ROOF"} for row in rows])
+    with pytest.raises(InputError, match="names the laser 'ROOF'; known are TOP, FRONT"):
+        everything(tmp_path)
+
+
+def reasons_after(copy, name, change):
+    rewritten(component(copy, name), change)
+    items, skipped = everything(copy)
+    return len(items), Counter(one.reason for one in skipped)
+
+
+def test_frames_that_lack_rows_are_skipped_and_others_read(copy):
+    first = files.scene()[0].time
+    here = lambda row: row["key.frame_timestamp_micros"] == first  # noqa: E731
+    count, found = reasons_after(copy, "lidar_pose", lambda rows: [row for row in rows if not here(row)])
+    assert count == 2 and found["no pixel poses of the top laser"] == 2
+    count, found = reasons_after(copy, "vehicle_pose", lambda rows: [row for row in rows if not here(row)])
+    assert count == 2 and found["no vehicle pose of the frame"] == 2
+    count, found = reasons_after(copy, "lidar", lambda rows: [row for row in rows if not here(row)])
+    assert count == 2 and found["no range image of the frame"] == 2
+
+
+def test_lists_of_different_lengths_are_skipped(copy):
+    name = "[LiDARHumanKeypointsComponent].lidar_keypoints[*].keypoint_3d.location_m.y"
+    count, found = reasons_after(copy, "lidar_hkp", lambda rows: [rows[0] | {name: [1.0]}, *rows[1:]])
+    assert count == 3 and found["label of another form"] == 1
+
+
+def test_a_missing_second_return_is_none(copy):
+    names = [f"[LiDARComponent].range_image_return2.{part}" for part in ("values", "shape")]
+    rewritten(component(copy, "lidar"), lambda rows: [row | dict.fromkeys(names) for row in rows])
+    items, _ = everything(copy)
+    for item in items:
+        points = truth()[item.frame, item.track].points
+        want = np.concatenate([points[key][0] for key in sorted(points) if key[1] == 1]) - TOP
+        np.testing.assert_allclose(item.sample.points, want, atol=1e-3)
+
+
+def test_values_that_do_not_fit_their_shape_are_told(copy):
+    shape = "[LiDARComponent].range_image_return1.shape"
+    count, found = reasons_after(copy, "lidar", lambda rows: [rows[0] | {shape: [1, 2, 3]}, *rows[1:]])
+    assert count == 2 and found["range image cannot be read"] == 2
+
+
+def test_range_images_are_never_all_in_memory(tmp_path):
+    shape, frames = (32, 256, 6), 150
+    column = "[LiDARPoseComponent].range_image_return1"
+    values = np.random.default_rng(0).random((frames, *shape), np.float32)
+    lists = pa.ListArray.from_arrays(np.arange(frames + 1, dtype=np.int32) * values[0].size, values.ravel())
+    rows = {
+        "key.segment_context_name": ["s"] * frames,
+        "key.frame_timestamp_micros": list(range(frames)),
+        "key.laser_name": [1] * frames,
+        f"{column}.values": lists,
+        f"{column}.shape": pa.array([list(shape)] * frames, pa.list_(pa.int32(), 3)),
+    }
+    path = tmp_path / "all.parquet"
+    # one row group: nothing but reading it bit by bit helps
+    pq.write_table(pa.table(rows), path)
+    del rows, lists
+    most, seen = 0, 0
+    before = pa.total_allocated_bytes()
+    tracemalloc.start()
+    for (_, k, _), (image,) in waymo_parquet.images(path, (column,), {("s", k) for k in range(frames)}):
+        np.testing.assert_array_equal(image, values[k])
+        most, seen = max(most, pa.total_allocated_bytes() - before), seen + 1
+    held = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert seen == frames and most + held < values.nbytes / 4
+
+
+def test_only_wanted_rows_are_given(v2):
+    times = [frame.time for frame in files.scene()]
+    path = component(v2, "lidar")
+    found = list(waymo_parquet.images(path, ("[LiDARComponent].range_image_return1",), {(SEGMENT, times[1])}))
+    assert [key for key, _ in found] == [(SEGMENT, times[1], laser) for laser in range(1, 6)]
+
+
+# --- version 1
+
+
+def test_a_corrupted_record_ends_a_file_by_name(v1, tmp_path):
+    data = (v1 / TFRECORD).read_bytes()
+    first = 16 + int.from_bytes(data[:8], "little")
+    (tmp_path / "training").mkdir()
+    for damaged, what in (
+        (data[: first + 500] + bytes([data[first + 500] ^ 1]) + data[first + 501 :], "is damaged in record 1"),
+        (data[: first + 3] + bytes([data[first + 3] ^ 1]) + data[first + 4 :], "is damaged at record 1"),
+        (data[: first + 500], "is cut off in record 1"),
+        (data[: first + 5], "is cut off in record 1"),
+    ):
+        (tmp_path / TFRECORD).write_bytes(damaged)
+        items, skipped = everything(tmp_path)
+        assert [item.frame for item in items] == [files.scene()[0].time] * 2
+        assert [one.reason for one in skipped] == ["the rest of a part cannot be read"]
+        assert what in skipped[0].where and TFRECORD in skipped[0].where and "\n" not in skipped[0].where
+
+
+def test_what_is_no_tfrecord_is_told(tmp_path):
+    (tmp_path / "training").mkdir()
+    (tmp_path / "training/a.tfrecord").write_bytes(b"\x1f\x8b gzip, or anything else")
+    _, skipped = everything(tmp_path)
+    assert len(skipped) == 1 and "is no TFRecord file" in skipped[0].where
+
+
+def test_records_that_are_no_frames_are_told_and_the_next_read(v1, tmp_path):
+    (tmp_path / "training").mkdir()
+    scenario = files.record(files.block(5, "a scenario of the motion dataset") + files.double(1, 2.0))
+    cut = files.record(files.v1_frame(files.scene()[0], SEGMENT)[:-30])
+    (tmp_path / TFRECORD).write_bytes(scenario + cut + (v1 / TFRECORD).read_bytes())
+    items, skipped = everything(tmp_path)
+    check(items)
+    assert [one.reason for one in skipped[:2]] == ["frame cannot be read"] * 2
+    assert "record 0: " in skipped[0].where and "record 1: message is cut off" in skipped[1].where
+
+
+@pytest.mark.parametrize("damage", [lambda data: data[:-9], lambda data: data[:9] + b"\0" + data[10:]])
+def test_a_range_image_that_cannot_be_inflated_skips_its_frame(tmp_path, damage, monkeypatch):
+    pack, first = files.matrix_float, []
+
+    def broken(image):
+        data = pack(image)
+        first.append(data)
+        return damage(data) if len(first) == 3 else data
+
+    monkeypatch.setattr(files, "matrix_float", broken)
+    files.write_v1(tmp_path)
+    items, skipped = everything(tmp_path)
+    assert [item.frame for item in items] == [files.scene()[1].time] * 2
+    assert [one.reason for one in skipped[:2]] == ["range image cannot be read"] * 2
+
+
+def test_top_without_pixel_poses_is_skipped_in_version_1_too(tmp_path, monkeypatch):
+    pack = files.matrix_float
+    monkeypatch.setattr(files, "matrix_float", lambda image: b"" if image.shape[2] == 6 else pack(image))
+    files.write_v1(tmp_path, frames=files.scene()[:1])
+    items, skipped = everything(tmp_path)
+    assert not items and [one.reason for one in skipped] == ["no pixel poses of the top laser"] * 2
+
+
+def test_a_range_image_of_another_size_than_it_says_is_told(tmp_path, monkeypatch):
+    wrong = zlib.compress(files.block(1, bytes(4 * 10)) + files.block(2, files.number(1, 3)))
+    monkeypatch.setattr(files, "matrix_float", lambda image: wrong)
+    files.write_v1(tmp_path, frames=files.scene()[:1])
+    items, skipped = everything(tmp_path)
+    assert not items and "a range image of 10 values says it is [3]" in skipped[0].where
+
+
+# --- TFRecord and protobuf
+
+
+def test_checksums_are_castagnoli():
+    # RFC 3720, B.4; the usual check value
+    assert crc32c(b"123456789") == 0xE3069283
+    assert crc32c(bytes(32)) == 0x8A9136AA and crc32c(b"\xff" * 32) == 0x62A8AB43
+    assert crc32c(bytes(range(32))) == 0x46DD794E
+    assert crc32c(b"") == 0
+
+
+@pytest.mark.parametrize("size", [1, 3, 4, 511, 512, 513, 1024, 1025, 2048, 3000, 4096, 5121, 20_000])
+def test_checksums_of_any_length(size):
+    data = np.random.default_rng(size).bytes(size)
+    assert crc32c(data) == files.slow_crc(data)
+    assert masked_checksum(data) == files.masked(data)
+
+
+def test_records_come_one_by_one(tmp_path):
+    written = [b"", b"a", bytes(1000), b"last"]
+    (tmp_path / "a").write_bytes(b"".join(map(files.record, written)))
+    assert list(records(tmp_path / "a")) == written
+    (tmp_path / "empty").write_bytes(b"")
+    assert list(records(tmp_path / "empty")) == []
+    with pytest.raises(InputError, match="cannot be read"):
+        list(records(tmp_path / "none"))
+
+
+def test_messages_give_fields_by_number():
+    inner = files.block(2, "text") + files.number(3, -5)
+    data = (
+        files.block(1, inner) + files.block(1, inner) + files.double(4, 2.5) + files.number(5, 1) + files.number(5, 2)
+    )
+    message = Message(data)
+    assert message.message(1).text(2) == "text" and message.message(1).integer(3) == -5
+    assert len(message.messages(1)) == 2 and message.double(4) == 2.5
+    assert message.integer(5) == 2 and message.integers(5) == [1, 2]
+    assert 4 in message and 9 not in message
+    assert message.message(9) is message.text(9) is message.double(9) is message.data(9) is message.integer(9) is None
+    assert message.doubles(9).shape == (0,) and message.integers(9) == []
+
+
+def test_repeated_numbers_are_packed_or_not():
+    data = files.doubles(1, [1.0, 2.0]) + files.block(1, np.array([3.0, 4.0], "<f8").tobytes())
+    assert Message(data).doubles(1).tolist() == [1, 2, 3, 4]
+    data = files.block(2, np.array([1.5, 2.5], "<f4").tobytes())
+    assert Message(data).floats(2).tolist() == [1.5, 2.5]
+    data = files.number(3, 300) + files.block(3, files.varint(7) + files.varint(-1))
+    assert Message(data).integers(3) == [300, 7, -1]
+
+
+@pytest.mark.parametrize(
+    "data, read, problem",
+    [
+        (b"\x0a\x05abc", None, "cut off in field 1"),
+        (b"\x09abc", None, "cut off in field 1"),
+        (b"\x08\x80", None, "cut off"),
+        (b"\x08" + b"\x80" * 12, None, "a varint has no end"),
+        (b"\x0b", None, "unknown kind 3"),
+        (b"\x08\x01", "text", "field 1 of a message is a varint, expected bytes"),
+        (b"\x0a\x01a", "integer", "field 1 of a message is bytes, expected a varint"),
+        (b"\x0a\x03abc", "doubles", "holds no whole number of f8"),
+    ],
+)
+def test_what_is_no_message_is_told(data, read, problem):
+    with pytest.raises(InputError, match=problem):
+        getattr(Message(data), read or "text")(1)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.binary(max_size=60))
+def test_any_bytes_are_a_message_or_an_input_error(data):
+    try:
+        message = Message(data)
+        message.messages(1), message.doubles(2), message.integers(3)
+    except InputError as error:
+        assert "\n" not in str(error)
+
+
+def test_every_cut_of_a_label_is_an_input_error_or_a_shorter_message():
+    whole = files.v1_frame(files.scene()[2], "s")[:400]
+    for end in range(0, 400, 7):
+        try:
+            Message(whole[:end])
+        except InputError as error:
+            assert "cut off" in str(error)
