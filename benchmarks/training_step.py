@@ -46,7 +46,7 @@ def main() -> None:
     rng = np.random.default_rng(0)
     arrays = collate([example(person, rng) for person in people], config, rng)
     batch = Batch.from_arrays(arrays)
-    targets = Targets(joints=torch.as_tensor(arrays["joints"]), part=torch.as_tensor(arrays["part"]))
+    targets = Targets.from_arrays(arrays)
     network = PoseNet(config)
     made = optimizers(network, recipe)
     rows = []

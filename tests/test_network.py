@@ -14,7 +14,7 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.model.batch import Batch, Targets
 from lidarpose.model.heads import DECODE, REACH, VoteHead, bin_centers, decode, encode
-from lidarpose.model.layers import Convolution, CrossAttention, Places, key_bias
+from lidarpose.model.layers import Convolution, CrossAttention, Places, key_bias, wave_numbers
 from lidarpose.model.network import PoseNet
 from lidarpose.model.plan import plan, view_features
 from lidarpose.model.presets import BIN, NetworkConfig, preset
@@ -237,10 +237,10 @@ def test_attention_sees_distances_not_places():
     torch.manual_seed(0)
     here, there = torch.randn(1, 1, 3), torch.randn(1, 1, 3)
     query, key = torch.randn(2, 1, 1, 3, 20)
-    shift = torch.tensor([3.1, -0.7, 0.4])
+    shift, scale = torch.tensor([3.1, -0.7, 0.4]), wave_numbers(3, 20)
 
     def product(a, b):
-        return (Places(a).turn(query) * Places(b).turn(key)).sum(-1)
+        return (Places(a).turn(query, scale) * Places(b).turn(key, scale)).sum(-1)
 
     torch.testing.assert_close(product(here, there), product(here + shift, there + shift), atol=1e-4, rtol=1e-4)
     assert (product(here, there) - product(here, there + shift)).abs().max() > 1e-2
@@ -261,6 +261,31 @@ def test_dense_voxels_weigh_as_points():
     merged = layer(anchors, believed, voxels, Places(position), count.log(), no_bias)
     apart = layer(anchors, believed, voxels[:, four], Places(position[:, four]), torch.zeros(1, 4), no_bias)
     torch.testing.assert_close(merged, apart, atol=1e-6, rtol=1e-5)
+
+
+def test_an_anchor_reads_the_mean_of_the_voxels_values():
+    """The twin: one query, one head and one voxel at a time."""
+    torch.manual_seed(0)
+    layer = CrossAttention(14, 2, 5)
+    anchors, believed = torch.randn(1, 3, 14), torch.randn(1, 3, 3)
+    voxels, position, count = torch.randn(1, 4, 5), torch.randn(1, 4, 3), torch.tensor([[1.0, 5.0, 2.0, 9.0]])
+    valid = torch.tensor([[True, True, True, False]])
+    found = layer(anchors, Places(believed), voxels, Places(position), count.log(), key_bias(valid, torch.float32))
+    for j in range(3):
+        mixed = []
+        for h in range(2):
+            channels = slice(7 * h, 7 * h + 7)
+            query, score = layer.query(anchors[0, j])[channels], []
+            for n in range(3):
+                key = layer.key(voxels[0, n])[channels]
+                turned = [
+                    Places(place[None, None]).turn(x[None, None, None], layer.scale[h : h + 1])[0, 0, 0]
+                    for place, x in ((believed[0, j], query), (position[0, n], key))
+                ]
+                score.append(turned[0] @ turned[1] / 7**0.5 + layer.density[h] * count[0, n].log())
+            weight = torch.stack(score).softmax(0)
+            mixed.append(sum(w * layer.value(voxels[0, n])[channels] for n, w in enumerate(weight)))
+        torch.testing.assert_close(found[0, j], layer.out(torch.cat(mixed)), atol=1e-5, rtol=1e-4)
 
 
 def test_a_vote_is_what_each_voxel_says():

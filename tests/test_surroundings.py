@@ -86,7 +86,9 @@ def test_occluders_stand_between_sensor_and_person_on_the_ground(seed, place, ta
     ahead = mesh.vertices[:, :2] @ feet[:2] / (feet[:2] @ feet[:2])
     assert 0.0 < ahead.min() and ahead.max() < 1.35
     assert 0.3 < np.median(ahead) < 1.1
-    assert mesh.vertices[:, 2].min() == pytest.approx(feet[2], abs=0.13)
+    # leaves are scattered one by one: the lowest of a hedge's hundred hangs a little
+    leaves = len(mesh.vertices) == 3 * len(mesh.faces)
+    assert -1e-5 < mesh.vertices[:, 2].min() - feet[2] < (0.5 if leaves else 1e-5)
 
 
 def test_occluders_hide_something_and_seldom_all():

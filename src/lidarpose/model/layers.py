@@ -26,28 +26,31 @@ class Places:
         """(B, N, PLACE_FEATURES): the coordinates, their sines and their cosines."""
         return torch.cat([self.position, self.sin.flatten(-2), self.cos.flatten(-2)], -1)
 
-    def turn(self, x: Tensor) -> Tensor:
-        """Rotary encoding of x (B, N, H, D): P = 3 * (D // 6) pairs of each head turn by the row's phases.
+    def turn(self, x: Tensor, scale: Tensor) -> Tensor:
+        """Rotary encoding of x (B, N, H, D): P pairs of each head turn by the row's phases, `scale` as `wave_numbers`.
 
-        The product of two turned vectors depends on the difference of their places in metres alone. Heads share out the
-        wavelengths; the D - 2 P channels that are left see no place.
+        The product of two turned vectors depends on the difference of their places in metres alone. The D - 2 P
+        channels that are left see no place.
         """
-        heads, width = x.shape[-2:]
-        each = width // 6
-        sin, cos = self._waves(heads, each)
-        a, b, rest = x.split([3 * each, 3 * each, width - 6 * each], -1)
+        sin, cos = self._waves(scale)
+        pairs = sin.shape[-1]
+        a, b, rest = x.split([pairs, pairs, x.shape[-1] - 2 * pairs], -1)
         return torch.cat([a * cos - b * sin, a * sin + b * cos, rest], -1)
 
-    def _waves(self, heads: int, each: int) -> tuple[Tensor, Tensor]:
+    def _waves(self, scale: Tensor) -> tuple[Tensor, Tensor]:
         """Sines and cosines (B, N, H, P) for a layout of heads, shared by all layers that read these rows."""
-        if (heads, each) not in self._shared:
-            pick = torch.arange(heads * each, device=self.sin.device) % len(WAVELENGTHS)
-            sin, cos = (
-                wave[..., pick].unflatten(-1, (heads, each)).movedim(-3, -2).flatten(-2)
-                for wave in (self.sin, self.cos)
-            )
-            self._shared[heads, each] = sin, cos
-        return self._shared[heads, each]
+        layout = scale.shape[0], scale.shape[2]
+        if layout not in self._shared:
+            phase = (self.position[..., None, :, None] * scale).flatten(-2)
+            self._shared[layout] = phase.sin(), phase.cos()
+        return self._shared[layout]
+
+
+def wave_numbers(heads: int, width: int) -> Tensor:
+    """(H, 1, P / 3) rad/m for heads of `width` channels, P = 3 * (width // 6): heads share out the wavelengths."""
+    each = width // 6
+    numbers = [2 * torch.pi / WAVELENGTHS[k % len(WAVELENGTHS)] for k in range(heads * each)]
+    return torch.tensor(numbers).view(heads, 1, each)
 
 
 def key_bias(valid: Tensor, dtype: torch.dtype) -> Tensor:
@@ -68,13 +71,14 @@ class SelfAttention(nn.Module):
         self.key = nn.Linear(channels, channels)
         self.value = nn.Linear(channels, channels)
         self.out = nn.Linear(channels, channels)
+        self.register_buffer("scale", wave_numbers(heads, channels // heads), persistent=False)
 
     def forward(self, rows: Tensor, places: Places | None, bias: Tensor | None) -> Tensor:
         query, key, value = (
             layer(rows).unflatten(-1, (self.heads, -1)) for layer in (self.query, self.key, self.value)
         )
         if places is not None:
-            query, key = places.turn(query), places.turn(key)
+            query, key = places.turn(query, self.scale), places.turn(key, self.scale)
         query, key, value = (x.transpose(1, 2) for x in (query, key, value))
         mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=bias)
         return self.out(mixed.transpose(1, 2).flatten(-2))
@@ -95,19 +99,22 @@ class CrossAttention(nn.Module):
         self.value = nn.Linear(key_channels, channels)
         self.out = nn.Linear(channels, channels)
         self.density = nn.Parameter(torch.linspace(0, 1, heads))
+        self.register_buffer("scale", wave_numbers(heads, channels // heads), persistent=False)
 
     def forward(
         self, queries: Tensor, query_places: Places, keys: Tensor, places: Places, log_count: Tensor, bias: Tensor
     ) -> Tensor:
         query = self.query(queries).unflatten(-1, (self.heads, -1))
-        query = (query_places.turn(query) * query.shape[-1] ** -0.5).transpose(1, 2)
-        key = places.turn(self.key(keys).unflatten(-1, (self.heads, -1))).transpose(1, 2)
-        value = self.value(keys).unflatten(-1, (self.heads, -1)).transpose(1, 2)
+        query = (query_places.turn(query, self.scale) * query.shape[-1] ** -0.5).transpose(1, 2)
+        key = places.turn(self.key(keys).unflatten(-1, (self.heads, -1)), self.scale).transpose(1, 2)
         dense = self.density[:, None, None].to(bias.dtype) * log_count[:, None, None, :]
         # few queries: written out, since the fused kernels give no gradient to a bias
-        logits = query @ key.transpose(-2, -1) + (bias + dense)
-        mixed = logits.softmax(-1).to(value.dtype) @ value
-        return self.out(mixed.transpose(1, 2).flatten(-2))
+        weight = (query @ key.transpose(-2, -1) + (bias + dense)).softmax(-1).to(keys.dtype)
+        # weights sum to 1, so the mean of the values is the value of the mean: no voxel's own is needed
+        mean = (weight.flatten(1, 2) @ keys).unflatten(1, (self.heads, -1))
+        values = self.value.weight.unflatten(0, (self.heads, -1))
+        mixed = (mean @ values.mT).transpose(1, 2).flatten(-2) + self.value.bias
+        return self.out(mixed)
 
 
 class FeedForward(nn.Sequential):

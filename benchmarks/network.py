@@ -1,0 +1,302 @@
+"""Speed and memory of the network, beside a plain transformer, a PointNet++ and the package's first draft.
+
+    python benchmarks/network.py                  # about half an hour on two cores; Markdown on standard output
+    python benchmarks/network.py --quick          # a trial of all of it, minutes
+    python benchmarks/network.py --device cuda    # training in bfloat16; no ONNX, no baselines
+
+Legend: B people a call, n points a person, J joints.
+
+Whatever is compared runs in one process and takes turns, round after round; cells give the best round and the median.
+Quote ratios: they hold on another machine, and mostly on a busy one. What is timed:
+
+- latency: one person, from points about their center to joints, the tables (voxels, groups) made on the way;
+- forward: the same of B people, and beside it the network alone;
+- training: a step on tables made before, as the loop's are by other processes: forward, losses, backward, gradients
+  clipped, optimizers, running mean of the weights. Baselines and the paper's network: AdamW on the mean distance of the
+  joints (of all heads that tell joints, and the parts, for the paper's).
+
+People are of the generator's scene `wild`, brought to exactly n points; "crops" are people as they come, their median
+170 points, sorted into batches as in training. Weights are random: no time depends on them.
+"""
+
+import argparse
+import json
+import math
+import multiprocessing
+import resource
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from network_report import CROPS, Key, Report, Times
+from runners import (
+    BATCH,
+    DRAFT,
+    PAPER_BATCH,
+    SIZES,
+    Example,
+    Runner,
+    Session,
+    batches,
+    crops,
+    of_points,
+    reason,
+    runner,
+    runners_of,
+    say,
+)
+from threadpoolctl import threadpool_limits
+
+from lidarpose.train.feed import BATCHES
+
+SECTIONS = ("latency", "forward", "training", "scaling", "memory")
+POINTS, SCALING_POINTS = (128, 256, 512, 1024), (128, 256, 512, 1024, 2048)
+SCALING_PEOPLE, SCALING_PEOPLE_CUDA = (1, 4, 16, 64), (1, 16, 64, 256, 1024)
+# a turn goes on for so long, s, so many times at most; between turns other threads come to rest for so long, s
+TURN, MOST_TIMES, REST = 0.15, 20, 0.02
+# what takes so long, s, has its turn every second round
+SLOW = 5.0
+# people whose latency is taken, one after the other: they differ in voxels
+ALONE = 8
+
+
+@dataclass(frozen=True)
+class Job:
+    """Something to time: `run` returns the seconds that the network alone took."""
+
+    key: Key
+    runner: Runner
+    run: Callable[[], float]
+
+
+def forward_job(section: str, one: Runner, points: int | str, calls: list[list[Example]]) -> Job:
+    def run() -> float:
+        alone = 0.0
+        for people in calls:
+            tables = one.tables(people)
+            started = time.perf_counter()
+            one.joints(tables)
+            alone += time.perf_counter() - started
+        return alone
+
+    return Job(Key(section, one.name, points, sum(map(len, calls))), one, run)
+
+
+def training_job(section: str, one: Runner, points: int | str, calls: list[list[Example]]) -> Job:
+    lessons = [one.lesson(people) for people in calls]
+
+    def run() -> float:
+        started = time.perf_counter()
+        for lesson in lessons:
+            one.step(lesson)
+        return time.perf_counter() - started
+
+    return Job(Key(section, one.name, points, sum(map(len, calls))), one, run)
+
+
+def measure(jobs: list[Job], rounds: int, left_out: list[str]) -> Times:
+    """Seconds of each job's calls, whole and of the network alone, all jobs in turn each round."""
+    repeat, slow, times = {}, set(), defaultdict(list)
+    for number, job in enumerate(jobs):
+        say(f"warming up {job.key.section} {number + 1}/{len(jobs)}: {job.key.network}, {job.key.points}")
+        try:
+            # the first call allocates, the second shows how long one takes
+            first = _turn(job, 1)[0][0]
+            taken = first if first > 1 else _turn(job, 1)[0][0]
+            repeat[job.key] = min(max(math.ceil(TURN / taken), 1), MOST_TIMES)
+            if taken > SLOW:
+                slow.add(job.key)
+        except Exception as error:
+            left_out.append(f"{job.key.section} of {job.key.network} at {job.key.points}: {reason(error)}")
+    for number in range(rounds):
+        say(f"{jobs[0].key.section if jobs else 'nothing'}: round {number + 1} of {rounds}")
+        for job in jobs:
+            if job.key in repeat and not (job.key in slow and number % 2):
+                # of several calls the first finds the caches as another network left them
+                several = repeat[job.key] > 1
+                times[job.key] += _turn(job, repeat[job.key] + several)[several:]
+    return dict(times)
+
+
+def _turn(job: Job, calls: int) -> list[tuple[float, float]]:
+    job.runner.train(job.key.section.endswith("training"))
+    out = []
+    for _ in range(calls):
+        started = time.perf_counter()
+        alone = job.run()
+        out.append((time.perf_counter() - started, alone))
+    job.runner.rest()
+    time.sleep(REST)
+    return out
+
+
+def measured(made: list[Runner], options: argparse.Namespace, left_out: list[str]) -> Times:
+    """All times that were asked for."""
+    if not made:
+        return {}
+    rng = np.random.default_rng(0)
+    most = max(one.batch for one in made)
+    number = 2 if options.quick else BATCHES
+    say("making people")
+    with threadpool_limits(limits=1, user_api="blas"):
+        pool = crops(most * number, rng)
+    clouds = {n: of_points(pool, n, most, rng) for n in sorted({*options.points, *options.scaling_points})}
+    times: Times = {}
+    if "latency" in options.sections:
+        jobs = [
+            forward_job("latency", one, n, [[person] for person in clouds[n][:ALONE]])
+            for n in options.points
+            for one in made
+        ]
+        times |= measure(jobs, 2 * options.rounds, left_out)
+    if "forward" in options.sections:
+        jobs = []
+        for n in (*options.points, CROPS):
+            for one in made:
+                if one.batch > 1 and not isinstance(one, Session):
+                    calls = batches(pool, one.batch, number) if n == CROPS else [clouds[n][: one.batch]]
+                    jobs.append(forward_job("forward", one, n, calls))
+        times |= measure(jobs, options.rounds, left_out)
+    if "training" in options.sections:
+        jobs = []
+        for n in (*options.points, CROPS):
+            for one in made:
+                if one.trains:
+                    calls = batches(pool, one.batch, number) if n == CROPS else [clouds[n][: one.batch]]
+                    jobs.append(training_job("training", one, n, calls))
+        times |= measure(jobs, options.rounds, left_out)
+    if "scaling" in options.sections and made and made[0].name == "tiny":
+        for section, make in (("scaling forward", forward_job), ("scaling training", training_job)):
+            jobs = [
+                make(section, made[0], n, [[clouds[n][k % most] for k in range(people)]])
+                for n in options.scaling_points
+                for people in options.scaling_people
+            ]
+            times |= measure(jobs, options.rounds, left_out)
+    return times
+
+
+def memory(options: argparse.Namespace, left_out: list[str]) -> list[dict]:
+    """Peak memory of training steps, each network in a process of its own; bytes."""
+    names = [name for size in options.sizes for name in ([size, DRAFT] if size == "small" else [size])]
+    names = names if options.device == "cpu" else [name for name in names if name != DRAFT]
+    rng = np.random.default_rng(0)
+    number = 2 if options.quick else BATCHES
+    pool = crops(BATCH * number, rng)
+    rows = []
+    context = multiprocessing.get_context("spawn")
+    for name in names:
+        batch = PAPER_BATCH if name == "paper" and options.device == "cpu" else BATCH
+        # of the crops the batch of the most voxels
+        sets = {n: of_points(pool, n, batch, rng) for n in options.points[-2:]}
+        sets[CROPS] = batches(pool, batch, number)[-1]
+        for points, people in sets.items():
+            say(f"memory of {name}, {points}")
+            out = context.SimpleQueue()
+            process = context.Process(target=_memory_of_steps, args=(name, people, options, out))
+            process.start()
+            process.join()
+            if out.empty():
+                left_out.append(f"memory of {name} at {points}: its process ended with {process.exitcode}")
+                continue
+            found = out.get()
+            if "error" in found:
+                left_out.append(f"memory of {name} at {points}: {found['error']}")
+            else:
+                rows.append({"network": name, "points": points, "people": len(people)} | found)
+    return rows
+
+
+def _memory_of_steps(name: str, people: list[Example], options: argparse.Namespace, out) -> None:
+    """Three training steps; puts bytes before the network is made and at the peak."""
+    torch.set_num_threads(options.threads)
+    try:
+        before = resident()
+        one = runner(name, options.device)
+        lesson = one.lesson(people)
+        one.train(True)
+        for _ in range(3):
+            one.step(lesson)
+        found = {"before": before, "peak": peak()}
+        if options.device != "cpu":
+            found |= {"device_peak": torch.cuda.max_memory_allocated()}
+        out.put(found)
+    except Exception as error:
+        out.put({"error": reason(error)})
+
+
+def resident() -> int:
+    """Bytes of this process in memory now; at the peak where the system does not say."""
+    return _status("VmRSS") or peak()
+
+
+def peak() -> int:
+    """The most bytes that this process had in memory.
+
+    Of /proc where there is one: what getrusage tells on Linux counts the process that started this one, too.
+    """
+    kilobytes = 1 if sys.platform == "darwin" else 1024
+    return _status("VmHWM") or resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * kilobytes
+
+
+def _status(entry: str) -> int:
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return 0
+    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{entry}:")), 0)
+
+
+def parsed(arguments: list[str] | None = None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--threads", type=_whole, default=2, help="of torch and ONNX Runtime (default 2)")
+    parser.add_argument("--rounds", type=_whole, help="turns of everything (default 5)")
+    parser.add_argument("--quick", action="store_true", help="2 rounds, 128 and 512 points, fewer crops: a trial")
+    parser.add_argument("--sizes", nargs="+", choices=SIZES, default=list(SIZES), help="of the package's networks")
+    parser.add_argument("--sections", nargs="+", choices=SECTIONS, default=list(SECTIONS))
+    parser.add_argument("--no-onnx", action="store_true", help="without ONNX, whose export takes a minute")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write all times")
+    options = parser.parse_args(arguments)
+    if options.device == "cuda" and not torch.cuda.is_available():
+        parser.error("--device cuda: torch finds no such device here")
+    if options.json is not None and not options.json.resolve().parent.is_dir():
+        parser.error(f"--json: the folder {options.json.resolve().parent} does not exist")
+    # in their own order, each once
+    options.sizes = [size for size in SIZES if size in options.sizes]
+    options.rounds = options.rounds or (2 if options.quick else 5)
+    options.points = (128, 512) if options.quick else POINTS
+    options.scaling_points = (128, 512) if options.quick else SCALING_POINTS
+    options.scaling_people = SCALING_PEOPLE if options.device == "cpu" else SCALING_PEOPLE_CUDA
+    return options
+
+
+def _whole(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, got {text!r}")
+    return int(text)
+
+
+def main() -> None:
+    options = parsed()
+    torch.set_num_threads(options.threads)
+    left_out: list[str] = []
+    # first, while this process is small and no thread of it is busy
+    memory_rows = memory(options, left_out) if "memory" in options.sections else []
+    with tempfile.TemporaryDirectory() as folder:
+        made = runners_of(options, Path(folder), left_out)
+        times = measured(made, options, left_out) if set(options.sections) - {"memory"} else {}
+    report = Report(options, made, times, memory_rows, left_out)
+    if options.json is not None:
+        options.json.write_text(json.dumps(report.to_json(), default=str, indent=1) + "\n")
+    print(report.write())
+
+
+if __name__ == "__main__":
+    main()

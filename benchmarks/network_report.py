@@ -1,0 +1,253 @@
+"""The Markdown and JSON of `benchmarks/network.py`: tables, ratios, and whether its targets are met."""
+
+import math
+import os
+import platform
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import numpy as np
+import torch
+from runners import BATCH, DRAFT, PAPER_BATCH, SIZES, Runner
+
+MEBIBYTE = 1 << 20
+CROPS = "crops"
+
+
+@dataclass(frozen=True)
+class Key:
+    """What a time is of. points: n, or "crops"; people: how many one call serves."""
+
+    section: str
+    network: str
+    points: int | str
+    people: int
+
+
+# seconds of calls, whole and of the network alone
+Times = dict[Key, list[tuple[float, float]]]
+
+
+class Report:
+    """Markdown from times and memory."""
+
+    def __init__(self, options, made: list[Runner], times: Times, memory_rows: list[dict], left_out: list[str]):
+        self.options, self.made, self.times = options, made, times
+        self.memory_rows, self.left_out = memory_rows, left_out
+        self.names = [one.name for one in made]
+        self.trained = [one.name for one in made if one.trains]
+
+    def seconds(self, section: str, network: str, points, people: int | None = None) -> tuple[np.ndarray, int] | None:
+        """Whole and network-alone seconds (calls, 2), and the people of a call; None where not measured."""
+        for key, values in self.times.items():
+            if (key.section, key.network, key.points) == (section, network, points) and people in (None, key.people):
+                return np.array(values), key.people
+        return None
+
+    def median(self, section: str, network: str, points, people: int | None = None, *, alone: bool = False) -> float:
+        """Median seconds a person, not a number where not measured."""
+        found = self.seconds(section, network, points, people)
+        return math.nan if found is None else float(np.median(found[0][:, int(alone)])) / found[1]
+
+    def best(self, section: str, network: str, points, people: int | None = None, *, alone: bool = False) -> float:
+        """Least seconds a person."""
+        found = self.seconds(section, network, points, people)
+        return math.nan if found is None else float(found[0][:, int(alone)].min()) / found[1]
+
+    def write(self) -> str:
+        parts = [f"# Speed and memory of the network\n\n{self._machine()}"]
+        if "latency" in self.options.sections:
+            note = "Best / median. A row's network alone: without making its tables; of ONNX Runtime the session's run."
+            parts.append(f"## Latency of one person, ms\n\n{note}\n\n{self._latency()}")
+        columns = (*self.options.points, CROPS)
+        if "forward" in self.options.sections:
+            note = f"Best / median, tables made on the way. Batches of {BATCH}, `paper` of {self._paper_batch()}."
+            names = [name for name in self.names if self.seconds("forward", name, columns[0])]
+            parts.append(f"## Forward, people a second\n\n{note}\n\n{self._rates('forward', names, columns)}")
+            parts.append(
+                "### The network alone, its tables made before\n\n"
+                + self._rates("forward", [n for n in names if "ONNX" not in n], columns, alone=True)
+            )
+        if "training" in self.options.sections:
+            precision = "float32" if self.options.device == "cpu" else "bfloat16"
+            note = f"Best / median, {precision}. Batches of {BATCH}, `paper` of {self._paper_batch()}."
+            parts.append(f"## Training, people a second\n\n{note}\n\n{self._rates('training', self.trained, columns)}")
+        parts.append(f"## Ratios of speed, of medians\n\n{self._ratios()}")
+        if "scaling" in self.options.sections:
+            parts.append(f"## `tiny`: people a second by batch and points, median\n\n{self._scaling()}")
+        if self.memory_rows:
+            parts.append(f"## Peak memory of training steps, MiB\n\n{self._memory()}")
+        parts.append(f"## Targets\n\n{self._targets()}")
+        if self.left_out:
+            parts.append("## Left out\n\n" + "\n".join(f"- {line}" for line in self.left_out))
+        return "\n\n".join(parts) + "\n"
+
+    def _machine(self) -> str:
+        load = " ".join(f"{value:.1f}" for value in os.getloadavg())
+        device = self.options.device
+        if device != "cpu":
+            device = torch.cuda.get_device_name()
+        return (
+            f"{processor()}, {os.cpu_count()} cores, {self.options.threads} threads; device {device}; "
+            f"torch {torch.__version__}, ONNX Runtime {_version('onnxruntime')}, Python {platform.python_version()}; "
+            f"{self.options.rounds} rounds; load at the end {load}."
+        )
+
+    def _paper_batch(self) -> int:
+        return next((one.batch for one in self.made if one.name == "paper"), PAPER_BATCH)
+
+    def _latency(self) -> str:
+        rows = []
+        parameters = {one.name: one.parameters for one in self.made}
+        for name in self.names:
+            if not name.endswith("session"):
+                cells = [self._cell("latency", name, n) for n in self.options.points]
+                rows.append([name, f"{parameters[name]:,}", *cells])
+            if "predict()" not in name and not name.endswith("ONNX"):
+                cells = [self._cell("latency", name, n, alone=True) for n in self.options.points]
+                rows.append([name if name.endswith("session") else f"{name}, network alone", "", *cells])
+        return table(["network", "parameters", *map(_points, self.options.points)], rows)
+
+    def _cell(self, section: str, name: str, points, *, alone: bool = False) -> str:
+        best, median = (f(section, name, points, alone=alone) * 1e3 for f in (self.best, self.median))
+        return "-" if math.isnan(median) else f"{best:.2f} / {median:.2f}"
+
+    def _rates(self, section: str, names: list[str], columns, *, alone: bool = False) -> str:
+        rows = []
+        for name in names:
+            pairs = [[f(section, name, n, alone=alone) for f in (self.best, self.median)] for n in columns]
+            rows.append([name, *("-" if math.isnan(b) else f"{_rate(a)} / {_rate(b)}" for a, b in pairs)])
+        return table(["network", *map(_points, columns)], rows)
+
+    def _ratios(self) -> str:
+        beside = {"tiny": f"{DRAFT} as tiny", "small": DRAFT}
+        pairs = []
+        for size, draft in beside.items():
+            pairs += [(size, other) for other in (draft, f"ViT as {size}", f"PointNet++ as {size}")]
+        pairs += [(f"{size} ONNX", size) for size in SIZES[:3]] + [("tiny", "small"), ("small", "base")]
+        pairs += [("tiny", "paper")]
+        columns = (*self.options.points, CROPS)
+        rows = []
+        for one, other in pairs:
+            for section in ("latency", "forward", "training"):
+                values = [self.median(section, other, n) / self.median(section, one, n) for n in columns]
+                if not all(map(math.isnan, values)):
+                    cells = ["-" if math.isnan(value) else f"{value:.2f}" for value in values]
+                    rows.append([f"{one} over {other}", section, *cells])
+        return table(["pair", "", *map(_points, columns)], rows)
+
+    def _scaling(self) -> str:
+        out = []
+        for section in ("scaling forward", "scaling training"):
+            rows = []
+            for n in self.options.scaling_points:
+                medians = [self.median(section, "tiny", n, people) for people in self.options.scaling_people]
+                rows.append([f"{section.split()[1]}, {_points(n)}", *("-" if m != m else _rate(m) for m in medians)])
+            out += rows
+        most = "A person of more than so many voxels is thinned, so cost stops growing where that begins."
+        head = ["points", *(f"batch {people}" for people in self.options.scaling_people)]
+        return f"{table(head, out)}\n\n{most}"
+
+    def _memory(self) -> str:
+        rows = []
+        for row in self.memory_rows:
+            before, high = row["before"] / MEBIBYTE, row["peak"] / MEBIBYTE
+            cells = [row["network"], _points(row["points"]), str(row["people"]), f"{before:,.0f}", f"{high:,.0f}"]
+            cells.append(f"{high - before:,.0f}")
+            if "device_peak" in row:
+                cells.append(f"{row['device_peak'] / MEBIBYTE:,.0f}")
+            rows.append(cells)
+        head = ["network", "points", "people", "after imports", "peak", "of the step"]
+        return table(head + ["on the device"] * any("device_peak" in row for row in self.memory_rows), rows)
+
+    def targets(self) -> list[dict]:
+        """what, unit, target, whether it is a ceiling; figures by the medians and by the best rounds, NaN where not
+        measured; whether the medians meet it."""
+        by_median, by_best = self._figures(self.median), self._figures(self.best)
+        found = []
+        for (what, unit, most, target, figure), (*_, best) in zip(by_median, by_best, strict=True):
+            met = None if math.isnan(figure) else bool(figure <= target if most else figure >= target)
+            found.append(dict(what=what, unit=unit, most=most, target=target, figure=figure, best=best, met=met))
+        return found
+
+    def _figures(self, take: Callable[..., float]) -> list[tuple[str, str, bool, float, float]]:
+        """what, unit, whether a ceiling, target, figure; take: `median` or `best`."""
+        out = [
+            ("`tiny` ONNX, one person of 512 points", "ms", True, 3, take("latency", "tiny ONNX", 512) * 1e3),
+            ("`tiny` in torch, one person of 512 points", "ms", True, 8, take("latency", "tiny", 512) * 1e3),
+            ("`tiny` training, crops", "people/s", False, 500, 1 / take("training", "tiny", CROPS)),
+        ]
+        for n in (256, 512):
+            ratio = take("training", DRAFT, n) / take("training", "small", n)
+            out.append((f"`small` over the draft, training, {n} points", "x", False, 1.5, ratio))
+        out.append(("`paper` forward, 512 points", "people/s", False, 10, 1 / take("forward", "paper", 512)))
+        low, high = self.options.scaling_people[-2:]
+        for kind in ("forward", "training"):
+            few, many = (take(f"scaling {kind}", "tiny", 512, people) for people in (low, high))
+            out.append((f"`tiny` {kind}, cost a person, batch {high} over batch {low}", "x", True, 1.15, many / few))
+            few, many = (take(f"scaling {kind}", "tiny", n, BATCH) for n in (128, 512))
+            exponent = math.log(many / few) / math.log(4)
+            out.append((f"`tiny` {kind}, exponent of cost, 128 to 512 points", "", True, 1.2, exponent))
+        peaks = [row["peak"] / 1e9 for row in self.memory_rows if row["network"] == "tiny"]
+        out.append(("`tiny` training, peak memory", "GB", True, 2, max(peaks, default=math.nan)))
+        return out
+
+    def _targets(self) -> str:
+        rows = []
+        for entry in self.targets():
+            figures = [
+                "-" if math.isnan(entry[which]) else f"{entry[which]:,.2f} {entry['unit']}".strip()
+                for which in ("figure", "best")
+            ]
+            due = f"{'at most' if entry['most'] else 'at least'} {entry['target']:g} {entry['unit']}".strip()
+            met = {None: "not measured", True: "yes", False: "no"}[entry["met"]]
+            rows.append([entry["what"], *figures, due, met])
+        return table(["", "by medians", "by best rounds", "asked for", "met by medians"], rows)
+
+    def to_json(self) -> dict:
+        shown = {name: value for name, value in vars(self.options).items() if name != "json"}
+        return {
+            "machine": self._machine(),
+            "options": shown,
+            "parameters": {one.name: one.parameters for one in self.made},
+            "times": [
+                vars(key) | {"whole_s": [a for a, _ in values], "network_s": [b for _, b in values]}
+                for key, values in self.times.items()
+            ],
+            "memory": self.memory_rows,
+            "targets": [
+                {name: None if value != value else value for name, value in entry.items()} for entry in self.targets()
+            ],
+            "left_out": self.left_out,
+        }
+
+
+def table(head: list[str], rows: list[list[str]]) -> str:
+    lines = [head, ["---"] + ["---:"] * (len(head) - 1), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _points(points: int | str) -> str:
+    return points if isinstance(points, str) else f"{points:,}"
+
+
+def _rate(seconds: float) -> str:
+    """People a second of seconds a person."""
+    return f"{1 / seconds:,.0f}" if seconds < 0.05 else f"{1 / seconds:.1f}"
+
+
+def processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"

@@ -1,0 +1,386 @@
+"""What `benchmarks/network.py` times: people in the numbers it wants, and each network behind one interface.
+
+Legend: B people a call, n points a person, J joints.
+
+A runner does in two halves, of which the first is not the network's: tables, then joints of them; a lesson, as a loader
+makes it in another process, then a training step on it.
+"""
+
+import argparse
+import inspect
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from backbones import Draft, GroupedViT, PointNet2, count
+from torch import nn
+
+from lidarpose.model.batch import Batch, Targets
+from lidarpose.model.network import PoseNet
+from lidarpose.model.plan import plan
+from lidarpose.model.presets import preset
+from lidarpose.skeleton import BODY26
+from lidarpose.synth.generate import Generator
+from lidarpose.synth.scene import scene_config
+from lidarpose.train.feed import Example, collate, example
+from lidarpose.train.loop import CLIP
+from lidarpose.train.losses import losses, total
+from lidarpose.train.optimize import average, optimizers
+from lidarpose.train.recipes import default
+
+SIZES = ("tiny", "small", "base", "paper")
+# median points a person of those who come as in training
+CROP_POINTS = 170
+# people a batch; the paper's network is a hundred times as large
+BATCH, PAPER_BATCH = 64, 8
+# a point that is doubled moves so far, m
+SPREAD = 0.01
+DRAFT = "draft"
+
+
+def crops(number: int, rng: np.random.Generator) -> list[Example]:
+    """So many people as they come in training, dense ones left out at random until their median is `CROP_POINTS`."""
+    generator = Generator(scene=scene_config(default().scene), measure=False)
+    halves: tuple[list, list] = [], []
+    index = 0
+    while min(map(len, halves)) < number // 2:
+        one = example(generator.person(1, index, hard=math.sqrt(rng.random())), rng)
+        halves[len(one.points) > CROP_POINTS].append(one)
+        index += 1
+    return halves[0][: number // 2] + halves[1][: number // 2]
+
+
+def of_points(people: list[Example], n: int, number: int, rng: np.random.Generator) -> list[Example]:
+    """The `number` people whose points are nearest to n in number, brought to exactly n."""
+    near = sorted(people, key=lambda e: abs(math.log(len(e.points) / n)))[:number]
+    near = [near[k % len(near)] for k in rng.permutation(number)]
+    return [_resampled(one, n, rng) for one in near]
+
+
+def _resampled(one: Example, n: int, rng: np.random.Generator) -> Example:
+    have = len(one.points)
+    kept = rng.permutation(have)[:n]
+    more = rng.integers(have, size=n - len(kept))
+    doubled = one.points[more] + rng.normal(0, SPREAD, (len(more), 3)).astype(np.float32)
+    return replace(
+        one,
+        points=np.concatenate([one.points[kept], doubled]),
+        part=one.part[np.concatenate([kept, more])],
+    )
+
+
+def batches(people: list[Example], size: int, number: int) -> list[list[Example]]:
+    """`number` batches of `size`, sorted by voxels as `train.feed` sorts a chunk; of too many people every k-th."""
+    order = sorted(people, key=lambda e: len(np.unique(np.floor(e.points * 10), axis=0)))
+    picked = [order[k * len(order) // (size * number)] for k in range(size * number)]
+    return [picked[k * size : (k + 1) * size] for k in range(number)]
+
+
+class Runner:
+    """A network to time. tables, joints: a forward pass in two halves; lesson, step: a training step in two halves."""
+
+    batch = BATCH
+    trains = True
+
+    def __init__(self, name: str, network: nn.Module | None, device: str = "cpu"):
+        self.name = name
+        self.device = device
+        self.network = None if network is None else network.to(device)
+        self.optimizer = None
+        self.parameters = 0 if network is None else count(network)
+
+    def tables(self, people: list[Example]) -> object:
+        """What the network reads of people, on its device."""
+        raise NotImplementedError
+
+    def joints(self, tables: object) -> np.ndarray:
+        """(B, J, 3) m."""
+        raise NotImplementedError
+
+    def lesson(self, people: list[Example]) -> object:
+        """What a loader would hand to the training step."""
+        raise NotImplementedError
+
+    def loss(self, lesson: object) -> torch.Tensor:
+        raise NotImplementedError
+
+    def step(self, lesson: object) -> None:
+        """A whole training step, to its end on any device."""
+        if self.optimizer is None:
+            self.optimizer = torch.optim.AdamW(self.network.parameters(), lr=1e-3, weight_decay=0.01, fused=True)
+        self.optimizer.zero_grad(set_to_none=True)
+        with self.precision():
+            loss = self.loss(lesson)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), CLIP)
+        self.optimizer.step()
+        self.wait()
+
+    def precision(self) -> torch.autocast:
+        return torch.autocast(torch.device(self.device).type, torch.bfloat16, enabled=self.device != "cpu")
+
+    def wait(self) -> None:
+        if self.device != "cpu":
+            torch.cuda.synchronize()
+
+    def train(self, mode: bool) -> None:
+        if self.network is not None:
+            self.network.train(mode)
+
+    def rest(self) -> None:
+        """Frees what only training holds, so that the next one's turn begins as this one's did."""
+        if self.network is not None:
+            self.network.zero_grad(set_to_none=True)
+
+
+class Ours(Runner):
+    """A network of this package."""
+
+    def __init__(self, size: str, device: str = "cpu"):
+        torch.manual_seed(0)
+        self.config = preset(size)
+        super().__init__(size, PoseNet(self.config), device)
+        self.mean = {name: value.detach().clone() for name, value in self.network.named_parameters()}
+        self.made = None
+        self.steps = 0
+
+    def plan(self, people: list[Example]):
+        return plan(
+            np.concatenate([one.points for one in people]),
+            np.array([len(one.points) for one in people]),
+            grid=self.config.grid,
+            max_voxels=self.config.max_voxels,
+            view=np.stack([one.view for one in people]),
+            neighbours=self.config.convolution,
+        )
+
+    def tables(self, people):
+        return Batch.from_plan(self.plan(people), self.device)
+
+    @torch.inference_mode()
+    def joints(self, tables):
+        return self.network(tables).joints().cpu().numpy()
+
+    def lesson(self, people):
+        return collate(people, self.config, np.random.default_rng(0))
+
+    def step(self, lesson):
+        if self.made is None:
+            self.made = optimizers(self.network, default())
+        for optimizer in self.made:
+            optimizer.zero_grad(set_to_none=True)
+        targets = Targets.from_arrays(lesson, self.device)
+        with self.precision():
+            terms = losses(self.network(Batch.from_arrays(lesson, self.device)), targets)
+        total(terms).backward()
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), CLIP)
+        for optimizer in self.made:
+            optimizer.step()
+        average(self.mean, self.network, self.steps)
+        self.steps += 1
+        self.wait()
+
+
+class Onnx(Runner):
+    """A network of this package, run by ONNX Runtime from a file: the predictor's path, voxels to decoded joints."""
+
+    trains = False
+
+    def __init__(self, ours: Ours, path: Path, threads: int):
+        from lidarpose.infer import backend
+        from lidarpose.model import decode, onnx_file
+
+        super().__init__(f"{ours.name} ONNX", None)
+        self.parameters = ours.parameters
+        self.plan = ours.plan
+        self.file, self.backend = onnx_file, backend
+        self.session = onnx_file.open_onnx(path, threads=threads)[0]
+        self.decoder = decode.decoder("window")
+        # parts are of no use to the predictor: what is not asked for is not computed
+        self.outputs = [name for name in onnx_file.OUTPUTS if name != "part"]
+
+    def tables(self, people):
+        arrays = self.file.network_inputs(self.plan(people))
+        return {self.file.input_name(name): array for name, array in arrays.items()}
+
+    def joints(self, tables):
+        return self.decode(self.run(tables))
+
+    def run(self, tables: dict[str, np.ndarray]) -> list[np.ndarray]:
+        return self.session.run(self.outputs, tables)
+
+    def decode(self, values: list[np.ndarray]) -> np.ndarray:
+        raw = self.backend.Raw.from_pose(dict(zip(self.outputs, values, strict=True)))
+        return self.backend.estimates(raw, self.decoder).joints
+
+
+class Session(Onnx):
+    """The bare session: only its own run counts as the network."""
+
+    def joints(self, tables):
+        return self.run(tables)[0]
+
+
+class Predict(Runner):
+    """The public `predict` of one cloud: its checks, two passes, the choice among candidates."""
+
+    trains = False
+    batch = 1
+
+    def __init__(self, name: str, predictor, parameters: int):
+        super().__init__(name, None)
+        self.predictor, self.parameters = predictor, parameters
+
+    def tables(self, people):
+        return [one.points for one in people]
+
+    def joints(self, tables):
+        return [self.predictor.predict(points) for points in tables]
+
+
+class Paper(Runner):
+    """The paper's network at full size."""
+
+    def __init__(self, device: str = "cpu"):
+        from lidarpose.model.dapt.config import named_config
+        from lidarpose.model.dapt.network import DaptBatch, DaptNet
+        from lidarpose.model.dapt.tables import build_tables
+
+        torch.manual_seed(0)
+        self.config = named_config("paper")
+        super().__init__("paper", DaptNet(self.config), device)
+        self.batch = PAPER_BATCH if device == "cpu" else BATCH
+        self.layout = "ragged" if device == "cpu" else "padded"
+        self.build, self.tensors = build_tables, DaptBatch.from_tables
+        self.order = self.config.order_in(BODY26)
+
+    def _tables(self, people: list[Example]):
+        return self.build([one.points for one in people], self.config, layout=self.layout)
+
+    def tables(self, people):
+        return self.tensors(self._tables(people), self.device)
+
+    @torch.inference_mode()
+    def joints(self, tables):
+        return self.network(tables).joints().cpu().numpy()[:, self.order]
+
+    def lesson(self, people):
+        tables = self._tables(people)
+        part = np.concatenate([one.part for one in people])[tables.kept]
+        true = np.stack([one.joints for one in people])
+        # the place of each of this skeleton's joints among the network's, turned round
+        place = np.argsort(self.order)
+        return tables, torch.as_tensor(true[:, place]), torch.as_tensor(part, dtype=torch.int64)
+
+    def loss(self, lesson):
+        tables, true, part = lesson
+        true, part = true.to(self.device), part.to(self.device)
+        out = self.network(self.tensors(tables, self.device))
+        heads = (out.joints(), out.coordinates, out.inter)
+        return sum(_distance(joints, true) for joints in heads) + nn.functional.cross_entropy(out.parts, part)
+
+
+class Baseline(Runner):
+    """One of `backbones`."""
+
+    def tables(self, people):
+        return self.network.prepare([one.points for one in people])
+
+    @torch.inference_mode()
+    def joints(self, tables):
+        return self.network(tables).numpy()
+
+    def lesson(self, people):
+        return self.tables(people), torch.as_tensor(np.stack([one.joints for one in people]))
+
+    def loss(self, lesson):
+        tables, true = lesson
+        return _distance(self.network(tables), true)
+
+
+def _distance(joints: torch.Tensor, true: torch.Tensor) -> torch.Tensor:
+    """(B, J, 3) m each -> mean distance, m."""
+    return (joints.float() - true).norm(dim=-1).mean()
+
+
+def baselines(size: str) -> dict[str, Callable[[], nn.Module]]:
+    """By name, the networks that stand beside a size of ours, with as many parameters."""
+    kinds = {"ViT": GroupedViT, "PointNet++": PointNet2}
+    parameters = count(PoseNet(preset(size)))
+    made = {f"{name} as {size}": (lambda kind=kind: kind.of_parameters(parameters)) for name, kind in kinds.items()}
+    # of the two networks' parameters, 1.2 and 1.1 million
+    return {DRAFT if size == "small" else f"{DRAFT} as {size}": lambda: Draft.of_parameters(parameters)} | made
+
+
+def runner(name: str, device: str = "cpu") -> Runner:
+    """A runner by name, but for those of a file. Raises ImportError where its code is not there."""
+    if name in SIZES:
+        return Paper(device) if name == "paper" else Ours(name, device)
+    beside = baselines("tiny") | baselines("small")
+    torch.manual_seed(0)
+    return Baseline(name, beside[name](), device)
+
+
+def runners_of(options: argparse.Namespace, folder: Path, left_out: list[str]) -> list[Runner]:
+    """All that take part; a reason in `left_out` for each that cannot."""
+    names = []
+    for size in options.sizes:
+        names.append(size)
+        if size in ("tiny", "small") and options.device == "cpu":
+            names += baselines(size)
+    made = []
+    for name in names:
+        try:
+            made.append(runner(name, options.device))
+        except ImportError as error:
+            left_out.append(f"{name}: cannot be imported ({error})")
+            continue
+        if isinstance(made[-1], Ours) and options.device == "cpu" and not options.no_onnx:
+            made += _from_files(made[-1], folder, options.threads, left_out)
+    return made
+
+
+def _from_files(ours: Ours, folder: Path, threads: int, left_out: list[str]) -> Iterator[Runner]:
+    """What ONNX Runtime runs of a network, and the public predictors of the smallest one."""
+    weights, path = folder / f"{ours.name}.safetensors", folder / f"{ours.name}.onnx"
+    try:
+        from lidarpose.model.checkpoint import save_checkpoint
+        from lidarpose.model.export import export
+
+        say(f"exporting {ours.name} to ONNX")
+        save_checkpoint(weights, ours.network, card={})
+        export(weights, path)
+        whole, bare = Onnx(ours, path, threads), Session(ours, path, threads)
+        bare.name += ", session"
+        yield from (whole, bare)
+    # whatever an exporter or a runtime raises: the other rows are worth having without this one
+    except Exception as error:
+        left_out.append(f"{ours.name} ONNX: {reason(error)}")
+    if ours.name != "tiny":
+        return
+    for backend in ("torch", "onnx"):
+        try:
+            from lidarpose.infer.predictor import load
+
+            if backend == "onnx" and "backend" not in inspect.signature(load).parameters:
+                raise ImportError("this version's predictor has no ONNX backend")
+            wanted = {"backend": backend, "threads": threads}
+            known = inspect.signature(load).parameters
+            chosen = {name: value for name, value in wanted.items() if name in known}
+            yield Predict(f"tiny predict(), {backend}", load(weights, **chosen), ours.parameters)
+        except Exception as error:
+            left_out.append(f"tiny predict(), {backend}: {reason(error)}")
+
+
+def reason(error: Exception) -> str:
+    """An error as a part of one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:160]}"
+
+
+def say(line: str) -> None:
+    print(f"[{time.strftime('%H:%M:%S')}] {line}", file=sys.stderr, flush=True)

@@ -1,0 +1,105 @@
+"""The networks that benchmarks measure beside this package's own do what they say."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lidarpose.model.network import PoseNet
+from lidarpose.model.presets import preset
+
+PATH = Path(__file__).parents[1] / "benchmarks" / "backbones.py"
+spec = importlib.util.spec_from_file_location("backbones", PATH)
+backbones = sys.modules["backbones"] = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(backbones)
+
+KINDS = (backbones.Draft, backbones.GroupedViT, backbones.PointNet2)
+SIZES = (1, 40, 300)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module", params=KINDS, ids=lambda kind: kind.__name__)
+def network(request):
+    torch.manual_seed(0)
+    return request.param.of_parameters(380_000).eval()
+
+
+def person(n, seed=0):
+    return np.random.default_rng(seed).normal(0, (0.2, 0.2, 0.5), (n, 3)).astype(np.float32)
+
+
+@torch.inference_mode()
+def run(network, clouds):
+    return network(network.prepare(clouds))
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("size", ["tiny", "small"])
+def test_has_about_as_many_parameters_as_asked_for(kind, size):
+    due = backbones.count(PoseNet(preset(size)))
+    assert backbones.count(kind.of_parameters(due)) == pytest.approx(due, rel=0.1)
+
+
+def test_no_width_has_so_few_parameters():
+    with pytest.raises(ValueError, match="within a tenth"):
+        backbones.PointNet2.of_parameters(100)
+
+
+def test_draft_is_the_one_that_was_measured():
+    assert backbones.count(backbones.Draft()) == pytest.approx(1.2e6, rel=0.1)
+
+
+def test_a_persons_joints_do_not_depend_on_batch_mates(network):
+    clouds = [person(n, n) for n in SIZES]
+    together = run(network, clouds)
+    assert together.shape == (len(SIZES), 26, 3)
+    for k, cloud in enumerate(clouds):
+        torch.testing.assert_close(together[k : k + 1], run(network, [cloud]), atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("clouds", [[person(1)], [person(0), person(3)], [np.ones((50, 3), np.float32)]])
+def test_few_points_give_finite_joints(network, clouds):
+    assert run(network, clouds).isfinite().all()
+
+
+def test_every_parameter_learns(network):
+    """All of it is computed with, so its cost is what is measured."""
+    network.train()
+    joints = network(network.prepare([person(n, n) for n in (200, 60)]))
+    joints.square().mean().backward()
+    network.eval()
+    idle = [name for name, value in network.named_parameters() if value.grad is None or not value.grad.any()]
+    network.zero_grad()
+    assert idle == []
+
+
+def test_far_points_are_in_no_ball_and_near_ones_are():
+    points = torch.tensor([[[0.0, 0, 0], [0.1, 0, 0], [1, 0, 0], [9, 9, 9]]])
+    valid = torch.tensor([[True, True, True, False]])
+    groups = backbones.grouped(points, valid, centers=4, neighbours=3, radius=0.2)
+    assert groups.center[0, :3, 0].tolist() == pytest.approx([0, 1, 0.1])
+    assert groups.center_valid.tolist() == [[True, True, True, False]]
+    assert groups.valid.sum(-1)[0, :3].tolist() == [2, 1, 2]
+    assert groups.relative[0, 0, 1].tolist() == pytest.approx([0.1, 0, 0])
+
+
+def test_draft_pools_each_voxel_into_its_own_parent():
+    tables = backbones.Draft().prepare([person(n, n) for n in SIZES])
+    for level, above in zip(tables.levels, tables.levels[1:], strict=False):
+        assert sorted(set(level.children.flatten().tolist())) == list(range(len(level.position)))
+        for parent, children in enumerate(level.children):
+            assert (level.parent[children] == parent).all()
+            # a parent lies at the mean of its points, so within its children's box
+            inside = level.position[children]
+            assert (inside.amin(0) <= above.position[parent] + 1e-5).all()
+            assert (above.position[parent] <= inside.amax(0) + 1e-5).all()
