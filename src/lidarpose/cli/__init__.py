@@ -1,0 +1,67 @@
+"""The command line: `lidarpose COMMAND`, also `python -m lidarpose`. Heavy imports stay inside the commands."""
+
+import argparse
+import os
+import sys
+
+from lidarpose._version import __version__
+from lidarpose.cli import datasets, evaluating, predicting, training, weights
+from lidarpose.errors import LidarPoseError, missing_extra
+
+# options whose value may start with a minus sign, which argparse would take for another option
+_SIGNED = ("--sensor-origin",)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs one command. Returns 0, or 2 after one line on stderr where the input is at fault."""
+    options = _parser().parse_args(_joined(sys.argv[1:] if arguments is None else arguments))
+    try:
+        options.run(options)
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        # whoever read our output has enough; keep python from complaining at exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except ModuleNotFoundError as error:
+        extra = "export" if options.command == "export" else None
+        told = missing_extra(error, f"`lidarpose {options.command}`", extra)
+        if not isinstance(told, LidarPoseError):
+            raise
+        return _failed(told)
+    except (LidarPoseError, OSError) as error:
+        return _failed(error)
+    except KeyboardInterrupt:
+        print("lidarpose: stopped", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _failed(error: Exception) -> int:
+    print(f"lidarpose: error: {error}", file=sys.stderr)
+    return 2
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str):
+        """One line, as for every other wrong input."""
+        self.exit(2, f"lidarpose: error: {message}; see {self.prog} --help\n")
+
+
+def _joined(arguments: list[str]) -> list[str]:
+    """`--sensor-origin -1,0,2` as `--sensor-origin=-1,0,2`."""
+    joined: list[str] = []
+    for argument in arguments:
+        if joined and joined[-1] in _SIGNED and argument.startswith("-") and argument[1:2] in tuple("0123456789."):
+            joined[-1] += f"={argument}"
+        else:
+            joined.append(argument)
+    return joined
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="lidarpose", description="3D human pose from LiDAR.")
+    parser.add_argument("--version", action="version", version=f"lidarpose {__version__}")
+    commands = parser.add_subparsers(title="commands", dest="command", required=True, metavar="COMMAND")
+    for module in (predicting, datasets, training, evaluating, weights):
+        module.add(commands)
+    return parser

@@ -1,0 +1,135 @@
+"""`lidarpose synth`, `prepare`, `view` and `sensors`."""
+
+import argparse
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+
+from lidarpose.cli.words import names
+
+
+def add(commands) -> None:
+    """Adds the commands to the parser's."""
+    synth = commands.add_parser(
+        "synth",
+        help="write synthesized people as Parquet shards",
+        description="Writes OUT/dataset.json and Parquet shards of people with their true poses. Stopped or killed, "
+        "the same command goes on; the same settings give the same bytes.",
+    )
+    synth.set_defaults(run=_synth)
+    synth.add_argument("--out", required=True, metavar="DIR", help="a new folder, or that of a run that was stopped")
+    synth.add_argument("-n", "--count", type=int, required=True, metavar="N", help="people, clips or streets")
+    synth.add_argument("--scene", default="wild", metavar="NAME", help="wild (default), paper or reference")
+    synth.add_argument(
+        "--sensor", metavar="A,B", help="sensors or files of their tables (default: the scene's); see lidarpose sensors"
+    )
+    synth.add_argument("--seed", type=int, default=0, metavar="N")
+    synth.add_argument("--hard", type=float, default=1.0, metavar="H", help="difficulty from 0 (easy) to 1 (default)")
+    synth.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1)")
+    synth.add_argument("--motion", metavar="FILE", help="captured motion to take poses from: a file or a folder")
+    synth.add_argument("--subjects", metavar="A,B", help="those of its clips to use, by the first part of names")
+    synth.add_argument("--captured", type=float, metavar="SHARE", help="of poses from the clips (default 0.5)")
+    synth.add_argument("--per-shard", type=int, metavar="N", help="people (2000), clips (125) or streets (2) a file")
+    several = synth.add_mutually_exclusive_group()
+    several.add_argument("--clips", action="store_true", help="clips of 16 frames at 10 Hz instead of single people")
+    several.add_argument("--scenes", action="store_true", help="whole streets of several walking people")
+
+    prepare = commands.add_parser(
+        "prepare",
+        help="write a real dataset's people as Parquet shards",
+        description="Reads the raw files of a public dataset and writes OUT/dataset.json and Parquet shards. Stopped "
+        "or killed, the same command goes on.",
+    )
+    prepare.set_defaults(run=_prepare)
+    prepare.add_argument(
+        "dataset", metavar="NAME", help="humanm3, lidarhuman26m, sloper4d, waymo, lipd, freemotion or noisemotion"
+    )
+    prepare.add_argument("root", metavar="RAW", help="the folder of its raw files")
+    prepare.add_argument("out", metavar="OUT", help="a new folder, or that of a run that was stopped")
+    prepare.add_argument("--split", metavar="NAME", help="only people of train, val or test")
+    prepare.add_argument(
+        "--split-by", metavar="NAME", help="a published split (default: RAW/train.txt and test.txt, else the usual one)"
+    )
+    prepare.add_argument(
+        "--smpl", metavar="FILE|DIR", help="your SMPL model, for lidarhuman26m, sloper4d, freemotion, noisemotion"
+    )
+    prepare.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1)")
+
+    sensors = commands.add_parser("sensors", help="the simulated sensors", description="Lists the sensors by name.")
+    sensors.set_defaults(run=_sensors)
+
+    view = commands.add_parser(
+        "view", help="draw people of a dataset", description="Draws a contact sheet of a dataset that synth wrote."
+    )
+    view.set_defaults(run=_view)
+    view.add_argument("folder", metavar="DIR", help="a dataset's folder")
+    view.add_argument("-n", "--count", type=int, default=24, metavar="N", help="people, evenly spread (default 24)")
+    view.add_argument("--html", action="store_true", help="a page to turn them in 3D instead of a picture")
+    view.add_argument("--out", metavar="FILE", help="default DIR.png or DIR.html, in the current folder")
+
+
+def _synth(options: argparse.Namespace) -> None:
+    from lidarpose.synth.write import Job, write_dataset
+
+    job = Job(
+        what="clips" if options.clips else "streets" if options.scenes else "people",
+        count=options.count,
+        scene=options.scene,
+        sensors=None if options.sensor is None else names(options.sensor),
+        seed=options.seed,
+        hard=options.hard,
+        motion=options.motion,
+        subjects=None if options.subjects is None else names(options.subjects),
+        captured=options.captured,
+        per_shard=options.per_shard,
+    )
+    with ExitStack() as stack:
+        progress = _bar(stack, unit=f" {job.what}") if sys.stderr is not None and sys.stderr.isatty() else None
+        made = write_dataset(job, options.out, workers=options.workers, progress=progress)
+    kept = "" if made == job.count else f", {job.count - made:,} were there"
+    print(f"{made:,} {job.what} made{kept} -> {options.out}", file=sys.stderr)
+
+
+def _bar(stack: ExitStack, *, unit: str) -> Callable[[int, int], None]:
+    """progress(done, total) that draws a bar with rate and time left; `stack` closes it."""
+    from tqdm import tqdm
+
+    bar = None
+
+    def progress(done: int, total: int) -> None:
+        nonlocal bar
+        if bar is None:
+            # what stood there before is not this run's speed
+            bar = stack.enter_context(tqdm(total=total, initial=done, unit=unit, smoothing=0.1))
+        bar.update(done - bar.n)
+
+    return progress
+
+
+def _prepare(options: argparse.Namespace) -> None:
+    from lidarpose.data.prepare import prepare
+    from lidarpose.data.summary import lines_of
+
+    summary = prepare(
+        options.dataset,
+        options.root,
+        options.out,
+        split=options.split,
+        split_by=options.split_by,
+        smpl=options.smpl,
+        workers=options.workers,
+    )
+    for line in lines_of(summary):
+        print(line, file=sys.stderr)
+
+
+def _sensors(options: argparse.Namespace) -> None:
+    from lidarpose.lidar.tables import listing
+
+    print("\n".join(listing()))
+
+
+def _view(options: argparse.Namespace) -> None:
+    from lidarpose.view.sheet import draw_dataset
+
+    print(draw_dataset(options.folder, count=options.count, html=options.html, out=options.out))

@@ -1,0 +1,111 @@
+"""`lidarpose predict` and `lidarpose demo`."""
+
+import argparse
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+
+# people named by a warning that several share
+_MOST_NAMED = 3
+
+
+def add(commands) -> None:
+    """Adds the commands to the parser's."""
+    predict = commands.add_parser(
+        "predict",
+        help="poses of the people in a point file",
+        description="Writes STEM.poses.json: the joints of every person, in the file's own frame, metres.",
+    )
+    predict.set_defaults(run=_predict)
+    predict.add_argument("file", help=".pcd .ply .bin .npy .npz .csv .xyz .txt")
+    predict.add_argument("--boxes", metavar="JSON", help='{"people": [{"center": [x,y,z], "size": [l,w,h], "yaw": r}]}')
+    predict.add_argument("--crop", action="store_true", help="the file is one person already")
+    predict.add_argument(
+        "--sensor-origin", metavar="X,Y,Z", help="where the sensor stood, or unknown (with boxes: 0,0,0; crop: unknown)"
+    )
+    predict.add_argument(
+        "--skeleton", metavar="NAME", help="smpl24, human15, waymo14 or body26 (default smpl24, or the network's own)"
+    )
+    predict.add_argument("--up", default="z", metavar="AXIS", help="the file's up axis: z (default), y or x")
+    predict.add_argument("--columns", type=int, metavar="N", help="values a row of a .bin: 4 KITTI, 5 nuScenes")
+    predict.add_argument("--out", default=".", metavar="DIR", help="folder for the results; - prints the JSON")
+    predict.add_argument("--picture", action="store_true", help="also draw STEM.poses.png")
+    predict.add_argument(
+        "--weights", default="tiny", metavar="NAME|FILE", help="bundled weights, a checkpoint or an exported .onnx"
+    )
+    predict.add_argument(
+        "--backend",
+        metavar="NAME",
+        help="onnx or torch (default onnx for bundled weights and .onnx, torch for .safetensors and other devices)",
+    )
+    predict.add_argument("--device", default="cpu", metavar="NAME", help="cpu (default), or cuda with torch")
+    predict.add_argument(
+        "--decode", default="window", metavar="NAME", help="how heatmaps are read: window (default), argmax or dark"
+    )
+
+    demo = commands.add_parser(
+        "demo", help="people seen by three LiDARs, true and predicted", description="Writes a report to turn in 3D."
+    )
+    demo.set_defaults(run=_demo)
+    demo.add_argument("--out", default="lidarpose-demo", metavar="DIR", help="folder (default lidarpose-demo)")
+    demo.add_argument("--seed", type=int, default=7, metavar="N")
+    demo.add_argument("--weights", default="tiny", metavar="NAME|FILE", help="bundled weights or a checkpoint")
+
+
+def _predict(options: argparse.Namespace) -> None:
+    from lidarpose.data.files import atomic_path
+    from lidarpose.infer.files import predict
+    from lidarpose.infer.predictor import load
+
+    choices = {"backend": options.backend, "device": options.device, "decode": options.decode}
+    poses = predict(
+        options.file,
+        boxes=options.boxes,
+        crop=options.crop,
+        sensor_origin=options.sensor_origin,
+        skeleton=options.skeleton,
+        up=options.up,
+        columns=options.columns,
+        # loaded once the input has proved readable
+        model=lambda: load(options.weights, **choices),
+        progress=sys.stderr is not None and sys.stderr.isatty(),
+    )
+    file = Path(options.file)
+    to_stdout = options.out == "-"
+    stem = Path("." if to_stdout else options.out) / file.stem
+    outputs: dict[str, bytes] = {}
+    if not to_stdout:
+        outputs[f"{stem}.poses.json"] = poses.to_json().encode()
+    if options.picture:
+        outputs[f"{stem}.poses.png"] = poses.picture(title=file.name)
+    # all of them or none
+    with ExitStack() as stack:
+        for path, content in outputs.items():
+            stack.enter_context(atomic_path(path)).write_bytes(content)
+    if to_stdout:
+        print(poses.to_json(), end="")
+    for line in _warnings(poses):
+        print(f"lidarpose: warning: {line}", file=sys.stderr)
+    seen = sum(person.pose is not None for person in poses)
+    where = f" -> {' and '.join(outputs)}" if outputs else ""
+    print(f"{seen} of {len(poses)} people, {poses.timing_ms['per_person']:.0f} ms each{where}", file=sys.stderr)
+
+
+def _warnings(poses) -> list[str]:
+    """The input's warnings, and each of the people's once with the ids of those it is about."""
+    shared: dict[str, list[str]] = {}
+    for person in poses:
+        for warning in person.warnings:
+            shared.setdefault(warning, []).append(str(person.id))
+    lines = list(poses.warnings)
+    for warning, ids in shared.items():
+        more = f" and {len(ids) - _MOST_NAMED} more" if len(ids) > _MOST_NAMED else ""
+        who = "person" if len(ids) == 1 else "people"
+        lines.append(f"{who} {', '.join(ids[:_MOST_NAMED])}{more}: {warning}")
+    return lines
+
+
+def _demo(options: argparse.Namespace) -> None:
+    from lidarpose.demo import run
+
+    run(options.out, seed=options.seed, weights=options.weights)

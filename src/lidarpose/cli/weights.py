@@ -1,0 +1,57 @@
+"""`lidarpose info`, `export` and `import`."""
+
+import argparse
+import sys
+from pathlib import Path
+
+
+def add(commands) -> None:
+    """Adds the commands to the parser's."""
+    info = commands.add_parser("info", help="versions, device, bundled weights and what they score")
+    info.set_defaults(run=_info)
+
+    export = commands.add_parser(
+        "export",
+        help="weights as ONNX or as a torch.export program",
+        description="Writes a checkpoint as one file of another format, for any number of people and points.",
+    )
+    export.set_defaults(run=_export)
+    export.add_argument("weights", nargs="?", default="tiny", metavar="NAME|FILE", help="default tiny")
+    export.add_argument("--format", default="onnx", metavar="NAME", help="onnx (default) or torch (a .pt2 program)")
+    export.add_argument("--out", metavar="FILE", help="default STEM.onnx or STEM.pt2, in the current folder")
+
+    take = commands.add_parser(
+        "import",
+        help="released DAPT weights as a checkpoint",
+        description="Writes the weights that DAPT's authors released, as safetensors, as a checkpoint that predict "
+        "takes.",
+    )
+    take.set_defaults(run=_import)
+    take.add_argument("file", help="their .safetensors")
+    take.add_argument("out", metavar="OUT", help="the checkpoint to write (.safetensors)")
+    take.add_argument(
+        "--config", metavar="NAME", help="waymo, humanm3, lidarhuman26m, sloper4d or pretrain (default: as FILE says)"
+    )
+
+
+def _info(options: argparse.Namespace) -> None:
+    from lidarpose.infer.info import lines
+
+    print("\n".join(lines()))
+
+
+def _export(options: argparse.Namespace) -> None:
+    from lidarpose.infer.predictor import weights_path
+    from lidarpose.model.export import FORMATS, export
+
+    path = weights_path(options.weights)
+    out = options.out or path.stem + FORMATS.get(options.format, "")
+    export(path, out, format=options.format)
+    print(f"{path.name} -> {out} ({Path(out).stat().st_size / 1e6:.2f} MB)", file=sys.stderr)
+
+
+def _import(options: argparse.Namespace) -> None:
+    from lidarpose.model.checkpoint import import_released
+
+    header = import_released(options.file, options.out, config=options.config)
+    print(f"{header.config.name}, joints of {header.skeleton.name} -> {options.out}", file=sys.stderr)
