@@ -18,7 +18,7 @@ from lidarpose.evaluate.metrics import auroc, calibration_error
 from lidarpose.infer.predictor import load
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import PoseBank
-from lidarpose.train.feed import seen
+from lidarpose.train.example import seen
 
 BINS = 10
 

@@ -20,18 +20,18 @@ import torch
 from backbones import Draft, GroupedViT, PointNet2, count
 from torch import nn
 
-from lidarpose.model.batch import Batch, Targets
+from lidarpose.model.batch import Batch
 from lidarpose.model.network import PoseNet
 from lidarpose.model.plan import plan
 from lidarpose.model.presets import preset
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.generate import Generator
 from lidarpose.synth.scene import scene_config
-from lidarpose.train.feed import Example, collate, example
-from lidarpose.train.loop import CLIP
-from lidarpose.train.losses import losses, total
+from lidarpose.train.example import Example, example
 from lidarpose.train.optimize import average, optimizers
-from lidarpose.train.recipes import default
+from lidarpose.train.pose_task import PoseTask
+from lidarpose.train.recipes import Pretrain
+from lidarpose.train.task import total
 
 SIZES = ("tiny", "small", "base", "paper")
 # median points a person of those who come as in training
@@ -41,15 +41,16 @@ BATCH, PAPER_BATCH = 64, 8
 # a point that is doubled moves so far, m
 SPREAD = 0.01
 DRAFT = "draft"
+RECIPE = Pretrain()
 
 
 def crops(number: int, rng: np.random.Generator) -> list[Example]:
     """So many people as they come in training, dense ones left out at random until their median is `CROP_POINTS`."""
-    generator = Generator(scene=scene_config(default().scene), measure=False)
+    generator = Generator(scene=scene_config(RECIPE.scene), measure=False)
     halves: tuple[list, list] = [], []
     index = 0
     while min(map(len, halves)) < number // 2:
-        one = example(generator.person(1, index, hard=math.sqrt(rng.random())), rng)
+        one = example(generator.person(1, index, hard=math.sqrt(rng.random())).sample, rng)
         halves[len(one.points) > CROP_POINTS].append(one)
         index += 1
     return halves[0][: number // 2] + halves[1][: number // 2]
@@ -117,7 +118,7 @@ class Runner:
         with self.precision():
             loss = self.loss(lesson)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), CLIP)
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), RECIPE.clip)
         self.optimizer.step()
         self.wait()
 
@@ -144,6 +145,7 @@ class Ours(Runner):
     def __init__(self, size: str, device: str = "cpu"):
         torch.manual_seed(0)
         self.config = preset(size)
+        self.task = PoseTask(config=self.config)
         super().__init__(size, PoseNet(self.config), device)
         self.mean = {name: value.detach().clone() for name, value in self.network.named_parameters()}
         self.made = None
@@ -167,21 +169,20 @@ class Ours(Runner):
         return self.network(tables).joints().cpu().numpy()
 
     def lesson(self, people):
-        return collate(people, self.config, np.random.default_rng(0))
+        return self.task.collate(people)
 
     def step(self, lesson):
         if self.made is None:
-            self.made = optimizers(self.network, default())
+            self.made = optimizers(self.network, RECIPE)
         for optimizer in self.made:
             optimizer.zero_grad(set_to_none=True)
-        targets = Targets.from_arrays(lesson, self.device)
         with self.precision():
-            terms = losses(self.network(Batch.from_arrays(lesson, self.device)), targets)
+            terms = self.task.terms(self.network, lesson, device=self.device)
         total(terms).backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), CLIP)
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), RECIPE.clip)
         for optimizer in self.made:
             optimizer.step()
-        average(self.mean, self.network, self.steps)
+        average(self.mean, self.network, self.steps, RECIPE.ema)
         self.steps += 1
         self.wait()
 

@@ -17,10 +17,12 @@ from lidarpose.model.network import PoseNet
 from lidarpose.model.presets import preset
 from lidarpose.synth.generate import Generator
 from lidarpose.synth.scene import scene_config
-from lidarpose.train.feed import collate, example
-from lidarpose.train.losses import losses, total
+from lidarpose.train.example import example
+from lidarpose.train.losses import losses
 from lidarpose.train.optimize import optimizers
-from lidarpose.train.recipes import default
+from lidarpose.train.pose_task import PoseTask
+from lidarpose.train.recipes import Pretrain
+from lidarpose.train.task import total
 
 ROUNDS = 5
 
@@ -31,7 +33,7 @@ def main() -> None:
     parser.add_argument("--people", type=int, default=64)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    recipe, config = default(), preset("tiny")
+    recipe, config = Pretrain(), preset("tiny")
     generator = Generator(scene=scene_config("wild"), measure=False)
     generator.person(0, 0)
     made_in: dict[int, list[float]] = {1: [], 2: []}
@@ -44,7 +46,7 @@ def main() -> None:
     for blas, times in made_in.items():
         print(f"a person made, {blas} BLAS threads: {np.median(times):.2f} ms")
     rng = np.random.default_rng(0)
-    arrays = collate([example(person, rng) for person in people], config, rng)
+    arrays = PoseTask(config=config).collate([example(person.sample, rng) for person in people])
     batch = Batch.from_arrays(arrays)
     targets = Targets.from_arrays(arrays)
     network = PoseNet(config)

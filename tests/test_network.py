@@ -20,10 +20,12 @@ from lidarpose.model.plan import plan, view_features
 from lidarpose.model.presets import BIN, NetworkConfig, preset
 from lidarpose.synth.generate import Generator
 from lidarpose.synth.scene import SCENES
-from lidarpose.train.feed import MAX_VOXELS, SEEN, collate, example, seen
-from lidarpose.train.losses import SIGMA, losses, total
+from lidarpose.train.example import SEEN, example, seen
+from lidarpose.train.losses import SIGMA, losses
 from lidarpose.train.optimize import optimizers
+from lidarpose.train.pose_task import MAX_VOXELS, PoseTask
 from lidarpose.train.recipes import Pretrain
+from lidarpose.train.task import total
 
 TINY = preset("tiny")
 TINY_PARAMETERS = 380_435
@@ -371,7 +373,7 @@ def people(count=12):
 def test_points_and_joints_move_together():
     kinds = set()
     for k, known in enumerate(people()):
-        shown = example(known, np.random.default_rng(k))
+        shown = example(known.sample, np.random.default_rng(k))
         # between a joint and a point lies what lies between them in the sensor's frame
         np.testing.assert_allclose(
             shown.points[0] - shown.joints, known.sample.points[0] - known.sample.pose.joints, atol=1e-5
@@ -392,8 +394,8 @@ def test_points_and_joints_move_together():
 def test_a_turned_person_is_the_turned_example(yaw):
     """Targets turn with the points and with the view: only the error of the pelvis' guess stays as it was drawn."""
     for k, known in enumerate(people()):
-        other, rotation = replace(known, sample=turned(known.sample, yaw)), rotation_about("z", yaw)
-        a, b = (example(p, np.random.default_rng(k)) for p in (known, other))
+        other, rotation = turned(known.sample, yaw), rotation_about("z", yaw)
+        a, b = (example(p, np.random.default_rng(k)) for p in (known.sample, other))
         shift = b.joints[0] - rotation @ a.joints[0]
         np.testing.assert_allclose(b.points, a.points @ rotation.T + shift, atol=2e-5)
         np.testing.assert_allclose(b.joints, a.joints @ rotation.T + shift, atol=2e-5)
@@ -415,8 +417,8 @@ def test_a_joint_is_seen_where_points_lie_near_it():
 
 
 def test_collated_targets_are_the_examples_and_the_majority_of_parts():
-    shown = [example(known, np.random.default_rng(k)) for k, known in enumerate(people())]
-    arrays = collate(shown, TINY, np.random.default_rng(0))
+    shown = [example(known.sample, np.random.default_rng(k)) for k, known in enumerate(people())]
+    arrays = PoseTask(config=TINY).collate(shown)
     assert arrays["fine.valid"].shape[1] <= MAX_VOXELS and "point_voxel" not in arrays
     assert (arrays["part"][~arrays["fine.valid"]] == -1).all()
     assert ((arrays["part"] >= 0) == arrays["fine.valid"]).all()
@@ -437,7 +439,7 @@ def test_eight_people_can_be_learned_by_heart():
     torch.manual_seed(0)
     maker = Generator(scene=SCENES["wild"], measure=False)
     rng = np.random.default_rng(0)
-    arrays = collate([example(maker.person(0, index), rng) for index in range(8)], TINY, None)
+    arrays = PoseTask(config=TINY).collate([example(maker.person(0, index).sample, rng) for index in range(8)])
     model, recipe, steps = PoseNet(TINY), Pretrain(), 300
     made = optimizers(model, recipe)
     for step in range(steps):

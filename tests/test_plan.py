@@ -45,11 +45,9 @@ def assert_plans_agree(a, b, atol=2e-6):
 def test_the_plan_is_what_its_twin_says(seed, lengths, grid, most, random):
     points, lengths = crowd(seed, lengths, spread=np.random.default_rng(seed).choice([0.1, 0.5, 1.2]))
     view = np.random.default_rng(seed).normal(size=(len(lengths), 5))
-    rngs = [np.random.default_rng(seed) if random else None for _ in range(2)]
     kwargs = {"grid": grid, "max_voxels": most, "view": view, "neighbours": bool(seed % 2)}
-    assert_plans_agree(
-        plan(points, lengths, rng=rngs[0], **kwargs), plan_reference(points, lengths, rng=rngs[1], **kwargs)
-    )
+    kwargs |= {"seeds": seed + np.arange(len(lengths)) if random else None}
+    assert_plans_agree(plan(points, lengths, **kwargs), plan_reference(points, lengths, **kwargs))
 
 
 @settings(max_examples=40, deadline=None)
@@ -165,19 +163,22 @@ def test_a_grid_too_fine_for_the_index_is_refused():
 @pytest.mark.parametrize("random", [False, True])
 def test_thinning_spares_the_small_and_spreads_over_the_large(random):
     small, large = crowd(1, [20])[0], crowd(2, [3000], spread=0.5)[0]
-    rng = np.random.default_rng(0) if random else None
-    tables = plan(np.concatenate([small, large]), np.array([20, 3000]), grid=GRID, max_voxels=100, rng=rng)
+    numbers = np.array([3, 4]) if random else None
+    tables = plan(np.concatenate([small, large]), np.array([20, 3000]), grid=GRID, max_voxels=100, seeds=numbers)
     assert tables.fine.valid[1].sum() == 100 and tables.fine.valid.shape == (2, 100)
     assert tables.fine.valid[0].sum() == plan(small, np.array([20]), grid=GRID, max_voxels=100).fine.valid.sum()
     # what is kept covers the person, not one end of them
     np.testing.assert_allclose(tables.fine.position[1].mean(0), large.mean(0), atol=0.2)
     np.testing.assert_allclose(tables.fine.position[1].std(0), large.std(0), rtol=0.4)
+    # whoever else is in the batch
+    alone = plan(large, np.array([3000]), grid=GRID, max_voxels=100, seeds=None if numbers is None else numbers[1:])
+    np.testing.assert_array_equal(alone.fine.position[0], tables.fine.position[1])
 
 
 def test_inputs_stay_as_they_are():
     points, lengths = crowd(5, [100, 300])
     kept = points.copy(), lengths.copy()
-    plan(points, lengths, grid=GRID, max_voxels=30, rng=np.random.default_rng(0))
+    plan(points, lengths, grid=GRID, max_voxels=30, seeds=np.array([1, 2]))
     np.testing.assert_array_equal(points, kept[0])
     np.testing.assert_array_equal(lengths, kept[1])
 

@@ -1,8 +1,19 @@
 """`lidarpose pretrain` and `finetune`."""
 
 import argparse
-from dataclasses import replace
+import os
+from dataclasses import fields
 from pathlib import Path
+
+from lidarpose.cli.words import names
+from lidarpose.errors import InputError
+from lidarpose.train.recipes import Finetune, Pretrain, Recipe
+
+_WHAT = (
+    "{what} RUN holds config.json, log.jsonl, model.safetensors, best.safetensors, pictures, and state.safetensors to "
+    "go on from. Stopped or killed, --resume goes on to the same losses. Several processes: "
+    "`accelerate launch -m lidarpose {name} ...`."
+)
 
 
 def add(commands) -> None:
@@ -10,35 +21,88 @@ def add(commands) -> None:
     pretrain = commands.add_parser(
         "pretrain",
         help="train a network on synthesized people",
-        description="Trains into the folder RUN: config.json, log.jsonl, state.safetensors, model.safetensors.",
+        description=_WHAT.format(name="pretrain", what="Trains on people who are made meanwhile, or on shards."),
     )
-    pretrain.set_defaults(run=_pretrain)
-    pretrain.add_argument("folder", metavar="RUN", help="a new folder; with --resume that of a run that was stopped")
-    pretrain.add_argument("--resume", action="store_true", help="go on with a run that was stopped")
-    pretrain.add_argument("--size", metavar="NAME", help="of the network: tiny (default), small or base")
-    pretrain.add_argument("--scene", metavar="NAME", help="wild or paper")
-    pretrain.add_argument("--people", type=int, metavar="N", help="people seen in all")
-    pretrain.add_argument("--easy", type=float, metavar="SHARE", help="of the run in which difficulty rises to full")
-    pretrain.add_argument("--batch", type=int, metavar="N", help="people a step")
-    pretrain.add_argument("--rate", type=float, metavar="R", help="peak learning rate")
-    pretrain.add_argument("--motion", metavar="FILE", help="captured motion to take poses from")
-    pretrain.add_argument(
-        "--subjects", metavar="A,B", help="those of its clips to learn from, by the first part of names"
+    finetune = commands.add_parser(
+        "finetune",
+        help="go on training on datasets that prepare wrote",
+        description=_WHAT.format(
+            name="finetune", what="Trains on labelled people; each dataset supervises the joints that it labels."
+        ),
     )
-    pretrain.add_argument("--captured", type=float, metavar="SHARE", help="share of poses from the clips")
-    pretrain.add_argument("--seed", type=int, metavar="N")
-    pretrain.add_argument("--workers", type=int, metavar="N", help="generator processes")
+    finetune.add_argument("data", nargs="+", metavar="DATASET", help="folders that lidarpose prepare wrote")
+    _add(pretrain, Pretrain)
+    _add(finetune, Finetune)
 
 
-def _pretrain(options: argparse.Namespace) -> None:
-    from lidarpose.train.loop import pretrain
-    from lidarpose.train.recipes import default
+def _add(parser, kind: type[Recipe]) -> None:
+    name = kind.__name__.lower()
+    parser.set_defaults(run=_train, kind=kind)
+    where = f"the run's folder: a new one (default runs/{name}-001, -002, ...), with --resume that of the run"
+    if kind is Pretrain:
+        parser.add_argument("folder", nargs="?", metavar="RUN", help=where)
+    else:
+        parser.add_argument("--out", dest="folder", metavar="RUN", help=where)
+    parser.add_argument("--resume", action="store_true", help="go on with a run that was stopped (default the latest)")
+    parser.add_argument("--recipe", default="default", metavar="NAME", help="default or paper; options override it")
+    parser.add_argument("--device", metavar="NAME", help="cpu (default: a GPU where there is one)")
+    parser.add_argument("--tracker", metavar="NAME", help="also log to tensorboard or wandb, where installed")
+    for field in fields(kind):
+        if field.name != "data":
+            default = "" if field.default in (None, ()) else f" ({_said(field.default)})"
+            option = f"--{field.name.replace('_', '-')}"
+            parser.add_argument(option, dest=f"set_{field.name}", metavar="V", help=field.metadata["help"] + default)
 
-    names = ("size", "scene", "people", "easy", "batch", "rate", "motion", "captured", "seed", "workers")
-    changes = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    if options.subjects is not None:
-        changes["subjects"] = tuple(options.subjects.split(","))
-    words = [f"--{name} {','.join(value) if isinstance(value, tuple) else value}" for name, value in changes.items()]
-    command = " ".join(["lidarpose pretrain", Path(options.folder).name, *words])
-    path = pretrain(replace(default(), **changes), options.folder, resume=options.resume, command=command)
-    print(path)
+
+def _train(options: argparse.Namespace) -> None:
+    from lidarpose.train.loop import train
+    from lidarpose.train.recipes import recipe
+    from lidarpose.train.runs import latest, stored_recipe
+
+    kind: type[Recipe] = options.kind
+    name = kind.__name__.lower()
+    changes = {
+        field.name: _parsed(field.name, text, field.type)
+        for field in fields(kind)
+        if (text := getattr(options, f"set_{field.name}", None)) is not None
+    }
+    if kind is Finetune:
+        changes["data"] = tuple(options.data)
+    folder = options.folder
+    if options.resume:
+        folder = folder or latest(name)
+        # a run keeps its recipe: what is not said again stays
+        wanted = kind(**(stored_recipe(Path(folder), kind).to_dict() | changes))
+    else:
+        wanted = recipe(kind, options.recipe, **changes)
+    words = [f"--{key.replace('_', '-')} {_said(value)}" for key, value in changes.items() if key != "data"]
+    words += [f"--recipe {options.recipe}"] * (options.recipe != "default")
+    words += ["--resume"] * options.resume
+    sets = [Path(data).name for data in changes.get("data", ())]
+    command = " ".join(["lidarpose", name, *sets, *words])
+    path = train(wanted, folder, resume=options.resume, command=command, device=options.device, tracker=options.tracker)
+    if os.environ.get("RANK", "0") == "0":
+        print(path)
+
+
+def _parsed(name: str, text: str, kind: type) -> object:
+    """An option's value. Raises InputError for a text of another type."""
+    option = f"--{name.replace('_', '-')}"
+    if kind is bool:
+        if text not in ("true", "false"):
+            raise InputError(f"{option}: expected true or false, got {text!r}")
+        return text == "true"
+    if kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            what = "a whole number" if kind is int else "a number"
+            raise InputError(f"{option}: expected {what}, got {text!r}") from None
+    return names(text) if kind == tuple[str, ...] else text
+
+
+def _said(value: object) -> str:
+    """A value as it is written after an option, of paths the name alone."""
+    if isinstance(value, tuple):
+        return ",".join(map(_said, value))
+    return Path(value).name if isinstance(value, str) and "/" in value else str(value).lower()

@@ -72,15 +72,16 @@ def plan(
     grid: float,
     max_voxels: int,
     view: np.ndarray | None = None,
-    rng: np.random.Generator | None = None,
+    seeds: np.ndarray | None = None,
     neighbours: bool = False,
 ) -> Plan:
     """Voxels of people whose points (M, 3) m stand one after the other, `lengths` (B,) points each, person's frame.
 
     grid: edge of a fine voxel in metres; the mid and coarse ones are 2 and 4 times as wide. A person of more than
-    `max_voxels` fine voxels keeps that many: random ones with `rng`, evenly spread ones without. Every person of at
-    least one point inside the window has at least one voxel at every level; one of none has only padding. neighbours:
-    also make the tables of the mid and coarse level that convolutions read.
+    `max_voxels` fine voxels keeps that many: evenly spread ones, or with seeds (B,) whole numbers random ones, drawn
+    from the person's own seed. Every person of at least one point inside the window has at least one voxel at every
+    level; one of none has only padding. neighbours: also make the tables of the mid and coarse level that convolutions
+    read.
     Twin: `plan_reference`. Raises InputError for a grid too fine for the voxel index.
     """
     if WINDOW / grid > 1 << (_BITS - 1):
@@ -93,7 +94,7 @@ def plan(
     key = ((person << _BITS | cell[:, 0]) << _BITS | cell[:, 1]) << _BITS | cell[:, 2]
     voxel_key, voxel_of_point, count = np.unique(key, return_inverse=True, return_counts=True)
 
-    chosen = _thin(voxel_key >> (3 * _BITS), people, max_voxels, rng)
+    chosen = _thin(voxel_key >> (3 * _BITS), people, max_voxels, seeds)
     if chosen is not None:
         new = np.full(len(voxel_key), -1)
         new[chosen] = np.arange(len(chosen))
@@ -206,7 +207,7 @@ def _segment_sum(segment: np.ndarray, values: np.ndarray, size: int) -> np.ndarr
     return np.stack([np.bincount(segment, values[:, k], size) for k in range(values.shape[1])], 1)
 
 
-def _thin(person: np.ndarray, people: int, most: int, rng: np.random.Generator | None) -> np.ndarray | None:
+def _thin(person: np.ndarray, people: int, most: int, seeds: np.ndarray | None) -> np.ndarray | None:
     """Indices of the voxels to keep, in order, or None where nobody has more than `most`."""
     lengths = np.bincount(person, minlength=people)
     if lengths.max(initial=0) <= most:
@@ -216,9 +217,9 @@ def _thin(person: np.ndarray, people: int, most: int, rng: np.random.Generator |
     for b in range(people):
         if lengths[b] <= most:
             pick = np.arange(lengths[b])
-        elif rng is None:
+        elif seeds is None:
             pick = np.arange(most) * lengths[b] // most
         else:
-            pick = np.sort(rng.choice(lengths[b], most, replace=False))
+            pick = np.sort(np.random.default_rng(seeds[b]).choice(lengths[b], most, replace=False))
         keep.append(start[b] + pick)
     return np.concatenate(keep)

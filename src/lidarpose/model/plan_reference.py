@@ -16,19 +16,19 @@ def plan_reference(
     grid: float,
     max_voxels: int,
     view: np.ndarray | None = None,
-    rng: np.random.Generator | None = None,
+    seeds: np.ndarray | None = None,
     neighbours: bool = False,
 ) -> Plan:
-    """The same arguments and result as `plan.plan`; with `rng` it draws the same numbers."""
+    """The same arguments and result as `plan.plan`; with `seeds` it draws the same numbers."""
     fine, mid, coarse = [], [], []
     start = 0
-    for length in lengths:
+    for b, length in enumerate(lengths):
         voxels: dict[Cell, list[int]] = defaultdict(list)
         for m in range(start, start + length):
             if all(abs(x) < WINDOW for x in points[m]):
                 voxels[tuple(int(np.floor(x / grid)) for x in points[m])].append(m)
         start += length
-        cells = _thinned(sorted(voxels), max_voxels, rng)
+        cells = _thinned(sorted(voxels), max_voxels, None if seeds is None else seeds[b])
         fine.append({cell: voxels[cell] for cell in cells})
         mid.append(_merged(fine[-1]))
         coarse.append(_merged(mid[-1]))
@@ -53,12 +53,12 @@ def plan_reference(
     )
 
 
-def _thinned(cells: list[Cell], most: int, rng: np.random.Generator | None) -> list[Cell]:
+def _thinned(cells: list[Cell], most: int, seed: int | None) -> list[Cell]:
     if len(cells) <= most:
         return cells
-    if rng is None:
+    if seed is None:
         return [cells[k * len(cells) // most] for k in range(most)]
-    return [cells[k] for k in sorted(rng.choice(len(cells), most, replace=False))]
+    return [cells[k] for k in sorted(np.random.default_rng(seed).choice(len(cells), most, replace=False))]
 
 
 def _merged(voxels: dict[Cell, list[int]]) -> dict[Cell, list[int]]:

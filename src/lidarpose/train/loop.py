@@ -1,155 +1,256 @@
-"""The training loop: synthetic people in, a run folder out.
+"""The training loop: people in, a run folder out (see `runs`), on one process or many.
 
-A run folder holds config.json (the recipe), log.jsonl (one line a chunk), state.safetensors (to go on from) and
-model.safetensors (the mean weights, to use). A run killed at any moment goes on with `resume`, to the same losses.
+A run killed at any moment goes on with `resume`, to the same losses. Processes are those of Accelerate's or torch's
+launcher; each makes its share of every batch, and together they take the same steps as one.
 """
 
 import json
 import os
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
+import numpy as np
 import torch
+from accelerate import Accelerator, DistributedDataParallelKwargs
+from torch import Tensor, nn
 from tqdm import tqdm
 
-from lidarpose._version import __version__
-from lidarpose.data.files import write_atomic
-from lidarpose.errors import InputError
-from lidarpose.model.batch import Batch, Targets
+from lidarpose.errors import InputError, missing_extra
 from lidarpose.model.checkpoint import save_checkpoint
-from lidarpose.model.network import PoseNet
-from lidarpose.model.presets import preset
-from lidarpose.train.feed import BATCHES, generator_of, loader
-from lidarpose.train.losses import losses, total
-from lidarpose.train.muon import Muon
-from lidarpose.train.optimize import average, optimizers, rate_factor
-from lidarpose.train.recipes import Pretrain
+from lidarpose.train.feed import BATCHES, Chunks, loader
+from lidarpose.train.job import Job, job_of
+from lidarpose.train.optimize import average, optimizers, set_rates
+from lidarpose.train.recipes import Recipe
+from lidarpose.train.runs import BEST, LOG, MODEL, STATE, begin, check_same, cut_log, latest, numbered, stored_recipe
 from lidarpose.train.state import load_state, save_state
+from lidarpose.train.task import total
+from lidarpose.train.validation import Validation
 
-STATE, MODEL, CONFIG, LOG = "state.safetensors", "model.safetensors", "config.json", "log.jsonl"
-# largest norm of a step's gradient
-CLIP = 1.0
 # seconds between two saved states
 SAVE_EVERY = 120
+# validations in a run whose recipe does not say how many
+_VALIDATIONS = 20
+# first words of generators' seeds; see `sources`
+_INIT, _STEP = 9, 10
 
 
-def pretrain(recipe: Pretrain, folder: str | Path, *, resume: bool = False, command: str = "") -> Path:
+def train(
+    recipe: Recipe,
+    folder: str | Path | None = None,
+    *,
+    resume: bool = False,
+    command: str = "",
+    device: str | None = None,
+    tracker: str | None = None,
+) -> Path:
     """Trains as the recipe says and returns the path of model.safetensors.
 
-    folder: a new one, or with `resume` that of a run with the same recipe (its length may differ). Raises InputError
-    where the folder does not fit, or where the loss stops being finite: the last good state then stays.
+    folder: a new one (None: the next number in `runs`), or with `resume` that of a run with the same recipe (its length
+    may differ). device: "cpu", or
+    None for what Accelerate finds; tracker: "tensorboard" or "wandb", which must be installed. Raises InputError where
+    the folder or the recipe does not fit, or where the loss stops being finite: the last good state then stays.
     """
-    folder = Path(folder)
-    network, mean, made, chunk, seen_seconds = _begin(recipe, folder, resume)
-    size = BATCHES * recipe.batch
-    chunks = -(-recipe.people // size)
-    network.train()
-    started = saved = time.monotonic()
-    bar = tqdm(
-        total=recipe.people, initial=min(chunk * size, recipe.people), unit=" people", disable=not sys.stderr.isatty()
-    )
-    with open(folder / LOG, "a") as log, bar:
-        for batches in loader(recipe, network.config, start=chunk, stop=chunks):
-            terms = [_step(network, mean, made, recipe, arrays, chunk, k, chunks) for k, arrays in enumerate(batches)]
-            means = {name: float(torch.stack([t[name] for t in terms]).mean()) for name in terms[0]}
-            if not all(map(_finite, means.values())):
-                raise InputError(f"the loss is not finite at people {chunk * size}: lower --rate; {STATE} is kept")
-            chunk += 1
-            elapsed = seen_seconds + time.monotonic() - started
-            line = {"people": chunk * size, "seconds": round(elapsed, 1)} | {k: round(v, 5) for k, v in means.items()}
-            log.write(json.dumps(line) + "\n")
-            log.flush()
-            bar.update(size)
-            bar.set_postfix(mpjpe_mm=f"{means['mpjpe'] * 1e3:.0f}")
-            if time.monotonic() - saved > SAVE_EVERY or chunk == chunks:
-                # the state last: killed between the two, a run goes on from the older one and writes both again
-                _save_model(folder, recipe, mean, chunk * size, elapsed, command)
-                save_state(folder / STATE, network, mean, made, {"chunk": chunk, "seconds": elapsed})
-                saved = time.monotonic()
+    kind = type(recipe)
+    if resume:
+        folder = latest(kind.__name__.lower()) if folder is None else Path(folder)
+        check_same(folder, stored_recipe(folder, kind), recipe)
+    elif folder is None and int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        raise InputError("several processes need to know the run's folder: name it")
+    job = job_of(recipe)
+    folder = numbered(kind.__name__.lower()) if folder is None else Path(folder)
+    accelerator = _accelerator(recipe, folder, device, tracker)
+    # every process looks before the first one writes
+    accelerator.wait_for_everyone()
+    run = _Run(recipe, job, folder, accelerator, command)
+    if resume:
+        run.take_up()
+    elif accelerator.is_main_process:
+        begin(folder, recipe, command)
+    accelerator.wait_for_everyone()
+    try:
+        run.go()
+    finally:
+        if tracker is not None:
+            accelerator.end_training()
     return folder / MODEL
 
 
-def _begin(recipe: Pretrain, folder: Path, resume: bool):
-    # here, not in a worker, whose errors come wrapped in a traceback
-    generator_of(recipe)
-    torch.manual_seed(recipe.seed)
-    network = PoseNet(preset(recipe.size))
-    mean = {name: value.detach().clone() for name, value in network.named_parameters()}
-    made = optimizers(network, recipe)
-    config = {"schema": "lidarpose.run/1", "version": __version__, "recipe": recipe.to_dict()}
-    if resume:
-        if not (folder / CONFIG).is_file():
-            raise InputError(f"{folder}: nothing to resume, it has no {CONFIG}: leave --resume away to start a run")
-        _same_recipe(folder / CONFIG, config["recipe"])
-        if not (folder / STATE).is_file():
-            # killed before its first state was saved: it begins again
-            _cut_log(folder / LOG, 0)
-            return network, mean, made, 0, 0.0
-        progress = load_state(folder / STATE, network, mean, made)
-        _cut_log(folder / LOG, progress["chunk"] * BATCHES * recipe.batch)
-        return network, mean, made, progress["chunk"], progress["seconds"]
-    if folder.exists() and any(folder.iterdir()):
-        raise InputError(
-            f"{folder}: expected a new or empty folder for the run; add --resume to go on with what is there"
-        )
-    write_atomic(folder / CONFIG, json.dumps(config, indent=1) + "\n")
-    return network, mean, made, 0, 0.0
-
-
-def _same_recipe(path: Path, recipe: dict) -> None:
+def _accelerator(recipe: Recipe, folder: Path, device: str | None, tracker: str | None) -> Accelerator:
+    on_cpu = device == "cpu" or not torch.cuda.is_available()
+    half = recipe.precision == "bf16" or recipe.precision == "auto" and not on_cpu
     try:
-        stored = dict(json.loads(path.read_text())["recipe"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"{path}: expected the recipe of a run, but it is damaged ({error}): start a new run"
-        ) from None
-    # length and workers change no person; the schedule follows the new length
-    for name in recipe:
-        if name not in ("people", "workers") and json.loads(json.dumps(recipe[name])) != stored.get(name):
+        accelerator = Accelerator(
+            cpu=on_cpu,
+            mixed_precision="bf16" if half else "no",
+            log_with=tracker,
+            project_dir=str(folder),
+            kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=False)],
+        )
+        if tracker is not None:
+            settings = {name: value for name, value in recipe.to_dict().items() if isinstance(value, int | float | str)}
+            accelerator.init_trackers("lidarpose", config=settings)
+    except ModuleNotFoundError as error:
+        raise missing_extra(error, f"--tracker {tracker}") from None
+    except (ValueError, ImportError) as error:
+        reason = str(error).partition("\n")[0]
+        raise InputError(f"cannot train so ({reason}): choose another --tracker or --precision") from None
+    return accelerator
+
+
+class _Run:
+    """A run that goes on: the network, the mean of its weights, its optimizers, how far it is."""
+
+    def __init__(self, recipe: Recipe, job: Job, folder: Path, accelerator: Accelerator, command: str):
+        self.recipe, self.job, self.folder, self.command = recipe, job, folder, command
+        self.accelerator = accelerator
+        torch.manual_seed(_number(recipe.seed, _INIT))
+        self.network: nn.Module = job.network().to(accelerator.device).train()
+        self.mean = {name: value.detach().clone() for name, value in self.network.named_parameters()}
+        self.optimizers = optimizers(self.network, recipe)
+        self.wrapped = accelerator.prepare(self.network) if accelerator.num_processes > 1 else self.network
+        self.size = BATCHES * recipe.batch
+        self.chunks = -(-job.people // self.size)
+        self.chunk, self.seconds, self.best = 0, 0.0, float("inf")
+        self.validation = Validation(job, recipe, folder)
+
+    def take_up(self) -> None:
+        """The state of the run that was stopped; the beginning, where it was killed before its first was saved."""
+        if (self.folder / STATE).is_file():
+            progress = load_state(self.folder / STATE, self.network, self.mean, self.optimizers)
+            self.chunk, self.seconds = progress["chunk"], progress["seconds"]
+            self.best = float("inf") if progress["best"] is None else progress["best"]
+        if self.accelerator.is_main_process:
+            cut_log(self.folder, self.chunk * self.size)
+
+    def go(self) -> None:
+        """All that is left of the run."""
+        main = self.accelerator.is_main_process
+        people = Chunks(
+            source=self.job.source,
+            task=self.job.task,
+            batch=self.recipe.batch,
+            seed=self.recipe.seed,
+            start=self.chunk,
+            stop=self.chunks,
+            rank=self.accelerator.process_index,
+            ranks=self.accelerator.num_processes,
+        )
+        due = self.recipe.validate or max(self.job.people // _VALIDATIONS, 1)
+        started = saved = time.monotonic()
+        before = self.seconds
+        with ExitStack() as stack:
+            log = stack.enter_context(open(self.folder / LOG, "a")) if main else None
+            bar = stack.enter_context(self._bar())
+            for batches in loader(people, workers=self.recipe.workers):
+                line = self._chunk(batches)
+                self.seconds = before + time.monotonic() - started
+                told = {"people": self.chunk * self.size, "seconds": round(self.seconds, 1)} | line
+                last = self.chunk == self.chunks
+                if last or told["people"] // due > (told["people"] - self.size) // due:
+                    told |= self._validated(told["people"])
+                if main:
+                    log.write(json.dumps(told) + "\n")
+                    log.flush()
+                self.accelerator.log({k: v for k, v in told.items() if k != "people"}, step=told["people"])
+                bar.update(min(self.size, bar.total - bar.n))
+                shown = {"loss": f"{sum(v for k, v in line.items() if k != 'mpjpe'):.3f}"}
+                shown |= {"mpjpe": f"{line['mpjpe'] * 1e3:.0f} mm"}
+                shown |= {"validation": f"{self.validation.last:.0f} mm"} if self.validation.last is not None else {}
+                bar.set_postfix(shown)
+                if main and (last or time.monotonic() - saved > SAVE_EVERY):
+                    self._save()
+                    saved = time.monotonic()
+        self.accelerator.wait_for_everyone()
+
+    def _bar(self) -> tqdm:
+        shown = self.accelerator.is_main_process and sys.stderr is not None and sys.stderr.isatty()
+        done = min(self.chunk * self.size, self.job.people)
+        return tqdm(total=self.job.people, initial=done, unit=" people", smoothing=0.1, disable=not shown)
+
+    def _chunk(self, batches: list) -> dict[str, float]:
+        """Takes the steps of a chunk; returns the mean of each term over them. Raises InputError where one is not
+        finite."""
+        terms = [self._step(arrays, k) for k, arrays in enumerate(batches)]
+        names = list(terms[0])
+        told = torch.stack([torch.stack([t[name] for name in names]) for t in terms])
+        told = self.accelerator.reduce(told, "mean").cpu()
+        broken = (~told.isfinite().all(1)).nonzero().flatten().tolist()
+        if broken:
+            first = self.chunk * self.size
+            kept = f"{STATE} is kept" if (self.folder / STATE).is_file() else "nothing was saved before"
             raise InputError(
-                f"{path}: the run has {name} = {stored.get(name)!r}, got {recipe[name]!r}: a run keeps its recipe"
+                f"the loss is not finite in batch {broken[0]} of people {first} to {first + self.size - 1}: start "
+                f"again with a lower --rate; {kept}"
             )
+        self.chunk += 1
+        return {name: round(value, 5) for name, value in zip(names, told.mean(0).tolist(), strict=True)}
+
+    def _step(self, arrays: object, k: int) -> dict[str, Tensor]:
+        step, recipe, accelerator = self.chunk * BATCHES + k, self.recipe, self.accelerator
+        # what a network drops at random follows from the step alone
+        torch.manual_seed(_number(recipe.seed, _STEP, step, accelerator.process_index))
+        set_rates(self.optimizers, recipe, step / (self.chunks * BATCHES))
+        for optimizer in self.optimizers:
+            optimizer.zero_grad(set_to_none=True)
+        with accelerator.autocast():
+            terms = self.job.task.terms(self.wrapped, arrays, device=accelerator.device, share=self._share)
+        accelerator.backward(total(terms))
+        if recipe.clip:
+            torch.nn.utils.clip_grad_norm_(self.network.parameters(), recipe.clip)
+        for optimizer in self.optimizers:
+            optimizer.step()
+        average(self.mean, self.network, step, recipe.ema)
+        return {name: value.detach() for name, value in terms.items()}
+
+    def _share(self, count: Tensor) -> Tensor:
+        return self.accelerator.reduce(count.detach().float(), "mean") if self.wrapped is not self.network else count
+
+    def _averaged(self) -> nn.Module:
+        """A network with the mean weights, in evaluation mode."""
+        network = self.job.task.network().to(self.accelerator.device)
+        network.load_state_dict(self.network.state_dict() | self.mean)
+        return network.eval()
+
+    def _validated(self, people: int) -> dict[str, float]:
+        """On the first process; the weights of the best validation are kept."""
+        if not self.accelerator.is_main_process:
+            return {}
+        network = self._averaged()
+        error = self.validation.run(network, people, self.accelerator.device)
+        if error is None:
+            return {}
+        if error < self.best:
+            self.best = error
+            self._save_weights(BEST, network, validation=error)
+        return {"validation_mm": round(error, 2)}
+
+    def _save(self) -> None:
+        # the state last: killed between the two, a run goes on from the older one and writes both again
+        self._save_weights(MODEL, self._averaged())
+        best = self.best if np.isfinite(self.best) else None
+        progress = {"chunk": self.chunk, "seconds": self.seconds, "best": best}
+        save_state(self.folder / STATE, self.network, self.mean, self.optimizers, progress)
+
+    def _save_weights(self, name: str, network: nn.Module, **more: float) -> None:
+        stated = self.recipe.to_dict()
+        for entry in ("motion", "shards", "data", "init"):
+            # names of files, not where they lie
+            value = stated.get(entry)
+            if value:
+                stated[entry] = Path(value).name if isinstance(value, str) else [Path(v).name for v in value]
+        card = {
+            "command": self.command or "lidarpose.train.loop.train",
+            "recipe": stated,
+            "people_seen": self.chunk * self.size,
+            "hours": round(self.seconds / 3600, 3),
+        }
+        if self.validation.last is not None:
+            card["validation_mm"] = round(more.get("validation", self.validation.last), 2)
+        save_checkpoint(self.folder / name, network, card=card | self.job.card)
 
 
-def _cut_log(path: Path, people: int) -> None:
-    """Lines behind the saved state belong to steps that will be taken again."""
-    if path.exists():
-        # a kill may leave half a line at the end
-        whole = [line for line in path.read_text().splitlines() if line.endswith("}")]
-        kept = [line for line in whole if json.loads(line)["people"] <= people]
-        write_atomic(path, "".join(line + "\n" for line in kept))
-
-
-def _step(network, mean, made, recipe: Pretrain, arrays: dict, chunk: int, k: int, chunks: int) -> dict:
-    step = chunk * BATCHES + k
-    factor = rate_factor(step / (chunks * BATCHES))
-    for optimizer in made:
-        rate = recipe.muon_rate if isinstance(optimizer, Muon) else recipe.rate
-        for group in optimizer.param_groups:
-            group["lr"] = rate * factor
-        optimizer.zero_grad(set_to_none=True)
-    targets = Targets.from_arrays(arrays)
-    terms = losses(network(Batch.from_arrays(arrays)), targets)
-    total(terms).backward()
-    torch.nn.utils.clip_grad_norm_(network.parameters(), CLIP)
-    for optimizer in made:
-        optimizer.step()
-    average(mean, network, step)
-    return {name: value.detach() for name, value in terms.items()}
-
-
-def _save_model(folder: Path, recipe: Pretrain, mean: dict, people: int, seconds: float, command: str) -> None:
-    network = PoseNet(preset(recipe.size))
-    network.load_state_dict(mean)
-    card = {
-        "command": command or "lidarpose.train.loop.pretrain",
-        "recipe": recipe.to_dict() | {"motion": None if recipe.motion is None else os.path.basename(recipe.motion)},
-        "people_seen": people,
-        "hours": round(seconds / 3600, 3),
-    }
-    save_checkpoint(folder / MODEL, network, card=card)
-
-
-def _finite(value: float) -> bool:
-    return value == value and abs(value) != float("inf")
+def _number(*words: int) -> int:
+    """A seed of torch's from words."""
+    return int(np.random.SeedSequence(words).generate_state(1)[0])

@@ -1,45 +1,150 @@
-"""A run is a function that returns a complete configuration; the command line only overrides its fields."""
+"""A run is a function that returns a complete configuration; the command line only overrides its fields.
 
-from dataclasses import asdict, dataclass
+A field's help is what the command line says of it; this module stays light for that.
+"""
 
-from lidarpose.errors import InputError
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any
+
+from lidarpose.errors import InputError, unknown_name
+
+# rises, stays, falls to nothing; or rises and falls as a cosine
+SCHEDULES = ("plateau", "cosine")
+PRECISIONS = ("auto", "float32", "bf16")
+# the paper's network before fine-tuning, besides the sizes of the package's own
+PAPER = "paper"
+# what changes no person and no step: a run that goes on may have others
+FREE = ("workers", "validate", "pictures", "precision")
+
+
+def _setting(default: Any, words: str) -> Any:
+    return field(default=default, metadata={"help": words})
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pretrain:
-    """Pre-training on synthesized people, made while the network learns.
+class Recipe:
+    """What pre-training and fine-tuning have in common. Raises InputError for a value that cannot be."""
 
-    size: of the network; scene: see `synth.scene`; people: how many are seen in all; batch: people a step; rate: peak
-    learning rate of AdamW, the hidden matrices learn by Muon at `muon_rate`; easy: share of the run over which the
-    difficulty rises from nothing to full; captured: share of poses from captured motion, where clips are given;
-    motion: a file or folder of captured motion or none; subjects: those of its clips to learn from, none: all;
-    workers: generator processes.
-    """
-
-    size: str = "tiny"
-    scene: str = "wild"
-    people: int = 300_000
-    batch: int = 64
-    rate: float = 2e-3
-    muon_rate: float = 0.02
-    easy: float = 0.15
-    captured: float = 0.5
-    motion: str | None = None
-    subjects: tuple[str, ...] = ()
-    seed: int = 0
-    workers: int = 1
+    batch: int = _setting(64, "people a step, in all processes together")
+    rate: float = _setting(2e-3, "peak learning rate of AdamW")
+    muon_rate: float = _setting(0.02, "peak learning rate of Muon for hidden matrices; 0: AdamW for all")
+    decay: float = _setting(0.01, "weight decay")
+    schedule: str = _setting("plateau", "plateau (rise, stay, fall) or cosine")
+    warmup: float = _setting(0.02, "share of the run in which the rate rises")
+    cool: float = _setting(0.3, "share of the run in which a plateau's rate falls to nothing")
+    ema: float = _setting(0.999, "how much the running mean of the weights keeps each step; 0: no mean")
+    clip: float = _setting(1.0, "largest norm of a step's gradient; 0: any")
+    bone: float = _setting(0.0, "weight of the error of bones' lengths")
+    symmetry: float = _setting(0.0, "weight of the difference of left and right bones")
+    precision: str = _setting("auto", "auto (bf16 on a GPU), float32 or bf16")
+    validate: int = _setting(0, "people between two validations; 0: twenty in the run")
+    pictures: int = _setting(6, "validation people drawn at every validation")
+    seed: int = _setting(0, "of all that is random")
+    workers: int = _setting(1, "processes that make people, of each process that trains")
 
     def __post_init__(self):
-        least = {"people": 1, "batch": 1, "rate": 0, "muon_rate": 0, "easy": 0, "captured": 0, "seed": 0, "workers": 0}
+        least = {"batch": 1} | {f.name: 0 for f in fields(self) if f.type in (int, float) and f.name != "batch"}
         for name, bound in least.items():
             if not getattr(self, name) >= bound:
                 raise InputError(f"{name} must be at least {bound}, got {getattr(self, name)}")
-        object.__setattr__(self, "subjects", tuple(self.subjects))
+        for name in ("warmup", "cool", "ema"):
+            if getattr(self, name) > 1 or name == "ema" and self.ema == 1:
+                raise InputError(f"{name} must be a share, at most 1, got {getattr(self, name)}")
+        for name, known in (("schedule", SCHEDULES), ("precision", PRECISIONS)):
+            if getattr(self, name) not in known:
+                raise unknown_name(name, getattr(self, name), known)
+        for f in fields(self):
+            if isinstance(f.default, tuple):
+                object.__setattr__(self, f.name, tuple(getattr(self, f.name)))
 
     def to_dict(self) -> dict:
         return asdict(self)
 
 
-def default() -> Pretrain:
+@dataclass(frozen=True, kw_only=True)
+class Pretrain(Recipe):
+    """Pre-training on synthesized people, made while the network learns, or read from shards."""
+
+    size: str = _setting("tiny", "of the network: tiny, small, base, or paper for the paper's")
+    scene: str = _setting("wild", "wild, paper or reference")
+    people: int = _setting(300_000, "seen in all")
+    easy: float = _setting(0.05, "share of the run in which difficulty rises to full")
+    captured: float = _setting(0.5, "share of poses from captured motion, where clips are given")
+    motion: str | None = _setting(None, "captured motion to take poses from: a file or a folder")
+    subjects: tuple[str, ...] = _setting((), "those of its clips to learn from, by the first part of names")
+    shards: tuple[str, ...] = _setting((), "folders that `lidarpose synth` wrote, to learn from instead")
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.people < 1:
+            raise InputError(f"people must be at least 1, got {self.people}")
+        for name in ("easy", "captured"):
+            if getattr(self, name) > 1:
+                raise InputError(f"{name} must be a share, at most 1, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finetune(Recipe):
+    """Fine-tuning on datasets that `lidarpose prepare` wrote."""
+
+    rate: float = _setting(5e-4, "peak learning rate of AdamW")
+    muon_rate: float = _setting(5e-3, "peak learning rate of Muon for hidden matrices; 0: AdamW for all")
+    data: tuple[str, ...] = _setting((), "their folders")
+    init: str = _setting("tiny", "weights to begin with: bundled, or a checkpoint")
+    epochs: float = _setting(20.0, "how often everybody is seen")
+    split: str = _setting("train", "whom to learn from; all: everybody")
+    interval: int = _setting(1, "only every so many frames, as published recipes thin out")
+    augment: str = _setting("default", "what happens to people: default, paper or none")
+    mix: float = _setting(0.25, "share of synthesized people")
+    scene: str = _setting("wild", "of the synthesized people: wild, paper or reference")
+    hold_out: float = _setting(0.1, "share of sequences kept for validation where the dataset has no split val")
+    keep_anchors: bool = _setting(True, "of the paper's network: go on with pre-trained anchors and heads")
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not self.data:
+            raise InputError("fine-tuning needs a dataset: name a folder that lidarpose prepare wrote")
+        if not self.epochs > 0 or self.interval < 1:
+            raise InputError(f"epochs must be above 0 and interval at least 1, got {self.epochs} and {self.interval}")
+        for name in ("mix", "hold_out"):
+            if getattr(self, name) > 1:
+                raise InputError(f"{name} must be a share, at most 1, got {getattr(self, name)}")
+
+
+# the released OneCycle schedule, AdamW on everything, neither mean of weights nor clipping
+_RELEASED = {"muon_rate": 0.0, "decay": 0.005, "schedule": "cosine", "warmup": 0.04, "ema": 0.0, "clip": 0.0}
+
+
+def pretrain_default() -> dict:
     """The recipe of the bundled weights but for its length."""
-    return Pretrain()
+    return {}
+
+
+def pretrain_paper() -> dict:
+    """Paper: implementation details. 50 epochs; an epoch is here 50,000 people, since the paper's follow frames of
+    LiDARHuman26M, and every pose is new."""
+    return _RELEASED | {"size": PAPER, "scene": "paper", "rate": 3e-4, "people": 2_500_000, "easy": 0.0}
+
+
+def finetune_default() -> dict:
+    """Anchors and heads stay, every joint has its name, synthesized people are mixed in."""
+    return {}
+
+
+def finetune_paper() -> dict:
+    """Paper: implementation details. 50 epochs on the dataset alone, anchors and heads begin anew."""
+    return _RELEASED | {"epochs": 50.0, "augment": "paper", "mix": 0.0, "keep_anchors": False}
+
+
+RECIPES = {
+    Pretrain: {"default": pretrain_default, "paper": pretrain_paper},
+    Finetune: {"default": finetune_default, "paper": finetune_paper},
+}
+
+
+def recipe(kind: type[Recipe], name: str = "default", **changes: Any) -> Recipe:
+    """A named recipe of `Pretrain` or `Finetune`, some of its fields changed."""
+    known = RECIPES[kind]
+    if name not in known:
+        raise unknown_name("recipe", name, known)
+    return kind(**(known[name]() | changes))

@@ -1,0 +1,137 @@
+"""Stored people shown anew each time: crop, center, turn, mirror, scale, loss and strays.
+
+All happens in the person's own frame but for the crop. Legend: n points.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidarpose.data.augment import half_space_keep, jitter, noise_clusters, random_keep
+from lidarpose.data.released import released_view
+from lidarpose.errors import unknown_name
+from lidarpose.geometry import rotation_about
+from lidarpose.model.plan import view_features
+from lidarpose.sample import center_of
+from lidarpose.skeleton import BODY26, SMPL24
+from lidarpose.train.crowd import Person
+from lidarpose.train.example import BLIND, PELVIS_ERROR, REFINED, Example
+
+# a person of fewer points after the crop is shown whole
+LEAST_POINTS = 5
+# largest number of strays in a blob
+_STRAYS = 60
+_FLIP_PART = np.array([-1, 0, *(1 + np.array(SMPL24.flip))], np.int16)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Augmentation:
+    """How often what happens to a person.
+
+    released: crop and center as the released code's, else by a box or by the points; box: standard deviation of a
+    detector's errors in a box, m; cut: probability that part of the cloud is cut off by a plane; turn: of a turn about
+    z by any angle; scale: sizes from 1 - scale to 1 + scale; flip: of a mirror, across x and across y on their own;
+    jitter: standard deviation of each coordinate, m, cut at four times that; drop: probability that a fifth of the
+    points is lost; strays: of blobs of stray points.
+    """
+
+    released: bool = False
+    box: float = 0.0
+    cut: float = 0.0
+    turn: float = 0.0
+    scale: float = 0.0
+    flip: float = 0.0
+    jitter: float = 0.0
+    drop: float = 0.0
+    strays: float = 0.0
+
+
+AUGMENTATIONS = {
+    "none": Augmentation(),
+    # Paper: none are named; those of the released fine-tuning. Its box of HumanM3 knows the joints
+    "paper": Augmentation(released=True, turn=0.5, scale=0.1, flip=0.3, jitter=0.005, drop=0.5),
+    "default": Augmentation(box=0.08, cut=0.15, turn=1.0, scale=0.1, flip=0.5, jitter=0.005, drop=0.5, strays=0.15),
+}
+
+
+def augmentation(name: str) -> Augmentation:
+    """A named augmentation: none, paper or default."""
+    if name not in AUGMENTATIONS:
+        raise unknown_name("augmentation", name, AUGMENTATIONS)
+    return AUGMENTATIONS[name]
+
+
+def augmented(person: Person, kind: Augmentation, rng: np.random.Generator) -> Example:
+    """A stored person as a step of training shows them. Labels that are missing stay missing."""
+    person, center = _view(person, kind, rng)
+    origin = np.zeros(3) if person.sensor_known and rng.random() >= BLIND else None
+    view = view_features(center, origin)
+    points, joints, part = person.points - center, person.joints - center, person.part
+    visible = person.visible
+    R = _turn(kind, rng) * (1 + kind.scale * rng.uniform(-1, 1))
+    mirrors = rng.random(2) < kind.flip
+    R = np.diag([*np.where(mirrors, -1.0, 1.0), 1.0]) @ R
+    if mirrors.sum() == 1:
+        flip = list(BODY26.flip)
+        joints, visible, part = joints[flip], visible[flip], _FLIP_PART[part + 1]
+    points, joints = points @ R.T, joints @ R.T
+    toward = view[:3] @ R.T
+    view = np.concatenate([toward / max(np.linalg.norm(toward), 1e-9), view[3:]]).astype(np.float32)
+    if rng.random() < kind.drop:
+        kept = random_keep(len(points), share=0.2, rng=rng)
+        points, part = points[kept], part[kept]
+    if kind.jitter:
+        points = jitter(points, sigma=kind.jitter, clip=4 * kind.jitter, rng=rng)
+    if rng.random() < kind.strays:
+        stray = noise_clusters(np.zeros(3), most=_STRAYS, rng=rng)
+        points = np.concatenate([points, stray])
+        part = np.concatenate([part, np.zeros(len(stray), part.dtype)])
+    return Example(
+        points=points.astype(np.float32),
+        part=part,
+        joints=joints.astype(np.float32),
+        visible=visible,
+        view=view,
+        seed=int(rng.integers(2**31)),
+    )
+
+
+def _view(person: Person, kind: Augmentation, rng: np.random.Generator) -> tuple[Person, np.ndarray]:
+    """The person's crop and its center (3,) m."""
+    if kind.released:
+        kept, center = released_view(person.points, person.joints, person.centers, person.box)
+        return _kept(person, kept), person.center if center is None else center
+    keep = np.ones(len(person.points), bool)
+    if person.box is not None and kind.box:
+        box, error = person.box, kind.box * rng.standard_normal(6)
+        size = np.maximum(box.size + np.abs(error[3:]) + kind.box, 0.1)
+        wrong = replace(
+            box, center=box.center + error[:3] * [1, 1, 0.5], size=size, yaw=box.yaw + kind.box * rng.normal()
+        )
+        keep &= wrong.contains(person.points)
+    if rng.random() < kind.cut:
+        keep &= half_space_keep(person.points, most=0.4, rng=rng)
+    person = _kept(person, keep)
+    center = center_of(person.points)
+    root = _root(person.joints)
+    if root is not None and rng.random() < REFINED:
+        center = root + rng.normal(0, PELVIS_ERROR, 3)
+    return person, center
+
+
+def _kept(person: Person, keep: np.ndarray) -> Person:
+    if keep.sum() < min(LEAST_POINTS, len(person.points)):
+        return person
+    return replace(person, points=person.points[keep], part=person.part[keep])
+
+
+def _root(joints: np.ndarray) -> np.ndarray | None:
+    """The pelvis, or half way between the hips where it is not labelled; what a second pass centers on."""
+    pelvis = joints[BODY26.index("pelvis")]
+    hips = joints[[BODY26.index("left_hip"), BODY26.index("right_hip")]].mean(0)
+    return next((place for place in (pelvis, hips) if not np.isnan(place).any()), None)
+
+
+def _turn(kind: Augmentation, rng: np.random.Generator) -> np.ndarray:
+    yaw = rng.uniform(-np.pi, np.pi)
+    return rotation_about("z", yaw if rng.random() < kind.turn else 0.0)

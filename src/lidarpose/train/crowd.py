@@ -1,0 +1,172 @@
+"""People of datasets in memory, in one frame each, joints by the names of body26.
+
+Legend: N people, M points of all of them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from lidarpose.data.columns import CENTERS
+from lidarpose.data.files import file_error
+from lidarpose.data.readers.items import HIDDEN, SEEN, UNLABELED
+from lidarpose.data.shards import Dataset, open_dataset
+from lidarpose.errors import InputError
+from lidarpose.sample import Box
+from lidarpose.skeleton import BODY26, skeleton
+from lidarpose.train.example import UNKNOWN_PART
+
+
+@dataclass(frozen=True, kw_only=True)
+class Person:
+    """One stored person, sensor's frame. points (n, 3) m; part (n,) int16, -1 unknown; joints (26, 3) m, NaN without
+    a label; visible (26,) 1, 0 or NaN; center (3,) m from the points; centers: others by name, as in `Item`; box or
+    None; sensor_known: whether the frame's origin is the sensor."""
+
+    points: np.ndarray
+    part: np.ndarray
+    joints: np.ndarray
+    visible: np.ndarray
+    center: np.ndarray
+    centers: dict[str, np.ndarray]
+    box: Box | None
+    sensor_known: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Crowd:
+    """Everybody. start (N + 1,): where a person's points begin; labels (N, 26) uint8, as in `Item`; centers: (N, 3) m
+    by name, NaN for none; box (N, 7), NaN for none; sequence (N,): numbers of `sequences`; dataset: name of the first
+    one, "" if synthetic; damaged: what could not be read; the rest as in `Person`."""
+
+    points: np.ndarray
+    part: np.ndarray
+    start: np.ndarray
+    joints: np.ndarray
+    labels: np.ndarray
+    center: np.ndarray
+    centers: dict[str, np.ndarray]
+    box: np.ndarray
+    sensor_known: np.ndarray
+    sequence: np.ndarray
+    sequences: tuple[str, ...]
+    skeleton: str
+    dataset: str
+    damaged: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.center)
+
+    def person(self, row: int) -> Person:
+        own = slice(self.start[row], self.start[row + 1])
+        box = self.box[row]
+        return Person(
+            points=self.points[own],
+            part=self.part[own],
+            joints=self.joints[row],
+            visible=self._visible(row),
+            center=self.center[row],
+            centers={name: at[row] for name, at in self.centers.items() if not np.isnan(at[row]).any()},
+            box=None if np.isnan(box).any() else Box(center=box[:3], size=box[3:6], yaw=float(box[6])),
+            sensor_known=bool(self.sensor_known[row]),
+        )
+
+    def _visible(self, row: int) -> np.ndarray:
+        # a dataset that never says hidden tells nothing of what is seen
+        told = np.select([self.labels[row] == SEEN, self.labels[row] == HIDDEN], [1.0, 0.0], np.nan)
+        return (told if self._tells_hidden else np.full(len(BODY26), np.nan)).astype(np.float32)
+
+    @cached_property
+    def _tells_hidden(self) -> bool:
+        return bool((self.labels == HIDDEN).any())
+
+
+def crowd_of(
+    folders: Sequence[str | Path], *, split: str | None = None, interval: int = 1, without: Sequence[str] = ()
+) -> Crowd:
+    """Everybody with points and a label in datasets that `lidarpose prepare` or `synth` wrote.
+
+    split: of real datasets, None for all; interval: only every so many of a person's frames, as published recipes thin
+    out; without: sequences to leave out. A shard that is damaged is left out and named in `damaged`. Raises InputError
+    where nobody is left, for a folder that is no dataset, and for datasets of different skeletons.
+    """
+    folders = [Path(folder) for folder in folders]
+    rows: list[dict] = []
+    damaged: list[str] = []
+    skeletons = {}
+    for folder in folders:
+        dataset = open_dataset(folder)
+        skeletons[dataset.card.skeleton] = folder
+        if split is not None and dataset.card.people != "labelled":
+            raise file_error(folder, f"holds synthetic people, which have no split {split!r}: leave --split away")
+        for row in _rows(dataset, damaged):
+            if split is not None and row["split"] != split or row.get("sequence") in without:
+                continue
+            if row["frame"] % interval == 0 and len(row["points"]):
+                rows.append(_kept(row, dataset.card.skeleton))
+    if len(skeletons) > 1:
+        raise InputError(f"datasets that are learned together need one skeleton, got {', '.join(sorted(skeletons))}")
+    rows = [row for row in rows if not np.isnan(row["joints"]).all()]
+    if not rows:
+        where = ", ".join(map(str, folders))
+        told = f" ({len(damaged)} shards cannot be read: {damaged[0]})" if damaged else ""
+        what = "labelled people" if split is None else f"labelled people in the split {split!r}"
+        raise InputError(f"{where}: expected {what}, found none{told}; lidarpose prepare says what is there")
+    names = sorted({row["sequence"] for row in rows})
+    number = {name: k for k, name in enumerate(names)}
+    stacked = ("joints", "labels", "center", "box", "sensor_known")
+    return Crowd(
+        points=np.concatenate([row["points"] for row in rows]),
+        part=np.concatenate([row["part"] for row in rows]),
+        start=np.cumsum([0, *(len(row["points"]) for row in rows)]),
+        sequence=np.array([number[row["sequence"]] for row in rows]),
+        sequences=tuple(names),
+        skeleton=next(iter(skeletons)),
+        dataset=str(open_dataset(folders[0]).card.settings.get("dataset", "")),
+        damaged=tuple(damaged),
+        centers={name: np.stack([row["centers"][name] for row in rows]) for name in CENTERS},
+        **{name: np.stack([row[name] for row in rows]) for name in stacked},
+    )
+
+
+def _rows(dataset: Dataset, damaged: list[str]):
+    """The rows of people, shard by shard; of a shard that breaks off, what came before."""
+    for shard in range(dataset.card.shards):
+        # a missing shard is an error: the dataset is not finished
+        try:
+            yield from dataset.rows(shards=range(shard, shard + 1))
+        except InputError as error:
+            if "is missing" in str(error):
+                raise
+            damaged.append(str(error))
+
+
+def _kept(row: dict, name: str) -> dict:
+    of = skeleton(name)
+    place = [BODY26.index(joint) for joint in of.joints]
+    joints = np.full((len(BODY26), 3), np.nan, np.float32)
+    joints[place] = row["joints"].reshape(-1, 3)
+    labels = np.full(len(BODY26), UNLABELED, np.uint8)
+    real = "joint_labels" in row
+    labels[place] = row["joint_labels"] if real else SEEN
+    points = row["points"].reshape(-1, 3)
+    part = np.full(len(points), UNKNOWN_PART, np.int16) if row["part"] is None else row["part"].astype(np.int16)
+    nowhere = np.full(3, np.nan)
+    centers = {name: row.get(f"center_{name}") for name in CENTERS}
+    box = np.full(7, np.nan)
+    if row["box_center"] is not None:
+        box = np.array([*row["box_center"], *row["box_size"], row["box_yaw"]])
+    return {
+        "points": points,
+        "part": part,
+        "joints": joints,
+        "labels": labels,
+        "center": np.asarray(row["center"], float),
+        "centers": {name: nowhere if at is None else np.asarray(at, float) for name, at in centers.items()},
+        "box": box,
+        "sensor_known": not real or row["distance"] is not None,
+        "sequence": f"{row['sequence']}" if real else "",
+    }

@@ -1,0 +1,177 @@
+"""What a recipe comes to: the task, where people come from, the weights to begin with, whom to validate on."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from torch import nn
+
+from lidarpose.errors import InputError
+from lidarpose.model.dapt.config import CONFIGS, named_config
+from lidarpose.model.header import Header
+from lidarpose.model.presets import SIZES, preset
+from lidarpose.skeleton import SMPL24, Skeleton, skeleton
+from lidarpose.train.augment import Augmentation, augmentation, augmented
+from lidarpose.train.crowd import Crowd, crowd_of
+from lidarpose.train.example import Example
+from lidarpose.train.pose_task import PoseTask
+from lidarpose.train.recipes import PAPER, Finetune, Pretrain, Recipe
+from lidarpose.train.sources import MixedSource, Source, StoredSource, SyntheticSource
+from lidarpose.train.task import Task
+
+# people to validate on; synthesized ones are of a seed that no run learns from
+VALIDATION = 256
+_VALIDATION_SEED = 2**31 - 7
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """people: how many are seen in all; validation: whom to validate on, made once, none for nobody; joints: the
+    skeleton to draw them in; card: what the checkpoint tells besides the recipe."""
+
+    task: Task
+    source: Source
+    people: int
+    network: Callable[[], nn.Module]
+    validation: Callable[[], list[Example]]
+    joints: Skeleton
+    card: dict
+
+
+def job_of(recipe: Recipe) -> Job:
+    """Raises InputError, one line, where the recipe names what is not there."""
+    return _pretraining(recipe) if isinstance(recipe, Pretrain) else _finetuning(recipe)
+
+
+def _pretraining(recipe: Pretrain) -> Job:
+    if recipe.size == PAPER:
+        from lidarpose.train.dapt_task import DaptTask
+
+        task = DaptTask(config=replace(named_config("pretrain"), legacy=False), stage="pretrain")
+    elif recipe.size not in SIZES:
+        preset(recipe.size)
+    else:
+        task = PoseTask(config=preset(recipe.size), bone=recipe.bone, symmetry=recipe.symmetry)
+    scene = {"scene": recipe.scene, "motion": recipe.motion, "subjects": recipe.subjects, "captured": recipe.captured}
+    if recipe.shards:
+        source = StoredSource(folders=recipe.shards, seed=recipe.seed, augmentation=Augmentation(turn=1.0, flip=0.5))
+    else:
+        source = SyntheticSource(seed=recipe.seed, easy=recipe.easy * recipe.people, **scene)
+
+    def validation() -> list[Example]:
+        held_out = SyntheticSource(seed=_VALIDATION_SEED, **scene)
+        return [held_out.example(index) for index in range(VALIDATION)]
+
+    joints = skeleton("human15") if recipe.size == PAPER else SMPL24
+    return Job(
+        task=task,
+        source=source,
+        people=recipe.people,
+        network=task.network,
+        validation=validation,
+        joints=joints,
+        card={"motion": None if recipe.motion is None else Path(recipe.motion).name},
+    )
+
+
+def _finetuning(recipe: Finetune) -> Job:
+    from lidarpose.infer.predictor import weights_path
+    from lidarpose.model.checkpoint import load_checkpoint
+
+    path = weights_path(recipe.init)
+    network, header = load_checkpoint(path)
+    split = None if recipe.split == "all" else recipe.split
+    kind = augmentation(recipe.augment)
+    held_out, watched = _held_out(recipe, split)
+    people = StoredSource(
+        folders=recipe.data,
+        seed=recipe.seed,
+        augmentation=kind,
+        split=split,
+        interval=recipe.interval,
+        without=held_out,
+    )
+    source: Source = people
+    if recipe.mix:
+        other = SyntheticSource(scene=recipe.scene, seed=recipe.seed)
+        source = MixedSource(main=people, other=other, share=recipe.mix, seed=recipe.seed)
+    joints = skeleton(people.crowd.skeleton)
+    task, begun = _begun(recipe, network, header, joints, people.crowd.dataset)
+
+    def validation() -> list[Example]:
+        quiet = replace(kind, box=0.0, cut=0.0, turn=0.0, scale=0.0, flip=0.0, jitter=0.0, drop=0.0, strays=0.0)
+        rows = np.unique(np.linspace(0, len(watched) - 1, min(VALIDATION, len(watched))).astype(int)) if watched else ()
+        return [augmented(watched.person(k), quiet, np.random.default_rng([recipe.seed, k])) for k in rows]
+
+    return Job(
+        task=task,
+        source=source,
+        people=max(round(recipe.epochs * len(people.crowd)), 1),
+        network=begun,
+        validation=validation,
+        joints=joints,
+        card={
+            "init": path.name,
+            "init_card": header.card,
+            "data": [Path(folder).name for folder in recipe.data],
+            "held_out_sequences": list(held_out),
+            "damaged": list(people.crowd.damaged),
+        },
+    )
+
+
+def _held_out(recipe: Finetune, split: str | None) -> tuple[tuple[str, ...], Crowd | None]:
+    """Sequences not to learn from, and whom to validate on: the split val where there is one, else those sequences."""
+    try:
+        if split is not None:
+            return (), crowd_of(recipe.data, split="val", interval=recipe.interval)
+    except InputError:
+        # no such split
+        pass
+    everybody = crowd_of(recipe.data, split=split, interval=recipe.interval)
+    number = int(recipe.hold_out * len(everybody.sequences) + 0.5) if len(everybody.sequences) > 1 else 0
+    if not number:
+        return (), None
+    held_out = everybody.sequences[-number:]
+    try:
+        return held_out, crowd_of(
+            recipe.data,
+            split=split,
+            interval=recipe.interval,
+            without=[name for name in everybody.sequences if name not in held_out],
+        )
+    except InputError:
+        return (), None
+
+
+def _begun(
+    recipe: Finetune, network: nn.Module, header: Header, joints: Skeleton, dataset: str
+) -> tuple[Task, Callable[[], nn.Module]]:
+    """The task and the network with the weights that it begins with."""
+    if header.network == "pose":
+        return PoseTask(config=header.config, bone=recipe.bone, symmetry=recipe.symmetry), lambda: network
+    from lidarpose.train.dapt_task import DaptTask, transferred
+
+    if header.config.bins and set(joints.joints) <= set(header.config.joints):
+        # a network of this dataset's joints already, as released ones are
+        return DaptTask(config=header.config, stage="finetune"), lambda: network
+    alike = [c for c in CONFIGS.values() if c.bins and set(c.joints) == set(joints.joints)]
+    if not alike:
+        raise InputError(f"the paper's network has no configuration for the joints of {joints.name}")
+    like = next((c for c in alike if c.name == dataset), alike[0])
+    # the paper fine-tunes by heatmaps alone
+    config = replace(
+        header.config,
+        name=like.name,
+        joints=like.joints,
+        bins=like.bins,
+        ranges=like.ranges,
+        parts=0,
+        coordinates=False,
+        auxiliary=False,
+    )
+    return (
+        DaptTask(config=config, stage="finetune"),
+        lambda: transferred(network, config, keep_anchors=recipe.keep_anchors),
+    )

@@ -1,0 +1,103 @@
+"""Where people to learn from come from: made as they are needed, or read from shards and shown anew each time.
+
+A source is a function of a person's number in the run alone, so any process makes any of them, in any order.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from lidarpose.synth.bodies import PoseBank
+from lidarpose.synth.generate import Generator
+from lidarpose.synth.scene import scene_config
+from lidarpose.train.augment import Augmentation, augmented
+from lidarpose.train.crowd import Crowd, crowd_of
+from lidarpose.train.example import Example, example
+
+# first words of generators' seeds: 1 is the synthetic person's own
+_SYNTHETIC, _STORED, _ORDER, _WHICH = 2, 5, 6, 7
+
+
+class Source(Protocol):
+    """People by their number in a run. May be pickled."""
+
+    def example(self, index: int) -> Example: ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class SyntheticSource:
+    """People of a scene whose difficulty rises.
+
+    easy: how many people it takes to rise from nothing to full; below the ceiling every difficulty goes on being seen,
+    the harder ones more often; motion, subjects, captured: see `recipes.Pretrain`. Raises InputError, at once, for an
+    unknown scene and for clips that cannot be read.
+    """
+
+    scene: str
+    seed: int
+    easy: float = 0.0
+    motion: str | None = None
+    subjects: tuple[str, ...] = ()
+    captured: float = 0.0
+
+    def __post_init__(self):
+        # here, not in a worker, whose errors come wrapped in a traceback
+        self._generator  # noqa: B018
+
+    @cached_property
+    def _generator(self) -> Generator:
+        bank = PoseBank.from_clips(self.motion, self.subjects) if self.motion else None
+        captured = self.captured if bank is not None else 0.0
+        return Generator(scene=scene_config(self.scene), bank=bank, captured=captured, measure=False)
+
+    def example(self, index: int) -> Example:
+        rng = np.random.default_rng([self.seed, _SYNTHETIC, index])
+        hard = min(index / max(self.easy, 1), 1.0) * np.sqrt(rng.random())
+        return example(self._generator.person(self.seed, index, hard=hard).sample, rng)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredSource:
+    """The people of datasets, all of them once an epoch in an order of the epoch's own, each time augmented anew.
+
+    folders, split, interval, without: see `crowd.crowd_of`. Raises InputError, at once, where there is nobody.
+    """
+
+    folders: tuple[str, ...]
+    seed: int
+    augmentation: Augmentation
+    split: str | None = None
+    interval: int = 1
+    without: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        self.crowd  # noqa: B018
+
+    @cached_property
+    def crowd(self) -> Crowd:
+        return crowd_of(self.folders, split=self.split, interval=self.interval, without=self.without)
+
+    def example(self, index: int) -> Example:
+        epoch, place = divmod(index, len(self.crowd))
+        if self.__dict__.get("_epoch", (None,))[0] != epoch:
+            order = np.random.default_rng([self.seed, _ORDER, epoch]).permutation(len(self.crowd))
+            self.__dict__["_epoch"] = epoch, order
+        row = int(self.__dict__["_epoch"][1][place])
+        rng = np.random.default_rng([self.seed, _STORED, index])
+        return augmented(self.crowd.person(row), self.augmentation, rng)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MixedSource:
+    """Of `main`, and in their stead, for a `share` of people, of `other`."""
+
+    main: Source
+    other: Source
+    share: float
+    seed: int
+
+    def example(self, index: int) -> Example:
+        mixed = np.random.default_rng([self.seed, _WHICH, index]).random() < self.share
+        return (self.other if mixed else self.main).example(index)

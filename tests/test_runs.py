@@ -1,0 +1,333 @@
+"""Runs that can be killed and taken up again, numbered folders, several processes."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from lidarpose.cli import main
+from lidarpose.errors import InputError
+from lidarpose.model.checkpoint import load_checkpoint
+from lidarpose.model.network import PoseNet
+from lidarpose.model.presets import preset
+from lidarpose.train import loop, runs
+from lidarpose.train.feed import BATCHES
+from lidarpose.train.optimize import optimizers
+from lidarpose.train.pose_task import PoseTask
+from lidarpose.train.recipes import Finetune, Pretrain, recipe
+
+# three chunks of `BATCHES` batches
+RECIPE = Pretrain(
+    scene="paper", people=3 * BATCHES * 2, batch=2, workers=0, seed=5, easy=0.15, pictures=0, validate=1000
+)
+TINY = preset("tiny")
+
+
+def log_of(folder):
+    lines = [json.loads(line) for line in (folder / runs.LOG).read_text().splitlines()]
+    for line in lines:
+        assert line.pop("seconds") >= 0
+    return lines
+
+
+def assert_same_run(a, b):
+    left, right = log_of(a), log_of(b)
+    assert [line["people"] for line in left] == [line["people"] for line in right] == [16, 32, 48]
+    for x, y in zip(left, right, strict=True):
+        assert x == pytest.approx(y, abs=2e-4)
+    for name in (runs.MODEL, runs.STATE):
+        one, other = load_file(a / name), load_file(b / name)
+        assert one.keys() == other.keys()
+        for key in one:
+            torch.testing.assert_close(one[key], other[key], atol=1e-5, rtol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run") / "whole"
+    assert loop.train(RECIPE, folder) == folder / runs.MODEL
+    return folder
+
+
+class Killed(BaseException):
+    """As a signal would: nothing catches it."""
+
+
+def killed_at(monkeypatch, name, call, *, save_every=-1.0):
+    """Lets the named function of the loop be called `call` times, then kills the run."""
+    where = loop if hasattr(loop, name) else loop._Run
+    original, calls = getattr(where, name), [0]
+
+    def counted(*args, **kwargs):
+        calls[0] += 1
+        if calls[0] > call:
+            raise Killed
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr(where, name, counted)
+    monkeypatch.setattr(loop, "SAVE_EVERY", save_every)
+
+
+def broken(monkeypatch, folder, *args, recipe=RECIPE, **kwargs):
+    with monkeypatch.context() as patch:
+        killed_at(patch, *args, **kwargs)
+        with pytest.raises(Killed):
+            loop.train(recipe, folder)
+
+
+def test_an_unbroken_run(unbroken):
+    names = [runs.BEST, runs.CONFIG, runs.LOG, runs.MODEL, runs.STATE]
+    assert sorted(p.name for p in unbroken.iterdir()) == sorted(names)
+    config = json.loads((unbroken / runs.CONFIG).read_text())
+    assert config["schema"] == runs.SCHEMA and config["kind"] == "pretrain"
+    assert config["recipe"] == json.loads(json.dumps(RECIPE.to_dict()))
+    _, header = load_checkpoint(unbroken / runs.MODEL)
+    assert header.card["people_seen"] == 48 and header.card["recipe"]["seed"] == 5
+    lines = log_of(unbroken)
+    assert lines[-1]["vote"] < lines[0]["vote"]
+    # at the end at the latest
+    assert lines[-1]["validation_mm"] == header.card["validation_mm"] > 0 and "validation_mm" not in lines[0]
+
+
+@pytest.mark.parametrize(
+    "name, call, saved",
+    [
+        ("_step", 2, 0),  # before the first chunk is done: nothing saved yet
+        ("_step", BATCHES + 2, 1),  # within the second chunk
+        ("save_state", 1, 1),  # the second chunk is in the log but not in the state
+        ("_save", 1, 1),  # a validation may have been told
+        ("save_state", 2, 2),
+    ],
+)
+def test_a_killed_run_goes_on_to_the_same_end(monkeypatch, tmp_path, unbroken, name, call, saved):
+    folder = tmp_path / "run"
+    broken(monkeypatch, folder, name, call)
+    assert (folder / runs.STATE).exists() == bool(saved)
+    loop.train(RECIPE, folder, resume=True)
+    assert_same_run(folder, unbroken)
+
+
+def test_half_a_line_in_the_log_is_no_obstacle(monkeypatch, tmp_path, unbroken):
+    folder = tmp_path / "run"
+    broken(monkeypatch, folder, "_step", BATCHES)
+    with open(folder / runs.LOG, "a") as log:
+        log.write('{"people": 32, "sec')
+    loop.train(RECIPE, folder, resume=True)
+    assert_same_run(folder, unbroken)
+
+
+def test_a_finished_run_stays_as_it_is(tmp_path, unbroken):
+    before = {p.name: p.read_bytes() for p in unbroken.iterdir()}
+    assert loop.train(RECIPE, unbroken, resume=True) == unbroken / runs.MODEL
+    assert before == {p.name: p.read_bytes() for p in unbroken.iterdir()}
+    with pytest.raises(InputError, match="expected a new or empty folder"):
+        loop.train(RECIPE, unbroken)
+    assert before == {p.name: p.read_bytes() for p in unbroken.iterdir()}
+
+
+@pytest.mark.parametrize("change", [{"seed": 6}, {"batch": 16}, {"rate": 1e-3}, {"scene": "wild"}, {"muon_rate": 0.0}])
+def test_a_run_keeps_its_recipe(unbroken, change):
+    with pytest.raises(InputError, match=f"the run has {next(iter(change))} = .* a run keeps its recipe"):
+        loop.train(replace(RECIPE, **change), unbroken, resume=True)
+
+
+def test_a_run_may_become_longer(monkeypatch, tmp_path):
+    folder = tmp_path / "run"
+    broken(monkeypatch, folder, "_step", BATCHES)
+    loop.train(replace(RECIPE, people=32, workers=1), folder, resume=True)
+    assert [line["people"] for line in log_of(folder)] == [16, 32]
+
+
+def test_nothing_to_resume(tmp_path):
+    with pytest.raises(InputError, match="nothing to resume"):
+        loop.train(RECIPE, tmp_path, resume=True)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"scene": "moon"}, "unknown scene 'moon'"),
+        ({"size": "huge"}, "unknown network size 'huge'"),
+        ({"motion": "/no/clips.npz", "subjects": ("a",)}, "no such file"),
+    ],
+)
+def test_a_recipe_that_cannot_be_is_one_line_and_leaves_no_folder(tmp_path, workers, change, message):
+    with pytest.raises(InputError, match=message) as caught:
+        loop.train(replace(RECIPE, workers=workers, **change), tmp_path / "run")
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "run").exists()
+
+
+def copied(unbroken, folder):
+    folder.mkdir()
+    for path in unbroken.iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+    return folder
+
+
+@pytest.mark.parametrize("name", [runs.STATE, runs.CONFIG])
+@pytest.mark.parametrize("content", [b"", b"rubbish", b"{}", b"[1]", None])
+def test_a_damaged_run_says_so(tmp_path, unbroken, name, content):
+    folder = copied(unbroken, tmp_path / "run")
+    whole = (folder / name).read_bytes()
+    (folder / name).write_bytes(whole[: len(whole) // 2] if content is None else content)
+    with pytest.raises(InputError, match="damaged") as caught:
+        loop.train(RECIPE, folder, resume=True)
+    assert "\n" not in str(caught.value) and str(folder / name) in str(caught.value)
+
+
+def test_the_state_of_another_network_is_refused(tmp_path, unbroken):
+    folder = copied(unbroken, tmp_path / "run")
+    (folder / runs.STATE).write_bytes((folder / runs.MODEL).read_bytes())
+    with pytest.raises(InputError, match="damaged"):
+        loop.train(RECIPE, folder, resume=True)
+    other = replace(TINY, channels=(32, 32, 32))
+    network = PoseNet(other)
+    mean = dict(network.named_parameters())
+    progress = {"chunk": 1, "seconds": 0.0, "best": None}
+    loop.save_state(folder / runs.STATE, network, mean, optimizers(network, RECIPE), progress)
+    with pytest.raises(InputError, match="not of this network") as caught:
+        loop.train(RECIPE, folder, resume=True)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_last_good_state(monkeypatch, tmp_path, unbroken):
+    folder, calls = tmp_path / "run", [0]
+
+    original = PoseTask.terms
+
+    def poisoned(*args, **kwargs):
+        calls[0] += 1
+        terms = original(*args, **kwargs)
+        return terms | {"vote": terms["vote"] * float("nan")} if calls[0] > BATCHES + 3 else terms
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PoseTask, "terms", poisoned)
+        patch.setattr(loop, "SAVE_EVERY", -1.0)
+        told = "not finite in batch 3 of people 16 to 31: start again with a lower --rate; state.safetensors is kept"
+        with pytest.raises(InputError, match=told):
+            loop.train(RECIPE, folder)
+    assert [line["people"] for line in log_of(folder)] == [16]
+    assert all(torch.isfinite(value).all() for value in load_file(folder / runs.STATE).values())
+    # the state is as good as new
+    loop.train(RECIPE, folder, resume=True)
+    assert_same_run(folder, unbroken)
+
+
+def test_an_absurd_rate_stops_the_run(tmp_path):
+    with pytest.raises(InputError, match="not finite in batch [0-9] of people 0 to 15"):
+        loop.train(replace(RECIPE, rate=1e30), tmp_path / "run")
+
+
+def test_the_command_line_trains_and_goes_on(tmp_path, capsys):
+    folder = tmp_path / "run"
+    words = ["pretrain", str(folder), "--people", "8", "--batch", "2", "--scene", "paper", "--workers", "0"]
+    assert not main(words)
+    assert str(folder / runs.MODEL) in capsys.readouterr().out
+    command = load_checkpoint(folder / runs.MODEL)[1].card["command"]
+    assert command == "lidarpose pretrain --batch 2 --workers 0 --scene paper --people 8"
+    assert main(words) == 2
+    assert "expected a new or empty folder" in capsys.readouterr().err
+    # what is not said again stays as it was
+    assert not main(["pretrain", str(folder), "--resume"])
+    assert not capsys.readouterr().err
+    assert main(["pretrain", str(folder), "--resume", "--batch", "4"]) == 2
+    assert "the run has batch = 2, got 4" in capsys.readouterr().err
+    assert main(["finetune", "some", "--out", str(folder), "--resume"]) == 2
+    assert "`lidarpose pretrain`" in capsys.readouterr().err
+    pictures = sorted(path.name for path in (folder / runs.PICTURES).iterdir())
+    assert pictures and all(name.endswith(".png") for name in pictures)
+
+
+def test_runs_without_a_name_are_numbered(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["pretrain", "--people", "4", "--batch", "2", "--scene", "paper", "--workers", "0", "--pictures", "0"]
+    assert not main(words) and not main(words)
+    assert sorted(path.name for path in (tmp_path / runs.RUNS).iterdir()) == ["pretrain-001", "pretrain-002"]
+    assert runs.latest("pretrain").name == "pretrain-002"
+    assert not main(["pretrain", "--resume"])
+    assert capsys.readouterr().out.split()[-1] == str(runs.Path(runs.RUNS) / "pretrain-002" / runs.MODEL)
+    with pytest.raises(InputError, match="has no run finetune-... to resume"):
+        runs.latest("finetune")
+    # a name that is taken meanwhile is passed over
+    (tmp_path / runs.RUNS / "pretrain-003").mkdir()
+    assert runs.numbered("pretrain").name == "pretrain-004"
+
+
+@pytest.mark.parametrize(
+    "words, told",
+    [
+        (["--people", "many"], "--people: expected a whole number, got 'many'"),
+        (["--rate", "fast"], "--rate: expected a number, got 'fast'"),
+        (["--recipe", "best"], "unknown recipe 'best'"),
+        (["--schedule", "steps"], "unknown schedule 'steps'"),
+        (["--shards", "nowhere"], "is no dataset"),
+        (["--cool", "1.5"], "cool must be a share"),
+        (["--tracker", "paper"], "cannot train so"),
+    ],
+)
+def test_wrong_words_are_one_line_and_leave_no_folder(tmp_path, monkeypatch, capsys, words, told):
+    monkeypatch.chdir(tmp_path)
+    assert main(["pretrain", "--people", "4", "--batch", "2", "--workers", "0", *words]) == 2
+    error = capsys.readouterr().err
+    assert told in error and error.count("\n") == 1
+    assert not list(tmp_path.glob("runs/*/*"))
+
+
+def test_named_recipes():
+    assert recipe(Pretrain) == Pretrain()
+    paper = recipe(Pretrain, "paper", people=5)
+    # Paper: AdamW, cosine, batch 64, 3e-4 and 5e-4, 50 epochs
+    assert (paper.size, paper.scene, paper.batch, paper.rate, paper.people) == ("paper", "paper", 64, 3e-4, 5)
+    assert paper.schedule == "cosine" and not (paper.muon_rate or paper.ema or paper.clip)
+    fine = recipe(Finetune, "paper", data=("a",))
+    assert (fine.rate, fine.epochs, fine.mix, fine.augment, fine.keep_anchors) == (5e-4, 50, 0, "paper", False)
+    with pytest.raises(InputError, match="fine-tuning needs a dataset"):
+        recipe(Finetune)
+
+
+TWO = """
+import sys, torch
+torch.set_num_threads(1)
+from lidarpose.train.loop import train
+from lidarpose.train.recipes import Finetune, Pretrain, recipe
+train(Pretrain(scene="paper", people=64, batch=4, workers=0, seed=3, easy=0.15, pictures=0, validate=1000, rate=2e-4, muon_rate=2e-3),
+      sys.argv[1], resume=len(sys.argv) > 2)
+"""
+
+
+def launched(folder, processes, *words):
+    """Trains as torch's and Accelerate's launchers would have it."""
+    common = os.environ | {"OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1", "WORLD_SIZE": str(processes)}
+    common |= {"MASTER_PORT": str(29000 + os.getpid() % 3000), "ACCELERATE_USE_CPU": "true"}
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-c", TWO, str(folder), *words],
+            env=common | {"RANK": str(rank), "LOCAL_RANK": str(rank)},
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for rank in range(processes)
+    ]
+    for process in started:
+        _, error = process.communicate(timeout=240)
+        assert process.returncode == 0, error
+
+
+def test_two_processes_take_the_same_steps_as_one(tmp_path):
+    launched(tmp_path / "two", 2)
+    launched(tmp_path / "one", 1)
+    one, two = (log_of(tmp_path / name) for name in ("one", "two"))
+    assert [line["people"] for line in two] == [line["people"] for line in one] == [32, 64]
+    for a, b in zip(one, two, strict=True):
+        assert b == pytest.approx(a, rel=2e-3, abs=2e-4)
+    weights = [load_file(tmp_path / name / runs.MODEL) for name in ("one", "two")]
+    for name, value in weights[0].items():
+        torch.testing.assert_close(weights[1][name], value, atol=3e-4, rtol=1e-2, msg=name)
