@@ -15,8 +15,9 @@ import torch
 import lidarpose
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.infer.backend import Raw, estimates
-from lidarpose.infer.predictor import Predictor, bundled_path, load
+from lidarpose.infer.predictor import Predictor, load
 from lidarpose.model import decode, heads
+from lidarpose.model.bundled import bundled_path
 from lidarpose.model.checkpoint import import_released, load_checkpoint, save_checkpoint
 from lidarpose.model.dapt.config import DaptConfig
 from lidarpose.model.dapt.network import DaptNet

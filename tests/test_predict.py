@@ -476,7 +476,7 @@ def test_a_sweep_of_another_up_axis_is_told(model, tmp_path, points):
 
 
 def test_load_takes_names_and_paths(model, points, tmp_path, monkeypatch):
-    from lidarpose.infer.predictor import bundled_path
+    from lidarpose.model.bundled import bundled_path
 
     copy = tmp_path / "mine.safetensors"
     copy.write_bytes(bundled_path("tiny").read_bytes())

@@ -18,7 +18,7 @@ FLOORS = (
     {"body", "lidar", "synth", "data"},
     {"model"},
     {"train", "evaluate"},
-    {"infer", "view", "demo", "cli", "metrics", "__init__", "__main__"},
+    {"infer", "view", "demo", "cli", "metrics", "evaluation", "__init__", "__main__"},
 )
 NO_TORCH = ({"torch", "safetensors"}, FLOORS[0] | FLOORS[1])
 STRANGERS = {("synth", "model"), ("model", "synth")}

@@ -16,7 +16,7 @@ from lidarpose.model.checkpoint import load_checkpoint
 from lidarpose.model.network import PoseNet
 from lidarpose.model.presets import preset
 from lidarpose.train import loop, runs
-from lidarpose.train.feed import BATCHES
+from lidarpose.train.feed import BATCHES, lanes_of
 from lidarpose.train.optimize import optimizers
 from lidarpose.train.pose_task import PoseTask
 from lidarpose.train.recipes import Finetune, Pretrain, recipe
@@ -293,23 +293,32 @@ def test_named_recipes():
         recipe(Finetune)
 
 
-TWO = """
-import sys, torch
-torch.set_num_threads(1)
-from lidarpose.train.loop import train
-from lidarpose.train.recipes import Finetune, Pretrain, recipe
-train(Pretrain(scene="paper", people=64, batch=4, workers=0, seed=3, easy=0.15, pictures=0, validate=1000, rate=2e-4, muon_rate=2e-3),
-      sys.argv[1], resume=len(sys.argv) > 2)
-"""
+SHARED = Pretrain(
+    scene="paper",
+    people=64,
+    batch=4,
+    workers=0,
+    seed=3,
+    easy=0.15,
+    pictures=0,
+    validate=1000,
+    rate=2e-4,
+    muon_rate=2e-3,
+)
 
 
-def launched(folder, processes, *words):
+def launched(recipe, folder, processes):
     """Trains as torch's and Accelerate's launchers would have it."""
+    code = (
+        "import sys, json, torch; torch.set_num_threads(1)\n"
+        "from lidarpose.train.loop import train; from lidarpose.train.recipes import Pretrain\n"
+        "train(Pretrain(**json.loads(sys.argv[1])), sys.argv[2])"
+    )
     common = os.environ | {"OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1", "WORLD_SIZE": str(processes)}
     common |= {"MASTER_PORT": str(29000 + os.getpid() % 3000), "ACCELERATE_USE_CPU": "true"}
     started = [
         subprocess.Popen(
-            [sys.executable, "-c", TWO, str(folder), *words],
+            [sys.executable, "-c", code, json.dumps(recipe.to_dict()), str(folder)],
             env=common | {"RANK": str(rank), "LOCAL_RANK": str(rank)},
             stderr=subprocess.PIPE,
             text=True,
@@ -322,8 +331,8 @@ def launched(folder, processes, *words):
 
 
 def test_two_processes_take_the_same_steps_as_one(tmp_path):
-    launched(tmp_path / "two", 2)
-    launched(tmp_path / "one", 1)
+    launched(SHARED, tmp_path / "two", 2)
+    loop.train(SHARED, tmp_path / "one")
     one, two = (log_of(tmp_path / name) for name in ("one", "two"))
     assert [line["people"] for line in two] == [line["people"] for line in one] == [32, 64]
     for a, b in zip(one, two, strict=True):
@@ -331,3 +340,9 @@ def test_two_processes_take_the_same_steps_as_one(tmp_path):
     weights = [load_file(tmp_path / name / runs.MODEL) for name in ("one", "two")]
     for name, value in weights[0].items():
         torch.testing.assert_close(weights[1][name], value, atol=3e-4, rtol=1e-2, msg=name)
+
+
+def test_a_batch_that_cannot_be_shared_out_is_refused():
+    assert lanes_of(64, 1) == lanes_of(64, 2) == 4 and lanes_of(64, 8) == 8 and lanes_of(3, 1) == 1
+    with pytest.raises(InputError, match="a batch of 64 cannot be shared out evenly among 3 processes"):
+        lanes_of(64, 3)

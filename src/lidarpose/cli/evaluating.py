@@ -1,5 +1,182 @@
 """`lidarpose evaluate` and `table`."""
 
+import argparse
+import shlex
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+# groups of lines that the terminal shows; the others are in scores.json
+_SHOWN = ("condition", "plain", "joints", "distance, m", "points", "hidden share")
+# figures of these groups that it shows, besides those of everybody
+_TOLD = ("mpjpe", "turned_round")
+_FIGURES = {"mpjpe": "MPJPE", "pa_mpjpe": "PA-MPJPE", "pck3": "PCK-3", "pck5": "PCK-5"}
+
 
 def add(commands) -> None:
     """Adds the commands to the parser's."""
+    evaluate = commands.add_parser(
+        "evaluate",
+        help="judge a checkpoint on datasets",
+        description="Prints figures and writes scores.json, poses.parquet and pictures into a folder.",
+    )
+    evaluate.set_defaults(run=_evaluate)
+    evaluate.add_argument(
+        "weights", metavar="CHECKPOINT", help="bundled weights (tiny), a checkpoint or an exported .onnx"
+    )
+    evaluate.add_argument(
+        "datasets", nargs="+", metavar="DATASET", help="a folder that prepare or synth wrote, or bench"
+    )
+    evaluate.add_argument(
+        "--protocol", default="clean", metavar="NAME", help="clean (default), or dapt: the released code's oracles"
+    )
+    evaluate.add_argument("--split", metavar="NAME", help="default test, else val, else everybody; all for everybody")
+    evaluate.add_argument("--skeleton", metavar="NAME", help="judge its joints (default: the dataset's)")
+    evaluate.add_argument("--limit", type=int, metavar="N", help="only N people, evenly spread")
+    evaluate.add_argument("--stability", action="store_true", help="also disturb the points, and draw the curves")
+    evaluate.add_argument("--legacy", action="store_true", help="also the released code's arithmetic")
+    evaluate.add_argument(
+        "--sensor-unknown", action="store_true", help="do not tell the network where the sensor stood"
+    )
+    evaluate.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="of displaced boxes and intervals (default 0)"
+    )
+    evaluate.add_argument("--out", metavar="DIR", help="a new or empty folder (default evaluation/NAME, numbered)")
+    evaluate.add_argument("--device", default="cpu", metavar="NAME", help="cpu (default), or cuda with torch")
+    evaluate.add_argument("--backend", metavar="NAME", help="onnx or torch, as in lidarpose predict")
+
+    table = commands.add_parser(
+        "table",
+        help="scores beside the paper's Table 1",
+        description="Lays scores.json files beside the figures that the paper prints, by protocol.",
+    )
+    table.set_defaults(run=_table)
+    table.add_argument("scores", nargs="*", metavar="FILE|DIR", help="scores.json, or folders that hold one")
+    table.add_argument("--format", default="markdown", metavar="NAME", help="markdown (default) or json")
+    table.add_argument("--out", metavar="FILE", help="default: print it")
+
+
+def _evaluate(options: argparse.Namespace) -> None:
+    from lidarpose import evaluation
+
+    folder = evaluation.new_folder(options.weights) if options.out is None else evaluation.check_folder(options.out)
+    with ExitStack() as stack:
+        found = evaluation.run(
+            options.weights,
+            options.datasets,
+            protocol=options.protocol,
+            split=options.split,
+            skeleton=options.skeleton,
+            limit=options.limit,
+            stability=options.stability,
+            legacy=options.legacy,
+            sensor_unknown=options.sensor_unknown,
+            seed=options.seed,
+            device=options.device,
+            backend=options.backend,
+            command=_command(options),
+            progress=_bar(stack) if sys.stderr is not None and sys.stderr.isatty() else None,
+        )
+    written = evaluation.write(found, folder)
+    for result in found.scores.results:
+        print("\n".join(_lines(result)))
+    for study in found.studies:
+        print("\n".join(_study(study)))
+    print(f"{', '.join(path.name for path in written)} -> {folder}", file=sys.stderr)
+
+
+def _table(options: argparse.Namespace) -> None:
+    from lidarpose import evaluation
+    from lidarpose.data.files import write_atomic
+
+    text = evaluation.table(options.scores, format=options.format)
+    if options.out is None:
+        print(text, end="")
+    else:
+        write_atomic(options.out, text)
+        print(options.out)
+
+
+def _command(options: argparse.Namespace) -> str:
+    """What was asked for, as it would be typed."""
+    words = ["lidarpose", "evaluate", options.weights, *options.datasets]
+    defaults = {"protocol": "clean", "seed": 0, "device": "cpu"}
+    for name in ("protocol", "split", "skeleton", "limit", "seed", "device", "backend"):
+        value = getattr(options, name)
+        if value is not None and value != defaults.get(name):
+            words += [f"--{name}", str(value)]
+    for name in ("stability", "legacy", "sensor_unknown"):
+        if getattr(options, name):
+            words.append(f"--{name.replace('_', '-')}")
+    return shlex.join(words)
+
+
+def _bar(stack: ExitStack):
+    """progress(dataset, done, total) that draws a bar for each dataset; `stack` closes the last."""
+    from tqdm import tqdm
+
+    bars: dict[str, tqdm] = {}
+
+    def progress(dataset: str, done: int, total: int) -> None:
+        if dataset not in bars:
+            bars[dataset] = stack.enter_context(tqdm(total=total or None, desc=dataset, unit=" people", leave=False))
+        bars[dataset].update(done - bars[dataset].n)
+
+    return progress
+
+
+def _lines(result) -> Iterator[str]:
+    """The result for a terminal: everybody first, then by condition, joint, distance, points, hidden share."""
+    setting, counts = result.setting, result.counts
+    yield f"{setting.dataset}: {counts['people']:,} people, {len(setting.joints)} joints, {setting.method}"
+    yield f"  protocol {setting.protocol}; center: {setting.centring}; crop: {setting.crop}"
+    split = setting.split + (f" ({setting.split_source})" if setting.split_source else "")
+    yield f"  split {split}; the sensor's place is {setting.sensor}"
+    for note in result.notes:
+        yield f"  note: {note}"
+    if counts["without a pose"]:
+        yield f"  without a pose, and in no figure: {counts['without a pose']:,} people"
+    for reason, entry in result.skipped.items():
+        yield f"  skipped {entry['count']:,}: {reason} (first: {entry['first']})"
+    shown = [line for line in result.lines if _is_shown(line)]
+    names = [_named(line, setting) for line in shown]
+    wide = max(map(len, names), default=0)
+    yield f"  {'':<{wide}}{'value':>8}  {'95 % interval':<16}{'people':>8}"
+    for name, line in zip(names, shown, strict=True):
+        yield f"  {name:<{wide}}{_value(line):>8}  {_ends(line):<16}{line.people:>8,}  {setting.told}"
+
+
+def _is_shown(line) -> bool:
+    return line.group == "all" or line.group in _SHOWN and line.figure in _TOLD and line.arithmetic == "lidarpose"
+
+
+def _named(line, setting) -> str:
+    words = _FIGURES.get(line.figure, line.figure.replace("_", " "))
+    if line.group == "plain":
+        words += f", {line.of}"
+    elif line.group != "all":
+        words += f", {line.group.removesuffix(', m')} {line.of}{' m' if line.group.endswith(', m') else ''}"
+    if line.arithmetic != "lidarpose":
+        words += ", released arithmetic"
+    if line.method != setting.method:
+        words = f"{line.method.removeprefix('floor: ')}: {words}"
+    return f"{words}, {line.unit}"
+
+
+def _value(line) -> str:
+    return "-" if line.value is None else f"{line.value:.1f}"
+
+
+def _ends(line) -> str:
+    return "" if line.low is None else f"[{line.low:.1f}, {line.high:.1f}]"
+
+
+def _study(study) -> Iterator[str]:
+    yield f"{study.setting.method} disturbed: MPJPE in mm of {study.who} · {study.setting.told}"
+    for curve in study.curves:
+        points = (f"{p.label}: {'-' if p.mpjpe is None else f'{p.mpjpe:.1f}'}" for p in curve.points)
+        yield f"  {curve.title:<38} {'  '.join(points)}"
+    for end in study.ends:
+        yield f"  {end.group} of the worst {end.worst:,}: {end.mean:.1f} mm, deviation {end.deviation:.1f}"
+    for note in study.notes:
+        yield f"  note: {note}"

@@ -58,6 +58,7 @@ def _train(options: argparse.Namespace) -> None:
     from lidarpose.train.loop import train
     from lidarpose.train.recipes import recipe
     from lidarpose.train.runs import latest, stored_recipe
+    from lidarpose.view.progress import draw_examples
 
     kind: type[Recipe] = options.kind
     name = kind.__name__.lower()
@@ -80,7 +81,15 @@ def _train(options: argparse.Namespace) -> None:
     words += ["--resume"] * options.resume
     sets = [Path(data).name for data in changes.get("data", ())]
     command = " ".join(["lidarpose", name, *sets, *words])
-    path = train(wanted, folder, resume=options.resume, command=command, device=options.device, tracker=options.tracker)
+    path = train(
+        wanted,
+        folder,
+        resume=options.resume,
+        command=command,
+        device=options.device,
+        tracker=options.tracker,
+        draw=draw_examples,
+    )
     if os.environ.get("RANK", "0") == "0":
         print(path)
 

@@ -41,7 +41,7 @@ def _info(options: argparse.Namespace) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
-    from lidarpose.infer.predictor import weights_path
+    from lidarpose.model.bundled import weights_path
     from lidarpose.model.export import FORMATS, export
 
     path = weights_path(options.weights)

@@ -5,7 +5,7 @@ from importlib import metadata
 from importlib.util import find_spec
 
 from lidarpose._version import __version__
-from lidarpose.infer.predictor import BUNDLED, bundled_path
+from lidarpose.model.bundled import BUNDLED, bundled_path
 from lidarpose.model.header import parameter_count, read_header
 from lidarpose.model.onnx_file import usable_threads
 

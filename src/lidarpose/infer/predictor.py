@@ -2,7 +2,6 @@
 
 import os
 from dataclasses import replace
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from lidarpose.errors import InputError, missing_extra, unknown_name
 from lidarpose.infer.backend import Backend, Estimates, OnnxBackend, estimates, exported_beside
 from lidarpose.infer.people import MIN_POINTS, as_origin, as_points, candidates, clean, unit_warning
 from lidarpose.infer.results import PersonPose, Poses
+from lidarpose.model.bundled import BUNDLED, weights_path
 from lidarpose.model.decode import decoder
 from lidarpose.model.header import read_header
 from lidarpose.model.plan import WINDOW, view_features
@@ -19,7 +19,6 @@ from lidarpose.sample import Pose, center_of
 from lidarpose.skeleton import SMPL24, Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
 
-BUNDLED = ("tiny",)
 BACKENDS = ("onnx", "torch")
 # passes: the second is centered on the pelvis that the first one found
 PASSES = 2
@@ -28,21 +27,6 @@ PASSES = 2
 _CENTER_STEP = 0.01
 # joints named by a warning
 _MOST_NAMED = 3
-
-
-def bundled_path(name: str = "tiny", suffix: str = ".safetensors") -> Path:
-    """Where the package keeps a bundled checkpoint, or with the suffix .onnx its exported twin."""
-    if name not in BUNDLED:
-        raise unknown_name("bundled weights", name, BUNDLED)
-    return Path(str(resources.files("lidarpose.model") / "weights" / f"{name}{suffix}"))
-
-
-def weights_path(weights: str | os.PathLike) -> Path:
-    """The file that a name of bundled weights or a path means. Raises InputError for an unknown name."""
-    name = os.fspath(weights)
-    is_path = not isinstance(weights, str) or "/" in name or name.endswith((".safetensors", ".onnx"))
-    is_path = name not in BUNDLED and (is_path or os.path.isfile(name))
-    return Path(name) if is_path else bundled_path(name)
 
 
 def load(

@@ -7,22 +7,24 @@ from pathlib import Path
 import numpy as np
 from torch import nn
 
-from lidarpose.errors import InputError
-from lidarpose.model.dapt.config import CONFIGS, named_config
+from lidarpose.errors import InputError, unknown_name
+from lidarpose.model.dapt.config import CONFIGS
 from lidarpose.model.header import Header
 from lidarpose.model.presets import SIZES, preset
-from lidarpose.skeleton import SMPL24, Skeleton, skeleton
+from lidarpose.skeleton import HUMAN15, SMPL24, Skeleton, skeleton
 from lidarpose.train.augment import Augmentation, augmentation, augmented
 from lidarpose.train.crowd import Crowd, crowd_of
 from lidarpose.train.example import Example
 from lidarpose.train.pose_task import PoseTask
-from lidarpose.train.recipes import PAPER, Finetune, Pretrain, Recipe
+from lidarpose.train.recipes import PAPER, SMALL_PAPER, Finetune, Pretrain, Recipe
 from lidarpose.train.sources import MixedSource, Source, StoredSource, SyntheticSource
 from lidarpose.train.task import Task
 
 # people to validate on; synthesized ones are of a seed that no run learns from
 VALIDATION = 256
 _VALIDATION_SEED = 2**31 - 7
+# of fewer sequences none is held out
+_LEAST_SEQUENCES = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,20 +41,25 @@ class Job:
     card: dict
 
 
-def job_of(recipe: Recipe) -> Job:
-    """Raises InputError, one line, where the recipe names what is not there."""
-    return _pretraining(recipe) if isinstance(recipe, Pretrain) else _finetuning(recipe)
+def job_of(recipe: Recipe, *, on_cpu: bool = True) -> Job:
+    """on_cpu: where the network will run, which decides the layout of the paper's tables. Raises InputError, one line,
+    where the recipe names what is not there."""
+    job = _pretraining(recipe) if isinstance(recipe, Pretrain) else _finetuning(recipe)
+    if isinstance(job.task, PoseTask) or on_cpu:
+        return job
+    return replace(job, task=replace(job.task, layout="padded"))
 
 
 def _pretraining(recipe: Pretrain) -> Job:
-    if recipe.size == PAPER:
-        from lidarpose.train.dapt_task import DaptTask
+    if recipe.size in (PAPER, SMALL_PAPER):
+        from lidarpose.train.dapt_task import DaptTask, pretraining_config, small
 
-        task = DaptTask(config=replace(named_config("pretrain"), legacy=False), stage="pretrain")
-    elif recipe.size not in SIZES:
-        preset(recipe.size)
-    else:
+        config = pretraining_config()
+        task = DaptTask(config=config if recipe.size == PAPER else small(config), stage="pretrain")
+    elif recipe.size in SIZES:
         task = PoseTask(config=preset(recipe.size), bone=recipe.bone, symmetry=recipe.symmetry)
+    else:
+        raise unknown_name("network size", recipe.size, (*SIZES, PAPER, SMALL_PAPER))
     scene = {"scene": recipe.scene, "motion": recipe.motion, "subjects": recipe.subjects, "captured": recipe.captured}
     if recipe.shards:
         source = StoredSource(folders=recipe.shards, seed=recipe.seed, augmentation=Augmentation(turn=1.0, flip=0.5))
@@ -63,7 +70,7 @@ def _pretraining(recipe: Pretrain) -> Job:
         held_out = SyntheticSource(seed=_VALIDATION_SEED, **scene)
         return [held_out.example(index) for index in range(VALIDATION)]
 
-    joints = skeleton("human15") if recipe.size == PAPER else SMPL24
+    joints = SMPL24 if isinstance(task, PoseTask) else HUMAN15
     return Job(
         task=task,
         source=source,
@@ -76,7 +83,7 @@ def _pretraining(recipe: Pretrain) -> Job:
 
 
 def _finetuning(recipe: Finetune) -> Job:
-    from lidarpose.infer.predictor import weights_path
+    from lidarpose.model.bundled import weights_path
     from lidarpose.model.checkpoint import load_checkpoint
 
     path = weights_path(recipe.init)
@@ -130,8 +137,8 @@ def _held_out(recipe: Finetune, split: str | None) -> tuple[tuple[str, ...], Cro
         # no such split
         pass
     everybody = crowd_of(recipe.data, split=split, interval=recipe.interval)
-    number = int(recipe.hold_out * len(everybody.sequences) + 0.5) if len(everybody.sequences) > 1 else 0
-    if not number:
+    number = max(round(recipe.hold_out * len(everybody.sequences)), 1)
+    if not recipe.hold_out or len(everybody.sequences) < _LEAST_SEQUENCES:
         return (), None
     held_out = everybody.sequences[-number:]
     try:

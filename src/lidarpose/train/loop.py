@@ -26,7 +26,7 @@ from lidarpose.train.recipes import Recipe
 from lidarpose.train.runs import BEST, LOG, MODEL, STATE, begin, check_same, cut_log, latest, numbered, stored_recipe
 from lidarpose.train.state import load_state, save_state
 from lidarpose.train.task import total
-from lidarpose.train.validation import Validation
+from lidarpose.train.validation import Draw, Validation
 
 # seconds between two saved states
 SAVE_EVERY = 120
@@ -44,12 +44,14 @@ def train(
     command: str = "",
     device: str | None = None,
     tracker: str | None = None,
+    draw: Draw | None = None,
 ) -> Path:
     """Trains as the recipe says and returns the path of model.safetensors.
 
     folder: a new one (None: the next number in `runs`), or with `resume` that of a run with the same recipe (its length
     may differ). device: "cpu", or
-    None for what Accelerate finds; tracker: "tensorboard" or "wandb", which must be installed. Raises InputError where
+    None for what Accelerate finds; tracker: "tensorboard" or "wandb", which must be installed; draw: what makes
+    pictures of validation people, None for none. Raises InputError where
     the folder or the recipe does not fit, or where the loss stops being finite: the last good state then stays.
     """
     kind = type(recipe)
@@ -58,12 +60,12 @@ def train(
         check_same(folder, stored_recipe(folder, kind), recipe)
     elif folder is None and int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise InputError("several processes need to know the run's folder: name it")
-    job = job_of(recipe)
+    job = job_of(recipe, on_cpu=_on_cpu(device))
     folder = numbered(kind.__name__.lower()) if folder is None else Path(folder)
     accelerator = _accelerator(recipe, folder, device, tracker)
     # every process looks before the first one writes
     accelerator.wait_for_everyone()
-    run = _Run(recipe, job, folder, accelerator, command)
+    run = _Run(recipe, job, folder, accelerator, command, draw)
     if resume:
         run.take_up()
     elif accelerator.is_main_process:
@@ -78,7 +80,7 @@ def train(
 
 
 def _accelerator(recipe: Recipe, folder: Path, device: str | None, tracker: str | None) -> Accelerator:
-    on_cpu = device == "cpu" or not torch.cuda.is_available()
+    on_cpu = _on_cpu(device)
     half = recipe.precision == "bf16" or recipe.precision == "auto" and not on_cpu
     try:
         accelerator = Accelerator(
@@ -99,10 +101,16 @@ def _accelerator(recipe: Recipe, folder: Path, device: str | None, tracker: str 
     return accelerator
 
 
+def _on_cpu(device: str | None) -> bool:
+    return device == "cpu" or not torch.cuda.is_available()
+
+
 class _Run:
     """A run that goes on: the network, the mean of its weights, its optimizers, how far it is."""
 
-    def __init__(self, recipe: Recipe, job: Job, folder: Path, accelerator: Accelerator, command: str):
+    def __init__(
+        self, recipe: Recipe, job: Job, folder: Path, accelerator: Accelerator, command: str, draw: Draw | None
+    ):
         self.recipe, self.job, self.folder, self.command = recipe, job, folder, command
         self.accelerator = accelerator
         torch.manual_seed(_number(recipe.seed, _INIT))
@@ -113,7 +121,7 @@ class _Run:
         self.size = BATCHES * recipe.batch
         self.chunks = -(-job.people // self.size)
         self.chunk, self.seconds, self.best = 0, 0.0, float("inf")
-        self.validation = Validation(job, recipe, folder)
+        self.validation = Validation(job, recipe, folder, draw)
 
     def take_up(self) -> None:
         """The state of the run that was stopped; the beginning, where it was killed before its first was saved."""

@@ -11,8 +11,8 @@ from lidarpose.errors import InputError, unknown_name
 # rises, stays, falls to nothing; or rises and falls as a cosine
 SCHEDULES = ("plateau", "cosine")
 PRECISIONS = ("auto", "float32", "bf16")
-# the paper's network before fine-tuning, besides the sizes of the package's own
-PAPER = "paper"
+# the paper's network, and one of the same design for CPUs, besides the sizes of the package's own
+PAPER, SMALL_PAPER = "paper", "paper-small"
 # what changes no person and no step: a run that goes on may have others
 FREE = ("workers", "validate", "pictures", "precision")
 
@@ -65,7 +65,7 @@ class Recipe:
 class Pretrain(Recipe):
     """Pre-training on synthesized people, made while the network learns, or read from shards."""
 
-    size: str = _setting("tiny", "of the network: tiny, small, base, or paper for the paper's")
+    size: str = _setting("tiny", "of the network: tiny, small, base; paper or paper-small for the paper's design")
     scene: str = _setting("wild", "wild, paper or reference")
     people: int = _setting(300_000, "seen in all")
     easy: float = _setting(0.05, "share of the run in which difficulty rises to full")

@@ -1,0 +1,24 @@
+"""Where the weights that ship with the package lie. No torch."""
+
+import os
+from importlib import resources
+from pathlib import Path
+
+from lidarpose.errors import unknown_name
+
+BUNDLED = ("tiny",)
+
+
+def bundled_path(name: str = "tiny", suffix: str = ".safetensors") -> Path:
+    """Where the package keeps a bundled checkpoint, or with the suffix .onnx its exported twin."""
+    if name not in BUNDLED:
+        raise unknown_name("bundled weights", name, BUNDLED)
+    return Path(str(resources.files("lidarpose.model") / "weights" / f"{name}{suffix}"))
+
+
+def weights_path(weights: str | os.PathLike) -> Path:
+    """The file that a name of bundled weights or a path means. Raises InputError for an unknown name."""
+    name = os.fspath(weights)
+    is_path = not isinstance(weights, str) or "/" in name or name.endswith((".safetensors", ".onnx"))
+    is_path = name not in BUNDLED and (is_path or os.path.isfile(name))
+    return Path(name) if is_path else bundled_path(name)

@@ -1,0 +1,148 @@
+"""What the paper's network minimizes, equation by equation. All in float32, whatever the network computes in.
+
+Legend: B people, J joints of the network, M voxels of level 0, W heatmap bins, P parts.
+
+The paper's hats stand for the truth in Eq. 7 and for the prediction in Eq. 8 and 10, since a divergence from the
+prediction to the truth would ask for the logarithm of labels that are zero; the released code reads them so too.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from lidarpose.model.dapt.network import DaptOutputs
+from lidarpose.train.task import Share, alone
+
+# width of a heatmap's target, bins
+SIGMA = 2.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class DaptTargets:
+    """What training compares with.
+
+    joints (B, J, 3) m in the network's order, numbers also where nothing is known; weight (B, J): v_i of the paper, 1
+    where a joint is labelled and else 0; part (M,) int64, -1 where it is not known, None where none is asked for.
+    """
+
+    joints: Tensor
+    weight: Tensor
+    part: Tensor | None = None
+
+
+def pretraining(
+    outputs: DaptOutputs,
+    targets: DaptTargets,
+    *,
+    regression: float = 0.5,
+    segmentation: float = 1.0,
+    share: Share = alone,
+) -> dict[str, Tensor]:
+    """Paper: Eq. 9, L_pre = lambda_reg L_reg + lambda_seg L_seg, of the coordinate head and the part head.
+
+    Terms "regression" and "segmentation", and "mpjpe" of the coordinates for the log; share: see `task`.
+    """
+    people, labels, voxels = _shared(share, *_counts(targets), (targets.part >= 0).sum())
+    coordinates = outputs.coordinates.float()
+    return {
+        "regression": regression * regression_loss(coordinates, targets, people),
+        "segmentation": segmentation * segmentation_loss(outputs.parts.float(), targets.part, voxels),
+        "mpjpe": _mpjpe(coordinates, targets, labels),
+    }
+
+
+def finetuning(
+    outputs: DaptOutputs, targets: DaptTargets, *, auxiliary: float = 0.0, share: Share = alone
+) -> dict[str, Tensor]:
+    """Paper: Eq. 10, L_ft = L_hm, of the heatmaps alone.
+
+    The released code adds 0.2 times a term of the auxiliary head, of which the paper has no word: `auxiliary`. Terms
+    "heatmap", with an `auxiliary` weight above 0 "auxiliary", and "mpjpe" of the decoded heatmaps for the log; share:
+    see `task`.
+    """
+    people, labels = _shared(share, *_counts(targets))
+    terms = {
+        "heatmap": heatmap_loss(outputs, targets, people),
+        "mpjpe": _mpjpe(outputs.joints().float(), targets, labels),
+    }
+    if auxiliary:
+        terms["auxiliary"] = auxiliary * auxiliary_loss(outputs.inter.float(), targets, people)
+    return terms
+
+
+def regression_loss(coordinates: Tensor, targets: DaptTargets, people: Tensor) -> Tensor:
+    """Paper: Eq. 7, sum_i ||J_i - J^_i||_2 v_i / sum_i v_i, its mean over `people`, those with a label.
+
+    coordinates (B, J, 3) m. The released code squares the distance.
+    """
+    return _person_mean((coordinates - targets.joints).norm(dim=-1), targets.weight).sum() / people
+
+
+def segmentation_loss(logits: Tensor, part: Tensor, voxels: Tensor) -> Tensor:
+    """Paper: Eq. 8, the cross entropy of P = K + 1 classes, 0 = not body among them, a point a voxel.
+
+    logits (M, P); part (M,), -1 where it is not known; voxels: how many are. The paper's sum over a cloud's points is a
+    mean over `voxels` here, as in the released code, so that its weight does not depend on how many points a person
+    has. The released code leaves points that are not of the body unsupervised.
+    """
+    return F.cross_entropy(logits, part, ignore_index=-1, reduction="sum") / voxels
+
+
+def heatmap_loss(outputs: DaptOutputs, targets: DaptTargets, people: Tensor) -> Tensor:
+    """Paper: Eq. 10, sum over x, y, z and joints of D_KL(h || h^), its mean over `people`, those with a label.
+
+    Labelled joints are summed (the K + 1 of the paper's sum counts a joint that does not exist). The released code's
+    targets do not sum to 1, and it takes the mean over bins and over joints, so that the finer or longer an axis is,
+    the less it weighs.
+    """
+    loss = outputs.logits_x.new_zeros((), dtype=torch.float32)
+    heatmaps = (outputs.logits_x, outputs.logits_y, outputs.logits_z)
+    for k, (logits, low, step) in enumerate(zip(heatmaps, outputs.low, outputs.step, strict=True)):
+        log_truth = log_gaussian((targets.joints[..., k] - low) / step, logits.shape[-1])
+        divergence = log_truth.exp() * (log_truth - logits.float().log_softmax(-1))
+        loss = loss + (divergence.sum(-1) * targets.weight).sum()
+    return loss / people
+
+
+def log_gaussian(place: Tensor, bins: int) -> Tensor:
+    """place (...) in bins -> (..., W): logarithm of a Gaussian of `SIGMA` bins about it that sums to 1.
+
+    A joint beyond the range is told to lie in the outermost bin, where whoever decodes it reports it as out of range
+    (`decode.out_of_range`); the released code's target for it fades to nothing.
+    """
+    index = torch.arange(bins, device=place.device)
+    away = (index - place.clamp(0, bins - 1)[..., None]) / SIGMA
+    return (-0.5 * away.square()).log_softmax(-1)
+
+
+def auxiliary_loss(joints: Tensor, targets: DaptTargets, people: Tensor) -> Tensor:
+    """The released code's term of all joints read off the bottleneck (B, J, 3) m, its distance squared: not in the
+    paper. sum_i ||J_i - J^_i||^2 v_i / sum_i v_i, its mean over `people`, those with a label."""
+    return _person_mean((joints - targets.joints).square().sum(-1), targets.weight).sum() / people
+
+
+def _person_mean(values: Tensor, weight: Tensor) -> Tensor:
+    """values, weight (B, J) -> (B,): the weighted mean of each person, 0 where nothing has a weight."""
+    return (values * weight).sum(1) / _at_least_one(weight.sum(1))
+
+
+def _mpjpe(joints: Tensor, targets: DaptTargets, labels: Tensor) -> Tensor:
+    """Mean distance over labelled joints, m."""
+    return ((joints.detach() - targets.joints).norm(dim=-1) * targets.weight).sum() / labels
+
+
+def _counts(targets: DaptTargets) -> tuple[Tensor, Tensor]:
+    """How many people have a label, and how many labels there are."""
+    return (targets.weight.sum(1) > 0).sum(), targets.weight.sum()
+
+
+def _shared(share: Share, *counts: Tensor) -> tuple[Tensor, ...]:
+    """Counts as divisors; told to the other processes all at once."""
+    return _at_least_one(share(torch.stack([count.float() for count in counts]))).unbind()
+
+
+def _at_least_one(count: Tensor) -> Tensor:
+    """1 for a sum over nothing; a share of one among several processes is below 1 and stays."""
+    return torch.where(count > 0, count, torch.ones_like(count))

@@ -1,0 +1,115 @@
+"""From the pre-trained network to the one to be fine-tuned. Strict: what is to be kept must fit, tensor by tensor."""
+
+import os
+
+import torch
+from torch import Tensor
+
+from lidarpose.data.files import file_error
+from lidarpose.errors import InputError
+from lidarpose.model.checkpoint import load_checkpoint
+from lidarpose.model.dapt.config import DaptConfig
+from lidarpose.model.dapt.network import DaptNet
+
+_ANCHORS = "keypoint_embedding"
+# settings that no tensor's shape betrays, but without which its numbers mean something else
+_MEANING = ("legacy", "grid", "strides", "encoder_heads", "decoder_heads", "anchor_heads")
+
+
+def transferred(source: DaptNet | str | os.PathLike, config: DaptConfig, *, keep_anchors: bool = False) -> DaptNet:
+    """A network of `config` that begins with the backbone of the pre-trained one, in training mode.
+
+    source: the network, which stays as it is, or the path of its checkpoint. Anchors and heads begin anew, drawn from
+    torch's global generator, as in the released code. With `keep_anchors` anchors go on by joint name, as does the
+    auxiliary head, and every other head that both have, the last layer of a heatmap's only where its bins and range are
+    the same; joints that are new begin anew. Raises InputError, one line, for a file that holds no such network and for
+    the first setting or tensor of the backbone that does not fit.
+    """
+    # before anything else draws
+    network = DaptNet(config)
+    if isinstance(source, DaptNet):
+        trained = source
+    else:
+        trained, _ = load_checkpoint(source)
+        if not isinstance(trained, DaptNet):
+            raise file_error(
+                source, f"expected the paper's network, got {type(trained).__name__}: name one pre-trained as such"
+            )
+    try:
+        kept = _backbone(trained, network)
+    except InputError as error:
+        raise error if trained is source else file_error(source, error) from None
+    wanted = network.state_dict()
+    if keep_anchors:
+        kept |= _anchors(trained, config, wanted) | _heads(trained, network)
+    network.load_state_dict(wanted | kept)
+    return network
+
+
+def _backbone(trained: DaptNet, network: DaptNet) -> dict[str, Tensor]:
+    """All of the trained backbone but its anchors. Raises InputError where it does not fit."""
+    names = f"{trained.config.name} was pre-trained with", f"{network.config.name} has"
+    remedy = "fine-tune with the sizes of the pre-trained network"
+    stored, wanted = (
+        {name: value for name, value in net.backbone.state_dict().items() if name != _ANCHORS}
+        for net in (trained, network)
+    )
+    for name in sorted(stored.keys() | wanted.keys()):
+        shapes = [tuple(state[name].shape) if name in state else "none" for state in (stored, wanted)]
+        if shapes[0] != shapes[1]:
+            raise InputError(
+                f"tensor backbone.{name} does not fit: {names[0]} {shapes[0]}, {names[1]} {shapes[1]}: {remedy}"
+            )
+    for setting in _MEANING:
+        values = [getattr(net.config, setting) for net in (trained, network)]
+        if values[0] != values[1]:
+            raise InputError(f"{setting} does not fit: {names[0]} {values[0]}, {names[1]} {values[1]}: {remedy}")
+    return {f"backbone.{name}": value for name, value in stored.items()}
+
+
+def _anchors(trained: DaptNet, config: DaptConfig, wanted: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Anchors by joint name; those of new joints stay as they were drawn. The backbones fit, so their widths do."""
+    name = f"backbone.{_ANCHORS}"
+    return {name: _by_joint(trained.state_dict()[name], wanted[name], trained.config.joints, config.joints)}
+
+
+def _heads(trained: DaptNet, network: DaptNet) -> dict[str, Tensor]:
+    """Tensors of the heads that both networks have, by what they do: the coordinate head has two names."""
+    old, new = trained.config, network.config
+    kept = {}
+    if old.coordinates and new.coordinates:
+        names = ["heads.coordinate" if config.bins else "heads.query" for config in (old, new)]
+        kept |= _alike(trained, network, *names)
+    if old.parts and new.parts:
+        kept |= _alike(trained, network, "heads.feat", "heads.feat")
+    if old.bins and new.bins:
+        for k in range(3):
+            fc = f"heads.query.fcs.{k}"
+            same = old.bins[k] == new.bins[k] and old.ranges[k] == new.ranges[k]
+            # bins of another place or width mean something else
+            kept |= {name: v for name, v in _alike(trained, network, fc, fc).items() if same or ".fc2." not in name}
+    if old.auxiliary and new.auxiliary:
+        stored, wanted = trained.state_dict(), network.state_dict()
+        kept |= _alike(trained, network, "heads.inter_feat.fc.fc1", "heads.inter_feat.fc.fc1")
+        for name in ("heads.inter_feat.fc.fc2.weight", "heads.inter_feat.fc.fc2.bias"):
+            # three rows a joint
+            before, after = (state[name].unflatten(0, (-1, 3)) for state in (stored, wanted))
+            kept[name] = _by_joint(before, after, old.joints, new.joints).flatten(0, 1)
+    return kept
+
+
+def _alike(trained: DaptNet, network: DaptNet, before: str, after: str) -> dict[str, Tensor]:
+    """Tensors under `before` by their names under `after`, where they have the same shape."""
+    stored, wanted = trained.state_dict(), network.state_dict()
+    names = {name: after + name.removeprefix(before) for name in stored if name.startswith(f"{before}.")}
+    return {
+        ours: stored[name]
+        for name, ours in names.items()
+        if ours in wanted and stored[name].shape == wanted[ours].shape
+    }
+
+
+def _by_joint(before: Tensor, after: Tensor, had: tuple[str, ...], has: tuple[str, ...]) -> Tensor:
+    """after (J', ...), the rows of joints that `before` (J, ...) has too taken from there."""
+    rows = [before[had.index(name)].to(after) if name in had else after[j] for j, name in enumerate(has)]
+    return torch.stack(rows)

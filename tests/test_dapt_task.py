@@ -1,0 +1,594 @@
+"""Training of the paper's network: its equations, its batches, and what goes on from one stage to the next."""
+
+import math
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpose.errors import InputError
+from lidarpose.model.checkpoint import save_checkpoint
+from lidarpose.model.dapt.config import named_config
+from lidarpose.model.dapt.network import DaptBatch, DaptNet, DaptOutputs
+from lidarpose.model.dapt.tables import LAYOUTS
+from lidarpose.model.network import PoseNet
+from lidarpose.model.presets import preset
+from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14
+from lidarpose.train.dapt_losses import DaptTargets, finetuning, log_gaussian, pretraining
+from lidarpose.train.dapt_task import DaptTask, finetuning_config, pretraining_config, small, transferred
+from lidarpose.train.example import Example
+from lidarpose.train.task import alone, total
+
+TINY = {
+    "encoder_depths": (1, 1, 1),
+    "encoder_channels": (16, 16, 32),
+    "encoder_heads": (1, 1, 2),
+    "decoder_depths": (1, 1),
+    "decoder_channels": (16, 16),
+    "decoder_heads": (1, 2),
+    "anchor_channels": (16, 24, 16),
+    "strides": (2, 2),
+    "grid": 0.04,
+    "patch": 512,
+    "drop_path": 0.0,
+    "anchor_dropout": 0.0,
+}
+PRETRAIN = DaptTask(config=replace(pretraining_config(), **TINY), stage="pretrain")
+# with the head of the released code's other term
+FINETUNE = DaptTask(config=replace(finetuning_config("waymo", auxiliary=True), **TINY), stage="finetune", auxiliary=0.2)
+BOTH = pytest.mark.parametrize("task", [PRETRAIN, FINETUNE], ids=["pretrain", "finetune"])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def person(n, seed=0, labelled=None, size=(0.2, 0.3, 0.6)):
+    """n points; labelled: how many of the joints have a label, None for all."""
+    rng = np.random.default_rng([seed, n])
+    joints = rng.normal(0, size, (26, 3)).astype(np.float32)
+    joints[rng.permutation(26)[26 if labelled is None else labelled :]] = np.nan
+    return Example(
+        points=rng.normal(0, size, (n, 3)).astype(np.float32),
+        part=rng.integers(-1, 25, n),
+        joints=joints,
+        visible=np.full(26, np.nan, np.float32),
+        view=np.zeros(5, np.float32),
+        seed=seed + 100,
+    )
+
+
+def network(task, seed=0):
+    torch.manual_seed(seed)
+    return task.network()
+
+
+def gradients(net, terms):
+    net.zero_grad()
+    total(terms).backward()
+    return {name: value.grad.clone() for name, value in net.named_parameters()}
+
+
+# --- the equations, against plain loops
+
+
+def made(seed=0, people=3, voxels=7):
+    """Outputs of nobody's network, with every head, and targets of which some are not known."""
+    torch.manual_seed(seed)
+    bins = (11, 13, 17)
+    outputs = DaptOutputs(
+        anchors=torch.zeros(people, 4, 1),
+        points=torch.zeros(voxels, 1),
+        logits_x=torch.randn(people, 4, bins[0]) * 3,
+        logits_y=torch.randn(people, 4, bins[1]) * 3,
+        logits_z=torch.randn(people, 4, bins[2]) * 3,
+        inter=torch.randn(people, 4, 3),
+        parts=torch.randn(voxels, 25) * 2,
+        coordinates=torch.randn(people, 4, 3),
+        low=(-1.0, -0.5, -2.0),
+        step=(0.2, 0.1, 0.25),
+    )
+    # some beyond the heatmaps' range
+    joints = torch.randn(people, 4, 3)
+    weight = torch.tensor([[1.0, 0, 1, 1], [0, 0, 0, 0], [0, 1, 0, 0]])
+    return outputs, DaptTargets(joints=joints, weight=weight, part=torch.tensor([0, 24, -1, 3, 3, -1, 0]))
+
+
+def numbers(value):
+    return np.asarray(value, float)
+
+
+def distance(a, b):
+    return math.sqrt(sum((x - y) ** 2 for x, y in zip(a, b, strict=True)))
+
+
+def slow_regression(joints, targets, power):
+    true, weight = numbers(targets.joints), numbers(targets.weight)
+    people = []
+    for b in range(len(true)):
+        if sum(weight[b]) > 0:
+            distances = [distance(joints[b, j], true[b, j]) ** power * weight[b, j] for j in range(len(true[b]))]
+            people.append(sum(distances) / sum(weight[b]))
+    return sum(people) / len(people)
+
+
+def slow_segmentation(logits, part):
+    voxels = []
+    for row, label in zip(numbers(logits), part.tolist(), strict=True):
+        if label >= 0:
+            voxels.append(-math.log(math.exp(row[label]) / sum(math.exp(value) for value in row)))
+    return sum(voxels) / len(voxels)
+
+
+def slow_heatmap(outputs, targets):
+    true, weight = numbers(targets.joints), numbers(targets.weight)
+    everything, people = 0.0, 0
+    for b in range(len(true)):
+        people += any(weight[b] > 0)
+        for j in range(len(true[b])):
+            for axis, low, step in zip("xyz", outputs.low, outputs.step, strict=True):
+                row = numbers(getattr(outputs, f"logits_{axis}"))[b, j]
+                at = min(max((true[b, j]["xyz".index(axis)] - low) / step, 0), len(row) - 1)
+                truth = [math.exp(-((k - at) ** 2) / (2 * 2.0**2)) for k in range(len(row))]
+                believed = [math.exp(value) for value in row]
+                for h, q in zip(truth, believed, strict=True):
+                    h, q = h / sum(truth), q / sum(believed)
+                    everything += weight[b, j] * h * math.log(h / q)
+    return everything / people
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_pretraining_is_equation_9(seed):
+    outputs, targets = made(seed)
+    terms = pretraining(outputs, targets, regression=0.5, segmentation=2.0)
+    regression = slow_regression(numbers(outputs.coordinates), targets, 1)
+    assert terms["regression"].item() == pytest.approx(0.5 * regression, rel=1e-5)
+    assert terms["segmentation"].item() == pytest.approx(2 * slow_segmentation(outputs.parts, targets.part), rel=1e-5)
+    assert total(terms).item() == pytest.approx(terms["regression"].item() + terms["segmentation"].item(), rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_finetuning_is_equation_10_and_the_released_codes_other_term(seed):
+    outputs, targets = made(seed)
+    assert finetuning(outputs, targets).keys() == {"heatmap", "mpjpe"}
+    terms = finetuning(outputs, targets, auxiliary=0.2)
+    assert terms["heatmap"].item() == pytest.approx(slow_heatmap(outputs, targets), rel=1e-5)
+    auxiliary = slow_regression(numbers(outputs.inter), targets, 2)
+    assert terms["auxiliary"].item() == pytest.approx(0.2 * auxiliary, rel=1e-5)
+    error = (numbers(outputs.joints()) - numbers(targets.joints))[targets.weight.bool().numpy()]
+    assert terms["mpjpe"].item() == pytest.approx(np.linalg.norm(error, axis=-1).mean(), rel=1e-5)
+
+
+def test_right_heatmaps_cost_nothing_and_others_something():
+    outputs, targets = made()
+    inside = replace(targets, joints=torch.tensor([0.2, 0.1, -0.25]).expand(3, 4, 3), weight=torch.ones(3, 4))
+    right = {
+        f"logits_{axis}": -((torch.arange(bins) - (at - low) / step) ** 2).expand(3, 4, bins) / 8 + 5
+        for axis, bins, at, low, step in zip(
+            "xyz", (11, 13, 17), (0.2, 0.1, -0.25), outputs.low, outputs.step, strict=True
+        )
+    }
+    terms = finetuning(replace(outputs, **right), inside)
+    assert abs(terms["heatmap"].item()) < 1e-5
+    # in the middle of bins
+    assert terms["mpjpe"].item() < 1e-5
+    for axis in "xyz":
+        off = right | {f"logits_{axis}": right[f"logits_{axis}"].roll(1, -1)}
+        assert finetuning(replace(outputs, **off), inside)["heatmap"] > 0.1
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(-1e4, 1e4), st.integers(1, 300))
+def test_targets_are_distributions(place, bins):
+    target = log_gaussian(torch.tensor([place]), bins).exp()
+    assert abs(target.sum().item() - 1) < 1e-5
+    # a joint beyond the range is told to be at its end
+    assert abs(target.argmax().item() - min(max(place, 0), bins - 1)) <= 0.5 + 1e-3
+
+
+def test_background_is_supervised():
+    outputs, targets = made()
+    logits = outputs.parts.clone().requires_grad_()
+    pretraining(replace(outputs, parts=logits), targets)["segmentation"].backward()
+    assert (logits.grad.abs().amax(1) > 0).tolist() == (targets.part >= 0).tolist()
+
+
+def test_joints_without_a_label_teach_nothing():
+    outputs, targets = made()
+    free = outputs.logits_x.clone().requires_grad_()
+    finetuning(replace(outputs, logits_x=free), targets)["heatmap"].backward()
+    assert ((free.grad.abs().amax(-1) > 0) == targets.weight.bool()).all()
+
+
+# --- batches
+
+
+@BOTH
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_nobody_depends_on_batch_mates_or_on_the_order_of_points(task, layout):
+    task = replace(task, layout=layout)
+    one, mates = person(300), [person(150, 1), person(0, 2), person(700, 3)]
+    alone_, among = task.collate([one]), task.collate([*mates, one])
+    rows = slice(len(among.tables.features) - len(alone_.tables.features), None)
+    np.testing.assert_array_equal(alone_.tables.features, among.tables.features[rows])
+    np.testing.assert_array_equal(alone_.joints[0], among.joints[3])
+    order = np.random.default_rng(0).permutation(300)
+    shuffled = task.collate([replace(one, points=one.points[order], part=one.part[order])])
+    np.testing.assert_array_equal(alone_.tables.features, shuffled.tables.features)
+    if task.stage == "pretrain":
+        np.testing.assert_array_equal(alone_.part, among.part[rows])
+        np.testing.assert_array_equal(alone_.part, shuffled.part)
+    net = network(task).eval()
+    np.testing.assert_allclose(task.joints(net, alone_)[0], task.joints(net, among)[3], atol=1e-5)
+
+
+@BOTH
+def test_the_order_of_people_does_not_matter(task):
+    people = [person(n, n) for n in (40, 0, 300, 9)]
+    net = network(task).eval()
+    forth, back = (task.collate(order) for order in (people, people[::-1]))
+    np.testing.assert_allclose(task.joints(net, forth), task.joints(net, back)[::-1], atol=1e-5)
+    terms = [task.terms(net, arrays) for arrays in (forth, back)]
+    for name in terms[0]:
+        torch.testing.assert_close(terms[0][name], terms[1][name], rtol=1e-5, atol=1e-6)
+
+
+def test_people_larger_than_a_patch_only_shuffle_their_curves():
+    task = replace(PRETRAIN, config=replace(PRETRAIN.config, patch=64))
+    large, little = person(400, 1), person(30)
+    alone_, among = task.collate([little]), task.collate([large, little])
+    net = network(task).eval()
+    np.testing.assert_allclose(task.joints(net, alone_)[0], task.joints(net, among)[1], atol=1e-5)
+
+
+def test_a_voxel_keeps_one_of_its_points_and_the_part_of_most():
+    cloud = np.float32([[0.001, 0.001, 0.001], [0.02, 0.02, 0.02], [0.039, 0.039, 0.039], [-0.01, 0, 0]])
+    one = replace(person(4), points=cloud, part=np.array([7, 3, 3, -1]))
+    kept = set()
+    for seed in range(40):
+        arrays = PRETRAIN.collate([replace(one, seed=seed)])
+        assert arrays.tables.features[0].tolist() == cloud[3].tolist() and arrays.part.tolist() == [-1, 3]
+        kept.add(arrays.tables.features[1, 0].item())
+    assert kept == set(cloud[:3, 0].tolist())
+    unknown = PRETRAIN.collate([replace(one, part=np.array([-1, 5, -1, 0]))])
+    assert unknown.part.tolist() == [0, 5]
+    assert PRETRAIN.collate([person(0), one]).part.tolist() == [-1, -1, 3]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**31 - 1), st.integers(0, 200), st.floats(0.02, 0.5))
+def test_parts_against_counting(seed, n, size):
+    one = replace(person(n, 3, size=size), seed=seed)
+    arrays = PRETRAIN.collate([one])
+    cells = {}
+    for point, part in zip(one.points, one.part.tolist(), strict=True):
+        cells.setdefault(tuple(np.floor(point / 0.04).tolist()), []).append((part, point.tolist()))
+    assert len(arrays.part) == max(len(cells), 1)
+    for row, part in zip(arrays.tables.features, arrays.part.tolist(), strict=True):
+        here = cells.get(tuple(np.floor(row / 0.04).tolist()), [])
+        assert not here or row.tolist() in [point for _, point in here]
+        known = [p for p, _ in here if p >= 0]
+        assert part == (-1 if not known else min(set(known), key=lambda p: (-known.count(p), p)))
+
+
+@BOTH
+def test_task_and_arrays_survive_the_way_from_a_worker(task):
+    assert pickle.loads(pickle.dumps(task)) == task
+    arrays = task.collate([person(60), person(0, 1, labelled=3)])
+    again = pickle.loads(pickle.dumps(arrays))
+    net = network(task).eval()
+    for a, b in zip(task.terms(net, arrays).values(), task.terms(net, again).values(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_joints_are_body26s():
+    out = FINETUNE.joints(network(FINETUNE).eval(), FINETUNE.collate([person(50), person(5, 1)]))
+    has = np.isin(BODY26.joints, WAYMO14.joints)
+    assert out.shape == (2, 26, 3) and np.isfinite(out[:, has]).all() and np.isnan(out[:, ~has]).all()
+    people = [replace(person(9), joints=np.arange(78, dtype=np.float32).reshape(26, 3))]
+    arrays = FINETUNE.collate(people)
+    for j, name in enumerate(FINETUNE.config.joints):
+        np.testing.assert_array_equal(arrays.joints[0, j], people[0].joints[BODY26.index(name)])
+
+
+def test_joints_of_a_network_with_every_head_are_those_that_the_stage_teaches():
+    config = replace(named_config("paper"), **TINY)
+    task = DaptTask(config=config, stage="pretrain")
+    net, arrays = network(task).eval(), task.collate([person(70)])
+    with torch.no_grad():
+        outputs = net(DaptBatch.from_tables(arrays.tables))
+    np.testing.assert_array_equal(task.joints(net, arrays), outputs.coordinates.numpy())
+    np.testing.assert_array_equal(replace(task, stage="finetune").joints(net, arrays), outputs.joints().numpy())
+
+
+# --- gradients
+
+
+@BOTH
+@pytest.mark.parametrize("rare", [False, True])
+def test_gradients_of_two_halves_average_to_those_of_the_whole(task, rare):
+    # people, labels and voxels are shared out unevenly; a batch norm in training would see its own half alone
+    people = [person(40), person(200, 1, labelled=2), person(3, 2, labelled=0), person(0, 3), person(90, 4)]
+    if rare:
+        # one joint and one point are all that is known, so that a share of the counts is less than one
+        nothing = np.full((26, 3), np.nan, np.float32)
+        hip = np.where(np.arange(26)[:, None] == BODY26.index("left_hip"), np.float32(0.2), nothing)
+        people = [replace(one, joints=nothing, part=np.full(len(one.points), -1)) for one in people]
+        people[4] = replace(people[4], joints=hip, part=np.where(np.arange(90) == 50, 4, -1))
+    net = network(task).eval()
+    whole = task.terms(net, task.collate(people))
+    want = gradients(net, whole)
+    halves = [task.collate(people[:1]), task.collate(people[1:])]
+    told = [[], []]
+    for half, counts in zip(halves, told, strict=True):
+        task.terms(net, half, share=lambda count, counts=counts: counts.append(count) or count)
+    assert len(told[0]) == len(told[1]) > 0
+    means = [(a + b) / 2 for a, b in zip(*told, strict=True)]
+    found, terms = [], []
+    for half in halves:
+        answers = iter(means)
+        terms.append(task.terms(net, half, share=lambda _, answers=answers: next(answers)))
+        found.append(gradients(net, terms[-1]))
+    for name, value in whole.items():
+        torch.testing.assert_close((terms[0][name] + terms[1][name]) / 2, value, rtol=1e-4, atol=1e-6, msg=name)
+    largest = max(value.abs().max() for value in want.values())
+    for name, value in want.items():
+        mean = (found[0][name] + found[1][name]) / 2
+        torch.testing.assert_close(mean, value, rtol=1e-3, atol=1e-6 * float(largest), msg=name)
+    # without it they would not
+    naive = [gradients(net, task.terms(net, half, share=alone)) for half in halves]
+    assert any(
+        ((a + b) / 2 - value).abs().max() > 1e-2 * largest
+        for (a, b, value) in zip(naive[0].values(), naive[1].values(), want.values(), strict=True)
+    )
+
+
+@BOTH
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("n", [1, 2, 5000])
+def test_gradients_are_finite(task, layout, n):
+    task = replace(task, layout=layout)
+    net = network(task).train()
+    terms = task.terms(net, task.collate([person(n)]))
+    assert all(torch.isfinite(value) for value in terms.values())
+    # every parameter has one
+    assert all(torch.isfinite(value).all() for value in gradients(net, terms).values())
+
+
+@BOTH
+def test_people_without_labels_or_points(task):
+    net = network(task).train()
+    nothing = [replace(person(n, n, labelled=0), part=np.full(n, -1)) for n in (30, 0, 1)]
+    terms = task.terms(net, task.collate(nothing))
+    assert total(terms).item() == 0 and terms["mpjpe"].item() == 0
+    assert all((value == 0).all() for value in gradients(net, terms).values())
+    terms = task.terms(net, task.collate([person(0), person(0, 1, labelled=4)]))
+    assert total(terms).item() > 0
+    assert all(torch.isfinite(value).all() for value in gradients(net, terms).values())
+
+
+@pytest.mark.parametrize("stage", ["pretrain", "finetune"])
+def test_heads_that_a_stage_does_not_ask_have_a_gradient_of_zero(stage):
+    task = DaptTask(config=replace(named_config("paper"), **TINY), stage=stage)
+    net = network(task)
+    found = gradients(net, task.terms(net, task.collate([person(60), person(9, 1)])))
+    still = {name.split(".")[1] for name, value in found.items() if (value == 0).all()}
+    idle = {"query", "inter_feat"} if stage == "pretrain" else {"coordinate", "feat", "inter_feat"}
+    assert idle <= still
+    assert not [name for name in still if name not in idle]
+
+
+@BOTH
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_half_precision(task, layout):
+    task = replace(task, layout=layout)
+    net = network(task).train()
+    people = [person(n, n) for n in (200, 0, 1, 600)]
+    want = task.terms(net, task.collate(people))
+    net = network(task).train()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        terms = task.terms(net, task.collate(people))
+        joints = task.joints(net, task.collate(people))
+    for name, value in terms.items():
+        assert value.dtype == torch.float32 and abs(value - want[name]) < 0.1 * want[name] + 0.05, name
+    assert np.isfinite(joints[:, np.isin(BODY26.joints, task.config.joints)]).all()
+    assert all(torch.isfinite(value).all() for value in gradients(net, terms).values())
+
+
+# --- learning
+
+
+@BOTH
+def test_it_learns_four_people_by_heart(task):
+    people = [person(30, k, size=0.25) for k in range(4)]
+    arrays = task.collate(people)
+    net = network(task).train()
+    optimizer = torch.optim.AdamW(net.parameters(), 3e-3)
+    losses = []
+    for _ in range(60):
+        terms = task.terms(net, arrays)
+        optimizer.zero_grad()
+        total(terms).backward()
+        optimizer.step()
+        losses.append({name: value.item() for name, value in terms.items()})
+    for name, value in losses[-1].items():
+        assert value < losses[0][name] / 2, name
+
+
+# --- from stage to stage
+
+
+def trained(config, seed=3):
+    torch.manual_seed(seed)
+    net = DaptNet(config).eval()
+    for value in net.state_dict().values():
+        if value.is_floating_point():
+            value.copy_(torch.rand_like(value))
+    return net
+
+
+def split_state(net):
+    """The tensors of the backbone without its anchors, and all others."""
+    state = net.state_dict()
+    body = {name for name in state if name.startswith("backbone.") and "keypoint_embedding" not in name}
+    return {name: state[name] for name in body}, {name: state[name] for name in state.keys() - body}
+
+
+def test_the_papers_transfer_keeps_the_backbone_alone(tmp_path):
+    source = trained(PRETRAIN.config)
+    before = {name: value.clone() for name, value in source.state_dict().items()}
+    save_checkpoint(tmp_path / "pretrained.safetensors", source, card={})
+    config = replace(FINETUNE.config, joints=HUMAN15.joints)
+    torch.manual_seed(8)
+    fresh = DaptNet(config)
+    for origin in (source, tmp_path / "pretrained.safetensors", str(tmp_path / "pretrained.safetensors")):
+        torch.manual_seed(8)
+        net = transferred(origin, config)
+        body, rest = split_state(net)
+        assert net.config == config and net.training and len(body) > 50
+        assert all(torch.equal(value, before[name]) for name, value in body.items())
+        assert all(torch.equal(value, fresh.state_dict()[name]) for name, value in rest.items()) and rest
+    with torch.no_grad():
+        for parameter in net.parameters():
+            parameter += 1
+    assert all(torch.equal(before[name], value) for name, value in source.state_dict().items())
+
+
+def test_anchors_go_on_by_name():
+    source = trained(replace(PRETRAIN.config, joints=BODY26.joints[:25]))
+    torch.manual_seed(8)
+    net = transferred(source, FINETUNE.config, keep_anchors=True)
+    torch.manual_seed(8)
+    fresh = DaptNet(FINETUNE.config).backbone.keypoint_embedding
+    for j, name in enumerate(FINETUNE.config.joints):
+        # the middle of the head is new
+        want = fresh[j] if name == "head_center" else source.backbone.keypoint_embedding[BODY26.index(name)]
+        assert torch.equal(net.backbone.keypoint_embedding[j], want), name
+    assert BODY26.joints[25] == "head_center" and "head_center" in FINETUNE.config.joints
+
+
+def test_heads_go_on_where_they_say_the_same():
+    whole = replace(named_config("paper"), **TINY)
+    source = trained(whole)
+    # another range of z, fewer joints in another order
+    config = replace(whole, joints=WAYMO14.joints, ranges=(*whole.ranges[:2], (-1.5, 1.5)))
+    torch.manual_seed(8)
+    net = transferred(source, config, keep_anchors=True)
+    torch.manual_seed(8)
+    fresh = DaptNet(config)
+    old, new, begun = source.state_dict(), net.state_dict(), fresh.state_dict()
+    anew = {name for name in new if torch.equal(new[name], begun[name]) and not torch.equal(new[name], old[name])}
+    assert anew == {
+        "heads.query.fcs.2.fc2.weight",
+        "heads.query.fcs.2.fc2.bias",
+        "heads.query.coord_range",
+        "heads.query.joint_wise_weight",
+    }
+    rows = old["heads.inter_feat.fc.fc2.weight"].reshape(26, 3, -1)
+    for j, name in enumerate(WAYMO14.joints):
+        assert torch.equal(new["heads.inter_feat.fc.fc2.weight"].reshape(14, 3, -1)[j], rows[BODY26.index(name)])
+    # the coordinate head bears another name where there is no other head of anchors
+    bare = transferred(source, replace(PRETRAIN.config, joints=SMPL24.joints), keep_anchors=True).state_dict()
+    assert torch.equal(bare["heads.query.fc.fc2.weight"], old["heads.coordinate.fc.fc2.weight"])
+    assert torch.equal(bare["heads.feat.fc.3.weight"], old["heads.feat.fc.3.weight"])
+
+
+def test_a_network_to_the_same_configuration_is_the_same_network():
+    source = trained(replace(named_config("paper"), **TINY))
+    again = transferred(source, source.config, keep_anchors=True).eval()
+    skipped = ("heads.query.coord_range", "heads.query.joint_wise_weight")
+    for name, value in source.state_dict().items():
+        assert name in skipped or torch.equal(value, again.state_dict()[name]), name
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (
+            {"encoder_channels": (16, 32, 32)},
+            r"tensor backbone.dec.dec1.up.proj_skip.0.weight does not fit: pretrain was pre-trained with \(16, 16\), "
+            r"waymo has \(16, 32\)",
+        ),
+        (
+            {"decoder_depths": (1, 2)},
+            r"tensor backbone.dec.dec1.block1.attn.proj.bias does not fit: .* pre-trained with none, waymo has \(16,\)",
+        ),
+        ({"anchor_channels": (16, 24, 24)}, "tensor backbone.dec.dec_ke1.fc_in.0.bias does not fit"),
+        ({"grid": 0.02}, "grid does not fit: pretrain was pre-trained with 0.04, waymo has 0.02: fine-tune with"),
+        ({"strides": (2, 4)}, "strides does not fit"),
+        ({"legacy": True}, "legacy does not fit"),
+        ({"encoder_heads": (2, 1, 2)}, "encoder_heads does not fit"),
+        ({"anchor_heads": 2}, "anchor_heads does not fit"),
+    ],
+)
+@pytest.mark.parametrize("keep", [False, True])
+def test_a_backbone_that_does_not_fit(change, message, keep):
+    with pytest.raises(InputError, match=message) as caught:
+        transferred(trained(PRETRAIN.config), replace(FINETUNE.config, **change), keep_anchors=keep)
+    assert "\n" not in str(caught.value)
+
+
+def test_transfer_from_files_that_do_not_fit(tmp_path):
+    path = tmp_path / "other.safetensors"
+    save_checkpoint(path, PoseNet(preset("tiny")), card={})
+    with pytest.raises(InputError, match="other.safetensors: expected the paper's network, got PoseNet"):
+        transferred(path, FINETUNE.config)
+    save_checkpoint(path, trained(PRETRAIN.config), card={})
+    with pytest.raises(InputError, match="other.safetensors: grid does not fit"):
+        transferred(path, replace(FINETUNE.config, grid=0.08))
+    with pytest.raises(InputError, match="does not exist"):
+        transferred(tmp_path / "none.safetensors", FINETUNE.config)
+
+
+# --- settings
+
+
+def test_configurations():
+    assert pretraining_config().joints == HUMAN15.joints and not pretraining_config().legacy
+    assert pretraining_config(BODY26.joints).joints == BODY26.joints
+    for dataset in ("waymo", "humanm3", "lidarhuman26m", "sloper4d"):
+        config = finetuning_config(dataset)
+        assert not config.legacy and not config.auxiliary and config.bins == named_config(dataset).bins
+        DaptTask(config=small(config), stage="finetune")
+    DaptTask(config=small(pretraining_config()), stage="pretrain")
+    weights = [sum(v.numel() for v in DaptNet(c).parameters()) for c in (small(pretraining_config()), PRETRAIN.config)]
+    assert 50e6 / 45 < weights[0] < 50e6 / 35 and weights[1] < weights[0]
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"stage": "train"}, "unknown stage of training 'train': .*pretrain"),
+        ({"layout": "flat"}, "unknown layout 'flat'"),
+        ({"auxiliary": -1.0}, "auxiliary must be a weight"),
+        ({"regression": float("nan")}, "regression must be a weight"),
+        ({"segmentation": float("inf")}, "segmentation must be a weight"),
+        ({"stage": "pretrain"}, "pre-training needs coordinates and 25 parts, waymo has coordinates=False and parts=0"),
+        ({"config": PRETRAIN.config}, "fine-tuning needs heatmaps, pretrain has no"),
+        ({"config": replace(FINETUNE.config, auxiliary=False)}, "needs the auxiliary head, which waymo lacks"),
+    ],
+)
+def test_bad_settings(change, message):
+    with pytest.raises(InputError, match=message):
+        replace(FINETUNE, **change)
+
+
+@pytest.mark.parametrize("part", [np.array([0, 25, 3]), np.array([1, 2])])
+def test_bad_parts(part):
+    with pytest.raises(InputError, match="each of 3 points needs a part below 25"):
+        PRETRAIN.collate([replace(person(3), part=part)])
+
+
+def test_points_that_are_not_finite():
+    broken = person(5).points.copy()
+    broken[2, 1] = np.nan
+    with pytest.raises(InputError, match="points must be finite"):
+        FINETUNE.collate([replace(person(5), points=broken)])

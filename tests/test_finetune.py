@@ -1,0 +1,373 @@
+"""Datasets to learn from: what is read, how it is shown, and runs on each of the four, from raw files to scores."""
+
+import json
+from dataclasses import replace
+
+import dataset_files as files
+import numpy as np
+import pytest
+import waymo_files
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpose import evaluation
+from lidarpose.cli import main
+from lidarpose.data.prepare import READERS, prepare
+from lidarpose.data.shards import open_dataset, shard_path
+from lidarpose.errors import InputError
+from lidarpose.infer.predictor import load
+from lidarpose.model.checkpoint import load_checkpoint
+from lidarpose.model.header import read_header
+from lidarpose.sample import Box
+from lidarpose.skeleton import BODY26, HUMAN15, skeleton
+from lidarpose.synth.write import Job, write_dataset
+from lidarpose.train import loop, runs
+from lidarpose.train.augment import AUGMENTATIONS, Augmentation, augmentation, augmented
+from lidarpose.train.crowd import Person, crowd_of
+from lidarpose.train.job import job_of
+from lidarpose.train.recipes import Finetune, Pretrain
+from lidarpose.train.sources import MixedSource, StoredSource, SyntheticSource
+
+NAMES = ("humanm3", "lidarhuman26m", "sloper4d", "waymo")
+
+
+def write_waymo(root, smpl):
+    waymo_files.write_v2(root)
+    waymo_files.write_v2(root, segment="10203656353524179475_7625_000_7645_000", split="validation")
+
+
+WRITERS = {
+    "humanm3": lambda root, smpl: files.write_humanm3(
+        root, smpl, sequences=("train/a", "train/b", "train/c", "test/d")
+    ),
+    "lidarhuman26m": lambda root, smpl: files.write_lidarhuman26m(root, smpl, sequences=("5", "6", "7")),
+    "sloper4d": files.write_sloper4d,
+    "waymo": write_waymo,
+}
+
+
+@pytest.fixture(scope="module")
+def datasets(tmp_path_factory):
+    """Name -> the folder that prepare wrote."""
+    root = tmp_path_factory.mktemp("datasets")
+    smpl, out = files.write_smpl(root / "SMPL_NEUTRAL.npz"), {}
+    for name, write in WRITERS.items():
+        write(root / f"raw-{name}", smpl)
+        out[name] = root / name
+        prepare(name, root / f"raw-{name}", out[name], smpl=smpl if READERS[name][2] else None, progress=False)
+    return out
+
+
+@pytest.fixture(scope="module")
+def synthetic(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("synthetic") / "people"
+    write_dataset(Job(what="people", count=6, scene="paper", seed=3), folder)
+    return folder
+
+
+# --- what is read
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_everybody_who_was_prepared_is_there(datasets, name):
+    crowd = crowd_of([datasets[name]])
+    items = list(open_dataset(datasets[name]).items())
+    of = skeleton(crowd.skeleton)
+    assert len(crowd) == len(items) and crowd.dataset == name and not crowd.damaged
+    for row, item in enumerate(items):
+        person = crowd.person(row)
+        np.testing.assert_array_equal(person.points, item.sample.points)
+        np.testing.assert_allclose(person.joints[BODY26.map_to(of)], item.sample.pose.joints, atol=1e-6)
+        others = [k for k, joint in enumerate(BODY26.joints) if joint not in of.joints]
+        assert np.isnan(person.joints[others]).all() and np.isnan(person.visible[others]).all()
+        assert person.centers.keys() == item.centers.keys()
+        assert (person.box is None) == (item.sample.box is None)
+        assert crowd.sequences[crowd.sequence[row]] == item.sequence
+
+
+def test_only_a_dataset_that_says_hidden_tells_what_is_seen(datasets):
+    waymo, other = crowd_of([datasets["waymo"]]), crowd_of([datasets["humanm3"]])
+    told = np.stack([waymo.person(row).visible for row in range(len(waymo))])
+    assert {0.0, 1.0} <= set(told[~np.isnan(told)])
+    assert all(np.isnan(other.person(row).visible).all() for row in range(len(other)))
+
+
+def test_splits_intervals_and_sequences_leave_people_out(datasets):
+    folder = datasets["humanm3"]
+    everybody = crowd_of([folder])
+    train, test = (crowd_of([folder], split=split) for split in ("train", "test"))
+    assert len(train) + len(test) == len(everybody) and test.sequences == ("test/d",)
+    assert set(train.sequences) == {"train/a", "train/b", "train/c"}
+    assert len(crowd_of([folder], without=["train/a"])) == len(everybody) * 3 // 4
+    # frames 7, 8, 9 of everybody
+    assert len(crowd_of([folder], interval=4)) == len(everybody) // 3
+    assert len(crowd_of([folder, folder])) == 2 * len(everybody)
+
+
+def test_synthesized_shards_are_people_too(synthetic):
+    crowd = crowd_of([synthetic])
+    assert len(crowd) == 6 and crowd.dataset == "" and crowd.skeleton == "body26"
+    assert (crowd.part > 0).any() and all(crowd.person(row).sensor_known for row in range(6))
+
+
+def test_what_cannot_be_read_is_one_line(datasets, synthetic, tmp_path):
+    for call, told in [
+        (lambda: crowd_of([tmp_path]), "is no dataset"),
+        (lambda: crowd_of([datasets["humanm3"]], split="val"), "expected labelled people in the split 'val'"),
+        (lambda: crowd_of([synthetic], split="train"), "have no split 'train'"),
+        (lambda: crowd_of([datasets["humanm3"], datasets["waymo"]]), "need one skeleton"),
+    ]:
+        with pytest.raises(InputError, match=told) as caught:
+            call()
+        assert "\n" not in str(caught.value)
+
+
+def copied(folder, to):
+    to.mkdir()
+    for path in folder.iterdir():
+        (to / path.name).write_bytes(path.read_bytes())
+    return to
+
+
+def test_a_damaged_shard_is_left_out_and_named(datasets, tmp_path):
+    folder = copied(datasets["humanm3"], tmp_path / "copy")
+    broken = shard_path(folder, "labelled", 1)
+    broken.write_bytes(broken.read_bytes()[:-200])
+    crowd = crowd_of([folder])
+    assert len(crowd) == len(crowd_of([datasets["humanm3"]])) * 3 // 4
+    assert len(crowd.damaged) == 1 and str(broken) in crowd.damaged[0]
+    # a missing one is something else: the dataset is not finished
+    broken.unlink()
+    with pytest.raises(InputError, match="is missing"):
+        crowd_of([folder])
+
+
+# --- how people are shown
+
+
+def someone(seed=0, count=80):
+    rng = np.random.default_rng(seed)
+    joints = rng.normal(0, 0.4, (26, 3)) + [6.0, 2.0, 0.0]
+    joints[rng.random(26) < 0.2] = np.nan
+    points = (rng.normal(0, [0.2, 0.2, 0.5], (count, 3)) + [6.0, 2.0, 0.0]).astype(np.float32)
+    return Person(
+        points=points,
+        part=rng.integers(-1, 25, count).astype(np.int16),
+        joints=joints.astype(np.float32),
+        visible=np.where(np.isnan(joints).any(-1), np.nan, 1.0).astype(np.float32),
+        center=points.mean(0).astype(float),
+        centers={"box": np.array([6.1, 2.0, 0.1])},
+        box=Box(center=(6.0, 2.0, 0.0), size=(1.0, 1.0, 2.0), yaw=0.3),
+        sensor_known=True,
+    )
+
+
+RIGID = Augmentation(turn=1.0, flip=0.5)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**31), st.integers(0, 100))
+def test_points_joints_and_the_view_move_together(seed, number):
+    person = someone(number)
+    shown = augmented(person, RIGID, np.random.default_rng(seed))
+    before = np.linalg.norm(person.points[:, None] - person.joints, axis=-1)
+    after = np.linalg.norm(shown.points[:, None] - shown.joints, axis=-1)
+    flip = list(BODY26.flip)
+    mirrored = np.allclose(np.nan_to_num(after), np.nan_to_num(before[:, flip]), atol=1e-4)
+    assert mirrored or np.allclose(np.nan_to_num(after), np.nan_to_num(before), atol=1e-4)
+    unlabelled = np.isnan(person.joints).any(-1)
+    np.testing.assert_array_equal(np.isnan(shown.joints).any(-1), unlabelled[flip] if mirrored else unlabelled)
+    if shown.view[4]:
+        # the sensor is as far from every point as it was
+        sensor = shown.view[:3] * np.exp(shown.view[3])
+        np.testing.assert_allclose(
+            np.linalg.norm(shown.points - sensor, axis=1), np.linalg.norm(person.points, axis=1), atol=1e-3
+        )
+
+
+def test_a_mirror_exchanges_left_and_right_parts():
+    person, mirrored = someone(), 0
+    left, right = 1 + BODY26.index("left_ankle"), 1 + BODY26.index("right_ankle")
+    for seed in range(40):
+        shown = augmented(person, RIGID, np.random.default_rng(seed))
+        if (shown.part != person.part).any():
+            mirrored += 1
+            np.testing.assert_array_equal(shown.part == left, person.part == right)
+            np.testing.assert_array_equal(shown.part == -1, person.part == -1)
+            np.testing.assert_array_equal(shown.part == 0, person.part == 0)
+    assert 10 < mirrored < 30
+
+
+@pytest.mark.parametrize("name", AUGMENTATIONS)
+def test_augmentations_are_functions_of_the_generator_and_change_nothing_given(name):
+    person, kept = someone(), someone()
+    a, b = (augmented(person, augmentation(name), np.random.default_rng(4)) for _ in range(2))
+    for field in ("points", "part", "joints", "visible", "view", "seed"):
+        np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
+    for field in ("points", "part", "joints", "visible", "center"):
+        np.testing.assert_array_equal(getattr(person, field), getattr(kept, field))
+    assert a.points.dtype == a.joints.dtype == a.view.dtype == np.float32 and len(a.points) == len(a.part)
+
+
+def test_the_paper_centers_on_what_it_knows():
+    person, still = someone(), replace(augmentation("paper"), turn=0.0, scale=0.0, flip=0.0, jitter=0.0, drop=0.0)
+    shown = augmented(person, still, np.random.default_rng(0))
+    inside = person.box.contains(person.points)
+    np.testing.assert_allclose(shown.points, person.points[inside] - person.centers["box"], atol=1e-5)
+    trans = replace(person, centers={"trans": np.array([5.0, 2.0, 0.0])})
+    shown = augmented(trans, still, np.random.default_rng(0))
+    np.testing.assert_allclose(shown.points, person.points - [5.0, 2.0, 0.0], atol=1e-5)
+    joints = replace(person, centers={"joints_box": np.array([6.0, 2.0, 0.0])})
+    shown = augmented(joints, still, np.random.default_rng(0))
+    low, high = np.nanmin(person.joints, 0), np.nanmax(person.joints, 0)
+    kept = (np.abs(person.points - (low + high) / 2) <= 0.625 * (high - low)).all(1)
+    np.testing.assert_allclose(shown.points, person.points[kept] - [6.0, 2.0, 0.0], atol=1e-5)
+
+
+@pytest.mark.parametrize("count", [1, 2, 6])
+def test_a_few_points_can_be_shown(count):
+    for seed in range(20):
+        shown = augmented(someone(count=count), augmentation("default"), np.random.default_rng(seed))
+        assert np.isfinite(shown.points).all()
+
+
+# --- whom a run sees
+
+
+def stored(datasets, name="humanm3", **more):
+    return StoredSource(folders=(str(datasets[name]),), seed=1, augmentation=AUGMENTATIONS["none"], **more)
+
+
+def test_an_epoch_shows_everybody_once_in_an_order_of_its_own(datasets):
+    source = stored(datasets)
+    count = len(source.crowd)
+    sizes = [[tuple(source.example(e * count + k).joints[0]) for k in range(count)] for e in range(3)]
+    for k in range(count):
+        assert len(source.crowd.person(k).points)
+    orders = [sorted(epoch) != epoch for epoch in sizes]
+    assert any(orders) and sizes[0] != sizes[1]
+    # whatever was asked for before
+    again = stored(datasets)
+    np.testing.assert_array_equal(again.example(2 * count + 1).points, source.example(2 * count + 1).points)
+
+
+def test_synthesized_people_are_mixed_in_by_their_share(datasets):
+    main, other = stored(datasets), SyntheticSource(scene="paper", seed=1)
+    mixed = MixedSource(main=main, other=other, share=0.3, seed=5)
+    synthesized = [not np.isnan(mixed.example(k).joints).any() for k in range(120)]
+    assert 0.18 < np.mean(synthesized) < 0.42
+    alone = MixedSource(main=main, other=other, share=0.0, seed=5)
+    np.testing.assert_array_equal(alone.example(3).points, main.example(3).points)
+
+
+def test_sequences_are_held_out_unless_the_dataset_has_a_split_for_it(datasets):
+    job = job_of(Finetune(data=(str(datasets["humanm3"]),), mix=0.0))
+    assert job.card["held_out_sequences"] == ["train/c"]
+    assert set(job.source.crowd.sequences) == {"train/a", "train/b"} and len(job.validation()) == 6
+    # Waymo has one
+    job = job_of(Finetune(data=(str(datasets["waymo"]),), mix=0.0))
+    assert not job.card["held_out_sequences"] and len(job.validation()) == 4
+    # and one sequence for training leaves nobody
+    job = job_of(Finetune(data=(str(datasets["sloper4d"]),), mix=0.0))
+    assert not job.card["held_out_sequences"] and not job.validation()
+
+
+# --- runs
+
+
+def test_pretraining_on_shards(synthetic, tmp_path):
+    recipe = Pretrain(shards=(str(synthetic),), people=32, batch=4, workers=0, pictures=0, validate=1000, scene="paper")
+    loop.train(recipe, tmp_path / "run")
+    assert read_header(tmp_path / "run" / runs.MODEL).card["recipe"]["shards"] == ["people"]
+
+
+@pytest.mark.parametrize("name, epochs", [("humanm3", 16), ("lidarhuman26m", 40), ("sloper4d", 60), ("waymo", 40)])
+def test_from_raw_files_to_scores(datasets, name, epochs, tmp_path, capsys, monkeypatch):
+    """Raw files, prepare, a few steps, evaluate: the joints come out where they went in, and the steps pay."""
+    monkeypatch.chdir(tmp_path)
+    words = ["finetune", str(datasets[name]), "--out", "run", "--workers", "0", "--batch", "8", "--mix", "0"]
+    assert not main([*words, "--epochs", str(epochs), "--pictures", "2"])
+    network, header = load_checkpoint("run/model.safetensors")
+    # one skeleton for all: anchors and heads are those of the bundled weights
+    assert header.config == load("tiny").header.config and header.card["data"] == [name]
+    assert not main(["evaluate", "run/model.safetensors", str(datasets[name]), "--out", "scores"])
+    assert "MPJPE" in capsys.readouterr().out
+    scores = json.loads((tmp_path / "scores" / "scores.json").read_text())
+    tuned = evaluation.read_scores(tmp_path / "scores").results[0]
+    untrained = evaluation.evaluate("tiny", datasets[name])
+    assert tuned.line("mpjpe").people == untrained.line("mpjpe").people > 0 and scores
+    assert tuned.line("mpjpe").value < 0.9 * untrained.line("mpjpe").value
+    (judged,) = evaluation.read_poses(tmp_path / "scores" / "poses.parquet").values()
+    truth = {(i.sequence, i.frame, i.track): i.sample.pose.joints for i in open_dataset(datasets[name]).items()}
+    for row in range(len(judged.true)):
+        known = truth[judged.sequence[row], judged.frame[row], judged.track[row]]
+        np.testing.assert_allclose(judged.true[row], known, atol=1e-3)
+
+
+@pytest.mark.parametrize("keep", ["true", "false"])
+def test_the_paper_s_two_stages(datasets, tmp_path, capsys, monkeypatch, keep):
+    monkeypatch.chdir(tmp_path)
+    common = ["--recipe", "paper", "--batch", "4", "--workers", "0", "--pictures", "0", "--validate", "1000"]
+    assert not main(["pretrain", "first", "--size", "paper-small", "--people", "32", *common])
+    words = ["finetune", str(datasets["humanm3"]), "--out", "second", "--init", "first/model.safetensors"]
+    assert not main([*words, "--epochs", "2", "--keep-anchors", keep, *common])
+    _, first = load_checkpoint("first/model.safetensors")
+    _, second = load_checkpoint("second/model.safetensors")
+    assert first.config.coordinates and not first.config.bins and first.config.parts == 25
+    assert second.config.bins == (140, 140, 220) and not (second.config.coordinates or second.config.parts)
+    assert second.config.joints == HUMAN15.joints and not second.config.legacy
+    assert not main(["evaluate", "second/model.safetensors", str(datasets["humanm3"]), "--protocol", "dapt"])
+    assert "MPJPE" in capsys.readouterr().out
+
+
+def test_a_run_on_a_dataset_is_taken_up(datasets, tmp_path, monkeypatch):
+    recipe = Finetune(
+        data=(str(datasets["lidarhuman26m"]),), epochs=8, batch=2, workers=0, pictures=0, scene="paper", validate=1000
+    )
+    loop.train(recipe, tmp_path / "whole")
+
+    class Killed(BaseException):
+        pass
+
+    def killed(*_):
+        raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "SAVE_EVERY", -1.0)
+        original, calls = loop._Run._chunk, []
+
+        def counted(self, batches):
+            calls.append(1)
+            return original(self, batches) if len(calls) < 3 else killed()
+
+        patch.setattr(loop._Run, "_chunk", counted)
+        with pytest.raises(Killed):
+            loop.train(recipe, tmp_path / "run")
+    loop.train(recipe, tmp_path / "run", resume=True)
+    whole, broken = (runs.read_log(tmp_path / name) for name in ("whole", "run"))
+    assert len(whole) == len(broken) == 3
+    for a, b in zip(whole, broken, strict=True):
+        a.pop("seconds"), b.pop("seconds")
+        assert b == pytest.approx(a, abs=2e-4)
+
+
+@pytest.mark.parametrize(
+    "words, told",
+    [
+        (["nowhere"], "is no dataset"),
+        (["{humanm3}", "--split", "morning"], "expected labelled people in the split 'morning'"),
+        (["{humanm3}", "--init", "huge"], "unknown bundled weights 'huge'"),
+        (["{humanm3}", "--init", "none.safetensors"], "does not exist"),
+        (["{humanm3}", "{waymo}"], "need one skeleton"),
+        (["{humanm3}", "--augment", "much"], "unknown augmentation 'much'"),
+        (["{humanm3}", "--keep-anchors", "perhaps"], "expected true or false, got 'perhaps'"),
+        (["{humanm3}", "--epochs", "0"], "epochs must be above 0"),
+    ],
+)
+def test_wrong_words_are_one_line_and_leave_no_folder(datasets, tmp_path, monkeypatch, capsys, words, told):
+    monkeypatch.chdir(tmp_path)
+    words = [word.format(**{name: str(folder) for name, folder in datasets.items()}) for word in words]
+    assert main(["finetune", *words, "--workers", "0"]) == 2
+    error = capsys.readouterr().err
+    assert told in error and error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
