@@ -270,7 +270,8 @@ def test_runs_without_a_name_are_numbered(tmp_path, monkeypatch, capsys):
         (["--schedule", "steps"], "unknown schedule 'steps'"),
         (["--shards", "nowhere"], "is no dataset"),
         (["--cool", "1.5"], "cool must be a share"),
-        (["--tracker", "paper"], "cannot train so"),
+        (["--tracker", "paper"], "unknown tracker 'paper'"),
+        (["--device", "moon"], "unknown device to train on 'moon'"),
     ],
 )
 def test_wrong_words_are_one_line_and_leave_no_folder(tmp_path, monkeypatch, capsys, words, told):

@@ -9,15 +9,16 @@ import os
 import sys
 import time
 from contextlib import ExitStack
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import torch
-from accelerate import Accelerator, DistributedDataParallelKwargs
+from accelerate import Accelerator
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from lidarpose.errors import InputError, missing_extra
+from lidarpose.errors import InputError, unknown_name
 from lidarpose.model.checkpoint import save_checkpoint
 from lidarpose.train.feed import BATCHES, Chunks, loader
 from lidarpose.train.job import Job, job_of
@@ -28,6 +29,8 @@ from lidarpose.train.state import load_state, save_state
 from lidarpose.train.task import total
 from lidarpose.train.validation import Draw, Validation
 
+# of Accelerate's, those that are known to work with a run's folder
+TRACKERS = ("tensorboard", "wandb")
 # seconds between two saved states
 SAVE_EVERY = 120
 # validations in a run whose recipe does not say how many
@@ -54,6 +57,7 @@ def train(
     pictures of validation people, None for none. Raises InputError where
     the folder or the recipe does not fit, or where the loss stops being finite: the last good state then stays.
     """
+    _check(device, tracker)
     kind = type(recipe)
     if resume:
         folder = latest(kind.__name__.lower()) if folder is None else Path(folder)
@@ -71,6 +75,9 @@ def train(
     elif accelerator.is_main_process:
         begin(folder, recipe, command)
     accelerator.wait_for_everyone()
+    if tracker is not None:
+        settings = {name: value for name, value in recipe.to_dict().items() if isinstance(value, int | float | str)}
+        accelerator.init_trackers("lidarpose", config=settings)
     try:
         run.go()
     finally:
@@ -84,21 +91,24 @@ def _accelerator(recipe: Recipe, folder: Path, device: str | None, tracker: str 
     half = recipe.precision == "bf16" or recipe.precision == "auto" and not on_cpu
     try:
         accelerator = Accelerator(
-            cpu=on_cpu,
-            mixed_precision="bf16" if half else "no",
-            log_with=tracker,
-            project_dir=str(folder),
-            kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=False)],
+            cpu=on_cpu, mixed_precision="bf16" if half else "no", log_with=tracker, project_dir=str(folder)
         )
-        if tracker is not None:
-            settings = {name: value for name, value in recipe.to_dict().items() if isinstance(value, int | float | str)}
-            accelerator.init_trackers("lidarpose", config=settings)
-    except ModuleNotFoundError as error:
-        raise missing_extra(error, f"--tracker {tracker}") from None
-    except (ValueError, ImportError) as error:
+    except ValueError as error:
+        # of a machine that has no bf16, or a launcher that asks for what is not there
         reason = str(error).partition("\n")[0]
-        raise InputError(f"cannot train so ({reason}): choose another --tracker or --precision") from None
+        raise InputError(f"cannot train so ({reason}): choose another --precision or --device") from None
     return accelerator
+
+
+def _check(device: str | None, tracker: str | None) -> None:
+    """Raises InputError for a device or a tracker that is not there."""
+    if device not in (None, "cpu"):
+        raise unknown_name("device to train on", device, ("cpu",))
+    if tracker is not None:
+        if tracker not in TRACKERS:
+            raise unknown_name("tracker", tracker, TRACKERS)
+        if find_spec(tracker) is None:
+            raise InputError(f"--tracker {tracker} needs the package {tracker}: pip install {tracker}")
 
 
 def _on_cpu(device: str | None) -> bool:
