@@ -11,8 +11,10 @@ from lidarpose.model.batch import Targets
 from lidarpose.model.heads import REACH, Outputs, encode
 from lidarpose.model.network import PoseNet
 from lidarpose.model.presets import BIN, preset
+from lidarpose.sample import center_of
 from lidarpose.synth.generate import Generator
 from lidarpose.synth.scene import SCENES
+from lidarpose.train.augment import disturbed
 from lidarpose.train.feed import BATCHES, Chunks, loader
 from lidarpose.train.job import job_of
 from lidarpose.train.losses import CONFIDENCE, HEATMAP, SIGMA, SPREAD, VOTE, losses
@@ -273,3 +275,25 @@ def test_recipes():
 def test_a_recipe_refuses_negative_numbers(field):
     with pytest.raises(InputError, match=f"^{field} must be at least [01], got -1$"):
         Pretrain(**{field: -1})
+
+
+def test_disturbed_people_have_their_joints_and_more_or_other_points():
+    sample = Generator(scene=SCENES["wild"], measure=False).person(2, 0).sample
+    kept = sample.points.copy()
+    assert disturbed(sample, strays=0.0, noise=0.0, rng=np.random.default_rng(0)) is sample
+    more = [disturbed(sample, strays=1.0, noise=0.0, rng=np.random.default_rng(k)) for k in range(40)]
+    for one in more:
+        count = len(sample.points)
+        np.testing.assert_array_equal(one.points[:count], sample.points)
+        assert (one.part[count:] == 0).all() and len(one.part) == len(one.points) and one.pose is sample.pose
+        np.testing.assert_array_equal(one.center, center_of(one.points))
+    assert max(len(one.points) for one in more) > len(sample.points) + 50
+    steps = []
+    for seed in range(40):
+        one = disturbed(sample, strays=0.0, noise=1.0, rng=np.random.default_rng(seed))
+        steps.append((one.points - sample.points).std())
+        assert one.points.dtype == np.float32 and np.array_equal(one.part, sample.part)
+    assert 0.003 < min(steps) < 0.01 and 0.04 < max(steps) < 0.09
+    share = [disturbed(sample, strays=0.3, noise=0.0, rng=np.random.default_rng(k)) is not sample for k in range(300)]
+    assert 0.2 < np.mean(share) < 0.4
+    np.testing.assert_array_equal(sample.points, kept)

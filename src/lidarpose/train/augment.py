@@ -12,7 +12,7 @@ from lidarpose.data.released import released_view
 from lidarpose.errors import unknown_name
 from lidarpose.geometry import rotation_about
 from lidarpose.model.plan import view_features
-from lidarpose.sample import center_of
+from lidarpose.sample import Sample, center_of
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.train.crowd import Person
 from lidarpose.train.example import BLIND, PELVIS_ERROR, REFINED, Example
@@ -21,6 +21,8 @@ from lidarpose.train.example import BLIND, PELVIS_ERROR, REFINED, Example
 LEAST_POINTS = 5
 # largest number of strays in a blob
 _STRAYS = 60
+# of a synthetic person's, and steps on their coordinates, m
+_MOST_STRAYS, _NOISE = 200, (0.005, 0.08)
 _FLIP_PART = np.array([-1, 0, *(1 + np.array(SMPL24.flip))], np.int16)
 
 
@@ -94,6 +96,27 @@ def augmented(person: Person, kind: Augmentation, rng: np.random.Generator) -> E
         view=view,
         seed=int(rng.integers(2**31)),
     )
+
+
+def disturbed(sample: Sample, *, strays: float, noise: float, rng: np.random.Generator) -> Sample:
+    """A synthetic person whose points are worse than a sensor's: with probability `strays` blobs of stray points, which
+    no box has cut, and with probability `noise` normal steps of 0.5 to 8 cm on every coordinate.
+
+    Paper: the disturbances of its stability study, of any size. The center is that of what is there now.
+    """
+    points, part = sample.points, sample.part
+    chance = rng.random(2)
+    if chance[0] < strays:
+        most = min(_MOST_STRAYS, _STRAYS // 3 + len(points))
+        blobs = noise_clusters(sample.center, most=most, rng=rng)
+        points = np.concatenate([points, blobs.astype(np.float32)])
+        part = np.concatenate([part, np.zeros(len(blobs), part.dtype)])
+    if chance[1] < noise:
+        sigma = np.exp(rng.uniform(*np.log(_NOISE)))
+        points = jitter(points, sigma=sigma, clip=2 * sigma, rng=rng).astype(np.float32)
+    if points is sample.points:
+        return sample
+    return replace(sample, points=points, part=part, ring=None, center=center_of(points))
 
 
 def _view(person: Person, kind: Augmentation, rng: np.random.Generator) -> tuple[Person, np.ndarray]:

@@ -60,7 +60,8 @@ def _pretraining(recipe: Pretrain) -> Job:
         task = PoseTask(config=preset(recipe.size), bone=recipe.bone, symmetry=recipe.symmetry)
     else:
         raise unknown_name("network size", recipe.size, (*SIZES, PAPER, SMALL_PAPER))
-    scene = {"scene": recipe.scene, "motion": recipe.motion, "subjects": recipe.subjects, "captured": recipe.captured}
+    names = ("scene", "motion", "subjects", "captured", "strays", "noise")
+    scene = {name: getattr(recipe, name) for name in names}
     if recipe.shards:
         source = StoredSource(folders=recipe.shards, seed=recipe.seed, augmentation=Augmentation(turn=1.0, flip=0.5))
     else:

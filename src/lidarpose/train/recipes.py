@@ -72,13 +72,15 @@ class Pretrain(Recipe):
     captured: float = _setting(0.5, "share of poses from captured motion, where clips are given")
     motion: str | None = _setting(None, "captured motion to take poses from: a file or a folder")
     subjects: tuple[str, ...] = _setting((), "those of its clips to learn from, by the first part of names")
+    strays: float = _setting(0.2, "how often stray points are about a person")
+    noise: float = _setting(0.15, "how often all points are blurred, by 0.5 to 8 cm")
     shards: tuple[str, ...] = _setting((), "folders that `lidarpose synth` wrote, to learn from instead")
 
     def __post_init__(self):
         super().__post_init__()
         if self.people < 1:
             raise InputError(f"people must be at least 1, got {self.people}")
-        for name in ("easy", "captured"):
+        for name in ("easy", "captured", "strays", "noise"):
             if getattr(self, name) > 1:
                 raise InputError(f"{name} must be a share, at most 1, got {getattr(self, name)}")
 
@@ -123,7 +125,15 @@ def pretrain_default() -> dict:
 def pretrain_paper() -> dict:
     """Paper: implementation details. 50 epochs; an epoch is here 50,000 people, since the paper's follow frames of
     LiDARHuman26M, and every pose is new."""
-    return _RELEASED | {"size": PAPER, "scene": "paper", "rate": 3e-4, "people": 2_500_000, "easy": 0.0}
+    return (
+        _RELEASED
+        | {"size": PAPER, "scene": "paper", "rate": 3e-4, "people": 2_500_000, "easy": 0.0}
+        | {
+            # its law of noise is the scene's
+            "strays": 0.0,
+            "noise": 0.0,
+        }
+    )
 
 
 def finetune_default() -> dict:

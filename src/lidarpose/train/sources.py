@@ -12,7 +12,7 @@ import numpy as np
 from lidarpose.synth.bodies import PoseBank
 from lidarpose.synth.generate import Generator
 from lidarpose.synth.scene import scene_config
-from lidarpose.train.augment import Augmentation, augmented
+from lidarpose.train.augment import Augmentation, augmented, disturbed
 from lidarpose.train.crowd import Crowd, crowd_of
 from lidarpose.train.example import Example, example
 
@@ -31,8 +31,8 @@ class SyntheticSource:
     """People of a scene whose difficulty rises.
 
     easy: how many people it takes to rise from nothing to full; below the ceiling every difficulty goes on being seen,
-    the harder ones more often; motion, subjects, captured: see `recipes.Pretrain`. Raises InputError, at once, for an
-    unknown scene and for clips that cannot be read.
+    the harder ones more often; motion, subjects, captured, strays, noise: see `recipes.Pretrain`. Raises InputError, at
+    once, for an unknown scene and for clips that cannot be read.
     """
 
     scene: str
@@ -41,6 +41,8 @@ class SyntheticSource:
     motion: str | None = None
     subjects: tuple[str, ...] = ()
     captured: float = 0.0
+    strays: float = 0.0
+    noise: float = 0.0
 
     def __post_init__(self):
         # here, not in a worker, whose errors come wrapped in a traceback
@@ -55,7 +57,8 @@ class SyntheticSource:
     def example(self, index: int) -> Example:
         rng = np.random.default_rng([self.seed, _SYNTHETIC, index])
         hard = min(index / max(self.easy, 1), 1.0) * np.sqrt(rng.random())
-        return example(self._generator.person(self.seed, index, hard=hard).sample, rng)
+        sample = self._generator.person(self.seed, index, hard=hard).sample
+        return example(disturbed(sample, strays=self.strays, noise=self.noise, rng=rng), rng)
 
 
 @dataclass(frozen=True, kw_only=True)
