@@ -36,6 +36,9 @@ _HOMES = {
     "InputError": "lidarpose.errors",
 }
 
+# modules of their own, for `lidarpose.metrics.mpjpe`
+_MODULES = ("metrics", "evaluation")
+
 __all__ = ["__version__", *_HOMES]
 
 
@@ -45,11 +48,10 @@ def __getattr__(name: str):
             return getattr(import_module(_HOMES[name]), name)
         except ModuleNotFoundError as error:
             raise missing_extra(error, f"lidarpose.{name}", "export" if name == "export" else None) from None
-    if name == "metrics":
-        # a module of its own, for `lidarpose.metrics.mpjpe`
-        return import_module("lidarpose.metrics")
+    if name in _MODULES:
+        return import_module(f"lidarpose.{name}")
     raise AttributeError(f"module 'lidarpose' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted([*__all__, "metrics"])
+    return sorted([*__all__, *_MODULES])

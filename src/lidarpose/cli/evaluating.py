@@ -43,6 +43,9 @@ def add(commands) -> None:
     )
     evaluate.add_argument("--out", metavar="DIR", help="a new or empty folder (default evaluation/NAME, numbered)")
     evaluate.add_argument("--device", default="cpu", metavar="NAME", help="cpu (default), or cuda with torch")
+    evaluate.add_argument(
+        "--decode", default="window", metavar="NAME", help="as in lidarpose predict; the paper's is dark"
+    )
     evaluate.add_argument("--backend", metavar="NAME", help="onnx or torch, as in lidarpose predict")
 
     table = commands.add_parser(
@@ -74,6 +77,7 @@ def _evaluate(options: argparse.Namespace) -> None:
             seed=options.seed,
             device=options.device,
             backend=options.backend,
+            decode=options.decode,
             command=_command(options),
             progress=_bar(stack) if sys.stderr is not None and sys.stderr.isatty() else None,
         )
@@ -100,8 +104,8 @@ def _table(options: argparse.Namespace) -> None:
 def _command(options: argparse.Namespace) -> str:
     """What was asked for, as it would be typed."""
     words = ["lidarpose", "evaluate", options.weights, *options.datasets]
-    defaults = {"protocol": "clean", "seed": 0, "device": "cpu"}
-    for name in ("protocol", "split", "skeleton", "limit", "seed", "device", "backend"):
+    defaults = {"protocol": "clean", "seed": 0, "device": "cpu", "decode": "window"}
+    for name in ("protocol", "split", "skeleton", "limit", "seed", "device", "backend", "decode"):
         value = getattr(options, name)
         if value is not None and value != defaults.get(name):
             words += [f"--{name}", str(value)]

@@ -109,11 +109,16 @@ def noise_clusters(center: np.ndarray, *, most: int, rng: np.random.Generator) -
     blobs = []
     for _ in range(rng.integers(1, 3)):
         count = int(rng.integers(0, most + 1))
-        place = center + rng.uniform(-1, 1, 3) * _CLUSTER_REACH
-        direction = rng.normal(size=(count, 3))
-        direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
-        blobs.append(place + direction * rng.uniform(0, _CLUSTER_RADIUS, (count, 1)))
+        blobs.append(stray_cluster(center, count=count, rng=rng))
     return np.concatenate(blobs)
+
+
+def stray_cluster(center: np.ndarray, *, count: int, rng: np.random.Generator) -> np.ndarray:
+    """(count, 3) m: one blob of stray points, within 0.3 m of a place up to 0.4 m (0.8 m in height) from `center`."""
+    place = center + rng.uniform(-1, 1, 3) * _CLUSTER_REACH
+    direction = rng.normal(size=(count, 3))
+    direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
+    return place + direction * rng.uniform(0, _CLUSTER_RADIUS, (count, 1))
 
 
 # half the extents of where clusters may lie and their radius, m: the released code's

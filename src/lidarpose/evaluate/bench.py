@@ -25,7 +25,7 @@ from lidarpose.data.files import file_error, read_bytes
 from lidarpose.errors import missing_extra
 from lidarpose.geometry import rotation_about
 from lidarpose.sample import center_of
-from lidarpose.skeleton import BODY26, HUMAN15
+from lidarpose.skeleton import BODY26
 
 NAME = "lidarpose-bench-1"
 # key of the card in the file's metadata
@@ -150,44 +150,8 @@ def floors(bench: Bench) -> dict[str, np.ndarray]:
     }
 
 
-# which joints are reported together, human15's names
-GROUPS = {
-    "head and neck": ("head", "neck"),
-    "shoulders": ("left_shoulder", "right_shoulder"),
-    "elbows": ("left_elbow", "right_elbow"),
-    "wrists": ("left_wrist", "right_wrist"),
-    "pelvis and hips": ("pelvis", "left_hip", "right_hip"),
-    "knees": ("left_knee", "right_knee"),
-    "ankles": ("left_ankle", "right_ankle"),
-}
-_DISTANCES, _POINTS = (2, 7, 12, 20, 41), (20, 50, 100, 200, 400, 100_000)
-
-
-def rows_by(bench: Bench) -> dict[str, dict[str, np.ndarray]]:
-    """People's rows by what they are reported by: condition, sensor, poses, distance, points, plain."""
-    people, columns = bench.people, bench.columns
-    out = {
-        name: {str(value): people[columns[name][people] == value] for value in sorted(set(columns[name][people]))}
-        for name in ("condition", "poses", "sensor")
-    }
-    for title, name, edges in (("distance, m", "distance", _DISTANCES), ("points", "num_points", _POINTS)):
-        spans = zip(edges[:-1], edges[1:], strict=True)
-        value = columns[name][people]
-        out[title] = {f"{a} to {b}": people[(value >= a) & (value < b)] for a, b in spans}
-    plain = (
-        columns["upright"] & (columns["visible"] > 0.8) & (columns["clutter"] < 0.05) & (columns["num_points"] >= 100)
-    )
-    out["plain"] = {"upright, whole, uncluttered, 100 points": people[plain[people]]}
-    return out
-
-
-def errors(bench: Bench, joints: np.ndarray) -> np.ndarray:
-    """Predicted joints (N, 26, 3) m -> (N, 15) m: distances from the truth of human15's joints."""
-    pick = BODY26.map_to(HUMAN15)
-    return np.linalg.norm(joints[:, pick] - bench.joints[:, pick], axis=-1)
-
-
-def swapped(bench: Bench, joints: np.ndarray) -> np.ndarray:
-    """Predicted joints (N, 26, 3) m -> (N,) bool: left and right exchanged, the facing over 90 degrees off."""
-    turn = (facing(joints) - facing(bench.joints) + np.pi) % (2 * np.pi) - np.pi
-    return np.abs(turn) > np.pi / 2
+def plain(bench: Bench) -> np.ndarray:
+    """(N,) bool: upright, whole, uncluttered, of 100 points and more."""
+    columns = bench.columns
+    whole = columns["upright"] & (columns["visible"] > 0.8) & (columns["clutter"] < 0.05)
+    return whole & (columns["num_points"] >= 100)

@@ -86,15 +86,7 @@ def acceleration_error(
     differences times rate^2; rate=1 gives mm per frame^2, the figure that most papers print. One counts where the joint
     is labelled in all its three frames. average "person" is over sequences here, and `people` counts sequences.
     """
-    pred, true, labelled = checked_poses(pred, true, visible, trailing=("frames", "joints", "3"))
-    if pred.shape[1] < 3:
-        raise InputError(f"acceleration needs sequences of 3 frames or more, got {pred.shape[1]}")
-    if not (np.isfinite(rate) and rate > 0):
-        raise InputError(f"rate must be a positive number of frames a second, got {rate}")
-    away = np.where(labelled[..., None], pred - true, 0.0)
-    known = labelled[:, :-2] & labelled[:, 1:-1] & labelled[:, 2:]
-    error = np.linalg.norm(away[:, :-2] - 2 * away[:, 1:-1] + away[:, 2:], axis=-1) * rate**2 * 1e3
-    return mean(np.where(known, error, np.nan).reshape(len(error), -1), average)
+    return mean(acceleration_errors(pred, true, rate, visible), average)
 
 
 # ---- tables
@@ -128,6 +120,21 @@ def aligned_errors(
         for known, joints in ((labelled[..., None], pred), (labelled[..., None], true))
     ]
     return _distances(similarity_align(*filled), true, labelled)
+
+
+def acceleration_errors(
+    pred: np.ndarray, true: np.ndarray, rate: float, visible: np.ndarray | None = None
+) -> np.ndarray:
+    """(n, (T - 2) J) mm/s^2: distance of predicted and true acceleration, see `acceleration_error`; NaN where none."""
+    pred, true, labelled = checked_poses(pred, true, visible, trailing=("frames", "joints", "3"))
+    if pred.shape[1] < 3:
+        raise InputError(f"acceleration needs sequences of 3 frames or more, got {pred.shape[1]}")
+    if not (np.isfinite(rate) and rate > 0):
+        raise InputError(f"rate must be a positive number of frames a second, got {rate}")
+    away = np.where(labelled[..., None], pred - true, 0.0)
+    known = labelled[:, :-2] & labelled[:, 1:-1] & labelled[:, 2:]
+    error = np.linalg.norm(away[:, :-2] - 2 * away[:, 1:-1] + away[:, 2:], axis=-1) * rate**2 * 1e3
+    return np.where(known, error, np.nan).reshape(len(error), -1)
 
 
 def joint_hits(

@@ -94,7 +94,7 @@ def describe(person) -> str:
     if distance is None:
         at = middle(person)
         distance = None if at is None else float(np.linalg.norm(at))
-    if distance is not None:
+    if distance is not None and np.isfinite(distance):
         words.append(f"{distance:.1f} m")
     if is_known(person.pose) and person.pose.confidence is not None:
         words.append(f"confidence {confidences(person.pose).mean():.2f}")

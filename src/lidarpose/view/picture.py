@@ -57,8 +57,8 @@ class Panel:
 
     points (n, 3) m, z up, n = 0 is legal; pose and truth of one person in the points' frame, joints (J, 3) m, a joint
     that is not finite is left out; part (n,) int, 0 = not body, 1 + j = the bone of SMPL-24's joint j, colors the
-    points; distance m is printed, by default that of the person from the frame's origin. Raises InputError on a
-    wrong shape.
+    points; distance m is printed, by default that of the person from the frame's origin, none for NaN. Raises
+    InputError on a wrong shape.
     """
 
     points: np.ndarray

@@ -1,0 +1,183 @@
+"""The table: published figures as printed, ours from scores.json alone, by protocol; and the command line."""
+
+import json
+
+import pytest
+
+from lidarpose import evaluation
+from lidarpose.cli import main
+from lidarpose.errors import InputError
+from lidarpose.evaluate.result import Line, Result, Scores, Setting
+
+
+def scores(folder, *, method="mine", kind="waymo", protocol="clean", value=70.0, digest="ab" * 32, **more):
+    """Writes a scores.json of one dataset, PA-MPJPE not found."""
+    told = {"protocol": protocol, "centring": "somewhere", "split": "val", "limit": more.get("limit")}
+    setting = Setting(
+        dataset=more.get("dataset", kind),
+        kind=kind,
+        method=method,
+        crop="so",
+        split_source="a list",
+        leaks=more.get("leaks", ""),
+        joints=("nose", "left_hip"),
+        not_judged="",
+        sensor="known",
+        total=200,
+        clusters=True,
+        seed=0,
+        **told,
+    )
+    lines = [
+        Line(
+            method=who, figure=name, group="all", of="all", value=v, unit="mm", people=9, joints=18, skipped=0,
+            arithmetic=a, **told,
+        )
+        for who, name, v, a in (
+            (method, "mpjpe", value, "lidarpose"),
+            (method, "pck3", None, "lidarpose"),
+            (method, "mpjpe", value - 1, "released"),
+            ("floor: nobody", "mpjpe", 300.0, "lidarpose"),
+        )
+    ]  # fmt: skip
+    counts = {"people": 9, "frames of clips": 0, "without a pose": 2}
+    result = Result(setting=setting, counts=counts, skipped={}, notes=(), lines=tuple(lines))
+    made = Scores(weights={"name": method, "digest": digest}, command="c", seed=0, results=(result,))
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "scores.json").write_text(made.to_json())
+    assert evaluation.read_scores(folder) == made
+    return folder
+
+
+def test_published_figures_are_the_paper_s():
+    found = evaluation.published()
+    methods = {method["method"]: method["figures"] for method in found["methods"]}
+    assert list(methods) == ["LiDARCap", "NE", "LPFormer", "PRN", "DAPT"]
+    assert methods["DAPT"] == {
+        "waymo": {"mpjpe": 51.59, "pck3": 97.34, "pck5": 98.98},
+        "humanm3": {"mpjpe": 59.76, "pck3": 95.39, "pck5": 98.30},
+        "lidarhuman26m": {"mpjpe": 73.47, "pa_mpjpe": 58.40, "pck3": 90.54, "pck5": 97.06},
+        "sloper4d": {"mpjpe": 28.01, "pa_mpjpe": 21.52, "pck3": 99.30, "pck5": 99.87},
+    }
+    assert set(methods["NE"]) == set(methods["LiDARCap"]) == {"lidarhuman26m", "sloper4d"}
+    assert "not run here" in found["note"] and "Table 1" in found["source"]
+    assert all("oracle" in told["protocol"] for told in found["datasets"].values())
+
+
+def test_without_scores_there_is_no_figure_of_ours():
+    text = evaluation.table([])
+    assert "Evaluated here" not in text and text.count("| DAPT |") == 1
+    # 3 + 3 + 4 + 4 figures of DAPT, PRN and LPFormer, 8 of the others
+    rows = [line for line in text.splitlines() if line.startswith("| ")][1:]
+    figures = [cell.strip() for row in rows for cell in row.split("|")[2:-1]]
+    assert len(rows) == 5 and len(figures) == 70 and figures.count("-") == 12
+
+
+def test_protocols_stand_in_blocks_of_their_own(tmp_path):
+    paths = [scores(tmp_path / "a"), scores(tmp_path / "b", protocol="dapt", value=66.0, leaks="much")]
+    text = evaluation.table(paths)
+    published, dapt, clean = text.split("**Evaluated here")
+    assert "Not comparable with the blocks above" in clean and "70.00" not in published + dapt
+    assert "66.00" in dapt and "66.00" not in published + clean.partition("\n\n[")[0]
+    assert "| mine, released arithmetic | 69.00 [" in clean
+    row = next(line for line in clean.splitlines() if line.startswith("| mine |"))
+    mark = row.split("|")[2].split()[1]
+    note = next(line for line in text.splitlines() if line.startswith(mark + " "))
+    for word in (
+        "protocol clean",
+        "center: somewhere",
+        "crop: so",
+        "split: val (a list)",
+        "9 people",
+        "2 joints",
+        "abababab",
+    ):
+        assert word in note
+    assert "2 without a pose" in note and "which leaks: much" in text
+
+
+def test_a_limit_is_in_the_note_and_other_sets_stand_apart(tmp_path):
+    text = evaluation.table([scores(tmp_path / "a", kind="bench", dataset="lidarpose-bench-1", limit=9)])
+    assert "9 people, evenly picked from 200" in text
+    assert "**Evaluated here on sets that the paper does not have.**" in text and "| floor: nobody | 300.00" in text
+
+
+def test_two_weights_of_one_name_are_two_rows(tmp_path):
+    paths = [scores(tmp_path / k, digest=k * 64, value=v) for k, v in (("a", 71.0), ("b", 72.0))]
+    both = evaluation.table(paths)
+    assert both.count("| mine |") == 2
+    # one network on two sets is one row
+    more = evaluation.table([paths[0], scores(tmp_path / "c", kind="humanm3", digest="a" * 64, value=80.0)])
+    row = next(line for line in more.splitlines() if line.startswith("| mine |"))
+    assert "71.00" in row and "80.00" in row
+
+
+def test_json_holds_both(tmp_path):
+    found = json.loads(evaluation.table([scores(tmp_path / "a")], format="json"))
+    assert found["published"] == evaluation.published()
+    assert [entry["row"] for entry in found["evaluated"]] == ["mine", "mine, released arithmetic", "floor: nobody"]
+    first = found["evaluated"][0]
+    assert first["figures"] == {"mpjpe": 70.0, "pa_mpjpe": None, "pck3": None, "pck5": None}
+    assert first["protocol"] == "clean" and first["weights"] == "ab" * 32
+
+
+def test_unknown_formats_are_refused():
+    with pytest.raises(InputError, match="markdown or json, got 'tex'"):
+        evaluation.table([], format="tex")
+
+
+# ---- the command line
+
+
+def run(*arguments):
+    try:
+        return main([str(argument) for argument in arguments])
+    except SystemExit as done:
+        return done.code
+
+
+def test_evaluate_and_table_from_the_command_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run("evaluate", "tiny", "bench", "--limit", "25", "--seed", "3") == 0
+    shown = capsys.readouterr()
+    assert {path.name for path in (tmp_path / "evaluation/tiny").iterdir()} == {
+        "scores.json", "poses.parquet", "lidarpose-bench-1-errors.png", "lidarpose-bench-1-reliability.png",
+        "lidarpose-bench-1-worst.png",
+    }  # fmt: skip
+    lines = [line for line in shown.out.splitlines() if "MPJPE" in line]
+    assert lines and all("clean · points alone · no split · 25 of 2,000 people" in line for line in lines)
+    made = evaluation.read_scores(tmp_path / "evaluation/tiny")
+    assert made.command == "lidarpose evaluate tiny bench --limit 25 --seed 3" and made.seed == 3
+    assert f"{made.results[0].line('mpjpe').value:.1f}" in lines[0]
+
+    assert run("table", "evaluation/tiny") == 0
+    assert f"{made.results[0].line('mpjpe').value:.2f} [" in capsys.readouterr().out
+    assert run("table", "evaluation/tiny", "--format", "json", "--out", "table.json") == 0
+    assert json.loads((tmp_path / "table.json").read_text())["evaluated"]
+    capsys.readouterr()
+
+    # the same folder is not written twice
+    assert run("evaluate", "tiny", "bench", "--limit", "5", "--out", "evaluation/tiny") == 2
+    assert "holds other files" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (("evaluate", "tiny", "nowhere"), "is no dataset"),
+        (("evaluate", "nix", "bench"), "known are tiny"),
+        (("evaluate", "nix.safetensors", "bench"), "nix.safetensors"),
+        (("evaluate", "tiny", "bench", "--protocol", "dapt"), "is synthetic"),
+        (("evaluate", "tiny", "bench", "--skeleton", "human51"), "did you mean human15"),
+        (("evaluate", "tiny", "bench", "--limit", "-1"), "at least 1 person"),
+        (("evaluate", "tiny"), "DATASET"),
+        (("table", "nowhere.json"), "no such file"),
+        (("table", "--format", "tex"), "markdown or json"),
+    ],
+)
+def test_what_is_wrong_is_one_line_and_nothing_is_written(arguments, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run(*arguments) == 2
+    told = capsys.readouterr()
+    assert told.out == "" and words in told.err and told.err.startswith("lidarpose: error: ")
+    assert told.err.count("\n") == 1 and not list(tmp_path.iterdir())
