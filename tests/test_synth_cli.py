@@ -1,6 +1,7 @@
 """`lidarpose synth` and its datasets in torch: the same bytes and the same people however they are made."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,7 +12,7 @@ import pytest
 from torch.utils.data import DataLoader
 
 from lidarpose.cli import main
-from lidarpose.data.shards import open_dataset
+from lidarpose.data.shards import open_dataset, read_rows, write_shard
 from lidarpose.errors import InputError
 from lidarpose.lidar.tables import listing
 from lidarpose.synth import write
@@ -92,6 +93,32 @@ def test_workers_give_the_same_bytes(dataset, tmp_path, capsys):
     assert "60 people made -> " in capsys.readouterr().err
     assert synth(tmp_path / "two", *WORDS, "--workers", 2) == 0
     assert "0 people made, 60 were there" in capsys.readouterr().err
+
+
+def test_a_shard_of_too_few_people_is_made_again(dataset, tmp_path):
+    out = tmp_path / "short"
+    shutil.copytree(dataset, out)
+    # a whole file that lacks one of them
+    write_shard(out / "people-00003.parquet", "people", list(read_rows(out / "people-00003.parquet", "people"))[:-1])
+    assert content(out) != content(dataset)
+    told = []
+    assert write_dataset(job(), out, progress=lambda *done: told.append(done)) == PER_SHARD
+    assert content(out) == content(dataset)
+    assert told[0] == (COUNT - PER_SHARD, COUNT) and told[-1] == (COUNT, COUNT) and told == sorted(told)
+
+
+def job(**settings):
+    """That of `WORDS`."""
+    return Job(what="people", count=COUNT, per_shard=PER_SHARD, sensors=("os1-64", "vlp-16"), seed=5, **settings)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_motion_that_cannot_be_read_is_one_line_and_leaves_no_folder(tmp_path, workers):
+    motion = tmp_path / "motion.npz"
+    motion.write_bytes(b"PK no motion")
+    with pytest.raises(InputError, match="motion.npz") as caught:
+        write_dataset(job(motion=str(motion)), tmp_path / "out", workers=workers)
+    assert "\n" not in str(caught.value) and [path.name for path in tmp_path.iterdir()] == ["motion.npz"]
 
 
 def test_other_settings_are_refused_by_name(dataset, capsys):

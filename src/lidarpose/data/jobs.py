@@ -1,6 +1,8 @@
 """Shards by several processes, restartable: what is missing of a folder, who makes it, and what killed runs left.
 
-A shard is written whole or not at all, so nothing else need be remembered. See also `synth.write`.
+Behind `lidarpose synth` and `prepare`. A shard is written whole or not at all, and its content depends on the settings
+and its number alone. So nothing else need be remembered: what is missing is made, whoever makes it, and the folder ends
+up the same byte for byte.
 """
 
 import multiprocessing
@@ -9,7 +11,7 @@ import re
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, suppress
@@ -20,7 +22,7 @@ from lidarpose.data.files import file_error
 from lidarpose.data.shards import CARD, Card, check_settings, read_card, rows_of_shard, shard_path
 from lidarpose.errors import InputError
 
-# makes and writes a shard; yields how many people are done since it last did
+# makes and writes a shard, by its number; yields how many people, clips or streets are done since it last did
 Make = Callable[[int], Iterator[int]]
 
 # how often progress is told, s
@@ -31,20 +33,27 @@ _STALE = 600.0
 _LEFT = re.compile(rf"\.(\d+)-\d+-(?:(?:{'|'.join(TABLES)})-\d{{5}}\.parquet|{re.escape(CARD)})")
 
 
-def open_folder(folder: Path, card: Card) -> list[int]:
-    """The numbers of the shards that are missing. Raises InputError unless the folder is missing, empty or of this very
-    dataset."""
+def open_folder(folder: Path, card: Card, rows: Mapping[str, int] | None = None) -> list[int]:
+    """The numbers of the shards that are missing, damaged or, by `rows`, not whole.
+
+    rows: by table, how many rows each one of `card.count` has, where that is known. Raises InputError unless the folder
+    is missing, empty or of this very dataset.
+    """
     if folder.exists() and not folder.is_dir():
         raise file_error(folder, "is a file; give a folder for the dataset")
     if (folder / CARD).is_file():
         check_settings(folder, read_card(folder), card)
     elif folder.is_dir() and any(not _LEFT.fullmatch(path.name) for path in folder.iterdir()):
         raise file_error(folder, f"holds other files and no {CARD}; give a new or empty folder for the dataset")
-    whole = [
-        all(rows_of_shard(shard_path(folder, table, shard)) is not None for table in card.tables)
-        for shard in range(card.shards)
-    ]
-    return [shard for shard, done in enumerate(whole) if not done]
+    return [shard for shard in range(card.shards) if not _is_whole(folder, card, shard, rows or {})]
+
+
+def _is_whole(folder: Path, card: Card, shard: int, rows: Mapping[str, int]) -> bool:
+    for table in card.tables:
+        found = rows_of_shard(shard_path(folder, table, shard))
+        if found is None or table in rows and found != rows[table] * card.size(shard):
+            return False
+    return True
 
 
 def clean_folder(folder: Path) -> None:
@@ -73,7 +82,8 @@ def _is_alive(process: int) -> bool:
 
 
 def make_shards(make: Make, shards: list[int], *, workers: int = 1) -> Iterator[tuple[int, int]]:
-    """Makes shards, here or in other processes; yields how many (shards, people) are done since it last did.
+    """Makes shards, here or in other processes; yields how many shards, and how many of what `make` counts, are done
+    since it last did.
 
     With several workers `make` is pickled once for each; they end with this process, however it ends. Raises what
     `make` raises, and InputError where a worker dies.
@@ -83,9 +93,9 @@ def make_shards(make: Make, shards: list[int], *, workers: int = 1) -> Iterator[
         yield from _by_processes(make, shards, workers)
         return
     for shard in shards:
-        with _one_thread():
-            for people in make(shard):
-                yield 0, people
+        with closing(_counts(make, shard)) as counts:
+            for count in counts:
+                yield 0, count
         yield 1, 0
 
 
@@ -132,16 +142,18 @@ def _leave_with_parent() -> None:
 
 def _shard(shard: int) -> None:
     make, done, stop = _mine
-    with _one_thread(), closing(make(shard)) as counts:
-        for people in counts:
+    with closing(_counts(make, shard)) as counts:
+        for count in counts:
             with done.get_lock():
-                done.value += people
+                done.value += count
             if stop.is_set():
                 return
 
 
-def _one_thread():
-    """Products of a few thousand numbers: threads of BLAS only get in each other's way."""
+def _counts(make: Make, shard: int) -> Iterator[int]:
+    """As `make`, on one thread: in products of a few thousand numbers threads of BLAS only get in each other's way.
+    What `make` does before it returns, such as reading what all shards need, has them all."""
     from threadpoolctl import threadpool_limits
 
-    return threadpool_limits(limits=1, user_api="blas")
+    with closing(make(shard)) as counts, threadpool_limits(limits=1, user_api="blas"):
+        yield from counts
