@@ -6,6 +6,7 @@ from dataclasses import replace
 import dataset_files as files
 import numpy as np
 import pytest
+import torch
 import waymo_files
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -102,6 +103,11 @@ def test_splits_intervals_and_sequences_leave_people_out(datasets):
     # frames 7, 8, 9 of everybody
     assert len(crowd_of([folder], interval=4)) == len(everybody) // 3
     assert len(crowd_of([folder, folder])) == 2 * len(everybody)
+    # Waymo's frames are time stamps: two of each person's, in order
+    waymo = datasets["waymo"]
+    frames = [(item.sequence, item.track, item.frame) for item in open_dataset(waymo).items()]
+    first = {whose: min(f for *w, f in frames if tuple(w) == whose) for whose in {tuple(w) for *w, _ in frames}}
+    assert len(crowd_of([waymo], interval=2)) == len(first) < len(frames)
 
 
 def test_synthesized_shards_are_people_too(synthetic):
@@ -136,6 +142,8 @@ def test_a_damaged_shard_is_left_out_and_named(datasets, tmp_path):
     crowd = crowd_of([folder])
     assert len(crowd) == len(crowd_of([datasets["humanm3"]])) * 3 // 4
     assert len(crowd.damaged) == 1 and str(broken) in crowd.damaged[0]
+    (warning,) = job_of(Finetune(data=(str(folder),), mix=0.0)).warnings
+    assert str(broken) in warning and warning.startswith("left out 1 damaged shards: ")
     # a missing one is something else: the dataset is not finished
     broken.unlink()
     with pytest.raises(InputError, match="is missing"):
@@ -241,11 +249,15 @@ def stored(datasets, name="humanm3", **more):
 def test_an_epoch_shows_everybody_once_in_an_order_of_its_own(datasets):
     source = stored(datasets)
     count = len(source.crowd)
-    sizes = [[tuple(source.example(e * count + k).joints[0]) for k in range(count)] for e in range(3)]
-    for k in range(count):
-        assert len(source.crowd.person(k).points)
-    orders = [sorted(epoch) != epoch for epoch in sizes]
-    assert any(orders) and sizes[0] != sizes[1]
+    # nobody's pelvis lies as another's does from the middle of their points
+    everybody = {tuple(p.joints[0] - p.joints[1]) for p in map(source.crowd.person, range(count))}
+    epochs = [
+        [tuple((e.joints[0] - e.joints[1]).round(4)) for e in map(source.example, range(n * count, (n + 1) * count))]
+        for n in range(3)
+    ]
+    for epoch in epochs:
+        assert len(set(epoch)) == len(everybody) == count
+    assert epochs[0] != epochs[1] != epochs[2]
     # whatever was asked for before
     again = stored(datasets)
     np.testing.assert_array_equal(again.example(2 * count + 1).points, source.example(2 * count + 1).points)
@@ -253,10 +265,15 @@ def test_an_epoch_shows_everybody_once_in_an_order_of_its_own(datasets):
 
 def test_synthesized_people_are_mixed_in_by_their_share(datasets):
     main, other = stored(datasets), SyntheticSource(scene="paper", seed=1)
-    mixed = MixedSource(main=main, other=other, share=0.3, seed=5)
-    synthesized = [not np.isnan(mixed.example(k).joints).any() for k in range(120)]
-    assert 0.18 < np.mean(synthesized) < 0.42
-    alone = MixedSource(main=main, other=other, share=0.0, seed=5)
+    mixed = MixedSource(main=main, other=other, share=0.3)
+    shown = [mixed.example(k) for k in range(120)]
+    synthesized = np.array([not np.isnan(one.joints).any() for one in shown])
+    assert synthesized.sum() == 36 and all(synthesized[k : k + 10].sum() == 3 for k in range(0, 120, 10))
+    # nobody is left out on either side
+    for source, people in ((main, np.flatnonzero(~synthesized)), (other, np.flatnonzero(synthesized))):
+        for place, k in enumerate(people[:20]):
+            np.testing.assert_array_equal(shown[k].points, source.example(place).points)
+    alone = MixedSource(main=main, other=other, share=0.0)
     np.testing.assert_array_equal(alone.example(3).points, main.example(3).points)
 
 
@@ -267,6 +284,9 @@ def test_sequences_are_held_out_unless_the_dataset_has_a_split_for_it(datasets):
     # Waymo has one
     job = job_of(Finetune(data=(str(datasets["waymo"]),), mix=0.0))
     assert not job.card["held_out_sequences"] and len(job.validation()) == 4
+    # but whoever learns from that one is not judged on it
+    job = job_of(Finetune(data=(str(datasets["waymo"]),), mix=0.0, split="val"))
+    assert not job.validation()
     # and one sequence for training leaves nobody
     job = job_of(Finetune(data=(str(datasets["sloper4d"]),), mix=0.0))
     assert not job.card["held_out_sequences"] and not job.validation()
@@ -316,13 +336,17 @@ def test_the_paper_s_two_stages(datasets, tmp_path, capsys, monkeypatch, keep):
     assert first.config.coordinates and not first.config.bins and first.config.parts == 25
     assert second.config.bins == (140, 140, 220) and not (second.config.coordinates or second.config.parts)
     assert second.config.joints == HUMAN15.joints and not second.config.legacy
+    begun = job_of(runs.stored_recipe(tmp_path / "second", Finetune)).network().state_dict()
+    anchors = "backbone.keypoint_embedding"
+    kept = torch.equal(begun[anchors], load_checkpoint("first/model.safetensors")[0].state_dict()[anchors])
+    assert kept == (keep == "true")
     assert not main(["evaluate", "second/model.safetensors", str(datasets["humanm3"]), "--protocol", "dapt"])
     assert "MPJPE" in capsys.readouterr().out
 
 
 def test_a_run_on_a_dataset_is_taken_up(datasets, tmp_path, monkeypatch):
     recipe = Finetune(
-        data=(str(datasets["lidarhuman26m"]),), epochs=8, batch=2, workers=0, pictures=0, scene="paper", validate=1000
+        data=(str(datasets["lidarhuman26m"]),), epochs=6, batch=2, workers=0, pictures=0, scene="paper", validate=1000
     )
     loop.train(recipe, tmp_path / "whole")
 
@@ -362,6 +386,11 @@ def test_a_run_on_a_dataset_is_taken_up(datasets, tmp_path, monkeypatch):
         (["{humanm3}", "--augment", "much"], "unknown augmentation 'much'"),
         (["{humanm3}", "--keep-anchors", "perhaps"], "expected true or false, got 'perhaps'"),
         (["{humanm3}", "--epochs", "0"], "epochs must be above 0"),
+        (["{humanm3}", "--epochs", "inf"], "epochs must be a finite number"),
+        (["{humanm3}", "--recipe", "paper"], "name it by --init"),
+        (["{humanm3}", "--keep-anchors", "false"], "keep_anchors=false is for the paper's network"),
+        (["{humanm3}", "--mix", "1"], "mix must be a share, below 1"),
+        ([], "fine-tuning needs a dataset"),
     ],
 )
 def test_wrong_words_are_one_line_and_leave_no_folder(datasets, tmp_path, monkeypatch, capsys, words, told):

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from dataclasses import replace
 
 import pytest
@@ -136,11 +137,100 @@ def test_a_run_keeps_its_recipe(unbroken, change):
         loop.train(replace(RECIPE, **change), unbroken, resume=True)
 
 
-def test_a_run_may_become_longer(monkeypatch, tmp_path):
+def test_a_run_may_become_shorter_and_longer(monkeypatch, tmp_path):
     folder = tmp_path / "run"
     broken(monkeypatch, folder, "_step", BATCHES)
-    loop.train(replace(RECIPE, people=32, workers=1), folder, resume=True)
-    assert [line["people"] for line in log_of(folder)] == [16, 32]
+    loop.train(replace(RECIPE, people=28, workers=1), folder, resume=True)
+    assert [line["people"] for line in log_of(folder)] == [16, 28]
+    loop.train(replace(RECIPE, people=48), folder, resume=True)
+    assert [line["people"] for line in log_of(folder)][-1] == 48
+    with pytest.raises(InputError, match="the run has seen 48 people already, got 16 in all"):
+        loop.train(replace(RECIPE, people=16), folder, resume=True)
+    assert [line["people"] for line in log_of(folder)][-1] == 48
+
+
+@pytest.mark.parametrize("step", [BATCHES + 3, 2 * BATCHES, 3 * BATCHES])
+def test_a_gradient_that_is_not_finite_never_reaches_what_is_saved(monkeypatch, tmp_path, step):
+    """Not even in the last step of a chunk, or of the run, whose loss is still good."""
+    folder, calls = tmp_path / "run", [0]
+    original = PoseTask.terms
+
+    def poisoned(self, network, arrays, **kwargs):
+        calls[0] += 1
+        terms = original(self, network, arrays, **kwargs)
+        if calls[0] == step:
+            # of the value of 0, whose slope is infinite
+            terms["vote"] = terms["vote"] + (terms["vote"] - terms["vote"]).abs().sqrt()
+        return terms
+
+    monkeypatch.setattr(PoseTask, "terms", poisoned)
+    monkeypatch.setattr(loop, "SAVE_EVERY", -1.0)
+    with pytest.raises(InputError, match="its gradient is not finite in batch"):
+        loop.train(RECIPE, folder)
+    for name in (runs.STATE, runs.MODEL):
+        assert all(
+            torch.isfinite(value).all() for value in load_file(folder / name).values() if value.is_floating_point()
+        )
+    assert [line["people"] for line in log_of(folder)] == [16, 32][: (step - 1) // BATCHES]
+
+
+def test_killed_for_good_with_workers_and_taken_up(tmp_path):
+    """SIGKILL: nothing is tidied, and the workers end by themselves."""
+    recipe = replace(RECIPE, workers=1, people=40 * BATCHES * 2)
+    code = (
+        "import sys, json, torch; torch.set_num_threads(1)\n"
+        "from lidarpose.train import loop; from lidarpose.train.recipes import Pretrain\n"
+        "loop.SAVE_EVERY = -1.0\n"
+        "loop.train(Pretrain(**json.loads(sys.argv[1])), sys.argv[2])"
+    )
+    words = [sys.executable, "-c", code, json.dumps(recipe.to_dict()), str(tmp_path / "run")]
+    process = subprocess.Popen(words, env=os.environ | {"OMP_NUM_THREADS": "1"}, start_new_session=True)
+    deadline = time.monotonic() + 120
+    while len(runs.read_log(tmp_path / "run")) < 2:
+        assert time.monotonic() < deadline and process.poll() is None
+        time.sleep(0.05)
+    process.kill()
+    process.wait()
+    # the group has no process left once its workers have seen that their parent is gone
+    while True:
+        try:
+            os.killpg(process.pid, 0)
+        except ProcessLookupError:
+            break
+        assert time.monotonic() < deadline, "a worker lives on"
+        time.sleep(0.1)
+    done = max(line["people"] for line in runs.read_log(tmp_path / "run"))
+    longer = replace(recipe, people=max(done + 2 * BATCHES * 2, 48), workers=0)
+    loop.train(longer, tmp_path / "run", resume=True)
+    assert not [path.name for path in (tmp_path / "run").iterdir() if path.name.startswith(".")]
+    assert [line["people"] for line in log_of(tmp_path / "run")] == list(range(16, longer.people + 1, 16))
+
+
+def test_what_a_kill_leaves_is_no_obstacle(tmp_path, unbroken):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    # killed while the very first file was written
+    (folder / ".123-0-config.json").write_text('{"schema"')
+    loop.train(RECIPE, folder)
+    assert_same_run(folder, unbroken)
+    assert not (folder / ".123-0-config.json").exists()
+    # a power cut may leave zeros in the log, and half of a file
+    with open(folder / runs.LOG, "ab") as log:
+        log.write(b"\0\0\0\0" + b'{"people": 12}\n[1]\n{"seconds": 3}\n')
+    (folder / ".123-1-model.safetensors").write_bytes(b"half")
+    loop.train(RECIPE, folder, resume=True)
+    assert_same_run(folder, unbroken)
+    assert not (folder / ".123-1-model.safetensors").exists()
+
+
+def test_a_dead_worker_is_one_line(tmp_path, monkeypatch):
+    def lost(*_, **__):
+        raise RuntimeError("DataLoader worker (pid 12) is killed by signal: Killed.")
+
+    monkeypatch.setattr(loop, "loader", lost)
+    with pytest.raises(InputError, match="a process that makes people was killed") as caught:
+        loop.train(RECIPE, tmp_path / "run")
+    assert "\n" not in str(caught.value)
 
 
 def test_nothing_to_resume(tmp_path):
@@ -211,7 +301,8 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_last_good_state(m
     with monkeypatch.context() as patch:
         patch.setattr(PoseTask, "terms", poisoned)
         patch.setattr(loop, "SAVE_EVERY", -1.0)
-        told = "not finite in batch 3 of people 16 to 31: start again with a lower --rate; state.safetensors is kept"
+        told = "not finite in batch 3 of the 8 from person 16 on: start in another folder with a lower --rate; "
+        told += "state.safetensors is kept"
         with pytest.raises(InputError, match=told):
             loop.train(RECIPE, folder)
     assert [line["people"] for line in log_of(folder)] == [16]
@@ -222,7 +313,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_last_good_state(m
 
 
 def test_an_absurd_rate_stops_the_run(tmp_path):
-    with pytest.raises(InputError, match="not finite in batch [0-9] of people 0 to 15"):
+    with pytest.raises(InputError, match="not finite in batch [0-9] of the 8 from person 0 on"):
         loop.train(replace(RECIPE, rate=1e30), tmp_path / "run")
 
 
@@ -240,6 +331,8 @@ def test_the_command_line_trains_and_goes_on(tmp_path, capsys):
     assert not capsys.readouterr().err
     assert main(["pretrain", str(folder), "--resume", "--batch", "4"]) == 2
     assert "the run has batch = 2, got 4" in capsys.readouterr().err
+    assert main(["pretrain", str(folder), "--resume", "--recipe", "paper"]) == 2
+    assert "leave --recipe away" in capsys.readouterr().err
     assert main(["finetune", "some", "--out", str(folder), "--resume"]) == 2
     assert "`lidarpose pretrain`" in capsys.readouterr().err
     pictures = sorted(path.name for path in (folder / runs.PICTURES).iterdir())
@@ -270,6 +363,8 @@ def test_runs_without_a_name_are_numbered(tmp_path, monkeypatch, capsys):
         (["--schedule", "steps"], "unknown schedule 'steps'"),
         (["--shards", "nowhere"], "is no dataset"),
         (["--cool", "1.5"], "cool must be a share"),
+        (["--rate", "inf"], "rate must be a finite number"),
+        (["--size", "paper", "--bone", "1"], "bone and symmetry are terms of the package's own networks"),
         (["--tracker", "paper"], "unknown tracker 'paper'"),
         (["--device", "moon"], "unknown device to train on 'moon'"),
     ],
@@ -279,7 +374,7 @@ def test_wrong_words_are_one_line_and_leave_no_folder(tmp_path, monkeypatch, cap
     assert main(["pretrain", "--people", "4", "--batch", "2", "--workers", "0", *words]) == 2
     error = capsys.readouterr().err
     assert told in error and error.count("\n") == 1
-    assert not list(tmp_path.glob("runs/*/*"))
+    assert not list(tmp_path.iterdir())
 
 
 def test_named_recipes():
@@ -288,7 +383,9 @@ def test_named_recipes():
     # Paper: AdamW, cosine, batch 64, 3e-4 and 5e-4, 50 epochs
     assert (paper.size, paper.scene, paper.batch, paper.rate, paper.people) == ("paper", "paper", 64, 3e-4, 5)
     assert paper.schedule == "cosine" and not (paper.muon_rate or paper.ema or paper.clip)
-    fine = recipe(Finetune, "paper", data=("a",))
+    with pytest.raises(InputError, match="name it by --init"):
+        recipe(Finetune, "paper", data=("a",))
+    fine = recipe(Finetune, "paper", data=("a",), init="first.safetensors")
     assert (fine.rate, fine.epochs, fine.mix, fine.augment, fine.keep_anchors) == (5e-4, 50, 0, "paper", False)
     with pytest.raises(InputError, match="fine-tuning needs a dataset"):
         recipe(Finetune)
@@ -344,6 +441,8 @@ def test_two_processes_take_the_same_steps_as_one(tmp_path):
 
 
 def test_a_batch_that_cannot_be_shared_out_is_refused():
-    assert lanes_of(64, 1) == lanes_of(64, 2) == 4 and lanes_of(64, 8) == 8 and lanes_of(3, 1) == 1
-    with pytest.raises(InputError, match="a batch of 64 cannot be shared out evenly among 3 processes"):
-        lanes_of(64, 3)
+    assert lanes_of(64, 1) == lanes_of(64, 2) == lanes_of(64, 8) == 8 and lanes_of(12, 4) == 4 and lanes_of(3) == 1
+    for batch, ranks, fit in ((64, 3, "1, 2, 4, 8"), (64, 16, "1, 2, 4, 8"), (15, 2, "1")):
+        told = f"a batch of {batch} can be shared out among {fit} processes, got {ranks}: change --batch"
+        with pytest.raises(InputError, match=told):
+            lanes_of(batch, ranks)

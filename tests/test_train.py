@@ -12,6 +12,7 @@ from lidarpose.model.heads import REACH, Outputs, encode
 from lidarpose.model.network import PoseNet
 from lidarpose.model.presets import BIN, preset
 from lidarpose.sample import center_of
+from lidarpose.skeleton import BODY26
 from lidarpose.synth.generate import Generator
 from lidarpose.synth.scene import SCENES
 from lidarpose.train.augment import disturbed
@@ -21,6 +22,7 @@ from lidarpose.train.losses import CONFIDENCE, HEATMAP, SIGMA, SPREAD, VOTE, los
 from lidarpose.train.optimize import average, optimizers, rate_factor
 from lidarpose.train.pose_task import PoseTask
 from lidarpose.train.recipes import Pretrain
+from lidarpose.train.recipes import recipe as recipe_of
 from lidarpose.train.task import total
 
 # three chunks of `BATCHES` batches
@@ -204,6 +206,36 @@ def test_the_mean_of_the_weights_follows_them():
     torch.testing.assert_close(mean["weight"], network.weight.detach(), rtol=1e-3, atol=1e-6)
 
 
+def test_the_released_schedule():
+    cosine = recipe_of(Pretrain, "paper")
+    assert rate_factor(0, cosine) == pytest.approx(0.1) and rate_factor(1, cosine) == pytest.approx(1e-3)
+    assert rate_factor(cosine.warmup, cosine) == 1
+    # half of the way down, half of the rate
+    middle = cosine.warmup + (1 - cosine.warmup) / 2
+    assert rate_factor(middle, cosine) == pytest.approx((1 + 1e-3) / 2)
+    factor = np.array([rate_factor(d, cosine) for d in np.linspace(cosine.warmup, 1, 500)])
+    assert (np.diff(factor) < 0).all()
+
+
+def test_lengths_of_bones_and_their_symmetry():
+    joints = truth()
+    exact = losses(outputs(joints), targets(joints), bone=2.0, symmetry=3.0)
+    # what the heatmap has no bin for is half a millimetre an axis
+    assert exact["bone"] < 2 * 3e-3
+    stretched = losses(outputs(joints * 1.1), targets(joints), bone=2.0)
+    lengths = torch.stack([(joints[:, a] - joints[:, b]).norm(dim=-1) for a, b in BODY26.bones])
+    assert stretched["bone"].item() == pytest.approx(2.0 * 0.1 * lengths.mean().item(), abs=4e-3)
+    # a body and its mirror image have even sides together
+    even = joints.clone()
+    even[:, [BODY26.flip[j] for j in range(26) if "left" in BODY26.joints[j]]] = even[
+        :, [j for j in range(26) if "left" in BODY26.joints[j]]
+    ] * torch.tensor([-1.0, 1, 1])
+    middle = [j for j, name in enumerate(BODY26.joints) if "_" not in name or name == "head_center"]
+    even[:, middle, 0] = 0.0
+    assert losses(outputs(even), targets(joints), symmetry=3.0)["symmetry"] < 3 * 3e-3
+    assert losses(outputs(joints), targets(joints), symmetry=3.0)["symmetry"] > 0.1
+
+
 # --- batches
 
 
@@ -215,9 +247,9 @@ def assert_same_chunks(a, b):
                 np.testing.assert_array_equal(np.asarray(x[name]), np.asarray(y[name]), err_msg=name)
 
 
-def chunks(recipe, start=0, stop=3):
+def chunks(recipe, start=0, steps=3 * BATCHES):
     people = Chunks(
-        source=job_of(recipe).source, task=TASK, batch=recipe.batch, seed=recipe.seed, start=start, stop=stop
+        source=job_of(recipe).source, task=TASK, batch=recipe.batch, seed=recipe.seed, start=start, steps=steps
     )
     return list(loader(people, workers=recipe.workers))
 
@@ -229,6 +261,26 @@ def test_chunks_are_the_same_from_any_start():
     assert_same_chunks(whole[2:], chunks(RECIPE, start=2))
     joints = np.concatenate([b["joints"] for batches in whole for b in batches])
     assert len(np.unique(joints[:, 5], axis=0)) == len(joints) == RECIPE.people
+
+
+def test_the_last_chunk_may_be_short():
+    whole, short = chunks(RECIPE), chunks(RECIPE, steps=BATCHES + 3)
+    assert [len(batches) for batches in short] == [BATCHES, 3]
+    assert_same_chunks(whole[:1], short[:1])
+
+
+@pytest.mark.parametrize("ranks", [2, 4])
+def test_processes_share_every_batch_out(ranks):
+    """Together they show the people of one process, batch by batch, and nobody twice."""
+    common = {"source": job_of(RECIPE).source, "task": TASK, "batch": 8, "seed": 5, "start": 0, "steps": BATCHES + 1}
+    (alone,) = (list(loader(Chunks(**common), workers=0)),)
+    shared = [list(loader(Chunks(**common, rank=rank, ranks=ranks), workers=0)) for rank in range(ranks)]
+    for c, batches in enumerate(alone):
+        for k, batch in enumerate(batches):
+            joints = np.concatenate([one[c][k]["joints"] for one in shared])
+            assert len(joints) == 8
+            order = [np.argsort(j[:, 0, 0], kind="stable") for j in (joints, batch["joints"])]
+            np.testing.assert_array_equal(joints[order[0]], batch["joints"][order[1]])
 
 
 def test_difficulty_rises_over_the_first_share_of_the_run(monkeypatch):

@@ -37,7 +37,9 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _failed(error: Exception) -> int:
-    print(f"lidarpose: error: {error}", file=sys.stderr)
+    # of several processes of a training one is enough to say it
+    if os.environ.get("RANK", "0") == "0":
+        print(f"lidarpose: error: {error}", file=sys.stderr)
     return 2
 
 

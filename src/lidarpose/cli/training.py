@@ -30,7 +30,9 @@ def add(commands) -> None:
             name="finetune", what="Trains on labelled people; each dataset supervises the joints that it labels."
         ),
     )
-    finetune.add_argument("data", nargs="+", metavar="DATASET", help="folders that lidarpose prepare wrote")
+    finetune.add_argument(
+        "data", nargs="*", metavar="DATASET", help="folders that lidarpose prepare wrote; with --resume the run's own"
+    )
     _add(pretrain, Pretrain)
     _add(finetune, Finetune)
 
@@ -44,7 +46,7 @@ def _add(parser, kind: type[Recipe]) -> None:
     else:
         parser.add_argument("--out", dest="folder", metavar="RUN", help=where)
     parser.add_argument("--resume", action="store_true", help="go on with a run that was stopped (default the latest)")
-    parser.add_argument("--recipe", default="default", metavar="NAME", help="default or paper; options override it")
+    parser.add_argument("--recipe", metavar="NAME", help="default or paper; options override it")
     parser.add_argument("--device", metavar="NAME", help="cpu (default: a GPU where there is one)")
     parser.add_argument("--tracker", metavar="NAME", help="also log to tensorboard or wandb, where installed")
     for field in fields(kind):
@@ -67,17 +69,19 @@ def _train(options: argparse.Namespace) -> None:
         for field in fields(kind)
         if (text := getattr(options, f"set_{field.name}", None)) is not None
     }
-    if kind is Finetune:
+    if kind is Finetune and options.data:
         changes["data"] = tuple(options.data)
     folder = options.folder
     if options.resume:
+        if options.recipe is not None:
+            raise InputError("a run keeps its recipe: leave --recipe away with --resume")
         folder = folder or latest(name)
         # a run keeps its recipe: what is not said again stays
         wanted = kind(**(stored_recipe(Path(folder), kind).to_dict() | changes))
     else:
-        wanted = recipe(kind, options.recipe, **changes)
+        wanted = recipe(kind, options.recipe or "default", **changes)
     words = [f"--{key.replace('_', '-')} {_said(value)}" for key, value in changes.items() if key != "data"]
-    words += [f"--recipe {options.recipe}"] * (options.recipe != "default")
+    words += [f"--recipe {options.recipe}"] * (options.recipe not in (None, "default"))
     words += ["--resume"] * options.resume
     sets = [Path(data).name for data in changes.get("data", ())]
     command = " ".join(["lidarpose", name, *sets, *words])

@@ -10,6 +10,7 @@ import numpy as np
 from lidarpose.data.augment import half_space_keep, jitter, noise_clusters, random_keep
 from lidarpose.data.released import released_view
 from lidarpose.errors import unknown_name
+from lidarpose.evaluate.protocols import jittered
 from lidarpose.geometry import rotation_about
 from lidarpose.model.plan import view_features
 from lidarpose.sample import Sample, center_of
@@ -30,8 +31,9 @@ _FLIP_PART = np.array([-1, 0, *(1 + np.array(SMPL24.flip))], np.int16)
 class Augmentation:
     """How often what happens to a person.
 
-    released: crop and center as the released code's, else by a box or by the points; box: standard deviation of a
-    detector's errors in a box, m; cut: probability that part of the cloud is cut off by a plane; turn: of a turn about
+    released: crop and center as the released code's, else by a box and by the points; box: probability that a box has a
+    detector's errors, those of the protocol clean, else it crops nothing; refined: that the center is a guess of the
+    pelvis; cut: probability that part of the cloud is cut off by a plane; turn: of a turn about
     z by any angle; scale: sizes from 1 - scale to 1 + scale; flip: of a mirror, across x and across y on their own;
     jitter: standard deviation of each coordinate, m, cut at four times that; drop: probability that a fifth of the
     points is lost; strays: of blobs of stray points.
@@ -39,6 +41,7 @@ class Augmentation:
 
     released: bool = False
     box: float = 0.0
+    refined: float = REFINED
     cut: float = 0.0
     turn: float = 0.0
     scale: float = 0.0
@@ -52,7 +55,7 @@ AUGMENTATIONS = {
     "none": Augmentation(),
     # Paper: none are named; those of the released fine-tuning. Its box of HumanM3 knows the joints
     "paper": Augmentation(released=True, turn=0.5, scale=0.1, flip=0.3, jitter=0.005, drop=0.5),
-    "default": Augmentation(box=0.08, cut=0.15, turn=1.0, scale=0.1, flip=0.5, jitter=0.005, drop=0.5, strays=0.15),
+    "default": Augmentation(box=0.9, cut=0.15, turn=1.0, scale=0.1, flip=0.5, jitter=0.005, drop=0.5, strays=0.15),
 }
 
 
@@ -125,19 +128,14 @@ def _view(person: Person, kind: Augmentation, rng: np.random.Generator) -> tuple
         kept, center = released_view(person.points, person.joints, person.centers, person.box)
         return _kept(person, kept), person.center if center is None else center
     keep = np.ones(len(person.points), bool)
-    if person.box is not None and kind.box:
-        box, error = person.box, kind.box * rng.standard_normal(6)
-        size = np.maximum(box.size + np.abs(error[3:]) + kind.box, 0.1)
-        wrong = replace(
-            box, center=box.center + error[:3] * [1, 1, 0.5], size=size, yaw=box.yaw + kind.box * rng.normal()
-        )
-        keep &= wrong.contains(person.points)
+    if person.box is not None and rng.random() < kind.box:
+        keep &= jittered(person.box, rng).contains(person.points)
     if rng.random() < kind.cut:
         keep &= half_space_keep(person.points, most=0.4, rng=rng)
     person = _kept(person, keep)
     center = center_of(person.points)
     root = _root(person.joints)
-    if root is not None and rng.random() < REFINED:
+    if root is not None and rng.random() < kind.refined:
         center = root + rng.normal(0, PELVIS_ERROR, 3)
     return person, center
 

@@ -3,7 +3,7 @@
 Legend: N people, M points of all of them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 from lidarpose.data.columns import CENTERS
 from lidarpose.data.files import file_error
 from lidarpose.data.readers.items import HIDDEN, SEEN, UNLABELED
-from lidarpose.data.shards import Dataset, open_dataset
+from lidarpose.data.shards import Dataset, open_dataset, shard_path
 from lidarpose.errors import InputError
 from lidarpose.sample import Box
 from lidarpose.skeleton import BODY26, skeleton
@@ -89,9 +89,9 @@ def crowd_of(
 ) -> Crowd:
     """Everybody with points and a label in datasets that `lidarpose prepare` or `synth` wrote.
 
-    split: of real datasets, None for all; interval: only every so many of a person's frames, as published recipes thin
-    out; without: sequences to leave out. A shard that is damaged is left out and named in `damaged`. Raises InputError
-    where nobody is left, for a folder that is no dataset, and for datasets of different skeletons.
+    split: of real datasets, None for all; interval: only every so many of a person's frames in a sequence, as published
+    recipes thin out; without: sequences to leave out. A shard that is damaged is left out and named in `damaged`.
+    Raises InputError where nobody is left, for a folder that is no dataset, and for datasets of different skeletons.
     """
     folders = [Path(folder) for folder in folders]
     rows: list[dict] = []
@@ -102,11 +102,15 @@ def crowd_of(
         skeletons[dataset.card.skeleton] = folder
         if split is not None and dataset.card.people != "labelled":
             raise file_error(folder, f"holds synthetic people, which have no split {split!r}: leave --split away")
+        frames: dict[tuple, int] = {}
         for row in _rows(dataset, damaged):
             if split is not None and row["split"] != split or row.get("sequence") in without:
                 continue
-            if row["frame"] % interval == 0 and len(row["points"]):
-                rows.append(_kept(row, dataset.card.skeleton))
+            # frames are numbered by anything, time stamps too
+            whose = row.get("sequence"), row["track"]
+            frames[whose] = frames.get(whose, -1) + 1
+            if frames[whose] % interval == 0 and len(row["points"]):
+                rows.append(_kept(row, dataset))
     if len(skeletons) > 1:
         raise InputError(f"datasets that are learned together need one skeleton, got {', '.join(sorted(skeletons))}")
     rows = [row for row in rows if not np.isnan(row["joints"]).all()]
@@ -132,26 +136,33 @@ def crowd_of(
     )
 
 
-def _rows(dataset: Dataset, damaged: list[str]):
-    """The rows of people, shard by shard; of a shard that breaks off, what came before."""
+def _rows(dataset: Dataset, damaged: list[str]) -> Iterator[dict]:
+    """The rows of people, shard by shard, but for shards that are damaged. Raises InputError where one is missing: the
+    dataset is not finished."""
     for shard in range(dataset.card.shards):
-        # a missing shard is an error: the dataset is not finished
+        there = shard_path(dataset.folder, dataset.card.people, shard).is_file()
         try:
-            yield from dataset.rows(shards=range(shard, shard + 1))
+            rows = list(dataset.rows(shards=range(shard, shard + 1)))
         except InputError as error:
-            if "is missing" in str(error):
+            if not there:
                 raise
             damaged.append(str(error))
+        else:
+            yield from rows
 
 
-def _kept(row: dict, name: str) -> dict:
-    of = skeleton(name)
+def _kept(row: dict, dataset: Dataset) -> dict:
+    of = skeleton(dataset.card.skeleton)
     place = [BODY26.index(joint) for joint in of.joints]
     joints = np.full((len(BODY26), 3), np.nan, np.float32)
-    joints[place] = row["joints"].reshape(-1, 3)
     labels = np.full(len(BODY26), UNLABELED, np.uint8)
     real = "joint_labels" in row
-    labels[place] = row["joint_labels"] if real else SEEN
+    try:
+        joints[place] = row["joints"].reshape(-1, 3)
+        labels[place] = row["joint_labels"] if real else SEEN
+    except (ValueError, AttributeError) as error:
+        problem = f"row {row['index']} has not the {len(of)} joints of its card ({error}); write it again"
+        raise file_error(dataset.folder, problem) from None
     points = row["points"].reshape(-1, 3)
     part = np.full(len(points), UNKNOWN_PART, np.int16) if row["part"] is None else row["part"].astype(np.int16)
     nowhere = np.full(3, np.nan)

@@ -35,13 +35,13 @@ class Example:
     seed: int
 
 
-def example(sample: Sample, rng: np.random.Generator) -> Example:
+def example(sample: Sample, rng: np.random.Generator, *, refined: float = REFINED) -> Example:
     """A synthetic person, pose and parts known, about one of two kinds of center, with or without the sensor's place.
 
-    The sensor stands at the origin of the sample's frame.
+    refined: how often about a guess of the pelvis. The sensor stands at the origin of the sample's frame.
     """
     center = sample.center
-    if rng.random() < REFINED:
+    if rng.random() < refined:
         center = sample.pose.joints[BODY26.index("pelvis")] + rng.normal(0, PELVIS_ERROR, 3)
     origin = None if rng.random() < BLIND else np.zeros(3)
     points, joints = sample.points - center, sample.pose.joints - center

@@ -6,8 +6,12 @@ on. It is sorted in lanes, and a process takes whole lanes: nobody makes people 
 all of them together are the same however many there are.
 """
 
+import os
+import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from math import gcd
 from typing import Any
 
@@ -22,15 +26,18 @@ from lidarpose.train.task import Task
 
 # batches a chunk
 BATCHES = 8
-# lanes, or as many as there are processes
-LANES = 4
+# lanes at most, and so processes
+LANES = 8
+# how often a worker looks whether its parent lives, s
+_LOOK = 1.0
 # what orders batches of a chunk
 _ORDER = 8
 
 
 @dataclass(frozen=True, kw_only=True)
 class Chunks(IterableDataset):
-    """The chunks of a run from `start` to `stop`, each a list of `BATCHES` batches as the task collates them.
+    """The chunks of a run of so many `steps` from chunk `start` on, each a list of `BATCHES` batches as the task
+    collates them, the last one perhaps shorter.
 
     batch: people of a step in all processes; rank, ranks: which process this is, of how many.
     """
@@ -40,7 +47,7 @@ class Chunks(IterableDataset):
     batch: int
     seed: int
     start: int
-    stop: int
+    steps: int
     rank: int = 0
     ranks: int = 1
 
@@ -50,30 +57,37 @@ class Chunks(IterableDataset):
     def __iter__(self) -> Iterator[list[Any]]:
         worker = get_worker_info()
         first, stride = (0, 1) if worker is None else (worker.id, worker.num_workers)
-        for chunk in range(self.start + first, self.stop, stride):
+        for chunk in range(self.start + first, chunks_of(self.steps), stride):
             # products of a few thousand numbers: threads of BLAS only get in each other's way
             with threadpool_limits(limits=1, user_api="blas"):
                 batches = self._chunk(chunk)
             yield batches
 
     def _chunk(self, chunk: int) -> list[Any]:
-        size = BATCHES * self.batch
+        first, batches = chunk * BATCHES * self.batch, min(self.steps - chunk * BATCHES, BATCHES)
         lanes = lanes_of(self.batch, self.ranks)
         mine = []
         for lane in range(self.rank, lanes, self.ranks):
-            people = [self.source.example(index) for index in range(chunk * size + lane, (chunk + 1) * size, lanes)]
+            people = [self.source.example(index) for index in range(first + lane, first + batches * self.batch, lanes)]
             mine.append(sorted(people, key=_width))
         share = self.batch // lanes
-        order = np.random.default_rng([self.seed, _ORDER, chunk]).permutation(BATCHES)
+        order = np.random.default_rng([self.seed, _ORDER, chunk]).permutation(batches)
         return [self.task.collate([e for lane in mine for e in lane[k * share : (k + 1) * share]]) for k in order]
 
 
-def lanes_of(batch: int, ranks: int) -> int:
-    """How many lanes a chunk has. Raises InputError where a batch cannot be shared out evenly."""
-    if batch % ranks:
-        raise InputError(f"a batch of {batch} cannot be shared out evenly among {ranks} processes: change --batch")
+def chunks_of(steps: int) -> int:
+    """How many chunks so many steps are."""
+    return -(-steps // BATCHES)
+
+
+def lanes_of(batch: int, ranks: int = 1) -> int:
+    """How many lanes a chunk has, whatever the number of processes. Raises InputError where they cannot be shared out
+    evenly among so many."""
     lanes = gcd(batch, LANES)
-    return lanes if lanes % ranks == 0 else ranks
+    if lanes % ranks:
+        fit = ", ".join(str(n) for n in range(1, lanes + 1) if lanes % n == 0)
+        raise InputError(f"a batch of {batch} can be shared out among {fit} processes, got {ranks}: change --batch")
+    return lanes
 
 
 def _width(one: Example) -> int:
@@ -82,12 +96,28 @@ def _width(one: Example) -> int:
 
 
 def loader(chunks: Chunks, *, workers: int) -> DataLoader:
-    """Chunks `start` ... `stop` - 1 in order, made by `workers` processes (0: by this one)."""
+    """The chunks in order, made by `workers` processes (0: by this one)."""
     return DataLoader(
-        chunks, batch_size=None, num_workers=workers, prefetch_factor=4 if workers else None, collate_fn=_as_it_is
+        chunks,
+        batch_size=None,
+        num_workers=workers,
+        prefetch_factor=4 if workers else None,
+        collate_fn=_as_it_is,
+        worker_init_fn=partial(_end_with, os.getpid()) if workers else None,
     )
 
 
 def _as_it_is(batches: list[Any]) -> list[Any]:
     # torch would turn arrays into tensors; the task does so, on its device
     return batches
+
+
+def _end_with(parent: int, worker: int) -> None:
+    """Ends this worker when its parent is no more: killed, that could not tell it, and it would wait for ever."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_LOOK)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -30,7 +30,7 @@ _LEAST_SEQUENCES = 3
 @dataclass(frozen=True, kw_only=True)
 class Job:
     """people: how many are seen in all; validation: whom to validate on, made once, none for nobody; joints: the
-    skeleton to draw them in; card: what the checkpoint tells besides the recipe."""
+    skeleton to draw them in; card: what the checkpoint tells besides the recipe; warnings: lines for the user."""
 
     task: Task
     source: Source
@@ -39,6 +39,7 @@ class Job:
     validation: Callable[[], list[Example]]
     joints: Skeleton
     card: dict
+    warnings: tuple[str, ...] = ()
 
 
 def job_of(recipe: Recipe, *, on_cpu: bool = True) -> Job:
@@ -62,13 +63,16 @@ def _pretraining(recipe: Pretrain) -> Job:
         raise unknown_name("network size", recipe.size, (*SIZES, PAPER, SMALL_PAPER))
     names = ("scene", "motion", "subjects", "captured", "strays", "noise")
     scene = {name: getattr(recipe, name) for name in names}
+    warnings: tuple[str, ...] = ()
     if recipe.shards:
         source = StoredSource(folders=recipe.shards, seed=recipe.seed, augmentation=Augmentation(turn=1.0, flip=0.5))
+        warnings = _about(source.crowd)
     else:
         source = SyntheticSource(seed=recipe.seed, easy=recipe.easy * recipe.people, **scene)
 
     def validation() -> list[Example]:
-        held_out = SyntheticSource(seed=_VALIDATION_SEED, **scene)
+        # as a user's cloud: centered on its points
+        held_out = SyntheticSource(seed=_VALIDATION_SEED, refined=0.0, **scene)
         return [held_out.example(index) for index in range(VALIDATION)]
 
     joints = SMPL24 if isinstance(task, PoseTask) else HUMAN15
@@ -80,7 +84,16 @@ def _pretraining(recipe: Pretrain) -> Job:
         validation=validation,
         joints=joints,
         card={"motion": None if recipe.motion is None else Path(recipe.motion).name},
+        warnings=warnings,
     )
+
+
+def _about(crowd: Crowd) -> tuple[str, ...]:
+    """What is left out of a dataset, in a line."""
+    if not crowd.damaged:
+        return ()
+    first, more = crowd.damaged[0], len(crowd.damaged) - 1
+    return (f"left out {len(crowd.damaged)} damaged shards: {first}" + (f", and {more} more" if more else ""),)
 
 
 def _finetuning(recipe: Finetune) -> Job:
@@ -103,19 +116,21 @@ def _finetuning(recipe: Finetune) -> Job:
     source: Source = people
     if recipe.mix:
         other = SyntheticSource(scene=recipe.scene, seed=recipe.seed)
-        source = MixedSource(main=people, other=other, share=recipe.mix, seed=recipe.seed)
+        source = MixedSource(main=people, other=other, share=recipe.mix)
     joints = skeleton(people.crowd.skeleton)
     task, begun = _begun(recipe, network, header, joints, people.crowd.dataset)
 
     def validation() -> list[Example]:
-        quiet = replace(kind, box=0.0, cut=0.0, turn=0.0, scale=0.0, flip=0.0, jitter=0.0, drop=0.0, strays=0.0)
+        # a box with a detector's errors where people have one, centered on the points
+        quiet = Augmentation(released=kind.released, box=kind.box, refined=0.0)
         rows = np.unique(np.linspace(0, len(watched) - 1, min(VALIDATION, len(watched))).astype(int)) if watched else ()
         return [augmented(watched.person(k), quiet, np.random.default_rng([recipe.seed, k])) for k in rows]
 
     return Job(
         task=task,
         source=source,
-        people=max(round(recipe.epochs * len(people.crowd)), 1),
+        # those that are mixed in come on top
+        people=max(round(recipe.epochs * len(people.crowd) / (1 - recipe.mix)), 1),
         network=begun,
         validation=validation,
         joints=joints,
@@ -126,13 +141,14 @@ def _finetuning(recipe: Finetune) -> Job:
             "held_out_sequences": list(held_out),
             "damaged": list(people.crowd.damaged),
         },
+        warnings=_about(people.crowd),
     )
 
 
 def _held_out(recipe: Finetune, split: str | None) -> tuple[tuple[str, ...], Crowd | None]:
     """Sequences not to learn from, and whom to validate on: the split val where there is one, else those sequences."""
     try:
-        if split is not None:
+        if split not in (None, "val"):
             return (), crowd_of(recipe.data, split="val", interval=recipe.interval)
     except InputError:
         # no such split
@@ -158,16 +174,20 @@ def _begun(
 ) -> tuple[Task, Callable[[], nn.Module]]:
     """The task and the network with the weights that it begins with."""
     if header.network == "pose":
+        if not recipe.keep_anchors:
+            raise InputError("keep_anchors=false is for the paper's network: --init names one of the package's own")
         return PoseTask(config=header.config, bone=recipe.bone, symmetry=recipe.symmetry), lambda: network
     from lidarpose.train.dapt_task import DaptTask, transferred
 
-    if header.config.bins and set(joints.joints) <= set(header.config.joints):
-        # a network of this dataset's joints already, as released ones are
-        return DaptTask(config=header.config, stage="finetune"), lambda: network
+    recipe.check_no_lengths()
     alike = [c for c in CONFIGS.values() if c.bins and set(c.joints) == set(joints.joints)]
     if not alike:
         raise InputError(f"the paper's network has no configuration for the joints of {joints.name}")
     like = next((c for c in alike if c.name == dataset), alike[0])
+    own = header.config
+    if recipe.keep_anchors and (own.joints, own.bins, own.ranges) == (like.joints, like.bins, like.ranges):
+        # a network of this dataset already, as released ones are
+        return DaptTask(config=own, stage="finetune"), lambda: network
     # the paper fine-tunes by heatmaps alone
     config = replace(
         header.config,

@@ -8,6 +8,7 @@ import json
 import os
 import sys
 import time
+from collections.abc import Iterator
 from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,11 +21,24 @@ from tqdm import tqdm
 
 from lidarpose.errors import InputError, unknown_name
 from lidarpose.model.checkpoint import save_checkpoint
-from lidarpose.train.feed import BATCHES, Chunks, loader
+from lidarpose.train.feed import BATCHES, Chunks, chunks_of, lanes_of, loader
 from lidarpose.train.job import Job, job_of
 from lidarpose.train.optimize import average, optimizers, set_rates
 from lidarpose.train.recipes import Recipe
-from lidarpose.train.runs import BEST, LOG, MODEL, STATE, begin, check_same, cut_log, latest, numbered, stored_recipe
+from lidarpose.train.runs import (
+    BEST,
+    LOG,
+    MODEL,
+    STATE,
+    begin,
+    check_new,
+    check_same,
+    clean,
+    cut_log,
+    latest,
+    numbered,
+    stored_recipe,
+)
 from lidarpose.train.state import load_state, save_state
 from lidarpose.train.task import total
 from lidarpose.train.validation import Draw, Validation
@@ -52,9 +66,8 @@ def train(
     """Trains as the recipe says and returns the path of model.safetensors.
 
     folder: a new one (None: the next number in `runs`), or with `resume` that of a run with the same recipe (its length
-    may differ). device: "cpu", or
-    None for what Accelerate finds; tracker: "tensorboard" or "wandb", which must be installed; draw: what makes
-    pictures of validation people, None for none. Raises InputError where
+    may differ). device: "cpu", or None for what Accelerate finds; tracker: "tensorboard" or "wandb", which must be
+    installed; draw: what makes pictures of validation people, None for none. Raises InputError where
     the folder or the recipe does not fit, or where the loss stops being finite: the last good state then stays.
     """
     _check(device, tracker)
@@ -64,12 +77,19 @@ def train(
         check_same(folder, stored_recipe(folder, kind), recipe)
     elif folder is None and int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise InputError("several processes need to know the run's folder: name it")
+    elif folder is not None:
+        check_new(Path(folder))
     job = job_of(recipe, on_cpu=_on_cpu(device))
-    folder = numbered(kind.__name__.lower()) if folder is None else Path(folder)
-    accelerator = _accelerator(recipe, folder, device, tracker)
-    # every process looks before the first one writes
+    accelerator = _accelerator(recipe, device, tracker)
+    lanes_of(recipe.batch, accelerator.num_processes)
+    # every process has looked before the first one writes
     accelerator.wait_for_everyone()
+    folder = numbered(kind.__name__.lower()) if folder is None else Path(folder)
+    accelerator.project_configuration.set_directories(str(folder))
     run = _Run(recipe, job, folder, accelerator, command, draw)
+    if accelerator.is_main_process:
+        for warning in job.warnings:
+            print(f"lidarpose: warning: {warning}", file=sys.stderr)
     if resume:
         run.take_up()
     elif accelerator.is_main_process:
@@ -86,18 +106,15 @@ def train(
     return folder / MODEL
 
 
-def _accelerator(recipe: Recipe, folder: Path, device: str | None, tracker: str | None) -> Accelerator:
+def _accelerator(recipe: Recipe, device: str | None, tracker: str | None) -> Accelerator:
     on_cpu = _on_cpu(device)
-    half = recipe.precision == "bf16" or recipe.precision == "auto" and not on_cpu
+    half = recipe.precision == "bf16" or recipe.precision == "auto" and not on_cpu and torch.cuda.is_bf16_supported()
     try:
-        accelerator = Accelerator(
-            cpu=on_cpu, mixed_precision="bf16" if half else "no", log_with=tracker, project_dir=str(folder)
-        )
+        return Accelerator(cpu=on_cpu, mixed_precision="bf16" if half else "no", log_with=tracker)
     except ValueError as error:
         # of a machine that has no bf16, or a launcher that asks for what is not there
         reason = str(error).partition("\n")[0]
         raise InputError(f"cannot train so ({reason}): choose another --precision or --device") from None
-    return accelerator
 
 
 def _check(device: str | None, tracker: str | None) -> None:
@@ -128,8 +145,8 @@ class _Run:
         self.mean = {name: value.detach().clone() for name, value in self.network.named_parameters()}
         self.optimizers = optimizers(self.network, recipe)
         self.wrapped = accelerator.prepare(self.network) if accelerator.num_processes > 1 else self.network
-        self.size = BATCHES * recipe.batch
-        self.chunks = -(-job.people // self.size)
+        self.steps = -(-job.people // recipe.batch)
+        self.chunks = chunks_of(self.steps)
         self.chunk, self.seconds, self.best = 0, 0.0, float("inf")
         self.validation = Validation(job, recipe, folder, draw)
 
@@ -139,8 +156,18 @@ class _Run:
             progress = load_state(self.folder / STATE, self.network, self.mean, self.optimizers)
             self.chunk, self.seconds = progress["chunk"], progress["seconds"]
             self.best = float("inf") if progress["best"] is None else progress["best"]
+            self.validation.last = progress.get("validation")
+        if self.chunk > self.chunks:
+            seen = self.chunk * BATCHES * self.recipe.batch
+            raise InputError(f"{self.folder}: the run has seen {seen:,} people already, got {self.job.people:,} in all")
         if self.accelerator.is_main_process:
-            cut_log(self.folder, self.chunk * self.size)
+            clean(self.folder)
+            cut_log(self.folder, self.seen)
+
+    @property
+    def seen(self) -> int:
+        """People of all chunks that are done."""
+        return min(self.chunk * BATCHES, self.steps) * self.recipe.batch
 
     def go(self) -> None:
         """All that is left of the run."""
@@ -151,7 +178,7 @@ class _Run:
             batch=self.recipe.batch,
             seed=self.recipe.seed,
             start=self.chunk,
-            stop=self.chunks,
+            steps=self.steps,
             rank=self.accelerator.process_index,
             ranks=self.accelerator.num_processes,
         )
@@ -161,46 +188,61 @@ class _Run:
         with ExitStack() as stack:
             log = stack.enter_context(open(self.folder / LOG, "a")) if main else None
             bar = stack.enter_context(self._bar())
-            for batches in loader(people, workers=self.recipe.workers):
+            for batches in self._chunks(people):
+                before_it = self.seen
                 line = self._chunk(batches)
                 self.seconds = before + time.monotonic() - started
-                told = {"people": self.chunk * self.size, "seconds": round(self.seconds, 1)} | line
+                told = {"people": self.seen, "seconds": round(self.seconds, 1)} | line
                 last = self.chunk == self.chunks
-                if last or told["people"] // due > (told["people"] - self.size) // due:
-                    told |= self._validated(told["people"])
+                if last or self.seen // due > before_it // due:
+                    told |= self._validated(self.seen)
                 if main:
                     log.write(json.dumps(told) + "\n")
                     log.flush()
                 self.accelerator.log({k: v for k, v in told.items() if k != "people"}, step=told["people"])
-                bar.update(min(self.size, bar.total - bar.n))
-                shown = {"loss": f"{sum(v for k, v in line.items() if k != 'mpjpe'):.3f}"}
+                bar.update(min(self.seen, bar.total) - bar.n)
+                shown = {"loss": f"{sum(v for k, v in line.items() if k not in ('mpjpe', 'gradient')):.3f}"}
                 shown |= {"mpjpe": f"{line['mpjpe'] * 1e3:.0f} mm"}
                 shown |= {"validation": f"{self.validation.last:.0f} mm"} if self.validation.last is not None else {}
                 bar.set_postfix(shown)
                 if main and (last or time.monotonic() - saved > SAVE_EVERY):
+                    # the state must not be on the disk before the log
+                    os.fsync(log.fileno())
                     self._save()
                     saved = time.monotonic()
         self.accelerator.wait_for_everyone()
 
+    def _chunks(self, people: Chunks) -> Iterator[list]:
+        """As the loader gives them. Raises InputError where one of its processes was killed."""
+        try:
+            yield from loader(people, workers=self.recipe.workers)
+        except RuntimeError as error:
+            if "DataLoader worker" not in str(error):
+                raise
+            raise InputError(
+                "a process that makes people was killed, perhaps for want of memory: go on with --resume and fewer "
+                "--workers"
+            ) from None
+
     def _bar(self) -> tqdm:
         shown = self.accelerator.is_main_process and sys.stderr is not None and sys.stderr.isatty()
-        done = min(self.chunk * self.size, self.job.people)
+        done = min(self.seen, self.job.people)
         return tqdm(total=self.job.people, initial=done, unit=" people", smoothing=0.1, disable=not shown)
 
     def _chunk(self, batches: list) -> dict[str, float]:
-        """Takes the steps of a chunk; returns the mean of each term over them. Raises InputError where one is not
-        finite."""
+        """Takes the steps of a chunk; returns the mean of each term and of the gradient's norm over them. Raises
+        InputError where one is not finite."""
         terms = [self._step(arrays, k) for k, arrays in enumerate(batches)]
         names = list(terms[0])
         told = torch.stack([torch.stack([t[name] for name in names]) for t in terms])
         told = self.accelerator.reduce(told, "mean").cpu()
         broken = (~told.isfinite().all(1)).nonzero().flatten().tolist()
         if broken:
-            first = self.chunk * self.size
+            first = self.seen
             kept = f"{STATE} is kept" if (self.folder / STATE).is_file() else "nothing was saved before"
             raise InputError(
-                f"the loss is not finite in batch {broken[0]} of people {first} to {first + self.size - 1}: start "
-                f"again with a lower --rate; {kept}"
+                f"the loss or its gradient is not finite in batch {broken[0]} of the {len(batches)} from person "
+                f"{first} on: start in another folder with a lower --rate; {kept}"
             )
         self.chunk += 1
         return {name: round(value, 5) for name, value in zip(names, told.mean(0).tolist(), strict=True)}
@@ -209,18 +251,17 @@ class _Run:
         step, recipe, accelerator = self.chunk * BATCHES + k, self.recipe, self.accelerator
         # what a network drops at random follows from the step alone
         torch.manual_seed(_number(recipe.seed, _STEP, step, accelerator.process_index))
-        set_rates(self.optimizers, recipe, step / (self.chunks * BATCHES))
+        set_rates(self.optimizers, recipe, step / self.steps)
         for optimizer in self.optimizers:
             optimizer.zero_grad(set_to_none=True)
         with accelerator.autocast():
             terms = self.job.task.terms(self.wrapped, arrays, device=accelerator.device, share=self._share)
         accelerator.backward(total(terms))
-        if recipe.clip:
-            torch.nn.utils.clip_grad_norm_(self.network.parameters(), recipe.clip)
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), recipe.clip or float("inf"))
         for optimizer in self.optimizers:
             optimizer.step()
         average(self.mean, self.network, step, recipe.ema)
-        return {name: value.detach() for name, value in terms.items()}
+        return {name: value.detach() for name, value in terms.items()} | {"gradient": norm.detach()}
 
     def _share(self, count: Tensor) -> Tensor:
         return self.accelerator.reduce(count.detach().float(), "mean") if self.wrapped is not self.network else count
@@ -248,7 +289,7 @@ class _Run:
         # the state last: killed between the two, a run goes on from the older one and writes both again
         self._save_weights(MODEL, self._averaged())
         best = self.best if np.isfinite(self.best) else None
-        progress = {"chunk": self.chunk, "seconds": self.seconds, "best": best}
+        progress = {"chunk": self.chunk, "seconds": self.seconds, "best": best, "validation": self.validation.last}
         save_state(self.folder / STATE, self.network, self.mean, self.optimizers, progress)
 
     def _save_weights(self, name: str, network: nn.Module, **more: float) -> None:
@@ -261,7 +302,7 @@ class _Run:
         card = {
             "command": self.command or "lidarpose.train.loop.train",
             "recipe": stated,
-            "people_seen": self.chunk * self.size,
+            "people_seen": self.seen,
             "hours": round(self.seconds / 3600, 3),
         }
         if self.validation.last is not None:

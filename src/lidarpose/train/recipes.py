@@ -4,6 +4,7 @@ A field's help is what the command line says of it; this module stays light for 
 """
 
 from dataclasses import asdict, dataclass, field, fields
+from math import isfinite
 from typing import Any
 
 from lidarpose.errors import InputError, unknown_name
@@ -13,7 +14,7 @@ SCHEDULES = ("plateau", "cosine")
 PRECISIONS = ("auto", "float32", "bf16")
 # the paper's network, and one of the same design for CPUs, besides the sizes of the package's own
 PAPER, SMALL_PAPER = "paper", "paper-small"
-# what changes no person and no step: a run that goes on may have others
+# what changes no person: a run that goes on may have others
 FREE = ("workers", "validate", "pictures", "precision")
 
 
@@ -47,15 +48,27 @@ class Recipe:
         for name, bound in least.items():
             if not getattr(self, name) >= bound:
                 raise InputError(f"{name} must be at least {bound}, got {getattr(self, name)}")
-        for name in ("warmup", "cool", "ema"):
-            if getattr(self, name) > 1 or name == "ema" and self.ema == 1:
-                raise InputError(f"{name} must be a share, at most 1, got {getattr(self, name)}")
+        for name in (f.name for f in fields(self) if f.type is float):
+            if not isfinite(getattr(self, name)):
+                raise InputError(f"{name} must be a finite number, got {getattr(self, name)}")
+        self._check_shares("warmup", "cool")
+        self._check_shares("ema", below=True)
         for name, known in (("schedule", SCHEDULES), ("precision", PRECISIONS)):
             if getattr(self, name) not in known:
                 raise unknown_name(name, getattr(self, name), known)
         for f in fields(self):
             if isinstance(f.default, tuple):
                 object.__setattr__(self, f.name, tuple(getattr(self, f.name)))
+
+    def check_no_lengths(self) -> None:
+        if self.bone or self.symmetry:
+            raise InputError("bone and symmetry are terms of the package's own networks: leave them at 0")
+
+    def _check_shares(self, *names: str, below: bool = False) -> None:
+        for name in names:
+            value = getattr(self, name)
+            if value > 1 or below and value == 1:
+                raise InputError(f"{name} must be a share, {'below' if below else 'at most'} 1, got {value}")
 
     def to_dict(self) -> dict:
         return asdict(self)
@@ -80,9 +93,9 @@ class Pretrain(Recipe):
         super().__post_init__()
         if self.people < 1:
             raise InputError(f"people must be at least 1, got {self.people}")
-        for name in ("easy", "captured", "strays", "noise"):
-            if getattr(self, name) > 1:
-                raise InputError(f"{name} must be a share, at most 1, got {getattr(self, name)}")
+        self._check_shares("easy", "captured", "strays", "noise")
+        if self.size in (PAPER, SMALL_PAPER):
+            self.check_no_lengths()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +110,7 @@ class Finetune(Recipe):
     split: str = _setting("train", "whom to learn from; all: everybody")
     interval: int = _setting(1, "only every so many frames, as published recipes thin out")
     augment: str = _setting("default", "what happens to people: default, paper or none")
-    mix: float = _setting(0.25, "share of synthesized people")
+    mix: float = _setting(0.25, "share of synthesized people, below 1")
     scene: str = _setting("wild", "of the synthesized people: wild, paper or reference")
     hold_out: float = _setting(0.1, "share of sequences kept for validation where the dataset has no split val")
     keep_anchors: bool = _setting(True, "of the paper's network: go on with pre-trained anchors and heads")
@@ -108,9 +121,11 @@ class Finetune(Recipe):
             raise InputError("fine-tuning needs a dataset: name a folder that lidarpose prepare wrote")
         if not self.epochs > 0 or self.interval < 1:
             raise InputError(f"epochs must be above 0 and interval at least 1, got {self.epochs} and {self.interval}")
-        for name in ("mix", "hold_out"):
-            if getattr(self, name) > 1:
-                raise InputError(f"{name} must be a share, at most 1, got {getattr(self, name)}")
+        self._check_shares("mix", "hold_out", below=True)
+        if not self.init:
+            raise InputError(
+                "the paper's fine-tuning goes on from a checkpoint of pretrain --recipe paper: name it by --init"
+            )
 
 
 # the released OneCycle schedule, AdamW on everything, neither mean of weights nor clipping
@@ -143,7 +158,7 @@ def finetune_default() -> dict:
 
 def finetune_paper() -> dict:
     """Paper: implementation details. 50 epochs on the dataset alone, anchors and heads begin anew."""
-    return _RELEASED | {"epochs": 50.0, "augment": "paper", "mix": 0.0, "keep_anchors": False}
+    return _RELEASED | {"init": "", "epochs": 50.0, "augment": "paper", "mix": 0.0, "keep_anchors": False}
 
 
 RECIPES = {

@@ -19,6 +19,10 @@ RUNS = "runs"
 STATE, MODEL, BEST = "state.safetensors", "model.safetensors", "best.safetensors"
 CONFIG, LOG, PICTURES = "config.json", "log.jsonl", "pictures"
 SCHEMA = "lidarpose.run/2"
+# settings that are files or folders, which may be written in several ways
+_PATHS = ("data", "shards", "motion")
+# the temporary names of `files.atomic_path`
+_LEFT = re.compile(r"\.\d+-\d+-.+")
 # how a run's length is called: a run may become longer, its schedule follows
 LENGTHS = ("people", "epochs")
 
@@ -40,10 +44,11 @@ def numbered(kind: str, parent: str | Path = RUNS) -> Path:
 
 def latest(kind: str, parent: str | Path = RUNS) -> Path:
     """The numbered folder that was begun last. Raises InputError where there is none."""
-    numbers = _numbers(Path(parent), kind)
-    if not numbers:
+    folders = [Path(parent) / f"{kind}-{number:03d}" for number in sorted(_numbers(Path(parent), kind))]
+    begun = [folder for folder in folders if (folder / CONFIG).is_file()]
+    if not begun:
         raise InputError(f"{parent} has no run {kind}-... to resume: name its folder")
-    return Path(parent) / f"{kind}-{max(numbers):03d}"
+    return begun[-1]
 
 
 def _numbers(parent: Path, kind: str) -> list[int]:
@@ -51,12 +56,28 @@ def _numbers(parent: Path, kind: str) -> list[int]:
     return [int(name[1]) for name in names if name]
 
 
+def check_new(folder: Path) -> None:
+    """Raises InputError where the folder holds anything but what a killed run left of a file."""
+    if folder.is_dir():
+        if all(_LEFT.fullmatch(path.name) for path in folder.iterdir()):
+            return
+    elif not folder.exists():
+        return
+    more = "; add --resume to go on with what is there" if (folder / CONFIG).is_file() else ""
+    raise InputError(f"{folder}: expected a new or empty folder for the run{more}")
+
+
+def clean(folder: Path) -> None:
+    """Removes what a killed run left of files that it was writing."""
+    for path in (*folder.glob(".*"), *(folder / PICTURES).glob(".*")):
+        if _LEFT.fullmatch(path.name):
+            path.unlink(missing_ok=True)
+
+
 def begin(folder: Path, recipe: Recipe, command: str) -> None:
-    """Writes the config of a new run. Raises InputError where the folder holds anything."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(
-            f"{folder}: expected a new or empty folder for the run; add --resume to go on with what is there"
-        )
+    """Writes the config of a new run. Raises InputError as `check_new`."""
+    check_new(folder)
+    clean(folder)
     config = {"schema": SCHEMA, "version": __version__, "kind": type(recipe).__name__.lower(), "command": command}
     write_atomic(folder / CONFIG, json.dumps(config | {"recipe": recipe.to_dict()}, indent=1) + "\n")
 
@@ -86,18 +107,31 @@ def check_same(folder: Path, stored: Recipe, wanted: Recipe) -> None:
     """Raises InputError unless a run may go on with the wanted recipe: as it began, or longer."""
     ours, theirs = wanted.to_dict(), stored.to_dict()
     for name, value in ours.items():
+        if name in _PATHS and _resolved(value) == _resolved(theirs[name]):
+            continue
         if name not in (*LENGTHS, *FREE) and value != theirs[name]:
             raise InputError(
                 f"{folder / CONFIG}: the run has {name} = {theirs[name]!r}, got {value!r}: a run keeps its recipe"
             )
 
 
+def _resolved(value: str | tuple[str, ...] | None) -> list[Path] | None:
+    return None if value is None else [Path(v).resolve() for v in ((value,) if isinstance(value, str) else value)]
+
+
 def read_log(folder: Path) -> list[dict]:
-    """The whole lines of a run's log; a kill may leave half a line at the end."""
+    """The whole lines of a run's log; a kill or a power cut may leave others."""
     path = folder / LOG
-    if not path.exists():
-        return []
-    return [json.loads(line) for line in path.read_text().splitlines() if line.endswith("}")]
+    lines = [_line(line) for line in path.read_text("utf-8", "replace").splitlines()] if path.exists() else []
+    return [line for line in lines if line is not None]
+
+
+def _line(text: str) -> dict | None:
+    try:
+        line = json.loads(text)
+    except ValueError:
+        return None
+    return line if isinstance(line, dict) and isinstance(line.get("people"), int) else None
 
 
 def cut_log(folder: Path, people: int) -> None:

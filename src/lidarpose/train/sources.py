@@ -5,6 +5,7 @@ A source is a function of a person's number in the run alone, so any process mak
 
 from dataclasses import dataclass
 from functools import cached_property
+from math import floor
 from typing import Protocol
 
 import numpy as np
@@ -14,10 +15,10 @@ from lidarpose.synth.generate import Generator
 from lidarpose.synth.scene import scene_config
 from lidarpose.train.augment import Augmentation, augmented, disturbed
 from lidarpose.train.crowd import Crowd, crowd_of
-from lidarpose.train.example import Example, example
+from lidarpose.train.example import REFINED, Example, example
 
 # first words of generators' seeds: 1 is the synthetic person's own
-_SYNTHETIC, _STORED, _ORDER, _WHICH = 2, 5, 6, 7
+_SYNTHETIC, _STORED, _ORDER = 2, 5, 6
 
 
 class Source(Protocol):
@@ -31,8 +32,8 @@ class SyntheticSource:
     """People of a scene whose difficulty rises.
 
     easy: how many people it takes to rise from nothing to full; below the ceiling every difficulty goes on being seen,
-    the harder ones more often; motion, subjects, captured, strays, noise: see `recipes.Pretrain`. Raises InputError, at
-    once, for an unknown scene and for clips that cannot be read.
+    the harder ones more often; motion, subjects, captured, strays, noise: see `recipes.Pretrain`; refined: see
+    `example`. Raises InputError, at once, for an unknown scene and for clips that cannot be read.
     """
 
     scene: str
@@ -43,6 +44,7 @@ class SyntheticSource:
     captured: float = 0.0
     strays: float = 0.0
     noise: float = 0.0
+    refined: float = REFINED
 
     def __post_init__(self):
         # here, not in a worker, whose errors come wrapped in a traceback
@@ -58,7 +60,7 @@ class SyntheticSource:
         rng = np.random.default_rng([self.seed, _SYNTHETIC, index])
         hard = min(index / max(self.easy, 1), 1.0) * np.sqrt(rng.random())
         sample = self._generator.person(self.seed, index, hard=hard).sample
-        return example(disturbed(sample, strays=self.strays, noise=self.noise, rng=rng), rng)
+        return example(disturbed(sample, strays=self.strays, noise=self.noise, rng=rng), rng, refined=self.refined)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,13 +96,13 @@ class StoredSource:
 
 @dataclass(frozen=True, kw_only=True)
 class MixedSource:
-    """Of `main`, and in their stead, for a `share` of people, of `other`."""
+    """People of `main` in their order, and evenly spread among them people of `other`, so that these are a `share` in
+    [0, 1) of all."""
 
     main: Source
     other: Source
     share: float
-    seed: int
 
     def example(self, index: int) -> Example:
-        mixed = np.random.default_rng([self.seed, _WHICH, index]).random() < self.share
-        return (self.other if mixed else self.main).example(index)
+        before, after = floor(index * self.share), floor((index + 1) * self.share)
+        return self.other.example(before) if after > before else self.main.example(index - before)

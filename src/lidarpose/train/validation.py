@@ -35,7 +35,9 @@ class Validation:
             return None
         joints = self.predicted(network, self._people, device)
         true = np.stack([one.joints for one in self._people])
-        self.last = float(np.nanmean(np.linalg.norm(joints - true, axis=-1)) * 1e3)
+        # labelled, and of a joint that the network has; what is not finite though it should be, must be seen
+        judged = ~np.isnan(true).any(-1) & ~np.isnan(joints).all((0, 2))
+        self.last = float(np.linalg.norm(joints - true, axis=-1)[judged].mean() * 1e3)
         if self.recipe.pictures and self.draw is not None:
             self._drawn(joints, people)
         return self.last
