@@ -1,4 +1,4 @@
-# make demo: people seen by three LiDARs, true and predicted. make test: the tests. Both set up .venv first.
+# make demo: people seen by three LiDARs, true and predicted. make test: the tests, two files at a time. Both set up .venv first.
 PYTHON ?= python3
 PIP = .venv/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
@@ -8,7 +8,7 @@ demo: .venv/synth
 	.venv/bin/lidarpose demo
 
 test: .venv/test
-	.venv/bin/python -m pytest
+	OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 --dist loadfile
 
 lint: .venv/test
 	$(PIP) ruff

@@ -327,8 +327,10 @@ def test_the_command_line_trains_and_goes_on(tmp_path, capsys):
     assert main(words) == 2
     assert "expected a new or empty folder" in capsys.readouterr().err
     # what is not said again stays as it was
-    assert not main(["pretrain", str(folder), "--resume"])
+    assert not main(["pretrain", str(folder), "--resume", "--people", "32"])
     assert not capsys.readouterr().err
+    longer = load_checkpoint(folder / runs.MODEL)[1].card["command"]
+    assert longer == f"{command}; then lidarpose pretrain --people 32 --resume"
     assert main(["pretrain", str(folder), "--resume", "--batch", "4"]) == 2
     assert "the run has batch = 2, got 4" in capsys.readouterr().err
     assert main(["pretrain", str(folder), "--resume", "--recipe", "paper"]) == 2

@@ -37,6 +37,7 @@ from lidarpose.train.runs import (
     cut_log,
     latest,
     numbered,
+    stored_command,
     stored_recipe,
 )
 from lidarpose.train.state import load_state, save_state
@@ -75,6 +76,8 @@ def train(
     if resume:
         folder = latest(kind.__name__.lower()) if folder is None else Path(folder)
         check_same(folder, stored_recipe(folder, kind), recipe)
+        begun = stored_command(folder)
+        command = f"{begun}; then {command}" if begun and command else begun or command
     elif folder is None and int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise InputError("several processes need to know the run's folder: name it")
     elif folder is not None:

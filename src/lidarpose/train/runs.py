@@ -103,6 +103,11 @@ def stored_recipe(folder: Path, kind: type[Recipe]) -> Recipe:
         raise file_error(path, f"expected the recipe of a run, but it is damaged ({error}): start a new run") from None
 
 
+def stored_command(folder: Path) -> str:
+    """The command that began a run; the folder's config has been read by `stored_recipe`."""
+    return str(json.loads((folder / CONFIG).read_text()).get("command", ""))
+
+
 def check_same(folder: Path, stored: Recipe, wanted: Recipe) -> None:
     """Raises InputError unless a run may go on with the wanted recipe: as it began, or longer."""
     ours, theirs = wanted.to_dict(), stored.to_dict()
