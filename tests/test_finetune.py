@@ -22,6 +22,7 @@ from lidarpose.model.header import read_header
 from lidarpose.sample import Box
 from lidarpose.skeleton import BODY26, HUMAN15, skeleton
 from lidarpose.synth.write import Job, write_dataset
+from lidarpose.train import job as jobs
 from lidarpose.train import loop, runs
 from lidarpose.train.augment import AUGMENTATIONS, Augmentation, augmentation, augmented
 from lidarpose.train.crowd import Person, crowd_of
@@ -29,7 +30,16 @@ from lidarpose.train.job import job_of
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.sources import MixedSource, StoredSource, SyntheticSource
 
+FEW = 16
 NAMES = ("humanm3", "lidarhuman26m", "sloper4d", "waymo")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_to_validate_on():
+    """So that a run of seconds is not all validation."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jobs, "VALIDATION", FEW)
+        yield
 
 
 def write_waymo(root, smpl):
@@ -367,7 +377,11 @@ def test_a_run_on_a_dataset_is_taken_up(datasets, tmp_path, monkeypatch):
         patch.setattr(loop._Run, "_chunk", counted)
         with pytest.raises(Killed):
             loop.train(recipe, tmp_path / "run")
-    loop.train(recipe, tmp_path / "run", resume=True)
+    # the dataset may have moved meanwhile
+    moved = copied(datasets["lidarhuman26m"], tmp_path / "lidarhuman26m")
+    loop.train(replace(recipe, data=(str(moved),)), tmp_path / "run", resume=True)
+    with pytest.raises(InputError, match="a run keeps its recipe"):
+        loop.train(replace(recipe, data=(str(datasets["sloper4d"]),)), tmp_path / "run", resume=True)
     whole, broken = (runs.read_log(tmp_path / name) for name in ("whole", "run"))
     assert len(whole) == len(broken) == 3
     for a, b in zip(whole, broken, strict=True):

@@ -16,7 +16,7 @@ from lidarpose.errors import InputError
 from lidarpose.model.checkpoint import load_checkpoint
 from lidarpose.model.network import PoseNet
 from lidarpose.model.presets import preset
-from lidarpose.train import loop, runs
+from lidarpose.train import job, loop, runs
 from lidarpose.train.feed import BATCHES, lanes_of
 from lidarpose.train.optimize import optimizers
 from lidarpose.train.pose_task import PoseTask
@@ -27,6 +27,15 @@ RECIPE = Pretrain(
     scene="paper", people=3 * BATCHES * 2, batch=2, workers=0, seed=5, easy=0.15, pictures=0, validate=1000
 )
 TINY = preset("tiny")
+FEW = 16
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_to_validate_on():
+    """So that a run of seconds is not all validation."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(job, "VALIDATION", FEW)
+        yield
 
 
 def log_of(folder):
@@ -179,8 +188,8 @@ def test_killed_for_good_with_workers_and_taken_up(tmp_path):
     recipe = replace(RECIPE, workers=1, people=40 * BATCHES * 2)
     code = (
         "import sys, json, torch; torch.set_num_threads(1)\n"
-        "from lidarpose.train import loop; from lidarpose.train.recipes import Pretrain\n"
-        "loop.SAVE_EVERY = -1.0\n"
+        "from lidarpose.train import job, loop; from lidarpose.train.recipes import Pretrain\n"
+        f"loop.SAVE_EVERY, job.VALIDATION = -1.0, {FEW}\n"
         "loop.train(Pretrain(**json.loads(sys.argv[1])), sys.argv[2])"
     )
     words = [sys.executable, "-c", code, json.dumps(recipe.to_dict()), str(tmp_path / "run")]
@@ -411,7 +420,8 @@ def launched(recipe, folder, processes):
     """Trains as torch's and Accelerate's launchers would have it."""
     code = (
         "import sys, json, torch; torch.set_num_threads(1)\n"
-        "from lidarpose.train.loop import train; from lidarpose.train.recipes import Pretrain\n"
+        "from lidarpose.train import job; from lidarpose.train.loop import train\n"
+        f"from lidarpose.train.recipes import Pretrain; job.VALIDATION = {FEW}\n"
         "train(Pretrain(**json.loads(sys.argv[1])), sys.argv[2])"
     )
     common = os.environ | {"OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1", "WORLD_SIZE": str(processes)}

@@ -19,7 +19,7 @@ RUNS = "runs"
 STATE, MODEL, BEST = "state.safetensors", "model.safetensors", "best.safetensors"
 CONFIG, LOG, PICTURES = "config.json", "log.jsonl", "pictures"
 SCHEMA = "lidarpose.run/2"
-# settings that are files or folders, which may be written in several ways
+# settings that are files or folders, which may have been moved
 _PATHS = ("data", "shards", "motion")
 # the temporary names of `files.atomic_path`
 _LEFT = re.compile(r"\.\d+-\d+-.+")
@@ -112,7 +112,7 @@ def check_same(folder: Path, stored: Recipe, wanted: Recipe) -> None:
     """Raises InputError unless a run may go on with the wanted recipe: as it began, or longer."""
     ours, theirs = wanted.to_dict(), stored.to_dict()
     for name, value in ours.items():
-        if name in _PATHS and _resolved(value) == _resolved(theirs[name]):
+        if name in _PATHS and _named(value) == _named(theirs[name]):
             continue
         if name not in (*LENGTHS, *FREE) and value != theirs[name]:
             raise InputError(
@@ -120,8 +120,9 @@ def check_same(folder: Path, stored: Recipe, wanted: Recipe) -> None:
             )
 
 
-def _resolved(value: str | tuple[str, ...] | None) -> list[Path] | None:
-    return None if value is None else [Path(v).resolve() for v in ((value,) if isinstance(value, str) else value)]
+def _named(value: str | tuple[str, ...] | None) -> list[str] | None:
+    """Files and folders by their names."""
+    return None if value is None else [Path(v).resolve().name for v in ((value,) if isinstance(value, str) else value)]
 
 
 def read_log(folder: Path) -> list[dict]:
