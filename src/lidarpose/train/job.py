@@ -23,6 +23,7 @@ from lidarpose.train.task import Task
 # people to validate on; synthesized ones are of a seed that no run learns from
 VALIDATION = 256
 _VALIDATION_SEED = 2**31 - 7
+_UNWATCHED = "nobody is left to validate on: no split val, and too few sequences to hold one out"
 # of fewer sequences none is held out
 _LEAST_SEQUENCES = 3
 
@@ -141,7 +142,7 @@ def _finetuning(recipe: Finetune) -> Job:
             "held_out_sequences": list(held_out),
             "damaged": list(people.crowd.damaged),
         },
-        warnings=_about(people.crowd),
+        warnings=_about(people.crowd) + (() if watched else (_UNWATCHED,)),
     )
 
 
