@@ -109,7 +109,7 @@ def test_splits_intervals_and_sequences_leave_people_out(datasets):
     train, test = (crowd_of([folder], split=split) for split in ("train", "test"))
     assert len(train) + len(test) == len(everybody) and test.sequences == ("test/d",)
     assert set(train.sequences) == {"train/a", "train/b", "train/c"}
-    assert len(crowd_of([folder], without=["train/a"])) == len(everybody) * 3 // 4
+    assert len(everybody.without(["train/a"])) == len(everybody) * 3 // 4
     # frames 7, 8, 9 of everybody
     assert len(crowd_of([folder], interval=4)) == len(everybody) // 3
     assert len(crowd_of([folder, folder])) == 2 * len(everybody)
@@ -253,7 +253,7 @@ def test_a_few_points_can_be_shown(count):
 
 
 def stored(datasets, name="humanm3", **more):
-    return StoredSource(folders=(str(datasets[name]),), seed=1, augmentation=AUGMENTATIONS["none"], **more)
+    return StoredSource(crowd=crowd_of([datasets[name]]), seed=1, augmentation=AUGMENTATIONS["none"], **more)
 
 
 def test_an_epoch_shows_everybody_once_in_an_order_of_its_own(datasets):
@@ -400,6 +400,7 @@ def test_a_run_on_a_dataset_is_taken_up(datasets, tmp_path, monkeypatch):
         (["{humanm3}", "{waymo}"], "need one skeleton"),
         (["{humanm3}", "--augment", "much"], "unknown augmentation 'much'"),
         (["{humanm3}", "--keep-anchors", "perhaps"], "expected true or false, got 'perhaps'"),
+        (["{humanm3}", "--hold-out", "0.99"], "leaves nobody to learn from"),
         (["{humanm3}", "--epochs", "0"], "epochs must be above 0"),
         (["{humanm3}", "--epochs", "inf"], "epochs must be a finite number"),
         (["{humanm3}", "--recipe", "paper"], "name it by --init"),

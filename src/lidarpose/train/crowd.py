@@ -4,7 +4,7 @@ Legend: N people, M points of all of them.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -38,13 +38,14 @@ class Person:
 
 @dataclass(frozen=True, kw_only=True)
 class Crowd:
-    """Everybody. start (N + 1,): where a person's points begin; labels (N, 26) uint8, as in `Item`; centers: (N, 3) m
-    by name, NaN for none; box (N, 7), NaN for none; sequence (N,): numbers of `sequences`; dataset: name of the first
-    one, "" if synthetic; damaged: what could not be read; the rest as in `Person`."""
+    """Everybody. start, end (N,): where a person's points begin and end; labels (N, 26) uint8, as in `Item`; centers:
+    (N, 3) m by name, NaN for none; box (N, 7), NaN for none; sequence (N,): numbers of `sequences`; dataset: name of
+    the first one, "" if synthetic; damaged: what could not be read; the rest as in `Person`."""
 
     points: np.ndarray
     part: np.ndarray
     start: np.ndarray
+    end: np.ndarray
     joints: np.ndarray
     labels: np.ndarray
     center: np.ndarray
@@ -61,7 +62,7 @@ class Crowd:
         return len(self.center)
 
     def person(self, row: int) -> Person:
-        own = slice(self.start[row], self.start[row + 1])
+        own = slice(self.start[row], self.end[row])
         box = self.box[row]
         return Person(
             points=self.points[own],
@@ -74,6 +75,20 @@ class Crowd:
             sensor_known=bool(self.sensor_known[row]),
         )
 
+    def without(self, sequences: Sequence[str]) -> "Crowd":
+        """Everybody but those of some sequences; the points are shared."""
+        left = [name for name in self.sequences if name not in sequences]
+        number = np.array([left.index(name) if name in left else -1 for name in self.sequences], int)
+        rows = np.flatnonzero(number[self.sequence] >= 0)
+        each = ("start", "end", "joints", "labels", "center", "box", "sensor_known")
+        return replace(
+            self,
+            sequence=number[self.sequence[rows]],
+            sequences=tuple(left),
+            centers={name: at[rows] for name, at in self.centers.items()},
+            **{name: getattr(self, name)[rows] for name in each},
+        )
+
     def _visible(self, row: int) -> np.ndarray:
         # a dataset that never says hidden tells nothing of what is seen
         told = np.select([self.labels[row] == SEEN, self.labels[row] == HIDDEN], [1.0, 0.0], np.nan)
@@ -84,13 +99,11 @@ class Crowd:
         return bool((self.labels == HIDDEN).any())
 
 
-def crowd_of(
-    folders: Sequence[str | Path], *, split: str | None = None, interval: int = 1, without: Sequence[str] = ()
-) -> Crowd:
+def crowd_of(folders: Sequence[str | Path], *, split: str | None = None, interval: int = 1) -> Crowd:
     """Everybody with points and a label in datasets that `lidarpose prepare` or `synth` wrote.
 
     split: of real datasets, None for all; interval: only every so many of a person's frames in a sequence, as published
-    recipes thin out; without: sequences to leave out. A shard that is damaged is left out and named in `damaged`.
+    recipes thin out. A shard that is damaged is left out and named in `damaged`.
     Raises InputError where nobody is left, for a folder that is no dataset, and for datasets of different skeletons.
     """
     folders = [Path(folder) for folder in folders]
@@ -104,7 +117,7 @@ def crowd_of(
             raise file_error(folder, f"holds synthetic people, which have no split {split!r}: leave --split away")
         frames: dict[tuple, int] = {}
         for row in _rows(dataset, damaged):
-            if split is not None and row["split"] != split or row.get("sequence") in without:
+            if split is not None and row["split"] != split:
                 continue
             # frames are numbered by anything, time stamps too
             whose = row.get("sequence"), row["track"]
@@ -121,11 +134,14 @@ def crowd_of(
         raise InputError(f"{where}: expected {what}, found none{told}; lidarpose prepare says what is there")
     names = sorted({row["sequence"] for row in rows})
     number = {name: k for k, name in enumerate(names)}
+    counts = np.array([len(row["points"]) for row in rows])
+    ends = counts.cumsum()
     stacked = ("joints", "labels", "center", "box", "sensor_known")
     return Crowd(
         points=np.concatenate([row["points"] for row in rows]),
         part=np.concatenate([row["part"] for row in rows]),
-        start=np.cumsum([0, *(len(row["points"]) for row in rows)]),
+        start=ends - counts,
+        end=ends,
         sequence=np.array([number[row["sequence"]] for row in rows]),
         sequences=tuple(names),
         skeleton=next(iter(skeletons)),

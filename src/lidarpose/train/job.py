@@ -1,6 +1,7 @@
 """What a recipe comes to: the task, where people come from, the weights to begin with, whom to validate on."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -66,8 +67,9 @@ def _pretraining(recipe: Pretrain) -> Job:
     scene = {name: getattr(recipe, name) for name in names}
     warnings: tuple[str, ...] = ()
     if recipe.shards:
-        source = StoredSource(folders=recipe.shards, seed=recipe.seed, augmentation=Augmentation(turn=1.0, flip=0.5))
-        warnings = _about(source.crowd)
+        crowd = crowd_of(recipe.shards)
+        source = StoredSource(crowd=crowd, seed=recipe.seed, augmentation=Augmentation(turn=1.0, flip=0.5))
+        warnings = _about(crowd)
     else:
         source = SyntheticSource(seed=recipe.seed, easy=recipe.easy * recipe.people, **scene)
 
@@ -105,21 +107,16 @@ def _finetuning(recipe: Finetune) -> Job:
     network, header = load_checkpoint(path)
     split = None if recipe.split == "all" else recipe.split
     kind = augmentation(recipe.augment)
-    held_out, watched = _held_out(recipe, split)
-    people = StoredSource(
-        folders=recipe.data,
-        seed=recipe.seed,
-        augmentation=kind,
-        split=split,
-        interval=recipe.interval,
-        without=held_out,
-    )
+    everybody = crowd_of(recipe.data, split=split, interval=recipe.interval)
+    held_out, watched = _held_out(recipe, split, everybody)
+    crowd = everybody.without(held_out)
+    people = StoredSource(crowd=crowd, seed=recipe.seed, augmentation=kind)
     source: Source = people
     if recipe.mix:
         other = SyntheticSource(scene=recipe.scene, seed=recipe.seed)
         source = MixedSource(main=people, other=other, share=recipe.mix)
-    joints = skeleton(people.crowd.skeleton)
-    task, begun = _begun(recipe, network, header, joints, people.crowd.dataset)
+    joints = skeleton(crowd.skeleton)
+    task, begun = _begun(recipe, network, header, joints, crowd.dataset)
 
     def validation() -> list[Example]:
         # a box with a detector's errors where people have one, centered on the points
@@ -131,7 +128,7 @@ def _finetuning(recipe: Finetune) -> Job:
         task=task,
         source=source,
         # those that are mixed in come on top
-        people=max(round(recipe.epochs * len(people.crowd) / (1 - recipe.mix)), 1),
+        people=max(round(recipe.epochs * len(crowd) / (1 - recipe.mix)), 1),
         network=begun,
         validation=validation,
         joints=joints,
@@ -140,34 +137,25 @@ def _finetuning(recipe: Finetune) -> Job:
             "init_card": header.card,
             "data": [Path(folder).name for folder in recipe.data],
             "held_out_sequences": list(held_out),
-            "damaged": list(people.crowd.damaged),
+            "damaged": list(crowd.damaged),
         },
-        warnings=_about(people.crowd) + (() if watched else (_UNWATCHED,)),
+        warnings=_about(crowd) + (() if watched else (_UNWATCHED,)),
     )
 
 
-def _held_out(recipe: Finetune, split: str | None) -> tuple[tuple[str, ...], Crowd | None]:
+def _held_out(recipe: Finetune, split: str | None, everybody: Crowd) -> tuple[tuple[str, ...], Crowd | None]:
     """Sequences not to learn from, and whom to validate on: the split val where there is one, else those sequences."""
-    try:
-        if split not in (None, "val"):
+    if split not in (None, "val"):
+        # there may be no such split
+        with suppress(InputError):
             return (), crowd_of(recipe.data, split="val", interval=recipe.interval)
-    except InputError:
-        # no such split
-        pass
-    everybody = crowd_of(recipe.data, split=split, interval=recipe.interval)
-    number = max(round(recipe.hold_out * len(everybody.sequences)), 1)
     if not recipe.hold_out or len(everybody.sequences) < _LEAST_SEQUENCES:
         return (), None
-    held_out = everybody.sequences[-number:]
-    try:
-        return held_out, crowd_of(
-            recipe.data,
-            split=split,
-            interval=recipe.interval,
-            without=[name for name in everybody.sequences if name not in held_out],
-        )
-    except InputError:
-        return (), None
+    number = max(round(recipe.hold_out * len(everybody.sequences)), 1)
+    if number == len(everybody.sequences):
+        raise InputError(f"hold_out = {recipe.hold_out} leaves nobody to learn from: lower it")
+    learned, held_out = everybody.sequences[:-number], everybody.sequences[-number:]
+    return held_out, everybody.without(learned)
 
 
 def _begun(

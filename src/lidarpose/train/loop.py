@@ -68,8 +68,8 @@ def train(
 
     folder: a new one (None: the next number in `runs`), or with `resume` that of a run with the same recipe (its length
     may differ). device: "cpu", or None for what Accelerate finds; tracker: "tensorboard" or "wandb", which must be
-    installed; draw: what makes pictures of validation people, None for none. Raises InputError where
-    the folder or the recipe does not fit, or where the loss stops being finite: the last good state then stays.
+    installed; draw: what makes pictures of validation people, None for none. Raises InputError where the folder or the
+    recipe does not fit, or where the loss stops being finite: the last good state then stays.
     """
     _check(device, tracker)
     kind = type(recipe)

@@ -4,7 +4,7 @@ A source is a function of a person's number in the run alone, so any process mak
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import floor
 from typing import Protocol
 
@@ -14,7 +14,7 @@ from lidarpose.synth.bodies import PoseBank
 from lidarpose.synth.generate import Generator
 from lidarpose.synth.scene import scene_config
 from lidarpose.train.augment import Augmentation, augmented, disturbed
-from lidarpose.train.crowd import Crowd, crowd_of
+from lidarpose.train.crowd import Crowd
 from lidarpose.train.example import REFINED, Example, example
 
 # first words of generators' seeds: 1 is the synthetic person's own
@@ -67,31 +67,24 @@ class SyntheticSource:
 class StoredSource:
     """The people of datasets, all of them once an epoch in an order of the epoch's own, each time augmented anew.
 
-    folders, split, interval, without: see `crowd.crowd_of`. Raises InputError, at once, where there is nobody.
+    crowd: see `crowd.crowd_of`.
     """
 
-    folders: tuple[str, ...]
+    crowd: Crowd
     seed: int
     augmentation: Augmentation
-    split: str | None = None
-    interval: int = 1
-    without: tuple[str, ...] = ()
-
-    def __post_init__(self):
-        self.crowd  # noqa: B018
-
-    @cached_property
-    def crowd(self) -> Crowd:
-        return crowd_of(self.folders, split=self.split, interval=self.interval, without=self.without)
 
     def example(self, index: int) -> Example:
         epoch, place = divmod(index, len(self.crowd))
-        if self.__dict__.get("_epoch", (None,))[0] != epoch:
-            order = np.random.default_rng([self.seed, _ORDER, epoch]).permutation(len(self.crowd))
-            self.__dict__["_epoch"] = epoch, order
-        row = int(self.__dict__["_epoch"][1][place])
+        row = int(_order(self.seed, epoch, len(self.crowd))[place])
         rng = np.random.default_rng([self.seed, _STORED, index])
         return augmented(self.crowd.person(row), self.augmentation, rng)
+
+
+@lru_cache(maxsize=2)
+def _order(seed: int, epoch: int, count: int) -> np.ndarray:
+    """(count,) int: whom an epoch shows, one after the other."""
+    return np.random.default_rng([seed, _ORDER, epoch]).permutation(count)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,6 +10,7 @@ Sources: 4DVLab/LIP dataset/LIP_dataset.py, 4DVLab/LiveHPS dataset/Livehps_datas
 Pickles are read without running them.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,11 +18,10 @@ import numpy as np
 
 from lidarpose.data.files import file_error
 from lidarpose.data.pickles import load_pickle
-from lidarpose.data.readers.items import SEEN, Item, Skipped
+from lidarpose.data.readers.items import Item, Skipped
 from lidarpose.data.readers.raw import find_below, numbers, read_cloud, wrong_root
-from lidarpose.data.readers.smpl_joints import SmplJoints
+from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_item
 from lidarpose.errors import InputError
-from lidarpose.sample import Pose, Sample, center_of
 from lidarpose.skeleton import SMPL24
 
 # points are this close to the nearest joint in the median where labels and clouds fit, m: a trunk is 0.2 m thick
@@ -29,7 +29,7 @@ _NEAR = 0.35
 _FPS = 10.0
 
 
-class _Corpus:
+class _Corpus(ABC):
     """Pickles of lists of dicts. A part is a file."""
 
     name = ""
@@ -59,8 +59,9 @@ class _Corpus:
             frame = counts[sequence] = counts.get(sequence, -1) + 1
             yield from self._entry(root, entry, where, f"{part}/{sequence}", frame)
 
+    @abstractmethod
     def _entry(self, root: Path, entry: dict, where: str, sequence: str, frame: int) -> Iterator[Item | Skipped]:
-        raise NotImplementedError
+        """Everybody in an entry."""
 
     def _item(
         self, points: np.ndarray, joints: np.ndarray, where: str, sequence: str, frame: int, track: str, source: str
@@ -69,21 +70,15 @@ class _Corpus:
             return Skipped(reason="empty cloud", where=where)
         if _apart(points, joints) > _NEAR:
             return Skipped(reason="joints are not where the points are", where=where)
-        points = points.astype(np.float32)
-        sample = Sample(
-            points=points,
-            center=center_of(points),
-            pose=Pose(joints=joints.astype(np.float32), skeleton=SMPL24, frame="sensor"),
-            source=source,
-            frame_id=f"{sequence}/{frame}",
-        )
-        return Item(
-            sample=sample,
-            joint_labels=np.full(len(SMPL24), SEEN, np.uint8),
+        return smpl_item(
+            points,
+            joints,
             sequence=sequence,
             frame=frame,
+            frame_id=f"{sequence}/{frame}",
             track=track,
             time=frame / _FPS,
+            source=source,
             centers={},
         )
 

@@ -13,11 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose.data.files import file_error
-from lidarpose.data.readers.items import SEEN, Item, Skipped
+from lidarpose.data.readers.items import Item, Skipped
 from lidarpose.data.readers.raw import numbered, numbers, read_cloud, read_json, wrong_root
-from lidarpose.data.readers.smpl_joints import SmplJoints
+from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_item
 from lidarpose.errors import InputError
-from lidarpose.sample import Pose, Sample, center_of
 from lidarpose.skeleton import SMPL24
 
 # frames a second of the LiDAR
@@ -110,20 +109,14 @@ def _item(path: Path, joints: np.ndarray, trans: np.ndarray, part: str, frame: i
         return Skipped(reason="cloud cannot be read", where=str(error))
     if not len(points):
         return Skipped(reason="empty cloud", where=f"{part}/{path.stem}")
-    points = points.astype(np.float32)
-    sample = Sample(
-        points=points,
-        center=center_of(points),
-        pose=Pose(joints=joints.astype(np.float32), skeleton=SMPL24, frame="sensor"),
-        source="lidarhuman26m",
-        frame_id=f"{part}/{path.stem}",
-    )
-    return Item(
-        sample=sample,
-        joint_labels=np.full(len(SMPL24), SEEN, np.uint8),
+    return smpl_item(
+        points,
+        joints,
         sequence=part,
         frame=frame,
+        frame_id=f"{part}/{path.stem}",
         track="0",
         time=time,
+        source="lidarhuman26m",
         centers={"trans": trans},
     )

@@ -18,12 +18,11 @@ import numpy as np
 
 from lidarpose.data.files import file_error
 from lidarpose.data.pickles import load_pickle
-from lidarpose.data.readers.items import SEEN, Item, Skipped
+from lidarpose.data.readers.items import Item, Skipped
 from lidarpose.data.readers.raw import numbers, wrong_root
-from lidarpose.data.readers.smpl_joints import SmplJoints
+from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_item
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
-from lidarpose.sample import Pose, Sample, center_of
 from lidarpose.skeleton import SMPL24
 
 _SUFFIX = "_labels.pkl"
@@ -199,20 +198,14 @@ def _item(labels: _Labels, index: int, cloud: np.ndarray, joints: np.ndarray, so
         (x - labels.position[index]) @ R_sensor_world.T for x in (cloud, joints, labels.trans[index])
     )
     frame = labels.frames[index]
-    points = points.astype(np.float32)
-    sample = Sample(
-        points=points,
-        center=center_of(points),
-        pose=Pose(joints=joints.astype(np.float32), skeleton=SMPL24, frame="sensor"),
-        source=source,
-        frame_id=f"{part}/{frame}",
-    )
-    return Item(
-        sample=sample,
-        joint_labels=np.full(len(SMPL24), SEEN, np.uint8),
+    return smpl_item(
+        points,
+        joints,
         sequence=part,
         frame=frame,
+        frame_id=f"{part}/{frame}",
         track="second_person",
         time=float(labels.time[index]),
+        source=source,
         centers={"trans": trans},
     )

@@ -1,4 +1,5 @@
-"""SMPL's 24 joints from its parameters, by the user's own model files: what datasets without joints need."""
+"""SMPL's 24 joints from its parameters, by the user's own model files: what datasets without joints need; and the
+people that they make."""
 
 import hashlib
 import re
@@ -10,8 +11,10 @@ import numpy as np
 from lidarpose.body.rig import forward_kinematics
 from lidarpose.body.smpl import SmplBody, load_body
 from lidarpose.data.files import file_error, read_bytes
+from lidarpose.data.readers.items import SEEN, Item
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix
+from lidarpose.sample import Pose, Sample, center_of
 from lidarpose.skeleton import SMPL24
 
 # what the published files are called: SMPL_MALE.pkl, basicmodel_m_lbs_10_207_0_v1.1.0.pkl, basicModel_f_lbs_...
@@ -65,6 +68,39 @@ class SmplJoints:
             kind: hashlib.sha256(read_bytes(path, expected="SMPL")).hexdigest()[:12]
             for kind, path in self.files.items()
         }
+
+
+def smpl_item(
+    points: np.ndarray,
+    joints: np.ndarray,
+    *,
+    sequence: str,
+    frame: int,
+    frame_id: str,
+    track: str,
+    time: float,
+    source: str,
+    centers: dict[str, np.ndarray],
+) -> Item:
+    """A person of whom points (n, 3) m and SMPL's joints (24, 3) m are known, which all count as seen; the rest as in
+    `Item` and `Sample`."""
+    points = points.astype(np.float32)
+    sample = Sample(
+        points=points,
+        center=center_of(points),
+        pose=Pose(joints=joints.astype(np.float32), skeleton=SMPL24, frame="sensor"),
+        source=source,
+        frame_id=frame_id,
+    )
+    return Item(
+        sample=sample,
+        joint_labels=np.full(len(SMPL24), SEEN, np.uint8),
+        sequence=sequence,
+        frame=frame,
+        track=track,
+        time=time,
+        centers=centers,
+    )
 
 
 class _Model:
