@@ -54,8 +54,13 @@ class Actor:
         )
 
 
-def draw_actor(bank: PoseBank | None, captured: float, frames: int, rng: np.random.Generator) -> Actor:
-    """Somebody who moves, at 10 Hz: from the prior, or with a chance of `captured` from the clips of a bank."""
+def draw_actor(
+    bank: PoseBank | None, captured: float, frames: int, rng: np.random.Generator, *, clothes: float = 1.0
+) -> Actor:
+    """Somebody who moves, at 10 Hz: from the prior, or with a chance of `captured` from the clips of a bank.
+
+    clothes: see `SceneConfig`.
+    """
     rig = load_rig()
     found = bank.clip(frames + 1, rng) if bank is not None and rng.random() < captured else None
     if found is not None:
@@ -66,8 +71,8 @@ def draw_actor(bank: PoseBank | None, captured: float, frames: int, rng: np.rand
         kind, clearance = KINDS[drawn.kind[0]], drawn.clearance[0]
     person = rig.rest(sample_people(rng, 1).coefficients)
     rest = RestBody(vertices=np.repeat(person.vertices, frames + 1, 0), joints=np.repeat(person.joints, frames + 1, 0))
-    clothes = np.repeat(clothing(rng, rig, 1), frames + 1, 0)
-    vertices, joints, low, _ = dressed(rest, clothes, rotations, translation)
+    worn = np.repeat(clothing(rng, rig, 1) * np.float32(clothes), frames + 1, 0)
+    vertices, joints, low, _ = dressed(rest, worn, rotations, translation)
     lowest = low[:, 2]
     if clearance is None:
         # the body is not as tall as who was captured: what is little above the lowest frame stands on the ground

@@ -105,10 +105,17 @@ class Bodies:
 
 
 def draw_bodies(
-    bank: PoseBank | None, captured: float, count: int, seed: int, block: int, *, moving: bool = True
+    bank: PoseBank | None,
+    captured: float,
+    count: int,
+    seed: int,
+    block: int,
+    *,
+    moving: bool = True,
+    clothes: float = 1.0,
 ) -> Bodies:
     """The `count` bodies of a block; a function of (seed, block) and of where poses come from. Unless `moving`, they
-    cannot be `moved`."""
+    cannot be `moved`; clothes: see `SceneConfig`."""
     rng = np.random.default_rng([seed, 0, block])
     rig = load_rig()
     prior = sample_rotations(rng, count, dt=FRAME_TIME if moving else 0.0)
@@ -124,8 +131,8 @@ def draw_bodies(
             moved, step = np.where(mask, both[:, 1], moved), np.where(chosen[:, None], way[:, 0], step)
         kinds = np.where(chosen, "captured", kinds)
     rest = rig.rest(sample_people(rng, count).coefficients)
-    clothes = clothing(rng, rig, count)
-    vertices, joints, low, high = dressed(rest, clothes, rotations, np.zeros((count, 3), np.float32))
+    worn = clothing(rng, rig, count) * np.float32(clothes)
+    vertices, joints, low, high = dressed(rest, worn, rotations, np.zeros((count, 3), np.float32))
     lift = low[:, 2].copy()
     vertices[..., 2] -= lift[:, None]
     joints[..., 2] -= lift[:, None]
@@ -138,7 +145,7 @@ def draw_bodies(
         faces=rig.faces,
         face_part=rig.face_part,
         rest=rest,
-        clothes=clothes,
+        clothes=worn,
         moved_rotations=moved,
         step=step,
         lift=lift,

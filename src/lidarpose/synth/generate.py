@@ -60,8 +60,8 @@ class Generator:
             raise InputError(f"Generator.captured must be a share in [0, 1], got {self.captured}")
         moving = any(isinstance(sensor(name), RayPattern) for name in self.scene.sensors)
         # neighbours share a block; two suffice for a reader that crosses from one to the next
-        drawn = lru_cache(maxsize=2)(partial(draw_bodies, self.bank, self.captured, BLOCK, moving=moving))
-        object.__setattr__(self, "_bodies", drawn)
+        drawn = partial(draw_bodies, self.bank, self.captured, BLOCK, moving=moving, clothes=self.scene.clothes)
+        object.__setattr__(self, "_bodies", lru_cache(maxsize=2)(drawn))
 
     def person(self, seed: int, index: int, *, hard: float | None = None) -> SyntheticPerson:
         """Person `index` of `seed`, at the scene's difficulty or at `hard` in [0, 1]."""
@@ -77,7 +77,7 @@ class Generator:
         if frames < 1:
             raise InputError(f"a clip needs frames of 1 or more, got {frames}")
         rng = np.random.default_rng([seed, 3, index])
-        actor = draw_actor(self.bank, self.captured, frames, rng)
+        actor = draw_actor(self.bank, self.captured, frames, rng, clothes=self.scene.clothes)
         return self._observed(actor, self._bodies(seed, index // BLOCK), index % BLOCK, rng, hard)
 
     def _observed(

@@ -57,7 +57,8 @@ class SceneConfig:
     the sensor's height, 0 = its own height whether the person fits or not; slope rad: standard deviation of the
     ground's tilt; margin rad and around m: how much farther than the body beams are cast; clutter: things near the
     person; occluder: something in front; company: a second person in or before the crop; carry: how often something
-    is carried or used, relative to the street's habit; hard in [0, 1].
+    is carried or used, relative to the street's habit; clothes: how far cloth and hair stand off the skin, relative to
+    the street's (0: bare); hard in [0, 1].
     """
 
     name: str
@@ -74,6 +75,7 @@ class SceneConfig:
     carry: float
     faults: Faults
     crop: CropErrors
+    clothes: float = 1.0
     hard: float = 1.0
 
     def __post_init__(self):

@@ -3,15 +3,19 @@
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from torch import nn
 
+from lidarpose.data.files import file_error
 from lidarpose.errors import InputError, unknown_name
 from lidarpose.model.dapt.config import CONFIGS
+from lidarpose.model.grow import grown
 from lidarpose.model.header import Header
-from lidarpose.model.presets import SIZES, preset
+from lidarpose.model.network import PoseNet
+from lidarpose.model.presets import SIZES, NetworkConfig, preset
 from lidarpose.skeleton import HUMAN15, SMPL24, Skeleton, skeleton
 from lidarpose.train.augment import Augmentation, augmentation, augmented
 from lidarpose.train.crowd import Crowd, crowd_of
@@ -79,16 +83,34 @@ def _pretraining(recipe: Pretrain) -> Job:
         return [held_out.example(index) for index in range(VALIDATION)]
 
     joints = SMPL24 if isinstance(task, PoseTask) else HUMAN15
+    card = {"motion": None if recipe.motion is None else Path(recipe.motion).name}
+    network = task.network
+    if recipe.init:
+        network, card["init_card"] = _grown(recipe.init, task.config)
     return Job(
         task=task,
         source=source,
         people=recipe.people,
-        network=task.network,
+        network=network,
         validation=validation,
         joints=joints,
-        card={"motion": None if recipe.motion is None else Path(recipe.motion).name},
+        card=card,
         warnings=warnings,
     )
+
+
+def _grown(init: str, config: NetworkConfig) -> tuple[Callable[[], nn.Module], dict]:
+    """What makes a network of this configuration that begins as the weights named, and their card."""
+    from lidarpose.model.bundled import weights_path
+    from lidarpose.model.checkpoint import load_checkpoint
+
+    path = weights_path(init)
+    smaller, header = load_checkpoint(path)
+    if not isinstance(smaller, PoseNet):
+        raise file_error(path, "holds the paper's network: --init names one of the package's own")
+    # tried at once, so that what does not fit is told before a folder is made
+    grown(smaller, config)
+    return partial(grown, smaller, config), header.card
 
 
 def _about(crowd: Crowd) -> tuple[str, ...]:

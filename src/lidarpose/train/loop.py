@@ -58,6 +58,7 @@ def train(
     recipe: Recipe,
     folder: str | Path | None = None,
     *,
+    job: Job | None = None,
     resume: bool = False,
     command: str = "",
     device: str | None = None,
@@ -66,10 +67,11 @@ def train(
 ) -> Path:
     """Trains as the recipe says and returns the path of model.safetensors.
 
-    folder: a new one (None: the next number in `runs`), or with `resume` that of a run with the same recipe (its length
-    may differ). device: "cpu", or None for what Accelerate finds; tracker: "tensorboard" or "wandb", which must be
-    installed; draw: what makes pictures of validation people, None for none. Raises InputError where the folder or the
-    recipe does not fit, or where the loss stops being finite: the last good state then stays.
+    job: people or a network of one's own instead of those that the recipe comes to (`job.job_of`); the run is as long
+    as it says. folder: a new one (None: the next number in `runs`), or with `resume` that of a run with the same recipe
+    (its length may differ). device: "cpu", or None for what Accelerate finds; tracker: "tensorboard" or "wandb", which
+    must be installed; draw: what makes pictures of validation people, None for none. Raises InputError where the folder
+    or the recipe does not fit, or where the loss stops being finite: the last good state then stays.
     """
     _check(device, tracker)
     kind = type(recipe)
@@ -82,7 +84,7 @@ def train(
         raise InputError("several processes need to know the run's folder: name it")
     elif folder is not None:
         check_new(Path(folder))
-    job = job_of(recipe, on_cpu=_on_cpu(device))
+    job = job_of(recipe, on_cpu=_on_cpu(device)) if job is None else job
     accelerator = _accelerator(recipe, device, tracker)
     lanes_of(recipe.batch, accelerator.num_processes)
     # every process has looked before the first one writes

@@ -79,6 +79,7 @@ class Pretrain(Recipe):
     """Pre-training on synthesized people, made while the network learns, or read from shards."""
 
     size: str = _setting("tiny", "of the network: tiny, small, base; paper or paper-small for the paper's design")
+    init: str = _setting("", "weights to begin with, of this size or smaller: bundled, or a checkpoint")
     scene: str = _setting("wild", "wild, paper or reference")
     people: int = _setting(300_000, "seen in all")
     easy: float = _setting(0.05, "share of the run in which difficulty rises to full")
@@ -96,6 +97,8 @@ class Pretrain(Recipe):
         self._check_shares("easy", "captured", "strays", "noise")
         if self.size in (PAPER, SMALL_PAPER):
             self.check_no_lengths()
+            if self.init:
+                raise InputError("init is for the package's own networks: the paper's begins at random")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,88 @@
+"""Networks that lack one thing each, for `ablations.py`."""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+
+from lidarpose.model.batch import Batch
+from lidarpose.model.exchange import Exchange
+from lidarpose.model.layers import Places
+from lidarpose.model.network import PoseNet
+from lidarpose.model.presets import NetworkConfig
+
+LEVELS = ("coarse", "mid", "fine")
+
+
+class Unread(nn.Module):
+    """An exchange whose anchors read no voxels, only each other."""
+
+    def __init__(self, exchange: Exchange):
+        super().__init__()
+        self.norm_self, self.among = exchange.norm_self, exchange.among
+        self.norm_feed, self.feed = exchange.norm_feed, exchange.feed
+
+    def forward(
+        self, anchors: Tensor, believed: Places, voxels: Tensor, places: Places, log_count: Tensor, bias: Tensor
+    ) -> Tensor:
+        anchors = anchors + self.read(voxels, bias)
+        anchors = anchors + self.among(self.norm_self(anchors), None, None)
+        return anchors + self.feed(self.norm_feed(anchors))
+
+    def read(self, voxels: Tensor, bias: Tensor) -> Tensor | float:
+        return 0.0
+
+
+class Pooled(Unread):
+    """An exchange that gives all anchors the same: mean and maximum of the level's voxels."""
+
+    def __init__(self, exchange: Exchange, voxel_channels: int):
+        super().__init__(exchange)
+        self.norm_voxels = exchange.norm_voxels
+        self.mix = nn.Linear(2 * voxel_channels, exchange.feed[0].in_features)
+
+    def read(self, voxels: Tensor, bias: Tensor) -> Tensor:
+        valid = bias[:, 0, 0, :, None] == 0
+        rows = self.norm_voxels(voxels)
+        mean = (rows * valid).sum(1) / valid.sum(1).clamp(min=1)
+        most = rows.masked_fill(~valid, -1e4).amax(1)
+        return self.mix(torch.cat([mean, most], -1))[:, None]
+
+
+def pooled(config: NetworkConfig) -> PoseNet:
+    """Joints from pooled features instead of anchors that look for their own evidence."""
+    network = PoseNet(config)
+    fine, mid, coarse = config.channels
+    levels = zip(network.exchanges, (coarse, mid, fine), strict=True)
+    network.exchanges = nn.ModuleList(Pooled(exchange, channels) for exchange, channels in levels)
+    return network
+
+
+def reading(*levels: str):
+    """A network whose anchors read these levels alone."""
+
+    def made(config: NetworkConfig) -> PoseNet:
+        network = PoseNet(config)
+        pairs = zip(LEVELS, network.exchanges, strict=True)
+        network.exchanges = nn.ModuleList(e if level in levels else Unread(e) for level, e in pairs)
+        return network
+
+    return made
+
+
+class Uncounted(PoseNet):
+    """Voxels whose number of points nobody is told."""
+
+    def forward(self, batch: Batch):
+        blank = {
+            name: replace(level, log_count=torch.zeros_like(level.log_count))
+            for name, level in (("fine", batch.fine), ("mid", batch.mid), ("coarse", batch.coarse))
+        }
+        return super().forward(replace(batch, **blank))
+
+
+class Unplaced(PoseNet):
+    """A person of whom nobody is told from where, and from how far, they are seen."""
+
+    def forward(self, batch: Batch):
+        return super().forward(replace(batch, view=torch.zeros_like(batch.view)))

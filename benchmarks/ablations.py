@@ -1,0 +1,217 @@
+"""What matters: the same network trained the same way on as many people, one thing changed at a time.
+
+    python benchmarks/ablations.py --list
+    python benchmarks/ablations.py --motion cmu_motion.npz --people 24576 --out runs/ablations
+    python benchmarks/ablations.py --motion cmu_motion.npz --people 24576 --seeds 1,2 base pooled "heatmaps alone"
+
+Each run trains `tiny` on `--people` synthesized people and judges it on lidarpose-bench, cloud-centered, the sensor
+known. What is done is not done again. A run's figures go to OUT/NAME-PEOPLE-SEED/scores.json, as `results.py` reads
+them. Seed s of every variant shows the same people in the same order, but for those that change the people.
+"""
+
+import argparse
+import json
+import math
+import os
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+
+import torch
+from ablation_networks import Uncounted, Unplaced, pooled, reading
+from torch import nn
+
+from lidarpose import evaluation
+from lidarpose._version import __version__
+from lidarpose.data.files import write_atomic
+from lidarpose.infer.backend_torch import TorchBackend
+from lidarpose.infer.predictor import Predictor
+from lidarpose.model.header import Header, opened
+from lidarpose.model.network import PoseNet
+from lidarpose.model.presets import NetworkConfig, preset
+from lidarpose.synth.generate import Generator
+from lidarpose.synth.scene import SCENES, SceneConfig
+from lidarpose.train.job import Job, job_of
+from lidarpose.train.loop import train
+from lidarpose.train.pose_task import PoseTask
+from lidarpose.train.recipes import Pretrain, recipe
+from lidarpose.train.sources import SyntheticSource
+
+# figures of a run that tables show: (name here, group, of, figure) of `evaluate.result.Line`
+FIGURES = {
+    "all": ("all", "all", "mpjpe"),
+    "plain": ("plain", None, "mpjpe"),
+    "clean": ("condition", "clean", "mpjpe"),
+    "cluttered": ("condition", "cluttered", "mpjpe"),
+    "company": ("condition", "company", "mpjpe"),
+    "crop": ("condition", "crop", "mpjpe"),
+    "occluded": ("condition", "occluded", "mpjpe"),
+    "turned round": ("points", None, "turned_round"),
+    "PA": ("all", "all", "pa_mpjpe"),
+}
+_WILD = SCENES["wild"]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One change. study: the table it stands in; network: what makes it of its configuration; config, recipe: changed
+    entries of `NetworkConfig` and `Pretrain`; scene: where people are drawn."""
+
+    study: str
+    what: str
+    network: Callable[[NetworkConfig], nn.Module] = PoseNet
+    size: str = "tiny"
+    config: dict = field(default_factory=dict)
+    recipe: dict = field(default_factory=dict)
+    scene: SceneConfig = _WILD
+
+
+_CALM = replace(_WILD, clutter=0.0, company=0.0, occluder=0.0, faults=replace(_WILD.faults, stray=0.0))
+VARIANTS = {
+    "base": Variant("base", "`tiny` as it ships"),
+    # the six that matter
+    "pooled": Variant("anchors", "joints from pooled features, votes", network=pooled),
+    "pooled, heatmaps alone": Variant(
+        "anchors", "joints from pooled features, heatmaps alone", network=pooled, config={"heatmap": "full"}
+    ),
+    "heatmaps alone": Variant("heads", "heatmaps over the whole person, as the paper's", config={"heatmap": "full"}),
+    "votes alone": Variant("heads", "votes, no heatmaps", config={"heatmap": "none"}),
+    "no curriculum": Variant("curriculum", "full difficulty from the first person on", recipe={"easy": 0.0}),
+    "curriculum 30 %": Variant("curriculum", "difficulty rises over 30 % of the run", recipe={"easy": 0.3}),
+    "easy only": Variant("curriculum", "nobody is made hard to see", scene=replace(_WILD, hard=0.0)),
+    "bare": Variant("people", "bare bodies, nothing carried", scene=replace(_WILD, clothes=0.0, carry=0.0)),
+    "no clutter": Variant("people", "no clutter, occluders, company or stray returns", scene=_CALM),
+    "nothing disturbed": Variant("people", "no stray points and no blur on top", recipe={"strays": 0.0, "noise": 0.0}),
+    "grid 4 cm": Variant("grid", "voxels of 4, 8 and 16 cm", config={"grid": 0.04, "max_voxels": 512}),
+    "grid 8 cm": Variant("grid", "voxels of 8, 16 and 32 cm", config={"grid": 0.08}),
+    "grid 10 cm": Variant("grid", "voxels of 10, 20 and 40 cm", config={"grid": 0.1}),
+    # and more
+    "coarse alone": Variant("levels", "anchors read 24 cm alone", network=reading("coarse")),
+    "fine alone": Variant("levels", "anchors read 6 cm alone", network=reading("fine")),
+    "coarse and mid": Variant("levels", "anchors read 24 and 12 cm", network=reading("coarse", "mid")),
+    "no mask": Variant("mask", "no laser-level masking", scene=replace(_WILD, faults=replace(_WILD.faults, mask=0.0))),
+    "always mask": Variant(
+        "mask",
+        "everybody masked, 60 % kept, as the paper's",
+        scene=replace(_WILD, faults=replace(_WILD.faults, mask=1.0, keep=0.6, keep_most=0.6)),
+    ),
+    "paper's scene": Variant("scene", "the paper's scene", scene=SCENES["paper"]),
+    "one sensor": Variant("scene", "the paper's sensor alone", scene=replace(_WILD, sensors=("dapt64",))),
+    "prior alone": Variant("motion", "no captured poses", recipe={"captured": 0.0}),
+    "captured alone": Variant("motion", "captured poses alone", recipe={"captured": 1.0}),
+    "convolution": Variant("network", "convolutions before the blocks", config={"convolution": True}),
+    "no counts": Variant("network", "no point counts, no weight by density", network=Uncounted),
+    "no view": Variant("network", "neither the sensor's direction nor its distance", network=Unplaced),
+    "no mean": Variant("network", "no running mean of the weights", recipe={"ema": 0.0}),
+    "AdamW": Variant("network", "AdamW for all weights, no Muon", recipe={"muon_rate": 0.0}),
+    "deeper": Variant("size", "2 + 3 + 2 blocks instead of 1 + 1 + 1", config={"blocks": (2, 3, 2)}),
+    "small": Variant("size", "`small`", size="small"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class VariantTask(PoseTask):
+    """`PoseTask` of a network that may lack something."""
+
+    made: Callable[[NetworkConfig], nn.Module]
+
+    def network(self) -> nn.Module:
+        return self.made(self.config)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneSource(SyntheticSource):
+    """`SyntheticSource` of a scene that has no name."""
+
+    config: SceneConfig
+
+    @cached_property
+    def _generator(self) -> Generator:
+        return replace(super()._generator, scene=self.config)
+
+
+def job(variant: Variant, settings: Pretrain) -> Job:
+    """What the variant comes to."""
+    usual = job_of(settings)
+    config = replace(preset(variant.size), **variant.config)
+    task = VariantTask(config=config, made=variant.network)
+    values = {name: value for name, value in vars(usual.source).items() if not name.startswith("_")}
+    if not variant.scene.hard:
+        values["easy"] = math.inf
+    return replace(usual, task=task, source=SceneSource(config=variant.scene, **values), network=task.network)
+
+
+def run(name: str, seed: int, people: int, motion: str, subjects: tuple[str, ...], folder: Path) -> dict:
+    """Trains and judges a variant; returns what its scores.json holds."""
+    variant = VARIANTS[name]
+    changes = {"motion": motion, "subjects": subjects, "people": people, "seed": seed, "workers": 0, "pictures": 0}
+    settings = recipe(Pretrain, **changes | {"validate": people} | variant.recipe)
+    shutil.rmtree(folder, ignore_errors=True)
+    started, used = time.perf_counter(), time.process_time()
+    own = job(variant, settings)
+    model = train(settings, folder, job=own)
+    taken = {"seconds": time.perf_counter() - started, "processor_seconds": time.process_time() - used}
+    network = own.task.network()
+    with opened(model, framework="pt") as file:
+        network.load_state_dict({key: file.get_tensor(key) for key in file.keys()})  # noqa: SIM118
+    predictor = Predictor(TorchBackend(network, Header(config=own.task.config, card={})), name=name)
+    result = evaluation.run(predictor, ["bench"]).scores.results[0]
+    return {
+        "version": __version__,
+        "variant": name,
+        "study": variant.study,
+        "what": variant.what,
+        "seed": seed,
+        "people": people,
+        "parameters": sum(value.numel() for value in network.parameters()),
+        **{key: round(value, 1) for key, value in taken.items()},
+        "figures": figures(result),
+    }
+
+
+def figures(result) -> dict[str, dict[str, float]]:
+    """value, low, high of each of `FIGURES`."""
+    found = {}
+    for line in result.lines:
+        for name, (group, of, figure) in FIGURES.items():
+            same = line.group == group and line.figure == figure and of in (None, line.of)
+            if same and line.method == result.setting.method and line.arithmetic == "lidarpose" and name not in found:
+                found[name] = {"value": line.value, "low": line.low, "high": line.high}
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME", help="default: all")
+    parser.add_argument("--list", action="store_true", help="the variants, and nothing else")
+    parser.add_argument("--motion", help="npz of clips, see lidarpose.body.clips")
+    parser.add_argument("--subjects", default="002,005", help="of its clips, those to learn from")
+    parser.add_argument("--people", type=int, default=32_768)
+    parser.add_argument("--seeds", default="1")
+    parser.add_argument("--out", default="runs/ablations")
+    options = parser.parse_args()
+    if options.list:
+        print("\n".join(f"{name:<24} {variant.what}" for name, variant in VARIANTS.items()))
+        return
+    if options.motion is None:
+        parser.error("--motion is needed: the bench's poses are captured ones")
+    for name in options.names:
+        if name not in VARIANTS:
+            parser.error(f"no variant {name!r}: see --list")
+    torch.set_num_threads(1)
+    for seed in map(int, options.seeds.split(",")):
+        for name in options.names or VARIANTS:
+            folder = Path(options.out) / f"{name.replace(' ', '-')}-{options.people}-{seed}"
+            if (folder / "scores.json").is_file():
+                continue
+            found = run(name, seed, options.people, options.motion, tuple(options.subjects.split(",")), folder)
+            write_atomic(folder / "scores.json", json.dumps(found, indent=1) + os.linesep)
+            shown = "  ".join(f"{key} {value['value']:.1f}" for key, value in found["figures"].items())
+            print(f"{name} {seed}: {shown}  ({found['processor_seconds']:.0f} s)", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,257 @@
+"""docs/results.md's tables, from the scores that lie in docs/scores.
+
+    python benchmarks/results.py --collect runs/ablations     # runs' scores.json -> docs/scores/ablations.json
+    python benchmarks/results.py                              # docs/scores -> the tables of docs/results.md
+    python benchmarks/results.py --check                      # exit code 1 where they differ
+
+A table stands between `<!-- table NAME -->` and `<!-- end -->`; the words around it are left as they are.
+
+A difference to `base` is the mean over the seeds that both have, seed by seed: each seed shows both the same people.
+Its 95 % interval is Student's, with the deviation between seeds taken over all variants of two seeds and more together.
+"""
+
+import argparse
+import json
+import math
+import re
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from lidarpose.data.files import write_atomic
+
+ROOT = Path(__file__).parents[1]
+SCORES, PAGE = ROOT / "docs" / "scores", ROOT / "docs" / "results.md"
+RUNS = "ablations.json"
+BASE = "base"
+_MARKED = re.compile(r"(<!-- table ([^>]+?) -->\n).*?(<!-- end -->)", re.S)
+# two-sided 95 % points of Student's t by degrees of freedom
+_STUDENT = {1: 12.71, 2: 4.30, 3: 3.18, 4: 2.78, 5: 2.57, 6: 2.45, 8: 2.31, 10: 2.23, 15: 2.13, 20: 2.09, 30: 2.04}
+_SHOWN = ("plain", "clean", "cluttered", "occluded", "turned round")
+
+
+def collect(folder: Path) -> list[dict]:
+    """What the runs of a folder scored, in a fixed order."""
+    runs = [json.loads(path.read_text()) for path in sorted(folder.glob("*/scores.json"))]
+    return sorted(runs, key=lambda run: (run["study"], run["variant"], run["people"], run["seed"]))
+
+
+class Runs:
+    """Runs of one length, by variant and seed."""
+
+    def __init__(self, runs: list[dict], people: int):
+        self.people = people
+        self.by = {(run["variant"], run["seed"]): run for run in runs if run["people"] == people}
+        self.deviation, self.freedom = self._pooled()
+
+    def seeds(self, variant: str) -> list[int]:
+        return sorted(seed for name, seed in self.by if name == variant)
+
+    def mean(self, variant: str, figure: str) -> float:
+        return float(np.mean([self.value(variant, seed, figure) for seed in self.seeds(variant)]))
+
+    def value(self, variant: str, seed: int, figure: str) -> float:
+        return self.by[variant, seed]["figures"][figure]["value"]
+
+    def differences(self, variant: str, figure: str = "all") -> np.ndarray:
+        """One a seed that the variant and `base` have, mm."""
+        seeds = [seed for seed in self.seeds(variant) if (BASE, seed) in self.by]
+        return np.array([self.value(variant, seed, figure) - self.value(BASE, seed, figure) for seed in seeds])
+
+    def told(self, variant: str) -> str:
+        """The difference and its interval, and whether it is one."""
+        found = self.differences(variant)
+        if not len(found):
+            return "-"
+        if math.isnan(self.deviation):
+            return f"{found.mean():+.1f}"
+        reach = self.reach(len(found))
+        word = "" if abs(found.mean()) > reach else ", unresolved"
+        return f"{found.mean():+.1f} ± {reach:.1f}{word}"
+
+    def reach(self, seeds: int) -> float:
+        """Half an interval of a mean of so many differences."""
+        point = next(value for freedom, value in reversed(_STUDENT.items()) if freedom <= self.freedom)
+        return point * self.deviation / seeds**0.5
+
+    def _pooled(self) -> tuple[float, int]:
+        """The deviation of a difference between seeds, and its degrees of freedom."""
+        square, freedom = 0.0, 0
+        for variant in {name for name, _ in self.by} - {BASE}:
+            found = self.differences(variant)
+            if len(found) > 1:
+                square += ((found - found.mean()) ** 2).sum()
+                freedom += len(found) - 1
+        return (square / freedom) ** 0.5 if freedom else math.nan, freedom
+
+
+def table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    """A table of markdown."""
+    lines = [header, ("---",) * len(header), *rows]
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+
+
+def study(name: str, runs: list[dict]) -> str:
+    """The variants of a study beside `base`, at the length that most runs have."""
+    own = _common(runs)
+    chosen = [v for v in dict.fromkeys(run["variant"] for run in runs if run["study"] == name) if own.seeds(v)]
+    chosen.sort(key=lambda variant: own.mean(variant, "all"))
+    header = ("", "MPJPE mm", "against base", *_SHOWN, "seeds")
+    return table(header, [_row(own, variant) for variant in (BASE, *chosen)])
+
+
+def _row(own: Runs, variant: str) -> tuple[str, ...]:
+    what = own.by[variant, own.seeds(variant)[0]]["what"]
+    figures = [f"{own.mean(variant, figure):.1f}" for figure in ("all", *_SHOWN)]
+    figures[-1] += " %"
+    against = "" if variant == BASE else own.told(variant)
+    return what, figures[0], against, *figures[1:], str(len(own.seeds(variant)))
+
+
+def noise(runs: list[dict]) -> str:
+    own = _common(runs)
+    return (
+        f"{own.people:,} people a run. A difference of two runs of one seed deviates by {own.deviation:.1f} mm\n"
+        f"from seed to seed ({own.freedom} degrees of freedom): that of one seed is resolved beyond\n"
+        f"{own.reach(1):.1f} mm, of two beyond {own.reach(2):.1f}.\n"
+    )
+
+
+def scaling(runs: list[dict]) -> str:
+    """`base` by the number of people seen; runs of their own, each cooled."""
+    seen = sorted({run["people"] for run in runs if run["variant"] == BASE})
+    rows, before = [], None
+    for people in seen:
+        own = Runs(runs, people)
+        all_ = own.mean(BASE, "all")
+        fall = "" if before is None else f"{(all_ - before[1]) / math.log2(people / before[0]):+.1f}"
+        rows.append((f"{people:,}", f"{all_:.1f}", fall, *(f"{own.mean(BASE, figure):.1f}" for figure in _SHOWN[:-1])))
+        rows[-1] += (f"{own.mean(BASE, 'turned round'):.1f} %",)
+        before = people, all_
+    return table(("people seen", "MPJPE mm", "a doubling", *_SHOWN), rows)
+
+
+def against_paper(runs: list[dict]) -> str:
+    own = _common(runs)
+    ways = [v for v in dict.fromkeys(run["variant"] for run in runs if run["study"] == "paper") if own.seeds(v)]
+    rows = []
+    for variant in (BASE, *ways):
+        one = own.by[variant, own.seeds(variant)[0]]
+        lost = own.mean(variant, "cluttered") - own.mean(variant, "clean")
+        what = "ours: `tiny` and its recipe" if variant == BASE else one["what"]
+        figures = [f"{own.mean(variant, figure):.1f}" for figure in ("all", "plain", "clean", "cluttered")]
+        hours = np.mean([own.by[variant, seed]["processor_seconds"] for seed in own.seeds(variant)]) / 60
+        rows.append((what, f"{one['parameters']:,}", *figures, f"{lost:+.1f}", f"{hours:.0f}"))
+    header = ("", "parameters", "MPJPE mm", "plain", "clean", "cluttered", "lost to clutter", "processor minutes")
+    return table(header, rows)
+
+
+def _common(runs: list[dict]) -> Runs:
+    """The runs of the length that most have."""
+    lengths = [run["people"] for run in runs]
+    return Runs(runs, max(set(lengths), key=lengths.count))
+
+
+def _lines(model: str) -> tuple[dict, list[dict]]:
+    """The setting and lines of a bundled model's scores on lidarpose-bench."""
+    result = json.loads((SCORES / f"{model}.json").read_text())["results"][0]
+    own = [line for line in result["lines"] if line["method"] == result["setting"]["method"]]
+    return result["setting"], own
+
+
+def shipped(model: str, group: str) -> str:
+    """MPJPE of a bundled model by groups of people or joints."""
+    rows = []
+    for line in _lines(model)[1]:
+        if line["group"] in group.split("+") and line["figure"] == "mpjpe" and line["arithmetic"] == "lidarpose":
+            interval = "" if line["low"] is None else f"[{line['low']:.1f}, {line['high']:.1f}]"
+            rows.append((line["of"], f"{line['value']:.1f}", interval, f"{line['people']:,}"))
+    return table((group.split("+")[-1], "MPJPE mm", "95 %", "people"), rows)
+
+
+def headline(*models: str) -> str:
+    """The bundled models side by side."""
+    wanted = {
+        "MPJPE, mm": ("all", "mpjpe"),
+        "PA-MPJPE, mm": ("all", "pa_mpjpe"),
+        "PCK-3, %": ("all", "pck3"),
+        "upright, whole, uncluttered, 100 points: MPJPE, mm": ("plain", "mpjpe"),
+        "turned round, of 100 points and more, %": ("points", "turned_round"),
+        "confidence: calibration error, %": ("all", "calibration_error"),
+        "confidence: AUROC, %": ("all", "auroc"),
+    }
+    rows = []
+    for name, (group, figure) in wanted.items():
+        cells = []
+        for model in models:
+            line = next(x for x in _lines(model)[1] if x["group"] == group and x["figure"] == figure)
+            ends = "" if line["low"] is None else f" [{line['low']:.1f}, {line['high']:.1f}]"
+            cells.append(f"{line['value']:.1f}{ends}")
+        rows.append((name, *cells))
+    return table(("lidarpose-bench", *(f"`{model}`" for model in models)), rows)
+
+
+def extras(model: str) -> str:
+    """What test-time extras bring; see test_time.py."""
+    rows = []
+    found = json.loads((SCORES / "test_time.json").read_text())[model]
+    usual = next(one for one in found["ways"] if one["usual"])
+    for one in found["ways"]:
+        cost = one["seconds"] / usual["seconds"]
+        figures = [f"{one['figures'][name]['value']:.1f}" for name in ("all", "plain", "cluttered", "occluded")]
+        rows.append((one["what"], *figures, f"{one['figures']['turned round']['value']:.1f} %", f"{cost:.1f}"))
+    return table(("", "MPJPE mm", "plain", "cluttered", "occluded", "turned round", "cost"), rows)
+
+
+def rejection(model: str) -> str:
+    found = json.loads((SCORES / "test_time.json").read_text())[model]["rejection"]
+    rows = [(f"{one['kept']:.0f} %", f"{one['people']:.1f}", f"{one['joints']:.1f}") for one in found]
+    return table(("kept", "people of the highest mean confidence: mm", "joints of the highest confidence: mm"), rows)
+
+
+def tables() -> dict[str, Callable[[], str]]:
+    """What makes each table, by name."""
+    runs = json.loads((SCORES / RUNS).read_text())
+    made = {f"study {name}": partial(study, name, runs) for name in {run["study"] for run in runs}}
+    made |= {"scaling": partial(scaling, runs), "noise": partial(noise, runs)}
+    made |= {"against the paper": partial(against_paper, runs)}
+    models = sorted(path.stem for path in SCORES.glob("*.json") if path.name not in (RUNS, "test_time.json"))
+    made["headline"] = partial(headline, *sorted(models, key=["tiny", "small", "base"].index))
+    for model in models:
+        made |= {f"{model} by {group}": partial(shipped, model, group) for group in _groups(model)}
+        made |= {f"{model} extras": partial(extras, model), f"{model} rejection": partial(rejection, model)}
+    return made
+
+
+def _groups(model: str) -> Iterator[str]:
+    return dict.fromkeys(line["group"] for line in _lines(model)[1])
+
+
+def written(page: str) -> str:
+    """The page, its tables made anew. Raises KeyError for a table that nothing makes."""
+    made = tables()
+    return _MARKED.sub(lambda found: found[1] + "\n" + made[found[2]]() + "\n" + found[3], page)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--collect", type=Path, metavar="DIR", help="folder of runs whose scores are taken over")
+    parser.add_argument("--check", action="store_true", help="write nothing, say whether the page is up to date")
+    options = parser.parse_args()
+    if options.collect:
+        runs = collect(options.collect)
+        write_atomic(SCORES / RUNS, "[\n" + ",\n".join(json.dumps(run) for run in runs) + "\n]\n")
+        print(f"{len(runs)} runs -> {SCORES / RUNS}")
+        return
+    page = PAGE.read_text()
+    new = written(page)
+    if options.check:
+        sys.exit(f"{PAGE.name} is not what docs/scores say: run benchmarks/results.py" if new != page else 0)
+    write_atomic(PAGE, new)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,95 @@
+"""A larger `PoseNet` that begins where a smaller one is: what has been learned goes on in more channels and blocks.
+
+After Net2Net (Chen et al. 2016), by padding. Channels that are new in a residual stream begin at zero, as what writes
+them does; hidden units and heads that are new begin at random, and what reads them at zero; blocks that are new add
+nothing. Layer norms see more channels, so their scale is made up for; what is left of the difference is the mean of
+their input, which is small in a trained network and gone after a few hundred steps.
+"""
+
+from math import sqrt
+
+import torch
+from torch import Tensor
+
+from lidarpose.errors import InputError
+from lidarpose.model.network import PoseNet
+from lidarpose.model.presets import NetworkConfig
+
+# what must be alike for numbers to mean the same
+_SAME = ("grid", "skeleton", "parts", "heatmap", "convolution", "head_channels")
+# layers that write a residual stream, and the keys of votes: their new rows are zero
+_WRITERS = (
+    *("stem.out", ".mix", ".place", "up_mid", "up_fine", "attention.out", "among.out", "cross.out", "feed.2"),
+    *("anchor_view", "vote.key"),
+)
+# layers that read hidden units: their new columns are zero
+_READERS = ("stem.out", "attention.out", "among.out", "cross.out", "feed.2", "joint.heatmap", "joint.certainty")
+
+
+def grown(network: PoseNet, config: NetworkConfig) -> PoseNet:
+    """A network of `config`, in training mode, that answers nearly as `network` does; of the same depth and width, the
+    same. What is drawn comes from torch's global generator. Raises InputError, one line, where `config` is narrower or
+    shallower, or of another grid, skeleton, heatmap, width of heads.
+    """
+    small, size = network.config, config.size
+    for name in _SAME:
+        if getattr(small, name) != getattr(config, name):
+            raise InputError(
+                f"a {size} network cannot begin as this {small.size} one: {name} is {getattr(config, name)!r}, "
+                f"there {getattr(small, name)!r}"
+            )
+    for name in ("channels", "blocks"):
+        if any(new < old for new, old in zip(getattr(config, name), getattr(small, name), strict=True)):
+            raise InputError(
+                f"a {size} network cannot begin as this {small.size} one: its {name} are {getattr(config, name)}, "
+                f"there {getattr(small, name)}, and none may shrink"
+            )
+    larger = PoseNet(config)
+    learned = network.state_dict()
+    state = larger.state_dict()
+    for name, value in state.items():
+        state[name] = _padded(name, learned[name], value, network, larger) if name in learned else _idle(name, value)
+    larger.load_state_dict(state)
+    return larger.train()
+
+
+def _idle(name: str, value: Tensor) -> Tensor:
+    """A tensor of a new block, which adds nothing to what goes through it."""
+    return torch.zeros_like(value) if name.rpartition(".")[0].endswith(_WRITERS) else value
+
+
+def _padded(name: str, old: Tensor, new: Tensor, small: PoseNet, larger: PoseNet) -> Tensor:
+    """The old tensor in the larger one's shape; what is new of it as it was drawn, or zero."""
+    layer, _, entry = name.rpartition(".")
+    out = new.clone()
+    if name in ("anchors", "vote.offset"):
+        out.zero_()
+        out[:, : old.shape[1]] = old
+        return out
+    if "norm" in layer:
+        # the mean square over more channels is smaller by as much
+        value = old * sqrt(len(old) / len(new)) if entry == "weight" else old
+        out[_places(small, larger)[: len(old)] if layer == "joint.norm" else torch.arange(len(old))] = value
+        return out
+    if layer == "vote.query":
+        # its products are divided by the root of the width
+        old = old * sqrt(len(new) / len(old))
+    if layer.endswith(_WRITERS):
+        out[len(old) :] = 0
+    if old.ndim == 1:
+        out[: len(old)] = old
+        return out
+    columns = _places(small, larger) if layer == "joint.hidden.0" else torch.arange(old.shape[1])
+    if layer.endswith(_READERS):
+        out[:, old.shape[1] :] = 0
+    out[: len(old), columns] = old
+    return out
+
+
+def _places(small: PoseNet, larger: PoseNet) -> Tensor:
+    """Where the joint head's old inputs lie among the new ones: the anchors', the voters', and the vote."""
+    (felt, width), (more_felt, wider) = (
+        (net.config.channels[0] if net.vote is not None else 0, net.config.channels[1]) for net in (small, larger)
+    )
+    after = wider + more_felt
+    return torch.cat([torch.arange(width), wider + torch.arange(felt), after + torch.arange(3)])

@@ -1,0 +1,113 @@
+"""A larger network that begins where a smaller one is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from lidarpose.errors import InputError
+from lidarpose.model.batch import Batch
+from lidarpose.model.bundled import bundled_path
+from lidarpose.model.checkpoint import load_checkpoint, save_checkpoint
+from lidarpose.model.grow import grown
+from lidarpose.model.network import PoseNet
+from lidarpose.model.presets import preset
+from lidarpose.synth.generate import Generator
+from lidarpose.synth.scene import scene_config
+from lidarpose.train.example import example
+from lidarpose.train.job import job_of
+from lidarpose.train.optimize import optimizers
+from lidarpose.train.pose_task import PoseTask
+from lidarpose.train.recipes import Pretrain
+from lidarpose.train.task import total
+
+
+@pytest.fixture(scope="module")
+def arrays():
+    generator, rng = Generator(scene=scene_config("wild"), measure=False), np.random.default_rng(0)
+    people = [example(generator.person(77, k).sample, rng, refined=0.0) for k in range(24)]
+    return PoseTask(config=preset("tiny")).collate(people)
+
+
+def told(network, arrays):
+    with torch.no_grad():
+        return network.eval()(Batch.from_arrays(arrays))
+
+
+@pytest.mark.parametrize("heatmap", ["window", "full", "none"])
+def test_more_blocks_change_nothing(arrays, heatmap):
+    torch.manual_seed(0)
+    config = replace(preset("tiny"), heatmap=heatmap)
+    small = PoseNet(config)
+    larger = grown(small, replace(config, size="deep", blocks=(2, 3, 2)))
+    before, after = told(small, arrays), told(larger, arrays)
+    for name in ("vote", "heatmap", "part", "confidence", "log_spread", "visible"):
+        torch.testing.assert_close(getattr(after, name), getattr(before, name), atol=1e-5, rtol=1e-5)
+
+
+def test_small_begins_where_tiny_is(arrays):
+    """What is left is the mean of the layer norms' input: joints move by a little and are as good."""
+    network, _ = load_checkpoint(bundled_path("tiny"))
+    torch.manual_seed(0)
+    before, after = told(network, arrays).joints(), told(grown(network, preset("small")), arrays).joints()
+    true = torch.as_tensor(arrays["joints"])
+    errors = [float((joints - true).norm(dim=-1).mean()) for joints in (before, after)]
+    moved = float((after - before).norm(dim=-1).mean())
+    assert moved < 0.2 * errors[0] and errors[1] < 1.05 * errors[0], (moved, errors)
+    # a network that is not grown is elsewhere
+    assert (told(PoseNet(preset("small")), arrays).joints() - before).norm(dim=-1).mean() > 0.2
+
+
+def test_all_that_is_new_learns(arrays):
+    torch.manual_seed(0)
+    network, _ = load_checkpoint(bundled_path("tiny"))
+    larger = grown(network, preset("small"))
+    before = {name: value.clone() for name, value in larger.named_parameters()}
+    made = optimizers(larger, Pretrain())
+    rows = arrays["joints"]
+    targets = PoseTask(config=preset("small"))
+    for _ in range(3):
+        terms = targets.terms(larger, arrays)
+        total(terms).backward()
+        for optimizer in made:
+            optimizer.step()
+            optimizer.zero_grad()
+    assert np.isfinite(rows).all() and all(value.detach().isfinite() for value in terms.values())
+    for name, value in larger.named_parameters():
+        still = value == before[name]
+        if value.ndim > 1:
+            # whole rows or columns that never move would be dead
+            assert not still.all(-1).any(), name
+            assert not still.flatten(0, -2).all(0).any(), name
+
+
+def test_growing_needs_room_and_the_same_meaning():
+    tiny = PoseNet(preset("tiny"))
+    for change, words in (
+        ({"channels": (32, 64, 96)}, "none may shrink"),
+        ({"blocks": (1, 0, 1)}, "none may shrink"),
+        ({"grid": 0.04}, "grid is 0.04, there 0.06"),
+        ({"heatmap": "none"}, "heatmap"),
+        ({"head_channels": 16}, "head_channels"),
+    ):
+        with pytest.raises(InputError, match=words):
+            grown(tiny, replace(preset("tiny"), **change))
+
+
+def test_pretraining_goes_on_from_weights(tmp_path):
+    job = job_of(Pretrain(size="small", init="tiny"))
+    torch.manual_seed(0)
+    network = job.network()
+    assert network.config == preset("small") and network.training
+    assert job.card["init_card"]["people_seen"] > 0
+    torch.manual_seed(0)
+    assert all(map(torch.equal, network.state_dict().values(), job.network().state_dict().values()))
+    with pytest.raises(InputError, match="cannot begin as this tiny one: grid"):
+        job_of(Pretrain(size="base", init="tiny"))
+    with pytest.raises(InputError, match="the paper's begins at random"):
+        Pretrain(size="paper-small", init="tiny")
+    path = tmp_path / "small.safetensors"
+    save_checkpoint(path, network, card={})
+    with pytest.raises(InputError, match="none may shrink"):
+        job_of(Pretrain(size="tiny", init=str(path)))
