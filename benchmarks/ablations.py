@@ -5,8 +5,10 @@
     python benchmarks/ablations.py --motion cmu_motion.npz --people 24576 --seeds 1,2 base pooled "heatmaps alone"
 
 Each run trains `tiny` on `--people` synthesized people and judges it on lidarpose-bench, cloud-centered, the sensor
-known. What is done is not done again. A run's figures go to OUT/NAME-PEOPLE-SEED/scores.json, as `results.py` reads
-them. Seed s of every variant shows the same people in the same order, but for those that change the people.
+known. With `--init FILE` it goes on from trained weights, its rate falling for most of the run, which tells by less
+noise what people to learn from; variants of another network are left out then. What is done is not done again. A
+run's figures go to OUT/NAME-PEOPLE-SEED/scores.json, as `results.py` reads them. Seed s of every variant shows the
+same people in the same order, but for those that change the people.
 """
 
 import argparse
@@ -17,11 +19,12 @@ import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import torch
 from ablation_networks import Uncounted, Unplaced, pooled, reading
+from results import FIGURES
 from torch import nn
 
 from lidarpose import evaluation
@@ -29,7 +32,9 @@ from lidarpose._version import __version__
 from lidarpose.data.files import write_atomic
 from lidarpose.infer.backend_torch import TorchBackend
 from lidarpose.infer.predictor import Predictor
-from lidarpose.model.header import Header, opened
+from lidarpose.model.checkpoint import load_checkpoint
+from lidarpose.model.grow import grown
+from lidarpose.model.header import Header, opened, read_header
 from lidarpose.model.network import PoseNet
 from lidarpose.model.presets import NetworkConfig, preset
 from lidarpose.synth.generate import Generator
@@ -40,18 +45,6 @@ from lidarpose.train.pose_task import PoseTask
 from lidarpose.train.recipes import Pretrain, recipe
 from lidarpose.train.sources import SyntheticSource
 
-# figures of a run that tables show: (name here, group, of, figure) of `evaluate.result.Line`
-FIGURES = {
-    "all": ("all", "all", "mpjpe"),
-    "plain": ("plain", None, "mpjpe"),
-    "clean": ("condition", "clean", "mpjpe"),
-    "cluttered": ("condition", "cluttered", "mpjpe"),
-    "company": ("condition", "company", "mpjpe"),
-    "crop": ("condition", "crop", "mpjpe"),
-    "occluded": ("condition", "occluded", "mpjpe"),
-    "turned round": ("points", None, "turned_round"),
-    "PA": ("all", "all", "pa_mpjpe"),
-}
 _WILD = SCENES["wild"]
 
 
@@ -133,6 +126,11 @@ class SceneSource(SyntheticSource):
         return replace(super()._generator, scene=self.config)
 
 
+def keeps_network(variant: Variant) -> bool:
+    """Whether trained weights of the usual network, perhaps grown, are such a one's too."""
+    return variant.network is PoseNet and not set(variant.config) - {"blocks", "channels"}
+
+
 def job(variant: Variant, settings: Pretrain) -> Job:
     """What the variant comes to."""
     usual = job_of(settings)
@@ -141,13 +139,17 @@ def job(variant: Variant, settings: Pretrain) -> Job:
     values = {name: value for name, value in vars(usual.source).items() if not name.startswith("_")}
     if not variant.scene.hard:
         values["easy"] = math.inf
-    return replace(usual, task=task, source=SceneSource(config=variant.scene, **values), network=task.network)
+    network = task.network
+    if settings.init:
+        network = partial(grown, load_checkpoint(settings.init)[0], config)
+    return replace(usual, task=task, source=SceneSource(config=variant.scene, **values), network=network)
 
 
-def run(name: str, seed: int, people: int, motion: str, subjects: tuple[str, ...], folder: Path) -> dict:
+def run(name: str, seed: int, people: int, motion: str, subjects: tuple[str, ...], init: str, folder: Path) -> dict:
     """Trains and judges a variant; returns what its scores.json holds."""
     variant = VARIANTS[name]
     changes = {"motion": motion, "subjects": subjects, "people": people, "seed": seed, "workers": 0, "pictures": 0}
+    changes |= {"init": init, "easy": 0.0, "cool": 0.9} if init else {}
     settings = recipe(Pretrain, **changes | {"validate": people} | variant.recipe)
     shutil.rmtree(folder, ignore_errors=True)
     started, used = time.perf_counter(), time.process_time()
@@ -166,6 +168,7 @@ def run(name: str, seed: int, people: int, motion: str, subjects: tuple[str, ...
         "what": variant.what,
         "seed": seed,
         "people": people,
+        "begun": read_header(init).card["people_seen"] if init else 0,
         "parameters": sum(value.numel() for value in network.parameters()),
         **{key: round(value, 1) for key, value in taken.items()},
         "figures": figures(result),
@@ -173,7 +176,7 @@ def run(name: str, seed: int, people: int, motion: str, subjects: tuple[str, ...
 
 
 def figures(result) -> dict[str, dict[str, float]]:
-    """value, low, high of each of `FIGURES`."""
+    """value, low and high of each of `results.FIGURES`."""
     found = {}
     for line in result.lines:
         for name, (group, of, figure) in FIGURES.items():
@@ -191,7 +194,8 @@ def main() -> None:
     parser.add_argument("--subjects", default="002,005", help="of its clips, those to learn from")
     parser.add_argument("--people", type=int, default=32_768)
     parser.add_argument("--seeds", default="1")
-    parser.add_argument("--out", default="runs/ablations")
+    parser.add_argument("--init", default="", metavar="FILE", help="trained weights to go on from")
+    parser.add_argument("--out", default="runs/ablations", help="one for each --init")
     options = parser.parse_args()
     if options.list:
         print("\n".join(f"{name:<24} {variant.what}" for name, variant in VARIANTS.items()))
@@ -201,13 +205,16 @@ def main() -> None:
     for name in options.names:
         if name not in VARIANTS:
             parser.error(f"no variant {name!r}: see --list")
+    subjects = tuple(options.subjects.split(","))
     torch.set_num_threads(1)
     for seed in map(int, options.seeds.split(",")):
         for name in options.names or VARIANTS:
+            if options.init and not keeps_network(VARIANTS[name]):
+                continue
             folder = Path(options.out) / f"{name.replace(' ', '-')}-{options.people}-{seed}"
             if (folder / "scores.json").is_file():
                 continue
-            found = run(name, seed, options.people, options.motion, tuple(options.subjects.split(",")), folder)
+            found = run(name, seed, options.people, options.motion, subjects, options.init, folder)
             write_atomic(folder / "scores.json", json.dumps(found, indent=1) + os.linesep)
             shown = "  ".join(f"{key} {value['value']:.1f}" for key, value in found["figures"].items())
             print(f"{name} {seed}: {shown}  ({found['processor_seconds']:.0f} s)", flush=True)

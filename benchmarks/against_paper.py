@@ -102,6 +102,7 @@ def run(name: str, seed: int, people: int, motion: str, subjects: tuple[str, ...
         "what": way.what,
         "seed": seed,
         "people": people,
+        "begun": 0,
         "parameters": sum(value.numel() for value in load_checkpoint(model)[0].parameters()),
         **{key: round(value, 1) for key, value in taken.items()},
         "figures": best,

@@ -1,8 +1,11 @@
-"""docs/results.md's tables, from the scores that lie in docs/scores.
+"""The tables of docs/results.md and of the model cards in docs/cards, from the scores that lie in docs/scores.
 
     python benchmarks/results.py --collect runs/ablations     # runs' scores.json -> docs/scores/ablations.json
-    python benchmarks/results.py                              # docs/scores -> the tables of docs/results.md
+    python benchmarks/results.py                              # docs/scores -> the tables of the pages
     python benchmarks/results.py --check                      # exit code 1 where they differ
+
+docs/scores/NAME.json is what `lidarpose evaluate NAME bench` wrote, test_time.json and visibility.json beside it what
+the benchmarks of these names did.
 
 A table stands between `<!-- table NAME -->` and `<!-- end -->`; the words around it are left as they are.
 
@@ -22,21 +25,36 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose.data.files import write_atomic
+from lidarpose.model.bundled import BUNDLED, bundled_path
+from lidarpose.model.header import digest, read_header
 
 ROOT = Path(__file__).parents[1]
-SCORES, PAGE = ROOT / "docs" / "scores", ROOT / "docs" / "results.md"
+SCORES = ROOT / "docs" / "scores"
+PAGES = (ROOT / "docs" / "results.md", *(ROOT / "docs" / "cards" / f"{name}.md" for name in BUNDLED))
 RUNS = "ablations.json"
 BASE = "base"
 _MARKED = re.compile(r"(<!-- table ([^>]+?) -->\n).*?(<!-- end -->)", re.S)
 # two-sided 95 % points of Student's t by degrees of freedom
 _STUDENT = {1: 12.71, 2: 4.30, 3: 3.18, 4: 2.78, 5: 2.57, 6: 2.45, 8: 2.31, 10: 2.23, 15: 2.13, 20: 2.09, 30: 2.04}
+# figures of a run that tables show: (group, of, figure) of `evaluate.result.Line`
+FIGURES = {
+    "all": ("all", "all", "mpjpe"),
+    "plain": ("plain", None, "mpjpe"),
+    "clean": ("condition", "clean", "mpjpe"),
+    "cluttered": ("condition", "cluttered", "mpjpe"),
+    "company": ("condition", "company", "mpjpe"),
+    "crop": ("condition", "crop", "mpjpe"),
+    "occluded": ("condition", "occluded", "mpjpe"),
+    "turned round": ("points", None, "turned_round"),
+    "PA": ("all", "all", "pa_mpjpe"),
+}
 _SHOWN = ("plain", "clean", "cluttered", "occluded", "turned round")
 
 
 def collect(folder: Path) -> list[dict]:
     """What the runs of a folder scored, in a fixed order."""
-    runs = [json.loads(path.read_text()) for path in sorted(folder.glob("*/scores.json"))]
-    return sorted(runs, key=lambda run: (run["study"], run["variant"], run["people"], run["seed"]))
+    runs = [json.loads(path.read_text()) for path in sorted(folder.rglob("scores.json"))]
+    return sorted(runs, key=lambda run: (run["study"], run["variant"], run["begun"], run["people"], run["seed"]))
 
 
 class Runs:
@@ -103,6 +121,15 @@ def study(name: str, runs: list[dict]) -> str:
     return table(header, [_row(own, variant) for variant in (BASE, *chosen)])
 
 
+def continued(runs: list[dict]) -> str:
+    """All variants of runs that went on from trained weights."""
+    own = _common(runs)
+    chosen = [v for v in dict.fromkeys(run["variant"] for run in runs) if v != BASE and own.seeds(v)]
+    chosen.sort(key=lambda variant: own.mean(variant, "all"))
+    header = ("", "MPJPE mm", "against base", *_SHOWN, "seeds")
+    return table(header, [_row(own, variant) for variant in (BASE, *chosen)])
+
+
 def _row(own: Runs, variant: str) -> tuple[str, ...]:
     what = own.by[variant, own.seeds(variant)[0]]["what"]
     figures = [f"{own.mean(variant, figure):.1f}" for figure in ("all", *_SHOWN)]
@@ -120,18 +147,27 @@ def noise(runs: list[dict]) -> str:
     )
 
 
-def scaling(runs: list[dict]) -> str:
-    """`base` by the number of people seen; runs of their own, each cooled."""
+def scaling(runs: list[dict], shipped: dict | None = None) -> str:
+    """`base` by the number of people seen; runs of their own, each cooled, and what ships as the longest."""
     seen = sorted({run["people"] for run in runs if run["variant"] == BASE})
+    found = {people: {name: Runs(runs, people).mean(BASE, name) for name in ("all", *_SHOWN)} for people in seen}
     rows, before = [], None
-    for people in seen:
-        own = Runs(runs, people)
-        all_ = own.mean(BASE, "all")
-        fall = "" if before is None else f"{(all_ - before[1]) / math.log2(people / before[0]):+.1f}"
-        rows.append((f"{people:,}", f"{all_:.1f}", fall, *(f"{own.mean(BASE, figure):.1f}" for figure in _SHOWN[:-1])))
-        rows[-1] += (f"{own.mean(BASE, 'turned round'):.1f} %",)
-        before = people, all_
+    for people, figures in (found | (shipped or {})).items():
+        fall = "" if before is None else f"{(figures['all'] - before[1]) / math.log2(people / before[0]):+.1f}"
+        cells = [f"{figures[name]:.1f}" for name in ("all", *_SHOWN)]
+        rows.append((f"{people:,}", cells[0], fall, *cells[1:-1], f"{cells[-1]} %"))
+        before = people, figures["all"]
     return table(("people seen", "MPJPE mm", "a doubling", *_SHOWN), rows)
+
+
+def _longest() -> dict[int, dict[str, float]]:
+    """The figures of `tiny` as it ships, by the number of people that it has seen."""
+    lines = _lines("tiny")[1]
+    found = {}
+    for name, (group, of, figure) in FIGURES.items():
+        fitting = (x for x in lines if x["group"] == group and x["figure"] == figure and of in (None, x["of"]))
+        found[name] = next(fitting)["value"]
+    return {read_header(bundled_path("tiny")).card["people_seen"]: found}
 
 
 def against_paper(runs: list[dict]) -> str:
@@ -194,6 +230,30 @@ def headline(*models: str) -> str:
     return table(("lidarpose-bench", *(f"`{model}`" for model in models)), rows)
 
 
+def card(model: str) -> str:
+    """How a bundled model was made, as its file says."""
+    path = bundled_path(model)
+    told = read_header(path).card
+    scores = json.loads((SCORES / f"{model}.json").read_text())
+    if scores["weights"]["digest"] != digest(path):
+        raise SystemExit(f"docs/scores/{model}.json is of other weights: run lidarpose evaluate {model} bench")
+    rows = [
+        ("file", f"`{path.name}`, {path.stat().st_size / 1e6:.1f} MB in float16"),
+        ("as ONNX", f"`{model}.onnx`, {bundled_path(model, '.onnx').stat().st_size / 1e6:.1f} MB"),
+        ("command", f"`{told['command']}`"),
+        ("seed", str(told["recipe"]["seed"])),
+        ("people seen", f"{told['people_seen']:,}"),
+        ("hours", f"{told['hours']:.2f}"),
+        ("captured motion", f"{told['motion']}, subjects {', '.join(told['recipe']['subjects'])}"),
+    ]
+    if "init_card" in told:
+        begun = told["init_card"]
+        rows.append(("begun as", f"{told['recipe']['init']}, grown: {begun['people_seen']:,} people before"))
+    if "note" in told:
+        rows.append(("note", told["note"]))
+    return table(("", ""), rows)
+
+
 def extras(model: str) -> str:
     """What test-time extras bring; see test_time.py."""
     rows = []
@@ -206,6 +266,17 @@ def extras(model: str) -> str:
     return table(("", "MPJPE mm", "plain", "cluttered", "occluded", "turned round", "cost"), rows)
 
 
+def visibility() -> str:
+    """Conditions against clean people of whom as much is hidden; see visibility.py."""
+    rows = []
+    for model, found in json.loads((SCORES / "visibility.json").read_text()).items():
+        for one in found:
+            ratio = f"{one['ratio']:.2f} [{one['low']:.2f}, {one['high']:.2f}]"
+            mm, clean = f"{one['mm']:.1f}", f"{one['clean']:.1f}"
+            rows.append((f"`{model}`", one["condition"], mm, clean, ratio, str(one["people"])))
+    return table(("", "condition", "MPJPE mm", "clean, as much hidden", "ratio", "people"), rows)
+
+
 def rejection(model: str) -> str:
     found = json.loads((SCORES / "test_time.json").read_text())[model]["rejection"]
     rows = [(f"{one['kept']:.0f} %", f"{one['people']:.1f}", f"{one['joints']:.1f}") for one in found]
@@ -214,13 +285,16 @@ def rejection(model: str) -> str:
 
 def tables() -> dict[str, Callable[[], str]]:
     """What makes each table, by name."""
-    runs = json.loads((SCORES / RUNS).read_text())
+    every = json.loads((SCORES / RUNS).read_text())
+    runs, later = ([run for run in every if bool(run["begun"]) == begun] for begun in (False, True))
     made = {f"study {name}": partial(study, name, runs) for name in {run["study"] for run in runs}}
-    made |= {"scaling": partial(scaling, runs), "noise": partial(noise, runs)}
+    made |= {"scaling": lambda: scaling(runs, _longest()), "noise": partial(noise, runs)}
+    made |= {"continued": partial(continued, later), "noise continued": partial(noise, later)}
     made |= {"against the paper": partial(against_paper, runs)}
-    models = sorted(path.stem for path in SCORES.glob("*.json") if path.name not in (RUNS, "test_time.json"))
-    made["headline"] = partial(headline, *sorted(models, key=["tiny", "small", "base"].index))
-    for model in models:
+    made["visibility"] = visibility
+    made["headline"] = partial(headline, *BUNDLED)
+    for model in BUNDLED:
+        made[f"{model} card"] = partial(card, model)
         made |= {f"{model} by {group}": partial(shipped, model, group) for group in _groups(model)}
         made |= {f"{model} extras": partial(extras, model), f"{model} rejection": partial(rejection, model)}
     return made
@@ -246,11 +320,13 @@ def main() -> None:
         write_atomic(SCORES / RUNS, "[\n" + ",\n".join(json.dumps(run) for run in runs) + "\n]\n")
         print(f"{len(runs)} runs -> {SCORES / RUNS}")
         return
-    page = PAGE.read_text()
-    new = written(page)
-    if options.check:
-        sys.exit(f"{PAGE.name} is not what docs/scores say: run benchmarks/results.py" if new != page else 0)
-    write_atomic(PAGE, new)
+    for path in PAGES:
+        page = path.read_text()
+        new = written(page)
+        if options.check and new != page:
+            sys.exit(f"{path.name} is not what docs/scores say: run benchmarks/results.py")
+        if not options.check:
+            write_atomic(path, new)
 
 
 if __name__ == "__main__":

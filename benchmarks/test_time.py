@@ -1,9 +1,9 @@
 """What more work at test time brings on lidarpose-bench, and what it costs.
 
-    python benchmarks/test_time.py tiny --out docs/scores/test_time.json
+    python benchmarks/test_time.py tiny --limit 1000 --out docs/scores/test_time.json
 
-Passes: each but the first is about the pelvis that the one before found. Views: the last pass is repeated with the
-person mirrored, turned by quarters, or shifted in the grid of voxels by up to a fine voxel, and joints are averaged, or
+Passes: each but the first is about the pelvis that the one before found. Looks: the last pass is repeated with the
+person mirrored, turned by quarters, or shifted in the grid of voxels, and joints are averaged (`infer/tta.py`), or
 heatmaps are (as logarithms, brought to the mean vote). Rejection: the error of the most confident people and joints.
 """
 
@@ -19,110 +19,69 @@ from ablations import figures
 from lidarpose import evaluation
 from lidarpose.data.files import write_atomic
 from lidarpose.infer.backend import Estimates, Raw, estimates
-from lidarpose.infer.predictor import _CENTER_STEP, Predictor, load
-from lidarpose.model.plan import WINDOW, view_features
-from lidarpose.sample import Pose, center_of
+from lidarpose.infer.predictor import PASSES, Predictor, load
+from lidarpose.infer.tta import LOOKS, Look, averaged
+from lidarpose.model.plan import view_features
 from lidarpose.skeleton import BODY26
 
 # a logarithm that stands for a bin out of the heatmap, or of next to no weight
 _LEAST = -12.0
 _FLIP = np.array(BODY26.flip)
-# quarter turns about z, each alone and mirrored; signed permutations, so that heatmaps turn exactly
-_QUARTERS = ((1, 0), (0, 1), (-1, 0), (0, -1))
-
-
-@dataclass(frozen=True)
-class View:
-    """How the person is shown: `turns` quarters, then a mirror across y; shift (3,) m of the grid."""
-
-    turns: int = 0
-    mirrored: bool = False
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    @property
-    def R_shown_person(self) -> np.ndarray:
-        cosine, sine = _QUARTERS[self.turns]
-        turn = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]], float)
-        return np.diag([1, -1, 1]) @ turn if self.mirrored else turn
 
 
 @dataclass(frozen=True)
 class Way:
     what: str
-    passes: int = 2
-    views: tuple[View, ...] = (View(),)
+    passes: int = PASSES
+    looks: tuple[Look, ...] = (Look(),)
     heatmaps: bool = False
 
 
-def _shifts(count: int) -> tuple[View, ...]:
-    rng = np.random.default_rng(0)
-    return tuple(View(shift=tuple(rng.uniform(-0.06, 0.06, 3))) for _ in range(count))
-
-
-_ALL = tuple(View(turns, mirrored) for turns in range(4) for mirrored in (False, True))
-USUAL = Way("as shipped: two passes, one view")
+_SYMMETRIES = tuple(Look(turns, mirrored) for turns in range(4) for mirrored in (False, True))
+USUAL = Way("as shipped: two passes, one look")
 WAYS = (
     Way("one pass", passes=1),
     USUAL,
     Way("three passes", passes=3),
-    Way("and mirrored, joints averaged", views=_ALL[:2]),
-    Way("and mirrored, heatmaps averaged", views=_ALL[:2], heatmaps=True),
-    Way("and turned by half, joints averaged", views=_ALL[::4]),
-    Way("four turns, joints averaged", views=_ALL[::2]),
-    Way("four turns, heatmaps averaged", views=_ALL[::2], heatmaps=True),
-    Way("four turns, each mirrored too, joints averaged", views=_ALL),
-    Way("four turns, each mirrored too, heatmaps averaged", views=_ALL, heatmaps=True),
-    Way("three shifts of the grid besides, joints averaged", views=(View(), *_shifts(3))),
+    Way("and mirrored, joints averaged", looks=_SYMMETRIES[:2]),
+    Way("and mirrored, heatmaps averaged", looks=_SYMMETRIES[:2], heatmaps=True),
+    Way("four quarter turns, joints averaged", looks=_SYMMETRIES[::2]),
+    Way("four turns, each mirrored too, joints averaged", looks=_SYMMETRIES),
+    Way("`--tta 2`: turned, mirrored and shifted", looks=LOOKS[:2]),
+    Way("`--tta 4`", looks=LOOKS[:4]),
+    Way("`--tta 8`", looks=LOOKS),
 )
 
 
 class Averaging(Predictor):
-    """A predictor whose last pass is repeated and averaged."""
+    """A predictor of other passes and looks."""
 
     def __init__(self, predictor: Predictor, way: Way):
         super().__init__(predictor.backend, name=predictor.model["name"], decode=predictor.model["decode"])
-        self.way = way
+        self._passes, self._tta, self.heatmaps = way.passes, way.looks, way.heatmaps
 
-    def _poses(self, clouds: list[np.ndarray], origin: np.ndarray | None) -> list[Pose | None]:
-        centers = np.stack([center_of(points) for points in clouds])
-        for _ in range(self.way.passes - 1):
-            found = self.outputs(clouds, centers, origin)
-            root = np.clip(found.joints[:, self._root].mean(1), -WINDOW / 2, WINDOW / 2)
-            centers = centers + np.round(root / _CENTER_STEP) * _CENTER_STEP
-        found = self._averaged([self._seen(view, clouds, centers, origin) for view in self.way.views])
-        return [
-            Pose(
-                joints=found.joints[k] + center,
-                skeleton=self.skeleton,
-                **{name: getattr(found, name)[k] for name in ("confidence", "spread", "visible", "in_range")},
-            )
-            for k, center in enumerate(centers)
-        ]
+    def _looks(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Estimates:
+        if not self.heatmaps:
+            # the first look may be any here
+            return averaged([self._look(look, clouds, centers, origin) for look in self._tta])
+        raws = [self._raw(look, clouds, centers, origin) for look in self._tta]
+        return estimates(_fused(raws), self._decoder)
 
-    def _seen(self, view: View, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Raw:
-        """What the network says of people shown so, brought back."""
-        R, middle = view.R_shown_person, centers + view.shift
+    def _raw(self, look: Look, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Raw:
+        """What the network says of people shown so, brought back before it is decoded: heatmaps turn exactly."""
+        R, middle = look.R_shown_person, centers + look.shift
         toward = np.stack([view_features(center, origin) for center in middle])
         toward[:, :3] = toward[:, :3] @ R.T
-        shown = [(points - center) @ R.T for points, center in zip(clouds, middle, strict=True)]
-        raw = self.backend.run(shown, toward)
+        raw = self.backend.run([(p - center) @ R.T for p, center in zip(clouds, middle, strict=True)], toward)
         heatmaps = []
         for axis in range(3):
             source = int(np.abs(R[:, axis]).argmax())
             heatmaps.append(raw.heatmaps[source][..., :: int(R[source, axis])])
         values = {name: getattr(raw, name) for name in ("confidence", "log_spread", "visible")}
-        values |= {"vote": raw.vote @ R + view.shift, "heatmaps": tuple(heatmaps)}
-        if view.mirrored:
+        values |= {"vote": raw.vote @ R + look.shift, "heatmaps": tuple(heatmaps)}
+        if look.mirrored:
             values = {k: tuple(h[:, _FLIP] for h in v) if k == "heatmaps" else v[:, _FLIP] for k, v in values.items()}
         return replace(raw, **values)
-
-    def _averaged(self, raws: list[Raw]) -> Estimates:
-        if len(raws) == 1 or self.way.heatmaps:
-            return estimates(_fused(raws), self._decoder)
-        each = [estimates(raw, self._decoder) for raw in raws]
-        names = ("joints", "confidence", "spread", "visible")
-        means = {name: np.mean([getattr(one, name) for one in each], 0) for name in names}
-        return replace(each[0], **means)
 
 
 def _fused(raws: list[Raw]) -> Raw:
@@ -170,7 +129,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="a JSON file; other weights in it are kept")
     parser.add_argument("--limit", type=int, help="only so many people")
     options = parser.parse_args()
-    model = load(options.weights)
+    model = load(options.weights, threads=1)
     ways = []
     for way in WAYS:
         started = time.process_time()

@@ -23,6 +23,7 @@ from lidarpose.model.dapt.config import DaptConfig
 from lidarpose.model.dapt.network import DaptNet
 from lidarpose.model.header import Header, digest, read_header
 from lidarpose.model.onnx_file import usable_threads
+from lidarpose.model.plan import view_features
 from lidarpose.model.presets import BIN, NetworkConfig
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14
 
@@ -46,20 +47,32 @@ def models():
 # ---- one answer
 
 
+def ties(model, clouds, centers, origin):
+    """(B, J, 3) bool: heatmaps whose two highest bins are equal but for rounding, which then decides."""
+    view = np.stack([view_features(center, origin) for center in centers])
+    raw = model.backend.run([cloud - center for cloud, center in zip(clouds, centers, strict=True)], view)
+    highest = np.sort(np.stack(raw.heatmaps, 2), -1)
+    return highest[..., -1] - highest[..., -2] < 2e-5
+
+
 def test_backends_agree_on_people_of_all_sizes(models):
     sizes = np.geomspace(1, 5000, 200).round().astype(int)
     clouds = [blob(size, seed) for seed, size in enumerate(sizes)]
+    equal = 0
     # together with others of about their size: rows are padded to the largest
     for start in range(0, 200, 10):
         group = clouds[start : start + 10]
         centers = np.stack([cloud.mean(0) for cloud in group])
         origin = np.zeros(3) if start % 20 else None
         ours, due = (models[name].outputs(group, centers, origin) for name in ("onnx", "torch"))
-        assert np.abs(ours.joints - due.joints).max() < 1e-4
-        np.testing.assert_array_equal(ours.in_range, due.in_range)
+        tied = ties(models["torch"], group, centers, origin)
+        equal += tied.sum()
+        assert np.abs(ours.joints - due.joints)[~tied].max() < 1e-4
+        np.testing.assert_array_equal(ours.in_range[~tied.any(-1)], due.in_range[~tied.any(-1)])
         for name in ("confidence", "spread", "visible"):
             np.testing.assert_allclose(getattr(ours, name), getattr(due, name), rtol=1e-4, atol=1e-5)
         assert np.ptp(due.joints) > 0.1
+    assert equal < 1e-3 * 200 * 26 * 3
 
 
 def test_backends_agree_to_the_end(models):

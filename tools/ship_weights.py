@@ -1,4 +1,5 @@
-"""Makes a run's model a bundled checkpoint: float16, its card completed with what it scores; and its ONNX twin beside.
+"""Makes a run's model a bundled checkpoint: float16, its card completed with what it scores; its ONNX twin beside; and
+what it says of the cloud in tests/golden_poses.json.
 
 python benchmarks/heldout.py --motion cmu_motion.npz --weights RUN/model.safetensors --json scores.json
 python tools/ship_weights.py RUN/model.safetensors scores.json src/lidarpose/model/weights/tiny.safetensors
@@ -10,8 +11,11 @@ import tempfile
 from pathlib import Path
 
 from lidarpose.data.files import write_atomic
+from lidarpose.infer.predictor import load
 from lidarpose.model.checkpoint import load_checkpoint, save_checkpoint
 from lidarpose.model.export import export
+
+GOLDEN = Path(__file__).parents[1] / "tests" / "golden_poses.json"
 
 
 def main() -> None:
@@ -39,6 +43,10 @@ def main() -> None:
         export(made, made.with_suffix(".onnx"))
         for path in (out, out.with_suffix(".onnx")):
             write_atomic(path, (made.parent / path.name).read_bytes())
+    golden = json.loads(GOLDEN.read_text())
+    pose = load(out.with_suffix(".onnx")).predict(golden["points"], sensor_origin=golden["sensor_origin"])
+    golden["joints"][out.stem] = pose.joints.round(4).tolist()
+    write_atomic(GOLDEN, json.dumps(golden) + "\n")
 
 
 if __name__ == "__main__":

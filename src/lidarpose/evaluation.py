@@ -87,6 +87,7 @@ def run(
     device: str = "cpu",
     backend: str | None = None,
     decode: str = "window",
+    tta: int = 1,
     command: str = "",
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Run:
@@ -97,7 +98,7 @@ def run(
     which is everybody; skeleton: judge its joints, by default the dataset's (of synthetic people human15's); limit: so
     many people, evenly spread; stability: disturb the points, too; legacy: also the released code's arithmetic;
     sensor_unknown: do not tell where the sensor stood; seed: of displaced boxes and intervals; device, backend,
-    decode: as of `load`; progress(dataset, done, total) is called as people are judged.
+    decode, tta: as of `load`; progress(dataset, done, total) is called as people are judged.
 
     Everything is checked before anybody is judged. Raises InputError, one line, for what does not fit; MissingExtra
     without pyarrow.
@@ -111,7 +112,7 @@ def run(
         raise InputError(f"two datasets are called {twice}: evaluate them one by one, or rename a folder")
     by_name = isinstance(model, str | os.PathLike)
     weights = _file(model) if by_name else {}
-    predictor = load(model, device=device, backend=backend, decode=decode) if by_name else model
+    predictor = load(model, device=device, backend=backend, decode=decode, tta=tta) if by_name else model
     options = {"protocol": protocol, "seed": seed, "skeleton": skeleton, "sensor_unknown": sensor_unknown}
     tasks = [task_of(predictor, one, **options) for one in people]
     evaluations, studies = [], []

@@ -47,6 +47,7 @@ def add(commands) -> None:
         "--decode", default="window", metavar="NAME", help="as in lidarpose predict; the paper's is dark"
     )
     evaluate.add_argument("--backend", metavar="NAME", help="onnx or torch, as in lidarpose predict")
+    evaluate.add_argument("--tta", type=int, default=1, metavar="N", help="as in lidarpose predict")
 
     table = commands.add_parser(
         "table",
@@ -78,6 +79,7 @@ def _evaluate(options: argparse.Namespace) -> None:
             device=options.device,
             backend=options.backend,
             decode=options.decode,
+            tta=options.tta,
             command=_command(options),
             progress=_bar(stack) if sys.stderr is not None and sys.stderr.isatty() else None,
         )
@@ -104,8 +106,8 @@ def _table(options: argparse.Namespace) -> None:
 def _command(options: argparse.Namespace) -> str:
     """What was asked for, as it would be typed."""
     words = ["lidarpose", "evaluate", options.weights, *options.datasets]
-    defaults = {"protocol": "clean", "seed": 0, "device": "cpu", "decode": "window"}
-    for name in ("protocol", "split", "skeleton", "limit", "seed", "device", "backend", "decode"):
+    defaults = {"protocol": "clean", "seed": 0, "device": "cpu", "decode": "window", "tta": 1}
+    for name in ("protocol", "split", "skeleton", "limit", "seed", "device", "backend", "decode", "tta"):
         value = getattr(options, name)
         if value is not None and value != defaults.get(name):
             words += [f"--{name}", str(value)]

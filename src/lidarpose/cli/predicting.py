@@ -42,6 +42,9 @@ def add(commands) -> None:
     predict.add_argument(
         "--decode", default="window", metavar="NAME", help="how heatmaps are read: window (default), argmax or dark"
     )
+    predict.add_argument(
+        "--tta", type=int, default=1, metavar="N", help="looks at each person, averaged: 1 (default) to 8"
+    )
 
     demo = commands.add_parser(
         "demo", help="people seen by three LiDARs, true and predicted", description="Writes a report to turn in 3D."
@@ -57,7 +60,7 @@ def _predict(options: argparse.Namespace) -> None:
     from lidarpose.infer.files import predict
     from lidarpose.infer.predictor import load
 
-    choices = {"backend": options.backend, "device": options.device, "decode": options.decode}
+    choices = {"backend": options.backend, "device": options.device, "decode": options.decode, "tta": options.tta}
     poses = predict(
         options.file,
         boxes=options.boxes,

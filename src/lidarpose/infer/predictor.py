@@ -11,6 +11,7 @@ from lidarpose.errors import InputError, missing_extra, unknown_name
 from lidarpose.infer.backend import Backend, Estimates, OnnxBackend, estimates, exported_beside
 from lidarpose.infer.people import MIN_POINTS, as_origin, as_points, candidates, clean, unit_warning
 from lidarpose.infer.results import PersonPose, Poses
+from lidarpose.infer.tta import Look, averaged, looked_at, looks_of
 from lidarpose.model.bundled import BUNDLED, weights_path
 from lidarpose.model.decode import decoder
 from lidarpose.model.header import read_header
@@ -37,16 +38,20 @@ def load(
     decode: str = "window",
     compile: bool = False,
     threads: int | None = None,
+    tta: int = 1,
 ) -> "Predictor":
     """The bundled network, or the checkpoint or exported file at a path, ready to predict.
 
     backend: "onnx" (ONNX Runtime, on the CPU) or "torch"; None takes onnx for bundled weights and .onnx files, torch
     for other paths and devices. decode: how heatmaps are read, "window" (the mean about the mode), "argmax" or "dark"
     (the released DAPT code's); where two peaks are equally high, rounding decides. compile: by `torch.compile`, backend
-    torch only. threads: of ONNX Runtime, None for all processors. Raises InputError for an unknown name, a file that is
-    no checkpoint, or a device that is not there; MissingExtra where torch is needed and not installed.
+    torch only. threads: of ONNX Runtime, None for all processors. tta: test-time augmentation, so many looks at each
+    person (1 to 8), averaged: each makes it a little better and costs as much as the first. Raises InputError for an
+    unknown name, a file that is no checkpoint, or a device that is not there; MissingExtra where torch is needed and
+    not installed.
     """
     decoder(decode)
+    looks_of(tta)
     if backend is not None and backend not in BACKENDS:
         raise unknown_name("backend", backend, BACKENDS)
     path = weights_path(weights)
@@ -66,7 +71,7 @@ def load(
         if bundled:
             path = path.with_suffix(".onnx")
         chosen = OnnxBackend(path, threads=threads) if bundled or exported else exported_beside(path, threads=threads)
-    return Predictor(chosen, name=path.stem, decode=decode)
+    return Predictor(chosen, name=path.stem, decode=decode, tta=tta)
 
 
 def _torch_backend(path: Path, device: str, compile: bool) -> Backend:
@@ -80,14 +85,16 @@ def _torch_backend(path: Path, device: str, compile: bool) -> Backend:
 
 
 class Predictor:
-    """A network ready to use. `predict` is kind; `outputs` is raw. model: what results tell of it."""
+    """A network ready to use. `predict` is kind; `outputs` is raw, of one look. model: what results tell of it."""
 
-    def __init__(self, backend: Backend, *, name: str, decode: str = "window"):
+    def __init__(self, backend: Backend, *, name: str, decode: str = "window", tta: int = 1):
         self.backend = backend
         self.header = backend.header
         self.skeleton = backend.header.skeleton
         self.model = {"name": name, "version": self.header.version, "backend": backend.name, "decode": decode}
-        self._decoder = decoder(decode)
+        if tta > 1:
+            self.model["tta"] = tta
+        self._decoder, self._tta, self._passes = decoder(decode), looks_of(tta), PASSES
         # the middle of a person: the pelvis, or half way between the hips where the skeleton has none
         root = ("pelvis",) if "pelvis" in self.skeleton.joints else ("left_hip", "right_hip")
         self._root = [self.skeleton.index(joint) for joint in root]
@@ -163,12 +170,11 @@ class Predictor:
     def _poses(self, clouds: list[np.ndarray], origin: np.ndarray | None) -> list[Pose | None]:
         """The pose of each cloud (n, 3) m, None where too little of it is near its middle."""
         centers = np.stack([center_of(points) for points in clouds])
-        for last in range(PASSES):
-            found = self.outputs(clouds, centers, origin)
-            if last < PASSES - 1:
-                root = np.clip(found.joints[:, self._root].mean(1), -WINDOW / 2, WINDOW / 2)
-                # an answer that is no number stays one
-                centers = centers + np.round(root / _CENTER_STEP) * _CENTER_STEP
+        for _ in range(self._passes - 1):
+            root = self.outputs(clouds, centers, origin).joints[:, self._root].mean(1)
+            # an answer that is no number stays one
+            centers = centers + np.round(np.clip(root, -WINDOW / 2, WINDOW / 2) / _CENTER_STEP) * _CENTER_STEP
+        found = self._looks(clouds, centers, origin)
         poses = []
         for k, points in enumerate(clouds):
             near = (np.abs(points - centers[k]) < WINDOW).all(1).sum()
@@ -182,9 +188,21 @@ class Predictor:
 
     def outputs(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Estimates:
         """What the network says of clouds (n, 3) m seen about centers (B, 3), from a sensor at origin (3,) or None."""
-        view = np.stack([view_features(center, origin) for center in centers])
-        about = [points - center for points, center in zip(clouds, centers, strict=True)]
-        return estimates(self.backend.run(about, view), self._decoder)
+        return self._look(Look(), clouds, centers, origin)
+
+    def _looks(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Estimates:
+        """The mean of all looks, of which the first is the plain one."""
+        others = [self._look(look, clouds, centers, origin) for look in self._tta[1:]]
+        return averaged([self.outputs(clouds, centers, origin), *others])
+
+    def _look(self, look: Look, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Estimates:
+        def answer(about: list[np.ndarray], features: np.ndarray) -> Estimates:
+            return estimates(self.backend.run(about, features), self._decoder)
+
+        def features(middle: np.ndarray) -> np.ndarray:
+            return np.stack([view_features(center, origin) for center in middle])
+
+        return looked_at(answer, look, clouds, centers, features, self.skeleton)
 
 
 def _shown(starts: range, progress: bool):

@@ -1,0 +1,111 @@
+"""Test-time augmentation: looks come back to where the person is, and the mean of them is one answer."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import lidarpose
+from lidarpose.errors import InputError
+from lidarpose.infer.backend import Estimates
+from lidarpose.infer.tta import LOOKS, Look, averaged, looked_at, looks_of
+from lidarpose.model.plan import view_features
+from lidarpose.skeleton import HUMAN15
+from lidarpose.synth.generate import Generator
+from lidarpose.synth.scene import scene_config
+
+LEFT = np.array([name.startswith("left_") for name in HUMAN15.joints])
+RIGHT = np.array([name.startswith("right_") for name in HUMAN15.joints])
+
+
+def answer(about, features):
+    """A network that is right by construction: joints about the points' mean, left ones to the left of who faces the
+    sensor, each a little higher than the one before of its side."""
+    mean = np.stack([points.mean(0) for points in about])
+    aside = np.cross([0, 0, 1.0], features[:, :3]) * 0.2
+    side = LEFT.astype(float) - RIGHT
+    # what has a twin must not depend on which of the two is named first
+    height = np.array([0.05 * min(j, HUMAN15.flip[j]) for j in range(len(HUMAN15))])
+    joints = mean[:, None] + side[:, None] * aside[:, None] + height[:, None] * [0, 0, 1]
+    confidence = np.broadcast_to(0.5 + 0.3 * LEFT, joints.shape[:2])
+    return Estimates(joints=joints, confidence=confidence, spread=None, visible=None, in_range=confidence > 0.6)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    turns=st.integers(0, 3),
+    mirrored=st.booleans(),
+    shift=st.tuples(*[st.floats(-0.1, 0.1)] * 3),
+    seed=st.integers(0, 1000),
+)
+def test_a_look_comes_back(turns, mirrored, shift, seed):
+    rng = np.random.default_rng(seed)
+    centers = rng.normal(0, 5, (3, 3)) + [20, 0, 0]
+    clouds = [center + rng.normal(0, 0.4, (30, 3)) for center in centers]
+
+    def features(middle):
+        # of a sensor so far away that a shift turns nothing
+        return np.stack([view_features(center, [1e7, 3e6, 0]) for center in middle])
+
+    plain = looked_at(answer, Look(), clouds, centers, features, HUMAN15)
+    other = looked_at(answer, Look(turns, mirrored, shift), clouds, centers, features, HUMAN15)
+    np.testing.assert_allclose(other.joints, plain.joints, atol=1e-5)
+    # a mirrored left hand is the right one's
+    flip = np.array(HUMAN15.flip) if mirrored else np.arange(len(HUMAN15))
+    np.testing.assert_array_equal(other.confidence, plain.confidence[:, flip])
+    np.testing.assert_array_equal(other.in_range, plain.in_range[:, flip])
+    assert other.spread is None and other.visible is None
+
+
+def estimate(value, confidence, people=2, joints=3):
+    told = None if confidence is None else np.full((people, joints), confidence)
+    return Estimates(
+        joints=np.full((people, joints, 3), float(value)), confidence=told, spread=told, visible=None, in_range=None
+    )
+
+
+def test_the_surer_look_counts_more():
+    one = averaged([estimate(0.0, 0.9), estimate(1.0, 0.45)])
+    assert 0 < one.joints.max() < 0.01
+    assert (averaged([estimate(0.0, 0.5), estimate(1.0, 0.5)]).joints == 0.5).all()
+    # a network that does not tell its confidence has all looks alike
+    assert (averaged([estimate(0.0, None), estimate(1.0, None)]).joints == 0.5).all()
+    single = estimate(0.3, 0.2)
+    assert averaged([single]) is single
+
+
+def test_looks_are_different_and_the_first_is_none():
+    assert looks_of(1) == (Look(),) and len(set(LOOKS)) == len(LOOKS) == len(looks_of(8))
+    # no two put the fine grid in the same place
+    assert len({tuple(np.round(np.mod(look.shift, 0.06), 6)) for look in LOOKS}) == len(LOOKS)
+
+
+@pytest.mark.parametrize("tta", [0, 9, -1, 1.5, True, "four"])
+def test_a_number_of_looks_that_cannot_be(tta):
+    with pytest.raises(InputError, match="tta must be a whole number from 1 to 8"):
+        lidarpose.load(tta=tta)
+
+
+@pytest.fixture(scope="module")
+def people():
+    generator = Generator(scene=scene_config("wild"), measure=False)
+    return [generator.person(4711, k).sample for k in range(64)]
+
+
+def test_more_looks_are_better_and_say_so(people):
+    clouds = [sample.points for sample in people]
+    true = np.stack([sample.pose.joints for sample in people])
+    errors = {}
+    for tta in (1, 4):
+        model = lidarpose.load(tta=tta, threads=1)
+        found = model.predict(clouds, sensor_origin=(0, 0, 0), skeleton="body26")
+        errors[tta] = np.linalg.norm(np.stack([person.joints for person in found]) - true, axis=-1).mean()
+        assert model.model.get("tta", 1) == tta
+    assert errors[4] < errors[1]
+
+
+def test_nobody_depends_on_others(people):
+    model = lidarpose.load(tta=2, threads=1)
+    together = model.predict([sample.points for sample in people[:3]], sensor_origin=(0, 0, 0))
+    alone = model.predict(people[1].points, sensor_origin=(0, 0, 0))
+    np.testing.assert_allclose(together[1].joints, alone.joints, atol=1e-5)
