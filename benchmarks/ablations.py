@@ -64,7 +64,7 @@ class Variant:
 
 _CALM = replace(_WILD, clutter=0.0, company=0.0, occluder=0.0, faults=replace(_WILD.faults, stray=0.0))
 VARIANTS = {
-    "base": Variant("base", "`tiny` as it ships"),
+    "base": Variant("base", "`tiny` and its recipe"),
     # the six that matter
     "pooled": Variant("anchors", "joints from pooled features, votes", network=pooled),
     "pooled, heatmaps alone": Variant(

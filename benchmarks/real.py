@@ -1,6 +1,6 @@
 """Poses of labelled people in real sweeps, where boxes are labelled and joints are not.
 
-    python benchmarks/real.py FOLDER
+    python benchmarks/real.py FOLDER --json docs/scores/real.json
 
 FOLDER holds sweep_N.pcd, .bin or .ply, and beside each a sweep_N.json of boxes as `lidarpose predict` takes them.
 Prints for each person: points, distance, the angle between where the pose faces and where the box heads, the share of
@@ -15,6 +15,8 @@ from pathlib import Path
 import numpy as np
 
 import lidarpose
+from lidarpose.data.files import write_atomic
+from lidarpose.infer.files import TTA
 from lidarpose.skeleton import SMPL24
 from lidarpose.view.person import facing
 
@@ -36,9 +38,12 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--least", type=int, default=50, help="fewest points a person")
     parser.add_argument("--weights", default="tiny")
+    parser.add_argument("--tta", type=int, default=TTA, help="looks at each person")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write people's figures")
     options = parser.parse_args()
-    model = lidarpose.load(options.weights)
+    model = lidarpose.load(options.weights, tta=options.tta)
     tracks: dict[str, list[np.ndarray]] = {}
+    rows = []
     for labels in sorted(options.folder.glob("sweep_*.json")):
         sweep = next(path for path in sorted(options.folder.glob(f"{labels.stem}.*")) if path.suffix != ".json")
         entries = json.loads(labels.read_text())["people"]
@@ -51,13 +56,23 @@ def main() -> None:
             trunk = person.joints[SMPL24.index("neck")] - person.joints[SMPL24.index("pelvis")]
             near = (distance_to_bones(person.points, person.joints) < NEAR).mean()
             distance = np.linalg.norm(person.box.center)
+            row = {"sweep": labels.stem, "person": str(person.id)[:8], "points": int(person.num_points)}
+            row |= {
+                "distance": float(distance),
+                "turn": float(np.degrees((turn + np.pi) % (2 * np.pi) - np.pi)),
+                "near": float(near),
+                "lean": float(np.degrees(np.arccos(trunk[2] / np.linalg.norm(trunk)))),
+                "confidence": float(person.confidence.mean()),
+            }
+            rows.append({key: round(value, 3) if isinstance(value, float) else value for key, value in row.items()})
             print(
-                f"{labels.stem} {str(person.id)[:8]}  {person.num_points:4d} points {distance:5.1f} m"
-                f"  facing {np.degrees((turn + np.pi) % (2 * np.pi) - np.pi):5.0f} deg off the box"
-                f"  {near:4.0%} near bones  lean {np.degrees(np.arccos(trunk[2] / np.linalg.norm(trunk))):3.0f} deg"
-                f"  confidence {person.confidence.mean():.2f}"
+                f"{row['sweep']} {row['person']}  {row['points']:4d} points {row['distance']:5.1f} m"
+                f"  facing {row['turn']:5.0f} deg off the box  {row['near']:4.0%} near bones"
+                f"  lean {row['lean']:3.0f} deg  confidence {row['confidence']:.2f}"
             )
             tracks.setdefault(str(person.id), []).append(person.joints)
+    if options.json:
+        write_atomic(options.json, json.dumps(rows, indent=1) + "\n")
     pelvis = SMPL24.index("pelvis")
     for track, seen in tracks.items():
         for first, second in zip(seen[:-1], seen[1:], strict=True):

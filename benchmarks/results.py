@@ -140,6 +140,8 @@ def _row(own: Runs, variant: str) -> tuple[str, ...]:
 
 def noise(runs: list[dict]) -> str:
     own = _common(runs)
+    if math.isnan(own.deviation):
+        return f"{own.people:,} people a run, one seed: differences have no interval.\n"
     return (
         f"{own.people:,} people a run. A difference of two runs of one seed deviates by {own.deviation:.1f} mm\n"
         f"from seed to seed ({own.freedom} degrees of freedom): that of one seed is resolved beyond\n"
@@ -277,6 +279,25 @@ def visibility() -> str:
     return table(("", "condition", "MPJPE mm", "clean, as much hidden", "ratio", "people"), rows)
 
 
+def real() -> str:
+    """Real people; see real.py."""
+    rows = [
+        (
+            one["sweep"].removeprefix("sweep_"),
+            one["person"],
+            str(one["points"]),
+            f"{one['distance']:.1f}",
+            f"{one['turn']:.0f} deg",
+            f"{100 * one['near']:.0f} %",
+            f"{one['lean']:.0f} deg",
+            f"{one['confidence']:.2f}",
+        )
+        for one in json.loads((SCORES / "real.json").read_text())
+    ]
+    header = ("sweep", "person", "points", "distance m", "facing against the box", "points within 15 cm of a bone")
+    return table((*header, "lean of the trunk", "confidence"), rows)
+
+
 def rejection(model: str) -> str:
     found = json.loads((SCORES / "test_time.json").read_text())[model]["rejection"]
     rows = [(f"{one['kept']:.0f} %", f"{one['people']:.1f}", f"{one['joints']:.1f}") for one in found]
@@ -291,7 +312,7 @@ def tables() -> dict[str, Callable[[], str]]:
     made |= {"scaling": lambda: scaling(runs, _longest()), "noise": partial(noise, runs)}
     made |= {"continued": partial(continued, later), "noise continued": partial(noise, later)}
     made |= {"against the paper": partial(against_paper, runs)}
-    made["visibility"] = visibility
+    made |= {"visibility": visibility, "real": real}
     made["headline"] = partial(headline, *BUNDLED)
     for model in BUNDLED:
         made[f"{model} card"] = partial(card, model)
@@ -301,7 +322,7 @@ def tables() -> dict[str, Callable[[], str]]:
 
 
 def _groups(model: str) -> Iterator[str]:
-    return dict.fromkeys(line["group"] for line in _lines(model)[1])
+    return dict.fromkeys(["all+condition", *(line["group"] for line in _lines(model)[1])])
 
 
 def written(page: str) -> str:

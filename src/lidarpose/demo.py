@@ -9,6 +9,7 @@ import numpy as np
 
 from lidarpose.data.files import atomic_path
 from lidarpose.errors import InputError, MissingExtra
+from lidarpose.infer.files import TTA
 from lidarpose.infer.predictor import Predictor, load
 
 SENSORS = ("vlp-32c", "os1-128", "hdl-64e")
@@ -34,7 +35,7 @@ def run(folder: str | Path, *, seed: int, weights: str = "tiny") -> None:
     # opened before the work, so that a folder without write access is known at once
     with ExitStack() as stack:
         files = {name: stack.enter_context(atomic_path(folder / name)) for name in names}
-        model = load(weights)
+        model = load(weights, tta=TTA)
         print("synthesizing people (the first time compiles the ray caster: some ten seconds) ...", flush=True)
         scene = scene_config("wild").eased(_HARD)
         people = []

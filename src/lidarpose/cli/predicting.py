@@ -42,9 +42,7 @@ def add(commands) -> None:
     predict.add_argument(
         "--decode", default="window", metavar="NAME", help="how heatmaps are read: window (default), argmax or dark"
     )
-    predict.add_argument(
-        "--tta", type=int, default=1, metavar="N", help="looks at each person, averaged: 1 (default) to 8"
-    )
+    predict.add_argument("--tta", type=int, metavar="N", help="looks at each person, averaged: 1 to 8 (default 4)")
 
     demo = commands.add_parser(
         "demo", help="people seen by three LiDARs, true and predicted", description="Writes a report to turn in 3D."
@@ -57,10 +55,11 @@ def add(commands) -> None:
 
 def _predict(options: argparse.Namespace) -> None:
     from lidarpose.data.files import atomic_path
-    from lidarpose.infer.files import predict
+    from lidarpose.infer.files import TTA, predict
     from lidarpose.infer.predictor import load
 
-    choices = {"backend": options.backend, "device": options.device, "decode": options.decode, "tta": options.tta}
+    choices = {"backend": options.backend, "device": options.device, "decode": options.decode}
+    choices["tta"] = TTA if options.tta is None else options.tta
     poses = predict(
         options.file,
         boxes=options.boxes,

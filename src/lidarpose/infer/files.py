@@ -18,6 +18,8 @@ from lidarpose.sample import Box
 
 # a file of less than this across is taken for a crop, m
 CROP_SIZE = 4.0
+# looks at each person of a file, where nobody says how many: nobody waits for milliseconds here
+TTA = 4
 # no LiDAR sees a person from farther away, m
 _FARTHEST_PERSON = 500.0
 
@@ -41,8 +43,8 @@ def predict(
     across is taken as a crop and anything else asks for boxes. sensor_origin: (x, y, z) m in the file's frame, or
     "unknown"; None means 0, 0, 0 with boxes and unknown for a crop. skeleton: a name, or None for smpl24, or for the
     network's own where it has other joints. up: the file's up axis; columns: values a row of a .bin; model: a
-    predictor, what `load` takes, or a function that gives the predictor when it is needed. Raises InputError, one line
-    that says what to do.
+    predictor, what `load` takes (each person is then looked at `TTA` times), or a function that gives the predictor
+    when it is needed. Raises InputError, one line that says what to do.
     """
     if boxes is not None and crop:
         raise InputError("expected boxes or a crop, got both: a crop is one person already, so leave the boxes away")
@@ -65,7 +67,7 @@ def predict(
         warnings.append(warning)
         origin = None
     # loaded once the input has proved readable
-    predictor = model if isinstance(model, Predictor) else model() if callable(model) else load(model)
+    predictor = model if isinstance(model, Predictor) else model() if callable(model) else load(model, tta=TTA)
     loaded = time.perf_counter()
     raw = predictor.predict(
         clouds, sensor_origin=None if origin is None else R_house_input @ origin, skeleton=skeleton, progress=progress
