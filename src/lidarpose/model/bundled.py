@@ -6,7 +6,7 @@ from pathlib import Path
 
 from lidarpose.errors import unknown_name
 
-BUNDLED = ("tiny",)
+BUNDLED = ("tiny", "small")
 
 
 def bundled_path(name: str = "tiny", suffix: str = ".safetensors") -> Path:
