@@ -17,14 +17,14 @@ import math
 import os
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 
 import torch
 from ablation_networks import Uncounted, Unplaced, pooled, reading
-from results import FIGURES
+from results import figures
 from torch import nn
 
 from lidarpose import evaluation
@@ -145,13 +145,14 @@ def job(variant: Variant, settings: Pretrain) -> Job:
     return replace(usual, task=task, source=SceneSource(config=variant.scene, **values), network=network)
 
 
-def run(name: str, seed: int, people: int, motion: str, subjects: tuple[str, ...], init: str, folder: Path) -> dict:
-    """Trains and judges a variant; returns what its scores.json holds."""
-    variant = VARIANTS[name]
-    changes = {"motion": motion, "subjects": subjects, "people": people, "seed": seed, "workers": 0, "pictures": 0}
+def run(options: argparse.Namespace, name: str, seed: int, folder: Path) -> dict:
+    """Trains and judges a variant; returns its `record`."""
+    variant, people, init = VARIANTS[name], options.people, options.init
+    subjects = tuple(options.subjects.split(","))
+    changes = {"motion": options.motion, "subjects": subjects, "people": people, "seed": seed}
+    changes |= {"workers": 0, "pictures": 0, "validate": people}
     changes |= {"init": init, "easy": 0.0, "cool": 0.9} if init else {}
-    settings = recipe(Pretrain, **changes | {"validate": people} | variant.recipe)
-    shutil.rmtree(folder, ignore_errors=True)
+    settings = recipe(Pretrain, **changes | variant.recipe)
     started, used = time.perf_counter(), time.process_time()
     own = job(variant, settings)
     model = train(settings, folder, job=own)
@@ -161,41 +162,55 @@ def run(name: str, seed: int, people: int, motion: str, subjects: tuple[str, ...
         network.load_state_dict({key: file.get_tensor(key) for key in file.keys()})  # noqa: SIM118
     predictor = Predictor(TorchBackend(network, Header(config=own.task.config, card={})), name=name)
     result = evaluation.run(predictor, ["bench"]).scores.results[0]
-    return {
-        "version": __version__,
-        "variant": name,
-        "study": variant.study,
-        "what": variant.what,
-        "seed": seed,
-        "people": people,
-        "begun": read_header(init).card["people_seen"] if init else 0,
-        "parameters": sum(value.numel() for value in network.parameters()),
-        **{key: round(value, 1) for key, value in taken.items()},
-        "figures": figures(result),
-    }
+    return record(
+        name,
+        variant.study,
+        variant.what,
+        seed,
+        people,
+        begun=read_header(init).card["people_seen"] if init else 0,
+        parameters=sum(value.numel() for value in network.parameters()),
+        **taken,
+        figures=figures(result),
+    )
 
 
-def figures(result) -> dict[str, dict[str, float]]:
-    """value, low and high of each of `results.FIGURES`."""
-    found = {}
-    for line in result.lines:
-        for name, (group, of, figure) in FIGURES.items():
-            same = line.group == group and line.figure == figure and of in (None, line.of)
-            if same and line.method == result.setting.method and line.arithmetic == "lidarpose" and name not in found:
-                found[name] = {"value": line.value, "low": line.low, "high": line.high}
-    return found
+def record(name: str, study: str, what: str, seed: int, people: int, **more) -> dict:
+    """What a scores.json holds, as `results.py` reads it."""
+    head = {"version": __version__, "variant": name, "study": study, "what": what, "seed": seed, "people": people}
+    return head | {key: round(value, 1) if isinstance(value, float) else value for key, value in more.items()}
+
+
+def each(names: Iterable[str], options: argparse.Namespace, scored: Callable[[str, int, Path], dict]) -> None:
+    """Runs every name with every seed whose scores.json is not there yet: scored(name, seed, folder) -> `record`."""
+    torch.set_num_threads(1)
+    for seed in map(int, options.seeds.split(",")):
+        for name in names:
+            folder = Path(options.out) / f"{name.replace(' ', '-')}-{options.people}-{seed}"
+            if (folder / "scores.json").is_file():
+                continue
+            shutil.rmtree(folder, ignore_errors=True)
+            found = scored(name, seed, folder)
+            write_atomic(folder / "scores.json", json.dumps(found, indent=1) + os.linesep)
+            shown = "  ".join(f"{key} {value['value']:.1f}" for key, value in found["figures"].items())
+            print(f"{name} {seed}: {shown}  ({found['processor_seconds']:.0f} s)", flush=True)
+
+
+def arguments(parser: argparse.ArgumentParser, **motion) -> None:
+    """What both benchmarks ask."""
+    parser.add_argument("--motion", help="npz of clips, see lidarpose.body.clips", **motion)
+    parser.add_argument("--subjects", default="002,005", help="of its clips, those to learn from")
+    parser.add_argument("--people", type=int, default=24_576)
+    parser.add_argument("--seeds", default="1")
+    parser.add_argument("--out", default="runs/ablations")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help="default: all")
     parser.add_argument("--list", action="store_true", help="the variants, and nothing else")
-    parser.add_argument("--motion", help="npz of clips, see lidarpose.body.clips")
-    parser.add_argument("--subjects", default="002,005", help="of its clips, those to learn from")
-    parser.add_argument("--people", type=int, default=32_768)
-    parser.add_argument("--seeds", default="1")
-    parser.add_argument("--init", default="", metavar="FILE", help="trained weights to go on from")
-    parser.add_argument("--out", default="runs/ablations", help="one for each --init")
+    arguments(parser)
+    parser.add_argument("--init", default="", metavar="FILE", help="trained weights to go on from; another --out then")
     options = parser.parse_args()
     if options.list:
         print("\n".join(f"{name:<24} {variant.what}" for name, variant in VARIANTS.items()))
@@ -205,19 +220,8 @@ def main() -> None:
     for name in options.names:
         if name not in VARIANTS:
             parser.error(f"no variant {name!r}: see --list")
-    subjects = tuple(options.subjects.split(","))
-    torch.set_num_threads(1)
-    for seed in map(int, options.seeds.split(",")):
-        for name in options.names or VARIANTS:
-            if options.init and not keeps_network(VARIANTS[name]):
-                continue
-            folder = Path(options.out) / f"{name.replace(' ', '-')}-{options.people}-{seed}"
-            if (folder / "scores.json").is_file():
-                continue
-            found = run(name, seed, options.people, options.motion, subjects, options.init, folder)
-            write_atomic(folder / "scores.json", json.dumps(found, indent=1) + os.linesep)
-            shown = "  ".join(f"{key} {value['value']:.1f}" for key, value in found["figures"].items())
-            print(f"{name} {seed}: {shown}  ({found['processor_seconds']:.0f} s)", flush=True)
+    names = [name for name in options.names or VARIANTS if not options.init or keeps_network(VARIANTS[name])]
+    each(names, options, partial(run, options))
 
 
 if __name__ == "__main__":

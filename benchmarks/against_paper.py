@@ -9,25 +9,20 @@ ours, whichever is better.
 """
 
 import argparse
-import json
-import os
-import shutil
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
-import torch
-from ablations import SceneSource, figures
+from ablations import arguments, each, record
+from results import figures
 
 from lidarpose import evaluation
-from lidarpose._version import __version__
-from lidarpose.data.files import write_atomic
 from lidarpose.infer.predictor import load
 from lidarpose.model.checkpoint import load_checkpoint
 from lidarpose.model.dapt.config import DaptConfig
-from lidarpose.synth.scene import SCENES
 from lidarpose.train.dapt_task import DaptTask, finetuning_config, pretraining_config, small, transferred
-from lidarpose.train.job import Job, job_of
+from lidarpose.train.job import job_of
 from lidarpose.train.loop import train
 from lidarpose.train.recipes import Pretrain, recipe
 
@@ -65,24 +60,18 @@ def sized(config: DaptConfig) -> DaptConfig:
     )
 
 
-def job(settings: Pretrain, way: Way, task: DaptTask, network) -> Job:
-    usual = job_of(settings)
-    values = {name: value for name, value in vars(usual.source).items() if not name.startswith("_")}
-    source = SceneSource(config=SCENES[way.scene], **values)
-    return replace(usual, task=task, source=source, network=network)
-
-
-def run(name: str, seed: int, people: int, motion: str, subjects: tuple[str, ...], folder: Path) -> dict:
-    """Both stages and the verdict; what scores.json holds."""
-    way = WAYS[name]
-    shutil.rmtree(folder, ignore_errors=True)
+def run(options: argparse.Namespace, name: str, seed: int, folder: Path) -> dict:
+    """Both stages and the verdict; returns its `ablations.record`."""
+    way, people = WAYS[name], options.people
     started, used = time.perf_counter(), time.process_time()
-    changes = {"size": "paper-small", "motion": motion, "subjects": subjects, "people": people // 2, "workers": 0}
-    changes |= {"pictures": 0, "validate": people, "scene": way.scene} | (way.recipe or {})
+    subjects = tuple(options.subjects.split(","))
+    changes = {"size": "paper-small", "motion": options.motion, "subjects": subjects, "people": people // 2}
+    changes |= {"workers": 0, "pictures": 0, "validate": people, "scene": way.scene} | (way.recipe or {})
     changes |= {"strays": 0.2, "noise": 0.15} if way.scene == "wild" else {}
     first = DaptTask(config=sized(pretraining_config()), stage="pretrain")
     settings = recipe(Pretrain, "paper", **changes, seed=seed, rate=way.rates[0])
-    model = train(settings, folder / "pretrain", job=job(settings, way, first, first.network))
+    own = replace(job_of(settings), task=first, network=first.network)
+    model = train(settings, folder / "pretrain", job=own)
     # other people than those of the first half
     settings = replace(settings, seed=seed + 1_000, rate=way.rates[1])
     second = DaptTask(config=sized(finetuning_config("humanm3")), stage="finetune")
@@ -91,43 +80,30 @@ def run(name: str, seed: int, people: int, motion: str, subjects: tuple[str, ...
     def begun():
         return transferred(trained, second.config, keep_anchors=way.anchors)
 
-    model = train(settings, folder / "finetune", job=job(settings, way, second, begun))
+    own = replace(job_of(settings), task=second, network=begun)
+    model = train(settings, folder / "finetune", job=own)
     taken = {"seconds": time.perf_counter() - started, "processor_seconds": time.process_time() - used}
     results = [evaluation.run(load(model, decode=way_), ["bench"]).scores.results[0] for way_ in ("dark", "window")]
     best = min((figures(result) for result in results), key=lambda found: found["all"]["value"])
-    return {
-        "version": __version__,
-        "variant": name,
-        "study": "paper",
-        "what": way.what,
-        "seed": seed,
-        "people": people,
-        "begun": 0,
-        "parameters": sum(value.numel() for value in load_checkpoint(model)[0].parameters()),
-        **{key: round(value, 1) for key, value in taken.items()},
-        "figures": best,
-    }
+    return record(
+        name,
+        "paper",
+        way.what,
+        seed,
+        people,
+        begun=0,
+        parameters=sum(value.numel() for value in load_checkpoint(model)[0].parameters()),
+        **taken,
+        figures=best,
+    )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(map(repr, WAYS))}; default: all")
-    parser.add_argument("--motion", required=True, help="npz of clips, see lidarpose.body.clips")
-    parser.add_argument("--subjects", default="002,005", help="of its clips, those to learn from")
-    parser.add_argument("--people", type=int, default=24_576)
-    parser.add_argument("--seeds", default="1")
-    parser.add_argument("--out", default="runs/ablations")
+    arguments(parser, required=True)
     options = parser.parse_args()
-    torch.set_num_threads(1)
-    for seed in map(int, options.seeds.split(",")):
-        for name in options.names or WAYS:
-            folder = Path(options.out) / f"{name.replace(' ', '-')}-{options.people}-{seed}"
-            if (folder / "scores.json").is_file():
-                continue
-            found = run(name, seed, options.people, options.motion, tuple(options.subjects.split(",")), folder)
-            write_atomic(folder / "scores.json", json.dumps(found, indent=1) + os.linesep)
-            shown = "  ".join(f"{key} {value['value']:.1f}" for key, value in found["figures"].items())
-            print(f"{name} {seed}: {shown}  ({found['processor_seconds']:.0f} s)", flush=True)
+    each(options.names or WAYS, options, partial(run, options))
 
 
 if __name__ == "__main__":

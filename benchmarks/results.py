@@ -18,13 +18,14 @@ import json
 import math
 import re
 import sys
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Callable
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 
 from lidarpose.data.files import write_atomic
+from lidarpose.evaluate.result import OURS, Line, Result, Scores, read_scores
 from lidarpose.model.bundled import BUNDLED, bundled_path
 from lidarpose.model.header import digest, read_header
 
@@ -112,19 +113,11 @@ def table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
     return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
 
 
-def study(name: str, runs: list[dict]) -> str:
-    """The variants of a study beside `base`, at the length that most runs have."""
+def study(runs: list[dict], name: str | None = None) -> str:
+    """The variants of a study, or of all, beside `base`, at the length that most runs have."""
     own = _common(runs)
-    chosen = [v for v in dict.fromkeys(run["variant"] for run in runs if run["study"] == name) if own.seeds(v)]
-    chosen.sort(key=lambda variant: own.mean(variant, "all"))
-    header = ("", "MPJPE mm", "against base", *_SHOWN, "seeds")
-    return table(header, [_row(own, variant) for variant in (BASE, *chosen)])
-
-
-def continued(runs: list[dict]) -> str:
-    """All variants of runs that went on from trained weights."""
-    own = _common(runs)
-    chosen = [v for v in dict.fromkeys(run["variant"] for run in runs) if v != BASE and own.seeds(v)]
+    names = dict.fromkeys(run["variant"] for run in runs if name in (None, run["study"]))
+    chosen = [variant for variant in names if variant != BASE and own.seeds(variant)]
     chosen.sort(key=lambda variant: own.mean(variant, "all"))
     header = ("", "MPJPE mm", "against base", *_SHOWN, "seeds")
     return table(header, [_row(own, variant) for variant in (BASE, *chosen)])
@@ -162,13 +155,19 @@ def scaling(runs: list[dict], shipped: dict | None = None) -> str:
     return table(("people seen", "MPJPE mm", "a doubling", *_SHOWN), rows)
 
 
-def _longest() -> dict[int, dict[str, float]]:
-    """The figures of `tiny` as it ships, by the number of people that it has seen."""
-    lines = _lines("tiny")[1]
+def figures(result: Result) -> dict[str, dict[str, float]]:
+    """value, low and high of each of `FIGURES` that the result has."""
     found = {}
     for name, (group, of, figure) in FIGURES.items():
-        fitting = (x for x in lines if x["group"] == group and x["figure"] == figure and of in (None, x["of"]))
-        found[name] = next(fitting)["value"]
+        fitting = (x for x in _own(result) if x.group == group and x.figure == figure and of in (None, x.of))
+        if (line := next(fitting, None)) is not None:
+            found[name] = {"value": line.value, "low": line.low, "high": line.high}
+    return found
+
+
+def _longest() -> dict[int, dict[str, float]]:
+    """The figures of `tiny` as it ships, by the number of people that it has seen."""
+    found = {name: figure["value"] for name, figure in figures(_scored("tiny").results[0]).items()}
     return {read_header(bundled_path("tiny")).card["people_seen"]: found}
 
 
@@ -181,8 +180,8 @@ def against_paper(runs: list[dict]) -> str:
         lost = own.mean(variant, "cluttered") - own.mean(variant, "clean")
         what = "ours: `tiny` and its recipe" if variant == BASE else one["what"]
         figures = [f"{own.mean(variant, figure):.1f}" for figure in ("all", "plain", "clean", "cluttered")]
-        hours = np.mean([own.by[variant, seed]["processor_seconds"] for seed in own.seeds(variant)]) / 60
-        rows.append((what, f"{one['parameters']:,}", *figures, f"{lost:+.1f}", f"{hours:.0f}"))
+        minutes = np.mean([own.by[variant, seed]["processor_seconds"] for seed in own.seeds(variant)]) / 60
+        rows.append((what, f"{one['parameters']:,}", *figures, f"{lost:+.1f}", f"{minutes:.0f}"))
     header = ("", "parameters", "MPJPE mm", "plain", "clean", "cluttered", "lost to clutter", "processor minutes")
     return table(header, rows)
 
@@ -193,21 +192,28 @@ def _common(runs: list[dict]) -> Runs:
     return Runs(runs, max(set(lengths), key=lengths.count))
 
 
-def _lines(model: str) -> tuple[dict, list[dict]]:
-    """The setting and lines of a bundled model's scores on lidarpose-bench."""
-    result = json.loads((SCORES / f"{model}.json").read_text())["results"][0]
-    own = [line for line in result["lines"] if line["method"] == result["setting"]["method"]]
-    return result["setting"], own
+@lru_cache
+def _scored(model: str) -> Scores:
+    """What a bundled model scored on lidarpose-bench."""
+    return read_scores(SCORES / f"{model}.json")
+
+
+def _own(result: Result) -> list[Line]:
+    """The lines of what was judged, without the floors', by this package's arithmetic."""
+    return [x for x in result.lines if x.method == result.setting.method and x.arithmetic == OURS]
 
 
 def shipped(model: str, group: str) -> str:
     """MPJPE of a bundled model by groups of people or joints."""
     rows = []
-    for line in _lines(model)[1]:
-        if line["group"] in group.split("+") and line["figure"] == "mpjpe" and line["arithmetic"] == "lidarpose":
-            interval = "" if line["low"] is None else f"[{line['low']:.1f}, {line['high']:.1f}]"
-            rows.append((line["of"], f"{line['value']:.1f}", interval, f"{line['people']:,}"))
+    for line in _own(_scored(model).results[0]):
+        if line.group in group.split("+") and line.figure == "mpjpe":
+            rows.append((line.of, f"{line.value:.1f}", _interval(line), f"{line.people:,}"))
     return table((group.split("+")[-1], "MPJPE mm", "95 %", "people"), rows)
+
+
+def _interval(line: Line) -> str:
+    return "" if line.low is None else f"[{line.low:.1f}, {line.high:.1f}]"
 
 
 def headline(*models: str) -> str:
@@ -225,9 +231,8 @@ def headline(*models: str) -> str:
     for name, (group, figure) in wanted.items():
         cells = []
         for model in models:
-            line = next(x for x in _lines(model)[1] if x["group"] == group and x["figure"] == figure)
-            ends = "" if line["low"] is None else f" [{line['low']:.1f}, {line['high']:.1f}]"
-            cells.append(f"{line['value']:.1f}{ends}")
+            line = next(x for x in _own(_scored(model).results[0]) if x.group == group and x.figure == figure)
+            cells.append(f"{line.value:.1f} {_interval(line)}".rstrip())
         rows.append((name, *cells))
     return table(("lidarpose-bench", *(f"`{model}`" for model in models)), rows)
 
@@ -236,8 +241,7 @@ def card(model: str) -> str:
     """How a bundled model was made, as its file says."""
     path = bundled_path(model)
     told = read_header(path).card
-    scores = json.loads((SCORES / f"{model}.json").read_text())
-    if scores["weights"]["digest"] != digest(path):
+    if _scored(model).weights["digest"] != digest(path):
         raise SystemExit(f"docs/scores/{model}.json is of other weights: run lidarpose evaluate {model} bench")
     rows = [
         ("file", f"`{path.name}`, {path.stat().st_size / 1e6:.1f} MB in float16"),
@@ -308,21 +312,18 @@ def tables() -> dict[str, Callable[[], str]]:
     """What makes each table, by name."""
     every = json.loads((SCORES / RUNS).read_text())
     runs, later = ([run for run in every if bool(run["begun"]) == begun] for begun in (False, True))
-    made = {f"study {name}": partial(study, name, runs) for name in {run["study"] for run in runs}}
+    made = {f"study {name}": partial(study, runs, name) for name in {run["study"] for run in runs}}
     made |= {"scaling": lambda: scaling(runs, _longest()), "noise": partial(noise, runs)}
-    made |= {"continued": partial(continued, later), "noise continued": partial(noise, later)}
+    made |= {"continued": partial(study, later), "noise continued": partial(noise, later)}
     made |= {"against the paper": partial(against_paper, runs)}
     made |= {"visibility": visibility, "real": real}
     made["headline"] = partial(headline, *BUNDLED)
     for model in BUNDLED:
         made[f"{model} card"] = partial(card, model)
-        made |= {f"{model} by {group}": partial(shipped, model, group) for group in _groups(model)}
+        groups = dict.fromkeys(["all+condition", *(line.group for line in _own(_scored(model).results[0]))])
+        made |= {f"{model} by {group}": partial(shipped, model, group) for group in groups}
         made |= {f"{model} extras": partial(extras, model), f"{model} rejection": partial(rejection, model)}
     return made
-
-
-def _groups(model: str) -> Iterator[str]:
-    return dict.fromkeys(["all+condition", *(line["group"] for line in _lines(model)[1])])
 
 
 def written(page: str) -> str:

@@ -14,14 +14,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from ablations import figures
+from results import figures
 
 from lidarpose import evaluation
 from lidarpose.data.files import write_atomic
 from lidarpose.infer.backend import Estimates, Raw, estimates
 from lidarpose.infer.predictor import PASSES, Predictor, load
-from lidarpose.infer.tta import LOOKS, Look, averaged
-from lidarpose.model.plan import view_features
+from lidarpose.infer.tta import LOOKS, Look, averaged, shown
 from lidarpose.skeleton import BODY26
 
 # a logarithm that stands for a bin out of the heatmap, or of next to no weight
@@ -69,11 +68,8 @@ class Averaging(Predictor):
 
     def _raw(self, look: Look, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Raw:
         """What the network says of people shown so, brought back before it is decoded: heatmaps turn exactly."""
-        R, middle = look.R_shown_person, centers + look.shift
-        toward = np.stack([view_features(center, origin) for center in middle])
-        toward[:, :3] = toward[:, :3] @ R.T
-        raw = self.backend.run([(p - center) @ R.T for p, center in zip(clouds, middle, strict=True)], toward)
-        heatmaps = []
+        R, heatmaps = look.R_shown_person, []
+        raw = self.backend.run(*shown(look, clouds, centers, origin))
         for axis in range(3):
             source = int(np.abs(R[:, axis]).argmax())
             heatmaps.append(raw.heatmaps[source][..., :: int(R[source, axis])])
@@ -110,7 +106,7 @@ def _bins(logits: np.ndarray, index: np.ndarray) -> np.ndarray:
 
 def rejection(judged) -> list[dict]:
     """Error of what is kept, the most confident first: whole people, and joints on their own."""
-    error = judged.errors() * 1.0
+    error = judged.errors()
     people, joints = [], []
     for score, value, rows in (
         (judged.confidence.mean(1), error.mean(1), people),
@@ -133,9 +129,7 @@ def main() -> None:
     ways = []
     for way in WAYS:
         started = time.process_time()
-        # the usual one as it is, so that a fault of the twin above would show
-        judge = model if way is USUAL else Averaging(model, way)
-        done = evaluation.run(judge, ["bench"], limit=options.limit)
+        done = evaluation.run(Averaging(model, way), ["bench"], limit=options.limit)
         seconds = time.process_time() - started
         if way is USUAL:
             kept = rejection(done.evaluations[0].judged)

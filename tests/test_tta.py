@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 import lidarpose
 from lidarpose.errors import InputError
 from lidarpose.infer.backend import Estimates
-from lidarpose.infer.tta import LOOKS, Look, averaged, looked_at, looks_of
-from lidarpose.model.plan import view_features
+from lidarpose.infer.tta import LOOKS, Look, averaged, brought_back, looks_of, shown
 from lidarpose.skeleton import HUMAN15
 from lidarpose.synth.generate import Generator
 from lidarpose.synth.scene import scene_config
@@ -43,12 +42,11 @@ def test_a_look_comes_back(turns, mirrored, shift, seed):
     centers = rng.normal(0, 5, (3, 3)) + [20, 0, 0]
     clouds = [center + rng.normal(0, 0.4, (30, 3)) for center in centers]
 
-    def features(middle):
-        # of a sensor so far away that a shift turns nothing
-        return np.stack([view_features(center, [1e7, 3e6, 0]) for center in middle])
+    def looked_at(look):
+        # from a sensor so far away that a shift turns nothing
+        return brought_back(answer(*shown(look, clouds, centers, np.array([1e7, 3e6, 0]))), look, HUMAN15)
 
-    plain = looked_at(answer, Look(), clouds, centers, features, HUMAN15)
-    other = looked_at(answer, Look(turns, mirrored, shift), clouds, centers, features, HUMAN15)
+    plain, other = looked_at(Look()), looked_at(Look(turns, mirrored, shift))
     np.testing.assert_allclose(other.joints, plain.joints, atol=1e-5)
     # a mirrored left hand is the right one's
     flip = np.array(HUMAN15.flip) if mirrored else np.arange(len(HUMAN15))

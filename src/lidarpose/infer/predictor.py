@@ -11,11 +11,11 @@ from lidarpose.errors import InputError, missing_extra, unknown_name
 from lidarpose.infer.backend import Backend, Estimates, OnnxBackend, estimates, exported_beside
 from lidarpose.infer.people import MIN_POINTS, as_origin, as_points, candidates, clean, unit_warning
 from lidarpose.infer.results import PersonPose, Poses
-from lidarpose.infer.tta import Look, averaged, looked_at, looks_of
+from lidarpose.infer.tta import Look, averaged, brought_back, looks_of, shown
 from lidarpose.model.bundled import BUNDLED, weights_path
 from lidarpose.model.decode import decoder
 from lidarpose.model.header import read_header
-from lidarpose.model.plan import WINDOW, view_features
+from lidarpose.model.plan import WINDOW
 from lidarpose.sample import Pose, center_of
 from lidarpose.skeleton import SMPL24, Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
@@ -196,13 +196,9 @@ class Predictor:
         return averaged([self.outputs(clouds, centers, origin), *others])
 
     def _look(self, look: Look, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Estimates:
-        def answer(about: list[np.ndarray], features: np.ndarray) -> Estimates:
-            return estimates(self.backend.run(about, features), self._decoder)
-
-        def features(middle: np.ndarray) -> np.ndarray:
-            return np.stack([view_features(center, origin) for center in middle])
-
-        return looked_at(answer, look, clouds, centers, features, self.skeleton)
+        about, view = shown(look, clouds, centers, origin)
+        found = estimates(self.backend.run(about, view), self._decoder)
+        return brought_back(found, look, self.skeleton)
 
 
 def _shown(starts: range, progress: bool):

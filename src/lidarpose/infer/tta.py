@@ -6,17 +6,18 @@ from look to look, where a point falls into another voxel; their mean is better 
 Legend: B people, J joints.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.infer.backend import Estimates
+from lidarpose.model.plan import view_features
 from lidarpose.skeleton import Skeleton
 
 # a look counts by its mean confidence to this power: who is turned round in one of four is outvoted
 _POWER = 8
+_NAMES = ("joints", "confidence", "spread", "visible", "in_range")
 _QUARTERS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 
 
@@ -56,32 +57,25 @@ def looks_of(count: int) -> tuple[Look, ...]:
     return LOOKS[:count]
 
 
-def looked_at(
-    answer: Callable[[list[np.ndarray], np.ndarray], Estimates],
-    look: Look,
-    clouds: list[np.ndarray],
-    centers: np.ndarray,
-    features: Callable[[np.ndarray], np.ndarray],
-    skeleton: Skeleton,
-) -> Estimates:
-    """What a network says of clouds (n, 3) m about centers (B, 3) when they are shown so, brought back.
-
-    answer(about, features): the network's, of clouds about their centers and view features (B, 5);
-    features(centers): these, unturned; skeleton: the network's.
-    """
+def shown(
+    look: Look, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """Clouds (n, 3) m about centers (B, 3) as the look shows them, and their view features (B, 5) from a sensor at
+    origin (3,) or None."""
     R, middle = look.R_shown_person, centers + look.shift
-    toward = np.array(features(middle))
-    toward[:, :3] = toward[:, :3] @ R.T
-    found = answer([(points - center) @ R.T for points, center in zip(clouds, middle, strict=True)], toward)
-    found = replace(found, joints=found.joints @ R + look.shift)
+    view = np.stack([view_features(center, origin) for center in middle])
+    view[:, :3] = view[:, :3] @ R.T
+    return [(points - center) @ R.T for points, center in zip(clouds, middle, strict=True)], view
+
+
+def brought_back(found: Estimates, look: Look, skeleton: Skeleton) -> Estimates:
+    """What a network of this skeleton says of people shown so, about their own centers."""
+    found = replace(found, joints=found.joints @ look.R_shown_person + look.shift)
     if not look.mirrored:
         return found
     flip = np.array(skeleton.flip)
     values = {name: getattr(found, name) for name in _NAMES}
     return replace(found, **{name: None if value is None else value[:, flip] for name, value in values.items()})
-
-
-_NAMES = ("joints", "confidence", "spread", "visible", "in_range")
 
 
 def averaged(found: list[Estimates]) -> Estimates:
