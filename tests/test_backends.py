@@ -17,7 +17,7 @@ from lidarpose.errors import InputError, MissingExtra
 from lidarpose.infer.backend import Raw, estimates
 from lidarpose.infer.predictor import Predictor, load
 from lidarpose.model import decode, heads
-from lidarpose.model.bundled import bundled_path
+from lidarpose.model.bundled import DEFAULT, bundled_path
 from lidarpose.model.checkpoint import import_released, load_checkpoint, save_checkpoint
 from lidarpose.model.dapt.config import DaptConfig
 from lidarpose.model.dapt.network import DaptNet
@@ -281,7 +281,7 @@ def test_backends_are_chosen(tmp_path):
         for call in calls:
             model = load(**call)
             assert model.backend.name == model.model["backend"] == name, call
-            assert model.model["name"] == ("mine" if "weights" in call else "tiny")
+            assert model.model["name"] == ("mine" if "weights" in call else DEFAULT)
 
 
 BAD = {
@@ -465,7 +465,7 @@ for call in (lambda: lidarpose.export, lambda: lidarpose.import_dapt, lambda: li
         assert re.fullmatch(rf"lidarpose: error: .*: pip install 'lidarpose\[{extra}\]'", line), line
     found = [re.search(r"(.*) needs .*\[(.*)\]", line).groups() for line in done.stdout.splitlines()]
     assert found[:2] == [("lidarpose.export", "export"), ("lidarpose.import_dapt", "train")]
-    assert found[2] == ("running tiny.safetensors with torch", "train")
+    assert found[2] == (f"running {DEFAULT}.safetensors with torch", "train")
 
 
 def test_a_bad_file_is_told_before_torch_is_asked_for(tmp_path):

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from lidarpose.cli import main
+from lidarpose.model.bundled import DEFAULT
 from lidarpose.synth.generate import Generator
 from lidarpose.synth.scene import scene_config
 
@@ -173,7 +174,8 @@ def test_a_crop_of_few_points_is_no_error(tmp_path, out, capsys):
 def test_info(capsys):
     assert run("info") == 0
     text = capsys.readouterr().out
-    for word in ("lidarpose ", "ONNX Runtime ", "torch ", "device ", "tiny", "MB", "parameters", "trained"):
+    words = ("lidarpose ", "ONNX Runtime ", "torch ", "device ", "tiny", "small", "MB", "default")
+    for word in (*words, "parameters", "trained"):
         assert word in text
 
 
@@ -194,7 +196,7 @@ def test_backends_and_decoders(crop, out):
 @pytest.mark.parametrize(
     "words, name, format, out",
     [
-        ([], "tiny", "onnx", "tiny.onnx"),
+        ([], DEFAULT, "onnx", f"{DEFAULT}.onnx"),
         (["tiny", "--format", "torch"], "tiny", "torch", "tiny.pt2"),
         (["runs/mine.safetensors", "--out", "deep/a.bin"], "mine", "onnx", "deep/a.bin"),
     ],

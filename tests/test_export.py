@@ -17,7 +17,15 @@ from lidarpose.model.checkpoint import load_checkpoint, save_checkpoint
 from lidarpose.model.export import PlanModule, check, export
 from lidarpose.model.header import digest, read_header
 from lidarpose.model.network import PoseNet
-from lidarpose.model.onnx_file import OUTPUTS, expected_inputs, network_inputs, open_onnx, plan_people
+from lidarpose.model.onnx_file import (
+    OUTPUTS,
+    expected_inputs,
+    input_name,
+    network_inputs,
+    open_onnx,
+    open_session,
+    plan_people,
+)
 from lidarpose.model.presets import NetworkConfig
 
 CARD = {"command": "none", "note": "random"}
@@ -74,6 +82,48 @@ def test_onnx_gives_what_torch_gives(folder, sizes):
         np.testing.assert_allclose(getattr(ours, name), getattr(due, name), rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(ours.heatmaps, due.heatmaps, rtol=1e-4, atol=1e-4)
     assert np.ptp(due.heatmaps[0]) > 0.1
+
+
+def test_float16_weights_stay_float16(folder, monkeypatch):
+    """A smaller file, and not a bit of any output is lost."""
+    monkeypatch.setattr(exporting, "_pack", lambda graph: None)
+    network, header = load_checkpoint(folder / "net.safetensors")
+    whole = exporting.onnx_bytes(network, {})
+    packed = (folder / "net.onnx").read_bytes()
+    parameters = sum(value.numel() for value in network.parameters())
+    assert len(packed) < len(whole) - 1.5 * parameters
+    arrays = network_inputs(plan_people(*people(300, 5, 900), header.config))
+    given = {input_name(name): array for name, array in arrays.items()}
+    for ours, due in zip(*(open_session(file, threads=1).run(None, given) for file in (packed, whole)), strict=True):
+        np.testing.assert_array_equal(ours, due)
+
+
+def test_weights_that_need_all_of_float32_keep_it():
+    rng = np.random.default_rng(0)
+    kept = {
+        "fine": rng.normal(size=100).astype(np.float32),
+        "large": np.full(100, 1e6, np.float32),
+        "few": np.ones(3, np.float32),
+        "whole": np.arange(100),
+    }
+    half = rng.normal(size=100).astype(np.float16).astype(np.float32)
+    arrays = kept | {"half": half}
+    graph = onnx.helper.make_graph(
+        [onnx.helper.make_node("Identity", ["half"], ["out"])],
+        "weights",
+        [],
+        [onnx.helper.make_tensor_value_info("out", onnx.TensorProto.FLOAT, [100])],
+        [onnx.numpy_helper.from_array(array, name) for name, array in arrays.items()],
+    )
+    exporting._pack(graph)
+    stored = {tensor.name: onnx.numpy_helper.to_array(tensor) for tensor in graph.initializer}
+    assert list(stored) == [*kept, "half.half"] and stored["half.half"].dtype == np.float16
+    for name, array in kept.items():
+        assert stored[name].dtype == array.dtype
+        np.testing.assert_array_equal(stored[name], array)
+    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=8)
+    onnx.checker.check_model(model)
+    np.testing.assert_array_equal(open_session(model.SerializeToString(), threads=1).run(None, {})[0], half)
 
 
 @pytest.mark.parametrize("sizes", SIZES, ids=str)

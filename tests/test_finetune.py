@@ -317,7 +317,7 @@ def test_from_raw_files_to_scores(datasets, name, epochs, tmp_path, capsys, monk
     """Raw files, prepare, a few steps, evaluate: the joints come out where they went in, and the steps pay."""
     monkeypatch.chdir(tmp_path)
     words = ["finetune", str(datasets[name]), "--out", "run", "--workers", "0", "--batch", "8", "--mix", "0"]
-    assert not main([*words, "--epochs", str(epochs), "--pictures", "2"])
+    assert not main([*words, "--init", "tiny", "--epochs", str(epochs), "--pictures", "2"])
     network, header = load_checkpoint("run/model.safetensors")
     # one skeleton for all: anchors and heads are those of the bundled weights
     assert header.config == load("tiny").header.config and header.card["data"] == [name]

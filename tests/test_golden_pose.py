@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import lidarpose
-from lidarpose.model.bundled import BUNDLED
+from lidarpose.model.bundled import BUNDLED, DEFAULT, bundled_path
 from lidarpose.skeleton import SMPL24
 
 GOLDEN = json.loads((Path(__file__).parent / "golden_poses.json").read_text())
@@ -32,3 +32,9 @@ def test_the_golden_pose_is_a_good_one(name):
     """Within 6 cm of the truth on average, so that what is held is no nonsense."""
     error = np.linalg.norm(np.array(GOLDEN["joints"][name]) - np.array(GOLDEN["truth"]), axis=-1)
     assert len(error) == len(SMPL24) and error.mean() < 0.06, f"{error.mean() * 1e3:.0f} mm"
+
+
+def test_the_files_are_small():
+    """What is taken by default is at most 6 MB with its ONNX twin, any file at most 12."""
+    sizes = {name: [bundled_path(name, end).stat().st_size for end in (".safetensors", ".onnx")] for name in BUNDLED}
+    assert sum(sizes[DEFAULT]) < 6e6 and max(map(max, sizes.values())) < 12e6

@@ -476,14 +476,14 @@ def test_a_sweep_of_another_up_axis_is_told(model, tmp_path, points):
 
 
 def test_load_takes_names_and_paths(model, points, tmp_path, monkeypatch):
-    from lidarpose.model.bundled import bundled_path
+    from lidarpose.model.bundled import DEFAULT, bundled_path
 
     copy = tmp_path / "mine.safetensors"
-    copy.write_bytes(bundled_path("tiny").read_bytes())
+    copy.write_bytes(bundled_path().read_bytes())
     (tmp_path / "odd.name").write_bytes(copy.read_bytes())
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "tiny").mkdir()
-    for given in (copy, str(copy), "mine.safetensors", Path("odd.name"), "odd.name", "tiny"):
+    (tmp_path / DEFAULT).mkdir()
+    for given in (copy, str(copy), "mine.safetensors", Path("odd.name"), "odd.name", DEFAULT):
         found = lidarpose.load(given).predict(points)
         np.testing.assert_allclose(found.joints, model.predict(points).joints, atol=1e-4)
 

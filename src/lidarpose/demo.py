@@ -11,6 +11,7 @@ from lidarpose.data.files import atomic_path
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.infer.files import TTA
 from lidarpose.infer.predictor import Predictor, load
+from lidarpose.model.bundled import DEFAULT
 
 SENSORS = ("vlp-32c", "os1-128", "hdl-64e")
 PEOPLE_EACH = 4
@@ -18,7 +19,7 @@ PEOPLE_EACH = 4
 _HARD = 0.4
 
 
-def run(folder: str | Path, *, seed: int, weights: str = "tiny") -> None:
+def run(folder: str | Path, *, seed: int, weights: str = DEFAULT) -> None:
     """Synthesizes, predicts, prints a table, and writes index.html and a PNG a sensor to `folder`, all or none.
 
     Raises MissingExtra without numba; InputError for a negative seed or a folder that cannot be written.

@@ -22,7 +22,7 @@ def add(commands) -> None:
     )
     evaluate.set_defaults(run=_evaluate)
     evaluate.add_argument(
-        "weights", metavar="CHECKPOINT", help="bundled weights (tiny), a checkpoint or an exported .onnx"
+        "weights", metavar="CHECKPOINT", help="bundled weights (small, tiny), a checkpoint or an exported .onnx"
     )
     evaluate.add_argument(
         "datasets", nargs="+", metavar="DATASET", help="a folder that prepare or synth wrote, or bench"

@@ -5,6 +5,8 @@ import sys
 from contextlib import ExitStack
 from pathlib import Path
 
+from lidarpose.model.bundled import DEFAULT
+
 # people named by a warning that several share
 _MOST_NAMED = 3
 
@@ -31,7 +33,10 @@ def add(commands) -> None:
     predict.add_argument("--out", default=".", metavar="DIR", help="folder for the results; - prints the JSON")
     predict.add_argument("--picture", action="store_true", help="also draw STEM.poses.png")
     predict.add_argument(
-        "--weights", default="tiny", metavar="NAME|FILE", help="bundled weights, a checkpoint or an exported .onnx"
+        "--weights",
+        default=DEFAULT,
+        metavar="NAME|FILE",
+        help="small (default) or tiny, a checkpoint, or an exported .onnx",
     )
     predict.add_argument(
         "--backend",
@@ -50,7 +55,7 @@ def add(commands) -> None:
     demo.set_defaults(run=_demo)
     demo.add_argument("--out", default="lidarpose-demo", metavar="DIR", help="folder (default lidarpose-demo)")
     demo.add_argument("--seed", type=int, default=7, metavar="N")
-    demo.add_argument("--weights", default="tiny", metavar="NAME|FILE", help="bundled weights or a checkpoint")
+    demo.add_argument("--weights", default=DEFAULT, metavar="NAME|FILE", help="small (default), tiny, or a checkpoint")
 
 
 def _predict(options: argparse.Namespace) -> None:

@@ -4,6 +4,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from lidarpose.model.bundled import DEFAULT
+
 
 def add(commands) -> None:
     """Adds the commands to the parser's."""
@@ -16,7 +18,7 @@ def add(commands) -> None:
         description="Writes a checkpoint as one file of another format, for any number of people and points.",
     )
     export.set_defaults(run=_export)
-    export.add_argument("weights", nargs="?", default="tiny", metavar="NAME|FILE", help="default tiny")
+    export.add_argument("weights", nargs="?", default=DEFAULT, metavar="NAME|FILE", help=f"default {DEFAULT}")
     export.add_argument("--format", default="onnx", metavar="NAME", help="onnx (default) or torch (a .pt2 program)")
     export.add_argument("--out", metavar="FILE", help="default STEM.onnx or STEM.pt2, in the current folder")
 

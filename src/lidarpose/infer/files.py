@@ -14,6 +14,7 @@ from lidarpose.geometry import rotation_from_up
 from lidarpose.infer.people import MIN_POINTS, as_origin, flat_axis, lies, unit_warning
 from lidarpose.infer.predictor import Predictor, load
 from lidarpose.infer.results import PersonPose, Poses
+from lidarpose.model.bundled import DEFAULT
 from lidarpose.sample import Box
 
 # a file of less than this across is taken for a crop, m
@@ -33,7 +34,7 @@ def predict(
     skeleton: str | None = None,
     up: str = "z",
     columns: int | None = None,
-    model: Predictor | str | os.PathLike | Callable[[], Predictor] = "tiny",
+    model: Predictor | str | os.PathLike | Callable[[], Predictor] = DEFAULT,
     progress: bool = False,
 ) -> Poses:
     """Poses of the people in a point file, in the file's own frame.

@@ -5,7 +5,7 @@ from importlib import metadata
 from importlib.util import find_spec
 
 from lidarpose._version import __version__
-from lidarpose.model.bundled import BUNDLED, bundled_path
+from lidarpose.model.bundled import BUNDLED, DEFAULT, bundled_path
 from lidarpose.model.header import parameter_count, read_header
 from lidarpose.model.onnx_file import usable_threads
 
@@ -27,7 +27,7 @@ def lines() -> list[str]:
         exported = bundled_path(name, ".onnx").stat().st_size / 1e6
         out += [
             f"weights    {name}: {path.stat().st_size / 1e6:.2f} MB, {parameter_count(path):,} parameters, "
-            f"as ONNX {exported:.2f} MB",
+            f"as ONNX {exported:.2f} MB{', the default' if name == DEFAULT else ''}",
             f"  trained  {card.get('command', 'unknown')}",
             f"           {card.get('people_seen', 0):,} people, {card.get('hours', 0)} hours",
         ]

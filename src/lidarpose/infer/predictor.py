@@ -12,7 +12,7 @@ from lidarpose.infer.backend import Backend, Estimates, OnnxBackend, estimates, 
 from lidarpose.infer.people import MIN_POINTS, as_origin, as_points, candidates, clean, unit_warning
 from lidarpose.infer.results import PersonPose, Poses
 from lidarpose.infer.tta import Look, averaged, brought_back, looks_of, shown
-from lidarpose.model.bundled import BUNDLED, weights_path
+from lidarpose.model.bundled import BUNDLED, DEFAULT, weights_path
 from lidarpose.model.decode import decoder
 from lidarpose.model.header import read_header
 from lidarpose.model.plan import WINDOW
@@ -31,7 +31,7 @@ _MOST_NAMED = 3
 
 
 def load(
-    weights: str | os.PathLike = "tiny",
+    weights: str | os.PathLike = DEFAULT,
     *,
     device: str = "cpu",
     backend: str | None = None,

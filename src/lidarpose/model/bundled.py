@@ -7,9 +7,11 @@ from pathlib import Path
 from lidarpose.errors import unknown_name
 
 BUNDLED = ("tiny", "small")
+# what is taken where nothing is named: the best whose two files are at most 6 MB
+DEFAULT = "small"
 
 
-def bundled_path(name: str = "tiny", suffix: str = ".safetensors") -> Path:
+def bundled_path(name: str = DEFAULT, suffix: str = ".safetensors") -> Path:
     """Where the package keeps a bundled checkpoint, or with the suffix .onnx its exported twin."""
     if name not in BUNDLED:
         raise unknown_name("bundled weights", name, BUNDLED)

@@ -26,6 +26,8 @@ _OPSET = 18
 _TRACED, _CHECKED = (300, 60, 700), ((1, 2000, 37, 0, 9), (1,))
 # an exported network may differ from torch's by rounding; its logits are of order ten
 _TOLERANCE = 1e-3
+# an array of fewer numbers is not worth a node
+_WORTH = 64
 
 
 class PlanModule(nn.Module):
@@ -42,11 +44,12 @@ class PlanModule(nn.Module):
 
 
 def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = "onnx") -> None:
-    """Writes the checkpoint at `weights` as a file of another format, float32, whole or not at all.
+    """Writes the checkpoint at `weights` as a file of another format, computing in float32, whole or not at all.
 
-    format: "onnx", a self-contained file that ONNX Runtime and this package run without torch, or "torch", a program
-    (.pt2) for `torch.export.load`. Both take any number of people and points; `onnx_file` tells the inputs. Raises
-    InputError for a file that is no checkpoint of this package's own networks, MissingExtra without onnx.
+    format: "onnx", a self-contained file that ONNX Runtime and this package run without torch, no larger than the
+    checkpoint where that keeps float16; or "torch", a program (.pt2) for `torch.export.load`. Both take any number of
+    people and points; `onnx_file` tells the inputs. Raises InputError for a file that is no checkpoint of this
+    package's own networks, MissingExtra without onnx.
     """
     if format not in FORMATS:
         raise unknown_name("format", format, FORMATS)
@@ -115,6 +118,7 @@ def onnx_bytes(network: PoseNet, metadata: dict[str, str]) -> bytes:
         del value.metadata_props[:]
     del model.graph.metadata_props[:], model.graph.value_info[:]
     _name_axes(model.graph, list(arrays))
+    _pack(model.graph)
     onnx.helper.set_model_props(model, metadata)
     model.producer_name, model.producer_version = "lidarpose", Header(config=network.config, card={}).version
     onnx.checker.check_model(model)
@@ -152,6 +156,30 @@ def _free(arrays: dict[str, np.ndarray]) -> tuple:
     """Which axes may have any length: people, and rows of a level."""
     free = torch.export.Dim.DYNAMIC
     return (tuple({0: free} if name == "view" else {0: free, 1: free} for name in arrays),)
+
+
+def _pack(graph) -> None:
+    """Keeps weights as float16 where that loses nothing, as of a checkpoint in float16: half the file.
+
+    A node brings each back to float32; runtimes do that once, when they open the file.
+    """
+    from onnx import TensorProto, helper, numpy_helper
+
+    casts = []
+    for weight in graph.initializer:
+        if weight.data_type != TensorProto.FLOAT:
+            continue
+        values = numpy_helper.to_array(weight)
+        with np.errstate(over="ignore"):
+            half = values.astype(np.float16)
+        if values.size < _WORTH or not np.array_equal(half.astype(np.float32), values):
+            continue
+        name = weight.name
+        weight.CopyFrom(numpy_helper.from_array(half, f"{name}.half"))
+        casts.append(helper.make_node("Cast", [weight.name], [name], to=TensorProto.FLOAT))
+    nodes = [*casts, *graph.node]
+    del graph.node[:]
+    graph.node.extend(nodes)
 
 
 def _name_axes(graph, names: list[str]) -> None:

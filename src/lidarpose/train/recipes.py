@@ -8,6 +8,7 @@ from math import isfinite
 from typing import Any
 
 from lidarpose.errors import InputError, unknown_name
+from lidarpose.model.bundled import DEFAULT
 
 # rises, stays, falls to nothing; or rises and falls as a cosine
 SCHEDULES = ("plateau", "cosine")
@@ -108,7 +109,7 @@ class Finetune(Recipe):
     rate: float = _setting(5e-4, "peak learning rate of AdamW")
     muon_rate: float = _setting(5e-3, "peak learning rate of Muon for hidden matrices; 0: AdamW for all")
     data: tuple[str, ...] = _setting((), "their folders")
-    init: str = _setting("tiny", "weights to begin with: bundled, or a checkpoint")
+    init: str = _setting(DEFAULT, "weights to begin with: bundled, or a checkpoint")
     epochs: float = _setting(20.0, "how often everybody is seen")
     split: str = _setting("train", "whom to learn from; all: everybody")
     interval: int = _setting(1, "only every so many frames, as published recipes thin out")
