@@ -152,9 +152,12 @@ class Predictor:
             owner += [i] * len(found)
         best: dict[int, Pose] = {}
         batch = self.backend.batch
+        # people of like size together: a batch costs as much as if all were its largest
+        order = sorted(range(len(clouds)), key=lambda k: len(clouds[k]))
         for start in _shown(range(0, len(clouds), batch), progress):
-            part = slice(start, start + batch)
-            for i, pose in zip(owner[part], self._poses(clouds[part], origin), strict=True):
+            part = order[start : start + batch]
+            for k, pose in zip(part, self._poses([clouds[k] for k in part], origin), strict=True):
+                i = owner[k]
                 if pose is not None and (i not in best or _surer(pose, best[i])):
                     best[i] = pose
         for i in sorted(set(owner)):
