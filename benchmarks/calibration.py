@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 
 from lidarpose.evaluate.metrics import auroc, calibration_error
 from lidarpose.infer.predictor import load
+from lidarpose.model.bundled import DEFAULT
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import PoseBank
 from lidarpose.train.example import seen
@@ -28,7 +29,7 @@ def main() -> None:
     parser.add_argument("--motion", required=True)
     parser.add_argument("--subjects", default="006,007")
     parser.add_argument("--people", type=int, default=1000)
-    parser.add_argument("--weights", default="tiny")
+    parser.add_argument("--weights", default=DEFAULT)
     parser.add_argument("--out", help="PNG of the reliability plot")
     options = parser.parse_args()
     bank = PoseBank.from_clips(options.motion, tuple(options.subjects.split(",")))

@@ -16,6 +16,7 @@ import numpy as np
 from lidarpose.evaluate.metrics import auroc, calibration_error, mpjpe, pa_mpjpe
 from lidarpose.geometry import rotation_about
 from lidarpose.infer.predictor import load
+from lidarpose.model.bundled import DEFAULT
 from lidarpose.skeleton import HUMAN15, SMPL24, WAYMO14
 from lidarpose.synth.bodies import PoseBank
 from lidarpose.synth.generate import Generator, SyntheticPerson
@@ -106,7 +107,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--motion", required=True, help="npz of clips, see lidarpose.body.clips")
     parser.add_argument("--subjects", default="006,007", help="subjects kept out of training")
-    parser.add_argument("--weights", default="tiny")
+    parser.add_argument("--weights", default=DEFAULT)
     parser.add_argument("--people", type=int, default=1000)
     parser.add_argument("--least", type=int, default=50, help="fewest points a person")
     parser.add_argument("--seed", type=int, default=SEED)

@@ -17,6 +17,7 @@ import numpy as np
 import lidarpose
 from lidarpose.data.files import write_atomic
 from lidarpose.infer.files import TTA
+from lidarpose.model.bundled import DEFAULT
 from lidarpose.skeleton import SMPL24
 from lidarpose.view.person import facing
 
@@ -37,7 +38,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--least", type=int, default=50, help="fewest points a person")
-    parser.add_argument("--weights", default="tiny")
+    parser.add_argument("--weights", default=DEFAULT)
     parser.add_argument("--tta", type=int, default=TTA, help="looks at each person")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write people's figures")
     options = parser.parse_args()

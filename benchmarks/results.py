@@ -1,11 +1,11 @@
-"""The tables of docs/results.md and of the model cards in docs/cards, from the scores that lie in docs/scores.
+"""The tables of docs/results.md, docs/evaluation.md and the model cards in docs/cards, from the scores in docs/scores.
 
     python benchmarks/results.py --collect runs/ablations     # runs' scores.json -> docs/scores/ablations.json
     python benchmarks/results.py                              # docs/scores -> the tables of the pages
     python benchmarks/results.py --check                      # exit code 1 where they differ
 
-docs/scores/NAME.json is what `lidarpose evaluate NAME bench` wrote, test_time.json and visibility.json beside it what
-the benchmarks of these names did.
+docs/scores/NAME.json is what `lidarpose evaluate NAME bench` wrote, stability/NAME.json what it writes besides with
+`--stability`, test_time.json and visibility.json what the benchmarks of these names did.
 
 A table stands between `<!-- table NAME -->` and `<!-- end -->`; the words around it are left as they are.
 
@@ -18,20 +18,22 @@ import json
 import math
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
+import stability_tables as disturbed
 
 from lidarpose.data.files import write_atomic
 from lidarpose.evaluate.result import OURS, Line, Result, Scores, read_scores
-from lidarpose.model.bundled import BUNDLED, bundled_path
+from lidarpose.model.bundled import BUNDLED, DEFAULT, bundled_path
 from lidarpose.model.header import digest, read_header
 
 ROOT = Path(__file__).parents[1]
-SCORES = ROOT / "docs" / "scores"
-PAGES = (ROOT / "docs" / "results.md", *(ROOT / "docs" / "cards" / f"{name}.md" for name in BUNDLED))
+DOCS = ROOT / "docs"
+SCORES = DOCS / "scores"
+PAGES = (DOCS / "results.md", DOCS / "evaluation.md", *(DOCS / "cards" / f"{name}.md" for name in BUNDLED))
 RUNS = "ablations.json"
 BASE = "base"
 _MARKED = re.compile(r"(<!-- table ([^>]+?) -->\n).*?(<!-- end -->)", re.S)
@@ -49,6 +51,8 @@ FIGURES = {
     "turned round": ("points", None, "turned_round"),
     "PA": ("all", "all", "pa_mpjpe"),
 }
+# studies of one seed, shown in one table
+_MORE = ("levels", "mask", "scene", "motion", "network", "steps")
 _SHOWN = ("plain", "clean", "cluttered", "occluded", "turned round")
 
 
@@ -113,10 +117,10 @@ def table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
     return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
 
 
-def study(runs: list[dict], name: str | None = None) -> str:
-    """The variants of a study, or of all, beside `base`, at the length that most runs have."""
+def study(runs: list[dict], studies: Collection[str] | None = None) -> str:
+    """The variants of some studies, or of all, beside `base`, at the length that most runs have."""
     own = _common(runs)
-    names = dict.fromkeys(run["variant"] for run in runs if name in (None, run["study"]))
+    names = dict.fromkeys(run["variant"] for run in runs if studies is None or run["study"] in studies)
     chosen = [variant for variant in names if variant != BASE and own.seeds(variant)]
     chosen.sort(key=lambda variant: own.mean(variant, "all"))
     header = ("", "MPJPE mm", "against base", *_SHOWN, "seeds")
@@ -172,18 +176,29 @@ def _longest() -> dict[int, dict[str, float]]:
 
 
 def against_paper(runs: list[dict]) -> str:
-    own = _common(runs)
-    ways = [v for v in dict.fromkeys(run["variant"] for run in runs if run["study"] == "paper") if own.seeds(v)]
+    """`base` and the paper's design, at every length at which both ran."""
     rows = []
-    for variant in (BASE, *ways):
-        one = own.by[variant, own.seeds(variant)[0]]
-        lost = own.mean(variant, "cluttered") - own.mean(variant, "clean")
-        what = "ours: `tiny` and its recipe" if variant == BASE else one["what"]
-        figures = [f"{own.mean(variant, figure):.1f}" for figure in ("all", "plain", "clean", "cluttered")]
-        minutes = np.mean([own.by[variant, seed]["processor_seconds"] for seed in own.seeds(variant)]) / 60
-        rows.append((what, f"{one['parameters']:,}", *figures, f"{lost:+.1f}", f"{minutes:.0f}"))
-    header = ("", "parameters", "MPJPE mm", "plain", "clean", "cluttered", "lost to clutter", "processor minutes")
-    return table(header, rows)
+    for people in sorted({run["people"] for run in runs if run["study"] == "paper"}):
+        own = Runs(runs, people)
+        ways = [v for v in dict.fromkeys(run["variant"] for run in runs if run["study"] == "paper") if own.seeds(v)]
+        rows += [_beside(own, variant) for variant in (BASE, *ways)]
+    header = ("", "people seen", "parameters", "MPJPE mm", "plain", "clean", "cluttered", "lost to clutter")
+    return table((*header, "processor minutes"), rows)
+
+
+def _beside(own: Runs, variant: str) -> tuple[str, ...]:
+    one = own.by[variant, own.seeds(variant)[0]]
+    lost = own.mean(variant, "cluttered") - own.mean(variant, "clean")
+    what = "ours: `tiny` and its recipe" if variant == BASE else one["what"]
+    figures = [f"{own.mean(variant, figure):.1f}" for figure in ("all", "plain", "clean", "cluttered")]
+    minutes = np.mean([own.by[variant, seed]["processor_seconds"] for seed in own.seeds(variant)]) / 60
+    return what, f"{own.people:,}", f"{one['parameters']:,}", *figures, f"{lost:+.1f}", f"{minutes:.0f}"
+
+
+def strays(**networks: str) -> str:
+    """What clusters of stray points cost networks, by the name of their study."""
+    header = ("", "undisturbed, mm", *(f"two of {amount} points" for amount in disturbed.amounts(next(iter(networks)))))
+    return table(header, [(what, *disturbed.strays(name)) for name, what in networks.items()])
 
 
 def _common(runs: list[dict]) -> Runs:
@@ -252,9 +267,12 @@ def card(model: str) -> str:
         ("hours", f"{told['hours']:.2f}"),
         ("captured motion", f"{told['motion']}, subjects {', '.join(told['recipe']['subjects'])}"),
     ]
-    if "init_card" in told:
-        begun = told["init_card"]
-        rows.append(("begun as", f"{told['recipe']['init']}, grown: {begun['people_seen']:,} people before"))
+    stages, stage = [], told
+    while "init_card" in stage:
+        name, stage = stage["recipe"]["init"], stage["init_card"]
+        stages.append(f"{name}, {stage['people_seen']:,} people before")
+    if stages:
+        rows.append(("begun as", "; itself begun as ".join(stages)))
     if "note" in told:
         rows.append(("note", told["note"]))
     return table(("", ""), rows)
@@ -312,12 +330,22 @@ def tables() -> dict[str, Callable[[], str]]:
     """What makes each table, by name."""
     every = json.loads((SCORES / RUNS).read_text())
     runs, later = ([run for run in every if bool(run["begun"]) == begun] for begun in (False, True))
-    made = {f"study {name}": partial(study, runs, name) for name in {run["study"] for run in runs}}
+    made = {f"study {name}": partial(study, runs, {name}) for name in {run["study"] for run in runs}}
+    made["study more"] = partial(study, runs, _MORE)
     made |= {"scaling": lambda: scaling(runs, _longest()), "noise": partial(noise, runs)}
     made |= {"continued": partial(study, later), "noise continued": partial(noise, later)}
     made |= {"against the paper": partial(against_paper, runs)}
     made |= {"visibility": visibility, "real": real}
     made["headline"] = partial(headline, *BUNDLED)
+    made["stability"] = lambda: table(("", "undisturbed", *5 * ("",)), disturbed.curves(DEFAULT))
+    made["stability sensors"] = lambda: table(("sensor", "points", "MPJPE mm"), disturbed.sensors(DEFAULT))
+    made["stability ends"] = lambda: table(("", "mean, mm", "deviation"), disturbed.ends(DEFAULT))
+    made["strays"] = partial(
+        strays,
+        paper="the paper's design, faster rates, 98,304 people",
+        ours="ours: `tiny` and its recipe, 98,304 people",
+        small="`small` as it ships",
+    )
     for model in BUNDLED:
         made[f"{model} card"] = partial(card, model)
         groups = dict.fromkeys(["all+condition", *(line.group for line in _own(_scored(model).results[0]))])

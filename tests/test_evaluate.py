@@ -27,6 +27,7 @@ from lidarpose.evaluate.run import judge, task_of
 from lidarpose.geometry import rotation_about
 from lidarpose.infer.backend import Estimates
 from lidarpose.infer.results import PersonPose, Poses
+from lidarpose.model.bundled import DEFAULT
 from lidarpose.sample import Box, Pose, center_of
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14, Skeleton
 
@@ -558,7 +559,7 @@ def test_the_public_name_is_there():
 def test_the_readme_s_figures_are_those_of_the_bundled_weights_on_the_bench():
     readme = (Path(__file__).parents[1] / "README.md").read_text("utf-8")
     row = re.search(r"^\| sensor's place known \|(.*)\|$", readme, re.MULTILINE)[1]
-    result = evaluation.evaluate("tiny", "bench")
+    result = evaluation.evaluate(DEFAULT, "bench")
     conditions = [
         result.line("mpjpe", "condition", name) for name in ("clean", "cluttered", "company", "crop", "occluded")
     ]

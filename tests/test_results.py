@@ -1,7 +1,6 @@
 """The tables of the docs: they say what the scores say, and differences come with intervals that are right."""
 
-import importlib.util
-import sys
+import importlib
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +11,10 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
 @pytest.fixture(scope="module")
 def results():
-    spec = importlib.util.spec_from_file_location("results", BENCHMARKS / "results.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["results"] = module
-    spec.loader.exec_module(module)
-    return module
+    # what it imports lies beside it
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(BENCHMARKS)
+        yield importlib.import_module("results")
 
 
 def run(variant, seed, value, people=100, **more):

@@ -1,10 +1,10 @@
 """Judging a network on datasets: what `lidarpose evaluate` and `lidarpose table` call.
 
     from lidarpose import evaluation
-    result = evaluation.evaluate("tiny", "bench")             # or a Predictor, and a folder of prepare or synth
+    result = evaluation.evaluate("small", "bench")            # or a Predictor, and a folder of prepare or synth
     result.line("mpjpe").value, result.line("mpjpe", "joints", "wrists").low
-    evaluation.write(evaluation.run("tiny", ["bench"]), "evaluation/tiny")
-    print(evaluation.table(["evaluation/tiny"]))
+    evaluation.write(evaluation.run("small", ["bench"]), "evaluation/small")
+    print(evaluation.table(["evaluation/small"]))
 
 docs/evaluation.md tells the protocols and the files.
 """

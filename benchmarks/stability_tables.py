@@ -1,0 +1,61 @@
+"""Tables of what disturbed points cost, from the stability.json files that lie in docs/scores/stability.
+
+lidarpose evaluate small bench --stability --out study        # study/stability.json -> small.json
+"""
+
+import json
+from pathlib import Path
+
+FOLDER = Path(__file__).parents[1] / "docs" / "scores" / "stability"
+
+
+def read(name: str) -> dict:
+    """The study of a network."""
+    (found,) = json.loads((FOLDER / f"{name}.json").read_text())["studies"]
+    return found
+
+
+def curves(name: str) -> list[tuple[str, ...]]:
+    """A row a disturbance: its title, undisturbed, and "amount: MPJPE (people without a pose)" of each amount."""
+    rows = []
+    for curve in _curves(name).values():
+        if curve["name"] == "sensors":
+            continue
+        whole, *points = curve["points"]
+        cells = [f"{point['label']}: {_error(point)}" for point in points]
+        rows.append((curve["title"], f"{whole['mpjpe']:.1f}", *cells))
+    return rows
+
+
+def sensors(name: str) -> list[tuple[str, ...]]:
+    """A row a sensor: its name, the points of half of the people, MPJPE."""
+    points = _curves(name)["sensors"]["points"]
+    return [
+        (point["label"], f"{point['points']:.0f}", _error(point)) for point in sorted(points, key=lambda p: p["points"])
+    ]
+
+
+def ends(name: str) -> list[tuple[str, ...]]:
+    """A row an end joint: mean and deviation over the worst people."""
+    return [(end["group"], f"{end['mean']:.1f}", f"{end['deviation']:.1f}") for end in read(name)["ends"]]
+
+
+def strays(name: str) -> tuple[str, ...]:
+    """Undisturbed, and what each amount of stray points adds, with its interval."""
+    whole, *points = _curves(name)["clusters"]["points"]
+    added = (f"{p['increase']:+.1f} [{p['increase_low']:.1f}, {p['increase_high']:.1f}]" for p in points)
+    return f"{whole['mpjpe']:.1f}", *added
+
+
+def amounts(name: str) -> tuple[str, ...]:
+    """Of stray points in a cluster."""
+    return tuple(point["label"] for point in _curves(name)["clusters"]["points"][1:])
+
+
+def _curves(name: str) -> dict[str, dict]:
+    return {curve["name"]: curve for curve in read(name)["curves"]}
+
+
+def _error(point: dict) -> str:
+    lost = f" ({point['no_pose']})" if point["no_pose"] else ""
+    return f"{point['mpjpe']:.1f}{lost}"
