@@ -1,4 +1,4 @@
-"""Tables of what disturbed points cost, from the stability.json files that lie in docs/scores/stability.
+"""Rows of tables of what disturbed points cost, from the stability.json files that lie in docs/scores/stability.
 
 lidarpose evaluate small bench --stability --out study        # study/stability.json -> small.json
 """

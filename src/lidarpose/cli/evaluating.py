@@ -6,6 +6,8 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
 
+from lidarpose.model.bundled import BUNDLED
+
 # groups of lines that the terminal shows; the others are in scores.json
 _SHOWN = ("condition", "plain", "joints", "distance, m", "points", "hidden share")
 # figures of these groups that it shows, besides those of everybody
@@ -22,7 +24,7 @@ def add(commands) -> None:
     )
     evaluate.set_defaults(run=_evaluate)
     evaluate.add_argument(
-        "weights", metavar="CHECKPOINT", help="bundled weights (small, tiny), a checkpoint or an exported .onnx"
+        "weights", metavar="CHECKPOINT", help=f"{', '.join(BUNDLED)}, a checkpoint, or an exported .onnx"
     )
     evaluate.add_argument(
         "datasets", nargs="+", metavar="DATASET", help="a folder that prepare or synth wrote, or bench"

@@ -5,7 +5,7 @@ import sys
 from contextlib import ExitStack
 from pathlib import Path
 
-from lidarpose.model.bundled import DEFAULT
+from lidarpose.model.bundled import DEFAULT, NAMES
 
 # people named by a warning that several share
 _MOST_NAMED = 3
@@ -36,7 +36,7 @@ def add(commands) -> None:
         "--weights",
         default=DEFAULT,
         metavar="NAME|FILE",
-        help="small (default) or tiny, a checkpoint, or an exported .onnx",
+        help=f"{NAMES}, a checkpoint, or an exported .onnx",
     )
     predict.add_argument(
         "--backend",
@@ -55,7 +55,7 @@ def add(commands) -> None:
     demo.set_defaults(run=_demo)
     demo.add_argument("--out", default="lidarpose-demo", metavar="DIR", help="folder (default lidarpose-demo)")
     demo.add_argument("--seed", type=int, default=7, metavar="N")
-    demo.add_argument("--weights", default=DEFAULT, metavar="NAME|FILE", help="small (default), tiny, or a checkpoint")
+    demo.add_argument("--weights", default=DEFAULT, metavar="NAME|FILE", help=f"{NAMES}, or a checkpoint")
 
 
 def _predict(options: argparse.Namespace) -> None:

@@ -9,6 +9,8 @@ from lidarpose.errors import unknown_name
 BUNDLED = ("tiny", "small")
 # what is taken where nothing is named: the best whose two files are at most 6 MB
 DEFAULT = "small"
+# the same, to be read
+NAMES = ", ".join(f"{name} (default)" if name == DEFAULT else name for name in BUNDLED)
 
 
 def bundled_path(name: str = DEFAULT, suffix: str = ".safetensors") -> Path:
