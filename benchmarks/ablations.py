@@ -19,12 +19,12 @@ import shutil
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 
 import torch
 from ablation_networks import Uncounted, Unplaced, pooled, reading
-from results import figures
+from ablation_tables import figures
 from torch import nn
 
 from lidarpose import evaluation
@@ -39,6 +39,7 @@ from lidarpose.model.network import PoseNet
 from lidarpose.model.presets import NetworkConfig, preset
 from lidarpose.synth.generate import Generator
 from lidarpose.synth.scene import SCENES, SceneConfig
+from lidarpose.train.example import Example
 from lidarpose.train.job import Job, job_of
 from lidarpose.train.loop import train
 from lidarpose.train.pose_task import PoseTask
@@ -119,13 +120,25 @@ class VariantTask(PoseTask):
 
 @dataclass(frozen=True, kw_only=True)
 class SceneSource(SyntheticSource):
-    """`SyntheticSource` of a scene that has no name."""
+    """`SyntheticSource` of a scene that has no name, that remembers its people for the next variant shown the same."""
 
     config: SceneConfig
+
+    def example(self, index: int) -> Example:
+        known = _remembered(self)
+        if index not in known:
+            known[index] = super().example(index)
+        return known[index]
 
     @cached_property
     def _generator(self) -> Generator:
         return replace(super()._generator, scene=self.config)
+
+
+@lru_cache(maxsize=1)
+def _remembered(source: SceneSource) -> dict[int, Example]:
+    """Those of the last source alone: to make them takes a third of a run, to keep them 10 KB each."""
+    return {}
 
 
 def keeps_network(variant: Variant) -> bool:

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from ablation_tables import figures
 from ablations import arguments, each, record
-from results import figures
 
 from lidarpose import evaluation
 from lidarpose.infer.predictor import load

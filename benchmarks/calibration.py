@@ -1,6 +1,7 @@
 """Whether a joint's confidence, spread and visibility can be taken at their word, on held-out synthetic people.
 
-    python benchmarks/calibration.py --motion cmu_motion.npz --out docs/reliability.png
+    python benchmarks/calibration.py --motion cmu_motion.npz \\
+        --out docs/reliability.png --json docs/scores/calibration.json
 
 The people of benchmarks/heldout.py under another seed. Confidence says how likely a joint is within 10 cm, `visible`
 how likely a point of the body lies within 18 cm of it, `spread` how far off it is on average. Expected calibration
@@ -8,12 +9,15 @@ error is over ten equal bins; the plot shows them, with the share of joints in e
 """
 
 import argparse
+import json
+from pathlib import Path
 
 import heldout
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from lidarpose.data.files import write_atomic
 from lidarpose.evaluate.metrics import auroc, calibration_error
 from lidarpose.infer.predictor import load
 from lidarpose.model.bundled import DEFAULT
@@ -22,6 +26,14 @@ from lidarpose.synth.bodies import PoseBank
 from lidarpose.train.example import seen
 
 BINS = 10
+# what `spread` may say, m
+SPREADS = (
+    ("all", 0.0, np.inf),
+    ("under 5 cm", 0.0, 0.05),
+    ("5 to 10 cm", 0.05, 0.1),
+    ("10 to 20 cm", 0.1, 0.2),
+    ("over 20 cm", 0.2, np.inf),
+)
 
 
 def main() -> None:
@@ -31,6 +43,7 @@ def main() -> None:
     parser.add_argument("--people", type=int, default=1000)
     parser.add_argument("--weights", default=DEFAULT)
     parser.add_argument("--out", help="PNG of the reliability plot")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures")
     options = parser.parse_args()
     bank = PoseBank.from_clips(options.motion, tuple(options.subjects.split(",")))
     found = heldout.people(bank, options.people, 50, heldout.SEED + 9)
@@ -45,18 +58,23 @@ def main() -> None:
     told = np.stack([p.pose.visible for p in predicted])
     hit = error < heldout.HIT
     curves = {
-        "confidence: within 10 cm": (confidence.ravel(), hit.ravel()),
-        "visible: a point within 18 cm": (told.ravel(), visible.ravel()),
+        "confidence: the joint is within 10 cm": (confidence.ravel(), hit.ravel()),
+        "visible: a point of the body lies within 18 cm of the joint": (told.ravel(), visible.ravel()),
     }
+    found = {"weights": options.weights, "people": len(true), "stated": [], "spread": []}
     for name, (stated, truth) in curves.items():
-        print(f"{name}: ECE {calibration_error(stated, truth):.3f}, AUROC {auroc(stated, truth):.3f}")
-    stated, off = spread.mean() * 1e3, error.mean() * 1e3
-    print(f"spread: {stated:.1f} mm stated, {off:.1f} mm true, rank correlation {_rank(spread, error):.2f}")
-    for low, high in ((0, 0.05), (0.05, 0.1), (0.1, 0.2), (0.2, np.inf)):
+        one = {"what": name, "ece": calibration_error(stated, truth), "auroc": auroc(stated, truth)}
+        found["stated"].append(one)
+        print(f"{name}: ECE {one['ece']:.3f}, AUROC {one['auroc']:.3f}")
+    print(f"spread and error: rank correlation {_rank(spread, error):.2f}")
+    for name, low, high in SPREADS:
         there = (spread >= low) & (spread < high)
-        if there.any():
-            off = error[there].mean() * 1e3
-            print(f"  spread {low:.2f} to {high:.2f} m: {there.mean():6.1%} of joints, {off:6.1f} mm off")
+        one = {"of": name, "share": 100 * there.mean()}
+        one |= {"stated": spread[there].mean() * 1e3, "true": error[there].mean() * 1e3}
+        found["spread"].append({key: value if key == "of" else float(value) for key, value in one.items()})
+        print(f"  {name}: {one['share']:.1f} % of joints, {one['stated']:.1f} mm stated, {one['true']:.1f} mm true")
+    if options.json:
+        write_atomic(options.json, json.dumps(found, indent=1) + "\n")
     if options.out:
         _plot(curves, options.out)
 

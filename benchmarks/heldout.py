@@ -3,7 +3,7 @@
     python benchmarks/heldout.py --motion cmu_motion.npz --subjects 006,007
     python benchmarks/heldout.py --motion cmu_motion.npz --weights runs/tiny/model.safetensors --json scores.json
 
-Full difficulty of the scene preset `wild` (occluders, masks, clutter, noise, jittered crop boxes, ten sensors), at
+Full difficulty of the scene preset `wild` (occluders, masks, clutter, noise, jittered crop boxes, 14 sensors), at
 least 50 points a person, centered from the points alone: no box, no root joint. MPJPE on the 15 joints of human15.
 """
 

@@ -3,13 +3,15 @@
     python benchmarks/real.py FOLDER --json docs/scores/real.json
 
 FOLDER holds sweep_N.pcd, .bin or .ply, and beside each a sweep_N.json of boxes as `lidarpose predict` takes them.
-Prints for each person: points, distance, the angle between where the pose faces and where the box heads, the share of
-points within 15 cm of the skeleton's bones, lean of the trunk, confidence; and, for a track that two sweeps share, how
-far the pose moved against itself once both are put on one pelvis.
+Prints for each person: points, distance, the angle between where the pose faces and where the box heads, and that of a
+single look, the share of points within 15 cm of the skeleton's bones, lean of the trunk, confidence; and, for a track
+that two sweeps share, how far the pose moved against itself once both are put on one pelvis.
 """
 
 import argparse
 import json
+from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,8 @@ import numpy as np
 import lidarpose
 from lidarpose.data.files import write_atomic
 from lidarpose.infer.files import TTA
+from lidarpose.infer.predictor import Predictor
+from lidarpose.infer.results import PersonPose
 from lidarpose.model.bundled import DEFAULT
 from lidarpose.skeleton import SMPL24
 from lidarpose.view.person import facing
@@ -34,6 +38,48 @@ def distance_to_bones(points: np.ndarray, joints: np.ndarray) -> np.ndarray:
     return np.linalg.norm(points[:, None] - nearest, axis=-1).min(1)
 
 
+def rows_of(model: Predictor, single: Predictor, folder: Path, least: int) -> Iterator[tuple[dict, PersonPose]]:
+    """Each labelled person of `least` points and more, sweep by sweep: their figures and their pose."""
+    for labels in sorted(folder.glob("sweep_*.json")):
+        sweep = next(path for path in sorted(folder.glob(f"{labels.stem}.*")) if path.suffix != ".json")
+        boxes = {"people": json.loads(labels.read_text())["people"]}
+        people = (lidarpose.predict(sweep, boxes=boxes, model=one) for one in (model, single))
+        for person, once in zip(*people, strict=True):
+            if person.num_points < least or person.pose is None:
+                continue
+            trunk = person.joints[SMPL24.index("neck")] - person.joints[SMPL24.index("pelvis")]
+            row = {
+                "sweep": labels.stem,
+                "person": str(person.id)[:8],
+                "points": int(person.num_points),
+                "distance": float(np.linalg.norm(person.box.center)),
+                "turn": turn(person),
+                "turn_single": turn(once),
+                "near": float((distance_to_bones(person.points, person.joints) < NEAR).mean()),
+                "lean": float(np.degrees(np.arccos(trunk[2] / np.linalg.norm(trunk)))),
+                "confidence": float(person.confidence.mean()),
+            }
+            yield {key: round(value, 3) if isinstance(value, float) else value for key, value in row.items()}, person
+
+
+def turn(person: PersonPose) -> float:
+    """From where the box heads to where the pose faces, degrees."""
+    forward = facing(person.pose)
+    angle = np.arctan2(forward[1], forward[0]) - person.box.yaw
+    return float(np.degrees((angle + np.pi) % (2 * np.pi) - np.pi))
+
+
+def moved(people: list[tuple[dict, PersonPose]]) -> Iterator[dict]:
+    """How far a person's joints went from one sweep to the next, both pelvises in one place, mm."""
+    tracks: dict[str, list[np.ndarray]] = {}
+    pelvis = SMPL24.index("pelvis")
+    for row, person in people:
+        tracks.setdefault(row["person"], []).append(person.joints - person.joints[pelvis])
+    for name, seen in tracks.items():
+        for first, second in pairwise(seen):
+            yield {"person": name, "mm": round(float(np.linalg.norm(second - first, axis=-1).mean() * 1e3), 1)}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
@@ -42,45 +88,20 @@ def main() -> None:
     parser.add_argument("--tta", type=int, default=TTA, help="looks at each person")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write people's figures")
     options = parser.parse_args()
-    model = lidarpose.load(options.weights, tta=options.tta)
-    tracks: dict[str, list[np.ndarray]] = {}
-    rows = []
-    for labels in sorted(options.folder.glob("sweep_*.json")):
-        sweep = next(path for path in sorted(options.folder.glob(f"{labels.stem}.*")) if path.suffix != ".json")
-        entries = json.loads(labels.read_text())["people"]
-        poses = lidarpose.predict(sweep, boxes={"people": entries}, model=model)
-        for person in poses:
-            if person.num_points < options.least or person.pose is None:
-                continue
-            forward = facing(person.pose)
-            turn = np.arctan2(forward[1], forward[0]) - person.box.yaw
-            trunk = person.joints[SMPL24.index("neck")] - person.joints[SMPL24.index("pelvis")]
-            near = (distance_to_bones(person.points, person.joints) < NEAR).mean()
-            distance = np.linalg.norm(person.box.center)
-            row = {"sweep": labels.stem, "person": str(person.id)[:8], "points": int(person.num_points)}
-            row |= {
-                "distance": float(distance),
-                "turn": float(np.degrees((turn + np.pi) % (2 * np.pi) - np.pi)),
-                "near": float(near),
-                "lean": float(np.degrees(np.arccos(trunk[2] / np.linalg.norm(trunk)))),
-                "confidence": float(person.confidence.mean()),
-            }
-            rows.append({key: round(value, 3) if isinstance(value, float) else value for key, value in row.items()})
-            print(
-                f"{row['sweep']} {row['person']}  {row['points']:4d} points {row['distance']:5.1f} m"
-                f"  facing {row['turn']:5.0f} deg off the box  {row['near']:4.0%} near bones"
-                f"  lean {row['lean']:3.0f} deg  confidence {row['confidence']:.2f}"
-            )
-            tracks.setdefault(str(person.id), []).append(person.joints)
+    models = (lidarpose.load(options.weights, tta=looks) for looks in (options.tta, 1))
+    people = list(rows_of(*models, options.folder, options.least))
+    for row, _ in people:
+        print(
+            f"{row['sweep']} {row['person']}  {row['points']:4d} points {row['distance']:5.1f} m"
+            f"  facing {row['turn']:5.0f} deg off the box, with one look {row['turn_single']:5.0f}"
+            f"  {row['near']:4.0%} near bones  lean {row['lean']:3.0f} deg  confidence {row['confidence']:.2f}"
+        )
+    tracks = list(moved(people))
+    for one in tracks:
+        print(f"track {one['person']}: two sweeps differ by {one['mm']:.0f} mm a joint")
     if options.json:
-        write_atomic(options.json, json.dumps(rows, indent=1) + "\n")
-    pelvis = SMPL24.index("pelvis")
-    for track, seen in tracks.items():
-        for first, second in zip(seen[:-1], seen[1:], strict=True):
-            moved = (second - second[pelvis]) - (first - first[pelvis])
-            print(
-                f"track {track[:8]}: two sweeps differ by {np.linalg.norm(moved, axis=-1).mean() * 1e3:.0f} mm a joint"
-            )
+        found = {"people": [row for row, _ in people], "tracks": tracks}
+        write_atomic(options.json, json.dumps(found, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -8,107 +8,38 @@ docs/scores/NAME.json is what `lidarpose evaluate NAME bench` wrote, stability/N
 `--stability`, test_time.json and visibility.json what the benchmarks of these names did.
 
 A table stands between `<!-- table NAME -->` and `<!-- end -->`; the words around it are left as they are.
-
-A difference to `base` is the mean over the seeds that both have, seed by seed: each seed shows both the same people.
-Its 95 % interval is Student's, with the deviation between seeds taken over all variants of two seeds and more together.
 """
 
 import argparse
 import json
-import math
 import re
 import sys
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from functools import lru_cache, partial
 from pathlib import Path
 
-import numpy as np
+import ablation_tables as changed
 import stability_tables as disturbed
+from ablation_tables import figures, own_lines
 
 from lidarpose.data.files import write_atomic
-from lidarpose.evaluate.result import OURS, Line, Result, Scores, read_scores
+from lidarpose.evaluate.result import Line, Scores, read_scores
 from lidarpose.model.bundled import BUNDLED, DEFAULT, bundled_path
 from lidarpose.model.header import digest, read_header
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 SCORES = DOCS / "scores"
-PAGES = (DOCS / "results.md", DOCS / "evaluation.md", *(DOCS / "cards" / f"{name}.md" for name in BUNDLED))
+PAGES = (
+    *(DOCS / f"{page}.md" for page in ("results", "evaluation", "model")),
+    *(DOCS / "cards" / f"{name}.md" for name in BUNDLED),
+)
 RUNS = "ablations.json"
-BASE = "base"
+# people of the longer runs that ask again what the first ones do
+LONGER = 98_304
 _MARKED = re.compile(r"(<!-- table ([^>]+?) -->\n).*?(<!-- end -->)", re.S)
-# two-sided 95 % points of Student's t by degrees of freedom
-_STUDENT = {1: 12.71, 2: 4.30, 3: 3.18, 4: 2.78, 5: 2.57, 6: 2.45, 8: 2.31, 10: 2.23, 15: 2.13, 20: 2.09, 30: 2.04}
-# figures of a run that tables show: (group, of, figure) of `evaluate.result.Line`
-FIGURES = {
-    "all": ("all", "all", "mpjpe"),
-    "plain": ("plain", None, "mpjpe"),
-    "clean": ("condition", "clean", "mpjpe"),
-    "cluttered": ("condition", "cluttered", "mpjpe"),
-    "company": ("condition", "company", "mpjpe"),
-    "crop": ("condition", "crop", "mpjpe"),
-    "occluded": ("condition", "occluded", "mpjpe"),
-    "turned round": ("points", None, "turned_round"),
-    "PA": ("all", "all", "pa_mpjpe"),
-}
-# studies of one seed, shown in one table
+# studies shown in one table
 _MORE = ("levels", "mask", "scene", "motion", "network", "steps")
-_SHOWN = ("plain", "clean", "cluttered", "occluded", "turned round")
-
-
-def collect(folder: Path) -> list[dict]:
-    """What the runs of a folder scored, in a fixed order."""
-    runs = [json.loads(path.read_text()) for path in sorted(folder.rglob("scores.json"))]
-    return sorted(runs, key=lambda run: (run["study"], run["variant"], run["begun"], run["people"], run["seed"]))
-
-
-class Runs:
-    """Runs of one length, by variant and seed."""
-
-    def __init__(self, runs: list[dict], people: int):
-        self.people = people
-        self.by = {(run["variant"], run["seed"]): run for run in runs if run["people"] == people}
-        self.deviation, self.freedom = self._pooled()
-
-    def seeds(self, variant: str) -> list[int]:
-        return sorted(seed for name, seed in self.by if name == variant)
-
-    def mean(self, variant: str, figure: str) -> float:
-        return float(np.mean([self.value(variant, seed, figure) for seed in self.seeds(variant)]))
-
-    def value(self, variant: str, seed: int, figure: str) -> float:
-        return self.by[variant, seed]["figures"][figure]["value"]
-
-    def differences(self, variant: str, figure: str = "all") -> np.ndarray:
-        """One a seed that the variant and `base` have, mm."""
-        seeds = [seed for seed in self.seeds(variant) if (BASE, seed) in self.by]
-        return np.array([self.value(variant, seed, figure) - self.value(BASE, seed, figure) for seed in seeds])
-
-    def told(self, variant: str) -> str:
-        """The difference and its interval, and whether it is one."""
-        found = self.differences(variant)
-        if not len(found):
-            return "-"
-        if math.isnan(self.deviation):
-            return f"{found.mean():+.1f}"
-        reach = self.reach(len(found))
-        word = "" if abs(found.mean()) > reach else ", unresolved"
-        return f"{found.mean():+.1f} ± {reach:.1f}{word}"
-
-    def reach(self, seeds: int) -> float:
-        """Half an interval of a mean of so many differences."""
-        point = next(value for freedom, value in reversed(_STUDENT.items()) if freedom <= self.freedom)
-        return point * self.deviation / seeds**0.5
-
-    def _pooled(self) -> tuple[float, int]:
-        """The deviation of a difference between seeds, and its degrees of freedom."""
-        square, freedom = 0.0, 0
-        for variant in {name for name, _ in self.by} - {BASE}:
-            found = self.differences(variant)
-            if len(found) > 1:
-                square += ((found - found.mean()) ** 2).sum()
-                freedom += len(found) - 1
-        return (square / freedom) ** 0.5 if freedom else math.nan, freedom
 
 
 def table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
@@ -117,82 +48,10 @@ def table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
     return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
 
 
-def study(runs: list[dict], studies: Collection[str] | None = None) -> str:
-    """The variants of some studies, or of all, beside `base`, at the length that most runs have."""
-    own = _common(runs)
-    names = dict.fromkeys(run["variant"] for run in runs if studies is None or run["study"] in studies)
-    chosen = [variant for variant in names if variant != BASE and own.seeds(variant)]
-    chosen.sort(key=lambda variant: own.mean(variant, "all"))
-    header = ("", "MPJPE mm", "against base", *_SHOWN, "seeds")
-    return table(header, [_row(own, variant) for variant in (BASE, *chosen)])
-
-
-def _row(own: Runs, variant: str) -> tuple[str, ...]:
-    what = own.by[variant, own.seeds(variant)[0]]["what"]
-    figures = [f"{own.mean(variant, figure):.1f}" for figure in ("all", *_SHOWN)]
-    figures[-1] += " %"
-    against = "" if variant == BASE else own.told(variant)
-    return what, figures[0], against, *figures[1:], str(len(own.seeds(variant)))
-
-
-def noise(runs: list[dict]) -> str:
-    own = _common(runs)
-    if math.isnan(own.deviation):
-        return f"{own.people:,} people a run, one seed: differences have no interval.\n"
-    return (
-        f"{own.people:,} people a run. A difference of two runs of one seed deviates by {own.deviation:.1f} mm\n"
-        f"from seed to seed ({own.freedom} degrees of freedom): that of one seed is resolved beyond\n"
-        f"{own.reach(1):.1f} mm, of two beyond {own.reach(2):.1f}.\n"
-    )
-
-
-def scaling(runs: list[dict], shipped: dict | None = None) -> str:
-    """`base` by the number of people seen; runs of their own, each cooled, and what ships as the longest."""
-    seen = sorted({run["people"] for run in runs if run["variant"] == BASE})
-    found = {people: {name: Runs(runs, people).mean(BASE, name) for name in ("all", *_SHOWN)} for people in seen}
-    rows, before = [], None
-    for people, figures in (found | (shipped or {})).items():
-        fall = "" if before is None else f"{(figures['all'] - before[1]) / math.log2(people / before[0]):+.1f}"
-        cells = [f"{figures[name]:.1f}" for name in ("all", *_SHOWN)]
-        rows.append((f"{people:,}", cells[0], fall, *cells[1:-1], f"{cells[-1]} %"))
-        before = people, figures["all"]
-    return table(("people seen", "MPJPE mm", "a doubling", *_SHOWN), rows)
-
-
-def figures(result: Result) -> dict[str, dict[str, float]]:
-    """value, low and high of each of `FIGURES` that the result has."""
-    found = {}
-    for name, (group, of, figure) in FIGURES.items():
-        fitting = (x for x in _own(result) if x.group == group and x.figure == figure and of in (None, x.of))
-        if (line := next(fitting, None)) is not None:
-            found[name] = {"value": line.value, "low": line.low, "high": line.high}
-    return found
-
-
 def _longest() -> dict[int, dict[str, float]]:
     """The figures of `tiny` as it ships, by the number of people that it has seen."""
     found = {name: figure["value"] for name, figure in figures(_scored("tiny").results[0]).items()}
     return {read_header(bundled_path("tiny")).card["people_seen"]: found}
-
-
-def against_paper(runs: list[dict]) -> str:
-    """`base` and the paper's design, at every length at which both ran."""
-    rows = []
-    for people in sorted({run["people"] for run in runs if run["study"] == "paper"}):
-        own = Runs(runs, people)
-        ways = [v for v in dict.fromkeys(run["variant"] for run in runs if run["study"] == "paper") if own.seeds(v)]
-        rows += [_beside(own, variant) for variant in (BASE, *ways)]
-    header = ("", "people seen", "parameters", "MPJPE mm", "plain", "clean", "cluttered", "lost to clutter")
-    return table((*header, "processor minutes"), rows)
-
-
-def _beside(own: Runs, variant: str) -> tuple[str, ...]:
-    one = own.by[variant, own.seeds(variant)[0]]
-    lost = own.mean(variant, "cluttered") - own.mean(variant, "clean")
-    what = "ours: `tiny` and its recipe" if variant == BASE else one["what"]
-    figures = [f"{own.mean(variant, figure):.1f}" for figure in ("all", "plain", "clean", "cluttered")]
-    minutes = np.mean([own.by[variant, seed]["processor_seconds"] for seed in own.seeds(variant)]) / 60
-    return what, f"{own.people:,}", f"{one['parameters']:,}", *figures, f"{lost:+.1f}", f"{minutes:.0f}"
 
 
 def strays(**networks: str) -> str:
@@ -201,10 +60,10 @@ def strays(**networks: str) -> str:
     return table(header, [(what, *disturbed.strays(name)) for name, what in networks.items()])
 
 
-def _common(runs: list[dict]) -> Runs:
-    """The runs of the length that most have."""
-    lengths = [run["people"] for run in runs]
-    return Runs(runs, max(set(lengths), key=lengths.count))
+@lru_cache
+def _read(name: str) -> dict:
+    """What a benchmark wrote."""
+    return json.loads((SCORES / f"{name}.json").read_text())
 
 
 @lru_cache
@@ -213,15 +72,10 @@ def _scored(model: str) -> Scores:
     return read_scores(SCORES / f"{model}.json")
 
 
-def _own(result: Result) -> list[Line]:
-    """The lines of what was judged, without the floors', by this package's arithmetic."""
-    return [x for x in result.lines if x.method == result.setting.method and x.arithmetic == OURS]
-
-
 def shipped(model: str, group: str) -> str:
     """MPJPE of a bundled model by groups of people or joints."""
     rows = []
-    for line in _own(_scored(model).results[0]):
+    for line in own_lines(_scored(model).results[0]):
         if line.group in group.split("+") and line.figure == "mpjpe":
             rows.append((line.of, f"{line.value:.1f}", _interval(line), f"{line.people:,}"))
     return table((group.split("+")[-1], "MPJPE mm", "95 %", "people"), rows)
@@ -246,7 +100,7 @@ def headline(*models: str) -> str:
     for name, (group, figure) in wanted.items():
         cells = []
         for model in models:
-            line = next(x for x in _own(_scored(model).results[0]) if x.group == group and x.figure == figure)
+            line = next(x for x in own_lines(_scored(model).results[0]) if x.group == group and x.figure == figure)
             cells.append(f"{line.value:.1f} {_interval(line)}".rstrip())
         rows.append((name, *cells))
     return table(("lidarpose-bench", *(f"`{model}`" for model in models)), rows)
@@ -281,7 +135,7 @@ def card(model: str) -> str:
 def extras(model: str) -> str:
     """What test-time extras bring; see test_time.py."""
     rows = []
-    found = json.loads((SCORES / "test_time.json").read_text())[model]
+    found = _read("test_time")[model]
     usual = next(one for one in found["ways"] if one["usual"])
     for one in found["ways"]:
         cost = one["seconds"] / usual["seconds"]
@@ -293,7 +147,7 @@ def extras(model: str) -> str:
 def visibility() -> str:
     """Conditions against clean people of whom as much is hidden; see visibility.py."""
     rows = []
-    for model, found in json.loads((SCORES / "visibility.json").read_text()).items():
+    for model, found in _read("visibility").items():
         for one in found:
             ratio = f"{one['ratio']:.2f} [{one['low']:.2f}, {one['high']:.2f}]"
             mm, clean = f"{one['mm']:.1f}", f"{one['clean']:.1f}"
@@ -310,31 +164,54 @@ def real() -> str:
             str(one["points"]),
             f"{one['distance']:.1f}",
             f"{one['turn']:.0f} deg",
+            f"{one['turn_single']:.0f} deg",
             f"{100 * one['near']:.0f} %",
             f"{one['lean']:.0f} deg",
             f"{one['confidence']:.2f}",
         )
-        for one in json.loads((SCORES / "real.json").read_text())
+        for one in _read("real")["people"]
     ]
-    header = ("sweep", "person", "points", "distance m", "facing against the box", "points within 15 cm of a bone")
-    return table((*header, "lean of the trunk", "confidence"), rows)
+    header = ("sweep", "person", "points", "distance m", "facing against the box", "with one look")
+    return table((*header, "points within 15 cm of a bone", "lean of the trunk", "confidence"), rows)
+
+
+def moved() -> str:
+    """How far real people's joints went between two sweeps; see real.py."""
+    rows = [(one["person"], f"{one['mm']:.0f}") for one in _read("real")["tracks"]]
+    return table(("person", "a joint, mm"), rows)
+
+
+def calibration() -> str:
+    """Whether confidence and visibility can be taken at their word; see calibration.py."""
+    rows = [(one["what"], f"{one['ece']:.3f}", f"{one['auroc']:.3f}") for one in _read("calibration")["stated"]]
+    return table(("", "expected calibration error", "AUROC"), rows)
+
+
+def spread() -> str:
+    """What `spread` says beside the truth; see calibration.py."""
+    found = _read("calibration")["spread"]
+    rows = [(one["of"], f"{one['share']:.1f} %", f"{one['stated']:.1f}", f"{one['true']:.1f}") for one in found]
+    return table(("`spread`", "joints", "stated, mm", "true, mm"), rows)
 
 
 def rejection(model: str) -> str:
-    found = json.loads((SCORES / "test_time.json").read_text())[model]["rejection"]
+    found = _read("test_time")[model]["rejection"]
     rows = [(f"{one['kept']:.0f} %", f"{one['people']:.1f}", f"{one['joints']:.1f}") for one in found]
     return table(("kept", "people of the highest mean confidence: mm", "joints of the highest confidence: mm"), rows)
 
 
 def tables() -> dict[str, Callable[[], str]]:
     """What makes each table, by name."""
-    every = json.loads((SCORES / RUNS).read_text())
+    every = _read("ablations")
     runs, later = ([run for run in every if bool(run["begun"]) == begun] for begun in (False, True))
-    made = {f"study {name}": partial(study, runs, {name}) for name in {run["study"] for run in runs}}
-    made["study more"] = partial(study, runs, _MORE)
-    made |= {"scaling": lambda: scaling(runs, _longest()), "noise": partial(noise, runs)}
-    made |= {"continued": partial(study, later), "noise continued": partial(noise, later)}
-    made |= {"against the paper": partial(against_paper, runs)}
+    longer = [run for run in runs if run["people"] == LONGER]
+    asked = {name: (runs, {name}) for name in {run["study"] for run in runs}}
+    asked |= {"more": (runs, _MORE), "longer": (longer, ("anchors", "heads")), "continued": (later, None)}
+    made = {f"study {name}": lambda some=some: table(*changed.study(*some)) for name, some in asked.items()}
+    made["noise"], made["noise continued"] = partial(changed.noise, runs), partial(changed.noise, later)
+    made["scaling"] = lambda: table(*changed.scaling(runs, _longest()))
+    made["against the paper"] = lambda: table(*changed.against_paper(runs))
+    made |= {"calibration": calibration, "spread": spread, "real moved": moved}
     made |= {"visibility": visibility, "real": real}
     made["headline"] = partial(headline, *BUNDLED)
     made["stability"] = lambda: table(("", "undisturbed", *5 * ("",)), disturbed.curves(DEFAULT))
@@ -348,7 +225,7 @@ def tables() -> dict[str, Callable[[], str]]:
     )
     for model in BUNDLED:
         made[f"{model} card"] = partial(card, model)
-        groups = dict.fromkeys(["all+condition", *(line.group for line in _own(_scored(model).results[0]))])
+        groups = dict.fromkeys(["all+condition", *(line.group for line in own_lines(_scored(model).results[0]))])
         made |= {f"{model} by {group}": partial(shipped, model, group) for group in groups}
         made |= {f"{model} extras": partial(extras, model), f"{model} rejection": partial(rejection, model)}
     return made
@@ -366,7 +243,7 @@ def main() -> None:
     parser.add_argument("--check", action="store_true", help="write nothing, say whether the page is up to date")
     options = parser.parse_args()
     if options.collect:
-        runs = collect(options.collect)
+        runs = changed.collect(options.collect)
         write_atomic(SCORES / RUNS, "[\n" + ",\n".join(json.dumps(run) for run in runs) + "\n]\n")
         print(f"{len(runs)} runs -> {SCORES / RUNS}")
         return

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from results import figures
+from ablation_tables import figures
 
 from lidarpose import evaluation
 from lidarpose.data.files import write_atomic
