@@ -96,7 +96,7 @@ VARIANTS = {
     "one sensor": Variant("scene", "the paper's sensor alone", scene=replace(_WILD, sensors=("dapt64",))),
     "prior alone": Variant("motion", "no captured poses", recipe={"captured": 0.0}),
     "captured alone": Variant("motion", "captured poses alone", recipe={"captured": 1.0}),
-    "convolution": Variant("network", "convolutions before the blocks", config={"convolution": True}),
+    "convolution": Variant("convolution", "convolutions of 16 channels before the blocks", config={"convolution": 16}),
     "no counts": Variant("network", "no point counts, no weight by density", network=Uncounted),
     "no view": Variant("network", "neither the sensor's direction nor its distance", network=Unplaced),
     "no mean": Variant("network", "no running mean of the weights", recipe={"ema": 0.0}),

@@ -30,7 +30,7 @@ from lidarpose.model.presets import NetworkConfig
 
 CARD = {"command": "none", "note": "random"}
 # every kind of layer, few of each: what is traced takes as long as there are layers
-SMALL = NetworkConfig(size="small", channels=(16, 32, 32), head_channels=16, blocks=(0, 1, 0), convolution=True)
+SMALL = NetworkConfig(size="small", channels=(16, 32, 32), head_channels=16, blocks=(0, 1, 0), convolution=8)
 
 
 def stored_network(path, config, seed=0):
@@ -229,7 +229,7 @@ def test_another_program_s_onnx_and_another_version_s(folder, tmp_path):
     older = json.dumps(entry | {"schema": "lidarpose.checkpoint/1"})
     assert_one_line(changed(folder, path, with_entry("lidarpose", older)), "expected schema lidarpose.checkpoint/2")
     assert_one_line(changed(folder, path, with_entry("lidarpose", "{")), "cannot be read")
-    other = json.dumps(entry | {"config": entry["config"] | {"convolution": False}})
+    other = json.dumps(entry | {"config": entry["config"] | {"convolution": 0}})
     assert_one_line(changed(folder, path, with_entry("lidarpose", other)), "input in_coarse_neighbours is unknown")
     fewer = changed(folder, path, lambda model: model.graph.output.remove(model.graph.output[-1]))
     assert_one_line(fewer, "output visible is missing")
@@ -290,9 +290,7 @@ def test_a_wrong_export_is_not_written(folder, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "change", [{"heatmap": "full"}, {"heatmap": "none"}, {"convolution": False, "blocks": (2, 1, 1)}]
-)
+@pytest.mark.parametrize("change", [{"heatmap": "full"}, {"heatmap": "none"}, {"convolution": 0, "blocks": (2, 1, 1)}])
 def test_every_kind_of_network_is_exported(tmp_path, change):
     path = stored_network(tmp_path / "net.safetensors", replace(SMALL, **change))
     export(path, tmp_path / "net.onnx")

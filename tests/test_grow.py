@@ -27,7 +27,8 @@ from lidarpose.train.task import total
 def arrays():
     generator, rng = Generator(scene=scene_config("wild"), measure=False), np.random.default_rng(0)
     people = [example(generator.person(77, k).sample, rng, refined=0.0) for k in range(24)]
-    return PoseTask(config=preset("tiny")).collate(people)
+    # with the tables that convolutions read; others leave them
+    return PoseTask(config=replace(preset("tiny"), convolution=1)).collate(people)
 
 
 def told(network, arrays):
@@ -36,11 +37,11 @@ def told(network, arrays):
 
 
 @pytest.mark.parametrize("heatmap", ["window", "full", "none"])
-def test_more_blocks_change_nothing(arrays, heatmap):
+def test_more_blocks_and_convolutions_change_nothing(arrays, heatmap):
     torch.manual_seed(0)
     config = replace(preset("tiny"), heatmap=heatmap)
     small = PoseNet(config)
-    larger = grown(small, replace(config, size="deep", blocks=(2, 3, 2)))
+    larger = grown(small, replace(config, size="deep", blocks=(2, 3, 2), convolution=8))
     before, after = told(small, arrays), told(larger, arrays)
     for name in ("vote", "heatmap", "part", "confidence", "log_spread", "visible"):
         torch.testing.assert_close(getattr(after, name), getattr(before, name), atol=1e-5, rtol=1e-5)
@@ -62,7 +63,7 @@ def test_small_begins_where_tiny_is(arrays):
 def test_all_that_is_new_learns(arrays):
     torch.manual_seed(0)
     network, _ = load_checkpoint(bundled_path("tiny"))
-    larger = grown(network, preset("small"))
+    larger = grown(network, replace(preset("small"), convolution=8))
     before = {name: value.clone() for name, value in larger.named_parameters()}
     made = optimizers(larger, Pretrain())
     rows = arrays["joints"]
@@ -93,6 +94,10 @@ def test_growing_needs_room_and_the_same_meaning():
     ):
         with pytest.raises(InputError, match=words):
             grown(tiny, replace(preset("tiny"), **change))
+    convolving = PoseNet(replace(preset("tiny"), convolution=8))
+    for other in (0, 16):
+        with pytest.raises(InputError, match=f"convolution is {other}, there 8"):
+            grown(convolving, replace(preset("tiny"), convolution=other))
 
 
 def test_pretraining_goes_on_from_weights(tmp_path):

@@ -154,7 +154,8 @@ SMALL_ONE = {"size": "x", "channels": [4, 8, 8], "head_channels": 8, "blocks": [
         ({"grid": 0}, "grid must be a positive number of metres, got 0"),
         ({"max_voxels": 1.5}, "max_voxels must be a whole number"),
         ({"heatmap": "wide"}, "unknown heatmap 'wide'.*window"),
-        ({"convolution": 1}, "convolution must be true or false, got 1"),
+        ({"convolution": -1}, "convolution must be a whole number of at least 0, got -1"),
+        ({"convolution": True}, "convolution must be a whole number of at least 0, got True"),
         ({"skeleton": "cat"}, "unknown skeleton 'cat'"),
     ],
 )
@@ -170,15 +171,16 @@ def test_configurations():
     assert NetworkConfig(**SMALL_ONE).blocks == (1, 0, 1)
 
 
-@pytest.mark.parametrize("size, parameters", [("tiny", TINY_PARAMETERS), ("small", 1_213_398), ("base", 4_955_845)])
+@pytest.mark.parametrize("size, parameters", [("tiny", TINY_PARAMETERS), ("small", 1_452_054), ("base", 4_955_845)])
 def test_sizes(size, parameters):
     made = PoseNet(preset(size))
     assert sum(p.numel() for p in made.parameters()) == parameters
-    out = made(batch_of([person(50)]))
+    tables = plan(person(50), np.array([50]), grid=TINY.grid, max_voxels=TINY.max_voxels, neighbours=True)
+    out = made(Batch.from_plan(tables))
     assert out.joints().shape == (1, 26, 3) and torch.isfinite(out.joints()).all()
 
 
-@pytest.mark.parametrize("change", [{"heatmap": "full"}, {"heatmap": "none"}, {"convolution": True}])
+@pytest.mark.parametrize("change", [{"heatmap": "full"}, {"heatmap": "none"}, {"convolution": 8}])
 def test_variants(change):
     """The paper's full-range heatmaps, votes alone, and convolutions: each learns, whoever is in the batch."""
     torch.manual_seed(0)
@@ -223,13 +225,13 @@ def test_variants(change):
 
 def test_a_convolution_is_a_dense_one_on_a_full_grid():
     torch.manual_seed(0)
-    layer = Convolution(5)
+    layer = Convolution(5, 3)
     axis = np.arange(8) * 0.06 + 0.03
     cube = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
     tables = plan(cube, np.array([512]), grid=0.06, max_voxels=999, neighbours=True)
     rows = torch.randn(1, 64, 5)
-    kernel = layer.mix.weight.view(5, 3, 3, 3, 5).movedim(-1, 1)
-    grid = layer.norm(rows).view(1, 4, 4, 4, 5).movedim(-1, 1)
+    kernel = layer.mix.weight.view(5, 3, 3, 3, 3).movedim(-1, 1)
+    grid = layer.narrow(layer.norm(rows)).view(1, 4, 4, 4, 3).movedim(-1, 1)
     dense = torch.nn.functional.conv3d(grid, kernel, layer.mix.bias, padding=1).movedim(1, -1).reshape(1, 64, 5)
     torch.testing.assert_close(layer(rows, torch.as_tensor(tables.mid.neighbours)), rows + dense, atol=1e-5, rtol=1e-4)
 

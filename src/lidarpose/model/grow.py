@@ -1,9 +1,9 @@
 """A larger `PoseNet` that begins where a smaller one is: what has been learned goes on in more channels and blocks.
 
 After Net2Net (Chen et al. 2016), by padding. Channels that are new in a residual stream begin at zero, as what writes
-them does; hidden units and heads that are new begin at random, and what reads them at zero; blocks that are new add
-nothing. Layer norms see more channels, so their scale is made up for; what is left of the difference is the mean of
-their input, which is small in a trained network and gone after a few hundred steps.
+them does; hidden units and heads that are new begin at random, and what reads them at zero; blocks and convolutions
+that are new add nothing. Layer norms see more channels, so their scale is made up for; what is left of the difference
+is the mean of their input, which is small in a trained network and gone after a few hundred steps.
 """
 
 from math import sqrt
@@ -16,7 +16,7 @@ from lidarpose.model.network import PoseNet
 from lidarpose.model.presets import NetworkConfig
 
 # what must be alike for numbers to mean the same
-_SAME = ("grid", "skeleton", "parts", "heatmap", "convolution", "head_channels")
+_SAME = ("grid", "skeleton", "parts", "heatmap", "head_channels", "convolution")
 # layers that write a residual stream, and the keys of votes: their new rows are zero
 _WRITERS = (
     *("stem.out", ".mix", ".place", "up_mid", "up_fine", "attention.out", "among.out", "cross.out", "feed.2"),
@@ -29,20 +29,23 @@ _READERS = ("stem.out", "attention.out", "among.out", "cross.out", "feed.2", "jo
 def grown(network: PoseNet, config: NetworkConfig) -> PoseNet:
     """A network of `config`, in training mode, that answers nearly as `network` does; of the same depth and width, the
     same. What is drawn comes from torch's global generator. Raises InputError, one line, where `config` is narrower or
-    shallower, or of another grid, skeleton, heatmap, width of heads.
+    shallower, or of another grid, skeleton, heatmap, width of heads or of convolutions.
     """
     small, size = network.config, config.size
-    for name in _SAME:
-        if getattr(small, name) != getattr(config, name):
-            raise InputError(
-                f"a {size} network cannot begin as this {small.size} one: {name} is {getattr(config, name)!r}, "
-                f"there {getattr(small, name)!r}"
-            )
     for name in ("channels", "blocks"):
         if any(new < old for new, old in zip(getattr(config, name), getattr(small, name), strict=True)):
             raise InputError(
                 f"a {size} network cannot begin as this {small.size} one: its {name} are {getattr(config, name)}, "
                 f"there {getattr(small, name)}, and none may shrink"
+            )
+    for name in _SAME:
+        if name == "convolution" and not small.convolution:
+            # new ones add nothing, as new blocks
+            continue
+        if getattr(small, name) != getattr(config, name):
+            raise InputError(
+                f"a {size} network cannot begin as this {small.size} one: {name} is {getattr(config, name)!r}, "
+                f"there {getattr(small, name)!r}"
             )
     larger = PoseNet(config)
     learned = network.state_dict()

@@ -142,21 +142,23 @@ class Block(nn.Module):
 class Convolution(nn.Module):
     """A residual submanifold convolution, 3 x 3 x 3, of rows (B, N, C) by a table of neighbours (B, N, 27).
 
-    The table holds row numbers, N where a cell is empty. After Point Transformer V3's conditional position encoding.
+    The table holds row numbers, N where a cell is empty. After Point Transformer V3's conditional position encoding,
+    but that neighbours are seen through `narrow` channels: its cost is theirs.
     """
 
-    def __init__(self, channels: int):
+    def __init__(self, channels: int, narrow: int):
         super().__init__()
         self.norm = nn.LayerNorm(channels)
-        self.mix = nn.Linear(27 * channels, channels)
+        self.narrow = nn.Linear(channels, narrow, bias=False)
+        self.mix = nn.Linear(27 * narrow, channels)
 
     def forward(self, rows: Tensor, neighbours: Tensor) -> Tensor:
-        people, n, channels = rows.shape
-        padded = F.pad(self.norm(rows), (0, 0, 0, 1)).flatten(0, 1)
+        people, n, _ = rows.shape
+        padded = F.pad(self.narrow(self.norm(rows)), (0, 0, 0, 1)).flatten(0, 1)
         # by row numbers of the whole batch: along dim 1 the gradient of gather is far slower on a CPU
         start = (n + 1) * torch.arange(people, device=rows.device)
         index = (neighbours + start[:, None, None]).flatten()
-        return rows + self.mix(padded.index_select(0, index).view(people, n, 27 * channels))
+        return rows + self.mix(padded.index_select(0, index).view(people, n, -1))
 
 
 def membership(parent: Tensor, valid: Tensor, parents: int, dtype: torch.dtype) -> Tensor:

@@ -142,10 +142,11 @@ class _Down(nn.Module):
 class _Stage(nn.Module):
     """The blocks of one level, a convolution before each where asked for."""
 
-    def __init__(self, channels: int, head_channels: int, count: int, convolution: bool):
+    def __init__(self, channels: int, head_channels: int, count: int, convolution: int):
         super().__init__()
         self.blocks = nn.ModuleList(Block(channels, channels // head_channels) for _ in range(count))
-        self.convolutions = nn.ModuleList(Convolution(channels) for _ in range(count if convolution else 0))
+        convolutions = count if convolution else 0
+        self.convolutions = nn.ModuleList(Convolution(channels, convolution) for _ in range(convolutions))
 
     def forward(self, rows: Tensor, places: Places, bias: Tensor, neighbours: Tensor | None) -> Tensor:
         for k, block in enumerate(self.blocks):

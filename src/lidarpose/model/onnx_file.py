@@ -38,7 +38,7 @@ def plan_people(clouds: list[np.ndarray], view: np.ndarray | None, config: Netwo
         grid=config.grid,
         max_voxels=config.max_voxels,
         view=view,
-        neighbours=config.convolution,
+        neighbours=config.convolution > 0,
     )
 
 

@@ -17,8 +17,8 @@ class NetworkConfig:
 
     channels: of the fine, mid and coarse level; head_channels: a head of attention; blocks: attention blocks (mid
     encoder, coarse, mid decoder); grid: edge of a fine voxel in metres (mid and coarse: 2 and 4 times); max_voxels:
-    fine voxels a person at the most; parts: body parts and 0; heatmap: one of `HEATMAPS`; convolution: submanifold
-    convolutions before the blocks of the mid and coarse level.
+    fine voxels a person at the most; parts: body parts and 0; heatmap: one of `HEATMAPS`; convolution: channels
+    of the submanifold convolutions before the blocks of the mid and coarse level, 0 for none.
     """
 
     size: str
@@ -30,7 +30,7 @@ class NetworkConfig:
     skeleton: str = "body26"
     parts: int = 25
     heatmap: str = "window"
-    convolution: bool = False
+    convolution: int = 0
 
     def __post_init__(self):
         for name in ("head_channels", "max_voxels", "parts"):
@@ -53,8 +53,10 @@ class NetworkConfig:
             raise InputError(f"grid must be a positive number of metres, got {self.grid!r}")
         if self.heatmap not in HEATMAPS:
             raise unknown_name("heatmap", self.heatmap, HEATMAPS)
-        if not isinstance(self.convolution, bool):
-            raise InputError(f"convolution must be true or false, got {self.convolution!r}")
+        # false in files of before it was a number
+        if not isinstance(self.convolution, int) or self.convolution < 0 or self.convolution is True:
+            raise InputError(f"convolution must be a whole number of at least 0, got {self.convolution!r}")
+        object.__setattr__(self, "convolution", int(self.convolution))
         skeleton(self.skeleton)
 
     def to_dict(self) -> dict:
@@ -63,7 +65,7 @@ class NetworkConfig:
 
 SIZES = {
     "tiny": NetworkConfig(size="tiny", channels=(48, 64, 96), head_channels=32, blocks=(1, 1, 1)),
-    "small": NetworkConfig(size="small", channels=(64, 96, 160), head_channels=32, blocks=(2, 2, 2)),
+    "small": NetworkConfig(size="small", channels=(64, 96, 160), head_channels=32, blocks=(2, 2, 2), convolution=12),
     "base": NetworkConfig(
         size="base", channels=(96, 192, 288), head_channels=24, blocks=(2, 3, 2), grid=0.04, max_voxels=512
     ),

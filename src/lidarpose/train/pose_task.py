@@ -39,7 +39,7 @@ class PoseTask:
             max_voxels=MAX_VOXELS,
             view=np.stack([e.view for e in examples]),
             seeds=np.array([e.seed for e in examples]),
-            neighbours=self.config.convolution,
+            neighbours=self.config.convolution > 0,
         )
         part = np.concatenate([e.part for e in examples]).astype(np.int64)
         joints, visible = np.stack([e.joints for e in examples]), np.stack([e.visible for e in examples])
