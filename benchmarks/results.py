@@ -206,7 +206,11 @@ def tables() -> dict[str, Callable[[], str]]:
     runs, later = ([run for run in every if bool(run["begun"]) == begun] for begun in (False, True))
     longer = [run for run in runs if run["people"] == LONGER]
     asked = {name: (runs, {name}) for name in {run["study"] for run in runs}}
-    asked |= {"more": (runs, _MORE), "longer": (longer, ("anchors", "heads")), "continued": (later, None)}
+    asked |= {
+        "more": (runs, _MORE),
+        "longer": (longer, {run["study"] for run in longer} - {"paper"}),
+        "continued": (later, None),
+    }
     made = {f"study {name}": lambda some=some: table(*changed.study(*some)) for name, some in asked.items()}
     made["noise"], made["noise continued"] = partial(changed.noise, runs), partial(changed.noise, later)
     made["scaling"] = lambda: table(*changed.scaling(runs, _longest()))
