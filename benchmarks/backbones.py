@@ -80,8 +80,8 @@ class Draft(nn.Module):
     GRID, MOST = 0.04, 1024
     # channels a head, of which the rotary encoding turns 12
     HEAD = 16
-    # of encoder and decoder: about a third of the draft's parameters, and the draft that was measured
-    WIDTHS = (((32, 48, 80), (48, 48)), ((48, 96, 144), (64, 96)))
+    # of encoder and decoder: about a third of the draft's parameters, a fifth more, and the draft that was measured
+    WIDTHS = (((32, 48, 80), (48, 48)), ((64, 96, 176), (64, 96)), ((48, 96, 144), (64, 96)))
 
     def __init__(
         self,

@@ -314,7 +314,6 @@ def baselines(size: str) -> dict[str, Callable[[], nn.Module]]:
     kinds = {"ViT": GroupedViT, "PointNet++": PointNet2}
     parameters = count(PoseNet(preset(size)))
     made = {f"{name} as {size}": (lambda kind=kind: kind.of_parameters(parameters)) for name, kind in kinds.items()}
-    # of the two networks' parameters, 1.2 and 1.1 million
     return {DRAFT if size == "small" else f"{DRAFT} as {size}": lambda: Draft.of_parameters(parameters)} | made
 
 
