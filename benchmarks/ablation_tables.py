@@ -146,7 +146,8 @@ def noise(runs: list[dict]) -> str:
 def scaling(runs: list[dict], shipped: dict | None = None) -> Rows:
     """`base` by the number of people seen; runs of their own, each cooled, and what ships as the longest."""
     seen = sorted({run["people"] for run in runs if run["variant"] == BASE})
-    found = {people: {name: Runs(runs, people).mean(BASE, name) for name in ("all", *_SHOWN)} for people in seen}
+    lengths = {people: Runs(runs, people) for people in seen}
+    found = {people: {name: own.mean(BASE, name) for name in ("all", *_SHOWN)} for people, own in lengths.items()}
     rows, before = [], None
     for people, own in (found | (shipped or {})).items():
         fall = "" if before is None else f"{(own['all'] - before[1]) / math.log2(people / before[0]):+.1f}"

@@ -137,7 +137,7 @@ class SceneSource(SyntheticSource):
 
 @lru_cache(maxsize=1)
 def _remembered(source: SceneSource) -> dict[int, Example]:
-    """Those of the last source alone: to make them takes a third of a run, to keep them 10 KB each."""
+    """Those of the last source alone: to make them takes a third of a run, to keep them 6 KB each."""
     return {}
 
 

@@ -1,11 +1,11 @@
-"""The tables of docs/results.md, docs/evaluation.md and the model cards in docs/cards, from the scores in docs/scores.
+"""The tables of docs/results.md, evaluation.md, model.md and the model cards in docs/cards, from docs/scores.
 
     python benchmarks/results.py --collect runs/ablations     # runs' scores.json -> docs/scores/ablations.json
     python benchmarks/results.py                              # docs/scores -> the tables of the pages
     python benchmarks/results.py --check                      # exit code 1 where they differ
 
-docs/scores/NAME.json is what `lidarpose evaluate NAME bench` wrote, stability/NAME.json what it writes besides with
-`--stability`, test_time.json and visibility.json what the benchmarks of these names did.
+docs/scores/NAME.json is what `lidarpose evaluate NAME bench` wrote, NAME-unknown.json with `--sensor-unknown`,
+stability/NAME.json what it writes besides with `--stability`; the others are what the benchmarks of their names wrote.
 
 A table stands between `<!-- table NAME -->` and `<!-- end -->`; the words around it are left as they are.
 """
@@ -34,7 +34,7 @@ PAGES = (
     *(DOCS / f"{page}.md" for page in ("results", "evaluation", "model")),
     *(DOCS / "cards" / f"{name}.md" for name in BUNDLED),
 )
-RUNS = "ablations.json"
+RUNS = "ablations"
 # people of the longer runs that ask again what the first ones do
 LONGER = 98_304
 _MARKED = re.compile(r"(<!-- table ([^>]+?) -->\n).*?(<!-- end -->)", re.S)
@@ -202,7 +202,7 @@ def rejection(model: str) -> str:
 
 def tables() -> dict[str, Callable[[], str]]:
     """What makes each table, by name."""
-    every = _read("ablations")
+    every = _read(RUNS)
     runs, later = ([run for run in every if bool(run["begun"]) == begun] for begun in (False, True))
     longer = [run for run in runs if run["people"] == LONGER]
     asked = {name: (runs, {name}) for name in {run["study"] for run in runs}}
@@ -247,9 +247,9 @@ def main() -> None:
     parser.add_argument("--check", action="store_true", help="write nothing, say whether the page is up to date")
     options = parser.parse_args()
     if options.collect:
-        runs = changed.collect(options.collect)
-        write_atomic(SCORES / RUNS, "[\n" + ",\n".join(json.dumps(run) for run in runs) + "\n]\n")
-        print(f"{len(runs)} runs -> {SCORES / RUNS}")
+        runs, path = changed.collect(options.collect), SCORES / f"{RUNS}.json"
+        write_atomic(path, "[\n" + ",\n".join(json.dumps(run) for run in runs) + "\n]\n")
+        print(f"{len(runs)} runs -> {path}")
         return
     for path in PAGES:
         page = path.read_text()

@@ -4,11 +4,13 @@ lidarpose evaluate small bench --stability --out study        # study/stability.
 """
 
 import json
+from functools import lru_cache
 from pathlib import Path
 
 FOLDER = Path(__file__).parents[1] / "docs" / "scores" / "stability"
 
 
+@lru_cache
 def read(name: str) -> dict:
     """The study of a network."""
     (found,) = json.loads((FOLDER / f"{name}.json").read_text())["studies"]

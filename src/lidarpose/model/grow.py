@@ -16,7 +16,7 @@ from lidarpose.model.network import PoseNet
 from lidarpose.model.presets import NetworkConfig
 
 # what must be alike for numbers to mean the same
-_SAME = ("grid", "skeleton", "parts", "heatmap", "head_channels", "convolution")
+_SAME = ("grid", "skeleton", "parts", "heatmap", "head_channels")
 # layers that write a residual stream, and the keys of votes: their new rows are zero
 _WRITERS = (
     *("stem.out", ".mix", ".place", "up_mid", "up_fine", "attention.out", "among.out", "cross.out", "feed.2"),
@@ -38,10 +38,8 @@ def grown(network: PoseNet, config: NetworkConfig) -> PoseNet:
                 f"a {size} network cannot begin as this {small.size} one: its {name} are {getattr(config, name)}, "
                 f"there {getattr(small, name)}, and none may shrink"
             )
-    for name in _SAME:
-        if name == "convolution" and not small.convolution:
-            # new ones add nothing, as new blocks
-            continue
+    # convolutions where there are none add nothing, as new blocks
+    for name in (*_SAME, "convolution") if small.convolution else _SAME:
         if getattr(small, name) != getattr(config, name):
             raise InputError(
                 f"a {size} network cannot begin as this {small.size} one: {name} is {getattr(config, name)!r}, "

@@ -33,10 +33,12 @@ class NetworkConfig:
     convolution: int = 0
 
     def __post_init__(self):
-        for name in ("head_channels", "max_voxels", "parts"):
+        for name, least in (("head_channels", 1), ("max_voxels", 1), ("parts", 1), ("convolution", 0)):
             value = getattr(self, name)
-            if not isinstance(value, int) or value < 1:
-                raise InputError(f"{name} must be a whole number of at least 1, got {value!r}")
+            if not isinstance(value, int) or value is True or value < least:
+                raise InputError(f"{name} must be a whole number of at least {least}, got {value!r}")
+        # false in files of before it was a number
+        object.__setattr__(self, "convolution", int(self.convolution))
         for name, least in (("channels", 1), ("blocks", 0)):
             value = getattr(self, name)
             counts = tuple(value) if isinstance(value, list | tuple) else ()
@@ -53,10 +55,6 @@ class NetworkConfig:
             raise InputError(f"grid must be a positive number of metres, got {self.grid!r}")
         if self.heatmap not in HEATMAPS:
             raise unknown_name("heatmap", self.heatmap, HEATMAPS)
-        # false in files of before it was a number
-        if not isinstance(self.convolution, int) or self.convolution < 0 or self.convolution is True:
-            raise InputError(f"convolution must be a whole number of at least 0, got {self.convolution!r}")
-        object.__setattr__(self, "convolution", int(self.convolution))
         skeleton(self.skeleton)
 
     def to_dict(self) -> dict:
