@@ -48,10 +48,11 @@ def figures(result: Result) -> dict[str, dict[str, float]]:
     return found
 
 
-def collect(folder: Path) -> list[dict]:
-    """What the runs of a folder scored, in a fixed order."""
-    runs = [json.loads(path.read_text()) for path in sorted(folder.rglob("scores.json"))]
-    return sorted(runs, key=lambda run: (run["study"], run["variant"], run["begun"], run["people"], run["seed"]))
+def collect(folder: Path, known: list[dict]) -> list[dict]:
+    """What the runs of a folder scored, and those known that it does not hold, in a fixed order."""
+    found = [json.loads(path.read_text()) for path in sorted(folder.rglob("scores.json"))]
+    runs = {(run["variant"], run["begun"], run["people"], run["seed"]): run for run in known + found}
+    return [runs[key] for key in sorted(runs)]
 
 
 class Runs:
@@ -171,7 +172,7 @@ def against_paper(runs: list[dict]) -> Rows:
 def _beside(own: Runs, variant: str) -> tuple[str, ...]:
     one = own.by[variant, own.seeds(variant)[0]]
     lost = own.mean(variant, "cluttered") - own.mean(variant, "clean")
-    what = "ours: `tiny` and its recipe" if variant == BASE else one["what"]
+    what = f"ours: {one['what']}" if variant == BASE else one["what"]
     found = [f"{own.mean(variant, figure):.1f}" for figure in ("all", "plain", "clean", "cluttered")]
     minutes = np.mean([own.by[variant, seed]["processor_seconds"] for seed in own.seeds(variant)]) / 60
     return what, f"{own.people:,}", f"{one['parameters']:,}", *found, f"{lost:+.1f}", f"{minutes:.0f}"

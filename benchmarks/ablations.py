@@ -4,11 +4,11 @@
     python benchmarks/ablations.py --motion cmu_motion.npz --people 24576 --out runs/ablations
     python benchmarks/ablations.py --motion cmu_motion.npz --people 24576 --seeds 1,2 base pooled "heatmaps alone"
 
-Each run trains `tiny` on `--people` synthesized people and judges it on lidarpose-bench, cloud-centered, the sensor
-known. With `--init FILE` it goes on from trained weights, its rate falling for most of the run, which tells by less
-noise what people to learn from; variants of another network are left out then. What is done is not done again. A
-run's figures go to OUT/NAME-PEOPLE-SEED/scores.json, as `results.py` reads them. Seed s of every variant shows the
-same people in the same order, but for those that change the people.
+Each run trains `tiny` without convolutions, as it was when the first of them ran, on `--people` synthesized people and
+judges it on lidarpose-bench, cloud-centered, the sensor known. With `--init FILE` it goes on from trained weights, its
+rate falling for most of the run, which tells by less noise what people to learn from; variants of another network are
+left out then. What is done is not done again. A run's figures go to OUT/NAME-PEOPLE-SEED/scores.json, as `results.py`
+reads them. Seed s of every variant shows the same people in the same order, but for those that change the people.
 """
 
 import argparse
@@ -65,7 +65,7 @@ class Variant:
 
 _CALM = replace(_WILD, clutter=0.0, company=0.0, occluder=0.0, faults=replace(_WILD.faults, stray=0.0))
 VARIANTS = {
-    "base": Variant("base", "`tiny` and its recipe"),
+    "base": Variant("base", "`tiny` without convolutions"),
     # the six that matter
     "pooled": Variant("anchors", "joints from pooled features, votes", network=pooled),
     "pooled, heatmaps alone": Variant(
@@ -146,10 +146,16 @@ def keeps_network(variant: Variant) -> bool:
     return variant.network is PoseNet and not set(variant.config) - {"blocks", "channels"}
 
 
+def configuration(variant: Variant, init: str) -> NetworkConfig:
+    """That of the variant's network: without convolutions, or with those of the weights that it goes on from."""
+    kept = read_header(init).config.convolution if init else 0
+    return replace(preset(variant.size), **{"convolution": kept} | variant.config)
+
+
 def job(variant: Variant, settings: Pretrain) -> Job:
     """What the variant comes to."""
     usual = job_of(settings)
-    config = replace(preset(variant.size), **variant.config)
+    config = configuration(variant, settings.init)
     task = VariantTask(config=config, made=variant.network)
     values = {name: value for name, value in vars(usual.source).items() if not name.startswith("_")}
     if not variant.scene.hard:
@@ -179,8 +185,6 @@ def run(options: argparse.Namespace, name: str, seed: int, folder: Path) -> dict
     result = evaluation.run(predictor, ["bench"]).scores.results[0]
     return record(
         name,
-        variant.study,
-        variant.what,
         seed,
         people,
         begun=read_header(init).card["people_seen"] if init else 0,
@@ -190,9 +194,9 @@ def run(options: argparse.Namespace, name: str, seed: int, folder: Path) -> dict
     )
 
 
-def record(name: str, study: str, what: str, seed: int, people: int, **more) -> dict:
+def record(name: str, seed: int, people: int, **more) -> dict:
     """What a scores.json holds, as `results.py` reads it."""
-    head = {"version": __version__, "variant": name, "study": study, "what": what, "seed": seed, "people": people}
+    head = {"version": __version__, "variant": name, "seed": seed, "people": people}
     return head | {key: round(value, 1) if isinstance(value, float) else value for key, value in more.items()}
 
 

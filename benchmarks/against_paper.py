@@ -87,8 +87,6 @@ def run(options: argparse.Namespace, name: str, seed: int, folder: Path) -> dict
     best = min((figures(result) for result in results), key=lambda found: found["all"]["value"])
     return record(
         name,
-        "paper",
-        way.what,
         seed,
         people,
         begun=0,

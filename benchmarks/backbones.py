@@ -81,7 +81,7 @@ class Draft(nn.Module):
     # channels a head, of which the rotary encoding turns 12
     HEAD = 16
     # of encoder and decoder: about a third of the draft's parameters, a fifth more, and the draft that was measured
-    WIDTHS = (((32, 48, 80), (48, 48)), ((64, 96, 176), (64, 96)), ((48, 96, 144), (64, 96)))
+    WIDTHS = (((32, 48, 96), (48, 48)), ((64, 96, 176), (64, 96)), ((48, 96, 144), (64, 96)))
 
     def __init__(
         self,
@@ -252,7 +252,7 @@ class GroupedViT(nn.Module):
 
     @classmethod
     def of_parameters(cls, parameters: int) -> "GroupedViT":
-        return about(cls, parameters, widths=range(32, 640, 16))
+        return about(cls, parameters, widths=range(32, 640, 8))
 
     @torch.no_grad()
     def prepare(self, clouds: list[np.ndarray]) -> Groups:

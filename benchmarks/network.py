@@ -262,7 +262,9 @@ def parsed(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--sections", nargs="+", choices=SECTIONS, default=list(SECTIONS))
     parser.add_argument("--no-onnx", action="store_true", help="without ONNX, whose export takes a minute")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="also write all times")
+    parser.add_argument(
+        "--json", type=Path, metavar="FILE", help="also write medians and best rounds, as `results.py` reads them"
+    )
     options = parser.parse_args(arguments)
     if options.device == "cuda" and not torch.cuda.is_available():
         parser.error("--device cuda: torch finds no such device here")

@@ -213,8 +213,9 @@ class Report:
             "options": shown,
             "parameters": {one.name: one.parameters for one in self.made},
             "times": [
-                vars(key) | {"whole_s": [a for a, _ in values], "network_s": [b for _, b in values]}
+                vars(key) | {"median_s": float(np.median(whole)) / key.people, "best_s": min(whole) / key.people}
                 for key, values in self.times.items()
+                for whole in [[value for value, _ in values]]
             ],
             "memory": self.memory_rows,
             "targets": [

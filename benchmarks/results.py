@@ -1,6 +1,6 @@
 """The tables of docs/results.md, evaluation.md, model.md and the model cards in docs/cards, from docs/scores.
 
-    python benchmarks/results.py --collect runs/ablations     # runs' scores.json -> docs/scores/ablations.json
+    python benchmarks/results.py --collect runs/ablations     # runs' scores.json into docs/scores/ablations.json
     python benchmarks/results.py                              # docs/scores -> the tables of the pages
     python benchmarks/results.py --check                      # exit code 1 where they differ
 
@@ -19,8 +19,11 @@ from functools import lru_cache, partial
 from pathlib import Path
 
 import ablation_tables as changed
+import speed_tables as timed
 import stability_tables as disturbed
 from ablation_tables import figures, own_lines
+from ablations import VARIANTS
+from against_paper import WAYS
 
 from lidarpose.data.files import write_atomic
 from lidarpose.evaluate.result import Line, Scores, read_scores
@@ -49,9 +52,14 @@ def table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
 
 
 def _longest() -> dict[int, dict[str, float]]:
-    """The figures of `tiny` as it ships, by the number of people that it has seen."""
+    """The figures of `tiny` as it ships, by the number of people that it has seen in all its runs."""
     found = {name: figure["value"] for name, figure in figures(_scored("tiny").results[0]).items()}
-    return {read_header(bundled_path("tiny")).card["people_seen"]: found}
+    return {sum(one["people_seen"] for one in _stages(read_header(bundled_path("tiny")).card)): found}
+
+
+def _stages(card: dict) -> list[dict]:
+    """The card and those of the weights that it was begun with, the last one first."""
+    return [card, *(_stages(card["init_card"]) if "init_card" in card else [])]
 
 
 def strays(**networks: str) -> str:
@@ -121,10 +129,11 @@ def card(model: str) -> str:
         ("hours", f"{told['hours']:.2f}"),
         ("captured motion", f"{told['motion']}, subjects {', '.join(told['recipe']['subjects'])}"),
     ]
-    stages, stage = [], told
-    while "init_card" in stage:
-        name, stage = stage["recipe"]["init"], stage["init_card"]
-        stages.append(f"{name}, {stage['people_seen']:,} people before")
+    runs = _stages(told)
+    stages = [
+        f"{run['recipe']['init']}, {before['people_seen']:,} people before"
+        for run, before in zip(runs, runs[1:], strict=False)
+    ]
     if stages:
         rows.append(("begun as", "; itself begun as ".join(stages)))
     if "note" in told:
@@ -200,9 +209,16 @@ def rejection(model: str) -> str:
     return table(("kept", "people of the highest mean confidence: mm", "joints of the highest confidence: mm"), rows)
 
 
+def _labels(variant: str) -> dict[str, str]:
+    """The study that a variant belongs to, and what it is."""
+    if variant in WAYS:
+        return {"study": "paper", "what": WAYS[variant].what}
+    return {"study": VARIANTS[variant].study, "what": VARIANTS[variant].what}
+
+
 def tables() -> dict[str, Callable[[], str]]:
     """What makes each table, by name."""
-    every = _read(RUNS)
+    every = [run | _labels(run["variant"]) for run in _read(RUNS)]
     runs, later = ([run for run in every if bool(run["begun"]) == begun] for begun in (False, True))
     longer = [run for run in runs if run["people"] == LONGER]
     asked = {name: (runs, {name}) for name in {run["study"] for run in runs}}
@@ -215,6 +231,8 @@ def tables() -> dict[str, Callable[[], str]]:
     made["noise"], made["noise continued"] = partial(changed.noise, runs), partial(changed.noise, later)
     made["scaling"] = lambda: table(*changed.scaling(runs, _longest()))
     made["against the paper"] = lambda: table(*changed.against_paper(runs))
+    made["speed"] = lambda: table(*timed.medians(_read("speed")))
+    made["speed asked"] = lambda: table(*timed.asked(_read("speed")))
     made |= {"calibration": calibration, "spread": spread, "real moved": moved}
     made |= {"visibility": visibility, "real": real}
     made["headline"] = partial(headline, *BUNDLED)
@@ -224,7 +242,7 @@ def tables() -> dict[str, Callable[[], str]]:
     made["strays"] = partial(
         strays,
         paper="the paper's design, faster rates, 98,304 people",
-        ours="ours: `tiny` and its recipe, 98,304 people",
+        ours="ours: `tiny` without convolutions, 98,304 people",
         small="`small` as it ships",
     )
     for model in BUNDLED:
@@ -243,11 +261,11 @@ def written(page: str) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--collect", type=Path, metavar="DIR", help="folder of runs whose scores are taken over")
+    parser.add_argument("--collect", type=Path, metavar="DIR", help="folder of runs whose scores are added")
     parser.add_argument("--check", action="store_true", help="write nothing, say whether the page is up to date")
     options = parser.parse_args()
     if options.collect:
-        runs, path = changed.collect(options.collect), SCORES / f"{RUNS}.json"
+        runs, path = changed.collect(options.collect, _read(RUNS)), SCORES / f"{RUNS}.json"
         write_atomic(path, "[\n" + ",\n".join(json.dumps(run) for run in runs) + "\n]\n")
         print(f"{len(runs)} runs -> {path}")
         return

@@ -31,7 +31,7 @@ def one_thread():
 @pytest.fixture(scope="module", params=KINDS, ids=lambda kind: kind.__name__)
 def network(request):
     torch.manual_seed(0)
-    return request.param.of_parameters(380_000).eval()
+    return request.param.of_parameters(450_000).eval()
 
 
 def person(n, seed=0):

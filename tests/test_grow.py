@@ -28,7 +28,7 @@ def arrays():
     generator, rng = Generator(scene=scene_config("wild"), measure=False), np.random.default_rng(0)
     people = [example(generator.person(77, k).sample, rng, refined=0.0) for k in range(24)]
     # with the tables that convolutions read; others leave them
-    return PoseTask(config=replace(preset("tiny"), convolution=1)).collate(people)
+    return PoseTask(config=preset("tiny")).collate(people)
 
 
 def told(network, arrays):
@@ -39,7 +39,7 @@ def told(network, arrays):
 @pytest.mark.parametrize("heatmap", ["window", "full", "none"])
 def test_more_blocks_and_convolutions_change_nothing(arrays, heatmap):
     torch.manual_seed(0)
-    config = replace(preset("tiny"), heatmap=heatmap)
+    config = replace(preset("tiny"), heatmap=heatmap, convolution=0)
     small = PoseNet(config)
     larger = grown(small, replace(config, size="deep", blocks=(2, 3, 2), convolution=8))
     before, after = told(small, arrays), told(larger, arrays)
@@ -63,7 +63,7 @@ def test_small_begins_where_tiny_is(arrays):
 def test_all_that_is_new_learns(arrays):
     torch.manual_seed(0)
     network, _ = load_checkpoint(bundled_path("tiny"))
-    larger = grown(network, replace(preset("small"), convolution=8))
+    larger = grown(network, preset("small"))
     before = {name: value.clone() for name, value in larger.named_parameters()}
     made = optimizers(larger, Pretrain())
     rows = arrays["joints"]
@@ -94,10 +94,9 @@ def test_growing_needs_room_and_the_same_meaning():
     ):
         with pytest.raises(InputError, match=words):
             grown(tiny, replace(preset("tiny"), **change))
-    convolving = PoseNet(replace(preset("tiny"), convolution=8))
     for other in (0, 16):
-        with pytest.raises(InputError, match=f"convolution is {other}, there 8"):
-            grown(convolving, replace(preset("tiny"), convolution=other))
+        with pytest.raises(InputError, match=f"convolution is {other}, there 12"):
+            grown(tiny, replace(preset("tiny"), convolution=other))
 
 
 def test_pretraining_goes_on_from_weights(tmp_path):

@@ -1,6 +1,7 @@
 """The tables of the docs: they say what the scores say, and differences come with intervals that are right."""
 
 import importlib
+import json
 import re
 from pathlib import Path
 
@@ -105,6 +106,16 @@ def test_what_noise_hides_is_called_so(changed):
     own = changed.Runs(runs, 100)
     assert "unresolved" not in own.told("large") and own.told("large").startswith("+50.5 ± ")
     assert own.told("small").endswith("unresolved")
+
+
+def test_runs_are_added_to_those_known(changed, tmp_path):
+    known = [run("base", 1, 10.0, begun=0), run("x", 1, 12.0, begun=0)]
+    again, new = run("x", 1, 11.0, begun=0), run("base", 2, 13.0, begun=0)
+    for one in (again, new):
+        folder = tmp_path / f"{one['variant']}-{one['seed']}"
+        folder.mkdir()
+        (folder / "scores.json").write_text(json.dumps(one))
+    assert changed.collect(tmp_path, known) == [known[0], new, again]
 
 
 def test_a_doubling_of_people(changed):
