@@ -28,7 +28,7 @@ from against_paper import WAYS
 from lidarpose.data.files import write_atomic
 from lidarpose.evaluate.result import Line, Scores, read_scores
 from lidarpose.model.bundled import BUNDLED, DEFAULT, bundled_path
-from lidarpose.model.header import digest, read_header
+from lidarpose.model.header import digest, read_header, runs_of
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -54,12 +54,7 @@ def table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
 def _longest() -> dict[int, dict[str, float]]:
     """The figures of `tiny` as it ships, by the number of people that it has seen in all its runs."""
     found = {name: figure["value"] for name, figure in figures(_scored("tiny").results[0]).items()}
-    return {sum(one["people_seen"] for one in _stages(read_header(bundled_path("tiny")).card)): found}
-
-
-def _stages(card: dict) -> list[dict]:
-    """The card and those of the weights that it was begun with, the last one first."""
-    return [card, *(_stages(card["init_card"]) if "init_card" in card else [])]
+    return {sum(one["people_seen"] for one in runs_of(read_header(bundled_path("tiny")).card)): found}
 
 
 def strays(**networks: str) -> str:
@@ -118,6 +113,7 @@ def card(model: str) -> str:
     """How a bundled model was made, as its file says."""
     path = bundled_path(model)
     told = read_header(path).card
+    runs = runs_of(told)
     if _scored(model).weights["digest"] != digest(path):
         raise SystemExit(f"docs/scores/{model}.json is of other weights: run lidarpose evaluate {model} bench")
     rows = [
@@ -125,11 +121,10 @@ def card(model: str) -> str:
         ("as ONNX", f"`{model}.onnx`, {bundled_path(model, '.onnx').stat().st_size / 1e6:.1f} MB"),
         ("command", f"`{told['command']}`"),
         ("seed", str(told["recipe"]["seed"])),
-        ("people seen", f"{told['people_seen']:,}"),
-        ("hours", f"{told['hours']:.2f}"),
+        ("people seen", _in_all(runs, "people_seen", ",")),
+        ("hours", _in_all(runs, "hours", ".2f")),
         ("captured motion", f"{told['motion']}, subjects {', '.join(told['recipe']['subjects'])}"),
     ]
-    runs = _stages(told)
     stages = [
         f"{run['recipe']['init']}, {before['people_seen']:,} people before"
         for run, before in zip(runs, runs[1:], strict=False)
@@ -139,6 +134,12 @@ def card(model: str) -> str:
     if "note" in told:
         rows.append(("note", told["note"]))
     return table(("", ""), rows)
+
+
+def _in_all(runs: list[dict], name: str, form: str) -> str:
+    """A number of the last run, and of all of them."""
+    own = f"{runs[0][name]:{form}}"
+    return own if len(runs) == 1 else f"{own}, in all runs {sum(run[name] for run in runs):{form}}"
 
 
 def extras(model: str) -> str:

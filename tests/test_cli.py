@@ -7,11 +7,13 @@ import runpy
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from lidarpose.cli import main
+from lidarpose.infer import info
 from lidarpose.model.bundled import DEFAULT
 from lidarpose.synth.generate import Generator
 from lidarpose.synth.scene import scene_config
@@ -177,6 +179,15 @@ def test_info(capsys):
     words = ("lidarpose ", "ONNX Runtime ", "torch ", "device ", "tiny", "small", "MB", "default")
     for word in (*words, "parameters", "trained"):
         assert word in text
+
+
+def test_info_counts_the_people_of_all_runs(monkeypatch):
+    before = {"people_seen": 1_000, "hours": 1.25}
+    header = SimpleNamespace(card={"people_seen": 500, "hours": 0.5, "init_card": before})
+    monkeypatch.setattr(info, "read_header", lambda path: header)
+    assert "           500 people, 0.50 hours; with the runs before it 1,500 people, 1.75 hours" in info.lines()
+    header.card = before
+    assert "           1,000 people, 1.25 hours" in info.lines()
 
 
 def test_backends_and_decoders(crop, out):

@@ -6,7 +6,7 @@ from importlib.util import find_spec
 
 from lidarpose._version import __version__
 from lidarpose.model.bundled import BUNDLED, DEFAULT, bundled_path
-from lidarpose.model.header import parameter_count, read_header
+from lidarpose.model.header import parameter_count, read_header, runs_of
 from lidarpose.model.onnx_file import usable_threads
 
 
@@ -29,11 +29,21 @@ def lines() -> list[str]:
             f"weights    {name}: {path.stat().st_size / 1e6:.2f} MB, {parameter_count(path):,} parameters, "
             f"as ONNX {exported:.2f} MB{', the default' if name == DEFAULT else ''}",
             f"  trained  {card.get('command', 'unknown')}",
-            f"           {card.get('people_seen', 0):,} people, {card.get('hours', 0)} hours",
+            f"           {_seen(card)}",
         ]
         out += [f"           {card['note']}"] if "note" in card else []
         out += [f"  score    {key}: {value}" for key, value in card.get("scores", {}).items()]
     return out
+
+
+def _seen(card: dict) -> str:
+    """People and hours of the run, and of those before it."""
+    runs = runs_of(card)
+    people, hours = ([run.get(name, 0) for run in runs] for name in ("people_seen", "hours"))
+    told = f"{people[0]:,} people, {hours[0]:.2f} hours"
+    if len(runs) == 1:
+        return told
+    return f"{told}; with the runs before it {sum(people):,} people, {sum(hours):.2f} hours"
 
 
 def _torch_line() -> str:

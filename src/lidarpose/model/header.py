@@ -64,6 +64,11 @@ class Header:
         return json.dumps(entry | {"config": self.config.to_dict(), "card": self.card})
 
 
+def runs_of(card: dict) -> list[dict]:
+    """The cards of the runs that made weights: the last one's, that of the weights it began with, and so on."""
+    return [card, *(runs_of(card["init_card"]) if "init_card" in card else [])]
+
+
 def read_header(path: str | os.PathLike) -> Header:
     """The header of a checkpoint. Raises InputError where the file is not a checkpoint of this package."""
     with opened(path) as file:
