@@ -40,6 +40,8 @@ PAGES = (
 RUNS = "ablations"
 # people of the longer runs that ask again what the first ones do
 LONGER = 98_304
+# plain people, in the words of heldout.py
+_PLAIN = "upright, whole, uncluttered"
 _MARKED = re.compile(r"(<!-- table ([^>]+?) -->\n).*?(<!-- end -->)", re.S)
 # studies shown in one table
 _MORE = ("levels", "mask", "scene", "motion", "network", "steps")
@@ -134,6 +136,19 @@ def card(model: str) -> str:
     if "note" in told:
         rows.append(("note", told["note"]))
     return table(("", ""), rows)
+
+
+def progress(model: str) -> str:
+    """What the runs of a bundled model brought one after the other, as its file says."""
+    rows, people, hours = [], 0, 0.0
+    for run in reversed(runs_of(read_header(bundled_path(model)).card)):
+        people, hours = people + run["people_seen"], hours + run["hours"]
+        scores = run.get("scores", {})
+        held_out = (scores.get(f"sensor known, {group}", "- -").split()[1] for group in ("all", _PLAIN))
+        rows.append(
+            (f"`{run['recipe']['size']}`", f"{people:,}", f"{hours:.1f}", f"{run['validation_mm']:.1f}", *held_out)
+        )
+    return table(("", "people in all", "hours", "validation mm", "`heldout.py` mm", "plain"), rows)
 
 
 def _in_all(runs: list[dict], name: str, form: str) -> str:
@@ -247,7 +262,7 @@ def tables() -> dict[str, Callable[[], str]]:
         small="`small` as it ships",
     )
     for model in BUNDLED:
-        made[f"{model} card"] = partial(card, model)
+        made |= {f"{model} card": partial(card, model), f"{model} progress": partial(progress, model)}
         groups = dict.fromkeys(["all+condition", *(line.group for line in own_lines(_scored(model).results[0]))])
         made |= {f"{model} by {group}": partial(shipped, model, group) for group in groups}
         made |= {f"{model} extras": partial(extras, model), f"{model} rejection": partial(rejection, model)}
