@@ -242,6 +242,32 @@ def test_a_dead_worker_is_one_line(tmp_path, monkeypatch):
     assert "\n" not in str(caught.value)
 
 
+def test_a_run_has_one_process_at_a_time(monkeypatch, tmp_path, unbroken):
+    monkeypatch.setattr(runs, "LOCK_WAIT", 0.0)
+    folder = copied(unbroken, tmp_path / "run")
+    longer = replace(RECIPE, people=RECIPE.people + 2 * BATCHES * 2)
+    before = {p.name: p.read_bytes() for p in folder.iterdir()}
+    with runs.held(folder):
+        with pytest.raises(InputError, match="another process trains there: stop it") as caught:
+            loop.train(longer, folder, resume=True)
+        assert "\n" not in str(caught.value)
+        assert before == {p.name: p.read_bytes() for p in folder.iterdir() if p.name != runs.LOCK}
+    loop.train(longer, folder, resume=True)
+    assert log_of(folder)[-1]["people"] == longer.people
+    # that of a process that was killed is no obstacle
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / runs.LOCK).touch()
+    loop.train(RECIPE, tmp_path / "other")
+    assert_same_run(tmp_path / "other", unbroken)
+
+
+def test_a_folder_that_cannot_be_made(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="run: cannot be made or locked") as caught:
+        loop.train(RECIPE, tmp_path / "file" / "run")
+    assert "\n" not in str(caught.value)
+
+
 def test_nothing_to_resume(tmp_path):
     with pytest.raises(InputError, match="nothing to resume"):
         loop.train(RECIPE, tmp_path, resume=True)

@@ -9,7 +9,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -35,6 +35,7 @@ from lidarpose.train.runs import (
     check_same,
     clean,
     cut_log,
+    held,
     latest,
     numbered,
     stored_command,
@@ -95,19 +96,20 @@ def train(
     if accelerator.is_main_process:
         for warning in job.warnings:
             print(f"lidarpose: warning: {warning}", file=sys.stderr)
-    if resume:
-        run.take_up()
-    elif accelerator.is_main_process:
-        begin(folder, recipe, command)
-    accelerator.wait_for_everyone()
-    if tracker is not None:
-        settings = {name: value for name, value in recipe.to_dict().items() if isinstance(value, int | float | str)}
-        accelerator.init_trackers("lidarpose", config=settings)
-    try:
-        run.go()
-    finally:
+    with held(folder) if accelerator.is_main_process else nullcontext():
+        if resume:
+            run.take_up()
+        elif accelerator.is_main_process:
+            begin(folder, recipe, command)
+        accelerator.wait_for_everyone()
         if tracker is not None:
-            accelerator.end_training()
+            settings = {name: value for name, value in recipe.to_dict().items() if isinstance(value, int | float | str)}
+            accelerator.init_trackers("lidarpose", config=settings)
+        try:
+            run.go()
+        finally:
+            if tracker is not None:
+                accelerator.end_training()
     return folder / MODEL
 
 

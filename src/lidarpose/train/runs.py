@@ -7,7 +7,11 @@ validation) and pictures/.
 
 import json
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+
+from filelock import FileLock, Timeout
 
 from lidarpose._version import __version__
 from lidarpose.data.files import file_error, read_bytes, write_atomic
@@ -18,6 +22,10 @@ from lidarpose.train.recipes import FREE, Recipe
 RUNS = "runs"
 STATE, MODEL, BEST = "state.safetensors", "model.safetensors", "best.safetensors"
 CONFIG, LOG, PICTURES = "config.json", "log.jsonl", "pictures"
+# held by the process that writes into the folder
+LOCK = ".lock"
+# seconds that the workers of a killed process, who hold it too, may take to end
+LOCK_WAIT = 10.0
 SCHEMA = "lidarpose.run/2"
 # settings that are files or folders, which may have been moved
 _PATHS = ("data", "shards", "motion")
@@ -59,12 +67,33 @@ def _numbers(parent: Path, kind: str) -> list[int]:
 def check_new(folder: Path) -> None:
     """Raises InputError where the folder holds anything but what a killed run left of a file."""
     if folder.is_dir():
-        if all(_LEFT.fullmatch(path.name) for path in folder.iterdir()):
+        if all(_LEFT.fullmatch(path.name) or path.name == LOCK for path in folder.iterdir()):
             return
     elif not folder.exists():
         return
     more = "; add --resume to go on with what is there" if (folder / CONFIG).is_file() else ""
     raise InputError(f"{folder}: expected a new or empty folder for the run{more}")
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Keeps other processes out of the run's folder, which is made. Raises InputError where one is in it; one that was
+    killed is not, once its workers have seen it."""
+    lock = FileLock(folder / LOCK)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock.acquire(timeout=LOCK_WAIT)
+    except Timeout:
+        raise InputError(f"{folder}: another process trains there: stop it, or wait for its end") from None
+    except (OSError, NotImplementedError) as error:
+        raise file_error(folder, f"cannot be made or locked ({error}): name a folder on a local disk") from None
+    try:
+        yield
+    finally:
+        # Windows does not let go of a file that is open
+        with suppress(OSError):
+            (folder / LOCK).unlink()
+        lock.release()
 
 
 def clean(folder: Path) -> None:
