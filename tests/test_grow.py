@@ -55,8 +55,8 @@ def test_small_begins_where_tiny_is(arrays):
     true = torch.as_tensor(arrays["joints"])
     errors = [float((joints - true).norm(dim=-1).mean()) for joints in (before, after)]
     moved = float((after - before).norm(dim=-1).mean())
-    assert moved < 0.2 * errors[0] and errors[1] < 1.05 * errors[0], (moved, errors)
-    # a network that is not grown is elsewhere
+    # a third of a voxel, whatever the weights' error; one that is not grown is ten times as far
+    assert moved < 0.02 and errors[1] < 1.05 * errors[0], (moved, errors)
     assert (told(PoseNet(preset("small")), arrays).joints() - before).norm(dim=-1).mean() > 0.2
 
 
