@@ -3,7 +3,7 @@
 import math
 import os
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from runners import BATCH, DRAFT, PAPER_BATCH, SIZES, Runner
+from speed_tables import asked, rate, shown
 
 MEBIBYTE = 1 << 20
 CROPS = "crops"
@@ -79,7 +80,7 @@ class Report:
             parts.append(f"## `tiny`: people a second by batch and points, median\n\n{self._scaling()}")
         if self.memory_rows:
             parts.append(f"## Peak memory of training steps, MiB\n\n{self._memory()}")
-        parts.append(f"## Targets\n\n{self._targets()}")
+        parts.append(f"## Targets\n\n{table(*asked(self.targets()))}")
         if self.left_out:
             parts.append("## Left out\n\n" + "\n".join(f"- {line}" for line in self.left_out))
         return "\n\n".join(parts) + "\n"
@@ -108,7 +109,7 @@ class Report:
             if "predict()" not in name and not name.endswith("ONNX"):
                 cells = [self._cell("latency", name, n, alone=True) for n in self.options.points]
                 rows.append([name if name.endswith("session") else f"{name}, network alone", "", *cells])
-        return table(["network", "parameters", *map(_points, self.options.points)], rows)
+        return table(["network", "parameters", *map(shown, self.options.points)], rows)
 
     def _cell(self, section: str, name: str, points, *, alone: bool = False) -> str:
         best, median = (f(section, name, points, alone=alone) * 1e3 for f in (self.best, self.median))
@@ -118,8 +119,8 @@ class Report:
         rows = []
         for name in names:
             pairs = [[f(section, name, n, alone=alone) for f in (self.best, self.median)] for n in columns]
-            rows.append([name, *("-" if math.isnan(b) else f"{_rate(a)} / {_rate(b)}" for a, b in pairs)])
-        return table(["network", *map(_points, columns)], rows)
+            rows.append([name, *("-" if math.isnan(b) else f"{rate(a)} / {rate(b)}" for a, b in pairs)])
+        return table(["network", *map(shown, columns)], rows)
 
     def _ratios(self) -> str:
         beside = {"tiny": f"{DRAFT} as tiny", "small": DRAFT}
@@ -136,7 +137,7 @@ class Report:
                 if not all(map(math.isnan, values)):
                     cells = ["-" if math.isnan(value) else f"{value:.2f}" for value in values]
                     rows.append([f"{one} over {other}", section, *cells])
-        return table(["pair", "", *map(_points, columns)], rows)
+        return table(["pair", "", *map(shown, columns)], rows)
 
     def _scaling(self) -> str:
         out = []
@@ -144,7 +145,7 @@ class Report:
             rows = []
             for n in self.options.scaling_points:
                 medians = [self.median(section, "tiny", n, people) for people in self.options.scaling_people]
-                rows.append([f"{section.split()[1]}, {_points(n)}", *("-" if m != m else _rate(m) for m in medians)])
+                rows.append([f"{section.split()[1]}, {shown(n)}", *("-" if m != m else rate(m) for m in medians)])
             out += rows
         most = "A person of more than so many voxels is thinned, so cost stops growing where that begins."
         head = ["points", *(f"batch {people}" for people in self.options.scaling_people)]
@@ -154,7 +155,7 @@ class Report:
         rows = []
         for row in self.memory_rows:
             before, high = row["before"] / MEBIBYTE, row["peak"] / MEBIBYTE
-            cells = [row["network"], _points(row["points"]), str(row["people"]), f"{before:,.0f}", f"{high:,.0f}"]
+            cells = [row["network"], shown(row["points"]), str(row["people"]), f"{before:,.0f}", f"{high:,.0f}"]
             cells.append(f"{high - before:,.0f}")
             if "device_peak" in row:
                 cells.append(f"{row['device_peak'] / MEBIBYTE:,.0f}")
@@ -163,12 +164,13 @@ class Report:
         return table(head + ["on the device"] * any("device_peak" in row for row in self.memory_rows), rows)
 
     def targets(self) -> list[dict]:
-        """what, unit, target, whether it is a ceiling; figures by the medians and by the best rounds, NaN where not
+        """what, unit, target, whether it is a ceiling; figures by the medians and by the best rounds, None where not
         measured; whether the medians meet it."""
         by_median, by_best = self._figures(self.median), self._figures(self.best)
         found = []
         for (what, unit, most, target, figure), (*_, best) in zip(by_median, by_best, strict=True):
             met = None if math.isnan(figure) else bool(figure <= target if most else figure >= target)
+            figure, best = (None if math.isnan(value) else value for value in (figure, best))
             found.append(dict(what=what, unit=unit, most=most, target=target, figure=figure, best=best, met=met))
         return found
 
@@ -194,49 +196,25 @@ class Report:
         out.append(("`tiny` training, peak memory", "GB", True, 2, max(peaks, default=math.nan)))
         return out
 
-    def _targets(self) -> str:
-        rows = []
-        for entry in self.targets():
-            figures = [
-                "-" if math.isnan(entry[which]) else f"{entry[which]:,.2f} {entry['unit']}".strip()
-                for which in ("figure", "best")
-            ]
-            due = f"{'at most' if entry['most'] else 'at least'} {entry['target']:g} {entry['unit']}".strip()
-            met = {None: "not measured", True: "yes", False: "no"}[entry["met"]]
-            rows.append([entry["what"], *figures, due, met])
-        return table(["", "by medians", "by best rounds", "asked for", "met by medians"], rows)
-
     def to_json(self) -> dict:
-        shown = {name: value for name, value in vars(self.options).items() if name != "json"}
+        options = {name: value for name, value in vars(self.options).items() if name != "json"}
         return {
             "machine": self._machine(),
-            "options": shown,
+            "options": options,
             "parameters": {one.name: one.parameters for one in self.made},
             "times": [
-                vars(key) | {"median_s": float(np.median(whole)) / key.people, "best_s": min(whole) / key.people}
-                for key, values in self.times.items()
-                for whole in [[value for value, _ in values]]
+                vars(key) | {"median_s": self.median(**vars(key)), "best_s": self.best(**vars(key))}
+                for key in self.times
             ],
             "memory": self.memory_rows,
-            "targets": [
-                {name: None if value != value else value for name, value in entry.items()} for entry in self.targets()
-            ],
+            "targets": self.targets(),
             "left_out": self.left_out,
         }
 
 
-def table(head: list[str], rows: list[list[str]]) -> str:
+def table(head: Sequence[str], rows: list[Sequence[str]]) -> str:
     lines = [head, ["---"] + ["---:"] * (len(head) - 1), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
-def _points(points: int | str) -> str:
-    return points if isinstance(points, str) else f"{points:,}"
-
-
-def _rate(seconds: float) -> str:
-    """People a second of seconds a person."""
-    return f"{1 / seconds:,.0f}" if seconds < 0.05 else f"{1 / seconds:.1f}"
 
 
 def processor() -> str:

@@ -16,6 +16,7 @@ import re
 import sys
 from collections.abc import Callable
 from functools import lru_cache, partial
+from itertools import pairwise
 from pathlib import Path
 
 import ablation_tables as changed
@@ -127,10 +128,7 @@ def card(model: str) -> str:
         ("hours", _in_all(runs, "hours", ".2f")),
         ("captured motion", f"{told['motion']}, subjects {', '.join(told['recipe']['subjects'])}"),
     ]
-    stages = [
-        f"{run['recipe']['init']}, {before['people_seen']:,} people before"
-        for run, before in zip(runs, runs[1:], strict=False)
-    ]
+    stages = [f"{run['recipe']['init']}, {before['people_seen']:,} people before" for run, before in pairwise(runs)]
     if stages:
         rows.append(("begun as", "; itself begun as ".join(stages)))
     if "note" in told:
@@ -248,7 +246,7 @@ def tables() -> dict[str, Callable[[], str]]:
     made["scaling"] = lambda: table(*changed.scaling(runs, _longest()))
     made["against the paper"] = lambda: table(*changed.against_paper(runs))
     made["speed"] = lambda: table(*timed.medians(_read("speed")))
-    made["speed asked"] = lambda: table(*timed.asked(_read("speed")))
+    made["speed asked"] = lambda: table(*timed.asked(_read("speed")["targets"]))
     made |= {"calibration": calibration, "spread": spread, "real moved": moved}
     made |= {"visibility": visibility, "real": real}
     made["headline"] = partial(headline, *BUNDLED)

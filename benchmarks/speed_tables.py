@@ -1,4 +1,4 @@
-"""Tables of speed, from what `network.py --json` wrote."""
+"""Tables of speed, from what `network.py --json` wrote; how its report tells rates and targets too."""
 
 from collections.abc import Callable
 
@@ -10,6 +10,11 @@ POINTS = (128, 256, 512, 1024)
 Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]
 
 
+def rate(seconds: float) -> str:
+    """People a second of seconds a person."""
+    return f"{1 / seconds:,.0f}" if seconds < 0.05 else f"{1 / seconds:.1f}"
+
+
 def medians(found: dict) -> Rows:
     """Latency, people a second forward and in training, by points."""
     seconds = {(one["section"], one["network"], one["points"]): one["median_s"] for one in found["times"]}
@@ -17,22 +22,28 @@ def medians(found: dict) -> Rows:
 
     def add(section: str, unit: str, points: int | str, told: Callable[[float], str]) -> None:
         own = [seconds.get((section, name, points)) for name in NETWORKS]
-        shown = points if isinstance(points, str) else f"{points:,}"
-        rows.append((f"{section}, {unit}", shown, *("-" if value is None else told(value) for value in own)))
+        rows.append((f"{section}, {unit}", shown(points), *("-" if value is None else told(value) for value in own)))
 
     for points in POINTS:
         add("latency", "ms", points, lambda value: f"{1e3 * value:.2f}")
     for section in ("forward", "training"):
         for points in (*POINTS, "crops"):
-            add(section, "people/s", points, lambda value: f"{1 / value:,.0f}" if value < 0.05 else f"{1 / value:.1f}")
+            add(section, "people/s", points, rate)
     return ("median", "points", *NETWORKS), rows
 
 
-def asked(found: dict) -> Rows:
-    """The targets of network.py, and what came of them."""
+def asked(targets: list[dict]) -> Rows:
+    """Targets of network.py, and what came of them; figures are None where nothing was measured."""
     rows = []
-    for one in found["targets"]:
+    for one in targets:
         due = f"{'at most' if one['most'] else 'at least'} {one['target']:g} {one['unit']}".strip()
-        figures = (f"{one[name]:,.2f} {one['unit']}".strip() for name in ("figure", "best"))
-        rows.append((one["what"], due, *figures, "yes" if one["met"] else "**no**"))
+        figures = (
+            "-" if one[name] is None else f"{one[name]:,.2f} {one['unit']}".strip() for name in ("figure", "best")
+        )
+        met = {None: "not measured", True: "yes", False: "**no**"}[one["met"]]
+        rows.append((one["what"], due, *figures, met))
     return ("", "asked", "by medians", "by best rounds", "met by medians"), rows
+
+
+def shown(points: int | str) -> str:
+    return points if isinstance(points, str) else f"{points:,}"
