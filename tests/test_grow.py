@@ -48,15 +48,15 @@ def test_more_blocks_and_convolutions_change_nothing(arrays, heatmap):
 
 
 def test_small_begins_where_tiny_is(arrays):
-    """What is left is the mean of the layer norms' input: joints move by a little and are as good."""
+    """What is left is the norm of the joint head's two streams: joints move by next to nothing and are as good."""
     network, _ = load_checkpoint(bundled_path("tiny"))
     torch.manual_seed(0)
     before, after = told(network, arrays).joints(), told(grown(network, preset("small")), arrays).joints()
     true = torch.as_tensor(arrays["joints"])
     errors = [float((joints - true).norm(dim=-1).mean()) for joints in (before, after)]
     moved = float((after - before).norm(dim=-1).mean())
-    # a third of a voxel, whatever the weights' error; one that is not grown is ten times as far
-    assert moved < 0.02 and errors[1] < 1.05 * errors[0], (moved, errors)
+    assert moved < 0.02 * errors[0] and errors[1] < 1.05 * errors[0], (moved, errors)
+    # a network that is not grown is elsewhere
     assert (told(PoseNet(preset("small")), arrays).joints() - before).norm(dim=-1).mean() > 0.2
 
 

@@ -1,9 +1,10 @@
 """A larger `PoseNet` that begins where a smaller one is: what has been learned goes on in more channels and blocks.
 
-After Net2Net (Chen et al. 2016), by padding. Channels that are new in a residual stream begin at zero, as what writes
-them does; hidden units and heads that are new begin at random, and what reads them at zero; blocks and convolutions
-that are new add nothing. Layer norms see more channels, so their scale is made up for; what is left of the difference
-is the mean of their input, which is small in a trained network and gone after a few hundred steps.
+After Net2Net (Chen et al. 2016), by padding. Channels that are new in a residual stream begin as the mean of the old
+ones: a layer norm over more channels then sees the same mean, and a variance smaller by as much as its scale makes up
+for; what reads the stream without a norm reads them by zero. Hidden units and heads that are new begin at random, and
+what reads them at zero; blocks and convolutions that are new add nothing. What is left of the difference is the norm
+of the joint head, which sees two streams at once: under a millimetre on average.
 """
 
 from math import sqrt
@@ -17,13 +18,17 @@ from lidarpose.model.presets import NetworkConfig
 
 # what must be alike for numbers to mean the same
 _SAME = ("grid", "skeleton", "parts", "heatmap", "head_channels")
-# layers that write a residual stream, and the keys of votes: their new rows are zero
+# layers that write a residual stream: their new rows are the mean of the old ones
 _WRITERS = (
     *("stem.out", ".mix", ".place", "up_mid", "up_fine", "attention.out", "among.out", "cross.out", "feed.2"),
-    *("anchor_view", "vote.key"),
+    "anchor_view",
 )
-# layers that read hidden units: their new columns are zero
-_READERS = ("stem.out", "attention.out", "among.out", "cross.out", "feed.2", "joint.heatmap", "joint.certainty")
+# layers that read hidden units, and those that read a stream without a norm: their new columns are zero
+_READERS = (
+    *("stem.out", "attention.out", "among.out", "cross.out", "feed.2", "joint.heatmap", "joint.certainty"),
+    *("up_mid", "up_fine", "level_joints.0", "level_joints.1", "vote.query", "vote.key", "vote.residual", "part"),
+    "joint.hidden.0",
+)
 
 
 def grown(network: PoseNet, config: NetworkConfig) -> PoseNet:
@@ -60,11 +65,11 @@ def _idle(name: str, value: Tensor) -> Tensor:
 
 
 def _padded(name: str, old: Tensor, new: Tensor, small: PoseNet, larger: PoseNet) -> Tensor:
-    """The old tensor in the larger one's shape; what is new of it as it was drawn, or zero."""
+    """The old tensor in the larger one's shape; what is new of it as it was drawn, zero, or the mean of a stream."""
     layer, _, entry = name.rpartition(".")
     out = new.clone()
     if name in ("anchors", "vote.offset"):
-        out.zero_()
+        out[:] = old.mean(1, keepdim=True) if name == "anchors" else 0
         out[:, : old.shape[1]] = old
         return out
     if "norm" in layer:
@@ -76,13 +81,17 @@ def _padded(name: str, old: Tensor, new: Tensor, small: PoseNet, larger: PoseNet
         # its products are divided by the root of the width
         old = old * sqrt(len(new) / len(old))
     if layer.endswith(_WRITERS):
+        old = torch.cat([old, old.mean(0, keepdim=True).expand(len(new) - len(old), *old.shape[1:])])
+    elif layer == "vote.key":
         out[len(old) :] = 0
     if old.ndim == 1:
         out[: len(old)] = old
         return out
     columns = _places(small, larger) if layer == "joint.hidden.0" else torch.arange(old.shape[1])
     if layer.endswith(_READERS):
-        out[:, old.shape[1] :] = 0
+        fresh = torch.ones(new.shape[1], dtype=torch.bool)
+        fresh[columns] = False
+        out[:, fresh] = 0
     out[: len(old), columns] = old
     return out
 
