@@ -11,10 +11,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from lidarpose.cli import main
 from lidarpose.infer import info
-from lidarpose.model.bundled import DEFAULT
+from lidarpose.model.bundled import DEFAULT, bundled_path
 from lidarpose.synth.generate import Generator
 from lidarpose.synth.scene import scene_config
 
@@ -318,6 +319,7 @@ BAD_BOXES = {
     "NaN": ('[{"center": [1, NaN, 1], "size": [1, 1, 1]}]', "people[0].center"),
     "yaw text": ('[{"center": [1, 1, 1], "size": [1, 1, 1], "yaw": "x"}]', "people[0].yaw"),
     "degrees": ('[{"center": [1, 1, 1], "size": [1, 1, 1], "yaw": 90}]', "degrees"),
+    "far off": ('[{"center": [1e300, 1, 1], "size": [1, 1, 1]}]', "people[0].center"),
     "second": ('[{"center": [1, 1, 1], "size": [1, 1, 1]}, 4]', "people[1]"),
 }
 
@@ -330,6 +332,72 @@ def test_bad_boxes_are_one_line(crop, tmp_path, out, capsys, case):
     line = one_line(capsys)
     assert words in line and str(file) in line
     assert not out.exists()
+
+
+def test_what_is_read_is_never_written_over(crop, boxes, tmp_path, capsys):
+    """By whatever name: the boxes' own, a link's, a checkpoint's."""
+    taken = boxes.rename(tmp_path / "crop.poses.json")
+    weights = tmp_path / "mine.safetensors"
+    weights.write_bytes(bundled_path("tiny").read_bytes())
+    link = tmp_path / "link.onnx"
+    link.symlink_to(weights)
+    for words in (
+        ("predict", crop, "--boxes", taken, "--out", tmp_path),
+        ("export", weights, "--out", weights),
+        ("export", weights, "--format", "torch", "--out", link),
+        ("import", DAPT, DAPT),
+    ):
+        named = [Path(word) for word in words if isinstance(word, Path) and word.is_file()]
+        before = [path.read_bytes() for path in named]
+        assert run(*words) == 2
+        assert "is itself what is read" in one_line(capsys)
+        assert [path.read_bytes() for path in named] == before
+    # printed, the result harms nobody
+    assert run("predict", crop, "--boxes", taken, "--out", "-") == 0
+
+
+def test_an_id_cannot_forge_a_line(crop, tmp_path, out, capsys):
+    far = {"center": [500, 0, 0], "size": [1, 1, 1]}
+    forged = write(
+        tmp_path / "b.json", json.dumps([far | {"id": "a\nlidarpose: error: b \x1b[31m"}, far | {"id": "7" * 3000}])
+    )
+    assert run("predict", crop, "--boxes", forged, "--out", out) == 0
+    err = capsys.readouterr().err
+    assert all(line.startswith(("lidarpose: warning: ", "0 of 2 people")) for line in err.splitlines())
+    assert "\x1b" not in err and max(map(len, err.splitlines())) < 400
+
+
+def test_a_closed_stderr_leaves_the_json_alone(crop, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "stderr", None)
+    assert run("predict", crop, "--crop", "--out", "-") == 0
+    assert len(json.loads(capsys.readouterr().out)["people"]) == 1
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("flags", [(), ("--crop",), ("--boxes", "BOXES")])
+@pytest.mark.parametrize("scale", [1e30, 1.7e308])
+def test_absurd_coordinates_are_one_line(crop, points, boxes, tmp_path, out, capsys, flags, scale):
+    flags = [boxes if word == "BOXES" else word for word in flags]
+    np.save(tmp_path / "far.npy", np.resize([scale, -scale], (10, 3)))
+    assert run("predict", tmp_path / "far.npy", *flags, "--out", out) == 2
+    line = one_line(capsys)
+    assert "expected points in metres, got none within 1e+09 m" in line and len(line) < 300
+    # among good ones they are dropped
+    np.save(tmp_path / "some.npy", np.concatenate([points, np.full((3, 3), scale)]))
+    assert run("predict", tmp_path / "some.npy", *flags, "--out", out) == 0
+    assert f"dropped 3 of {len(points) + 3} points" in capsys.readouterr().err
+
+
+def test_json_that_is_nothing_but_brackets_is_one_line(tmp_path, capsys):
+    deep = "[" * 100_000
+    folder = tmp_path / "run"
+    folder.mkdir()
+    write(folder / "config.json", deep)
+    assert run("pretrain", folder, "--resume") == 2
+    assert "damaged" in one_line(capsys)
+    save_file({"a": np.zeros(1)}, tmp_path / "deep.safetensors", metadata={"lidarpose": deep})
+    assert run("export", tmp_path / "deep.safetensors", "--out", tmp_path / "x.onnx") == 2
+    assert "its header cannot be read" in one_line(capsys)
 
 
 # ---- what is wrong with the command: (words of it, words of the error)
@@ -355,6 +423,7 @@ BAD_COMMANDS = {
     "backend": ("predict CROP --backend tensorrt", "known are onnx, torch"),
     "decoder": ("predict CROP --decode mean", "unknown decoder 'mean'"),
     "device": ("predict CROP --device warp", "device 'warp' cannot be used"),
+    "device without numbers": ("predict CROP --device meta", "device 'meta' cannot be used"),
     "device of onnx": ("predict CROP --device cuda --backend onnx", "needs the backend torch"),
     "onnx missing": ("predict CROP --weights no/such.onnx", "no such file"),
     "onnx file": ("predict CROP --weights BOXES --backend onnx", "something else"),

@@ -16,9 +16,11 @@ from hypothesis import strategies as st
 
 import lidarpose
 from lidarpose import evaluation, metrics
+from lidarpose.cli import main
 from lidarpose.data.prepare import prepare
 from lidarpose.data.shards import open_dataset, read_rows, shard_path, write_shard
 from lidarpose.errors import InputError
+from lidarpose.evaluate import stability
 from lidarpose.evaluate.bench import load_bench
 from lidarpose.evaluate.lines import lines_of, span_rows, triples, turned_round
 from lidarpose.evaluate.people import open_people, spread
@@ -356,6 +358,10 @@ def test_triples_follow_each_other_evenly(sets):
     # every second frame is not the sequence's own step
     assert sorted(map(tuple, frames.tolist())) == [(1, 2, 3), (5, 6, 7)]
     assert not len(triples(_moving(sets, [1, 2])))
+    # another track's frames nearby take nothing away
+    several = _moving(sets, [0, 2, 4, 6, 8, 9, 10])
+    several = replace(several, track=np.array(["a"] * 5 + ["b"] * 2))
+    assert len(triples(several)) == 3
     unknown = replace(_moving(sets, [1, 2, 3]), time=np.full(3, np.nan))
     assert not len(triples(unknown))
 
@@ -438,6 +444,17 @@ def test_who_the_released_code_leaves_out_is_counted(sets, tmp_path):
     assert after.counts["people"] == before.counts["people"] - 2
     assert after.skipped["people of under 10 points, as the released code skips them"]["count"] == 1
     assert after.skipped["people without the center 'trans'"]["count"] == 1
+    # nor are they disturbed
+    task = task_of(Fake(standing), open_people(tmp_path / "leaking"), protocol="dapt")
+    assert len(stability._people(task)[0]) == after.counts["people"]
+
+
+def test_the_released_protocol_is_one_look(sets):
+    model = Fake(standing)
+    model.model["tta"] = 4
+    assert judged(sets, "humanm3", model)
+    with pytest.raises(InputError, match="dapt is one look at each person"):
+        judged(sets, "humanm3", model, protocol="dapt")
 
 
 # ---- files
@@ -536,6 +553,27 @@ def test_other_files_are_no_scores(tmp_path):
     (tmp_path / "poses.parquet").write_bytes(b"PAR1 and no more")
     with pytest.raises(InputError, match="is no poses.parquet"):
         evaluation.read_poses(tmp_path / "poses.parquet")
+
+
+def test_scores_whose_words_are_none_are_no_scores(written, tmp_path):
+    good = json.loads((written[1] / "scores.json").read_text())
+    for change in ({"digest": -1}, {"digest": float("nan")}):
+        (tmp_path / "a.json").write_text(json.dumps(good | {"weights": good["weights"] | change}))
+        with pytest.raises(InputError, match="no scores.json .*digest"):
+            evaluation.table([tmp_path / "a.json"])
+    good["results"][0]["setting"]["dataset"] = []
+    (tmp_path / "a.json").write_text(json.dumps(good))
+    with pytest.raises(InputError, match="no scores.json .*dataset is no text"):
+        evaluation.table([tmp_path / "a.json"])
+
+
+def test_a_table_never_replaces_its_scores(written, capsys):
+    path = written[1] / "scores.json"
+    before = path.read_bytes()
+    for named in (written[1], path):
+        assert main(["table", str(named), "--out", str(path)]) == 2
+        assert "is itself what is read" in capsys.readouterr().err
+    assert path.read_bytes() == before
 
 
 def test_folders_are_numbered(tmp_path):

@@ -18,10 +18,11 @@ from lidarpose.evaluate import stability as module
 from lidarpose.evaluate.disturb import DISTURBANCES
 from lidarpose.evaluate.judged import gathered
 from lidarpose.evaluate.people import open_people
-from lidarpose.evaluate.run import judge, task_of
+from lidarpose.evaluate.run import Task, judge, task_of
 from lidarpose.evaluate.stability import end_errors, study, to_json
 from lidarpose.sample import Box, center_of
 from lidarpose.skeleton import BODY26, HUMAN15
+from lidarpose.synth.generate import LEAST_POINTS
 from lidarpose.synth.write import Job, write_dataset
 from lidarpose.view.charts import draw_stability
 
@@ -257,9 +258,18 @@ def test_without_the_extra_other_sensors_are_left_out(synthetic, monkeypatch):
 
 def test_no_pose_stays_out_of_the_increase():
     base = np.array([[100.0], [200.0], [300.0]])
-    found = np.array([[110.0], [np.nan], [330.0]])
+
+    def answers(*errors):
+        errors = np.array(errors)[:, None]
+        return SimpleNamespace(errors=lambda: errors, posed=~np.isnan(errors[:, 0]))
+
+    found = answers(110.0, np.nan, 330.0)
     point = module._point(found, base, 1.0, "1", [5, 6, 7])
     assert (point.mpjpe, point.increase, point.no_pose, point.people, point.points) == (220.0, 20.0, 1, 3, 6.0)
+    # whoever had none undisturbed has none here either
+    base = np.array([[100.0], [np.nan], [300.0]])
+    assert module._point(answers(110.0, np.nan, np.nan), base, 1.0, "1", [5, 6, 7]).no_pose == 2
+    assert module._point(answers(100.0, np.nan, 300.0), base, 0.0, "0", [5, 6, 7]).no_pose == 1
     alone = module._point(found, base, 1.0, "1", [5, 6, 7], np.array(["a", "a", "a"]))
     assert alone.low is None and alone.increase_high is None
 
@@ -269,3 +279,35 @@ def test_the_fake_answers_as_a_predictor_does(synthetic):
     assert model.skeleton is BODY26 and isinstance(model.backend, SimpleNamespace)
     found = judge(replace(task_of(model, open_people(synthetic)), sensor_unknown=True))
     assert model.origins == [None] * 12 and len(found.judged) == 12
+
+
+def test_other_sensors_see_the_same_people_at_the_same_places(synthetic, monkeypatch):
+    """Few beams do not bring them nearer: who is hardly seen then has no pose, and is counted."""
+    monkeypatch.setattr(module, "CAST", 12)
+    monkeypatch.setattr(module, "SENSORS", ("vlp-16", "livox-mid360", "os1-128"))
+    asked = []
+
+    def answered(self, people):
+        asked.append(people)
+        return real(self, people)
+
+    real = Task.answered
+    monkeypatch.setattr(Task, "answered", answered)
+    curve = module._sensors(task_of(Fake(standing), open_people(synthetic)), None)
+    for people in asked[1:]:
+        for one, first in zip(people, asked[0], strict=True):
+            assert one.distance == pytest.approx(first.distance, abs=1.0)
+            np.testing.assert_allclose(one.joints[:, :2], first.joints[:, :2], atol=1e-3)
+    assert min(len(one.points) for one in asked[1]) < LEAST_POINTS
+    assert [point.people for point in curve.points] == [12, 12, 12]
+
+
+def test_a_crop_moved_by_nothing_is_the_crop(tmp_path):
+    """In the protocol dapt too, whose box is another one."""
+    files.write_humanm3(tmp_path / "raw", files.write_smpl(tmp_path / "smpl.npz"), sequences=("test/b",), frames=2)
+    prepare("humanm3", tmp_path / "raw", tmp_path / "humanm3")
+    for protocol in ("clean", "dapt"):
+        task = task_of(Fake(standing), open_people(tmp_path / "humanm3"), protocol=protocol)
+        for shown in module._people(task)[0]:
+            found = module._disturbed(task, shown, "crop", 0.0).points
+            np.testing.assert_array_equal(found, shown.person.points.astype(float))

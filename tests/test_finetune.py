@@ -122,6 +122,8 @@ def test_splits_intervals_and_sequences_leave_people_out(datasets):
 
 def test_synthesized_shards_are_people_too(synthetic):
     crowd = crowd_of([synthetic])
+    # single people are nobody's frames
+    assert len(crowd_of([synthetic], interval=5)) == 6
     assert len(crowd) == 6 and crowd.dataset == "" and crowd.skeleton == "body26"
     assert (crowd.part > 0).any() and all(crowd.person(row).sensor_known for row in range(6))
 

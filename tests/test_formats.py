@@ -277,7 +277,7 @@ def test_bin_columns(folder):
     for rows in (7, 8):
         cloud = read(folder, "a.bin", nuscenes[:rows].tobytes())
         same(cloud, nuscenes[:rows], fields)
-        assert len(cloud.warnings) == 1 and "columns=4" in cloud.warnings[0]
+        assert len(cloud.warnings) == 1 and "--columns 4" in cloud.warnings[0]
     # the converse: 10 rows of KITTI's 4 are also 8 rows of 5
     kitti = rng.normal(scale=20, size=(10, 4)).astype(np.float32)
     cloud = read(folder, "a.bin", kitti.tobytes())
@@ -439,7 +439,7 @@ BAD = {
     "ply no points": ("a.ply", ply_header(0), ["has no points"]),
     "ply odd count": ("a.ply", ply_header("many") + ROWS, ["'many'"]),
     "bin odd size": ("a.bin", ROWS[:-1], ["47 bytes", "cut off"]),
-    "bin of three": ("a.bin", np.ones((7, 3), "f4").tobytes(), ["84 bytes", "columns=3"]),
+    "bin of three": ("a.bin", np.ones((7, 3), "f4").tobytes(), ["84 bytes", "--columns 3"]),
     "bin garbage": ("a.bin", np.random.default_rng(0).bytes(4000), ["beyond"]),
     "bin all nan": ("a.bin", np.full((3, 4), np.nan, "f4").tobytes(), ["NaN"]),
     "npy objects": ("a.npy", OBJECTS, ["dtype object"]),
@@ -592,3 +592,23 @@ def test_real_sweeps(name):
     many = [(a, b) for a, b in zip(found, expected, strict=True) if b >= 50]
     assert len(many) == 3
     assert all(abs(a - b) <= 3 for a, b in many)
+
+
+@pytest.mark.parametrize(
+    "text", ['"x" "y" "z"\n"1" 0.1 0.2 0.3\n"2" 1.1 1.2 1.3\n', "x,y,z\n0,0.1,0.2,0.3\n", "# rows\nx y z\n\n1 2 3 4\n"]
+)
+def test_more_values_than_the_header_names_are_refused(tmp_path, text):
+    """Row numbers, as of R or pandas: all would move by a column."""
+    path = tmp_path / "r.txt"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"expected 3 values a row, as its header names, got 4 on line \d"):
+        read_points(path)
+    path.write_text("x,y,z\n0.1,0.2,0.3,\n")
+    np.testing.assert_allclose(read_points(path).points, [[0.1, 0.2, 0.3]])
+
+
+def test_raw_rows_of_another_width_are_told_all_that_fit(tmp_path):
+    path = tmp_path / "xyz.bin"
+    np.ones((102, 3), "f4").tofile(path)
+    with pytest.raises(InputError, match=r"say how many values a row has \(--columns 3 or 6\)"):
+        read_points(path)

@@ -4,6 +4,7 @@ import json
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,9 @@ import lidarpose
 from lidarpose.data.boxes import read_boxes
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, rotation_about
+from lidarpose.infer.backend import Raw
 from lidarpose.infer.people import MAX_POINTS, as_origin, as_points, candidates, flat_axis, lies, unit_warning
+from lidarpose.infer.predictor import Predictor
 from lidarpose.lidar.sensor import sensor
 from lidarpose.sample import Box
 from lidarpose.skeleton import SKELETONS
@@ -565,3 +568,51 @@ def test_real_sweeps(model, name):
         if person.num_points >= 50:
             assert np.linalg.norm(person.joints[0] - box["center"]) < 0.6
             assert height(person, "head") > height(person, "pelvis") > height(person, "left_ankle")
+
+
+def test_masked_points_are_no_points(model, points):
+    mask = np.zeros(points.shape, bool)
+    mask[::3, 1] = True
+    found = model.predict(np.ma.masked_array(np.where(mask, 9.0, points), mask))
+    assert found.num_points == (~mask.any(1)).sum()
+    np.testing.assert_array_equal(found.joints, model.predict(points[~mask.any(1)]).joints)
+
+
+@pytest.mark.parametrize("given", [None, 5, 0.5])
+def test_load_of_no_name_is_told(given):
+    with pytest.raises(InputError, match="expected weights as tiny, small or the path of a file"):
+        lidarpose.load(given)
+
+
+def test_points_are_no_path():
+    with pytest.raises(InputError, match="expected the path of a point file, got ndarray") as caught:
+        lidarpose.predict(np.zeros((300, 3)), crop=True)
+    assert len(str(caught.value)) < 200
+
+
+def test_ids_are_what_json_can_hold(model, sweep):
+    path, boxes = sweep[:2]
+    box = Box(center=[0, 0, 0], size=[9, 9, 9], id=np.int64(3))
+    assert box.id == 3 and type(box.id) is int
+    assert read_boxes([{"center": [0, 0, 0], "size": [1, 1, 1], "id": np.int64(3)}])[0].id == 3
+    for wrong in (1.5, True, ["a"]):
+        with pytest.raises(InputError, match="Box.id must be text or a whole number"):
+            Box(center=[0, 0, 0], size=[9, 9, 9], id=wrong)
+    json.loads(lidarpose.predict(path, boxes=[box], model=model).to_json())
+
+
+def test_without_confidence_the_whole_cloud_is_the_answer(points):
+    """Not the smallest of the candidates, which is seen first."""
+
+    class Counting:
+        name, header, batch = "counting", SimpleNamespace(skeleton=SKELETONS["smpl24"], version="0", card={}), 8
+
+        def run(self, clouds, view):
+            vote = np.zeros((len(clouds), 24, 3), np.float32)
+            vote[:, 1:, 2] = np.array([len(cloud) for cloud in clouds])[:, None] * 1e-3
+            return Raw(vote=vote, heatmaps=None, low=np.zeros(3), step=np.ones(3))
+
+    cloud = cluttered(points)
+    assert len({len(one) for one in candidates(cloud)}) > 1
+    joints = Predictor(Counting(), name="counting").predict(cloud).joints
+    assert joints[1, 2] - joints[0, 2] == pytest.approx(len(cloud) * 1e-3, abs=1e-3)

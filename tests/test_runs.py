@@ -21,6 +21,7 @@ from lidarpose.train.feed import BATCHES, lanes_of
 from lidarpose.train.optimize import optimizers
 from lidarpose.train.pose_task import PoseTask
 from lidarpose.train.recipes import Finetune, Pretrain, recipe
+from lidarpose.train.sources import SyntheticSource
 
 # three chunks of `BATCHES` batches
 RECIPE = Pretrain(
@@ -156,6 +157,19 @@ def test_a_run_may_become_shorter_and_longer(monkeypatch, tmp_path):
     with pytest.raises(InputError, match="the run has seen 48 people already, got 16 in all"):
         loop.train(replace(RECIPE, people=16), folder, resume=True)
     assert [line["people"] for line in log_of(folder)][-1] == 48
+
+
+def test_a_longer_run_sees_everybody(monkeypatch, tmp_path):
+    """Those of the last, short chunk of the shorter run too."""
+    folder, seen = tmp_path / "run", []
+    original = SyntheticSource.example
+    monkeypatch.setattr(SyntheticSource, "example", lambda self, index: seen.append(index) or original(self, index))
+    monkeypatch.setattr(job, "VALIDATION", 0)
+    loop.train(replace(RECIPE, people=6), folder)
+    assert sorted(set(seen)) == list(range(6))
+    loop.train(replace(RECIPE, people=32), folder, resume=True)
+    assert set(seen) >= set(range(32))
+    assert [line["people"] for line in log_of(folder)] == [16, 32]
 
 
 @pytest.mark.parametrize("step", [BATCHES + 3, 2 * BATCHES, 3 * BATCHES])
@@ -316,7 +330,7 @@ def test_the_state_of_another_network_is_refused(tmp_path, unbroken):
     other = replace(TINY, channels=(32, 32, 32))
     network = PoseNet(other)
     mean = dict(network.named_parameters())
-    progress = {"chunk": 1, "seconds": 0.0, "best": None}
+    progress = {"steps": 8, "seconds": 0.0, "best": None}
     loop.save_state(folder / runs.STATE, network, mean, optimizers(network, RECIPE), progress)
     with pytest.raises(InputError, match="not of this network") as caught:
         loop.train(RECIPE, folder, resume=True)

@@ -5,8 +5,10 @@ import re
 import pytest
 
 from lidarpose.cli import main
+from lidarpose.errors import InputError
 from lidarpose.synth import write
 from lidarpose.synth.write import Job, write_dataset
+from lidarpose.view.sheet import draw_dataset
 
 PNG = b"\x89PNG\r\n"
 
@@ -71,3 +73,16 @@ def test_the_table_and_the_cards_of_a_page_tell_the_same_distance(dataset):
     table = re.findall(rf"<tr><td>#\d+ os1-64</td>{number}\d+</td><td>\w+</td>{number}([\d.]+)</td>", page)
     cards = re.findall(r"points · ([\d.]+) m<", page)
     assert len(cards) == 20 and cards == table
+
+
+def test_a_sheet_never_replaces_the_dataset(tmp_path):
+    folder = tmp_path / "people"
+    write_dataset(Job(what="people", count=2, seed=3), folder)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    for name in before:
+        with pytest.raises(InputError, match="is itself what is read"):
+            draw_dataset(folder, out=folder / name)
+    assert before == {path.name: path.read_bytes() for path in folder.iterdir()}
+    # a sheet beside them, and again
+    for _ in range(2):
+        draw_dataset(folder, out=folder / "people.png")

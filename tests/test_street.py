@@ -1,5 +1,7 @@
 """Whole streets: who stands where, whose points are whose, and what a sample of them holds."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -154,3 +156,13 @@ def test_every_kind_of_sensor_sees_streets(name):
                 # a rosette smears who walks on
                 assert len(own) == 0 or box.contains(own, margin=0.3).mean() > 0.95
     assert seen > 100
+
+
+def test_a_sensor_of_any_number_of_rings_has_errors_of_centimetres(tmp_path):
+    path = tmp_path / "many.json"
+    path.write_text(json.dumps({"elevations_deg": np.linspace(-30, 30, 400).tolist(), "columns": 256}))
+    frame = street(0, 0, sensor=str(path)).frames[0]
+    assert frame.ring.max() > 256
+    assert np.isfinite(frame.points).all() and np.abs(frame.points).max() < 300
+    again = street(0, 0, sensor=str(path)).frames[0]
+    np.testing.assert_array_equal(frame.points, again.points)

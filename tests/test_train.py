@@ -283,16 +283,22 @@ def test_processes_share_every_batch_out(ranks):
             np.testing.assert_array_equal(joints[order[0]], batch["joints"][order[1]])
 
 
-def test_difficulty_rises_over_the_first_share_of_the_run(monkeypatch):
-    asked = []
+@pytest.fixture
+def asked(monkeypatch):
+    """(index, hard) of everybody who is made."""
+    made = []
     original = Generator.person
 
     def person(self, seed, index, *, hard):
-        asked.append((index, hard))
+        made.append((index, hard))
         return original(self, seed, index, hard=hard)
 
     monkeypatch.setattr(Generator, "person", person)
-    chunks(replace(RECIPE, easy=0.5, batch=4, people=96))
+    return made
+
+
+def test_difficulty_rises_over_the_first_share_of_the_run(asked):
+    chunks(replace(RECIPE, scene="wild", easy=0.5, batch=4, people=96))
     # lane by lane
     index, hard = np.array(sorted(asked)).T
     np.testing.assert_array_equal(index, np.arange(96))
@@ -300,6 +306,16 @@ def test_difficulty_rises_over_the_first_share_of_the_run(monkeypatch):
     assert hard[0] == 0 and (hard <= ceiling).all()
     # below the ceiling every difficulty goes on being seen, the harder ones more often: its mean is two thirds
     assert (hard[1:] / ceiling[1:]).mean() == pytest.approx(2 / 3, abs=0.08) and hard[48:].min() < 0.35
+
+
+@pytest.mark.parametrize("scene", ["paper", "reference"])
+def test_the_paper_s_people_are_all_as_hard_as_the_paper_s(asked, scene):
+    """Everybody masked: `hard` would take the mask away."""
+    chunks(replace(recipe_of(Pretrain, "paper"), size="tiny", scene=scene, batch=4, people=32, workers=0))
+    assert {hard for _, hard in asked} == {1.0}
+    asked.clear()
+    chunks(replace(RECIPE, scene=scene, easy=0.5, batch=4, people=96))
+    assert [hard for _, hard in sorted(asked)] == [min(k / 48, 1.0) for k in range(96)]
 
 
 def test_easier_people_are_seen_better():

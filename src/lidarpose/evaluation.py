@@ -25,7 +25,7 @@ from lidarpose.errors import InputError
 from lidarpose.evaluate.judged import Judged, read_poses, write_poses
 from lidarpose.evaluate.people import BENCH, open_people
 from lidarpose.evaluate.protocols import PROTOCOLS
-from lidarpose.evaluate.result import FILE, Line, Result, Scores, Setting, read_scores
+from lidarpose.evaluate.result import FILE, Line, Result, Scores, Setting, read_scores, scores_path
 from lidarpose.evaluate.run import Evaluation, Model, Task, judge, task_of
 from lidarpose.evaluate.stability import Stability, study, to_json
 from lidarpose.evaluate.table import published, table
@@ -50,6 +50,7 @@ __all__ = [
     "read_poses",
     "read_scores",
     "run",
+    "scores_path",
     "table",
     "write",
 ]

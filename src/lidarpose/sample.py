@@ -4,13 +4,15 @@ All are frozen, keyword-only and validated when built. Lengths in metres, angles
 """
 
 from dataclasses import dataclass, replace
-from numbers import Real
+from numbers import Integral, Real
 
 import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.skeleton import Skeleton
 
+# no coordinate on Earth is larger, m; arithmetic on what is would overflow
+FARTHEST = 1e9
 # what a pose may say of each joint
 _PER_JOINT = ("confidence", "spread", "visible", "in_range")
 
@@ -70,13 +72,16 @@ class Box:
                 value = np.array(given, float)
             except (TypeError, ValueError):
                 raise InputError(f"Box.{name} must be three finite numbers in metres, got {given!r}") from None
-            if value.shape != (3,) or not np.isfinite(value).all():
-                raise InputError(f"Box.{name} must be three finite numbers in metres, got {value.tolist()}")
+            if value.shape != (3,) or not (np.abs(value) < FARTHEST).all():
+                raise InputError(
+                    f"Box.{name} must be three finite numbers in metres, below {FARTHEST:g}, got {value.tolist()}"
+                )
             object.__setattr__(self, name, value)
         if (self.size <= 0).any():
             raise InputError(f"Box.size must be positive (length, width, height), got {self.size.tolist()}")
         if not isinstance(self.yaw, Real) or not np.isfinite(self.yaw):
             raise InputError(f"Box.yaw must be a finite number in radians, got {self.yaw!r}")
+        object.__setattr__(self, "id", box_id(self.id))
 
     def contains(self, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """points (n, 3) m -> (n,) bool: inside the box grown by `margin` m on each side."""
@@ -84,6 +89,15 @@ class Box:
         offset = np.asarray(points, float)[:, :3] - self.center
         local = np.stack([c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0], offset[:, 2]], -1)
         return (np.abs(local) <= self.size / 2 + margin).all(-1)
+
+
+def box_id(given: object) -> str | int | None:
+    """A box's id as JSON can hold it. Raises InputError for what is neither text nor a whole number, numpy's too."""
+    if isinstance(given, Integral) and not isinstance(given, bool):
+        return int(given)
+    if given is None or isinstance(given, str):
+        return given
+    raise InputError(f"Box.id must be text or a whole number, got {given!r}")
 
 
 @dataclass(frozen=True, kw_only=True)

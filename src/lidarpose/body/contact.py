@@ -18,9 +18,9 @@ _BEARING = 0.008
 
 
 @cache
-def _offsets() -> np.ndarray:
-    """(2, 3, 5, 3) float32 m: from the pelvis to the hip, from the hip to the knee, from the knee to the ankle (each
-    five times), and the ankle's sole points, of the left and the right leg."""
+def _offsets() -> tuple[np.ndarray, ...]:
+    """Of the left and the right leg, float32 m: from the pelvis to the hip, from the hip to the knee, from the knee to
+    the ankle, each (2, 3), and from the ankle to the sole's points (2, 4, 3)."""
     rest = mean_adult_joints()
     hip, knee, ankle = (rest[_LEGS[:, k]] for k in range(3))
     sole = np.stack([_SOLE, _SOLE * [1, -1, 1]])

@@ -6,6 +6,7 @@ import sys
 
 from lidarpose._version import __version__
 from lidarpose.cli import datasets, evaluating, predicting, training, weights
+from lidarpose.cli.words import tell
 from lidarpose.errors import LidarPoseError, missing_extra
 
 # options whose value may start with a minus sign, which argparse would take for another option
@@ -31,7 +32,7 @@ def main(arguments: list[str] | None = None) -> int:
     except (LidarPoseError, OSError) as error:
         return _failed(error)
     except KeyboardInterrupt:
-        print("lidarpose: stopped", file=sys.stderr)
+        tell("lidarpose: stopped")
         return 130
     return 0
 
@@ -39,7 +40,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _failed(error: Exception) -> int:
     # of several processes of a training one is enough to say it
     if os.environ.get("RANK", "0") == "0":
-        print(f"lidarpose: error: {error}", file=sys.stderr)
+        tell(f"lidarpose: error: {error}")
     return 2
 
 

@@ -1,11 +1,10 @@
 """`lidarpose synth`, `prepare`, `view` and `sensors`."""
 
 import argparse
-import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 
-from lidarpose.cli.words import names
+from lidarpose.cli.words import is_watched, names, tell
 
 
 def add(commands) -> None:
@@ -84,10 +83,10 @@ def _synth(options: argparse.Namespace) -> None:
         per_shard=options.per_shard,
     )
     with ExitStack() as stack:
-        progress = _bar(stack, unit=f" {job.what}") if sys.stderr is not None and sys.stderr.isatty() else None
+        progress = _bar(stack, unit=f" {job.what}") if is_watched() else None
         made = write_dataset(job, options.out, workers=options.workers, progress=progress)
     kept = "" if made == job.count else f", {job.count - made:,} were there"
-    print(f"{made:,} {job.what} made{kept} -> {options.out}", file=sys.stderr)
+    tell(f"{made:,} {job.what} made{kept} -> {options.out}")
 
 
 def _bar(stack: ExitStack, *, unit: str) -> Callable[[int, int], None]:
@@ -120,7 +119,7 @@ def _prepare(options: argparse.Namespace) -> None:
         workers=options.workers,
     )
     for line in lines_of(summary):
-        print(line, file=sys.stderr)
+        tell(line)
 
 
 def _sensors(options: argparse.Namespace) -> None:

@@ -2,10 +2,10 @@
 
 import argparse
 import shlex
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
 
+from lidarpose.cli.words import is_watched, tell
 from lidarpose.model.bundled import BUNDLED
 
 # groups of lines that the terminal shows; the others are in scores.json
@@ -49,7 +49,9 @@ def add(commands) -> None:
         "--decode", default="window", metavar="NAME", help="as in lidarpose predict; the paper's is dark"
     )
     evaluate.add_argument("--backend", metavar="NAME", help="onnx or torch, as in lidarpose predict")
-    evaluate.add_argument("--tta", type=int, default=1, metavar="N", help="as in lidarpose predict")
+    evaluate.add_argument(
+        "--tta", type=int, default=1, metavar="N", help="looks at each person, averaged: 1 (default) to 8"
+    )
 
     table = commands.add_parser(
         "table",
@@ -83,20 +85,22 @@ def _evaluate(options: argparse.Namespace) -> None:
             decode=options.decode,
             tta=options.tta,
             command=_command(options),
-            progress=_bar(stack) if sys.stderr is not None and sys.stderr.isatty() else None,
+            progress=_bar(stack) if is_watched() else None,
         )
     written = evaluation.write(found, folder)
     for result in found.scores.results:
         print("\n".join(_lines(result)))
     for study in found.studies:
         print("\n".join(_study(study)))
-    print(f"{', '.join(path.name for path in written)} -> {folder}", file=sys.stderr)
+    tell(f"{', '.join(path.name for path in written)} -> {folder}")
 
 
 def _table(options: argparse.Namespace) -> None:
     from lidarpose import evaluation
-    from lidarpose.data.files import write_atomic
+    from lidarpose.data.files import check_apart, write_atomic
 
+    if options.out is not None:
+        check_apart(options.out, *map(evaluation.scores_path, options.scores))
     text = evaluation.table(options.scores, format=options.format)
     if options.out is None:
         print(text, end="")

@@ -1,14 +1,14 @@
 """`lidarpose predict` and `lidarpose demo`."""
 
 import argparse
-import sys
 from contextlib import ExitStack
 from pathlib import Path
 
+from lidarpose.cli.words import is_watched, tell
 from lidarpose.model.bundled import DEFAULT, NAMES
 
-# people named by a warning that several share
-_MOST_NAMED = 3
+# people named by a warning that several share, and characters of an id
+_MOST_NAMED, _LONGEST_ID = 3, 40
 
 
 def add(commands) -> None:
@@ -59,10 +59,17 @@ def add(commands) -> None:
 
 
 def _predict(options: argparse.Namespace) -> None:
-    from lidarpose.data.files import atomic_path
+    from lidarpose.data.files import atomic_path, check_apart
     from lidarpose.infer.files import TTA, predict
     from lidarpose.infer.predictor import load
 
+    file = Path(options.file)
+    to_stdout = options.out == "-"
+    stem = Path("." if to_stdout else options.out) / file.stem
+    json_path = None if to_stdout else f"{stem}.poses.json"
+    picture_path = f"{stem}.poses.png" if options.picture else None
+    for path in filter(None, (json_path, picture_path)):
+        check_apart(path, options.file, options.boxes, options.weights)
     choices = {"backend": options.backend, "device": options.device, "decode": options.decode}
     choices["tta"] = TTA if options.tta is None else options.tta
     poses = predict(
@@ -75,16 +82,13 @@ def _predict(options: argparse.Namespace) -> None:
         columns=options.columns,
         # loaded once the input has proved readable
         model=lambda: load(options.weights, **choices),
-        progress=sys.stderr is not None and sys.stderr.isatty(),
+        progress=is_watched(),
     )
-    file = Path(options.file)
-    to_stdout = options.out == "-"
-    stem = Path("." if to_stdout else options.out) / file.stem
     outputs: dict[str, bytes] = {}
-    if not to_stdout:
-        outputs[f"{stem}.poses.json"] = poses.to_json().encode()
-    if options.picture:
-        outputs[f"{stem}.poses.png"] = poses.picture(title=file.name)
+    if json_path is not None:
+        outputs[json_path] = poses.to_json().encode()
+    if picture_path is not None:
+        outputs[picture_path] = poses.picture(title=file.name)
     # all of them or none
     with ExitStack() as stack:
         for path, content in outputs.items():
@@ -92,18 +96,20 @@ def _predict(options: argparse.Namespace) -> None:
     if to_stdout:
         print(poses.to_json(), end="")
     for line in _warnings(poses):
-        print(f"lidarpose: warning: {line}", file=sys.stderr)
+        tell(f"lidarpose: warning: {line}")
     seen = sum(person.pose is not None for person in poses)
     where = f" -> {' and '.join(outputs)}" if outputs else ""
-    print(f"{seen} of {len(poses)} people, {poses.timing_ms['per_person']:.0f} ms each{where}", file=sys.stderr)
+    tell(f"{seen} of {len(poses)} people, {poses.timing_ms['per_person']:.0f} ms each{where}")
 
 
 def _warnings(poses) -> list[str]:
     """The input's warnings, and each of the people's once with the ids of those it is about."""
+    from lidarpose.data.headers import shorten
+
     shared: dict[str, list[str]] = {}
     for person in poses:
         for warning in person.warnings:
-            shared.setdefault(warning, []).append(str(person.id))
+            shared.setdefault(warning, []).append(shorten(str(person.id), _LONGEST_ID))
     lines = list(poses.warnings)
     for warning, ids in shared.items():
         more = f" and {len(ids) - _MOST_NAMED} more" if len(ids) > _MOST_NAMED else ""

@@ -12,7 +12,7 @@ from lidarpose.train.recipes import Finetune, Pretrain, Recipe
 _WHAT = (
     "{what} RUN holds config.json, log.jsonl, model.safetensors, best.safetensors, pictures, and state.safetensors to "
     "go on from. Stopped or killed, --resume goes on to the same losses. Several processes: "
-    "`accelerate launch -m lidarpose {name} ...`."
+    "`torchrun --nproc_per_node N -m lidarpose {name} ...`."
 )
 
 

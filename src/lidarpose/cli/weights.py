@@ -1,9 +1,9 @@
 """`lidarpose info`, `export` and `import`."""
 
 import argparse
-import sys
 from pathlib import Path
 
+from lidarpose.cli.words import tell
 from lidarpose.model.bundled import DEFAULT
 
 
@@ -49,11 +49,11 @@ def _export(options: argparse.Namespace) -> None:
     path = weights_path(options.weights)
     out = options.out or path.stem + FORMATS.get(options.format, "")
     export(path, out, format=options.format)
-    print(f"{path.name} -> {out} ({Path(out).stat().st_size / 1e6:.2f} MB)", file=sys.stderr)
+    tell(f"{path.name} -> {out} ({Path(out).stat().st_size / 1e6:.2f} MB)")
 
 
 def _import(options: argparse.Namespace) -> None:
     from lidarpose.model.checkpoint import import_released
 
     header = import_released(options.file, options.out, config=options.config)
-    print(f"{header.config.name}, joints of {header.skeleton.name} -> {options.out}", file=sys.stderr)
+    tell(f"{header.config.name}, joints of {header.skeleton.name} -> {options.out}")

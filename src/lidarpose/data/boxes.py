@@ -8,7 +8,8 @@ import os
 import numpy as np
 
 from lidarpose.data.files import file_error, read_bytes
-from lidarpose.sample import Box
+from lidarpose.errors import InputError
+from lidarpose.sample import FARTHEST, Box, box_id
 
 # nobody writes more than two full turns in radians; 30, 90 or 180 are degrees
 _MAX_YAW = 4 * math.pi
@@ -83,23 +84,25 @@ def _triple(entry: dict, key: str, name: object, where: str, *, meaning: str) ->
 
 
 def _number(value: object) -> float | None:
-    """The value as a finite float, else None. Truth values and texts are not numbers; numpy's numbers are."""
+    """The value as a float that a place or an angle may have, else None. Truth values and texts are no numbers."""
     if isinstance(value, bool | np.bool_ | str | bytes):
         return None
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError):
         return None
-    return number if math.isfinite(number) else None
+    return number if abs(number) < FARTHEST else None
 
 
 def _id(entry: dict, name: object, where: str) -> str | int | None:
     for key in ("id", "track"):
         value = entry.get(key)
-        if isinstance(value, str | int) and not isinstance(value, bool):
-            return value
-        if value is not None:
-            raise file_error(name, f"{where}.{key}: expected text or a whole number, got {_show(value)}")
+        try:
+            found = box_id(value)
+        except InputError:
+            raise file_error(name, f"{where}.{key}: expected text or a whole number, got {_show(value)}") from None
+        if found is not None:
+            return found
     return None
 
 

@@ -6,6 +6,7 @@ Every failure that the user can cause is an `InputError` of one line that names 
 import difflib
 import errno
 import os
+import reprlib
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -32,11 +33,33 @@ _REMEDIES = {
 }
 
 
+def one_line(text: str) -> str:
+    """The text as one line that any terminal can print: what would break the line or steer the terminal is escaped."""
+    text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(text.splitlines()))
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
 def file_error(path: object, problem: object) -> InputError:
     """The error `PATH: PROBLEM` on one line that any terminal can print."""
-    text = " ".join(f"{path or repr(path)}: {problem}".splitlines())
-    text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
-    return InputError(text.encode("utf-8", "backslashreplace").decode())
+    return InputError(one_line(f"{path or repr(path)}: {problem}"))
+
+
+def check_apart(out: str | os.PathLike, *inputs: object) -> None:
+    """Raises InputError where the file to write is one of those that are read, by whatever name. Inputs that are no
+    paths, or of files that are not there, do not count."""
+    for source in inputs:
+        if _is_same(out, source):
+            raise file_error(out, "is itself what is read, and would be lost: name another file to write")
+
+
+def _is_same(out: str | os.PathLike, source: object) -> bool:
+    # a bare number would be taken for an open file's handle
+    if not isinstance(source, str | os.PathLike):
+        return False
+    try:
+        return os.path.samefile(out, source)
+    except (OSError, ValueError):
+        return False
 
 
 def read_bytes(path: str | os.PathLike, *, expected: str) -> bytes:
@@ -63,7 +86,7 @@ def read_bytes(path: str | os.PathLike, *, expected: str) -> bytes:
     except MemoryError:
         raise file_error(path, "does not fit in memory; split it first") from None
     except (TypeError, ValueError) as error:
-        raise file_error(repr(path), f"expected the path of {expected} ({error})") from None
+        raise file_error(reprlib.repr(path), f"expected the path of {expected} ({error})") from None
     if not data:
         raise file_error(path, f"is empty; expected {expected}: was it copied completely?")
     return data

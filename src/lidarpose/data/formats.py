@@ -155,9 +155,9 @@ def _parse_bin(data: bytes, columns: int | None):
     if columns is None:
         columns, notes = _guess_columns(data)
     if len(data) % (4 * columns):
-        fits = next((c for c in (4, 5, 6, 3, 7, 8) if len(data) % (4 * c) == 0), None)
+        fits = [str(c) for c in range(3, 9) if len(data) % (4 * c) == 0]
         remedy = (
-            f"give columns={fits} if rows have {fits} values"
+            f"say how many values a row has (--columns {' or '.join(fits)})"
             if fits
             else "it is cut off or not raw float32, copy it again"
         )
@@ -167,7 +167,9 @@ def _parse_bin(data: bytes, columns: int | None):
     share = float((np.isfinite(points) & (np.abs(points) > _MAX_PLAUSIBLE)).any(axis=1).mean())
     if share > _MAX_IMPLAUSIBLE_SHARE:
         came = f"{share:.0%} of rows beyond {_MAX_PLAUSIBLE:g} m"
-        raise Problem(f"expected rows of {columns} float32 in metres, got {came}: another format, or give columns=")
+        raise Problem(
+            f"expected rows of {columns} float32 in metres, got {came}: another format, or another --columns?"
+        )
     return points, {4: KITTI_FIELDS, 5: NUSCENES_FIELDS}.get(columns) or numbered(columns), notes
 
 
@@ -182,7 +184,7 @@ def _guess_columns(data: bytes) -> tuple[int, tuple[str, ...]]:
     if len(data) % (4 * four) == 0 and not beams:
         return four, ()
     why = "every fifth value is a beam number" if beams else "the size divides by 5 values and not by 4"
-    return five, (f"read as rows of 5 float32 (nuScenes), since {why}; give columns=4 (KITTI) if that is wrong",)
+    return five, (f"read as rows of 5 float32 (nuScenes), since {why}; give --columns 4 (KITTI) if that is wrong",)
 
 
 # ---- NumPy: https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html

@@ -6,6 +6,8 @@ from lidarpose.sample import Box
 
 # how much larger than the labelled joints the released box of HumanM3 is
 _ROOM = 1.25
+# of a box, m
+_LEAST_EDGE = 1e-6
 
 
 def released_view(
@@ -19,10 +21,17 @@ def released_view(
     everything = np.ones(len(points), bool)
     if "trans" in centers:
         return everything, centers["trans"]
-    if "joints_box" in centers:
-        low, high = np.nanmin(joints, 0), np.nanmax(joints, 0)
-        inside = np.abs(points - (low + high) / 2) <= _ROOM * (high - low) / 2
-        return inside.all(1), centers["joints_box"]
-    if "box" in centers:
-        return everything if box is None else box.contains(points), centers["box"]
+    crop = released_box(joints, centers, box)
+    for name in ("joints_box", "box"):
+        if name in centers:
+            return everything if crop is None else crop.contains(points), centers[name]
     return everything, None
+
+
+def released_box(joints: np.ndarray, centers: dict[str, np.ndarray], box: Box | None) -> Box | None:
+    """The box that `released_view` crops by; where it crops nothing, the dataset's own, if any."""
+    if "trans" in centers or "joints_box" not in centers:
+        return box
+    low, high = np.nanmin(joints, 0), np.nanmax(joints, 0)
+    # of a single labelled joint too
+    return Box(center=(low + high) / 2, size=np.maximum(_ROOM * (high - low), _LEAST_EDGE))

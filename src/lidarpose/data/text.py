@@ -51,8 +51,23 @@ def parse_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...
         edge = separator or r"[ \t]"
         if re.search(rf"(?m)(?:^|{edge})[ \t]*[-+]?\d*,\d+(?:[eE][-+]?\d+)?[ \t]*(?:{edge}|$)", body):
             decimal = ","
+    if has_header:
+        _check_width(body, names, separator, num_skipped)
     points = _parse_rows(body, pick_xyz(names), separator=separator, decimal=decimal, num_skipped=num_skipped)
     return points, tuple(names), ()
+
+
+def _check_width(body: str, names: list[str], separator: str | None, num_skipped: int) -> None:
+    """Raises Problem where the first row has more cells than the header names: which column is x nobody knows then."""
+    for number, line in enumerate(io.StringIO(body), num_skipped + 1):
+        if line.strip():
+            cells = _split(line.strip(), separator)
+            if any(cells[len(names) :]):
+                raise Problem(
+                    f"expected {len(names)} values a row, as its header names, got {len(cells)} on line {number}, "
+                    f"{shorten(line)!r}: name every column, row numbers too, or leave them away"
+                )
+            return
 
 
 def decode(data: bytes) -> str:

@@ -281,13 +281,13 @@ def triples(judged: Judged) -> np.ndarray:
     rows = np.stack([order[:-2], order[1:-1], order[2:]], 1)
     first, second = (np.diff(judged.time[rows], axis=1)[:, k] for k in (0, 1))
     with np.errstate(invalid="ignore"):
-        even = (first > 0) & (np.abs(second - first) < _EVEN * first)
+        # of one person: a step from one track's end to the next one's beginning is nobody's
+        even = (owner[rows] == owner[rows[:, :1]]).all(1) & (first > 0) & (np.abs(second - first) < _EVEN * first)
         # the sequence's own step: not one that skips frames
         step = np.full(int(owner.max()) + 1, np.inf)
         np.minimum.at(step, owner[rows[even, 0]], first[even])
         even &= first < (1 + _EVEN) * step[owner[rows[:, 0]]]
-    alike = (owner[rows] == owner[rows[:, :1]]).all(1)
-    return rows[even & alike & judged.posed[rows].all(1)]
+    return rows[even & judged.posed[rows].all(1)]
 
 
 def _motion(judged: Judged, setting: Setting) -> Iterator[Line]:

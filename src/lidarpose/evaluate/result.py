@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -122,10 +122,15 @@ class Scores:
         return f'{{\n{rows},\n "results": [\n{results}\n ]\n}}\n'
 
 
+def scores_path(path: str | Path) -> Path:
+    """scores.json itself, of a file or of a folder that holds one."""
+    path = Path(path)
+    return path / FILE if path.is_dir() else path
+
+
 def read_scores(path: str | Path) -> Scores:
     """scores.json, or that of a folder. Raises InputError for a file that is none."""
-    path = Path(path)
-    path = path / FILE if path.is_dir() else path
+    path = scores_path(path)
     try:
         found = json.loads(read_bytes(path, expected=f"{FILE} of lidarpose evaluate"))
         if found["schema"] != SCHEMA:
@@ -134,8 +139,11 @@ def read_scores(path: str | Path) -> Scores:
                 f"is of schema {found['schema']!r}, this lidarpose reads {SCHEMA}: evaluate again, or use the "
                 "lidarpose version that wrote it",
             )
+        weights = dict(found["weights"])
+        if not isinstance(weights.get("digest") or "", str):
+            raise TypeError("the digest of the weights is no text")
         return Scores(
-            weights=dict(found["weights"]),
+            weights=weights,
             command=str(found["command"]),
             seed=int(found["seed"]),
             results=tuple(map(_result_of, found["results"])),
@@ -164,6 +172,9 @@ def _result_json(result: Result) -> str:
 def _result_of(found: dict[str, Any]) -> Result:
     setting = dict(found["setting"])
     setting["joints"] = tuple(setting["joints"])
+    for field in fields(Setting):
+        if field.type is str and not isinstance(setting[field.name], str):
+            raise TypeError(f"{field.name} is no text")
     return Result(
         setting=Setting(**setting),
         counts=dict(found["counts"]),

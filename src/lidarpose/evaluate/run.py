@@ -7,6 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from lidarpose.data.readers.items import UNLABELED
+from lidarpose.data.released import released_box
 from lidarpose.errors import InputError
 from lidarpose.evaluate.bench import floors
 from lidarpose.evaluate.judged import Judged, gathered, subset
@@ -69,10 +70,17 @@ class Task:
         return cropped(setting.protocol, setting.kind, person, setting.seed)
 
     def box(self, person: Person) -> Box | None:
-        """The box that a crop is displaced from: a detector's in the protocol clean, else the dataset's, if any."""
+        """The box that a crop is displaced from: a detector's in the protocol clean, the released code's in dapt, else
+        the dataset's, if any."""
         setting = self.setting
-        drawn = detector_box(setting.kind, person, setting.seed) if setting.protocol == "clean" else None
-        return drawn or person.box
+        if setting.protocol == "dapt":
+            return released_box(person.joints, person.centers, person.box)
+        return detector_box(setting.kind, person, setting.seed) or person.box
+
+    @property
+    def least(self) -> int:
+        """A person of fewer points is not judged."""
+        return RELEASED[self.setting.kind].least if self.setting.protocol == "dapt" else 1
 
     def answered(self, people: list[Person]) -> list[dict]:
         """Rows for `judged.gathered`: what the network says of people as the protocol shows them."""
@@ -132,6 +140,8 @@ def task_of(
     if seed < 0:
         raise InputError(f"expected a seed of at least 0, got {seed}")
     check_protocol(protocol, people.kind, people.split_by, people.name)
+    if protocol == "dapt" and model.model.get("tta", 1) > 1:
+        raise InputError("the protocol dapt is one look at each person, as the released code's: leave --tta away")
     wanted = people.judged
     if skeleton is not None:
         wanted = skeleton_of(skeleton)

@@ -103,9 +103,10 @@ def study(
     Of lidarpose-bench its clean people are disturbed, of other datasets at most `PEOPLE`, evenly spread.
     """
     people, who = _people(task)
-    base = _errors(task, [one.person for one in people])
+    undisturbed = _answers(task, [one.person for one in people])
+    base = undisturbed.errors()
     clusters = np.array([one.person.sequence for one in people]) if task.setting.clusters else None
-    whole = _point(base, base, 0.0, "0", [len(one.person.points) for one in people], clusters)
+    whole = _point(undisturbed, base, 0.0, "0", [len(one.person.points) for one in people], clusters)
     curves = []
     for name, disturbance in DISTURBANCES.items():
         points = [whole]
@@ -113,7 +114,7 @@ def study(
             shown = [_disturbed(task, one, name, amount) for one in people]
             counts = [len(one.points) for one in shown]
             label = f"{amount * disturbance.scale:g}"
-            points.append(_point(_errors(task, shown), base, amount, label, counts, clusters))
+            points.append(_point(_answers(task, shown), base, amount, label, counts, clusters))
             if progress is not None:
                 progress(len(people))
         curves.append(Curve(name=name, title=disturbance.title, says=disturbance.says, points=tuple(points)))
@@ -171,7 +172,7 @@ def _people(task: Task) -> tuple[list[_Shown], str]:
     if setting.protocol == "dapt":
         found = [one for one in found if released_center(setting.kind, one) is not None]
     shown = [_Shown(person=task.prepared(one), whole=one, box=task.box(one)) for one in found]
-    shown = [one for one in shown if len(one.person.points)]
+    shown = [one for one in shown if len(one.person.points) >= task.least]
     if not shown:
         raise InputError(f"none of the {who} has a point to disturb")
     return shown, f"{len(shown):,} {who}"
@@ -186,20 +187,17 @@ def _disturbed(task: Task, shown: _Shown, name: str, amount: float) -> Person:
     return replace(person, points=does(points, shown.box, amount, np.random.default_rng(seed)))
 
 
-def _errors(task: Task, people: list[Person]) -> np.ndarray:
-    """(n, J) mm; NaN without a label, a row of NaN without a pose."""
-    return gathered(task.joints, task.answered(people)).errors()
+def _answers(task: Task, people: list[Person]) -> Judged:
+    return gathered(task.joints, task.answered(people))
 
 
 def _point(
-    found: np.ndarray,
-    base: np.ndarray,
-    amount: float,
-    label: str,
-    counts: list[int],
-    clusters: np.ndarray | None = None,
+    answers: Judged, base: np.ndarray, amount: float, label: str, counts: list[int], clusters: np.ndarray | None = None
 ) -> Point:
+    """One amount's point; base (n, J) mm: the errors of the same people undisturbed."""
     rng = np.random.default_rng(zlib.crc32(label.encode()))
+    # NaN without a label, a row of NaN without a pose
+    found = answers.errors()
     both = ~np.isnan(found) & ~np.isnan(base)
     first, second = np.where(both, found, np.nan), np.where(both, base, np.nan)
     ends = [None] * 4
@@ -217,7 +215,7 @@ def _point(
         increase_low=ends[2],
         increase_high=ends[3],
         people=len(found),
-        no_pose=int((np.isnan(found).all(1) & ~np.isnan(base).all(1)).sum()),
+        no_pose=int((~answers.posed).sum()),
         points=float(np.median(counts)),
     )
 
@@ -240,7 +238,7 @@ def _sensors(task: Task, progress: Callable[[int], None] | None) -> Curve:
     pick = BODY26.map_to(task.people.skeleton)
     points = []
     for k, name in enumerate(SENSORS):
-        generator = Generator(scene=replace(scene, sensors=(name,)), measure=False)
+        generator = Generator(scene=replace(scene, sensors=(name,)), measure=False, redraw=False)
         samples = [generator.person(_SEED, index).sample for index in range(CAST)]
         people = [
             Person(
@@ -259,8 +257,8 @@ def _sensors(task: Task, progress: Callable[[int], None] | None) -> Curve:
             )
             for row, sample in enumerate(samples)
         ]
-        found = _errors(task, people)
-        made = _point(found, found, float(k), name, [len(one.points) for one in people])
+        found = _answers(task, people)
+        made = _point(found, found.errors(), float(k), name, [len(one.points) for one in people])
         points.append(replace(made, increase=None, increase_low=None, increase_high=None))
         if progress is not None:
             progress(len(people))

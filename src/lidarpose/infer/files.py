@@ -8,14 +8,15 @@ from dataclasses import replace
 import numpy as np
 
 from lidarpose.data.boxes import read_boxes
+from lidarpose.data.files import file_error
 from lidarpose.data.formats import Cloud, read_points
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_from_up
-from lidarpose.infer.people import MIN_POINTS, as_origin, flat_axis, lies, unit_warning
+from lidarpose.infer.people import MIN_POINTS, as_origin, flat_axis, lies, unit_warning, within_reach
 from lidarpose.infer.predictor import Predictor, load
 from lidarpose.infer.results import PersonPose, Poses
 from lidarpose.model.bundled import DEFAULT
-from lidarpose.sample import Box
+from lidarpose.sample import FARTHEST, Box
 
 # a file of less than this across is taken for a crop, m
 CROP_SIZE = 4.0
@@ -49,11 +50,16 @@ def predict(
     """
     if boxes is not None and crop:
         raise InputError("expected boxes or a crop, got both: a crop is one person already, so leave the boxes away")
+    if not isinstance(path, str | os.PathLike):
+        kind = type(path).__name__
+        raise InputError(
+            f"expected the path of a point file, got {kind}: for points use lidarpose.load().predict(points)"
+        )
     started = time.perf_counter()
     R_house_input = rotation_from_up(up)
     origin = np.zeros(3) if sensor_origin is None and boxes is not None else as_origin(sensor_origin)
     found = None if boxes is None else _boxes(boxes)
-    cloud = read_points(path, columns=columns)
+    cloud = _within_reach(path, read_points(path, columns=columns))
     read = time.perf_counter()
     points = cloud.points @ R_house_input.T
     if found is None:
@@ -109,6 +115,14 @@ def _boxes(given: object) -> list[Box]:
     if isinstance(given, list) and given and all(isinstance(box, Box) for box in given):
         return given
     return read_boxes(given)
+
+
+def _within_reach(path: object, cloud: Cloud) -> Cloud:
+    points, notes = within_reach(cloud.points)
+    if not len(points):
+        raise file_error(path, f"expected points in metres, got none within {FARTHEST:g} m: export it again")
+    dropped = len(cloud.points) - len(points)
+    return replace(cloud, points=points, num_dropped=cloud.num_dropped + dropped, warnings=(*cloud.warnings, *notes))
 
 
 def _check_crop_size(path: object, points: np.ndarray) -> None:

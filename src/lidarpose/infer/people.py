@@ -5,7 +5,7 @@ import os
 import numpy as np
 
 from lidarpose.errors import InputError
-from lidarpose.sample import Pose, center_of
+from lidarpose.sample import FARTHEST, Pose, center_of
 
 # joints that every skeleton has
 _TRUNK = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
@@ -14,8 +14,6 @@ _TRUNK = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 MIN_POINTS = 5
 # a person of more points is thinned: no sensor sees so many, and no voxel needs them
 MAX_POINTS = 50_000
-# no coordinate on Earth is larger, m; arithmetic on what is would overflow
-_FARTHEST = 1e9
 
 # a crop wider than this may hold more than a person, so people are looked for in it, m
 _TIGHT = 2.0
@@ -45,6 +43,9 @@ def as_points(points: object, what: str = "points") -> np.ndarray:
     """Anything array-like (n, 3+) as (n, 3) float64. Raises InputError for another shape or type; n = 0 is legal."""
     if isinstance(points, str | os.PathLike):
         raise InputError(f"{what} must be an (n, 3) array, got a path: use lidarpose.predict({str(points)!r})")
+    if isinstance(points, np.ma.MaskedArray):
+        # masked is no point
+        points = points.astype(np.float64).filled(np.nan)
     if hasattr(points, "detach"):
         # a torch tensor that may sit on a device, in a graph, or in bfloat16, which numpy lacks
         points = points.detach().cpu().double()
@@ -75,25 +76,31 @@ def as_origin(given: object) -> np.ndarray | None:
         origin = np.array([float(value) for value in values])
     except (TypeError, ValueError):
         origin = np.zeros(0)
-    if origin.shape != (3,) or not (np.abs(origin) < _FARTHEST).all():
+    if origin.shape != (3,) or not (np.abs(origin) < FARTHEST).all():
         raise InputError(f"sensor origin: expected x,y,z in metres or unknown, got {given!r}")
     return origin
 
 
 def clean(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """points (n, 3) without NaN, infinite and absurd rows and at most `MAX_POINTS`, and a note for each thing done."""
-    notes = []
-    usable = (np.abs(points) < _FARTHEST).all(1)
-    if not usable.all():
-        dropped = int((~usable).sum())
-        notes.append(f"dropped {dropped} of {len(points)} points that were NaN, infinite or beyond {_FARTHEST:g} m")
-        points = points[usable]
+    points, notes = within_reach(points)
     if len(points) > MAX_POINTS:
         notes.append(
             f"thinned from {len(points)} to {MAX_POINTS} points: crop closer to the person if there are others"
         )
         points = points[np.arange(MAX_POINTS) * len(points) // MAX_POINTS]
     return points, notes
+
+
+def within_reach(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """points (n, 3) m without rows that arithmetic would choke on, and a note where there are some."""
+    usable = (np.abs(points) < FARTHEST).all(1)
+    if usable.all():
+        return points, []
+    dropped = int((~usable).sum())
+    return points[usable], [
+        f"dropped {dropped} of {len(points)} points that were NaN, infinite or beyond {FARTHEST:g} m"
+    ]
 
 
 def candidates(points: np.ndarray) -> list[np.ndarray]:

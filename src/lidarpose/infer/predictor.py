@@ -150,16 +150,19 @@ class Predictor:
             found = candidates(points)
             clouds += found
             owner += [i] * len(found)
-        best: dict[int, Pose] = {}
+        answers: list[Pose | None] = [None] * len(clouds)
         batch = self.backend.batch
         # people of like size together: a batch costs as much as if all were its largest
         order = sorted(range(len(clouds)), key=lambda k: len(clouds[k]))
         for start in _shown(range(0, len(clouds), batch), progress):
             part = order[start : start + batch]
             for k, pose in zip(part, self._poses([clouds[k] for k in part], origin), strict=True):
-                i = owner[k]
-                if pose is not None and (i not in best or _surer(pose, best[i])):
-                    best[i] = pose
+                answers[k] = pose
+        best: dict[int, Pose] = {}
+        # a person's first candidate is the whole cloud
+        for i, pose in zip(owner, answers, strict=True):
+            if pose is not None and (i not in best or _surer(pose, best[i])):
+                best[i] = pose
         for i in sorted(set(owner)):
             if i in best:
                 results[i] = replace(results[i], pose=best[i].to(wanted))

@@ -88,7 +88,9 @@ def _numbers(path: Path, name: str, values: object) -> np.ndarray:
 def _number(path: Path, name: str, value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise file_error(path, f"{name} must be a number, got {value!r}")
-    return float(_numbers(path, name, [value])[0])
+    if not math.isfinite(value):
+        raise file_error(path, f"{name} must be a finite number, got {value!r}")
+    return float(value)
 
 
 def _from_json(path: Path, text: str) -> dict:

@@ -4,7 +4,7 @@ import os
 from importlib import resources
 from pathlib import Path
 
-from lidarpose.errors import unknown_name
+from lidarpose.errors import InputError, unknown_name
 
 BUNDLED = ("tiny", "small")
 # what is taken where nothing is named: the best whose two files are at most 6 MB
@@ -22,7 +22,11 @@ def bundled_path(name: str = DEFAULT, suffix: str = ".safetensors") -> Path:
 
 def weights_path(weights: str | os.PathLike) -> Path:
     """The file that a name of bundled weights or a path means. Raises InputError for an unknown name."""
-    name = os.fspath(weights)
+    try:
+        name = os.fsdecode(weights)
+    except TypeError:
+        kind = type(weights).__name__
+        raise InputError(f"expected weights as {', '.join(BUNDLED)} or the path of a file, got {kind}") from None
     is_path = not isinstance(weights, str) or "/" in name or name.endswith((".safetensors", ".onnx"))
     is_path = name not in BUNDLED and (is_path or os.path.isfile(name))
     return Path(name) if is_path else bundled_path(name)

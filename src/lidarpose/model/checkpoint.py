@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 from safetensors.torch import save as to_bytes
 
-from lidarpose.data.files import file_error, write_atomic
+from lidarpose.data.files import check_apart, file_error, write_atomic
 from lidarpose.model.header import ENTRY, Header, opened, parse_header
 from lidarpose.model.network import PoseNet
 
@@ -89,6 +89,7 @@ def import_released(source: str | os.PathLike, out: str | os.PathLike, *, config
     """
     from lidarpose.model.dapt.released import import_dapt
 
+    check_apart(out, source)
     network = import_dapt(source, config)
     named = "" if config is None else f" --config {config}"
     card = {

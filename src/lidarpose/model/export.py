@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lidarpose.data.files import atomic_path, write_atomic
+from lidarpose.data.files import atomic_path, check_apart, write_atomic
 from lidarpose.errors import InputError, LidarPoseError, missing_extra, unknown_name
 from lidarpose.model.batch import Batch
 from lidarpose.model.checkpoint import load_checkpoint
@@ -53,6 +53,7 @@ def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = 
     """
     if format not in FORMATS:
         raise unknown_name("format", format, FORMATS)
+    check_apart(out, weights)
     network, header = load_checkpoint(weights)
     if header.network != "pose":
         raise InputError(

@@ -148,7 +148,7 @@ def parse_header(path: str | os.PathLike, entry: str | None) -> Header:
         if not isinstance(card, dict):
             raise TypeError(f"card is a {type(card).__name__}")
         return Header(version=str(version), config=config, card=card)
-    except (KeyError, TypeError, AttributeError, json.JSONDecodeError) as error:
+    except (KeyError, TypeError, AttributeError, RecursionError, json.JSONDecodeError) as error:
         reason = f"{type(error).__name__}: {error}"
         raise file_error(path, f"its header cannot be read ({reason}): get the file again, or train anew") from None
 

@@ -51,7 +51,7 @@ def facts_of(
 
 
 def _upright(joints: np.ndarray) -> bool:
-    """Stands or walks: trunk within 35 degrees of upright, and a knee at least at three quarters of its leg's reach."""
+    """Stands or walks: trunk within 35 degrees of upright, and a hip above its ankle by over four fifths of the leg."""
     pelvis, neck = joints[BODY26.index("pelvis")], joints[BODY26.index("neck")]
     if (neck - pelvis)[2] < np.cos(np.radians(35)) * np.linalg.norm(neck - pelvis):
         return False

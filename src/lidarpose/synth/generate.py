@@ -46,12 +46,14 @@ class SyntheticPerson:
 @dataclass(frozen=True, kw_only=True)
 class Generator:
     """Synthetic people of one scene configuration. captured: share of poses from `bank`, the rest from the prior;
-    measure: also find the facts, which costs a second cast. The sample is the same either way."""
+    measure: also find the facts, which costs a second cast: the sample is the same either way; redraw: somebody of whom
+    hardly anything is seen is drawn again, each time easier to see; else they stay as they are, without points too."""
 
     scene: SceneConfig
     bank: PoseBank | None = None
     captured: float = 0.0
     measure: bool = True
+    redraw: bool = True
 
     def __post_init__(self):
         if self.captured and self.bank is None:
@@ -87,13 +89,13 @@ class Generator:
         come from `bodies`. After the last try the best one counts, if it has any points at all."""
         scene = self.scene if hard is None else self.scene.eased(hard)
         best, most = None, 0.0
-        for attempt in range(_TRIES):
+        for attempt in range(_TRIES if self.redraw else 1):
             eased = scene.eased(scene.hard * (1 - attempt / (_TRIES - 1))) if attempt else scene
             stage = _draw_stage(eased, actor, bodies, row, 0.8**attempt, rng)
             seen = [_sample(eased, stage, actor, frame, rng) for frame in range(actor.frames)]
             # of the middle frame: half of a clip's frames have more
             points = float(np.median([np.count_nonzero(sample.part) for sample in seen]))
-            if points > most:
+            if points > most or not self.redraw:
                 best, most = (eased, stage, seen), points
             if points >= LEAST_POINTS:
                 break

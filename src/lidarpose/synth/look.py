@@ -57,7 +57,7 @@ class Conditions:
 
 
 def draw_conditions(config: SceneConfig, device: Sensor | RayPattern, rng: np.random.Generator) -> Conditions:
-    """Conditions of a scene, as bad as its difficulty."""
+    """Conditions of a scene; of them the mask alone is as frequent as the scene is difficult."""
     faults = config.faults
     noise, bias, weak, wide, divergence, mask, keep, phase = rng.random(8).tolist()
     sigma = 0.0 if faults.released else device.range_sigma * _between(faults.sigma, noise)

@@ -50,7 +50,8 @@ class CropErrors:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneConfig:
-    """How scenes are drawn. Probabilities unless a unit is named; `hard` scales all that makes a person hard to see.
+    """How scenes are drawn. Probabilities unless a unit is named; `hard` scales what hides a person or spoils
+    their crop, not the sensor's own noise.
 
     name; sensors: names or files of tables, each as often as it stands there; distance m: nearest and farthest;
     median_points: of the law of point counts, 0 = distance uniform as in the paper; mount m: standard deviation of

@@ -34,8 +34,8 @@ _STREET_KINDS = ("walk", "idle", "run", "push", "step")
 _KIND_TRIES = 12
 # share of what is weak that is lost, and the standard deviation of a ring's own range error, m
 _WEAK, _RING_BIAS = 0.6, 0.008
-# no LiDAR has more
-_MOST_RINGS = 256
+# that errors are drawn for, if the sensor has no more: so what is drawn after them does not depend on the sensor
+_RINGS = 256
 # what a label's box adds to the body's extent, m
 _BOX_ROOM = 0.1
 # errors of a detector's box in `samples`: center m, size m, yaw rad
@@ -79,7 +79,7 @@ def street(
     plan = draw_plan(device, rng)
     still = union(scenery(plan, rng)).moved((0, 0, 0), plan.turn)
     walkers = _draw_walkers(plan, int(rng.integers(least, most + 1)), frames, rng)
-    ring_error = rng.standard_normal(_MOST_RINGS, np.float32)
+    ring_error = rng.standard_normal(max(_RINGS, device.rows), np.float32)
     seen = tuple(_look(device, still, walkers, frame, ring_error, rng) for frame in range(frames))
     return Street(frames=seen, sensor=device.name, height=plan.height)
 

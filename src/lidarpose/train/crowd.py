@@ -119,8 +119,8 @@ def crowd_of(folders: Sequence[str | Path], *, split: str | None = None, interva
         for row in _rows(dataset, damaged):
             if split is not None and row["split"] != split:
                 continue
-            # frames are numbered by anything, time stamps too
-            whose = row.get("sequence"), row["track"]
+            # frames are numbered by anything, time stamps too; a synthetic clip has a number instead of a sequence
+            whose = row.get("sequence", row["index"]), row["track"]
             frames[whose] = frames.get(whose, -1) + 1
             if frames[whose] % interval == 0 and len(row["points"]):
                 rows.append(_kept(row, dataset))

@@ -161,20 +161,29 @@ class _Run:
         """The state of the run that was stopped; the beginning, where it was killed before its first was saved."""
         if (self.folder / STATE).is_file():
             progress = load_state(self.folder / STATE, self.network, self.mean, self.optimizers)
-            self.chunk, self.seconds = progress["chunk"], progress["seconds"]
+            done, self.seconds = progress["steps"], progress["seconds"]
+            if done > self.steps:
+                seen = done * self.recipe.batch
+                raise InputError(
+                    f"{self.folder}: the run has seen {seen:,} people already, got {self.job.people:,} in all"
+                )
+            # a longer run makes the last chunk of a shorter one anew, whole
+            self.chunk = self.chunks if done == self.steps else done // BATCHES
             self.best = float("inf") if progress["best"] is None else progress["best"]
             self.validation.last = progress.get("validation")
-        if self.chunk > self.chunks:
-            seen = self.chunk * BATCHES * self.recipe.batch
-            raise InputError(f"{self.folder}: the run has seen {seen:,} people already, got {self.job.people:,} in all")
         if self.accelerator.is_main_process:
             clean(self.folder)
             cut_log(self.folder, self.seen)
 
     @property
+    def taken(self) -> int:
+        """Steps of all chunks that are done."""
+        return min(self.chunk * BATCHES, self.steps)
+
+    @property
     def seen(self) -> int:
         """People of all chunks that are done."""
-        return min(self.chunk * BATCHES, self.steps) * self.recipe.batch
+        return self.taken * self.recipe.batch
 
     def go(self) -> None:
         """All that is left of the run."""
@@ -296,7 +305,7 @@ class _Run:
         # the state last: killed between the two, a run goes on from the older one and writes both again
         self._save_weights(MODEL, self._averaged())
         best = self.best if np.isfinite(self.best) else None
-        progress = {"chunk": self.chunk, "seconds": self.seconds, "best": best, "validation": self.validation.last}
+        progress = {"steps": self.taken, "seconds": self.seconds, "best": best, "validation": self.validation.last}
         save_state(self.folder / STATE, self.network, self.mean, self.optimizers, progress)
 
     def _save_weights(self, name: str, network: nn.Module, **more: float) -> None:

@@ -45,7 +45,7 @@ class Recipe:
     workers: int = _setting(1, "processes that make people, of each process that trains")
 
     def __post_init__(self):
-        least = {"batch": 1} | {f.name: 0 for f in fields(self) if f.type in (int, float) and f.name != "batch"}
+        least = {f.name: int(f.name in ("batch", "people")) for f in fields(self) if f.type in (int, float)}
         for name, bound in least.items():
             if not getattr(self, name) >= bound:
                 raise InputError(f"{name} must be at least {bound}, got {getattr(self, name)}")
@@ -93,8 +93,6 @@ class Pretrain(Recipe):
 
     def __post_init__(self):
         super().__post_init__()
-        if self.people < 1:
-            raise InputError(f"people must be at least 1, got {self.people}")
         self._check_shares("easy", "captured", "strays", "noise")
         if self.size in (PAPER, SMALL_PAPER):
             self.check_no_lengths()

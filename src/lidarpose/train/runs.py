@@ -128,7 +128,7 @@ def stored_recipe(folder: Path, kind: type[Recipe]) -> Recipe:
         return kind(**config["recipe"])
     except InputError:
         raise
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise file_error(path, f"expected the recipe of a run, but it is damaged ({error}): start a new run") from None
 
 

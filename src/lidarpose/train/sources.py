@@ -17,6 +17,8 @@ from lidarpose.train.augment import Augmentation, augmented, disturbed
 from lidarpose.train.crowd import Crowd
 from lidarpose.train.example import REFINED, Example, example
 
+# scenes whose every person is as the paper says, masked always
+_OF_ONE_DIFFICULTY = ("paper", "reference")
 # first words of generators' seeds: 1 is the synthetic person's own
 _SYNTHETIC, _STORED, _ORDER = 2, 5, 6
 
@@ -32,8 +34,9 @@ class SyntheticSource:
     """People of a scene whose difficulty rises.
 
     easy: how many people it takes to rise from nothing to full; below the ceiling every difficulty goes on being seen,
-    the harder ones more often; motion, subjects, captured, strays, noise: see `recipes.Pretrain`; refined: see
-    `example`. Raises InputError, at once, for an unknown scene and for clips that cannot be read.
+    the harder ones more often, but for the paper's scenes, which know one difficulty; motion, subjects, captured,
+    strays, noise: see `recipes.Pretrain`; refined: see `example`. Raises InputError, at once, for an unknown scene and
+    for clips that cannot be read.
     """
 
     scene: str
@@ -58,7 +61,9 @@ class SyntheticSource:
 
     def example(self, index: int) -> Example:
         rng = np.random.default_rng([self.seed, _SYNTHETIC, index])
-        hard = min(index / max(self.easy, 1), 1.0) * np.sqrt(rng.random())
+        hard = min(index / self.easy, 1.0) if self.easy else 1.0
+        if self.scene not in _OF_ONE_DIFFICULTY:
+            hard *= np.sqrt(rng.random())
         sample = self._generator.person(self.seed, index, hard=hard).sample
         return example(disturbed(sample, strays=self.strays, noise=self.noise, rng=rng), rng, refined=self.refined)
 

@@ -11,6 +11,9 @@ from torch import Tensor, nn
 from lidarpose.data.files import write_atomic
 from lidarpose.errors import InputError
 
+# what a state tells of the run besides tensors: steps taken, seconds, error of the best validation or None
+_PROGRESS = {"steps", "seconds", "best"}
+
 
 def save_state(
     path: Path, network: nn.Module, mean: dict[str, Tensor], optimizers: list[torch.optim.Optimizer], progress: dict
@@ -32,8 +35,10 @@ def load_state(
     try:
         with safe_open(str(path), framework="pt") as file:
             progress = json.loads((file.metadata() or {})["progress"])
+            if missing := _PROGRESS - set(progress):
+                raise ValueError(f"it does not tell {', '.join(sorted(missing))}")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
-    except (SafetensorError, OSError, ValueError, KeyError) as error:
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{path}: expected the state of a run, but it is damaged ({error}): start a new run") from None
     stored_mean = _part(tensors, "mean.")
     try:

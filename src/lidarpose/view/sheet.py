@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.files import file_error
-from lidarpose.data.shards import Dataset, open_dataset, shard_path
+from lidarpose.data.files import check_apart, file_error
+from lidarpose.data.shards import CARD, Dataset, open_dataset, shard_path
 from lidarpose.errors import InputError
 from lidarpose.view.picture import MAX_PEOPLE, Panel, draw_people
 from lidarpose.view.report import ReportPerson, write_report
@@ -23,6 +23,7 @@ def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out
     dataset = open_dataset(folder)
     name = Path(folder).resolve().name
     path = Path(out) if out is not None else Path(f"{name}.{'html' if html else 'png'}")
+    check_apart(path, dataset.folder / CARD, *dataset.folder.glob("*.parquet"))
     rows = _spread(dataset, count)
     settings = dataset.card.settings
     title = f"{name}: {dataset.card.count:,} {settings.get('what', 'people')}"

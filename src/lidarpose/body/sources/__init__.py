@@ -21,7 +21,7 @@ from lidarpose.body.sources.asf_amc import load_amc
 from lidarpose.body.sources.bvh import load_bvh
 from lidarpose.body.sources.lidarhuman26m import load_pose_json, pose_files
 from lidarpose.body.sources.sloper4d import load_sloper4d
-from lidarpose.data.files import file_error
+from lidarpose.data.files import file_error, read_bytes
 from lidarpose.errors import unknown_name
 from lidarpose.geometry import UP_AXES
 
@@ -68,6 +68,9 @@ def load_motion(
         folder = path.is_dir()
     except (TypeError, ValueError) as error:
         raise file_error(repr(path), f"expected the path of a file or folder of motion ({error})") from None
+    if not folder and format is None and path.suffix.lower() not in _BY_SUFFIX:
+        # says whether there is such a file at all
+        read_bytes(path, expected=f"a file of motion ({' '.join(_BY_SUFFIX)}) or a folder of them")
     if not folder or (format == "lidarhuman26m" and pose_files(path)):
         return _load(path, format, up=up, fps=fps, hz=hz)
     motions = []
@@ -83,7 +86,7 @@ def _load(path: Path, format: str | None, *, up: str | None, fps: float | None, 
     format = format or ("lidarhuman26m" if path.is_dir() else _BY_SUFFIX.get(path.suffix.lower()))
     if format is None:
         raise file_error(
-            path, f"expected a file of motion, one of {', '.join(_BY_SUFFIX)}, or a folder; else give format="
+            path, f"expected a file of motion, one of {', '.join(_BY_SUFFIX)}, or a folder: convert it first"
         )
     motion = FORMATS[format](path, up=up, fps=fps)
     return motion if hz is None else motion.resampled(hz)
