@@ -89,7 +89,7 @@ VARIANTS = {
     "no mask": Variant("mask", "no laser-level masking", scene=replace(_WILD, faults=replace(_WILD.faults, mask=0.0))),
     "always mask": Variant(
         "mask",
-        "everybody masked, 60 % kept, as the paper's",
+        "two in three masked, 60 % kept; the paper masks everybody",
         scene=replace(_WILD, faults=replace(_WILD.faults, mask=1.0, keep=0.6, keep_most=0.6)),
     ),
     "paper's scene": Variant("scene", "the paper's scene", scene=SCENES["paper"]),
@@ -158,6 +158,7 @@ def job(variant: Variant, settings: Pretrain) -> Job:
     config = configuration(variant, settings.init)
     task = VariantTask(config=config, made=variant.network)
     values = {name: value for name, value in vars(usual.source).items() if not name.startswith("_")}
+    values["scene"] = variant.scene.name
     if not variant.scene.hard:
         values["easy"] = math.inf
     network = task.network

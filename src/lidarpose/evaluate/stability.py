@@ -170,7 +170,9 @@ def _people(task: Task) -> tuple[list[_Shown], str]:
         found = [one for k, one in enumerate(task.people) if k in chosen]
         who = f"people of {setting.dataset}"
     if setting.protocol == "dapt":
-        found = [one for one in found if released_center(setting.kind, one) is not None]
+        # whose center is unknown, or whose box is, is not judged either
+        known = [one for one in found if released_center(setting.kind, one) is not None]
+        found = [one for one in known if not np.isnan(one.joints).all()]
     shown = [_Shown(person=task.prepared(one), whole=one, box=task.box(one)) for one in found]
     shown = [one for one in shown if len(one.person.points) >= task.least]
     if not shown:
@@ -221,7 +223,8 @@ def _point(
 
 
 def _sensors(task: Task, progress: Callable[[int], None] | None) -> Curve:
-    """The same bodies in the same poses and distances before each sensor, nothing around them."""
+    """The same bodies in the same poses at the same places before each sensor, however little it sees of them, nothing
+    around them."""
     from lidarpose.synth.generate import Generator
     from lidarpose.synth.scene import scene_config
 
@@ -266,7 +269,7 @@ def _sensors(task: Task, progress: Callable[[int], None] | None) -> Curve:
         name="sensors",
         title="other sensors",
         says=f"{CAST} people of the procedural prior, {_DISTANCE[0]:g} to {_DISTANCE[1]:g} m away, cast anew for each "
-        "sensor: the same bodies, poses and distances, nothing around them",
+        "sensor: the same bodies, poses and places, nothing around them",
         points=tuple(points),
     )
 

@@ -79,7 +79,7 @@ def street(
     plan = draw_plan(device, rng)
     still = union(scenery(plan, rng)).moved((0, 0, 0), plan.turn)
     walkers = _draw_walkers(plan, int(rng.integers(least, most + 1)), frames, rng)
-    ring_error = rng.standard_normal(max(_RINGS, device.rows), np.float32)
+    ring_error = rng.standard_normal(max(_RINGS, device.rows if isinstance(device, Sensor) else 0), np.float32)
     seen = tuple(_look(device, still, walkers, frame, ring_error, rng) for frame in range(frames))
     return Street(frames=seen, sensor=device.name, height=plan.height)
 
