@@ -56,11 +56,13 @@ def ties(model, clouds, centers, origin):
 
 
 def test_backends_agree_on_people_of_all_sizes(models):
-    sizes = np.geomspace(1, 5000, 200).round().astype(int)
+    # each once: single points about themselves are all one person, whose ties would count as often
+    sizes = np.unique(np.geomspace(1, 5000, 290).round().astype(int))
+    assert len(sizes) >= 200
     clouds = [blob(size, seed) for seed, size in enumerate(sizes)]
     equal = 0
     # together with others of about their size: rows are padded to the largest
-    for start in range(0, 200, 10):
+    for start in range(0, len(sizes), 10):
         group = clouds[start : start + 10]
         centers = np.stack([cloud.mean(0) for cloud in group])
         origin = np.zeros(3) if start % 20 else None
@@ -72,7 +74,7 @@ def test_backends_agree_on_people_of_all_sizes(models):
         for name in ("confidence", "spread", "visible"):
             np.testing.assert_allclose(getattr(ours, name), getattr(due, name), rtol=1e-4, atol=1e-5)
         assert np.ptp(due.joints) > 0.1
-    assert equal < 1e-3 * 200 * 26 * 3
+    assert equal < 1e-3 * len(sizes) * 26 * 3
 
 
 def test_backends_agree_to_the_end(models):

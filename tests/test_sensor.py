@@ -117,7 +117,7 @@ def test_user_tables_that_go_wrong_are_told_in_one_line(tmp_path):
             sensor(path)
         assert "\n" not in str(caught.value) and str(path) in str(caught.value)
 
-    refused("a.json", '{"elevations_deg": [1, 2], "height": 1' + "0" * 400 + "}", "height must be a list of numbers")
+    refused("a.json", '{"elevations_deg": [1, 2], "height": 1' + "0" * 400 + "}", "height must be a finite number")
     refused("b.json", '{"elevations_deg": [1, 2], "tilt_deg": "down"}', "tilt_deg must be a number")
     refused("c.json", "[1, 2, NaN]", "number 2 is not finite")
     refused("d.json", "[" * 100_000, "is not JSON")

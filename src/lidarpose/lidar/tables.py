@@ -17,6 +17,7 @@ import json
 import math
 import os
 import re
+import reprlib
 from pathlib import Path
 
 import numpy as np
@@ -88,9 +89,13 @@ def _numbers(path: Path, name: str, values: object) -> np.ndarray:
 def _number(path: Path, name: str, value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise file_error(path, f"{name} must be a number, got {value!r}")
-    if not math.isfinite(value):
-        raise file_error(path, f"{name} must be a finite number, got {value!r}")
-    return float(value)
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise file_error(path, f"{name} must be a finite number, got {reprlib.repr(value)}")
+    return number
 
 
 def _from_json(path: Path, text: str) -> dict:

@@ -86,7 +86,9 @@ def _load(path: Path, format: str | None, *, up: str | None, fps: float | None, 
     format = format or ("lidarhuman26m" if path.is_dir() else _BY_SUFFIX.get(path.suffix.lower()))
     if format is None:
         raise file_error(
-            path, f"expected a file of motion, one of {', '.join(_BY_SUFFIX)}, or a folder: convert it first"
+            path,
+            f"expected a file of motion, one of {', '.join(_BY_SUFFIX)}, or a folder: convert it, or in Python give "
+            "format=",
         )
     motion = FORMATS[format](path, up=up, fps=fps)
     return motion if hz is None else motion.resampled(hz)
