@@ -77,10 +77,20 @@ class Task:
             return released_box(person.joints, person.centers, person.box)
         return detector_box(setting.kind, person, setting.seed) or person.box
 
-    @property
-    def least(self) -> int:
-        """A person of fewer points is not judged."""
-        return RELEASED[self.setting.kind].least if self.setting.protocol == "dapt" else 1
+    def fit(self, person: Person) -> tuple[Person | None, str]:
+        """The person as the protocol shows them; or None, and why it leaves them out."""
+        kind = self.setting.kind
+        if self.setting.protocol != "dapt":
+            return self.prepared(person), ""
+        released = RELEASED[kind]
+        if released_center(kind, person) is None:
+            return None, f"people without the center {released.center!r}"
+        if kind == "humanm3" and (person.labels == UNLABELED).all():
+            return None, "people without a labelled joint, whom their box is made of"
+        shown = self.prepared(person)
+        if len(shown.points) < released.least:
+            return None, f"people of under {released.least} points, as the released code skips them"
+        return shown, ""
 
     def answered(self, people: list[Person]) -> list[dict]:
         """Rows for `judged.gathered`: what the network says of people as the protocol shows them."""
@@ -222,24 +232,13 @@ def judge(task: Task, *, legacy: bool = False, progress: Callable[[int], None] |
 
 def _fit(task: Task) -> Iterator[Person]:
     """The people as the protocol shows them; who has nothing to show is counted."""
-    kind, skipped = task.setting.kind, task.people.skipped
-    released = RELEASED[kind] if task.setting.protocol == "dapt" else None
     for person in task.people:
-        where = f"{person.sequence}, frame {person.frame}, track {person.track}"
-        if released is not None:
-            if released_center(kind, person) is None:
-                note(skipped, f"people without the center {released.center!r}", where)
-                continue
-            if kind == "humanm3" and (person.labels == UNLABELED).all():
-                note(skipped, "people without a labelled joint, whom their box is made of", where)
-                continue
-            shown = task.prepared(person)
-            if len(shown.points) < released.least:
-                note(skipped, f"people of under {released.least} points, as the released code skips them", where)
-                continue
-            yield shown
+        shown, why = task.fit(person)
+        if shown is None:
+            where = f"{person.sequence}, frame {person.frame}, track {person.track}"
+            note(task.people.skipped, why, where)
         else:
-            yield task.prepared(person)
+            yield shown
 
 
 def _chunks(people: Iterator[Person]) -> Iterator[list[Person]]:

@@ -18,7 +18,6 @@ from lidarpose.evaluate.disturb import DISTURBANCES
 from lidarpose.evaluate.groups import joint_groups
 from lidarpose.evaluate.judged import Judged, gathered
 from lidarpose.evaluate.people import BENCH, Person, spread
-from lidarpose.evaluate.protocols import released_center
 from lidarpose.evaluate.result import Setting, number
 from lidarpose.evaluate.run import Task
 from lidarpose.evaluate.scores import mean
@@ -169,12 +168,11 @@ def _people(task: Task) -> tuple[list[_Shown], str]:
         chosen = set(spread(task.people.count, PEOPLE).tolist())
         found = [one for k, one in enumerate(task.people) if k in chosen]
         who = f"people of {setting.dataset}"
-    if setting.protocol == "dapt":
-        # whose center is unknown, or whose box is, is not judged either
-        known = [one for one in found if released_center(setting.kind, one) is not None]
-        found = [one for one in known if not np.isnan(one.joints).all()]
-    shown = [_Shown(person=task.prepared(one), whole=one, box=task.box(one)) for one in found]
-    shown = [one for one in shown if len(one.person.points) >= task.least]
+    # who is not judged is not disturbed either
+    fit = [(task.fit(one)[0], one) for one in found]
+    shown = [
+        _Shown(person=seen, whole=one, box=task.box(one)) for seen, one in fit if seen is not None and len(seen.points)
+    ]
     if not shown:
         raise InputError(f"none of the {who} has a point to disturb")
     return shown, f"{len(shown):,} {who}"
