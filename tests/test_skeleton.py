@@ -121,6 +121,12 @@ def test_unknown_names_offer_the_nearest():
     assert skeleton("waymo14") is WAYMO14
 
 
+@pytest.mark.parametrize("name", [["smpl24"], None, 24, np.zeros(2), {"smpl24"}])
+def test_what_is_no_name_is_an_unknown_one(name):
+    with pytest.raises(InputError, match="unknown skeleton .*known are smpl24"):
+        skeleton(name)
+
+
 def test_a_side_without_its_other_side_has_no_flip():
     lame = Skeleton(name="lame", joints=("root", "left_leg"), parents=(-1, 0))
     with pytest.raises(InputError, match="right_leg"):

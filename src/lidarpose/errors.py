@@ -46,3 +46,9 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> InputError:
     near = difflib.get_close_matches(str(name), known, n=2, cutoff=0.5)
     hint = f"did you mean {' or '.join(near)}? " if near else ""
     return InputError(f"unknown {kind} {name!r}: {hint}known are {', '.join(known)}")
+
+
+def check_name(kind: str, name: object, known: Iterable[str]) -> None:
+    """Raises `unknown_name` unless `name` is one of a closed list of names; what is no text is none of them."""
+    if not isinstance(name, str) or name not in known:
+        raise unknown_name(kind, name, known)

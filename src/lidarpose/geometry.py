@@ -6,7 +6,7 @@ column vectors: `rotated = R @ v`, for rows `points @ R.T`.
 
 import numpy as np
 
-from lidarpose.errors import unknown_name
+from lidarpose.errors import check_name
 
 
 def axis_angle_to_matrix(vector: np.ndarray) -> np.ndarray:
@@ -78,8 +78,7 @@ UP_AXES = {
 
 def rotation_from_up(up: str) -> np.ndarray:
     """R_house_input (3, 3): turns coordinates of an input whose up axis is `up` into the house's (z up)."""
-    if up not in UP_AXES:
-        raise unknown_name("up axis", up, UP_AXES)
+    check_name("up axis", up, UP_AXES)
     return UP_AXES[up]
 
 

@@ -16,7 +16,7 @@ from functools import cached_property
 
 import numpy as np
 
-from lidarpose.errors import InputError, unknown_name
+from lidarpose.errors import InputError, check_name, unknown_name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,6 +125,5 @@ SKELETONS = {s.name: s for s in (SMPL24, HUMAN15, WAYMO14, BODY26)}
 
 def skeleton(name: str) -> Skeleton:
     """A named skeleton: smpl24, human15, waymo14 or body26."""
-    if name not in SKELETONS:
-        raise unknown_name("skeleton", name, SKELETONS)
+    check_name("skeleton", name, SKELETONS)
     return SKELETONS[name]

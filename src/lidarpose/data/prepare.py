@@ -21,7 +21,7 @@ from lidarpose.data.readers.items import Item, Reader, Skipped
 from lidarpose.data.shards import CARD, SENSOR_FRAME, Card, open_dataset, shard_path, shard_writer, write_card
 from lidarpose.data.split_rules import SplitRule, split_rule
 from lidarpose.data.summary import summarize
-from lidarpose.errors import InputError, unknown_name
+from lidarpose.errors import InputError, check_name
 
 # dataset -> module and class of its reader, and whether that takes the user's SMPL
 READERS: dict[str, tuple[str, str, bool]] = {
@@ -45,8 +45,7 @@ def reader(name: str, smpl: str | Path | None = None) -> Reader:
     Raises InputError for an unknown name, where SMPL is needed and not given or cannot be read, and where it is given
     and not needed.
     """
-    if name not in READERS:
-        raise unknown_name("dataset", name, READERS)
+    check_name("dataset", name, READERS)
     module, kind, takes_smpl = READERS[name]
     make = getattr(import_module(f"lidarpose.data.readers.{module}"), kind)
     if not takes_smpl:
@@ -125,8 +124,7 @@ def _of_split(name: str, parts: list[str], rule: SplitRule | None, split: str | 
         return parts
     if rule is None:
         raise InputError(f"{name} has no split to choose {split!r} from: put train.txt and test.txt into its folder")
-    if split not in rule.sets:
-        raise unknown_name(f"split of {name} by {rule.name}", split, rule.sets)
+    check_name(f"split of {name} by {rule.name}", split, rule.sets)
     kept = [part for part in parts if not rule.by_part or rule.of_part(part) == split]
     if not kept:
         raise InputError(f"none of the {len(parts)} parts of {name} is in {split!r} by {rule.name}: {rule.source}")

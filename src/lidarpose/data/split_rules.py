@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose.data.files import file_error, read_bytes
-from lidarpose.errors import InputError, unknown_name
+from lidarpose.errors import InputError, check_name
 
 # what a user's own lists are called
 _LISTS = {"train": "train.txt", "val": "val.txt", "test": "test.txt"}
@@ -73,14 +73,11 @@ def split_rule(dataset: str, root: Path, name: str | None = None) -> SplitRule |
     """
     published = {rule.name: rule for rule in _published(dataset)}
     if name is not None:
-        if name not in published:
-            raise (
-                unknown_name(f"split of {dataset}", name, published)
-                if published
-                else InputError(
-                    f"{dataset} has no published splits, got {name!r}: put train.txt and test.txt into its folder"
-                )
+        if not published:
+            raise InputError(
+                f"{dataset} has no published splits, got {name!r}: put train.txt and test.txt into its folder"
             )
+        check_name(f"split of {dataset}", name, published)
         return published[name]
     return _own(root) or next(iter(published.values()), None)
 

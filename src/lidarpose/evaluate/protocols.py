@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidarpose.data.released import released_view
-from lidarpose.errors import InputError, unknown_name
+from lidarpose.errors import InputError, check_name
 from lidarpose.evaluate.people import Person
 from lidarpose.sample import Box
 
@@ -74,8 +74,7 @@ _SEGMENTED = "people as the dataset segmented them: there is no box, so none cou
 def check_protocol(protocol: str, kind: str, split_by: str | None, name: str) -> None:
     """Raises InputError, one line, where the dataset cannot be judged by the protocol. kind: the raw dataset's name,
     "synth" or "bench"; split_by: the split it was prepared with; name: what to call it."""
-    if protocol not in PROTOCOLS:
-        raise unknown_name("protocol", protocol, PROTOCOLS)
+    check_name("protocol", protocol, PROTOCOLS)
     if protocol == "clean":
         if split_by == "dapt":
             raise InputError(

@@ -6,7 +6,7 @@ person. NaN stands where there is nothing to judge: a joint without a label.
 
 import numpy as np
 
-from lidarpose.errors import InputError, unknown_name
+from lidarpose.errors import InputError, check_name
 
 # how people and joints are averaged: over people the mean of each one's joints, or over all joints alike
 AVERAGES = ("person", "joint")
@@ -50,8 +50,7 @@ def person_sums(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def checked_average(average: str) -> str:
     """The name of an average; raises InputError for an unknown one."""
-    if average not in AVERAGES:
-        raise unknown_name("average", average, AVERAGES)
+    check_name("average", average, AVERAGES)
     return average
 
 

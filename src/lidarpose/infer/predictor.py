@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose.data.files import file_error
-from lidarpose.errors import InputError, missing_extra, unknown_name
+from lidarpose.errors import InputError, check_name, missing_extra
 from lidarpose.infer.backend import Backend, Estimates, OnnxBackend, estimates, exported_beside
 from lidarpose.infer.people import MIN_POINTS, as_origin, as_points, candidates, clean, unit_warning
 from lidarpose.infer.results import PersonPose, Poses
@@ -52,8 +52,8 @@ def load(
     """
     decoder(decode)
     looks_of(tta)
-    if backend is not None and backend not in BACKENDS:
-        raise unknown_name("backend", backend, BACKENDS)
+    if backend is not None:
+        check_name("backend", backend, BACKENDS)
     path = weights_path(weights)
     bundled = os.fspath(weights) in BUNDLED
     exported = path.suffix.lower() == ".onnx"

@@ -4,7 +4,7 @@ import os
 from importlib import resources
 from pathlib import Path
 
-from lidarpose.errors import InputError, unknown_name
+from lidarpose.errors import InputError, check_name
 
 BUNDLED = ("tiny", "small")
 # what is taken where nothing is named: the best whose two files are at most 6 MB
@@ -15,8 +15,7 @@ NAMES = ", ".join(f"{name} (default)" if name == DEFAULT else name for name in B
 
 def bundled_path(name: str = DEFAULT, suffix: str = ".safetensors") -> Path:
     """Where the package keeps a bundled checkpoint, or with the suffix .onnx its exported twin."""
-    if name not in BUNDLED:
-        raise unknown_name("bundled weights", name, BUNDLED)
+    check_name("bundled weights", name, BUNDLED)
     return Path(str(resources.files("lidarpose.model") / "weights" / f"{name}{suffix}"))
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from lidarpose.errors import InputError, unknown_name
+from lidarpose.errors import InputError, check_name
 
 # half width of `window` about the mode, in bins
 REACH = 3
@@ -84,8 +84,7 @@ DECODERS: dict[str, Decoder] = {"argmax": argmax, "dark": dark, "window": window
 
 def decoder(name: str) -> Decoder:
     """A decoder by name: argmax, dark or window. Raises InputError for another."""
-    if name not in DECODERS:
-        raise unknown_name("decoder", name, DECODERS)
+    check_name("decoder", name, DECODERS)
     return DECODERS[name]
 
 

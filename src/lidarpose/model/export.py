@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from lidarpose.data.files import atomic_path, check_apart, write_atomic
-from lidarpose.errors import InputError, LidarPoseError, missing_extra, unknown_name
+from lidarpose.errors import InputError, LidarPoseError, check_name, missing_extra
 from lidarpose.model.batch import Batch
 from lidarpose.model.checkpoint import load_checkpoint
 from lidarpose.model.header import ENTRY, Header, digest
@@ -51,8 +51,7 @@ def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = 
     people and points; `onnx_file` tells the inputs. Raises InputError for a file that is no checkpoint of this
     package's own networks, MissingExtra without onnx.
     """
-    if format not in FORMATS:
-        raise unknown_name("format", format, FORMATS)
+    check_name("format", format, FORMATS)
     check_apart(out, weights)
     network, header = load_checkpoint(weights)
     if header.network != "pose":

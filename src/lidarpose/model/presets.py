@@ -2,7 +2,7 @@
 
 from dataclasses import asdict, dataclass
 
-from lidarpose.errors import InputError, unknown_name
+from lidarpose.errors import InputError, check_name
 from lidarpose.skeleton import skeleton
 
 # heatmaps in a window about each joint's vote; over the whole person, as the paper's; or votes alone
@@ -53,8 +53,7 @@ class NetworkConfig:
             )
         if not isinstance(self.grid, int | float) or not self.grid > 0:
             raise InputError(f"grid must be a positive number of metres, got {self.grid!r}")
-        if self.heatmap not in HEATMAPS:
-            raise unknown_name("heatmap", self.heatmap, HEATMAPS)
+        check_name("heatmap", self.heatmap, HEATMAPS)
         skeleton(self.skeleton)
 
     def to_dict(self) -> dict:
@@ -78,6 +77,5 @@ SIZES = {
 
 def preset(size: str) -> NetworkConfig:
     """The configuration of a named size."""
-    if size not in SIZES:
-        raise unknown_name("network size", size, SIZES)
+    check_name("network size", size, SIZES)
     return SIZES[size]

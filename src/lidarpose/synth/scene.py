@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidarpose.errors import InputError, unknown_name
+from lidarpose.errors import InputError, check_name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,6 +170,5 @@ SCENES = {
 
 def scene_config(name: str) -> SceneConfig:
     """The named scene preset: paper, reference or wild."""
-    if name not in SCENES:
-        raise unknown_name("scene", name, SCENES)
+    check_name("scene", name, SCENES)
     return SCENES[name]

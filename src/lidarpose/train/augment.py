@@ -9,7 +9,7 @@ import numpy as np
 
 from lidarpose.data.augment import half_space_keep, jitter, noise_clusters, random_keep
 from lidarpose.data.released import released_view
-from lidarpose.errors import unknown_name
+from lidarpose.errors import check_name
 from lidarpose.evaluate.protocols import jittered
 from lidarpose.geometry import rotation_about
 from lidarpose.model.plan import view_features
@@ -61,8 +61,7 @@ AUGMENTATIONS = {
 
 def augmentation(name: str) -> Augmentation:
     """A named augmentation: none, paper or default."""
-    if name not in AUGMENTATIONS:
-        raise unknown_name("augmentation", name, AUGMENTATIONS)
+    check_name("augmentation", name, AUGMENTATIONS)
     return AUGMENTATIONS[name]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidarpose.errors import InputError, unknown_name
+from lidarpose.errors import InputError, check_name
 from lidarpose.model.dapt.config import PARTS, DaptConfig, named_config
 from lidarpose.model.dapt.network import DaptBatch, DaptNet, DaptOutputs
 from lidarpose.model.dapt.tables import LAYOUTS, Tables, build_tables
@@ -58,10 +58,8 @@ class DaptTask:
 
     def __post_init__(self):
         config = self.config
-        if self.stage not in STAGES:
-            raise unknown_name("stage of training", self.stage, STAGES)
-        if self.layout not in LAYOUTS:
-            raise unknown_name("layout", self.layout, LAYOUTS)
+        check_name("stage of training", self.stage, STAGES)
+        check_name("layout", self.layout, LAYOUTS)
         for name in ("regression", "segmentation", "auxiliary"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise InputError(f"{name} must be a weight of at least 0, got {getattr(self, name)}")

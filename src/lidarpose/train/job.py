@@ -10,7 +10,7 @@ import numpy as np
 from torch import nn
 
 from lidarpose.data.files import file_error
-from lidarpose.errors import InputError, unknown_name
+from lidarpose.errors import InputError, check_name
 from lidarpose.model.dapt.config import CONFIGS
 from lidarpose.model.grow import grown
 from lidarpose.model.header import Header
@@ -63,10 +63,9 @@ def _pretraining(recipe: Pretrain) -> Job:
 
         config = pretraining_config()
         task = DaptTask(config=config if recipe.size == PAPER else small(config), stage="pretrain")
-    elif recipe.size in SIZES:
-        task = PoseTask(config=preset(recipe.size), bone=recipe.bone, symmetry=recipe.symmetry)
     else:
-        raise unknown_name("network size", recipe.size, (*SIZES, PAPER, SMALL_PAPER))
+        check_name("network size", recipe.size, (*SIZES, PAPER, SMALL_PAPER))
+        task = PoseTask(config=preset(recipe.size), bone=recipe.bone, symmetry=recipe.symmetry)
     names = ("scene", "motion", "subjects", "captured", "strays", "noise")
     scene = {name: getattr(recipe, name) for name in names}
     warnings: tuple[str, ...] = ()

@@ -19,7 +19,7 @@ from accelerate import Accelerator
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from lidarpose.errors import InputError, unknown_name
+from lidarpose.errors import InputError, check_name
 from lidarpose.model.checkpoint import save_checkpoint
 from lidarpose.train.feed import BATCHES, Chunks, chunks_of, lanes_of, loader
 from lidarpose.train.job import Job, job_of
@@ -126,11 +126,10 @@ def _accelerator(recipe: Recipe, device: str | None, tracker: str | None) -> Acc
 
 def _check(device: str | None, tracker: str | None) -> None:
     """Raises InputError for a device or a tracker that is not there."""
-    if device not in (None, "cpu"):
-        raise unknown_name("device to train on", device, ("cpu",))
+    if device is not None:
+        check_name("device to train on", device, ("cpu",))
     if tracker is not None:
-        if tracker not in TRACKERS:
-            raise unknown_name("tracker", tracker, TRACKERS)
+        check_name("tracker", tracker, TRACKERS)
         if find_spec(tracker) is None:
             raise InputError(f"--tracker {tracker} needs the package {tracker}: pip install {tracker}")
 

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, fields
 from math import isfinite
 from typing import Any
 
-from lidarpose.errors import InputError, unknown_name
+from lidarpose.errors import InputError, check_name
 from lidarpose.model.bundled import DEFAULT
 
 # rises, stays, falls to nothing; or rises and falls as a cosine
@@ -55,8 +55,7 @@ class Recipe:
         self._check_shares("warmup", "cool")
         self._check_shares("ema", below=True)
         for name, known in (("schedule", SCHEDULES), ("precision", PRECISIONS)):
-            if getattr(self, name) not in known:
-                raise unknown_name(name, getattr(self, name), known)
+            check_name(name, getattr(self, name), known)
         for f in fields(self):
             if isinstance(f.default, tuple):
                 object.__setattr__(self, f.name, tuple(getattr(self, f.name)))
@@ -172,6 +171,5 @@ RECIPES = {
 def recipe(kind: type[Recipe], name: str = "default", **changes: Any) -> Recipe:
     """A named recipe of `Pretrain` or `Finetune`, some of its fields changed."""
     known = RECIPES[kind]
-    if name not in known:
-        raise unknown_name("recipe", name, known)
+    check_name("recipe", name, known)
     return kind(**(known[name]() | changes))

@@ -22,7 +22,7 @@ from lidarpose.body.sources.bvh import load_bvh
 from lidarpose.body.sources.lidarhuman26m import load_pose_json, pose_files
 from lidarpose.body.sources.sloper4d import load_sloper4d
 from lidarpose.data.files import file_error, read_bytes
-from lidarpose.errors import unknown_name
+from lidarpose.errors import check_name
 from lidarpose.geometry import UP_AXES
 
 FORMATS: dict[str, Callable[..., Motion]] = {
@@ -56,10 +56,10 @@ def load_motion(
     Rotation formats (AMASS, LiDARHuman26M, SLOPER4D) keep every turn; the others are retargeted by positions.
     Raises InputError, naming the file, for everything that cannot be read.
     """
-    if format is not None and format not in FORMATS:
-        raise unknown_name("format of motion", format, FORMATS)
-    if up is not None and up not in UP_AXES:
-        raise unknown_name("up axis", up, UP_AXES)
+    if format is not None:
+        check_name("format of motion", format, FORMATS)
+    if up is not None:
+        check_name("up axis", up, UP_AXES)
     for name, rate in (("fps", fps), ("hz", hz)):
         if rate is not None and not 0 < rate < float("inf"):
             raise file_error(path, f"{name} must be frames a second, above 0, got {rate}")

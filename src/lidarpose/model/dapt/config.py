@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 
-from lidarpose.errors import InputError, unknown_name
+from lidarpose.errors import InputError, check_name
 from lidarpose.model.dapt.curves import CURVES
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, Skeleton
 
@@ -101,8 +101,7 @@ class DaptConfig:
         if not self.orders:
             raise InputError(f"orders must name at least one curve of {', '.join(CURVES)}, got none")
         for order in self.orders:
-            if order not in CURVES:
-                raise unknown_name("curve", order, CURVES)
+            check_name("curve", order, CURVES)
 
     def _check_heads(self) -> None:
         if not isinstance(self.joints, tuple) or not self.joints or len(set(self.joints)) != len(self.joints):
@@ -163,8 +162,7 @@ class DaptConfig:
             entries = _from_reference(entries)
         known = [field.name for field in fields(cls)]
         for entry in entries:
-            if entry not in known:
-                raise unknown_name("setting of the network", entry, known)
+            check_name("setting of the network", entry, known)
         for needed in ("name", "joints"):
             if needed not in entries:
                 raise InputError(f"a configuration needs the entry {needed!r}, got only {', '.join(entries) or 'none'}")
@@ -278,6 +276,5 @@ CONFIGS = {
 
 def named_config(name: str) -> DaptConfig:
     """A configuration by name: paper, or one of the released waymo, humanm3, lidarhuman26m, sloper4d and pretrain."""
-    if name not in CONFIGS:
-        raise unknown_name("DAPT configuration", name, CONFIGS)
+    check_name("DAPT configuration", name, CONFIGS)
     return CONFIGS[name]

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from lidarpose.errors import InputError, unknown_name
+from lidarpose.errors import InputError, check_name
 
 # bits an axis that a code holds: three of them and a batch number fit in an int64
 MAX_BITS = 17
@@ -70,8 +70,7 @@ CURVES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 def curve(name: str) -> Callable[[np.ndarray], np.ndarray]:
     """A curve by name: cells (n, 3) of 16 bits an axis -> (n,) int64 codes; "-trans" exchanges x and y."""
-    if name not in CURVES:
-        raise unknown_name("curve", name, CURVES)
+    check_name("curve", name, CURVES)
     return CURVES[name]
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarpose.errors import InputError, unknown_name
+from lidarpose.errors import InputError, check_name
 from lidarpose.model.dapt.config import DaptConfig
 from lidarpose.model.dapt.curves import curve, dilated, z_order
 
@@ -95,8 +95,7 @@ def build_tables(
     subtracted, so that an outlier decides which voxels share a parent. Raises InputError for clouds wider than the
     cells can count, and for more people than a batch can hold.
     """
-    if layout not in LAYOUTS:
-        raise unknown_name("layout", layout, LAYOUTS)
+    check_name("layout", layout, LAYOUTS)
     lengths = np.array([len(cloud) for cloud in clouds], np.int64)
     if not 1 <= len(clouds) < _MOST_PEOPLE:
         raise InputError(f"a batch holds 1 to {_MOST_PEOPLE - 1} people, got {len(clouds)}: split it")
