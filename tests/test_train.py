@@ -1,6 +1,8 @@
 """Losses, schedule, and runs that can be killed and taken up again."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,7 +23,7 @@ from lidarpose.train.job import job_of
 from lidarpose.train.losses import CONFIDENCE, HEATMAP, SIGMA, SPREAD, VOTE, losses
 from lidarpose.train.optimize import average, optimizers, rate_factor
 from lidarpose.train.pose_task import PoseTask
-from lidarpose.train.recipes import Pretrain
+from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.recipes import recipe as recipe_of
 from lidarpose.train.task import total
 
@@ -337,6 +339,27 @@ def test_recipes():
         with pytest.raises(InputError, match=message):
             Pretrain(**change)
     assert Pretrain(subjects=["a"]) == Pretrain(subjects=("a",))
+
+
+def test_numbers_of_numpy_paths_and_one_name_alone_are_settings_too():
+    plain = Pretrain(people=64, rate=0.5, motion="walks", subjects=("002",), shards=("a",))
+    other = Pretrain(people=np.int64(64), rate=np.float32(0.5), motion=Path("walks"), subjects="002", shards=Path("a"))
+    assert other == plain and json.loads(json.dumps(other.to_dict())) == json.loads(json.dumps(plain.to_dict()))
+    assert Finetune(data="humanm3").data == ("humanm3",)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"people": 5.5}, "people must be a whole number, got 5.5"),
+        ({"rate": None}, "rate must be a number, got None"),
+        ({"scene": 3}, "scene must be text, got 3"),
+        ({"shards": [3]}, r"shards must be a list of texts, got \[3\]"),
+    ],
+)
+def test_a_recipe_refuses_what_is_no_such_setting(change, message):
+    with pytest.raises(InputError, match=f"^{message}$"):
+        Pretrain(**change)
 
 
 @pytest.mark.parametrize("field", ["people", "rate", "captured", "seed", "workers"])

@@ -3,8 +3,10 @@
 A field's help is what the command line says of it; this module stays light for that.
 """
 
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import Field, asdict, dataclass, field, fields
 from math import isfinite
+from operator import index
+from os import PathLike, fspath
 from typing import Any
 
 from lidarpose.errors import InputError, check_name
@@ -21,6 +23,27 @@ FREE = ("workers", "validate", "pictures", "precision")
 
 def _setting(default: Any, words: str) -> Any:
     return field(default=default, metadata={"help": words})
+
+
+def _declared(f: Field, value: Any) -> Any:
+    """A setting as its field declares it, so that numpy's numbers and paths are as good as Python's and can be stored.
+    Raises InputError for what is none."""
+    try:
+        if f.type is int:
+            return index(value)
+        if f.type is float:
+            return float(value)
+        if isinstance(f.default, tuple):
+            # one name or folder alone is one, not a list of letters
+            return tuple(map(fspath, (value,) if isinstance(value, (str, PathLike)) else value))
+        if f.type is bool:
+            return bool(value)
+        return None if value is None and f.default is None else fspath(value)
+    except (TypeError, ValueError, OverflowError):
+        wanted = {int: "a whole number", float: "a number"}.get(f.type, "text")
+        raise InputError(
+            f"{f.name} must be {'a list of texts' if isinstance(f.default, tuple) else wanted}, got {value!r}"
+        ) from None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,10 +68,12 @@ class Recipe:
     workers: int = _setting(1, "processes that make people, of each process that trains")
 
     def __post_init__(self):
+        for f in fields(self):
+            object.__setattr__(self, f.name, _declared(f, getattr(self, f.name)))
         least = {f.name: int(f.name in ("batch", "people")) for f in fields(self) if f.type in (int, float)}
         for name, bound in least.items():
             if not getattr(self, name) >= bound:
-                raise InputError(f"{name} must be at least {bound}, got {getattr(self, name)}")
+                raise InputError(f"{name} must be at least {bound}, got {getattr(self, name):g}")
         for name in (f.name for f in fields(self) if f.type is float):
             if not isfinite(getattr(self, name)):
                 raise InputError(f"{name} must be a finite number, got {getattr(self, name)}")
@@ -56,9 +81,6 @@ class Recipe:
         self._check_shares("ema", below=True)
         for name, known in (("schedule", SCHEDULES), ("precision", PRECISIONS)):
             check_name(name, getattr(self, name), known)
-        for f in fields(self):
-            if isinstance(f.default, tuple):
-                object.__setattr__(self, f.name, tuple(getattr(self, f.name)))
 
     def check_no_lengths(self) -> None:
         if self.bone or self.symmetry:
