@@ -468,6 +468,13 @@ def written(sets, tmp_path_factory):
     return run, folder, evaluation.write(run, folder)
 
 
+def test_numpy_s_numbers_and_one_dataset_alone_are_judged_and_written(tmp_path):
+    run = evaluation.run("tiny", "bench", limit=np.int64(3), seed=np.int32(2))
+    evaluation.write(run, tmp_path / "new")
+    assert evaluation.read_scores(tmp_path / "new").results == run.scores.results
+    assert evaluation.table(tmp_path / "new") == evaluation.table([tmp_path / "new"])
+
+
 def test_every_figure_can_be_computed_from_the_poses(written):
     run, folder, _ = written
     scores, people = evaluation.read_scores(folder), evaluation.read_poses(folder / "poses.parquet")

@@ -19,13 +19,14 @@ from lidarpose.errors import InputError
 from lidarpose.infer.predictor import load
 from lidarpose.model.checkpoint import load_checkpoint
 from lidarpose.model.header import read_header
-from lidarpose.sample import Box
+from lidarpose.sample import Box, center_of
 from lidarpose.skeleton import BODY26, HUMAN15, skeleton
 from lidarpose.synth.write import Job, write_dataset
 from lidarpose.train import job as jobs
 from lidarpose.train import loop, runs
 from lidarpose.train.augment import AUGMENTATIONS, Augmentation, augmentation, augmented
 from lidarpose.train.crowd import Person, crowd_of
+from lidarpose.train.example import PELVIS_ERROR, example
 from lidarpose.train.job import job_of
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.sources import MixedSource, StoredSource, SyntheticSource
@@ -128,6 +129,21 @@ def test_synthesized_shards_are_people_too(synthetic):
     assert (crowd.part > 0).any() and all(crowd.person(row).sensor_known for row in range(6))
 
 
+def test_synthesized_shards_tell_what_is_seen_and_can_be_disturbed(synthetic):
+    """As people who are made meanwhile do."""
+    crowd = crowd_of([synthetic])
+    for row, item in enumerate(open_dataset(synthetic)):
+        wanted = example(item, np.random.default_rng(0)).visible
+        np.testing.assert_array_equal(crowd.person(row).visible, wanted)
+    assert {0.0, 1.0} == set(crowd.visible.ravel())
+    plain, other = (job_of(Pretrain(shards=synthetic, strays=s, noise=s)).source for s in (0.0, 1.0))
+    for index in range(len(crowd)):
+        a, b = plain.example(index), other.example(index)
+        assert len(b.points) > len(a.points) and (b.part[len(a.part) :] == 0).all()
+        np.testing.assert_allclose(np.ptp(b.joints, 0)[2], np.ptp(a.joints, 0)[2], atol=1e-5)
+    assert all(len(plain.example(k).points) in np.diff([crowd.start, crowd.end], axis=0) for k in range(6))
+
+
 def test_what_cannot_be_read_is_one_line(datasets, synthetic, tmp_path):
     for call, told in [
         (lambda: crowd_of([tmp_path]), "is no dataset"),
@@ -203,6 +219,45 @@ def test_points_joints_and_the_view_move_together(seed, number):
         np.testing.assert_allclose(
             np.linalg.norm(shown.points - sensor, axis=1), np.linalg.norm(person.points, axis=1), atol=1e-3
         )
+
+
+def test_a_person_scaled_is_scaled_with_their_joints():
+    person, scales = someone(), []
+    before = np.linalg.norm(person.points[:, None] - person.joints, axis=-1)
+    for seed in range(40):
+        shown = augmented(person, Augmentation(scale=0.1), np.random.default_rng(seed))
+        ratio = np.linalg.norm(shown.points[:, None] - shown.joints, axis=-1) / before
+        scales.append(np.nanmean(ratio))
+        np.testing.assert_allclose(ratio[~np.isnan(ratio)], scales[-1], atol=1e-3)
+    assert 0.9 <= min(scales) < 0.93 and 1.07 < max(scales) <= 1.1
+
+
+def test_a_mirror_exchanges_what_is_seen():
+    person = someone()
+    visible = np.where(np.isnan(person.visible), np.nan, np.arange(26) % 2).astype(np.float32)
+    person, mirrored = replace(person, visible=visible), 0
+    for seed in range(20):
+        shown = augmented(person, Augmentation(flip=0.5), np.random.default_rng(seed))
+        exchanged = (np.isnan(shown.joints) != np.isnan(person.joints)).any()
+        mirrored += exchanged
+        np.testing.assert_array_equal(shown.visible, visible[list(BODY26.flip)] if exchanged else visible)
+    assert 4 < mirrored < 16
+
+
+def test_half_of_people_are_centered_on_a_guess_of_the_pelvis():
+    person = replace(someone(), joints=np.nan_to_num(someone().joints, nan=6.0))
+    pelvis = BODY26.index("pelvis")
+    draw = [augmented(person, Augmentation(refined=1.0), np.random.default_rng(k)).joints[pelvis] for k in range(300)]
+    np.testing.assert_allclose(np.std(draw, 0), PELVIS_ERROR, rtol=0.2)
+    np.testing.assert_allclose(np.mean(draw, 0), 0, atol=0.02)
+    still = [augmented(person, Augmentation(refined=0.0), np.random.default_rng(k)).joints[pelvis] for k in range(3)]
+    np.testing.assert_allclose(still, [person.joints[pelvis] - center_of(person.points)] * 3, atol=1e-5)
+
+
+def test_a_fifth_of_points_is_lost():
+    lost = augmented(someone(count=500), Augmentation(drop=1.0), np.random.default_rng(0))
+    # 400 of 500, drawn one by one
+    assert len(lost.points) == len(lost.part) and 370 < len(lost.points) < 430
 
 
 def test_a_mirror_exchanges_left_and_right_parts():

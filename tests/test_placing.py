@@ -24,6 +24,21 @@ def test_distances_keep_their_range(name):
             assert drawn.mean() == pytest.approx(np.mean(config.distance), abs=1) and np.ptp(drawn) > 14
 
 
+def test_lasers_of_one_elevation_share_its_beams():
+    """As many points are wanted of whatever sensor: twice the beams, the root of two farther."""
+    elevations, step = np.radians(np.linspace(-15, 15, 16)), np.radians(0.2)
+    once = Sensor(name="once", elevations=elevations, azimuth_step=step)
+    twice = Sensor(
+        name="twice",
+        elevations=np.repeat(elevations, 2),
+        azimuth_step=step,
+        azimuth_offsets=np.tile([0.0, step / 2], 16),
+    )
+    config = replace(WILD, distance=(0.1, 1000.0))
+    a, b = (draw_distance(config, device, np.random.default_rng(1)) for device in (once, twice))
+    assert b == pytest.approx(a * np.sqrt(2), rel=1e-6)
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(2, 40), st.floats(0.4, 2.1), st.floats(-0.3, 0.3), st.floats(-3, 3))
 def test_a_sensor_is_mounted_so_that_the_person_fits(seed, distance, tall, pitch, ahead):

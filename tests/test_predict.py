@@ -173,6 +173,11 @@ def test_lists_of_none_and_stacks(model, points):
     assert len(model.predict((points, points))) == len(model.predict(np.stack([points] * 2))) == 2
     assert len(model.predict([points.tolist()])) == len(model.predict([torch.from_numpy(points.copy())])) == 1
     assert [person.joints for person in model.predict([points[:0], [], np.zeros((0, 3))])] == [None] * 3
+    # somebody without points may stand anywhere
+    for empty in ([], np.zeros(0), np.zeros((0, 3)), ()):
+        for clouds in ([empty, points], [points, empty], [empty, empty]):
+            found = [person.joints is not None for person in model.predict(clouds)]
+            assert found == [cloud is points for cloud in clouds]
 
 
 # ---- a crop with more in it than a person
@@ -314,6 +319,17 @@ def sweep(tmp_path, points):
     path = tmp_path / "sweep.npy"
     np.save(path, np.concatenate([points, there]))
     return path, (points, there), [box_around(points, id="a"), box_around(there, track=7, category="PEDESTRIAN")]
+
+
+def test_boxes_of_every_kind_make_the_same_people(model, sweep):
+    path, _, boxes = sweep
+    a, b = (Box(**{name: box[name] for name in ("center", "size")}) for box in boxes)
+    people = lidarpose.predict(path, boxes=boxes, model=model)
+    for given in ([a, b], (a, b), [a, boxes[1]], tuple(boxes)):
+        for one, other in zip(people, lidarpose.predict(path, boxes=given, model=model), strict=True):
+            np.testing.assert_array_equal(one.joints, other.joints)
+    alone = lidarpose.predict(path, boxes=b, model=model)[0]
+    np.testing.assert_allclose(alone.joints, people[1].joints, atol=1e-5)
 
 
 def test_boxes_keep_their_order_and_ids(model, sweep):

@@ -100,6 +100,17 @@ def test_a_pose_in_another_skeleton_keeps_each_joint_by_name(shape, other):
     assert pose(shape=shape).to(other).confidence is None
 
 
+def test_lists_are_as_good_as_arrays():
+    joints = np.arange(78.0).reshape(26, 3)
+    made = Pose(joints=joints.tolist(), skeleton=BODY26, confidence=[0.5] * 26, in_range=[True] * 26)
+    np.testing.assert_array_equal(made.joints, joints)
+    assert made.joints.shape == (26, 3) and made.confidence.shape == (26,) and made.in_range.dtype == bool
+    assert Sample(points=np.zeros((4, 3), np.float32), center=[0, 0, 1]).center.shape == (3,)
+    for bad in ("joints", ["a"] * 26, [[1.0], [2.0, 3.0]]):
+        with pytest.raises(InputError, match=r"Pose\.joints must be an array of numbers"):
+            Pose(joints=bad, skeleton=BODY26)
+
+
 def test_a_pose_of_the_wrong_shape_is_refused():
     with pytest.raises(InputError, match=r"must be \(\.\.\., 26, 3\), got \(24, 3\)"):
         Pose(joints=np.zeros((24, 3)), skeleton=BODY26)

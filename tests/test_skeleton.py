@@ -121,6 +121,12 @@ def test_unknown_names_offer_the_nearest():
     assert skeleton("waymo14") is WAYMO14
 
 
+def test_a_tree_of_lists_is_one_of_tuples():
+    made = Skeleton(name="v", joints=["a", "b", "c"], parents=[-1, 0, 0], extra_bones=[[1, 2]])
+    assert made == Skeleton(name="v", joints=("a", "b", "c"), parents=(-1, 0, 0), extra_bones=((1, 2),))
+    assert len(made.bones) == 3 and hash(made)
+
+
 @pytest.mark.parametrize("name", [["smpl24"], None, 24, np.zeros(2), {"smpl24"}])
 def test_what_is_no_name_is_an_unknown_one(name):
     with pytest.raises(InputError, match="unknown skeleton .*known are smpl24"):

@@ -20,7 +20,7 @@ from lidarpose.synth.scene import SCENES
 from lidarpose.train.augment import disturbed
 from lidarpose.train.feed import BATCHES, Chunks, loader
 from lidarpose.train.job import job_of
-from lidarpose.train.losses import CONFIDENCE, HEATMAP, SIGMA, SPREAD, VOTE, losses
+from lidarpose.train.losses import CONFIDENCE, HEATMAP, JOINTS, LEVEL, SIGMA, SPREAD, VOTE, losses
 from lidarpose.train.optimize import average, optimizers, rate_factor
 from lidarpose.train.pose_task import PoseTask
 from lidarpose.train.recipes import Finetune, Pretrain
@@ -73,6 +73,15 @@ def test_exact_joints_cost_nothing():
 def test_the_vote_costs_its_distance():
     shift = torch.tensor([0.3, 0.0, -0.4])
     assert losses(outputs(truth() + shift), targets(truth()))["vote"].item() == pytest.approx(VOTE * 0.5, rel=1e-4)
+
+
+def test_every_level_and_the_joints_cost_their_distance_too():
+    """Not its square, as in the released code."""
+    shift = torch.tensor([0.3, 0.0, -0.4])
+    terms = losses(outputs(truth() + shift), targets(truth()))
+    assert terms["level"].item() == pytest.approx(2 * LEVEL * 0.5, rel=1e-4)
+    # a heatmap about the vote is decoded half a millimetre off an axis
+    assert terms["joints"].item() == pytest.approx(JOINTS * 0.5, rel=5e-3)
 
 
 def test_gradients_at_exact_joints_are_finite():

@@ -68,6 +68,10 @@ def test_the_surer_look_counts_more():
     assert (averaged([estimate(0.0, 0.5), estimate(1.0, 0.5)]).joints == 0.5).all()
     # a network that does not tell its confidence has all looks alike
     assert (averaged([estimate(0.0, None), estimate(1.0, None)]).joints == 0.5).all()
+    # whom no look is sure of at all has them alike too, and is no harm to others
+    sure, unsure = estimate(0.0, 0.5), estimate(1.0, 0.5)
+    unsure.confidence[1] = sure.confidence[1] = 0.0
+    assert (averaged([sure, unsure]).joints == 0.5).all()
     single = estimate(0.3, 0.2)
     assert averaged([single]) is single
 
@@ -76,6 +80,10 @@ def test_looks_are_different_and_the_first_is_none():
     assert looks_of(1) == (Look(),) and len(set(LOOKS)) == len(LOOKS) == len(looks_of(8))
     # no two put the fine grid in the same place
     assert len({tuple(np.round(np.mod(look.shift, 0.06), 6)) for look in LOOKS}) == len(LOOKS)
+
+
+def test_numpy_s_numbers_are_numbers_of_looks():
+    assert looks_of(np.int64(3)) == looks_of(3)
 
 
 @pytest.mark.parametrize("tta", [0, 9, -1, 1.5, True, "four"])

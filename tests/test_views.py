@@ -1,5 +1,6 @@
 """Turned and mirrored people: everything moves together, and their targets are the turned and mirrored targets."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -73,6 +74,15 @@ def test_distances_stay_and_left_becomes_right(yaw):
         for moved in (there, image):
             same = moved.box.contains(moved.points) == sample.box.contains(sample.points)
             assert same.mean() > 0.99
+
+
+def test_what_is_told_of_a_joint_stays_with_it_in_a_mirror():
+    sample, rng = samples()[0], np.random.default_rng(0)
+    told = {name: rng.random(26) for name in ("confidence", "spread", "visible")} | {"in_range": rng.random(26) < 0.5}
+    image = mirrored(replace(sample, pose=replace(sample.pose, **told))).pose
+    for name, values in told.items():
+        for j, other in enumerate(BODY26.flip):
+            assert getattr(image, name)[other] == values[j], (name, BODY26.joints[j])
 
 
 @pytest.mark.parametrize("seed", range(4))

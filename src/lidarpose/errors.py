@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Iterable
+from numbers import Integral
 
 
 class LidarPoseError(Exception):
@@ -46,6 +47,15 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> InputError:
     near = difflib.get_close_matches(str(name), known, n=2, cutoff=0.5)
     hint = f"did you mean {' or '.join(near)}? " if near else ""
     return InputError(f"unknown {kind} {name!r}: {hint}known are {', '.join(known)}")
+
+
+def whole(name: str, value: object, *, least: int, most: int | None = None, hint: str = "") -> int:
+    """A whole number, numpy's too, as Python's. Raises InputError for anything else, and outside least to most."""
+    if isinstance(value, Integral) and not isinstance(value, bool):
+        if value >= least and (most is None or value <= most):
+            return int(value)
+    bounds = f"of at least {least}" if most is None else f"from {least} to {most}"
+    raise InputError(f"{name} must be a whole number {bounds}{hint}, got {value!r}")
 
 
 def check_name(kind: str, name: object, known: Iterable[str]) -> None:

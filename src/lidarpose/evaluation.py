@@ -20,8 +20,8 @@ import numpy as np
 
 from lidarpose._version import __version__
 from lidarpose.data.columns import pyarrow
-from lidarpose.data.files import atomic_path, file_error
-from lidarpose.errors import InputError
+from lidarpose.data.files import atomic_path, file_error, listed
+from lidarpose.errors import InputError, whole
 from lidarpose.evaluate.judged import Judged, read_poses, write_poses
 from lidarpose.evaluate.people import BENCH, open_people
 from lidarpose.evaluate.protocols import PROTOCOLS
@@ -104,6 +104,8 @@ def run(
     Everything is checked before anybody is judged. Raises InputError, one line, for what does not fit; MissingExtra
     without pyarrow.
     """
+    datasets = listed(datasets)
+    seed = whole("seed", seed, least=0)
     if not datasets:
         raise InputError("expected a dataset to judge: a folder that lidarpose prepare or synth wrote, or bench")
     pyarrow()

@@ -14,7 +14,7 @@ from lidarpose.skeleton import Skeleton
 # no coordinate on Earth is larger, m; arithmetic on what is would overflow
 FARTHEST = 1e9
 # what a pose may say of each joint
-_PER_JOINT = ("confidence", "spread", "visible", "in_range")
+PER_JOINT = ("confidence", "spread", "visible", "in_range")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,11 +37,12 @@ class Pose:
 
     def __post_init__(self):
         count = len(self.skeleton)
+        _as_arrays(self, "joints", *PER_JOINT)
         if self.joints.ndim < 2 or self.joints.shape[-2:] != (count, 3):
             raise InputError(
                 f"Pose.joints of {self.skeleton.name} must be (..., {count}, 3), got {tuple(self.joints.shape)}"
             )
-        for name in _PER_JOINT:
+        for name in PER_JOINT:
             value = getattr(self, name)
             if value is not None and value.shape != self.joints.shape[:-1]:
                 raise InputError(f"Pose.{name} must be {self.joints.shape[:-1]}, one a joint, got {value.shape}")
@@ -51,7 +52,7 @@ class Pose:
     def to(self, skeleton: Skeleton) -> "Pose":
         """The same pose with the joints of another skeleton, picked by name."""
         pick = self.skeleton.map_to(skeleton)
-        values = {name: getattr(self, name) for name in _PER_JOINT}
+        values = {name: getattr(self, name) for name in PER_JOINT}
         picked = {name: None if value is None else value[..., pick] for name, value in values.items()}
         return replace(self, joints=self.joints[..., pick, :], skeleton=skeleton, **picked)
 
@@ -119,6 +120,7 @@ class Sample:
     frame_id: str = ""
 
     def __post_init__(self):
+        _as_arrays(self, "points", "center", "part", "ring")
         if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.dtype != np.float32:
             raise InputError(f"Sample.points must be (n, 3) float32, got {self.points.shape} {self.points.dtype}")
         if self.center.shape != (3,):
@@ -127,6 +129,21 @@ class Sample:
             value = getattr(self, name)
             if value is not None and value.shape != (len(self.points),):
                 raise InputError(f"Sample.{name} must be ({len(self.points)},), one a point, got {value.shape}")
+
+
+def _as_arrays(self: Pose | Sample, *names: str) -> None:
+    """What was given as lists becomes arrays; arrays stay what they are. Raises InputError for what is no numbers."""
+    for name in names:
+        value = getattr(self, name)
+        if value is None or isinstance(value, np.ndarray):
+            continue
+        try:
+            made = np.asarray(value)
+        except (TypeError, ValueError):
+            made = np.empty(0, object)
+        if made.dtype.kind not in "fiub":
+            raise InputError(f"{type(self).__name__}.{name} must be an array of numbers, got {type(value).__name__}")
+        object.__setattr__(self, name, made)
 
 
 # edge of the cells in which a cloud's density is evened out before its center is taken, metres

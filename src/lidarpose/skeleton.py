@@ -33,6 +33,10 @@ class Skeleton:
     extra_bones: tuple[tuple[int, int], ...] = ()
 
     def __post_init__(self):
+        # lists are as good as tuples
+        for name in ("joints", "parents"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        object.__setattr__(self, "extra_bones", tuple(tuple(pair) for pair in self.extra_bones))
         if len(set(self.joints)) != len(self.joints):
             raise InputError(f"skeleton {self.name}: joint names must be unique, got {list(self.joints)}")
         if len(self.parents) != len(self.joints):

@@ -8,7 +8,7 @@ import errno
 import os
 import reprlib
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
@@ -42,6 +42,11 @@ def one_line(text: str) -> str:
 def file_error(path: object, problem: object) -> InputError:
     """The error `PATH: PROBLEM` on one line that any terminal can print."""
     return InputError(one_line(f"{path or repr(path)}: {problem}"))
+
+
+def listed(paths: str | os.PathLike | Iterable[str | os.PathLike]) -> list[str | os.PathLike]:
+    """Paths or names as a list; one alone is one, not a list of letters."""
+    return [paths] if isinstance(paths, str | os.PathLike) else list(paths)
 
 
 def check_apart(out: str | os.PathLike, *inputs: object) -> None:

@@ -24,7 +24,7 @@ from lidarpose.data.headers import Problem, need_bytes, numbered, pick_xyz, shor
 from lidarpose.data.pcd import parse_pcd
 from lidarpose.data.ply import parse_ply
 from lidarpose.data.text import parse_text
-from lidarpose.errors import InputError
+from lidarpose.errors import whole
 
 KITTI_FIELDS = ("x", "y", "z", "intensity")
 NUSCENES_FIELDS = ("x", "y", "z", "intensity", "ring")
@@ -93,8 +93,8 @@ def read_points(path: str | os.PathLike, *, columns: int | None = None) -> Cloud
 
     Raises InputError of one line that names the file, what was expected, what came and what to do.
     """
-    if columns is not None and (isinstance(columns, bool) or not isinstance(columns, int) or columns < 3):
-        raise InputError(f"columns must be a whole number of at least 3 (x y z first), got {columns!r}")
+    if columns is not None:
+        columns = whole("columns", columns, least=3, hint=" (x y z first)")
     data = read_bytes(path, expected=f"a point cloud ({' '.join(SUFFIXES)})")
     name = os.path.basename(os.fsdecode(path)).lower()
     suffix = os.path.splitext(name)[1]

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from lidarpose.geometry import rotation_about
-from lidarpose.sample import Box, Pose, Sample
+from lidarpose.sample import PER_JOINT, Box, Pose, Sample
 from lidarpose.skeleton import SMPL24
 
 # the plane x = 0 or y = 0 is as good as any other: turning the mirror turns the image
@@ -30,9 +30,7 @@ def mirrored(sample: Sample) -> Sample:
     pose = moved.pose
     if pose is not None:
         flip = list(pose.skeleton.flip)
-        changed = {
-            name: value[..., flip] for name in ("confidence", "spread") if (value := getattr(pose, name)) is not None
-        }
+        changed = {name: value[..., flip] for name in PER_JOINT if (value := getattr(pose, name)) is not None}
         pose = replace(pose, joints=pose.joints[..., flip, :], **changed)
     part = None if moved.part is None else np.array([0, *(1 + np.array(SMPL24.flip))], moved.part.dtype)[moved.part]
     return replace(moved, pose=pose, part=part, box=moved.box and replace(moved.box, yaw=-moved.box.yaw))

@@ -10,7 +10,7 @@ import numpy as np
 from lidarpose.data.files import file_error
 from lidarpose.data.readers.items import HIDDEN, SEEN, UNLABELED
 from lidarpose.data.shards import Dataset, open_dataset, read_rows, rows_of_shard, shard_path
-from lidarpose.errors import InputError
+from lidarpose.errors import InputError, whole
 from lidarpose.evaluate.bench import NAME, Bench, load_bench, plain
 from lidarpose.sample import Box
 from lidarpose.skeleton import BODY26, HUMAN15, Skeleton, skeleton
@@ -84,8 +84,8 @@ def open_people(dataset: str | Path, *, split: str | None = None, limit: int | N
     """A dataset's people: those of `split`, "all" for everybody; None: test, else val, else everybody where there is no
     split. limit: only so many, evenly spread. Raises InputError for what is no dataset, a split that nobody is in, and
     a dataset whose shards are missing or all damaged; MissingExtra without pyarrow."""
-    if limit is not None and limit < 1:
-        raise InputError(f"expected a limit of at least 1 person, got {limit}")
+    if limit is not None:
+        limit = whole("limit", limit, least=1, hint=" person")
     if str(dataset) == BENCH:
         return BenchPeople.open(split, limit)
     return FolderPeople.open(Path(dataset), split, limit)

@@ -11,6 +11,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from lidarpose.data.files import listed
 from lidarpose.errors import InputError
 from lidarpose.evaluate.protocols import PROTOCOLS
 from lidarpose.evaluate.result import OURS, RELEASED, Result, Scores, read_scores
@@ -54,7 +55,7 @@ def table(paths: Sequence[str | Path], *, format: str = "markdown") -> str:
     file that is none."""
     if format not in FORMATS:
         raise InputError(f"expected a table's format, {' or '.join(FORMATS)}, got {format!r}")
-    entries = [entry for path in paths for entry in _entries(str(path), read_scores(path))]
+    entries = [entry for path in listed(paths) for entry in _entries(str(path), read_scores(path))]
     return _markdown(entries) if format == "markdown" else _json(entries)
 
 

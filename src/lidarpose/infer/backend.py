@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from lidarpose.data.files import file_error
-from lidarpose.errors import InputError
+from lidarpose.errors import whole
 from lidarpose.model.decode import Decoder, out_of_range
 from lidarpose.model.header import Header, digest, read_header
 from lidarpose.model.onnx_file import OUTPUTS, input_name, network_inputs, open_onnx, plan_people
@@ -92,8 +92,8 @@ class OnnxBackend:
     batch = _BATCH
 
     def __init__(self, path: str | os.PathLike, *, threads: int | None = None):
-        if threads is not None and (not isinstance(threads, int) or threads < 1):
-            raise InputError(f"threads must be a whole number of at least 1, got {threads!r}")
+        if threads is not None:
+            threads = whole("threads", threads, least=1)
         self.session, self.header, self.source = open_onnx(path, threads=threads)
         # parts are of no use here: what is not asked for is not computed
         self._outputs = [name for name in OUTPUTS if name != "part"]

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -29,7 +29,7 @@ _FARTHEST_PERSON = 500.0
 def predict(
     path: str | os.PathLike,
     *,
-    boxes: str | os.PathLike | dict | list | None = None,
+    boxes: str | os.PathLike | dict | Box | Sequence[Box | dict] | None = None,
     crop: bool = False,
     sensor_origin: tuple[float, float, float] | str | None = None,
     skeleton: str | None = None,
@@ -40,7 +40,7 @@ def predict(
 ) -> Poses:
     """Poses of the people in a point file, in the file's own frame.
 
-    boxes: a JSON file, its content (see `data.boxes`) or a list of `Box`, their length and width level, their height
+    boxes: a JSON file, its content (see `data.boxes`), a `Box` or several, their length and width level, their height
     and yaw along and about the up axis; crop: the file is one person already. With neither, a file of less than 4 m
     across is taken as a crop and anything else asks for boxes. sensor_origin: (x, y, z) m in the file's frame, or
     "unknown"; None means 0, 0, 0 with boxes and unknown for a crop. skeleton: a name, or None for smpl24, or for the
@@ -112,8 +112,12 @@ def predict(
 
 
 def _boxes(given: object) -> list[Box]:
-    if isinstance(given, list) and given and all(isinstance(box, Box) for box in given):
-        return given
+    if isinstance(given, Box):
+        return [given]
+    if isinstance(given, tuple):
+        given = list(given)
+    if isinstance(given, list) and any(isinstance(box, Box) for box in given):
+        return [box if isinstance(box, Box) else read_boxes([box])[0] for box in given]
     return read_boxes(given)
 
 

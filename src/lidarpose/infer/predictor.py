@@ -16,7 +16,7 @@ from lidarpose.model.bundled import BUNDLED, DEFAULT, weights_path
 from lidarpose.model.decode import decoder
 from lidarpose.model.header import read_header
 from lidarpose.model.plan import WINDOW
-from lidarpose.sample import Pose, center_of
+from lidarpose.sample import PER_JOINT, Pose, center_of
 from lidarpose.skeleton import SMPL24, Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
 
@@ -187,7 +187,7 @@ class Predictor:
             if near < MIN_POINTS or not np.isfinite(found.joints[k]).all():
                 poses.append(None)
                 continue
-            values = {name: getattr(found, name) for name in ("confidence", "spread", "visible", "in_range")}
+            values = {name: getattr(found, name) for name in PER_JOINT}
             told = {name: None if value is None else value[k] for name, value in values.items()}
             poses.append(Pose(joints=found.joints[k] + centers[k], skeleton=self.skeleton, **told))
         return poses
@@ -236,10 +236,12 @@ def _is_many(points) -> bool:
 
 
 def _is_row(value) -> bool:
-    """One point: a flat list or array. Anything ragged is none."""
+    """One point: a flat list or array of numbers. Anything ragged is none, and what is empty is a cloud."""
     if isinstance(value, list | tuple):
-        return not any(isinstance(entry, list | tuple) or getattr(entry, "ndim", 0) for entry in value)
-    return getattr(value, "ndim", 0) == 1
+        return len(value) > 0 and not any(
+            isinstance(entry, list | tuple) or getattr(entry, "ndim", 0) for entry in value
+        )
+    return getattr(value, "ndim", 0) == 1 and len(value) > 0
 
 
 def _warned(person: PersonPose, warning: str) -> PersonPose:

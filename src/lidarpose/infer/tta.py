@@ -10,14 +10,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidarpose.errors import InputError
+from lidarpose.errors import whole
 from lidarpose.infer.backend import Estimates
 from lidarpose.model.plan import view_features
+from lidarpose.sample import PER_JOINT
 from lidarpose.skeleton import Skeleton
 
 # a look counts by its mean confidence to this power: who is turned round in one of four is outvoted
 _POWER = 8
-_NAMES = ("joints", "confidence", "spread", "visible", "in_range")
+_NAMES = ("joints", *PER_JOINT)
 _QUARTERS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 
 
@@ -52,9 +53,7 @@ LOOKS = (
 
 def looks_of(count: int) -> tuple[Look, ...]:
     """The first so many looks; the very first shows the person as they are. Raises InputError for none or too many."""
-    if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= len(LOOKS):
-        raise InputError(f"tta must be a whole number from 1 to {len(LOOKS)}, got {count!r}")
-    return LOOKS[:count]
+    return LOOKS[: whole("tta", count, least=1, most=len(LOOKS))]
 
 
 def shown(
@@ -87,7 +86,9 @@ def averaged(found: list[Estimates]) -> Estimates:
     weight = np.ones(joints.shape[:2])
     if values["confidence"][0] is not None:
         weight = np.stack(values["confidence"]).mean(-1) ** _POWER
-        weight = weight / np.maximum(weight.sum(0), 1e-12)
+        total = weight.sum(0)
+        # of whom no look is sure at all, all looks count the same
+        weight = np.where(total > 0, weight / np.where(total > 0, total, 1.0), 1.0)
 
     def mean(stack: list[np.ndarray] | list[None]) -> np.ndarray | None:
         if stack[0] is None:

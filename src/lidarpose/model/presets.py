@@ -2,7 +2,7 @@
 
 from dataclasses import asdict, dataclass
 
-from lidarpose.errors import InputError, check_name
+from lidarpose.errors import InputError, check_name, whole
 from lidarpose.skeleton import skeleton
 
 # heatmaps in a window about each joint's vote; over the whole person, as the paper's; or votes alone
@@ -35,10 +35,9 @@ class NetworkConfig:
     def __post_init__(self):
         for name, least in (("head_channels", 1), ("max_voxels", 1), ("parts", 1), ("convolution", 0)):
             value = getattr(self, name)
-            if not isinstance(value, int) or value is True or value < least:
-                raise InputError(f"{name} must be a whole number of at least {least}, got {value!r}")
-        # false in files of before it was a number
-        object.__setattr__(self, "convolution", int(self.convolution))
+            # false in files of before it was a number
+            value = 0 if name == "convolution" and value is False else value
+            object.__setattr__(self, name, whole(name, value, least=least))
         for name, least in (("channels", 1), ("blocks", 0)):
             value = getattr(self, name)
             counts = tuple(value) if isinstance(value, list | tuple) else ()

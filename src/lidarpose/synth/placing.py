@@ -21,6 +21,8 @@ _CUT = 0.05
 _MOUNT_TILT = np.radians(1.5)
 # a sensor tilted by more than this looks at people ahead of it, within this azimuth, rad
 _TILTED, _AHEAD = np.radians(10.0), np.radians(50.0)
+# lasers nearer than this share one elevation, rad
+_SAME_ELEVATION = 1e-9
 # edges of a field of view steeper than this leave room for anybody, rad
 _STEEPEST = np.radians(80.0)
 
@@ -102,10 +104,13 @@ def draw_distance(config: SceneConfig, device: Sensor | RayPattern, rng: np.rand
 
 @lru_cache(maxsize=64)
 def _beam(device: Sensor | RayPattern) -> float:
-    """Solid angle that a beam of the sensor stands for (where its rings lie closest), sr."""
+    """Solid angle that a beam of the sensor stands for (where its rings lie closest), sr. Lasers of one elevation share
+    theirs."""
     if isinstance(device, Sensor):
-        gap = np.median(np.diff(device.elevations)) if len(device.elevations) > 1 else np.radians(1.0)
-        return device.azimuth_step * float(gap)
+        gaps = np.diff(device.elevations)
+        gaps = gaps[gaps > _SAME_ELEVATION]
+        gap = np.median(gaps) if len(gaps) else np.radians(1.0)
+        return device.azimuth_step * float(gap) * (len(gaps) + 1) / len(device.elevations)
     width = device.azimuths[1] - device.azimuths[0]
     return float(width * np.diff(np.sin(device.elevations))[0] / len(device.frame(0).directions))
 

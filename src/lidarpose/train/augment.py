@@ -4,6 +4,7 @@ All happens in the person's own frame but for the crop. Legend: n points.
 """
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -24,6 +25,7 @@ LEAST_POINTS = 5
 _STRAYS = 60
 # of a synthetic person's, and steps on their coordinates, m
 _MOST_STRAYS, _NOISE = 200, (0.005, 0.08)
+_Somebody = TypeVar("_Somebody", Sample, Person)
 _FLIP_PART = np.array([-1, 0, *(1 + np.array(SMPL24.flip))], np.int16)
 
 
@@ -100,25 +102,27 @@ def augmented(person: Person, kind: Augmentation, rng: np.random.Generator) -> E
     )
 
 
-def disturbed(sample: Sample, *, strays: float, noise: float, rng: np.random.Generator) -> Sample:
+def disturbed(one: _Somebody, *, strays: float, noise: float, rng: np.random.Generator) -> _Somebody:
     """A synthetic person whose points are worse than a sensor's: with probability `strays` blobs of stray points, which
     no box has cut, and with probability `noise` normal steps of 0.5 to 8 cm on every coordinate.
 
     Paper: the disturbances of its stability study, of any size. The center is that of what is there now.
     """
-    points, part = sample.points, sample.part
+    points, part = one.points, one.part
     chance = rng.random(2)
     if chance[0] < strays:
         most = min(_MOST_STRAYS, _STRAYS // 3 + len(points))
-        blobs = noise_clusters(sample.center, most=most, rng=rng)
+        blobs = noise_clusters(one.center, most=most, rng=rng)
         points = np.concatenate([points, blobs.astype(np.float32)])
         part = np.concatenate([part, np.zeros(len(blobs), part.dtype)])
     if chance[1] < noise:
         sigma = np.exp(rng.uniform(*np.log(_NOISE)))
         points = jitter(points, sigma=sigma, clip=2 * sigma, rng=rng).astype(np.float32)
-    if points is sample.points:
-        return sample
-    return replace(sample, points=points, part=part, ring=None, center=center_of(points))
+    if points is one.points:
+        return one
+    # strays come from no ring
+    rest = {"ring": None} if isinstance(one, Sample) else {}
+    return replace(one, points=points, part=part, center=center_of(points), **rest)
 
 
 def _view(person: Person, kind: Augmentation, rng: np.random.Generator) -> tuple[Person, np.ndarray]:

@@ -5,19 +5,18 @@ Legend: N people, M points of all of them.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from lidarpose.data.columns import CENTERS
-from lidarpose.data.files import file_error
-from lidarpose.data.readers.items import HIDDEN, SEEN, UNLABELED
+from lidarpose.data.files import file_error, listed
+from lidarpose.data.readers.items import HIDDEN, SEEN
 from lidarpose.data.shards import Dataset, open_dataset, shard_path
 from lidarpose.errors import InputError
 from lidarpose.sample import Box
 from lidarpose.skeleton import BODY26, skeleton
-from lidarpose.train.example import UNKNOWN_PART
+from lidarpose.train.example import UNKNOWN_PART, seen
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +37,7 @@ class Person:
 
 @dataclass(frozen=True, kw_only=True)
 class Crowd:
-    """Everybody. start, end (N,): where a person's points begin and end; labels (N, 26) uint8, as in `Item`; centers:
+    """Everybody. start, end (N,): where a person's points begin and end; visible (N, 26): as in `Person`; centers:
     (N, 3) m by name, NaN for none; box (N, 7), NaN for none; sequence (N,): numbers of `sequences`; dataset: name of
     the first one, "" if synthetic; damaged: what could not be read; the rest as in `Person`."""
 
@@ -47,7 +46,7 @@ class Crowd:
     start: np.ndarray
     end: np.ndarray
     joints: np.ndarray
-    labels: np.ndarray
+    visible: np.ndarray
     center: np.ndarray
     centers: dict[str, np.ndarray]
     box: np.ndarray
@@ -68,7 +67,7 @@ class Crowd:
             points=self.points[own],
             part=self.part[own],
             joints=self.joints[row],
-            visible=self._visible(row),
+            visible=self.visible[row],
             center=self.center[row],
             centers={name: at[row] for name, at in self.centers.items() if not np.isnan(at[row]).any()},
             box=None if np.isnan(box).any() else Box(center=box[:3], size=box[3:6], yaw=float(box[6])),
@@ -80,7 +79,7 @@ class Crowd:
         left = [name for name in self.sequences if name not in sequences]
         number = np.array([left.index(name) if name in left else -1 for name in self.sequences], int)
         rows = np.flatnonzero(number[self.sequence] >= 0)
-        each = ("start", "end", "joints", "labels", "center", "box", "sensor_known")
+        each = ("start", "end", "joints", "visible", "center", "box", "sensor_known")
         return replace(
             self,
             sequence=number[self.sequence[rows]],
@@ -88,15 +87,6 @@ class Crowd:
             centers={name: at[rows] for name, at in self.centers.items()},
             **{name: getattr(self, name)[rows] for name in each},
         )
-
-    def _visible(self, row: int) -> np.ndarray:
-        # a dataset that never says hidden tells nothing of what is seen
-        told = np.select([self.labels[row] == SEEN, self.labels[row] == HIDDEN], [1.0, 0.0], np.nan)
-        return (told if self._tells_hidden else np.full(len(BODY26), np.nan)).astype(np.float32)
-
-    @cached_property
-    def _tells_hidden(self) -> bool:
-        return bool((self.labels == HIDDEN).any())
 
 
 def crowd_of(folders: Sequence[str | Path], *, split: str | None = None, interval: int = 1) -> Crowd:
@@ -106,7 +96,7 @@ def crowd_of(folders: Sequence[str | Path], *, split: str | None = None, interva
     recipes thin out. A shard that is damaged is left out and named in `damaged`.
     Raises InputError where nobody is left, for a folder that is no dataset, and for datasets of different skeletons.
     """
-    folders = [Path(folder) for folder in folders]
+    folders = [Path(folder) for folder in listed(folders)]
     rows: list[dict] = []
     damaged: list[str] = []
     skeletons = {}
@@ -116,6 +106,7 @@ def crowd_of(folders: Sequence[str | Path], *, split: str | None = None, interva
         if split is not None and dataset.card.people != "labelled":
             raise file_error(folder, f"holds synthetic people, which have no split {split!r}: leave --split away")
         frames: dict[tuple, int] = {}
+        first = len(rows)
         for row in _rows(dataset, damaged):
             if split is not None and row["split"] != split:
                 continue
@@ -124,6 +115,10 @@ def crowd_of(folders: Sequence[str | Path], *, split: str | None = None, interva
             frames[whose] = frames.get(whose, -1) + 1
             if frames[whose] % interval == 0 and len(row["points"]):
                 rows.append(_kept(row, dataset))
+        if not any((row["visible"] == 0).any() for row in rows[first:]):
+            # a dataset that never says hidden tells nothing of what is seen
+            for row in rows[first:]:
+                row["visible"] = np.full_like(row["visible"], np.nan)
     if len(skeletons) > 1:
         raise InputError(f"datasets that are learned together need one skeleton, got {', '.join(sorted(skeletons))}")
     rows = [row for row in rows if not np.isnan(row["joints"]).all()]
@@ -136,7 +131,7 @@ def crowd_of(folders: Sequence[str | Path], *, split: str | None = None, interva
     number = {name: k for k, name in enumerate(names)}
     counts = np.array([len(row["points"]) for row in rows])
     ends = counts.cumsum()
-    stacked = ("joints", "labels", "center", "box", "sensor_known")
+    stacked = ("joints", "visible", "center", "box", "sensor_known")
     return Crowd(
         points=np.concatenate([row["points"] for row in rows]),
         part=np.concatenate([row["part"] for row in rows]),
@@ -171,16 +166,20 @@ def _kept(row: dict, dataset: Dataset) -> dict:
     of = skeleton(dataset.card.skeleton)
     place = [BODY26.index(joint) for joint in of.joints]
     joints = np.full((len(BODY26), 3), np.nan, np.float32)
-    labels = np.full(len(BODY26), UNLABELED, np.uint8)
+    visible = np.full(len(BODY26), np.nan, np.float32)
     real = "joint_labels" in row
     try:
         joints[place] = row["joints"].reshape(-1, 3)
-        labels[place] = row["joint_labels"] if real else SEEN
+        if real:
+            visible[place] = np.select([row["joint_labels"] == SEEN, row["joint_labels"] == HIDDEN], [1.0, 0.0], np.nan)
     except (ValueError, AttributeError) as error:
         problem = f"row {row['index']} has not the {len(of)} joints of its card ({error}); write it again"
         raise file_error(dataset.folder, problem) from None
     points = row["points"].reshape(-1, 3)
     part = np.full(len(points), UNKNOWN_PART, np.int16) if row["part"] is None else row["part"].astype(np.int16)
+    if not real and row["part"] is not None:
+        # parts tell it, as of people made meanwhile
+        visible[place] = seen(joints[place], points[part > 0])
     nowhere = np.full(3, np.nan)
     centers = {name: row.get(f"center_{name}") for name in CENTERS}
     box = np.full(7, np.nan)
@@ -190,7 +189,7 @@ def _kept(row: dict, dataset: Dataset) -> dict:
         "points": points,
         "part": part,
         "joints": joints,
-        "labels": labels,
+        "visible": visible,
         "center": np.asarray(row["center"], float),
         "centers": {name: nowhere if at is None else np.asarray(at, float) for name, at in centers.items()},
         "box": box,

@@ -71,7 +71,8 @@ def _pretraining(recipe: Pretrain) -> Job:
     warnings: tuple[str, ...] = ()
     if recipe.shards:
         crowd = crowd_of(recipe.shards)
-        source = StoredSource(crowd=crowd, seed=recipe.seed, augmentation=Augmentation(turn=1.0, flip=0.5))
+        worse = {"strays": recipe.strays, "noise": recipe.noise}
+        source = StoredSource(crowd=crowd, seed=recipe.seed, augmentation=Augmentation(turn=1.0, flip=0.5), **worse)
         warnings = _about(crowd)
     else:
         source = SyntheticSource(seed=recipe.seed, easy=recipe.easy * recipe.people, **scene)

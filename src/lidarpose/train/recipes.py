@@ -6,9 +6,10 @@ A field's help is what the command line says of it; this module stays light for 
 from dataclasses import Field, asdict, dataclass, field, fields
 from math import isfinite
 from operator import index
-from os import PathLike, fspath
+from os import fspath
 from typing import Any
 
+from lidarpose.data.files import listed
 from lidarpose.errors import InputError, check_name
 from lidarpose.model.bundled import DEFAULT
 
@@ -34,8 +35,7 @@ def _declared(f: Field, value: Any) -> Any:
         if f.type is float:
             return float(value)
         if isinstance(f.default, tuple):
-            # one name or folder alone is one, not a list of letters
-            return tuple(map(fspath, (value,) if isinstance(value, (str, PathLike)) else value))
+            return tuple(map(fspath, listed(value)))
         if f.type is bool:
             return bool(value)
         return None if value is None and f.default is None else fspath(value)
@@ -104,13 +104,15 @@ class Pretrain(Recipe):
     init: str = _setting("", "weights to begin with, of this size or smaller: bundled, or a checkpoint")
     scene: str = _setting("wild", "wild, paper or reference")
     people: int = _setting(300_000, "seen in all")
-    easy: float = _setting(0.05, "share of the run in which difficulty rises to full")
+    easy: float = _setting(0.05, "share of the run in which difficulty rises to full; that of shards is what it is")
     captured: float = _setting(0.5, "share of poses from captured motion, where clips are given")
     motion: str | None = _setting(None, "captured motion to take poses from: a file or a folder")
     subjects: tuple[str, ...] = _setting((), "those of its clips to learn from, by the first part of names")
     strays: float = _setting(0.2, "how often stray points are about a person")
     noise: float = _setting(0.15, "how often all points are blurred, by 0.5 to 8 cm")
-    shards: tuple[str, ...] = _setting((), "folders that `lidarpose synth` wrote, to learn from instead")
+    shards: tuple[str, ...] = _setting(
+        (), "folders that `lidarpose synth` wrote, to learn from; scene and motion then choose validation people"
+    )
 
     def __post_init__(self):
         super().__post_init__()

@@ -72,18 +72,23 @@ class SyntheticSource:
 class StoredSource:
     """The people of datasets, all of them once an epoch in an order of the epoch's own, each time augmented anew.
 
-    crowd: see `crowd.crowd_of`.
+    crowd: see `crowd.crowd_of`; strays, noise: see `disturbed`.
     """
 
     crowd: Crowd
     seed: int
     augmentation: Augmentation
+    strays: float = 0.0
+    noise: float = 0.0
 
     def example(self, index: int) -> Example:
         epoch, place = divmod(index, len(self.crowd))
         row = int(_order(self.seed, epoch, len(self.crowd))[place])
         rng = np.random.default_rng([self.seed, _STORED, index])
-        return augmented(self.crowd.person(row), self.augmentation, rng)
+        person = self.crowd.person(row)
+        if self.strays or self.noise:
+            person = disturbed(person, strays=self.strays, noise=self.noise, rng=rng)
+        return augmented(person, self.augmentation, rng)
 
 
 @lru_cache(maxsize=2)
