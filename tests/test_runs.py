@@ -13,6 +13,7 @@ from safetensors.torch import load_file
 
 from lidarpose.cli import main
 from lidarpose.errors import InputError
+from lidarpose.model.bundled import weights_path
 from lidarpose.model.checkpoint import load_checkpoint
 from lidarpose.model.network import PoseNet
 from lidarpose.model.presets import preset
@@ -89,6 +90,24 @@ def broken(monkeypatch, folder, *args, recipe=RECIPE, **kwargs):
         killed_at(patch, *args, **kwargs)
         with pytest.raises(Killed):
             loop.train(recipe, folder)
+
+
+def test_what_is_saved_is_the_running_mean_of_the_weights(unbroken, tmp_path):
+    loop.train(replace(RECIPE, ema=0.0), tmp_path / "run")
+    for line, other in zip(log_of(unbroken), log_of(tmp_path / "run"), strict=True):
+        assert line["joints"] == pytest.approx(other["joints"], abs=2e-4)
+    mean, last = (load_file(folder / runs.MODEL) for folder in (unbroken, tmp_path / "run"))
+    assert max((mean[name] - last[name]).abs().max() for name in mean) > 1e-3
+
+
+@pytest.mark.parametrize("clip, moves", [(0.0, True), (1.0, True), (1e-12, False)])
+def test_gradients_are_clipped(clip, moves, tmp_path):
+    """Adam divides by the gradient's size, but not by less than its epsilon."""
+    recipe = replace(RECIPE, init="tiny", people=16, clip=clip, muon_rate=0.0, decay=0.0, ema=0.0)
+    loop.train(recipe, tmp_path / "run")
+    before, after = (load_file(path) for path in (weights_path("tiny"), tmp_path / "run" / runs.MODEL))
+    moved = max((after[name].float() - before[name].float()).abs().max() for name in before)
+    assert moved > 1e-3 if moves else moved < 1e-5
 
 
 def test_an_unbroken_run(unbroken):
