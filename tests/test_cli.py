@@ -489,6 +489,15 @@ def test_a_reader_that_has_enough_is_no_error(crop):
     assert child.wait(60) == 0
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no full device here")
+def test_a_full_output_is_one_line(crop):
+    code = f"import sys; from lidarpose.cli import main; sys.exit(main(['predict', {str(crop)!r}, '--out', '-']))"
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, text=True, timeout=120)
+    assert done.returncode == 2 and "error: cannot write the output (No space left on device)" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_without_numba_predict_works_and_demo_names_the_extra(crop, tmp_path):
     done = program(
         "import sys; sys.modules['numba'] = None\n"

@@ -208,7 +208,7 @@ def test_dapt_crops_and_centers_as_released(sets):
         ("humanm3", {"skeleton": "smpl24"}, "has no spine1"),
         ("humanm3", {"protocol": "clear"}, "did you mean clean"),
         ("humanm3", {"limit": 0}, "at least 1 person"),
-        ("humanm3", {"seed": -1}, "seed of at least 0"),
+        ("humanm3", {"seed": -1}, "seed must be a whole number of at least 0, got -1"),
         ("nowhere", {}, "is no dataset"),
         ("a", {}, "is no dataset"),
     ],
@@ -468,6 +468,32 @@ def written(sets, tmp_path_factory):
     return run, folder, evaluation.write(run, folder)
 
 
+def test_what_cannot_be_written_or_disturbed_is_known_before_anybody_is_judged(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(evaluation, "judge", None)
+    (tmp_path / "file").write_text("")
+    for out in ("file", "file/deep"):
+        assert main(["evaluate", "tiny", "bench", "--limit", "2", "--out", str(tmp_path / out)]) == 2
+        assert "file" in capsys.readouterr().err
+    # of a single person of the bench nobody is clean
+    assert main(["evaluate", "tiny", "bench", "--limit", "1", "--stability", "--out", str(tmp_path / "new")]) == 2
+    assert "judge more people, or no --stability" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize(
+    "model, dataset, options, words",
+    [
+        (3, "bench", {}, "expected a network to judge"),
+        ("tiny", None, {}, "expected a dataset to judge"),
+        ("tiny", "bench", {"limit": "4"}, "limit must be a whole number of at least 1 person, got '4'"),
+        ("tiny", "bench", {"limit": 4.0}, "limit must be a whole number"),
+    ],
+)
+def test_arguments_of_the_wrong_kind_are_told(model, dataset, options, words):
+    with pytest.raises(InputError, match=words):
+        evaluation.evaluate(model, dataset, **options)
+
+
 def test_numpy_s_numbers_and_one_dataset_alone_are_judged_and_written(tmp_path):
     run = evaluation.run("tiny", "bench", limit=np.int64(3), seed=np.int32(2))
     evaluation.write(run, tmp_path / "new")
@@ -535,6 +561,8 @@ def test_all_files_or_none(written, tmp_path, monkeypatch):
     run = replace(run, evaluations=run.evaluations[:1])
     with pytest.raises(InputError, match="holds other files"):
         evaluation.write(run, folder)
+    with pytest.raises(InputError, match="is a file; give a new or empty folder"):
+        evaluation.write(run, folder / "scores.json")
     import lidarpose.evaluation as module
 
     def broken(path, judged):

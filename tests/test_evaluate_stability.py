@@ -228,7 +228,7 @@ def test_a_displaced_box_lets_in_what_lies_around(tmp_path):
     prepare("humanm3", tmp_path / "raw", tmp_path / "humanm3")
     task = task_of(Fake(standing), open_people(tmp_path / "humanm3"))
     gained = 0
-    for shown in module._people(task)[0]:
+    for shown in module.to_disturb(task):
         np.testing.assert_array_equal(shown.person.points, shown.whole.points[shown.box.contains(shown.whole.points)])
         # a box so small that the person reaches beyond it
         small = replace(shown.box, size=shown.box.size * 0.6)
@@ -308,6 +308,6 @@ def test_a_crop_moved_by_nothing_is_the_crop(tmp_path):
     prepare("humanm3", tmp_path / "raw", tmp_path / "humanm3")
     for protocol in ("clean", "dapt"):
         task = task_of(Fake(standing), open_people(tmp_path / "humanm3"), protocol=protocol)
-        for shown in module._people(task)[0]:
+        for shown in module.to_disturb(task):
             found = module._disturbed(task, shown, "crop", 0.0).points
             np.testing.assert_array_equal(found, shown.person.points.astype(float))

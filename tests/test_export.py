@@ -249,13 +249,18 @@ def test_the_twin_beside_a_checkpoint(folder, tmp_path):
 # ---- what is wrong with an export
 
 
-def test_what_cannot_be_exported_is_one_line(folder, tmp_path):
+def test_what_cannot_be_exported_is_one_line(folder, tmp_path, monkeypatch):
     out = tmp_path / "out.onnx"
     with pytest.raises(InputError, match="unknown format 'tflite': known are onnx, torch"):
         export(folder / "net.safetensors", out, format="tflite")
     with pytest.raises(InputError, match="does not exist"):
         export(tmp_path / "none.safetensors", out)
-    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "file").write_text("")
+    # at once, not after a minute of tracing
+    monkeypatch.setattr("lidarpose.model.export.onnx_bytes", None)
+    with pytest.raises(InputError, match="a part of the path is a file"):
+        export(folder / "net.safetensors", tmp_path / "file" / "out.onnx")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_without_onnx_the_extra_is_named(folder, tmp_path, monkeypatch):

@@ -148,7 +148,7 @@ def test_what_cannot_be_read_is_one_line(datasets, synthetic, tmp_path):
     for call, told in [
         (lambda: crowd_of([tmp_path]), "is no dataset"),
         (lambda: crowd_of([datasets["humanm3"]], split="val"), "expected labelled people in the split 'val'"),
-        (lambda: crowd_of([synthetic], split="train"), "have no split 'train'"),
+        (lambda: crowd_of([synthetic], split="train"), "have no split 'train': say --split all"),
         (lambda: crowd_of([datasets["humanm3"], datasets["waymo"]]), "need one skeleton"),
     ]:
         with pytest.raises(InputError, match=told) as caught:

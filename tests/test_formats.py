@@ -208,6 +208,12 @@ def test_number_types_of_numpy(folder, dtype):
 # ---- what the formats allow
 
 
+def test_cells_in_quotes_of_either_kind(folder):
+    for quote in "'\"":
+        text = "".join(",".join(f"{quote}{value:.3f}{quote}" for value in row) + "\n" for row in POINTS[:, :3])
+        same(read(folder, "a.csv", "x,y,z\n" + text), POINTS[:, :3].round(3))
+
+
 def test_pcd_variants(folder):
     rows = POINTS.tobytes()
     same(read(folder, "A.PCD", pcd_header() + rows), fields=("x", "y", "z", "i"))
@@ -450,8 +456,10 @@ BAD = {
     "npy of 10^40": ("a.npy", npy_header((10**40, 3)), ["cut off"]),
     "npy negative": ("a.npy", npy_header((-1, 3)) + ROWS, ["(-1, 3)"]),
     "npy flat": ("a.npy", npy(POINTS.ravel()), ["(12,)", "(n, 3+)"]),
-    "npy two columns": ("a.npy", npy(np.ones((9, 2))), ["(9, 2)"]),
+    "npy two columns": ("a.npy", npy(np.ones((9, 2))), ["(9, 2)", "save x, y and z"]),
     "npy transposed": ("a.npy", npy(np.ones((2, 3)).T[:, :2]), ["points.T"]),
+    "npy really transposed": ("a.npy", npy(np.ones((3, 60))), ["(3, 60)", "points.T"]),
+    "npy transposed records": ("a.npy", npy(np.ones((5, 51))), ["(5, 51)", "points.T"]),
     "npy batch": ("a.npy", npy(np.ones((2, 5, 4))), ["(2, 5, 4)", "reshape(-1, 4)"]),
     "npy words": ("a.npy", npy(np.array([["a", "b", "c"]])), ["<U1"]),
     "npy complex": ("a.npy", npy(np.ones((2, 3), complex)), ["complex128"]),

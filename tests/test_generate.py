@@ -49,6 +49,17 @@ def test_a_person_is_the_same_alone_in_any_order_and_from_another_generator(scen
     assert_same(Generator(scene=SCENES[scene]).person(SEED, 70).sample, known.person(SEED, 70).sample)
 
 
+def test_a_scene_s_name_and_numpy_s_numbers_do():
+    maker = Generator(scene="paper", measure=False)
+    known = Generator(scene=SCENES["paper"], measure=False).person(SEED, 3)
+    assert_same(maker.person(np.int64(SEED), np.int32(3)).sample, known.sample)
+    for seed, index, word in ((-1, 0, "seed"), (0, -1, "index"), (0.5, 0, "seed"), ("1", 0, "seed")):
+        with pytest.raises(InputError, match=f"^{word} must be a whole number of at least 0, got"):
+            maker.person(seed, index)
+    with pytest.raises(InputError, match="did you mean wild"):
+        Generator(scene="wilt")
+
+
 @pytest.mark.parametrize("scene", ["paper", "wild"])
 def test_measuring_does_not_change_the_sample(scene):
     maker = Generator(scene=SCENES[scene], measure=False)

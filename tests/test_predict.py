@@ -108,6 +108,7 @@ def test_the_input_is_left_alone(model, points):
     [
         (np.zeros((4, 2)), "shape (4, 2)"),
         (np.zeros(3), "shape (3,)"),
+        (np.zeros((3, 60)), "shape (3, 60): give points.T"),
         (np.zeros((2, 2, 2, 3)), "shape (2, 2, 2, 3)"),
         (np.array([[1, 2, "a"]]), "<U"),
         (np.array([[1, 2, 3]], object), "objects"),
@@ -129,6 +130,12 @@ def test_a_wrong_array_is_told_in_one_line(model, bad, words):
     with pytest.raises(InputError) as raised:
         model.predict(bad)
     assert words in str(raised.value) and "\n" not in str(raised.value) and "points" in str(raised.value)
+
+
+def test_a_wrong_place_of_the_sensor_is_told_in_one_line(model, points):
+    with pytest.raises(InputError, match="sensor origin: expected x,y,z in metres or unknown") as raised:
+        model.predict(points, sensor_origin=np.eye(3))
+    assert "\n" not in str(raised.value)
 
 
 def test_nan_and_absurd_points_are_dropped_and_counted(model, points):

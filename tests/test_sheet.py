@@ -45,7 +45,9 @@ def test_people_are_spread_over_the_dataset(dataset):
     [
         (["none"], "is no dataset: dataset.json is missing"),
         (["streetlife", "-n", "0"], "expected 1 to"),
-        (["streetlife", "--out", "streetlife"], "is a folder"),
+        (["streetlife", "--out", "streetlife/dataset.json/x.png"], "is a file"),
+        (["streetlife", "--out", "sheet.jpg"], "sheet.jpg: is to hold PNG: give a name that ends in .png"),
+        (["streetlife", "--html", "--out", "page.png"], "page.png: is to hold HTML: give a name that ends in .html"),
     ],
 )
 def test_what_cannot_be_drawn_is_told_in_one_line(dataset, capsys, arguments, message):

@@ -152,6 +152,7 @@ BAD = {
     "workers": (["-n", "5", "--workers", "0"], "worker"),
     "motion": (["-n", "5", "--motion", "none.npz"], "none.npz"),
     "subjects": (["-n", "5", "--subjects", "a"], "--motion"),
+    "no subject": (["-n", "5", "--motion", "none.npz", "--subjects", ","], "leave --subjects away"),
     "both": (["-n", "5", "--clips", "--scenes"], "not allowed with"),
     "shard": (["-n", "5", "--per-shard", "0"], "a shard, got 0"),
     "captured": (["-n", "5", "--captured", "0.3"], "--motion"),

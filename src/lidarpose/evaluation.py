@@ -20,14 +20,14 @@ import numpy as np
 
 from lidarpose._version import __version__
 from lidarpose.data.columns import pyarrow
-from lidarpose.data.files import atomic_path, file_error, listed
-from lidarpose.errors import InputError, whole
+from lidarpose.data.files import atomic_path, check_writable, file_error, listed
+from lidarpose.errors import InputError
 from lidarpose.evaluate.judged import Judged, read_poses, write_poses
 from lidarpose.evaluate.people import BENCH, open_people
 from lidarpose.evaluate.protocols import PROTOCOLS
 from lidarpose.evaluate.result import FILE, Line, Result, Scores, Setting, read_scores, scores_path
 from lidarpose.evaluate.run import Evaluation, Model, Task, judge, task_of
-from lidarpose.evaluate.stability import Stability, study, to_json
+from lidarpose.evaluate.stability import Stability, study, to_disturb, to_json
 from lidarpose.evaluate.table import published, table
 from lidarpose.infer.predictor import load
 from lidarpose.model.bundled import weights_path
@@ -105,7 +105,6 @@ def run(
     without pyarrow.
     """
     datasets = listed(datasets)
-    seed = whole("seed", seed, least=0)
     if not datasets:
         raise InputError("expected a dataset to judge: a folder that lidarpose prepare or synth wrote, or bench")
     pyarrow()
@@ -116,19 +115,22 @@ def run(
     by_name = isinstance(model, str | os.PathLike)
     weights = _file(model) if by_name else {}
     predictor = load(model, device=device, backend=backend, decode=decode, tta=tta) if by_name else model
+    if not hasattr(predictor, "predict"):
+        raise InputError(f"expected a network to judge, weights by name or path or a predictor, got {model!r}")
     options = {"protocol": protocol, "seed": seed, "skeleton": skeleton, "sensor_unknown": sensor_unknown}
     tasks = [task_of(predictor, one, **options) for one in people]
+    disturbed = [to_disturb(task) for task in tasks] if stability else [None] * len(tasks)
     evaluations, studies = [], []
-    for task in tasks:
+    for task, shown in zip(tasks, disturbed, strict=True):
         evaluations.append(judge(task, legacy=legacy, progress=_told(task, "", progress)))
-        if stability:
+        if shown is not None:
             more = _told(task, ", disturbed", progress)
-            studies.append(study(task, evaluations[-1].judged, progress=more))
+            studies.append(study(task, evaluations[-1].judged, people=shown, progress=more))
     return Run(
         scores=Scores(
             weights=dict(predictor.model) | weights | _known(predictor),
             command=command,
-            seed=seed,
+            seed=tasks[0].setting.seed,
             results=tuple(one.result for one in evaluations),
         ),
         evaluations=tuple(evaluations),
@@ -171,10 +173,14 @@ def new_folder(checkpoint: str | os.PathLike, folder: str | os.PathLike = FOLDER
 
 
 def check_folder(folder: str | os.PathLike) -> Path:
-    """The folder to write to. Raises InputError unless it is new or empty."""
+    """The folder to write to. Raises InputError unless it is new or empty, and can be written."""
     path = Path(folder)
-    if path.is_dir() and any(path.iterdir()) or path.exists() and not path.is_dir():
-        raise file_error(path, "holds other files; give a new or empty folder for the results (--out DIR)")
+    remedy = "give a new or empty folder for the results (--out DIR)"
+    if path.exists() and not path.is_dir():
+        raise file_error(path, f"is a file; {remedy}")
+    if path.is_dir() and any(path.iterdir()):
+        raise file_error(path, f"holds other files; {remedy}")
+    check_writable(path / FILE)
     return path
 
 

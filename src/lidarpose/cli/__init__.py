@@ -7,7 +7,7 @@ import sys
 from lidarpose._version import __version__
 from lidarpose.cli import datasets, evaluating, predicting, training, weights
 from lidarpose.cli.words import tell
-from lidarpose.errors import LidarPoseError, missing_extra
+from lidarpose.errors import InputError, LidarPoseError, missing_extra
 
 # options whose value may start with a minus sign, which argparse would take for another option
 _SIGNED = ("--sensor-origin",)
@@ -29,8 +29,12 @@ def main(arguments: list[str] | None = None) -> int:
         if not isinstance(told, LidarPoseError):
             raise
         return _failed(told)
-    except (LidarPoseError, OSError) as error:
+    except LidarPoseError as error:
         return _failed(error)
+    except OSError as error:
+        # what is written to files says which; this is the standard output
+        nowhere = InputError(f"cannot write the output ({error.strerror}): send it elsewhere")
+        return _failed(nowhere if error.filename is None and error.strerror else error)
     except KeyboardInterrupt:
         tell("lidarpose: stopped")
         return 130

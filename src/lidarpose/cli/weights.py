@@ -32,7 +32,9 @@ def add(commands) -> None:
     take.add_argument("file", help="their .safetensors")
     take.add_argument("out", metavar="OUT", help="the checkpoint to write (.safetensors)")
     take.add_argument(
-        "--config", metavar="NAME", help="waymo, humanm3, lidarhuman26m, sloper4d or pretrain (default: as FILE says)"
+        "--config",
+        metavar="NAME",
+        help="waymo, humanm3, lidarhuman26m, sloper4d, pretrain or paper (default: as FILE says)",
     )
 
 

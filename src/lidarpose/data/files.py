@@ -108,6 +108,23 @@ def _nearest(path: str | os.PathLike) -> str:
     return f"; did you mean {near[0]}?" if near else "; check the path"
 
 
+def check_writable(path: str | os.PathLike) -> None:
+    """Raises InputError where `atomic_path` would, for what is known long before there is something to write. Leaves
+    nothing behind."""
+    with suppress(_Abandoned), atomic_path(path):
+        raise _Abandoned
+
+
+class _Abandoned(Exception):
+    """Nothing is to be written after all."""
+
+
+def check_suffix(path: str | os.PathLike, *suffixes: str) -> None:
+    """Raises InputError where a file's name says another format than it gets."""
+    if not os.fsdecode(path).lower().endswith(suffixes):
+        raise file_error(path, f"is to hold {suffixes[0][1:].upper()}: give a name that ends in {suffixes[0]}")
+
+
 @contextmanager
 def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """Yields a temporary path in the folder of `path`; it becomes `path` when the block ends well.

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from os import PathLike
 from pathlib import Path
 from typing import Protocol
 
@@ -86,6 +87,8 @@ def open_people(dataset: str | Path, *, split: str | None = None, limit: int | N
     a dataset whose shards are missing or all damaged; MissingExtra without pyarrow."""
     if limit is not None:
         limit = whole("limit", limit, least=1, hint=" person")
+    if not isinstance(dataset, str | PathLike):
+        raise InputError(f"expected a dataset to judge, {BENCH} or the path of a folder, got {dataset!r}")
     if str(dataset) == BENCH:
         return BenchPeople.open(split, limit)
     return FolderPeople.open(Path(dataset), split, limit)

@@ -8,7 +8,7 @@ import numpy as np
 
 from lidarpose.data.readers.items import UNLABELED
 from lidarpose.data.released import released_box
-from lidarpose.errors import InputError
+from lidarpose.errors import InputError, whole
 from lidarpose.evaluate.bench import floors
 from lidarpose.evaluate.judged import Judged, gathered, subset
 from lidarpose.evaluate.lines import headline, lines_of
@@ -147,8 +147,7 @@ def task_of(
 ) -> Task:
     """Puts a network before a dataset. Raises InputError, one line, where the protocol does not fit the dataset, the
     dataset lacks joints of the `skeleton` asked for, or it and the network have no joint in common."""
-    if seed < 0:
-        raise InputError(f"expected a seed of at least 0, got {seed}")
+    seed = whole("seed", seed, least=0)
     check_protocol(protocol, people.kind, people.split_by, people.name)
     if protocol == "dapt" and model.model.get("tta", 1) > 1:
         raise InputError("the protocol dapt is one look at each person, as the released code's: leave --tta away")

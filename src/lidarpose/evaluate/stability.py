@@ -95,13 +95,16 @@ class Stability:
 
 
 def study(
-    task: Task, judged: Judged, *, sensors: bool = True, progress: Callable[[int], None] | None = None
+    task: Task,
+    judged: Judged,
+    *,
+    people: list["Shown"] | None = None,
+    sensors: bool = True,
+    progress: Callable[[int], None] | None = None,
 ) -> Stability:
-    """The study of a task's people, whom `judged` holds undisturbed; sensors: also people cast anew for other sensors.
-
-    Of lidarpose-bench its clean people are disturbed, of other datasets at most `PEOPLE`, evenly spread.
-    """
-    people, who = _people(task)
+    """The study of a task's people, whom `judged` holds undisturbed; people: whom to disturb, by default `to_disturb`;
+    sensors: also people cast anew for other sensors."""
+    people = to_disturb(task) if people is None else people
     undisturbed = _answers(task, [one.person for one in people])
     base = undisturbed.errors()
     clusters = np.array([one.person.sequence for one in people]) if task.setting.clusters else None
@@ -125,6 +128,7 @@ def study(
             notes.append("other sensors need people cast anew: pip install 'lidarpose[synth]'")
     elif sensors:
         notes.append("other sensors: people cast anew have no released center")
+    who = f"{len(people):,} {_who(task.setting)}"
     return Stability(setting=task.setting, who=who, curves=tuple(curves), ends=end_errors(judged), notes=tuple(notes))
 
 
@@ -151,7 +155,7 @@ def end_errors(judged: Judged) -> tuple[End, ...]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Shown:
+class Shown:
     """Somebody as the protocol shows them; whole: with all points that the dataset holds; box: that of the crop."""
 
     person: Person
@@ -159,26 +163,30 @@ class _Shown:
     box: Box | None
 
 
-def _people(task: Task) -> tuple[list[_Shown], str]:
+def to_disturb(task: Task) -> list[Shown]:
+    """Of lidarpose-bench its clean people, of other datasets at most `PEOPLE`, evenly spread. Raises InputError where
+    nobody has a point."""
     setting = task.setting
     if setting.kind == BENCH:
         found = [one for one in task.people if one.condition == _CLEAN and not one.moving]
-        who = f"clean people of {setting.dataset}"
     else:
         chosen = set(spread(task.people.count, PEOPLE).tolist())
         found = [one for k, one in enumerate(task.people) if k in chosen]
-        who = f"people of {setting.dataset}"
     # who is not judged is not disturbed either
     fit = [(task.fit(one)[0], one) for one in found]
     shown = [
-        _Shown(person=seen, whole=one, box=task.box(one)) for seen, one in fit if seen is not None and len(seen.points)
+        Shown(person=seen, whole=one, box=task.box(one)) for seen, one in fit if seen is not None and len(seen.points)
     ]
     if not shown:
-        raise InputError(f"none of the {who} has a point to disturb")
-    return shown, f"{len(shown):,} {who}"
+        raise InputError(f"none of the {_who(setting)} has a point to disturb: judge more people, or no --stability")
+    return shown
 
 
-def _disturbed(task: Task, shown: _Shown, name: str, amount: float) -> Person:
+def _who(setting: Setting) -> str:
+    return f"{'clean ' if setting.kind == BENCH else ''}people of {setting.dataset}"
+
+
+def _disturbed(task: Task, shown: Shown, name: str, amount: float) -> Person:
     person = shown.person
     seed = [task.setting.seed, zlib.crc32(name.encode()), person.shard, person.row]
     # a displaced box may let in what the dataset holds around the person

@@ -4,6 +4,8 @@ import os
 
 import numpy as np
 
+from lidarpose.data.files import one_line
+from lidarpose.data.formats import is_transposed
 from lidarpose.errors import InputError
 from lidarpose.sample import FARTHEST, Pose, center_of
 
@@ -62,8 +64,9 @@ def as_points(points: object, what: str = "points") -> np.ndarray:
         )
     if array.dtype.kind not in "fiu":
         raise InputError(f"{what} must be an (n, 3) array of numbers, got {array.dtype} of shape {array.shape}")
-    if array.ndim != 2 or array.shape[1] < 3:
-        raise InputError(f"{what} must be (n, 3) or (n, 3 + more) with x, y, z first, got shape {array.shape}")
+    if array.ndim != 2 or array.shape[1] < 3 or is_transposed(array):
+        remedy = ": give points.T" if is_transposed(array) else ""
+        raise InputError(f"{what} must be (n, 3) or (n, 3 + more) with x, y, z first, got shape {array.shape}{remedy}")
     return array[:, :3].astype(np.float64)
 
 
@@ -77,7 +80,7 @@ def as_origin(given: object) -> np.ndarray | None:
     except (TypeError, ValueError):
         origin = np.zeros(0)
     if origin.shape != (3,) or not (np.abs(origin) < FARTHEST).all():
-        raise InputError(f"sensor origin: expected x,y,z in metres or unknown, got {given!r}")
+        raise InputError(one_line(f"sensor origin: expected x,y,z in metres or unknown, got {given!r}"))
     return origin
 
 

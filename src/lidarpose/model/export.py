@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lidarpose.data.files import atomic_path, check_apart, write_atomic
+from lidarpose.data.files import atomic_path, check_apart, check_writable, write_atomic
 from lidarpose.errors import InputError, LidarPoseError, check_name, missing_extra
 from lidarpose.model.batch import Batch
 from lidarpose.model.checkpoint import load_checkpoint
@@ -59,6 +59,8 @@ def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = 
             f"{os.fspath(weights)}: the paper's network ({header.config.name}) is not offered as {format}: "
             "it runs with torch, and networks that `lidarpose pretrain` trains are exported"
         )
+    # tracing takes a minute
+    check_writable(out)
     metadata = {ENTRY: header.to_json(), SOURCE: digest(weights)}
     if format == "onnx":
         content = onnx_bytes(network, metadata)

@@ -10,7 +10,7 @@ from functools import lru_cache, partial
 import numpy as np
 
 from lidarpose.data import augment
-from lidarpose.errors import InputError
+from lidarpose.errors import InputError, whole
 from lidarpose.lidar.pattern import RayPattern
 from lidarpose.lidar.sensor import Sensor, sensor
 from lidarpose.sample import Pose, Sample
@@ -23,7 +23,7 @@ from lidarpose.synth.facts import Facts, facts_of
 from lidarpose.synth.look import Conditions, Layer, Returns, count_alone, draw_conditions, look
 from lidarpose.synth.placing import Place, draw_place
 from lidarpose.synth.props import Prop, draw_props
-from lidarpose.synth.scene import SceneConfig
+from lidarpose.synth.scene import SceneConfig, scene_config
 from lidarpose.synth.surroundings import ground, occluder, surroundings
 
 # people whose poses and shapes are drawn together
@@ -45,17 +45,20 @@ class SyntheticPerson:
 
 @dataclass(frozen=True, kw_only=True)
 class Generator:
-    """Synthetic people of one scene configuration. captured: share of poses from `bank`, the rest from the prior;
-    measure: also find the facts, which costs a second cast: the sample is the same either way; redraw: somebody of whom
-    hardly anything is seen is drawn again, each time easier to see; else they stay as they are, without points too."""
+    """Synthetic people of one scene configuration, or of a named one. captured: share of poses from `bank`, the rest
+    from the prior; measure: also find the facts, which costs a second cast: the sample is the same either way; redraw:
+    somebody of whom hardly anything is seen is drawn again, each time easier to see; else they stay as they are,
+    without points too."""
 
-    scene: SceneConfig
+    scene: SceneConfig | str
     bank: PoseBank | None = None
     captured: float = 0.0
     measure: bool = True
     redraw: bool = True
 
     def __post_init__(self):
+        if isinstance(self.scene, str):
+            object.__setattr__(self, "scene", scene_config(self.scene))
         if self.captured and self.bank is None:
             raise InputError("Generator.captured needs a bank of captured poses, got none")
         if not 0 <= self.captured <= 1:
@@ -67,6 +70,7 @@ class Generator:
 
     def person(self, seed: int, index: int, *, hard: float | None = None) -> SyntheticPerson:
         """Person `index` of `seed`, at the scene's difficulty or at `hard` in [0, 1]."""
+        seed, index = whole("seed", seed, least=0), whole("index", index, least=0)
         rng = np.random.default_rng([seed, 1, index])
         bodies = self._bodies(seed, index // BLOCK)
         return self._observed(Actor.of_block(bodies, index % BLOCK), bodies, index % BLOCK, rng, hard)[0]
@@ -78,6 +82,7 @@ class Generator:
         are. Frames in which nothing of the person is seen have samples without points."""
         if frames < 1:
             raise InputError(f"a clip needs frames of 1 or more, got {frames}")
+        seed, index = whole("seed", seed, least=0), whole("index", index, least=0)
         rng = np.random.default_rng([seed, 3, index])
         actor = draw_actor(self.bank, self.captured, frames, rng, clothes=self.scene.clothes)
         return self._observed(actor, self._bodies(seed, index // BLOCK), index % BLOCK, rng, hard)

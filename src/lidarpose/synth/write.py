@@ -65,6 +65,8 @@ class Job:
             )
         if self.motion is None and (self.subjects is not None or self.captured is not None):
             raise InputError("--subjects and --captured are of captured clips: name their file with --motion too")
+        if self.subjects is not None and not self.subjects:
+            raise InputError("expected the subjects of clips, got none: leave --subjects away for all of them")
         if self.captured is not None and not 0 <= self.captured <= 1:
             raise InputError(f"expected a share of captured poses between 0 and 1, got {self.captured}")
         if self.seed < 0:

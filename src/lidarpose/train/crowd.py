@@ -104,7 +104,7 @@ def crowd_of(folders: Sequence[str | Path], *, split: str | None = None, interva
         dataset = open_dataset(folder)
         skeletons[dataset.card.skeleton] = folder
         if split is not None and dataset.card.people != "labelled":
-            raise file_error(folder, f"holds synthetic people, which have no split {split!r}: leave --split away")
+            raise file_error(folder, f"holds synthetic people, which have no split {split!r}: say --split all")
         frames: dict[tuple, int] = {}
         first = len(rows)
         for row in _rows(dataset, damaged):

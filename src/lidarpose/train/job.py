@@ -186,7 +186,10 @@ def _begun(
     """The task and the network with the weights that it begins with."""
     if header.network == "pose":
         if not recipe.keep_anchors:
-            raise InputError("keep_anchors=false is for the paper's network: --init names one of the package's own")
+            raise InputError(
+                "keep_anchors=false is for the paper's network, and --init names one of the package's own: name a "
+                "checkpoint of pretrain --recipe paper, or leave --recipe paper and --keep-anchors away"
+            )
         return PoseTask(config=header.config, bone=recipe.bone, symmetry=recipe.symmetry), lambda: network
     from lidarpose.train.dapt_task import DaptTask, transferred
 

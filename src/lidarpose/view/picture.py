@@ -82,6 +82,10 @@ def draw_people(panels: list[Panel], path: str | Path | None = None, *, title: s
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    if path is not None:
+        from lidarpose.data.files import check_suffix
+
+        check_suffix(path, ".png")
     panels = list(panels)
     shown = panels[:MAX_PEOPLE]
     columns = min(_PER_ROW, max(len(shown), 1))
