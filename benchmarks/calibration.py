@@ -66,7 +66,8 @@ def main() -> None:
         one = {"what": name, "ece": calibration_error(stated, truth), "auroc": auroc(stated, truth)}
         found["stated"].append(one)
         print(f"{name}: ECE {one['ece']:.3f}, AUROC {one['auroc']:.3f}")
-    print(f"spread and error: rank correlation {_rank(spread, error):.2f}")
+    found["rank"] = float(_rank(spread, error))
+    print(f"spread and error: rank correlation {found['rank']:.2f}")
     for name, low, high in SPREADS:
         there = (spread >= low) & (spread < high)
         one = {"of": name, "share": 100 * there.mean()}

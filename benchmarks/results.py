@@ -212,8 +212,11 @@ def calibration() -> str:
 
 def spread() -> str:
     """What `spread` says beside the truth; see calibration.py."""
-    found = _read("calibration")["spread"]
-    rows = [(one["of"], f"{one['share']:.1f} %", f"{one['stated']:.1f}", f"{one['true']:.1f}") for one in found]
+    found = _read("calibration")
+    rows = [
+        (one["of"], f"{one['share']:.1f} %", f"{one['stated']:.1f}", f"{one['true']:.1f}") for one in found["spread"]
+    ]
+    rows.append(("rank correlation of the two", "", "", f"{found['rank']:.2f}"))
     return table(("`spread`", "joints", "stated, mm", "true, mm"), rows)
 
 
