@@ -104,13 +104,16 @@ def draw_distance(config: SceneConfig, device: Sensor | RayPattern, rng: np.rand
 
 @lru_cache(maxsize=64)
 def _beam(device: Sensor | RayPattern) -> float:
-    """Solid angle that a beam of the sensor stands for (where its rings lie closest), sr. Lasers of one elevation share
-    theirs."""
+    """Solid angle that a beam of the sensor stands for (where its rings lie closest), sr. Where most lasers share their
+    elevations, those of one elevation share the gap to the next."""
     if isinstance(device, Sensor):
         gaps = np.diff(device.elevations)
-        gaps = gaps[gaps > _SAME_ELEVATION]
-        gap = np.median(gaps) if len(gaps) else np.radians(1.0)
-        return device.azimuth_step * float(gap) * (len(gaps) + 1) / len(device.elevations)
+        gap = np.median(gaps) if len(gaps) else 0.0
+        if gap < _SAME_ELEVATION:
+            gaps = gaps[gaps > _SAME_ELEVATION]
+            gap = np.median(gaps) if len(gaps) else np.radians(1.0)
+            gap *= (len(gaps) + 1) / len(device.elevations)
+        return device.azimuth_step * float(gap)
     width = device.azimuths[1] - device.azimuths[0]
     return float(width * np.diff(np.sin(device.elevations))[0] / len(device.frame(0).directions))
 
