@@ -475,6 +475,7 @@ BAD = {
     "npz of words": ("a.npz", npz(a=np.array("me")), ["'points'", "got a"]),
     "npz of 10^12": ("a.npz", zipped("points.npy", npy_header((HUGE, 3))), ["cut off"]),
     "txt of words": ("a.txt", "hello world this is\nsome text\n", ["'hello world this is'", "line 1"]),
+    "txt transposed": ("a.txt", "\n".join(["1.5 " * 60] * 3), ["got 3 of 60", "transpose"]),
     "txt of two columns": ("a.txt", "1 2\n3 4\n", ["got 2 on line 1"]),
     "txt of comments": ("a.txt", "# nothing\n\n# here\n", ["has no points"]),
     "csv header alone": ("a.csv", "x,y,z\n", ["has no points"]),

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarpose.data.files import file_error, read_bytes
-from lidarpose.data.headers import Problem, need_bytes, numbered, pick_xyz, shorten
+from lidarpose.data.headers import Problem, is_transposed, need_bytes, numbered, pick_xyz, shorten
 from lidarpose.data.pcd import parse_pcd
 from lidarpose.data.ply import parse_ply
 from lidarpose.data.text import parse_text
@@ -35,8 +35,6 @@ _MAX_PLAUSIBLE = 1e7
 _MAX_IMPLAUSIBLE_SHARE = 0.01
 # beams are numbered from 0; no LiDAR has more
 _MAX_BEAMS = 256
-# an array of so few rows and so many columns holds points as columns
-_FEW_ROWS, _MANY_COLUMNS = 5, 50
 
 # the first bytes of what users rename by mistake, with the remedy; long enough never to be float32 coordinates
 _FOREIGN = (
@@ -263,19 +261,14 @@ def _points_of(array: np.ndarray, what: str):
         return np.stack([part.astype(np.float64) for part in parts], axis=-1), names, ()
     if array.dtype.kind not in "fiu":
         raise Problem(f"expected numbers in {what}, got dtype {array.dtype}: save a float array")
-    if array.ndim != 2 or array.shape[1] < 3 or is_transposed(array):
+    if array.ndim != 2 or array.shape[1] < 3 or is_transposed(array.shape):
         remedy = "save x, y and z of each point" if array.ndim == 2 else "save a row for each point"
-        if is_transposed(array) or array.ndim == 2 and 3 <= array.shape[0] <= 5:
+        if is_transposed(array.shape) or array.ndim == 2 and 3 <= array.shape[0] <= 5:
             remedy = "save its transpose, points.T"
         elif array.ndim > 2 and array.shape[-1] >= 3:
             remedy = f"save points.reshape(-1, {array.shape[-1]})"
         raise Problem(f"expected {what} to have the shape (n, 3+), got {array.shape}: {remedy}")
     return array[:, :3].astype(np.float64), numbered(array.shape[1]), ()
-
-
-def is_transposed(array: np.ndarray) -> bool:
-    """Whether it holds x, y, z as rows: no format has so many columns."""
-    return array.ndim == 2 and 3 <= array.shape[0] <= _FEW_ROWS and array.shape[1] > _MANY_COLUMNS
 
 
 _PARSERS = {

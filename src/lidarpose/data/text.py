@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 
-from lidarpose.data.headers import Problem, numbered, pick_xyz, shorten
+from lidarpose.data.headers import Problem, is_transposed, numbered, pick_xyz, shorten
 
 # what stands in text for a value that is not there, in the usual exports
 _MISSING = ("", "na", "n/a", "nan", "-nan", "+nan", "null", "none", "<na>")
@@ -55,6 +55,8 @@ def parse_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...
     if has_header:
         _check_width(body, names, separator, num_skipped)
     points = _parse_rows(body, pick_xyz(names), separator=separator, decimal=decimal, num_skipped=num_skipped)
+    if not has_header and is_transposed((len(points), len(names))):
+        raise Problem(f"expected a line of x y z for each point, got {len(points)} of {len(names)}: save its transpose")
     return points, tuple(names), ()
 
 

@@ -5,7 +5,7 @@ import os
 import numpy as np
 
 from lidarpose.data.files import one_line
-from lidarpose.data.formats import is_transposed
+from lidarpose.data.headers import is_transposed
 from lidarpose.errors import InputError
 from lidarpose.sample import FARTHEST, Pose, center_of
 
@@ -64,8 +64,8 @@ def as_points(points: object, what: str = "points") -> np.ndarray:
         )
     if array.dtype.kind not in "fiu":
         raise InputError(f"{what} must be an (n, 3) array of numbers, got {array.dtype} of shape {array.shape}")
-    if array.ndim != 2 or array.shape[1] < 3 or is_transposed(array):
-        remedy = ": give points.T" if is_transposed(array) else ""
+    if array.ndim != 2 or array.shape[1] < 3 or is_transposed(array.shape):
+        remedy = ": give points.T" if is_transposed(array.shape) else ""
         raise InputError(f"{what} must be (n, 3) or (n, 3 + more) with x, y, z first, got shape {array.shape}{remedy}")
     return array[:, :3].astype(np.float64)
 
