@@ -139,6 +139,13 @@ def test_a_missing_an_extra_and_a_misshapen_tensor(stored, tmp_path):
     assert_one_line(wrong, "part.weight should be (25, 48) by its configuration, got (24, 48)")
 
 
+@pytest.mark.parametrize("change", [{"channels": [48, 64, 2**20]}, {"max_voxels": 10, "blocks": [1, 10**7, 1]}])
+def test_nothing_is_allocated_for_what_a_header_says(stored, tmp_path, change):
+    """A network of terabytes, or of millions of layers, in a file of half a megabyte."""
+    path = rewritten(stored, tmp_path / "x.safetensors", header=lambda h: h | {"config": h["config"] | change})
+    assert_one_line(path, "get the file again")
+
+
 @pytest.mark.parametrize("value", [torch.full((25,), torch.nan), torch.zeros(25, dtype=torch.int32)])
 def test_a_tensor_that_is_no_finite_float(stored, tmp_path, value):
     path = rewritten(stored, tmp_path / "x.safetensors", tensors=lambda t: t | {"part.bias": value})
@@ -179,6 +186,7 @@ def test_a_tensor_that_is_no_finite_float(stored, tmp_path, value):
         (lambda h: h | {"config": h["config"] | {"heatmap": "round"}}, "unknown heatmap 'round'"),
         (lambda h: h | {"config": h["config"] | {"skeleton": "body27"}}, "unknown skeleton 'body27'"),
         (lambda h: [h], "cannot be read"),
+        (lambda h: json.dumps(h).replace('"card": {', '"card": {"n": ' + "1" * 5000 + ", ", 1), "cannot be read"),
         (lambda h: "{", "cannot be read"),
         (lambda h: "7", "cannot be read"),
     ],

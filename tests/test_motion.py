@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from lidarpose.body import activities, angles, captured, clips, latents, motion, retarget, rig
@@ -351,6 +351,40 @@ def test_clips_are_read_and_selected(tmp_path):
 def test_a_wrong_clips_file_is_named(tmp_path, changes, message):
     path, _ = stored(tmp_path, **changes)
     with pytest.raises(InputError, match=message):
+        clips.load_clips(path)
+
+
+@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(at=st.integers(0, 2**20), bit=st.integers(0, 7), keep=st.integers(0, 2**20))
+def test_a_damaged_clips_file_is_read_or_told(tmp_path, at, bit, keep):
+    path, joints = stored(tmp_path)
+    content = {name: value for name, value in np.load(path).items()}
+    np.savez_compressed(path, **content)
+    data = bytearray(path.read_bytes())
+    data[at % len(data)] ^= 1 << bit
+    path.write_bytes(data if keep % 2 else data[: keep % len(data)])
+    try:
+        clips.load_clips(path)
+    except InputError as error:
+        assert "clips.npz" in str(error)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.int8, np.uint64, np.int32])
+def test_cuts_of_any_whole_numbers(tmp_path, kind):
+    """200 + 200 is 144 in a byte."""
+    joints = np.zeros((240, 24, 3), np.float32)
+    start, length = (0, 120), (120, 120)
+    path, _ = stored(
+        tmp_path, joints=joints, clip=np.array(["a", "b"]), clip_start=np.array(start, kind),
+        clip_length=np.array(length, kind),
+    )  # fmt: skip
+    loaded = clips.load_clips(path)
+    assert [len(loaded[k]) for k in range(2)] == [120, 120]
+    path, _ = stored(
+        tmp_path, joints=joints[:100], clip=np.array(["a"]), clip_start=np.array([100], kind),
+        clip_length=np.array([120], kind),
+    )  # fmt: skip
+    with pytest.raises(InputError, match="inside the 100 frames, got up to frame 220"):
         clips.load_clips(path)
 
 

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lidarpose.data import pickles
 from lidarpose.data.pickles import MAX_BYTES, Unread, load_pickle
 from lidarpose.errors import InputError
 
@@ -188,6 +189,14 @@ def test_wrong_sparse_matrices(refused, foreign, monkeypatch, wrong):
     assert "has a scipy.sparse.csc.csc_matrix" in refused(data)
 
 
+def test_sparse_matrices_are_counted_together(load, refused, foreign, monkeypatch):
+    parts = dict(indptr=np.zeros(5, np.int32), indices=np.zeros(0, np.int32), data=np.zeros(0), _shape=(2, 4))
+    monkeypatch.setattr(pickles, "MAX_DENSE", 16)
+    two, three = ([foreign("scipy.sparse.csc.csc_matrix", parts) for _ in range(n)] for n in (2, 3))
+    assert [one.shape for one in load(dumped(monkeypatch, two))] == [(2, 4)] * 2
+    assert "up to 16 numbers are read in all" in refused(dumped(monkeypatch, three))
+
+
 class Evil:
     def __init__(self, call, *args):
         self.call, self.args = call, args
@@ -242,6 +251,9 @@ def test_hostile_instructions(refused, load):
     assert "nested more than" in refused(b"]" * 200_000 + b"a" * 199_999 + b".")
     assert "contains itself" in refused(b"]q\x00h\x00a.")
     assert "as a key" in refused(b"}]Ns.")
+    # numbers that share one hash
+    assert "as a key" in refused(pickle.dumps({k * (2**61 - 1): 0 for k in range(9)}, protocol=2))
+    assert load(pickle.dumps({2**62: 1, -1: 2}, protocol=2)) == {2**62: 1, -1: 2}
     # sharing is no copy: 2**60 references to one list
     shared = load(b"]q\x00" + b"0(h\x00h\x00tq\x00" * 60 + b".")
     assert shared[0] is shared[1]

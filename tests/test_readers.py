@@ -147,6 +147,17 @@ def test_humanm3_s_database_alone_is_a_root(tmp_path, smpl):
     ]  # fmt: skip
 
 
+def test_humanm3_s_clouds_may_lie_beside_its_database(tmp_path, smpl):
+    truth = files.write_humanm3(tmp_path / "x", smpl, frames=1, sequences=("train/a",))
+    files.write_humanm3_database(tmp_path, truth)
+    root = tmp_path / "flat"
+    root.mkdir()
+    (tmp_path / "train.pkl").rename(root / "train.pkl")
+    next((tmp_path / "x").rglob("*.pcd")).rename(root / "000007.pcd")
+    items = [one for one in made("humanm3", smpl).read(root, "train.pkl") if isinstance(one, Item)]
+    assert len(items) == 2 and {item.sequence for item in items} == {"."}
+
+
 def test_humanm3_skips_are_counted_and_named(tmp_path, smpl):
     files.write_humanm3(tmp_path, smpl, sequences=("train/a",), frames=8, first=0)
     here = tmp_path / "train/a"
@@ -310,6 +321,15 @@ def test_sloper4d_skips_are_counted(tmp_path, smpl):
         (lambda c: c | {"second_person": c["second_person"] | {"point_clouds": None}}, "another release"),
         (lambda c: c | {"second_person": c["second_person"] | {"beta": "tall"}}, "beta must be numbers"),
         (lambda c: c | {"extra": Counter}, "Counter"),
+        *[(lambda c, v=v: c | {"total_frames": v}, "total_frames") for v in ([1], "x", float("nan"))],
+        *[
+            (
+                lambda c, v=v: c | {"second_person": c["second_person"] | {"point_frame": v}},
+                "point_frame must be|has val",
+            )
+            for v in (5, ["a", "b", "c"], [1, 2, float("nan")])
+        ],
+        (lambda c: c | {"second_person": c["second_person"] | {"point_clouds": 5}}, "point_clouds should be a list"),
     ],
 )
 def test_sloper4d_labels_that_are_wrong_are_one_line(tmp_path, smpl, change, message):

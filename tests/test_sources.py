@@ -44,6 +44,17 @@ def test_amass_in_parts_and_of_another_up(tmp_path):
     assert load_motion(path, up="y", hz=60).rotations.shape[0] == 3
 
 
+def test_people_may_lie_where_somebody_says_what_is_up(tmp_path):
+    rotations, way = files.a_clip(5)
+    lie = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], float)
+    rotations = rotations.copy()
+    rotations[:, 0] = lie @ rotations[:, 0]
+    path = files.write_amass(tmp_path / "lies_poses.npz", rotations, way)
+    with pytest.raises(InputError, match="people stand along"):
+        load_motion(path)
+    check_same(load_motion(path, up="z"), rotations, way)
+
+
 @pytest.mark.parametrize("up", ["z", "y"])
 def test_lidarhuman26m_comes_back(tmp_path, up):
     rotations, way = files.a_clip(12)

@@ -315,6 +315,11 @@ def test_report_thins_what_is_too_much():
     text = render_report(people, title="t", summary=[])
     assert len(text.encode()) < 1_500_000
     assert "30,000 of 60,000 points drawn" in text
+    # points that are nowhere are not drawn, and not counted as drawn
+    odd = person(ReportPerson, count=100)
+    odd.points[:90], odd.points[90] = np.nan, 1e30
+    text = render_report([odd], title="t", summary=[])
+    assert "9 of 100 points drawn" in text and len(Reader(text).data()["people"][0]["points"]) == 27
 
 
 def test_report_of_odd_people():

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpose.data.prepare import prepare, reader
-from lidarpose.data.readers import waymo_parquet
+from lidarpose.data.readers import protobuf, waymo_parquet
 from lidarpose.data.readers.items import HIDDEN, SEEN, UNLABELED, Item, Skipped
 from lidarpose.data.readers.protobuf import Message
 from lidarpose.data.readers.tfrecord import crc32c, masked_checksum, records
@@ -619,6 +619,13 @@ def test_messages_give_fields_by_number():
     assert 4 in message and 9 not in message
     assert message.message(9) is message.text(9) is message.double(9) is message.data(9) is message.integer(9) is None
     assert message.doubles(9).shape == (0,) and message.integers(9) == []
+
+
+def test_a_message_of_endless_fields_is_refused(monkeypatch):
+    monkeypatch.setattr(protobuf, "_MOST_FIELDS", 3)
+    assert Message(files.number(1, 1) * 3).integers(1) == [1] * 3
+    with pytest.raises(InputError, match="more than 3 fields"):
+        Message(files.number(1, 1) * 4)
 
 
 def test_repeated_numbers_are_packed_or_not():

@@ -5,7 +5,6 @@ A file of clips is an npz with `joints` (F, 24, 3) m, z up, all clips one after 
 `body.sources` reads this and the usual formats of motion capture.
 """
 
-import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -226,7 +225,9 @@ def load_clips(path: str | Path) -> Clips:
         raise InputError(f"{path}: no such file") from None
     except InputError:
         raise
-    except (OSError, ValueError, AttributeError, TypeError, zipfile.BadZipFile) as error:
+    except MemoryError:
+        raise InputError(f"{path}: does not fit in memory; split it first") from None
+    except Exception as error:  # numpy and zlib raise many kinds for a broken archive
         raise InputError(f"{path}: not an npz of plain arrays ({error})") from None
     order = stored.get("joint_names")
     if order is not None and tuple(map(str, np.ravel(order))) != SMPL24.joints:
@@ -255,6 +256,8 @@ def _check_cuts(clips: Clips | Motion, frames: int) -> None:
             raise InputError(
                 f"clip_{name} needs one whole number a clip, ({len(clips.names)}), got {value.dtype} {value.shape}"
             )
+        # in narrow or unsigned numbers an end could overflow
+        object.__setattr__(clips, name, value.astype(np.int64))
     ends = clips.start + clips.length
     if len(ends) and (min(clips.start.min(), clips.length.min()) < 0 or ends.max() > frames):
         raise InputError(f"clips must lie inside the {frames} frames, got up to frame {ends.max()}")

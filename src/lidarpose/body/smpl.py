@@ -269,6 +269,9 @@ def _numbers(path: object, key: str, value: object) -> np.ndarray:
     if isinstance(value, Unread):
         raise file_error(path, f"{key} is a {value.name} that holds no numbers: ask for npz")
     try:
+        if not isinstance(value, np.ndarray):
+            # lists that hold one list many times over would grow without end
+            raise TypeError
         array = np.array(value)
         if array.dtype.kind not in "fiub":
             raise TypeError

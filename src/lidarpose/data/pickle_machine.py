@@ -198,6 +198,9 @@ def keys(items: list) -> list:
         parts = item if type(item) is tuple else (item,)
         if not all(type(part) in PLAIN or isinstance(part, Call | Named) for part in parts):
             raise TypeError(f"a {type(item).__name__} as a key")
+        # larger ones can be made to share one hash, and to take for ever
+        if any(type(part) is int and abs(part) >= 2**63 for part in parts):
+            raise TypeError("a number of more than 64 bits as a key")
     return items
 
 

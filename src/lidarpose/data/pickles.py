@@ -21,7 +21,7 @@ from lidarpose.data.pickle_machine import PLAIN, Call, Named, run
 MAX_BYTES = 4 * 2**30
 # how deep lists and dicts may be nested (chosen: data sets have less than ten levels)
 MAX_DEPTH = 100
-# a sparse matrix becomes a dense one of at most so many numbers: SMPL-X's largest has 0.6 million
+# sparse matrices become dense ones, together of at most so many numbers: SMPL-X's largest has 0.6 million
 MAX_DENSE = 20_000_000
 
 
@@ -67,6 +67,7 @@ class _Reader:
 
     def __init__(self):
         self.done: dict[int, object] = {}
+        self.dense = 0
 
     def value(self, found: object, depth: int) -> object:
         if type(found) in PLAIN:
@@ -108,7 +109,9 @@ class _Reader:
         if name.startswith("chumpy."):
             return _chumpy(name, state)
         if _SPARSE.fullmatch(name):
-            return _dense(name, state)
+            made = _dense(name, state, MAX_DENSE - self.dense)
+            self.dense += made.size
+            return made
         if name not in _MEANINGS:
             return Unread(name)
         return _MEANINGS[name](args, state)
@@ -242,8 +245,8 @@ def _chumpy(name: str, state: object) -> np.ndarray | Unread:
     return state["x"] if isinstance(state.get("x"), np.ndarray) else Unread(name)
 
 
-def _dense(name: str, state: object) -> np.ndarray:
-    """A compressed sparse matrix: indptr (lines + 1,), indices and data (entries,)."""
+def _dense(name: str, state: object, most: int) -> np.ndarray:
+    """A compressed sparse matrix, of at most so many numbers: indptr (lines + 1,), indices and data (entries,)."""
     state = state if isinstance(state, dict) else {}
     shape = state.get("_shape", state.get("shape"))
     pieces = [state.get(part) for part in ("indptr", "indices", "data")]
@@ -256,8 +259,8 @@ def _dense(name: str, state: object) -> np.ndarray:
     rows, columns = (int(n) for n in shape)
     by_column = "csc" in name
     lines, across = (columns, rows) if by_column else (rows, columns)
-    if min(shape) < 0 or rows * columns > MAX_DENSE:
-        raise Problem(f"has a {name} of {rows} x {columns}; up to {MAX_DENSE} numbers are read: ask for npz")
+    if min(shape) < 0 or rows * columns > most:
+        raise Problem(f"has a {name} of {rows} x {columns}; up to {MAX_DENSE} numbers are read in all: ask for npz")
     start, index, data = pieces
     wrong = (
         len(start) != lines + 1

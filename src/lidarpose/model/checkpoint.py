@@ -41,10 +41,9 @@ def load_checkpoint(path: str | os.PathLike) -> tuple[PoseNet | DaptNet, Header]
     """
     with opened(path, framework="pt") as file:
         header = parse_header(path, (file.metadata() or {}).get(ENTRY))
-        network = build(header)
         name = header.config.size if header.network == "pose" else header.config.name
-        wanted = network.state_dict()
         stored = set(file.keys())
+        wanted = shapes(path, header, len(stored))
         loaded = {}
         for key, value in wanted.items():
             if key not in stored:
@@ -69,8 +68,20 @@ def load_checkpoint(path: str | os.PathLike) -> tuple[PoseNet | DaptNet, Header]
                 f"unknown tensor {extra[0]}, which no {name} network has: use the lidarpose version that wrote it "
                 f"({header.version})",
             )
+    network = build(header)
     network.load_state_dict(loaded)
     return network.eval(), header
+
+
+def shapes(path: str | os.PathLike, header: Header, count: int) -> dict[str, torch.Tensor]:
+    """The tensors that a network of the header's configuration has, none of them in memory: whatever the header of a
+    file of `count` tensors says, nothing is allocated for it before the file is known to hold it. Raises InputError."""
+    config = header.config
+    depths = config.blocks if header.network == "pose" else (*config.encoder_depths, *config.decoder_depths)
+    if sum(depths) > count:
+        raise file_error(path, f"has {count} tensors, too few for {sum(depths)} layers: get the file again")
+    with torch.device("meta"):
+        return build(header).state_dict()
 
 
 def build(header: Header) -> PoseNet | DaptNet:

@@ -123,7 +123,7 @@ def _damage(path: Path, error: Exception) -> str:
                 return f"the file ends at byte {size:,} where its header says {due:,}: {again}"
         except json.JSONDecodeError as broken:
             return f"its header is damaged at byte {8 + broken.pos:,} ({broken.msg}): get the file again"
-        except (UnicodeDecodeError, AttributeError, KeyError, IndexError, TypeError):
+        except (ValueError, AttributeError, KeyError, IndexError, TypeError, RecursionError):
             pass
     return f"its header is damaged ({error}): get the file again"
 
@@ -148,7 +148,10 @@ def parse_header(path: str | os.PathLike, entry: str | None) -> Header:
         if not isinstance(card, dict):
             raise TypeError(f"card is a {type(card).__name__}")
         return Header(version=str(version), config=config, card=card)
-    except (KeyError, TypeError, AttributeError, RecursionError, json.JSONDecodeError) as error:
+    except InputError:
+        raise
+    # a number of thousands of digits is a plain ValueError
+    except (KeyError, TypeError, AttributeError, RecursionError, ValueError) as error:
         reason = f"{type(error).__name__}: {error}"
         raise file_error(path, f"its header cannot be read ({reason}): get the file again, or train anew") from None
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose._version import __version__
-from lidarpose.sample import Pose
+from lidarpose.sample import FARTHEST, Pose
 from lidarpose.skeleton import SMPL24, Skeleton
 from lidarpose.view.person import (
     bone_sides,
@@ -103,7 +103,7 @@ def _person_data(person: ReportPerson, limit: int) -> dict:
     center = middle(person)
     center = np.zeros(3) if center is None else center
     points = np.asarray(person.points, float)
-    kept = np.flatnonzero(np.isfinite(points).all(-1))
+    kept = _drawable(points)
     kept = kept[thinned(len(kept), limit)]
     points = points[kept]
     forward = facing(person.pose)
@@ -117,6 +117,11 @@ def _person_data(person: ReportPerson, limit: int) -> dict:
     if person.part is not None:
         data["sides"] = "".join(_PART_SIDES[np.clip(person.part[kept], 0, len(SMPL24))])
     return data
+
+
+def _drawable(points: np.ndarray) -> np.ndarray:
+    """Indices of points that are somewhere."""
+    return np.flatnonzero((np.abs(points) < FARTHEST).all(-1))
 
 
 # a letter a part: n = not body, else the body side's
@@ -139,8 +144,8 @@ def _pose_data(pose: Pose | None, center: np.ndarray) -> dict | None:
 
 def _card(i: int, person: ReportPerson, limit: int) -> str:
     notes = [missing_pose(person)]
-    if len(person.points) > limit:
-        notes.append(f"{limit:,} of {len(person.points):,} points drawn")
+    if (count := len(_drawable(np.asarray(person.points, float)))) > limit or count < len(person.points):
+        notes.append(f"{min(limit, count):,} of {len(person.points):,} points drawn")
     note = "".join(f'<p class="note">{escape(n)}</p>' for n in notes if n)
     label = escape(person.label)
     return (

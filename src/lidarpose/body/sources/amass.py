@@ -41,10 +41,12 @@ def load_npz(path: str | os.PathLike, *, up: str | None = None, fps: float | Non
         raise file_error(path, f"not an npz of plain arrays ({error}); was it copied completely?") from None
     if "joints" in names:
         return positions_motion(path, load_clips(path), up=up, fps=fps)
-    return _amass(path, names, stored, up=up or "z", fps=fps)
+    return _amass(path, names, stored, up=up, fps=fps)
 
 
-def _amass(path: object, names: set[str], stored: dict[str, np.ndarray], *, up: str, fps: float | None) -> Motion:
+def _amass(
+    path: object, names: set[str], stored: dict[str, np.ndarray], *, up: str | None, fps: float | None
+) -> Motion:
     poses = stored.get("poses")
     if poses is None and {"root_orient", "pose_body"} <= names:
         parts = [stored["root_orient"], stored["pose_body"]]

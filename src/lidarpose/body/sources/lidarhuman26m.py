@@ -41,7 +41,7 @@ def load_pose_json(path: str | os.PathLike, *, up: str | None = None, fps: float
         np.array(trans),
         name=path.stem,
         fps=fps or LIDARHUMAN26M_FPS,
-        up=up or "z",
+        up=up,
         kind="LiDARHuman26M",
         number=number,
     )

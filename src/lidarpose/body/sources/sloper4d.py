@@ -38,7 +38,7 @@ def load_sloper4d(path: str | os.PathLike, *, up: str | None = None, fps: float 
             *_poses(labels[person]),
             name=f"{Path(path).stem}_{person.removesuffix('_person')}",
             fps=fps,
-            up=up or "z",
+            up=up,
             kind="SLOPER4D",
         )
         for person in people

@@ -29,17 +29,19 @@ def smpl_motion(
     *,
     name: str,
     fps: float,
-    up: str,
+    up: str | None,
     kind: str,
     number: np.ndarray | None = None,
 ) -> Motion:
-    """One clip of SMPL poses: pose (F, 72) rad, the root first, trans (F, 3) m, world with the axis `up` upwards.
+    """One clip of SMPL poses: pose (F, 72) rad, the root first, trans (F, 3) m, world with the axis `up` upwards, z
+    where nobody says.
 
     SMPL's pelvis is at `trans` plus its rest position, which only SMPL's own file knows: a constant of the person,
     about 0.24 m along the recording's y axis, is missing from `Motion.translation`. number (F,) numbers the frames.
-    Raises InputError for other shapes, for degrees, for far-off positions, and where people do not stand along `up`.
+    Raises InputError for other shapes, for degrees, for far-off positions, and, unless `up` is said, where people do
+    not stand along z: those whose `up` is said may lie.
     """
-    world = rotation_from_up(up)
+    world = rotation_from_up(up or "z")
     pose, trans = (_numbers(path, value, what) for value, what in ((pose, "pose"), (trans, "trans")))
     if pose.ndim != 2 or pose.shape[1] != 72 or trans.shape != (len(pose), 3):
         raise file_error(path, f"{kind} needs pose (frames, 72) and trans (frames, 3), got {pose.shape}, {trans.shape}")
@@ -59,7 +61,8 @@ def smpl_motion(
     rotations[:, 1:] = _TO_HOUSE @ axis_angle_to_matrix(pose[:, 1:]) @ _TO_HOUSE.T
     root = axis_angle_to_matrix(pose[:, 0])
     rotations[:, 0] = world @ root @ _TO_HOUSE.T
-    _check_upright(path, root[..., 1].mean(0), up)
+    if up is None:
+        _check_upright(path, root[..., 1].mean(0), "z")
     return Motion(
         rotations=rotations,
         translation=(trans @ world.T).astype(np.float32),
@@ -83,5 +86,5 @@ def _check_upright(path: object, trunk: np.ndarray, up: str) -> None:
 def _numbers(path: object, value: object, what: str) -> np.ndarray:
     try:
         return np.asarray(value, dtype=float)
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError, OverflowError, MemoryError):
         raise file_error(path, f"{what} must be numbers in rows of equal length") from None

@@ -136,7 +136,7 @@ class HumanM3:
             if path is None:
                 yield Skipped(reason="labels without a cloud", where=f"{where}: {entry['pcd']}")
                 continue
-            sequence = path.parent.parent.relative_to(root).as_posix()
+            sequence = path.relative_to(root).parent.parent.as_posix()
             frame = int(path.stem) if re.fullmatch("[0-9]{1,12}", path.stem) else number
             yield from _people(path, people, sequence, frame, float("nan"))
 

@@ -12,6 +12,8 @@ _VARINT, _EIGHT, _BYTES, _FOUR = 0, 1, 2, 5
 _SIZES = {_EIGHT: 8, _FOUR: 4}
 _KINDS = {_VARINT: "a varint", _EIGHT: "8 bytes", _BYTES: "bytes", _FOUR: "4 bytes"}
 _LONGEST = 10
+# of a message: one of matrices has as many as they have numbers, where these are not packed
+_MOST_FIELDS = 2_000_000
 
 
 class Message:
@@ -22,7 +24,7 @@ class Message:
 
     def __init__(self, data: bytes | memoryview):
         self._fields: dict[int, list[tuple[int, int | memoryview]]] = {}
-        data, at = memoryview(data), 0
+        data, at, count = memoryview(data), 0, 0
         while at < len(data):
             key, at = _varint(data, at)
             number, kind = key >> 3, key & 7
@@ -36,6 +38,9 @@ class Message:
                 value, at = data[at : at + length], at + length
             else:
                 raise InputError(f"message has a field of unknown kind {kind}: damaged, or no protobuf")
+            count += 1
+            if count > _MOST_FIELDS:
+                raise InputError(f"message has more than {_MOST_FIELDS:,} fields: damaged, or none of Waymo's")
             self._fields.setdefault(number, []).append((kind, value))
 
     def __contains__(self, number: int) -> bool:

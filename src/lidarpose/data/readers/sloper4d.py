@@ -138,9 +138,10 @@ def _labels(path: Path) -> _Labels:
     way = numbers(path, walker.get("lidar_traj"), (-1, 9), "first_person's lidar_traj", finite=False)
     good = np.isfinite(pose).all(1) & np.isfinite(trans).all(1)
     total = content.get("total_frames")
+    total = len(frames) if total is None else int(numbers(path, total, (), "total_frames"))
     return _Labels(
         frames=frames,
-        total=len(frames) if total is None else int(total),
+        total=total,
         pose=np.where(good[:, None], pose, 0.0),
         trans=np.where(good[:, None], trans, 0.0),
         good=good,
@@ -173,15 +174,17 @@ def _clouds(path: Path, person: dict) -> dict[int, np.ndarray | str]:
     clouds, frames = person.get("point_clouds"), person.get("point_frame")
     if clouds is None or frames is None:
         raise file_error(path, "second_person has no point_clouds and point_frame: labels of another release?")
+    if not isinstance(clouds, list | tuple | np.ndarray):
+        raise file_error(path, f"point_clouds should be a list of clouds, got {type(clouds).__name__}")
+    frames = numbers(path, frames, (-1,), "point_frame").astype(int).tolist()
     if len(clouds) != len(frames):
         raise file_error(path, f"has {len(clouds)} point_clouds of {len(frames)} frames (point_frame)")
     found: dict[int, np.ndarray | str] = {}
-    for frame, cloud in zip(np.asarray(frames).tolist(), clouds, strict=True):
+    for frame, cloud in zip(frames, clouds, strict=True):
         try:
-            points = numbers(path, np.asarray(cloud, float).reshape(-1, 3), (-1, 3), "a cloud")
-            found[int(frame)] = points
+            found[frame] = numbers(path, np.asarray(cloud, float).reshape(-1, 3), (-1, 3), "a cloud")
         except (InputError, TypeError, ValueError) as error:
-            found[int(frame)] = str(error)
+            found[frame] = str(error)
     return found
 
 

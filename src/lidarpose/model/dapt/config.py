@@ -109,9 +109,9 @@ class DaptConfig:
         for joint in self.joints:
             BODY26.index(joint)
         if self.bins or self.ranges:
-            if len(self.bins) != 3 or not all(map(_is_count, self.bins)):
+            if not isinstance(self.bins, tuple) or len(self.bins) != 3 or not all(map(_is_count, self.bins)):
                 raise InputError(f"bins must be three whole numbers (x, y, z), or none, got {self.bins!r}")
-            if len(self.ranges) != 3 or not all(map(_is_range, self.ranges)):
+            if not isinstance(self.ranges, tuple) or len(self.ranges) != 3 or not all(map(_is_range, self.ranges)):
                 raise InputError(f"ranges must be three pairs (low, high) of metres, or none, got {self.ranges!r}")
         elif not self.coordinates:
             raise InputError("a network needs heatmaps (bins and ranges) or coordinates=True: it would predict nothing")

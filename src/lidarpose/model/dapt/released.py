@@ -31,13 +31,18 @@ def import_dapt(path: str | os.PathLike, config: DaptConfig | dict | str | None 
     """
     path = Path(path)
     with _opened(path) as file:
-        network = DaptNet(_config(path, file.metadata(), config))
+        config = _config(path, file.metadata(), config)
         stored = {name: name for name in file.keys()}
         if stored and all(name.startswith(_PREFIX) for name in stored):
             stored = {name.removeprefix(_PREFIX): name for name in stored}
-        wanted = network.state_dict()
-        source = f"the configuration {network.config.name}"
+        source = f"the configuration {config.name}"
         remedy = f"name the configuration that it was trained with ({', '.join(CONFIGS)})"
+        layers = sum((*config.encoder_depths, *config.decoder_depths))
+        if layers > len(stored):
+            raise file_error(path, f"has {len(stored)} tensors, too few for {layers} layers by {source}: {remedy}")
+        # nothing is allocated before the file is known to hold it
+        with torch.device("meta"):
+            wanted = DaptNet(config).state_dict()
         missing = [name for name in wanted if name not in stored]
         extra = sorted(set(stored) - set(wanted))
         # a head that only one side knows says more about a wrong configuration than a tensor of it
@@ -55,7 +60,8 @@ def import_dapt(path: str | os.PathLike, config: DaptConfig | dict | str | None 
             loaded[name] = file.get_tensor(stored[name]).to(value.dtype)
             if value.is_floating_point() and not torch.isfinite(loaded[name]).all():
                 raise file_error(path, f"tensor {name} has values that are not finite: get the file again")
-    _check_ranges(path, network.config, loaded)
+    _check_ranges(path, config, loaded)
+    network = DaptNet(config)
     network.load_state_dict(loaded)
     return network.eval()
 
@@ -90,7 +96,7 @@ def _config(path: Path, metadata: dict[str, str] | None, config: DaptConfig | di
             raise file_error(path, f"its header has no configuration: name one of {', '.join(CONFIGS)} (config=...)")
         try:
             config = json.loads(raw)
-        except json.JSONDecodeError as error:
+        except (ValueError, RecursionError) as error:
             raise file_error(path, f"{where} is not JSON ({error}): name one of {', '.join(CONFIGS)}") from None
     else:
         where = "the configuration given"
@@ -98,7 +104,8 @@ def _config(path: Path, metadata: dict[str, str] | None, config: DaptConfig | di
         raise file_error(path, f"{where} should be a dict, a name or a DaptConfig, got {type(config).__name__}")
     try:
         return DaptConfig.from_dict({"legacy": True} | config)
-    except InputError as error:
+    # TypeError: lists and dicts where numbers and names belong
+    except (InputError, TypeError) as error:
         raise file_error(path, f"{where} does not fit: {error}") from None
 
 
