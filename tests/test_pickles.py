@@ -1,6 +1,7 @@
 """Pickles: data comes out as pickle itself would give it, nothing else is named, called or imported."""
 
 import collections
+import copy
 import os
 import pickle
 import struct
@@ -191,10 +192,13 @@ def test_wrong_sparse_matrices(refused, foreign, monkeypatch, wrong):
 
 def test_sparse_matrices_are_counted_together(load, refused, foreign, monkeypatch):
     parts = dict(indptr=np.zeros(5, np.int32), indices=np.zeros(0, np.int32), data=np.zeros(0), _shape=(2, 4))
+    two, three = (
+        dumped(monkeypatch, [copy.copy(matrix) for matrix in [foreign("scipy.sparse.csc.csc_matrix", parts)] * count])
+        for count in (2, 3)
+    )
     monkeypatch.setattr(pickles, "MAX_DENSE", 16)
-    two, three = ([foreign("scipy.sparse.csc.csc_matrix", parts) for _ in range(n)] for n in (2, 3))
-    assert [one.shape for one in load(dumped(monkeypatch, two))] == [(2, 4)] * 2
-    assert "up to 16 numbers are read in all" in refused(dumped(monkeypatch, three))
+    assert [one.shape for one in load(two)] == [(2, 4)] * 2
+    assert "up to 16 numbers are read in all" in refused(three)
 
 
 class Evil:

@@ -321,13 +321,14 @@ def test_sloper4d_skips_are_counted(tmp_path, smpl):
         (lambda c: c | {"second_person": c["second_person"] | {"point_clouds": None}}, "another release"),
         (lambda c: c | {"second_person": c["second_person"] | {"beta": "tall"}}, "beta must be numbers"),
         (lambda c: c | {"extra": Counter}, "Counter"),
-        *[(lambda c, v=v: c | {"total_frames": v}, "total_frames") for v in ([1], "x", float("nan"))],
+        *[(lambda c, v=v: c | {"total_frames": v}, "total_frames") for v in ([1, 2], "x", float("nan"))],
         *[
-            (
-                lambda c, v=v: c | {"second_person": c["second_person"] | {"point_frame": v}},
-                "point_frame must be|has val",
+            (lambda c, v=v: c | {"second_person": c["second_person"] | {"point_frame": v}}, told)
+            for v, told in (
+                (5, "3 point_clouds of 1 frames"),
+                (["a", "b", "c"], "point_frame must be numbers"),
+                ([1, 2, float("nan")], "point_frame has values that are no numbers"),
             )
-            for v in (5, ["a", "b", "c"], [1, 2, float("nan")])
         ],
         (lambda c: c | {"second_person": c["second_person"] | {"point_clouds": 5}}, "point_clouds should be a list"),
     ],
