@@ -446,7 +446,7 @@ def test_who_the_released_code_leaves_out_is_counted(sets, tmp_path):
     assert after.skipped["people without the center 'trans'"]["count"] == 1
     # nor are they disturbed
     task = task_of(Fake(standing), open_people(tmp_path / "leaking"), protocol="dapt")
-    assert len(stability._people(task)[0]) == after.counts["people"]
+    assert len(stability.to_disturb(task)) == after.counts["people"]
 
 
 def test_the_released_protocol_is_one_look(sets):

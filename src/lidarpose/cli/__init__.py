@@ -3,6 +3,7 @@
 import argparse
 import os
 import sys
+from contextlib import suppress
 
 from lidarpose._version import __version__
 from lidarpose.cli import datasets, evaluating, predicting, training, weights
@@ -21,8 +22,8 @@ def main(arguments: list[str] | None = None) -> int:
         if sys.stdout is not None:
             sys.stdout.flush()
     except BrokenPipeError:
-        # whoever read our output has enough; keep python from complaining at exit
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # whoever read our output has enough
+        _drop_output()
     except ModuleNotFoundError as error:
         extra = "export" if options.command == "export" else None
         told = missing_extra(error, f"`lidarpose {options.command}`", extra)
@@ -32,13 +33,21 @@ def main(arguments: list[str] | None = None) -> int:
     except LidarPoseError as error:
         return _failed(error)
     except OSError as error:
+        if error.filename is not None or not error.strerror:
+            return _failed(error)
         # what is written to files says which; this is the standard output
-        nowhere = InputError(f"cannot write the output ({error.strerror}): send it elsewhere")
-        return _failed(nowhere if error.filename is None and error.strerror else error)
+        _drop_output()
+        return _failed(InputError(f"cannot write the output ({error.strerror}): send it elsewhere"))
     except KeyboardInterrupt:
         tell("lidarpose: stopped")
         return 130
     return 0
+
+
+def _drop_output() -> None:
+    """What is left of the output goes nowhere, so that python does not complain at exit."""
+    with suppress(OSError, AttributeError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _failed(error: Exception) -> int:
