@@ -481,6 +481,7 @@ BAD = {
     "csv header alone": ("a.csv", "x,y,z\n", ["has no points"]),
     "csv other header": ("a.csv", "# by me\nlon,lat,height\n1,2,3\n", ["'lon,lat,height'", "line 2"]),
     "csv word below": ("a.csv", "# by me\nx,y,z\n1,2,3\n# odd\n1,oops,3\n", ["'1,oops,3'", "line 5"]),
+    "csv of feet": ("a.csv", "x,y,z\n5'30,2,3\n", ["5'30"]),
     "csv of short rows": ("a.csv", "x,y,z\n1,2\n3,4\n", ["'1,2'", "line 2"]),
     "csv open quote": ("a.csv", 'x,y,z\n1,2,"3\n', ["rows of numbers"]),
     "csv all missing": ("a.csv", "x,y,z\n,,\nNA,1,2\n", ["NaN", "all 2"]),

@@ -45,8 +45,8 @@ def parse_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...
     text = re.sub(r"(?m)^[ \t]+$", "", re.sub(r"[ \t]*#.*", "", text))
     num_skipped = skip + has_header
     parts = text.split("\n", num_skipped)
-    # pandas knows double quotes alone
-    body = parts[num_skipped].replace("'", "") if len(parts) > num_skipped else ""
+    # pandas knows double quotes alone; within a number a quote is something else
+    body = re.sub(r"(?<![^,;\s])'|'(?![^,;\s])", "", parts[num_skipped]) if len(parts) > num_skipped else ""
     # 1e-05 on the first line and 0,5 on a later one
     if separator != "," and "," in body:
         edge = separator or r"[ \t]"
