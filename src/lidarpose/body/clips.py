@@ -5,13 +5,16 @@ A file of clips is an npz with `joints` (F, 24, 3) m, z up, all clips one after 
 `body.sources` reads this and the usual formats of motion capture.
 """
 
-from collections.abc import Iterable
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from lidarpose.body.retarget import heading, rotation_vector, without_yaw
+from lidarpose.data.files import file_error
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix, rotation_about
 from lidarpose.skeleton import SMPL24
@@ -213,22 +216,28 @@ def facing_x(rotations: np.ndarray, translation: np.ndarray) -> tuple[np.ndarray
     return turned, (back @ way[..., None])[..., 0].astype(np.float32)
 
 
-def load_clips(path: str | Path) -> Clips:
-    """Reads a clips file (its layout is at the top of this module). Raises InputError where it is another."""
+@contextmanager
+def archive(path: str | os.PathLike) -> Iterator[None]:
+    """Around the reading of an npz: InputError, naming the file, for all that goes wrong there."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            missing = [key for key in _KEYS if key not in file]
-            if missing:
-                raise InputError(f"{path}: clips need {', '.join(_KEYS)}; {', '.join(missing)} is missing")
-            stored = {key: file[key] for key in file.files if key in (*_KEYS, "joint_names")}
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
+        yield
     except InputError:
         raise
+    except FileNotFoundError:
+        raise file_error(path, "no such file") from None
     except MemoryError:
-        raise InputError(f"{path}: does not fit in memory; split it first") from None
+        raise file_error(path, "does not fit in memory; split it first") from None
     except Exception as error:  # numpy and zlib raise many kinds for a broken archive
-        raise InputError(f"{path}: not an npz of plain arrays ({error})") from None
+        raise file_error(path, f"not an npz of plain arrays ({error}); was it copied completely?") from None
+
+
+def load_clips(path: str | Path) -> Clips:
+    """Reads a clips file (its layout is at the top of this module). Raises InputError where it is another."""
+    with archive(path), np.load(path, allow_pickle=False) as file:
+        missing = [key for key in _KEYS if key not in file]
+        if missing:
+            raise InputError(f"{path}: clips need {', '.join(_KEYS)}; {', '.join(missing)} is missing")
+        stored = {key: file[key] for key in file.files if key in (*_KEYS, "joint_names")}
     order = stored.get("joint_names")
     if order is not None and tuple(map(str, np.ravel(order))) != SMPL24.joints:
         raise InputError(f"{path}: joint_names must be SMPL's 24 in SMPL's order, got {', '.join(map(str, order))}")

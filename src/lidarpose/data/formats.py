@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarpose.data.files import file_error, read_bytes
-from lidarpose.data.headers import Problem, is_transposed, need_bytes, numbered, pick_xyz, shorten
+from lidarpose.data.headers import FEW_ROWS, Problem, is_transposed, need_bytes, numbered, pick_xyz, shorten
 from lidarpose.data.pcd import parse_pcd
 from lidarpose.data.ply import parse_ply
 from lidarpose.data.text import parse_text
@@ -263,7 +263,7 @@ def _points_of(array: np.ndarray, what: str):
         raise Problem(f"expected numbers in {what}, got dtype {array.dtype}: save a float array")
     if array.ndim != 2 or array.shape[1] < 3 or is_transposed(array.shape):
         remedy = "save x, y and z of each point" if array.ndim == 2 else "save a row for each point"
-        if is_transposed(array.shape) or array.ndim == 2 and 3 <= array.shape[0] <= 5:
+        if array.ndim == 2 and 3 <= array.shape[0] <= FEW_ROWS:
             remedy = "save its transpose, points.T"
         elif array.ndim > 2 and array.shape[-1] >= 3:
             remedy = f"save points.reshape(-1, {array.shape[-1]})"

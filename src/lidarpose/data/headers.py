@@ -5,7 +5,7 @@ import re
 # characters of a file or of a library's message that an error shows
 _MAX_SHOWN = 80
 # a table of so few rows and so many columns holds points as columns
-_FEW_ROWS, _MANY_COLUMNS = 5, 50
+FEW_ROWS, _MANY_COLUMNS = 5, 50
 
 
 class Problem(Exception):
@@ -34,7 +34,7 @@ def numbered(columns: int) -> tuple[str, ...]:
 
 def is_transposed(shape: tuple[int, ...]) -> bool:
     """Whether an array of this shape (rows, columns) holds points as columns: no format has so many values a point."""
-    return len(shape) == 2 and 3 <= shape[0] <= _FEW_ROWS and shape[1] > _MANY_COLUMNS
+    return len(shape) == 2 and 3 <= shape[0] <= FEW_ROWS and shape[1] > _MANY_COLUMNS
 
 
 def parse_count(text: str, what: str) -> int:

@@ -64,8 +64,9 @@ def as_points(points: object, what: str = "points") -> np.ndarray:
         )
     if array.dtype.kind not in "fiu":
         raise InputError(f"{what} must be an (n, 3) array of numbers, got {array.dtype} of shape {array.shape}")
-    if array.ndim != 2 or array.shape[1] < 3 or is_transposed(array.shape):
-        remedy = ": give points.T" if is_transposed(array.shape) else ""
+    transposed = is_transposed(array.shape)
+    if array.ndim != 2 or array.shape[1] < 3 or transposed:
+        remedy = ": give points.T" if transposed else ""
         raise InputError(f"{what} must be (n, 3) or (n, 3 + more) with x, y, z first, got shape {array.shape}{remedy}")
     return array[:, :3].astype(np.float64)
 

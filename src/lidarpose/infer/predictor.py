@@ -238,10 +238,10 @@ def _is_many(points) -> bool:
 def _is_row(value) -> bool:
     """One point: a flat list or array of numbers. Anything ragged is none, and what is empty is a cloud."""
     if isinstance(value, list | tuple):
-        return len(value) > 0 and not any(
-            isinstance(entry, list | tuple) or getattr(entry, "ndim", 0) for entry in value
-        )
-    return getattr(value, "ndim", 0) == 1 and len(value) > 0
+        flat = not any(isinstance(entry, list | tuple) or getattr(entry, "ndim", 0) for entry in value)
+    else:
+        flat = getattr(value, "ndim", 0) == 1
+    return flat and len(value) > 0
 
 
 def _warned(person: PersonPose, warning: str) -> PersonPose:

@@ -86,9 +86,8 @@ def averaged(found: list[Estimates]) -> Estimates:
     weight = np.ones(joints.shape[:2])
     if values["confidence"][0] is not None:
         weight = np.stack(values["confidence"]).mean(-1) ** _POWER
-        total = weight.sum(0)
         # of whom no look is sure at all, all looks count the same
-        weight = np.where(total > 0, weight / np.where(total > 0, total, 1.0), 1.0)
+        weight = np.where(weight.sum(0) > 0, weight, 1.0)
 
     def mean(stack: list[np.ndarray] | list[None]) -> np.ndarray | None:
         if stack[0] is None:

@@ -15,8 +15,10 @@ from safetensors.torch import save as to_bytes
 from lidarpose.data.files import check_apart, file_error, write_atomic
 from lidarpose.model.header import ENTRY, Header, opened, parse_header
 from lidarpose.model.network import PoseNet
+from lidarpose.model.presets import NetworkConfig
 
 if TYPE_CHECKING:
+    from lidarpose.model.dapt.config import DaptConfig
     from lidarpose.model.dapt.network import DaptNet
 
 _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
@@ -43,7 +45,7 @@ def load_checkpoint(path: str | os.PathLike) -> tuple[PoseNet | DaptNet, Header]
         header = parse_header(path, (file.metadata() or {}).get(ENTRY))
         name = header.config.size if header.network == "pose" else header.config.name
         stored = set(file.keys())
-        wanted = shapes(path, header, len(stored))
+        wanted = shapes(path, header.config, len(stored), by="its configuration", remedy="get the file again")
         loaded = {}
         for key, value in wanted.items():
             if key not in stored:
@@ -68,29 +70,30 @@ def load_checkpoint(path: str | os.PathLike) -> tuple[PoseNet | DaptNet, Header]
                 f"unknown tensor {extra[0]}, which no {name} network has: use the lidarpose version that wrote it "
                 f"({header.version})",
             )
-    network = build(header)
+    network = build(header.config)
     network.load_state_dict(loaded)
     return network.eval(), header
 
 
-def shapes(path: str | os.PathLike, header: Header, count: int) -> dict[str, torch.Tensor]:
-    """The tensors that a network of the header's configuration has, none of them in memory: whatever the header of a
-    file of `count` tensors says, nothing is allocated for it before the file is known to hold it. Raises InputError."""
-    config = header.config
-    depths = config.blocks if header.network == "pose" else (*config.encoder_depths, *config.decoder_depths)
-    if sum(depths) > count:
-        raise file_error(path, f"has {count} tensors, too few for {sum(depths)} layers: get the file again")
+def shapes(
+    path: str | os.PathLike, config: NetworkConfig | DaptConfig, count: int, *, by: str, remedy: str
+) -> dict[str, torch.Tensor]:
+    """The tensors that a network of a configuration has, none of them in memory: whatever the header of a file of
+    `count` tensors says, nothing is allocated for it before the file is known to hold it. Raises InputError, which says
+    by what configuration, and what to do."""
+    if config.layers > count:
+        raise file_error(path, f"has {count} tensors, too few for {config.layers} layers by {by}: {remedy}")
     with torch.device("meta"):
-        return build(header).state_dict()
+        return build(config).state_dict()
 
 
-def build(header: Header) -> PoseNet | DaptNet:
-    """A network of the header's kind and configuration, its weights random."""
-    if header.network == "pose":
-        return PoseNet(header.config)
+def build(config: NetworkConfig | DaptConfig) -> PoseNet | DaptNet:
+    """A network of a configuration, its weights random."""
+    if isinstance(config, NetworkConfig):
+        return PoseNet(config)
     from lidarpose.model.dapt.network import DaptNet
 
-    return DaptNet(header.config)
+    return DaptNet(config)
 
 
 def import_released(source: str | os.PathLike, out: str | os.PathLike, *, config: str | None = None) -> Header:

@@ -55,6 +55,11 @@ class NetworkConfig:
         check_name("heatmap", self.heatmap, HEATMAPS)
         skeleton(self.skeleton)
 
+    @property
+    def layers(self) -> int:
+        """Blocks of all levels."""
+        return sum(self.blocks)
+
     def to_dict(self) -> dict:
         return asdict(self)
 

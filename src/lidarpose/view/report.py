@@ -66,21 +66,23 @@ def render_report(people: list[ReportPerson], *, title: str, summary: list[dict]
     people = list(people)
     skeletons = {pose.skeleton.name: pose.skeleton for p in people for pose in (p.pose, p.truth) if pose is not None}
     limit = max(_FEWEST_POINTS, MAX_POINTS // max(len(people), 1))
+    drawn = [_person_data(p, limit) for p in people]
     data = {
         "schema": _SCHEMA,
         "unit": "mm",
         "skeletons": {name: _skeleton_data(s) for name, s in skeletons.items()},
-        "people": [_person_data(p, limit) for p in people],
+        "people": drawn,
     }
     # inside a script element only "<" could end the element early
     blob = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    cards = [_card(i, p, len(d["points"]) // 3) for i, (p, d) in enumerate(zip(people, drawn, strict=True))]
     fields = {
         "TITLE": escape(title),
         "VERSION": escape(__version__),
         "STYLE": _asset("report.css"),
         "SCRIPT": _asset("report.js"),
         "SUMMARY": _table(summary),
-        "CARDS": "\n".join(_card(i, p, limit) for i, p in enumerate(people)) or '<p class="none">no people</p>',
+        "CARDS": "\n".join(cards) or '<p class="none">no people</p>',
         "DATA": blob,
     }
     # split once, so that a text of the caller's that looks like a field is left alone
@@ -103,7 +105,8 @@ def _person_data(person: ReportPerson, limit: int) -> dict:
     center = middle(person)
     center = np.zeros(3) if center is None else center
     points = np.asarray(person.points, float)
-    kept = _drawable(points)
+    # points that are somewhere
+    kept = np.flatnonzero((np.abs(points) < FARTHEST).all(-1))
     kept = kept[thinned(len(kept), limit)]
     points = points[kept]
     forward = facing(person.pose)
@@ -117,11 +120,6 @@ def _person_data(person: ReportPerson, limit: int) -> dict:
     if person.part is not None:
         data["sides"] = "".join(_PART_SIDES[np.clip(person.part[kept], 0, len(SMPL24))])
     return data
-
-
-def _drawable(points: np.ndarray) -> np.ndarray:
-    """Indices of points that are somewhere."""
-    return np.flatnonzero((np.abs(points) < FARTHEST).all(-1))
 
 
 # a letter a part: n = not body, else the body side's
@@ -142,10 +140,11 @@ def _pose_data(pose: Pose | None, center: np.ndarray) -> dict | None:
     return data
 
 
-def _card(i: int, person: ReportPerson, limit: int) -> str:
+def _card(i: int, person: ReportPerson, drawn: int) -> str:
+    """drawn: how many of the person's points are."""
     notes = [missing_pose(person)]
-    if (count := len(_drawable(np.asarray(person.points, float)))) > limit or count < len(person.points):
-        notes.append(f"{min(limit, count):,} of {len(person.points):,} points drawn")
+    if drawn < len(person.points):
+        notes.append(f"{drawn:,} of {len(person.points):,} points drawn")
     note = "".join(f'<p class="note">{escape(n)}</p>' for n in notes if n)
     label = escape(person.label)
     return (

@@ -11,11 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.body.clips import Motion, load_clips
+from lidarpose.body.clips import Motion, archive, load_clips
 from lidarpose.body.sources.positions import positions_motion
 from lidarpose.body.sources.smpl import smpl_motion
 from lidarpose.data.files import file_error, read_bytes
-from lidarpose.errors import InputError
 
 _RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
 _BODY = 66  # the root and SMPL's 21 joints of the body, 3 numbers each; SMPL has two hands more, the others fingers
@@ -26,19 +25,13 @@ _KEYS = ("poses", "root_orient", "pose_body", "trans", *_RATES)
 def load_npz(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
     """Motion of an npz file, AMASS's or own clips (see `body.clips`); z is up unless `up` says otherwise."""
     data = read_bytes(path, expected="an npz file of motion")
-    try:
+    with archive(path):
         loaded = np.load(io.BytesIO(data), allow_pickle=False)
         if isinstance(loaded, np.ndarray):
             raise file_error(path, "is a single array, not an npz of motion")
         with loaded as file:
             names = set(file.files)
             stored = {key: file[key] for key in _KEYS if key in names and "joints" not in names}
-    except InputError:
-        raise
-    except MemoryError:
-        raise file_error(path, "does not fit in memory; split it first") from None
-    except Exception as error:  # numpy and zlib raise many kinds for a broken archive
-        raise file_error(path, f"not an npz of plain arrays ({error}); was it copied completely?") from None
     if "joints" in names:
         return positions_motion(path, load_clips(path), up=up, fps=fps)
     return _amass(path, names, stored, up=up, fps=fps)

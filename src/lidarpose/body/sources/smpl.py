@@ -62,7 +62,7 @@ def smpl_motion(
     root = axis_angle_to_matrix(pose[:, 0])
     rotations[:, 0] = world @ root @ _TO_HOUSE.T
     if up is None:
-        _check_upright(path, root[..., 1].mean(0), "z")
+        _check_upright(path, root[..., 1].mean(0))
     return Motion(
         rotations=rotations,
         translation=(trans @ world.T).astype(np.float32),
@@ -75,12 +75,13 @@ def smpl_motion(
     )
 
 
-def _check_upright(path: object, trunk: np.ndarray, up: str) -> None:
+def _check_upright(path: object, trunk: np.ndarray) -> None:
+    """Raises InputError where the mean direction of the trunk lies along another axis than z."""
     axis = int(np.abs(trunk).argmax())
     stands = "xyz"[axis]
-    if stands != up and abs(trunk[axis]) > _STANDS:
+    if stands != "z" and abs(trunk[axis]) > _STANDS:
         remedy = f"give up={stands!r}" if trunk[axis] > 0 else "turn the recording first"
-        raise file_error(path, f"people stand along {'-' if trunk[axis] < 0 else ''}{stands}, not {up}; {remedy}")
+        raise file_error(path, f"people stand along {'-' if trunk[axis] < 0 else ''}{stands}, not z; {remedy}")
 
 
 def _numbers(path: object, value: object, what: str) -> np.ndarray:

@@ -122,6 +122,11 @@ class DaptConfig:
                 raise InputError(f"{name} must be true or false, got {getattr(self, name)!r}")
 
     @property
+    def layers(self) -> int:
+        """Blocks of all levels, encoder and decoder."""
+        return sum(self.encoder_depths) + sum(self.decoder_depths)
+
+    @property
     def low(self) -> np.ndarray:
         """(3,) m: where bin 0 of each axis lies."""
         return np.array([low for low, _ in self.ranges])

@@ -13,6 +13,7 @@ from safetensors import SafetensorError, safe_open
 
 from lidarpose.data.files import file_error
 from lidarpose.errors import InputError
+from lidarpose.model.checkpoint import shapes
 from lidarpose.model.dapt.config import CONFIGS, DaptConfig, named_config
 from lidarpose.model.dapt.network import DaptNet
 
@@ -37,12 +38,7 @@ def import_dapt(path: str | os.PathLike, config: DaptConfig | dict | str | None 
             stored = {name.removeprefix(_PREFIX): name for name in stored}
         source = f"the configuration {config.name}"
         remedy = f"name the configuration that it was trained with ({', '.join(CONFIGS)})"
-        layers = sum((*config.encoder_depths, *config.decoder_depths))
-        if layers > len(stored):
-            raise file_error(path, f"has {len(stored)} tensors, too few for {layers} layers by {source}: {remedy}")
-        # nothing is allocated before the file is known to hold it
-        with torch.device("meta"):
-            wanted = DaptNet(config).state_dict()
+        wanted = shapes(path, config, len(stored), by=source, remedy=remedy)
         missing = [name for name in wanted if name not in stored]
         extra = sorted(set(stored) - set(wanted))
         # a head that only one side knows says more about a wrong configuration than a tensor of it
