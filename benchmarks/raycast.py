@@ -20,10 +20,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
+from lidarpose.lidar.catalog import sensor as named_sensor
 from lidarpose.lidar.raycast import find_window, scan
 from lidarpose.lidar.raycast_people import scan_people
 from lidarpose.lidar.raycast_reference import cast_ray_list_reference
-from lidarpose.lidar.sensor import sensor as named_sensor
 
 DISTANCES = (4.0, 7.0, 10.0, 15.0, 20.0)
 MESHES = 6

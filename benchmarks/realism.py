@@ -24,10 +24,11 @@ import numpy as np
 from lidarpose.data.boxes import read_boxes
 from lidarpose.data.formats import read_points
 from lidarpose.geometry import rotation_about
+from lidarpose.lidar.catalog import sensor
 from lidarpose.lidar.pattern import RayPattern
 from lidarpose.lidar.pattern_scan import scan_pattern
 from lidarpose.lidar.raycast import scan
-from lidarpose.lidar.sensor import Sensor, sensor
+from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import Box
 from lidarpose.synth.bodies import draw_bodies
 from lidarpose.synth.generate import Generator

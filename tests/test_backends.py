@@ -18,9 +18,10 @@ from lidarpose.infer.backend import Raw, estimates
 from lidarpose.infer.predictor import Predictor, load
 from lidarpose.model import decode, heads
 from lidarpose.model.bundled import DEFAULT, bundled_path
-from lidarpose.model.checkpoint import import_released, load_checkpoint, save_checkpoint
+from lidarpose.model.checkpoint import load_checkpoint, save_checkpoint
 from lidarpose.model.dapt.config import DaptConfig
 from lidarpose.model.dapt.network import DaptNet
+from lidarpose.model.dapt.released import import_released
 from lidarpose.model.header import Header, digest, read_header
 from lidarpose.model.onnx_file import usable_threads
 from lidarpose.model.plan import view_features

@@ -10,9 +10,10 @@ from safetensors.torch import load_file, save_file
 
 from lidarpose._version import __version__
 from lidarpose.errors import InputError
-from lidarpose.model.checkpoint import import_released, load_checkpoint, save_checkpoint
+from lidarpose.model.checkpoint import load_checkpoint, save_checkpoint
 from lidarpose.model.dapt.config import DaptConfig
 from lidarpose.model.dapt.network import DaptNet
+from lidarpose.model.dapt.released import import_released
 from lidarpose.model.header import SCHEMA, Header, parameter_count, read_header
 from lidarpose.model.network import PoseNet
 from lidarpose.model.presets import preset

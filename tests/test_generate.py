@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from lidarpose.errors import InputError
-from lidarpose.lidar.sensor import Sensor, sensor
+from lidarpose.lidar.catalog import sensor
+from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import center_of
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth.bodies import draw_bodies

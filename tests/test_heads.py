@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from lidarpose.errors import InputError
+from lidarpose.lidar.catalog import sensor
 from lidarpose.lidar.divergence import scan_wide
 from lidarpose.lidar.raycast import scan
 from lidarpose.lidar.raycast_people import scan_people
 from lidarpose.lidar.raycast_reference import cast_ray_list_reference
-from lidarpose.lidar.sensor import sensor
 from lidarpose.synth.mesh import box
 
 AV2 = sensor("av2")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarpose.geometry import rotation_about
-from lidarpose.lidar.sensor import sensor
+from lidarpose.lidar.catalog import sensor
 from lidarpose.synth.look import Conditions, Layer, count_alone, draw_conditions, look
 from lidarpose.synth.mesh import box, quad
 from lidarpose.synth.placing import Place

@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
+from lidarpose.lidar.catalog import sensor
 from lidarpose.lidar.pattern import PATTERNS, RayPattern
 from lidarpose.lidar.pattern_scan import scan_pattern
 from lidarpose.lidar.raycast_reference import cast_ray_list_reference
-from lidarpose.lidar.sensor import sensor
 from lidarpose.synth.mesh import box
 
 BY_NAME = {p.name: p for p in PATTERNS}

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpose.lidar.sensor import SENSORS, Sensor, sensor
+from lidarpose.lidar.catalog import SENSORS, sensor
+from lidarpose.lidar.sensor import Sensor
 from lidarpose.synth.placing import draw_distance, draw_height, draw_place
 from lidarpose.synth.scene import SCENES
 

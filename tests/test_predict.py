@@ -17,7 +17,7 @@ from lidarpose.geometry import UP_AXES, rotation_about
 from lidarpose.infer.backend import Raw
 from lidarpose.infer.people import MAX_POINTS, as_origin, as_points, candidates, flat_axis, lies, unit_warning
 from lidarpose.infer.predictor import Predictor
-from lidarpose.lidar.sensor import sensor
+from lidarpose.lidar.catalog import sensor
 from lidarpose.sample import Box
 from lidarpose.skeleton import SKELETONS
 from lidarpose.synth.generate import Generator

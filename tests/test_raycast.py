@@ -10,9 +10,10 @@ from raycast_meshes import body, ground, join, soup, sphere
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
+from lidarpose.lidar.catalog import SENSORS, sensor
 from lidarpose.lidar.raycast import cast_ray_list, cast_rays, cast_window, find_window, scan
 from lidarpose.lidar.raycast_reference import cast_ray_list_reference, cast_rays_reference
-from lidarpose.lidar.sensor import SENSORS, Sensor, Window, sensor
+from lidarpose.lidar.sensor import Sensor, Window
 
 PARITY = Path(__file__).parent / "parity" / "raycast.npz"
 FULL_TURN = np.linspace(-np.pi, np.pi, 41)

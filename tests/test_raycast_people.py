@@ -10,9 +10,10 @@ from raycast_meshes import body, ground, join, soup, sphere
 from lidarpose.body.rig import load_rig
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
+from lidarpose.lidar.catalog import SENSORS, sensor
 from lidarpose.lidar.raycast import Hits, cast_window, find_window, is_closed, scan
 from lidarpose.lidar.raycast_people import scan_people
-from lidarpose.lidar.sensor import SENSORS, Sensor, Window, sensor
+from lidarpose.lidar.sensor import Sensor, Window
 
 SPINNING = [name for name, s in SENSORS.items() if isinstance(s, Sensor)]
 ONE_ORIGIN = [name for name in SPINNING if not SENSORS[name].heads]

@@ -5,9 +5,10 @@ from raycast_meshes import body, ground
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
+from lidarpose.lidar.catalog import SENSORS, sensor
 from lidarpose.lidar.raycast_people import scan_people
 from lidarpose.lidar.raycast_torch import scan_people_torch
-from lidarpose.lidar.sensor import SENSORS, Sensor, sensor
+from lidarpose.lidar.sensor import Sensor
 
 NAMES = [name for name, s in SENSORS.items() if isinstance(s, Sensor) and not s.heads]
 FACES = body(np.random.default_rng(0))[1]

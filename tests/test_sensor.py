@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from lidarpose.errors import InputError
-from lidarpose.lidar.sensor import SENSORS, Sensor, Window, sensor
+from lidarpose.lidar.catalog import SENSORS, sensor
+from lidarpose.lidar.sensor import Sensor, Window
 from lidarpose.lidar.tables import load_sensor
 
 ROWS = {

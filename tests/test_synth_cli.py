@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 from lidarpose.cli import main
 from lidarpose.data.shards import open_dataset, read_rows, write_shard
 from lidarpose.errors import InputError
-from lidarpose.lidar.tables import listing
+from lidarpose.lidar.catalog import listing
 from lidarpose.synth import write
 from lidarpose.synth.scene import scene_config
 from lidarpose.synth.write import Job, write_dataset

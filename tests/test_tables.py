@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
-from lidarpose.lidar.sensor import SENSORS, sensor
-from lidarpose.lidar.tables import listing, load_sensor
+from lidarpose.lidar.catalog import SENSORS, listing, sensor
+from lidarpose.lidar.tables import load_sensor
 
 ANGLES = [15.0, 5.0, -5.0, -15.0]
 

@@ -22,7 +22,7 @@ _HOMES = {
     "PersonPose": "lidarpose.infer.results",
     "Poses": "lidarpose.infer.results",
     "cast_rays": "lidarpose.lidar.raycast",
-    "sensor": "lidarpose.lidar.sensor",
+    "sensor": "lidarpose.lidar.catalog",
     "Sensor": "lidarpose.lidar.sensor",
     "sample_poses": "lidarpose.body.motion",
     "read_points": "lidarpose.data.formats",

@@ -123,7 +123,7 @@ def _prepare(options: argparse.Namespace) -> None:
 
 
 def _sensors(options: argparse.Namespace) -> None:
-    from lidarpose.lidar.tables import listing
+    from lidarpose.lidar.catalog import listing
 
     print("\n".join(listing()))
 

@@ -55,7 +55,7 @@ def _export(options: argparse.Namespace) -> None:
 
 
 def _import(options: argparse.Namespace) -> None:
-    from lidarpose.model.checkpoint import import_released
+    from lidarpose.model.dapt.released import import_released
 
     header = import_released(options.file, options.out, config=options.config)
     tell(f"{header.config.name}, joints of {header.skeleton.name} -> {options.out}")

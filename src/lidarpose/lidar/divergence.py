@@ -17,7 +17,8 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import unit
 from lidarpose.lidar.divergence_kernels import merge_echoes, scan_diverging
 from lidarpose.lidar.heads import scan_heads
-from lidarpose.lidar.raycast import Hits, beams_of, cast_ray_list, scan
+from lidarpose.lidar.hits import Hits
+from lidarpose.lidar.raycast import beams_of, cast_ray_list, scan
 from lidarpose.lidar.raycast_input import as_culled, as_mesh, as_points, check_margin, read_only
 from lidarpose.lidar.sensor import Sensor
 

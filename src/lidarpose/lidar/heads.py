@@ -2,23 +2,20 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lidarpose.lidar.hits import Hits
 from lidarpose.lidar.raycast_input import as_points
 from lidarpose.lidar.sensor import Sensor
 
-if TYPE_CHECKING:
-    from lidarpose.lidar.raycast import Hits
-
 
 def scan_heads(
-    scan: "Callable[[np.ndarray, Sensor, np.ndarray], Hits]",
+    scan: Callable[[np.ndarray, Sensor, np.ndarray], Hits],
     vertices: np.ndarray,
     sensor: Sensor,
     window_vertices: np.ndarray | None,
-) -> "Hits":
+) -> Hits:
     """The hits of all heads of a sensor (`Sensor.heads`), ordered by column, then ring, in one window.
 
     scan(vertices, sensor, window_vertices) casts one head as `raycast.scan` does.

@@ -5,8 +5,9 @@ Legend: V vertices, F faces, M vertices of the body.
 
 import numpy as np
 
+from lidarpose.lidar.hits import Hits
 from lidarpose.lidar.pattern import RayPattern, Rays
-from lidarpose.lidar.raycast import Hits, cast_ray_list
+from lidarpose.lidar.raycast import cast_ray_list
 from lidarpose.lidar.raycast_scan import bounds
 
 
@@ -24,7 +25,7 @@ def scan_pattern(
 
     vertices (V, 3) m in the sensor's frame when the frame begins, faces (F, 3); moved (V, 3) m: where the vertices are
     when it ends (None: they stand still). body_vertices: how many of the first vertices are the body (None: all).
-    Returns `raycast.Hits`, ordered by azimuth: ring is the ray's line, column its number in the frame; columns and rows
+    Returns `Hits`, ordered by azimuth: ring is the ray's line, column its number in the frame; columns and rows
     are 0. A hit outside the pattern's range limits returns nothing. Raises InputError.
     """
     rays = pattern.frame(frame)

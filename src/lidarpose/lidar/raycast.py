@@ -21,13 +21,13 @@ which changes nothing but the time. A closed mesh that may hold the sensor is no
 Letters: V vertices, F faces, C columns, R rows of a window, A azimuths, E elevations, N rays, n hits.
 """
 
-from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.lidar.heads import scan_heads
+from lidarpose.lidar.hits import Hits
 from lidarpose.lidar.raycast_input import (
     as_angles,
     as_culled,
@@ -46,25 +46,6 @@ from lidarpose.lidar.raycast_scan import BAD_FACES, BAD_VERTICES, SECTOR, Beams,
 from lidarpose.lidar.sensor import Sensor, Window
 
 _BEAMS: WeakKeyDictionary[Sensor, Beams] = WeakKeyDictionary()
-
-
-@dataclass(frozen=True, kw_only=True)
-class Hits:
-    """What a sensor saw through a window, ordered by column, then ring.
-
-    points (n, 3) float32 m in the sensor's frame; face (n,) int32; column (n,) int32 counted from the window's first,
-    so it runs on over the +-pi seam; ring (n,) int32, the sensor's own number, 0 the lowest; columns, rows: the
-    window's size; column0, row0: where it starts, `(column + column0) % sensor.columns` is the sensor's column.
-    """
-
-    points: np.ndarray
-    face: np.ndarray
-    column: np.ndarray
-    ring: np.ndarray
-    columns: int
-    rows: int
-    column0: int
-    row0: int
 
 
 def cast_rays(

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarpose.errors import InputError
-from lidarpose.lidar.raycast import Hits, beams_of
+from lidarpose.lidar.hits import Hits
+from lidarpose.lidar.raycast import beams_of
 from lidarpose.lidar.raycast_input import as_culled, as_mesh, as_points, check_margin, read_only
 from lidarpose.lidar.raycast_scan import scan_chunk
 from lidarpose.lidar.sensor import Sensor

@@ -1,4 +1,4 @@
-"""A sensor's table of beams from the user's file, and the list of the sensors that ship.
+"""A sensor's table of beams from the user's file.
 
 Files, angles in degrees, in any order of lasers (they are sorted by elevation, their offsets with them). Makers count
 azimuths clockwise as seen from above, this package counter-clockwise, and so do azimuth_offset(s):
@@ -24,8 +24,7 @@ import numpy as np
 
 from lidarpose.data.files import file_error, read_bytes
 from lidarpose.errors import InputError
-from lidarpose.lidar.pattern import RayPattern
-from lidarpose.lidar.sensor import SENSORS, Sensor
+from lidarpose.lidar.sensor import Sensor
 
 # columns a turn where a file does not say: 0.2 degrees
 _COLUMNS = 1800
@@ -163,29 +162,3 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-# where the beams of a sensor come from: its maker's table, a paper, or the maker's field of view in equal steps
-_SOURCES = {"dapt64": "paper", "waymo-top": "nominal", "hdl-64e": "nominal", "av2": "maker", "depth-camera": "typical"}
-
-
-def listing() -> list[str]:
-    """Lines of a table of the sensors that ship: name, kind, beams (rings x columns, or rays a frame), field of view,
-    ranges, usual height, and where its beams come from."""
-    rows = [("sensor", "kind", "beams", "azimuth", "elevation deg", "range m", "height m", "source")]
-    for name in sorted(SENSORS):
-        device = SENSORS[name]
-        low, high = np.degrees([device.elevations[0], device.elevations[-1]])
-        if isinstance(device, RayPattern):
-            count = len(device.frame(0).azimuth)
-            kind = "rosette" if device.duration else "camera"
-            beams = f"{count:,} in {device.duration * 1e3:.0f} ms" if device.duration else f"{count:,} pixels"
-            wide = np.degrees(device.azimuths[1] - device.azimuths[0])
-        else:
-            kind, beams, wide = "spinning", f"{device.rows} x {device.columns}", 360.0
-        source = _SOURCES.get(name, "nominal" if name.startswith("os") else "maker")
-        ranges = f"{device.range_min:g}-{device.range_max:g}"
-        elevation = f"{low:+.1f} to {high:+.1f}"
-        rows.append((name, kind, beams, f"{wide:.4g}", elevation, ranges, f"{device.height:g}", source))
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    return ["  ".join(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]

@@ -6,13 +6,12 @@ Loading is strict: every tensor must be there, no other, each of its shape and f
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 from safetensors.torch import save as to_bytes
 
-from lidarpose.data.files import check_apart, file_error, write_atomic
+from lidarpose.data.files import file_error, write_atomic
 from lidarpose.model.header import ENTRY, Header, opened, parse_header
 from lidarpose.model.network import PoseNet
 from lidarpose.model.presets import NetworkConfig
@@ -94,21 +93,3 @@ def build(config: NetworkConfig | DaptConfig) -> PoseNet | DaptNet:
     from lidarpose.model.dapt.network import DaptNet
 
     return DaptNet(config)
-
-
-def import_released(source: str | os.PathLike, out: str | os.PathLike, *, config: str | None = None) -> Header:
-    """Writes the authors' weights at `source` as a checkpoint of this package; config: as `import_dapt` takes it.
-
-    Raises InputError, one line that names the file and the tensor, for all that does not fit; then nothing is written.
-    """
-    from lidarpose.model.dapt.released import import_dapt
-
-    check_apart(out, source)
-    network = import_dapt(source, config)
-    named = "" if config is None else f" --config {config}"
-    card = {
-        "command": f"lidarpose import {Path(source).name}{named}",
-        "note": "released DAPT weights; confidence and spread are read off its heatmaps and not calibrated",
-    }
-    save_checkpoint(out, network, card=card)
-    return Header(config=network.config, card=card)

@@ -11,8 +11,9 @@ import numpy as np
 
 from lidarpose.data import augment
 from lidarpose.errors import InputError, whole
+from lidarpose.lidar.catalog import sensor
 from lidarpose.lidar.pattern import RayPattern
-from lidarpose.lidar.sensor import Sensor, sensor
+from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import Pose, Sample
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.actor import Actor, draw_actor

@@ -14,11 +14,11 @@ import numpy as np
 from lidarpose.data.augment import REACH
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
+from lidarpose.lidar.catalog import sensor as named_sensor
 from lidarpose.lidar.pattern import RayPattern
 from lidarpose.lidar.pattern_scan import scan_pattern
 from lidarpose.lidar.raycast import Hits, scan
 from lidarpose.lidar.sensor import Sensor
-from lidarpose.lidar.sensor import sensor as named_sensor
 from lidarpose.sample import Box, Pose, Sample, center_of
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.actor import Actor, draw_actor

@@ -15,7 +15,7 @@ from lidarpose.data.files import read_bytes
 from lidarpose.data.jobs import clean_folder, make_shards, open_folder
 from lidarpose.data.shards import CARD, Card, person_row, shard_path, shard_writer, write_card
 from lidarpose.errors import InputError
-from lidarpose.lidar.sensor import SENSORS, sensor
+from lidarpose.lidar.catalog import SENSORS, sensor
 from lidarpose.synth.scene import scene_config
 
 # persons, clips or streets a shard

@@ -11,11 +11,12 @@ from pathlib import Path
 import torch
 from safetensors import SafetensorError, safe_open
 
-from lidarpose.data.files import file_error
+from lidarpose.data.files import check_apart, file_error
 from lidarpose.errors import InputError
-from lidarpose.model.checkpoint import shapes
+from lidarpose.model.checkpoint import save_checkpoint, shapes
 from lidarpose.model.dapt.config import CONFIGS, DaptConfig, named_config
 from lidarpose.model.dapt.network import DaptNet
+from lidarpose.model.header import Header
 
 # what a wrapper for several GPUs puts before every name
 _PREFIX = "module."
@@ -60,6 +61,22 @@ def import_dapt(path: str | os.PathLike, config: DaptConfig | dict | str | None 
     network = DaptNet(config)
     network.load_state_dict(loaded)
     return network.eval()
+
+
+def import_released(source: str | os.PathLike, out: str | os.PathLike, *, config: str | None = None) -> Header:
+    """Writes the authors' weights at `source` as a checkpoint of this package; config: as `import_dapt` takes it.
+
+    Raises InputError, one line that names the file and the tensor, for all that does not fit; then nothing is written.
+    """
+    check_apart(out, source)
+    network = import_dapt(source, config)
+    named = "" if config is None else f" --config {config}"
+    card = {
+        "command": f"lidarpose import {Path(source).name}{named}",
+        "note": "released DAPT weights; confidence and spread are read off its heatmaps and not calibrated",
+    }
+    save_checkpoint(out, network, card=card)
+    return Header(config=network.config, card=card)
 
 
 def _opened(path: Path):
