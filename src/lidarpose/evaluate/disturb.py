@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidarpose.data.augment import jitter, random_keep, stray_cluster
+from lidarpose.geometry import axis_angle_to_matrix
 from lidarpose.sample import Box, center_of
 
 # of the paper's: two clusters, as in its released code
@@ -22,13 +23,14 @@ _ROOM = 0.05
 @dataclass(frozen=True, kw_only=True)
 class Disturbance:
     """title, with the unit of its amounts; amounts that a study tries; scale: amounts times this are printed; says:
-    what is done, in words; does(points, box, amount, rng) -> points."""
+    what is done, in words; does(points, box, amount, rng) -> points; rigid: the whole frame is moved, labels too."""
 
     title: str
     amounts: tuple[float, ...]
     scale: float
     says: str
     does: Callable[[np.ndarray, Box | None, float, np.random.Generator], np.ndarray]
+    rigid: bool = False
 
 
 def jittered_points(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
@@ -77,6 +79,14 @@ def box_moved(points: np.ndarray, box: Box | None, amount: float, rng: np.random
     return points[moved.contains(points)]
 
 
+def out_of_level(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
+    """Everything turned by `amount` rad about a random level axis through the sensor, as the cloud of a sensor is that is
+    mounted askew and takes its own axis for up."""
+    turn = rng.uniform(0, 2 * np.pi)
+    R_tilted_level = axis_angle_to_matrix(amount * np.array([np.cos(turn), np.sin(turn), 0.0]))
+    return points @ R_tilted_level.T
+
+
 DISTURBANCES = {
     "jitter": Disturbance(
         title="point jitter, clip in cm",
@@ -113,5 +123,13 @@ DISTURBANCES = {
         says="the crop's box is moved in a random level direction; what it leaves is lost, nothing new comes in unless "
         "the dataset holds points around the box",
         does=box_moved,
+    ),
+    "tilt": Disturbance(
+        title="frame out of level, deg",
+        amounts=tuple(np.radians([5.0, 10.0, 15.0, 20.0, 30.0]).tolist()),
+        scale=180 / np.pi,
+        says="the sensor is mounted askew, in a random direction, and its own axis is taken for up",
+        does=out_of_level,
+        rigid=True,
     ),
 }

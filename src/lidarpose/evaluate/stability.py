@@ -115,7 +115,7 @@ def study(
         for amount in disturbance.amounts:
             shown = [_disturbed(task, one, name, amount) for one in people]
             counts = [len(one.points) for one in shown]
-            label = f"{amount * disturbance.scale:g}"
+            label = f"{amount * disturbance.scale:.4g}"
             points.append(_point(_answers(task, shown), base, amount, label, counts, clusters))
             if progress is not None:
                 progress(len(people))
@@ -191,8 +191,19 @@ def _disturbed(task: Task, shown: Shown, name: str, amount: float) -> Person:
     seed = [task.setting.seed, zlib.crc32(name.encode()), person.shard, person.row]
     # a displaced box may let in what the dataset holds around the person
     points = (shown.whole if name == "crop" else person).points.astype(float)
-    does = DISTURBANCES[name].does
-    return replace(person, points=does(points, shown.box, amount, np.random.default_rng(seed)))
+
+    def does(places: np.ndarray) -> np.ndarray:
+        return DISTURBANCES[name].does(places, shown.box, amount, np.random.default_rng(seed))
+
+    if not DISTURBANCES[name].rigid:
+        return replace(person, points=does(points))
+    return replace(
+        person,
+        points=does(points),
+        joints=does(person.joints),
+        box=person.box and replace(person.box, center=does(person.box.center)),
+        centers={name: does(center) for name, center in person.centers.items()},
+    )
 
 
 def _answers(task: Task, people: list[Person]) -> Judged:
