@@ -77,9 +77,9 @@ def print_costs(bodies: Bodies) -> None:
 
     print("\ncosts, us a person")
     print(f"shapes          {best(lambda: sample_people(rng, BLOCK)) / BLOCK * 1e6:6.1f}")
-    print(f"clothing        {best(lambda: clothing(rng, rig, BLOCK)) / BLOCK * 1e6:6.1f}")
+    print(f"clothing        {best(lambda: clothing(rng, BLOCK)) / BLOCK * 1e6:6.1f}")
     print(f"props and place {best(props) / count * 1e6:6.1f}")
-    worn = clothing(rng, rig, 400)
+    worn = clothing(rng, 400)
     torso = rig.dense_weight[:, [BODY26.index(n) for n in ("pelvis", "spine1", "spine2", "spine3")]].sum(1) > 0.9
     low, middle, high = 100 * np.percentile(worn[:, torso].mean(1), (5, 50, 95))
     print(f"clothes on the torso, mean of a person, 5/50/95: {low:.1f} {middle:.1f} {high:.1f} cm")

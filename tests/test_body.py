@@ -238,12 +238,12 @@ def test_people_are_those_of_a_street():
 def test_people_and_clothes_repeat_with_the_seed(rig):
     again = [sample_people(np.random.default_rng(9), 5) for _ in range(2)]
     np.testing.assert_array_equal(again[0].coefficients, again[1].coefficients)
-    worn = [clothing(np.random.default_rng(9), rig, 5) for _ in range(2)]
+    worn = [clothing(np.random.default_rng(9), 5) for _ in range(2)]
     np.testing.assert_array_equal(*worn)
 
 
 def test_clothes(rig):
-    worn = clothing(np.random.default_rng(4), rig, 400)
+    worn = clothing(np.random.default_rng(4), 400)
     assert worn.shape == (400, len(rig.template)) and worn.dtype == np.float32
     assert worn.min() >= 0 and worn.max() <= MAX_CLOTHING
     dense = rig.dense_weight
@@ -274,7 +274,7 @@ def test_fast_folds_equal_reference(seed, n):
 
 def test_folds_are_wider_than_15_cm(rig):
     """A quarter of the shortest wave away, the cloth is still much as thick: no spikes between neighbours."""
-    worn = clothing(np.random.default_rng(11), rig, 60)
+    worn = clothing(np.random.default_rng(11), 60)
     trunk = np.flatnonzero(rig.dense_weight[:, [J(j) for j in ("spine1", "spine2", "spine3")]].sum(1) > 0.9)
     apart = np.linalg.norm(rig.template[trunk, None] - rig.template[None, trunk], axis=-1)
     near = (apart > 0) & (apart < 0.025)

@@ -334,6 +334,17 @@ def one_line(caught):
     return str(caught.value)
 
 
+@pytest.mark.parametrize("name", ["sloper4d", "lidarhuman26m"])
+def test_a_body_that_is_not_smpl_is_refused_before_anything_is_written(tmp_path, smpl, name):
+    getattr(files, f"write_{name}")(tmp_path / "raw", smpl)
+    wrong = tmp_path / "SMPL_NEUTRAL.npz"
+    wrong.write_bytes(b"PK no model")
+    for asked in (wrong, tmp_path):
+        with pytest.raises(InputError, match="SMPL_NEUTRAL.npz"):
+            prepare(name, tmp_path / "raw", tmp_path / "out", smpl=asked)
+    assert not (tmp_path / "out").exists()
+
+
 def test_wrong_calls_are_one_line_and_write_nothing(raw, tmp_path, smpl):
     out = tmp_path / "out"
     wrong = (

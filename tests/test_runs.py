@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 import time
@@ -9,6 +10,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from motion_files import a_clip, write_amass
 from safetensors.torch import load_file
 
 from lidarpose.cli import main
@@ -517,3 +519,13 @@ def test_a_batch_that_cannot_be_shared_out_is_refused():
         told = f"a batch of {batch} can be shared out among {fit} processes, got {ranks}: change --batch"
         with pytest.raises(InputError, match=told):
             lanes_of(batch, ranks)
+
+
+def test_the_card_s_command_is_as_it_was_typed(tmp_path, monkeypatch):
+    motion = write_amass(tmp_path / "My Walk_poses.npz", *a_clip(40))
+    monkeypatch.chdir(tmp_path)
+    words = ["--batch", "2", "--workers", "0", "--scene", "paper", "--people", "2", "--motion", str(motion)]
+    assert not main(["pretrain", "run", *words, "--subjects", "My Walk,B"])
+    config = json.loads((tmp_path / "run" / runs.CONFIG).read_text())
+    typed = shlex.split(config["command"])
+    assert typed[typed.index("--motion") + 1] == motion.name and typed[typed.index("--subjects") + 1] == "My Walk,B"

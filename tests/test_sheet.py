@@ -2,9 +2,11 @@
 
 import re
 
+import dataset_files as files
 import pytest
 
 from lidarpose.cli import main
+from lidarpose.data.prepare import prepare
 from lidarpose.errors import InputError
 from lidarpose.synth import write
 from lidarpose.synth.write import Job, write_dataset
@@ -75,6 +77,20 @@ def test_the_table_and_the_cards_of_a_page_tell_the_same_distance(dataset):
     table = re.findall(rf"<tr><td>#\d+ os1-64</td>{number}\d+</td><td>\w+</td>{number}([\d.]+)</td>", page)
     cards = re.findall(r"points · ([\d.]+) m<", page)
     assert len(cards) == 20 and cards == table
+
+
+def test_labelled_people_are_drawn_on_a_sheet_and_on_a_page(tmp_path, monkeypatch):
+    smpl = files.write_smpl(tmp_path / "SMPL_NEUTRAL.npz")
+    files.write_sloper4d(tmp_path / "raw", smpl)
+    prepare("sloper4d", tmp_path / "raw", tmp_path / "walks", smpl=smpl)
+    monkeypatch.chdir(tmp_path)
+    assert main(["view", "walks"]) == 0 and main(["view", "walks", "--html"]) == 0
+    page = (tmp_path / "walks.html").read_text()
+    assert "distance m" in page and "does" not in re.findall("<th>(.*?)</th>", page)
+    for path in (tmp_path / "walks").glob("*.parquet"):
+        path.unlink()
+    with pytest.raises(InputError, match="or run lidarpose prepare again"):
+        draw_dataset("walks")
 
 
 def test_a_sheet_never_replaces_the_dataset(tmp_path):

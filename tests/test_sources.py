@@ -7,8 +7,9 @@ import motion_files as files
 import numpy as np
 import pytest
 
-from lidarpose.body.sources import load_motion
+from lidarpose.body.sources import digest, load_motion
 from lidarpose.errors import InputError
+from lidarpose.synth.write import Job
 
 
 def check_same(motion, rotations, way):
@@ -42,6 +43,22 @@ def test_amass_in_parts_and_of_another_up(tmp_path):
     check_same(load_motion(path, up="y"), rotations, way)
     assert load_motion(path, up="y", fps=30).fps == 30
     assert load_motion(path, up="y", hz=60).rotations.shape[0] == 3
+
+
+def test_a_recording_is_told_from_another_by_what_it_holds(tmp_path):
+    for name in ("one", "two"):
+        (tmp_path / name / "02").mkdir(parents=True)
+        files.write_amass(tmp_path / name / "02" / "a_poses.npz", *files.a_clip(3))
+    (tmp_path / "two" / "notes.txt").write_text("no motion")
+    one, two = tmp_path / "one", tmp_path / "two"
+    was = digest(one)
+    assert digest(two) == was and digest(one / "02" / "a_poses.npz") not in (was, digest(one / "02"))
+    card = Job(what="people", count=3, motion=str(one)).card()
+    assert card == Job(what="people", count=3, motion=str(two)).card()
+    files.write_amass(one / "02" / "b_poses.npz", *files.a_clip(4))
+    assert digest(one) != was and card != Job(what="people", count=3, motion=str(one)).card()
+    with pytest.raises(InputError, match="none.npz: no such file"):
+        digest(tmp_path / "none.npz")
 
 
 def test_people_may_lie_where_somebody_says_what_is_up(tmp_path):

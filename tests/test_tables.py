@@ -111,3 +111,16 @@ def test_the_list_names_all_sensors():
     lines = listing()
     assert len(lines) == 1 + len(SENSORS) >= 13 and {line.split()[0] for line in lines[1:]} == set(SENSORS)
     assert all(len(line) < 100 for line in lines)
+
+
+def test_a_table_that_has_changed_is_read_again(tmp_path, monkeypatch):
+    path = written(tmp_path / "mine.json", ANGLES)
+    assert sensor(path).rows == 4 and sensor(path) is sensor(path)
+    written(path, [*ANGLES, 25.0])
+    assert sensor(path).rows == 5
+    # of the same name in another folder
+    (tmp_path / "other").mkdir()
+    written(tmp_path / "other" / "mine.json", ANGLES[:3])
+    for folder, rows in ((tmp_path, 5), (tmp_path / "other", 3)):
+        monkeypatch.chdir(folder)
+        assert sensor("mine.json").rows == rows

@@ -1,12 +1,14 @@
 """Losses, schedule, and runs that can be killed and taken up again."""
 
 import json
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from motion_files import a_clip, write_amass
 
 from lidarpose.errors import InputError
 from lidarpose.model.batch import Targets
@@ -25,6 +27,7 @@ from lidarpose.train.optimize import average, optimizers, rate_factor
 from lidarpose.train.pose_task import PoseTask
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.recipes import recipe as recipe_of
+from lidarpose.train.sources import SyntheticSource
 from lidarpose.train.task import total
 
 # three chunks of `BATCHES` batches
@@ -397,3 +400,17 @@ def test_disturbed_people_have_their_joints_and_more_or_other_points():
     share = [disturbed(sample, strays=0.3, noise=0.0, rng=np.random.default_rng(k)) is not sample for k in range(300)]
     assert 0.2 < np.mean(share) < 0.4
     np.testing.assert_array_equal(sample.points, kept)
+
+
+def test_sources_go_to_processes_that_do_not_fork(tmp_path):
+    motion = write_amass(tmp_path / "walk_poses.npz", *a_clip(40))
+    source = SyntheticSource(scene="wild", seed=3, motion=str(motion), captured=0.5)
+    want = source.example(1)
+    chunks = Chunks(source=source, task=TASK, batch=2, seed=3, start=0, steps=8)
+    # what is remembered stays behind
+    sent = pickle.dumps(chunks)
+    assert len(sent) < 20_000
+    np.testing.assert_array_equal(pickle.loads(sent).source.example(1).points, want.points)
+    generator = Generator(scene="paper")
+    there = pickle.loads(pickle.dumps(generator))
+    np.testing.assert_array_equal(there.person(1, 2).sample.points, generator.person(1, 2).sample.points)

@@ -12,7 +12,7 @@ from functools import cache
 
 import numpy as np
 
-from lidarpose.body.rig import Rig, load_rig
+from lidarpose.body.rig import load_rig
 from lidarpose.skeleton import BODY26, SMPL24
 
 CHILD_SHARE = 0.12
@@ -98,7 +98,7 @@ def _ratio(value: np.ndarray, mean: float, spread: float) -> np.ndarray:
     return np.exp((found**2 - target**2) / 2)
 
 
-def clothing(rng: np.random.Generator, rig: Rig, n: int) -> np.ndarray:
+def clothing(rng: np.random.Generator, n: int) -> np.ndarray:
     """How far clothes, hair and shoes stand off the skin along its normals: (n, V) float32 m in [0, 0.04].
 
     Smooth over the body. A torso's mean is about 1.5 cm; a tenth of the people wear next to nothing, a tenth bulky

@@ -1,4 +1,6 @@
-"""A user's SMPL body stored as the shipped one is, for whatever takes a `Rig`: posing kernels, clothing, the generator.
+"""A user's SMPL body stored as the shipped one is, for what takes a `Rig`: the posing kernels.
+
+Clothes, garments and the generator know the shipped body alone.
 
 n people, V vertices, S shape coefficients. Lengths in metres, house frame.
 """

@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import shlex
 from dataclasses import fields
 from pathlib import Path
 
@@ -83,7 +84,7 @@ def _train(options: argparse.Namespace) -> None:
     words = [f"--{key.replace('_', '-')} {_said(value)}" for key, value in changes.items() if key != "data"]
     words += [f"--recipe {options.recipe}"] * (options.recipe not in (None, "default"))
     words += ["--resume"] * options.resume
-    sets = [Path(data).name for data in changes.get("data", ())]
+    sets = [shlex.quote(Path(data).name) for data in changes.get("data", ())]
     command = " ".join(["lidarpose", name, *sets, *words])
     path = train(
         wanted,
@@ -117,5 +118,7 @@ def _parsed(name: str, text: str, kind: type) -> object:
 def _said(value: object) -> str:
     """A value as it is written after an option, of paths the name alone."""
     if isinstance(value, tuple):
-        return ",".join(map(_said, value))
-    return Path(value).name if isinstance(value, str) and "/" in value else str(value).lower()
+        return shlex.quote(",".join(Path(one).name if "/" in one else one for one in value))
+    if isinstance(value, bool):
+        return str(value).lower()
+    return shlex.quote(Path(value).name if isinstance(value, str) and "/" in value else str(value))

@@ -80,8 +80,8 @@ def box_moved(points: np.ndarray, box: Box | None, amount: float, rng: np.random
 
 
 def out_of_level(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
-    """Everything turned by `amount` rad about a random level axis through the sensor, as the cloud of a sensor is that is
-    mounted askew and takes its own axis for up."""
+    """Everything turned by `amount` rad about a random level axis through the sensor, as if that were mounted askew and
+    took its own axis for up."""
     turn = rng.uniform(0, 2 * np.pi)
     R_tilted_level = axis_angle_to_matrix(amount * np.array([np.cos(turn), np.sin(turn), 0.0]))
     return points @ R_tilted_level.T

@@ -151,20 +151,31 @@ SENSORS: dict[str, Sensor | RayPattern] = {
 
 
 def sensor(name: str | os.PathLike) -> Sensor | RayPattern:
-    """A named sensor, or that of a .json or .csv file (`tables.load_sensor`), which is read once; an unknown name
-    raises an InputError that lists the nearest ones."""
+    """A named sensor, or that of a .json or .csv file (`tables.load_sensor`), which is read again once it has
+    changed: a `Sensor`, or a `RayPattern` for what does not spin. An unknown name raises an InputError that lists the
+    nearest ones."""
     name = os.fspath(name) if isinstance(name, os.PathLike) else str(name)
     if name in SENSORS:
         return SENSORS[name]
     if name.lower().endswith((".json", ".csv")):
-        return _of_file(name)
+        return _of_file(name, *_stamp(name))
     raise unknown_name("sensor", name, SENSORS)
 
 
 @cache
-def _of_file(path: str) -> Sensor:
-    """Read once: generators ask for every person."""
+def _of_file(path: str, *stamp: object) -> Sensor:
+    """Read once as long as its stamp stays: generators ask for every person."""
     return load_sensor(path)
+
+
+def _stamp(path: str) -> tuple[object, ...]:
+    """What tells a file from another of its name, or from itself after a change."""
+    try:
+        found = os.stat(path)
+    except (OSError, ValueError):
+        # reading it says why
+        return ()
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
 
 
 # where the beams of a sensor come from: its maker's table, a paper, or the maker's field of view in equal steps

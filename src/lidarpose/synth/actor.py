@@ -71,7 +71,7 @@ def draw_actor(
         kind, clearance = KINDS[drawn.kind[0]], drawn.clearance[0]
     person = rig.rest(sample_people(rng, 1).coefficients)
     rest = RestBody(vertices=np.repeat(person.vertices, frames + 1, 0), joints=np.repeat(person.joints, frames + 1, 0))
-    worn = np.repeat(clothing(rng, rig, 1) * np.float32(clothes), frames + 1, 0)
+    worn = np.repeat(clothing(rng, 1) * np.float32(clothes), frames + 1, 0)
     vertices, joints, low, _ = dressed(rest, worn, rotations, translation)
     lowest = low[:, 2]
     if clearance is None:

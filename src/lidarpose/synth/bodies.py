@@ -131,7 +131,7 @@ def draw_bodies(
             moved, step = np.where(mask, both[:, 1], moved), np.where(chosen[:, None], way[:, 0], step)
         kinds = np.where(chosen, "captured", kinds)
     rest = rig.rest(sample_people(rng, count).coefficients)
-    worn = clothing(rng, rig, count) * np.float32(clothes)
+    worn = clothing(rng, count) * np.float32(clothes)
     vertices, joints, low, high = dressed(rest, worn, rotations, np.zeros((count, 3), np.float32))
     lift = low[:, 2].copy()
     vertices[..., 2] -= lift[:, None]

@@ -4,8 +4,9 @@ Person i of a seed is the same whatever was asked for before and whoever asks: p
 `BLOCK` people (vectorized, from the block's own generator), everything else from the person's own generator.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 
@@ -49,7 +50,7 @@ class Generator:
     """Synthetic people of one scene configuration, or of a named one. captured: share of poses from `bank`, the rest
     from the prior; measure: also find the facts, which costs a second cast: the sample is the same either way; redraw:
     somebody of whom hardly anything is seen is drawn again, each time easier to see; else they stay as they are,
-    without points too."""
+    without points too. May be pickled."""
 
     scene: SceneConfig | str
     bank: PoseBank | None = None
@@ -64,10 +65,20 @@ class Generator:
             raise InputError("Generator.captured needs a bank of captured poses, got none")
         if not 0 <= self.captured <= 1:
             raise InputError(f"Generator.captured must be a share in [0, 1], got {self.captured}")
+        # at once: an unknown sensor is told here
+        self._bodies  # noqa: B018
+
+    def __getstate__(self) -> dict:
+        # blocks that are remembered stay where they are
+        return {name: value for name, value in vars(self).items() if name != "_bodies"}
+
+    @cached_property
+    def _bodies(self) -> Callable[[int, int], Bodies]:
+        """(seed, block) -> its bodies."""
         moving = any(isinstance(sensor(name), RayPattern) for name in self.scene.sensors)
         # neighbours share a block; two suffice for a reader that crosses from one to the next
         drawn = partial(draw_bodies, self.bank, self.captured, BLOCK, moving=moving, clothes=self.scene.clothes)
-        object.__setattr__(self, "_bodies", lru_cache(maxsize=2)(drawn))
+        return lru_cache(maxsize=2)(drawn)
 
     def person(self, seed: int, index: int, *, hard: float | None = None) -> SyntheticPerson:
         """Person `index` of `seed`, at the scene's difficulty or at `hard` in [0, 1]."""

@@ -1,7 +1,6 @@
 """The job behind `lidarpose synth`: people, clips or streets into Parquet shards; see `data.jobs` for how."""
 
 import hashlib
-import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -11,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from lidarpose.body.sources import digest as motion_digest
 from lidarpose.data.files import read_bytes
 from lidarpose.data.jobs import clean_folder, make_shards, open_folder
 from lidarpose.data.shards import CARD, Card, person_row, shard_path, shard_writer, write_card
@@ -97,7 +97,7 @@ class Job:
         if tables:
             settings["tables"] = list(tables.values())
         if self.motion is not None:
-            settings["motion"] = _digest(self.motion, "motion") if os.path.isfile(self.motion) else str(self.motion)
+            settings["motion"] = motion_digest(self.motion)
             settings["captured"] = self.share
             settings["subjects"] = list(self.subjects) if self.subjects else None
         per_shard = self.per_shard or PER_SHARD[self.what]

@@ -53,6 +53,10 @@ class SyntheticSource:
         # here, not in a worker, whose errors come wrapped in a traceback
         self._generator  # noqa: B018
 
+    def __getstate__(self) -> dict:
+        # each process reads the clips itself
+        return {name: value for name, value in vars(self).items() if name != "_generator"}
+
     @cached_property
     def _generator(self) -> Generator:
         bank = PoseBank.from_clips(self.motion, self.subjects) if self.motion else None

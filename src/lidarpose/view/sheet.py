@@ -48,7 +48,9 @@ def _spread(dataset: Dataset, count: int) -> list[dict]:
     """`count` rows, evenly spread over the shards that are there; of a smaller dataset all rows."""
     there = _written(dataset)
     if not there:
-        raise file_error(dataset.folder, "holds no shard yet; wait for the first one, or run lidarpose synth again")
+        raise file_error(
+            dataset.folder, f"holds no shard yet; wait for the first one, or run {dataset.card.writer} again"
+        )
     sizes = [dataset.rows_of(dataset.card.people, shard) for shard in there]
     total = sum(sizes)
     count = min(count, total)
@@ -98,11 +100,12 @@ def _card(row: dict, dataset: Dataset) -> ReportPerson:
 
 def _line(row: dict, dataset: Dataset) -> dict:
     line = {"person": _label(row, dataset), "points": len(row["points"]) // 3}
+    # synthetic people have facts beside their distance
+    if row.get("kind") is not None:
+        line["does"] = row["kind"]
     if row.get("distance") is not None:
-        line |= {
-            "does": row["kind"],
-            "distance m": round(row["distance"], 1),
-            "visible %": round(100 * row["visible"]),
-            "clutter %": round(100 * row["clutter"]),
-        }
+        line["distance m"] = round(row["distance"], 1)
+    for name in ("visible", "clutter"):
+        if row.get(name) is not None:
+            line[f"{name} %"] = round(100 * row[name])
     return line

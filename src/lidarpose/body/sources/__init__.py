@@ -10,6 +10,7 @@
 A folder is searched for all of these.
 """
 
+import hashlib
 import os
 from collections.abc import Callable
 from dataclasses import replace
@@ -107,6 +108,22 @@ def _sources(folder: Path, format: str | None) -> list[Path]:
         if ".json" in suffixes and pose_files(Path(here)):
             found.append(Path(here))
     return sorted(found)
+
+
+def digest(path: str | os.PathLike) -> str:
+    """16 hexadecimal digits that tell one recording from another: of a file its content's, of a folder those of the
+    files of motion in it and its folders and of the skeletons beside them. Raises InputError."""
+    path = Path(path)
+    if not path.is_dir():
+        return _hash(path)[:16]
+    wanted = {*_BY_SUFFIX, ".asf"}
+    files = sorted(Path(here, name) for here, _, names in os.walk(path) for name in names)
+    told = [f"{file.relative_to(path).as_posix()} {_hash(file)}" for file in files if file.suffix.lower() in wanted]
+    return hashlib.sha256("\n".join(told).encode("utf-8", "surrogateescape")).hexdigest()[:16]
+
+
+def _hash(path: Path) -> str:
+    return hashlib.sha256(read_bytes(path, expected="motion")).hexdigest()
 
 
 def _placed(name: str, source: Path, folder: Path) -> str:

@@ -30,10 +30,11 @@ _GET = (
 
 
 class SmplJoints:
-    """The joints of SMPL bodies in any pose. Models are read when first needed.
+    """The joints of SMPL bodies in any pose. The neutral model, or the only one, is read at once, others when needed.
 
     path: the user's SMPL, one file for everybody, or a folder with a file for each gender, by their published names.
-    Raises InputError where it is None, missing, or a folder without a neutral body; the dataset's name is told.
+    Raises InputError where it is None, missing, a folder without a neutral body, or where that is no SMPL; the
+    dataset's name is told.
     """
 
     def __init__(self, path: str | Path | None, dataset: str):
@@ -47,7 +48,8 @@ class SmplJoints:
                 raise file_error(path, f"expected SMPL_NEUTRAL.pkl or .npz, got {there}: {_GET}")
         elif not Path(path).is_file():
             raise file_error(path, f"no such file; expected SMPL's own: {_GET}")
-        self._models: dict[str, _Model] = {}
+        usual = self.kind("neutral")
+        self._models = {usual: _Model(self.files[usual])}
 
     def kind(self, gender: str) -> str:
         """Which model a gender gets: "any" where one file is for everybody, else its own, else the neutral one."""
