@@ -11,6 +11,7 @@ import motion_files
 import numpy as np
 from test_smpl import synthetic
 
+from lidarpose.body.retarget import rotation_vector
 from lidarpose.body.smpl import load_body
 from lidarpose.geometry import axis_angle_to_matrix
 from lidarpose.skeleton import HUMAN15, SMPL24
@@ -114,16 +115,21 @@ def write_humanm3_database(root, truth, *, cameras=4, name="train.pkl"):
 # --- LiDARHuman26M
 
 
-def write_lidarhuman26m(root, smpl, *, sequences=("5", "7"), frames=3):
+def write_lidarhuman26m(root, smpl, *, sequences=("5", "7"), frames=3, R_sensor_level=None):
+    """R_sensor_level (3, 3): how the LiDAR is mounted, level by default; what is returned is level."""
+    R = np.eye(3) if R_sensor_level is None else R_sensor_level
     truth = {}
     for sequence in sequences:
         rng = np.random.default_rng(int(sequence))
         one = person(smpl, frames, seed=int(sequence), at=(14.0, 3.0, 0.0))
         for f in range(frames):
-            write_ply(root / f"labels/3d/segment/{sequence}/{f + 1:06d}.ply", one.cloud(f, rng), text=f == 1)
+            write_ply(root / f"labels/3d/segment/{sequence}/{f + 1:06d}.ply", one.cloud(f, rng) @ R.T, text=f == 1)
             path = root / f"labels/3d/pose/{sequence}/{f + 1:06d}.json"
             path.parent.mkdir(parents=True, exist_ok=True)
-            content = {"beta": one.betas.tolist(), "pose": one.pose[f].tolist(), "trans": one.trans[f].tolist()}
+            pose, rest = one.pose[f].copy(), one.joints[f, 0] - one.trans[f]
+            pose[:3] = rotation_vector((R @ axis_angle_to_matrix(pose[:3]))[None])[0]
+            trans = R @ one.joints[f, 0] - rest
+            content = {"beta": one.betas.tolist(), "pose": pose.tolist(), "trans": trans.tolist()}
             path.write_text(json.dumps(content))
             truth[sequence, f + 1, "0"] = one.joints[f]
     return truth

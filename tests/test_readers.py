@@ -120,6 +120,18 @@ def test_humanm3_s_database_has_everybody_once(tmp_path, smpl):
         source.parts(tmp_path)
 
 
+def test_humanm3_says_which_folder_is_incomplete_or_above_the_root(tmp_path, smpl):
+    files.write_humanm3(tmp_path / "HumanM3", smpl, sequences=("train/a", "train/plaza/p1", "test/c"), frames=1)
+    with pytest.raises(InputError, match="is a folder above HumanM3's root, which is likely .*HumanM3: name that"):
+        made("humanm3", smpl).parts(tmp_path)
+    assert made("humanm3", smpl).parts(tmp_path / "HumanM3") == ["test/c", "train/a", "train/plaza/p1"]
+    for path in (tmp_path / "HumanM3/train/a/pose_calib").iterdir():
+        path.unlink()
+    (tmp_path / "HumanM3/train/a/pose_calib").rmdir()
+    with pytest.raises(InputError, match="has .*train/a without pose_calib: get that folder too"):
+        made("humanm3", smpl).parts(tmp_path / "HumanM3")
+
+
 def test_humanm3_s_database_alone_is_a_root(tmp_path, smpl):
     truth = files.write_humanm3(tmp_path / "x", smpl, frames=1)
     files.write_humanm3_database(tmp_path, truth)
@@ -289,14 +301,14 @@ def test_sloper4d_skips_are_counted(tmp_path, smpl):
     content, truth = files.sloper4d_labels(smpl, "seq001", frames=7, without=())
     person = content["second_person"]
     person["point_clouds"][0] = np.zeros((0, 3))
-    person["point_clouds"][1] = []
-    person["point_clouds"][2] = np.full((5, 3), np.nan)
+    person["point_clouds"][1] = np.full((5, 3), np.nan)
+    person["point_clouds"][2] = [["x", 1, 2]]
     person["opt_pose"][3, 5] = np.nan
     person["opt_pose"], person["opt_trans"] = person["opt_pose"][:6], person["opt_trans"][:6]
     content["first_person"]["lidar_traj"][4, 4:8] = 0
     person["point_clouds"].append(person["point_clouds"][5][:9])
     person["point_frame"] = [*person["point_frame"], 7777]
-    person["point_clouds"][5] = person["point_clouds"][5][:9]
+    person["point_clouds"][5] = np.concatenate([person["point_clouds"][5][:9], [[1.0, np.nan, 2.0]]])
     write_labels(tmp_path, content)
     items, skipped = everything("sloper4d", tmp_path, smpl)
     # nine points are kept: protocols leave them out later

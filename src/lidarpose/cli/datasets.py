@@ -52,6 +52,9 @@ def add(commands) -> None:
     prepare.add_argument(
         "--smpl", metavar="FILE|DIR", help="your SMPL model, for lidarhuman26m, sloper4d, freemotion, noisemotion"
     )
+    prepare.add_argument(
+        "--no-level", action="store_true", help="lidarhuman26m: keep the release's frame, as the LiDAR was mounted"
+    )
     prepare.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1)")
 
     sensors = commands.add_parser("sensors", help="the simulated sensors", description="Lists the sensors by name.")
@@ -116,6 +119,7 @@ def _prepare(options: argparse.Namespace) -> None:
         split=options.split,
         split_by=options.split_by,
         smpl=options.smpl,
+        level=not options.no_level,
         workers=options.workers,
     )
     for line in lines_of(summary):

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -33,21 +33,28 @@ READERS: dict[str, tuple[str, str, bool]] = {
     "freemotion": ("corpora", "FreeMotion", True),
     "noisemotion": ("corpora", "NoiseMotion", True),
 }
+# whose frame is turned level unless somebody wants the release's own
+_LEVELED = ("lidarhuman26m",)
 # tables of such a dataset; the people's last, since a part is whole once they are there
 _TABLES = ("skipped", "labelled")
 # how many people between two tellings of progress
 _TOLD = 200
 
 
-def reader(name: str, smpl: str | Path | None = None) -> Reader:
-    """The reader of a dataset, by its name in `READERS`. smpl: the user's SMPL model, a file or a folder of them.
+def reader(name: str, smpl: str | Path | None = None, *, level: bool = True) -> Reader:
+    """The reader of a dataset, by its name in `READERS`. smpl: the user's SMPL model, a file or a folder of them;
+    level: turn the frame level where the release's is not.
 
-    Raises InputError for an unknown name, where SMPL is needed and not given or cannot be read, and where it is given
-    and not needed.
+    Raises InputError for an unknown name, where SMPL is needed and not given or cannot be read, where it is given and
+    not needed, and where the release's frame is asked for and there is no other.
     """
     check_name("dataset", name, READERS)
     module, kind, takes_smpl = READERS[name]
     make = getattr(import_module(f"lidarpose.data.readers.{module}"), kind)
+    if name in _LEVELED:
+        make = partial(make, level=level)
+    elif not level:
+        raise InputError(f"{name} is not turned level, only {', '.join(_LEVELED)} is: leave --no-level away")
     if not takes_smpl:
         if smpl is not None:
             raise InputError(f"{name} has joints of its own: leave the SMPL model out")
@@ -63,6 +70,7 @@ def prepare(
     split: str | None = None,
     split_by: str | None = None,
     smpl: str | Path | None = None,
+    level: bool = True,
     workers: int = 1,
     progress: bool = True,
 ) -> dict[str, Any]:
@@ -71,7 +79,8 @@ def prepare(
     name: one of `READERS`; root: the folder of its raw files; split: only people of that split ("train", "val",
     "test"), by default all; split_by: the published split to go by, by default the user's own train.txt and test.txt in
     `root`, else the dataset's usual one; smpl: the user's SMPL model, a file or a folder of one for each gender;
-    workers: processes; progress: draw a bar on a terminal.
+    level: turn lidarhuman26m's sequences level, False keeps the release's frame; workers: processes; progress: draw a
+    bar on a terminal.
 
     The summary, also in out/dataset.json: people, skipped by reason with an example each, people by split and source,
     parts, and warnings. Raises InputError, one line, for a wrong root, name, split or SMPL model and for a folder that
@@ -80,7 +89,7 @@ def prepare(
     if workers < 1:
         raise InputError(f"expected at least 1 worker, got {workers}")
     root, out = Path(root), Path(out)
-    source = reader(name, smpl)
+    source = reader(name, smpl, level=level)
     if not root.is_dir():
         raise file_error(root, f"is no folder; expected the raw files of {name}")
     parts = list(source.parts(root))
@@ -97,6 +106,7 @@ def prepare(
     make = PartWriter(
         name=name,
         smpl=None if smpl is None else str(smpl),
+        level=level,
         root=root,
         out=out,
         parts=tuple(parts),
@@ -161,6 +171,7 @@ class PartWriter:
 
     name: str
     smpl: str | None
+    level: bool
     root: Path
     out: Path
     parts: tuple[str, ...]
@@ -170,7 +181,7 @@ class PartWriter:
 
     @cached_property
     def _reader(self) -> Reader:
-        return reader(self.name, self.smpl)
+        return reader(self.name, self.smpl, level=self.level)
 
     def __call__(self, number: int) -> Iterator[int]:
         people, waiting = 0, 0

@@ -31,6 +31,8 @@ _FPS = 10.0
 _BOX_MARGIN = 0.2
 # and the points are those in a box this much larger still, m: what a detector's box lets in
 _POINT_MARGIN = 0.3
+# what lies at the root
+_SPLITS = ("train", "test")
 # how many folders below the root a sequence may lie
 _DEEPEST = 3
 _EXPECTED = (
@@ -63,8 +65,12 @@ class HumanM3:
     }
 
     def parts(self, root: Path) -> list[str]:
-        """Sequences as paths below the root, or the databases where sequences have no labels. Raises InputError where
-        there is neither."""
+        """Sequences as paths below the root, or the databases where a sequence has no labels. Raises InputError where
+        there is neither, and for a sequence that lacks its labels or clouds."""
+        databases = [path.name for path in sorted(root.glob("*.pkl"))]
+        below = [path.parent for name in _SPLITS for path in sorted(root.glob(f"*/{name}")) if path.is_dir()]
+        if below and not databases and not any((root / name).is_dir() for name in _SPLITS):
+            raise file_error(root, f"is a folder above HumanM3's root, which is likely {below[0]}: name that")
         found, half = [], ""
         for folder in sorted(self._folders(root, _DEEPEST)):
             missing = [name for name in ("pointcloud", "pose_calib") if not (folder / name).is_dir()]
@@ -72,11 +78,12 @@ class HumanM3:
                 found.append(folder.relative_to(root).as_posix())
             elif len(missing) == 1:
                 half = half or f"{folder} without {missing[0]}"
-        databases = [path.name for path in sorted(root.glob("*.pkl"))]
         if found and not half:
             return found
         if databases:
             return databases
+        if found:
+            raise file_error(root, f"has {half}: get that folder too, or move its sequence away")
         there = half or ", ".join(sorted(path.name for path in root.iterdir())[:6]) or "nothing"
         raise wrong_root(root, "HumanM3", _EXPECTED, f"got {there}", _GET)
 

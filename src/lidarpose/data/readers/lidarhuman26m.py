@@ -3,8 +3,9 @@
     ROOT/labels/3d/pose/7/000001.json       beta (10), pose (72) rad, trans (3) m: SMPL, neutral
     ROOT/labels/3d/segment/7/000001.ply     the person's points, m, in the LiDAR's frame, as pose and trans
 
-Joints are SMPL's, so the user's SMPL file is needed. Source: the dataset's page, AutoCONFIG/Neighborhood-enhanced-
-LidarCap sample/gen_dataset.py.
+Joints are SMPL's, so the user's SMPL file is needed. The LiDAR looks down on the people, and its frame is as it was
+mounted, so each sequence is turned level by one rotation. Source: the dataset's page, AutoCONFIG/Neighborhood-enhanced-
+LidarCap sample/gen_dataset.py; jingyi-zhang/ASC_Lidar_human process.py, which makes the labels in the raw frame.
 """
 
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ import numpy as np
 
 from lidarpose.data.files import file_error
 from lidarpose.data.readers.items import Item, Skipped
+from lidarpose.data.readers.level import leveling
 from lidarpose.data.readers.raw import numbered, numbers, read_cloud, read_json, wrong_root
 from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_item
 from lidarpose.errors import InputError
@@ -27,16 +29,20 @@ _GET = "www.lidarhumanmotion.net/lidarcap"
 
 
 class LidarHuman26M:
-    """Reads LiDARHuman26M. A part is a sequence. smpl: the user's SMPL model, see `SmplJoints`."""
+    """Reads LiDARHuman26M. A part is a sequence. smpl: the user's SMPL model, see `SmplJoints`; level: turn each
+    sequence so that z is up, see `leveling`."""
 
     name = "lidarhuman26m"
     skeleton = SMPL24.name
 
-    def __init__(self, *, smpl: str | Path | None = None):
+    def __init__(self, *, smpl: str | Path | None = None, level: bool = True):
         self._smpl = SmplJoints(smpl, self.name)
+        self._level = level
         self.about = {
-            "frame": "the LiDAR's own, as in the release: it stands still, z up as far as it was mounted level",
-            "settings": {"smpl": self._smpl.digests[self._smpl.kind("neutral")]},
+            "frame": "level frame at the LiDAR: the release's own, turned by one rotation a sequence"
+            if level
+            else "the LiDAR's own, as in the release: it stands still, z up as far as it was mounted level",
+            "settings": {"smpl": self._smpl.digests[self._smpl.kind("neutral")], "level": level},
             "licence": "asked for on the dataset's page; treat it as non-commercial research, no redistribution",
             "get": _GET,
             "notes": [
@@ -44,6 +50,9 @@ class LidarHuman26M:
                 "betas = 0 and joints relative to the pelvis: not the same joints.",
                 "center_trans is SMPL's trans: the released DAPT evaluation centers on it. The pelvis is about 0.24 m "
                 "from it, at a place that betas decide.",
+                "The labelled people of a sequence tell what is up, since they stand upright on average; a frame "
+                "hardly out of level (3 degrees, 10 where everybody faces one way) or of fewer than 100 people stays "
+                "as it is; source tells the turn. Networks trained on the release's frame need --no-level.",
                 "All joints count as seen; the labels come from suits, not from what the LiDAR saw.",
                 "There are no boxes. time is the frame's number at 10 Hz.",
                 "train.txt and test.txt are not in the release; the published ids are used where they are missing, and "
@@ -71,10 +80,12 @@ class LidarHuman26M:
                 labels[frame] = _labels(paths[0])
             except InputError as error:
                 wrong[frame] = str(error)
-        joints = {}
+        joints, turn = {}, None
         if labels:
             betas, pose, trans = (np.stack(rows) for rows in zip(*labels.values(), strict=True))
-            joints = dict(zip(labels, self._smpl(betas, pose, trans), strict=True))
+            found = self._smpl(betas, pose, trans)
+            joints = dict(zip(labels, found, strict=True))
+            turn = leveling(found) if self._level else None
         for frame in sorted(poses.keys() | clouds.keys()):
             where = f"{part}/{frame:06d}"
             if frame in wrong:
@@ -87,7 +98,8 @@ class LidarHuman26M:
                 names = ", ".join(path.name for path in [*poses[frame], *clouds[frame]])
                 yield Skipped(reason="several files of one frame", where=f"{where}: {names}")
             else:
-                yield _item(clouds[frame][0], joints[frame], labels[frame][2], part, frame, (frame - first) / _FPS)
+                time = (frame - first) / _FPS
+                yield _item(clouds[frame][0], joints[frame], labels[frame][2], part, frame, time, turn)
 
 
 def _labels(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -102,13 +114,20 @@ def _labels(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return beta, pose, trans
 
 
-def _item(path: Path, joints: np.ndarray, trans: np.ndarray, part: str, frame: int, time: float) -> Item | Skipped:
+def _item(
+    path: Path, joints: np.ndarray, trans: np.ndarray, part: str, frame: int, time: float, turn: np.ndarray | None
+) -> Item | Skipped:
+    """turn: R_level_sensor, None to stay in the sensor's frame."""
     try:
         points = read_cloud(path)
     except InputError as error:
         return Skipped(reason="cloud cannot be read", where=str(error))
     if not len(points):
         return Skipped(reason="empty cloud", where=f"{part}/{path.stem}")
+    source = "lidarhuman26m"
+    if turn is not None:
+        points, joints, trans = (x @ turn.T for x in (points, joints, trans))
+        source += f", turned level by {np.degrees(np.arccos(np.clip(turn[2, 2], -1, 1))):.0f} deg"
     return smpl_item(
         points,
         joints,
@@ -117,6 +136,6 @@ def _item(path: Path, joints: np.ndarray, trans: np.ndarray, part: str, frame: i
         frame_id=f"{part}/{path.stem}",
         track="0",
         time=time,
-        source="lidarhuman26m",
+        source=source,
         centers={"trans": trans},
     )

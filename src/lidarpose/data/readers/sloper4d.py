@@ -4,7 +4,8 @@
         frame_num               (n,) the frames that are labelled; total_frames: those with pictures
         first_person            lidar_traj (n, 9): frame, x y z m, quaternion x y z w, time s
         second_person           opt_pose or pose (n, 72) rad, opt_trans or trans (n, 3) m, beta (10), gender;
-                                point_clouds, a list of (k, 3) m in the world's frame, and point_frame, whose they are
+                                point_clouds, a list of (k, 3) m in the world's frame, and point_frame, whose they are;
+                                rows that are no numbers are no points
 
 Joints are SMPL's, so the user's SMPL file is needed. Pickles are read without running them.
 Source: climbingdaily/SLOPER4D src/data_loader.py, guidodumont/SMPLify-3D datasets/sloper4d.py.
@@ -182,7 +183,9 @@ def _clouds(path: Path, person: dict) -> dict[int, np.ndarray | str]:
     found: dict[int, np.ndarray | str] = {}
     for frame, cloud in zip(frames, clouds, strict=True):
         try:
-            found[frame] = numbers(path, np.asarray(cloud, float).reshape(-1, 3), (-1, 3), "a cloud")
+            points = numbers(path, np.asarray(cloud, float).reshape(-1, 3), (-1, 3), "a cloud", finite=False)
+            # as the authors' loaders
+            found[frame] = points[np.isfinite(points).all(1)]
         except (InputError, TypeError, ValueError) as error:
             found[frame] = str(error)
     return found

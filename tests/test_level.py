@@ -1,0 +1,90 @@
+"""Which way is up before a sensor that is mounted askew, told by people."""
+
+import json
+
+import dataset_files as files
+import numpy as np
+import pytest
+from motion_files import a_clip, joints_of
+
+from lidarpose.data.prepare import prepare, reader
+from lidarpose.data.readers.level import LEAST_FRAMES, leveling, up_of_people
+from lidarpose.errors import InputError
+from lidarpose.geometry import axis_angle_to_matrix, rotation_about
+
+AXIS = np.array([0.6, 0.8, 0.0])
+
+
+def tilt(degrees):
+    """R_sensor_level of a LiDAR out of level by so much."""
+    return axis_angle_to_matrix(np.radians(degrees) * AXIS)
+
+
+def people(degrees, frames=2 * LEAST_FRAMES):
+    return joints_of(*a_clip(frames, 4)) @ tilt(degrees).T
+
+
+@pytest.mark.parametrize("degrees", [0, 5, 15, 40])
+def test_people_who_turn_round_tell_what_is_up(degrees):
+    up, doubt = up_of_people(people(degrees))
+    assert np.degrees(np.arccos(up @ tilt(degrees)[:, 2])) < 2 and np.degrees(doubt) == pytest.approx(3)
+    found = leveling(people(degrees))
+    assert (found is None) == (degrees == 0)
+    if degrees:
+        np.testing.assert_allclose(found @ up, [0, 0, 1], atol=1e-9)
+        # the smallest such rotation: nothing turns about z
+        assert np.degrees(np.arccos((np.trace(found) - 1) / 2)) == pytest.approx(degrees, abs=2)
+
+
+def test_too_few_people_say_nothing():
+    assert up_of_people(people(15, frames=LEAST_FRAMES - 1)) is None and leveling(people(15, frames=3)) is None
+
+
+def test_who_leans_and_never_turns_is_no_reason_to_turn_the_frame():
+    joints = people(0)
+    left = joints[:, 1] - joints[:, 2]
+    for k, yaw in enumerate(np.arctan2(left[:, 1], left[:, 0])):
+        joints[k] = joints[k] @ rotation_about("z", -yaw).T @ rotation_about("x", np.radians(-6)).T
+    up, doubt = up_of_people(joints)
+    assert np.degrees(doubt) == pytest.approx(10) and np.degrees(np.arccos(up[2])) < 10
+    assert leveling(joints) is None
+
+
+@pytest.fixture(scope="module")
+def raw(tmp_path_factory):
+    """A root whose sequence 5 was seen by a LiDAR out of level by 15 degrees, and SMPL."""
+    root = tmp_path_factory.mktemp("raw")
+    smpl = files.write_smpl(root / "SMPL_NEUTRAL.npz")
+    truth = files.write_lidarhuman26m(root, smpl, sequences=("5",), frames=LEAST_FRAMES, R_sensor_level=tilt(15))
+    return root, smpl, truth
+
+
+def test_lidarhuman26m_is_turned_level(raw):
+    root, smpl, truth = raw
+    kept, leveled = (list(reader("lidarhuman26m", smpl, level=level).read(root, "5")) for level in (False, True))
+    assert {item.sample.source for item in kept} == {"lidarhuman26m"}
+    assert {item.sample.source for item in leveled} == {"lidarhuman26m, turned level by 15 deg"}
+    for a, b in zip(kept, leveled, strict=True):
+        np.testing.assert_allclose(a.sample.pose.joints, truth["5", a.frame, "0"] @ tilt(15).T, atol=1e-4)
+        # one rotation about the LiDAR for points, joints and trans; heights come out as they were to 2 degrees
+        np.testing.assert_allclose(b.sample.pose.joints[:, 2], truth["5", a.frame, "0"][:, 2], atol=15 * 0.035)
+        for before, after in (
+            (a.sample.points, b.sample.points),
+            (a.sample.pose.joints, b.sample.pose.joints),
+            (a.centers["trans"], b.centers["trans"]),
+        ):
+            np.testing.assert_allclose(np.linalg.norm(after, axis=-1), np.linalg.norm(before, axis=-1), atol=1e-4)
+        # the points stay on the person
+        apart = np.linalg.norm(b.sample.points[:, None] - b.sample.pose.joints, axis=-1).min(1)
+        assert np.median(apart) < 0.3
+
+
+def test_the_release_s_own_frame_can_be_had(raw, tmp_path):
+    root, smpl, _ = raw
+    found = prepare("lidarhuman26m", root, tmp_path / "own", smpl=smpl, level=False)
+    assert list(found["sources"]) == ["lidarhuman26m"]
+    with pytest.raises(InputError, match="level false there, true asked for"):
+        prepare("lidarhuman26m", root, tmp_path / "own", smpl=smpl)
+    assert json.loads((tmp_path / "own" / "dataset.json").read_text())["frame"].startswith("the LiDAR's own")
+    with pytest.raises(InputError, match="leave --no-level away"):
+        reader("sloper4d", smpl, level=False)
