@@ -219,8 +219,27 @@ def test_curves_say_what_was_done(synthetic, monkeypatch):
     # the same numbers whoever asks again, and they can be written and drawn
     assert study(task, base) == found
     written = json.loads(to_json([found], head={"command": "x"}))
-    assert written["schema"] == "lidarpose.stability/1" and len(written["studies"][0]["curves"]) == 6
+    assert written["schema"] == "lidarpose.stability/1" and len(written["studies"][0]["curves"]) == 7
     assert draw_stability(found)[:4] == b"\x89PNG"
+
+
+def test_a_frame_out_of_level_moves_points_and_labels_alike(synthetic, monkeypatch):
+    monkeypatch.setattr(module, "DISTURBANCES", {"tilt": DISTURBANCES["tilt"]})
+    # who knows no up errs as much in any frame; who takes z for up does not
+    careless = task_of(Fake(lambda points: np.repeat(points.mean(0)[None], 26, 0)), open_people(synthetic))
+    (curve,) = study(careless, judge(careless).judged, sensors=False).curves
+    assert [point.label for point in curve.points] == ["0", "5", "10", "15", "20", "30"]
+    assert [point.mpjpe for point in curve.points] == pytest.approx([curve.points[0].mpjpe] * 6, abs=0.01)
+    upright = task_of(Fake(standing), open_people(synthetic))
+    (curve,) = study(upright, judge(upright).judged, sensors=False).curves
+    assert max(abs(point.increase) for point in curve.points) > 1
+    shown = module.to_disturb(upright)[0]
+    turned, before = module._disturbed(upright, shown, "tilt", np.radians(20)), shown.person
+    u, _, vt = np.linalg.svd((turned.points - turned.points.mean(0)).T @ (before.points - before.points.mean(0)))
+    R = u @ vt
+    assert np.degrees(np.arccos((np.trace(R) - 1) / 2)) == pytest.approx(20, abs=0.1)
+    np.testing.assert_allclose(turned.joints, before.joints @ R.T, atol=1e-3)
+    np.testing.assert_allclose(turned.box.center, R @ before.box.center, atol=1e-3)
 
 
 def test_a_displaced_box_lets_in_what_lies_around(tmp_path):

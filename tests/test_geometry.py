@@ -122,6 +122,19 @@ def test_up_axes_known_and_unknown():
     assert set(UP_AXES) == set("xyz")
     with pytest.raises(InputError, match="unknown up axis 'Z'"):
         rotation_from_up("Z")
+    for wrong in (None, 3, (1, 2), (0, 0, 0), (0, np.nan, 1), "1,2", "a,b,c", ["x", "y", "z"]):
+        with pytest.raises(InputError, match="a direction x,y,z, got"):
+            rotation_from_up(wrong)
+
+
+@given(st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=3).filter(lambda v: np.abs(v).max() > 1e-3))
+def test_a_direction_is_put_up_by_the_smallest_rotation(direction):
+    rotation = rotation_from_up(direction)
+    up = unit(np.array(direction))
+    np.testing.assert_allclose(rotation @ up, [0, 0, 1], atol=1e-9)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+    assert np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)) == pytest.approx(np.arccos(up[2]), abs=1e-6)
+    np.testing.assert_array_equal(rotation_from_up(",".join(map(repr, direction))), rotation)
 
 
 def random_similarities(seed, batch):

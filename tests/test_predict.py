@@ -13,7 +13,7 @@ import torch
 import lidarpose
 from lidarpose.data.boxes import read_boxes
 from lidarpose.errors import InputError
-from lidarpose.geometry import UP_AXES, rotation_about
+from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about
 from lidarpose.infer.backend import Raw
 from lidarpose.infer.people import MAX_POINTS, as_origin, as_points, candidates, flat_axis, lies, unit_warning
 from lidarpose.infer.predictor import Predictor
@@ -465,6 +465,35 @@ def test_other_up_axes_give_the_same_person_in_the_files_frame(model, sweep, tmp
     a = lidarpose.predict(path, boxes=boxes, sensor_origin=(1, 2, 3), model=model)
     b = lidarpose.predict(turned, boxes=moved, up=up, sensor_origin=origin, model=model)
     np.testing.assert_allclose(a[0].joints @ R_input_house.T, b[0].joints, atol=2e-3)
+
+
+def test_a_sensor_mounted_askew_gives_the_same_person(model, sweep, tmp_path):
+    path, clouds, boxes = sweep
+    R_input_house = axis_angle_to_matrix([0.0, np.radians(20), 0.0])
+    tilted = tmp_path / "tilted.npy"
+    np.save(tilted, np.concatenate(clouds) @ R_input_house.T)
+    up = R_input_house[:, 2]
+    # boxes stand along the file's z, and are large enough for a person who leans in it
+    boxes = [{**box, "size": [2.5, 2.5, 3.0]} for box in boxes]
+    moved = [{**box, "center": (R_input_house @ box["center"]).tolist()} for box in boxes]
+    plain = lidarpose.predict(path, boxes=boxes, model=model)
+    for given in (up, ",".join(map(repr, up.tolist()))):
+        found = lidarpose.predict(tilted, boxes=moved, up=given, model=model)
+        for a, b in zip(plain, found, strict=True):
+            assert b.num_points == a.num_points
+            np.testing.assert_allclose(a.joints @ R_input_house.T, b.joints, atol=2e-3)
+    assert found.warnings == () and found[0].picture().startswith(b"\x89PNG")
+
+
+def test_boxes_of_a_tilted_file_crop_in_its_own_frame(model, tmp_path, points):
+    R_input_house = axis_angle_to_matrix([0.0, np.radians(30), 0.0])
+    tilted = points @ R_input_house.T
+    low, high = tilted.min(0), tilted.max(0)
+    stray = (low + high) / 2 + [(high - low)[0] / 2 + 0.05, 0, 0]
+    np.save(tmp_path / "a.npy", np.concatenate([tilted, stray[None]]))
+    box = {"center": ((low + high) / 2).tolist(), "size": (high - low + 0.02).tolist()}
+    (person,) = lidarpose.predict(tmp_path / "a.npy", boxes=[box], up=R_input_house[:, 2], model=model)
+    assert person.num_points == len(points)
 
 
 def test_pictures_stand_upright_whatever_the_axes(model, tmp_path, points, monkeypatch):

@@ -4,9 +4,12 @@ Frames are right-handed, x forward, y left, z up; lengths in metres, angles in r
 column vectors: `rotated = R @ v`, for rows `points @ R.T`.
 """
 
+import reprlib
+from collections.abc import Sequence
+
 import numpy as np
 
-from lidarpose.errors import check_name
+from lidarpose.errors import InputError, check_name
 
 
 def axis_angle_to_matrix(vector: np.ndarray) -> np.ndarray:
@@ -76,10 +79,28 @@ UP_AXES = {
 }
 
 
-def rotation_from_up(up: str) -> np.ndarray:
-    """R_house_input (3, 3): turns coordinates of an input whose up axis is `up` into the house's (z up)."""
-    check_name("up axis", up, UP_AXES)
-    return UP_AXES[up]
+def rotation_from_up(up: str | Sequence[float]) -> np.ndarray:
+    """R_house_input (3, 3): turns coordinates of an input in which `up` is up into the house's (z up).
+
+    up: an axis, "z", "y" or "x", or a direction of any length > 0 in the input's coordinates, three numbers or "x,y,z",
+    which is turned up by the smallest rotation. Raises InputError.
+    """
+    if isinstance(up, str) and "," not in up:
+        check_name("up axis", up, UP_AXES)
+        return UP_AXES[up]
+    direction = vector_of(up)
+    if direction is None or not np.abs(direction).max() > 0:
+        raise InputError(f"up: expected {', '.join(UP_AXES)} or a direction x,y,z, got {reprlib.repr(up)}")
+    return rotation_between(direction / np.abs(direction).max(), np.array([0.0, 0.0, 1.0]))
+
+
+def vector_of(given: object) -> np.ndarray | None:
+    """Three finite numbers or the text "x,y,z" as (3,) float64; None for anything else."""
+    try:
+        vector = np.array([float(value) for value in (given.split(",") if isinstance(given, str) else given)])
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return vector if vector.shape == (3,) and np.isfinite(vector).all() else None
 
 
 def similarity_align(source: np.ndarray, target: np.ndarray) -> np.ndarray:

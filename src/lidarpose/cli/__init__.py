@@ -11,7 +11,7 @@ from lidarpose.cli.words import tell
 from lidarpose.errors import InputError, LidarPoseError, missing_extra
 
 # options whose value may start with a minus sign, which argparse would take for another option
-_SIGNED = ("--sensor-origin",)
+_SIGNED = ("--sensor-origin", "--up")
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -28,7 +28,9 @@ def add(commands) -> None:
     predict.add_argument(
         "--skeleton", metavar="NAME", help="smpl24, human15, waymo14 or body26 (default smpl24, or the network's own)"
     )
-    predict.add_argument("--up", default="z", metavar="AXIS", help="the file's up axis: z (default), y or x")
+    predict.add_argument(
+        "--up", default="z", metavar="AXIS", help="what is up in the file: z (default), y or x, or a direction x,y,z"
+    )
     predict.add_argument("--columns", type=int, metavar="N", help="values a row of a .bin: 4 KITTI, 5 nuScenes")
     predict.add_argument("--out", default=".", metavar="DIR", help="folder for the results; - prints the JSON")
     predict.add_argument("--picture", action="store_true", help="also draw STEM.poses.png")

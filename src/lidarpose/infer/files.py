@@ -11,7 +11,7 @@ from lidarpose.data.boxes import read_boxes
 from lidarpose.data.files import file_error
 from lidarpose.data.formats import Cloud, read_points
 from lidarpose.errors import InputError
-from lidarpose.geometry import rotation_from_up
+from lidarpose.geometry import UP_AXES, rotation_from_up
 from lidarpose.infer.people import MIN_POINTS, as_origin, flat_axis, lies, unit_warning, within_reach
 from lidarpose.infer.predictor import Predictor, load
 from lidarpose.infer.results import PersonPose, Poses
@@ -33,7 +33,7 @@ def predict(
     crop: bool = False,
     sensor_origin: tuple[float, float, float] | str | None = None,
     skeleton: str | None = None,
-    up: str = "z",
+    up: str | Sequence[float] = "z",
     columns: int | None = None,
     model: Predictor | str | os.PathLike | Callable[[], Predictor] = DEFAULT,
     progress: bool = False,
@@ -41,12 +41,13 @@ def predict(
     """Poses of the people in a point file, in the file's own frame.
 
     boxes: a JSON file, its content (see `data.boxes`), a `Box` or several, their length and width level, their height
-    and yaw along and about the up axis; crop: the file is one person already. With neither, a file of less than 4 m
-    across is taken as a crop and anything else asks for boxes. sensor_origin: (x, y, z) m in the file's frame, or
-    "unknown"; None means 0, 0, 0 with boxes and unknown for a crop. skeleton: a name, or None for smpl24, or for the
-    network's own where it has other joints. up: the file's up axis; columns: values a row of a .bin; model: a
-    predictor, what `load` takes (each person is then looked at `TTA` times), or a function that gives the predictor
-    when it is needed. Raises InputError, one line that says what to do.
+    and yaw along and about the up axis (the file's z where `up` is a direction); crop: the file is one person already.
+    With neither, a file of less than 4 m across is taken as a crop and anything else asks for boxes. sensor_origin:
+    (x, y, z) m in the file's frame, or "unknown"; None means 0, 0, 0 with boxes and unknown for a crop. skeleton: a
+    name, or None for smpl24, or for the network's own where it has other joints. up: the file's up axis, "z", "y" or
+    "x", or for a sensor mounted askew the direction that is up, (x, y, z) or "x,y,z" in the file's frame. columns:
+    values a row of a .bin; model: a predictor, what `load` takes (each person is then looked at `TTA` times), or a
+    function that gives the predictor when it is needed. Raises InputError, one line that says what to do.
     """
     if boxes is not None and crop:
         raise InputError("expected boxes or a crop, got both: a crop is one person already, so leave the boxes away")
@@ -57,6 +58,9 @@ def predict(
         )
     started = time.perf_counter()
     R_house_input = rotation_from_up(up)
+    up = up if isinstance(up, str) else ",".join(repr(float(value)) for value in up)
+    # boxes stand along the file's own axis
+    R_boxes_input = UP_AXES.get(up, UP_AXES["z"])
     origin = np.zeros(3) if sensor_origin is None and boxes is not None else as_origin(sensor_origin)
     found = None if boxes is None else _boxes(boxes)
     cloud = _within_reach(path, read_points(path, columns=columns))
@@ -67,8 +71,11 @@ def predict(
             _check_crop_size(path, points)
         clouds = [points]
     else:
-        housed = [replace(box, center=R_house_input @ box.center) for box in found]
-        clouds = [points[box.contains(points)] for box in housed]
+        housed, within = (
+            [replace(box, center=R_boxes_input @ box.center) for box in found],
+            cloud.points @ R_boxes_input.T,
+        )
+        clouds = [points[box.contains(within)] for box in housed]
     warnings = list(cloud.warnings)
     if origin is not None and found and (warning := _origin_warning(origin, found)):
         warnings.append(warning)
@@ -176,12 +183,13 @@ def _place(point: np.ndarray) -> str:
 def _axis_warning(people: Poses, cloud: Cloud, up: str) -> str | None:
     """What is likely wrong with the axes. `people` in the house's frame."""
     flat = flat_axis(cloud.points)
-    if flat is not None and flat != up:
+    axis = up if up in UP_AXES else "xyz"[int(np.abs(rotation_from_up(up)[2]).argmax())]
+    if flat is not None and flat != axis:
         return f"the points extend least along {flat}, so {up} is hardly the input's up axis: try --up {flat}"
     found = [person for person in people if person.pose is not None]
     if not found or not all(lies(person.pose, person.points) for person in found):
         return None
-    others = " or ".join(f"--up {axis}" for axis in "zyx" if axis != up)
+    others = " or ".join(f"--up {other}" for other in "zyx" if other != axis)
     who = "the person lies" if len(found) == 1 else f"all {len(found)} people lie"
     return f"{who} down: if that is wrong, {up} is not the input's up axis: try {others}"
 

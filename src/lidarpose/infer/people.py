@@ -7,6 +7,7 @@ import numpy as np
 from lidarpose.data.files import one_line
 from lidarpose.data.headers import is_transposed
 from lidarpose.errors import InputError
+from lidarpose.geometry import vector_of
 from lidarpose.sample import FARTHEST, Pose, center_of
 
 # joints that every skeleton has
@@ -75,12 +76,8 @@ def as_origin(given: object) -> np.ndarray | None:
     """The sensor's place (3,) m from three numbers or "x,y,z"; None, also for "unknown". Raises InputError."""
     if given is None or isinstance(given, str) and given.strip() == "unknown":
         return None
-    try:
-        values = given.split(",") if isinstance(given, str) else given
-        origin = np.array([float(value) for value in values])
-    except (TypeError, ValueError):
-        origin = np.zeros(0)
-    if origin.shape != (3,) or not (np.abs(origin) < FARTHEST).all():
+    origin = vector_of(given)
+    if origin is None or not (np.abs(origin) < FARTHEST).all():
         raise InputError(one_line(f"sensor origin: expected x,y,z in metres or unknown, got {given!r}"))
     return origin
 
