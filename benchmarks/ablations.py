@@ -78,6 +78,7 @@ VARIANTS = {
     "easy only": Variant("curriculum", "nobody is made hard to see", scene=replace(_WILD, hard=0.0)),
     "bare": Variant("people", "bare bodies, nothing carried", scene=replace(_WILD, clothes=0.0, carry=0.0)),
     "no clutter": Variant("people", "no clutter, occluders, company or stray returns", scene=_CALM),
+    "strays often": Variant("people", "stray points about three people in five", recipe={"strays": 0.6}),
     "nothing disturbed": Variant("people", "no stray points and no blur on top", recipe={"strays": 0.0, "noise": 0.0}),
     "grid 4 cm": Variant("grid", "voxels of 4, 8 and 16 cm", config={"grid": 0.04, "max_voxels": 512}),
     "grid 8 cm": Variant("grid", "voxels of 8, 16 and 32 cm", config={"grid": 0.08}),
