@@ -211,13 +211,13 @@ def calibration() -> str:
 
 
 def spread() -> str:
-    """What `spread` says beside the truth; see calibration.py."""
+    """What `spread` predicts beside the truth; see calibration.py."""
     found = _read("calibration")
     rows = [
         (one["of"], f"{one['share']:.1f} %", f"{one['stated']:.1f}", f"{one['true']:.1f}") for one in found["spread"]
     ]
     rows.append(("rank correlation of the two", "", "", f"{found['rank']:.2f}"))
-    return table(("`spread`", "joints", "stated, mm", "true, mm"), rows)
+    return table(("`spread`", "joints", "predicted, mm", "true, mm"), rows)
 
 
 def rejection(model: str) -> str:
@@ -249,7 +249,7 @@ def tables() -> dict[str, Callable[[], str]]:
     made["scaling"] = lambda: table(*changed.scaling(runs, _longest()))
     made["against the paper"] = lambda: table(*changed.against_paper(runs))
     made["speed"] = lambda: table(*timed.medians(_read("speed")))
-    made["speed asked"] = lambda: table(*timed.asked(_read("speed")["targets"]))
+    made["speed ratios"] = lambda: table(*timed.ratios(_read("speed")["targets"]))
     made |= {"calibration": calibration, "spread": spread, "real moved": moved}
     made |= {"visibility": visibility, "real": real}
     made["headline"] = partial(headline, *BUNDLED)
