@@ -11,8 +11,8 @@ from lidarpose.train.recipes import Finetune, Pretrain, Recipe
 
 _WHAT = (
     "{what} The run's folder holds config.json, log.jsonl, model.safetensors, best.safetensors, pictures, and "
-    "state.safetensors to resume from. After an interruption, --resume continues with the same losses. Several processes: "
-    "`torchrun --nproc_per_node N -m lidarpose {name} ...`, with the run's folder named."
+    "state.safetensors to resume from. After an interruption, --resume continues with the same losses. Several "
+    "processes: `torchrun --nproc_per_node N -m lidarpose {name} ...`, with the run's folder named."
 )
 
 
