@@ -31,6 +31,9 @@ FIGURES = {
     "PA": ("all", "all", "pa_mpjpe"),
 }
 _SHOWN = ("plain", "clean", "cluttered", "company", "occluded", "turned round")
+# what the pages call figures and conditions, where the data has another name
+WORDS = {"company": "second person", "crop": "poor box", "turned round": "facing > 90 deg off"}
+_HEADER = tuple(WORDS.get(name, name) for name in _SHOWN)
 
 
 def own_lines(result: Result) -> list[Line]:
@@ -122,7 +125,7 @@ def study(runs: list[dict], studies: Collection[str] | None = None) -> Rows:
     names = dict.fromkeys(run["variant"] for run in runs if studies is None or run["study"] in studies)
     chosen = [variant for variant in names if variant != BASE and own.seeds(variant)]
     chosen.sort(key=lambda variant: own.mean(variant, "all"))
-    header = ("", "MPJPE mm", "against base", *_SHOWN, "seeds")
+    header = ("", "MPJPE mm", "against base", *_HEADER, "seeds")
     return header, [_row(own, variant) for variant in (BASE, *chosen)]
 
 
@@ -137,10 +140,11 @@ def _row(own: Runs, variant: str) -> tuple[str, ...]:
 def noise(runs: list[dict]) -> str:
     own = _common(runs)
     if not own.freedom:
-        return f"{own.people:,} people a run, one seed: differences have no interval.\n"
+        return f"{own.people:,} people per run, one seed: differences have no interval.\n"
     return (
-        f"{own.people:,} people a run. Between runs alike but for their seed, what all variants of a seed share left\n"
-        f"out, the error deviates by {own.deviation:.1f} mm ({own.freedom} degrees of freedom).\n"
+        f"{own.people:,} people per run. Runs that differ only in their seed have a standard deviation of "
+        f"{own.deviation:.1f} mm,\n"
+        f"after removing what all variants of a seed share ({own.freedom} degrees of freedom).\n"
     )
 
 
@@ -155,7 +159,7 @@ def scaling(runs: list[dict], shipped: dict | None = None) -> Rows:
         cells = [f"{own[name]:.1f}" for name in ("all", *_SHOWN)]
         rows.append((f"{people:,}", cells[0], fall, *cells[1:-1], f"{cells[-1]} %"))
         before = people, own["all"]
-    return ("people seen", "MPJPE mm", "a doubling", *_SHOWN), rows
+    return ("people seen", "MPJPE mm", "per doubling", *_HEADER), rows
 
 
 def against_paper(runs: list[dict]) -> Rows:

@@ -41,7 +41,9 @@ class Way:
 _FASTER = {"rates": (2e-3, 2e-3), "anchors": True, "recipe": {"ema": 0.99, "clip": 1.0}}
 WAYS = {
     "paper": Way("the paper's network and recipe"),
-    "paper, faster": Way("the paper's network, rates of 2e-3, anchors kept, clipped, mean of weights", **_FASTER),
+    "paper, faster": Way(
+        "the paper's network, rates of 2e-3, anchors kept, gradients clipped, mean of weights", **_FASTER
+    ),
     "paper, wild": Way("the same, on our people", scene="wild", **_FASTER),
 }
 

@@ -83,7 +83,7 @@ def shipped(model: str, group: str) -> str:
     rows = []
     for line in own_lines(_scored(model).results[0]):
         if line.group in group.split("+") and line.figure == "mpjpe":
-            rows.append((line.of, f"{line.value:.1f}", _interval(line), f"{line.people:,}"))
+            rows.append((changed.WORDS.get(line.of, line.of), f"{line.value:.1f}", _interval(line), f"{line.people:,}"))
     return table((group.split("+")[-1], "MPJPE mm", "95 %", "people"), rows)
 
 
@@ -98,7 +98,7 @@ def headline(*models: str) -> str:
         "PA-MPJPE, mm": ("all", "pa_mpjpe"),
         "PCK-3, %": ("all", "pck3"),
         "upright, whole, uncluttered, 100 points: MPJPE, mm": ("plain", "mpjpe"),
-        "turned round, of 100 points and more, %": ("points", "turned_round"),
+        "facing > 90 deg off, of people of 100 points and more, %": ("points", "turned_round"),
         "confidence: calibration error, %": ("all", "calibration_error"),
         "confidence: AUROC, %": ("all", "auroc"),
     }
@@ -128,9 +128,9 @@ def card(model: str) -> str:
         ("hours", _in_all(runs, "hours", ".2f")),
         ("captured motion", f"{told['motion']}, subjects {', '.join(told['recipe']['subjects'])}"),
     ]
-    stages = [f"{run['recipe']['init']}, {before['people_seen']:,} people before" for run, before in pairwise(runs)]
+    stages = [f"{run['recipe']['init']} ({before['people_seen']:,} people)" for run, before in pairwise(runs)]
     if stages:
-        rows.append(("begun as", "; itself begun as ".join(stages)))
+        rows.append(("started from", ", itself from ".join(stages)))
     if "note" in told:
         rows.append(("note", told["note"]))
     return table(("", ""), rows)
@@ -146,13 +146,13 @@ def progress(model: str) -> str:
         rows.append(
             (f"`{run['recipe']['size']}`", f"{people:,}", f"{hours:.1f}", f"{run['validation_mm']:.1f}", *held_out)
         )
-    return table(("", "people in all", "hours", "validation mm", "`heldout.py` mm", "plain"), rows)
+    return table(("", "people in total", "hours", "validation mm", "`heldout.py` mm", "`heldout.py` plain mm"), rows)
 
 
 def _in_all(runs: list[dict], name: str, form: str) -> str:
     """A number of the last run, and of all of them."""
     own = f"{runs[0][name]:{form}}"
-    return own if len(runs) == 1 else f"{own}, in all runs {sum(run[name] for run in runs):{form}}"
+    return own if len(runs) == 1 else f"{own}; over all runs {sum(run[name] for run in runs):{form}}"
 
 
 def extras(model: str) -> str:
@@ -164,7 +164,7 @@ def extras(model: str) -> str:
         cost = one["seconds"] / usual["seconds"]
         figures = [f"{one['figures'][name]['value']:.1f}" for name in ("all", "plain", "cluttered", "occluded")]
         rows.append((one["what"], *figures, f"{one['figures']['turned round']['value']:.1f} %", f"{cost:.1f}"))
-    return table(("", "MPJPE mm", "plain", "cluttered", "occluded", "turned round", "cost"), rows)
+    return table(("", "MPJPE mm", "plain", "cluttered", "occluded", changed.WORDS["turned round"], "cost"), rows)
 
 
 def visibility() -> str:
@@ -174,8 +174,9 @@ def visibility() -> str:
         for one in found:
             ratio = f"{one['ratio']:.2f} [{one['low']:.2f}, {one['high']:.2f}]"
             mm, clean = f"{one['mm']:.1f}", f"{one['clean']:.1f}"
-            rows.append((f"`{model}`", one["condition"], mm, clean, ratio, str(one["people"])))
-    return table(("", "condition", "MPJPE mm", "clean, as much hidden", "ratio", "people"), rows)
+            condition = changed.WORDS.get(one["condition"], one["condition"])
+            rows.append((f"`{model}`", condition, mm, clean, ratio, str(one["people"])))
+    return table(("", "condition", "MPJPE mm", "clean, equally hidden: mm", "ratio", "people"), rows)
 
 
 def real() -> str:
@@ -194,14 +195,14 @@ def real() -> str:
         )
         for one in _read("real")["people"]
     ]
-    header = ("sweep", "person", "points", "distance m", "facing against the box", "with one look")
-    return table((*header, "points within 15 cm of a bone", "lean of the trunk", "confidence"), rows)
+    header = ("sweep", "person", "points", "distance m", "facing relative to the box", "the same, one look")
+    return table((*header, "points within 15 cm of a bone", "trunk lean", "confidence"), rows)
 
 
 def moved() -> str:
     """How far real people's joints went between two sweeps; see real.py."""
     rows = [(one["person"], f"{one['mm']:.0f}") for one in _read("real")["tracks"]]
-    return table(("person", "a joint, mm"), rows)
+    return table(("person", "mean over joints, mm"), rows)
 
 
 def calibration() -> str:
@@ -211,19 +212,21 @@ def calibration() -> str:
 
 
 def spread() -> str:
-    """What `spread` says beside the truth; see calibration.py."""
+    """What `spread` predicts beside the truth; see calibration.py."""
     found = _read("calibration")
     rows = [
         (one["of"], f"{one['share']:.1f} %", f"{one['stated']:.1f}", f"{one['true']:.1f}") for one in found["spread"]
     ]
     rows.append(("rank correlation of the two", "", "", f"{found['rank']:.2f}"))
-    return table(("`spread`", "joints", "stated, mm", "true, mm"), rows)
+    return table(("`spread`", "joints", "predicted, mm", "true, mm"), rows)
 
 
 def rejection(model: str) -> str:
     found = _read("test_time")[model]["rejection"]
     rows = [(f"{one['kept']:.0f} %", f"{one['people']:.1f}", f"{one['joints']:.1f}") for one in found]
-    return table(("kept", "people of the highest mean confidence: mm", "joints of the highest confidence: mm"), rows)
+    return table(
+        ("kept", "people with the highest mean confidence: mm", "joints with the highest confidence: mm"), rows
+    )
 
 
 def _labels(variant: str) -> dict[str, str]:
@@ -249,7 +252,7 @@ def tables() -> dict[str, Callable[[], str]]:
     made["scaling"] = lambda: table(*changed.scaling(runs, _longest()))
     made["against the paper"] = lambda: table(*changed.against_paper(runs))
     made["speed"] = lambda: table(*timed.medians(_read("speed")))
-    made["speed asked"] = lambda: table(*timed.asked(_read("speed")["targets"]))
+    made["speed ratios"] = lambda: table(*timed.ratios(_read("speed")["targets"]))
     made |= {"calibration": calibration, "spread": spread, "real moved": moved}
     made |= {"visibility": visibility, "real": real}
     made["headline"] = partial(headline, *BUNDLED)

@@ -32,17 +32,25 @@ def medians(found: dict) -> Rows:
     return ("median", "points", *NETWORKS), rows
 
 
+def ratios(targets: list[dict]) -> Rows:
+    """Single figures of network.py, by the medians and by the best rounds, without what was asked of them."""
+    rows = [(one["what"], *_figures(one)) for one in targets]
+    return ("", "by medians", "by best rounds"), rows
+
+
 def asked(targets: list[dict]) -> Rows:
     """Targets of network.py, and what came of them; figures are None where nothing was measured."""
     rows = []
     for one in targets:
         due = f"{'at most' if one['most'] else 'at least'} {one['target']:g} {one['unit']}".strip()
-        figures = (
-            "-" if one[name] is None else f"{one[name]:,.2f} {one['unit']}".strip() for name in ("figure", "best")
-        )
         met = {None: "not measured", True: "yes", False: "**no**"}[one["met"]]
-        rows.append((one["what"], due, *figures, met))
+        rows.append((one["what"], due, *_figures(one), met))
     return ("", "asked", "by medians", "by best rounds", "met by medians"), rows
+
+
+def _figures(one: dict) -> list[str]:
+    """By the medians and by the best rounds."""
+    return ["-" if one[name] is None else f"{one[name]:,.2f} {one['unit']}".strip() for name in ("figure", "best")]
 
 
 def shown(points: int | str) -> str:

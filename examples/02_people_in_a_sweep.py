@@ -1,7 +1,7 @@
 """Everybody in a whole sweep, given their boxes, from files.
 
 The sweep here is synthesized and written first; the second half is all that your own files need.
-Run: python examples/02_people_in_a_sweep.py    (needs: pip install 'lidarpose[synth]')
+Run: python examples/02_people_in_a_sweep.py    (needs, in the clone: pip install '.[synth]')
 """
 
 import json

@@ -465,7 +465,7 @@ for call in (lambda: lidarpose.export, lambda: lidarpose.import_dapt, lambda: li
     lines = done.stderr.splitlines()
     assert lines[::2] == list(LACKING) and [path.name for path in tmp_path.iterdir()] == ["crop.npy"]
     for line, (_, extra) in zip(lines[1::2], LACKING.values(), strict=True):
-        assert re.fullmatch(rf"lidarpose: error: .*: pip install 'lidarpose\[{extra}\]'", line), line
+        assert re.fullmatch(rf"lidarpose: error: .*: in the clone, pip install '\.\[{extra}\]'", line), line
     found = [re.search(r"(.*) needs .*\[(.*)\]", line).groups() for line in done.stdout.splitlines()]
     assert found[:2] == [("lidarpose.export", "export"), ("lidarpose.import_dapt", "train")]
     assert found[2] == (f"running {DEFAULT}.safetensors with torch", "train")

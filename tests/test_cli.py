@@ -509,7 +509,7 @@ def test_without_numba_predict_works_and_demo_names_the_extra(crop, tmp_path):
         cwd=tmp_path,
     )
     assert done.returncode == 2 and "Traceback" not in done.stderr
-    assert done.stderr.splitlines()[-1].endswith("pip install 'lidarpose[synth]'")
+    assert done.stderr.splitlines()[-1].endswith("in the clone, pip install '.[synth]'")
     assert not (tmp_path / "lidarpose-demo").exists() and (tmp_path / "crop.poses.png").exists()
 
 
@@ -536,3 +536,10 @@ def test_examples_run(example, tmp_path, monkeypatch, capsys):
     runpy.run_path(str(example), run_name="__main__")
     assert any(path.suffix == ".png" for path in tmp_path.iterdir())
     assert "wrote" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["pretrain", "finetune"])
+def test_help_shows_no_empty_default(command, capsys):
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    assert "()" not in capsys.readouterr().out

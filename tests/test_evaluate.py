@@ -642,7 +642,7 @@ def test_the_readme_s_figures_are_those_of_the_bundled_weights_on_the_bench():
     off, auroc = result.line("calibration_error").value, result.line("auroc").value
     assert f"off by {off:.1f} points on average" in readme and f"an AUROC of {auroc / 100:.3f}" in readme
     turned = result.line("turned_round", "points", "100 and more").value
-    assert f"{turned:.1f} % of people of 100 points and more are turned round" in readme
+    assert f"{turned:.1f} % of people of 100 points and more are predicted facing more than 90 degrees off" in readme
     assert result.line("mpjpe", method="floor: mean pose, true facing").value == pytest.approx(267.1, abs=0.05)
     assert result.counts == {"people": 2000, "frames of clips": 960, "without a pose": 0}
     assert len(load_bench().people) == 2000

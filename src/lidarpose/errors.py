@@ -17,7 +17,7 @@ class MissingExtra(LidarPoseError, ImportError):
     """An optional dependency is not installed; the message names the pip command."""
 
     def __init__(self, what: str, extra: str):
-        super().__init__(f"{what} needs an optional dependency: pip install 'lidarpose[{extra}]'")
+        super().__init__(f"{what} needs an optional dependency: in the clone, pip install '.[{extra}]'")
 
 
 # what a base install lacks, and the extra that brings it

@@ -12,42 +12,48 @@ def add(commands) -> None:
     synth = commands.add_parser(
         "synth",
         help="write synthesized people as Parquet shards",
-        description="Writes OUT/dataset.json and Parquet shards of people with their true poses. Stopped or killed, "
-        "the same command goes on; the same settings give the same bytes.",
+        description="Writes DIR/dataset.json and Parquet shards of people with their true poses. After an interruption "
+        "the same command continues; the same settings give the same bytes.",
     )
     synth.set_defaults(run=_synth)
-    synth.add_argument("--out", required=True, metavar="DIR", help="a new folder, or that of a run that was stopped")
-    synth.add_argument("-n", "--count", type=int, required=True, metavar="N", help="people, clips or streets")
+    synth.add_argument("--out", required=True, metavar="DIR", help="a new folder, or the one of an interrupted run")
+    synth.add_argument("-n", "--count", type=int, required=True, metavar="N", help="number of people, clips or streets")
     synth.add_argument("--scene", default="wild", metavar="NAME", help="wild (default), paper or reference")
     synth.add_argument(
-        "--sensor", metavar="A,B", help="sensors or files of their tables (default: the scene's); see lidarpose sensors"
+        "--sensor", metavar="A,B", help="names of sensors or sensor files (default: the scene's); see lidarpose sensors"
     )
-    synth.add_argument("--seed", type=int, default=0, metavar="N")
+    synth.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
     synth.add_argument("--hard", type=float, default=1.0, metavar="H", help="difficulty from 0 (easy) to 1 (default)")
-    synth.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1)")
-    synth.add_argument("--motion", metavar="FILE", help="captured motion to take poses from: a file or a folder")
-    synth.add_argument("--subjects", metavar="A,B", help="those of its clips to use, by the first part of names")
-    synth.add_argument("--captured", type=float, metavar="SHARE", help="of poses from the clips (default 0.5)")
-    synth.add_argument("--per-shard", type=int, metavar="N", help="people (2000), clips (125) or streets (2) a file")
+    synth.add_argument("--workers", type=int, default=1, metavar="N", help="number of processes (default 1)")
+    synth.add_argument("--motion", metavar="FILE", help="take poses from captured motion: a file or a folder")
+    synth.add_argument("--subjects", metavar="A,B", help="subjects to use: the first part of a clip's name")
+    synth.add_argument(
+        "--captured", type=float, metavar="SHARE", help="share of poses taken from the clips (default 0.5)"
+    )
+    synth.add_argument("--per-shard", type=int, metavar="N", help="people (2000), clips (125) or streets (2) per file")
     several = synth.add_mutually_exclusive_group()
-    several.add_argument("--clips", action="store_true", help="clips of 16 frames at 10 Hz instead of single people")
-    several.add_argument("--scenes", action="store_true", help="whole streets of several walking people")
+    several.add_argument(
+        "--clips", action="store_true", help="write clips of 16 frames at 10 Hz instead of single people"
+    )
+    several.add_argument("--scenes", action="store_true", help="write whole streets with several walking people")
 
     prepare = commands.add_parser(
         "prepare",
         help="write a real dataset's people as Parquet shards",
-        description="Reads the raw files of a public dataset and writes OUT/dataset.json and Parquet shards. Stopped "
-        "or killed, the same command goes on.",
+        description="Reads the raw files of a public dataset and writes OUT/dataset.json and Parquet shards. After an "
+        "interruption the same command continues.",
     )
     prepare.set_defaults(run=_prepare)
     prepare.add_argument(
         "dataset", metavar="NAME", help="humanm3, lidarhuman26m, sloper4d, waymo, lipd, freemotion or noisemotion"
     )
-    prepare.add_argument("root", metavar="RAW", help="the folder of its raw files")
-    prepare.add_argument("out", metavar="OUT", help="a new folder, or that of a run that was stopped")
-    prepare.add_argument("--split", metavar="NAME", help="only people of train, val or test")
+    prepare.add_argument("root", metavar="RAW", help="folder of the dataset's raw files")
+    prepare.add_argument("out", metavar="OUT", help="a new folder, or the one of an interrupted run")
+    prepare.add_argument("--split", metavar="NAME", help="write only the people of train, val or test")
     prepare.add_argument(
-        "--split-by", metavar="NAME", help="a published split (default: RAW/train.txt and test.txt, else the usual one)"
+        "--split-by",
+        metavar="NAME",
+        help="a published split (default: RAW/train.txt, val.txt and test.txt if present, else the usual one)",
     )
     prepare.add_argument(
         "--smpl", metavar="FILE|DIR", help="your SMPL model, for lidarhuman26m, sloper4d, freemotion, noisemotion"
@@ -55,18 +61,24 @@ def add(commands) -> None:
     prepare.add_argument(
         "--no-level", action="store_true", help="lidarhuman26m: keep the release's frame, as the LiDAR was mounted"
     )
-    prepare.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1)")
+    prepare.add_argument("--workers", type=int, default=1, metavar="N", help="number of processes (default 1)")
 
-    sensors = commands.add_parser("sensors", help="the simulated sensors", description="Lists the sensors by name.")
+    sensors = commands.add_parser(
+        "sensors", help="list the simulated sensors", description="Lists the simulated sensors by name."
+    )
     sensors.set_defaults(run=_sensors)
 
     view = commands.add_parser(
-        "view", help="draw people of a dataset", description="Draws a contact sheet of a dataset that synth wrote."
+        "view",
+        help="draw people of a dataset",
+        description="Draws a contact sheet of a dataset that synth or prepare wrote.",
     )
     view.set_defaults(run=_view)
     view.add_argument("folder", metavar="DIR", help="a dataset's folder")
-    view.add_argument("-n", "--count", type=int, default=24, metavar="N", help="people, evenly spread (default 24)")
-    view.add_argument("--html", action="store_true", help="a page to turn them in 3D instead of a picture")
+    view.add_argument(
+        "-n", "--count", type=int, default=24, metavar="N", help="number of people, evenly spread (default 24)"
+    )
+    view.add_argument("--html", action="store_true", help="write an interactive 3D page instead of a picture")
     view.add_argument("--out", metavar="FILE", help="default DIR.png or DIR.html, in the current folder")
 
 

@@ -19,7 +19,7 @@ def add(commands) -> None:
     """Adds the commands to the parser's."""
     evaluate = commands.add_parser(
         "evaluate",
-        help="judge a checkpoint on datasets",
+        help="score a checkpoint on datasets",
         description="Prints figures and writes scores.json, poses.parquet and pictures into a folder.",
     )
     evaluate.set_defaults(run=_evaluate)
@@ -27,41 +27,48 @@ def add(commands) -> None:
         "weights", metavar="CHECKPOINT", help=f"{', '.join(BUNDLED)}, a checkpoint, or an exported .onnx"
     )
     evaluate.add_argument(
-        "datasets", nargs="+", metavar="DATASET", help="a folder that prepare or synth wrote, or bench"
+        "datasets", nargs="+", metavar="DATASET", help="a folder written by prepare or synth, or bench"
     )
     evaluate.add_argument(
-        "--protocol", default="clean", metavar="NAME", help="clean (default), or dapt: the released code's oracles"
+        "--protocol",
+        default="clean",
+        metavar="NAME",
+        help="clean (default), or dapt: crops and centers from labels, as in the released code",
     )
-    evaluate.add_argument("--split", metavar="NAME", help="default test, else val, else everybody; all for everybody")
-    evaluate.add_argument("--skeleton", metavar="NAME", help="judge its joints (default: the dataset's)")
-    evaluate.add_argument("--limit", type=int, metavar="N", help="only N people, evenly spread")
-    evaluate.add_argument("--stability", action="store_true", help="also disturb the points, and draw the curves")
-    evaluate.add_argument("--legacy", action="store_true", help="also the released code's arithmetic")
+    evaluate.add_argument("--split", metavar="NAME", help="split to score, or all (default: test, else val, else all)")
     evaluate.add_argument(
-        "--sensor-unknown", action="store_true", help="do not tell the network where the sensor stood"
+        "--skeleton", metavar="NAME", help="score the joints of this skeleton (default: the dataset's)"
     )
+    evaluate.add_argument("--limit", type=int, metavar="N", help="score only N people, evenly spread")
+    evaluate.add_argument("--stability", action="store_true", help="also disturb the points and draw the curves")
+    evaluate.add_argument("--legacy", action="store_true", help="also score with the released code's arithmetic")
+    evaluate.add_argument("--sensor-unknown", action="store_true", help="hide the sensor's position from the network")
     evaluate.add_argument(
-        "--seed", type=int, default=0, metavar="N", help="of displaced boxes and intervals (default 0)"
+        "--seed", type=int, default=0, metavar="N", help="random seed for displaced boxes and intervals (default 0)"
     )
     evaluate.add_argument("--out", metavar="DIR", help="a new or empty folder (default evaluation/NAME, numbered)")
-    evaluate.add_argument("--device", default="cpu", metavar="NAME", help="cpu (default), or cuda with torch")
+    evaluate.add_argument("--device", default="cpu", metavar="NAME", help="cpu (default), or cuda (backend torch)")
     evaluate.add_argument(
-        "--decode", default="window", metavar="NAME", help="as in lidarpose predict; the paper's is dark"
+        "--decode", default="window", metavar="NAME", help="as in lidarpose predict; the released code uses dark"
     )
     evaluate.add_argument("--backend", metavar="NAME", help="onnx or torch, as in lidarpose predict")
     evaluate.add_argument(
-        "--tta", type=int, default=1, metavar="N", help="looks at each person, averaged: 1 (default) to 8"
+        "--tta",
+        type=int,
+        default=1,
+        metavar="N",
+        help="test-time augmentation: average N looks at each person, 1 (default) to 8",
     )
 
     table = commands.add_parser(
         "table",
-        help="scores beside the paper's Table 1",
-        description="Lays scores.json files beside the figures that the paper prints, by protocol.",
+        help="show scores beside the paper's Table 1",
+        description="Sets scores.json files beside the figures printed in the paper, by protocol.",
     )
     table.set_defaults(run=_table)
-    table.add_argument("scores", nargs="*", metavar="FILE|DIR", help="scores.json, or folders that hold one")
+    table.add_argument("scores", nargs="*", metavar="FILE|DIR", help="scores.json files, or folders that contain one")
     table.add_argument("--format", default="markdown", metavar="NAME", help="markdown (default) or json")
-    table.add_argument("--out", metavar="FILE", help="default: print it")
+    table.add_argument("--out", metavar="FILE", help="write to FILE (default: print)")
 
 
 def _evaluate(options: argparse.Namespace) -> None:

@@ -15,24 +15,34 @@ def add(commands) -> None:
     """Adds the commands to the parser's."""
     predict = commands.add_parser(
         "predict",
-        help="poses of the people in a point file",
-        description="Writes STEM.poses.json: the joints of every person, in the file's own frame, metres.",
+        help="estimate the poses of the people in a point file",
+        description="Writes STEM.poses.json: every person's joints, in metres and in the file's own frame.",
     )
     predict.set_defaults(run=_predict)
     predict.add_argument("file", help=".pcd .ply .bin .npy .npz .csv .xyz .txt")
-    predict.add_argument("--boxes", metavar="JSON", help='{"people": [{"center": [x,y,z], "size": [l,w,h], "yaw": r}]}')
-    predict.add_argument("--crop", action="store_true", help="the file is one person already")
     predict.add_argument(
-        "--sensor-origin", metavar="X,Y,Z", help="where the sensor stood, or unknown (with boxes: 0,0,0; crop: unknown)"
+        "--boxes", metavar="JSON", help='people to find: {"people": [{"center": [x,y,z], "size": [l,w,h], "yaw": rad}]}'
     )
     predict.add_argument(
-        "--skeleton", metavar="NAME", help="smpl24, human15, waymo14 or body26 (default smpl24, or the network's own)"
+        "--crop", action="store_true", help="the file holds one person (assumed when it is under 4 m across)"
+    )
+    predict.add_argument(
+        "--sensor-origin",
+        metavar="X,Y,Z",
+        help="sensor position, or unknown (default: 0,0,0 with --boxes, unknown otherwise)",
+    )
+    predict.add_argument(
+        "--skeleton", metavar="NAME", help="smpl24, human15, waymo14 or body26 (default smpl24, else the network's own)"
     )
     predict.add_argument(
         "--up", default="z", metavar="AXIS", help="what is up in the file: z (default), y or x, or a direction x,y,z"
     )
-    predict.add_argument("--columns", type=int, metavar="N", help="values a row of a .bin: 4 KITTI, 5 nuScenes")
-    predict.add_argument("--out", default=".", metavar="DIR", help="folder for the results; - prints the JSON")
+    predict.add_argument(
+        "--columns", type=int, metavar="N", help="values per point in a .bin: 4 for KITTI, 5 for nuScenes"
+    )
+    predict.add_argument(
+        "--out", default=".", metavar="DIR", help="folder for the results (default: the current one); - prints the JSON"
+    )
     predict.add_argument("--picture", action="store_true", help="also draw STEM.poses.png")
     predict.add_argument(
         "--weights",
@@ -45,18 +55,25 @@ def add(commands) -> None:
         metavar="NAME",
         help="onnx or torch (default onnx for bundled weights and .onnx, torch for .safetensors and other devices)",
     )
-    predict.add_argument("--device", default="cpu", metavar="NAME", help="cpu (default), or cuda with torch")
+    predict.add_argument("--device", default="cpu", metavar="NAME", help="cpu (default), or cuda (backend torch)")
     predict.add_argument(
-        "--decode", default="window", metavar="NAME", help="how heatmaps are read: window (default), argmax or dark"
+        "--decode", default="window", metavar="NAME", help="how heatmaps are decoded: window (default), argmax or dark"
     )
-    predict.add_argument("--tta", type=int, metavar="N", help="looks at each person, averaged: 1 to 8 (default 4)")
+    predict.add_argument(
+        "--tta",
+        type=int,
+        metavar="N",
+        help="test-time augmentation: average N looks at each person, 1 to 8 (default 4)",
+    )
 
     demo = commands.add_parser(
-        "demo", help="people seen by three LiDARs, true and predicted", description="Writes a report to turn in 3D."
+        "demo",
+        help="show people seen by three LiDARs, true and predicted",
+        description="Synthesizes people, predicts their poses and writes an interactive 3D report.",
     )
     demo.set_defaults(run=_demo)
     demo.add_argument("--out", default="lidarpose-demo", metavar="DIR", help="folder (default lidarpose-demo)")
-    demo.add_argument("--seed", type=int, default=7, metavar="N")
+    demo.add_argument("--seed", type=int, default=7, metavar="N", help="random seed (default 7)")
     demo.add_argument("--weights", default=DEFAULT, metavar="NAME|FILE", help=f"{NAMES}, or a checkpoint")
 
 

@@ -11,9 +11,9 @@ from lidarpose.errors import InputError
 from lidarpose.train.recipes import Finetune, Pretrain, Recipe
 
 _WHAT = (
-    "{what} RUN holds config.json, log.jsonl, model.safetensors, best.safetensors, pictures, and state.safetensors to "
-    "go on from. Stopped or killed, --resume goes on to the same losses. Several processes: "
-    "`torchrun --nproc_per_node N -m lidarpose {name} ...`."
+    "{what} The run's folder holds config.json, log.jsonl, model.safetensors, best.safetensors, pictures, and "
+    "state.safetensors to resume from. After an interruption, --resume continues with the same losses. Several "
+    "processes: `torchrun --nproc_per_node N -m lidarpose {name} ...`, with the run's folder named."
 )
 
 
@@ -22,17 +22,17 @@ def add(commands) -> None:
     pretrain = commands.add_parser(
         "pretrain",
         help="train a network on synthesized people",
-        description=_WHAT.format(name="pretrain", what="Trains on people who are made meanwhile, or on shards."),
+        description=_WHAT.format(name="pretrain", what="Trains on people synthesized during training, or on shards."),
     )
     finetune = commands.add_parser(
         "finetune",
-        help="go on training on datasets that prepare wrote",
+        help="fine-tune a network on datasets that prepare wrote",
         description=_WHAT.format(
             name="finetune", what="Trains on labelled people; each dataset supervises the joints that it labels."
         ),
     )
     finetune.add_argument(
-        "data", nargs="*", metavar="DATASET", help="folders that lidarpose prepare wrote; with --resume the run's own"
+        "data", nargs="*", metavar="DATASET", help="folders written by lidarpose prepare; with --resume the run's own"
     )
     _add(pretrain, Pretrain)
     _add(finetune, Finetune)
@@ -41,18 +41,18 @@ def add(commands) -> None:
 def _add(parser, kind: type[Recipe]) -> None:
     name = kind.__name__.lower()
     parser.set_defaults(run=_train, kind=kind)
-    where = f"the run's folder: a new one (default runs/{name}-001, -002, ...), with --resume that of the run"
+    where = f"a new folder for the run (default runs/{name}-001, -002, ...); with --resume that of the run"
     if kind is Pretrain:
         parser.add_argument("folder", nargs="?", metavar="RUN", help=where)
     else:
         parser.add_argument("--out", dest="folder", metavar="RUN", help=where)
-    parser.add_argument("--resume", action="store_true", help="go on with a run that was stopped (default the latest)")
-    parser.add_argument("--recipe", metavar="NAME", help="default or paper; options override it")
-    parser.add_argument("--device", metavar="NAME", help="cpu (default: a GPU where there is one)")
-    parser.add_argument("--tracker", metavar="NAME", help="also log to tensorboard or wandb, where installed")
+    parser.add_argument("--resume", action="store_true", help="continue an interrupted run (default: the latest)")
+    parser.add_argument("--recipe", metavar="NAME", help="default or paper; other options override its settings")
+    parser.add_argument("--device", metavar="NAME", help="cpu (default: a GPU if there is one)")
+    parser.add_argument("--tracker", metavar="NAME", help="also log to tensorboard or wandb, if installed")
     for field in fields(kind):
         if field.name != "data":
-            default = "" if field.default in (None, ()) else f" ({_said(field.default)})"
+            default = "" if field.default in (None, (), "") else f" ({_said(field.default)})"
             option = f"--{field.name.replace('_', '-')}"
             parser.add_argument(option, dest=f"set_{field.name}", metavar="V", help=field.metadata["help"] + default)
 

@@ -9,13 +9,13 @@ from lidarpose.model.bundled import DEFAULT
 
 def add(commands) -> None:
     """Adds the commands to the parser's."""
-    info = commands.add_parser("info", help="versions, device, bundled weights and what they score")
+    info = commands.add_parser("info", help="show versions, device, bundled weights and their scores")
     info.set_defaults(run=_info)
 
     export = commands.add_parser(
         "export",
-        help="weights as ONNX or as a torch.export program",
-        description="Writes a checkpoint as one file of another format, for any number of people and points.",
+        help="write weights as ONNX or as a torch.export program",
+        description="Converts a checkpoint to one file of another format, for any number of people and points.",
     )
     export.set_defaults(run=_export)
     export.add_argument("weights", nargs="?", default=DEFAULT, metavar="NAME|FILE", help=f"default {DEFAULT}")
@@ -24,17 +24,16 @@ def add(commands) -> None:
 
     take = commands.add_parser(
         "import",
-        help="released DAPT weights as a checkpoint",
-        description="Writes the weights that DAPT's authors released, as safetensors, as a checkpoint that predict "
-        "takes.",
+        help="convert released DAPT weights to a checkpoint",
+        description="Converts weights that DAPT's authors released, saved as safetensors, to a checkpoint for predict.",
     )
     take.set_defaults(run=_import)
-    take.add_argument("file", help="their .safetensors")
+    take.add_argument("file", help="the released weights, as .safetensors")
     take.add_argument("out", metavar="OUT", help="the checkpoint to write (.safetensors)")
     take.add_argument(
         "--config",
         metavar="NAME",
-        help="waymo, humanm3, lidarhuman26m, sloper4d, pretrain or paper (default: as FILE says)",
+        help="waymo, humanm3, lidarhuman26m, sloper4d, pretrain or paper (default: as the file says)",
     )
 
 

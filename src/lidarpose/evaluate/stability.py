@@ -125,7 +125,7 @@ def study(
         try:
             curves.append(_sensors(task, progress))
         except (MissingExtra, ModuleNotFoundError):
-            notes.append("other sensors need people cast anew: pip install 'lidarpose[synth]'")
+            notes.append("other sensors need people cast anew: in the clone, pip install '.[synth]'")
     elif sensors:
         notes.append("other sensors: people cast anew have no released center")
     who = f"{len(people):,} {_who(task.setting)}"

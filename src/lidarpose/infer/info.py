@@ -48,7 +48,7 @@ def _seen(card: dict) -> str:
 
 def _torch_line() -> str:
     if find_spec("torch") is None:
-        return "torch      not installed, which training and --device need: pip install 'lidarpose[train]'"
+        return "torch      not installed, training and --device need it: in the clone, pip install '.[train]'"
     try:
         # found is not yet usable: libraries of it may be missing
         import torch

@@ -45,10 +45,10 @@ def load(
     backend: "onnx" (ONNX Runtime, on the CPU) or "torch"; None takes onnx for bundled weights and .onnx files, torch
     for other paths and devices. decode: how heatmaps are read, "window" (the mean about the mode), "argmax" or "dark"
     (the released DAPT code's); where two peaks are equally high, rounding decides. compile: by `torch.compile`, backend
-    torch only. threads: of ONNX Runtime, None for all processors. tta: test-time augmentation, so many looks at each
-    person (1 to 8), averaged: each makes it a little better and costs as much as the first. Raises InputError for an
-    unknown name, a file that is no checkpoint, or a device that is not there; MissingExtra where torch is needed and
-    not installed.
+    torch only. threads: of ONNX Runtime, None for all processors. tta: test-time augmentation, the number of looks at
+    each person (1 to 8), averaged. A person costs one pass to center the cloud and one pass a look, so 1 look takes two
+    passes, 4 looks five. Raises InputError for an unknown name, a file that is no checkpoint, or a device that is not
+    there; MissingExtra where torch is needed and not installed.
     """
     decoder(decode)
     looks_of(tta)
