@@ -59,6 +59,8 @@ def test_a_sensor_is_frozen():
         ({"dropout": 1.0}, "dropout"),
         ({"range_sigma": -0.1}, "range_sigma"),
         ({"height": np.nan}, "height must be a finite number"),
+        ({"elevations": ["x"]}, "elevations must be a list of finite angles"),
+        ({"azimuth_step": "x"}, "azimuth_step must be a finite number, got 'x'"),
     ],
 )
 def test_bad_sensors_say_what_is_wrong(change, message):
