@@ -20,7 +20,7 @@ from lidarpose.data.labelled import item_of, labelled_row, labels_of
 from lidarpose.data.prepare import READERS, PartWriter, prepare
 from lidarpose.data.readers.items import HIDDEN, SEEN, UNLABELED, Item
 from lidarpose.data.shards import open_dataset, read_rows, write_shard
-from lidarpose.data.split_rules import SplitRule, split_rule
+from lidarpose.data.split_rules import SplitRule, _published, split_rule
 from lidarpose.data.summary import lines_of
 from lidarpose.errors import InputError
 from lidarpose.sample import Box, Pose, Sample, center_of
@@ -308,6 +308,12 @@ def test_chunks_are_drawn_by_the_part_s_name_alone(people, part):
     chunks = [splits[k : k + 16] for k in range(0, people, 16)]
     assert all(len(set(chunk)) == 1 for chunk in chunks)
     assert sum(chunk[0] == "train" for chunk in chunks) == int(0.7 * len(chunks))
+
+
+@pytest.mark.parametrize("dataset", READERS)
+def test_one_published_split_of_a_dataset_is_the_usual_one(dataset):
+    rules = list(_published(dataset))
+    assert sum(rule.usual for rule in rules) == bool(rules)
 
 
 def test_published_splits_are_apart_and_name_their_source(tmp_path):

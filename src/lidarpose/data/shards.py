@@ -228,7 +228,8 @@ def rows_of_shard(path: str | Path) -> int | None:
     """How many rows a shard says it holds; None where it is missing or damaged."""
     _, parquet = pyarrow()
     try:
-        return parquet.ParquetFile(path).metadata.num_rows
+        with parquet.ParquetFile(path) as file:
+            return file.metadata.num_rows
     except Exception:
         # pyarrow raises many kinds for damaged files; what matters is that it is to be written again
         return None

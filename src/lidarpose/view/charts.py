@@ -179,6 +179,10 @@ def _spread(axes, stated: np.ndarray, error: np.ndarray) -> None:
 
 def _curve(axes, curve: Curve, top: float) -> None:
     points = [point for point in curve.points if point.mpjpe is not None]
+    if not points:
+        axes.set_title(curve.title, fontsize=9.5, loc="left", color=_INK)
+        _nothing(axes, "nobody has a pose")
+        return
     # amounts are not evenly apart, but each is one step of the study
     at = np.array([k for k, point in enumerate(curve.points) if point.mpjpe is not None])
     values = np.array([point.mpjpe for point in points])
@@ -200,6 +204,10 @@ def _curve(axes, curve: Curve, top: float) -> None:
 
 def _sensors(axes, curve: Curve) -> None:
     points = sorted((p for p in curve.points if p.mpjpe is not None), key=lambda point: point.points)
+    if not points:
+        axes.set_title(curve.title, fontsize=9.5, loc="left", color=_INK)
+        _nothing(axes, "nobody has a pose")
+        return
     at = np.arange(len(points))[::-1]
     values = np.array([point.mpjpe for point in points])
     axes.barh(at, values, 0.72, color=_BAR, zorder=1)
