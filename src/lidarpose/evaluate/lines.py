@@ -35,7 +35,6 @@ PLENTY = 100
 _REPEATS = 1000
 # frames count as evenly apart where two steps differ by less than this share
 _EVEN = 0.2
-_TITLES = {"condition": "condition", "poses": "poses", "sensor": "sensor"}
 
 
 def lines_of(judged: Judged, setting: Setting, *, legacy: bool = False) -> tuple[Line, ...]:
@@ -159,7 +158,7 @@ def _by_joint(figures: _Figures) -> Iterator[Line]:
 
 def _conditions(judged: Judged) -> Iterator[tuple[str, str, np.ndarray]]:
     """(title, name, rows) of what synthetic people are told apart by."""
-    for title in _TITLES:
+    for title in ("condition", "poses", "sensor"):
         values = getattr(judged, title)
         for of in sorted(set(values[values != ""].tolist())):
             yield title, of, values == of

@@ -10,7 +10,6 @@ from functools import cached_property
 import numpy as np
 
 from lidarpose.errors import InputError, check_finite
-from lidarpose.geometry import rotation_about
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,14 +131,6 @@ class Sensor:
             head = replace(self, elevations=self.elevations[rings], azimuth_offsets=offsets, origin_heights=None)
             found.append((float(height), head, rings))
         return tuple(found)
-
-    @property
-    def T_sensor_from_ground(self) -> np.ndarray:
-        """(4, 4): from the level frame on the ground below the sensor (z = 0 is the ground) to the sensor's frame."""
-        transform = np.eye(4)
-        transform[:3, :3] = rotation_about("y", -self.tilt)
-        transform[:3, 3] = transform[:3, :3] @ [0, 0, -self.height]
-        return transform
 
     def window(self, left: float, right: float, low: float, high: float) -> Window:
         """The beams with azimuth in [left, right] and elevation in [low, high], rad; left <= right, unwrapped."""
