@@ -1,7 +1,5 @@
 """What people carry, use and wear: closed meshes, attached where they belong, for any pose and for the next one."""
 
-import time
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -302,16 +300,3 @@ def test_hats_sit_on_the_head(drawn, bodies):
         up /= np.linalg.norm(up)
         top = (hat @ up).max() - (skin @ up).max()
         assert -0.02 < top < 0.08
-
-
-def test_drawing_and_placing_costs_little(bodies):
-    rng = np.random.default_rng(0)
-    best = np.inf
-    for _ in range(3):
-        start = time.process_time()
-        for row, kind in enumerate(bodies.kinds):
-            for prop in draw_props(rng, kind=kind, joints=bodies.joints[row]):
-                prop.place(bodies.joints[row])
-        best = min(best, (time.process_time() - start) / len(bodies.kinds))
-    # 25 microseconds on the machine of docs/log.md; others are slower
-    assert best < 200e-6
