@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.model.batch import Batch, Targets
-from lidarpose.model.heads import DECODE, REACH, VoteHead, bin_centers, decode, encode
+from lidarpose.model.decode import HALF_WIDTH
+from lidarpose.model.heads import REACH, VoteHead, bin_centers, decode, encode
 from lidarpose.model.layers import Convolution, CrossAttention, Places, key_bias, wave_numbers
 from lidarpose.model.network import PoseNet
 from lidarpose.model.plan import plan, view_features
@@ -315,7 +316,7 @@ def test_a_vote_is_what_each_voxel_says():
 # --- heatmaps
 
 # the target is 1.2 bins wide: so far inside the window its flank is not cut
-CLEAR = WINDOW - (DECODE + 1) * BIN
+CLEAR = WINDOW - (HALF_WIDTH + 1) * BIN
 
 
 @settings(max_examples=80, deadline=None)
@@ -345,7 +346,7 @@ def decode_slowly(logits):
     """One heatmap at a time, in plain numbers: mean of the bins about the mode."""
     mode = max(range(BINS), key=lambda w: logits[w])
     # as far to either side as the nearer edge allows
-    near = [w for w in range(BINS) if abs(w - mode) <= min(DECODE, mode, BINS - 1 - mode)]
+    near = [w for w in range(BINS) if abs(w - mode) <= min(HALF_WIDTH, mode, BINS - 1 - mode)]
     weight = {w: np.exp(logits[w] - logits[mode]) for w in near}
     return sum(weight[w] * (-WINDOW + (w + 0.5) * BIN) for w in near) / sum(weight.values())
 

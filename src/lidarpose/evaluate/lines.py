@@ -27,9 +27,8 @@ from lidarpose.evaluate.result import RELEASED, Line, Setting, number
 from lidarpose.evaluate.scores import mean
 from lidarpose.evaluate.slices import DISTANCE_EDGES, OCCLUSION_EDGES, POINT_EDGES
 from lidarpose.evaluate.waymo import PCK_THRESHOLDS, box_hits, oks, oks_hits, oks_sigmas, pem
+from lidarpose.sample import HIT
 
-# a joint nearer to the truth than this is a hit, mm: what a network's confidence is the probability of
-HIT = 100.0
 # people of fewer points do not tell where they face
 PLENTY = 100
 _REPEATS = 1000
@@ -250,7 +249,7 @@ def _confidence(figures: _Figures) -> Iterator[Line]:
     known = ~np.isnan(error) & ~np.isnan(judged.confidence)
     if not known.any():
         return
-    stated, hit = judged.confidence[known].astype(float), error[known] < HIT
+    stated, hit = judged.confidence[known].astype(float), error[known] < 1e3 * HIT
     found = {"calibration_error": 100 * calibration_error(stated, hit)}
     if 0 < hit.mean() < 1:
         found["auroc"] = 100 * auroc(stated, hit)

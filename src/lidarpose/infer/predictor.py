@@ -9,14 +9,14 @@ import numpy as np
 from lidarpose.data.files import file_error
 from lidarpose.errors import InputError, check_name, missing_extra, whole
 from lidarpose.infer.backend import Backend, Estimates, OnnxBackend, estimates, exported_beside
-from lidarpose.infer.people import MIN_POINTS, as_origin, as_points, candidates, clean, unit_warning
+from lidarpose.infer.people import as_origin, as_points, candidates, clean, unit_warning
 from lidarpose.infer.results import PersonPose, Poses
 from lidarpose.infer.tta import Look, averaged, brought_back, looks_of, shown
 from lidarpose.model.bundled import BUNDLED, DEFAULT, weights_path
 from lidarpose.model.decode import decoder
 from lidarpose.model.header import read_header
 from lidarpose.model.plan import WINDOW
-from lidarpose.sample import PER_JOINT, Pose, center_of
+from lidarpose.sample import MIN_POINTS, PER_JOINT, Pose, center_of
 from lidarpose.skeleton import SMPL24, Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
 

@@ -3,9 +3,8 @@
 import numpy as np
 
 from lidarpose.errors import InputError
+from lidarpose.sample import FARTHEST
 
-# beyond any scene, m, and its powers are still finite
-FARTHEST = 1e9
 _NO_FACES = np.zeros(0, bool)
 _NO_FACES.setflags(write=False)
 

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from lidarpose.evaluate.judged import Judged
-from lidarpose.evaluate.lines import HIT
 from lidarpose.evaluate.result import OURS, Line, Result
 from lidarpose.evaluate.stability import Curve, End, Stability
+from lidarpose.sample import HIT
 
 # blue and orange of Okabe and Ito's color-blind-safe palette (2008), the orange darker to stand out on white
 _BLUE, _ORANGE = "#0072b2", "#e07000"
@@ -70,7 +70,7 @@ def draw_reliability(judged: Judged, result: Result) -> bytes | None:
     figure, canvas = _figure(9.0, 4.3)
     _title(figure, f"{result.setting.dataset}: what {result.setting.method} says of itself", result.setting.told)
     left, right = figure.subplots(1, 2)
-    _confidence(left, confidence, error < HIT, result)
+    _confidence(left, confidence, error < 1e3 * HIT, result)
     _spread(right, spread * 1e3, error)
     return _png(canvas)
 
