@@ -21,6 +21,7 @@ from lidarpose.data.files import write_atomic
 from lidarpose.evaluate.metrics import auroc, calibration_error
 from lidarpose.infer.predictor import load
 from lidarpose.model.bundled import DEFAULT
+from lidarpose.sample import HIT
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import PoseBank
 from lidarpose.train.example import seen
@@ -56,7 +57,7 @@ def main() -> None:
     confidence = np.stack([p.confidence for p in predicted])
     spread = np.stack([p.spread for p in predicted])
     told = np.stack([p.pose.visible for p in predicted])
-    hit = error < heldout.HIT
+    hit = error < HIT
     curves = {
         "confidence: the joint is within 10 cm": (confidence.ravel(), hit.ravel()),
         "visible: a point of the body lies within 18 cm of the joint": (told.ravel(), visible.ravel()),

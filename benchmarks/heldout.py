@@ -17,6 +17,7 @@ from lidarpose.evaluate.metrics import auroc, calibration_error, mpjpe, pa_mpjpe
 from lidarpose.geometry import rotation_about
 from lidarpose.infer.predictor import load
 from lidarpose.model.bundled import DEFAULT
+from lidarpose.sample import HIT
 from lidarpose.skeleton import HUMAN15, SMPL24, WAYMO14
 from lidarpose.synth.bodies import PoseBank
 from lidarpose.synth.generate import Generator, SyntheticPerson
@@ -24,7 +25,6 @@ from lidarpose.synth.scene import scene_config
 
 # never a seed of a training run, which count from 0
 SEED = 90_001
-HIT = 0.1
 PAIRED = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
 
 

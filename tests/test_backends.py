@@ -292,6 +292,8 @@ BAD = {
     "decoder": ({"decode": "mean"}, "unknown decoder 'mean'"),
     "weights": ({"weights": "tyni"}, "did you mean tiny"),
     "threads": ({"threads": 0}, "threads must be a whole number"),
+    "threads of torch": ({"backend": "torch", "threads": -3}, "threads must be a whole number"),
+    "threads and torch": ({"backend": "torch", "threads": 3}, "threads are of the backend onnx"),
     "onnx elsewhere": ({"backend": "onnx", "device": "cuda"}, "device 'cuda' needs the backend torch"),
     "onnx compiled": ({"backend": "onnx", "compile": True}, "torch.compile needs the backend torch"),
     "onnx file elsewhere": ({"weights": bundled_path(suffix=".onnx"), "device": "cuda"}, "needs the backend torch"),

@@ -167,8 +167,8 @@ def test_few_clips_pass_through_themselves_and_the_mix_is_kept():
 
 def test_wrong_clips_are_refused():
     rng = np.random.default_rng(0)
-    for n, frames, hz in ((-1, 3, 10.0), (1, -3, 10.0), (1, 3, 0.0)):
-        with pytest.raises(InputError, match="hz > 0"):
+    for n, frames, hz, message in ((-1, 3, 10.0, "n must"), (1, -3, 10.0, "frames must"), (1, 3, 0.0, "hz > 0")):
+        with pytest.raises(InputError, match=message):
             motion.sample_clips(rng, n, frames=frames, hz=hz)
     with pytest.raises(InputError, match="did you mean walk"):
         motion.sample_clips(rng, 1, frames=2, mix={"wakl": 1})

@@ -74,7 +74,7 @@ def test_window_does_not_lean_near_an_edge(bins, data):
     middle = round(at)
     assert decode.window(gaussian(middle, bins), low=0.0, step=1.0) == pytest.approx(middle, abs=1e-9)
     assert decode.window(gaussian(at, bins), low=0.0, step=1.0) == pytest.approx(at, abs=0.51)
-    inside = min(at, bins - 1 - at) >= decode.REACH + 1
+    inside = min(at, bins - 1 - at) >= decode.HALF_WIDTH + 1
     if inside:
         assert decode.window(gaussian(at, bins), low=0.0, step=1.0) == pytest.approx(at, abs=0.35)
 

@@ -13,12 +13,13 @@ import pytest
 import waymo_files
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from shard_files import write_shard
 
 import lidarpose
 from lidarpose import evaluation, metrics
 from lidarpose.cli import main
 from lidarpose.data.prepare import prepare
-from lidarpose.data.shards import open_dataset, read_rows, shard_path, write_shard
+from lidarpose.data.shards import open_dataset, read_rows, shard_path
 from lidarpose.errors import InputError
 from lidarpose.evaluate import stability
 from lidarpose.evaluate.bench import load_bench

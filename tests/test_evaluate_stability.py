@@ -219,7 +219,7 @@ def test_curves_say_what_was_done(synthetic, monkeypatch):
     # the same numbers whoever asks again, and they can be written and drawn
     assert study(task, base) == found
     written = json.loads(to_json([found], head={"command": "x"}))
-    assert written["schema"] == "lidarpose.stability/1" and len(written["studies"][0]["curves"]) == 7
+    assert written["schema"] == "lidarpose.stability/1" and len(written["studies"][0]["curves"]) == len(found.curves)
     assert draw_stability(found)[:4] == b"\x89PNG"
 
 
@@ -240,6 +240,18 @@ def test_a_frame_out_of_level_moves_points_and_labels_alike(synthetic, monkeypat
     assert np.degrees(np.arccos((np.trace(R) - 1) / 2)) == pytest.approx(20, abs=0.1)
     np.testing.assert_allclose(turned.joints, before.joints @ R.T, atol=1e-3)
     np.testing.assert_allclose(turned.box.center, R @ before.box.center, atol=1e-3)
+
+
+def test_intervals_are_of_the_seed_and_nobody_posed_is_drawn(synthetic):
+    error = np.random.default_rng(0).uniform(0, 1, (50, 1)) + np.zeros((50, 15))
+    args = people_of(error), 1e3 * error, 0.0, "0", [9] * 50
+    first, again, other = (module._point(*args, seed) for seed in (0, 0, 1))
+    assert first == again and first.mpjpe == other.mpjpe and first.low != other.low
+    nobody = task_of(Fake(lambda points: None), open_people(synthetic))
+    found = study(nobody, judge(nobody).judged, sensors=False)
+    assert all(point.mpjpe is None for curve in found.curves for point in curve.points) and not found.ends
+    sensors = replace(found.curves[0], name="sensors")
+    assert draw_stability(replace(found, curves=(*found.curves, sensors)))[:4] == b"\x89PNG"
 
 
 def test_a_displaced_box_lets_in_what_lies_around(tmp_path):

@@ -255,6 +255,9 @@ def test_what_cannot_be_exported_is_one_line(folder, tmp_path, monkeypatch):
         export(folder / "net.safetensors", out, format="tflite")
     with pytest.raises(InputError, match="does not exist"):
         export(tmp_path / "none.safetensors", out)
+    for name, format, ending in (("x.safetensors", "onnx", ".onnx"), ("x.onnx", "torch", ".pt2")):
+        with pytest.raises(InputError, match=f"give a name that ends in {ending}"):
+            export(folder / "net.safetensors", tmp_path / name, format=format)
     (tmp_path / "file").write_text("")
     # at once, not after a minute of tracing
     monkeypatch.setattr("lidarpose.model.export.onnx_bytes", None)

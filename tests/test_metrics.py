@@ -284,6 +284,30 @@ def test_auroc_is_the_share_of_pairs_in_order(seed):
         metrics.auroc(score, np.ones(30))
 
 
+@pytest.mark.parametrize(
+    ("figure", "stated", "hit", "message"),
+    [
+        (metrics.auroc, [0.5, np.nan], [1, 0], "score must hold numbers, got NaN in 1 of 2"),
+        (metrics.auroc, [0.5, 0.1], [1, 0, 1], r"hit must be \(2,\), one a score, got \(3,\)"),
+        (metrics.auroc, [[0.5], [0.1]], [[1], [0]], r"score must be \(n,\), got \(2, 1\)"),
+        (metrics.auroc, ["a", "b"], [1, 0], "score must hold numbers"),
+        (metrics.calibration_error, [np.nan], [1], "confidence must hold numbers, got NaN"),
+        (metrics.calibration_error, [95.0, 15.0], [1, 0], "within 0 and 1, got 15 to 95"),
+        (metrics.calibration_error, [0.5], [0.5], "hit must be bool, or 0 and 1"),
+        (metrics.calibration_error, [0.5], [1, 0], "one a confidence"),
+    ],
+)
+def test_confidence_that_is_none_is_refused(figure, stated, hit, message):
+    with pytest.raises(InputError, match=message):
+        figure(stated, hit)
+
+
+def test_confidence_of_nobody_and_bins():
+    assert np.isnan(metrics.calibration_error([], []))
+    with pytest.raises(InputError, match="bins must be a whole number"):
+        metrics.calibration_error([0.5], [1], bins=0)
+
+
 def test_every_public_name_is_there():
     assert all(hasattr(metrics, name) for name in metrics.__all__) and metrics.__all__ == sorted(metrics.__all__)
 

@@ -189,7 +189,7 @@ def test_the_mix_is_obeyed_and_checked():
         drawn(3, 0, wakl=1)
     with pytest.raises(InputError, match="above 0"):
         drawn(3, 0, walk=0)
-    with pytest.raises(InputError, match="0 or more"):
+    with pytest.raises(InputError, match="n must be a whole number of at least 0"):
         drawn(-1)
 
 
@@ -199,6 +199,9 @@ def test_sample_poses():
     np.testing.assert_array_equal(a, b)
     np.testing.assert_allclose(a[:, 0], 0, atol=1e-6)
     assert (np.linalg.norm(a, axis=-1) < 1.6).all()
+    for n, seed, message in ((3, -1, "seed must be a whole number"), (2.5, 0, "n must be a whole number")):
+        with pytest.raises(InputError, match=message):
+            motion.sample_poses(n, seed)
 
 
 def test_kneeling_people_have_a_knee_on_the_ground():

@@ -9,11 +9,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpose.data.views import turned
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.model.batch import Batch, Targets
-from lidarpose.model.heads import DECODE, REACH, VoteHead, bin_centers, decode, encode
+from lidarpose.model.decode import HALF_WIDTH
+from lidarpose.model.heads import REACH, VoteHead, bin_centers, decode, encode
 from lidarpose.model.layers import Convolution, CrossAttention, Places, key_bias, wave_numbers
 from lidarpose.model.network import PoseNet
 from lidarpose.model.plan import plan, view_features
@@ -316,7 +316,7 @@ def test_a_vote_is_what_each_voxel_says():
 # --- heatmaps
 
 # the target is 1.2 bins wide: so far inside the window its flank is not cut
-CLEAR = WINDOW - (DECODE + 1) * BIN
+CLEAR = WINDOW - (HALF_WIDTH + 1) * BIN
 
 
 @settings(max_examples=80, deadline=None)
@@ -346,7 +346,7 @@ def decode_slowly(logits):
     """One heatmap at a time, in plain numbers: mean of the bins about the mode."""
     mode = max(range(BINS), key=lambda w: logits[w])
     # as far to either side as the nearer edge allows
-    near = [w for w in range(BINS) if abs(w - mode) <= min(DECODE, mode, BINS - 1 - mode)]
+    near = [w for w in range(BINS) if abs(w - mode) <= min(HALF_WIDTH, mode, BINS - 1 - mode)]
     weight = {w: np.exp(logits[w] - logits[mode]) for w in near}
     return sum(weight[w] * (-WINDOW + (w + 0.5) * BIN) for w in near) / sum(weight.values())
 
@@ -397,7 +397,14 @@ def test_points_and_joints_move_together():
 def test_a_turned_person_is_the_turned_example(yaw):
     """Targets turn with the points and with the view: only the error of the pelvis' guess stays as it was drawn."""
     for k, known in enumerate(people()):
-        other, rotation = turned(known.sample, yaw), rotation_about("z", yaw)
+        sample, rotation = known.sample, rotation_about("z", yaw)
+        other = replace(
+            sample,
+            points=(sample.points @ rotation.T).astype(np.float32),
+            center=rotation @ sample.center,
+            pose=replace(sample.pose, joints=sample.pose.joints @ rotation.T),
+            box=replace(sample.box, center=rotation @ sample.box.center, yaw=sample.box.yaw + yaw),
+        )
         a, b = (example(p, np.random.default_rng(k)) for p in (known.sample, other))
         shift = b.joints[0] - rotation @ a.joints[0]
         np.testing.assert_allclose(b.points, a.points @ rotation.T + shift, atol=2e-5)

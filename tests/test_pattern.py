@@ -225,6 +225,7 @@ def test_range_limits_hold():
         {"range_min": 5.0, "range_max": 1.0},
         {"dropout": 1.0},
         {"height": np.nan},
+        {"duration": "x"},
         {"duration": -0.1},
     ],
 )

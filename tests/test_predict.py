@@ -1,7 +1,6 @@
 """`predict` from Python: arrays, files, boxes, and what is told about odd inputs."""
 
 import json
-import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +13,7 @@ import lidarpose
 from lidarpose.data.boxes import read_boxes
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about
+from lidarpose.infer import people as people_module
 from lidarpose.infer.backend import Raw
 from lidarpose.infer.people import MAX_POINTS, as_origin, as_points, candidates, flat_axis, lies, unit_warning
 from lidarpose.infer.predictor import Predictor
@@ -63,7 +63,8 @@ def test_an_easy_person_stands_on_their_feet(model, standing):
     assert height(pose, "head") > height(pose, "pelvis") > max(height(pose, "left_ankle"), height(pose, "right_ankle"))
     assert (pose.confidence >= 0).all() and (pose.confidence <= 1).all() and (pose.spread > 0).all()
     truth = standing.sample.pose.to(pose.skeleton)
-    assert np.linalg.norm(pose.joints - truth.joints, axis=1).mean() < 0.3
+    # the bundled weights are 25 mm off
+    assert np.linalg.norm(pose.joints - truth.joints, axis=1).mean() < 0.05
     assert pose.warnings == () and pose.num_points == len(standing.sample.points)
 
 
@@ -224,11 +225,13 @@ def test_a_crop_of_a_persons_width_is_all_person(points):
 
 
 @pytest.mark.parametrize("wide, least", [(4.0, 4), (20.0, 4), (300.0, 1)])
-def test_the_search_is_quick(wide, least):
+def test_the_search_does_not_grow_with_the_cloud(wide, least, monkeypatch):
+    cells, heights = [], people_module._heights
+    monkeypatch.setattr(people_module, "_heights", lambda grid, *ring: cells.append(grid.size) or heights(grid, *ring))
     cloud = np.random.default_rng(0).random((50_000, 3)) * (wide, wide, 2.5)
-    started = time.process_time()
-    assert len(candidates(cloud)) >= least
-    assert time.process_time() - started < 0.6
+    assert least <= len(candidates(cloud)) <= 1 + people_module._COLUMNS
+    # 20 x 20 x 2.3 m in cells of 10 cm
+    assert len(cells) == 2 and max(cells) < 1_000_000
 
 
 def test_the_search_survives_strays_and_flat_crops():
@@ -242,9 +245,7 @@ def test_the_search_survives_strays_and_flat_crops():
 def test_a_million_points_are_thinned_with_a_note(model, points):
     rng = np.random.default_rng(0)
     cloud = points[rng.integers(len(points), size=1_000_000)] + rng.normal(0, 0.005, (1_000_000, 3))
-    started = time.process_time()
     pose = model.predict(cloud)
-    assert time.process_time() - started < 6
     assert pose.joints is not None and pose.num_points == MAX_POINTS
     assert pose.warnings[0].startswith(f"thinned from 1000000 to {MAX_POINTS} points")
 
@@ -252,7 +253,8 @@ def test_a_million_points_are_thinned_with_a_note(model, points):
 def test_map_coordinates_cost_no_accuracy(model, points):
     offset = np.array([5e5, 5e6, 300.0])
     moved = model.predict(points.astype(float) + offset)
-    assert np.abs(moved.joints - offset - model.predict(points).joints).max() < 0.03
+    # the coordinates themselves are kept to a nanometre
+    assert np.abs(moved.joints - offset - model.predict(points).joints).max() < 1e-5
 
 
 # ---- units, axes, the sensor's place
@@ -421,7 +423,7 @@ def test_a_sensor_that_cannot_have_seen_the_people_is_unknown(model, sweep, tmp_
     people = lidarpose.predict(tmp_path / "utm.npy", boxes=moved, model=model)
     assert any("taken as unknown" in warning for warning in people.warnings)
     blind = lidarpose.predict(path, boxes=boxes, sensor_origin="unknown", model=model)
-    assert np.abs(people[0].joints - offset - blind[0].joints).max() < 0.03
+    assert np.abs(people[0].joints - offset - blind[0].joints).max() < 1e-5
     given = lidarpose.predict(tmp_path / "utm.npy", boxes=moved, sensor_origin=offset, model=model)
     assert given.warnings == ()
 

@@ -14,13 +14,14 @@ import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from shard_files import write_shard
 
 from lidarpose.data import jobs
-from lidarpose.data.labelled import item_of, labelled_row, labels_of
+from lidarpose.data.labelled import item_of, labelled_row
 from lidarpose.data.prepare import READERS, PartWriter, prepare
-from lidarpose.data.readers.items import HIDDEN, SEEN, UNLABELED, Item
-from lidarpose.data.shards import open_dataset, read_rows, write_shard
-from lidarpose.data.split_rules import SplitRule, split_rule
+from lidarpose.data.readers.items import SEEN, UNLABELED, Item
+from lidarpose.data.shards import open_dataset, read_rows
+from lidarpose.data.split_rules import SplitRule, _published, split_rule
 from lidarpose.data.summary import lines_of
 from lidarpose.errors import InputError
 from lidarpose.sample import Box, Pose, Sample, center_of
@@ -116,7 +117,6 @@ def test_any_item_comes_back_as_it_was(tmp_path_factory, seed, count, boxed, rin
     joints = rng.normal(0, 1, (14, 3)).astype(np.float32)
     labels = rng.integers(0, 3, 14).astype(np.uint8)
     joints[labels == UNLABELED] = np.nan
-    assert (labels_of(joints, HIDDEN) > 0).tolist() == (labels > 0).tolist()
     sample = Sample(
         points=rng.normal(0, 1, (count, 3)).astype(np.float32),
         center=rng.normal(0, 1, 3),
@@ -308,6 +308,12 @@ def test_chunks_are_drawn_by_the_part_s_name_alone(people, part):
     chunks = [splits[k : k + 16] for k in range(0, people, 16)]
     assert all(len(set(chunk)) == 1 for chunk in chunks)
     assert sum(chunk[0] == "train" for chunk in chunks) == int(0.7 * len(chunks))
+
+
+@pytest.mark.parametrize("dataset", READERS)
+def test_one_published_split_of_a_dataset_is_the_usual_one(dataset):
+    rules = list(_published(dataset))
+    assert sum(rule.usual for rule in rules) == bool(rules)
 
 
 def test_published_splits_are_apart_and_name_their_source(tmp_path):

@@ -1,7 +1,5 @@
 """What people carry, use and wear: closed meshes, attached where they belong, for any pose and for the next one."""
 
-import time
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -125,10 +123,10 @@ def test_draws_repeat_and_leave_the_pose_alone(bodies):
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.floats(-np.pi, np.pi), st.floats(-5, 5), st.floats(-3, 3), st.integers(0, 39))
-def test_what_is_carried_goes_along(drawn, bodies, yaw, x, ground, pick):
-    """Turned, moved and raised with its person."""
-    turn, move = rotation_about("z", yaw), np.array([x, -x, ground])
+@given(st.floats(-np.pi, np.pi), st.floats(-5, 5), st.integers(0, 39))
+def test_what_is_carried_goes_along(drawn, bodies, yaw, x, pick):
+    """Turned and moved with its person."""
+    turn, move = rotation_about("z", yaw), np.array([x, -x, 0])
     for name, props in drawn.items():
         prop, row = props[pick % len(props)]
         if name == "ball":
@@ -136,7 +134,7 @@ def test_what_is_carried_goes_along(drawn, bodies, yaw, x, ground, pick):
         joints = bodies.joints[row]
         there = (joints @ turn.T + move).astype(np.float32)
         expected = prop.place(joints).vertices @ turn.T + move
-        np.testing.assert_allclose(prop.place(there, ground).vertices, expected, atol=2e-4, err_msg=name)
+        np.testing.assert_allclose(prop.place(there).vertices, expected, atol=2e-4, err_msg=name)
 
 
 def test_the_next_pose_moves_the_thing(drawn, bodies):
@@ -281,7 +279,7 @@ def test_skirts_bridge_the_legs_and_hold_them(drawn, bodies):
     assert np.mean(shares) > 0.95 and np.percentile(shares, 10) > 0.8
     for prop, _ in drawn["skirt"]:
         assert set(prop.face_part) <= {1 + J[n] for n in ("pelvis", "left_hip", "right_hip", "left_knee", "right_knee")}
-        assert len(prop.face_part) == len(prop.mesh.faces) and prop.part > 0
+        assert len(prop.face_part) == len(prop.mesh.faces) and prop.face_part.min() > 0
     prop, row = drawn["skirt"][0]
     vertices = prop.place(bodies.joints[row]).vertices
     middle = vertices[prop.mesh.faces].mean(1)
@@ -302,16 +300,3 @@ def test_hats_sit_on_the_head(drawn, bodies):
         up /= np.linalg.norm(up)
         top = (hat @ up).max() - (skin @ up).max()
         assert -0.02 < top < 0.08
-
-
-def test_drawing_and_placing_costs_little(bodies):
-    rng = np.random.default_rng(0)
-    best = np.inf
-    for _ in range(3):
-        start = time.process_time()
-        for row, kind in enumerate(bodies.kinds):
-            for prop in draw_props(rng, kind=kind, joints=bodies.joints[row]):
-                prop.place(bodies.joints[row])
-        best = min(best, (time.process_time() - start) / len(bodies.kinds))
-    # 25 microseconds on the machine of docs/log.md; others are slower
-    assert best < 200e-6

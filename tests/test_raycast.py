@@ -208,6 +208,7 @@ def test_empty_input_gives_empty_output():
         ({"faces": np.zeros((1, 3))}, r"faces must be \(F, 3\) integers"),
         ({"azimuth": [np.inf]}, "azimuth must be a list of finite angles"),
         ({"azimuth": [[0.1]]}, "azimuth must be a list"),
+        ({"azimuth": ["a"]}, "azimuth must be a list of finite angles in radians, got list"),
         ({"elevation": [-10.0, 10.0]}, "degrees"),
     ],
 )

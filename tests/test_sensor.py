@@ -59,6 +59,8 @@ def test_a_sensor_is_frozen():
         ({"dropout": 1.0}, "dropout"),
         ({"range_sigma": -0.1}, "range_sigma"),
         ({"height": np.nan}, "height must be a finite number"),
+        ({"elevations": ["x"]}, "elevations must be a list of finite angles"),
+        ({"azimuth_step": "x"}, "azimuth_step must be a finite number, got 'x'"),
     ],
 )
 def test_bad_sensors_say_what_is_wrong(change, message):
@@ -100,14 +102,6 @@ def test_window_over_the_seam_and_all_round():
     assert w.columns == 9 and w.column0 + 4 == s.columns and (w.row0, w.rows) == (0, 64)
     assert s.window(-4, 4, -1, 1) == Window(column0=0, columns=2649, row0=0, rows=64)
     assert s.window(0, 1e-6, 0, 1e-6).columns in (0, 1) and s.window(0, 1, 0.5, 0.6).rows == 0
-
-
-def test_ground_frame():
-    s = dataclasses.replace(sensor("os1-128"), height=2.0, tilt=np.radians(30))
-    # the ground where the tilted x axis meets it
-    ahead = s.T_sensor_from_ground @ [2 / np.tan(np.radians(30)), 0, 0, 1]
-    assert ahead[:3] == pytest.approx([4, 0, 0])
-    assert s.T_sensor_from_ground @ [0, 0, 2, 1] == pytest.approx([0, 0, 0, 1])
 
 
 def test_user_tables_that_go_wrong_are_told_in_one_line(tmp_path):

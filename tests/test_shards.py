@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from pyarrow import parquet
+from shard_files import write_shard
 
 from lidarpose.data import shards
 from lidarpose.data.shards import (
@@ -17,7 +18,6 @@ from lidarpose.data.shards import (
     read_rows,
     sample_of,
     write_card,
-    write_shard,
 )
 from lidarpose.errors import InputError
 from lidarpose.sample import Box, Pose, Sample

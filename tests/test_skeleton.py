@@ -106,6 +106,10 @@ def test_a_map_goes_both_ways_between_two_orders_of_the_same_joints():
         (("a", "b"), (-1, -1), (), "joint 1 has parent -1"),
         (("a", "b"), (0, 0), (), "joint 0 has parent 0"),
         (("a", "b"), (-1, 0), ((0, 2),), "not within its 2 joints"),
+        (("a",), (None,), (), "parents of indices"),
+        (("a", "b"), (-1, 0), (("a", "b"),), "pairs of indices"),
+        (("a", "b"), (-1, 0), ((0,),), r"extra bone \(0,\) must be a pair"),
+        ((1, 2), (-1, 0), (), "joint names must be text"),
     ],
 )
 def test_what_is_no_tree_is_refused(joints, parents, extra, message):

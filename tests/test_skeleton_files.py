@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from lidarpose.body.sources import asf_amc, bvh, load_motion, tree
+from lidarpose.body.sources import asf_amc, bvh, load_motion, tree, units
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES
 
@@ -74,8 +74,8 @@ def test_units_and_up_are_found(tmp_path, unit, up):
 def test_children_and_tall_people_keep_their_unit():
     rest = JOINTS[:1]
     for size in (0.62, 0.8, 1.0, 1.2):
-        for name, metres in tree.UNITS.items():
-            assert tree._scale("x", rest * size / metres, None) == metres, (size, name)
+        for name, metres in units.UNITS.items():
+            assert units.metres_of("x", rest * size / metres) == metres, (size, name)
 
 
 def test_skeletons_with_less(tmp_path):
@@ -156,6 +156,8 @@ ROW = BVH.splitlines()[-1]
         (BVH[: BVH.index("Frame Time")], "must begin with Frames: and Frame Time:"),
         (BVH[: BVH.index("Frames")], "must begin with Frames"),
         (changed(BVH, "Frames: 20", "Frames: x"), "whole number"),
+        (re.sub(r"CHANNELS.*", "CHANNELS 0", changed(BVH, "Frames: 20", "Frames: -1")), "no joint has CHANNELS"),
+        (changed(BVH, "Frames: 20", "Frames: -1")[: BVH.index(ROW)], "whole number of 0 or more, got ' -1'"),
         (changed(BVH, "Frames: 20", "Frames: 0")[: BVH.index(ROW)], "frames of 75|no frame"),
         (re.sub("Frame Time: .*", "Frame Time: 0", BVH), "no frame time above 0"),
         (re.sub("Frame Time: .*", "Frame Time: x", BVH), "no frame time above 0"),

@@ -163,6 +163,14 @@ def test_own_clips_are_retargeted(tmp_path):
     assert error.mean() < 0.010 and error.max() < 0.06
     np.testing.assert_array_equal(motion.rotations, load_motion(path, format="clips").rotations)
 
+    for change, message in (
+        ({"joints": 1e3 * joints}, "998 times as tall"),
+        ({"fps": np.array(1e5)}, "people move at"),
+    ):
+        np.savez(path, **content | change)
+        with pytest.raises(InputError, match=message):
+            load_motion(path)
+
     joints[3, 4] = joints[3, 1]  # a thigh without length
     np.savez(path, **content | {"joints": joints})
     motion = load_motion(path)

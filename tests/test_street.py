@@ -134,13 +134,17 @@ def test_samples_are_cropped_by_boxes_with_errors_and_know_their_track(scenes):
     [
         (dict(people=(0, 3)), "people must be"),
         (dict(people=(5, 3)), "people must be"),
-        (dict(frames=0), "frames of 1 or more"),
+        (dict(people=3), "people must be"),
+        (dict(people=(1.5, 3)), "people must be"),
+        (dict(frames=0), "frames must be a whole number of at least 1"),
+        (dict(seed=-1), "seed must be a whole number"),
+        (dict(index=0.5), "index must be a whole number"),
         (dict(sensor="os1-182"), "unknown sensor"),
     ],
 )
 def test_what_cannot_be_drawn_is_said_in_a_line(given, words):
     with pytest.raises(InputError, match=words) as caught:
-        street(1, 0, **given)
+        street(**{"seed": 1, "index": 0, **given})
     assert "\n" not in str(caught.value)
 
 

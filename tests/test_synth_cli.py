@@ -9,10 +9,11 @@ import time
 
 import numpy as np
 import pytest
+from shard_files import write_shard
 from torch.utils.data import DataLoader
 
 from lidarpose.cli import main
-from lidarpose.data.shards import open_dataset, read_rows, write_shard
+from lidarpose.data.shards import open_dataset, read_rows
 from lidarpose.errors import InputError
 from lidarpose.lidar.catalog import listing
 from lidarpose.synth import write

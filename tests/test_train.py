@@ -374,6 +374,13 @@ def test_a_recipe_refuses_what_is_no_such_setting(change, message):
         Pretrain(**change)
 
 
+def test_a_recipe_s_booleans_are_booleans():
+    assert Finetune(data="a", keep_anchors=np.bool_(False)).keep_anchors is False
+    for other in ("false", 0, None):
+        with pytest.raises(InputError, match="^keep_anchors must be True or False, got"):
+            recipe_of(Finetune, data="a", keep_anchors=other)
+
+
 @pytest.mark.parametrize("field", ["people", "rate", "captured", "seed", "workers"])
 def test_a_recipe_refuses_negative_numbers(field):
     with pytest.raises(InputError, match=f"^{field} must be at least [01], got -1$"):

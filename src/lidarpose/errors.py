@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Iterable
+from math import isfinite
 from numbers import Integral
 
 
@@ -56,6 +57,16 @@ def whole(name: str, value: object, *, least: int, most: int | None = None, hint
             return int(value)
     bounds = f"of at least {least}" if most is None else f"from {least} to {most}"
     raise InputError(f"{name} must be a whole number {bounds}{hint}, got {value!r}")
+
+
+def check_finite(name: str, value: object) -> None:
+    """Raises InputError unless `value` is a finite number, Python's or numpy's."""
+    try:
+        good = isfinite(value)
+    except (TypeError, ValueError, OverflowError):
+        good = False
+    if not good:
+        raise InputError(f"{name} must be a finite number, got {value!r}")
 
 
 def check_name(kind: str, name: object, known: Iterable[str]) -> None:

@@ -13,6 +13,7 @@ Definitions (all points are carried rigidly by the bone whose name stands in bra
 
 from dataclasses import dataclass
 from functools import cached_property
+from operator import index
 
 import numpy as np
 
@@ -34,9 +35,17 @@ class Skeleton:
 
     def __post_init__(self):
         # lists are as good as tuples
-        for name in ("joints", "parents"):
-            object.__setattr__(self, name, tuple(getattr(self, name)))
-        object.__setattr__(self, "extra_bones", tuple(tuple(pair) for pair in self.extra_bones))
+        try:
+            object.__setattr__(self, "joints", tuple(self.joints))
+            object.__setattr__(self, "parents", tuple(map(index, self.parents)))
+            object.__setattr__(self, "extra_bones", tuple(tuple(map(index, pair)) for pair in self.extra_bones))
+        except TypeError as error:
+            raise InputError(
+                f"skeleton {self.name}: joints are a list of names, parents of indices, extra_bones of pairs of "
+                f"indices ({error})"
+            ) from None
+        if not all(isinstance(name, str) for name in self.joints):
+            raise InputError(f"skeleton {self.name}: joint names must be text, got {list(self.joints)}")
         if len(set(self.joints)) != len(self.joints):
             raise InputError(f"skeleton {self.name}: joint names must be unique, got {list(self.joints)}")
         if len(self.parents) != len(self.joints):
@@ -48,6 +57,8 @@ class Skeleton:
                     f"but joint {j} has parent {p}"
                 )
         for pair in self.extra_bones:
+            if len(pair) != 2:
+                raise InputError(f"skeleton {self.name}: extra bone {pair} must be a pair of joints")
             if not all(0 <= j < len(self.joints) for j in pair):
                 raise InputError(f"skeleton {self.name}: extra bone {pair} is not within its {len(self.joints)} joints")
 

@@ -91,11 +91,6 @@ def _bearing_points(part: np.ndarray, points: np.ndarray, kneel: np.ndarray) -> 
     return points
 
 
-def support_points(rotations: np.ndarray) -> np.ndarray:
-    """rotations (n, 24, 3, 3) -> (n, 10, 3) m: points of soles and knees that may stand on the ground."""
-    return _ground_points(rotations, body_frames(rotations)[1])
-
-
 @cache
 def _lengths() -> tuple[float, float]:
     rest = mean_adult_joints()[_LEGS[:, 0]]

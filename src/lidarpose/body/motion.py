@@ -34,7 +34,7 @@ from lidarpose.body.gait import GAITS, strides
 from lidarpose.body.latents import Latents, draw_latents
 from lidarpose.body.retarget import heading, mean_adult_joints, without_yaw
 from lidarpose.body.solid import body_frames, capsule_ends, depths, undersides
-from lidarpose.errors import InputError, check_name
+from lidarpose.errors import InputError, check_name, whole
 from lidarpose.geometry import rotation_about
 from lidarpose.skeleton import SMPL24
 
@@ -96,8 +96,7 @@ def sample_rotations(
     a road or at work sees them. The root leans and tilts but has no yaw (`retarget.heading` is 0). The poses do not
     depend on dt. Raises InputError for a negative n or dt or a mix with unknown names or without weight.
     """
-    if n < 0:
-        raise InputError(f"n must be 0 or more poses, got {n}")
+    n = whole("n", n, least=0)
     if not 0 <= dt < np.inf:
         raise InputError(f"dt must be seconds, 0 or more, got {dt}")
     latents, rotations = _drawn(rng, n, _shares(mix), np.zeros(1))
@@ -117,8 +116,9 @@ def sample_clips(
 
     Raises InputError for a negative n or frames, hz <= 0, or a wrong mix.
     """
-    if n < 0 or frames < 0 or not 0 < hz < np.inf:
-        raise InputError(f"clips need n >= 0, frames >= 0 and hz > 0, got {n}, {frames} and {hz}")
+    n, frames = whole("n", n, least=0), whole("frames", frames, least=0)
+    if not 0 < hz < np.inf:
+        raise InputError(f"clips need hz > 0, got {hz}")
     last = max(0, frames - 1) / hz
     latents, _ = _drawn(rng, n, _shares(mix), np.arange(0, last + _LOOK_EVERY, _LOOK_EVERY))
     between = max(1, int(np.ceil(1 / (hz * _MOMENT))))
@@ -216,10 +216,14 @@ def _motion(latents: Latents, times: np.ndarray) -> _Motion:
 
 
 def sample_poses(n: int, seed: int) -> np.ndarray:
-    """n poses of the default mix on the mean adult: (n, 24, 3) float32 m, SMPL's order, z up, facing +x."""
+    """n poses of the default mix on the mean adult: (n, 24, 3) float32 m, SMPL's order, z up, facing +x.
+
+    Raises InputError unless n and seed are whole numbers of 0 or more.
+    """
     from lidarpose.body.rig import forward_kinematics
 
-    rotations = sample_rotations(np.random.default_rng(seed), n).rotations
+    n = whole("n", n, least=0)
+    rotations = sample_rotations(np.random.default_rng(whole("seed", seed, least=0)), n).rotations
     return forward_kinematics(SMPL24.parents, mean_adult_joints()[None], rotations, np.zeros((n, 3)))[1].astype(
         np.float32
     )
@@ -317,4 +321,4 @@ def _in_trunk(arm: np.ndarray) -> np.ndarray:
 
 
 __all__ = ["ANGLES", "ARM_ANGLES", "ARM_NAMES", "KINDS", "DrawnClips", "PosePrior", "mirror_angles"]
-__all__ += ["rotations_from_angles", "sample_clips", "sample_clips", "sample_poses", "sample_rotations"]
+__all__ += ["rotations_from_angles", "sample_clips", "sample_poses", "sample_rotations"]

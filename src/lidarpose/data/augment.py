@@ -12,23 +12,6 @@ import numpy as np
 from lidarpose.sample import Box
 
 
-def range_noise(
-    points: np.ndarray, ring: np.ndarray, *, sigma: float, bias: float, rng: np.random.Generator
-) -> np.ndarray:
-    """points (n, 3) m from a sensor at the origin, moved along their beams.
-
-    sigma: standard deviation of a single range in metres, symmetric (the released code adds 0 to 2 cm, always
-    outwards: `one_sided_noise`); bias: standard deviation of an error that all points of a ring share.
-    """
-    of_ring = rng.normal(0, bias, int(ring.max(initial=-1)) + 1)
-    return along_beams(points, rng.normal(0, sigma, len(points)) + of_ring[ring])
-
-
-def one_sided_noise(points: np.ndarray, *, most: float, rng: np.random.Generator) -> np.ndarray:
-    """points (n, 3) m, their ranges too long by uniform [0, most) m: the released code's law, `most` 2 cm."""
-    return along_beams(points, rng.random(len(points)) * most)
-
-
 def along_beams(points: np.ndarray, error: np.ndarray) -> np.ndarray:
     """points (n, 3) m moved away from the sensor by error (n,) m."""
     distance = np.linalg.norm(points, axis=1)
@@ -37,11 +20,6 @@ def along_beams(points: np.ndarray, error: np.ndarray) -> np.ndarray:
 
 # what is nearer to the sensor is not moved by more than its share, m
 _NEAREST = 1e-3
-
-
-def grazing_keep(points: np.ndarray, normals: np.ndarray, *, strength: float, rng: np.random.Generator) -> np.ndarray:
-    """(n,) bool: returns that survive; a beam that grazes a surface is lost with probability up to `strength`."""
-    return rng.random(len(points)) >= strength * (1 - _cosine(points, normals)) ** 4
 
 
 # makers' range limits hold for targets that reflect about 80 percent; clothes at 20 percent are seen half as far
@@ -59,14 +37,6 @@ def weak_loss(points: np.ndarray, normals: np.ndarray, *, range_max: float) -> n
     squared = (points**2).sum(1)
     power = _cosine(points, normals) * reach**2 / np.maximum(squared, _NEAREST**2)
     return 1 / (1 + power**2)
-
-
-def weak_keep(
-    points: np.ndarray, normals: np.ndarray, *, strength: float, range_max: float, rng: np.random.Generator
-) -> np.ndarray:
-    """(n,) bool: returns that survive where what is weak (see `weak_loss`) is lost with `strength` times its
-    probability."""
-    return rng.random(len(points)) >= strength * weak_loss(points, normals, range_max=range_max)
 
 
 def random_keep(count: int, *, share: float, rng: np.random.Generator) -> np.ndarray:

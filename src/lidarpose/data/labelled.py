@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.data.columns import CENTERS
-from lidarpose.data.readers.items import UNLABELED, Item
+from lidarpose.data.readers.items import Item
 from lidarpose.errors import InputError
 from lidarpose.sample import Box, Pose, Sample
 from lidarpose.skeleton import skeleton
@@ -67,8 +67,3 @@ def item_of(row: dict[str, Any], skeleton_name: str) -> Item:
         time=row["time"],
         centers={name: row[f"center_{name}"] for name in CENTERS if row[f"center_{name}"] is not None},
     )
-
-
-def labels_of(joints: np.ndarray, seen: int) -> np.ndarray:
-    """joints (J, 3) -> (J,) uint8: `seen` where a joint has a position, UNLABELED where it is NaN."""
-    return np.where(np.isnan(joints).any(-1), UNLABELED, seen).astype(np.uint8)

@@ -30,7 +30,7 @@ of everybody in the street, seen or not, track (P,), box (P, 7: center, size, ya
 """
 
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from pathlib import Path
@@ -190,19 +190,13 @@ def sample_of(row: dict[str, Any], skeleton_name: str = BODY26.name) -> Sample:
     )
 
 
-def write_shard(path: str | Path, table: str, rows: Iterable[dict[str, Any]]) -> None:
-    """Writes the rows of a table ("people", "frames"), whole or not at all; the same rows give the same bytes.
-
-    Raises InputError where the folder cannot be written, MissingExtra without pyarrow.
-    """
-    with shard_writer(path, table) as add:
-        for row in rows:
-            add(row)
-
-
 @contextmanager
 def shard_writer(path: str | Path, table: str) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """As `write_shard`, for rows that come one by one: yields what adds a row. Holds a row group of them at a time."""
+    """Writes the rows of a table ("people", "frames", ...), whole or not at all; the same rows give the same bytes.
+
+    Yields what adds a row, and holds a row group of them at a time. Raises InputError where the folder cannot be
+    written, MissingExtra without pyarrow.
+    """
     pa, parquet = pyarrow()
     schema, waiting = schema_of(pa, table), []
 
@@ -228,7 +222,8 @@ def rows_of_shard(path: str | Path) -> int | None:
     """How many rows a shard says it holds; None where it is missing or damaged."""
     _, parquet = pyarrow()
     try:
-        return parquet.ParquetFile(path).metadata.num_rows
+        with parquet.ParquetFile(path) as file:
+            return file.metadata.num_rows
     except Exception:
         # pyarrow raises many kinds for damaged files; what matters is that it is to be written again
         return None

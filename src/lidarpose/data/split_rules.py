@@ -28,7 +28,8 @@ _NEEDED = ("train", "test")
 @dataclass(frozen=True, kw_only=True)
 class SplitRule:
     """name and source of a split; sets: split -> the names of its sequences or folders; leaks: what of train is also in
-    test, "" for nothing. See the module for rule, length, share and seed."""
+    test, "" for nothing; usual: whether it is the one of its dataset that is taken where nobody names one. See the
+    module for rule, length, share and seed."""
 
     name: str
     source: str
@@ -38,6 +39,7 @@ class SplitRule:
     share: float = 0.0
     seed: int = 0
     leaks: str = ""
+    usual: bool = True
 
     @property
     def by_part(self) -> bool:
@@ -79,7 +81,7 @@ def split_rule(dataset: str, root: Path, name: str | None = None) -> SplitRule |
             )
         check_name(f"split of {dataset}", name, published)
         return published[name]
-    return _own(root) or next(iter(published.values()), None)
+    return _own(root) or next((rule for rule in published.values() if rule.usual), None)
 
 
 def _own(root: Path) -> SplitRule | None:
@@ -105,9 +107,8 @@ def _own(root: Path) -> SplitRule | None:
 
 
 def _published(dataset: str) -> Iterator[SplitRule]:
-    """The usual one first."""
     folder = files("lidarpose.data") / "splits"
-    for file in sorted(folder.iterdir(), key=lambda file: len(file.name)):
+    for file in sorted(folder.iterdir(), key=lambda file: file.name):
         if not file.name.endswith(".json"):
             continue
         found = json.loads(file.read_text("utf-8"))

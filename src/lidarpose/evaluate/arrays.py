@@ -13,11 +13,11 @@ def numbers(name: str, value: np.ndarray) -> np.ndarray:
         raise InputError(f"{name} must hold numbers, in lists of equal length") from None
 
 
-def flags(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """bool of a shape, from bool or 0 and 1; raises InputError otherwise."""
+def flags(name: str, value: np.ndarray, shape: tuple[int, ...], *, of: str = "joint") -> np.ndarray:
+    """bool of a shape, one a joint or another thing, from bool or 0 and 1; raises InputError otherwise."""
     given = numbers(name, value)
     if given.shape != shape:
-        raise InputError(f"{name} must be {shape}, one a joint, got {given.shape}")
+        raise InputError(f"{name} must be {shape}, one a {of}, got {given.shape}")
     if not ((given == 0) | (given == 1)).all():
         raise InputError(f"{name} must be bool, or 0 and 1; of other codes pass a comparison, such as codes > 0")
     return given == 1

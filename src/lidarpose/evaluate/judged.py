@@ -29,7 +29,6 @@ import numpy as np
 from lidarpose.data.columns import pyarrow
 from lidarpose.data.files import file_error, read_bytes
 from lidarpose.data.readers.items import UNLABELED
-from lidarpose.errors import InputError
 from lidarpose.evaluate.metrics import joint_errors
 from lidarpose.skeleton import Skeleton
 
@@ -200,6 +199,4 @@ def read_poses(path: str | Path) -> dict[str, Judged]:
             out[name] = gathered(skeleton, rows)
         return out
     except (pa.ArrowException, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise file_error(path, f"is no poses.parquet of an evaluation ({error}); evaluate again") from None
-    except InputError as error:
         raise file_error(path, f"is no poses.parquet of an evaluation ({error}); evaluate again") from None

@@ -27,15 +27,13 @@ from lidarpose.evaluate.result import RELEASED, Line, Setting, number
 from lidarpose.evaluate.scores import mean
 from lidarpose.evaluate.slices import DISTANCE_EDGES, OCCLUSION_EDGES, POINT_EDGES
 from lidarpose.evaluate.waymo import PCK_THRESHOLDS, box_hits, oks, oks_hits, oks_sigmas, pem
+from lidarpose.sample import HIT
 
-# a joint nearer to the truth than this is a hit, mm: what a network's confidence is the probability of
-HIT = 100.0
 # people of fewer points do not tell where they face
 PLENTY = 100
 _REPEATS = 1000
 # frames count as evenly apart where two steps differ by less than this share
 _EVEN = 0.2
-_TITLES = {"condition": "condition", "poses": "poses", "sensor": "sensor"}
 
 
 def lines_of(judged: Judged, setting: Setting, *, legacy: bool = False) -> tuple[Line, ...]:
@@ -159,7 +157,7 @@ def _by_joint(figures: _Figures) -> Iterator[Line]:
 
 def _conditions(judged: Judged) -> Iterator[tuple[str, str, np.ndarray]]:
     """(title, name, rows) of what synthetic people are told apart by."""
-    for title in _TITLES:
+    for title in ("condition", "poses", "sensor"):
         values = getattr(judged, title)
         for of in sorted(set(values[values != ""].tolist())):
             yield title, of, values == of
@@ -251,7 +249,7 @@ def _confidence(figures: _Figures) -> Iterator[Line]:
     known = ~np.isnan(error) & ~np.isnan(judged.confidence)
     if not known.any():
         return
-    stated, hit = judged.confidence[known].astype(float), error[known] < HIT
+    stated, hit = judged.confidence[known].astype(float), error[known] < 1e3 * HIT
     found = {"calibration_error": 100 * calibration_error(stated, hit)}
     if 0 < hit.mean() < 1:
         found["auroc"] = 100 * auroc(stated, hit)

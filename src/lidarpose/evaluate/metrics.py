@@ -11,8 +11,8 @@ intervals. legacy=True: the arithmetic of the paper's released code, faults incl
 
 import numpy as np
 
-from lidarpose.errors import InputError
-from lidarpose.evaluate.arrays import checked_poses
+from lidarpose.errors import InputError, whole
+from lidarpose.evaluate.arrays import checked_poses, flags, numbers
 from lidarpose.evaluate.scores import Score, checked_average, mean
 from lidarpose.geometry import similarity_align
 
@@ -162,17 +162,32 @@ def _distances(pred: np.ndarray, true: np.ndarray, labelled: np.ndarray) -> np.n
 
 
 def calibration_error(confidence: np.ndarray, hit: np.ndarray, *, bins: int = 10) -> float:
-    """Expected calibration error: mean distance of stated confidence (n,) and share of hits (n,), over equal bins."""
-    index = np.minimum((np.asarray(confidence) * bins).astype(int), bins - 1)
-    count = np.bincount(index, minlength=bins)
+    """Expected calibration error, 0 to 1: mean distance of stated confidence (n,) and share of hits (n,), over equal
+    bins; NaN of nothing.
+
+    confidence: 0 to 1; hit: bool or 0/1. Raises InputError for NaN and other values: leave out what is not known.
+    """
+    bins = whole("bins", bins, least=1)
+    confidence = _known("confidence", confidence)
+    if not ((confidence >= 0) & (confidence <= 1)).all():
+        raise InputError(f"confidence must be within 0 and 1, got {confidence.min():g} to {confidence.max():g}")
+    hit = flags("hit", hit, confidence.shape, of="confidence")
+    if not len(confidence):
+        return float("nan")
+    index = np.minimum((confidence * bins).astype(int), bins - 1)
     stated = np.bincount(index, confidence, bins)
-    true = np.bincount(index, np.asarray(hit, float), bins)
-    return float(np.abs(stated - true).sum() / max(count.sum(), 1))
+    true = np.bincount(index, hit, bins)
+    return float(np.abs(stated - true).sum() / len(confidence))
 
 
 def auroc(score: np.ndarray, hit: np.ndarray) -> float:
-    """Area under the ROC curve of scores (n,) for hits (n,) bool: how well the score ranks hits before misses."""
-    score, hit = np.asarray(score, float), np.asarray(hit, bool)
+    """Area under the ROC curve, 0 to 1, of scores (n,) for hits (n,): how well the score ranks hits before misses.
+
+    score: any numbers, more is surer; hit: bool or 0/1. Raises InputError for NaN, which has no rank, and where there
+    are not both hits and misses.
+    """
+    score = _known("score", score)
+    hit = flags("hit", hit, score.shape, of="score")
     positives, negatives = int(hit.sum()), int((~hit).sum())
     if not positives or not negatives:
         raise InputError(f"AUROC needs hits and misses, got {positives} hits and {negatives} misses")
@@ -181,6 +196,18 @@ def auroc(score: np.ndarray, hit: np.ndarray) -> float:
     last = np.cumsum(counts)
     rank = (last - (counts - 1) / 2)[inverse]
     return float((rank[hit].sum() - positives * (positives + 1) / 2) / (positives * negatives))
+
+
+def _known(name: str, values: np.ndarray) -> np.ndarray:
+    """(n,) floats without NaN."""
+    values = numbers(name, values)
+    if values.ndim != 1:
+        raise InputError(f"{name} must be (n,), got {values.shape}: pass values.ravel()")
+    if unknown := int(np.isnan(values).sum()):
+        raise InputError(
+            f"{name} must hold numbers, got NaN in {unknown} of {len(values)}: leave these and their hits out"
+        )
+    return values
 
 
 def _average(average: str, legacy: bool) -> str:

@@ -108,7 +108,8 @@ def study(
     undisturbed = _answers(task, [one.person for one in people])
     base = undisturbed.errors()
     clusters = np.array([one.person.sequence for one in people]) if task.setting.clusters else None
-    whole = _point(undisturbed, base, 0.0, "0", [len(one.person.points) for one in people], clusters)
+    seed = task.setting.seed
+    whole = _point(undisturbed, base, 0.0, "0", [len(one.person.points) for one in people], seed, clusters)
     curves = []
     for name, disturbance in DISTURBANCES.items():
         points = [whole]
@@ -116,7 +117,7 @@ def study(
             shown = [_disturbed(task, one, name, amount) for one in people]
             counts = [len(one.points) for one in shown]
             label = f"{amount * disturbance.scale:.4g}"
-            points.append(_point(_answers(task, shown), base, amount, label, counts, clusters))
+            points.append(_point(_answers(task, shown), base, amount, label, counts, seed, clusters))
             if progress is not None:
                 progress(len(people))
         curves.append(Curve(name=name, title=disturbance.title, says=disturbance.says, points=tuple(points)))
@@ -211,10 +212,16 @@ def _answers(task: Task, people: list[Person]) -> Judged:
 
 
 def _point(
-    answers: Judged, base: np.ndarray, amount: float, label: str, counts: list[int], clusters: np.ndarray | None = None
+    answers: Judged,
+    base: np.ndarray,
+    amount: float,
+    label: str,
+    counts: list[int],
+    seed: int,
+    clusters: np.ndarray | None = None,
 ) -> Point:
     """One amount's point; base (n, J) mm: the errors of the same people undisturbed."""
-    rng = np.random.default_rng(zlib.crc32(label.encode()))
+    rng = np.random.default_rng([zlib.crc32(label.encode()), seed])
     # NaN without a label, a row of NaN without a pose
     found = answers.errors()
     both = ~np.isnan(found) & ~np.isnan(base)
@@ -278,7 +285,8 @@ def _sensors(task: Task, progress: Callable[[int], None] | None) -> Curve:
             for row, sample in enumerate(samples)
         ]
         found = _answers(task, people)
-        made = _point(found, found.errors(), float(k), name, [len(one.points) for one in people])
+        counts = [len(one.points) for one in people]
+        made = _point(found, found.errors(), float(k), name, counts, task.setting.seed)
         points.append(replace(made, increase=None, increase_low=None, increase_high=None))
         if progress is not None:
             progress(len(people))

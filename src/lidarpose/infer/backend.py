@@ -19,9 +19,8 @@ from lidarpose.model.decode import Decoder, out_of_range
 from lidarpose.model.header import Header, digest, read_header
 from lidarpose.model.onnx_file import OUTPUTS, input_name, network_inputs, open_onnx, plan_people
 from lidarpose.model.presets import BIN
+from lidarpose.sample import HIT
 
-# a joint closer to the truth than this counts as found, m: what confidence is the probability of
-HIT = 0.1
 # people a call; more fill the memory without being faster
 _BATCH = 64
 # log of the largest spread that is told, m: an untrained network may say anything

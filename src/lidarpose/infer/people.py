@@ -8,13 +8,11 @@ from lidarpose.data.files import one_line
 from lidarpose.data.headers import is_transposed
 from lidarpose.errors import InputError
 from lidarpose.geometry import vector_of
-from lidarpose.sample import FARTHEST, Pose, center_of
+from lidarpose.sample import FARTHEST, MIN_POINTS, Pose, center_of
 
 # joints that every skeleton has
 _TRUNK = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 
-# fewer points than this say nothing about a pose
-MIN_POINTS = 5
 # a person of more points is thinned: no sensor sees so many, and no voxel needs them
 MAX_POINTS = 50_000
 

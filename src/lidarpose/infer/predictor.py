@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose.data.files import file_error
-from lidarpose.errors import InputError, check_name, missing_extra
+from lidarpose.errors import InputError, check_name, missing_extra, whole
 from lidarpose.infer.backend import Backend, Estimates, OnnxBackend, estimates, exported_beside
-from lidarpose.infer.people import MIN_POINTS, as_origin, as_points, candidates, clean, unit_warning
+from lidarpose.infer.people import as_origin, as_points, candidates, clean, unit_warning
 from lidarpose.infer.results import PersonPose, Poses
 from lidarpose.infer.tta import Look, averaged, brought_back, looks_of, shown
 from lidarpose.model.bundled import BUNDLED, DEFAULT, weights_path
 from lidarpose.model.decode import decoder
 from lidarpose.model.header import read_header
 from lidarpose.model.plan import WINDOW
-from lidarpose.sample import PER_JOINT, Pose, center_of
+from lidarpose.sample import MIN_POINTS, PER_JOINT, Pose, center_of
 from lidarpose.skeleton import SMPL24, Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
 
@@ -45,13 +45,15 @@ def load(
     backend: "onnx" (ONNX Runtime, on the CPU) or "torch"; None takes onnx for bundled weights and .onnx files, torch
     for other paths and devices. decode: how heatmaps are read, "window" (the mean about the mode), "argmax" or "dark"
     (the released DAPT code's); where two peaks are equally high, rounding decides. compile: by `torch.compile`, backend
-    torch only. threads: of ONNX Runtime, None for all processors. tta: test-time augmentation, the number of looks at
-    each person (1 to 8), averaged. A person costs one pass to center the cloud and one pass a look, so 1 look takes two
-    passes, 4 looks five. Raises InputError for an unknown name, a file that is no checkpoint, or a device that is not
-    there; MissingExtra where torch is needed and not installed.
+    torch only. threads: of ONNX Runtime, None for all processors; backend onnx only. tta: test-time augmentation, the
+    number of looks at each person (1 to 8), averaged. A person costs one pass to center the cloud and one pass a look,
+    so 1 look takes two passes, 4 looks five. Raises InputError for an unknown name, a file that is no checkpoint, or a
+    device that is not there; MissingExtra where torch is needed and not installed.
     """
     decoder(decode)
     looks_of(tta)
+    if threads is not None:
+        threads = whole("threads", threads, least=1)
     if backend is not None:
         check_name("backend", backend, BACKENDS)
     path = weights_path(weights)
@@ -63,6 +65,8 @@ def load(
     if backend == "torch":
         if exported:
             raise file_error(path, "torch runs a .safetensors file, not .onnx: name the one that it was made from")
+        if threads is not None:
+            raise InputError("threads are of the backend onnx: for torch call torch.set_num_threads")
         chosen = _torch_backend(path, device, compile)
     else:
         if device != "cpu" or compile:

@@ -12,7 +12,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from lidarpose.errors import InputError
+from lidarpose.errors import InputError, check_finite
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -58,8 +58,7 @@ class RayPattern:
             if not (np.isfinite([low, high]).all() and low < high):
                 raise InputError(f"RayPattern.{name} must be (lowest, highest) rad, got ({low}, {high})")
         for name in ("duration", "range_min", "range_max", "range_sigma", "dropout", "height", "tilt"):
-            if not np.isfinite(getattr(self, name)):
-                raise InputError(f"RayPattern.{name} must be a finite number, got {getattr(self, name)}")
+            check_finite(f"RayPattern.{name}", getattr(self, name))
         if self.duration < 0:
             raise InputError(f"RayPattern.duration must be 0 s or more, got {self.duration}")
         if not 0 <= self.range_min < self.range_max:

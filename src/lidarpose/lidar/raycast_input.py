@@ -3,9 +3,8 @@
 import numpy as np
 
 from lidarpose.errors import InputError
+from lidarpose.sample import FARTHEST
 
-# beyond any scene, m, and its powers are still finite
-FARTHEST = 1e9
 _NO_FACES = np.zeros(0, bool)
 _NO_FACES.setflags(write=False)
 
@@ -104,7 +103,10 @@ def as_times(time: np.ndarray, count: int) -> np.ndarray:
 
 def as_angles(name: str, values: np.ndarray) -> np.ndarray:
     """(n,) float64, finite."""
-    values = np.asarray(values, np.float64)
+    try:
+        values = np.asarray(values, np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must be a list of finite angles in radians, got {type(values).__name__}") from None
     if values.ndim != 1 or not np.isfinite(values).all():
         raise InputError(f"{name} must be a list of finite angles in radians, got shape {values.shape}")
     return values

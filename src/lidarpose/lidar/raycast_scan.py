@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarpose.lidar.raycast_input import FARTHEST
 from lidarpose.lidar.raycast_kernels import AXIS, STEEP, compiled, njit, raster
+from lidarpose.sample import FARTHEST
 
 # a sector spans at most this much azimuth, so that tan(a) stays near 1
 SECTOR = np.radians(92.0)

@@ -9,8 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from lidarpose.errors import InputError
-from lidarpose.geometry import rotation_about
+from lidarpose.errors import InputError, check_finite
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,8 +72,7 @@ class Sensor:
                 raise InputError(f"Sensor.origin_heights must be {elevations.shape}, one a ring, got {heights.shape}")
             object.__setattr__(self, "origin_heights", heights)
         for field in ("azimuth_step", "range_min", "range_max", "range_sigma", "dropout", "height", "tilt"):
-            if not np.isfinite(getattr(self, field)):
-                raise InputError(f"Sensor.{field} must be a finite number, got {getattr(self, field)}")
+            check_finite(f"Sensor.{field}", getattr(self, field))
         turn = 2 * np.pi / self.azimuth_step if self.azimuth_step > 0 else 0
         if turn < 1 or abs(turn - round(turn)) > 1e-3:
             raise InputError(f"Sensor.azimuth_step must divide 2 pi, got {self.azimuth_step} rad, {turn:.4f} a turn")
@@ -134,14 +132,6 @@ class Sensor:
             found.append((float(height), head, rings))
         return tuple(found)
 
-    @property
-    def T_sensor_from_ground(self) -> np.ndarray:
-        """(4, 4): from the level frame on the ground below the sensor (z = 0 is the ground) to the sensor's frame."""
-        transform = np.eye(4)
-        transform[:3, :3] = rotation_about("y", -self.tilt)
-        transform[:3, 3] = transform[:3, :3] @ [0, 0, -self.height]
-        return transform
-
     def window(self, left: float, right: float, low: float, high: float) -> Window:
         """The beams with azimuth in [left, right] and elevation in [low, high], rad; left <= right, unwrapped."""
         first = int(np.ceil((left - self.azimuth_start - self.azimuth_shifts.max()) / self.azimuth_step))
@@ -159,7 +149,10 @@ class Sensor:
 
 
 def _frozen(name: str, values: np.ndarray) -> np.ndarray:
-    values = np.array(values, float)
+    try:
+        values = np.array(values, float)
+    except (TypeError, ValueError):
+        raise InputError(f"Sensor.{name} must be a list of finite angles in radians, got {values!r}") from None
     if values.ndim != 1 or not np.isfinite(values).all():
         raise InputError(f"Sensor.{name} must be a list of finite angles in radians, got shape {values.shape}")
     values.setflags(write=False)

@@ -14,8 +14,8 @@ import numpy as np
 
 from lidarpose.errors import InputError, check_name
 
-# half width of `window` about the mode, in bins
-REACH = 3
+# half width of `window`, and of its twins in torch, about the mode, in bins
+HALF_WIDTH = 3
 # the released code's blur before `dark`: kernel and deviation, in bins (the kernel from 20 * its sigma of 2 bins)
 _TAPS, _SIGMA = 11, 2.0
 # what it clips the blurred logits to before their logarithm, and the refinement it does not believe, in bins
@@ -57,7 +57,9 @@ def dark(logits: np.ndarray, *, low: float | np.ndarray, step: float | np.ndarra
     return low + (mode - np.where(np.abs(offset) > _MOST, 0, offset)) * step
 
 
-def window(logits: np.ndarray, *, low: float | np.ndarray, step: float | np.ndarray, reach: int = REACH) -> np.ndarray:
+def window(
+    logits: np.ndarray, *, low: float | np.ndarray, step: float | np.ndarray, reach: int = HALF_WIDTH
+) -> np.ndarray:
     """logits (..., W) -> (...) m: the mean position under the softmax of the bins within `reach` of the mode.
 
     A mean over all bins would fall between the two peaks of a left/right doubt. The window has as many bins on either

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lidarpose.data.files import atomic_path, check_apart, check_writable, write_atomic
+from lidarpose.data.files import atomic_path, check_apart, check_suffix, check_writable, write_atomic
 from lidarpose.errors import InputError, LidarPoseError, check_name, missing_extra
 from lidarpose.model.batch import Batch
 from lidarpose.model.checkpoint import load_checkpoint
@@ -49,10 +49,12 @@ def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = 
     format: "onnx", a self-contained file that ONNX Runtime and this package run without torch, no larger than the
     checkpoint where that keeps float16; or "torch", a program (.pt2) for `torch.export.load`. Both take any number of
     people and points; `onnx_file` tells the inputs. Raises InputError for a file that is no checkpoint of this
-    package's own networks, MissingExtra without onnx.
+    package's own networks and for an `out` that ends in another suffix than `FORMATS` says, MissingExtra without
+    onnx.
     """
     check_name("format", format, FORMATS)
     check_apart(out, weights)
+    check_suffix(out, FORMATS[format])
     network, header = load_checkpoint(weights)
     if header.network != "pose":
         raise InputError(

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from lidarpose.model.decode import HALF_WIDTH
 from lidarpose.model.presets import BIN
 
 # half the width of a heatmap's range: about the vote, or about the person's center; metres
 REACH = {"window": 0.36, "full": 1.2}
-# half width of the decoding window around the mode, in bins
-DECODE = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +46,7 @@ def bin_centers(bins: int, device: torch.device | None = None) -> Tensor:
 
 
 def decode(logits: Tensor) -> Tensor:
-    """logits (..., W) -> (...) m: expectation of the softmax within `DECODE` bins of its mode, fewer at an edge.
+    """logits (..., W) -> (...) m: expectation of the softmax within `HALF_WIDTH` bins of its mode, fewer at an edge.
 
     A mean over all bins would fall between the two peaks of a left/right doubt; the window keeps to one of them. It has
     as many bins on either side of the mode: a window that an edge cuts would lean inwards. Twin in numpy, for whoever
@@ -55,7 +54,7 @@ def decode(logits: Tensor) -> Tensor:
     """
     bins = logits.shape[-1]
     mode = logits.argmax(-1, keepdim=True)
-    reach = torch.minimum(mode, bins - 1 - mode).clamp(max=DECODE)
+    reach = torch.minimum(mode, bins - 1 - mode).clamp(max=HALF_WIDTH)
     near = (torch.arange(bins, device=logits.device) - mode).abs() <= reach
     weight = torch.softmax(logits.masked_fill(~near, -1e4), -1)
     return (weight * bin_centers(bins, logits.device)).sum(-1)

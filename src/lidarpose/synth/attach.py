@@ -33,20 +33,9 @@ class Prop:
     face_part: np.ndarray | None = None
     lift: float = 0.0
 
-    @property
-    def part(self) -> int:
-        """The part most of its faces count as: 0 for things."""
-        return 0 if self.face_part is None else int(np.bincount(self.face_part).argmax())
-
-    def place(self, joints: np.ndarray, ground: float = 0.0) -> Mesh:
-        """The mesh for a pose: joints (26, 3) m in BODY26's order, on a ground at z = `ground` m."""
-        points = joints.tolist()
-        if ground:
-            points = [[x, y, z - ground] for x, y, z in points]
-        vertices = self.where(points)
-        if ground:
-            vertices = vertices + np.float32([0, 0, ground])
-        return Mesh(vertices, self.mesh.faces)
+    def place(self, joints: np.ndarray) -> Mesh:
+        """The mesh for a pose: joints (26, 3) m in BODY26's order."""
+        return Mesh(self.where(joints.tolist()), self.mesh.faces)
 
 
 def fixed(name: str, mesh: Mesh, frame: Callable[[Points], Rows], **more: object) -> Prop:

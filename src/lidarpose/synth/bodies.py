@@ -76,7 +76,7 @@ class Bodies:
     face_part (F,) as in `body.rig`.
 
     The rest is what `moved` needs: rest bodies, clothes (n, V) m, moved_rotations (n, 24, 3, 3), step (n, 3) m and
-    lift (n,) m.
+    lift (n,) m; None are moved_rotations and step of bodies that do not move.
     """
 
     vertices: np.ndarray
@@ -92,7 +92,10 @@ class Bodies:
     lift: np.ndarray
 
     def moved(self, row: int) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices (V, 3) and joints (26, 3) of body `row`, `FRAME_TIME` s later."""
+        """Vertices (V, 3) and joints (26, 3) of body `row`, `FRAME_TIME` s later. Raises InputError where the block was
+        drawn with moving=False."""
+        if self.moved_rotations is None or self.step is None:
+            raise InputError("these bodies do not move: draw them with moving=True")
         one = slice(row, row + 1)
         vertices, joints, _, _ = dressed(
             RestBody(vertices=self.rest.vertices[one], joints=self.rest.joints[one]),
@@ -146,8 +149,8 @@ def draw_bodies(
         face_part=rig.face_part,
         rest=rest,
         clothes=worn,
-        moved_rotations=moved,
-        step=step,
+        moved_rotations=moved if moving else None,
+        step=step if moving else None,
         lift=lift,
     )
 

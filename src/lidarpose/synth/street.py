@@ -8,11 +8,12 @@ alone. Letters: P people, F frames, n points of a frame.
 
 from dataclasses import dataclass
 from math import pi
+from operator import index as as_index
 
 import numpy as np
 
 from lidarpose.data.augment import REACH
-from lidarpose.errors import InputError
+from lidarpose.errors import InputError, whole
 from lidarpose.geometry import rotation_about
 from lidarpose.lidar.catalog import sensor as named_sensor
 from lidarpose.lidar.pattern import RayPattern
@@ -69,11 +70,13 @@ def street(
     seed: int, index: int, *, sensor: str = "os1-128", people: tuple[int, int] = (3, 8), frames: int = 1
 ) -> Street:
     """Street `index` of `seed` with `people` (least, most) in it, `frames` turns at 10 Hz. Raises InputError."""
-    least, most = people
+    seed, index, frames = whole("seed", seed, least=0), whole("index", index, least=0), whole("frames", frames, least=1)
+    try:
+        least, most = map(as_index, people)
+    except (TypeError, ValueError):
+        least, most = 0, 0
     if not 1 <= least <= most:
-        raise InputError(f"people must be (least, most) with 1 <= least <= most, got {tuple(people)}")
-    if frames < 1:
-        raise InputError(f"a street needs frames of 1 or more, got {frames}")
+        raise InputError(f"people must be (least, most), whole numbers with 1 <= least <= most, got {people!r}")
     device = named_sensor(sensor)
     rng = np.random.default_rng([seed, 4, index])
     plan = draw_plan(device, rng)

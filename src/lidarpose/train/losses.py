@@ -10,6 +10,7 @@ from torch.nn import functional as F
 from lidarpose.model.batch import Targets
 from lidarpose.model.heads import Outputs, encode
 from lidarpose.model.presets import BIN
+from lidarpose.sample import HIT
 from lidarpose.skeleton import BODY26
 from lidarpose.train.task import Share, alone
 
@@ -17,8 +18,6 @@ from lidarpose.train.task import Share, alone
 VOTE, JOINTS, LEVEL, HEATMAP, PART, CONFIDENCE, SPREAD, VISIBLE = 10.0, 5.0, 2.0, 0.25, 0.25, 0.1, 0.05, 0.05
 # width of the heatmap's target: 1.2 bins
 SIGMA = 0.036
-# an error under this counts as a hit for the confidence, metres
-HIT = 0.1
 
 
 # bones as pairs (parent, child), and pairs of bones that mirror each other

@@ -37,10 +37,13 @@ def _declared(f: Field, value: Any) -> Any:
         if isinstance(f.default, tuple):
             return tuple(map(fspath, listed(value)))
         if f.type is bool:
+            # by name: numpy's is one too, and is not loaded for that
+            if type(value).__name__ not in ("bool", "bool_"):
+                raise TypeError
             return bool(value)
         return None if value is None and f.default is None else fspath(value)
     except (TypeError, ValueError, OverflowError):
-        wanted = {int: "a whole number", float: "a number"}.get(f.type, "text")
+        wanted = {int: "a whole number", float: "a number", bool: "True or False"}.get(f.type, "text")
         raise InputError(
             f"{f.name} must be {'a list of texts' if isinstance(f.default, tuple) else wanted}, got {value!r}"
         ) from None

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from lidarpose.evaluate.judged import Judged
-from lidarpose.evaluate.lines import HIT
 from lidarpose.evaluate.result import OURS, Line, Result
 from lidarpose.evaluate.stability import Curve, End, Stability
+from lidarpose.sample import HIT
 
 # blue and orange of Okabe and Ito's color-blind-safe palette (2008), the orange darker to stand out on white
 _BLUE, _ORANGE = "#0072b2", "#e07000"
@@ -70,7 +70,7 @@ def draw_reliability(judged: Judged, result: Result) -> bytes | None:
     figure, canvas = _figure(9.0, 4.3)
     _title(figure, f"{result.setting.dataset}: what {result.setting.method} says of itself", result.setting.told)
     left, right = figure.subplots(1, 2)
-    _confidence(left, confidence, error < HIT, result)
+    _confidence(left, confidence, error < 1e3 * HIT, result)
     _spread(right, spread * 1e3, error)
     return _png(canvas)
 
@@ -179,6 +179,10 @@ def _spread(axes, stated: np.ndarray, error: np.ndarray) -> None:
 
 def _curve(axes, curve: Curve, top: float) -> None:
     points = [point for point in curve.points if point.mpjpe is not None]
+    if not points:
+        axes.set_title(curve.title, fontsize=9.5, loc="left", color=_INK)
+        _nothing(axes, "nobody has a pose")
+        return
     # amounts are not evenly apart, but each is one step of the study
     at = np.array([k for k, point in enumerate(curve.points) if point.mpjpe is not None])
     values = np.array([point.mpjpe for point in points])
@@ -200,6 +204,10 @@ def _curve(axes, curve: Curve, top: float) -> None:
 
 def _sensors(axes, curve: Curve) -> None:
     points = sorted((p for p in curve.points if p.mpjpe is not None), key=lambda point: point.points)
+    if not points:
+        axes.set_title(curve.title, fontsize=9.5, loc="left", color=_INK)
+        _nothing(axes, "nobody has a pose")
+        return
     at = np.arange(len(points))[::-1]
     values = np.array([point.mpjpe for point in points])
     axes.barh(at, values, 0.72, color=_BAR, zorder=1)

@@ -3,10 +3,8 @@
 import numpy as np
 
 from lidarpose.errors import InputError
-from lidarpose.sample import Pose
+from lidarpose.sample import MIN_POINTS, Pose
 from lidarpose.skeleton import Skeleton
-
-MIN_POINTS = 5  # with fewer points the predictor answers with no pose
 
 
 def check_person(person, kind: str) -> None:

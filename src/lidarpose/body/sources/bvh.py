@@ -37,6 +37,8 @@ def load_bvh(path: str | os.PathLike, *, up: str | None = None, fps: float | Non
     if motion is None:
         raise file_error(path, "has no MOTION part; was it copied completely?")
     joints = _hierarchy(path, lines[1:motion])
+    if not any(joint.channels for joint in joints):
+        raise file_error(path, "no joint has CHANNELS, so nobody moves: was it exported with its motion?")
     values, rate = _frames(path, lines[motion + 1 :], sum(len(joint.channels) for joint in joints))
     if fps is None and rate is None:
         raise file_error(path, "has no frame time above 0 (Frame Time: seconds); give fps=")
@@ -122,7 +124,9 @@ def _frames(path: object, lines: list[str], width: int) -> tuple[np.ndarray, flo
     try:
         count = int(head["frames"][2])
     except ValueError:
-        raise file_error(path, f"Frames: must be a whole number, got {head['frames'][2][:40]!r}") from None
+        count = -1
+    if count < 0:
+        raise file_error(path, f"Frames: must be a whole number of 0 or more, got {head['frames'][2][:40]!r}")
     try:
         seconds = float(head["frame time"][2])
     except ValueError:

@@ -6,6 +6,7 @@ from lidarpose.body.clips import Clips, Motion
 from lidarpose.body.retarget import SHORTEST_BONE, mean_adult_joints, retarget_positions, shortest_bone
 from lidarpose.body.rig import forward_kinematics
 from lidarpose.body.sources.cuts import cut
+from lidarpose.body.sources.units import check_speed, metres_of
 from lidarpose.geometry import rotation_from_up
 from lidarpose.skeleton import SMPL24
 
@@ -14,7 +15,8 @@ _HIPS = [SMPL24.index("left_hip"), SMPL24.index("right_hip")]
 
 def positions_motion(path: object, clips: Clips, *, up: str | None = None, fps: float | None = None) -> Motion:
     """Clips of joint positions as the body plays them. The body's hips go where the clips' are: where the pelvis lies
-    above them differs from skeleton to skeleton."""
+    above them differs from skeleton to skeleton. Raises InputError for people of no one's size or speed, as where the
+    positions are not in metres."""
     joints = clips.joints @ rotation_from_up(up or "z").T
     good = shortest_bone(joints)[0] > SHORTEST_BONE
     parts = [
@@ -25,14 +27,18 @@ def positions_motion(path: object, clips: Clips, *, up: str | None = None, fps: 
     chosen = [np.arange(s, s + n)[good[s : s + n]] for s, n in zip(clips.start, clips.length, strict=True)]
     frames = np.concatenate([*chosen, np.zeros(0, int)]).astype(int)
     length = np.concatenate([*(part[2] for part in parts), np.zeros(0, int)]).astype(int)
+    start, fps = np.cumsum(length) - length, float(fps or clips.fps)
+    if len(frames):
+        metres_of(path, joints[frames], 1.0)
+        check_speed(path, joints[frames], start, fps)
     rotations, translation = played(joints[frames])
     return Motion(
         rotations=rotations,
         translation=translation,
         names=tuple(name for part in parts for name in part[0]),
-        start=np.cumsum(length) - length,
+        start=start,
         length=length,
-        fps=float(fps or clips.fps),
+        fps=fps,
         source=f"joint positions: {path}",
         dropped=int(clips.length.sum() - len(frames)),
     )

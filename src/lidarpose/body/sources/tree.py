@@ -15,6 +15,7 @@ from lidarpose.body.clips import Motion
 from lidarpose.body.retarget import SHORTEST_BONE, mean_adult_joints, shortest_bone
 from lidarpose.body.sources.cuts import cut
 from lidarpose.body.sources.positions import played
+from lidarpose.body.sources.units import check_speed, metres_of
 from lidarpose.data.files import file_error
 from lidarpose.geometry import rotation_from_up, unit
 from lidarpose.skeleton import SMPL24
@@ -52,13 +53,6 @@ _SIDES = ("left", "right")
 # ends of limbs that have no name are called after their parent, with this behind
 END = " (end)"
 
-# how many metres a file's number is: metres, centimetres, millimetres, inches, and CMU's unit (inches / 0.45)
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "inch/0.45": 0.0254 / 0.45}
-# people are this much smaller or larger than the mean adult
-_SMALLEST, _LARGEST = 0.4, 1.45
-_TYPICAL = 0.85  # between children and tall adults: inches and centimetres must be told apart for both
-_UNEVEN = 2.0  # legs whose lengths are further apart than this were not measured in one unit
-_FASTEST = 50.0  # m/s
 _STANDS = 0.7  # mean share of the trunk along the axis that is taken for up
 
 
@@ -96,7 +90,7 @@ def tree_motion(
     cut(path, name, good)
     with np.errstate(over="ignore", invalid="ignore"):
         joints = smpl_joints(tree, found, tree.positions[good])
-        joints = joints * _scale(path, joints, unit_m)
+        joints = joints * metres_of(path, joints, unit_m)
         if not np.abs(joints).max() < 1e5:
             raise file_error(path, "joints lie farther than 100 km from the origin; expected one unit throughout")
     joints = joints @ rotation_from_up(up or _upwards(path, joints)).T
@@ -106,11 +100,7 @@ def tree_motion(
     good[good] = length > SHORTEST_BONE
     joints = joints[length > SHORTEST_BONE]
     names, start, count = cut(path, name, good)
-    steps = np.linalg.norm(np.diff(joints[:, _J["pelvis"]], axis=0), axis=-1) * fps
-    if len(steps) and np.median(steps) > _FASTEST:
-        raise file_error(
-            path, f"people move at {np.median(steps):.4g} m/s: are positions and bones in one unit, and is fps right?"
-        )
+    check_speed(path, joints, start, fps)
     rotations, translation = played(joints)
     return Motion(
         rotations=rotations,
@@ -212,35 +202,6 @@ def _spine(
     k = np.clip(np.searchsorted(along, at, side="right") - 1, 0, len(bones) - 1)
     part = (at - along[k]) / np.maximum(bones[k], 1e-12)
     return [line[n] + p * (line[n + 1] - line[n]) for n, p in zip(k, part, strict=True)]
-
-
-def _scale(path: object, joints: np.ndarray, unit_m: float | None) -> float:
-    """Metres of a number: the unit that gives the person the most usual size."""
-    left, right, trunk = (_size(joints, side) for side in ("left", "right", None))
-    if not (np.isfinite([left, right, trunk]).all() and min(left, right, trunk) > 0):
-        raise file_error(path, "the legs or the trunk have no length; expected the offsets of a person's bones")
-    if max(left, right) > _UNEVEN * min(left, right):
-        raise file_error(path, f"the left leg is {left:.4g} long, the right {right:.4g}; expected one unit throughout")
-    rest = mean_adult_joints()[None]
-    ratio = ((left + right) / 2 + trunk) / (_size(rest, "left") + _size(rest, None))
-    scale = unit_m or min(UNITS.values(), key=lambda m: abs(np.log(ratio * m / _TYPICAL)))
-    if not _SMALLEST < ratio * scale < _LARGEST:
-        raise file_error(
-            path,
-            f"the person is {ratio * scale:.3g} times as tall as an adult; known units are {', '.join(UNITS)}: "
-            "scale the skeleton to one of them",
-        )
-    return scale
-
-
-def _size(joints: np.ndarray, side: str | None) -> float:
-    """Median length of a leg, or without side of the line hips -> neck -> head."""
-    if side:
-        line = [joints[:, _J[f"{side}_{n}"]] for n in ("hip", "knee", "ankle")]
-    else:
-        middle = (joints[:, _J["left_hip"]] + joints[:, _J["right_hip"]]) / 2
-        line = [middle, joints[:, _J["neck"]], joints[:, _J["head"]]]
-    return float(sum(np.median(np.linalg.norm(b - a, axis=-1)) for a, b in zip(line, line[1:], strict=False)))
 
 
 def _upwards(path: object, joints: np.ndarray) -> str:

@@ -29,7 +29,7 @@ from lidarpose.model.dapt.layers import (
     Unpooling,
 )
 from lidarpose.model.dapt.tables import Level, Neighbours, Tables, build_tables
-from lidarpose.model.decode import REACH
+from lidarpose.model.decode import HALF_WIDTH
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -271,7 +271,7 @@ def _window(logits: Tensor) -> Tensor:
     """logits (..., W) -> (...) bins: see `decode.window`."""
     bins = logits.shape[-1]
     mode = logits.argmax(-1, keepdim=True)
-    reach = torch.minimum(mode, bins - 1 - mode).clamp(max=REACH)
+    reach = torch.minimum(mode, bins - 1 - mode).clamp(max=HALF_WIDTH)
     index = torch.arange(bins, device=logits.device)
     # finite, and in float32, since half types cannot tell bins of the hundreds apart
     weight = logits.float().masked_fill((index - mode).abs() > reach, -1e4).softmax(-1)
