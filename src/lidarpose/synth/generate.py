@@ -92,8 +92,7 @@ class Generator:
     ) -> list[SyntheticPerson]:
         """Clip `index` of `seed`: one person who moves, `frames` samples at 10 Hz; things and sensor stay where they
         are. Frames in which nothing of the person is seen have samples without points."""
-        if frames < 1:
-            raise InputError(f"a clip needs frames of 1 or more, got {frames}")
+        frames = whole("a clip's frames", frames, least=1)
         seed, index = whole("seed", seed, least=0), whole("index", index, least=0)
         rng = np.random.default_rng([seed, 3, index])
         actor = draw_actor(self.bank, self.captured, frames, rng, clothes=self.scene.clothes)
