@@ -431,7 +431,7 @@ BAD_COMMANDS = {
     "onnx file": ("predict CROP --weights BOXES --backend onnx", "something else"),
     "export what": ("export tyni", "did you mean tiny"),
     "export how": ("export --format tflite --out DIR/x", "known are onnx, torch"),
-    "export nothing": ("export no/such.safetensors --out DIR/x", "does not exist"),
+    "export nothing": ("export no/such.safetensors --out DIR/x.onnx", "does not exist"),
     "import nothing": ("import no/such.safetensors DIR/x", "there is no such file"),
     "import a pickle": ("import weights.pth DIR/x", "got a pickle"),
     "import as": ("import DAPT DIR/x --config kitti", "waymo"),

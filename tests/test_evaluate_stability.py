@@ -295,13 +295,13 @@ def test_no_pose_stays_out_of_the_increase():
         return SimpleNamespace(errors=lambda: errors, posed=~np.isnan(errors[:, 0]))
 
     found = answers(110.0, np.nan, 330.0)
-    point = module._point(found, base, 1.0, "1", [5, 6, 7])
+    point = module._point(found, base, 1.0, "1", [5, 6, 7], 0)
     assert (point.mpjpe, point.increase, point.no_pose, point.people, point.points) == (220.0, 20.0, 1, 3, 6.0)
     # whoever had none undisturbed has none here either
     base = np.array([[100.0], [np.nan], [300.0]])
-    assert module._point(answers(110.0, np.nan, np.nan), base, 1.0, "1", [5, 6, 7]).no_pose == 2
-    assert module._point(answers(100.0, np.nan, 300.0), base, 0.0, "0", [5, 6, 7]).no_pose == 1
-    alone = module._point(found, base, 1.0, "1", [5, 6, 7], np.array(["a", "a", "a"]))
+    assert module._point(answers(110.0, np.nan, np.nan), base, 1.0, "1", [5, 6, 7], 0).no_pose == 2
+    assert module._point(answers(100.0, np.nan, 300.0), base, 0.0, "0", [5, 6, 7], 0).no_pose == 1
+    alone = module._point(found, base, 1.0, "1", [5, 6, 7], 0, np.array(["a", "a", "a"]))
     assert alone.low is None and alone.increase_high is None
 
 

@@ -436,6 +436,9 @@ def test_published_names_of_smpl_are_known(tmp_path):
     names = ("basicModel_f_lbs_10_207_0_v1.0.0", "basicmodel_m_lbs_10_207_0_v1.1.0", "SMPL_NEUTRAL", "other")
     for name in names:
         (tmp_path / f"{name}.pkl").write_bytes(b"x")
+    # the one that is read at once
+    (tmp_path / f"{names[2]}.pkl").unlink()
+    files.write_smpl(tmp_path / f"{names[2]}.npz")
     found = SmplJoints(tmp_path, "x")
     assert {kind: path.stem for kind, path in found.files.items()} == {
         "female": names[0], "male": names[1], "neutral": names[2]
