@@ -105,7 +105,7 @@ VARIANTS = {
     "batch 128": Variant("steps", "batches of 128, half the steps", recipe={"batch": 128}),
     "AdamW": Variant("network", "AdamW for all weights, no Muon", recipe={"muon_rate": 0.0}),
     "deeper": Variant("size", "2 + 3 + 2 blocks instead of 1 + 1 + 1", config={"blocks": (2, 3, 2)}),
-    "small": Variant("size", "`small`", size="small"),
+    "small": Variant("size", "`small` without convolutions: 2 + 2 + 2 blocks, wider", size="small"),
 }
 
 
