@@ -117,8 +117,7 @@ def _parsed(name: str, text: str, kind: type) -> object:
 
 def _said(value: object) -> str:
     """A value as it is written after an option, of paths the name alone."""
-    if isinstance(value, tuple):
-        return shlex.quote(",".join(Path(one).name if "/" in one else one for one in value))
     if isinstance(value, bool):
         return str(value).lower()
-    return shlex.quote(Path(value).name if isinstance(value, str) and "/" in value else str(value))
+    parts = value if isinstance(value, tuple) else (str(value),)
+    return shlex.quote(",".join(Path(part).name if "/" in part else part for part in parts))

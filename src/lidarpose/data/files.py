@@ -5,6 +5,7 @@ Every failure that the user can cause is an `InputError` of one line that names 
 
 import difflib
 import errno
+import hashlib
 import os
 import reprlib
 import stat
@@ -65,6 +66,11 @@ def _is_same(out: str | os.PathLike, source: object) -> bool:
         return os.path.samefile(out, source)
     except (OSError, ValueError):
         return False
+
+
+def content_digest(path: str | os.PathLike, *, expected: str) -> str:
+    """The SHA-256 of a file, in hexadecimal digits. expected and errors: as of `read_bytes`."""
+    return hashlib.sha256(read_bytes(path, expected=expected)).hexdigest()
 
 
 def read_bytes(path: str | os.PathLike, *, expected: str) -> bytes:

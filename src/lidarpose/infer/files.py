@@ -12,11 +12,11 @@ from lidarpose.data.files import file_error
 from lidarpose.data.formats import Cloud, read_points
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, rotation_from_up
-from lidarpose.infer.people import MIN_POINTS, as_origin, flat_axis, lies, unit_warning, within_reach
+from lidarpose.infer.people import as_origin, flat_axis, lies, unit_warning, within_reach
 from lidarpose.infer.predictor import Predictor, load
 from lidarpose.infer.results import PersonPose, Poses
 from lidarpose.model.bundled import DEFAULT
-from lidarpose.sample import FARTHEST, Box
+from lidarpose.sample import FARTHEST, MIN_POINTS, Box
 
 # a file of less than this across is taken for a crop, m
 CROP_SIZE = 4.0
@@ -89,7 +89,7 @@ def predict(
     done = time.perf_counter()
     if found:
         warnings += _box_warnings(raw, found, cloud)
-    if warning := _axis_warning(raw, cloud, up):
+    if warning := _axis_warning(raw, cloud, up, R_house_input):
         warnings.append(warning)
     people = [_in_input(person, R_house_input, up) for person in raw]
     if found is None:
@@ -180,10 +180,10 @@ def _place(point: np.ndarray) -> str:
     return "(" + ", ".join(f"{value:.1f}" for value in point) + ")"
 
 
-def _axis_warning(people: Poses, cloud: Cloud, up: str) -> str | None:
-    """What is likely wrong with the axes. `people` in the house's frame."""
+def _axis_warning(people: Poses, cloud: Cloud, up: str, R_house_input: np.ndarray) -> str | None:
+    """What is likely wrong with the axes. `people` in the house's frame, into which R_house_input turns by `up`."""
     flat = flat_axis(cloud.points)
-    axis = up if up in UP_AXES else "xyz"[int(np.abs(rotation_from_up(up)[2]).argmax())]
+    axis = "xyz"[int(np.abs(R_house_input[2]).argmax())]
     if flat is not None and flat != axis:
         return f"the points extend least along {flat}, so {up} is hardly the input's up axis: try --up {flat}"
     found = [person for person in people if person.pose is not None]

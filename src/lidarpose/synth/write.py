@@ -1,6 +1,5 @@
 """The job behind `lidarpose synth`: people, clips or streets into Parquet shards; see `data.jobs` for how."""
 
-import hashlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.body.sources import digest as motion_digest
-from lidarpose.data.files import read_bytes
+from lidarpose.data.files import content_digest
 from lidarpose.data.jobs import clean_folder, make_shards, open_folder
 from lidarpose.data.shards import CARD, Card, person_row, shard_path, shard_writer, write_card
 from lidarpose.errors import InputError
@@ -93,19 +92,15 @@ class Job:
         if self.what != "streets":
             settings |= {"scene": self.scene, "hard": self.hard}
         # files by content, so that another file of the same name is noticed and the same one elsewhere is not
-        tables = {name: _digest(name, "a sensor's table") for name in dict.fromkeys(sensors) if name not in SENSORS}
+        tables = [name for name in dict.fromkeys(sensors) if name not in SENSORS]
         if tables:
-            settings["tables"] = list(tables.values())
+            settings["tables"] = [content_digest(name, expected="a sensor's table")[:16] for name in tables]
         if self.motion is not None:
             settings["motion"] = motion_digest(self.motion)
             settings["captured"] = self.share
             settings["subjects"] = list(self.subjects) if self.subjects else None
         per_shard = self.per_shard or PER_SHARD[self.what]
         return Card(settings=settings, count=self.count, per_shard=per_shard, tables=_TABLES[self.what])
-
-
-def _digest(path: str, expected: str) -> str:
-    return hashlib.sha256(read_bytes(path, expected=expected)).hexdigest()[:16]
 
 
 def write_dataset(

@@ -4,13 +4,12 @@ A field's help is what the command line says of it; this module stays light for 
 """
 
 from dataclasses import Field, asdict, dataclass, field, fields
-from math import isfinite
 from operator import index
 from os import fspath
 from typing import Any
 
 from lidarpose.data.files import listed
-from lidarpose.errors import InputError, check_name
+from lidarpose.errors import InputError, check_finite, check_name
 from lidarpose.model.bundled import DEFAULT
 
 # rises, stays, falls to nothing; or rises and falls as a cosine
@@ -78,8 +77,7 @@ class Recipe:
             if not getattr(self, name) >= bound:
                 raise InputError(f"{name} must be at least {bound}, got {getattr(self, name):g}")
         for name in (f.name for f in fields(self) if f.type is float):
-            if not isfinite(getattr(self, name)):
-                raise InputError(f"{name} must be a finite number, got {getattr(self, name)}")
+            check_finite(name, getattr(self, name))
         self._check_shares("warmup", "cool")
         self._check_shares("ema", below=True)
         for name, known in (("schedule", SCHEDULES), ("precision", PRECISIONS)):

@@ -22,7 +22,7 @@ from lidarpose.body.sources.asf_amc import load_amc
 from lidarpose.body.sources.bvh import load_bvh
 from lidarpose.body.sources.lidarhuman26m import load_pose_json, pose_files
 from lidarpose.body.sources.sloper4d import load_sloper4d
-from lidarpose.data.files import file_error, read_bytes
+from lidarpose.data.files import content_digest, file_error, read_bytes
 from lidarpose.errors import check_name
 from lidarpose.geometry import UP_AXES
 
@@ -115,15 +115,15 @@ def digest(path: str | os.PathLike) -> str:
     files of motion in it and its folders and of the skeletons beside them. Raises InputError."""
     path = Path(path)
     if not path.is_dir():
-        return _hash(path)[:16]
+        return content_digest(path, expected="motion")[:16]
     wanted = {*_BY_SUFFIX, ".asf"}
     files = sorted(Path(here, name) for here, _, names in os.walk(path) for name in names)
-    told = [f"{file.relative_to(path).as_posix()} {_hash(file)}" for file in files if file.suffix.lower() in wanted]
+    told = [
+        f"{file.relative_to(path).as_posix()} {content_digest(file, expected='motion')}"
+        for file in files
+        if file.suffix.lower() in wanted
+    ]
     return hashlib.sha256("\n".join(told).encode("utf-8", "surrogateescape")).hexdigest()[:16]
-
-
-def _hash(path: Path) -> str:
-    return hashlib.sha256(read_bytes(path, expected="motion")).hexdigest()
 
 
 def _placed(name: str, source: Path, folder: Path) -> str:

@@ -1,7 +1,6 @@
 """SMPL's 24 joints from its parameters, by the user's own model files: what datasets without joints need; and the
 people that they make."""
 
-import hashlib
 import re
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +9,7 @@ import numpy as np
 
 from lidarpose.body.rig import forward_kinematics
 from lidarpose.body.smpl import SmplBody, load_body
-from lidarpose.data.files import file_error, read_bytes
+from lidarpose.data.files import content_digest, file_error
 from lidarpose.data.readers.items import SEEN, Item
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix
@@ -66,10 +65,7 @@ class SmplJoints:
     @cached_property
     def digests(self) -> dict[str, str]:
         """By kind, what tells one file from another."""
-        return {
-            kind: hashlib.sha256(read_bytes(path, expected="SMPL")).hexdigest()[:12]
-            for kind, path in self.files.items()
-        }
+        return {kind: content_digest(path, expected="SMPL")[:12] for kind, path in self.files.items()}
 
 
 def smpl_item(
