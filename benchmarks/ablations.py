@@ -29,9 +29,9 @@ from torch import nn
 
 from lidarpose import evaluation
 from lidarpose._version import __version__
-from lidarpose.data.files import write_atomic
 from lidarpose.infer.backend_torch import TorchBackend
 from lidarpose.infer.predictor import Predictor
+from lidarpose.io.files import write_atomic
 from lidarpose.model.checkpoint import load_checkpoint
 from lidarpose.model.grow import grown
 from lidarpose.model.header import Header, opened, read_header

@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 
 import lidarpose
-from lidarpose.data.files import write_atomic
 from lidarpose.infer.files import TTA
 from lidarpose.infer.predictor import Predictor
 from lidarpose.infer.results import PersonPose
+from lidarpose.io.files import write_atomic
 from lidarpose.model.bundled import DEFAULT
 from lidarpose.skeleton import SMPL24
 from lidarpose.view.person import facing

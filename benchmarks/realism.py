@@ -21,9 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.boxes import read_boxes
-from lidarpose.data.formats import read_points
 from lidarpose.geometry import rotation_about
+from lidarpose.io.boxes import read_boxes
+from lidarpose.io.formats import read_points
 from lidarpose.lidar.catalog import sensor
 from lidarpose.lidar.pattern import RayPattern
 from lidarpose.lidar.pattern_scan import scan_pattern

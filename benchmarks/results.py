@@ -26,8 +26,8 @@ from ablation_tables import figures, own_lines
 from ablations import VARIANTS
 from against_paper import WAYS
 
-from lidarpose.data.files import write_atomic
 from lidarpose.evaluate.result import Line, Scores, read_scores
+from lidarpose.io.files import write_atomic
 from lidarpose.model.bundled import BUNDLED, DEFAULT, bundled_path
 from lidarpose.model.header import digest, read_header, runs_of
 

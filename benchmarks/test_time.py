@@ -17,10 +17,10 @@ import numpy as np
 from ablation_tables import figures
 
 from lidarpose import evaluation
-from lidarpose.data.files import write_atomic
 from lidarpose.infer.backend import Estimates, Raw, estimates
 from lidarpose.infer.predictor import PASSES, Predictor, load
 from lidarpose.infer.tta import LOOKS, Look, averaged, shown
+from lidarpose.io.files import write_atomic
 from lidarpose.skeleton import BODY26
 
 # a logarithm that stands for a bin out of the heatmap, or of next to no weight

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpose.data import augment
 from lidarpose.geometry import unit
 from lidarpose.sample import Box
+from lidarpose.synth import augment
 from lidarpose.synth.mask import direction_mask
 from lidarpose.synth.mesh import Mesh
 from lidarpose.synth.spoil import range_errors, spoil, spoil_points

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpose.data.boxes import read_boxes
 from lidarpose.errors import InputError
+from lidarpose.io.boxes import read_boxes
 
 PERSON = {"center": [10.0, -2.0, 0.5], "size": [0.6, 0.7, 1.8], "yaw": 0.3, "id": "a"}
 

@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_evaluate import Fake, standing
 
-from lidarpose.data.augment import noise_clusters, stray_cluster
 from lidarpose.data.prepare import prepare
 from lidarpose.evaluate import stability as module
 from lidarpose.evaluate.disturb import DISTURBANCES
@@ -22,6 +21,7 @@ from lidarpose.evaluate.run import Task, judge, task_of
 from lidarpose.evaluate.stability import end_errors, study, to_json
 from lidarpose.sample import Box, center_of
 from lidarpose.skeleton import BODY26, HUMAN15
+from lidarpose.synth.augment import noise_clusters, stray_cluster
 from lidarpose.synth.generate import LEAST_POINTS
 from lidarpose.synth.write import Job, write_dataset
 from lidarpose.view.charts import draw_stability

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpose.data import files
-from lidarpose.data.files import atomic_path, file_error, read_bytes, write_atomic
 from lidarpose.errors import InputError
+from lidarpose.io import files
+from lidarpose.io.files import atomic_path, file_error, read_bytes, write_atomic
 
 
 def tree(folder):

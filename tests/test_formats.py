@@ -17,9 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from lidarpose.data.boxes import read_boxes
-from lidarpose.data.formats import SUFFIXES, Cloud, read_points
 from lidarpose.errors import InputError
+from lidarpose.io.boxes import read_boxes
+from lidarpose.io.formats import SUFFIXES, Cloud, read_points
 
 REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "real"
 
@@ -586,7 +586,7 @@ def test_damaged_files_read_or_fail_in_one_line(folder, data):
 
 def test_import_loads_no_heavy_library():
     heavy = {"pandas", "trimesh", "pypcd4", "lzf", "torch"}
-    code = f"import sys, lidarpose.data.formats; print(sorted({heavy} & set(sys.modules)))"
+    code = f"import sys, lidarpose.io.formats; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

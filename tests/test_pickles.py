@@ -14,9 +14,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpose.data import pickles
-from lidarpose.data.pickles import MAX_BYTES, Unread, load_pickle
 from lidarpose.errors import InputError
+from lidarpose.io import pickles
+from lidarpose.io.pickles import MAX_BYTES, Unread, load_pickle
 
 
 @pytest.fixture

@@ -10,13 +10,13 @@ import pytest
 import torch
 
 import lidarpose
-from lidarpose.data.boxes import read_boxes
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about
 from lidarpose.infer import people as people_module
 from lidarpose.infer.backend import Raw
 from lidarpose.infer.people import MAX_POINTS, as_origin, as_points, candidates, flat_axis, lies, unit_warning
 from lidarpose.infer.predictor import Predictor
+from lidarpose.io.boxes import read_boxes
 from lidarpose.lidar.catalog import sensor
 from lidarpose.sample import Box
 from lidarpose.skeleton import SKELETONS

@@ -16,15 +16,16 @@ MODULES = sorted(SOURCE.rglob("*.py"))
 # the house from the ground up: a room imports its own floor and those below
 FLOORS = (
     {"skeleton", "geometry", "sample", "errors", "_version"},
-    {"body", "lidar", "synth", "data"},
+    {"io"},
+    {"body", "lidar"},
+    {"data"},
+    {"synth"},
     {"model"},
     {"train", "evaluate"},
     {"infer", "view", "demo", "cli", "metrics", "evaluation", "__init__", "__main__"},
 )
-NO_TORCH = ({"torch", "safetensors"}, FLOORS[0] | FLOORS[1])
-STRANGERS = {("synth", "model"), ("model", "synth")}
-# writes files whole or not at all: of use on every floor
-FOR_ALL = "lidarpose.data.files"
+NO_TORCH = ({"torch", "safetensors"}, set().union(*FLOORS[:5]))
+STRANGERS = {("body", "lidar"), ("lidar", "body"), *(("model", room) for room in ("body", "lidar", "data", "synth"))}
 
 
 def loaded_by(code):
@@ -107,7 +108,7 @@ def test_imports_go_downwards(path):
         # the caster for GPUs is imported by whoever asks for it
         if name.split(".")[0] in NO_TORCH[0] and path.stem != "raycast_torch":
             assert here not in NO_TORCH[1], f"{here} imports {name}"
-        if name.split(".")[0] != "lidarpose" or name == FOR_ALL:
+        if name.split(".")[0] != "lidarpose":
             continue
         there = room(name)
         assert floor(there) <= floor(here), f"{here} imports {name}, which is a floor above"
@@ -121,6 +122,15 @@ def test_imports_run_in_no_circle():
     below = {name: wanted - {name} for name, wanted in below.items()}
     # raises CycleError, which names the modules
     assert len(list(graphlib.TopologicalSorter(below).static_order())) >= len(MODULES)
+
+
+def test_no_two_rooms_need_each_other():
+    below = {}
+    for path in MODULES:
+        wanted = {room(name) for name in imports(path) if name.split(".")[0] == "lidarpose"}
+        # `from lidarpose import Name` loads the name's own room
+        below.setdefault(where(path), set()).update(wanted - {where(path), "__init__"})
+    assert list(graphlib.TopologicalSorter(below).static_order())
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(SOURCE)))

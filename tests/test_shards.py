@@ -10,6 +10,7 @@ from pyarrow import parquet
 from shard_files import write_shard
 
 from lidarpose.data import shards
+from lidarpose.data.facts import Facts
 from lidarpose.data.shards import (
     Card,
     open_dataset,
@@ -22,7 +23,6 @@ from lidarpose.data.shards import (
 from lidarpose.errors import InputError
 from lidarpose.sample import Box, Pose, Sample
 from lidarpose.skeleton import BODY26
-from lidarpose.synth.facts import Facts
 
 FACTS = Facts(sensor="os1-64", kind="walk", distance=7.5, visible=0.5, height_seen=0.9, clutter=0.1, upright=True)
 

@@ -19,8 +19,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lidarpose._version import __version__
-from lidarpose.data.files import atomic_path
 from lidarpose.evaluate.bench import METADATA, NAME, schema
+from lidarpose.io.files import atomic_path
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import PoseBank
 from lidarpose.synth.generate import Generator, SyntheticPerson

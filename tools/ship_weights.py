@@ -10,8 +10,8 @@ import json
 import tempfile
 from pathlib import Path
 
-from lidarpose.data.files import write_atomic
 from lidarpose.infer.predictor import load
+from lidarpose.io.files import write_atomic
 from lidarpose.model.checkpoint import load_checkpoint, save_checkpoint
 from lidarpose.model.export import export
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.files import atomic_path
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.infer.files import TTA
 from lidarpose.infer.predictor import Predictor, load
+from lidarpose.io.files import atomic_path
 from lidarpose.model.bundled import DEFAULT
 
 SENSORS = ("vlp-32c", "os1-128", "hdl-64e")

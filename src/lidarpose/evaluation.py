@@ -20,7 +20,6 @@ import numpy as np
 
 from lidarpose._version import __version__
 from lidarpose.data.columns import pyarrow
-from lidarpose.data.files import atomic_path, check_writable, file_error, listed
 from lidarpose.errors import InputError
 from lidarpose.evaluate.judged import Judged, read_poses, write_poses
 from lidarpose.evaluate.people import BENCH, open_people
@@ -30,6 +29,7 @@ from lidarpose.evaluate.run import Evaluation, Model, Task, judge, task_of
 from lidarpose.evaluate.stability import Stability, study, to_disturb, to_json
 from lidarpose.evaluate.table import published, table
 from lidarpose.infer.predictor import load
+from lidarpose.io.files import atomic_path, check_writable, file_error, listed
 from lidarpose.model.bundled import weights_path
 from lidarpose.model.header import digest
 from lidarpose.sample import Pose

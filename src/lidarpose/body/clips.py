@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose.body.retarget import heading, rotation_vector, without_yaw
-from lidarpose.data.files import file_error
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix, rotation_about
+from lidarpose.io.files import file_error
 from lidarpose.skeleton import SMPL24
 
 _KEYS = ("joints", "clip", "clip_start", "clip_length", "fps")

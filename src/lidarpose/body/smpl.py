@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose.body.rig import forward_kinematics
-from lidarpose.data.files import file_error, read_bytes
-from lidarpose.data.pickles import Unread, load_pickle
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix
+from lidarpose.io.files import file_error, read_bytes
+from lidarpose.io.pickles import Unread, load_pickle
 from lidarpose.skeleton import SMPL24
 
 _TO_HOUSE = UP_AXES["y"]

@@ -104,7 +104,7 @@ def _evaluate(options: argparse.Namespace) -> None:
 
 def _table(options: argparse.Namespace) -> None:
     from lidarpose import evaluation
-    from lidarpose.data.files import check_apart, write_atomic
+    from lidarpose.io.files import check_apart, write_atomic
 
     if options.out is not None:
         check_apart(options.out, *map(evaluation.scores_path, options.scores))

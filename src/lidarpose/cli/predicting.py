@@ -78,9 +78,9 @@ def add(commands) -> None:
 
 
 def _predict(options: argparse.Namespace) -> None:
-    from lidarpose.data.files import atomic_path, check_apart
     from lidarpose.infer.files import TTA, predict
     from lidarpose.infer.predictor import load
+    from lidarpose.io.files import atomic_path, check_apart
 
     file = Path(options.file)
     to_stdout = options.out == "-"
@@ -123,7 +123,7 @@ def _predict(options: argparse.Namespace) -> None:
 
 def _warnings(poses) -> list[str]:
     """The input's warnings, and each of the people's once with the ids of those it is about."""
-    from lidarpose.data.headers import shorten
+    from lidarpose.io.headers import shorten
 
     shared: dict[str, list[str]] = {}
     for person in poses:

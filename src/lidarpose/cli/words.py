@@ -2,7 +2,7 @@
 
 import sys
 
-from lidarpose.data.files import one_line
+from lidarpose.io.files import one_line
 
 
 def names(text: str) -> tuple[str, ...]:

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from lidarpose.data.facts import Facts
 from lidarpose.errors import MissingExtra
-from lidarpose.synth.facts import Facts
 
 Kind = str | list[str]
 

@@ -18,9 +18,9 @@ from contextlib import closing, suppress
 from pathlib import Path
 
 from lidarpose.data.columns import TABLES
-from lidarpose.data.files import file_error
 from lidarpose.data.shards import CARD, Card, check_settings, read_card, rows_of_shard, shard_path
 from lidarpose.errors import InputError
+from lidarpose.io.files import file_error
 
 # makes and writes a shard, by its number; yields how many people, clips or streets are done since it last did
 Make = Callable[[int], Iterator[int]]

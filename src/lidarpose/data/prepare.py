@@ -14,7 +14,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from lidarpose.data.files import file_error
 from lidarpose.data.jobs import clean_folder, make_shards, open_folder
 from lidarpose.data.labelled import labelled_row
 from lidarpose.data.readers.items import Item, Reader, Skipped
@@ -22,6 +21,7 @@ from lidarpose.data.shards import CARD, SENSOR_FRAME, Card, open_dataset, shard_
 from lidarpose.data.split_rules import SplitRule, split_rule
 from lidarpose.data.summary import summarize
 from lidarpose.errors import InputError, check_name
+from lidarpose.io.files import file_error
 
 # dataset -> module and class of its reader, and whether that takes the user's SMPL
 READERS: dict[str, tuple[str, str, bool]] = {

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.files import file_error, read_bytes
 from lidarpose.errors import InputError, check_name
+from lidarpose.io.files import file_error, read_bytes
 
 # what a user's own lists are called
 _LISTS = {"train": "train.txt", "val": "val.txt", "test": "test.txt"}

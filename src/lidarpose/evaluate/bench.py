@@ -6,7 +6,7 @@ made it once). A row is one person in one frame:
     clip, frame         number of the clip and frame of it; clip -1: a person alone
     condition           clean, occluded, cluttered, crop (a poor detector's box) or company (a second person)
     poses               prior (procedural) or captured (subjects kept out of all training)
-    sensor, kind, distance, visible, clutter, upright      as in `synth.facts.Facts`
+    sensor, kind, distance, visible, clutter, upright      as in `data.facts.Facts`
     origin              (3,) m in the level frame at the sensor; points_mm: x, y, z of all points from it, millimetres
     part                one a point: 0 = not body, 1 + j = the bone of SMPL-24's joint j
     joints              x, y, z of body26's joints, m, in the level frame at the sensor, which stands at its origin
@@ -21,9 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.files import file_error, read_bytes
 from lidarpose.errors import missing_extra
 from lidarpose.geometry import rotation_about
+from lidarpose.io.files import file_error, read_bytes
 from lidarpose.sample import center_of
 from lidarpose.skeleton import BODY26
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidarpose.data.augment import jitter, random_keep, stray_cluster
 from lidarpose.geometry import axis_angle_to_matrix
 from lidarpose.sample import Box, center_of
+from lidarpose.synth.augment import jitter, random_keep, stray_cluster
 
 # of the paper's: two clusters, as in its released code
 _CLUSTERS = 2

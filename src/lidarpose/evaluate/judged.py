@@ -27,9 +27,9 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose.data.columns import pyarrow
-from lidarpose.data.files import file_error, read_bytes
 from lidarpose.data.readers.items import UNLABELED
 from lidarpose.evaluate.metrics import joint_errors
+from lidarpose.io.files import file_error, read_bytes
 from lidarpose.skeleton import Skeleton
 
 # key of the joints' names in the file's metadata

@@ -8,11 +8,11 @@ from typing import Protocol
 
 import numpy as np
 
-from lidarpose.data.files import file_error
 from lidarpose.data.readers.items import HIDDEN, SEEN, UNLABELED
 from lidarpose.data.shards import Dataset, open_dataset, read_rows, rows_of_shard, shard_path
 from lidarpose.errors import InputError, whole
 from lidarpose.evaluate.bench import NAME, Bench, load_bench, plain
+from lidarpose.io.files import file_error
 from lidarpose.sample import Box
 from lidarpose.skeleton import BODY26, HUMAN15, Skeleton, skeleton
 

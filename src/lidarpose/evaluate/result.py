@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from lidarpose._version import __version__
-from lidarpose.data.files import file_error, read_bytes
 from lidarpose.errors import InputError
+from lidarpose.io.files import file_error, read_bytes
 
 SCHEMA = "lidarpose.scores/1"
 FILE = "scores.json"

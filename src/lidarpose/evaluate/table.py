@@ -11,10 +11,10 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from lidarpose.data.files import listed
 from lidarpose.errors import InputError
 from lidarpose.evaluate.protocols import PROTOCOLS
 from lidarpose.evaluate.result import OURS, RELEASED, Result, Scores, read_scores
+from lidarpose.io.files import listed
 
 SCHEMA = "lidarpose.table/1"
 FORMATS = ("markdown", "json")

@@ -13,8 +13,8 @@ from typing import Protocol
 
 import numpy as np
 
-from lidarpose.data.files import file_error
 from lidarpose.errors import whole
+from lidarpose.io.files import file_error
 from lidarpose.model.decode import Decoder, out_of_range
 from lidarpose.model.header import Header, digest, read_header
 from lidarpose.model.onnx_file import OUTPUTS, input_name, network_inputs, open_onnx, plan_people

@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidarpose.data.boxes import read_boxes
-from lidarpose.data.files import file_error
-from lidarpose.data.formats import Cloud, read_points
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, rotation_from_up
 from lidarpose.infer.people import as_origin, flat_axis, lies, unit_warning, within_reach
 from lidarpose.infer.predictor import Predictor, load
 from lidarpose.infer.results import PersonPose, Poses
+from lidarpose.io.boxes import read_boxes
+from lidarpose.io.files import file_error
+from lidarpose.io.formats import Cloud, read_points
 from lidarpose.model.bundled import DEFAULT
 from lidarpose.sample import FARTHEST, MIN_POINTS, Box
 
@@ -40,7 +40,7 @@ def predict(
 ) -> Poses:
     """Poses of the people in a point file, in the file's own frame.
 
-    boxes: a JSON file, its content (see `data.boxes`), a `Box` or several, their length and width level, their height
+    boxes: a JSON file, its content (see `io.boxes`), a `Box` or several, their length and width level, their height
     and yaw along and about the up axis (the file's z where `up` is a direction); crop: the file is one person already.
     With neither, a file of less than 4 m across is taken as a crop and anything else asks for boxes. sensor_origin:
     (x, y, z) m in the file's frame, or "unknown"; None means 0, 0, 0 with boxes and unknown for a crop. skeleton: a

@@ -4,10 +4,10 @@ import os
 
 import numpy as np
 
-from lidarpose.data.files import one_line
-from lidarpose.data.headers import is_transposed
 from lidarpose.errors import InputError
 from lidarpose.geometry import vector_of
+from lidarpose.io.files import one_line
+from lidarpose.io.headers import is_transposed
 from lidarpose.sample import FARTHEST, MIN_POINTS, Pose, center_of
 
 # joints that every skeleton has

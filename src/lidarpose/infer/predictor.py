@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.files import file_error
 from lidarpose.errors import InputError, check_name, missing_extra, whole
 from lidarpose.infer.backend import Backend, Estimates, OnnxBackend, estimates, exported_beside
 from lidarpose.infer.people import as_origin, as_points, candidates, clean, unit_warning
 from lidarpose.infer.results import PersonPose, Poses
 from lidarpose.infer.tta import Look, averaged, brought_back, looks_of, shown
+from lidarpose.io.files import file_error
 from lidarpose.model.bundled import BUNDLED, DEFAULT, weights_path
 from lidarpose.model.decode import decoder
 from lidarpose.model.header import read_header

@@ -152,7 +152,7 @@ class Poses(Sequence):
 
     def save(self, path: str | Path) -> None:
         """Writes `to_json` to a file, whole or not at all."""
-        from lidarpose.data.files import write_atomic
+        from lidarpose.io.files import write_atomic
 
         write_atomic(path, self.to_json())
 

@@ -22,8 +22,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.files import file_error, read_bytes
 from lidarpose.errors import InputError
+from lidarpose.io.files import file_error, read_bytes
 from lidarpose.lidar.sensor import Sensor
 
 # columns a turn where a file does not say: 0.2 degrees

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 from safetensors.torch import save as to_bytes
 
-from lidarpose.data.files import file_error, write_atomic
+from lidarpose.io.files import file_error, write_atomic
 from lidarpose.model.header import ENTRY, Header, opened, parse_header
 from lidarpose.model.network import PoseNet
 from lidarpose.model.presets import NetworkConfig

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lidarpose.data.files import atomic_path, check_apart, check_suffix, check_writable, write_atomic
 from lidarpose.errors import InputError, LidarPoseError, check_name, missing_extra
+from lidarpose.io.files import atomic_path, check_apart, check_suffix, check_writable, write_atomic
 from lidarpose.model.batch import Batch
 from lidarpose.model.checkpoint import load_checkpoint
 from lidarpose.model.header import ENTRY, Header, digest

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 from safetensors import SafetensorError, safe_open
 
 from lidarpose._version import __version__
-from lidarpose.data.files import file_error
 from lidarpose.errors import InputError, unknown_name
+from lidarpose.io.files import file_error
 from lidarpose.model.presets import NetworkConfig
 from lidarpose.skeleton import SKELETONS, Skeleton, skeleton
 

@@ -10,7 +10,7 @@ from importlib import import_module
 
 import numpy as np
 
-from lidarpose.data.files import file_error, read_bytes
+from lidarpose.io.files import file_error, read_bytes
 from lidarpose.model.header import ENTRY, Header, parse_header
 from lidarpose.model.plan import Plan, plan
 from lidarpose.model.presets import NetworkConfig

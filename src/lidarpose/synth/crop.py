@@ -4,8 +4,8 @@ from math import cos, sin
 
 import numpy as np
 
-from lidarpose.data.augment import cut_box
 from lidarpose.sample import Box
+from lidarpose.synth.augment import cut_box
 from lidarpose.synth.placing import Place
 from lidarpose.synth.scene import CropErrors
 

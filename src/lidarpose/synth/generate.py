@@ -10,18 +10,18 @@ from functools import cached_property, lru_cache, partial
 
 import numpy as np
 
-from lidarpose.data import augment
+from lidarpose.data.facts import Facts, facts_of
 from lidarpose.errors import InputError, whole
 from lidarpose.lidar.catalog import sensor
 from lidarpose.lidar.pattern import RayPattern
 from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import Pose, Sample
 from lidarpose.skeleton import BODY26
+from lidarpose.synth import augment
 from lidarpose.synth.actor import Actor, draw_actor
 from lidarpose.synth.bodies import Bodies, PoseBank, draw_bodies
 from lidarpose.synth.crop import draw_box
 from lidarpose.synth.crop_kernels import center_of_cells, crop_points
-from lidarpose.synth.facts import Facts, facts_of
 from lidarpose.synth.look import Conditions, Layer, Returns, count_alone, draw_conditions, look
 from lidarpose.synth.placing import Place, draw_place
 from lidarpose.synth.props import Prop, draw_props

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from lidarpose.data.augment import REACH
 from lidarpose.errors import MissingExtra
+from lidarpose.synth.augment import REACH
 
 try:
     from numba import njit
@@ -31,7 +31,7 @@ def spoil(
 
     points (n, 3) float32 m of a sensor at the origin, face (n,) indices of faces (F, 3), vertices (V, 3) m of the same
     frame, ring (n,); keep (n,) bool: what is left of them so far. sigma m: standard deviation of a range, symmetric;
-    bias m: of an error that a ring's points share; dropout, weak, range_max m: see `data.augment.spoil_reference`;
+    bias m: of an error that a ring's points share; dropout, weak, range_max m: see `synth.augment.spoil_reference`;
     one_sided m: range errors uniform in [0, one_sided) besides, as in the released code.
     Returns points (k, 3) float32 m and their indices (k,).
     """
@@ -58,7 +58,7 @@ def range_errors(ring, normals, sigma, bias):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def spoil_points(points, face, vertices, faces, keep, error, chance, dropout, weak, reach):
-    """As `data.augment.spoil_reference`, with the faces' normals found on the way; what a face without area returns
+    """As `synth.augment.spoil_reference`, with the faces' normals found on the way; what a face without area returns
     is weak."""
     kept = np.empty(len(points), np.int64)
     moved = np.empty((len(points), 3), np.float32)

@@ -12,7 +12,6 @@ from operator import index as as_index
 
 import numpy as np
 
-from lidarpose.data.augment import REACH
 from lidarpose.errors import InputError, whole
 from lidarpose.geometry import rotation_about
 from lidarpose.lidar.catalog import sensor as named_sensor
@@ -23,6 +22,7 @@ from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import Box, Pose, Sample, center_of
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.actor import Actor, draw_actor
+from lidarpose.synth.augment import REACH
 from lidarpose.synth.mesh import Mesh, union
 from lidarpose.synth.spoil import range_errors, spoil_points
 from lidarpose.synth.street_scenery import RAIL, Plan, draw_plan, scenery

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from lidarpose.body.sources import digest as motion_digest
-from lidarpose.data.files import content_digest
 from lidarpose.data.jobs import clean_folder, make_shards, open_folder
 from lidarpose.data.shards import CARD, Card, person_row, shard_path, shard_writer, write_card
 from lidarpose.errors import InputError
+from lidarpose.io.files import content_digest
 from lidarpose.lidar.catalog import SENSORS, sensor
 from lidarpose.synth.scene import scene_config
 

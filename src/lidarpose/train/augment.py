@@ -8,7 +8,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from lidarpose.data.augment import half_space_keep, jitter, noise_clusters, random_keep
 from lidarpose.data.released import released_view
 from lidarpose.errors import check_name
 from lidarpose.evaluate.protocols import jittered
@@ -16,6 +15,7 @@ from lidarpose.geometry import rotation_about
 from lidarpose.model.plan import view_features
 from lidarpose.sample import Sample, center_of
 from lidarpose.skeleton import BODY26, SMPL24
+from lidarpose.synth.augment import half_space_keep, jitter, noise_clusters, random_keep
 from lidarpose.train.crowd import Person
 from lidarpose.train.example import BLIND, PELVIS_ERROR, REFINED, Example
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose.data.columns import CENTERS
-from lidarpose.data.files import file_error, listed
 from lidarpose.data.readers.items import HIDDEN, SEEN
 from lidarpose.data.shards import Dataset, open_dataset, shard_path
 from lidarpose.errors import InputError
+from lidarpose.io.files import file_error, listed
 from lidarpose.sample import Box
 from lidarpose.skeleton import BODY26, skeleton
 from lidarpose.train.example import UNKNOWN_PART, seen

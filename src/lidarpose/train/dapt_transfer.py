@@ -5,8 +5,8 @@ import os
 import torch
 from torch import Tensor
 
-from lidarpose.data.files import file_error
 from lidarpose.errors import InputError
+from lidarpose.io.files import file_error
 from lidarpose.model.checkpoint import load_checkpoint
 from lidarpose.model.dapt.config import DaptConfig
 from lidarpose.model.dapt.network import DaptNet

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from torch import nn
 
-from lidarpose.data.files import file_error
 from lidarpose.errors import InputError, check_name
+from lidarpose.io.files import file_error
 from lidarpose.model.dapt.config import CONFIGS
 from lidarpose.model.grow import grown
 from lidarpose.model.header import Header

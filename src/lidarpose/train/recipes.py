@@ -8,8 +8,8 @@ from operator import index
 from os import fspath
 from typing import Any
 
-from lidarpose.data.files import listed
 from lidarpose.errors import InputError, check_finite, check_name
+from lidarpose.io.files import listed
 from lidarpose.model.bundled import DEFAULT
 
 # rises, stays, falls to nothing; or rises and falls as a cosine

@@ -14,8 +14,8 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from lidarpose._version import __version__
-from lidarpose.data.files import file_error, read_bytes, write_atomic
 from lidarpose.errors import InputError
+from lidarpose.io.files import file_error, read_bytes, write_atomic
 from lidarpose.train.recipes import FREE, Recipe
 
 # where numbered runs go

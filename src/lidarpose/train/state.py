@@ -8,8 +8,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_bytes
 from torch import Tensor, nn
 
-from lidarpose.data.files import write_atomic
 from lidarpose.errors import InputError
+from lidarpose.io.files import write_atomic
 
 # what a state tells of the run besides tensors: steps taken, seconds, error of the best validation or None
 _PROGRESS = {"steps", "seconds", "best"}

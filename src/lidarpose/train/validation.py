@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from lidarpose.data.files import write_atomic
+from lidarpose.io.files import write_atomic
 from lidarpose.skeleton import Skeleton
 from lidarpose.train.example import Example
 from lidarpose.train.job import Job

@@ -83,7 +83,7 @@ def draw_people(panels: list[Panel], path: str | Path | None = None, *, title: s
     from matplotlib.figure import Figure
 
     if path is not None:
-        from lidarpose.data.files import check_suffix
+        from lidarpose.io.files import check_suffix
 
         check_suffix(path, ".png")
     panels = list(panels)
@@ -117,7 +117,7 @@ def draw_people(panels: list[Panel], path: str | Path | None = None, *, title: s
         canvas.print_png(buffer, metadata={"Software": None})  # print_figure would follow the user's savefig settings
     data = buffer.getvalue()
     if path is not None:
-        from lidarpose.data.files import write_atomic
+        from lidarpose.io.files import write_atomic
 
         write_atomic(path, data)
     return data

@@ -55,7 +55,7 @@ def write_report(path: str | Path, people: list[ReportPerson], *, title: str, su
     `summary` holds the rows of the table on top; its columns are the rows' keys in order of appearance, and a column
     of numbers is aligned to the right. More than 60,000 points in all are thinned evenly for the views.
     """
-    from lidarpose.data.files import check_suffix, write_atomic
+    from lidarpose.io.files import check_suffix, write_atomic
 
     check_suffix(path, ".html", ".htm")
     write_atomic(path, render_report(people, title=title, summary=summary).encode("utf-8", "replace"))

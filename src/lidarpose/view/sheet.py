@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.files import check_apart, file_error
 from lidarpose.data.shards import CARD, Dataset, open_dataset, shard_path
 from lidarpose.errors import InputError
+from lidarpose.io.files import check_apart, file_error
 from lidarpose.view.picture import MAX_PEOPLE, Panel, draw_people
 from lidarpose.view.report import ReportPerson, write_report
 

@@ -22,9 +22,9 @@ from lidarpose.body.sources.asf_amc import load_amc
 from lidarpose.body.sources.bvh import load_bvh
 from lidarpose.body.sources.lidarhuman26m import load_pose_json, pose_files
 from lidarpose.body.sources.sloper4d import load_sloper4d
-from lidarpose.data.files import content_digest, file_error, read_bytes
 from lidarpose.errors import check_name
 from lidarpose.geometry import UP_AXES
+from lidarpose.io.files import content_digest, file_error, read_bytes
 
 FORMATS: dict[str, Callable[..., Motion]] = {
     "clips": load_npz,

@@ -14,7 +14,7 @@ import numpy as np
 from lidarpose.body.clips import Motion, archive, load_clips
 from lidarpose.body.sources.positions import positions_motion
 from lidarpose.body.sources.smpl import smpl_motion
-from lidarpose.data.files import file_error, read_bytes
+from lidarpose.io.files import file_error, read_bytes
 
 _RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
 _BODY = 66  # the root and SMPL's 21 joints of the body, 3 numbers each; SMPL has two hands more, the others fingers

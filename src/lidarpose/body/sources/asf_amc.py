@@ -15,8 +15,8 @@ import numpy as np
 
 from lidarpose.body.clips import Motion
 from lidarpose.body.sources.tree import Tree, tree_motion
-from lidarpose.data.files import file_error, read_bytes
 from lidarpose.geometry import rotation_about
+from lidarpose.io.files import file_error, read_bytes
 
 # frames a second of CMU's database; an AMC file does not say its own
 CMU_FPS = 120.0

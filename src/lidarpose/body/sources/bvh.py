@@ -13,8 +13,8 @@ import numpy as np
 
 from lidarpose.body.clips import Motion
 from lidarpose.body.sources.tree import END, Tree, tree_motion
-from lidarpose.data.files import file_error, read_bytes
 from lidarpose.geometry import rotation_about
+from lidarpose.io.files import file_error, read_bytes
 
 _CHANNELS = {f"{axis}{kind}": (kind, axis.lower()) for axis in "XYZ" for kind in ("position", "rotation")}
 _CHANNELS = {name.lower(): value for name, value in _CHANNELS.items()}

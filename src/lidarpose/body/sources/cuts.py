@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lidarpose.data.files import file_error
+from lidarpose.io.files import file_error
 
 # more frames than this that are no numbers: the file is broken, not the odd frame
 MOST_DROPPED = 0.2

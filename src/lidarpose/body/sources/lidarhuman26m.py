@@ -13,7 +13,7 @@ import numpy as np
 
 from lidarpose.body.clips import Motion
 from lidarpose.body.sources.smpl import smpl_motion
-from lidarpose.data.files import file_error, read_bytes
+from lidarpose.io.files import file_error, read_bytes
 
 # frames a second of the LiDAR that the labels belong to
 LIDARHUMAN26M_FPS = 10.0

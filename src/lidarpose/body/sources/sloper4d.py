@@ -12,8 +12,8 @@ import numpy as np
 
 from lidarpose.body.clips import Motion, join
 from lidarpose.body.sources.smpl import smpl_motion
-from lidarpose.data.files import file_error
-from lidarpose.data.pickles import load_pickle
+from lidarpose.io.files import file_error
+from lidarpose.io.pickles import load_pickle
 
 _PEOPLE = ("first_person", "second_person")
 

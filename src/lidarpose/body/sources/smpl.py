@@ -10,8 +10,8 @@ import numpy as np
 
 from lidarpose.body.clips import Motion
 from lidarpose.body.sources.cuts import cut
-from lidarpose.data.files import file_error
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_from_up
+from lidarpose.io.files import file_error
 
 _TO_HOUSE = UP_AXES["y"]
 # rotations beyond this are degrees, rad

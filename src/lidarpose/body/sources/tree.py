@@ -16,8 +16,8 @@ from lidarpose.body.retarget import SHORTEST_BONE, mean_adult_joints, shortest_b
 from lidarpose.body.sources.cuts import cut
 from lidarpose.body.sources.positions import played
 from lidarpose.body.sources.units import check_speed, metres_of
-from lidarpose.data.files import file_error
 from lidarpose.geometry import rotation_from_up, unit
+from lidarpose.io.files import file_error
 from lidarpose.skeleton import SMPL24
 
 _J = {name: i for i, name in enumerate(SMPL24.joints)}

@@ -3,7 +3,7 @@
 import numpy as np
 
 from lidarpose.body.retarget import mean_adult_joints
-from lidarpose.data.files import file_error
+from lidarpose.io.files import file_error
 from lidarpose.skeleton import SMPL24
 
 _J = {name: i for i, name in enumerate(SMPL24.joints)}

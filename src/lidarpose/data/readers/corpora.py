@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.files import file_error
-from lidarpose.data.pickles import load_pickle
 from lidarpose.data.readers.items import Item, Skipped
 from lidarpose.data.readers.raw import find_below, numbers, read_cloud, wrong_root
 from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_item
 from lidarpose.errors import InputError
+from lidarpose.io.files import file_error
+from lidarpose.io.pickles import load_pickle
 from lidarpose.skeleton import SMPL24
 
 # points are this close to the nearest joint in the median where labels and clouds fit, m: a trunk is 0.2 m thick

@@ -17,11 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.files import file_error
-from lidarpose.data.pickles import load_pickle
 from lidarpose.data.readers.items import SEEN, UNLABELED, Item, Skipped
 from lidarpose.data.readers.raw import find_below, numbered, numbers, read_cloud, read_json, wrong_root
 from lidarpose.errors import InputError
+from lidarpose.io.files import file_error
+from lidarpose.io.pickles import load_pickle
 from lidarpose.sample import Box, Pose, Sample, center_of
 from lidarpose.skeleton import HUMAN15
 

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.files import file_error
 from lidarpose.data.readers.items import Item, Skipped
 from lidarpose.data.readers.level import leveling
 from lidarpose.data.readers.raw import numbered, numbers, read_cloud, read_json, wrong_root
 from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_item
 from lidarpose.errors import InputError
+from lidarpose.io.files import file_error
 from lidarpose.skeleton import SMPL24
 
 # frames a second of the LiDAR

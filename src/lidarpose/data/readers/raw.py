@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.files import file_error, read_bytes
-from lidarpose.data.formats import read_points
 from lidarpose.errors import InputError
+from lidarpose.io.files import file_error, read_bytes
+from lidarpose.io.formats import read_points
 
 _NUMBER = re.compile("[0-9]{1,12}")
 

@@ -17,13 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.files import file_error
-from lidarpose.data.pickles import load_pickle
 from lidarpose.data.readers.items import Item, Skipped
 from lidarpose.data.readers.raw import numbers, wrong_root
 from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_item
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
+from lidarpose.io.files import file_error
+from lidarpose.io.pickles import load_pickle
 from lidarpose.skeleton import SMPL24
 
 _SUFFIX = "_labels.pkl"

@@ -9,10 +9,10 @@ import numpy as np
 
 from lidarpose.body.rig import forward_kinematics
 from lidarpose.body.smpl import SmplBody, load_body
-from lidarpose.data.files import content_digest, file_error
 from lidarpose.data.readers.items import SEEN, Item
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix
+from lidarpose.io.files import content_digest, file_error
 from lidarpose.sample import Pose, Sample, center_of
 from lidarpose.skeleton import SMPL24
 

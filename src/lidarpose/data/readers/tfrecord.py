@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.files import file_error
+from lidarpose.io.files import file_error
 
 # Castagnoli's polynomial, bits reflected
 _POLYNOMIAL = 0x82F63B78

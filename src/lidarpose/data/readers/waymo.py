@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.data.files import file_error
 from lidarpose.data.readers.items import Item, Reader, Skipped
 from lidarpose.data.readers.raw import wrong_root
 from lidarpose.data.readers.waymo_frames import (
@@ -43,6 +42,7 @@ from lidarpose.data.readers.waymo_parquet import (
 )
 from lidarpose.data.readers.waymo_v1 import SPLITS, WaymoV1
 from lidarpose.errors import InputError
+from lidarpose.io.files import file_error
 from lidarpose.skeleton import WAYMO14
 
 COMPONENTS = ("lidar_hkp", "lidar_box", "lidar_calibration", "vehicle_pose", "lidar", "lidar_pose")

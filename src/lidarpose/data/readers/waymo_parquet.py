@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from lidarpose.data.columns import pyarrow
-from lidarpose.data.files import file_error
 from lidarpose.data.readers.waymo_frames import LASERS
 from lidarpose.errors import InputError
+from lidarpose.io.files import file_error
 
 SEGMENT, TIME, LASER, OBJECT = (
     f"key.{name}" for name in ("segment_context_name", "frame_timestamp_micros", "laser_name", "laser_object_id")

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.files import file_error
 from lidarpose.data.readers.items import Item, Skipped
 from lidarpose.data.readers.protobuf import Message
 from lidarpose.data.readers.tfrecord import records
@@ -29,6 +28,7 @@ from lidarpose.data.readers.waymo_frames import (
     transform,
 )
 from lidarpose.errors import InputError
+from lidarpose.io.files import file_error
 from lidarpose.skeleton import WAYMO14
 
 SPLITS = ("training", "validation")

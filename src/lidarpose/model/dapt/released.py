@@ -11,8 +11,8 @@ from pathlib import Path
 import torch
 from safetensors import SafetensorError, safe_open
 
-from lidarpose.data.files import check_apart, file_error
 from lidarpose.errors import InputError
+from lidarpose.io.files import check_apart, file_error
 from lidarpose.model.checkpoint import save_checkpoint, shapes
 from lidarpose.model.dapt.config import CONFIGS, DaptConfig, named_config
 from lidarpose.model.dapt.network import DaptNet

@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 
-from lidarpose.data.headers import Problem, is_transposed, numbered, pick_xyz, shorten
+from lidarpose.io.headers import Problem, is_transposed, numbered, pick_xyz, shorten
 
 # what stands in text for a value that is not there, in the usual exports
 _MISSING = ("", "na", "n/a", "nan", "-nan", "+nan", "null", "none", "<na>")

@@ -12,7 +12,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from lidarpose.data.headers import Problem, shorten
+from lidarpose.io.headers import Problem, shorten
 
 
 @dataclass(frozen=True)

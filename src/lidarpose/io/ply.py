@@ -11,8 +11,8 @@ import warnings
 
 import numpy as np
 
-from lidarpose.data.headers import Problem, need_bytes, parse_count, pick_xyz, shorten
-from lidarpose.data.text import decode, number_lines, wrong_line
+from lidarpose.io.headers import Problem, need_bytes, parse_count, pick_xyz, shorten
+from lidarpose.io.text import decode, number_lines, wrong_line
 
 # bytes of a number; the names are those that trimesh knows
 _TYPE_SIZES = {

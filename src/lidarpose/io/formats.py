@@ -19,12 +19,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarpose.data.files import file_error, read_bytes
-from lidarpose.data.headers import FEW_ROWS, Problem, is_transposed, need_bytes, numbered, pick_xyz, shorten
-from lidarpose.data.pcd import parse_pcd
-from lidarpose.data.ply import parse_ply
-from lidarpose.data.text import parse_text
 from lidarpose.errors import whole
+from lidarpose.io.files import file_error, read_bytes
+from lidarpose.io.headers import FEW_ROWS, Problem, is_transposed, need_bytes, numbered, pick_xyz, shorten
+from lidarpose.io.pcd import parse_pcd
+from lidarpose.io.ply import parse_ply
+from lidarpose.io.text import parse_text
 
 KITTI_FIELDS = ("x", "y", "z", "intensity")
 NUSCENES_FIELDS = ("x", "y", "z", "intensity", "ring")

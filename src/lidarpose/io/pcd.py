@@ -11,8 +11,8 @@ import re
 
 import numpy as np
 
-from lidarpose.data.headers import Problem, need_bytes, parse_count, pick_xyz, shorten
-from lidarpose.data.text import decode, number_lines, wrong_line
+from lidarpose.io.headers import Problem, need_bytes, parse_count, pick_xyz, shorten
+from lidarpose.io.text import decode, number_lines, wrong_line
 
 _TYPES = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
 _KINDS = ("ascii", "binary", "binary_compressed")

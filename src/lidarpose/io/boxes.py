@@ -7,8 +7,8 @@ import os
 
 import numpy as np
 
-from lidarpose.data.files import file_error, read_bytes
 from lidarpose.errors import InputError
+from lidarpose.io.files import file_error, read_bytes
 from lidarpose.sample import FARTHEST, Box, box_id
 
 # nobody writes more than two full turns in radians; 30, 90 or 180 are degrees

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarpose.data.files import file_error, read_bytes
-from lidarpose.data.headers import Problem, shorten
-from lidarpose.data.pickle_machine import PLAIN, Call, Named, run
+from lidarpose.io.files import file_error, read_bytes
+from lidarpose.io.headers import Problem, shorten
+from lidarpose.io.pickle_machine import PLAIN, Call, Named, run
 
 # larger files do not hold labels or a body; they would be in memory three times
 MAX_BYTES = 4 * 2**30
