@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from test_evaluate import Fake, standing
 
 from lidarpose.data.prepare import prepare
+from lidarpose.data.shards import open_dataset
 from lidarpose.evaluate import stability as module
 from lidarpose.evaluate.disturb import DISTURBANCES
 from lidarpose.evaluate.judged import gathered
@@ -188,6 +189,17 @@ def synthetic(tmp_path_factory):
     folder = tmp_path_factory.mktemp("synth") / "people"
     write_dataset(Job(what="people", count=12, hard=0.0, sensors=("os1-128",)), folder)
     return folder
+
+
+def test_plain_people_of_a_synthesized_folder_have_a_line(synthetic):
+    wanted = [
+        row["upright"] and row["visible"] > 0.8 and row["clutter"] < 0.05 and len(row["points"]) >= 300
+        for row in open_dataset(synthetic).rows()
+    ]
+    people = open_people(synthetic)
+    assert [one.plain for one in people] == wanted and 0 < sum(wanted) < len(wanted)
+    judged = judge(task_of(Fake(standing), people))
+    assert judged.result.line("mpjpe", "plain", "upright, whole, uncluttered, 100 points").people == sum(wanted)
 
 
 def test_curves_say_what_was_done(synthetic, monkeypatch):

@@ -151,7 +151,12 @@ def floors(bench: Bench) -> dict[str, np.ndarray]:
 
 
 def plain(bench: Bench) -> np.ndarray:
-    """(N,) bool: upright, whole, uncluttered, of 100 points and more."""
+    """(N,) bool: who of the bench `is_plain`."""
     columns = bench.columns
-    whole = columns["upright"] & (columns["visible"] > 0.8) & (columns["clutter"] < 0.05)
-    return whole & (columns["num_points"] >= 100)
+    return is_plain(columns["upright"], columns["visible"], columns["clutter"], columns["num_points"])
+
+
+def is_plain(upright, visible, clutter, points):
+    """Bools for arrays (N,) or one person's: upright, whole, uncluttered, of 100 points and more. upright, visible and
+    clutter as in `data.facts.Facts`; points: how many."""
+    return upright & (visible > 0.8) & (clutter < 0.05) & (points >= 100)

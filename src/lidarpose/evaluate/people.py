@@ -11,7 +11,7 @@ import numpy as np
 from lidarpose.data.readers.items import HIDDEN, SEEN, UNLABELED
 from lidarpose.data.shards import Dataset, open_dataset, read_rows, rows_of_shard, shard_path
 from lidarpose.errors import InputError, whole
-from lidarpose.evaluate.bench import NAME, Bench, load_bench, plain
+from lidarpose.evaluate.bench import NAME, Bench, is_plain, load_bench, plain
 from lidarpose.io.files import file_error
 from lidarpose.sample import Box
 from lidarpose.skeleton import BODY26, HUMAN15, Skeleton, skeleton
@@ -226,7 +226,9 @@ class FolderPeople:
     def _synthetic(self, shard: int, k: int, row: dict) -> Person:
         sample = self.dataset.sample(row)
         alone = self.dataset.card.settings.get("what") == "people"
-        distance, visible = (np.nan if row[name] is None else row[name] for name in ("distance", "visible"))
+        # nothing is known of people in streets
+        measured = ("distance", "visible", "clutter")
+        distance, visible, clutter = (np.nan if row[name] is None else row[name] for name in measured)
         return Person(
             shard=shard,
             row=k,
@@ -242,6 +244,7 @@ class FolderPeople:
             distance=distance,
             hidden=1 - visible,
             sensor=row["sensor"] or "",
+            plain=bool(is_plain(bool(row["upright"]), visible, clutter, len(sample.points))),
         )
 
 
@@ -316,7 +319,7 @@ class BenchPeople:
 
     def __iter__(self) -> Iterator[Person]:
         columns = self.bench.columns
-        is_plain = plain(self.bench)
+        plain_rows = plain(self.bench)
         for k in self.rows.tolist():
             clip, frame = int(columns["clip"][k]), int(columns["frame"][k])
             box = columns["box"][k]
@@ -336,7 +339,7 @@ class BenchPeople:
                 sensor=str(columns["sensor"][k]),
                 condition=str(columns["condition"][k]),
                 poses=str(columns["poses"][k]),
-                plain=bool(is_plain[k]),
+                plain=bool(plain_rows[k]),
                 moving=clip >= 0,
             )
 
