@@ -16,13 +16,14 @@ import lidarpose
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.infer.backend import Raw, estimates
 from lidarpose.infer.predictor import Predictor, load
+from lidarpose.io.files import content_digest
 from lidarpose.model import decode, heads
 from lidarpose.model.bundled import DEFAULT, bundled_path
 from lidarpose.model.checkpoint import load_checkpoint, save_checkpoint
 from lidarpose.model.dapt.config import DaptConfig
 from lidarpose.model.dapt.network import DaptNet
 from lidarpose.model.dapt.released import import_released
-from lidarpose.model.header import Header, digest, read_header
+from lidarpose.model.header import Header, read_header
 from lidarpose.model.onnx_file import usable_threads
 from lidarpose.model.plan import view_features
 from lidarpose.model.presets import BIN, NetworkConfig
@@ -89,7 +90,7 @@ def test_backends_agree_to_the_end(models):
 
 def test_the_bundled_twins_are_of_one_network():
     model = load()
-    assert model.backend.source == digest(bundled_path())
+    assert model.backend.source == content_digest(bundled_path(), expected="a checkpoint")
     assert model.header == read_header(bundled_path())
 
 

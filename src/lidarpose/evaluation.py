@@ -29,9 +29,8 @@ from lidarpose.evaluate.run import Evaluation, Model, Task, judge, task_of
 from lidarpose.evaluate.stability import Stability, study, to_disturb, to_json
 from lidarpose.evaluate.table import published, table
 from lidarpose.infer.predictor import load
-from lidarpose.io.files import atomic_path, check_writable, file_error, listed
+from lidarpose.io.files import atomic_path, check_writable, content_digest, file_error, listed
 from lidarpose.model.bundled import weights_path
-from lidarpose.model.header import digest
 from lidarpose.sample import Pose
 
 __all__ = [
@@ -141,7 +140,7 @@ def run(
 def _file(model: str | os.PathLike) -> dict[str, str]:
     path = weights_path(model)
     # a missing file is told by `load`
-    return {"file": path.name, "digest": digest(path)} if path.is_file() else {}
+    return {"file": path.name, "digest": content_digest(path, expected="a checkpoint")} if path.is_file() else {}
 
 
 def _known(model: Model) -> dict[str, Any]:

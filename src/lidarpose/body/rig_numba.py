@@ -7,8 +7,11 @@ pose people side by side; `pose_person` and `normals_of_person` may be called fr
 import numba
 import numpy as np
 
-_HEAD = 15
-_JOINTS = 24
+from lidarpose.skeleton import SMPL24
+
+# numbers that the compiler knows
+_HEAD = SMPL24.index("head")
+_JOINTS = len(SMPL24)
 # float32 sums may be reordered and fused: differences stay at rounding level, vector units are used
 _jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp"})
 

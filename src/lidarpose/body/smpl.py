@@ -25,7 +25,7 @@ from lidarpose.skeleton import SMPL24
 _TO_HOUSE = UP_AXES["y"]
 _KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
 # all of the family share these joints; then come hands, and in SMPL-X the jaw and the eyes
-_SHARED = 22
+_SHARED = SMPL24.index("left_hand")
 _HEAD = SMPL24.index("head")
 _HANDS = {SMPL24.index(f"{side}_wrist"): SMPL24.index(f"{side}_hand") for side in ("left", "right")}
 # J and S of SMPL-X's files, and how many of S are shapes; the rest are expressions of the face

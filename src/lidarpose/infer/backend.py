@@ -14,9 +14,9 @@ from typing import Protocol
 import numpy as np
 
 from lidarpose.errors import whole
-from lidarpose.io.files import file_error
+from lidarpose.io.files import content_digest, file_error
 from lidarpose.model.decode import Decoder, out_of_range
-from lidarpose.model.header import Header, digest, read_header
+from lidarpose.model.header import Header, read_header
 from lidarpose.model.onnx_file import OUTPUTS, input_name, network_inputs, open_onnx, plan_people
 from lidarpose.model.presets import BIN
 from lidarpose.sample import HIT
@@ -117,7 +117,7 @@ def exported_beside(path: str | os.PathLike, *, threads: int | None = None) -> O
     if not beside.is_file():
         raise file_error(path, f"ONNX Runtime needs {beside.name} beside it, which does not exist: {make}")
     backend = OnnxBackend(beside, threads=threads)
-    if backend.source != digest(path):
+    if backend.source != content_digest(path, expected="a checkpoint"):
         raise file_error(beside, f"made from other weights than {path.name} beside it: {make}")
     return backend
 

@@ -12,10 +12,10 @@ import torch
 from torch import Tensor, nn
 
 from lidarpose.errors import InputError, LidarPoseError, check_name, missing_extra
-from lidarpose.io.files import atomic_path, check_apart, check_suffix, check_writable, write_atomic
+from lidarpose.io.files import atomic_path, check_apart, check_suffix, check_writable, content_digest, write_atomic
 from lidarpose.model.batch import Batch
 from lidarpose.model.checkpoint import load_checkpoint
-from lidarpose.model.header import ENTRY, Header, digest
+from lidarpose.model.header import ENTRY, Header
 from lidarpose.model.network import PoseNet
 from lidarpose.model.onnx_file import OUTPUTS, SOURCE, input_name, network_inputs, open_session, plan_people
 
@@ -63,7 +63,7 @@ def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = 
         )
     # tracing takes a minute
     check_writable(out)
-    metadata = {ENTRY: header.to_json(), SOURCE: digest(weights)}
+    metadata = {ENTRY: header.to_json(), SOURCE: content_digest(weights, expected="a checkpoint")}
     if format == "onnx":
         content = onnx_bytes(network, metadata)
         session = open_session(content, threads=1)

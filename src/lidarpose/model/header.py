@@ -5,7 +5,6 @@ network, the network's configuration, and "card": what it was trained with (comm
 scores. An exported ONNX file carries the same entry.
 """
 
-import hashlib
 import json
 import math
 import os
@@ -79,11 +78,6 @@ def parameter_count(path: str | os.PathLike) -> int:
     """Numbers that a checkpoint holds. Raises InputError as `read_header` does."""
     with opened(path) as file:
         return sum(math.prod(file.get_slice(name).get_shape()) for name in file.keys())
-
-
-def digest(path: str | os.PathLike) -> str:
-    """SHA-256 of a file: what an exported file names its source by."""
-    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
 def opened(path: str | os.PathLike, framework: str = "np"):

@@ -213,7 +213,7 @@ _FIXED = {
     "pdnorm_bn": False,
     "pdnorm_ln": False,
 }
-_JOINTS_BY_COUNT = {14: WAYMO_JOINTS, 15: HUMAN15.joints, 24: SMPL24.joints}
+_JOINTS_BY_COUNT = {len(joints): joints for joints in (WAYMO_JOINTS, HUMAN15.joints, SMPL24.joints)}
 
 
 def _several(entries: dict, name: str) -> tuple:
