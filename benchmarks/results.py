@@ -27,9 +27,9 @@ from ablations import VARIANTS
 from against_paper import WAYS
 
 from lidarpose.evaluate.result import Line, Scores, read_scores
-from lidarpose.io.files import write_atomic
+from lidarpose.io.files import content_digest, write_atomic
 from lidarpose.model.bundled import BUNDLED, DEFAULT, bundled_path
-from lidarpose.model.header import digest, read_header, runs_of
+from lidarpose.model.header import read_header, runs_of
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -117,7 +117,7 @@ def card(model: str) -> str:
     path = bundled_path(model)
     told = read_header(path).card
     runs = runs_of(told)
-    if _scored(model).weights["digest"] != digest(path):
+    if _scored(model).weights["digest"] != content_digest(path, expected="a checkpoint"):
         raise SystemExit(f"docs/scores/{model}.json is of other weights: run lidarpose evaluate {model} bench")
     rows = [
         ("file", f"`{path.name}`, {path.stat().st_size / 1e6:.1f} MB in float16"),

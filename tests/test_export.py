@@ -12,10 +12,11 @@ import lidarpose
 from lidarpose.errors import InputError, LidarPoseError, MissingExtra
 from lidarpose.infer.backend import OnnxBackend, exported_beside
 from lidarpose.infer.backend_torch import TorchBackend
+from lidarpose.io.files import content_digest
 from lidarpose.model import export as exporting
 from lidarpose.model.checkpoint import load_checkpoint, save_checkpoint
 from lidarpose.model.export import PlanModule, check, export
-from lidarpose.model.header import digest, read_header
+from lidarpose.model.header import read_header
 from lidarpose.model.network import PoseNet
 from lidarpose.model.onnx_file import (
     OUTPUTS,
@@ -141,7 +142,7 @@ def test_a_program_of_torch_runs_at_other_sizes(folder, program, sizes):
 def test_the_files_tell_what_they_are(folder, program):
     session, header, source = open_onnx(folder / "net.onnx", threads=1)
     assert header == read_header(folder / "net.safetensors") and header.config == SMALL
-    assert source == digest(folder / "net.safetensors")
+    assert source == content_digest(folder / "net.safetensors", expected="a checkpoint")
     assert [value.name for value in session.get_inputs()] == expected_inputs(SMALL)
     assert "in_mid_neighbours" in expected_inputs(SMALL)
     assert [value.name for value in session.get_outputs()] == list(OUTPUTS)
