@@ -25,7 +25,7 @@ from lidarpose.synth.write import Job, write_dataset
 from lidarpose.train import job as jobs
 from lidarpose.train import loop, runs
 from lidarpose.train.augment import AUGMENTATIONS, Augmentation, augmentation, augmented
-from lidarpose.train.crowd import Person, crowd_of
+from lidarpose.train.crowd import StoredPerson, crowd_of
 from lidarpose.train.example import PELVIS_ERROR, example
 from lidarpose.train.job import job_of
 from lidarpose.train.recipes import Finetune, Pretrain
@@ -186,7 +186,7 @@ def someone(seed=0, count=80):
     joints = rng.normal(0, 0.4, (26, 3)) + [6.0, 2.0, 0.0]
     joints[rng.random(26) < 0.2] = np.nan
     points = (rng.normal(0, [0.2, 0.2, 0.5], (count, 3)) + [6.0, 2.0, 0.0]).astype(np.float32)
-    return Person(
+    return StoredPerson(
         points=points,
         part=rng.integers(-1, 25, count).astype(np.int16),
         joints=joints.astype(np.float32),

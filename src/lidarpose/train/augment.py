@@ -16,7 +16,7 @@ from lidarpose.model.plan import view_features
 from lidarpose.sample import Sample, center_of
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth.augment import half_space_keep, jitter, noise_clusters, random_keep
-from lidarpose.train.crowd import Person
+from lidarpose.train.crowd import StoredPerson
 from lidarpose.train.example import BLIND, PELVIS_ERROR, REFINED, Example
 
 # a person of fewer points after the crop is shown whole
@@ -25,7 +25,7 @@ LEAST_POINTS = 5
 _STRAYS = 60
 # of a synthetic person's, and steps on their coordinates, m
 _MOST_STRAYS, _NOISE = 200, (0.005, 0.08)
-_Somebody = TypeVar("_Somebody", Sample, Person)
+_Somebody = TypeVar("_Somebody", Sample, StoredPerson)
 _FLIP_PART = np.array([-1, 0, *(1 + np.array(SMPL24.flip))], np.int16)
 
 
@@ -67,7 +67,7 @@ def augmentation(name: str) -> Augmentation:
     return AUGMENTATIONS[name]
 
 
-def augmented(person: Person, kind: Augmentation, rng: np.random.Generator) -> Example:
+def augmented(person: StoredPerson, kind: Augmentation, rng: np.random.Generator) -> Example:
     """A stored person as a step of training shows them. Labels that are missing stay missing."""
     person, center = _view(person, kind, rng)
     origin = np.zeros(3) if person.sensor_known and rng.random() >= BLIND else None
@@ -125,7 +125,7 @@ def disturbed(one: _Somebody, *, strays: float, noise: float, rng: np.random.Gen
     return replace(one, points=points, part=part, center=center_of(points), **rest)
 
 
-def _view(person: Person, kind: Augmentation, rng: np.random.Generator) -> tuple[Person, np.ndarray]:
+def _view(person: StoredPerson, kind: Augmentation, rng: np.random.Generator) -> tuple[StoredPerson, np.ndarray]:
     """The person's crop and its center (3,) m."""
     if kind.released:
         kept, center = released_view(person.points, person.joints, person.centers, person.box)
@@ -143,7 +143,7 @@ def _view(person: Person, kind: Augmentation, rng: np.random.Generator) -> tuple
     return person, center
 
 
-def _kept(person: Person, keep: np.ndarray) -> Person:
+def _kept(person: StoredPerson, keep: np.ndarray) -> StoredPerson:
     if keep.sum() < min(LEAST_POINTS, len(person.points)):
         return person
     return replace(person, points=person.points[keep], part=person.part[keep])

@@ -20,7 +20,7 @@ from lidarpose.train.example import UNKNOWN_PART, seen
 
 
 @dataclass(frozen=True, kw_only=True)
-class Person:
+class StoredPerson:
     """One stored person, sensor's frame. points (n, 3) m; part (n,) int16, -1 unknown; joints (26, 3) m, NaN without
     a label; visible (26,) 1, 0 or NaN; center (3,) m from the points; centers: others by name, as in `Item`; box or
     None; sensor_known: whether the frame's origin is the sensor."""
@@ -37,9 +37,9 @@ class Person:
 
 @dataclass(frozen=True, kw_only=True)
 class Crowd:
-    """Everybody. start, end (N,): where a person's points begin and end; visible (N, 26): as in `Person`; centers:
-    (N, 3) m by name, NaN for none; box (N, 7), NaN for none; sequence (N,): numbers of `sequences`; dataset: name of
-    the first one, "" if synthetic; damaged: what could not be read; the rest as in `Person`."""
+    """Everybody. start, end (N,): where a person's points begin and end; visible (N, 26): as in `StoredPerson`;
+    centers: (N, 3) m by name, NaN for none; box (N, 7), NaN for none; sequence (N,): numbers of `sequences`; dataset:
+    name of the first one, "" if synthetic; damaged: what could not be read; the rest as in `StoredPerson`."""
 
     points: np.ndarray
     part: np.ndarray
@@ -60,10 +60,10 @@ class Crowd:
     def __len__(self) -> int:
         return len(self.center)
 
-    def person(self, row: int) -> Person:
+    def person(self, row: int) -> StoredPerson:
         own = slice(self.start[row], self.end[row])
         box = self.box[row]
-        return Person(
+        return StoredPerson(
             points=self.points[own],
             part=self.part[own],
             joints=self.joints[row],

@@ -23,7 +23,7 @@ from lidarpose.data.readers.waymo_frames import (
     MARGIN,
     Calibration,
     Frame,
-    Person,
+    LabelledPerson,
     about,
     person,
     transform,
@@ -186,7 +186,7 @@ def _frames(files: dict[str, Path], margin: float) -> dict[FrameKey, Frame]:
         poses[segment, time] = row[_VEHICLE_POSE]
         starts[segment] = min(time, starts.get(segment, time))
     calibrations = _calibrations(files["lidar_calibration"])
-    people: dict[FrameKey, list[Person]] = {}
+    people: dict[FrameKey, list[LabelledPerson]] = {}
     for row in labels:
         people.setdefault((row[SEGMENT], row[TIME]), []).append(_person(row, boxes.get(_object_key(row))))
     return {
@@ -237,10 +237,10 @@ def _calibrations(path: Path) -> dict[str, dict[int, Calibration]]:
     return found
 
 
-def _person(label: dict[str, Any], box: dict[str, Any] | None) -> Person:
+def _person(label: dict[str, Any], box: dict[str, Any] | None) -> LabelledPerson:
     kinds, *places, hidden = (label[name] or [] for name in _KEYPOINT_COLUMNS)
     if len({len(kinds), len(hidden), *map(len, places)}) > 1:
-        return Person(track=label[OBJECT], problem=(BAD_LABEL, "its lists have different lengths"))
+        return LabelledPerson(track=label[OBJECT], problem=(BAD_LABEL, "its lists have different lengths"))
     keypoints = zip(kinds, np.array(places, float).T, hidden, strict=True)
     if box is None:
         return person(label[OBJECT], keypoints, None)

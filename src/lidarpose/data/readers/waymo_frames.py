@@ -139,7 +139,7 @@ def _turned(a: np.ndarray, b: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Person:
+class LabelledPerson:
     """Somebody with keypoints in one frame, in the vehicle's frame. joints (14, 3) m, NaN where not labelled, and their
     labels (14,); kind: Waymo's type of the box; counted: points in the box by the label; problem: why they are left
     out, and what else to say of it."""
@@ -159,7 +159,7 @@ def person(
     box: tuple[float, ...] | None,
     kind: int = 0,
     counted: int | None = None,
-) -> Person:
+) -> LabelledPerson:
     """Somebody by their labels. keypoints: (type, x y z, whether occluded) each, in any order, types that the skeleton
     lacks ignored; box: center, size (length, width, height) and heading, 7 numbers."""
     joints, labels = np.full((len(WAYMO14), 3), np.nan), np.full(len(WAYMO14), UNLABELED, np.uint8)
@@ -168,14 +168,14 @@ def person(
             joints[_JOINTS[found]] = place
             labels[_JOINTS[found]] = HIDDEN if hidden else SEEN
     if box is None:
-        return Person(track=track, problem=(NO_BOX, ""))
+        return LabelledPerson(track=track, problem=(NO_BOX, ""))
     if (labels == UNLABELED).all():
-        return Person(track=track, problem=(NO_JOINTS, ""))
+        return LabelledPerson(track=track, problem=(NO_JOINTS, ""))
     try:
         of = Box(center=box[:3], size=box[3:6], yaw=box[6], id=track)
     except InputError as error:
-        return Person(track=track, problem=(BAD_LABEL, str(error)))
-    return Person(track=track, joints=joints, labels=labels, box=of, kind=kind, counted=counted)
+        return LabelledPerson(track=track, problem=(BAD_LABEL, str(error)))
+    return LabelledPerson(track=track, joints=joints, labels=labels, box=of, kind=kind, counted=counted)
 
 
 @dataclass(kw_only=True, eq=False)
@@ -189,7 +189,7 @@ class Frame:
     sequence: str
     timestamp: int
     start: int
-    people: list[Person]
+    people: list[LabelledPerson]
     calibrations: dict[int, Calibration]
     T_world_vehicle: np.ndarray | None
     margin: float = MARGIN
@@ -245,7 +245,7 @@ class Frame:
             reason, why = problem
             yield Skipped(reason=reason, where=f"{where}: {why}" if why else where)
 
-    def _item(self, one: Person, points: np.ndarray, ring: np.ndarray) -> Item:
+    def _item(self, one: LabelledPerson, points: np.ndarray, ring: np.ndarray) -> Item:
         # the sensor is at the origin
         origin = self.calibrations[TOP].T_vehicle_laser[:3, 3]
         points = (points - origin).astype(np.float32)

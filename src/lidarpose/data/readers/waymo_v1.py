@@ -22,7 +22,7 @@ from lidarpose.data.readers.waymo_frames import (
     MARGIN,
     Calibration,
     Frame,
-    Person,
+    LabelledPerson,
     about,
     person,
     transform,
@@ -113,7 +113,7 @@ def _frame(message: Message, start: int | None, margin: float) -> Frame:
     return frame
 
 
-def _person(label: Message) -> Person:
+def _person(label: Message) -> LabelledPerson:
     box = label.message(_LABEL_BOX)
     keypoints = []
     for keypoint in label.message(_LABEL_KEYPOINTS).messages(_KEYPOINTS_EACH):
