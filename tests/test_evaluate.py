@@ -99,6 +99,7 @@ def sets(tmp_path_factory):
     prepare("sloper4d", root / "b", root / "leaking", smpl=smpl, split_by="dapt")
     files.write_lidarhuman26m(root / "c", smpl, frames=3)
     prepare("lidarhuman26m", root / "c", root / "lidarhuman26m", smpl=smpl)
+    prepare("lidarhuman26m", root / "c", root / "askew", smpl=smpl, level=False)
     waymo_files.write_v2(root / "d", split="validation")
     prepare("waymo", root / "d", root / "waymo")
     return root
@@ -198,6 +199,12 @@ def test_dapt_crops_and_centers_as_released(sets):
     assert all(
         line.split == "test" and line.protocol == "dapt" and "SMPL" in line.centring for line in found.result.lines
     )
+
+
+def test_a_frame_that_was_turned_is_told_where_it_is_compared_with_the_released_code(sets):
+    for name, protocol, told in (("lidarhuman26m", "dapt", 1), ("lidarhuman26m", "clean", 0), ("askew", "dapt", 0)):
+        notes = judged(sets, name, Fake(standing), protocol=protocol).result.notes
+        assert sum("prepare with --no-level" in note for note in notes) == told, (name, protocol)
 
 
 @pytest.mark.parametrize(

@@ -61,8 +61,9 @@ class Person:
 class People(Protocol):
     """Somebody's dataset, opened. name; kind: the raw dataset's name, "synth" or "bench"; skeleton of the joints;
     judged: the joints that are judged by default; split: name or "none"; split_by and split_source: of the split, ""
-    where there is none; leaks; count: people who are judged; total: of how many; limit as asked for; clusters: people
-    of one `sequence` are not independent; skipped: reason -> how many and the first, of the last reading."""
+    where there is none; leaks; level: sequences out of level were turned; count: people who are judged; total: of how
+    many; limit as asked for; clusters: people of one `sequence` are not independent; skipped: reason -> how many and
+    the first, of the last reading."""
 
     name: str
     kind: str
@@ -72,6 +73,7 @@ class People(Protocol):
     split_by: str
     split_source: str
     leaks: str
+    level: bool
     count: int
     total: int
     limit: int | None
@@ -122,6 +124,7 @@ class FolderPeople:
     split_by: str
     split_source: str
     leaks: str
+    level: bool
     total: int
     limit: int | None
     wanted: dict[int, np.ndarray]
@@ -165,6 +168,7 @@ class FolderPeople:
             split_by=own,
             split_source=text.removeprefix(f"{own}: "),
             leaks=leaks,
+            level=bool(card.settings.get("level")),
             total=total,
             limit=limit if limit is not None and limit < total else None,
             wanted=_limited(rows, total, limit),
@@ -295,6 +299,7 @@ class BenchPeople:
     split_by: str = ""
     split_source: str = ""
     leaks: str = ""
+    level: bool = False
     clusters: bool = False
     skipped: dict[str, dict] = field(default_factory=dict)
 

@@ -223,7 +223,7 @@ def judge(task: Task, *, legacy: bool = False, progress: Callable[[int], None] |
         setting=setting,
         counts=counts,
         skipped={reason: dict(entry) for reason, entry in people.skipped.items()},
-        notes=tuple(_notes(setting, judged)),
+        notes=tuple(_notes(setting, people, judged)),
         lines=lines,
     )
     return Evaluation(result=result, judged=judged, worst=tuple((person, k) for _, k, person in worst))
@@ -289,13 +289,15 @@ def _floor_lines(people: BenchPeople, judged: Judged, setting: Setting) -> tuple
     return out
 
 
-def _notes(setting: Setting, judged: Judged) -> Iterator[str]:
+def _notes(setting: Setting, people: People, judged: Judged) -> Iterator[str]:
     if setting.not_judged:
         yield f"judged are {', '.join(setting.joints)}; {setting.not_judged}"
     if setting.leaks:
         yield f"the split leaks: {setting.leaks}"
     if setting.protocol == "dapt":
         yield "crop and center are made of labels, as in the released code: not comparable with the protocol clean"
+        if people.level:
+            yield "sequences out of level were turned; for the released code's frame, prepare with --no-level"
     if setting.kind == "waymo" and not (judged.labels == UNLABELED).all():
         yield "joints that are labelled as hidden count, but in PEM; people are predicted in their labelled boxes"
     if setting.clusters and len(np.unique(judged.sequence)) < 2:
