@@ -50,11 +50,12 @@ def models():
 
 
 def ties(model, clouds, centers, origin):
-    """(B, J, 3) bool: heatmaps whose two highest bins are equal but for rounding, which then decides."""
+    """(B, J, 3) bool: heatmaps whose two highest bins are equal but for rounding, which then decides. Between the
+    runtimes the difference of two neighbouring bins differs by 5e-6 at most."""
     view = np.stack([view_features(center, origin) for center in centers])
     raw = model.backend.run([cloud - center for cloud, center in zip(clouds, centers, strict=True)], view)
     highest = np.sort(np.stack(raw.heatmaps, 2), -1)
-    return highest[..., -1] - highest[..., -2] < 2e-5
+    return highest[..., -1] - highest[..., -2] < 1e-5
 
 
 def test_backends_agree_on_people_of_all_sizes(models):
