@@ -245,6 +245,20 @@ def test_released_weights_are_imported_and_predict(crop, tmp_path, monkeypatch, 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["crop.npy", "crop.poses.json", "mine.safetensors"]
 
 
+def test_results_go_to_a_file_that_is_named(crop, boxes, tmp_path, capsys):
+    assert run("predict", crop, "--out", tmp_path / "a" / "one.JSON", "--picture") == 0
+    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["one.JSON", "one.png"]
+    assert json.loads((tmp_path / "a" / "one.JSON").read_text())["people"]
+    # a folder is a folder whatever its name, and what is read is never written
+    (tmp_path / "b.json").mkdir()
+    assert run("predict", crop, "--out", tmp_path / "b.json") == 0
+    assert [path.name for path in (tmp_path / "b.json").iterdir()] == ["crop.poses.json"]
+    capsys.readouterr()
+    before = boxes.read_text()
+    assert run("predict", crop, "--boxes", boxes, "--out", boxes) == 2
+    assert "is itself what is read" in capsys.readouterr().err and boxes.read_text() == before
+
+
 def test_an_older_result_is_replaced_and_no_other_file_stays(crop, out):
     out.mkdir()
     write(out / "crop.poses.json", "old")

@@ -212,9 +212,10 @@ def test_a_sensor_s_file_counts_by_content(tmp_path, capsys):
     assert "tables" in one_line(capsys)
 
 
-def test_streets_hold_everybody_of_a_turn(tmp_path, monkeypatch):
+def test_streets_hold_everybody_of_a_turn(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(write, "STREET_FRAMES", 2)
     assert synth(tmp_path / "s", "-n", 1, "--scenes", "--sensor", "vlp-16") == 0
+    assert "1 street made -> " in capsys.readouterr().err
     data = open_dataset(tmp_path / "s")
     assert "scene" not in data.card.settings
     frames = list(data.rows("frames"))

@@ -101,7 +101,8 @@ def _synth(options: argparse.Namespace) -> None:
         progress = _bar(stack, unit=f" {job.what}") if is_watched() else None
         made = write_dataset(job, options.out, workers=options.workers, progress=progress)
     kept = "" if made == job.count else f", {job.count - made:,} were there"
-    tell(f"{made:,} {job.what} made{kept} -> {options.out}")
+    what = job.what if made != 1 else {"people": "person", "clips": "clip", "streets": "street"}[job.what]
+    tell(f"{made:,} {what} made{kept} -> {options.out}")
 
 
 def _bar(stack: ExitStack, *, unit: str) -> Callable[[int, int], None]:

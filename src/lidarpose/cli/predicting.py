@@ -41,9 +41,12 @@ def add(commands) -> None:
         "--columns", type=int, metavar="N", help="values per point in a .bin: 4 for KITTI, 5 for nuScenes"
     )
     predict.add_argument(
-        "--out", default=".", metavar="DIR", help="folder for the results (default: the current one); - prints the JSON"
+        "--out",
+        default=".",
+        metavar="DIR|FILE.json",
+        help="folder or file for the results (default: the current folder); - prints the JSON",
     )
-    predict.add_argument("--picture", action="store_true", help="also draw STEM.poses.png")
+    predict.add_argument("--picture", action="store_true", help="also draw STEM.poses.png, or FILE.png")
     predict.add_argument(
         "--weights",
         default=DEFAULT,
@@ -84,9 +87,10 @@ def _predict(options: argparse.Namespace) -> None:
 
     file = Path(options.file)
     to_stdout = options.out == "-"
-    stem = Path("." if to_stdout else options.out) / file.stem
-    json_path = None if to_stdout else f"{stem}.poses.json"
-    picture_path = f"{stem}.poses.png" if options.picture else None
+    out = Path("." if to_stdout else options.out)
+    stem = out.with_suffix("") if _is_json(out) else out / f"{file.stem}.poses"
+    json_path = None if to_stdout else str(out) if _is_json(out) else f"{stem}.json"
+    picture_path = f"{stem}.png" if options.picture else None
     for path in filter(None, (json_path, picture_path)):
         check_apart(path, options.file, options.boxes, options.weights)
     choices = {"backend": options.backend, "device": options.device, "decode": options.decode}
@@ -119,6 +123,11 @@ def _predict(options: argparse.Namespace) -> None:
     seen = sum(person.pose is not None for person in poses)
     where = f" -> {' and '.join(outputs)}" if outputs else ""
     tell(f"{seen} of {len(poses)} people, {poses.timing_ms['per_person']:.0f} ms each{where}")
+
+
+def _is_json(out: Path) -> bool:
+    """Whether results go to this file, not into a folder."""
+    return out.suffix.lower() == ".json" and not out.is_dir()
 
 
 def _warnings(poses) -> list[str]:
