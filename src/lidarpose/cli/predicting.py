@@ -88,9 +88,9 @@ def _predict(options: argparse.Namespace) -> None:
     file = Path(options.file)
     to_stdout = options.out == "-"
     out = Path("." if to_stdout else options.out)
-    stem = out.with_suffix("") if _is_json(out) else out / f"{file.stem}.poses"
-    json_path = None if to_stdout else str(out) if _is_json(out) else f"{stem}.json"
-    picture_path = f"{stem}.png" if options.picture else None
+    result = out if _is_json(out) else out / f"{file.stem}.poses.json"
+    json_path = None if to_stdout else str(result)
+    picture_path = str(result.with_suffix(".png")) if options.picture else None
     for path in filter(None, (json_path, picture_path)):
         check_apart(path, options.file, options.boxes, options.weights)
     choices = {"backend": options.backend, "device": options.device, "decode": options.decode}

@@ -28,8 +28,13 @@ class Facts:
 
     @property
     def plain(self) -> bool:
-        """Upright, whole and uncluttered."""
-        return self.upright and self.visible > 0.8 and self.height_seen > 0.85 and self.clutter < 0.05
+        """Upright, whole and uncluttered, most of the height seen."""
+        return bool(is_plain(self.upright, self.visible, self.clutter) and self.height_seen > 0.85)
+
+
+def is_plain(upright, visible, clutter):
+    """Bools for arrays (N,) or one person's, as in `Facts`: upright, whole, uncluttered. NaN is not plain."""
+    return upright & (visible > 0.8) & (clutter < 0.05)
 
 
 def facts_of(

@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarpose.data.facts import is_plain
 from lidarpose.errors import missing_extra
 from lidarpose.geometry import rotation_about
 from lidarpose.io.files import file_error, read_bytes
@@ -28,6 +29,8 @@ from lidarpose.sample import center_of
 from lidarpose.skeleton import BODY26
 
 NAME = "lidarpose-bench-1"
+# plain people have so many points and more
+PLAIN_POINTS = 100
 # key of the card in the file's metadata
 METADATA = "lidarpose-bench"
 SHA256 = "8abcafc6628c7580b8bdf91f9c05992c7c6e4098d6922973c7cfc39d8fe0e0d2"
@@ -151,12 +154,7 @@ def floors(bench: Bench) -> dict[str, np.ndarray]:
 
 
 def plain(bench: Bench) -> np.ndarray:
-    """(N,) bool: who of the bench `is_plain`."""
+    """(N,) bool: upright, whole, uncluttered, of 100 points and more."""
     columns = bench.columns
-    return is_plain(columns["upright"], columns["visible"], columns["clutter"], columns["num_points"])
-
-
-def is_plain(upright, visible, clutter, points):
-    """Bools for arrays (N,) or one person's: upright, whole, uncluttered, of 100 points and more. upright, visible and
-    clutter as in `data.facts.Facts`; points: how many."""
-    return upright & (visible > 0.8) & (clutter < 0.05) & (points >= 100)
+    many = columns["num_points"] >= PLAIN_POINTS
+    return many & is_plain(columns["upright"], columns["visible"], columns["clutter"])

@@ -8,10 +8,11 @@ from typing import Protocol
 
 import numpy as np
 
+from lidarpose.data.facts import is_plain
 from lidarpose.data.readers.items import HIDDEN, SEEN, UNLABELED
 from lidarpose.data.shards import Dataset, open_dataset, read_rows, rows_of_shard, shard_path
 from lidarpose.errors import InputError, whole
-from lidarpose.evaluate.bench import NAME, Bench, is_plain, load_bench, plain
+from lidarpose.evaluate.bench import NAME, PLAIN_POINTS, Bench, load_bench, plain
 from lidarpose.io.files import file_error
 from lidarpose.sample import Box
 from lidarpose.skeleton import BODY26, HUMAN15, Skeleton, skeleton
@@ -248,7 +249,7 @@ class FolderPeople:
             distance=distance,
             hidden=1 - visible,
             sensor=row["sensor"] or "",
-            plain=bool(is_plain(bool(row["upright"]), visible, clutter, len(sample.points))),
+            plain=len(sample.points) >= PLAIN_POINTS and bool(is_plain(bool(row["upright"]), visible, clutter)),
         )
 
 
