@@ -4,7 +4,7 @@
 import numpy as np
 
 from lidarpose.lidar.raycast_kernels import compiled, raster
-from lidarpose.lidar.raycast_scan import collect, window_of
+from lidarpose.lidar.raycast_scan import collect, sector_columns, window_of
 
 # no beam beyond the zenith
 _ZENITH = np.pi / 2 - 1e-6
@@ -87,14 +87,8 @@ def scan_diverging(vertices, faces, culled, window_vertices, beams, margin, offs
         by_tan = np.argsort(row_tan[:n])
         row_tan[:n], row_index[:n] = row_tan[:n][by_tan], row_index[:n][by_tan]
         for start in range(0, columns, beams.sector):
-            count = min(beams.sector, columns - start)
-            for k in range(count):
-                half = 2 * k - (count - 1)
-                tan[k] = beams.half_tan[half] if half >= 0 else -beams.half_tan[-half]
-                cos[k] = beams.half_cos[abs(half)]
-                scale[start + k] = 1 / cos[k]
-            middle = start + (count - 1) / 2
-            center = beams.start + (column0 + middle) * beams.step + beams.group_shift[g]
+            count = sector_columns(beams, start, columns, tan, cos, scale)
+            center = beams.start + (column0 + start + (count - 1) / 2) * beams.step + beams.group_shift[g]
             index = np.arange(start, start + count)
             for a in range(subs):
                 raster(

@@ -114,6 +114,19 @@ def window_of(vertices, beams, margin):
 
 
 @compiled
+def sector_columns(beams, start, columns, tan, cos, scale):
+    """How many columns from `start` on share a sector; their tangents and cosines from its middle are written into
+    tan and cos, 1/cos into scale[start:]."""
+    count = min(beams.sector, columns - start)
+    for k in range(count):
+        half = 2 * k - (count - 1)
+        tan[k] = beams.half_tan[half] if half >= 0 else -beams.half_tan[-half]
+        cos[k] = beams.half_cos[abs(half)]
+        scale[start + k] = 1 / cos[k]
+    return count
+
+
+@compiled
 def cast_grid(vertices, faces, culled, beams, column0, columns, row0, rows):
     """1/x (C, R) in the sectors' frames, face (C, R), 1/cos(azimuth - the sector's middle) (C,) of a window."""
     inverse_x = np.zeros((columns, rows))
@@ -130,14 +143,8 @@ def cast_grid(vertices, faces, culled, beams, column0, columns, row0, rows):
         if not n:
             continue
         for start in range(0, columns, beams.sector):
-            count = min(beams.sector, columns - start)
-            for k in range(count):
-                half = 2 * k - (count - 1)
-                tan[k] = beams.half_tan[half] if half >= 0 else -beams.half_tan[-half]
-                cos[k] = beams.half_cos[abs(half)]
-                scale[start + k] = 1 / cos[k]
-            middle = start + (count - 1) / 2
-            center = beams.start + (column0 + middle) * beams.step + beams.group_shift[g]
+            count = sector_columns(beams, start, columns, tan, cos, scale)
+            center = beams.start + (column0 + start + (count - 1) / 2) * beams.step + beams.group_shift[g]
             index = np.arange(start, start + count)
             raster(
                 vertices, faces, culled, center, tan[:count], cos[:count], row_tan[:n], index, row_index,
