@@ -1,5 +1,6 @@
 """Evaluation: what each protocol shows the network, what counts, and that poses.parquet holds every figure."""
 
+import itertools
 import json
 import re
 import shutil
@@ -17,11 +18,11 @@ from shard_files import write_shard
 
 import lidarpose
 from lidarpose import evaluation, metrics
-from lidarpose.cli import main
+from lidarpose.cli import evaluating, main
 from lidarpose.data.prepare import prepare
 from lidarpose.data.shards import open_dataset, read_rows, shard_path
 from lidarpose.errors import InputError
-from lidarpose.evaluate import stability
+from lidarpose.evaluate import lines, stability
 from lidarpose.evaluate.bench import load_bench
 from lidarpose.evaluate.lines import lines_of, span_rows, triples, turned_round
 from lidarpose.evaluate.people import open_people, spread
@@ -297,6 +298,27 @@ def test_hidden_labels_count_and_missing_ones_do_not(sets):
     assert found.result.line("pem").value == pytest.approx(wanted.pem)
 
 
+def test_people_without_a_pose_count_in_pem_alone(sets):
+    turns = itertools.cycle([True, False])
+    shy = judged(sets, "waymo", Fake(lambda cloud: standing(cloud) if next(turns) else None)).result
+    told = "without a pose, and in no figure but PEM"
+    assert shy.counts["without a pose"] and any(told in line for line in evaluating._lines(shy))
+
+
+@pytest.mark.parametrize(
+    "learned, told",
+    [("train", "validated on this split"), ("val", "learned from split val"), ("all", "learned from split all")],
+)
+def test_a_network_that_knows_the_people_is_told(sets, learned, told):
+    """Waymo's people are of the split val."""
+    model = Fake(standing)
+    model.header = SimpleNamespace(card={"data": ["waymo"], "recipe": {"split": learned}, "validation_mm": 60.0})
+    notes = judged(sets, "waymo", model).result.notes
+    assert any(told in note for note in notes)
+    model.header.card["data"] = ["another"]
+    assert not any(told in note for note in judged(sets, "waymo", model).result.notes)
+
+
 def test_who_gets_no_pose_is_counted_and_in_no_figure(sets):
     def shy(cloud):
         return None if len(cloud) % 2 else standing(cloud)
@@ -325,9 +347,14 @@ def test_joints_that_both_have_are_judged_and_named(sets):
     assert set(asked.joints) == set(HUMAN15.joints)
 
 
-def test_one_sequence_has_no_interval_and_two_are_drawn_whole(sets):
-    one = judged(sets, "lidarhuman26m", Fake(standing)).result
-    assert one.line("mpjpe").low is None and any("one sequence" in note for note in one.notes)
+def test_few_sequences_have_no_interval(sets):
+    for name, told in (("lidarhuman26m", "one sequence alone"), ("humanm3", "2 sequences alone")):
+        found = judged(sets, name, Fake(standing)).result
+        assert found.line("mpjpe").low is None and any(note.startswith(told) for note in found.notes)
+
+
+def test_sequences_are_drawn_whole(sets, monkeypatch):
+    monkeypatch.setattr(lines, "LEAST_UNITS", 2)
     found = judged(sets, "humanm3", Fake(standing))
     line, table = found.result.line("mpjpe"), found.judged.errors()
     means = [np.nanmean(table[found.judged.sequence == name]) for name in ("test/b", "test/c")]
@@ -495,6 +522,7 @@ def test_what_cannot_be_written_or_disturbed_is_known_before_anybody_is_judged(t
         ("tiny", None, {}, "expected a dataset to judge"),
         ("tiny", "bench", {"limit": "4"}, "limit must be a whole number of at least 1 person, got '4'"),
         ("tiny", "bench", {"limit": 4.0}, "limit must be a whole number"),
+        (Fake(None), "bench", {"tta": 4}, "of weights by name or path: give them to load instead"),
     ],
 )
 def test_arguments_of_the_wrong_kind_are_told(model, dataset, options, words):

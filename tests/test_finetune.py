@@ -26,7 +26,7 @@ from lidarpose.train import job as jobs
 from lidarpose.train import loop, runs
 from lidarpose.train.augment import AUGMENTATIONS, Augmentation, augmentation, augmented
 from lidarpose.train.crowd import StoredPerson, crowd_of
-from lidarpose.train.example import PELVIS_ERROR, example
+from lidarpose.train.example import PELVIS_ERROR, example, seen
 from lidarpose.train.job import job_of
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.sources import MixedSource, StoredSource, SyntheticSource
@@ -258,6 +258,21 @@ def test_a_fifth_of_points_is_lost():
     lost = augmented(someone(count=500), Augmentation(drop=1.0), np.random.default_rng(0))
     # 400 of 500, drawn one by one
     assert len(lost.points) == len(lost.part) and 370 < len(lost.points) < 430
+
+
+@pytest.mark.parametrize("how", [Augmentation(cut=1.0), Augmentation(box=1.0)], ids=["cut", "box"])
+def test_what_an_augmentation_hides_is_not_told_visible(how):
+    person, hidden = someone(count=60), 0
+    body = person.part != 0
+    # labels that tell the truth before
+    visible = np.where(np.isnan(person.visible), np.nan, seen(person.joints, person.points[body])).astype(np.float32)
+    person = replace(person, visible=visible)
+    for index in range(40):
+        shown = augmented(person, how, np.random.default_rng(index))
+        wanted = np.where(np.isnan(visible), np.nan, seen(shown.joints, shown.points[shown.part != 0]))
+        np.testing.assert_array_equal(shown.visible, wanted)
+        hidden += np.nansum(visible) - np.nansum(wanted)
+    assert hidden > 4
 
 
 def test_a_mirror_exchanges_left_and_right_parts():

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from lidarpose import metrics
 from lidarpose.errors import InputError
 from lidarpose.evaluate import bootstrap
+from lidarpose.evaluate.bootstrap import LEAST_UNITS
 from lidarpose.skeleton import HUMAN15, SKELETONS, WAYMO14
 
 quick = settings(max_examples=40, deadline=None)
@@ -194,6 +195,17 @@ def test_intervals_are_as_wide_as_theory_says():
     assert found.high == pytest.approx(values.mean() + half, abs=0.3)
     narrow = metrics.interval(values, np.random.default_rng(0), level=0.5)
     assert found.low < narrow.low < narrow.high < found.high
+
+
+@pytest.mark.parametrize("units, least, most", [(2, 40, 60), (LEAST_UNITS, 80, 94), (20, 88, 97)])
+def test_how_often_intervals_of_few_hold_the_truth(units, least, most):
+    """Why few have none."""
+    held = 0
+    for seed in range(400):
+        values = np.random.default_rng(seed).normal(100, 20, units)
+        found = metrics.interval(values, np.random.default_rng(seed), repeats=500)
+        held += found.low <= 100 <= found.high
+    assert least < held / 4 < most
 
 
 def test_sequences_make_intervals_wider():

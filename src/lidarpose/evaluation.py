@@ -98,7 +98,8 @@ def run(
     which is everybody; skeleton: judge its joints, by default the dataset's (of synthetic people human15's); limit: so
     many people, evenly spread; stability: disturb the points, too; legacy: also the released code's arithmetic;
     sensor_unknown: do not tell where the sensor stood; seed: of displaced boxes and intervals; device, backend,
-    decode, tta: as of `load`; progress(dataset, done, total) is called as people are judged.
+    decode, tta: as of `load`, for weights by name or path; progress(dataset, done, total) is called as people are
+    judged.
 
     Everything is checked before anybody is judged. Raises InputError, one line, for what does not fit; MissingExtra
     without pyarrow.
@@ -116,6 +117,8 @@ def run(
     predictor = load(model, device=device, backend=backend, decode=decode, tta=tta) if by_name else model
     if not hasattr(predictor, "predict"):
         raise InputError(f"expected a network to judge, weights by name or path or a predictor, got {model!r}")
+    if not by_name and (device, backend, decode, tta) != ("cpu", None, "window", 1):
+        raise InputError("device, backend, decode and tta are of weights by name or path: give them to load instead")
     options = {"protocol": protocol, "seed": seed, "skeleton": skeleton, "sensor_unknown": sensor_unknown}
     tasks = [task_of(predictor, one, **options) for one in people]
     disturbed = [to_disturb(task) for task in tasks] if stability else [None] * len(tasks)

@@ -154,7 +154,8 @@ def _lines(result) -> Iterator[str]:
     for note in result.notes:
         yield f"  note: {note}"
     if counts["without a pose"]:
-        yield f"  without a pose, and in no figure: {counts['without a pose']:,} people"
+        but = " but PEM" if any(line.figure == "pem" for line in result.lines) else ""
+        yield f"  without a pose, and in no figure{but}: {counts['without a pose']:,} people"
     for reason, entry in result.skipped.items():
         yield f"  skipped {entry['count']:,}: {reason} (first: {entry['first']})"
     shown = [line for line in result.lines if _is_shown(line)]

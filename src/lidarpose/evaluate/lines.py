@@ -12,7 +12,7 @@ import numpy as np
 
 from lidarpose.data.readers.items import SEEN
 from lidarpose.errors import InputError
-from lidarpose.evaluate.bootstrap import interval
+from lidarpose.evaluate.bootstrap import LEAST_UNITS, interval
 from lidarpose.evaluate.groups import joint_groups
 from lidarpose.evaluate.judged import Judged
 from lidarpose.evaluate.metrics import (
@@ -102,15 +102,14 @@ def line(
     clusters: np.ndarray | None = None,
     no_pose: int = 0,
 ) -> Line:
-    """The mean of a table (n, J) or (n,) as a line with its interval; none where one sequence is all there is."""
+    """The mean of a table (n, J) or (n,) as a line; its interval needs `LEAST_UNITS` people or sequences."""
     score = mean(table, average)
     ends = (None, None)
-    if score.people and (clusters is None or len(np.unique(clusters)) > 1):
+    if score.people >= LEAST_UNITS:
         name = f"{setting.method}/{figure}/{group}/{of}"
         rng = np.random.default_rng([setting.seed, zlib.crc32(name.encode())])
         found = interval(table, rng, average, clusters=clusters, repeats=_REPEATS)
-        # one person, or one sequence with labels
-        ends = (number(found.low), number(found.high)) if found.units > 1 else ends
+        ends = (number(found.low), number(found.high)) if found.units >= LEAST_UNITS else ends
     told = _told(setting)
     return Line(
         figure=figure,

@@ -57,8 +57,9 @@ class Line:
 
     method; figure: its name, "mpjpe"; group and of: of whom or of what, ("all", "all"), ("joints", "wrists"),
     ("distance, m", "0 to 10"); value in `unit`, None where nobody could be judged; low, high: ends of the 95 %
-    interval, None where there is none; people, joints that it is of; skipped: people without a labelled joint; no_pose:
-    people for whom the network had no answer; arithmetic; protocol, centring, split, limit: as in `Setting`.
+    interval, None where there is none; people, joints that it is of (of oks_ap and turned_round, one a person);
+    skipped: people without a labelled joint; no_pose: people for whom the network had no answer; arithmetic;
+    protocol, centring, split, limit: as in `Setting`.
     """
 
     method: str

@@ -10,6 +10,7 @@ from lidarpose.data.readers.items import UNLABELED
 from lidarpose.data.released import released_box
 from lidarpose.errors import InputError, whole
 from lidarpose.evaluate.bench import floors
+from lidarpose.evaluate.bootstrap import LEAST_UNITS
 from lidarpose.evaluate.judged import Judged, gathered, subset
 from lidarpose.evaluate.lines import headline, lines_of
 from lidarpose.evaluate.people import BENCH, BenchPeople, People, Person, note
@@ -223,7 +224,7 @@ def judge(task: Task, *, legacy: bool = False, progress: Callable[[int], None] |
         setting=setting,
         counts=counts,
         skipped={reason: dict(entry) for reason, entry in people.skipped.items()},
-        notes=tuple(_notes(setting, people, judged)),
+        notes=tuple(_notes(task, setting, judged)),
         lines=lines,
     )
     return Evaluation(result=result, judged=judged, worst=tuple((person, k) for _, k, person in worst))
@@ -289,18 +290,34 @@ def _floor_lines(people: BenchPeople, judged: Judged, setting: Setting) -> tuple
     return out
 
 
-def _notes(setting: Setting, people: People, judged: Judged) -> Iterator[str]:
+def _notes(task: Task, setting: Setting, judged: Judged) -> Iterator[str]:
+    """What the reader must know; setting: the task's, as it turned out."""
+    yield from _acquainted(task)
     if setting.not_judged:
         yield f"judged are {', '.join(setting.joints)}; {setting.not_judged}"
     if setting.leaks:
         yield f"the split leaks: {setting.leaks}"
     if setting.protocol == "dapt":
         yield "crop and center are made of labels, as in the released code: not comparable with the protocol clean"
-        if people.level:
+        if task.people.level:
             yield "sequences out of level were turned; for the released code's frame, prepare with --no-level"
     if setting.kind == "waymo" and not (judged.labels == UNLABELED).all():
         yield "joints that are labelled as hidden count, but in PEM; people are predicted in their labelled boxes"
-    if setting.clusters and len(np.unique(judged.sequence)) < 2:
-        yield "one sequence alone: no intervals, since its frames are not independent"
+    if setting.clusters and (sequences := len(np.unique(judged.sequence[~judged.moving]))) < LEAST_UNITS:
+        few = "one sequence alone" if sequences == 1 else f"{sequences} sequences alone"
+        yield f"{few}: no intervals, which take {LEAST_UNITS}, since frames of a sequence are not independent"
     if setting.kind == BENCH:
         yield "the floors know no points: the mean skeleton about the points' center, turned to the true facing or not"
+
+
+def _acquainted(task: Task) -> Iterator[str]:
+    """That the network knows these people, by what its checkpoint tells."""
+    card = getattr(getattr(task.model, "header", None), "card", {})
+    judged, recipe = task.setting.split, card.get("recipe")
+    data, learned = card.get("data"), recipe.get("split") if isinstance(recipe, dict) else None
+    if not isinstance(data, list) or task.people.name not in data or learned is None:
+        return
+    if learned == judged or "all" in (learned, judged):
+        yield f"the network learned from split {learned} of {task.people.name}: it is judged on people whom it knows"
+    elif judged == "val" and "validation_mm" in card:
+        yield "the network's run was validated on this split: its best.safetensors was chosen by these people"

@@ -13,7 +13,7 @@ import numpy as np
 
 from lidarpose.data.readers.items import SEEN
 from lidarpose.errors import InputError, MissingExtra
-from lidarpose.evaluate.bootstrap import interval, paired_interval
+from lidarpose.evaluate.bootstrap import LEAST_UNITS, interval, paired_interval
 from lidarpose.evaluate.disturb import DISTURBANCES
 from lidarpose.evaluate.groups import joint_groups
 from lidarpose.evaluate.judged import Judged, gathered
@@ -227,10 +227,12 @@ def _point(
     both = ~np.isnan(found) & ~np.isnan(base)
     first, second = np.where(both, found, np.nan), np.where(both, base, np.nan)
     ends = [None] * 4
-    if clusters is None or len(np.unique(clusters)) > 1:
-        own = interval(found, rng, clusters=clusters, repeats=_REPEATS)
-        more = paired_interval(first, second, rng, clusters=clusters, repeats=_REPEATS)
-        ends = [number(value) for value in (own.low, own.high, more.low, more.high)]
+    own = interval(found, rng, clusters=clusters, repeats=_REPEATS)
+    more = paired_interval(first, second, rng, clusters=clusters, repeats=_REPEATS)
+    if own.units >= LEAST_UNITS:
+        ends[:2] = number(own.low), number(own.high)
+    if more.units >= LEAST_UNITS:
+        ends[2:] = number(more.low), number(more.high)
     return Point(
         amount=amount,
         label=label,

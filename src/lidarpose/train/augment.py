@@ -17,7 +17,7 @@ from lidarpose.sample import Sample, center_of
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth.augment import half_space_keep, jitter, noise_clusters, random_keep
 from lidarpose.train.crowd import StoredPerson
-from lidarpose.train.example import BLIND, PELVIS_ERROR, REFINED, Example
+from lidarpose.train.example import BLIND, PELVIS_ERROR, REFINED, Example, seen
 
 # a person of fewer points after the crop is shown whole
 LEAST_POINTS = 5
@@ -146,7 +146,15 @@ def _view(person: StoredPerson, kind: Augmentation, rng: np.random.Generator) ->
 def _kept(person: StoredPerson, keep: np.ndarray) -> StoredPerson:
     if keep.sum() < min(LEAST_POINTS, len(person.points)):
         return person
-    return replace(person, points=person.points[keep], part=person.part[keep])
+    # a joint whose points are all gone is not seen any more
+    gone = _near(person, np.ones_like(keep)) & ~_near(person, keep)
+    visible = np.where(gone & (person.visible == 1), np.float32(0), person.visible)
+    return replace(person, points=person.points[keep], part=person.part[keep], visible=visible)
+
+
+def _near(person: StoredPerson, keep: np.ndarray) -> np.ndarray:
+    """(26,) bool: some point of the body, or of which nothing is known, lies near the joint; keep (n,): which count."""
+    return seen(person.joints, person.points[keep & (person.part != 0)])
 
 
 def _root(joints: np.ndarray) -> np.ndarray | None:
