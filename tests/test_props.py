@@ -224,6 +224,18 @@ def test_cyclists_sit_hold_and_pedal(drawn, bodies):
     assert np.median(held) < 0.2
 
 
+def test_pedals_go_along_with_the_feet():
+    moving, rng, apart = draw_bodies(None, 0.0, 200, 5, 0), np.random.default_rng(0), []
+    for row in np.flatnonzero(np.array(moving.kinds) == "cycle"):
+        (prop,) = (p for p in draw_props(rng, kind="cycle", joints=moving.joints[row]) if p.name == "bicycle")
+        for joints in (moving.joints[row], moving.moved(row)[1]):
+            vertices = prop.place(joints).vertices
+            feet = joints[[J["left_foot"], J["right_foot"]]]
+            apart.append(np.linalg.norm(vertices - feet[:, None], axis=-1).min(1))
+    now, later = np.array(apart).reshape(-1, 2, 2).transpose(1, 0, 2)
+    assert len(now) >= 3 and np.median(later) < np.median(now) + 0.02
+
+
 def test_prams_are_held_at_their_handles(drawn, bodies):
     for name in ("pram", "trolley"):
         for prop, row in drawn[name]:

@@ -38,7 +38,7 @@ def test_amass_in_parts_and_of_another_up(tmp_path):
     np.savez(
         path, root_orient=pose[:, :3], pose_body=pose[:, 3:66], trans=way @ files.C, mocap_frame_rate=np.array(120.0)
     )
-    with pytest.raises(InputError, match="stand along y, not z; give up='y'"):
+    with pytest.raises(InputError, match="stand along y, not z; give load_motion up='y'"):
         load_motion(path)
     check_same(load_motion(path, up="y"), rotations, way)
     assert load_motion(path, up="y", fps=30).fps == 30
@@ -226,7 +226,7 @@ def test_frames_that_are_no_numbers_end_a_clip(tmp_path):
     [
         ({"drop": ("trans",)}, "holds betas, dmpls, gender, mocap_framerate, poses; an npz of motion needs"),
         ({"drop": ("poses",)}, "root_orient"),
-        ({"drop": ("mocap_framerate",)}, "does not say its frame rate .* give fps="),
+        ({"drop": ("mocap_framerate",)}, "does not say its frame rate .* give load_motion fps="),
         ({"fps": 0}, "above 0"),
         ({"fps": np.nan}, "above 0"),
         ({"mocap_framerate": np.array(["x"])}, "one number"),

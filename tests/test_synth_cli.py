@@ -9,6 +9,7 @@ import time
 
 import numpy as np
 import pytest
+from motion_files import a_clip, write_amass
 from shard_files import write_shard
 from torch.utils.data import DataLoader
 
@@ -120,6 +121,25 @@ def test_motion_that_cannot_be_read_is_one_line_and_leaves_no_folder(tmp_path, w
     with pytest.raises(InputError, match="motion.npz") as caught:
         write_dataset(job(motion=str(motion)), tmp_path / "out", workers=workers)
     assert "\n" not in str(caught.value) and [path.name for path in tmp_path.iterdir()] == ["motion.npz"]
+
+
+def test_what_made_nothing_leaves_no_folder(tmp_path, capsys):
+    near = tmp_path / "near.json"
+    near.write_text('{"elevations_deg": [-2, -1, 0], "range_max": 1.2}')
+    out = tmp_path / "out"
+    assert synth(out, "-n", 3, "--sensor", near) == 2
+    assert "sensors such as near" in one_line(capsys) and not out.exists()
+    # nor anything in a folder that was there
+    out.mkdir()
+    assert synth(out, "-n", 3, "--sensor", near) == 2
+    assert not list(out.iterdir())
+
+
+def test_clips_of_motion_that_is_too_short_are_refused(tmp_path, capsys):
+    motion = tmp_path / "motion.npz"
+    write_amass(motion, *a_clip(frames=16), fps=10.0)
+    assert synth(tmp_path / "out", "-n", 2, "--clips", "--motion", motion) == 2
+    assert "no clip lasts 1.6 s" in one_line(capsys) and not (tmp_path / "out").exists()
 
 
 def test_other_settings_are_refused_by_name(dataset, capsys):

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.errors import InputError
+from lidarpose.errors import InputError, unknown_name
 from lidarpose.io.files import file_error, read_bytes
 from lidarpose.lidar.sensor import Sensor
 
@@ -32,6 +32,7 @@ _EXPECTED = "a sensor's table (.json, .csv)"
 # tables take some kilobytes
 _MOST_BYTES = 2**24
 _OWN_KEYS = ("range_min", "range_max", "range_sigma", "dropout", "height")
+_KEYS = ("elevations_deg", "azimuth_offsets_deg", "columns", "name", "tilt_deg", *_OWN_KEYS)
 
 
 def load_sensor(path: str | Path) -> Sensor:
@@ -106,13 +107,20 @@ def _from_json(path: Path, text: str) -> dict:
         return {"elevations": found}
     if isinstance(found, dict):
         if "elevations_deg" in found:
+            if stranger := next((key for key in found if key not in _KEYS), None):
+                raise file_error(path, str(unknown_name("key", stranger, _KEYS)))
             fields = {"elevations": found["elevations_deg"], "offsets": found.get("azimuth_offsets_deg")}
             fields |= {key: found[key] for key in (*_OWN_KEYS, "columns", "name") if key in found}
             for key in _OWN_KEYS:
                 if key in fields:
                     fields[key] = _number(path, key, fields[key])
+            if fields.get("height", 1) <= 0:
+                raise file_error(path, f"height must be above 0 m, the ground, got {fields['height']:g}")
             if "tilt_deg" in found:
-                fields["tilt"] = math.radians(_number(path, "tilt_deg", found["tilt_deg"]))
+                tilt = _number(path, "tilt_deg", found["tilt_deg"])
+                if abs(tilt) > 90:
+                    raise file_error(path, f"tilt_deg must be within +-90 degrees, got {tilt:g}")
+                fields["tilt"] = math.radians(tilt)
             return fields
         # newer metadata has sections
         sections = [found, *(value for value in found.values() if isinstance(value, dict))]

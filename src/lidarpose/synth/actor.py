@@ -11,7 +11,7 @@ from lidarpose.body.motion import sample_clips
 from lidarpose.body.person import clothing, sample_people
 from lidarpose.body.rig import RestBody, load_rig
 from lidarpose.geometry import rotation_about
-from lidarpose.synth.bodies import CLIP_HZ, Bodies, PoseBank, dressed, extents
+from lidarpose.synth.bodies import CLIP_HZ, Bodies, PoseBank, dressed, extents, strides
 
 # how high a captured foot may be above its clip's lowest and still stand on the ground, m
 _JUMP = 0.06
@@ -70,6 +70,7 @@ def draw_actor(
         rotations, translation = drawn.rotations[0], drawn.translation[0] * np.float32([1, 1, 0])
         kind, clearance = KINDS[drawn.kind[0]], drawn.clearance[0]
     person = rig.rest(sample_people(rng, 1).coefficients)
+    translation = translation * [*strides(person, [kind]).repeat(2), 1]
     rest = RestBody(vertices=np.repeat(person.vertices, frames + 1, 0), joints=np.repeat(person.joints, frames + 1, 0))
     worn = np.repeat(clothing(rng, 1) * np.float32(clothes), frames + 1, 0)
     vertices, joints, low, _ = dressed(rest, worn, rotations, translation)

@@ -1,5 +1,6 @@
 """Posed, clothed bodies for the generator: blocks of single poses, and clips of one person who moves."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from lidarpose.body.activities import KINDS
 from lidarpose.body.clips import Motion, facing_x
 from lidarpose.body.motion import sample_rotations
 from lidarpose.body.person import clothing, sample_people
+from lidarpose.body.retarget import mean_adult_joints
 from lidarpose.body.rig import RestBody, load_rig, pose_bodies
 from lidarpose.body.sources import load_motion
 from lidarpose.errors import InputError, MissingExtra
@@ -150,9 +152,23 @@ def draw_bodies(
         rest=rest,
         clothes=worn,
         moved_rotations=moved if moving else None,
-        step=step if moving else None,
+        step=step * strides(rest, kinds) if moving else None,
         lift=lift,
     )
+
+
+def strides(rest: RestBody, kinds: Sequence[str]) -> np.ndarray:
+    """(n, 1) float32: how long the steps of people (n) are beside the mean adult's, whose way all motion has: as their
+    legs, or feet would slide. Cyclists' are as long."""
+    mean = _legs(mean_adult_joints()[None])
+    rolls = np.array([kind == "cycle" for kind in kinds])
+    return np.where(rolls, 1.0, _legs(rest.joints) / mean)[:, None].astype(np.float32)
+
+
+def _legs(joints: np.ndarray) -> np.ndarray:
+    """(n,) m: from the left hip over the knee to the ankle."""
+    hip, knee, ankle = (joints[:, SMPL24.index(f"left_{name}")] for name in ("hip", "knee", "ankle"))
+    return np.linalg.norm(hip - knee, axis=-1) + np.linalg.norm(knee - ankle, axis=-1)
 
 
 def dressed(

@@ -116,7 +116,10 @@ class Generator:
             if points >= LEAST_POINTS:
                 break
         if best is None:
-            raise InputError(f"scene {scene.name}: no draw of {_TRIES} left a point on a person; is it out of range?")
+            raise InputError(
+                f"scene {scene.name}: no draw of {_TRIES} left a point on a person, with sensors such as "
+                f"{stage.device.name}: does its range hold people at {scene.distance[0]:g} to {scene.distance[1]:g} m?"
+            )
         eased, stage, seen = best
         facts = [None] * len(seen)
         if self.measure:

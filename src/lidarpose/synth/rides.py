@@ -1,5 +1,7 @@
 """What people push, sit on and ride: each a function of the pose and of uniforms."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from lidarpose.synth import prop_meshes as meshes
@@ -95,35 +97,45 @@ def bicycle(points: Points, u: list[float]) -> Prop:
     """As large as the rider needs: saddle under the hips, pedals under the feet, bars at the hands."""
     hips = _hips(points)
     size = min(max((hips[2] - _SADDLE + _PEDAL) / meshes.SADDLE[1], 0.45), 1.15)
-    x, y = heading(points)
-
-    def in_frame(point: Point) -> tuple[float, float, float]:
-        dx, dy = point[0] - hips[0], point[1] - hips[1]
-        return ((dx * x + dy * y) / size, (dy * x - dx * y) / size, (point[2] + _PEDAL) / size)
-
-    hands = [in_frame(points[hand]) for hand in HANDS]
+    hands = [_within(points, points[hand], size) for hand in HANDS]
     # hands that are where bars can be; else straight ones
     held = [h for h in hands if 0.25 < h[0] < 0.9 and 0.75 < h[2] < 1.4]
     bar_x, bar_z = (sum(h[0] for h in held) / len(held), sum(h[2] for h in held) / len(held)) if held else (0.52, 1.05)
     neck = (meshes.NECK[0], 0.0, meshes.NECK[1])
     parts = [meshes.bicycle(), meshes.unit_box().scaled((0.04, 0.56, 0.035)).moved((bar_x, 0, bar_z - 0.03))]
-    rods = [(neck, (bar_x, 0.0, bar_z))]
-    crank = (meshes.CRANK[0], meshes.CRANK[1])
-    for side, name in ((0.1, "left_foot"), (-0.1, "right_foot")):
-        px, _, pz = in_frame(points[JOINT[name]])
-        # pedals are on a circle about the crank
-        dx, dz = px - crank[0], pz - 0.03 - crank[1]
+    still = union([*parts, _rod(neck, (bar_x, 0.0, bar_z))])
+
+    def shape(p: Points) -> Mesh:
+        """In the bicycle's frame, the pedals where the feet are."""
+        return union([still, *_pedals([_within(p, p[JOINT[name]], size) for name in ("left_foot", "right_foot")])])
+
+    def where(p: Points) -> np.ndarray:
+        x, y, _ = _hips(p)
+        rows = upright(p, (size, size, size))
+        return shape(p).vertices @ np.array(rows, np.float32) + np.array([x, y, -_PEDAL], np.float32)
+
+    return Prop(name="bicycle", mesh=shape(points), where=where, lift=_PEDAL)
+
+
+def _within(points: Points, point: Point, size: float) -> tuple[float, float, float]:
+    """A point in the frame of the bicycle that is under these joints."""
+    hips, (x, y) = _hips(points), heading(points)
+    dx, dy = point[0] - hips[0], point[1] - hips[1]
+    return ((dx * x + dy * y) / size, (dy * x - dx * y) / size, (point[2] + _PEDAL) / size)
+
+
+def _pedals(feet: list[tuple[float, float, float]]) -> Iterator[Mesh]:
+    """Left and right pedal and their cranks, on a circle about the axle, as near to the feet as it comes."""
+    ax, az = meshes.CRANK
+    for side, (px, _, pz) in zip((0.1, -0.1), feet, strict=True):
+        dx, dz = px - ax, pz - 0.03 - az
         long = max((dx * dx + dz * dz) ** 0.5, 1e-6)
-        pedal = (crank[0] + 0.17 * dx / long, side, crank[1] + 0.17 * dz / long)
-        rods.append(((crank[0], 0.6 * side, crank[1]), (pedal[0], 0.6 * side, pedal[2])))
-        parts.append(meshes.unit_box().scaled((0.09, 0.09, 0.025)).moved(pedal))
-    for start, end in rods:
-        rows, origin = meshes.rod_rows(start, end, 0.016)
-        bar = meshes.tube(3)
-        parts.append(Mesh(bar.vertices @ np.array(rows, np.float32) + np.float32(origin), bar.faces))
+        pedal = (ax + 0.17 * dx / long, side, az + 0.17 * dz / long)
+        yield meshes.unit_box().scaled((0.09, 0.09, 0.025)).moved(pedal)
+        yield _rod((ax, 0.6 * side, az), (pedal[0], 0.6 * side, pedal[2]))
 
-    def frame(p: Points):
-        at = _hips(p)
-        return upright(p, (size, size, size)), [at[0], at[1], -_PEDAL]
 
-    return fixed("bicycle", union(parts), frame, lift=_PEDAL)
+def _rod(start: tuple[float, float, float], end: tuple[float, float, float]) -> Mesh:
+    rows, origin = meshes.rod_rows(start, end, 0.016)
+    bar = meshes.tube(3)
+    return Mesh(bar.vertices @ np.array(rows, np.float32) + np.float32(origin), bar.faces)

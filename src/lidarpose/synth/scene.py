@@ -59,7 +59,7 @@ class SceneConfig:
     ground's tilt; margin rad and around m: how much farther than the body beams are cast; clutter: things near the
     person; occluder: something in front; company: a second person in or before the crop; carry: how often something
     is carried or used, relative to the street's habit; clothes: how far cloth and hair stand off the skin, relative to
-    the street's (0: bare); hard in [0, 1].
+    the street's (0: bare); hard in [0, 1]. Whatever `hard`, boxes jitter and the field of view ends.
     """
 
     name: str

@@ -1,7 +1,7 @@
 """The job behind `lidarpose synth`: people, clips or streets into Parquet shards; see `data.jobs` for how."""
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +13,7 @@ from lidarpose.body.sources import digest as motion_digest
 from lidarpose.data.jobs import clean_folder, make_shards, open_folder
 from lidarpose.data.shards import CARD, Card, person_row, shard_path, shard_writer, write_card
 from lidarpose.errors import InputError
-from lidarpose.io.files import content_digest
+from lidarpose.io.files import content_digest, file_error
 from lidarpose.lidar.catalog import SENSORS, sensor
 from lidarpose.synth.scene import scene_config
 
@@ -122,16 +122,32 @@ def write_dataset(
         # before anything is written, so that motion that cannot be read leaves no folder
         make.get_ready()
     clean_folder(folder)
-    if not (folder / CARD).is_file():
+    is_new, has_card = not folder.exists(), (folder / CARD).is_file()
+    if not has_card:
         write_card(folder, card)
     if progress is not None:
         progress(done, card.count)
-    for _, count in make_shards(make, missing, workers=workers):
-        done += count
-        if progress is not None:
-            progress(done, card.count)
+    try:
+        for _, count in make_shards(make, missing, workers=workers):
+            done += count
+            if progress is not None:
+                progress(done, card.count)
+    except InputError:
+        if not has_card:
+            _give_up(folder, is_new)
+        raise
     clean_folder(folder)
     return left
+
+
+def _give_up(folder: Path, is_new: bool) -> None:
+    """Takes the card of settings that made nothing away again, so that others can follow."""
+    clean_folder(folder)
+    with suppress(OSError):
+        if {path.name for path in folder.iterdir()} == {CARD}:
+            (folder / CARD).unlink()
+            if is_new:
+                folder.rmdir()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +173,7 @@ class Maker:
 
     @cached_property
     def _generator(self):
-        from lidarpose.synth.bodies import PoseBank
+        from lidarpose.synth.bodies import CLIP_HZ, PoseBank
         from lidarpose.synth.generate import Generator
 
         job = self.job
@@ -165,6 +181,10 @@ class Maker:
         if job.sensors is not None:
             scene = replace(scene, sensors=job.sensors)
         bank = PoseBank.from_clips(job.motion, job.subjects) if job.motion is not None else None
+        if job.what == "clips" and job.share and not len(bank.clips.windows(CLIP_FRAMES + 1)):
+            raise file_error(
+                job.motion, f"no clip lasts {CLIP_FRAMES / CLIP_HZ:g} s: give longer motion, or leave --clips away"
+            )
         return Generator(scene=scene, bank=bank, captured=job.share)
 
     def _shard(self, shard: int) -> Iterator[int]:

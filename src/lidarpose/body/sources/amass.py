@@ -60,9 +60,11 @@ def _amass(
     if fps is None:
         rate = next((stored[key] for key in _RATES if key in names), None)
         if rate is None:
-            raise file_error(path, "does not say its frame rate (mocap_framerate); give fps=")
+            raise file_error(path, "does not say its frame rate (mocap_framerate); give load_motion fps=")
         if rate.size != 1 or rate.dtype.kind not in "iuf":
-            raise file_error(path, f"the frame rate must be one number, got {rate.dtype} {rate.shape}; give fps=")
+            raise file_error(
+                path, f"the frame rate must be one number, got {rate.dtype} {rate.shape}; give load_motion fps="
+            )
         fps = float(rate.item())
     kept = _SMPL if poses.shape[1] == _SMPL else _BODY
     pose = np.zeros((len(poses), _SMPL))

@@ -41,7 +41,7 @@ def load_bvh(path: str | os.PathLike, *, up: str | None = None, fps: float | Non
         raise file_error(path, "no joint has CHANNELS, so nobody moves: was it exported with its motion?")
     values, rate = _frames(path, lines[motion + 1 :], sum(len(joint.channels) for joint in joints))
     if fps is None and rate is None:
-        raise file_error(path, "has no frame time above 0 (Frame Time: seconds); give fps=")
+        raise file_error(path, "has no frame time above 0 (Frame Time: seconds); give load_motion fps=")
     tree = Tree(
         names=[joint.name for joint in joints],
         parents=[joint.parent for joint in joints],

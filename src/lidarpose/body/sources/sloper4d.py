@@ -31,7 +31,7 @@ def load_sloper4d(path: str | os.PathLike, *, up: str | None = None, fps: float 
         try:
             fps = float(np.asarray(labels["framerate"]).item())
         except (KeyError, TypeError, ValueError):
-            raise file_error(path, "does not say its frame rate (framerate); give fps=") from None
+            raise file_error(path, "does not say its frame rate (framerate); give load_motion fps=") from None
     motions = [
         smpl_motion(
             path,

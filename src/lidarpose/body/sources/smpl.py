@@ -46,7 +46,7 @@ def smpl_motion(
     if pose.ndim != 2 or pose.shape[1] != 72 or trans.shape != (len(pose), 3):
         raise file_error(path, f"{kind} needs pose (frames, 72) and trans (frames, 3), got {pose.shape}, {trans.shape}")
     if not 0 < fps < np.inf:
-        raise file_error(path, f"the frame rate must be above 0, got {fps}; give fps=")
+        raise file_error(path, f"the frame rate must be above 0, got {fps}; give load_motion fps=")
     good = np.isfinite(pose).all(1) & np.isfinite(trans).all(1)
     names, start, length = cut(path, name, good, number)
     pose, trans = pose[good].reshape(-1, 24, 3), trans[good]
@@ -80,7 +80,7 @@ def _check_upright(path: object, trunk: np.ndarray) -> None:
     axis = int(np.abs(trunk).argmax())
     stands = "xyz"[axis]
     if stands != "z" and abs(trunk[axis]) > _STANDS:
-        remedy = f"give up={stands!r}" if trunk[axis] > 0 else "turn the recording first"
+        remedy = f"give load_motion up={stands!r}" if trunk[axis] > 0 else "turn the recording first"
         raise file_error(path, f"people stand along {'-' if trunk[axis] < 0 else ''}{stands}, not z; {remedy}")
 
 

@@ -84,7 +84,7 @@ def tree_motion(
     tree by SMPL's names, where names are not to be guessed. Raises InputError for a skeleton that is nobody's.
     """
     if not 0 < fps < np.inf:
-        raise file_error(path, f"the frame rate must be above 0, got {fps}; give fps=")
+        raise file_error(path, f"the frame rate must be above 0, got {fps}; give load_motion fps=")
     found = match_joints(path, tree.names, tree.parents) if found is None else found
     good = np.isfinite(tree.positions).all((1, 2))
     cut(path, name, good)
@@ -209,7 +209,9 @@ def _upwards(path: object, joints: np.ndarray) -> str:
     trunk = unit(joints[:, _J["neck"]] - hips).mean(0)
     axis = int(np.abs(trunk).argmax())
     if trunk[axis] < -_STANDS:
-        raise file_error(path, f"people stand along -{'xyz'[axis]}; turn the recording, or give up= if they do")
+        raise file_error(
+            path, f"people stand along -{'xyz'[axis]}; turn the recording, or give load_motion up= if they do"
+        )
     return "xyz"[axis] if trunk[axis] > _STANDS else "y"
 
 
