@@ -54,8 +54,9 @@ def test_other_libraries_see_the_suffix(tmp_path):
     assert tree(tmp_path) == ["a.npz"]
 
 
-def test_long_names(tmp_path):
-    path = tmp_path / ("a" * 250 + ".png")
+@pytest.mark.parametrize("name", ["a" * 250 + ".png", "点" * 84, "é" * 125 + ".png"])
+def test_long_names(tmp_path, name):
+    path = tmp_path / name
     write_atomic(path, b"x")
     assert path.read_bytes() == b"x"
 

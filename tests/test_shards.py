@@ -130,6 +130,8 @@ def test_damaged_and_missing_shards_are_named(folder):
         ({"schema": 2}, "is of schema 2, this lidarpose reads 1: install lidarpose [0-9]"),
         ({"count": 0}, "make no sense"),
         ({"tables": ["cars"]}, "make no sense"),
+        ({"tables": [["people"]]}, "make no sense"),
+        ({"count": float("inf")}, "not a dataset's card"),
         ({"skeleton": "cat"}, "unknown skeleton"),
     ],
 )

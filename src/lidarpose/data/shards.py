@@ -126,7 +126,7 @@ def read_card(folder: str | Path) -> Card:
             settings=dict(found["settings"]),
             count=int(found["count"]),
             per_shard=int(found["per_shard"]),
-            tables=tuple(found["tables"]),
+            tables=tuple(map(str, found["tables"])),
             skeleton=str(found["skeleton"]),
             version=str(found["version"]),
             frame=str(found.get("frame", SENSOR_FRAME)),
@@ -135,7 +135,7 @@ def read_card(folder: str | Path) -> Card:
         )
     except InputError:
         raise
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         problem = f"{error} is missing" if isinstance(error, KeyError) else error
         raise file_error(path, f"is not a dataset's card ({problem})") from None
     if card.count < 1 or card.per_shard < 1 or not set(card.tables) <= set(TABLES):

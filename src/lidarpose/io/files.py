@@ -19,7 +19,7 @@ from lidarpose.errors import InputError
 # part of a temporary file's name beside the process id, so that threads of one process never share a name
 _serial = count()
 
-# a name of a file may have 255 bytes on the usual file systems, of which the temporary name needs some itself
+# bytes: a name may have 255 on the usual file systems, of which the temporary name needs some itself
 _MAX_KEPT_NAME = 100
 
 _REMEDIES = {
@@ -154,7 +154,9 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
             raise file_error(path, "is a device or pipe; give the name of a file to write")
 
     made: list[Path] = []
-    temporary = target.parent / f".{os.getpid()}-{next(_serial)}-{target.name[-_MAX_KEPT_NAME:]}"
+    # a character that is cut in two is left out
+    kept = target.name.encode("utf-8", "ignore")[-_MAX_KEPT_NAME:].decode("utf-8", "ignore")
+    temporary = target.parent / f".{os.getpid()}-{next(_serial)}-{kept}"
     try:
         for folder in (*reversed(target.parent.parents), target.parent):
             if not folder.is_dir():

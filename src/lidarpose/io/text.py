@@ -41,16 +41,18 @@ def parse_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...
         raise Problem(f"expected at least 3 columns x y z, got {came}: export x, y and z")
     else:
         names = _names_above(comment, len(names))
-    # lines that are blank but for a comment would count as rows without values
-    text = re.sub(r"(?m)^[ \t]+$", "", re.sub(r"[ \t]*#.*", "", text))
+    # lines that are blank but for a comment would count as rows without values; what is looked for behind keeps every
+    # blank of a long run from being tried as the first
+    text = re.sub(r"(?m)^[ \t]+$", "", re.sub(r"(?<![ \t])[ \t]*#.*", "", text))
     num_skipped = skip + has_header
     parts = text.split("\n", num_skipped)
     # pandas knows double quotes alone; within a number a quote is something else
     body = re.sub(r"(?<![^,;\s])'|'(?![^,;\s])", "", parts[num_skipped]) if len(parts) > num_skipped else ""
     # 1e-05 on the first line and 0,5 on a later one
     if separator != "," and "," in body:
-        edge = separator or r"[ \t]"
-        if re.search(rf"(?m)(?:^|{edge})[ \t]*[-+]?\d*,\d+(?:[eE][-+]?\d+)?[ \t]*(?:{edge}|$)", body):
+        # blanks in a cell, none that could be its edge: in a long run of them each could be either
+        edge, blanks = separator or r"[ \t]", {None: "", "\t": " *"}.get(separator, r"[ \t]*")
+        if re.search(rf"(?m)(?:^|{edge}){blanks}[-+]?\d*,\d+(?:[eE][-+]?\d+)?{blanks}(?:{edge}|$)", body):
             decimal = ","
     if has_header:
         _check_width(body, names, separator, num_skipped)
