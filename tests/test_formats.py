@@ -285,7 +285,7 @@ def test_bin_columns(folder):
         same(cloud, nuscenes[:rows], fields)
         assert len(cloud.warnings) == 1 and "--columns 4" in cloud.warnings[0]
     # the converse: 10 rows of KITTI's 4 are also 8 rows of 5
-    kitti = rng.normal(scale=20, size=(10, 4)).astype(np.float32)
+    kitti = np.hstack([rng.normal(scale=20, size=(10, 3)), rng.uniform(0, 1, (10, 1))]).astype(np.float32)
     cloud = read(folder, "a.bin", kitti.tobytes())
     same(cloud, kitti)
     assert cloud.warnings == ()
@@ -295,6 +295,49 @@ def test_bin_columns(folder):
         assert cloud.warnings == ()
     same(read(folder, "a.bin", metres.tobytes(), columns=3), metres, ("x", "y", "z"))
     same(read(folder, "a.bin", nuscenes[:, [0, 1, 2, 3, 4, 0]].tobytes(), columns=6), metres)
+
+
+def _sweep(rng, n):
+    distance, azimuth = rng.gamma(2, 8, n) + 2, rng.uniform(-np.pi, np.pi, n)
+    return np.stack([distance * np.cos(azimuth), distance * np.sin(azimuth), rng.uniform(-2, 2, n)], 1)
+
+
+def _person(rng, n):
+    return rng.normal(0, [0.25, 0.25, 0.5], (n, 3)) + rng.uniform([3, -10, -1], [30, 10, 1])
+
+
+@pytest.mark.parametrize("cloud", [_sweep, _person])
+@pytest.mark.parametrize("n", [20, 21, 24, 30, 40, 45, 60, 75, 100, 240, 999, 1000, 2000])
+def test_bin_columns_are_told_by_the_values(folder, cloud, n):
+    """Sizes that divide by 3, 4 and 5 alike say nothing, and a fifth column need not be a beam's number."""
+    rng = np.random.default_rng(n)
+    xyz = cloud(rng, n)
+    for intensity in (rng.uniform(0, 1, n), rng.beta(1, 5, n), rng.integers(0, 256, n), np.zeros(n)):
+        rows = np.column_stack([xyz, intensity]).astype(np.float32)
+        found = read(folder, "a.bin", rows.tobytes())
+        same(found, rows)
+        assert found.warnings == ()
+        for fifth in (0.0, 0.05, rng.integers(0, 10, n) / 10):
+            rows5 = np.column_stack([rows, np.broadcast_to(fifth, n)]).astype(np.float32)
+            found = read(folder, "a.bin", rows5.tobytes())
+            same(found, rows5, ("x", "y", "z", "intensity", "ring"))
+            assert len(found.warnings) == 1 and "--columns 4" in found.warnings[0]
+    if n % 4 == 0 and n >= 40:
+        found = read(folder, "a.bin", xyz.astype(np.float32).tobytes())
+        same(found, xyz.astype(np.float32), ("x", "y", "z"))
+        assert "rows of 3 float32, since rows of 4 would mix" in found.warnings[0]
+
+
+def test_bin_columns_that_nothing_tells(folder):
+    """All columns alike: KITTI's four, which a warning tells where another number fits better by chance."""
+    warned = 0
+    for seed in range(30):
+        rows = np.random.default_rng(seed).normal(size=(60, 4)).astype(np.float32)
+        found = read(folder, "a.bin", rows.tobytes())
+        same(found, rows)
+        warned += len(found.warnings)
+        assert all("rows of 4 float32 (KITTI), since nothing speaks clearly for" in line for line in found.warnings)
+    assert 0 < warned < 30
 
 
 def test_bin_of_printable_bytes(folder):
@@ -622,3 +665,11 @@ def test_raw_rows_of_another_width_are_told_all_that_fit(tmp_path):
     np.ones((102, 3), "f4").tofile(path)
     with pytest.raises(InputError, match=r"say how many values a row has \(--columns 3 or 6\)"):
         read_points(path)
+
+
+@pytest.mark.parametrize("text", ["1 2 3{}# note\n", "1e-05{}2 3\n0,5 1 2\n", "1\t2{}\t3 # a\n4\t{}5,5\t6\n"])
+def test_long_runs_of_blanks_are_read(tmp_path, text):
+    """Where every blank is tried as the first of its run, this takes an hour."""
+    path = tmp_path / "b.txt"
+    path.write_text(text.format(" " * 200_000, " " * 200_000))
+    assert len(read_points(path).points) == text.count("\n")

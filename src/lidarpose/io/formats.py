@@ -35,6 +35,11 @@ _MAX_PLAUSIBLE = 1e7
 _MAX_IMPLAUSIBLE_SHARE = 0.01
 # beams are numbered from 0; no LiDAR has more
 _MAX_BEAMS = 256
+# of raw bytes, rows of another width are taken where their columns are so much narrower, in the mean logarithm: 0.5 and
+# more where the other width is right, below 0.05 where it is wrong, of synthetic sweeps and people of 20 rows and more
+_NARROWER = 0.4
+# no LiDAR sees farther, m; a column of constants is as wide as noise, m
+_FAR, _NARROWEST = 1e3, 1e-3
 
 # the first bytes of what users rename by mistake, with the remedy; long enough never to be float32 coordinates
 _FOREIGN = (
@@ -88,8 +93,8 @@ def read_points(path: str | os.PathLike, *, columns: int | None = None) -> Cloud
     header; commas, semicolons, tabs or blanks; # starts a comment), .bin (rows of `columns` float32).
 
     columns: values a row of a .bin, x y z first; other formats ignore it. Where it is None, rows have 4 (KITTI) or,
-    where the size or a column of beam numbers says so, 5 (nuScenes), which a warning tells; `.pcd.bin`, nuScenes' own
-    suffix, means 5.
+    where the size or the values say so, 5 (nuScenes) or 3, which a warning tells; `.pcd.bin`, nuScenes' own suffix,
+    means 5.
 
     Raises InputError of one line that names the file, what was expected, what came and what to do.
     """
@@ -174,17 +179,36 @@ def _parse_bin(data: bytes, columns: int | None):
 
 
 def _guess_columns(data: bytes) -> tuple[int, tuple[str, ...]]:
-    """(values a row, warnings): KITTI's 4 but where the size or the content speaks for nuScenes' 5."""
+    """(values a row, warnings): KITTI's 4 but where the size or the content speaks for nuScenes' 5, or for 3."""
     four, five = len(KITTI_FIELDS), len(NUSCENES_FIELDS)
-    if len(data) % (4 * five):
-        return four, ()
-    # where both divide: a fifth value that is always a beam number is no accident, misaligned metres are not whole
-    ring = np.frombuffer(data, "<f4").reshape(-1, five)[:, -1]
-    beams = bool(((ring >= 0) & (ring < _MAX_BEAMS) & (ring == np.floor(ring))).all() and ring.any())
-    if len(data) % (4 * four) == 0 and not beams:
-        return four, ()
-    why = "every fifth value is a beam number" if beams else "the size divides by 5 values and not by 4"
-    return five, (f"read as rows of 5 float32 (nuScenes), since {why}; give --columns 4 (KITTI) if that is wrong",)
+    fits = [columns for columns in (four, five, 3) if len(data) % (4 * columns) == 0]
+    usual = four if four in fits or five not in fits else five
+    why, other = "the size divides by 5 values and not by 4" if usual == five else "", four
+    values = np.frombuffer(data[: len(data) // 4 * 4], "<f4")
+    if five in fits:
+        # a fifth value that is always a beam number is no accident, misaligned metres are not whole
+        ring = values.reshape(-1, five)[:, -1]
+        if ((ring >= 0) & (ring < _MAX_BEAMS) & (ring == np.floor(ring))).all() and ring.any():
+            usual, fits, why = five, [five], "every fifth value is a beam number"
+    if usual in fits and len(fits) > 1:
+        width = {columns: _width(values.reshape(-1, columns)) for columns in fits}
+        best = min(fits, key=width.get)
+        if width[best] < width[usual] - _NARROWER:
+            usual, why = best, f"rows of {usual} would mix its columns up"
+        elif best != usual:
+            why, other = f"nothing speaks clearly for rows of {best}", best
+    if not why:
+        return usual, ()
+    names = {four: " (KITTI)", five: " (nuScenes)"}
+    remedy = f"give --columns {other}{names.get(other, '')} if that is wrong"
+    return usual, (f"read as rows of {usual} float32{names.get(usual, '')}, since {why}; {remedy}",)
+
+
+def _width(rows: np.ndarray) -> float:
+    """How wide the columns of rows are on average: least for the right number of columns, since any other mixes x, y, z
+    and the rest in all of them. Infinite where nothing is a number."""
+    spread = np.nanstd(np.clip(rows, -_FAR, _FAR), axis=0, dtype=np.float64)
+    return float(np.nan_to_num(np.log(spread + _NARROWEST).mean(), nan=np.inf))
 
 
 # ---- NumPy: https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html
