@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import shutil
 from collections import Counter
 
 import dataset_files as files
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 from lidarpose.body.smpl import load_body
 from lidarpose.data.prepare import READERS, reader
 from lidarpose.data.readers.items import SEEN, UNLABELED, Item, Skipped
-from lidarpose.data.readers.raw import numbered, numbers
+from lidarpose.data.readers.raw import numbered, numbers, read_cloud
 from lidarpose.data.readers.sloper4d import _heading
 from lidarpose.data.readers.smpl_joints import SmplJoints
 from lidarpose.errors import InputError
@@ -193,7 +194,68 @@ def test_humanm3_skips_are_counted_and_named(tmp_path, smpl):
     assert all("\n" not in one.where for one in skipped)
 
 
+def test_humanm3_takes_nothing_but_its_own_database(tmp_path, smpl):
+    files.write_humanm3(tmp_path, smpl, frames=1)
+    (tmp_path / "SMPL_NEUTRAL.pkl").write_bytes(pickle.dumps({}))
+    shutil.rmtree(tmp_path / "test/plaza/seg0/pose_calib")
+    for _ in range(2):
+        with pytest.raises(InputError, match="has .*plaza/seg0 without pose_calib: get that folder too"):
+            made("humanm3", smpl).parts(tmp_path)
+        # nor its own where a sequence is complete
+        (tmp_path / "train.pkl").write_bytes(b"")
+
+
+def test_humanm3_joints_out_of_reach_cost_nobody_else(tmp_path, smpl):
+    truth = files.write_humanm3(tmp_path, smpl, sequences=("train/a",))
+    path = tmp_path / "train/a/pose_calib/0007.json"
+    content = json.loads(path.read_text())
+    content["2"][0][0] = 1e10
+    path.write_text(json.dumps(content))
+    items, skipped = everything("humanm3", tmp_path, smpl)
+    check(items, {key: joints for key, joints in truth.items() if key[1:] != (7, "2")})
+    assert reasons(skipped) == {"joints out of reach": 1} and "train/a/7/2" in skipped[0].where
+
+
 # --- LiDARHuman26M
+
+
+def test_lidarhuman26m_one_bad_file_costs_one_frame(tmp_path, smpl):
+    truth = files.write_lidarhuman26m(tmp_path, smpl, sequences=("5",), frames=5)
+    segment = tmp_path / "labels/3d/segment/5"
+    for frame in (1, 2):
+        (segment / f"{frame:06d}.ply").unlink()
+    (segment / "000001.ply").symlink_to(tmp_path / "nowhere.ply")
+    (segment / "000002.ply").mkdir()
+    path = tmp_path / "labels/3d/pose/5/000003.json"
+    content = json.loads(path.read_text())
+    content["trans"][0] = 1e60
+    path.write_text(json.dumps(content))
+    items, skipped = everything("lidarhuman26m", tmp_path, smpl)
+    check(items, {key: joints for key, joints in truth.items() if key[1] > 3})
+    assert reasons(skipped) == {"cloud cannot be read": 2, "joints out of reach": 1}
+    assert "it is a link to what is not there" in skipped[0].where and "got a folder" in skipped[1].where
+
+
+@pytest.mark.parametrize("bad", [1e30, np.finfo(np.float32).max, -1e10])
+def test_points_out_of_reach_are_left_out(tmp_path, smpl, bad):
+    """They moved the center by up to 1e18 m."""
+    root = tmp_path / "lidarhuman26m"
+    files.write_lidarhuman26m(root, smpl, sequences=("5",), frames=1)
+    path = root / "labels/3d/segment/5/000001.ply"
+    points = read_cloud(path)
+    files.write_ply(path, np.concatenate([[[bad, 0, 0], [0, bad, 0]], points]))
+    content, _ = files.sloper4d_labels(smpl, "seq001", frames=1, without=())
+    content["second_person"]["point_clouds"][0][0] = bad
+    write_labels(tmp_path / "sloper4d", content)
+    files.write_lipd(tmp_path / "lipd", smpl)
+    path = tmp_path / "lipd/LIPD_train.pkl"
+    entries = pickle.loads(path.read_bytes())[1:2]
+    entries[0]["pc"][0] = bad
+    path.write_bytes(pickle.dumps(entries))
+    for name, count in (("lidarhuman26m", 150), ("sloper4d", 149), ("lipd", 149)):
+        (item,), skipped = everything(name, tmp_path / name, smpl)
+        assert len(item.sample.points) == count and not skipped
+        assert np.abs(item.sample.center - item.sample.pose.joints.mean(0)).max() < 1
 
 
 def test_lidarhuman26m_labels_and_clouds_are_paired_by_number(tmp_path, smpl):
@@ -306,6 +368,8 @@ def test_sloper4d_skips_are_counted(tmp_path, smpl):
     person["opt_pose"][3, 5] = np.nan
     person["opt_pose"], person["opt_trans"] = person["opt_pose"][:6], person["opt_trans"][:6]
     content["first_person"]["lidar_traj"][4, 4:8] = 0
+    # with a fourth column, which would shift all that follows
+    person["point_clouds"][3] = np.hstack([person["point_clouds"][3], np.ones((150, 1))])
     person["point_clouds"].append(person["point_clouds"][5][:9])
     person["point_frame"] = [*person["point_frame"], 7777]
     person["point_clouds"][5] = np.concatenate([person["point_clouds"][5][:9], [[1.0, np.nan, 2.0]]])
@@ -314,7 +378,7 @@ def test_sloper4d_skips_are_counted(tmp_path, smpl):
     # nine points are kept: protocols leave them out later
     assert [(item.frame, len(item.sample.points)) for item in items] == [(125, 9)]
     assert reasons(skipped) == {
-        "empty cloud": 2, "cloud cannot be read": 1, "cloud without a pose": 2, "cloud without the LiDAR's place": 1,
+        "empty cloud": 2, "cloud cannot be read": 2, "cloud without a pose": 1, "cloud without the LiDAR's place": 1,
         "cloud of a frame without labels": 1,
     }  # fmt: skip
 
@@ -332,6 +396,7 @@ def test_sloper4d_skips_are_counted(tmp_path, smpl):
         (lambda c: c | {"second_person": c["second_person"] | {"point_frame": [1]}}, "3 point_clouds of 1 frames"),
         (lambda c: c | {"second_person": c["second_person"] | {"point_clouds": None}}, "another release"),
         (lambda c: c | {"second_person": c["second_person"] | {"beta": "tall"}}, "beta must be numbers"),
+        (lambda c: c | {"second_person": c["second_person"] | {"beta": [[1], [1, 2]]}}, "beta must be numbers"),
         (lambda c: c | {"extra": Counter}, "Counter"),
         *[(lambda c, v=v: c | {"total_frames": v}, "total_frames") for v in ([1, 2], "x", float("nan"))],
         *[
@@ -343,6 +408,7 @@ def test_sloper4d_skips_are_counted(tmp_path, smpl):
             )
         ],
         (lambda c: c | {"second_person": c["second_person"] | {"point_clouds": 5}}, "point_clouds should be a list"),
+        (lambda c: c | {"second_person": c["second_person"] | {"point_clouds": np.array(5.0)}}, "should be a list"),
     ],
 )
 def test_sloper4d_labels_that_are_wrong_are_one_line(tmp_path, smpl, change, message):
@@ -377,6 +443,16 @@ def test_entries_without_a_field_are_skipped_with_it(tmp_path, smpl):
     (tmp_path / "fm_test2.pkl").write_bytes(pickle.dumps(entries))
     items, skipped = everything("lipd", tmp_path, smpl)
     assert not items and "y.bin is not in" in skipped[0].where and skipped[1].reason == "no pc"
+
+
+@pytest.mark.parametrize("cloud", ["/a/" + "x" * 300 + ".bin", "/a/x\0.bin", [[1, 2, 3], [1, 2]], np.ones((3, 40))])
+def test_lipd_s_bad_clouds_cost_one_entry(tmp_path, smpl, cloud):
+    files.write_lipd(tmp_path, smpl)
+    entries = pickle.loads((tmp_path / "LIPD_train.pkl").read_bytes())[:3]
+    entries[0]["pc"] = cloud
+    (tmp_path / "LIPD_train.pkl").write_bytes(pickle.dumps(entries))
+    items, skipped = everything("lipd", tmp_path, smpl)
+    assert len(items) == 2 and reasons(skipped) == {"entry of another form": 1}
 
 
 def test_noisemotion_without_poses_says_how_they_are_made(tmp_path, smpl):

@@ -294,6 +294,11 @@ def test_keypoints_by_type_in_any_order():
     assert person("a", [(5, (np.nan, 0, 0), False)], (0, 0, 0, 1, 1, 2, 0.5)).problem == ("no joint is labelled", "")
 
 
+def test_keypoints_out_of_reach_are_not_labelled():
+    found = person("a", [(5, (1e300, 0, 0), False), (6, (0, 0, 0), False)], (0, 0, 0, 1, 1, 1, 0.5))
+    assert found.labels.sum() == SEEN and np.isfinite(found.joints).any(1).sum() == 1
+
+
 def test_a_box_that_is_none_is_told():
     found = person("a", [(5, (0, 0, 0), False)], (0, 0, 0, 1, 1, 0, 0.5))
     assert found.problem[0] == "label of another form" and "size" in found.problem[1]
@@ -451,6 +456,39 @@ def test_frames_that_lack_rows_are_skipped_and_others_read(copy):
     assert count == 2 and found["no vehicle pose of the frame"] == 2
     count, found = reasons_after(copy, "lidar", lambda rows: [row for row in rows if not here(row)])
     assert count == 2 and found["no range image of the frame"] == 2
+
+
+_KEYPOINT = "[LiDARHumanKeypointsComponent].lidar_keypoints[*]"
+_POSE = "[VehiclePoseComponent].world_from_vehicle.transform"
+
+
+@pytest.mark.parametrize(
+    "name, changed, reason, lost",
+    [
+        ("vehicle_pose", {_POSE: [0.0] * 16}, "frame cannot be read", 2),
+        ("vehicle_pose", {_POSE: [1.0] * 15 + [None]}, "frame cannot be read", 2),
+        ("vehicle_pose", {"key.frame_timestamp_micros": None}, "no vehicle pose of the frame", 2),
+        ("lidar_hkp", {"key.frame_timestamp_micros": None}, "label of another form", 1),
+        ("lidar_hkp", {"key.laser_object_id": None}, "label of another form", 1),
+        ("lidar_box", {"[LiDARBoxComponent].box.center.x": 1e10}, "label of another form", 1),
+    ],
+)
+def test_one_bad_value_costs_one_frame_or_person(copy, name, changed, reason, lost):
+    count, found = reasons_after(copy, name, lambda rows: [rows[0] | changed, *rows[1:]])
+    assert count == 4 - lost and found[reason] == lost
+
+
+@pytest.mark.parametrize(
+    "name, column",
+    [("lidar_box", "[LiDARBoxComponent].box.center.x"), ("lidar_hkp", f"{_KEYPOINT}.keypoint_3d.location_m.x")],
+)
+def test_text_for_numbers_is_skipped(copy, name, column):
+    path = component(copy, name)
+    found = pq.read_table(path)
+    values = ["a" if not isinstance(v, list) else ["a"] * len(v) for v in found[column].to_pylist()]
+    pq.write_table(found.set_column(found.schema.get_field_index(column), column, pa.array(values)), path)
+    items, skipped = everything(copy)
+    assert not items and Counter(one.reason for one in skipped)["label of another form"] >= 4
 
 
 def test_lists_of_different_lengths_are_skipped(copy):

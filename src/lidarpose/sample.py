@@ -21,6 +21,11 @@ MIN_POINTS = 5
 PER_JOINT = ("confidence", "spread", "visible", "in_range")
 
 
+def within_reach(points: np.ndarray) -> np.ndarray:
+    """points (..., 3) m -> (...) bool: where arithmetic can work with them, neither NaN nor beyond `FARTHEST`."""
+    return (np.abs(points) < FARTHEST).all(-1)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Pose:
     """Joints in space, of one person or of many.

@@ -9,7 +9,7 @@ import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, rotation_from_up
-from lidarpose.infer.people import as_origin, flat_axis, lies, unit_warning, within_reach
+from lidarpose.infer.people import as_origin, flat_axis, lies, only_within_reach, unit_warning
 from lidarpose.infer.predictor import Predictor, load
 from lidarpose.infer.results import PersonPose, Poses
 from lidarpose.io.boxes import read_boxes
@@ -129,7 +129,7 @@ def _boxes(given: object) -> list[Box]:
 
 
 def _within_reach(path: object, cloud: Cloud) -> Cloud:
-    points, notes = within_reach(cloud.points)
+    points, notes = only_within_reach(cloud.points)
     if not len(points):
         raise file_error(path, f"expected points in metres, got none within {FARTHEST:g} m: export it again")
     dropped = len(cloud.points) - len(points)

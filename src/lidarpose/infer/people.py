@@ -8,7 +8,7 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import vector_of
 from lidarpose.io.files import one_line
 from lidarpose.io.headers import is_transposed
-from lidarpose.sample import FARTHEST, MIN_POINTS, Pose, center_of
+from lidarpose.sample import FARTHEST, MIN_POINTS, Pose, center_of, within_reach
 
 # joints that every skeleton has
 _TRUNK = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
@@ -82,7 +82,7 @@ def as_origin(given: object) -> np.ndarray | None:
 
 def clean(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """points (n, 3) without NaN, infinite and absurd rows and at most `MAX_POINTS`, and a note for each thing done."""
-    points, notes = within_reach(points)
+    points, notes = only_within_reach(points)
     if len(points) > MAX_POINTS:
         notes.append(
             f"thinned from {len(points)} to {MAX_POINTS} points: crop closer to the person if there are others"
@@ -91,9 +91,9 @@ def clean(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
     return points, notes
 
 
-def within_reach(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
+def only_within_reach(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """points (n, 3) m without rows that arithmetic would choke on, and a note where there are some."""
-    usable = (np.abs(points) < FARTHEST).all(1)
+    usable = within_reach(points)
     if usable.all():
         return points, []
     dropped = int((~usable).sum())

@@ -110,6 +110,8 @@ def _nearest(path: str | os.PathLike) -> str:
         names = os.listdir(folder)
     except OSError:
         return f"; the folder {folder} does not exist either"
+    if name in names:
+        return "; it is a link to what is not there"
     near = difflib.get_close_matches(name, names, n=1, cutoff=0.7)
     return f"; did you mean {near[0]}?" if near else "; check the path"
 

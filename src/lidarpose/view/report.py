@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose._version import __version__
-from lidarpose.sample import FARTHEST, Pose
+from lidarpose.sample import Pose, within_reach
 from lidarpose.skeleton import SMPL24, Skeleton
 from lidarpose.view.person import (
     bone_sides,
@@ -106,7 +106,7 @@ def _person_data(person: ReportPerson, limit: int) -> dict:
     center = np.zeros(3) if center is None else center
     points = np.asarray(person.points, float)
     # points that are somewhere
-    kept = np.flatnonzero((np.abs(points) < FARTHEST).all(-1))
+    kept = np.flatnonzero(within_reach(points))
     kept = kept[thinned(len(kept), limit)]
     points = points[kept]
     forward = facing(person.pose)

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose.data.readers.items import Item, Skipped
-from lidarpose.data.readers.raw import find_below, numbers, read_cloud, wrong_root
+from lidarpose.data.readers.raw import as_cloud, find_below, numbers, read_cloud, wrong_root
 from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_item
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
@@ -200,10 +200,12 @@ def _points(root: Path, value: object, where: str) -> np.ndarray:
         if path is None:
             raise InputError(f"{where}: the cloud {value} is not in {root}: copy it there")
         if path.suffix == ".bin":
-            data = np.fromfile(path, "<f4")
-            return numbers(path, data.reshape(-1, 3) if len(data) % 3 == 0 else data, (-1, 3), "a cloud")
+            try:
+                return as_cloud(path, np.fromfile(path, "<f4"))
+            except OSError as error:
+                raise file_error(path, f"cannot be read ({error.strerror or error})") from None
         return read_cloud(path)
-    return numbers(where, np.asarray(value), (-1, 3), "the cloud")
+    return as_cloud(where, value)
 
 
 def _apart(points: np.ndarray, joints: np.ndarray) -> float:

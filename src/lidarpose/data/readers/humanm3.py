@@ -65,9 +65,9 @@ class HumanM3:
     }
 
     def parts(self, root: Path) -> list[str]:
-        """Sequences as paths below the root, or the databases where a sequence has no labels. Raises InputError where
-        there is neither, and for a sequence that lacks its labels or clouds."""
-        databases = [path.name for path in sorted(root.glob("*.pkl"))]
+        """Sequences as paths below the root, or the databases where none is complete. Raises InputError where there
+        is neither, and where only some sequences have labels and clouds."""
+        databases = [f"{name}.pkl" for name in sorted(_SPLITS) if (root / f"{name}.pkl").is_file()]
         below = [path.parent for name in _SPLITS for path in sorted(root.glob(f"*/{name}")) if path.is_dir()]
         if below and not databases and not any((root / name).is_dir() for name in _SPLITS):
             raise file_error(root, f"is a folder above HumanM3's root, which is likely {below[0]}: name that")
@@ -80,10 +80,10 @@ class HumanM3:
                 half = half or f"{folder} without {missing[0]}"
         if found and not half:
             return found
-        if databases:
-            return databases
         if found:
             raise file_error(root, f"has {half}: get that folder too, or move its sequence away")
+        if databases:
+            return databases
         there = half or ", ".join(sorted(path.name for path in root.iterdir())[:6]) or "nothing"
         raise wrong_root(root, "HumanM3", _EXPECTED, f"got {there}", _GET)
 
@@ -187,7 +187,11 @@ def _people(
             yield Skipped(reason="no joint is labelled", where=f"{frame_id}/{track}")
             continue
         low, high = joints[labeled].min(0), joints[labeled].max(0)
-        box = Box(center=(low + high) / 2, size=high - low + 2 * _BOX_MARGIN, id=track)
+        try:
+            box = Box(center=(low + high) / 2, size=high - low + 2 * _BOX_MARGIN, id=track)
+        except InputError as error:
+            yield Skipped(reason="joints out of reach", where=f"{frame_id}/{track}: {error}")
+            continue
         points = cloud[box.contains(cloud, _POINT_MARGIN)]
         if not len(points):
             yield Skipped(reason="no points in the box", where=f"{frame_id}/{track}")

@@ -19,6 +19,7 @@ from lidarpose.data.readers.raw import numbered, numbers, read_cloud, read_json,
 from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_item
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
+from lidarpose.sample import within_reach
 from lidarpose.skeleton import SMPL24
 
 # frames a second of the LiDAR
@@ -85,7 +86,8 @@ class LidarHuman26M:
             betas, pose, trans = (np.stack(rows) for rows in zip(*labels.values(), strict=True))
             found = self._smpl(betas, pose, trans)
             joints = dict(zip(labels, found, strict=True))
-            turn = leveling(found) if self._level else None
+            # one that cannot be will be skipped, and says nothing about the others
+            turn = leveling(found[within_reach(found).all(-1)]) if self._level else None
         for frame in sorted(poses.keys() | clouds.keys()):
             where = f"{part}/{frame:06d}"
             if frame in wrong:

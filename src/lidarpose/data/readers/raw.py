@@ -1,7 +1,9 @@
 """What the readers of raw files share: lines about wrong roots, numbered files, JSON, clouds of people."""
 
 import json
+import os
 import re
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +11,7 @@ import numpy as np
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error, read_bytes
 from lidarpose.io.formats import read_points
+from lidarpose.sample import within_reach
 
 _NUMBER = re.compile("[0-9]{1,12}")
 
@@ -59,9 +62,11 @@ def numbers(path: object, value: object, shape: tuple[int, ...], what: str, *, f
 
 
 def read_cloud(path: Path) -> np.ndarray:
-    """x y z (n, 3) float64 of a file; n = 0 where it says itself that it holds no points. Raises InputError."""
+    """x y z (n, 3) float64 of a file, without points out of reach; n = 0 where it says itself that it holds none.
+    Raises InputError."""
     try:
-        return read_points(path).points
+        points = read_points(path).points
+        return points[within_reach(points)]
     except InputError:
         # written for a person who was not seen; a file that is cut off says more points than it has
         if _says_empty(path):
@@ -69,16 +74,29 @@ def read_cloud(path: Path) -> np.ndarray:
         raise
 
 
+def as_cloud(path: object, value: object) -> np.ndarray:
+    """x y z (n, 3) float64 of an array or a flat list, without points out of reach or that are no numbers. Raises
+    InputError, since rows of another length would be read shifted. path: for the message."""
+    if isinstance(value, np.ndarray) and value.ndim > 2:
+        raise file_error(path, f"a cloud must be (n, 3), got {value.shape}")
+    points = numbers(path, value, (-1, 3), "a cloud", finite=False)
+    return points[within_reach(points)]
+
+
 def find_below(root: Path, path: str) -> Path | None:
     """The cloud that a path of another machine means: the longest end of it that is in the root."""
     names = [name for name in re.split(r"[/\\]", path) if name not in ("", ".", "..")]
     for k in range(len(names)):
-        if (root / Path(*names[k:])).is_file():
+        # False, too, for a name that no disk can hold
+        if os.path.isfile(root / Path(*names[k:])):
             return root / Path(*names[k:])
     return None
 
 
 def _says_empty(path: Path) -> bool:
-    with open(path, "rb") as file:
-        head = file.read(4096)
-    return re.search(rb"^(element vertex|POINTS) +0\s*$", head, re.MULTILINE) is not None
+    with suppress(OSError):
+        # a pipe would be waited for
+        if os.path.isfile(path):
+            with open(path, "rb") as file:
+                return re.search(rb"^(element vertex|POINTS) +0\s*$", file.read(4096), re.MULTILINE) is not None
+    return False

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose.data.readers.items import Item, Skipped
-from lidarpose.data.readers.raw import numbers, wrong_root
+from lidarpose.data.readers.raw import as_cloud, numbers, wrong_root
 from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_item
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
@@ -147,7 +147,7 @@ def _labels(path: Path) -> _Labels:
         trans=np.where(good[:, None], trans, 0.0),
         good=good,
         which=which,
-        betas=numbers(path, np.ravel(person.get("beta"))[:10], (10,), "beta")[None],
+        betas=numbers(path, numbers(path, person.get("beta"), (-1,), "beta")[:10], (10,), "beta")[None],
         gender=str(person.get("gender", "neutral")).lower(),
         clouds=_clouds(path, person),
         position=way[:, 1:4],
@@ -175,7 +175,7 @@ def _clouds(path: Path, person: dict) -> dict[int, np.ndarray | str]:
     clouds, frames = person.get("point_clouds"), person.get("point_frame")
     if clouds is None or frames is None:
         raise file_error(path, "second_person has no point_clouds and point_frame: labels of another release?")
-    if not isinstance(clouds, list | tuple | np.ndarray):
+    if not isinstance(clouds, list | tuple | np.ndarray) or isinstance(clouds, np.ndarray) and not clouds.ndim:
         raise file_error(path, f"point_clouds should be a list of clouds, got {type(clouds).__name__}")
     frames = numbers(path, frames, (-1,), "point_frame").astype(int).tolist()
     if len(clouds) != len(frames):
@@ -183,10 +183,9 @@ def _clouds(path: Path, person: dict) -> dict[int, np.ndarray | str]:
     found: dict[int, np.ndarray | str] = {}
     for frame, cloud in zip(frames, clouds, strict=True):
         try:
-            points = numbers(path, np.asarray(cloud, float).reshape(-1, 3), (-1, 3), "a cloud", finite=False)
-            # as the authors' loaders
-            found[frame] = points[np.isfinite(points).all(1)]
-        except (InputError, TypeError, ValueError) as error:
+            # rows that are no numbers are left out, as the authors' loaders do
+            found[frame] = as_cloud(path, cloud)
+        except InputError as error:
             found[frame] = str(error)
     return found
 
@@ -198,7 +197,7 @@ def _heading(quaternion: np.ndarray) -> np.ndarray:
     return np.where(unit, np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)), np.nan)
 
 
-def _item(labels: _Labels, index: int, cloud: np.ndarray, joints: np.ndarray, source: str, part: str) -> Item:
+def _item(labels: _Labels, index: int, cloud: np.ndarray, joints: np.ndarray, source: str, part: str) -> Item | Skipped:
     R_sensor_world = rotation_about("z", -labels.heading[index])
     points, joints, trans = (
         (x - labels.position[index]) @ R_sensor_world.T for x in (cloud, joints, labels.trans[index])

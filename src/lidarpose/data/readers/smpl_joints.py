@@ -9,11 +9,11 @@ import numpy as np
 
 from lidarpose.body.rig import forward_kinematics
 from lidarpose.body.smpl import SmplBody, load_body
-from lidarpose.data.readers.items import SEEN, Item
+from lidarpose.data.readers.items import SEEN, Item, Skipped
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix
 from lidarpose.io.files import content_digest, file_error
-from lidarpose.sample import Pose, Sample, center_of
+from lidarpose.sample import FARTHEST, Pose, Sample, center_of, within_reach
 from lidarpose.skeleton import SMPL24
 
 # what the published files are called: SMPL_MALE.pkl, basicmodel_m_lbs_10_207_0_v1.1.0.pkl, basicModel_f_lbs_...
@@ -79,9 +79,11 @@ def smpl_item(
     time: float,
     source: str,
     centers: dict[str, np.ndarray],
-) -> Item:
+) -> Item | Skipped:
     """A person of whom points (n, 3) m and SMPL's joints (24, 3) m are known, which all count as seen; the rest as in
-    `Item` and `Sample`."""
+    `Item` and `Sample`. Skipped where the parameters put joints out of reach, which float32 could not hold."""
+    if not within_reach(joints).all():
+        return Skipped(reason="joints out of reach", where=f"{frame_id}/{track}: beyond {FARTHEST:g} m")
     points = points.astype(np.float32)
     sample = Sample(
         points=points,

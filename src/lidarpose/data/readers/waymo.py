@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from lidarpose.data.readers.items import Item, Reader, Skipped
-from lidarpose.data.readers.raw import wrong_root
+from lidarpose.data.readers.raw import numbers, wrong_root
 from lidarpose.data.readers.waymo_frames import (
+    BAD_FRAME,
     BAD_IMAGE,
     BAD_LABEL,
     MARGIN,
@@ -136,7 +137,12 @@ class WaymoV2:
         labels cannot be read; where the range images cannot, everybody is skipped."""
         split, _, segment = part.partition("/")
         files = {name: root / split / name / f"{segment}.parquet" for name in COMPONENTS}
-        frames = _frames(files, self.margin)
+        labels = table(files["lidar_hkp"], (SEGMENT, TIME, OBJECT, *_KEYPOINT_COLUMNS))
+        for number, row in enumerate(labels):
+            if None in _object_key(row):
+                lacks = "lacks its segment, its time or whose it is"
+                yield Skipped(reason=BAD_LABEL, where=f"{part}: row {number} of lidar_hkp {lacks}")
+        frames = _frames(files, [row for row in labels if None not in _object_key(row)], self.margin)
         try:
             _add_images(files, frames)
         except InputError as error:
@@ -171,9 +177,8 @@ def _urls(split: str, components: list[str]) -> str:
     return f"{_BUCKET}/{split}/{names}"
 
 
-def _frames(files: dict[str, Path], margin: float) -> dict[FrameKey, Frame]:
+def _frames(files: dict[str, Path], labels: list[dict[str, Any]], margin: float) -> dict[FrameKey, Frame]:
     """The frames that have keypoints, with boxes, calibrations and poses joined to them."""
-    labels = table(files["lidar_hkp"], (SEGMENT, TIME, OBJECT, *_KEYPOINT_COLUMNS))
     keys = {_object_key(row) for row in labels}
     boxes = {
         key: row
@@ -183,35 +188,37 @@ def _frames(files: dict[str, Path], margin: float) -> dict[FrameKey, Frame]:
     poses, starts = {}, {}
     for row in table(files["vehicle_pose"], (SEGMENT, TIME, _VEHICLE_POSE)):
         segment, time = row[SEGMENT], row[TIME]
+        if time is None:
+            continue
         poses[segment, time] = row[_VEHICLE_POSE]
         starts[segment] = min(time, starts.get(segment, time))
     calibrations = _calibrations(files["lidar_calibration"])
     people: dict[FrameKey, list[LabelledPerson]] = {}
     for row in labels:
         people.setdefault((row[SEGMENT], row[TIME]), []).append(_person(row, boxes.get(_object_key(row))))
-    return {
-        (segment, time): Frame(
+    frames = {}
+    for (segment, time), found in people.items():
+        values, T_world_vehicle, wrong = poses.get((segment, time)), None, ""
+        try:
+            T_world_vehicle = None if values is None else transform(values, "the vehicle's pose")
+        except InputError as error:
+            wrong = str(error)
+        frame = frames[segment, time] = Frame(
             sequence=segment,
             timestamp=time,
             start=starts.get(segment, time),
             people=found,
             calibrations=calibrations.get(segment, {}),
-            T_world_vehicle=_vehicle_pose(files["vehicle_pose"], poses.get((segment, time))),
+            T_world_vehicle=T_world_vehicle,
             margin=margin,
         )
-        for (segment, time), found in people.items()
-    }
+        if wrong:
+            frame.fail(BAD_FRAME, wrong)
+    return frames
 
 
 def _object_key(row: dict[str, Any]) -> tuple[str, int, str]:
     return row[SEGMENT], row[TIME], row[OBJECT]
-
-
-def _vehicle_pose(path: Path, values: list[float] | None) -> np.ndarray | None:
-    try:
-        return None if values is None else transform(values, "a pose")
-    except InputError as error:
-        raise file_error(path, error) from None
 
 
 def _calibrations(path: Path) -> dict[str, dict[int, Calibration]]:
@@ -230,7 +237,7 @@ def _calibrations(path: Path) -> dict[str, dict[int, Calibration]]:
         found.setdefault(row[SEGMENT], {})[row[LASER]] = Calibration(
             laser=row[LASER],
             T_vehicle_laser=extrinsic,
-            inclinations=np.array(values, float) if values else None,
+            inclinations=numbers(path, values, (-1,), "beam inclinations", finite=False) if values else None,
             low=low,
             high=high,
         )
@@ -241,11 +248,15 @@ def _person(label: dict[str, Any], box: dict[str, Any] | None) -> LabelledPerson
     kinds, *places, hidden = (label[name] or [] for name in _KEYPOINT_COLUMNS)
     if len({len(kinds), len(hidden), *map(len, places)}) > 1:
         return LabelledPerson(track=label[OBJECT], problem=(BAD_LABEL, "its lists have different lengths"))
-    keypoints = zip(kinds, np.array(places, float).T, hidden, strict=True)
-    if box is None:
-        return person(label[OBJECT], keypoints, None)
-    values = np.array([box[name] for name in _BOX_COLUMNS], float)
-    return person(label[OBJECT], keypoints, values, box[_BOX_TYPE], box[_BOX_COUNT])
+    try:
+        places = numbers("lidar_hkp", places, (3, -1), "keypoints", finite=False)
+        keypoints = zip(kinds, places.T, hidden, strict=True)
+        if box is None:
+            return person(label[OBJECT], keypoints, None)
+        values = numbers("lidar_box", [box[name] for name in _BOX_COLUMNS], (7,), "a box", finite=False)
+        return person(label[OBJECT], keypoints, values, box[_BOX_TYPE], box[_BOX_COUNT])
+    except InputError as error:
+        return LabelledPerson(track=label[OBJECT], problem=(BAD_LABEL, str(error)))
 
 
 def _add_images(files: dict[str, Path], frames: dict[FrameKey, Frame]) -> None:

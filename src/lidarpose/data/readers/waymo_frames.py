@@ -14,7 +14,7 @@ import numpy as np
 from lidarpose.data.readers.items import HIDDEN, SEEN, UNLABELED, Item, Skipped
 from lidarpose.errors import InputError
 from lidarpose.geometry import from_spherical
-from lidarpose.sample import Box, Pose, Sample, center_of
+from lidarpose.sample import Box, Pose, Sample, center_of, within_reach
 from lidarpose.skeleton import WAYMO14
 
 LASERS = {"TOP": 1, "FRONT": 2, "SIDE_LEFT": 3, "SIDE_RIGHT": 4, "REAR": 5}
@@ -66,9 +66,12 @@ def about(margin: float) -> dict[str, Any]:
 
 def transform(values: Iterable[float] | None, what: str) -> np.ndarray:
     """16 numbers, row by row -> T (4, 4), a rotation and a shift. Raises InputError for anything else."""
-    matrix = np.array([] if values is None else values, float)
+    try:
+        matrix = np.array([] if values is None else values, float)
+    except (TypeError, ValueError):
+        raise InputError(f"{what} must be 16 numbers, a 4 x 4 transform, got other things") from None
     if matrix.shape != (16,) or not np.isfinite(matrix).all():
-        raise InputError(f"{what} must be 16 numbers, a 4 x 4 transform, got {matrix.size}")
+        raise InputError(f"{what} must be 16 numbers, a 4 x 4 transform, got {np.isfinite(matrix).sum()}")
     matrix = matrix.reshape(4, 4)
     if abs(np.linalg.det(matrix[:3, :3]) - 1) > 0.01 or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise InputError(f"{what} must be a rotation and a shift, got a matrix that is none")
@@ -164,7 +167,7 @@ def person(
     lacks ignored; box: center, size (length, width, height) and heading, 7 numbers."""
     joints, labels = np.full((len(WAYMO14), 3), np.nan), np.full(len(WAYMO14), UNLABELED, np.uint8)
     for found, place, hidden in keypoints:
-        if found in _JOINTS and np.isfinite(place).all():
+        if found in _JOINTS and within_reach(np.asarray(place)):
             joints[_JOINTS[found]] = place
             labels[_JOINTS[found]] = HIDDEN if hidden else SEEN
     if box is None:
