@@ -19,6 +19,7 @@ from shard_files import write_shard
 from lidarpose.data import jobs
 from lidarpose.data.labelled import item_of, labelled_row
 from lidarpose.data.prepare import READERS, PartWriter, prepare
+from lidarpose.data.readers.humanm3 import HumanM3
 from lidarpose.data.readers.items import SEEN, UNLABELED, Item
 from lidarpose.data.shards import open_dataset, read_rows
 from lidarpose.data.split_rules import SplitRule, _published, split_rule
@@ -275,6 +276,42 @@ def test_a_user_s_own_lists_win_and_blank_lines_are_no_sequence(tmp_path, smpl):
         prepare("lidarhuman26m", root, tmp_path / "out", smpl=smpl)
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-8"])
+def test_own_lists_may_leave_out_the_first_folder(raw, tmp_path, encoding):
+    root = tmp_path / "raw"
+    shutil.copytree(raw[0], root)
+    (root / "train.txt").write_text("c\r\nb/seg0\r\n", encoding)
+    (root / "test.txt").write_text("train/a\nelsewhere\n", encoding)
+    rule = split_rule("humanm3", root, parts=["test/c", "train/a", "train/b/seg0"])
+    assert rule.sets == {"train": ("test/c", "train/b/seg0"), "test": ("train/a", "elsewhere")}
+    # of two that end alike neither is meant
+    rule = split_rule("humanm3", root, parts=["test/c", "train/c", "train/a"])
+    assert rule.of_part("test/c") is None and rule.of_part("train/a") == "test"
+    (root / "test.txt").write_text("test/c\n", encoding)
+    with pytest.raises(InputError, match="test.txt: names test/c, which is in train.txt too"):
+        prepare("humanm3", root, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("train", "message"),
+    [
+        (b"basketball1\n", "expected names such as 'test/c', got 'basketball1'"),
+        ("train/a\n".encode("utf-16"), "train.txt: expected text in UTF-8, got UTF-16"),
+        ("train/a\n".encode("utf-16-le"), "train.txt: expected text, got zero bytes"),
+        ("stra\xdfe\n".encode("latin-1"), "train.txt: expected text in UTF-8, got other bytes at 4"),
+    ],
+)
+def test_own_lists_that_name_nothing_are_refused(raw, tmp_path, train, message):
+    root = tmp_path / "raw"
+    shutil.copytree(raw[0], root)
+    (root / "train.txt").write_bytes(train)
+    (root / "test.txt").write_text("plaza\n")
+    with pytest.raises(InputError, match=message) as caught:
+        prepare("humanm3", root, tmp_path / "out")
+    one_line(caught)
+    assert not (tmp_path / "out").exists()
+
+
 def test_one_split_alone(raw, tmp_path):
     summary = prepare("humanm3", raw[0], tmp_path / "out", split="test")
     assert summary["splits"] == {"test": 6} and [part["part"] for part in summary["parts"]] == ["test/c"]
@@ -393,6 +430,34 @@ def test_a_corrupted_part_is_counted_and_the_rest_goes_on(tmp_path, smpl):
     for shard in (tmp_path / "out").glob("*-00000.parquet"):
         shard.unlink()
     assert prepare("sloper4d", root, tmp_path / "out", smpl=smpl)["people"] == 6
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names on other systems are text")
+def test_names_that_are_no_text_are_written_escaped(tmp_path, smpl):
+    root = tmp_path / "raw"
+    files.write_humanm3(root, smpl, sequences=("train/a",), frames=1)
+    path = root / "train/a/pose_calib/0007.json"
+    path.write_text(path.read_text().replace('"2"', '"\\ud800"'))
+    os.rename(bytes(root / "train/a"), bytes(root / "train") + b"/stra\xdfe")
+    assert prepare("humanm3", root, tmp_path / "out")["people"] == 2
+    people = list(open_dataset(tmp_path / "out").items())
+    assert {item.sequence for item in people} == {"train/stra\\udcdfe"}
+    assert {item.track for item in people} == {"\\ud800", "10"}
+
+
+def test_what_no_reader_foresaw_is_counted_with_its_kind(raw, tmp_path, monkeypatch):
+    whole = HumanM3.read
+
+    def read(self, root, part):
+        yield from list(whole(self, root, part))[:2]
+        if part == "train/a":
+            raise KeyError("joints")
+
+    monkeypatch.setattr(HumanM3, "read", read)
+    summary = prepare("humanm3", raw[0], tmp_path / "out")
+    reason = "the rest of a part cannot be read (KeyError)"
+    assert summary["people"] == 6 and summary["skipped"] == {reason: 1}
+    assert summary["skipped_first"] == {reason: "train/a: KeyError: 'joints'"}
 
 
 def test_people_who_do_not_stand_and_labels_of_others_are_told(tmp_path, smpl):

@@ -114,6 +114,9 @@ def rows_of(batch, table: str) -> Iterator[dict[str, Any]]:
 
 
 def _column(pa, values: list, kind: Kind):
+    if kind == "string":
+        # names from a disk or from JSON may hold what is no character
+        values = [value if value is None else value.encode("utf-8", "backslashreplace").decode() for value in values]
     if isinstance(kind, str):
         return pa.array(values, _type(pa, kind))
     null = [value is None for value in values]

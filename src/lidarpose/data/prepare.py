@@ -21,7 +21,7 @@ from lidarpose.data.shards import CARD, SENSOR_FRAME, Card, open_dataset, shard_
 from lidarpose.data.split_rules import SplitRule, split_rule
 from lidarpose.data.summary import summarize
 from lidarpose.errors import InputError, check_name
-from lidarpose.io.files import file_error
+from lidarpose.io.files import file_error, one_line
 
 # dataset -> module and class of its reader, and whether that takes the user's SMPL
 READERS: dict[str, tuple[str, str, bool]] = {
@@ -37,6 +37,8 @@ READERS: dict[str, tuple[str, str, bool]] = {
 _LEVELED = ("lidarhuman26m",)
 # tables of such a dataset; the people's last, since a part is whole once they are there
 _TABLES = ("skipped", "labelled")
+# why the people of a part, or those after a fault in it, are left out
+_REST = "the rest of a part cannot be read"
 # how many people between two tellings of progress
 _TOLD = 200
 
@@ -93,7 +95,7 @@ def prepare(
     if not root.is_dir():
         raise file_error(root, f"is no folder; expected the raw files of {name}")
     parts = list(source.parts(root))
-    rule = split_rule(name, root, split_by)
+    rule = split_rule(name, root, split_by, parts)
     absent = rule.absent(parts) if rule is not None else {}
     parts = _of_split(name, parts, rule, split)
     about = getattr(source, "about", {})
@@ -145,7 +147,7 @@ def _card(
     name: str, source: Reader, parts: list[str], rule: SplitRule | None, split: str | None, about: dict[str, Any]
 ) -> Card:
     # the names themselves would fill the line that says what differs
-    digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
+    digest = hashlib.sha256("\n".join(parts).encode("utf-8", "backslashreplace")).hexdigest()[:12]
     settings: dict[str, Any] = {"what": "parts", "dataset": name, "parts": digest}
     settings |= {"split": split, "split_by": None if rule is None else rule.name}
     if rule is not None and rule.name == "own":
@@ -219,7 +221,11 @@ class PartWriter:
         try:
             yield from self._reader.read(self.root, part)
         except InputError as error:
-            yield Skipped(reason="the rest of a part cannot be read", where=f"{part}: {error}")
+            yield Skipped(reason=_REST, where=f"{part}: {error}")
+        except (OSError, ArithmeticError, LookupError, TypeError, ValueError, AttributeError) as error:
+            # what no reader foresaw must not cost the other parts; its kind tells a mistake in a reader from a bad file
+            kind = type(error).__name__
+            yield Skipped(reason=f"{_REST} ({kind})", where=one_line(f"{part}: {kind}: {error}"))
 
 
 def _bar(stack: ExitStack, total: int, missing: int):

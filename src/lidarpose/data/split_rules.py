@@ -9,7 +9,8 @@ Published ones are small files in `splits/` that name their source. A rule is on
 
 import json
 import zlib
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -18,6 +19,8 @@ import numpy as np
 
 from lidarpose.errors import InputError, check_name
 from lidarpose.io.files import file_error, read_bytes
+from lidarpose.io.headers import Problem
+from lidarpose.io.text import decode
 
 # what a user's own lists are called
 _LISTS = {"train": "train.txt", "val": "val.txt", "test": "test.txt"}
@@ -56,7 +59,8 @@ class SplitRule:
     def of_chunks(self, part: str, people: int) -> list[str]:
         """The split of each of a part's people, in their order."""
         chunks = -(-people // self.length)
-        order = np.random.default_rng([self.seed, zlib.crc32(part.encode())]).permutation(chunks)
+        drawn_by = zlib.crc32(part.encode("utf-8", "backslashreplace"))
+        order = np.random.default_rng([self.seed, drawn_by]).permutation(chunks)
         train = set(order[: int(self.share * chunks)].tolist())
         return ["train" if k // self.length in train else "test" for k in range(people)]
 
@@ -67,11 +71,13 @@ class SplitRule:
         return {split: names for split, names in missing.items() if names}
 
 
-def split_rule(dataset: str, root: Path, name: str | None = None) -> SplitRule | None:
+def split_rule(dataset: str, root: Path, name: str | None = None, parts: Sequence[str] = ()) -> SplitRule | None:
     """The split to use: the published one called `name`; by default the user's own lists in `root` (train.txt, test.txt
-    and val.txt, a sequence a line), else the dataset's usual one; None where it has none.
+    and val.txt, a part a line), else the dataset's usual one; None where it has none.
 
-    Raises InputError for an unknown name, half of the lists, an empty list and a sequence in two of them.
+    parts: the names that the user's lists may have, also without what is before the first "/" where only one then has
+    the name. Raises InputError for an unknown name, half of the lists, one that is empty or no text, lists of which no
+    name is a part's, and a part in two of them.
     """
     published = {rule.name: rule for rule in _published(dataset)}
     if name is not None:
@@ -81,28 +87,38 @@ def split_rule(dataset: str, root: Path, name: str | None = None) -> SplitRule |
             )
         check_name(f"split of {dataset}", name, published)
         return published[name]
-    return _own(root) or next((rule for rule in published.values() if rule.usual), None)
+    return _own(root, parts) or next((rule for rule in published.values() if rule.usual), None)
 
 
-def _own(root: Path) -> SplitRule | None:
+def _own(root: Path, parts: Sequence[str]) -> SplitRule | None:
     there = [split for split, file in _LISTS.items() if (root / file).is_file()]
     if not there:
         return None
     missing = [_LISTS[split] for split in _NEEDED if split not in there]
     if missing:
         raise file_error(root, f"has {_LISTS[there[0]]} and no {missing[0]}: add it, or take the other away")
+    short = Counter(part.partition("/")[2] for part in parts)
+    full = {part.partition("/")[2]: part for part in parts if short[part.partition("/")[2]] == 1}
+    full |= {part: part for part in parts}
     sets: dict[str, tuple[str, ...]] = {}
     for split in there:
         path = root / _LISTS[split]
-        lines = read_bytes(path, expected="names of sequences, one a line").decode("utf-8", "replace").splitlines()
+        try:
+            lines = decode(read_bytes(path, expected="names of sequences, one a line")).splitlines()
+        except Problem as problem:
+            raise file_error(path, problem) from None
         # a line end at the end of the file is no sequence
-        sets[split] = tuple(line.strip() for line in lines if line.strip())
+        names = [line.strip() for line in lines if line.strip()]
+        sets[split] = tuple(full.get(name, name) for name in names)
         if not sets[split]:
             raise file_error(path, "names no sequence; expected one a line")
         for other in there[: there.index(split)]:
             if both := sorted(set(sets[split]) & set(sets[other])):
                 raise file_error(path, f"names {both[0]}, which is in {_LISTS[other]} too: leave it out of one")
     source = ", ".join(_LISTS[split] for split in there)
+    if parts and not any(name in full for names in sets.values() for name in names):
+        got = sets[there[0]][0]
+        raise file_error(root, f"has nothing that {source} name: expected names such as {parts[0]!r}, got {got!r}")
     return SplitRule(name="own", source=f"{source} beside the data", rule="sequences", sets=sets)
 
 
