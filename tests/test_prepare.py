@@ -337,6 +337,7 @@ def test_the_split_in_chunks_leaks_and_says_so(tmp_path, smpl):
     assert tests["people"] == splits.count("test") and tests["skipped"] == summary["skipped"]
 
 
+@settings(deadline=None)
 @given(st.integers(0, 3000), st.text(max_size=5))
 def test_chunks_are_drawn_by_the_part_s_name_alone(people, part):
     rule = SplitRule(name="x", source="", rule="chunks", length=16, share=0.7)
