@@ -109,17 +109,19 @@ def test_spherical_conventions():
     assert grid.shape == (4, 3, 3)
 
 
-@pytest.mark.parametrize("up", "xyz")
+@pytest.mark.parametrize("up", UP_AXES)
 def test_up_axes_are_proper_rotations_that_put_the_axis_up(up):
     rotation = rotation_from_up(up)
     np.testing.assert_array_equal(rotation @ rotation.T, np.eye(3))
     assert np.linalg.det(rotation) == pytest.approx(1)
-    np.testing.assert_array_equal(rotation @ np.eye(3)["xyz".index(up)], [0, 0, 1])
+    sign = -1 if up[0] == "-" else 1
+    np.testing.assert_array_equal(rotation @ np.eye(3)["xyz".index(up[-1])], [0, 0, sign])
 
 
 def test_up_axes_known_and_unknown():
     np.testing.assert_array_equal(rotation_from_up("z"), np.eye(3))
-    assert set(UP_AXES) == set("xyz")
+    # a camera looks along z, its x to the right and its y down
+    np.testing.assert_array_equal(rotation_from_up("-y"), np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
     with pytest.raises(InputError, match="unknown up axis 'Z'"):
         rotation_from_up("Z")
     for wrong in (None, 3, (1, 2), (0, 0, 0), (0, np.nan, 1), "1,2", "a,b,c", ["x", "y", "z"]):

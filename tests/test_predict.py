@@ -449,7 +449,7 @@ def test_a_crop_in_other_units_is_told_by_name(model, tmp_path, points):
     assert any("millimetres" in warning for warning in people[0].warnings)
 
 
-@pytest.mark.parametrize("up", ["y", "x"])
+@pytest.mark.parametrize("up", ["y", "x", "-y"])
 def test_other_up_axes_give_the_same_person_in_the_files_frame(model, sweep, tmp_path, up):
     path, clouds, boxes = sweep
     R_input_house = UP_AXES[up].T
@@ -516,7 +516,10 @@ def test_people_that_all_lie_raise_the_question_of_the_axis(model, tmp_path, poi
     assert lidarpose.predict(tmp_path / "crop.npy", model=model).warnings == ()
     np.save(tmp_path / "crop.npy", points @ UP_AXES["y"])
     (warning,) = lidarpose.predict(tmp_path / "crop.npy", model=model).warnings
-    assert warning == "the person lies down: if that is wrong, z is not the input's up axis: try --up y or --up x"
+    assert warning == (
+        "the person lies down: if that is wrong, z is not the input's up axis: "
+        "try --up y, or --up -y where y points down (cameras), or --up x"
+    )
     assert lidarpose.predict(tmp_path / "crop.npy", up="y", model=model).warnings == ()
 
 

@@ -64,10 +64,10 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _joined(arguments: list[str]) -> list[str]:
-    """`--sensor-origin -1,0,2` as `--sensor-origin=-1,0,2`."""
+    """`--sensor-origin -1,0,2` as `--sensor-origin=-1,0,2`, and `--up -y` as `--up=-y`."""
     joined: list[str] = []
     for argument in arguments:
-        if joined and joined[-1] in _SIGNED and argument.startswith("-") and argument[1:2] in tuple("0123456789."):
+        if joined and joined[-1] in _SIGNED and argument.startswith("-") and argument[1:2] in tuple("0123456789.xyz"):
             joined[-1] += f"={argument}"
         else:
             joined.append(argument)

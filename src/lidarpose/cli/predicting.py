@@ -35,7 +35,10 @@ def add(commands) -> None:
         "--skeleton", metavar="NAME", help="smpl24, human15, waymo14 or body26 (default smpl24, else the network's own)"
     )
     predict.add_argument(
-        "--up", default="z", metavar="AXIS", help="what is up in the file: z (default), y or x, or a direction x,y,z"
+        "--up",
+        default="z",
+        metavar="AXIS",
+        help="what is up in the file: z (default), y or x, -y where y points down (cameras), or a direction x,y,z",
     )
     predict.add_argument(
         "--columns", type=int, metavar="N", help="values per point in a .bin: 4 for KITTI, 5 for nuScenes"

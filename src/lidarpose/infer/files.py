@@ -40,14 +40,15 @@ def predict(
 ) -> Poses:
     """Poses of the people in a point file, in the file's own frame.
 
-    boxes: a JSON file, its content (see `io.boxes`), a `Box` or several, their length and width level, their height
-    and yaw along and about the up axis (the file's z where `up` is a direction); crop: the file is one person already.
-    With neither, a file of less than 4 m across is taken as a crop and anything else asks for boxes. sensor_origin:
+    boxes: a JSON file, its content (see `io.boxes`), a `Box` or several, their length and width level, their height and
+    yaw along and about the up axis (the file's z where `up` is a direction); crop: the file is one person already. With
+    neither, a file of less than 4 m across is taken as a crop and anything else asks for boxes. sensor_origin:
     (x, y, z) m in the file's frame, or "unknown"; None means 0, 0, 0 with boxes and unknown for a crop. skeleton: a
     name, or None for smpl24, or for the network's own where it has other joints. up: the file's up axis, "z", "y" or
-    "x", or for a sensor mounted askew the direction that is up, (x, y, z) or "x,y,z" in the file's frame. columns:
-    values a row of a .bin; model: a predictor, what `load` takes (each person is then looked at `TTA` times), or a
-    function that gives the predictor when it is needed. Raises InputError, one line that says what to do.
+    "x", with a minus where it points down ("-y": cameras), or for a sensor mounted askew the direction that is up,
+    (x, y, z) or "x,y,z" in the file's frame. columns: values a row of a .bin; model: a predictor, what `load` takes
+    (each person is then looked at `TTA` times), or a function that gives the predictor when it is needed. Raises
+    InputError, one line that says what to do.
     """
     if boxes is not None and crop:
         raise InputError("expected boxes or a crop, got both: a crop is one person already, so leave the boxes away")
@@ -185,13 +186,17 @@ def _axis_warning(people: Poses, cloud: Cloud, up: str, R_house_input: np.ndarra
     flat = flat_axis(cloud.points)
     axis = "xyz"[int(np.abs(R_house_input[2]).argmax())]
     if flat is not None and flat != axis:
-        return f"the points extend least along {flat}, so {up} is hardly the input's up axis: try --up {flat}"
+        return f"the points extend least along {flat}, so {up} is hardly the input's up axis: try {_option(flat)}"
     found = [person for person in people if person.pose is not None]
     if not found or not all(lies(person.pose, person.points) for person in found):
         return None
-    others = " or ".join(f"--up {other}" for other in "zyx" if other != axis)
+    others = ", or ".join(_option(other) for other in "zyx" if other != axis)
     who = "the person lies" if len(found) == 1 else f"all {len(found)} people lie"
     return f"{who} down: if that is wrong, {up} is not the input's up axis: try {others}"
+
+
+def _option(axis: str) -> str:
+    return "--up y, or --up -y where y points down (cameras)" if axis == "y" else f"--up {axis}"
 
 
 def _in_input(person: PersonPose, R_house_input: np.ndarray, up: str) -> PersonPose:

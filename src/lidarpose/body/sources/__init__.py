@@ -49,10 +49,11 @@ def load_motion(
 ) -> Motion:
     """The motion of a file, or of all files in a folder and its folders, as rotations of the shipped body.
 
-    format: a name of `FORMATS`, by default told by the file; up: the axis of the recording that is up, "x", "y" or
-    "z", by default what its format says (BVH: the one people stand along); fps: the recording's frames a second, by
-    default what the file says; hz: resample each file to so many. A folder's clips are named by their paths in it,
-    and get the lowest rate among its files unless `hz` says one. Frames that are no numbers are left out and counted.
+    format: a name of `FORMATS`, by default told by the file; up: the axis of the recording that is up, "x", "y" or "z",
+    with a minus where it points down, by default what its format says (BVH: the one people stand along); fps: the
+    recording's frames a second, by default what the file says; hz: resample each file to so many. A folder's clips are
+    named by their paths in it, and get the lowest rate among its files unless `hz` says one. Frames that are no numbers
+    are left out and counted.
 
     Rotation formats (AMASS, LiDARHuman26M, SLOPER4D) keep every turn; the others are retargeted by positions.
     Raises InputError, naming the file, for everything that cannot be read.

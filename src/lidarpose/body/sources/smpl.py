@@ -80,8 +80,8 @@ def _check_upright(path: object, trunk: np.ndarray) -> None:
     axis = int(np.abs(trunk).argmax())
     stands = "xyz"[axis]
     if stands != "z" and abs(trunk[axis]) > _STANDS:
-        remedy = f"give load_motion up={stands!r}" if trunk[axis] > 0 else "turn the recording first"
-        raise file_error(path, f"people stand along {'-' if trunk[axis] < 0 else ''}{stands}, not z; {remedy}")
+        stands = f"-{stands}" if trunk[axis] < 0 else stands
+        raise file_error(path, f"people stand along {stands}, not z; give load_motion up={stands!r}")
 
 
 def _numbers(path: object, value: object, what: str) -> np.ndarray:

@@ -209,9 +209,9 @@ def _upwards(path: object, joints: np.ndarray) -> str:
     trunk = unit(joints[:, _J["neck"]] - hips).mean(0)
     axis = int(np.abs(trunk).argmax())
     if trunk[axis] < -_STANDS:
-        raise file_error(
-            path, f"people stand along -{'xyz'[axis]}; turn the recording, or give load_motion up= if they do"
-        )
+        stands = "xyz"[axis]
+        remedy = f"give load_motion up='-{stands}', or up={stands!r} if they are upside down"
+        raise file_error(path, f"people stand along -{stands}; {remedy}")
     return "xyz"[axis] if trunk[axis] > _STANDS else "y"
 
 
