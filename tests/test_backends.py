@@ -1,6 +1,7 @@
 """Two backends, one answer; and everything that needs no torch works without it."""
 
 import json
+import pickle
 import re
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from lidarpose.errors import InputError, MissingExtra
 from lidarpose.infer.backend import Raw, estimates
 from lidarpose.infer.predictor import Predictor, load
 from lidarpose.io.files import content_digest
-from lidarpose.model import decode, heads
+from lidarpose.model import decode, heads, onnx_file
 from lidarpose.model.bundled import DEFAULT, bundled_path
 from lidarpose.model.checkpoint import load_checkpoint, save_checkpoint
 from lidarpose.model.dapt.config import DaptConfig
@@ -317,6 +318,32 @@ def test_threads():
     assert 1 <= usable_threads() <= 8
     assert load(threads=3).backend.session.get_session_options().intra_op_num_threads == 3
     assert load().backend.session.get_session_options().intra_op_num_threads == usable_threads()
+
+
+@pytest.mark.parametrize("name", ["onnx", "torch"])
+def test_a_predictor_goes_to_another_process(models, name):
+    given = models[name].predict(blob(60)).joints
+    other = pickle.loads(pickle.dumps(models[name]))
+    np.testing.assert_array_equal(other.predict(blob(60)).joints, given)
+
+
+def test_a_runtime_that_cannot_be_loaded_is_not_the_file_s_fault(monkeypatch):
+    def fails(error):
+        def load_module(name):
+            raise error
+
+        monkeypatch.setattr(onnx_file, "import_module", load_module)
+
+    for error in (ImportError("DLL load failed:\nnot found"), OSError("libgomp.so.1: cannot open")):
+        fails(error)
+        with pytest.raises(InputError, match=r"^ONNX Runtime cannot be loaded \(.*\): reinstall it, pip") as raised:
+            load()
+        assert "\n" not in str(raised.value)
+    stopped = ImportError("initialization failed")
+    stopped.__cause__ = KeyboardInterrupt()
+    fails(stopped)
+    with pytest.raises(KeyboardInterrupt):
+        load()
 
 
 # ---- the paper's network

@@ -27,7 +27,7 @@ _BATCH = 64
 _LARGEST_LOG_SPREAD = 5.0
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Raw:
     """A network's outputs in the person's frame, joints in the order of its skeleton.
 
@@ -62,7 +62,7 @@ class Raw:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Estimates:
     """Joints of B people about their centers: joints (B, J, 3) m, confidence (B, J), spread (B, J) m, visible (B, J),
     in_range (B, J) bool, as in `Pose`; None for what the network does not say."""
@@ -93,9 +93,17 @@ class OnnxBackend:
     def __init__(self, path: str | os.PathLike, *, threads: int | None = None):
         if threads is not None:
             threads = whole("threads", threads, least=1)
+        self._opened = {"path": os.path.abspath(path), "threads": threads}
         self.session, self.header, self.source = open_onnx(path, threads=threads)
         # parts are of no use here: what is not asked for is not computed
         self._outputs = [name for name in OUTPUTS if name != "part"]
+
+    def __getstate__(self) -> dict:
+        # a session cannot go to another process, which opens the file anew
+        return self._opened
+
+    def __setstate__(self, state: dict) -> None:
+        self.__init__(**state)
 
     def run(self, clouds: list[np.ndarray], view: np.ndarray) -> Raw:
         inputs = network_inputs(plan_people(clouds, view, self.header.config))

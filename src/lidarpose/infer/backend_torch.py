@@ -53,6 +53,10 @@ class TorchBackend:
         self._compile = compile
         self._module = None
 
+    def __getstate__(self) -> dict:
+        # what torch compiled stays in its process
+        return {**self.__dict__, "_module": None}
+
     @torch.inference_mode()
     def run(self, clouds: list[np.ndarray], view: np.ndarray) -> Raw:
         arrays = network_inputs(plan_people(clouds, view, self.header.config))

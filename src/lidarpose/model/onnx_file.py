@@ -10,7 +10,8 @@ from importlib import import_module
 
 import numpy as np
 
-from lidarpose.io.files import file_error, read_bytes
+from lidarpose.errors import InputError
+from lidarpose.io.files import file_error, one_line, read_bytes
 from lidarpose.model.header import ENTRY, Header, parse_header
 from lidarpose.model.plan import Plan, plan
 from lidarpose.model.presets import NetworkConfig
@@ -57,9 +58,21 @@ def usable_threads() -> int:
     return min(usable, _MOST_THREADS)
 
 
+def _runtime():
+    """The module onnxruntime. Raises InputError where it cannot be loaded, as for want of a system library."""
+    try:
+        return import_module("onnxruntime")
+    except (ImportError, OSError) as error:
+        # its extension makes one of Ctrl-C
+        if isinstance(error.__cause__, KeyboardInterrupt):
+            raise KeyboardInterrupt from None
+        remedy = "reinstall it, pip install --force-reinstall onnxruntime"
+        raise InputError(one_line(f"ONNX Runtime cannot be loaded ({error}): {remedy}")) from None
+
+
 def open_session(content: bytes, *, threads: int | None = None):
     """An `onnxruntime.InferenceSession` of a file's content. Raises what ONNX Runtime does."""
-    runtime = import_module("onnxruntime")
+    runtime = _runtime()
     settings = runtime.SessionOptions()
     # set in any case: left alone it would pin threads to processors, which a container may forbid
     settings.intra_op_num_threads = usable_threads() if threads is None else threads
@@ -75,6 +88,8 @@ def open_onnx(path: str | os.PathLike, *, threads: int | None = None) -> tuple[o
     Raises InputError, one line, for a file that is cut off, something else, or another program's ONNX.
     """
     content = read_bytes(path, expected="an ONNX file (.onnx)")
+    # what is wrong with it is not the file's fault
+    _runtime()
     try:
         session = open_session(content, threads=threads)
     except Exception as error:
