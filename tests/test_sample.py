@@ -142,6 +142,20 @@ def test_a_sample_is_checked_when_built():
         Sample(**good).center = np.ones(3)
 
 
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Box(center=[0, 0, 0], size=[1, 1, 2]),
+        lambda: pose(),
+        lambda: Sample(points=np.zeros((4, 3), np.float32), center=np.zeros(3)),
+    ],
+    ids=["box", "pose", "sample"],
+)
+def test_what_holds_arrays_is_equal_to_itself_alone(make):
+    one, other = make(), make()
+    assert one == one and one != other and one in [other, one] and len({one, other}) == 2
+
+
 def cloud(rng, n=150):
     """Points well inside their 10 cm cells, so that rounding never moves one to the next cell."""
     cells = rng.integers(-15, 15, (n, 3))

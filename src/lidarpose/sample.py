@@ -1,6 +1,7 @@
 """What flows between the rooms: a person's points (`Sample`), a skeleton in space (`Pose`), a detector's `Box`.
 
-All are frozen, keyword-only and validated when built. Lengths in metres, angles in radians, z up.
+All are frozen, keyword-only and validated when built, and equal to nothing but themselves, since they hold arrays.
+Lengths in metres, angles in radians, z up.
 """
 
 from dataclasses import dataclass, replace
@@ -26,7 +27,7 @@ def within_reach(points: np.ndarray) -> np.ndarray:
     return (np.abs(points) < FARTHEST).all(-1)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Pose:
     """Joints in space, of one person or of many.
 
@@ -66,7 +67,7 @@ class Pose:
         return replace(self, joints=self.joints[..., pick, :], skeleton=skeleton, **picked)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Box:
     """A person's box: center (3,) m, size (length, width, height) m, yaw rad about z. It may only crop."""
 
@@ -110,7 +111,7 @@ def box_id(given: object) -> str | int | None:
     raise InputError(f"Box.id must be text or a whole number, got {given!r}")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Sample:
     """One person as a LiDAR saw it.
 

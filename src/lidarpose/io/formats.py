@@ -70,7 +70,7 @@ _MAGIC = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Cloud:
     """A point cloud as read from a file.
 

@@ -37,7 +37,7 @@ _TRIES = 8
 CLIP_FRAMES = 16
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class SyntheticPerson:
     """A sample with its true pose (body26, the level frame at the sensor) and parts, and the facts if asked for."""
 

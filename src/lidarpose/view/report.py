@@ -31,7 +31,7 @@ _FEWEST_POINTS = 150  # a person keeps these, however many people there are
 _SCHEMA = 1
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ReportPerson:
     """One person of a report: points (n, 3) m, z up, n = 0 is legal; pose and truth of one person, joints (J, 3) m in
     the points' frame; caption is a line of the caller's (sensor, distance, error), by default the number of points,
