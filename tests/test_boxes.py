@@ -68,6 +68,7 @@ def changed(**changes):
 
 
 BAD = {
+    "one box alone": (PERSON, ["got one box alone: put it in a list"]),
     "no people": ({"peoples": [], "frame": "a"}, ['"people"', "peoples, frame", "rename 'peoples'"]),
     "empty": ({}, ['"people"', "{}"]),
     "people a number": ({"people": 3}, ["got 3"]),
@@ -123,7 +124,11 @@ def test_bad_structure(case):
         (b"\n", ["is not JSON", "line 2, column 1"]),
         (b'{"people": [\n  {"center": [1, 2 3]}\n]}', ["is not JSON", "line 2, column 20"]),
         (b'{"people": [{"center": [1', ["is not JSON", "line 1, column 26"]),
-        (b"center,size\n1,2\n", ["is not JSON", "line 1, column 1"]),
+        (
+            b"center,size\n1,2\n",
+            ['expected JSON {"people": [{"center": [x, y, z], "size"', "got text: write the boxes"],
+        ),
+        (b"Pedestrian 0 0 -0.2 712 143 810 307 1.89 0.48 1.2 1.84 1.47 8.41 0.01\n", ["got text"]),
         (b'{"people": "\xe4"}', ["UTF-8"]),
         (b"[" * 100_000, ["JSON"]),
         (b"[" + b"9" * 5000 + b"]", ["JSON"]),

@@ -16,6 +16,8 @@ _MAX_YAW = 4 * math.pi
 
 _MAX_SHOWN = 60
 
+_FORM = '{"people": [{"center": [x, y, z], "size": [l, w, h]}]}'
+
 
 def read_boxes(source: str | os.PathLike | dict | list) -> list[Box]:
     """The people's boxes of a JSON file, or of the same structure already loaded.
@@ -31,6 +33,8 @@ def read_boxes(source: str | os.PathLike | dict | list) -> list[Box]:
     else:
         name, content = source, _load_json(source)
     if isinstance(content, dict):
+        if "people" not in content and {"center", "size"} <= content.keys():
+            raise file_error(name, f"expected {_FORM}, got one box alone: put it in a list, [{{...}}]")
         if "people" not in content:
             raise file_error(name, f'expected a list under the key "people", {_keys(content, "people")}')
         content = content["people"]
@@ -44,6 +48,10 @@ def _load_json(path: str | os.PathLike) -> object:
     try:
         return json.loads(data.decode("utf-8-sig"))
     except json.JSONDecodeError as error:
+        start = error.doc.lstrip()[:1]
+        if start and start not in "{[":
+            # a table of another tool, as KITTI's labels or CSV
+            raise file_error(path, f"expected JSON {_FORM}, got text: write the boxes so") from None
         where = f"line {error.lineno}, column {error.colno}"
         raise file_error(path, f"is not JSON: {error.msg} at {where}; correct it there") from None
     except UnicodeDecodeError as error:
