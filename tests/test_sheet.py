@@ -79,6 +79,12 @@ def test_the_table_and_the_cards_of_a_page_tell_the_same_distance(dataset):
     assert len(cards) == 20 and cards == table
 
 
+def test_one_person_is_not_people(tmp_path):
+    write_dataset(Job(what="people", count=1, sensors=("os1-64",)), tmp_path / "alone")
+    page = draw_dataset(tmp_path / "alone", html=True, out=tmp_path / "page.html").read_text()
+    assert "alone: 1 person, scene wild" in page
+
+
 def test_labelled_people_are_drawn_on_a_sheet_and_on_a_page(tmp_path, monkeypatch):
     smpl = files.write_smpl(tmp_path / "SMPL_NEUTRAL.npz")
     files.write_sloper4d(tmp_path / "raw", smpl)

@@ -17,7 +17,7 @@ from lidarpose.geometry import rotation_about
 from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14, Skeleton
 from lidarpose.view.person import bone_sides, describe, facing, project, side, thinned, view_directions
-from lidarpose.view.picture import MAX_PEOPLE, Panel, draw_people
+from lidarpose.view.picture import MAX_PEOPLE, Panel, _shortened, draw_people
 from lidarpose.view.report import MAX_POINTS, ReportPerson, render_report, write_report
 
 BLUE, ORANGE = (0x00, 0x72, 0xB2), (0xE0, 0x70, 0x00)
@@ -174,6 +174,11 @@ def test_what_is_said_under_a_person():
     assert describe(panel) == "1,500 points · 5.0 m · confidence 0.50"
     assert describe(Panel(points=np.zeros((1, 3)), distance=12.34)) == "1 point · 12.3 m"
     assert describe(Panel(points=np.zeros((0, 3)))) == "0 points"
+
+
+def test_a_long_name_keeps_its_ends():
+    name = "0aa51a7c-6c2d-4c0e-9d5e-7f1b2a3c4d5e"
+    assert _shortened(name, 36) == name and _shortened(name, 11) == "0aa51…c4d5e"
 
 
 def test_only_the_first_sixty_people_fit():

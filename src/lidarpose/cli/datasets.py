@@ -83,6 +83,7 @@ def add(commands) -> None:
 
 
 def _synth(options: argparse.Namespace) -> None:
+    from lidarpose.data.shards import counted
     from lidarpose.synth.write import Job, write_dataset
 
     job = Job(
@@ -101,8 +102,7 @@ def _synth(options: argparse.Namespace) -> None:
         progress = _bar(stack, unit=f" {job.what}") if is_watched() else None
         made = write_dataset(job, options.out, workers=options.workers, progress=progress)
     kept = "" if made == job.count else f", {job.count - made:,} were there"
-    what = job.what if made != 1 else {"people": "person", "clips": "clip", "streets": "street"}[job.what]
-    tell(f"{made:,} {what} made{kept} -> {options.out}")
+    tell(f"{counted(made, job.what)} made{kept} -> {options.out}")
 
 
 def _bar(stack: ExitStack, *, unit: str) -> Callable[[int, int], None]:

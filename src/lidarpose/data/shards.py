@@ -54,6 +54,15 @@ SENSOR_FRAME = "level frame at the sensor: x forward, y left, z up"
 _ROW_GROUP = {"people": 500, "frames": 4, "labelled": 500, "skipped": 5000}
 
 
+# one of what a dataset counts
+_ONE = {"people": "person", "clips": "clip", "streets": "street", "parts": "part"}
+
+
+def counted(count: int, what: str) -> str:
+    """ "1 street", "1,200 people"."""
+    return f"{count:,} {_ONE.get(what, what) if count == 1 else what}"
+
+
 @dataclass(frozen=True, kw_only=True)
 class Card:
     """What dataset.json says: settings, all that decides the content; count of persons, clips, streets or parts;

@@ -51,7 +51,7 @@ _TALLEST = 1.8  # m that a view's height shows at least, so that people on a she
 _DEPTH_SPAN = 0.35  # m in front of and behind the middle, over which the points' gray runs
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Panel:
     """One person to draw.
 
@@ -130,7 +130,9 @@ def _text(ax, x: float, y: float, words: str, *, size: float, color: str = _INK,
 def _shortened(words: str, limit: int) -> str:
     # names of files may hold lone surrogates, and no font draws control letters
     words = " ".join("".join(c if c.isprintable() else " " for c in str(words)).split())
-    return words if len(words) <= limit else words[: limit - 1] + "…"
+    # ids and paths tell most by their ends
+    tail = (limit - 1) // 2
+    return words if len(words) <= limit else f"{words[: limit - 1 - tail]}…{words[len(words) - tail :]}"
 
 
 def _header(ax, panels: list[Panel], shown: list[Panel], *, title: str, at: tuple[float, float]) -> None:
@@ -203,7 +205,8 @@ def _card(ax, panel: Panel, *, at: tuple[float, float], size: tuple[float, float
     )
     ax.add_patch(frame)
     center = left + width / 2
-    letters = int(width / 0.085)
+    # a UUID fits on the narrowest card
+    letters = int(width / 0.083)
     _text(ax, center, bottom + 0.25, _shortened(panel.label, letters), size=8.5, weight="bold", ha="center")
     _text(ax, center, bottom + 0.09, describe(panel), size=7.5, color=_FAINT, ha="center")
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.shards import CARD, Dataset, open_dataset, shard_path
+from lidarpose.data.shards import CARD, Dataset, counted, open_dataset, shard_path
 from lidarpose.errors import InputError
 from lidarpose.io.files import check_apart, file_error
 from lidarpose.view.picture import MAX_PEOPLE, Panel, draw_people
@@ -26,7 +26,7 @@ def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out
     check_apart(path, dataset.folder / CARD, *dataset.folder.glob("*.parquet"))
     rows = _spread(dataset, count)
     settings = dataset.card.settings
-    title = f"{name}: {dataset.card.count:,} {settings.get('what', 'people')}"
+    title = f"{name}: {counted(dataset.card.count, settings.get('what', 'people'))}"
     if "scene" in settings:
         title += f", scene {settings['scene']}"
     if (written := len(_written(dataset))) < dataset.card.shards:
