@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
+from lidarpose import demo
 from lidarpose.cli import main
-from lidarpose.infer import info
+from lidarpose.errors import InputError
+from lidarpose.infer import info, predictor
 from lidarpose.model.bundled import DEFAULT, bundled_path
 from lidarpose.synth.generate import Generator
 from lidarpose.synth.scene import scene_config
@@ -486,6 +488,23 @@ def test_a_picture_that_cannot_be_written_leaves_no_json(crop, out, capsys):
     assert run("predict", crop, "--out", out, "--picture") == 2
     assert "crop.poses.png" in one_line(capsys)
     assert [path.name for path in out.iterdir()] == ["crop.poses.png"]
+
+
+def test_an_output_that_cannot_be_written_is_told_before_the_work(crop, monkeypatch, capsys):
+    monkeypatch.setattr(predictor.Predictor, "predict", lambda *_, **__: pytest.fail("predicted first"))
+    assert run("predict", crop, "--out", crop / "deep", "--picture") == 2
+    assert "cannot write" in one_line(capsys)
+
+
+def test_a_demo_that_is_killed_leaves_nothing(out, monkeypatch, capsys):
+    there = []
+
+    def load(*_, **__):
+        there.extend(out.parent.rglob(f"{out.name}*"))
+        raise InputError("stopped")
+
+    monkeypatch.setattr(demo, "load", load)
+    assert run("demo", "--out", out) == 2 and "stopped" in one_line(capsys) and there == []
 
 
 # ---- as a program

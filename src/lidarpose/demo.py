@@ -10,7 +10,7 @@ import numpy as np
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.infer.files import TTA
 from lidarpose.infer.predictor import Predictor, load
-from lidarpose.io.files import atomic_path
+from lidarpose.io.files import atomic_path, check_writable
 from lidarpose.model.bundled import DEFAULT
 
 SENSORS = ("vlp-32c", "os1-128", "hdl-64e")
@@ -33,25 +33,29 @@ def run(folder: str | Path, *, seed: int, weights: str = DEFAULT) -> None:
         raise MissingExtra("the demo synthesizes people and", "synth") from None
     folder = Path(folder)
     names = ["index.html", *(f"{name}.png" for name in SENSORS)]
-    # opened before the work, so that a folder without write access is known at once
+    # a folder without write access is known at once; files are opened when there is something to write, since whoever
+    # is killed leaves them
+    for name in names:
+        check_writable(folder / name)
+    model = load(weights, tta=TTA)
+    print("synthesizing people (the first time compiles the ray caster: some ten seconds) ...", flush=True)
+    scene = scene_config("wild").eased(_HARD)
+    people = []
+    for k, name in enumerate(SENSORS):
+        generator = Generator(scene=replace(scene, sensors=(name,), distance=(3.0, 20.0)))
+        people += [generator.person(seed, k * PEOPLE_EACH + i) for i in range(PEOPLE_EACH)]
+    rows, contents = _report(model, people)
     with ExitStack() as stack:
-        files = {name: stack.enter_context(atomic_path(folder / name)) for name in names}
-        model = load(weights, tta=TTA)
-        print("synthesizing people (the first time compiles the ray caster: some ten seconds) ...", flush=True)
-        scene = scene_config("wild").eased(_HARD)
-        people = []
-        for k, name in enumerate(SENSORS):
-            generator = Generator(scene=replace(scene, sensors=(name,), distance=(3.0, 20.0)))
-            people += [generator.person(seed, k * PEOPLE_EACH + i) for i in range(PEOPLE_EACH)]
-        rows = _report(model, people, files)
+        for name, content in contents.items():
+            stack.enter_context(atomic_path(folder / name)).write_bytes(content)
     print(_table(rows))
     print(f"open {folder / 'index.html'} to turn the people in 3D; pictures: {folder}/*.png")
 
 
-def _report(model: Predictor, people: list, files: dict[str, Path]) -> list[dict]:
-    """Predicts synthetic people, writes the report and the pictures to `files` by name. Returns the table's rows."""
+def _report(model: Predictor, people: list) -> tuple[list[dict], dict[str, bytes]]:
+    """Predicts synthetic people. Returns the table's rows, and the report and the pictures by their files' names."""
     from lidarpose.view.picture import Panel, draw_people
-    from lidarpose.view.report import ReportPerson, write_report
+    from lidarpose.view.report import ReportPerson, render_report
 
     clouds = [person.sample.points for person in people]
     # the sensor of a sample is the origin of its frame; the first call warms the network up
@@ -81,12 +85,13 @@ def _report(model: Predictor, people: list, files: dict[str, Path]) -> list[dict
         cards.append(
             ReportPerson(label=label, points=person.sample.points, pose=pose.pose, truth=truth, caption=caption)
         )
+    contents = {}
     for k, name in enumerate(SENSORS):
         shown = panels[k * PEOPLE_EACH : (k + 1) * PEOPLE_EACH]
-        files[f"{name}.png"].write_bytes(draw_people(shown, title=f"{name}: predicted, and the truth dashed"))
+        contents[f"{name}.png"] = draw_people(shown, title=f"{name}: predicted, and the truth dashed")
     title = "lidarpose demo: synthesized people, predicted and true"
-    write_report(files["index.html"], cards, title=title, summary=rows)
-    return rows
+    contents["index.html"] = render_report(cards, title=title, summary=rows).encode()
+    return rows, contents
 
 
 def _table(rows: list[dict]) -> str:

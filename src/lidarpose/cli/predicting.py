@@ -86,7 +86,7 @@ def add(commands) -> None:
 def _predict(options: argparse.Namespace) -> None:
     from lidarpose.infer.files import TTA, predict
     from lidarpose.infer.predictor import load
-    from lidarpose.io.files import atomic_path, check_apart
+    from lidarpose.io.files import atomic_path, check_apart, check_writable
 
     file = Path(options.file)
     to_stdout = options.out == "-"
@@ -96,6 +96,8 @@ def _predict(options: argparse.Namespace) -> None:
     picture_path = str(result.with_suffix(".png")) if options.picture else None
     for path in filter(None, (json_path, picture_path)):
         check_apart(path, options.file, options.boxes, options.weights)
+        # before the work
+        check_writable(path)
     choices = {"backend": options.backend, "device": options.device, "decode": options.decode}
     choices["tta"] = TTA if options.tta is None else options.tta
     poses = predict(
