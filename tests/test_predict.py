@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
@@ -14,7 +15,7 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about
 from lidarpose.infer import people as people_module
 from lidarpose.infer.backend import Raw
-from lidarpose.infer.people import MAX_POINTS, as_origin, as_points, candidates, flat_axis, lies, unit_warning
+from lidarpose.infer.people import MAX_POINTS, as_origin, as_points, candidates, clean, flat_axis, lies, unit_warning
 from lidarpose.infer.predictor import Predictor
 from lidarpose.io.boxes import read_boxes
 from lidarpose.lidar.catalog import sensor
@@ -50,6 +51,11 @@ def box_around(cloud, margin=0.05, **more):
     return {"center": ((low + high) / 2).tolist(), "size": (high - low + 2 * margin).tolist(), **more}
 
 
+def records(points):
+    """The points as records that begin with something else."""
+    return np.rec.fromarrays([np.arange(len(points)), *points.T], names="ring,x,y,z")
+
+
 def height(pose, joint):
     return pose.joints[pose.skeleton.index(joint), 2]
 
@@ -81,8 +87,12 @@ def test_an_easy_person_stands_on_their_feet(model, standing):
         lambda p: np.column_stack([p, np.arange(len(p))]),
         lambda p: torch.from_numpy(p.copy()),
         lambda p: torch.from_numpy(p.copy()).requires_grad_(),
+        lambda p: pd.DataFrame({"intensity": 0.5, "z": p[:, 2], "x": p[:, 0], "Y": p[:, 1]}),
+        lambda p: pd.DataFrame(p),
+        lambda p: records(p),
     ],
-    ids="float64 big-endian rows tuples row-arrays fortran strided four-columns torch torch-grad".split(),
+    ids="float64 big-endian rows tuples row-arrays fortran strided four-columns torch torch-grad table plain-table "
+    "records".split(),
 )
 def test_every_kind_of_array_is_the_same_person(model, points, kind):
     np.testing.assert_allclose(model.predict(kind(points)).joints, model.predict(points).joints, atol=1e-4)
@@ -90,7 +100,7 @@ def test_every_kind_of_array_is_the_same_person(model, points, kind):
 
 @pytest.mark.parametrize("kind", [np.float16, np.int16, np.int64, np.uint8, torch.bfloat16])
 def test_coarse_numbers_are_taken(model, points, kind):
-    near = points - points.min(0)
+    near = 1 + 3 * (points - points.min(0))
     cloud = torch.from_numpy(near).to(kind) if kind is torch.bfloat16 else near.astype(kind)
     assert np.isfinite(model.predict(cloud).joints).all()
 
@@ -115,7 +125,8 @@ def test_the_input_is_left_alone(model, points):
         (np.array([[1, 2, 3]], object), "objects"),
         (np.array([[True, False, True]]), "bool"),
         (np.array([[1j, 2, 3]]), "complex"),
-        (np.zeros(4, [("x", "f4"), ("y", "f4"), ("z", "f4")]), "(4,)"),
+        (np.zeros(4, [("a", "f4"), ("b", "f4"), ("c", "f4")]), "expected columns x, y and z, got a b c"),
+        (pd.DataFrame({"range": [1.0], "x": 0.0, "y": 0.0}), "expected columns x, y and z, got range x y"),
         ([[1, 2, 3], [1, 2]], "unequal"),
         ([[[1, 2, 3], [1, 2]]], "points[0]"),
         ([np.zeros((9, 3)), np.zeros((9, 2))], "points[1]"),
@@ -156,9 +167,24 @@ def test_too_few_points_are_no_pose(model, points, count):
     assert json.loads(pose.to_json())["people"][0]["joints"] is None
 
 
-@pytest.mark.parametrize("cloud", [np.zeros((5, 3)), np.zeros((9, 3)), np.eye(3)[[0] * 9] * 1e8])
-def test_points_on_one_spot_do_not_break(model, cloud):
-    assert np.isfinite(model.predict(cloud).joints).all()
+@pytest.mark.parametrize("cloud", [np.ones((5, 3)), np.ones((300, 3)), np.eye(3)[[0, 1, 2, 0] * 9] * 1e8])
+def test_points_on_one_spot_are_nobody(model, cloud):
+    pose = model.predict(cloud)
+    assert pose.joints is None and pose.warnings[-1] == "no pose: under 5 different points"
+
+
+def test_no_returns_are_no_points(model, points, tmp_path):
+    empty = np.zeros((300, 3))
+    pose = model.predict(np.concatenate([empty, points]))
+    assert pose.warnings == (f"dropped 300 of {len(points) + 300} points at 0,0,0, which are no returns",)
+    np.testing.assert_array_equal(pose.points, points)
+    assert model.predict(empty).joints is None
+    np.save(tmp_path / "empty.npy", empty)
+    with pytest.raises(InputError, match="expected points in metres, got only 0,0,0"):
+        lidarpose.predict(tmp_path / "empty.npy", model=model)
+    # one may be a point of a cloud that is about its middle
+    alone, notes = clean(np.concatenate([empty[:1], points - points.mean(0)]))
+    assert len(alone) == len(points) + 1 and not notes
 
 
 # ---- many
@@ -179,6 +205,7 @@ def test_many_are_as_one_by_one(model, points, standing):
 def test_lists_of_none_and_stacks(model, points):
     assert len(model.predict([])) == 0 and json.loads(model.predict([]).to_json())["people"] == []
     assert len(model.predict((points, points))) == len(model.predict(np.stack([points] * 2))) == 2
+    assert len(model.predict([records(points)] * 2)) == 2
     assert len(model.predict([points.tolist()])) == len(model.predict([torch.from_numpy(points.copy())])) == 1
     assert [person.joints for person in model.predict([points[:0], [], np.zeros((0, 3))])] == [None] * 3
     # somebody without points may stand anywhere
@@ -415,6 +442,29 @@ def test_boxes_and_points_in_millimetres_are_told(model, sweep, tmp_path):
     assert any("a person's box" in warning and "millimetres" in warning for warning in people.warnings)
 
 
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (lambda box: {**box, "size": box["size"][::-1]}, "m): size is length, width, height"),
+        (lambda box: {**box, "center": np.subtract(box["center"], [0, 0, box["size"][2] / 2])}, "center at the feet?"),
+    ],
+    ids=["height first", "feet"],
+)
+def test_boxes_of_another_convention_are_told(model, sweep, change, words):
+    path, _, boxes = sweep
+    (warning,) = lidarpose.predict(path, boxes=[change(box) for box in boxes], model=model).warnings
+    assert words in warning and "--up" not in warning
+
+
+def test_a_tree_above_boxes_is_nobody(model, tmp_path, points):
+    """Nor is who shows no legs."""
+    box = box_around(points)
+    upper = points[points[:, 2] > box["center"][2]]
+    tree = box["center"] + np.random.default_rng(0).uniform((-0.3, -0.3, 1), (0.3, 0.3, 3), (len(points), 3))
+    np.save(tmp_path / "a.npy", np.concatenate([upper, tree]))
+    assert lidarpose.predict(tmp_path / "a.npy", boxes=[box], model=model).warnings == ()
+
+
 def test_a_sensor_that_cannot_have_seen_the_people_is_unknown(model, sweep, tmp_path):
     path, clouds, boxes = sweep
     offset = np.array([5e5, 5e6, 0])
@@ -509,6 +559,10 @@ def test_pictures_stand_upright_whatever_the_axes(model, tmp_path, points, monke
         person.picture()
         np.testing.assert_allclose(drawn["panel"].points, points, atol=1e-4)
         assert height(drawn["panel"].pose, "head") > height(drawn["panel"].pose, "pelvis")
+    # a box of a frame that leans is not the upright one
+    for up, is_drawn in (("-y", True), ("0.26,0,0.97", False)):
+        replace(person, box=Box(center=[0, 0, 0], size=[1, 1, 2]), up=up).picture()
+        assert (drawn["panel"].box is not None) == is_drawn
 
 
 def test_people_that_all_lie_raise_the_question_of_the_axis(model, tmp_path, points):
@@ -639,6 +693,11 @@ def test_masked_points_are_no_points(model, points):
 def test_load_of_no_name_is_told(given):
     with pytest.raises(InputError, match="expected weights as tiny, small or the path of a file"):
         lidarpose.load(given)
+
+
+def test_people_are_found_in_what_holds_them(model, points):
+    poses = model.predict([points, points[:0]])
+    assert poses[1] in poses and poses != model.predict([points[:0]]) and len({*poses, poses[0], poses}) == 3
 
 
 def test_points_are_no_path():

@@ -9,7 +9,7 @@ import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, rotation_from_up
-from lidarpose.infer.people import as_origin, flat_axis, lies, only_within_reach, unit_warning
+from lidarpose.infer.people import as_origin, flat_axis, lies, only_returns, unit_warning
 from lidarpose.infer.predictor import Predictor, load
 from lidarpose.infer.results import PersonPose, Poses
 from lidarpose.io.boxes import read_boxes
@@ -24,6 +24,12 @@ CROP_SIZE = 4.0
 TTA = 4
 # no LiDAR sees a person from farther away, m
 _FARTHEST_PERSON = 500.0
+# boxes so much less tall than wide have their sizes in another order
+_TALL_TO_WIDE = 0.8
+# heights above a box's center, in its own height: the ground, and of who stands on the center the chest and the top; at
+# most this share of the points is elsewhere, and so few tell nothing
+_GROUND, _CHEST, _TOP = -0.1, 0.75, 1.1
+_ELSEWHERE, _FEWEST = 0.05, 20
 
 
 def predict(
@@ -76,7 +82,8 @@ def predict(
             [replace(box, center=R_boxes_input @ box.center) for box in found],
             cloud.points @ R_boxes_input.T,
         )
-        clouds = [points[box.contains(within)] for box in housed]
+        inside = [box.contains(within) for box in housed]
+        clouds = [points[mask] for mask in inside]
     warnings = list(cloud.warnings)
     if origin is not None and found and (warning := _origin_warning(origin, found)):
         warnings.append(warning)
@@ -88,9 +95,14 @@ def predict(
         clouds, sensor_origin=None if origin is None else R_house_input @ origin, skeleton=skeleton, progress=progress
     )
     done = time.perf_counter()
+    cut_short = []
     if found:
         warnings += _box_warnings(raw, found, cloud)
-    if warning := _axis_warning(raw, cloud, up, R_house_input):
+        cut_short = list(filter(None, (_wide_warning(found), _foot_warning(housed, within, inside))))
+        warnings += cut_short
+    # who is cut short only seems to lie
+    lying = None if cut_short else _lying_warning(raw, up, R_house_input)
+    if warning := _flat_warning(cloud, up, R_house_input) or lying:
         warnings.append(warning)
     people = [_in_input(person, R_house_input, up) for person in raw]
     if found is None:
@@ -130,9 +142,10 @@ def _boxes(given: object) -> list[Box]:
 
 
 def _within_reach(path: object, cloud: Cloud) -> Cloud:
-    points, notes = only_within_reach(cloud.points)
+    points, notes = only_returns(cloud.points)
     if not len(points):
-        raise file_error(path, f"expected points in metres, got none within {FARTHEST:g} m: export it again")
+        found = f"none within {FARTHEST:g} m" if cloud.points.any() else "only 0,0,0, which are no returns"
+        raise file_error(path, f"expected points in metres, got {found}: export it again")
     dropped = len(cloud.points) - len(points)
     return replace(cloud, points=points, num_dropped=cloud.num_dropped + dropped, warnings=(*cloud.warnings, *notes))
 
@@ -177,22 +190,60 @@ def _box_warnings(people: Poses, boxes: list[Box], cloud: Cloud) -> list[str]:
     return warnings
 
 
+def _wide_warning(boxes: list[Box]) -> str | None:
+    wide = np.median([box.size[:2].max() for box in boxes])
+    tall = np.median([box.size[2] for box in boxes])
+    if tall >= _TALL_TO_WIDE * wide:
+        return None
+    return f"boxes are wider ({wide:.1f} m) than tall ({tall:.1f} m): size is length, width, height"
+
+
+def _foot_warning(boxes: list[Box], points: np.ndarray, inside: list[np.ndarray]) -> str | None:
+    """What is likely wrong where people begin at the centers of their boxes. points (n, 3) m, z up; inside (n,): which
+    of them each box holds."""
+    heights = _heights(boxes, points, inside)
+    if (heights < _GROUND).sum() > _ELSEWHERE * len(heights):
+        return None
+    upon = [replace(box, center=box.center + [0, 0, box.size[2]]) for box in boxes]
+    above = 1 + _heights(upon, points, [box.contains(points) for box in upon])
+    # a ceiling leaves room above the box, a tree goes on above the head
+    trunk, sky = (above < _CHEST).sum(), (above > _TOP).sum()
+    if trunk < max(_FEWEST, len(heights) / 4) or sky > _ELSEWHERE * len(above):
+        return None
+    return "people stand in the upper half of their boxes and above: is center at the feet? add half the height"
+
+
+def _heights(boxes: list[Box], points: np.ndarray, inside: list[np.ndarray]) -> np.ndarray:
+    """(k,): how high above the centers of their boxes, in those boxes' heights, points lie."""
+    return np.concatenate(
+        [(points[mask, 2] - box.center[2]) / box.size[2] for box, mask in zip(boxes, inside, strict=True)]
+    )
+
+
 def _place(point: np.ndarray) -> str:
     return "(" + ", ".join(f"{value:.1f}" for value in point) + ")"
 
 
-def _axis_warning(people: Poses, cloud: Cloud, up: str, R_house_input: np.ndarray) -> str | None:
-    """What is likely wrong with the axes. `people` in the house's frame, into which R_house_input turns by `up`."""
+def _flat_warning(cloud: Cloud, up: str, R_house_input: np.ndarray) -> str | None:
     flat = flat_axis(cloud.points)
-    axis = "xyz"[int(np.abs(R_house_input[2]).argmax())]
-    if flat is not None and flat != axis:
-        return f"the points extend least along {flat}, so {up} is hardly the input's up axis: try {_option(flat)}"
+    if flat is None or flat == _axis(R_house_input):
+        return None
+    return f"the points extend least along {flat}, so {up} is hardly the input's up axis: try {_option(flat)}"
+
+
+def _lying_warning(people: Poses, up: str, R_house_input: np.ndarray) -> str | None:
+    """`people` in the house's frame, into which R_house_input turns by `up`."""
     found = [person for person in people if person.pose is not None]
     if not found or not all(lies(person.pose, person.points) for person in found):
         return None
-    others = ", or ".join(_option(other) for other in "zyx" if other != axis)
+    others = ", or ".join(_option(other) for other in "zyx" if other != _axis(R_house_input))
     who = "the person lies" if len(found) == 1 else f"all {len(found)} people lie"
     return f"{who} down: if that is wrong, {up} is not the input's up axis: try {others}"
+
+
+def _axis(R_house_input: np.ndarray) -> str:
+    """The input's axis that is nearest to upright."""
+    return "xyz"[int(np.abs(R_house_input[2]).argmax())]
 
 
 def _option(axis: str) -> str:

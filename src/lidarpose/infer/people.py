@@ -7,7 +7,7 @@ import numpy as np
 from lidarpose.errors import InputError
 from lidarpose.geometry import vector_of
 from lidarpose.io.files import one_line
-from lidarpose.io.headers import is_transposed
+from lidarpose.io.headers import Problem, is_transposed, pick_xyz
 from lidarpose.sample import FARTHEST, MIN_POINTS, Pose, center_of, within_reach
 
 # joints that every skeleton has
@@ -41,9 +41,13 @@ _MOST, _STREET, _FLATTER = (10, 90), 10.0, 3.0
 
 
 def as_points(points: object, what: str = "points") -> np.ndarray:
-    """Anything array-like (n, 3+) as (n, 3) float64. Raises InputError for another shape or type; n = 0 is legal."""
+    """Anything array-like (n, 3+), or a table or records with columns x, y, z, as (n, 3) float64.
+
+    Raises InputError for another shape or type; n = 0 is legal.
+    """
     if isinstance(points, str | os.PathLike):
         raise InputError(f"{what} must be an (n, 3) array, got a path: use lidarpose.predict({str(points)!r})")
+    points = _by_name(points, what)
     if isinstance(points, np.ma.MaskedArray):
         # masked is no point
         points = points.astype(np.float64).filled(np.nan)
@@ -70,6 +74,19 @@ def as_points(points: object, what: str = "points") -> np.ndarray:
     return array[:, :3].astype(np.float64)
 
 
+def _by_name(points: object, what: str) -> object:
+    """The columns x, y and z of a table (pandas, polars) or of records, wherever they stand; anything else as it is."""
+    names = getattr(getattr(points, "dtype", None), "names", None) or getattr(points, "columns", None)
+    if names is None or not len(names) or not all(isinstance(name, str) for name in names):
+        return points
+    try:
+        chosen = [points[names[i]] for i in pick_xyz(names)]
+        return (np.ma if isinstance(points, np.ma.MaskedArray) else np).stack(chosen, -1)
+    except (Problem, ValueError) as problem:
+        # two columns of one name cannot be told apart
+        raise InputError(f"{what}: {problem}") from None
+
+
 def as_origin(given: object) -> np.ndarray | None:
     """The sensor's place (3,) m from three numbers or "x,y,z"; None, also for "unknown". Raises InputError."""
     if given is None or isinstance(given, str) and given.strip() == "unknown":
@@ -81,8 +98,8 @@ def as_origin(given: object) -> np.ndarray | None:
 
 
 def clean(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """points (n, 3) without NaN, infinite and absurd rows and at most `MAX_POINTS`, and a note for each thing done."""
-    points, notes = only_within_reach(points)
+    """points (n, 3) as of `only_returns`, at most `MAX_POINTS` of them, and a note for each thing done."""
+    points, notes = only_returns(points)
     if len(points) > MAX_POINTS:
         notes.append(
             f"thinned from {len(points)} to {MAX_POINTS} points: crop closer to the person if there are others"
@@ -91,15 +108,27 @@ def clean(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
     return points, notes
 
 
-def only_within_reach(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """points (n, 3) m without rows that arithmetic would choke on, and a note where there are some."""
+def only_returns(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """points (n, 3) m without rows that arithmetic would choke on or that are no returns, and a note for each kind."""
+    notes = []
     usable = within_reach(points)
-    if usable.all():
-        return points, []
-    dropped = int((~usable).sum())
-    return points[usable], [
-        f"dropped {dropped} of {len(points)} points that were NaN, infinite or beyond {FARTHEST:g} m"
-    ]
+    if dropped := int((~usable).sum()):
+        notes.append(f"dropped {dropped} of {len(points)} points that were NaN, infinite or beyond {FARTHEST:g} m")
+    # so organised clouds fill the pixels that nothing came back from; a single one may be a point of a centered cloud
+    empty = ~points.any(1)
+    if (zeros := int(empty.sum())) > 1:
+        notes.append(f"dropped {zeros} of {len(points)} points at 0,0,0, which are no returns")
+        usable &= ~empty
+    return (points[usable], notes) if notes else (points, [])
+
+
+def is_few(points: np.ndarray) -> bool:
+    """Whether fewer than `MIN_POINTS` places are among points (n, 3), which may repeat."""
+    for _ in range(MIN_POINTS):
+        if not len(points):
+            return True
+        points = points[(points != points[0]).any(1)]
+    return False
 
 
 def candidates(points: np.ndarray) -> list[np.ndarray]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from lidarpose.errors import InputError, check_name, missing_extra, whole
 from lidarpose.infer.backend import Backend, Estimates, OnnxBackend, estimates, exported_beside
-from lidarpose.infer.people import as_origin, as_points, candidates, clean, unit_warning
+from lidarpose.infer.people import as_origin, as_points, candidates, clean, is_few, unit_warning
 from lidarpose.infer.results import PersonPose, Poses
 from lidarpose.infer.tta import Look, averaged, brought_back, looks_of, shown
 from lidarpose.io.files import file_error
@@ -126,9 +126,9 @@ class Predictor:
         """One cloud (n, 3+) -> `PersonPose`; a list of clouds -> `Poses`, in their order.
 
         points: x, y, z in metres, z up, any frame, each cloud one person, ground and clutter allowed; more columns are
-        ignored. sensor_origin (3,) m: where the sensor stood in that frame, None or "unknown" if that is not known.
-        skeleton: see `in_skeleton`. A cloud of under 5 points gets a result without joints and a warning. Raises
-        InputError for arrays of another shape or type.
+        ignored, those of tables and records are taken by name. sensor_origin (3,) m: where the sensor stood in that
+        frame, None or "unknown" if that is not known. skeleton: see `in_skeleton`. A cloud of under 5 different points
+        gets a result without joints and a warning. Raises InputError for arrays of another shape or type.
         """
         wanted = self.in_skeleton(skeleton)
         origin = as_origin(sensor_origin)
@@ -146,8 +146,9 @@ class Predictor:
         ]
         clouds, owner = [], []
         for i, (points, _) in enumerate(cleaned):
-            if len(points) < MIN_POINTS:
-                results[i] = _warned(results[i], f"no pose: under {MIN_POINTS} points")
+            if is_few(points):
+                points_of = "points" if len(points) < MIN_POINTS else "different points"
+                results[i] = _warned(results[i], f"no pose: under {MIN_POINTS} {points_of}")
                 continue
             if warning := unit_warning(np.ptp(points, axis=0), what="the person"):
                 results[i] = _warned(results[i], warning)
@@ -244,7 +245,8 @@ def _is_row(value) -> bool:
     if isinstance(value, list | tuple):
         flat = not any(isinstance(entry, list | tuple) or getattr(entry, "ndim", 0) for entry in value)
     else:
-        flat = getattr(value, "ndim", 0) == 1
+        # records are a cloud
+        flat = getattr(value, "ndim", 0) == 1 and not getattr(getattr(value, "dtype", None), "names", None)
     return flat and len(value) > 0
 
 

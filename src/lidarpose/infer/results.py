@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.geometry import rotation_from_up
+from lidarpose.geometry import UP_AXES, rotation_from_up
 from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import Skeleton
 
 SCHEMA = "lidarpose.poses/1"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class PersonPose:
     """One person's pose in the input's own frame.
 
@@ -101,7 +101,7 @@ class PersonPose:
         return self.alone().picture(path)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Poses(Sequence):
     """The people of one call, in the order of the boxes or arrays. A sequence of `PersonPose`.
 
@@ -168,9 +168,9 @@ class Poses(Sequence):
 
 
 def _upright(person: PersonPose, up: str) -> PersonPose:
-    """The person with z up, as pictures are drawn."""
+    """The person with z up, as pictures are drawn. A box of a frame that leans would lean in them: it is left out."""
     R_house_input = rotation_from_up(up)
-    pose, box = person.pose, person.box
+    pose, box = person.pose, person.box if up in UP_AXES else None
     return replace(
         person,
         points=person.points @ R_house_input.T,
