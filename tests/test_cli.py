@@ -428,7 +428,7 @@ BAD_COMMANDS = {
     "boxes a folder": ("predict CROP --boxes DIR", "got a folder"),
     "both": ("predict CROP --crop --boxes BOXES", "got both"),
     "up": ("predict CROP --up w", "z, y, x"),
-    "up direction": ("predict CROP --up -1,0", "expected z, y, x or a direction x,y,z, got '-1,0'"),
+    "up direction": ("predict CROP --up -1,0", "expected z, y, x, -z, -y, -x or a direction x,y,z, got '-1,0'"),
     "up that points down": ("predict DIR/crob.npy --up -y", "did you mean crop.npy"),
     "up of no length": ("predict CROP --up 0,0,0", "or a direction x,y,z, got '0,0,0'"),
     "skeleton": ("predict CROP --skeleton smpl42", "did you mean smpl24"),
