@@ -195,7 +195,7 @@ def test_mixed_units_upside_down_and_no_rate(tmp_path):
     over = ROTATIONS.copy()
     over[:, 0] = np.diag([1.0, -1, -1]) @ over[:, 0]
     path = written(tmp_path, files.bvh_text(over, WAY, names=files.CMU_NAMES))
-    with pytest.raises(InputError, match="people stand along -y; give up='-y'"):
+    with pytest.raises(InputError, match="people stand along -y; give load_motion up='-y'"):
         load_motion(path)
     assert errors(load_motion(path, up="y"), files.joints_of(over, WAY))[:, MAIN].mean() < 0.01
     path = written(tmp_path, re.sub("Frame Time: .*", "Frame Time: 0", BVH))
