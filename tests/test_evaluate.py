@@ -22,7 +22,7 @@ from lidarpose.cli import evaluating, main
 from lidarpose.data.prepare import prepare
 from lidarpose.data.shards import open_dataset, read_rows, shard_path
 from lidarpose.errors import InputError
-from lidarpose.evaluate import lines, stability
+from lidarpose.evaluate import bootstrap, stability
 from lidarpose.evaluate.bench import load_bench
 from lidarpose.evaluate.lines import lines_of, span_rows, triples, turned_round
 from lidarpose.evaluate.people import open_people, spread
@@ -354,7 +354,7 @@ def test_few_sequences_have_no_interval(sets):
 
 
 def test_sequences_are_drawn_whole(sets, monkeypatch):
-    monkeypatch.setattr(lines, "LEAST_UNITS", 2)
+    monkeypatch.setattr(bootstrap, "LEAST_UNITS", 2)
     found = judged(sets, "humanm3", Fake(standing))
     line, table = found.result.line("mpjpe"), found.judged.errors()
     means = [np.nanmean(table[found.judged.sequence == name]) for name in ("test/b", "test/c")]

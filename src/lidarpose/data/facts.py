@@ -13,11 +13,10 @@ _GROUND = 0.1
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
-    """sensor; kind: what the person does, a name of `body.activities.KINDS`; distance m; visible: returns
-    of body and clothes, as a share (at most 1) of those that the body alone has without any loss: what is out of range
-    or at a slant counts as hidden too; height_seen: share of the body's height between
-    its lowest and highest return; clutter: share of the points that are neither body nor ground; upright: stands or
-    walks."""
+    """sensor; kind: what the person does, a name of `body.activities.KINDS`; distance m; visible: returns of body
+    and clothes, as a share (at most 1) of those that the body alone has without any loss: what range or slant lost
+    counts as hidden too; height_seen: share of the body's height between its lowest and highest return; clutter: share
+    of the points that are neither body nor ground; upright: stands or walks."""
 
     sensor: str
     kind: str

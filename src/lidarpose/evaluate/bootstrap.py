@@ -30,6 +30,11 @@ class Interval:
     units: int
     repeats: int
 
+    @property
+    def stated(self) -> tuple[float, float] | tuple[None, None]:
+        """low and high as an evaluation states them: None of fewer than `LEAST_UNITS`."""
+        return (self.low, self.high) if self.units >= LEAST_UNITS else (None, None)
+
 
 def interval(
     table: np.ndarray,

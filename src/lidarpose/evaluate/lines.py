@@ -12,7 +12,7 @@ import numpy as np
 
 from lidarpose.data.readers.items import SEEN
 from lidarpose.errors import InputError
-from lidarpose.evaluate.bootstrap import LEAST_UNITS, interval
+from lidarpose.evaluate.bootstrap import interval
 from lidarpose.evaluate.groups import joint_groups
 from lidarpose.evaluate.judged import Judged
 from lidarpose.evaluate.metrics import (
@@ -102,14 +102,11 @@ def line(
     clusters: np.ndarray | None = None,
     no_pose: int = 0,
 ) -> Line:
-    """The mean of a table (n, J) or (n,) as a line; its interval needs `LEAST_UNITS` people or sequences."""
+    """The mean of a table (n, J) or (n,) as a line; see `Interval.stated`."""
     score = mean(table, average)
-    ends = (None, None)
-    if score.people >= LEAST_UNITS:
-        name = f"{setting.method}/{figure}/{group}/{of}"
-        rng = np.random.default_rng([setting.seed, zlib.crc32(name.encode())])
-        found = interval(table, rng, average, clusters=clusters, repeats=_REPEATS)
-        ends = (number(found.low), number(found.high)) if found.units >= LEAST_UNITS else ends
+    name = f"{setting.method}/{figure}/{group}/{of}"
+    rng = np.random.default_rng([setting.seed, zlib.crc32(name.encode())])
+    low, high = interval(table, rng, average, clusters=clusters, repeats=_REPEATS).stated
     told = _told(setting)
     return Line(
         figure=figure,
@@ -117,8 +114,8 @@ def line(
         of=of,
         value=number(score),
         unit=unit,
-        low=ends[0],
-        high=ends[1],
+        low=low,
+        high=high,
         people=score.people,
         joints=score.joints,
         skipped=score.skipped - no_pose,

@@ -13,7 +13,7 @@ import numpy as np
 
 from lidarpose.data.readers.items import SEEN
 from lidarpose.errors import InputError, MissingExtra
-from lidarpose.evaluate.bootstrap import LEAST_UNITS, interval, paired_interval
+from lidarpose.evaluate.bootstrap import interval, paired_interval
 from lidarpose.evaluate.disturb import DISTURBANCES
 from lidarpose.evaluate.groups import joint_groups
 from lidarpose.evaluate.judged import Judged, gathered
@@ -226,22 +226,17 @@ def _point(
     found = answers.errors()
     both = ~np.isnan(found) & ~np.isnan(base)
     first, second = np.where(both, found, np.nan), np.where(both, base, np.nan)
-    ends = [None] * 4
-    own = interval(found, rng, clusters=clusters, repeats=_REPEATS)
-    more = paired_interval(first, second, rng, clusters=clusters, repeats=_REPEATS)
-    if own.units >= LEAST_UNITS:
-        ends[:2] = number(own.low), number(own.high)
-    if more.units >= LEAST_UNITS:
-        ends[2:] = number(more.low), number(more.high)
+    low, high = interval(found, rng, clusters=clusters, repeats=_REPEATS).stated
+    increase_low, increase_high = paired_interval(first, second, rng, clusters=clusters, repeats=_REPEATS).stated
     return Point(
         amount=amount,
         label=label,
         mpjpe=number(mean(found)),
-        low=ends[0],
-        high=ends[1],
+        low=low,
+        high=high,
         increase=number(mean(first - second)),
-        increase_low=ends[2],
-        increase_high=ends[3],
+        increase_low=increase_low,
+        increase_high=increase_high,
         people=len(found),
         no_pose=int((~answers.posed).sum()),
         points=float(np.median(counts)),

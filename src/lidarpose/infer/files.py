@@ -70,7 +70,7 @@ def predict(
     R_boxes_input = UP_AXES.get(up, UP_AXES["z"])
     origin = np.zeros(3) if sensor_origin is None and boxes is not None else as_origin(sensor_origin)
     found = None if boxes is None else _boxes(boxes)
-    cloud = _within_reach(path, read_points(path, columns=columns))
+    cloud = _only_returns(path, read_points(path, columns=columns))
     read = time.perf_counter()
     points = cloud.points @ R_house_input.T
     if found is None:
@@ -141,7 +141,7 @@ def _boxes(given: object) -> list[Box]:
     return read_boxes(given)
 
 
-def _within_reach(path: object, cloud: Cloud) -> Cloud:
+def _only_returns(path: object, cloud: Cloud) -> Cloud:
     points, notes = only_returns(cloud.points)
     if not len(points):
         found = f"none within {FARTHEST:g} m" if cloud.points.any() else "only 0,0,0, which are no returns"

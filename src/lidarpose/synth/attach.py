@@ -42,8 +42,7 @@ def fixed(name: str, mesh: Mesh, frame: Callable[[Points], Rows], **more: object
     """A prop that keeps its shape."""
 
     def where(points: Points) -> np.ndarray:
-        rows, origin = frame(points)
-        return mesh.vertices @ np.array(rows, np.float32) + np.array(origin, np.float32)
+        return mesh.placed(*frame(points)).vertices
 
     return Prop(name=name, mesh=mesh, where=where, **more)
 

@@ -29,6 +29,10 @@ class Mesh:
         """Stretched along x, y and z."""
         return Mesh(self.vertices * np.asarray(size, np.float32), self.faces)
 
+    def placed(self, rows: list, origin: list) -> "Mesh":
+        """In another frame: rows (3, 3) say where x, y and z go, then `origin` (3,) m is added."""
+        return Mesh(self.vertices @ np.array(rows, np.float32) + np.array(origin, np.float32), self.faces)
+
 
 def union(meshes: list[Mesh]) -> Mesh:
     """All meshes as one; their faces stand one mesh after the other."""

@@ -78,7 +78,7 @@ def pram() -> Mesh:
     ]
     rods = []
     for y in (-0.24, 0.24):
-        rods += [_rod((0.0, y, 1.0), (0.98, y, 0.13)), _rod((0.8, y, 0.5), (0.2, y, 0.13))]
+        rods += [rod((0.0, y, 1.0), (0.98, y, 0.13)), rod((0.8, y, 0.5), (0.2, y, 0.13))]
     handle = box((0.03, 0.5, 0.03)).moved((0, 0, 0.985))
     return union([_hull(rings), _hull(folded), *rods, handle, _wheels(0.13, (0.2, 0.98), 0.26, 0.04, sides=4)])
 
@@ -90,7 +90,7 @@ def cart() -> Mesh:
     high = np.array([(0.08, 0.26), (0.95, 0.26), (0.95, -0.26), (0.08, -0.26)])
     load = _hull([np.column_stack([low, np.full(4, 0.45)]), np.column_stack([high, np.full(4, 0.92)])])
     bed = box((0.85, 0.46, 0.05)).moved((0.52, 0, 0.16))
-    rods = [_rod((0.12, y, 0.18), (0.0, y, 1.0)) for y in (-0.24, 0.24)]
+    rods = [rod((0.12, y, 0.18), (0.0, y, 1.0)) for y in (-0.24, 0.24)]
     handle = box((0.035, 0.5, 0.035)).moved((0, 0, 0.98))
     return union([load, bed, *rods, handle, _wheels(0.07, (0.16, 0.88), 0.22, 0.035)])
 
@@ -134,7 +134,7 @@ def bicycle() -> Mesh:
     """Frame, saddle and wheels; bars and pedals depend on the rider."""
     seat, head, low = (0.03, 0.78), (0.59, 0.82), (0.63, 0.7)
     tubes = [((0.0, 0.94), CRANK), (CRANK, REAR), (REAR, seat), (seat, head), (CRANK, low), (NECK, FRONT)]
-    parts = [_rod((ax, 0.0, az), (bx, 0.0, bz), 0.018) for (ax, az), (bx, bz) in tubes]
+    parts = [rod((ax, 0.0, az), (bx, 0.0, bz), 0.018) for (ax, az), (bx, bz) in tubes]
     saddle = [np.array([(-0.13, 0.08, z), (0.15, 0.02, z), (0.15, -0.02, z), (-0.13, -0.08, z)]) for z in (0.92, 0.97)]
     parts += [_hull(saddle), *(rim(0.34, 0.02, sides=11).moved((x, 0, z)) for x, z in (REAR, FRONT))]
     return union(parts)
@@ -175,10 +175,9 @@ def rod_rows(start: tuple, end: tuple, radius: float) -> tuple[list, list]:
     return [[radius * a for a in aside], [radius * a for a in over], [dx, dy, dz]], list(start)
 
 
-def _rod(start: tuple, end: tuple, radius: float = 0.015) -> Mesh:
-    rows, origin = rod_rows(start, end, radius)
-    mesh = tube(3)
-    return Mesh(mesh.vertices @ np.array(rows, np.float32) + np.float32(origin), mesh.faces)
+def rod(start: tuple, end: tuple, radius: float = 0.015) -> Mesh:
+    """A three-sided `tube` between two points (x, y, z)."""
+    return tube(3).placed(*rod_rows(start, end, radius))
 
 
 def _wheels(radius: float, x: tuple, half: float, wide: float, *, sides: int = 5) -> Mesh:

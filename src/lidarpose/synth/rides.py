@@ -91,6 +91,8 @@ def wheelchair(points: Points, u: list[float]) -> Prop | None:
 
 # a pedal at its lowest is this high above the ground, the saddle this far below the middle of the hips, m
 _PEDAL, _SADDLE = 0.1, 0.05
+# radius of the bars and cranks, of a bicycle of full size, m
+_TUBE = 0.016
 
 
 def bicycle(points: Points, u: list[float]) -> Prop:
@@ -103,7 +105,7 @@ def bicycle(points: Points, u: list[float]) -> Prop:
     bar_x, bar_z = (sum(h[0] for h in held) / len(held), sum(h[2] for h in held) / len(held)) if held else (0.52, 1.05)
     neck = (meshes.NECK[0], 0.0, meshes.NECK[1])
     parts = [meshes.bicycle(), meshes.unit_box().scaled((0.04, 0.56, 0.035)).moved((bar_x, 0, bar_z - 0.03))]
-    still = union([*parts, _rod(neck, (bar_x, 0.0, bar_z))])
+    still = union([*parts, meshes.rod(neck, (bar_x, 0.0, bar_z), _TUBE)])
 
     def shape(p: Points) -> Mesh:
         """In the bicycle's frame, the pedals where the feet are."""
@@ -111,8 +113,7 @@ def bicycle(points: Points, u: list[float]) -> Prop:
 
     def where(p: Points) -> np.ndarray:
         x, y, _ = _hips(p)
-        rows = upright(p, (size, size, size))
-        return shape(p).vertices @ np.array(rows, np.float32) + np.array([x, y, -_PEDAL], np.float32)
+        return shape(p).placed(upright(p, (size, size, size)), [x, y, -_PEDAL]).vertices
 
     return Prop(name="bicycle", mesh=shape(points), where=where, lift=_PEDAL)
 
@@ -132,10 +133,4 @@ def _pedals(feet: list[tuple[float, float, float]]) -> Iterator[Mesh]:
         long = max((dx * dx + dz * dz) ** 0.5, 1e-6)
         pedal = (ax + 0.17 * dx / long, side, az + 0.17 * dz / long)
         yield meshes.unit_box().scaled((0.09, 0.09, 0.025)).moved(pedal)
-        yield _rod((ax, 0.6 * side, az), (pedal[0], 0.6 * side, pedal[2]))
-
-
-def _rod(start: tuple[float, float, float], end: tuple[float, float, float]) -> Mesh:
-    rows, origin = meshes.rod_rows(start, end, 0.016)
-    bar = meshes.tube(3)
-    return Mesh(bar.vertices @ np.array(rows, np.float32) + np.float32(origin), bar.faces)
+        yield meshes.rod((ax, 0.6 * side, az), (pedal[0], 0.6 * side, pedal[2]), _TUBE)

@@ -144,7 +144,7 @@ def _view(person: StoredPerson, kind: Augmentation, rng: np.random.Generator) ->
 
 
 def _kept(person: StoredPerson, keep: np.ndarray) -> StoredPerson:
-    if keep.sum() < min(LEAST_POINTS, len(person.points)):
+    if keep.all() or keep.sum() < LEAST_POINTS:
         return person
     # a joint whose points are all gone is not seen any more
     gone = _near(person, np.ones_like(keep)) & ~_near(person, keep)
