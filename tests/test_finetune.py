@@ -372,7 +372,9 @@ def test_sequences_are_held_out_unless_the_dataset_has_a_split_for_it(datasets):
     # and one sequence for training leaves nobody
     job = job_of(Finetune(data=(str(datasets["sloper4d"]),), mix=0.0))
     assert not job.card["held_out_sequences"] and not job.validation()
-    assert job.warnings == ("nobody is left to validate on: no split val, and too few sequences to hold one out",)
+    assert job.warnings == (
+        "nobody is left to validate on: no split val, and no sequence is held out (--hold-out, or too few of them)",
+    )
 
 
 # --- runs

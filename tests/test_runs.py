@@ -459,6 +459,8 @@ def test_named_recipes():
         recipe(Finetune, "paper", data=("a",))
     fine = recipe(Finetune, "paper", data=("a",), init="first.safetensors")
     assert (fine.rate, fine.epochs, fine.mix, fine.augment, fine.keep_anchors) == (5e-4, 50, 0, "paper", False)
+    # the paper's figures are of networks that learned from every training sequence
+    assert fine.hold_out == 0
     with pytest.raises(InputError, match="fine-tuning needs a dataset"):
         recipe(Finetune)
 

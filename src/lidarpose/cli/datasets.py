@@ -24,7 +24,9 @@ def add(commands) -> None:
     )
     synth.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
     synth.add_argument("--hard", type=float, default=1.0, metavar="H", help="difficulty from 0 (easy) to 1 (default)")
-    synth.add_argument("--workers", type=int, default=1, metavar="N", help="number of processes (default 1)")
+    synth.add_argument(
+        "--workers", type=int, default=1, metavar="N", help="number of processes, at most one a shard (default 1)"
+    )
     synth.add_argument("--motion", metavar="FILE", help="take poses from captured motion: a file or a folder")
     synth.add_argument("--subjects", metavar="A,B", help="subjects to use: the first part of a clip's name")
     synth.add_argument(
@@ -61,7 +63,9 @@ def add(commands) -> None:
     prepare.add_argument(
         "--no-level", action="store_true", help="lidarhuman26m: keep the release's frame, as the LiDAR was mounted"
     )
-    prepare.add_argument("--workers", type=int, default=1, metavar="N", help="number of processes (default 1)")
+    prepare.add_argument(
+        "--workers", type=int, default=1, metavar="N", help="number of processes, at most one a shard (default 1)"
+    )
 
     sensors = commands.add_parser(
         "sensors", help="list the simulated sensors", description="Lists the simulated sensors by name."

@@ -28,7 +28,7 @@ from lidarpose.train.task import Task
 # people to validate on; synthesized ones are of a seed that no run learns from
 VALIDATION = 256
 _VALIDATION_SEED = 2**31 - 7
-_UNWATCHED = "nobody is left to validate on: no split val, and too few sequences to hold one out"
+_UNWATCHED = "nobody is left to validate on: no split val, and no sequence is held out (--hold-out, or too few of them)"
 # of fewer sequences none is held out
 _LEAST_SEQUENCES = 3
 

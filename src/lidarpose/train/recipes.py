@@ -105,7 +105,9 @@ class Pretrain(Recipe):
     init: str = _setting("", "weights to begin with, of this size or smaller: bundled, or a checkpoint")
     scene: str = _setting("wild", "wild, paper or reference")
     people: int = _setting(300_000, "seen in all")
-    easy: float = _setting(0.05, "share of the run in which difficulty rises to full; that of shards is what it is")
+    easy: float = _setting(
+        0.05, "share of the run in which the largest difficulty rises to full; that of shards is what it is"
+    )
     captured: float = _setting(0.5, "share of poses from captured motion, where clips are given")
     motion: str | None = _setting(None, "captured motion to take poses from: a file or a folder")
     subjects: tuple[str, ...] = _setting((), "those of its clips to learn from, by the first part of names")
@@ -183,8 +185,9 @@ def finetune_default() -> dict:
 
 
 def finetune_paper() -> dict:
-    """Paper: implementation details. 50 epochs on the dataset alone, anchors and heads begin anew."""
-    return _RELEASED | {"init": "", "epochs": 50.0, "augment": "paper", "mix": 0.0, "keep_anchors": False}
+    """Paper: implementation details. 50 epochs on all training sequences and no others; anchors and heads anew."""
+    own = {"init": "", "epochs": 50.0, "augment": "paper", "mix": 0.0, "hold_out": 0.0, "keep_anchors": False}
+    return _RELEASED | own
 
 
 RECIPES = {
