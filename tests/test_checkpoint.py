@@ -1,5 +1,6 @@
 """Weights on disk: there and back, and one line for every fault."""
 
+import copy
 import json
 from pathlib import Path
 
@@ -140,14 +141,48 @@ def test_a_missing_an_extra_and_a_misshapen_tensor(stored, tmp_path):
     assert_one_line(wrong, "part.weight should be (25, 48) by its configuration, got (24, 48)")
 
 
-@pytest.mark.parametrize("change", [{"channels": [48, 64, 2**20]}, {"max_voxels": 10, "blocks": [1, 10**7, 1]}])
+@pytest.mark.parametrize("change", [{"channels": [48, 64, 2**14]}, {"max_voxels": 10, "blocks": [1, 16_000, 1]}])
 def test_nothing_is_allocated_for_what_a_header_says(stored, tmp_path, change):
-    """A network of terabytes, or of millions of layers, in a file of half a megabyte."""
+    """A network of gigabytes, or of thousands of layers, in a file of half a megabyte."""
     path = rewritten(stored, tmp_path / "x.safetensors", header=lambda h: h | {"config": h["config"] | change})
     assert_one_line(path, "get the file again")
 
 
-@pytest.mark.parametrize("value", [torch.full((25,), torch.nan), torch.zeros(25, dtype=torch.int32)])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"channels": [48, 3_200_000_000_000, 96]},
+        {"channels": [48, 10**7, 96]},
+        {"parts": 10**19},
+        {"convolution": 10**9},
+    ],
+)
+def test_no_width_is_taken_that_nobody_trains(stored, tmp_path, change):
+    path = rewritten(stored, tmp_path / "x.safetensors", header=lambda h: h | {"config": h["config"] | change})
+    assert_one_line(path, f"{next(iter(change))} must be", "16384")
+
+
+def test_weights_that_could_not_be_loaded_are_not_written(network, tmp_path):
+    out = tmp_path / "x.safetensors"
+    large = copy.deepcopy(network)
+    with torch.no_grad():
+        large.part.bias[0] = 1e5
+    save_checkpoint(out, large, card={})
+    before = out.read_bytes()
+    with pytest.raises(InputError, match="part.bias is not finite as float16"):
+        save_checkpoint(out, large, card={}, half=True)
+    assert out.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        torch.full((25,), torch.nan),
+        torch.zeros(25, dtype=torch.int32),
+        # finite until they are float32
+        torch.full((25,), 1e300, dtype=torch.float64),
+    ],
+)
 def test_a_tensor_that_is_no_finite_float(stored, tmp_path, value):
     path = rewritten(stored, tmp_path / "x.safetensors", tensors=lambda t: t | {"part.bias": value})
     assert_one_line(path, "tensor part.bias", "not finite or no floats")
@@ -252,4 +287,13 @@ def test_released_weights_come_in(tmp_path):
 def test_a_refused_import_writes_nothing(tmp_path, stored):
     with pytest.raises(InputError, match="is missing"):
         import_released(stored, tmp_path / "in.safetensors", config="waymo")
-    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(InputError, match=r"give a name that ends in \.safetensors"):
+        import_released(TINY_DAPT, tmp_path / "in.onnx")
+    whole = load_file(TINY_DAPT)
+    name = next(name for name, value in whole.items() if value.is_floating_point())
+    with safe_open(str(TINY_DAPT), framework="pt") as file:
+        metadata = file.metadata()
+    save_file(whole | {name: whole[name].int()}, tmp_path / "whole.safetensors", metadata=metadata)
+    with pytest.raises(InputError, match=f"tensor {name} holds numbers that are not finite or no floats"):
+        import_released(tmp_path / "whole.safetensors", tmp_path / "in.safetensors")
+    assert [path.name for path in tmp_path.iterdir()] == ["whole.safetensors"]

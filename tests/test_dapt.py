@@ -646,12 +646,25 @@ def test_bins_of_the_released_networks():
         ({"ranges": ((1.0, -1.0),) * 3}, "ranges must be three pairs"),
         ({"bins": (), "ranges": (), "coordinates": False}, "it would predict nothing"),
         ({"parts": 1}, "parts must be 0"),
+        ({"parts": 10**19}, "parts must be 0 .* from 2 to 16384"),
+        ({"bins": (10**19, 1, 1)}, "bins must be three"),
+        ({"patch": 10**6}, "patch must be a whole number from 1 to 16384"),
         ({"legacy": 1}, "legacy must be true or false"),
     ],
 )
 def test_bad_configurations(change, message):
     with pytest.raises(InputError, match=message):
         replace(TINY, **change)
+
+
+def test_no_voxels_wider_than_cells_are_counted():
+    sizes = {"encoder_depths": (1,) * 8, "encoder_channels": (8,) * 8, "encoder_heads": (1,) * 8}
+    sizes |= {"decoder_depths": (1,) * 7, "decoder_channels": (8,) * 7, "decoder_heads": (1,) * 7}
+    sizes |= {"anchor_channels": (8,) * 8, "anchor_heads": 1}
+    config = replace(TINY, strides=(4, 4, 4, 4, 4, 8, 8), **sizes)
+    assert len(build_tables([person(50)], config).levels) == 8
+    with pytest.raises(InputError, match="65536 in all at most"):
+        replace(config, strides=(8,) * 7)
 
 
 def test_wider_strides():
@@ -708,7 +721,7 @@ def test_import_by_name(tmp_path):
         ),
         (
             lambda t: t["heads.query.fcs.0.fc1.bias"].fill_(np.nan),
-            "tensor heads.query.fcs.0.fc1.bias has values that are",
+            "tensor heads.query.fcs.0.fc1.bias holds numbers that are not finite",
         ),
         (
             lambda t: t["heads.query.coord_range"].mul_(2),
@@ -751,6 +764,7 @@ def test_import_with_a_wrong_configuration(config, message):
         ({"in_channels": 6}, "in_channels must be 3"),
         ({"dec_kp_mixer": "linear"}, "dec_kp_mixer must be 'attn'"),
         ({"num_keypoints": 17}, "num_keypoints must be 14, 15 or 24"),
+        ({"num_keypoints": [14]}, "num_keypoints must be 14, 15 or 24"),
         ({"enc_patch_size": [1024, 512, 1024, 1024, 1024]}, "one number throughout"),
         ({"grid": 7}, "grid must be .*of the heatmaps, got 7"),
     ],

@@ -157,3 +157,12 @@ def test_bad_widths_say_what_is_wrong(change, message):
         scan_wide(*wall(5.0, (-1, 1)), sensor("vlp-16"), **{"divergence": 0.003, **change})
     with pytest.raises(InputError, match="range_max"):
         cast_wide_ray_list(*wall(5.0, (-1, 1)), [[1.0, 0, 0]], divergence=0.003, range_max=-1)
+
+
+@pytest.mark.parametrize("sub_beams", [2, 3])
+def test_bad_wide_rays_are_counted_as_they_were_given(sub_beams):
+    mesh, wide = wall(5.0, (-1, 1)), {"divergence": 0.003, "sub_beams": sub_beams}
+    with pytest.raises(InputError, match="directions must be longer than 0, but number 1 is zero"):
+        cast_wide_ray_list(*mesh, [[1.0, 0, 0], [0, 0, 0]], **wide)
+    with pytest.raises(InputError, match=r"time must be \(1,\), one a ray, got \(2,\)"):
+        cast_wide_ray_list(*mesh, [[1.0, 0, 0]], time=[0.0, 1.0], **wide)

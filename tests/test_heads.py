@@ -67,6 +67,8 @@ def test_nothing_seen_and_wrong_heights():
     assert len(scan(far.vertices, far.faces, AV2).points) == 0
     with pytest.raises(InputError, match="origin_heights must be"):
         replace(AV2, origin_heights=np.zeros(3))
+    with pytest.raises(InputError, match="origin_heights must be a list of finite heights in metres"):
+        replace(AV2, origin_heights=np.full(64, np.nan))
     body = mesh(0.2)
     with pytest.raises(InputError, match="several origins"):
         scan_people(body.vertices[None], body.faces, AV2)

@@ -191,6 +191,10 @@ def test_the_mix_is_obeyed_and_checked():
         drawn(3, 0, walk=0)
     with pytest.raises(InputError, match="n must be a whole number of at least 0"):
         drawn(-1)
+    for weight in (np.inf, np.nan, "a"):
+        with pytest.raises(InputError, match="the mix's weight of walk must be a finite number"):
+            drawn(2, walk=weight)
+    np.testing.assert_array_equal(drawn(40, walk=1e308, run=1e308).rotations, drawn(40, walk=1, run=1).rotations)
 
 
 def test_sample_poses():

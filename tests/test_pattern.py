@@ -1,5 +1,7 @@
 """Rosettes and depth cameras: what they send, and what of it comes back from a body that moves."""
 
+import pickle
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -34,6 +36,17 @@ def test_rays_are_sorted_unit_and_inside_the_field_of_view(name):
         np.testing.assert_allclose(np.arcsin(rays.directions[:, 2]), rays.elevation, atol=1e-9)
         with pytest.raises(ValueError, match="read-only"):
             rays.directions[0] = 0
+
+
+@pytest.mark.parametrize("name", BY_NAME)
+def test_a_pattern_goes_to_another_process_without_its_frames(name):
+    pattern = BY_NAME[name]
+    rays = pattern.frame(1)
+    stored = pickle.dumps(pattern)
+    assert len(stored) < 10_000
+    again = pickle.loads(stored).frame(1)
+    assert not again.time.flags.writeable
+    np.testing.assert_array_equal(again.directions, rays.directions)
 
 
 @pytest.mark.parametrize(

@@ -37,12 +37,35 @@ def written(path, content):
 def test_tables_are_read_in_any_order_of_lasers(tmp_path, name, content):
     found = load_sensor(written(tmp_path / name, content))
     np.testing.assert_allclose(np.degrees(found.elevations), sorted(ANGLES))
-    assert found.name == name[0] and found.columns == (512 if name == "d.json" else 1800)
+    # every Ouster sensor has 512 columns or their double, once more or twice
+    assert found.name == name[0] and found.columns == {"c.json": 1024, "d.json": 512}.get(name, 1800)
     if name in ("c.json", "f.csv"):
         offsets = {"c.json": [4.2, 1.4, -1.4, -4.2], "f.csv": [-4.0, -3.0, -2.0, -1.0]}[name]
         np.testing.assert_allclose(np.degrees(found.azimuth_offsets), offsets)
     # the same through the name, as on the command line
     np.testing.assert_array_equal(sensor(str(tmp_path / name)).elevations, found.elevations)
+
+
+@pytest.mark.parametrize(
+    ("named", "sign"),
+    [("azimuth_offset", 1), ("azimuth_offset_deg", 1), ("Azimuth offsets (deg)", 1), ("azimuth-offsets-deg", 1)]
+    + [("azimuth", -1), ("azimuth_deg", -1), ("Horizontal", -1)],
+)
+def test_offsets_of_a_csv_by_any_of_their_names(tmp_path, named, sign):
+    found = load_sensor(written(tmp_path / "a.csv", f"laser,elevation_deg,{named}\n1,-1,5\n2,0,3\n3,1,2\n"))
+    np.testing.assert_allclose(np.degrees(found.azimuth_offsets), np.multiply(sign, [5, 3, 2]))
+
+
+@pytest.mark.parametrize(
+    ("told", "columns"),
+    [
+        ({"lidar_mode": "MODE_2048x10"}, 2048),
+        ({"lidar_mode": "4096x5"}, 4096),
+        ({"lidar_mode": "unknown", "data_format": {"columns_per_frame": 512}}, 512),
+    ],
+)
+def test_columns_of_an_ouster_sensor(tmp_path, told, columns):
+    assert load_sensor(written(tmp_path / "a.json", {"beam_altitude_angles": ANGLES} | told)).columns == columns
 
 
 def test_the_own_form_sets_every_field(tmp_path):
@@ -76,6 +99,8 @@ def test_the_own_form_sets_every_field(tmp_path):
         ("a.json", {"elevations_deg": ANGLES, "tilt_deg": 400}, "within .*90 degrees, got 400"),
         ("a.json", {"elevations_deg": ANGLES, "range_max": "far"}, "range_max must be a number"),
         ("a.json", {"elevations_deg": ANGLES, "range_min": 9.0, "range_max": 1.0}, "min < max"),
+        ("a.json", {"beam_altitude_angles": ANGLES, "lidar_mode": 5}, "a lidar_mode such as 1024x10, got '5'"),
+        ("a.csv", "elevation,azimuths\n1,2\n3,4\n", "unknown column 'azimuths': name it azimuth_offset"),
         ("a.csv", "\n\n", "no rows"),
         ("a.csv", "1,2\n3,4\n", "no header"),
         ("a.csv", "laser,azimuth\n1,2\n", "no column named elevation"),

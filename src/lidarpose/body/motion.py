@@ -34,7 +34,7 @@ from lidarpose.body.gait import GAITS, strides
 from lidarpose.body.latents import Latents, draw_latents
 from lidarpose.body.retarget import heading, mean_adult_joints, without_yaw
 from lidarpose.body.solid import body_frames, capsule_ends, depths, undersides
-from lidarpose.errors import InputError, check_name, whole
+from lidarpose.errors import InputError, check_finite, check_name, whole
 from lidarpose.geometry import rotation_about
 from lidarpose.skeleton import SMPL24
 
@@ -232,11 +232,14 @@ def sample_poses(n: int, seed: int) -> np.ndarray:
 def _shares(mix: dict[str, float] | None) -> np.ndarray:
     if mix is None:
         return SHARES
-    for name in mix:
+    for name, weight in mix.items():
         check_name("kind of pose", name, KINDS)
+        check_finite(f"the mix's weight of {name}", weight)
     shares = np.array([float(mix.get(name, 0)) for name in KINDS])
-    if (shares < 0).any() or not shares.sum() > 0:
+    if (shares < 0).any() or not shares.any():
         raise InputError(f"a mix needs weights of 0 or more and one above 0, got {mix}")
+    # a sum of large ones may be infinite
+    shares /= shares.max()
     return shares / shares.sum()
 
 

@@ -170,7 +170,7 @@ class SmplBody:
     @cached_property
     def _head_vertices(self) -> tuple[int, np.ndarray]:
         """The nose's vertex and the two ears'; shapes move them with the head."""
-        head = np.flatnonzero(_on_smpl(self.weights, self.parents).argmax(1) == _HEAD)
+        head = np.flatnonzero(on_smpl(self.weights, self.parents).argmax(1) == _HEAD)
         x, _, z = self.template[head].T
         return int(head[z.argmax()]), head[[x.argmax(), x.argmin()]]
 
@@ -247,8 +247,8 @@ def _body(path: object, raw: Mapping) -> SmplBody:
     height = np.ptp(template[:, 1])
     if not _HEIGHTS[0] < height < _HEIGHTS[1]:
         raise file_error(path, f"v_template is {height:.3g} high along y; expected metres, y up")
-    on_smpl = _on_smpl(weights, parents)
-    if not (on_smpl.argmax(1) == _HEAD).any():
+    owned = on_smpl(weights, parents)
+    if not (owned.argmax(1) == _HEAD).any():
         raise file_error(path, "no vertex belongs to the head; was the file changed?")
     faces = faces.astype(np.int32)
     return SmplBody(
@@ -260,7 +260,7 @@ def _body(path: object, raw: Mapping) -> SmplBody:
         weights=weights,
         parents=parents,
         faces=faces,
-        face_part=(1 + on_smpl[faces].sum(1).argmax(1)).astype(np.uint8),
+        face_part=(1 + owned[faces].sum(1).argmax(1)).astype(np.uint8),
         source=str(path),
     )
 
@@ -295,7 +295,7 @@ def _parents(path: object, tree: np.ndarray) -> np.ndarray:
     return parents
 
 
-def _on_smpl(weights: np.ndarray, parents: np.ndarray) -> np.ndarray:
+def on_smpl(weights: np.ndarray, parents: np.ndarray) -> np.ndarray:
     """(V, 24): what belongs to SMPL's joints; what hangs on a wrist is its hand, what hangs on the head is the head."""
     owner = np.empty(len(parents), int)
     for j, parent in enumerate(parents):

@@ -8,7 +8,7 @@ n people, V vertices, S shape coefficients. Lengths in metres, house frame.
 import numpy as np
 
 from lidarpose.body.rig import Rig
-from lidarpose.body.smpl import SmplBody
+from lidarpose.body.smpl import SmplBody, on_smpl
 from lidarpose.errors import InputError
 from lidarpose.skeleton import SMPL24
 
@@ -17,8 +17,6 @@ _MOST_DEVIATIONS = 2.5
 # kg/m3, of a person with air in the lungs
 _DENSITY = 980.0
 _WEIGHTS = 4
-_SHARED = SMPL24.index("left_hand")
-_OWNERS = {SMPL24.index(f"{side}_wrist"): SMPL24.index(f"{side}_hand") for side in ("left", "right")}
 
 
 def rig_of(body: SmplBody, rng: np.random.Generator, *, people: int = 512, coefficients: int = 10) -> Rig:
@@ -64,12 +62,7 @@ def _at_rest(body: SmplBody, betas: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 def _strongest(body: SmplBody) -> tuple[np.ndarray, np.ndarray]:
     """Joints (V, 4) int32 of SMPL24 and weights (V, 4) float32, strongest first, unused ones 0."""
-    owner = np.empty(len(body.parents), int)
-    for joint, parent in enumerate(body.parents):
-        # fingers hang on a wrist, jaw and eyes on the head
-        owner[joint] = joint if joint < _SHARED else _OWNERS.get(owner[parent], owner[parent])
-    grouped = np.zeros((len(body.weights), len(SMPL24)))
-    np.add.at(grouped.T, owner, body.weights.T)
+    grouped = on_smpl(body.weights, body.parents)
     index = np.argsort(-grouped, 1, kind="stable")[:, :_WEIGHTS]
     weight = np.maximum(np.take_along_axis(grouped, index, 1), 0)
     weight /= weight.sum(1, keepdims=True)

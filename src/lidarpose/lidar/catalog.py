@@ -91,7 +91,7 @@ SENSORS: dict[str, Sensor | RayPattern] = {
             range_max=120.0,
             height=1.73,
         ),
-        # Ouster OS1, OS0 and OS2, uniform. Beams of a column leave in four azimuth groups 8 columns of 2048 apart:
+        # Ouster OS1, OS0 and OS2, uniform. Beams of a column leave in four azimuth groups 8 columns of 1024 apart:
         # whole columns, so they shift when a beam fires, not where it points. Real units deviate by some 0.01 deg.
         Sensor(
             name="os1-64",

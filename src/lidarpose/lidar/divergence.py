@@ -19,7 +19,15 @@ from lidarpose.lidar.divergence_kernels import merge_echoes, scan_diverging
 from lidarpose.lidar.heads import scan_heads
 from lidarpose.lidar.hits import Hits
 from lidarpose.lidar.raycast import beams_of, cast_ray_list, scan
-from lidarpose.lidar.raycast_input import as_culled, as_mesh, as_points, check_margin, read_only
+from lidarpose.lidar.raycast_input import (
+    as_culled,
+    as_directions,
+    as_mesh,
+    as_points,
+    as_times,
+    check_margin,
+    read_only,
+)
 from lidarpose.lidar.sensor import Sensor
 
 # m: c tau / 2 of a pulse of 5 ns, as spinning sensors send it
@@ -91,8 +99,9 @@ def cast_wide_ray_list(
     if divergence == 0:
         return cast_ray_list(vertices, faces, directions, moved=moved, time=time)
     offsets, weights = footprint(divergence, sub_beams)
-    rays = spread(as_points("directions", directions), offsets)
-    time = None if time is None else np.repeat(time, rays.shape[1])
+    directions = as_directions(directions)
+    rays = spread(directions, offsets)
+    time = None if time is None else np.repeat(as_times(time, len(directions)), rays.shape[1])
     distance, face = cast_ray_list(vertices, faces, rays.reshape(-1, 3), moved=moved, time=time)
     return merge_echoes(
         distance.reshape(rays.shape[:2]).astype(float), face.reshape(rays.shape[:2]), weights.reshape(-1),

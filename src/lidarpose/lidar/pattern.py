@@ -8,7 +8,6 @@ Legend: N rays of a frame, V vertices, F faces, n hits.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
@@ -67,11 +66,18 @@ class RayPattern:
             raise InputError(
                 f"RayPattern.range_sigma must be >= 0 m and dropout in [0, 1), got {self.range_sigma}, {self.dropout}"
             )
-        object.__setattr__(self, "_sorted", lru_cache(maxsize=None)(self._sort))
+        object.__setattr__(self, "_made", {})
+
+    def __getstate__(self) -> dict:
+        # frames are made again in another process
+        return self.__dict__ | {"_made": {}}
 
     def frame(self, number: int) -> Rays:
         """The rays of frame `number`; they repeat after `frames`. Made once and kept, read-only."""
-        return self._sorted(number % self.frames)
+        number %= self.frames
+        if number not in self._made:
+            self._made[number] = self._sort(number)
+        return self._made[number]
 
     def _sort(self, number: int) -> Rays:
         azimuth, elevation, time, line = self.rays(number)

@@ -31,6 +31,7 @@ from lidarpose.lidar.hits import Hits
 from lidarpose.lidar.raycast_input import (
     as_angles,
     as_culled,
+    as_directions,
     as_faces,
     as_mesh,
     as_points,
@@ -118,8 +119,10 @@ def scan(
     cull: the faces, all (True) or a mask (F,), of closed meshes whose faces are counter-clockwise seen from outside
     (see `is_closed`): the same hits, sooner. Other faces count from both sides.
     A beam whose nearest hit is outside the sensor's range limits returns nothing. A sensor inside a mesh sees it from
-    inside. Nothing is random. The heads of a
-    sensor with several origins are cast one by one. Raises InputError.
+    inside. Nothing is random. The heads of a sensor with several origins are cast one by one. Raises InputError.
+
+    The window holds vertices, not edges: as seen from the sensor, the upper edge of a near wall rises above its two
+    ends. A coarse mesh needs a `margin`, or a finer one as `window_vertices`.
     """
     if sensor.heads:
         return scan_heads(
@@ -193,7 +196,8 @@ def is_closed(faces: np.ndarray) -> bool:
 def find_window(vertices: np.ndarray, sensor: Sensor, *, margin: float = 0.0) -> Window:
     """The smallest window of the sensor's beams that holds the vertices (V, 3) m, `margin` rad wider on each side.
 
-    Paper: Eq. 3 (no margin). A body around the sensor gets the whole turn. Raises InputError.
+    Paper: Eq. 3 (no margin). A body around the sensor gets the whole turn. Long edges may rise above it, see `scan`.
+    Raises InputError.
     """
     vertices = as_points("vertices", vertices)
     check_margin(margin)
@@ -219,10 +223,8 @@ def cast_ray_list(
     Faces count from both sides. Raises InputError.
     """
     vertices, faces = as_mesh(vertices, faces)
-    directions = as_points("directions", directions)
+    directions = as_directions(directions)
     length = np.linalg.norm(directions, axis=1)
-    if (length == 0).any():
-        raise InputError(f"directions must be longer than 0, but number {int(np.argmin(length))} is zero")
     if time is not None:
         time = as_times(time, len(directions))
     if moved is None:

@@ -87,6 +87,15 @@ def check_margin(margin: float) -> None:
         raise InputError(f"margin must be a finite angle in radians, got {margin}")
 
 
+def as_directions(directions: np.ndarray) -> np.ndarray:
+    """(N, 3) float64 m, none of them zero."""
+    directions = as_points("directions", directions)
+    length = np.linalg.norm(directions, axis=1)
+    if (length == 0).any():
+        raise InputError(f"directions must be longer than 0, but number {int(np.argmin(length))} is zero")
+    return directions
+
+
 def as_times(time: np.ndarray, count: int) -> np.ndarray:
     """(count,) float64 in [0, 1]."""
     try:

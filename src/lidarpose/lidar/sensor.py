@@ -67,7 +67,7 @@ class Sensor:
                 raise InputError(f"Sensor.azimuth_offsets must be {elevations.shape}, one a ring, got {offsets.shape}")
             object.__setattr__(self, "azimuth_offsets", offsets)
         if self.origin_heights is not None:
-            heights = _frozen("origin_heights", self.origin_heights)
+            heights = _frozen("origin_heights", self.origin_heights, "heights in metres")
             if heights.shape != elevations.shape:
                 raise InputError(f"Sensor.origin_heights must be {elevations.shape}, one a ring, got {heights.shape}")
             object.__setattr__(self, "origin_heights", heights)
@@ -148,12 +148,12 @@ class Sensor:
         return columns[:, None] + self.azimuth_shifts[window.row0 : window.row0 + window.rows]
 
 
-def _frozen(name: str, values: np.ndarray) -> np.ndarray:
+def _frozen(name: str, values: np.ndarray, what: str = "angles in radians") -> np.ndarray:
     try:
         values = np.array(values, float)
     except (TypeError, ValueError):
-        raise InputError(f"Sensor.{name} must be a list of finite angles in radians, got {values!r}") from None
+        raise InputError(f"Sensor.{name} must be a list of finite {what}, got {values!r}") from None
     if values.ndim != 1 or not np.isfinite(values).all():
-        raise InputError(f"Sensor.{name} must be a list of finite angles in radians, got shape {values.shape}")
+        raise InputError(f"Sensor.{name} must be a list of finite {what}, got shape {values.shape}")
     values.setflags(write=False)
     return values

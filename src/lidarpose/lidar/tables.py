@@ -4,12 +4,14 @@ Files, angles in degrees, in any order of lasers (they are sorted by elevation, 
 azimuths clockwise as seen from above, this package counter-clockwise, and so do azimuth_offset(s):
 
     JSON of an Ouster sensor     beam_altitude_angles, beam_azimuth_angles, lidar_mode; at the top or, as newer
-                                 firmware writes it, in sections (beam_intrinsics, config_params, ...)
+                                 firmware writes it, in sections (beam_intrinsics, config_params, ...); without a
+                                 mode it is taken to have 1024 columns
     JSON list                    elevations
     JSON object                  elevations_deg, and optionally azimuth_offsets_deg, columns, range_min, range_max,
                                  range_sigma, dropout, height, tilt_deg, name
     CSV                          a column of elevations, or columns with a header: elevation and azimuth_offset, or
-                                 azimuth (clockwise, as in Hesai's correction files), others are ignored
+                                 azimuth (clockwise, as in Hesai's correction files); others are ignored, but not
+                                 such as seem to be angles
 """
 
 import csv
@@ -28,10 +30,15 @@ from lidarpose.lidar.sensor import Sensor
 
 # columns a turn where a file does not say: 0.2 degrees
 _COLUMNS = 1800
+_OUSTER_COLUMNS = 1024
 _EXPECTED = "a sensor's table (.json, .csv)"
 # tables take some kilobytes
 _MOST_BYTES = 2**24
 _OWN_KEYS = ("range_min", "range_max", "range_sigma", "dropout", "height")
+# a CSV's columns, - and blanks read as _; the last ones are clockwise
+_ELEVATIONS = ("elevation", "elevation_deg", "elevations", "elevations_deg", "vertical", "altitude")
+_OFFSETS = ("azimuth_offset", "azimuth_offset_deg", "azimuth_offsets", "azimuth_offsets_deg")
+_CLOCKWISE = ("azimuth", "azimuth_deg", "horizontal")
 _KEYS = ("elevations_deg", "azimuth_offsets_deg", "columns", "name", "tilt_deg", *_OWN_KEYS)
 
 
@@ -129,8 +136,11 @@ def _from_json(path: Path, text: str) -> dict:
             fields = {"elevations": beams["beam_altitude_angles"], "offsets": beams.get("beam_azimuth_angles")}
             fields["clockwise"] = True
             modes = [str(s[key]) for key in ("lidar_mode", "columns_per_frame") for s in sections if key in s]
-            columns = next((digits[0] for mode in modes if (digits := re.match("[0-9]{1,6}", mode))), None)
-            return fields if columns is None else fields | {"columns": int(columns)}
+            # 1024x10, MODE_1024x10, or a count alone
+            found = [columns for mode in modes if (columns := re.search("([0-9]{3,5})(x|$)", mode))]
+            if modes and not found:
+                raise file_error(path, f"expected a lidar_mode such as 1024x10, got {reprlib.repr(modes[0])}")
+            return fields | {"columns": int(found[0][1]) if found else _OUSTER_COLUMNS}
     raise file_error(path, "holds no beams; expected beam_altitude_angles, elevations_deg or a list of degrees")
 
 
@@ -145,11 +155,14 @@ def _from_csv(path: Path, text: str) -> dict:
     header = [cell.lower() for cell in rows[0]]
     if any(cell and not _is_number(cell) for cell in header):
         rows = rows[1:]
-        named = {cell.split("(")[0].strip(): k for k, cell in enumerate(header)}
-        up = next((named[n] for n in ("elevation", "elevation_deg", "vertical", "altitude") if n in named), None)
-        off = next((named[n] for n in ("azimuth", "azimuth_offset", "azimuth_deg", "horizontal") if n in named), None)
+        named = {re.sub("[ -]", "_", cell.split("(")[0].strip()): k for k, cell in enumerate(header)}
+        up = next((named[n] for n in _ELEVATIONS if n in named), None)
+        off = next((named[n] for n in (*_OFFSETS, *_CLOCKWISE) if n in named), None)
         if up is None:
             raise file_error(path, f"has no column named elevation, got {', '.join(header)}")
+        # beams without their offsets would be another sensor
+        if off is None and (strange := next((n for n in named if re.search("azimuth|offset|horiz", n)), None)):
+            raise file_error(path, f"unknown column {strange!r}: name it azimuth_offset, or azimuth if clockwise")
     elif len(rows[0]) == 1:
         up, off = 0, None
     else:
@@ -158,7 +171,7 @@ def _from_csv(path: Path, text: str) -> dict:
         fields = {"elevations": [float(row[up]) for row in rows]}
         if off is not None:
             fields["offsets"] = [float(row[off]) for row in rows]
-            fields["clockwise"] = "offset" not in header[off]
+            fields["clockwise"] = not any(named.get(name) == off for name in _OFFSETS)
     except (ValueError, IndexError):
         raise file_error(path, "must hold a number of degrees in every row") from None
     return fields

@@ -24,7 +24,10 @@ _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 
 
 def save_checkpoint(path: str | os.PathLike, network: PoseNet | DaptNet, *, card: dict, half: bool = False) -> None:
-    """Writes the network's weights and its card, whole or not at all; `half` stores them as float16."""
+    """Writes the network's weights and its card, whole or not at all; `half` stores them as float16.
+
+    Raises InputError for weights that are not finite, or too large for float16: nothing could load them.
+    """
     header = Header(config=network.config, card=card).to_json()
     dtype = torch.float16 if half else torch.float32
     tensors = {
@@ -32,6 +35,10 @@ def save_checkpoint(path: str | os.PathLike, network: PoseNet | DaptNet, *, card
         name: value.detach().to("cpu", dtype if value.is_floating_point() else value.dtype).contiguous()
         for name, value in network.state_dict().items()
     }
+    for name, value in tensors.items():
+        if not value.isfinite().all():
+            kind = str(dtype).removeprefix("torch.")
+            raise file_error(path, f"not written, since tensor {name} is not finite as {kind}")
     write_atomic(path, to_bytes(tensors, metadata={ENTRY: header}))
 
 
@@ -56,12 +63,7 @@ def load_checkpoint(path: str | os.PathLike) -> tuple[PoseNet | DaptNet, Header]
                     f"tensor {key} should be {tuple(value.shape)} by its configuration, got {shape}: get the file "
                     f"again, or use the lidarpose version that wrote it ({header.version})",
                 )
-            tensor = file.get_tensor(key)
-            if value.is_floating_point() and (tensor.dtype not in _FLOATS or not tensor.isfinite().all()):
-                raise file_error(
-                    path, f"tensor {key} holds numbers that are not finite or no floats: get the file again"
-                )
-            loaded[key] = tensor.to(value.dtype)
+            loaded[key] = as_stored(path, key, file.get_tensor(key), value.dtype)
         extra = sorted(stored - set(wanted))
         if extra:
             raise file_error(
@@ -72,6 +74,14 @@ def load_checkpoint(path: str | os.PathLike) -> tuple[PoseNet | DaptNet, Header]
     network = build(header.config)
     network.load_state_dict(loaded)
     return network.eval(), header
+
+
+def as_stored(path: str | os.PathLike, name: str, tensor: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
+    """A file's tensor in the network's type. Raises InputError for anything but finite floats where it has such."""
+    cast = tensor.to(dtype)
+    if dtype.is_floating_point and (tensor.dtype not in _FLOATS or not cast.isfinite().all()):
+        raise file_error(path, f"tensor {name} holds numbers that are not finite or no floats: get the file again")
+    return cast
 
 
 def shapes(

@@ -18,6 +18,10 @@ WAYMO_JOINTS = tuple(
 )
 # SMPL's 24 parts and 0 = not body
 PARTS = 25
+# of any size, far above what anybody trains: a damaged file's header is to ask for nothing larger
+_MOST = 16_384
+# times as wide as the finest voxels may the coarsest be: cells are counted in 16 bits
+_COARSEST = 2**16
 
 Range = tuple[float, float]
 
@@ -78,13 +82,14 @@ class DaptConfig:
             value = getattr(self, name)
             if not isinstance(value, tuple) or len(value) != length or not all(map(_is_count, value)):
                 raise InputError(
-                    f"{name} must be {length} whole numbers of at least 1 (encoder_depths has {levels}), got {value!r}"
+                    f"{name} must be {length} whole numbers from 1 to {_MOST} (encoder_depths has {levels}), "
+                    f"got {value!r}"
                 )
         for name in ("anchor_heads", "mlp_ratio", "patch"):
             if not _is_count(getattr(self, name)):
-                raise InputError(f"{name} must be a whole number of at least 1, got {getattr(self, name)!r}")
-        if not set(self.strides) <= {2, 4, 8}:
-            raise InputError(f"strides must be 2, 4 or 8 each, got {self.strides}")
+                raise InputError(f"{name} must be a whole number from 1 to {_MOST}, got {getattr(self, name)!r}")
+        if not set(self.strides) <= {2, 4, 8} or np.prod(self.strides, dtype=float) > _COARSEST:
+            raise InputError(f"strides must be 2, 4 or 8 each and {_COARSEST} in all at most, got {self.strides}")
         for part in ("encoder", "decoder"):
             widths, heads = getattr(self, f"{part}_channels"), getattr(self, f"{part}_heads")
             if any(c % h for c, h in zip(widths, heads, strict=True)):
@@ -110,13 +115,15 @@ class DaptConfig:
             BODY26.index(joint)
         if self.bins or self.ranges:
             if not isinstance(self.bins, tuple) or len(self.bins) != 3 or not all(map(_is_count, self.bins)):
-                raise InputError(f"bins must be three whole numbers (x, y, z), or none, got {self.bins!r}")
+                raise InputError(
+                    f"bins must be three whole numbers (x, y, z) from 1 to {_MOST}, or none, got {self.bins!r}"
+                )
             if not isinstance(self.ranges, tuple) or len(self.ranges) != 3 or not all(map(_is_range, self.ranges)):
                 raise InputError(f"ranges must be three pairs (low, high) of metres, or none, got {self.ranges!r}")
         elif not self.coordinates:
             raise InputError("a network needs heatmaps (bins and ranges) or coordinates=True: it would predict nothing")
-        if not isinstance(self.parts, int) or self.parts < 0 or self.parts == 1:
-            raise InputError(f"parts must be 0 (no part head) or at least 2, got {self.parts!r}")
+        if not isinstance(self.parts, int) or not 0 <= self.parts <= _MOST or self.parts == 1:
+            raise InputError(f"parts must be 0 (no part head) or from 2 to {_MOST}, got {self.parts!r}")
         for name in ("coordinates", "auxiliary", "legacy"):
             if not isinstance(getattr(self, name), bool):
                 raise InputError(f"{name} must be true or false, got {getattr(self, name)!r}")
@@ -179,7 +186,7 @@ def _is_number(value: object) -> bool:
 
 
 def _is_count(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 1
+    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= _MOST
 
 
 def _is_range(value: object) -> bool:
@@ -230,7 +237,7 @@ def _from_reference(entries: dict) -> dict:
         raise InputError(f"enc_patch_size and dec_patch_size must be one number throughout, got {sorted(patches)}")
     out = {ours: entries[theirs] for theirs, ours in _REFERENCE.items() if theirs in entries}
     count = entries.get("num_keypoints", 14)
-    if "joints" not in entries and count not in _JOINTS_BY_COUNT:
+    if not _is_count(count) or "joints" not in entries and count not in _JOINTS_BY_COUNT:
         raise InputError(f"num_keypoints must be 14, 15 or 24 where no joints are named, got {count!r}: add 'joints'")
     out |= {"joints": _JOINTS_BY_COUNT.get(count), "patch": patches.pop(), "legacy": True}
     heatmaps = entries.get("grid")

@@ -12,8 +12,8 @@ import torch
 from safetensors import SafetensorError, safe_open
 
 from lidarpose.errors import InputError
-from lidarpose.io.files import check_apart, file_error
-from lidarpose.model.checkpoint import save_checkpoint, shapes
+from lidarpose.io.files import check_apart, check_suffix, file_error
+from lidarpose.model.checkpoint import as_stored, save_checkpoint, shapes
 from lidarpose.model.dapt.config import CONFIGS, DaptConfig, named_config
 from lidarpose.model.dapt.network import DaptNet
 from lidarpose.model.header import Header
@@ -54,9 +54,7 @@ def import_dapt(path: str | os.PathLike, config: DaptConfig | dict | str | None 
                 raise file_error(
                     path, f"tensor {name} should be {tuple(value.shape)} by {source}, got {shape}: {remedy}"
                 )
-            loaded[name] = file.get_tensor(stored[name]).to(value.dtype)
-            if value.is_floating_point() and not torch.isfinite(loaded[name]).all():
-                raise file_error(path, f"tensor {name} has values that are not finite: get the file again")
+            loaded[name] = as_stored(path, name, file.get_tensor(stored[name]), value.dtype)
     _check_ranges(path, config, loaded)
     network = DaptNet(config)
     network.load_state_dict(loaded)
@@ -68,6 +66,7 @@ def import_released(source: str | os.PathLike, out: str | os.PathLike, *, config
 
     Raises InputError, one line that names the file and the tensor, for all that does not fit; then nothing is written.
     """
+    check_suffix(out, ".safetensors")
     check_apart(out, source)
     network = import_dapt(source, config)
     named = "" if config is None else f" --config {config}"

@@ -153,9 +153,9 @@ def _cells(points: np.ndarray, lengths: np.ndarray, config: DaptConfig) -> np.nd
     else:
         scaled = scaled + middle
     if scaled.size and not (scaled.min() >= 0 and scaled.max() < 2 * middle):
-        raise InputError(
-            f"points must lie within {middle * config.grid:.0f} m of their person, got some beyond: crop to one person"
-        )
+        reach = middle * config.grid
+        limit = f"span {2 * reach:.0f} m at most" if config.legacy else f"lie within {reach:.0f} m of their person"
+        raise InputError(f"points must {limit}, got some beyond: crop to one person")
     return scaled.astype(np.int64)
 
 
