@@ -577,3 +577,9 @@ def test_help_shows_no_empty_default(command, capsys):
     with pytest.raises(SystemExit):
         main([command, "--help"])
     assert "()" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words, looks", [([], 4), (["--tta", "1"], None), (["--tta", "2"], 2)])
+def test_looks_are_as_many_as_asked_for(crop, words, looks, capsys):
+    assert main(["predict", str(crop), "--out", "-", *words]) == 0
+    assert json.loads(capsys.readouterr().out)["model"].get("tta") == looks

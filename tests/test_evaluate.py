@@ -34,6 +34,7 @@ from lidarpose.infer.results import PersonPose, Poses
 from lidarpose.model.bundled import DEFAULT
 from lidarpose.sample import Box, Pose, center_of
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14, Skeleton
+from lidarpose.synth.write import Job, write_dataset
 
 
 class Fake:
@@ -682,3 +683,34 @@ def test_the_readme_s_figures_are_those_of_the_bundled_weights_on_the_bench():
     assert result.line("mpjpe", method="floor: mean pose, true facing").value == pytest.approx(267.1, abs=0.05)
     assert result.counts == {"people": 2000, "frames of clips": 960, "without a pose": 0}
     assert len(load_bench().people) == 2000
+
+
+def test_evaluate_looks_as_often_as_asked_for():
+    assert evaluation.run("tiny", "bench", limit=2, tta=2).scores.weights["tta"] == 2
+
+
+def test_evaluate_hides_the_sensor():
+    assert evaluation.evaluate("tiny", "bench", limit=2, sensor_unknown=True).setting.sensor == "unknown"
+
+
+def test_dapt_s_poses_are_in_the_dataset_s_frame(sets):
+    people = list(open_people(sets / "humanm3"))
+    pick = [HUMAN15.index(name) if name in HUMAN15.joints else 0 for name in BODY26.joints]
+    known = knowing(people, (0.06, 0, 0.08))
+    task = task_of(Fake(lambda cloud: known(cloud)[pick]), open_people(sets / "humanm3"), protocol="dapt")
+    assert judge(task).result.line("mpjpe").value == pytest.approx(100, abs=1e-2)
+
+
+def test_the_worst_are_the_worst(sets):
+    found = judge(task_of(Fake(standing), open_people(sets / "humanm3", split="all")))
+    error = found.judged.errors().mean(1)
+    assert len(error) == 24 and [k for _, k in found.worst] == np.argsort(-error, kind="stable").tolist()
+
+
+def test_what_is_hidden_is_not_visible(tmp_path):
+    write_dataset(Job(what="people", count=3, hard=0.0, sensors=("os1-128",)), tmp_path / "people")
+    for one, row in zip(open_people(tmp_path / "people"), open_dataset(tmp_path / "people").rows(), strict=True):
+        assert one.hidden == pytest.approx(1 - row["visible"], abs=1e-6)
+    visible = load_bench().columns["visible"]
+    for one in open_people("bench", limit=9):
+        assert one.hidden == pytest.approx(1 - visible[one.row], abs=1e-6)

@@ -21,12 +21,13 @@ from lidarpose.model.checkpoint import load_checkpoint
 from lidarpose.model.header import read_header
 from lidarpose.sample import Box, center_of
 from lidarpose.skeleton import BODY26, HUMAN15, skeleton
+from lidarpose.synth.generate import Generator
 from lidarpose.synth.write import Job, write_dataset
 from lidarpose.train import job as jobs
 from lidarpose.train import loop, runs
 from lidarpose.train.augment import AUGMENTATIONS, Augmentation, augmentation, augmented
 from lidarpose.train.crowd import StoredPerson, crowd_of
-from lidarpose.train.example import PELVIS_ERROR, example, seen
+from lidarpose.train.example import BLIND, PELVIS_ERROR, example, seen
 from lidarpose.train.job import job_of
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.sources import MixedSource, StoredSource, SyntheticSource
@@ -490,3 +491,51 @@ def test_wrong_words_are_one_line_and_leave_no_folder(datasets, tmp_path, monkey
     error = capsys.readouterr().err
     assert told in error and error.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_the_sensor_s_place_is_often_kept_from_the_network_and_never_made_up():
+    person = someone()
+    known = [augmented(person, Augmentation(), np.random.default_rng(k)).view[4] for k in range(400)]
+    assert np.mean(known) == pytest.approx(1 - BLIND, abs=0.07)
+    fused = replace(person, sensor_known=False)
+    assert not any(augmented(fused, Augmentation(), np.random.default_rng(k)).view.any() for k in range(40))
+    sample = Generator(scene="paper", measure=False).person(1, 0).sample
+    known = [example(sample, np.random.default_rng(k)).view[4] for k in range(400)]
+    assert np.mean(known) == pytest.approx(1 - BLIND, abs=0.07)
+
+
+@pytest.mark.parametrize("name, known", [("humanm3", False), ("waymo", True)])
+def test_a_crowd_s_people_keep_their_boxes_and_centers(datasets, name, known):
+    crowd, items = crowd_of([datasets[name]]), list(open_dataset(datasets[name]).items())
+
+    def same(person, item):
+        box = item.sample.box
+        np.testing.assert_array_equal([*person.box.center, *person.box.size], [*box.center, *box.size])
+        assert person.box.yaw == box.yaw and person.sensor_known == known
+        for key, center in item.centers.items():
+            np.testing.assert_array_equal(person.centers[key], center)
+        np.testing.assert_array_equal(person.center, item.sample.center)
+
+    for row, item in enumerate(items):
+        same(crowd.person(row), item)
+    left = crowd.without(crowd.sequences[:1])
+    kept = [item for item in items if item.sequence != crowd.sequences[0]]
+    assert len(left) == len(kept)
+    for row, item in enumerate(kept):
+        same(left.person(row), item)
+
+
+def test_points_are_jittered_and_strays_are_added():
+    person = someone(count=400)
+    plain, blurred, strays = (
+        augmented(person, Augmentation(refined=0.0, **more), np.random.default_rng(3))
+        for more in ({}, {"jitter": 0.005}, {"strays": 1.0})
+    )
+    assert (blurred.points - plain.points).std() == pytest.approx(0.005, rel=0.1)
+    assert len(strays.points) > 400 and len(strays.points) == len(strays.part) and not strays.part[400:].any()
+
+
+def test_everybody_is_seen_as_often_as_epochs_say(datasets):
+    for mix, people in ((0.0, 72), (0.25, 96)):
+        job = job_of(Finetune(data=(str(datasets["humanm3"]),), epochs=6, mix=mix, hold_out=0.34))
+        assert len(job.source.crowd if not mix else job.source.main.crowd) == 12 and job.people == people

@@ -74,6 +74,9 @@ def test_lidarhuman26m_is_turned_level(raw):
             (a.centers["trans"], b.centers["trans"]),
         ):
             np.testing.assert_allclose(np.linalg.norm(after, axis=-1), np.linalg.norm(before, axis=-1), atol=1e-4)
+        # and all together: trans stays where it is on the person
+        before, after = (np.linalg.norm(x.sample.pose.joints - x.centers["trans"], axis=-1) for x in (a, b))
+        np.testing.assert_allclose(after, before, atol=1e-4)
         # the points stay on the person
         apart = np.linalg.norm(b.sample.points[:, None] - b.sample.pose.joints, axis=-1).min(1)
         assert np.median(apart) < 0.3

@@ -173,6 +173,12 @@ def test_points_on_one_spot_are_nobody(model, cloud):
     assert pose.joints is None and pose.warnings[-1] == "no pose: under 5 different points"
 
 
+def test_points_far_apart_are_nobody(model):
+    cloud = 50.0 * np.arange(18).reshape(6, 3)
+    pose = model.predict(cloud)
+    assert pose.joints is None and pose.warnings[-1].startswith("no pose: under 5 points within")
+
+
 def test_no_returns_are_no_points(model, points, tmp_path):
     empty = np.zeros((300, 3))
     pose = model.predict(np.concatenate([empty, points]))
@@ -275,6 +281,13 @@ def test_a_million_points_are_thinned_with_a_note(model, points):
     pose = model.predict(cloud)
     assert pose.joints is not None and pose.num_points == MAX_POINTS
     assert pose.warnings[0].startswith(f"thinned from 1000000 to {MAX_POINTS} points")
+
+
+def test_thinning_takes_points_from_everywhere():
+    cloud = np.linspace([0.1, 0, 0], [1.1, 0, 0], 3 * MAX_POINTS)
+    points, _ = clean(cloud)
+    assert len(points) == MAX_POINTS and np.diff(points[:, 0]).max() < 1e-4
+    assert points[0, 0] == 0.1 and points[-1, 0] > 1.0999
 
 
 def test_map_coordinates_cost_no_accuracy(model, points):

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from lidarpose.body.smpl import load_body
 from lidarpose.data.prepare import READERS, reader
 from lidarpose.data.readers.items import SEEN, UNLABELED, Item, Skipped
-from lidarpose.data.readers.raw import numbered, numbers, read_cloud
+from lidarpose.data.readers.raw import find_below, numbered, numbers, read_cloud
 from lidarpose.data.readers.sloper4d import _heading
 from lidarpose.data.readers.smpl_joints import SmplJoints
 from lidarpose.errors import InputError
@@ -539,3 +539,34 @@ def test_numbered_files_by_number(tmp_path):
     found = {n: [p.name for p in paths] for n, paths in numbered(tmp_path, ".json").items()}
     assert found == {9: ["0009.json", "9.json"], 10: ["10.json"]} and list(found) == [9, 10]
     assert numbered(tmp_path / "none", ".json") == {}
+
+
+def test_sloper4d_s_trans_moves_with_the_joints(tmp_path):
+    smpl = files.write_smpl(tmp_path / "SMPL_NEUTRAL.npz")
+    content, _ = files.sloper4d_labels(smpl, "seq001", without=())
+    (tmp_path / "raw").mkdir()
+    (tmp_path / "raw/seq001_labels.pkl").write_bytes(pickle.dumps(content))
+    for k, item in enumerate(reader("sloper4d", smpl).read(tmp_path / "raw", "seq001")):
+        place, heading = content["first_person"]["lidar_traj"][k, 1:4], 0.4 + 0.1 * k
+        trans = rotation_about("z", -heading) @ (content["second_person"]["opt_trans"][k] - place)
+        np.testing.assert_allclose(item.centers["trans"], trans, atol=1e-6)
+
+
+def test_humanm3_s_points_reach_beyond_the_box(tmp_path):
+    smpl = files.write_smpl(tmp_path / "SMPL_NEUTRAL.npz")
+    truth = files.write_humanm3(tmp_path, smpl, sequences=("train/a",), frames=1)
+    path = tmp_path / "train/a/pointcloud/000007.pcd"
+    joints = truth["train/a", 7, "2"]
+    low, high = joints.min(0), joints.max(0)
+    # the box is 20 cm larger than the joints, and points are taken within 30 cm of it
+    files.write_pcd(path, [(low + high) / 2 + [0, 0, (high - low)[2] / 2 + 0.2 + more] for more in (0.0, 0.28, 0.32)])
+    (item,) = (one for one in reader("humanm3").read(tmp_path, "train/a") if hasattr(one, "sample"))
+    assert len(item.sample.points) == 2
+
+
+def test_the_longest_end_of_a_path_is_the_cloud(tmp_path):
+    for path in (tmp_path / "a/b.pcd", tmp_path / "b.pcd"):
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("")
+    assert find_below(tmp_path, "/their/machine/a/b.pcd") == tmp_path / "a/b.pcd"
+    assert find_below(tmp_path, "/their/machine/c/b.pcd") == tmp_path / "b.pcd"

@@ -8,6 +8,7 @@ import sys
 import time
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from motion_files import a_clip, write_amass
@@ -21,10 +22,11 @@ from lidarpose.model.network import PoseNet
 from lidarpose.model.presets import preset
 from lidarpose.train import job, loop, runs
 from lidarpose.train.feed import BATCHES, lanes_of
-from lidarpose.train.optimize import optimizers
+from lidarpose.train.optimize import optimizers, rate_factor
 from lidarpose.train.pose_task import PoseTask
 from lidarpose.train.recipes import Finetune, Pretrain, recipe
 from lidarpose.train.sources import SyntheticSource
+from lidarpose.train.validation import Validation
 
 # three chunks of `BATCHES` batches
 RECIPE = Pretrain(
@@ -531,3 +533,50 @@ def test_the_card_s_command_is_as_it_was_typed(tmp_path, monkeypatch):
     config = json.loads((tmp_path / "run" / runs.CONFIG).read_text())
     typed = shlex.split(config["command"])
     assert typed[typed.index("--motion") + 1] == motion.name and typed[typed.index("--subjects") + 1] == "My Walk"
+
+
+def test_a_run_s_rates_follow_its_schedule(monkeypatch, tmp_path):
+    rates, step = [], loop._Run._step
+
+    def told(self, arrays, k):
+        terms = step(self, arrays, k)
+        rates.append([group["lr"] for optimizer in self.optimizers for group in optimizer.param_groups])
+        return terms
+
+    monkeypatch.setattr(loop._Run, "_step", told)
+    monkeypatch.setattr(Validation, "run", lambda *_: None)
+    loop.train(RECIPE, tmp_path / "run")
+    due = [rate_factor(k / 24, RECIPE) for k in range(24)]
+    np.testing.assert_allclose(rates, np.outer(due, [RECIPE.rate, RECIPE.muon_rate]))
+
+
+def test_the_best_validation_is_kept_across_a_resume(monkeypatch, tmp_path):
+    errors = [50.0, 40.0, 60.0, 45.0]
+
+    def run(self, network, people, device):
+        self.last = errors.pop(0)
+        return self.last
+
+    monkeypatch.setattr(Validation, "run", run)
+    folder = tmp_path / "run"
+
+    def best():
+        card = load_checkpoint(folder / runs.BEST)[1].card
+        return card["validation_mm"], card["people_seen"]
+
+    often = replace(RECIPE, validate=16)
+    loop.train(often, folder)
+    assert best() == (40.0, 32)
+    loop.train(replace(often, people=often.people + 16), folder, resume=True)
+    assert not errors and best() == (40.0, 32)
+
+
+def test_another_seed_begins_with_other_weights(tmp_path, monkeypatch):
+    monkeypatch.setattr(Validation, "run", lambda *_: None)
+
+    def begun(seed):
+        recipe = replace(RECIPE, people=2, seed=seed, rate=0.0, muon_rate=0.0)
+        return load_file(loop.train(recipe, tmp_path / str(seed)))
+
+    a, b = begun(1), begun(2)
+    assert max((a[name] - b[name]).abs().max() for name in a) > 0.01

@@ -170,3 +170,10 @@ def test_a_sensor_of_any_number_of_rings_has_errors_of_centimetres(tmp_path):
     assert np.isfinite(frame.points).all() and np.abs(frame.points).max() < 300
     again = street(0, 0, sensor=str(path)).frames[0]
     np.testing.assert_array_equal(frame.points, again.points)
+
+
+def test_a_street_before_a_tilted_sensor_is_level(tmp_path):
+    path = tmp_path / "down.json"
+    path.write_text(json.dumps({"elevations_deg": np.linspace(-20, 20, 32).tolist(), "columns": 512, "tilt_deg": 20}))
+    scene = street(7, 1, sensor=str(path))
+    assert scene.frames[0].points[:, 2].min() == pytest.approx(-scene.height, abs=0.15)

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from lidarpose.data.shards import open_dataset, read_rows
 from lidarpose.errors import InputError
 from lidarpose.lidar.catalog import listing
 from lidarpose.synth import write
+from lidarpose.synth.generate import Generator
 from lidarpose.synth.scene import scene_config
 from lidarpose.synth.write import Job, write_dataset
 from lidarpose.train.people import ShardPeople, SyntheticPeople
@@ -54,8 +56,6 @@ def test_a_dataset_holds_the_generators_people(dataset):
     rows = list(open_dataset(dataset).rows())
     assert [row["index"] for row in rows] == list(range(COUNT))
     assert {row["sensor"] for row in rows} == {"os1-64", "vlp-16"}
-    from dataclasses import replace
-
     made = SyntheticPeople(scene=replace(scene, sensors=("os1-64", "vlp-16")), seed=5, start=17, stop=18)
     np.testing.assert_array_equal(next(iter(made)).points, rows[17]["points"].reshape(-1, 3))
 
@@ -240,7 +240,11 @@ def test_streets_hold_everybody_of_a_turn(tmp_path, monkeypatch, capsys):
     data = open_dataset(tmp_path / "s")
     assert "scene" not in data.card.settings
     frames = list(data.rows("frames"))
-    for row, sample in zip(data.rows(), data, strict=True):
+    assert [frame["frame"] for frame in frames] == [0, 1] and frames[0]["sensor"] == "vlp-16"
+    assert len(frames[0]["points"]) == 3 * len(frames[0]["person"]) > 10_000
+    people = list(data.rows())
+    assert people and {row["frame"] for row in people} <= {0, 1}
+    for row, sample in zip(people, data, strict=True):
         frame = frames[row["frame"]]
         assert sample.box.id == row["track"] and sample.box.id in frame["track"]
         joints = frame["joints"].reshape(len(frame["track"]), -1, 3)[sample.box.id]
@@ -306,22 +310,15 @@ def test_people_go_on_without_end_and_settings_are_checked():
 # --- streets
 
 
-def test_streets_hold_whole_turns_and_the_people_in_them(tmp_path, monkeypatch):
-    monkeypatch.setattr(write, "STREET_FRAMES", 2)
-    write_dataset(Job(what="streets", count=1, sensors=("vlp-16",)), tmp_path / "s")
-    dataset = open_dataset(tmp_path / "s")
-    frames = list(dataset.rows("frames"))
-    assert [frame["frame"] for frame in frames] == [0, 1] and frames[0]["sensor"] == "vlp-16"
-    assert len(frames[0]["points"]) == 3 * len(frames[0]["person"]) > 10_000
-    people = list(dataset.rows())
-    assert people and {row["frame"] for row in people} <= {0, 1}
-    for row in people:
-        turn = frames[row["frame"]]
-        own = turn["points"].reshape(-1, 3)[turn["person"] == row["track"]]
-        # the person's points of the turn are about the person's joints
-        assert np.linalg.norm(own.mean(0) - row["joints"].reshape(-1, 3).mean(0)) < 0.5
-
-
 def test_streets_take_no_scene():
     with pytest.raises(InputError, match="of their own"):
         Job(what="streets", count=1, scene="paper")
+
+
+def test_difficulty_asked_for_is_the_people_s(tmp_path):
+    scene = replace(scene_config("wild"), sensors=("os1-64",))
+    (sample,) = SyntheticPeople(scene=scene, seed=2, start=1, stop=2, hard=0.0)
+    wanted = Generator(scene=scene, measure=False).person(2, 1, hard=0.0).sample
+    np.testing.assert_array_equal(sample.points, wanted.points)
+    write_dataset(Job(what="people", count=3, hard=0.0, seed=2, sensors=("os1-64",)), tmp_path / "d")
+    np.testing.assert_array_equal(list(open_dataset(tmp_path / "d"))[1].points, wanted.points)

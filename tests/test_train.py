@@ -4,6 +4,7 @@ import json
 import pickle
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from lidarpose.model.heads import REACH, Outputs, encode
 from lidarpose.model.network import PoseNet
 from lidarpose.model.presets import BIN, preset
 from lidarpose.sample import center_of
-from lidarpose.skeleton import BODY26
+from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth.generate import Generator
 from lidarpose.synth.scene import SCENES
 from lidarpose.train.augment import disturbed
@@ -29,6 +30,7 @@ from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.recipes import recipe as recipe_of
 from lidarpose.train.sources import SyntheticSource
 from lidarpose.train.task import total
+from lidarpose.train.validation import Validation
 
 # three chunks of `BATCHES` batches
 RECIPE = Pretrain(scene="paper", people=3 * BATCHES * 2, batch=2, workers=0, seed=5, easy=0.15, pictures=0)
@@ -421,3 +423,22 @@ def test_sources_go_to_processes_that_do_not_fork(tmp_path):
     generator = Generator(scene="paper")
     there = pickle.loads(pickle.dumps(generator))
     np.testing.assert_array_equal(there.person(1, 2).sample.points, generator.person(1, 2).sample.points)
+
+
+def test_weights_decay():
+    groups = [g for o in optimizers(PoseNet(preset("tiny")), RECIPE) for g in o.param_groups]
+    (alone,) = optimizers(PoseNet(preset("tiny")), replace(RECIPE, muon_rate=0.0))
+    assert {g["weight_decay"] for g in [*groups, *alone.param_groups]} == {RECIPE.decay} != {0.0}
+
+
+def test_a_validation_is_the_mean_error_in_mm(tmp_path):
+    joints = np.random.default_rng(0).normal(size=(3, 26, 3))
+    joints[0, 4] = np.nan
+    people = [SimpleNamespace(joints=one) for one in joints]
+
+    def found(network, some, *, device):
+        return np.nan_to_num(np.stack(some)) + [0.03, 0.0, 0.04]
+
+    task = SimpleNamespace(collate=lambda some: [one.joints for one in some], joints=found)
+    job = SimpleNamespace(validation=lambda: people, task=task, joints=SMPL24)
+    assert Validation(job, RECIPE, tmp_path).run(None, 0, "cpu") == pytest.approx(50)
