@@ -678,6 +678,11 @@ def test_box_objects_of_the_package_are_public():
     assert isinstance(box, Box) and as_points([[0, 0, 0]]).shape == (1, 3) and sensor("os1-128").name == "os1-128"
 
 
+def test_a_file_is_looked_at_four_times(points, tmp_path):
+    np.save(tmp_path / "crop.npy", points)
+    assert lidarpose.predict(tmp_path / "crop.npy").model["tta"] == 4
+
+
 @pytest.mark.skipif(not REAL.is_dir(), reason=f"the real sweeps are not at {REAL}")
 @pytest.mark.parametrize("name", ["sweep_0.pcd", "sweep_1.bin", "sweep_2.ply"])
 def test_real_sweeps(model, name):
