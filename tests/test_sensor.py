@@ -119,7 +119,11 @@ def test_user_tables_that_go_wrong_are_told_in_one_line(tmp_path):
     refused("e.csv", '"' + "9" * 200_000 + '"', "is not CSV")
     refused("f.csv", b"1\n" * 2**23 + b"1\n", "is it a recording")
     refused("g.csv", b"", "is empty")
-    refused("h.json", '{"beam_altitude_angles": [1, 2], "lidar_mode": "0x10"}', "columns must be a whole number")
+    refused(
+        "h.json", '{"beam_altitude_angles": [1, 2], "lidar_mode": "0x10"}', "a lidar_mode such as 1024x10, got '0x10'"
+    )
+    refused("h.json", '{"beam_altitude_angles": [1, 2], "lidar_mode": "\u00b2x10"}', "a lidar_mode such as 1024x10")
+    refused("h.json", '{"beam_altitude_angles": [1, 2], "lidar_mode": 5}', "a lidar_mode such as 1024x10, got '5'")
 
 
 def test_ouster_files_of_all_ages_say_their_columns(tmp_path):
@@ -128,7 +132,9 @@ def test_ouster_files_of_all_ages_say_their_columns(tmp_path):
         ({"beam_altitude_angles": angles, "lidar_mode": "2048x10"}, 2048),
         ({"beam_intrinsics": {"beam_altitude_angles": angles}, "config_params": {"lidar_mode": "512x20"}}, 512),
         ({"beam_intrinsics": {"beam_altitude_angles": angles}, "lidar_data_format": {"columns_per_frame": 1024}}, 1024),
-        ({"beam_altitude_angles": angles, "lidar_mode": "\u00b2x10"}, 1800),
+        ({"beam_altitude_angles": angles, "lidar_mode": "MODE_4096x5"}, 4096),
+        ({"beam_altitude_angles": angles, "lidar_mode": "?", "lidar_data_format": {"columns_per_frame": 512}}, 512),
+        ({"beam_altitude_angles": angles}, 1024),
     ):
         path.write_text(json.dumps(content))
         found = load_sensor(path)

@@ -56,18 +56,6 @@ def test_offsets_of_a_csv_by_any_of_their_names(tmp_path, named, sign):
     np.testing.assert_allclose(np.degrees(found.azimuth_offsets), np.multiply(sign, [5, 3, 2]))
 
 
-@pytest.mark.parametrize(
-    ("told", "columns"),
-    [
-        ({"lidar_mode": "MODE_2048x10"}, 2048),
-        ({"lidar_mode": "4096x5"}, 4096),
-        ({"lidar_mode": "unknown", "data_format": {"columns_per_frame": 512}}, 512),
-    ],
-)
-def test_columns_of_an_ouster_sensor(tmp_path, told, columns):
-    assert load_sensor(written(tmp_path / "a.json", {"beam_altitude_angles": ANGLES} | told)).columns == columns
-
-
 def test_the_own_form_sets_every_field(tmp_path):
     given = {
         "name": "mine", "elevations_deg": ANGLES, "azimuth_offsets_deg": [0, 1, 2, 3], "columns": 720,
@@ -99,7 +87,6 @@ def test_the_own_form_sets_every_field(tmp_path):
         ("a.json", {"elevations_deg": ANGLES, "tilt_deg": 400}, "within .*90 degrees, got 400"),
         ("a.json", {"elevations_deg": ANGLES, "range_max": "far"}, "range_max must be a number"),
         ("a.json", {"elevations_deg": ANGLES, "range_min": 9.0, "range_max": 1.0}, "min < max"),
-        ("a.json", {"beam_altitude_angles": ANGLES, "lidar_mode": 5}, "a lidar_mode such as 1024x10, got '5'"),
         ("a.csv", "elevation,azimuths\n1,2\n3,4\n", "unknown column 'azimuths': name it azimuth_offset"),
         ("a.csv", "\n\n", "no rows"),
         ("a.csv", "1,2\n3,4\n", "no header"),

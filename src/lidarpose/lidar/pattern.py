@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarpose.errors import InputError, check_finite
+from lidarpose.lidar.sensor import check_limits
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,16 +57,10 @@ class RayPattern:
             low, high = getattr(self, name)
             if not (np.isfinite([low, high]).all() and low < high):
                 raise InputError(f"RayPattern.{name} must be (lowest, highest) rad, got ({low}, {high})")
-        for name in ("duration", "range_min", "range_max", "range_sigma", "dropout", "height", "tilt"):
-            check_finite(f"RayPattern.{name}", getattr(self, name))
+        check_finite("RayPattern.duration", self.duration)
         if self.duration < 0:
             raise InputError(f"RayPattern.duration must be 0 s or more, got {self.duration}")
-        if not 0 <= self.range_min < self.range_max:
-            raise InputError(f"RayPattern ranges must be 0 <= min < max, got {self.range_min} and {self.range_max} m")
-        if self.range_sigma < 0 or not 0 <= self.dropout < 1:
-            raise InputError(
-                f"RayPattern.range_sigma must be >= 0 m and dropout in [0, 1), got {self.range_sigma}, {self.dropout}"
-            )
+        check_limits(self)
         object.__setattr__(self, "_made", {})
 
     def __getstate__(self) -> dict:

@@ -71,17 +71,11 @@ class Sensor:
             if heights.shape != elevations.shape:
                 raise InputError(f"Sensor.origin_heights must be {elevations.shape}, one a ring, got {heights.shape}")
             object.__setattr__(self, "origin_heights", heights)
-        for field in ("azimuth_step", "range_min", "range_max", "range_sigma", "dropout", "height", "tilt"):
-            check_finite(f"Sensor.{field}", getattr(self, field))
+        check_finite("Sensor.azimuth_step", self.azimuth_step)
         turn = 2 * np.pi / self.azimuth_step if self.azimuth_step > 0 else 0
         if turn < 1 or abs(turn - round(turn)) > 1e-3:
             raise InputError(f"Sensor.azimuth_step must divide 2 pi, got {self.azimuth_step} rad, {turn:.4f} a turn")
-        if not 0 <= self.range_min < self.range_max:
-            raise InputError(f"Sensor ranges must be 0 <= min < max, got {self.range_min} m and {self.range_max} m")
-        if self.range_sigma < 0 or not 0 <= self.dropout < 1:
-            raise InputError(
-                f"Sensor.range_sigma must be >= 0 m and dropout in [0, 1), got {self.range_sigma} and {self.dropout}"
-            )
+        check_limits(self)
 
     @cached_property
     def columns(self) -> int:
@@ -146,6 +140,19 @@ class Sensor:
         """(C, R) rad: azimuth of each beam of a window, not wrapped at the seam."""
         columns = self.azimuth_start + (window.column0 + np.arange(window.columns)) * self.azimuth_step
         return columns[:, None] + self.azimuth_shifts[window.row0 : window.row0 + window.rows]
+
+
+def check_limits(sensor: object) -> None:
+    """Raises InputError for a range, noise, loss or mount that no `Sensor` or `RayPattern` has."""
+    kind = type(sensor).__name__
+    for field in ("range_min", "range_max", "range_sigma", "dropout", "height", "tilt"):
+        check_finite(f"{kind}.{field}", getattr(sensor, field))
+    if not 0 <= sensor.range_min < sensor.range_max:
+        raise InputError(f"{kind} ranges must be 0 <= min < max, got {sensor.range_min} m and {sensor.range_max} m")
+    if sensor.range_sigma < 0 or not 0 <= sensor.dropout < 1:
+        raise InputError(
+            f"{kind}.range_sigma must be >= 0 m and dropout in [0, 1), got {sensor.range_sigma} and {sensor.dropout}"
+        )
 
 
 def _frozen(name: str, values: np.ndarray, what: str = "angles in radians") -> np.ndarray:
