@@ -320,3 +320,12 @@ def test_the_mask_without_a_grid_takes_single_beams_and_lines():
     assert direction_mask(np.array([[1.0, 0, 0]]), keep=1.0, rng=rng).all()
     line = np.column_stack([np.ones(500), np.linspace(-0.2, 0.2, 500), np.zeros(500)])
     assert direction_mask(line, keep=0.5, rng=rng).mean() == pytest.approx(0.5, abs=0.05)
+
+
+def test_a_half_space_cuts_up_to_its_share_and_seldom_all_of_it():
+    points = np.random.default_rng(0).normal(size=(2000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    rng = np.random.default_rng(1)
+    # of a sphere a plane takes as large a share of the surface as of the extent
+    lost = np.array([1 - augment.half_space_keep(points, most=0.4, rng=rng).mean() for _ in range(300)])
+    assert lost.max() < 0.43 and lost.mean() == pytest.approx(0.2, abs=0.03) and lost.min() < 0.03

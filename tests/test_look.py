@@ -132,3 +132,17 @@ def test_conditions_follow_the_preset_and_its_difficulty():
     assert {c.divergence for c in paper} == {0.0}
     easy = [draw_conditions(SCENES["wild"].eased(0.0), device, rng) for _ in range(100)]
     assert {c.keep for c in easy} == {1.0}
+
+
+def test_the_window_has_the_scene_s_margin():
+    where = Place(feet=np.array([6.0, 0.0, -0.5]), yaw=0.0, distance=6.0, R_sensor_level=None)
+    mesh = box((0.4, 0.6, 1.2))
+    body = Layer(vertices=where.of_body(mesh.vertices), faces=mesh.faces, part=np.ones(12, np.uint8))
+    ground = Layer.still(quad(1.0, np.zeros(2)).moved(where.feet))
+    widths = []
+    for margin in (0.0, 0.05):
+        config = replace(PLAIN, margin=margin)
+        seen = look([body, ground], sensor("dapt64"), where, PERFECT, config, np.random.default_rng(0))
+        azimuth = np.arctan2(seen.points[:, 1], seen.points[:, 0])
+        widths.append(np.ptp(azimuth))
+    assert widths[1] - widths[0] == pytest.approx(0.1, abs=0.006)

@@ -112,3 +112,13 @@ def test_a_tilted_sensor_looks_down_ahead():
         middle = place.to_sensor((place.feet + [0, 0, 0.85])[None])[0]
         elevations.append(np.arctan2(middle[2], np.hypot(middle[0], middle[1])))
     assert np.mean(np.abs(elevations) < np.radians(24)) > 0.9
+
+
+def test_another_try_comes_nearer():
+    for config in (SCENES["paper"], WILD):
+        for seed in range(20):
+            far, near = (
+                draw_place(config, sensor("os1-64"), 1.7, 0.3, nearer, np.random.default_rng(seed)).distance
+                for nearer in (1.0, 0.5)
+            )
+            assert near == pytest.approx(max(far / 2, config.distance[0]))

@@ -10,9 +10,9 @@ from lidarpose.body.person import sample_people
 from lidarpose.body.rig import load_rig
 from lidarpose.geometry import rotation_about
 from lidarpose.skeleton import BODY26
-from lidarpose.synth import prop_meshes
+from lidarpose.synth import carried, prop_meshes
 from lidarpose.synth.bodies import draw_bodies
-from lidarpose.synth.garments import girth
+from lidarpose.synth.garments import girth, skirt
 from lidarpose.synth.props import draw_props
 
 J = {name: i for i, name in enumerate(BODY26.joints)}
@@ -312,3 +312,29 @@ def test_hats_sit_on_the_head(drawn, bodies):
         up /= np.linalg.norm(up)
         top = (hat @ up).max() - (skin @ up).max()
         assert -0.02 < top < 0.08
+
+
+def test_a_long_skirt_s_lower_half_is_of_the_shank_on_its_side():
+    joints = load_rig().rest(np.zeros((1, load_rig().coefficients.shape[1]), np.float32)).joints[0]
+    joints = joints + [0, 0, 1 - joints[:, 2].min()]
+    vertices, mesh, part = skirt(joints.tolist(), [1.0, 0.0, 0.0, 0.0])
+    middle = mesh.vertices[mesh.faces].mean(1)[:, 1] - joints[J["pelvis"], 1]
+    for row in ("hip", "knee"):
+        for side, sign in (("left", 1), ("right", -1)):
+            own = part == 1 + J[f"{side}_{row}"]
+            assert own.any() and (sign * middle[own] > -0.02).all(), (side, row)
+
+
+@pytest.mark.parametrize("name", ["bag", "suitcase"])
+def test_either_hand_carries(name):
+    joints = load_rig().rest(np.zeros((1, load_rig().coefficients.shape[1]), np.float32)).joints[0]
+    for side, sign in (("left", 1), ("right", -1)):
+        for joint, place in (("elbow", (0, 0.22, 0.15)), ("wrist", (0, 0.24, -0.1)), ("hand", (0, 0.24, -0.18))):
+            joints[J[f"{side}_{joint}"]] = np.multiply(place, [1, sign, 1])
+    joints = joints + [0, 0, -joints[:, 2].min()]
+    arms = carried._arms(joints.tolist())
+    assert arms.hanging == HANDS
+    make = {"bag": carried._bag, "suitcase": carried._suitcase}[name]
+    for share, sign in ((0.2, 1), (0.8, -1)):
+        u = [0.5, 0.5, share, *[0.5] * 9]
+        assert sign * make(joints.tolist(), arms, u).place(joints).vertices[:, 1].mean() > 0.15

@@ -148,3 +148,13 @@ def test_wild_grounds_are_of_every_kind_and_carry_the_feet():
     # nobody floats or sinks; grass reaches up
     assert np.abs(heights[~kinds["grass"]]).max() < 0.08
     assert np.abs(heights).max() < 0.25
+
+
+def test_either_side_is_hidden():
+    feet, config, sides = np.array([8.0, 0.0, -1.5]), replace(SCENES["wild"], occluder=1.0), []
+    for seed in range(300):
+        middle = occluder(config, feet, 1.7, np.random.default_rng(seed)).vertices[:, 1]
+        # what stands aside altogether
+        if middle.min() > -0.3 or middle.max() < 0.3:
+            sides.append(middle.mean() > 0)
+    assert len(sides) > 60 and 0.35 < np.mean(sides) < 0.65

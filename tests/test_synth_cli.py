@@ -18,10 +18,11 @@ from lidarpose.cli import main
 from lidarpose.data.shards import open_dataset, read_rows
 from lidarpose.errors import InputError
 from lidarpose.lidar.catalog import listing
-from lidarpose.synth import write
+from lidarpose.synth import street, write
 from lidarpose.synth.generate import Generator
 from lidarpose.synth.scene import scene_config
-from lidarpose.synth.write import Job, write_dataset
+from lidarpose.synth.street import Street
+from lidarpose.synth.write import Job, Maker, write_dataset
 from lidarpose.train.people import ShardPeople, SyntheticPeople
 
 COUNT, PER_SHARD = 60, 10
@@ -322,3 +323,28 @@ def test_difficulty_asked_for_is_the_people_s(tmp_path):
     np.testing.assert_array_equal(sample.points, wanted.points)
     write_dataset(Job(what="people", count=3, hard=0.0, seed=2, sensors=("os1-64",)), tmp_path / "d")
     np.testing.assert_array_equal(list(open_dataset(tmp_path / "d"))[1].points, wanted.points)
+
+
+def test_streets_take_turns_with_the_sensors(monkeypatch, tmp_path):
+    asked = []
+
+    def made(seed, index, *, sensor, frames):
+        asked.append((index, sensor))
+        return Street(frames=(), sensor=sensor, height=1.7)
+
+    monkeypatch.setattr(street, "street", made)
+    job = Job(what="streets", count=5, sensors=("os1-64", "vlp-16"))
+    maker = Maker(job=job, card=job.card(), folder=tmp_path)
+    for index in range(5):
+        maker._street(index)
+    assert asked == [(k, ("os1-64", "vlp-16")[k % 2]) for k in range(5)]
+
+
+def test_a_job_s_scene_and_share_are_the_generator_s(tmp_path):
+    rotations, way = a_clip(40)
+    path = write_amass(tmp_path / "walk_01.npz", rotations, way, fps=10.0)
+    for settings, share in ((dict(), 0.0), (dict(motion=str(path)), 0.5), (dict(motion=str(path), captured=0.2), 0.2)):
+        job = Job(what="people", count=1, scene="paper", **settings)
+        maker = Maker(job=job, card=job.card(), folder=tmp_path)
+        assert maker._generator.scene == scene_config("paper") and maker._generator.captured == share
+        assert (maker._generator.bank is None) == (not settings)

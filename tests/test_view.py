@@ -16,6 +16,7 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14, Skeleton
+from lidarpose.view import picture, report
 from lidarpose.view.person import bone_sides, describe, facing, project, side, thinned, view_directions
 from lidarpose.view.picture import MAX_PEOPLE, Panel, _shortened, draw_people
 from lidarpose.view.report import MAX_POINTS, ReportPerson, render_report, write_report
@@ -388,3 +389,23 @@ def test_numbers_of_a_table_end_without_needless_zeros():
     page = render_report([], title="t", summary=[{"a": 8.6, "b": 3.0, "c": 0.1234}, {"a": 20.0, "b": 4.0, "c": 12.5}])
     cells = re.findall(r'<td class="number">([^<]*)</td>', page)
     assert cells == ["8.6", "3", "0.12", "20.0", "4", "12.50"]
+
+
+def test_points_have_the_colors_that_the_legend_says():
+    left, right = picture._part_colors(np.array([1 + BODY26.index("left_knee"), 1 + BODY26.index("right_knee")]))
+    assert left[2] > left[0] + 0.2 and right[0] > right[2] + 0.2
+    near, far = picture._depth_colors(np.array([1.0, -1.0]))
+    np.testing.assert_allclose([near, far], [picture._NEAR, picture._FAR])
+
+
+def test_a_report_says_the_side_of_every_joint_and_point():
+    part = np.array([0, 1, 1 + BODY26.index("left_knee"), 1 + BODY26.index("right_hand"), 24], np.uint8)
+    points = np.arange(15.0).reshape(5, 3)
+    points[1] = np.nan
+    pose = Pose(joints=np.zeros((26, 3)), skeleton=BODY26)
+    sides = report._skeleton_data(BODY26)["sides"]
+    for name, letter in (("left_hand", "l"), ("right_hip", "r"), ("neck", "c")):
+        assert sides[BODY26.index(name)] == letter
+    assert [sides.count(letter) for letter in "lrc"] == [9, 9, 8]
+    person = ReportPerson(label="a", points=points, pose=pose, part=part)
+    assert report._person_data(person, 100)["sides"] == "nlrr"

@@ -1,0 +1,27 @@
+"""Somebody simple for scenes: a box that goes and turns."""
+
+import numpy as np
+
+from lidarpose.geometry import rotation_about
+from lidarpose.synth.actor import Actor
+from lidarpose.synth.mesh import box
+
+HEADINGS, STEP = (0.0, 1.2, -2.0), 1.5
+
+
+def goer(still=False):
+    """A box 0.3 m deep, 0.9 m wide and 1.7 m tall that goes along x and turns; joints along its left-right axis."""
+    mesh = box((0.3, 0.9, 1.7))
+    headings = (0.0,) * 3 if still else HEADINGS
+    vertices, joints, extent = [], [], []
+    for frame, heading in enumerate(headings):
+        turn, way = rotation_about("z", heading).T, np.array([0.0 if still else STEP * frame, 0, 0])
+        vertices.append((mesh.vertices @ turn + way).astype(np.float32))
+        joints.append((np.linspace([0, -0.4, 0.1], [0, 0.4, 1.6], 26) @ turn + way).astype(np.float32))
+        local = vertices[-1] @ rotation_about("z", heading)
+        extent.append((local.min(0).tolist(), local.max(0).tolist()))
+    return Actor(
+        vertices=np.array(vertices), joints=np.array(joints), heading=headings, extent=tuple(extent),
+        moved=lambda frame: (vertices[frame], joints[frame]), kind="walk", faces=mesh.faces,
+        face_part=np.full(12, 3, np.uint8),
+    )  # fmt: skip
