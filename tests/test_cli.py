@@ -449,9 +449,10 @@ BAD_COMMANDS = {
     "export what": ("export tyni", "did you mean tiny"),
     "export how": ("export --format tflite --out DIR/x", "known are onnx, torch"),
     "export nothing": ("export no/such.safetensors --out DIR/x.onnx", "does not exist"),
-    "import nothing": ("import no/such.safetensors DIR/x", "there is no such file"),
-    "import a pickle": ("import weights.pth DIR/x", "got a pickle"),
-    "import as": ("import DAPT DIR/x --config kitti", "waymo"),
+    "import nothing": ("import no/such.safetensors DIR/x.safetensors", "there is no such file"),
+    "import a pickle": ("import weights.pth DIR/x.safetensors", "got a pickle"),
+    "import as": ("import DAPT DIR/x.safetensors --config kitti", "waymo"),
+    "import into another kind": ("import DAPT DIR/x.onnx", "give a name that ends in .safetensors"),
     "import without an out": ("import DAPT", "OUT"),
     "unknown option": ("predict CROP --picure", "--picure"),
     "demo seed": ("demo --seed -1 --out DIR/d", "seed"),
@@ -470,7 +471,7 @@ def test_a_bad_command_is_one_line(crop, boxes, tmp_path, capsys, monkeypatch, c
     before = sorted(tmp_path.iterdir())
     names = {"DIR": tmp_path, "CROP": crop, "BOXES": boxes, "DAPT": DAPT}
     for name, path in names.items():
-        words = words.replace(name, str(path)) if name != "COMMAND" else words
+        words = words.replace(name, str(path))
     assert run(*words.split()) == 2
     assert expected in one_line(capsys)
     assert sorted(tmp_path.iterdir()) == before

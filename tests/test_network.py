@@ -149,14 +149,14 @@ SMALL_ONE = {"size": "x", "channels": [4, 8, 8], "head_channels": 8, "blocks": [
     "change, message",
     [
         ({"head_channels": 5}, r"must divide by head_channels, got \(4, 8, 8\) and 5"),
-        ({"channels": 8}, r"channels must be three whole numbers \(fine, mid, coarse\), got 8"),
+        ({"channels": 8}, r"channels must be three whole numbers \(fine, mid, coarse\) from 1 to 16384, got 8"),
         ({"channels": [4, 0, 8]}, "channels must be three whole numbers"),
         ({"blocks": (1, -1, 1)}, r"blocks must be three whole numbers \(mid encoder, coarse, mid decoder\)"),
         ({"grid": 0}, "grid must be a positive number of metres, got 0"),
         ({"max_voxels": 1.5}, "max_voxels must be a whole number"),
         ({"heatmap": "wide"}, "unknown heatmap 'wide'.*window"),
-        ({"convolution": -1}, "convolution must be a whole number of at least 0, got -1"),
-        ({"convolution": True}, "convolution must be a whole number of at least 0, got True"),
+        ({"convolution": -1}, "convolution must be a whole number from 0 to 16384, got -1"),
+        ({"convolution": True}, "convolution must be a whole number from 0 to 16384, got True"),
         ({"skeleton": "cat"}, "unknown skeleton 'cat'"),
     ],
 )
