@@ -182,8 +182,9 @@ def test_a_long_name_keeps_its_ends():
     assert _shortened(name, 36) == name and _shortened(name, 11) == "0aa51…c4d5e"
 
 
-def test_only_the_first_sixty_people_fit():
-    people = [Panel(points=np.ones((1, 3)) * i, label=str(i)) for i in range(MAX_PEOPLE + 1)]
+def test_only_so_many_people_fit(monkeypatch):
+    monkeypatch.setattr(picture, "MAX_PEOPLE", 6)
+    people = [Panel(points=np.ones((1, 3)) * i, label=str(i)) for i in range(7)]
     full, over = decoded(draw_people(people[:-1], title="t")), decoded(draw_people(people, title="t"))
     assert over.shape == full.shape
     assert (over[60:] == full[60:]).all() and (over[:60] != full[:60]).any()  # they differ by the note
