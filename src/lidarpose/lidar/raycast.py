@@ -224,17 +224,16 @@ def cast_ray_list(
     """
     vertices, faces = as_mesh(vertices, faces)
     directions = as_directions(directions)
-    length = np.linalg.norm(directions, axis=1)
     if time is not None:
         time = as_times(time, len(directions))
     if moved is None:
-        return ray_list(vertices, faces, directions / length[:, None], None, None)
+        return ray_list(vertices, faces, directions, None, None)
     if time is None:
         raise InputError("moved vertices need the rays' times: pass time (N,) in [0, 1]")
     moved = as_points("moved", moved)
     if moved.shape != vertices.shape:
         raise InputError(f"moved must hold the vertices once more, {vertices.shape}, got {moved.shape}")
-    return ray_list(vertices, faces, directions / length[:, None], moved - vertices, time)
+    return ray_list(vertices, faces, directions, moved - vertices, time)
 
 
 def _sectors(turned: np.ndarray) -> list[np.ndarray]:

@@ -88,12 +88,12 @@ def check_margin(margin: float) -> None:
 
 
 def as_directions(directions: np.ndarray) -> np.ndarray:
-    """(N, 3) float64 m, none of them zero."""
+    """(N, 3) float64, each of length 1."""
     directions = as_points("directions", directions)
     length = np.linalg.norm(directions, axis=1)
     if (length == 0).any():
         raise InputError(f"directions must be longer than 0, but number {int(np.argmin(length))} is zero")
-    return directions
+    return directions / length[:, None]
 
 
 def as_times(time: np.ndarray, count: int) -> np.ndarray:

@@ -157,7 +157,8 @@ def _from_csv(path: Path, text: str) -> dict:
         rows = rows[1:]
         named = {re.sub("[ -]", "_", cell.split("(")[0].strip()): k for k, cell in enumerate(header)}
         up = next((named[n] for n in _ELEVATIONS if n in named), None)
-        off = next((named[n] for n in (*_OFFSETS, *_CLOCKWISE) if n in named), None)
+        by = next((n for n in (*_OFFSETS, *_CLOCKWISE) if n in named), None)
+        off = named.get(by)
         if up is None:
             raise file_error(path, f"has no column named elevation, got {', '.join(header)}")
         # beams without their offsets would be another sensor
@@ -171,7 +172,7 @@ def _from_csv(path: Path, text: str) -> dict:
         fields = {"elevations": [float(row[up]) for row in rows]}
         if off is not None:
             fields["offsets"] = [float(row[off]) for row in rows]
-            fields["clockwise"] = not any(named.get(name) == off for name in _OFFSETS)
+            fields["clockwise"] = by in _CLOCKWISE
     except (ValueError, IndexError):
         raise file_error(path, "must hold a number of degrees in every row") from None
     return fields

@@ -10,7 +10,7 @@ HEATMAPS = ("window", "full", "none")
 # width of a heatmap's bin, m
 BIN = 0.03
 # of any width, far above what anybody trains: a damaged file's header is to ask for nothing larger
-_MOST = 16_384
+MOST = 16_384
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,15 +39,13 @@ class NetworkConfig:
             value = getattr(self, name)
             # false in files of before it was a number
             value = 0 if name == "convolution" and value is False else value
-            object.__setattr__(self, name, whole(name, value, least=least, most=_MOST))
+            object.__setattr__(self, name, whole(name, value, least=least, most=MOST))
         for name, least in (("channels", 1), ("blocks", 0)):
             value = getattr(self, name)
             counts = tuple(value) if isinstance(value, list | tuple) else ()
-            if len(counts) != 3 or not all(isinstance(count, int) and least <= count <= _MOST for count in counts):
+            if len(counts) != 3 or not all(isinstance(count, int) and least <= count <= MOST for count in counts):
                 levels = "fine, mid, coarse" if name == "channels" else "mid encoder, coarse, mid decoder"
-                raise InputError(
-                    f"{name} must be three whole numbers ({levels}) from {least} to {_MOST}, got {value!r}"
-                )
+                raise InputError(f"{name} must be three whole numbers ({levels}) from {least} to {MOST}, got {value!r}")
             object.__setattr__(self, name, counts)
         if any(width % self.head_channels for width in self.channels[1:]):
             raise InputError(

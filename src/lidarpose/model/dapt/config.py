@@ -9,6 +9,7 @@ import numpy as np
 
 from lidarpose.errors import InputError, check_name
 from lidarpose.model.dapt.curves import CURVES
+from lidarpose.model.presets import MOST
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, Skeleton
 
 # the order in which the released Waymo network knows its joints: Waymo's own numbers, limb after limb
@@ -18,10 +19,8 @@ WAYMO_JOINTS = tuple(
 )
 # SMPL's 24 parts and 0 = not body
 PARTS = 25
-# of any size, far above what anybody trains: a damaged file's header is to ask for nothing larger
-_MOST = 16_384
-# times as wide as the finest voxels may the coarsest be: cells are counted in 16 bits
-_COARSEST = 2**16
+# cells are counted in so many bits along each axis
+CELL_BITS = 16
 
 Range = tuple[float, float]
 
@@ -82,14 +81,14 @@ class DaptConfig:
             value = getattr(self, name)
             if not isinstance(value, tuple) or len(value) != length or not all(map(_is_count, value)):
                 raise InputError(
-                    f"{name} must be {length} whole numbers from 1 to {_MOST} (encoder_depths has {levels}), "
+                    f"{name} must be {length} whole numbers from 1 to {MOST} (encoder_depths has {levels}), "
                     f"got {value!r}"
                 )
         for name in ("anchor_heads", "mlp_ratio", "patch"):
             if not _is_count(getattr(self, name)):
-                raise InputError(f"{name} must be a whole number from 1 to {_MOST}, got {getattr(self, name)!r}")
-        if not set(self.strides) <= {2, 4, 8} or np.prod(self.strides, dtype=float) > _COARSEST:
-            raise InputError(f"strides must be 2, 4 or 8 each and {_COARSEST} in all at most, got {self.strides}")
+                raise InputError(f"{name} must be a whole number from 1 to {MOST}, got {getattr(self, name)!r}")
+        if not set(self.strides) <= {2, 4, 8} or np.prod(self.strides, dtype=float) > 1 << CELL_BITS:
+            raise InputError(f"strides must be 2, 4 or 8 each and {1 << CELL_BITS} in all at most, got {self.strides}")
         for part in ("encoder", "decoder"):
             widths, heads = getattr(self, f"{part}_channels"), getattr(self, f"{part}_heads")
             if any(c % h for c, h in zip(widths, heads, strict=True)):
@@ -116,14 +115,14 @@ class DaptConfig:
         if self.bins or self.ranges:
             if not isinstance(self.bins, tuple) or len(self.bins) != 3 or not all(map(_is_count, self.bins)):
                 raise InputError(
-                    f"bins must be three whole numbers (x, y, z) from 1 to {_MOST}, or none, got {self.bins!r}"
+                    f"bins must be three whole numbers (x, y, z) from 1 to {MOST}, or none, got {self.bins!r}"
                 )
             if not isinstance(self.ranges, tuple) or len(self.ranges) != 3 or not all(map(_is_range, self.ranges)):
                 raise InputError(f"ranges must be three pairs (low, high) of metres, or none, got {self.ranges!r}")
         elif not self.coordinates:
             raise InputError("a network needs heatmaps (bins and ranges) or coordinates=True: it would predict nothing")
-        if not isinstance(self.parts, int) or not 0 <= self.parts <= _MOST or self.parts == 1:
-            raise InputError(f"parts must be 0 (no part head) or from 2 to {_MOST}, got {self.parts!r}")
+        if not isinstance(self.parts, int) or not 0 <= self.parts <= MOST or self.parts == 1:
+            raise InputError(f"parts must be 0 (no part head) or from 2 to {MOST}, got {self.parts!r}")
         for name in ("coordinates", "auxiliary", "legacy"):
             if not isinstance(getattr(self, name), bool):
                 raise InputError(f"{name} must be true or false, got {getattr(self, name)!r}")
@@ -186,7 +185,7 @@ def _is_number(value: object) -> bool:
 
 
 def _is_count(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= _MOST
+    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= MOST
 
 
 def _is_range(value: object) -> bool:

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarpose.errors import InputError, check_name
-from lidarpose.model.dapt.config import DaptConfig
+from lidarpose.model.dapt.config import CELL_BITS, DaptConfig
 from lidarpose.model.dapt.curves import curve, dilated, z_order
 
 # bits an axis of a cell, and of a neighbour's cell: one more, so that a step across the edge meets no cell
-_BITS, _WIDE = 16, 17
+_BITS, _WIDE = CELL_BITS, CELL_BITS + 1
 _MOST_PEOPLE = 1 << (63 - 3 * _WIDE)
 # how convolutions and attention run: see `build_tables`
 LAYOUTS = ("ragged", "padded")
