@@ -21,10 +21,11 @@ def a_clip(frames=6, seed=0):
     return rotations, way
 
 
-def joints_of(rotations, translation):
-    """(F, 24, 3) m of the mean adult."""
+def joints_of(rotations, translation=None):
+    """(F, 24, 3) m of the mean adult, the pelvis at `translation` (F, 3) or at the origin."""
     rest = retarget.mean_adult_joints()[None]
-    return rig.forward_kinematics(SMPL24.parents, rest, np.asarray(rotations, float), np.asarray(translation, float))[1]
+    way = np.zeros((len(rotations), 3)) if translation is None else np.asarray(translation, float)
+    return rig.forward_kinematics(SMPL24.parents, rest, np.asarray(rotations, float), way)[1]
 
 
 def to_smpl(rotations, up="z"):

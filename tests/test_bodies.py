@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from motion_files import joints_of
 
-from lidarpose.body import retarget, rig
 from lidarpose.body.clips import Motion
 from lidarpose.geometry import rotation_about
 from lidarpose.skeleton import BODY26, SMPL24
@@ -37,23 +37,18 @@ def motion(frames=40, fps=10.0, jump=0.0, turn=0.0, names=("001_01",)):
     )  # fmt: skip
 
 
-def positions(rotations):
-    rest = retarget.mean_adult_joints()[None]
-    return rig.forward_kinematics(SMPL24.parents, rest, rotations, np.zeros((len(rotations), 3)))[1]
-
-
 def test_captured_people_are_varied_by_their_mirror_image(monkeypatch):
     monkeypatch.setattr(bodies, "_VARIATION", 0.0)
     bank = PoseBank.of_motion(motion())
     both = np.stack([bank.rotations, bank.moved], 1)
     varied, (way,) = bodies._vary(both, np.random.default_rng(0), bank.step[:, None])
-    known = positions(bank.rotations[:1])[0]
+    known = joints_of(bank.rotations[:1])[0]
     across = known[list(SMPL24.flip)] * [1, -1, 1]
     assert np.abs(known - across).max() > 0.3
     mirrored = 0
     for k in range(len(varied)):
         for frame in range(2):
-            p = positions(varied[k, frame][None])[0]
+            p = joints_of(varied[k, frame][None])[0]
             off = [np.abs(p - there).max() for there in (known, across)]
             assert min(off) < 0.03
         # who is mirrored goes right

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from motion_files import joints_of
 
-from lidarpose.body import clips, motion, retarget, rig
+from lidarpose.body import clips, motion, retarget
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix, rotation_about
 from lidarpose.skeleton import SMPL24
@@ -141,17 +142,12 @@ def test_what_is_wrong_with_a_motion_is_said(call, message):
 # retargeting
 
 
-def positions(rotations):
-    rest = retarget.mean_adult_joints()[None]
-    return rig.forward_kinematics(SMPL24.parents, rest, rotations, np.zeros((len(rotations), 3)))[1]
-
-
 def arm(bend, twist):
     """The rest pose with the left upper arm turned about itself by `twist` (n,) and the elbow bent by `bend` (n,)."""
     rotations = np.broadcast_to(np.eye(3), (len(bend), 24, 3, 3)).copy()
     rotations[:, J["left_shoulder"]] = rotation_about("y", twist)
     rotations[:, J["left_elbow"]] = rotation_about("z", -bend)
-    return positions(rotations)
+    return joints_of(rotations)
 
 
 @pytest.mark.parametrize("twist", [0.0, 1.5, 2.6, 2.9])
@@ -179,7 +175,7 @@ def test_a_hand_across_the_elbows_axis_does_not_flip():
     rotations[:, J["left_elbow"]] = rotation_about("z", np.full(60, -1.0))
     # a hair off, so that the hand passes beside the axis and not through it
     rotations[:, J["left_wrist"]] = rotation_about("z", 0.02) @ rotation_about("x", side)
-    found = retarget.retarget_positions(positions(rotations))[:, J["left_wrist"]].astype(float)
+    found = retarget.retarget_positions(joints_of(rotations))[:, J["left_wrist"]].astype(float)
     steps = np.linalg.norm(retarget.rotation_vector(np.swapaxes(found[:-1], -1, -2) @ found[1:]), axis=-1)
     assert np.degrees(steps.max()) < 5
 
@@ -189,10 +185,10 @@ def test_an_overstretched_knee_is_not_a_thigh_turned_round():
     rotations = np.broadcast_to(np.eye(3), (1, 24, 3, 3)).copy()
     for side in ("left", "right"):
         rotations[:, J[f"{side}_knee"]] = rotation_about("y", np.radians(-15))
-    found = retarget.retarget_positions(positions(rotations))
+    found = retarget.retarget_positions(joints_of(rotations))
     for name in ("left_hip", "right_hip"):
         assert np.trace(found[0, J[name]]) > 2.8
-    np.testing.assert_allclose(positions(found), positions(rotations), atol=0.01)
+    np.testing.assert_allclose(joints_of(found), joints_of(rotations), atol=0.01)
 
 
 @settings(max_examples=25, deadline=None)
@@ -207,7 +203,7 @@ def test_retargeting_anything_gives_rotations(seed):
 
 
 def test_a_bone_without_length_is_named():
-    joints = positions(motion.sample_rotations(np.random.default_rng(0), 3).rotations)
+    joints = joints_of(motion.sample_rotations(np.random.default_rng(0), 3).rotations)
     joints[1, J["left_knee"]] = joints[1, J["left_hip"]]
     with pytest.raises(InputError, match="left_hip -> left_knee has no length in frame 1"):
         retarget.retarget_positions(joints)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from motion_files import joints_of
 
 from lidarpose.body import activities, angles, captured, clips, latents, motion, retarget, rig
 from lidarpose.errors import InputError
@@ -17,11 +18,6 @@ from lidarpose.skeleton import SMPL24
 
 J = {name: i for i, name in enumerate(SMPL24.joints)}
 MAIN = [J[n] for n in SMPL24.joints if not n.endswith(("foot", "hand"))]
-
-
-def positions(rotations):
-    rest = retarget.mean_adult_joints()[None]
-    return rig.forward_kinematics(SMPL24.parents, rest, rotations, np.zeros((len(rotations), 3)))[1]
 
 
 def drawn(n=1500, seed=0, **mix):
@@ -95,7 +91,7 @@ def test_knees_point_forward_and_hands_reach_in_front():
     for side in ("left", "right"):
         bent[:, name[f"{side}_knee"]] = bent[:, name[f"{side}_elbow"]] = 80
         bent[:, name[f"{side}_abd"]] = bent[:, name[f"{side}_out"]] = 15
-    p = positions(motion.rotations_from_angles(bent))[0]
+    p = joints_of(motion.rotations_from_angles(bent))[0]
     for side, left in (("left", 1), ("right", -1)):
         assert p[J[f"{side}_ankle"], 0] < p[J[f"{side}_knee"], 0] - 0.2
         assert p[J[f"{side}_wrist"], 0] > p[J[f"{side}_elbow"], 0] + 0.15
@@ -110,13 +106,13 @@ def test_knees_point_forward_and_hands_reach_in_front():
     ):
         forward = bent.copy()
         forward[:, name[positive]] = 40
-        q, r = positions(motion.rotations_from_angles(forward))[0], positions(motion.rotations_from_angles(bent))[0]
+        q, r = joints_of(motion.rotations_from_angles(forward))[0], joints_of(motion.rotations_from_angles(bent))[0]
         assert q[J[joint], 0] > r[J[joint], 0] + 0.1, positive
 
 
 @pytest.mark.parametrize("kind", ["idle", "walk"])
 def test_standing_people_stand(kind):
-    p = positions(drawn(800, 2, **{kind: 1}).rotations)
+    p = joints_of(drawn(800, 2, **{kind: 1}).rotations)
     pelvis = p[:, J["pelvis"], 2]
     feet = p[:, [J["left_ankle"], J["right_ankle"]], 2]
     assert (p[:, J["head"], 2] > pelvis + 0.4).all()
@@ -129,7 +125,7 @@ def test_standing_people_stand(kind):
 
 
 def test_standing_people_are_in_balance():
-    p = positions(drawn(600, 3, idle=1).rotations)
+    p = joints_of(drawn(600, 3, idle=1).rotations)
     middle = 0.5 * p[:, J["spine2"]] + 0.2 * p[:, J["neck"]] + 0.3 * p[:, [J["left_hip"], J["right_hip"]]].mean(1)
     feet = p[:, [J[f"{s}_{n}"] for s in ("left", "right") for n in ("ankle", "foot")]].mean(1)
     assert np.median(np.abs(middle - feet)[:, 0]) < 0.12
@@ -139,13 +135,13 @@ def test_arms_swing_against_the_legs():
     walkers = latents_of(24, 4, walk=1)
     walkers = replace(walkers, arm=np.full((24, 2), activities.OWN_ARMS), captured=np.zeros((0, 2, 27)))
     for walk in motion._motion(walkers, np.arange(60) / 40).rotations:
-        p = positions(walk)
+        p = joints_of(walk)
         for side, across in (("left", "right"), ("right", "left")):
             arm = (p[:, J[f"{side}_elbow"]] - p[:, J[f"{side}_shoulder"]])[:, 0]
             for leg, sign in ((side, -1), (across, 1)):
                 ankle = (p[:, J[f"{leg}_ankle"]] - p[:, J["pelvis"]])[:, 0]
                 assert sign * np.corrcoef(arm, ankle)[0, 1] > 0.6
-    p = positions(drawn(2000, 5, walk=1).rotations)
+    p = joints_of(drawn(2000, 5, walk=1).rotations)
     arms = (p[:, J["left_elbow"]] - p[:, J["right_elbow"]])[:, 0]
     legs = (p[:, J["left_ankle"]] - p[:, J["right_ankle"]])[:, 0]
     assert np.corrcoef(arms, legs)[0, 1] < -0.3
@@ -155,20 +151,20 @@ def test_a_mirrored_pose_is_the_mirror_image():
     one = motion._angles(latents_of(200, 6)).angles
     mirrored = motion.mirror_angles(one)
     assert (mirrored >= activities.LIMITS[0]).all() and (mirrored <= activities.LIMITS[1]).all()
-    p, q = (positions(motion.rotations_from_angles(a)) for a in (one, mirrored))
+    p, q = (joints_of(motion.rotations_from_angles(a)) for a in (one, mirrored))
     np.testing.assert_allclose(q, p[:, SMPL24.flip] * [1, -1, 1], atol=0.02)
     np.testing.assert_allclose(motion.mirror_angles(mirrored), one)
 
 
 def test_both_sides_are_alike_on_average():
-    p = positions(drawn(6000, 9).rotations)
+    p = joints_of(drawn(6000, 9).rotations)
     mean = p.mean(0)
     np.testing.assert_allclose(mean, mean[list(SMPL24.flip)] * [1, -1, 1], atol=0.03)
 
 
 def test_hands_stay_out_of_the_trunk():
     prior = drawn(3000, 10)
-    p = positions(prior.rotations)
+    p = joints_of(prior.rotations)
     # the chest's frame is that of spine3
     turned = rig.forward_kinematics(
         SMPL24.parents, retarget.mean_adult_joints()[None], prior.rotations, np.zeros((3000, 3))
@@ -209,7 +205,7 @@ def test_sample_poses():
 
 
 def test_kneeling_people_have_a_knee_on_the_ground():
-    p = positions(drawn(300, 14, kneel=1).rotations)
+    p = joints_of(drawn(300, 14, kneel=1).rotations)
     knee = p[:, [J["left_knee"], J["right_knee"]], 2].min(1)
     # a knee joint is 5 cm above the floor, an ankle joint 8 cm
     assert np.median(np.abs(knee - p[:, [J["left_ankle"], J["right_ankle"]], 2].min(1))) < 0.08
@@ -231,7 +227,7 @@ def test_captured_poses_are_people_upright():
         2,
         27,
     )
-    p = positions(drawn(500, 15, captured=1).rotations)
+    p = joints_of(drawn(500, 15, captured=1).rotations)
     assert (p[:, J["neck"], 2] > p[:, J["pelvis"], 2]).mean() > 0.95
     assert Path(captured.__file__).with_name("assets").joinpath("motion_prior.npz").stat().st_size < 60_000
 
@@ -261,9 +257,9 @@ def test_the_fit_finds_a_known_mixture(tmp_path):
 def test_retargeting_own_poses_gives_them_back(yaw):
     rotations = drawn(1500, 11).rotations
     rotations[:, 0] = rotation_about("z", yaw) @ rotations[:, 0]
-    p = positions(rotations)
+    p = joints_of(rotations)
     found = retarget.retarget_positions(p + [3.0, -2, 1])
-    error = np.linalg.norm(positions(found) - p, axis=-1)
+    error = np.linalg.norm(joints_of(found) - p, axis=-1)
     assert error[:, MAIN].mean() < 0.01 and error[:, MAIN].mean(0).max() < 0.02
     assert np.percentile(error[:, MAIN], 99.5) < 0.05
     turn = retarget.heading(found) - retarget.heading(rotations)
@@ -275,7 +271,7 @@ def test_retargeting_another_body_keeps_the_directions_of_its_limbs():
     rotations = drawn(300, 12).rotations
     rest = retarget.mean_adult_joints() * [1.0, 1.2, 0.8] * 0.9
     p = rig.forward_kinematics(SMPL24.parents, rest[None], rotations, np.zeros((300, 3)))[1]
-    q = positions(retarget.retarget_positions(p))
+    q = joints_of(retarget.retarget_positions(p))
     for start, end in (("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist")):
         for side in ("left", "right"):
             a, b = (x[:, J[f"{side}_{end}"]] - x[:, J[f"{side}_{start}"]] for x in (p, q))
