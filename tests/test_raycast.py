@@ -11,7 +11,9 @@ from raycast_meshes import body, ground, join, soup, sphere
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.lidar.catalog import SENSORS, sensor
+from lidarpose.lidar.divergence import scan_wide
 from lidarpose.lidar.raycast import cast_ray_list, cast_rays, cast_window, find_window, scan
+from lidarpose.lidar.raycast_kernels import raster
 from lidarpose.lidar.raycast_reference import cast_ray_list_reference, cast_rays_reference
 from lidarpose.lidar.sensor import Sensor, Window
 
@@ -47,6 +49,20 @@ def test_same_as_embree(scene):
     rays = np.stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)], -1).reshape(-1, 3)
     distance, face = cast_ray_list(vertices, data["faces"], rays)
     assert_same((distance.reshape(a.shape), face.reshape(a.shape)), want)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_first_cast_compiles_once(dtype):
+    """Whatever array comes, by whatever way: compiling for another type takes seconds."""
+    vertices, faces = sphere()
+    vertices = (vertices + [5.0, 0, 0]).astype(dtype)
+    vertices.setflags(write=False)
+    s = sensor("vlp-16")
+    hits = scan(vertices, faces, s)
+    assert len(hits.points) and len(scan_wide(vertices, faces, s, divergence=0.003).points)
+    cast_window(vertices, faces, s, find_window(vertices, s))
+    cast_rays(vertices, faces, FULL_TURN, ALL_ELEVATIONS)
+    assert len(raster.signatures) == 1
 
 
 @pytest.mark.parametrize("name", [name for name, s in SENSORS.items() if isinstance(s, Sensor)])

@@ -26,7 +26,6 @@ from lidarpose.lidar.raycast_input import (
     as_points,
     as_times,
     check_margin,
-    read_only,
 )
 from lidarpose.lidar.sensor import Sensor
 
@@ -65,7 +64,7 @@ def scan_wide(
         )
     check_margin(margin)
     vertices, faces = as_mesh(vertices, faces)
-    window_vertices = vertices if window_vertices is None else read_only(as_points("window_vertices", window_vertices))
+    window_vertices = vertices if window_vertices is None else as_points("window_vertices", window_vertices)
     offsets, weights = footprint(divergence, sub_beams)
     (points, face, column, ring), (column0, columns, row0, rows) = scan_diverging(
         vertices, faces, as_culled(cull, faces), window_vertices, beams_of(sensor), margin + divergence / 2,

@@ -68,7 +68,8 @@ def scan_diverging(vertices, faces, culled, window_vertices, beams, margin, offs
     inverse_x = np.zeros((subs, columns, rows * subs))
     face = np.full((subs, columns, rows * subs), -1, np.int32)
     scale, merged, merged_face = np.ones(columns), np.zeros((columns, rows)), np.full((columns, rows), -1, np.int32)
-    tan, cos = np.empty(min(columns, beams.sector)), np.empty(min(columns, beams.sector))
+    most = min(columns, beams.sector)
+    tan, cos, index = np.empty(most), np.empty(most), np.empty(most, np.int64)
     row_tan, row_index = np.empty(rows * subs), np.empty(rows * subs, np.int64)
     lift = np.empty(rows * subs)
     for g in range(len(beams.group_shift)):
@@ -83,17 +84,22 @@ def scan_diverging(vertices, faces, culled, window_vertices, beams, margin, offs
                     n += 1
         if not n:
             continue
-        # the sub-rows of rows that are near one another mix
-        by_tan = np.argsort(row_tan[:n])
-        row_tan[:n], row_index[:n] = row_tan[:n][by_tan], row_index[:n][by_tan]
+        # the sub-rows of rows that are near one another mix: almost in order as they are
+        for m in range(1, n):
+            tangent, row, i = row_tan[m], row_index[m], m
+            while i > 0 and row_tan[i - 1] > tangent:
+                row_tan[i], row_index[i] = row_tan[i - 1], row_index[i - 1]
+                i -= 1
+            row_tan[i], row_index[i] = tangent, row
         for start in range(0, columns, beams.sector):
             count = sector_columns(beams, start, columns, tan, cos, scale)
             center = beams.start + (column0 + start + (count - 1) / 2) * beams.step + beams.group_shift[g]
-            index = np.arange(start, start + count)
+            for k in range(count):
+                index[k] = start + k
             for a in range(subs):
                 raster(
-                    vertices, faces, culled, center + offsets[a], tan[:count], cos[:count], row_tan[:n], index,
-                    row_index, inverse_x[a], face[a],
+                    vertices, faces, culled, center + offsets[a], tan[:count], cos[:count], row_tan[:n],
+                    index[:count], row_index, inverse_x[a], face[a],
                 )  # fmt: skip
     distance, flat = np.empty(subs * subs), weights.copy().reshape(-1)
     order = np.empty(subs * subs, np.int64)

@@ -10,9 +10,9 @@ _NO_FACES.setflags(write=False)
 
 
 def as_points(name: str, values: np.ndarray) -> np.ndarray:
-    """(n, 3) float64, C-contiguous, finite."""
+    """A copy (n, 3) float64, C-contiguous, finite; writable, as what compiled code makes: one type to compile for."""
     try:
-        values = np.ascontiguousarray(values, np.float64)
+        values = np.array(values, np.float64, order="C")
     except (TypeError, ValueError):
         raise InputError(f"{name} must be an (n, 3) array of numbers, got {type(values).__name__}") from None
     if values.ndim != 2 or values.shape[1] != 3:
@@ -33,12 +33,12 @@ def as_vertices(name: str, values: np.ndarray) -> np.ndarray:
 
 
 def as_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """vertices (V, 3) float64 and faces (F, 3) int32 that index them, C-contiguous, read-only."""
+    """A copy of vertices (V, 3) float64, and faces (F, 3) int32 that index them, read-only; C-contiguous."""
     vertices = as_points("vertices", vertices)
     faces = as_faces(faces, len(vertices))
     if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise _out_of_range(faces, len(vertices))
-    return read_only(vertices), faces
+    return vertices, faces
 
 
 def as_faces(faces: np.ndarray, count: int) -> np.ndarray:
@@ -97,9 +97,9 @@ def as_directions(directions: np.ndarray) -> np.ndarray:
 
 
 def as_times(time: np.ndarray, count: int) -> np.ndarray:
-    """(count,) float64 in [0, 1]."""
+    """A copy (count,) float64 in [0, 1]."""
     try:
-        time = np.ascontiguousarray(time, np.float64)
+        time = np.array(time, np.float64, order="C")
     except (TypeError, ValueError):
         raise InputError(f"time must be ({count},) numbers, one a ray, got {type(time).__name__}") from None
     if time.shape != (count,):

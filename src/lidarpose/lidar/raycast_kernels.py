@@ -3,6 +3,10 @@ run outside the interpreter's lock and may be called from many threads.
 
 Loops over vertices, faces and pairs read flat arrays by unsigned numbers: only then does the compiler know the step
 between elements, and that no index is negative, and use the processor's vectors. That halves the time.
+
+Compiling is what a first call waits for. So every kernel knows one type of each array (see `raycast_input`), and what
+numpy does in one expression, assignment between slices, `max()`, `searchsorted()`, is a loop here: numba takes longer
+to compile one such expression, with its messages, than most of these functions.
 """
 
 from typing import NamedTuple
@@ -77,7 +81,8 @@ def _table(values):
         single = single and lut[b + 1] < 2
         lut[b + 1] += lut[b]
     padded = np.empty(n + 1)
-    padded[:n] = values
+    for i in range(n):
+        padded[i] = values[i]
     padded[n] = np.inf
     return Table(padded, lut, values[0], scale, float(bins), single)
 
@@ -225,7 +230,8 @@ def raster(vertices, faces, culled, center, column_tan, column_cos, row_tan, col
     if len(culled) and not (beside and _may_surround(faces, culled, ahead)):
         kept = _front(faces, culled, P, kept)
     lines = np.empty(2 * len(column_tan))
-    lines[::2], lines[1::2] = column_tan, column_cos
+    for k in range(len(column_tan)):
+        lines[2 * k], lines[2 * k + 1] = column_tan[k], column_cos[k]
     pairs = np.empty(8 * (_BLOCK + len(column_tan)), np.int32)
     n = 0
     for f in kept:

@@ -97,6 +97,15 @@ def bounds(vertices):
 
 
 @compiled
+def _rings_below(elevations, limit, up_to):
+    """How many of the elevations (E,), ascending, are below the limit, or `up_to` it."""
+    n = 0
+    while n < len(elevations) and (elevations[n] < limit or (up_to and elevations[n] == limit)):
+        n += 1
+    return n
+
+
+@compiled
 def window_of(vertices, beams, margin):
     """column0, columns, row0, rows of the smallest window that holds the vertices, as `raycast.find_window`."""
     if not len(vertices):
@@ -104,12 +113,15 @@ def window_of(vertices, beams, margin):
     center, left, right, low, high = bounds(vertices)
     # the same sums in the same order as in `Sensor.window`
     left, right, low, high = center + left - margin, center + right + margin, low - margin, high + margin
-    first = int(np.ceil((left - beams.start - beams.shifts.max()) / beams.step))
-    last = int(np.floor((right - beams.start - beams.shifts.min()) / beams.step))
+    least = most = beams.shifts[0]
+    for shift in beams.shifts:
+        least, most = min(least, shift), max(most, shift)
+    first = int(np.ceil((left - beams.start - most) / beams.step))
+    last = int(np.floor((right - beams.start - least) / beams.step))
     count = max(0, last - first + 1)
     if count >= beams.columns:
         first, count = 0, beams.columns
-    row0, end = np.searchsorted(beams.elevations, low), np.searchsorted(beams.elevations, high, side="right")
+    row0, end = _rings_below(beams.elevations, low, False), _rings_below(beams.elevations, high, True)
     return first % beams.columns, count, row0, max(0, end - row0)
 
 
@@ -132,7 +144,8 @@ def cast_grid(vertices, faces, culled, beams, column0, columns, row0, rows):
     inverse_x = np.zeros((columns, rows))
     face = np.full((columns, rows), -1, np.int32)
     scale = np.ones(columns)
-    tan, cos = np.empty(min(columns, beams.sector)), np.empty(min(columns, beams.sector))
+    most = min(columns, beams.sector)
+    tan, cos, index = np.empty(most), np.empty(most), np.empty(most, np.int64)
     row_tan, row_index = np.empty(rows), np.empty(rows, np.int64)
     for g in range(len(beams.group_shift)):
         n = 0
@@ -145,9 +158,10 @@ def cast_grid(vertices, faces, culled, beams, column0, columns, row0, rows):
         for start in range(0, columns, beams.sector):
             count = sector_columns(beams, start, columns, tan, cos, scale)
             center = beams.start + (column0 + start + (count - 1) / 2) * beams.step + beams.group_shift[g]
-            index = np.arange(start, start + count)
+            for k in range(count):
+                index[k] = start + k
             raster(
-                vertices, faces, culled, center, tan[:count], cos[:count], row_tan[:n], index, row_index,
+                vertices, faces, culled, center, tan[:count], cos[:count], row_tan[:n], index[:count], row_index,
                 inverse_x, face,
             )  # fmt: skip
     return inverse_x, face, scale

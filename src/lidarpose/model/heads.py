@@ -46,18 +46,24 @@ def bin_centers(bins: int, device: torch.device | None = None) -> Tensor:
 
 
 def decode(logits: Tensor) -> Tensor:
-    """logits (..., W) -> (...) m: expectation of the softmax within `HALF_WIDTH` bins of its mode, fewer at an edge.
+    """logits (..., W) -> (...) m from the heatmap's origin: `mean_bin` as a length."""
+    return (mean_bin(logits) + 0.5 - logits.shape[-1] / 2) * BIN
+
+
+def mean_bin(logits: Tensor) -> Tensor:
+    """logits (..., W) -> (...) bins: expectation of the softmax within `HALF_WIDTH` bins of its mode, fewer at an edge.
 
     A mean over all bins would fall between the two peaks of a left/right doubt; the window keeps to one of them. It has
-    as many bins on either side of the mode: a window that an edge cuts would lean inwards. Twin in numpy, for whoever
-    has no torch: `decode.window`.
+    as many bins on either side of the mode: a window that an edge cuts would lean inwards. Computed in float32, since
+    half types cannot tell bins of the hundreds apart. Twin in numpy, for whoever has no torch: `decode.window`.
     """
     bins = logits.shape[-1]
     mode = logits.argmax(-1, keepdim=True)
     reach = torch.minimum(mode, bins - 1 - mode).clamp(max=HALF_WIDTH)
-    near = (torch.arange(bins, device=logits.device) - mode).abs() <= reach
-    weight = torch.softmax(logits.masked_fill(~near, -1e4), -1)
-    return (weight * bin_centers(bins, logits.device)).sum(-1)
+    index = torch.arange(bins, device=logits.device)
+    # finite: a softmax's gradient at -inf may not be a number
+    weight = logits.float().masked_fill((index - mode).abs() > reach, -1e4).softmax(-1)
+    return (weight * index).sum(-1)
 
 
 def encode(offset: Tensor, sigma: float, bins: int) -> Tensor:

@@ -57,7 +57,8 @@ def _center(points):
     for a in range(3):
         for i in range(count):
             cell[i, a] = np.int64(np.floor(np.float64(points[i, a]) / CENTER_CELL))
-        low[a], high[a] = cell[:, a].min(), cell[:, a].max()
+            low[a] = min(low[a], cell[i, a]) if i else cell[i, a]
+            high[a] = max(high[a], cell[i, a]) if i else cell[i, a]
         if high[a] - low[a] >= _FAR:
             return center, False
     number = np.empty(count, np.int64)

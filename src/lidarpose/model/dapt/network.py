@@ -29,7 +29,7 @@ from lidarpose.model.dapt.layers import (
     Unpooling,
 )
 from lidarpose.model.dapt.tables import Level, Neighbours, Tables, build_tables
-from lidarpose.model.decode import HALF_WIDTH
+from lidarpose.model.heads import mean_bin
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +76,7 @@ class DaptOutputs:
         if self.logits_x is None:
             return self.coordinates
         heatmaps = (self.logits_x, self.logits_y, self.logits_z)
-        axes = [_window(h) * step + low for h, low, step in zip(heatmaps, self.low, self.step, strict=True)]
+        axes = [mean_bin(h) * step + low for h, low, step in zip(heatmaps, self.low, self.step, strict=True)]
         return torch.stack(axes, -1)
 
 
@@ -265,17 +265,6 @@ class PartHead(nn.Module):
 
 def _blocks(channels: int, heads: int, drops: list[float], config: DaptConfig) -> list[Block]:
     return [Block(channels, heads, config.mlp_ratio, drop, order) for order, drop in enumerate(drops)]
-
-
-def _window(logits: Tensor) -> Tensor:
-    """logits (..., W) -> (...) bins: see `decode.window`."""
-    bins = logits.shape[-1]
-    mode = logits.argmax(-1, keepdim=True)
-    reach = torch.minimum(mode, bins - 1 - mode).clamp(max=HALF_WIDTH)
-    index = torch.arange(bins, device=logits.device)
-    # finite, and in float32, since half types cannot tell bins of the hundreds apart
-    weight = logits.float().masked_fill((index - mode).abs() > reach, -1e4).softmax(-1)
-    return (weight * index).sum(-1)
 
 
 def _cloud(cloud: np.ndarray, number: int) -> np.ndarray:
