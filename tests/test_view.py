@@ -5,6 +5,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -170,9 +171,23 @@ def test_odd_people_are_drawn(panel):
     assert (image < 128).any()
 
 
+def test_a_person_beside_a_wall_is_in_the_picture():
+    pose = t_pose(confidence=1.0)
+    wall = np.random.default_rng(0).uniform((13, 4, -1), (13.1, 12, 2), (3000, 3))
+    alone, beside = (
+        pixels(decoded(draw_people([Panel(points=points, pose=pose)]))[70:], BLUE)
+        for points in (cloud(pose), np.concatenate([cloud(pose), wall]))
+    )
+    assert len(beside) > 0.15 * len(alone)
+
+
 def test_what_is_said_under_a_person():
-    panel = Panel(points=np.tile([3.0, 4, 0], (1500, 1)), pose=t_pose(confidence=0.5))
-    assert describe(panel) == "1,500 points · 5.0 m · confidence 0.50"
+    panel = Panel(points=np.tile([3.0, 4, 0], (1500, 1)))
+    assert describe(panel) == "1,500 points · 5.0 m"
+    # where the person is, not most of the points
+    assert describe(replace(panel, pose=t_pose(at=(6, 8, -1), confidence=0.5))) == (
+        "1,500 points · 10.0 m · confidence 0.50"
+    )
     assert describe(Panel(points=np.zeros((1, 3)), distance=12.34)) == "1 point · 12.3 m"
     assert describe(Panel(points=np.zeros((0, 3)))) == "0 points"
 
@@ -180,6 +195,11 @@ def test_what_is_said_under_a_person():
 def test_a_long_name_keeps_its_ends():
     name = "0aa51a7c-6c2d-4c0e-9d5e-7f1b2a3c4d5e"
     assert _shortened(name, 36) == name and _shortened(name, 11) == "0aa51…c4d5e"
+
+
+def test_a_title_of_digits_ends_on_the_sheet():
+    image = decoded(draw_people([Panel(points=np.zeros((0, 3)))], title="0123456789abcdef" * 4 + ".npy"))
+    assert (image[:, -8:] == 255).all()
 
 
 def test_only_so_many_people_fit(monkeypatch):
@@ -297,7 +317,7 @@ def test_report_holds_the_data():
     one = ReportPerson(label="x", points=one.points, pose=Pose(joints=joints, skeleton=BODY26), truth=one.truth)
     data = Reader(render_report([one], title="t", summary=[])).data()
     (got,) = data["people"]
-    center = np.median(one.points.astype(float), axis=0)
+    center = np.median(one.truth.joints, axis=0)
     np.testing.assert_allclose(np.reshape(got["points"], (-1, 3)) / 1000 + center, one.points, atol=6e-4)
     assert got["pose"]["joints"][3] is None and "confidence" not in got["pose"]
     np.testing.assert_allclose(np.array(got["pose"]["joints"][:3]) / 1000 + center, joints[:3], atol=6e-4)

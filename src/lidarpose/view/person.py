@@ -114,8 +114,9 @@ def thinned(count: int, limit: int) -> np.ndarray:
 
 
 def middle(person) -> np.ndarray | None:
-    """A point (3,) in the person: of the points, else of a skeleton; None where there is nothing."""
-    clouds = [person.points] + [pose.joints for pose in (person.pose, person.truth) if pose is not None]
+    """A point (3,) in the person: of a skeleton, else of the points, most of which may be of a wall; None where there
+    is nothing."""
+    clouds = [pose.joints for pose in (person.truth, person.pose) if pose is not None] + [person.points]
     for cloud in clouds:
         cloud = np.asarray(cloud, float)
         cloud = cloud[np.isfinite(cloud).all(-1)]

@@ -142,7 +142,8 @@ def _header(ax, panels: list[Panel], shown: list[Panel], *, title: str, at: tupl
     width = ax.get_xlim()[1] - 2 * x
     note = f"the first {len(shown)} of {len(panels)} people" if len(shown) < len(panels) else ""
     if title:
-        room = int(width / 0.115) - len(note)
+        # a hash fits
+        room = int(width / 0.127) - len(note)
         _text(ax, x, y, _shortened(title, max(room, 12)), size=13, weight="bold", va="top")
     if note:
         _text(ax, x + width, y - 0.03, note, size=9, color=_FAINT, va="top", ha="right")
