@@ -15,6 +15,7 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about
 from lidarpose.infer import people as people_module
 from lidarpose.infer.backend import Raw
+from lidarpose.infer.files import _inside
 from lidarpose.infer.people import MAX_POINTS, as_origin, as_points, candidates, clean, flat_axis, lies, unit_warning
 from lidarpose.infer.predictor import Predictor
 from lidarpose.io.boxes import read_boxes
@@ -425,6 +426,18 @@ def test_any_box_of_the_same_points_gives_the_same_pose(model, sweep):
     assert all(pose.num_points == len(cloud) for pose in poses)
     for pose in poses[1:]:
         np.testing.assert_array_equal(pose.joints, poses[0].joints)
+
+
+def test_a_box_looks_at_few_of_many_points(monkeypatch):
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-40, 40, (20_000, 3))
+    boxes = [Box(center=rng.uniform(-40, 40, 3), size=rng.uniform(0.5, 9, 3), yaw=rng.uniform(-7, 7)) for _ in "ab" * 9]
+    expected = [np.flatnonzero(box.contains(points)) for box in boxes]
+    looked, contains = [], Box.contains
+    monkeypatch.setattr(Box, "contains", lambda box, near: looked.append(len(near)) or contains(box, near))
+    for rows, wanted in zip(_inside(boxes, points), expected, strict=True):
+        np.testing.assert_array_equal(rows, wanted)
+    assert sum(map(len, expected)) > 50 and np.mean(looked) < 0.3 * len(points)
 
 
 def test_an_empty_box_is_no_harm_to_the_others(model, sweep):
