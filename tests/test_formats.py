@@ -214,6 +214,21 @@ def test_cells_in_quotes_of_either_kind(folder):
         same(read(folder, "a.csv", "x,y,z\n" + text), POINTS[:, :3].round(3))
 
 
+@pytest.mark.parametrize(("separator", "suffix"), [(",", "csv"), (";", "csv"), ("\t", "txt"), (" ", "xyz")])
+def test_a_separator_in_quotes_separates_nothing(folder, separator, suffix):
+    rows = (("name", "x", "y", "z"), (f'"person{separator}sitting"', "1.5", "2", "3"), ('"car"', "4", "5", "6"))
+    text = "\n".join(separator.join(row) for row in rows)
+    same(read(folder, f"a.{suffix}", text), np.array([[1.5, 2, 3], [4, 5, 6]]))
+
+
+@pytest.mark.parametrize("missing", ["nan", "NAN", "NaN", "Nan", "-NAN", "NULL", "Null", "n/a", "N/A", "none"])
+def test_a_missing_value_has_many_spellings(folder, missing):
+    same(
+        read(folder, "a.csv", f"x,y,z\n1,2,3\n{missing},{missing},{missing}\n4,5,6\n"),
+        np.array([[1, 2, 3], [4, 5, 6.0]]),
+    )
+
+
 def test_pcd_variants(folder):
     rows = POINTS.tobytes()
     same(read(folder, "A.PCD", pcd_header() + rows), fields=("x", "y", "z", "i"))

@@ -1,5 +1,6 @@
 """Points in text: files of lines decoded by pandas, and the lines of ascii PCD and PLY bodies."""
 
+import csv
 import io
 import itertools
 import re
@@ -8,7 +9,7 @@ import numpy as np
 
 from lidarpose.io.headers import Problem, is_transposed, numbered, pick_xyz, shorten
 
-# what stands in text for a value that is not there, in the usual exports
+# what stands in text for a value that is not there, in the usual exports, in any case
 _MISSING = ("", "na", "n/a", "nan", "-nan", "+nan", "null", "none", "<na>")
 
 
@@ -138,7 +139,8 @@ def _parse_rows(text: str, columns: list[int], *, separator: str | None, decimal
             dtype=np.float64,
             skipinitialspace=True,
             decimal=decimal,
-            na_values=list(_MISSING),
+            # pandas knows only some of them, and tells cases apart
+            na_values=[case(word) for case in (str.lower, str.upper, str.capitalize) for word in _MISSING],
             engine="c",
         )
     except pd.errors.EmptyDataError:
@@ -149,7 +151,12 @@ def _parse_rows(text: str, columns: list[int], *, separator: str | None, decimal
 
 
 def _split(line: str, separator: str | None) -> list[str]:
-    return [cell.strip().strip("\"'").strip() for cell in line.split(separator)]
+    cells = line.split(separator)
+    if '"' in line:
+        # a separator in quotes separates nothing
+        line = " ".join(cells) if separator is None else line
+        cells = next(csv.reader([line], delimiter=separator or " ", skipinitialspace=True))
+    return [cell.strip().strip("\"'").strip() for cell in cells]
 
 
 def _separator(line: str) -> tuple[str | None, str]:
