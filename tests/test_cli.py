@@ -1,6 +1,7 @@
 """The command line: what it writes, and one line with exit code 2 for whatever is wrong."""
 
 import gzip
+import io
 import json
 import os
 import runpy
@@ -20,6 +21,7 @@ from lidarpose.infer import info, predictor
 from lidarpose.model.bundled import DEFAULT, bundled_path
 from lidarpose.synth.generate import Generator
 from lidarpose.synth.scene import scene_config
+from lidarpose.view import sheet
 
 DAPT = Path(__file__).parent / "parity" / "dapt_tiny.safetensors"
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("[0-9]*.py"))
@@ -387,6 +389,14 @@ def test_a_closed_stderr_leaves_the_json_alone(crop, monkeypatch, capsys):
     monkeypatch.setattr(sys, "stderr", None)
     assert run("predict", crop, "--crop", "--out", "-") == 0
     assert len(json.loads(capsys.readouterr().out)["people"]) == 1
+
+
+def test_what_the_output_cannot_show_is_escaped(monkeypatch):
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding="cp932"))
+    monkeypatch.setattr(sheet, "draw_dataset", lambda *args, **more: Path(os.fsdecode(b"caf\xe9 \xc2\xb7.png")))
+    assert run("view", "streetlife") == 0
+    assert written.getvalue().split() == [rb"caf\udce9", rb"\xb7.png"]
 
 
 @pytest.mark.filterwarnings("error")

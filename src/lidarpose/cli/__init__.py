@@ -17,6 +17,9 @@ _SIGNED = ("--sensor-origin", "--up")
 def main(arguments: list[str] | None = None) -> int:
     """Runs one command. Returns 0, or 2 after one line on stderr where the input is at fault."""
     options = _parser().parse_args(_joined(sys.argv[1:] if arguments is None else arguments))
+    with suppress(AttributeError, ValueError):
+        # names of files need not be text, nor has every terminal all letters; stderr does so by itself
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         options.run(options)
         if sys.stdout is not None:
