@@ -256,7 +256,9 @@ def test_results_go_to_a_file_that_is_named(crop, boxes, tmp_path, capsys):
     # a folder is a folder whatever its name, and what is read is never written
     (tmp_path / "b.json").mkdir()
     assert run("predict", crop, "--out", tmp_path / "b.json") == 0
-    assert [path.name for path in (tmp_path / "b.json").iterdir()] == ["crop.poses.json"]
+    assert run("predict", crop, "--out", f"{tmp_path / 'c.json'}/") == 0
+    for name in ("b.json", "c.json"):
+        assert [path.name for path in (tmp_path / name).iterdir()] == ["crop.poses.json"]
     capsys.readouterr()
     before = boxes.read_text()
     assert run("predict", crop, "--boxes", boxes, "--out", boxes) == 2
@@ -470,6 +472,7 @@ BAD_COMMANDS = {
     "demo into a file": ("demo --out CROP", "cannot write"),
     "out is a file": ("predict CROP --out CROP", "cannot write"),
     "out below a file": ("predict CROP --out CROP/deep", "cannot write"),
+    "out of a long name": (f"predict CROP --out {'x' * 300}.json", "choose a shorter name"),
     "out in a place of no files": ("predict CROP --out /proc/nothing", "cannot write"),
 }
 

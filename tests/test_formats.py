@@ -578,6 +578,7 @@ def test_bad_paths(tmp_path):
         tmp_path / "sweep_2.pcd": ["no such file", "did you mean sweep_1.pcd"],
         tmp_path / "gone" / "a.pcd": ["no such file", f"the folder {tmp_path / 'gone'} does not exist"],
         tmp_path / "folder.pcd": ["folder"],
+        "": ["'': no such file", "give its name"],
         tmp_path / "sweep_1.pcd" / "a.pcd": ["cannot be read"],
         tmp_path / ("a" * 300 + ".pcd"): ["cannot be read"],
         "a\0.pcd": ["expected the path"],

@@ -1,6 +1,7 @@
 """`lidarpose predict` and `lidarpose demo`."""
 
 import argparse
+import os
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -91,7 +92,7 @@ def _predict(options: argparse.Namespace) -> None:
     file = Path(options.file)
     to_stdout = options.out == "-"
     out = Path("." if to_stdout else options.out)
-    result = out if _is_json(out) else out / f"{file.stem}.poses.json"
+    result = out if _is_json(options.out) else out / f"{file.stem}.poses.json"
     json_path = None if to_stdout else str(result)
     picture_path = str(result.with_suffix(".png")) if options.picture else None
     for path in filter(None, (json_path, picture_path)):
@@ -130,9 +131,10 @@ def _predict(options: argparse.Namespace) -> None:
     tell(f"{seen} of {len(poses)} people, {poses.timing_ms['per_person']:.0f} ms each{where}")
 
 
-def _is_json(out: Path) -> bool:
+def _is_json(out: str) -> bool:
     """Whether results go to this file, not into a folder."""
-    return out.suffix.lower() == ".json" and not out.is_dir()
+    # os.path says no where a name is too long, which is told when it is written
+    return Path(out).suffix.lower() == ".json" and not out.endswith(("/", os.sep)) and not os.path.isdir(out)
 
 
 def _warnings(poses) -> list[str]:

@@ -105,6 +105,8 @@ def read_bytes(path: str | os.PathLike, *, expected: str) -> bytes:
 
 def _nearest(path: str | os.PathLike) -> str:
     """What to do about a missing file: the nearest name in its folder, or that the folder itself is missing."""
+    if not path:
+        return "; give its name"
     folder, name = os.path.split(os.path.abspath(os.fsdecode(path)))
     try:
         names = os.listdir(folder)
