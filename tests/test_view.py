@@ -361,6 +361,8 @@ def test_report_of_odd_people():
     assert [len(p["points"]) for p in data["people"]] == [0, 12, 0]
     assert all(p["pose"] is None and p["facing"] is None for p in data["people"])
     assert text.count("no pose: under 5 points") == 2
+    labelled = ReportPerson(label="few, but labelled", points=np.zeros((4, 3)), truth=t_pose())
+    assert "no pose" not in render_report([labelled], title="t", summary=[])
     assert "no people" in render_report([], title="t", summary=[])
 
 

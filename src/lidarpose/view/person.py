@@ -101,7 +101,8 @@ def describe(person) -> str:
 
 def missing_pose(person) -> str:
     """What to say where there is nothing predicted: empty if there is a pose, or nobody could expect one."""
-    if is_known(person.pose):
+    # a labelled person of a dataset was never predicted
+    if is_known(person.pose) or (person.pose is None and is_known(person.truth)):
         return ""
     if len(person.points) < MIN_POINTS:
         return f"no pose: under {MIN_POINTS} points"
