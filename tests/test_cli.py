@@ -401,6 +401,13 @@ def test_what_the_output_cannot_show_is_escaped(monkeypatch):
     assert written.getvalue().split() == [rb"caf\udce9", rb"\xb7.png"]
 
 
+def test_a_full_memory_is_one_line(monkeypatch, capsys):
+    # more than any machine has
+    monkeypatch.setattr(sheet, "draw_dataset", lambda *args, **more: np.empty(2**60, np.uint8))
+    assert run("view", "streetlife") == 2
+    assert "the memory is full (Unable to allocate 1.00 EiB" in one_line(capsys)
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("flags", [(), ("--crop",), ("--boxes", "BOXES")])
 @pytest.mark.parametrize("scale", [1e30, 1.7e308])

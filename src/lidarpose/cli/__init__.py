@@ -41,6 +41,9 @@ def main(arguments: list[str] | None = None) -> int:
         # what is written to files says which; this is the standard output
         _drop_output()
         return _failed(InputError(f"cannot write the output ({error.strerror}): send it elsewhere"))
+    except MemoryError as error:
+        reason = f" ({error})" if str(error) else ""
+        return _failed(InputError(f"the memory is full{reason}: give less at once, as fewer points or people"))
     except KeyboardInterrupt:
         tell("lidarpose: stopped")
         return 130
