@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
 from lidarpose.io import files
-from lidarpose.io.files import atomic_path, file_error, read_bytes, write_atomic
+from lidarpose.io.files import atomic_path, check_suffix, file_error, read_bytes, write_atomic
 
 
 def tree(folder):
@@ -143,6 +143,11 @@ def test_folder_without_write_access(tmp_path):
 def test_not_a_path(bad):
     with pytest.raises(InputError, match="expected the path of a file to write"):
         write_atomic(bad, "x")
+
+
+def test_what_is_no_path_has_no_suffix():
+    with pytest.raises(InputError, match="3: expected the path of a file to write"):
+        check_suffix(3, ".png")
 
 
 def test_folder_as_target(tmp_path):

@@ -131,7 +131,11 @@ class _Abandoned(Exception):
 
 def check_suffix(path: str | os.PathLike, *suffixes: str) -> None:
     """Raises InputError where a file's name says another format than it gets."""
-    if not os.fsdecode(path).lower().endswith(suffixes):
+    try:
+        name = os.fsdecode(path).lower()
+    except TypeError as error:
+        raise file_error(repr(path), f"expected the path of a file to write ({error})") from None
+    if not name.endswith(suffixes):
         raise file_error(path, f"is to hold {suffixes[0][1:].upper()}: give a name that ends in {suffixes[0]}")
 
 
