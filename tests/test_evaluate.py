@@ -316,8 +316,14 @@ def test_a_network_that_knows_the_people_is_told(sets, learned, told):
     model.header = SimpleNamespace(card={"data": ["waymo"], "recipe": {"split": learned}, "validation_mm": 60.0})
     notes = judged(sets, "waymo", model).result.notes
     assert any(told in note for note in notes)
-    model.header.card["data"] = ["another"]
+    # an earlier run's people are known as well
+    model.header.card = {"data": ["another"], "recipe": {"split": learned}, "init_card": model.header.card}
+    assert sum(told in note for note in judged(sets, "waymo", model).result.notes) == 1
+    del model.header.card["init_card"]
     assert not any(told in note for note in judged(sets, "waymo", model).result.notes)
+    # pre-training on shards takes everybody
+    model.header.card = {"recipe": {"shards": ["waymo"], "seed": 0, "scene": "wild"}}
+    assert any("learned from split all" in note for note in judged(sets, "waymo", model).result.notes)
 
 
 def test_who_gets_no_pose_is_counted_and_in_no_figure(sets):
@@ -707,9 +713,35 @@ def test_the_worst_are_the_worst(sets):
     assert len(error) == 24 and [k for _, k in found.worst] == np.argsort(-error, kind="stable").tolist()
 
 
-def test_what_is_hidden_is_not_visible(tmp_path):
-    write_dataset(Job(what="people", count=3, hard=0.0, sensors=("os1-128",)), tmp_path / "people")
-    for one, row in zip(open_people(tmp_path / "people"), open_dataset(tmp_path / "people").rows(), strict=True):
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Synthesized people of seed 0."""
+    folder = tmp_path_factory.mktemp("made") / "people"
+    write_dataset(Job(what="people", count=3, hard=0.0, sensors=("os1-128",)), folder)
+    return folder
+
+
+@pytest.mark.parametrize(
+    "recipe, knows",
+    [
+        ({"seed": 0, "scene": "wild", "shards": []}, True),
+        ({"seed": 0, "scene": "wild", "split": "train", "mix": 0.25}, True),
+        ({"seed": 0, "scene": "wild", "split": "train", "mix": 0.0}, False),
+        ({"seed": 0, "scene": "wild", "shards": ["others"]}, False),
+        ({"seed": 1, "scene": "wild", "shards": []}, False),
+        ({"seed": 0, "scene": "paper", "shards": []}, False),
+    ],
+)
+def test_people_of_the_seed_that_a_network_learned_from_are_no_strangers(made, recipe, knows):
+    """Person i of a seed has the same body, pose and place at any difficulty."""
+    model = Fake(standing)
+    model.header = SimpleNamespace(card={"recipe": {"seed": 5, "scene": "wild"}, "init_card": {"recipe": recipe}})
+    notes = judge(task_of(model, open_people(made))).result.notes
+    assert any("of seed 0, as these are" in note for note in notes) == knows
+
+
+def test_what_is_hidden_is_not_visible(made):
+    for one, row in zip(open_people(made), open_dataset(made).rows(), strict=True):
         assert one.hidden == pytest.approx(1 - row["visible"], abs=1e-6)
     visible = load_bench().columns["visible"]
     for one in open_people("bench", limit=9):

@@ -16,6 +16,7 @@ from lidarpose.cli import main
 from lidarpose.data.prepare import READERS, prepare
 from lidarpose.data.shards import open_dataset, shard_path
 from lidarpose.errors import InputError
+from lidarpose.evaluate.people import open_people
 from lidarpose.infer.predictor import load
 from lidarpose.model.checkpoint import load_checkpoint
 from lidarpose.model.header import read_header
@@ -376,6 +377,14 @@ def test_sequences_are_held_out_unless_the_dataset_has_a_split_for_it(datasets):
     assert job.warnings == (
         "nobody is left to validate on: no split val, and no sequence is held out (--hold-out, or too few of them)",
     )
+
+
+def test_a_dataset_is_remembered_by_the_name_that_an_evaluation_gives_it(datasets, tmp_path, monkeypatch):
+    folder = datasets["humanm3"]
+    (tmp_path / "link").symlink_to(folder)
+    monkeypatch.chdir(folder)
+    for folder in (".", tmp_path / "link"):
+        assert job_of(Finetune(data=(folder,), init="tiny")).card["data"] == [open_people(folder).name] == ["humanm3"]
 
 
 # --- runs

@@ -24,6 +24,7 @@ from lidarpose.evaluate.protocols import (
     released_center,
 )
 from lidarpose.evaluate.result import Line, Result, Setting
+from lidarpose.model.header import runs_of
 from lidarpose.sample import Box
 from lidarpose.skeleton import BODY26, Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
@@ -311,13 +312,28 @@ def _notes(task: Task, setting: Setting, judged: Judged) -> Iterator[str]:
 
 
 def _acquainted(task: Task) -> Iterator[str]:
-    """That the network knows these people, by what its checkpoint tells."""
+    """That the network knows these people, by what its checkpoint tells of the runs that made it."""
     card = getattr(getattr(task.model, "header", None), "card", {})
-    judged, recipe = task.setting.split, card.get("recipe")
-    data, learned = card.get("data"), recipe.get("split") if isinstance(recipe, dict) else None
-    if not isinstance(data, list) or task.people.name not in data or learned is None:
+    yield from dict.fromkeys(note for run in runs_of(card) for note in _learned_by(run, task))
+
+
+def _learned_by(run: dict, task: Task) -> Iterator[str]:
+    """What one run, by its card, had of the people."""
+    recipe, people, judged = run.get("recipe"), task.people, task.setting.split
+    if not isinstance(recipe, dict):
         return
-    if learned == judged or "all" in (learned, judged):
-        yield f"the network learned from split {learned} of {task.people.name}: it is judged on people whom it knows"
-    elif judged == "val" and "validation_mm" in card:
-        yield "the network's run was validated on this split: its best.safetensors was chosen by these people"
+    # pre-training on shards takes everybody
+    data, learned = run.get("data") or recipe.get("shards"), recipe.get("split", "all")
+    if isinstance(data, list) and people.name in data:
+        if learned == judged or "all" in (learned, judged):
+            yield f"the network learned from split {learned} of {people.name}: it is judged on people whom it knows"
+        elif judged == "val" and "validation_mm" in run:
+            yield "the network's run was validated on this split: its best.safetensors was chosen by these people"
+    made = people.dataset.card.settings if people.kind == "synth" else {}
+    synthesized = recipe["mix"] if "mix" in recipe else not recipe.get("shards")
+    if synthesized and made.get("what") == "people":
+        if all(made.get(name) == recipe.get(name) for name in ("seed", "scene")):
+            yield (
+                f"the network learned from synthesized people of seed {made['seed']}, as these are: they may be the "
+                "very same; make others by lidarpose synth --seed"
+            )

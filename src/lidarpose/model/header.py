@@ -65,7 +65,8 @@ class Header:
 
 def runs_of(card: dict) -> list[dict]:
     """The cards of the runs that made weights: the last one's, that of the weights it began with, and so on."""
-    return [card, *(runs_of(card["init_card"]) if "init_card" in card else [])]
+    before = card.get("init_card")
+    return [card, *(runs_of(before) if isinstance(before, dict) else [])]
 
 
 def read_header(path: str | os.PathLike) -> Header:

@@ -157,7 +157,8 @@ def _finetuning(recipe: Finetune) -> Job:
         card={
             "init": path.name,
             "init_card": header.card,
-            "data": [Path(folder).name for folder in recipe.data],
+            # as an evaluation names them, be it by a link or as "."
+            "data": [Path(folder).resolve().name for folder in recipe.data],
             "held_out_sequences": list(held_out),
             "damaged": list(crowd.damaged),
         },

@@ -313,7 +313,7 @@ class _Run:
             # names of files, not where they lie
             value = stated.get(entry)
             if value:
-                stated[entry] = Path(value).name if isinstance(value, str) else [Path(v).name for v in value]
+                stated[entry] = Path(value).name if isinstance(value, str) else [Path(v).resolve().name for v in value]
         card = {
             "command": self.command or "lidarpose.train.loop.train",
             "recipe": stated,
