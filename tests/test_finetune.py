@@ -387,6 +387,20 @@ def test_a_dataset_is_remembered_by_the_name_that_an_evaluation_gives_it(dataset
         assert job_of(Finetune(data=(folder,), init="tiny")).card["data"] == [open_people(folder).name] == ["humanm3"]
 
 
+def test_pretraining_takes_nobody_who_is_kept_for_testing(datasets, tmp_path):
+    with pytest.raises(InputError, match="has people for testing, by the split official.*--split train") as error:
+        job_of(Pretrain(shards=(datasets["humanm3"],)))
+    assert "\n" not in str(error.value)
+    raw = datasets["humanm3"].parent / "raw-humanm3"
+    prepare("humanm3", raw, tmp_path / "train", split="train", progress=False)
+    crowd = job_of(Pretrain(shards=(tmp_path / "train",))).source.crowd
+    assert crowd.sequences == ("train/a", "train/b", "train/c")
+    # a corpus has no split
+    files.write_lipd(tmp_path / "raw", files.write_smpl(tmp_path / "SMPL_NEUTRAL.npz"))
+    prepare("lipd", tmp_path / "raw", tmp_path / "corpus", progress=False)
+    assert len(job_of(Pretrain(shards=(tmp_path / "corpus",))).source.crowd)
+
+
 # --- runs
 
 

@@ -349,10 +349,12 @@ def test_recipes():
     for change, message in [
         ({"people": 0}, "people must be at least 1"),
         ({"batch": 0}, "batch must be at least 1"),
+        # without a file they would choose nobody
+        ({"subjects": ("a",)}, "subjects are of captured clips: name their file by motion too"),
     ]:
         with pytest.raises(InputError, match=message):
             Pretrain(**change)
-    assert Pretrain(subjects=["a"]) == Pretrain(subjects=("a",))
+    assert Pretrain(motion="m", subjects=["a"]) == Pretrain(motion="m", subjects=("a",))
 
 
 def test_numbers_of_numpy_paths_and_one_name_alone_are_settings_too():

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from torch import nn
 
+from lidarpose.data.shards import read_card
 from lidarpose.errors import InputError, check_name
 from lidarpose.io.files import file_error
 from lidarpose.model.dapt.config import CONFIGS
@@ -70,6 +71,7 @@ def _pretraining(recipe: Pretrain) -> Job:
     scene = {name: getattr(recipe, name) for name in names}
     warnings: tuple[str, ...] = ()
     if recipe.shards:
+        _check_no_test(recipe.shards)
         crowd = crowd_of(recipe.shards)
         worse = {"strays": recipe.strays, "noise": recipe.noise}
         source = StoredSource(crowd=crowd, seed=recipe.seed, augmentation=Augmentation(turn=1.0, flip=0.5), **worse)
@@ -97,6 +99,18 @@ def _pretraining(recipe: Pretrain) -> Job:
         card=card,
         warnings=warnings,
     )
+
+
+def _check_no_test(shards: tuple[str, ...]) -> None:
+    """Raises InputError for people of whom some are kept for testing: pre-training takes everybody."""
+    for folder in shards:
+        settings = read_card(folder).settings
+        if settings.get("split_by") and settings.get("split") != "train":
+            raise file_error(
+                folder,
+                f"has people for testing, by the split {settings['split_by']}, and pre-training takes everybody: "
+                "prepare it with --split train, or learn from it by lidarpose finetune",
+            )
 
 
 def _grown(init: str, config: NetworkConfig) -> tuple[Callable[[], nn.Module], dict]:

@@ -120,6 +120,8 @@ class Pretrain(Recipe):
     def __post_init__(self):
         super().__post_init__()
         self._check_shares("easy", "captured", "strays", "noise")
+        if self.subjects and not self.motion:
+            raise InputError("subjects are of captured clips: name their file by motion too")
         if self.size in (PAPER, SMALL_PAPER):
             self.check_no_lengths()
             if self.init:
