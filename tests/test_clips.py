@@ -107,6 +107,17 @@ def test_pairs_are_what_happens_next():
     assert (moved[:, -1, 0] > 0.5).all()
 
 
+def test_a_subject_whose_number_goes_on_is_another_one():
+    """CMU's subjects go from 01 to 144: who trains on 10 must not meet 102, who is kept for judging."""
+    names = ("1_01", "10_01", "102_03", "walk01", "02/02_01")
+    at, each = np.arange(len(names)), np.ones(len(names), int)
+    some = clips.Clips(joints=np.zeros((5, 24, 3), np.float32), names=names, start=at, length=each, fps=30.0)
+    assert some.of("10").names == ("10_01",) and some.of("1").names == ("1_01",)
+    assert some.of(("walk", "02")).names == ("walk01", "02/02_01")
+    with pytest.raises(InputError, match="no clip starts with '0'"):
+        some.of("0")
+
+
 def test_clips_are_chosen_and_joined():
     one, two = a_motion((4, 2, 6), 20.0), a_motion((7,), 10.0, seed=1)
     chosen = one.of(("002", "000"))

@@ -50,7 +50,8 @@ class Clips:
         return self.joints[self.start[clip] : self.start[clip] + self.length[clip]]
 
     def of(self, subjects: str | Iterable[str]) -> "Clips":
-        """The clips whose names start with one of `subjects`, such as "002". Raises InputError for one without."""
+        """The clips whose names start with one of `subjects`, such as "002", which "0021_03" does not. Raises
+        InputError for one without."""
         chosen, frames, start = _chosen(self, subjects)
         return replace(
             self,
@@ -98,7 +99,8 @@ class Motion:
         return slice(int(self.start[clip]), int(self.start[clip] + self.length[clip]))
 
     def of(self, subjects: str | Iterable[str]) -> "Motion":
-        """The clips whose names start with one of `subjects`, such as "002". Raises InputError for one without."""
+        """The clips whose names start with one of `subjects`, such as "002", which "0021_03" does not. Raises
+        InputError for one without."""
         chosen, frames, start = _chosen(self, subjects)
         return replace(
             self,
@@ -278,10 +280,16 @@ def _chosen(clips: Clips | Motion, subjects: str | Iterable[str]) -> tuple[list[
     """Which clips start with one of `subjects`, which frames those are, and where each clip starts among them."""
     subjects = (subjects,) if isinstance(subjects, str) else tuple(subjects)
     for subject in subjects:
-        if not any(name.startswith(subject) for name in clips.names):
+        if not any(_is_of(name, subject) for name in clips.names):
             known = ", ".join(sorted({name.partition("_")[0] for name in clips.names}))
             raise InputError(f"no clip starts with {subject!r}: there are {known}")
-    chosen = [c for c, name in enumerate(clips.names) if name.startswith(subjects)]
+    chosen = [c for c, name in enumerate(clips.names) if any(_is_of(name, subject) for subject in subjects)]
     frames = [np.arange(clips.start[c], clips.start[c] + clips.length[c]) for c in chosen]
     length = clips.length[chosen]
     return chosen, np.concatenate([*frames, np.zeros(0, int)]).astype(int), np.cumsum(length) - length
+
+
+def _is_of(name: str, subject: str) -> bool:
+    """Whether a clip's name starts with a subject's. A number that goes on is another one: 102_03 is not of 10, nor
+    10_01 of 1."""
+    return name.startswith(subject) and not (subject[-1:].isdigit() and name[len(subject) :][:1].isdigit())
