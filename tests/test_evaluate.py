@@ -304,6 +304,9 @@ def test_people_without_a_pose_count_in_pem_alone(sets):
     shy = judged(sets, "waymo", Fake(lambda cloud: standing(cloud) if next(turns) else None)).result
     told = "without a pose, and in no figure but PEM"
     assert shy.counts["without a pose"] and any(told in line for line in evaluating._lines(shy))
+    # each labelled keypoint is missed, be it everybody's
+    nobody = judged(sets, "waymo", Fake(lambda cloud: None)).result
+    assert nobody.line("pem").value == 250 and nobody.line("mpjpe").value is None
 
 
 @pytest.mark.parametrize(

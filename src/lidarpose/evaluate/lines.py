@@ -194,9 +194,16 @@ def _waymo(figures: _Figures) -> Iterator[Line]:
         sigmas = oks_sigmas(judged.skeleton)
     except InputError:
         return
-    rows = judged.posed & np.isfinite(judged.box).all(1)
-    if not rows.any():
-        return
+    boxed = np.isfinite(judged.box).all(1)
+    if (judged.posed & boxed).any():
+        yield from _in_boxes(figures, judged.posed & boxed, sigmas)
+    if boxed.any():
+        yield _pem(judged.of(boxed), setting)
+
+
+def _in_boxes(figures: _Figures, rows: np.ndarray, sigmas: np.ndarray) -> Iterator[Line]:
+    """PCK and OKS-AP of people `rows` (N,) who have a pose and a box."""
+    judged, setting = figures.judged, figures.setting
     some = judged.of(rows)
     pred, true, known, size = some.pred, some.true, some.labelled, some.box[:, 3:6]
     clusters = None if figures.clusters is None else figures.clusters[rows]
@@ -207,7 +214,6 @@ def _waymo(figures: _Figures) -> Iterator[Line]:
         yield replace(made, no_pose=no_pose)
     table = oks_hits(oks(pred, true, size, known, sigmas=sigmas))
     yield replace(line(table, setting, "oks_ap", "all", "all", "%", clusters=clusters), no_pose=no_pose)
-    yield _pem(judged.of(np.isfinite(judged.box).all(1)), setting)
 
 
 def _pem(judged: Judged, setting: Setting) -> Line:
