@@ -164,6 +164,15 @@ def test_a_finished_run_stays_as_it_is(tmp_path, unbroken):
     assert before == {p.name: p.read_bytes() for p in unbroken.iterdir()}
 
 
+def test_what_a_run_begins_with_may_have_been_moved(tmp_path):
+    """The weights it was begun with are read again: it could not go on without them."""
+    begun = Pretrain(init=str(tmp_path / "old/model.safetensors"))
+    runs.check_same(tmp_path, begun, replace(begun, init=str(tmp_path / "new/model.safetensors")))
+    for other in (str(tmp_path / "new/best.safetensors"), ""):
+        with pytest.raises(InputError, match="the run has init = .* a run keeps its recipe"):
+            runs.check_same(tmp_path, begun, replace(begun, init=other))
+
+
 @pytest.mark.parametrize("change", [{"seed": 6}, {"batch": 16}, {"rate": 1e-3}, {"scene": "wild"}, {"muon_rate": 0.0}])
 def test_a_run_keeps_its_recipe(unbroken, change):
     with pytest.raises(InputError, match=f"the run has {next(iter(change))} = .* a run keeps its recipe"):

@@ -28,7 +28,7 @@ LOCK = ".lock"
 LOCK_WAIT = 10.0
 SCHEMA = "lidarpose.run/2"
 # settings that are files or folders, which may have been moved
-_PATHS = ("data", "shards", "motion")
+_PATHS = ("data", "shards", "motion", "init")
 # the temporary names of `files.atomic_path`
 _LEFT = re.compile(r"\.\d+-\d+-.+")
 # how a run's length is called: a run may become longer, its schedule follows
@@ -151,7 +151,7 @@ def check_same(folder: Path, stored: Recipe, wanted: Recipe) -> None:
 
 def _named(value: str | tuple[str, ...] | None) -> list[str] | None:
     """Files and folders by their names."""
-    return None if value is None else [Path(v).resolve().name for v in ((value,) if isinstance(value, str) else value)]
+    return None if not value else [Path(v).resolve().name for v in ((value,) if isinstance(value, str) else value)]
 
 
 def read_log(folder: Path) -> list[dict]:
