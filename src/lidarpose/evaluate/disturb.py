@@ -53,7 +53,7 @@ def thinned_out(points: np.ndarray, box: Box | None, amount: float, rng: np.rand
 
 def behind_an_edge(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
     """All but what lies behind one straight edge of something opaque, which hides a share `amount` of the points: the
-    end of a wall, a parapet, a car. The edge is straight as the sensor sees it and has any direction."""
+    end of a wall, a parapet, a car. The edge is straight as seen from the origin and has any direction."""
     turn = rng.uniform(0, 2 * np.pi)
     middle = points.mean(0)
     ahead = np.hypot(middle[0], middle[1])

@@ -81,7 +81,7 @@ def smpl_item(
     centers: dict[str, np.ndarray],
 ) -> Item | Skipped:
     """A person of whom points (n, 3) m and SMPL's joints (24, 3) m are known, which all count as seen; the rest as in
-    `Item` and `Sample`. Skipped where the parameters put joints out of reach, which float32 could not hold."""
+    `Item` and `Sample`. Skipped where the parameters put joints out of reach."""
     if not within_reach(joints).all():
         return Skipped(reason="joints out of reach", where=f"{frame_id}/{track}: beyond {FARTHEST:g} m")
     points = points.astype(np.float32)
