@@ -507,9 +507,10 @@ def test_a_missing_second_return_is_none(copy):
         np.testing.assert_allclose(item.sample.points, want, atol=1e-3)
 
 
-def test_values_that_do_not_fit_their_shape_are_told(copy):
+@pytest.mark.parametrize("size", [[1, 2, 3], [1, None, 3]])
+def test_values_that_do_not_fit_their_shape_are_told(copy, size):
     shape = "[LiDARComponent].range_image_return1.shape"
-    count, found = reasons_after(copy, "lidar", lambda rows: [rows[0] | {shape: [1, 2, 3]}, *rows[1:]])
+    count, found = reasons_after(copy, "lidar", lambda rows: [rows[0] | {shape: size}, *rows[1:]])
     assert count == 2 and found["range image cannot be read"] == 2
 
 
@@ -609,12 +610,21 @@ def test_top_without_pixel_poses_is_skipped_in_version_1_too(tmp_path, monkeypat
     assert not items and [one.reason for one in skipped] == ["no pixel poses of the top laser"] * 2
 
 
-def test_a_range_image_of_another_size_than_it_says_is_told(tmp_path, monkeypatch):
-    wrong = zlib.compress(files.block(1, bytes(4 * 10)) + files.block(2, files.number(1, 3)))
+@pytest.mark.parametrize(
+    "values, sizes, told",
+    [
+        (10, [3], "a range image of 10 values says it is [3]"),
+        # whose product is 0 in 64 bits
+        (0, [1 << 32, 1 << 32, 1], "a range image of 0 values says it is [4294967296, 4294967296, 1]"),
+    ],
+)
+def test_a_range_image_of_another_size_than_it_says_is_told(tmp_path, monkeypatch, values, sizes, told):
+    shape = b"".join(files.number(1, size) for size in sizes)
+    wrong = zlib.compress(files.block(1, bytes(4 * values)) + files.block(2, shape))
     monkeypatch.setattr(files, "matrix_float", lambda image: wrong)
     files.write_v1(tmp_path, frames=files.scene()[:1])
     items, skipped = everything(tmp_path)
-    assert not items and "a range image of 10 values says it is [3]" in skipped[0].where
+    assert not items and told in skipped[0].where
 
 
 # --- TFRecord and protobuf

@@ -4,6 +4,7 @@ Columns are picked by name and rows by key, so that their order, their row group
 columns such as pandas' `index` do not matter.
 """
 
+import math
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -86,7 +87,7 @@ def _image(values, shape) -> np.ndarray | None:
         return None
     flat = values.values.to_numpy(zero_copy_only=False).astype(np.float32, copy=False)
     size = shape.as_py()
-    if len(size) != 3 or min(size) < 1 or len(flat) != np.prod(size):
+    if len(size) != 3 or None in size or min(size) < 1 or len(flat) != math.prod(size):
         return np.zeros((0, 0, 0), np.float32)
     return flat.reshape(size)
 

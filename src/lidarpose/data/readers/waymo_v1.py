@@ -6,6 +6,7 @@ Read without TensorFlow and without generated code, by the numbers of the fields
 waymo-research/waymo-open-dataset dataset.proto, label.proto, protos/keypoint.proto, protos/vector.proto.
 """
 
+import math
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -177,6 +178,6 @@ def _matrix(compressed: memoryview | None) -> np.ndarray | None:
     message = Message(content)
     values, shape = message.floats(_MATRIX_DATA), message.message(_MATRIX_SHAPE)
     sizes = [] if shape is None else shape.integers(_SHAPE_SIZES)
-    if len(sizes) != 3 or min(sizes) < 1 or len(values) != np.prod(sizes):
+    if len(sizes) != 3 or min(sizes) < 1 or len(values) != math.prod(sizes):
         raise InputError(f"a range image of {len(values)} values says it is {sizes}")
     return values.reshape(sizes)
