@@ -275,7 +275,16 @@ def test_sizes_that_do_not_fit_are_refused(image, calibration, poses, problem):
 
 @pytest.mark.parametrize(
     "values",
-    [None, [1.0] * 12, [float("nan")] * 16, [2.0 * x for x in np.eye(4).ravel()], np.diag([1, 1, -1, 1]).ravel()],
+    [
+        None,
+        [1.0] * 12,
+        [float("nan")] * 16,
+        [2.0 * x for x in np.eye(4).ravel()],
+        np.diag([1, 1, -1, 1]).ravel(),
+        # of volume 1, but no rotation
+        np.diag([2, 0.5, 1, 1]).ravel(),
+        np.diag([1e200, 1e200, 1, 1]).ravel(),
+    ],
 )
 def test_matrices_that_are_no_transforms_are_refused(values):
     with pytest.raises(InputError, match="the extrinsic must be"):

@@ -73,7 +73,10 @@ def transform(values: Iterable[float] | None, what: str) -> np.ndarray:
     if matrix.shape != (16,) or not np.isfinite(matrix).all():
         raise InputError(f"{what} must be 16 numbers, a 4 x 4 transform, got {np.isfinite(matrix).sum()}")
     matrix = matrix.reshape(4, 4)
-    if abs(np.linalg.det(matrix[:3, :3]) - 1) > 0.01 or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
+    R = matrix[:3, :3]
+    # entries first: products of far larger ones overflow
+    turns = np.abs(R).max() < 1.01 and np.abs(R @ R.T - np.eye(3)).max() < 0.01 and np.linalg.det(R) > 0
+    if not turns or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise InputError(f"{what} must be a rotation and a shift, got a matrix that is none")
     return matrix
 
