@@ -625,6 +625,8 @@ def test_top_without_pixel_poses_is_skipped_in_version_1_too(tmp_path, monkeypat
         (10, [3], "a range image of 10 values says it is [3]"),
         # whose product is 0 in 64 bits
         (0, [1 << 32, 1 << 32, 1], "a range image of 0 values says it is [4294967296, 4294967296, 1]"),
+        # however many there are
+        (1, [1] * 1000, "a range image of 1 values says it is [1, 1, 1, 1, 1, 1, ...]"),
     ],
 )
 def test_a_range_image_of_another_size_than_it_says_is_told(tmp_path, monkeypatch, values, sizes, told):
@@ -683,6 +685,10 @@ def test_a_message_of_endless_fields_is_refused(monkeypatch):
     assert Message(files.number(1, 1) * 3).integers(1) == [1] * 3
     with pytest.raises(InputError, match="more than 3 fields"):
         Message(files.number(1, 1) * 4)
+    # packed ones are in one field
+    assert Message(files.block(1, b"\1" * 3)).integers(1) == [1] * 3
+    with pytest.raises(InputError, match="more than 3 integers"):
+        Message(files.block(1, b"\1" * 4)).integers(1)
 
 
 def test_repeated_numbers_are_packed_or_not():

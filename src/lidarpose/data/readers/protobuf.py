@@ -12,7 +12,7 @@ _VARINT, _EIGHT, _BYTES, _FOUR = 0, 1, 2, 5
 _SIZES = {_EIGHT: 8, _FOUR: 4}
 _KINDS = {_VARINT: "a varint", _EIGHT: "8 bytes", _BYTES: "bytes", _FOUR: "4 bytes"}
 _LONGEST = 10
-# of a message: one of matrices has as many as they have numbers, where these are not packed
+# of a message: one of matrices has as many as they have numbers, where these are not packed; and packed integers
 _MOST_FIELDS = 2_000_000
 
 
@@ -99,6 +99,8 @@ class Message:
             while at < len(value):
                 one, at = _varint(value, at)
                 found.append(_signed(one))
+                if len(found) > _MOST_FIELDS:
+                    raise InputError(f"field {number} of a message has more than {_MOST_FIELDS:,} integers: damaged")
         return found
 
     def _repeated(self, number: int, kind: int, dtype: str) -> np.ndarray:

@@ -7,6 +7,7 @@ waymo-research/waymo-open-dataset dataset.proto, label.proto, protos/keypoint.pr
 """
 
 import math
+import reprlib
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -179,5 +180,5 @@ def _matrix(compressed: memoryview | None) -> np.ndarray | None:
     values, shape = message.floats(_MATRIX_DATA), message.message(_MATRIX_SHAPE)
     sizes = [] if shape is None else shape.integers(_SHAPE_SIZES)
     if len(sizes) != 3 or min(sizes) < 1 or len(values) != math.prod(sizes):
-        raise InputError(f"a range image of {len(values)} values says it is {sizes}")
+        raise InputError(f"a range image of {len(values)} values says it is {reprlib.repr(sizes)}")
     return values.reshape(sizes)
