@@ -87,6 +87,7 @@ def test_weights_and_parts(rig):
     assert (np.diff(rig.weight, axis=1) <= 0).all(), "the kernel stops at the first zero"
     np.testing.assert_allclose(rig.dense_weight.sum(1), 1, atol=1e-6)
     assert set(rig.face_part) <= set(range(1, 25))
+    np.testing.assert_array_equal(rig.face_part, 1 + rig.dense_weight[rig.faces].sum(1).argmax(1))
     middle = rig.template[rig.faces].mean(1)
     for name in SMPL24.joints:
         here = middle[rig.face_part == 1 + SMPL24.index(name)]
