@@ -273,12 +273,16 @@ def scan_chunk(vertices, extra, faces, culled, beams, margin, first, last):
         if n + len(one) > room:
             room = 2 * (n + len(one))
             more, more_numbers = np.empty((room, 3), np.float32), np.empty((3, room), np.int32)
-            more[:n], more_numbers[:, :n] = points[:n], numbers[:, :n]
+            for m in range(n):
+                for j in range(3):
+                    more[m, j], more_numbers[j, m] = points[m, j], numbers[j, m]
             points, numbers = more, more_numbers
-        end = n + len(one)
-        points[n:end], numbers[0, n:end], numbers[1, n:end], numbers[2, n:end] = one, face, column, ring
+        for m in range(len(one)):
+            for j in range(3):
+                points[n + m, j] = one[m, j]
+            numbers[0, n + m], numbers[1, n + m], numbers[2, n + m] = face[m], column[m], ring[m]
         hits[i - first] = len(one)
         for j in range(4):
             windows[i - first, j] = window[j]
-        n = end
+        n += len(one)
     return points[:n], numbers[0, :n], numbers[1, :n], numbers[2, :n], hits, windows, fault
