@@ -331,9 +331,9 @@ def _learned_by(run: dict, task: Task) -> Iterator[str]:
             yield "the network's run was validated on this split: its best.safetensors was chosen by these people"
     made = people.dataset.card.settings if people.kind == "synth" else {}
     synthesized = recipe["mix"] if "mix" in recipe else not recipe.get("shards")
-    if synthesized and made.get("what") == "people":
-        if all(made.get(name) == recipe.get(name) for name in ("seed", "scene")):
-            yield (
-                f"the network learned from synthesized people of seed {made['seed']}, as these are: they may be the "
-                "very same; make others by lidarpose synth --seed"
-            )
+    alike = made.get("what") == "people" and all(made.get(name) == recipe.get(name) for name in ("seed", "scene"))
+    if synthesized and alike:
+        yield (
+            f"the network learned from synthesized people of seed {made['seed']}, as these are: they may be the "
+            "very same; make others by lidarpose synth --seed"
+        )

@@ -92,10 +92,8 @@ def scan_diverging(vertices, faces, culled, window_vertices, beams, margin, offs
                 i -= 1
             row_tan[i], row_index[i] = tangent, row
         for start in range(0, columns, beams.sector):
-            count = sector_columns(beams, start, columns, tan, cos, scale)
+            count = sector_columns(beams, start, columns, index, tan, cos, scale)
             center = beams.start + (column0 + start + (count - 1) / 2) * beams.step + beams.group_shift[g]
-            for k in range(count):
-                index[k] = start + k
             for a in range(subs):
                 raster(
                     vertices, faces, culled, center + offsets[a], tan[:count], cos[:count], row_tan[:n],

@@ -97,15 +97,6 @@ def bounds(vertices):
 
 
 @compiled
-def _rings_below(elevations, limit, up_to):
-    """How many of the elevations (E,), ascending, are below the limit, or `up_to` it."""
-    n = 0
-    while n < len(elevations) and (elevations[n] < limit or (up_to and elevations[n] == limit)):
-        n += 1
-    return n
-
-
-@compiled
 def window_of(vertices, beams, margin):
     """column0, columns, row0, rows of the smallest window that holds the vertices, as `raycast.find_window`."""
     if not len(vertices):
@@ -121,20 +112,24 @@ def window_of(vertices, beams, margin):
     count = max(0, last - first + 1)
     if count >= beams.columns:
         first, count = 0, beams.columns
-    row0, end = _rings_below(beams.elevations, low, False), _rings_below(beams.elevations, high, True)
+    row0 = end = 0
+    for elevation in beams.elevations:
+        row0 += elevation < low
+        end += elevation <= high
     return first % beams.columns, count, row0, max(0, end - row0)
 
 
 @compiled
-def sector_columns(beams, start, columns, tan, cos, scale):
-    """How many columns from `start` on share a sector; their tangents and cosines from its middle are written into
-    tan and cos, 1/cos into scale[start:]."""
+def sector_columns(beams, start, columns, index, tan, cos, scale):
+    """How many columns from `start` on share a sector; their numbers are written into index, their tangents and cosines
+    from its middle into tan and cos, 1/cos into scale[start:]."""
     count = min(beams.sector, columns - start)
     for k in range(count):
         half = 2 * k - (count - 1)
         tan[k] = beams.half_tan[half] if half >= 0 else -beams.half_tan[-half]
         cos[k] = beams.half_cos[abs(half)]
         scale[start + k] = 1 / cos[k]
+        index[k] = start + k
     return count
 
 
@@ -156,10 +151,8 @@ def cast_grid(vertices, faces, culled, beams, column0, columns, row0, rows):
         if not n:
             continue
         for start in range(0, columns, beams.sector):
-            count = sector_columns(beams, start, columns, tan, cos, scale)
+            count = sector_columns(beams, start, columns, index, tan, cos, scale)
             center = beams.start + (column0 + start + (count - 1) / 2) * beams.step + beams.group_shift[g]
-            for k in range(count):
-                index[k] = start + k
             raster(
                 vertices, faces, culled, center, tan[:count], cos[:count], row_tan[:n], index[:count], row_index,
                 inverse_x, face,

@@ -42,12 +42,17 @@ class Outputs:
 
 def bin_centers(bins: int, device: torch.device | None = None) -> Tensor:
     """(W,) m: offsets from the heatmap's origin at the middle of each bin."""
-    return (torch.arange(bins, device=device) + 0.5 - bins / 2) * BIN
+    return _offset(torch.arange(bins, device=device), bins)
+
+
+def _offset(at: Tensor, bins: int) -> Tensor:
+    """at (...) bins -> (...) m from the heatmap's origin, which is the middle of all bins."""
+    return (at + 0.5 - bins / 2) * BIN
 
 
 def decode(logits: Tensor) -> Tensor:
     """logits (..., W) -> (...) m from the heatmap's origin: `mean_bin` as a length."""
-    return (mean_bin(logits) + 0.5 - logits.shape[-1] / 2) * BIN
+    return _offset(mean_bin(logits), logits.shape[-1])
 
 
 def mean_bin(logits: Tensor) -> Tensor:

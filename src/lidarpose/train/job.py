@@ -23,6 +23,7 @@ from lidarpose.train.crowd import Crowd, crowd_of
 from lidarpose.train.example import Example
 from lidarpose.train.pose_task import PoseTask
 from lidarpose.train.recipes import PAPER, SMALL_PAPER, Finetune, Pretrain, Recipe
+from lidarpose.train.runs import folder_names
 from lidarpose.train.sources import MixedSource, Source, StoredSource, SyntheticSource
 from lidarpose.train.task import Task
 
@@ -171,8 +172,7 @@ def _finetuning(recipe: Finetune) -> Job:
         card={
             "init": path.name,
             "init_card": header.card,
-            # as an evaluation names them, be it by a link or as "."
-            "data": [Path(folder).resolve().name for folder in recipe.data],
+            "data": folder_names(recipe.data),
             "held_out_sequences": list(held_out),
             "damaged": list(crowd.damaged),
         },

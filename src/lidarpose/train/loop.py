@@ -29,12 +29,14 @@ from lidarpose.train.runs import (
     BEST,
     LOG,
     MODEL,
+    PATHS,
     STATE,
     begin,
     check_new,
     check_same,
     clean,
     cut_log,
+    folder_names,
     held,
     latest,
     numbered,
@@ -309,11 +311,11 @@ class _Run:
 
     def _save_weights(self, name: str, network: nn.Module, **more: float) -> None:
         stated = self.recipe.to_dict()
-        for entry in ("motion", "shards", "data", "init"):
+        for entry in PATHS:
             # names of files, not where they lie
             value = stated.get(entry)
             if value:
-                stated[entry] = Path(value).name if isinstance(value, str) else [Path(v).resolve().name for v in value]
+                stated[entry] = Path(value).name if isinstance(value, str) else folder_names(value)
         card = {
             "command": self.command or "lidarpose.train.loop.train",
             "recipe": stated,

@@ -7,7 +7,7 @@ validation) and pictures/.
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -28,7 +28,7 @@ LOCK = ".lock"
 LOCK_WAIT = 10.0
 SCHEMA = "lidarpose.run/2"
 # settings that are files or folders, which may have been moved
-_PATHS = ("data", "shards", "motion", "init")
+PATHS = ("data", "shards", "motion", "init")
 # the temporary names of `files.atomic_path`
 _LEFT = re.compile(r"\.\d+-\d+-.+")
 # how a run's length is called: a run may become longer, its schedule follows
@@ -141,7 +141,7 @@ def check_same(folder: Path, stored: Recipe, wanted: Recipe) -> None:
     """Raises InputError unless a run may go on with the wanted recipe: as it began, or longer."""
     ours, theirs = wanted.to_dict(), stored.to_dict()
     for name, value in ours.items():
-        if name in _PATHS and _named(value) == _named(theirs[name]):
+        if name in PATHS and _named(value) == _named(theirs[name]):
             continue
         if name not in (*LENGTHS, *FREE) and value != theirs[name]:
             raise InputError(
@@ -151,7 +151,12 @@ def check_same(folder: Path, stored: Recipe, wanted: Recipe) -> None:
 
 def _named(value: str | tuple[str, ...] | None) -> list[str] | None:
     """Files and folders by their names."""
-    return None if not value else [Path(v).resolve().name for v in ((value,) if isinstance(value, str) else value)]
+    return None if not value else folder_names((value,) if isinstance(value, str) else value)
+
+
+def folder_names(folders: Iterable[str]) -> list[str]:
+    """The names by which an evaluation knows folders, be they given by a link or as "."."""
+    return [Path(folder).resolve().name for folder in folders]
 
 
 def read_log(folder: Path) -> list[dict]:

@@ -5,7 +5,8 @@ the frame's pose, in which boxes and keypoints are labelled; the world's. Length
 and W columns of a range image, n points, J = 14 joints.
 """
 
-from collections.abc import Iterable, Iterator
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -62,6 +63,12 @@ def about(margin: float) -> dict[str, Any]:
             "joint_labels: 2 clearly visible, 1 occluded or uncertain, 0 not labelled.",
         ],
     }
+
+
+def is_image(sizes: Sequence[int | None], count: int) -> bool:
+    """Whether a range image of so many values may have these sizes: rows, columns, channels."""
+    # of Python's numbers: the product of damaged ones may be 0 in 64 bits
+    return len(sizes) == 3 and None not in sizes and min(sizes) >= 1 and count == math.prod(sizes)
 
 
 def transform(values: Iterable[float] | None, what: str) -> np.ndarray:

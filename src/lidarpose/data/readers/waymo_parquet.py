@@ -4,7 +4,6 @@ Columns are picked by name and rows by key, so that their order, their row group
 columns such as pandas' `index` do not matter.
 """
 
-import math
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.data.columns import pyarrow
-from lidarpose.data.readers.waymo_frames import LASERS
+from lidarpose.data.readers.waymo_frames import LASERS, is_image
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
 
@@ -87,7 +86,7 @@ def _image(values, shape) -> np.ndarray | None:
         return None
     flat = values.values.to_numpy(zero_copy_only=False).astype(np.float32, copy=False)
     size = shape.as_py()
-    if len(size) != 3 or None in size or min(size) < 1 or len(flat) != math.prod(size):
+    if not is_image(size, len(flat)):
         return np.zeros((0, 0, 0), np.float32)
     return flat.reshape(size)
 

@@ -6,7 +6,6 @@ Read without TensorFlow and without generated code, by the numbers of the fields
 waymo-research/waymo-open-dataset dataset.proto, label.proto, protos/keypoint.proto, protos/vector.proto.
 """
 
-import math
 import reprlib
 import zlib
 from collections.abc import Iterator
@@ -26,6 +25,7 @@ from lidarpose.data.readers.waymo_frames import (
     Frame,
     LabelledPerson,
     about,
+    is_image,
     person,
     transform,
 )
@@ -179,6 +179,6 @@ def _matrix(compressed: memoryview | None) -> np.ndarray | None:
     message = Message(content)
     values, shape = message.floats(_MATRIX_DATA), message.message(_MATRIX_SHAPE)
     sizes = [] if shape is None else shape.integers(_SHAPE_SIZES)
-    if len(sizes) != 3 or min(sizes) < 1 or len(values) != math.prod(sizes):
+    if not is_image(sizes, len(values)):
         raise InputError(f"a range image of {len(values)} values says it is {reprlib.repr(sizes)}")
     return values.reshape(sizes)
