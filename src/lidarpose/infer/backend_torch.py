@@ -27,8 +27,8 @@ def torch_backend(path: str | os.PathLike, *, device: str = "cpu", compile: bool
         network = network.to(device)
         # there are devices, "meta", from which no number comes back
         torch.zeros(1, device=device).cpu()
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        # torch raises any of them for an unknown or a missing device
+    except (RuntimeError, AssertionError) as error:
+        # torch raises either, or a NotImplementedError, which is a RuntimeError, for an unknown or a missing device
         reason = str(error).partition("\n")[0]
         raise InputError(
             f"device {device!r} cannot be used ({reason}); expected cpu, or cuda where torch has it"
