@@ -5,11 +5,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from lidarpose.model.batch import Batch
-from lidarpose.model.exchange import Exchange
-from lidarpose.model.layers import Places
-from lidarpose.model.network import PoseNet
-from lidarpose.model.presets import NetworkConfig
+from lidarpose.models.batch import Batch
+from lidarpose.models.config import NetworkConfig
+from lidarpose.models.exchange import Exchange
+from lidarpose.models.layers import Places
+from lidarpose.models.posenet import PoseNet
 
 LEVELS = ("coarse", "mid", "fine")
 

@@ -29,21 +29,21 @@ from torch import nn
 
 from lidarpose import evaluation
 from lidarpose._version import __version__
-from lidarpose.infer.backend_torch import TorchBackend
-from lidarpose.infer.predictor import Predictor
+from lidarpose.inference.predictor import Predictor
+from lidarpose.inference.torch_backend import TorchBackend
 from lidarpose.io.files import write_atomic
-from lidarpose.model.checkpoint import load_checkpoint
-from lidarpose.model.grow import grown
-from lidarpose.model.header import Header, opened, read_header
-from lidarpose.model.network import PoseNet
-from lidarpose.model.presets import NetworkConfig, preset
-from lidarpose.synth.generate import Generator
+from lidarpose.models.checkpoint import load_checkpoint
+from lidarpose.models.config import NetworkConfig, preset
+from lidarpose.models.expand import grown
+from lidarpose.models.header import Header, opened, read_header
+from lidarpose.models.posenet import PoseNet
+from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import SCENES, SceneConfig
 from lidarpose.train.example import Example
-from lidarpose.train.job import Job, job_of
 from lidarpose.train.loop import train
-from lidarpose.train.pose_task import PoseTask
+from lidarpose.train.posenet_objective import PoseTask
 from lidarpose.train.recipes import Pretrain, recipe
+from lidarpose.train.setup import Job, job_of
 from lidarpose.train.sources import SyntheticSource
 
 _WILD = SCENES["wild"]
@@ -219,7 +219,7 @@ def each(names: Iterable[str], options: argparse.Namespace, scored: Callable[[st
 
 def arguments(parser: argparse.ArgumentParser, **motion) -> None:
     """What both benchmarks ask."""
-    parser.add_argument("--motion", help="npz of clips, see lidarpose.body.clips", **motion)
+    parser.add_argument("--motion", help="npz of clips, see lidarpose.body.mocap.motion", **motion)
     parser.add_argument("--subjects", default="002,005", help="of its clips, those to learn from")
     parser.add_argument("--people", type=int, default=24_576)
     parser.add_argument("--seeds", default="1")

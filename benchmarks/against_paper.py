@@ -18,13 +18,13 @@ from ablation_tables import figures
 from ablations import arguments, each, record
 
 from lidarpose import evaluation
-from lidarpose.infer.predictor import load
-from lidarpose.model.checkpoint import load_checkpoint
-from lidarpose.model.dapt.config import DaptConfig
-from lidarpose.train.dapt_task import DaptTask, finetuning_config, pretraining_config, small, transferred
-from lidarpose.train.job import job_of
+from lidarpose.inference.predictor import load
+from lidarpose.models.checkpoint import load_checkpoint
+from lidarpose.models.dapt.dapt_config import DaptConfig
+from lidarpose.train.dapt_objective import DaptTask, finetuning_config, pretraining_config, small, transferred
 from lidarpose.train.loop import train
 from lidarpose.train.recipes import Pretrain, recipe
+from lidarpose.train.setup import job_of
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lidarpose.model.layers import FeedForward, Places, SelfAttention, key_bias, wave_numbers
-from lidarpose.model.plan import Level, plan
+from lidarpose.models.layers import FeedForward, Places, SelfAttention, key_bias, wave_numbers
+from lidarpose.models.voxelize import Level, plan
 from lidarpose.skeleton import BODY26
 
 JOINTS = len(BODY26)

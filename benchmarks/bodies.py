@@ -17,11 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.body.person import clothing, sample_people
 from lidarpose.body.rig import load_rig
+from lidarpose.body.shape import clothing, sample_people
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import Bodies, draw_bodies
-from lidarpose.synth.props import Prop, draw_props
+from lidarpose.synth.props.draw_props import Prop, draw_props
 
 BLOCK = 64
 ON_SHEET = (

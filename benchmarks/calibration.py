@@ -17,10 +17,10 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from lidarpose.evaluate.metrics import auroc, calibration_error
-from lidarpose.infer.predictor import load
+from lidarpose.eval.metrics.joint_errors import auroc, calibration_error
+from lidarpose.inference.predictor import load
 from lidarpose.io.files import write_atomic
-from lidarpose.model.bundled import DEFAULT
+from lidarpose.models.bundled import DEFAULT
 from lidarpose.sample import HIT
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import PoseBank

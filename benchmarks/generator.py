@@ -16,7 +16,7 @@ import time
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
-from lidarpose.synth.generate import BLOCK, Generator  # noqa: E402 - after the threads are held
+from lidarpose.synth.generator import BLOCK, Generator  # noqa: E402 - after the threads are held
 from lidarpose.synth.scene import scene_config  # noqa: E402
 
 

@@ -13,14 +13,14 @@ import time
 
 import numpy as np
 
-from lidarpose.evaluate.metrics import auroc, calibration_error, mpjpe, pa_mpjpe
+from lidarpose.eval.metrics.joint_errors import auroc, calibration_error, mpjpe, pa_mpjpe
 from lidarpose.geometry import rotation_about
-from lidarpose.infer.predictor import load
-from lidarpose.model.bundled import DEFAULT
+from lidarpose.inference.predictor import load
+from lidarpose.models.bundled import DEFAULT
 from lidarpose.sample import HIT
 from lidarpose.skeleton import HUMAN15, SMPL24, WAYMO14
 from lidarpose.synth.bodies import PoseBank
-from lidarpose.synth.generate import Generator, SyntheticPerson
+from lidarpose.synth.generator import Generator, SyntheticPerson
 from lidarpose.synth.scene import scene_config
 
 # never a seed of a training run, which count from 0
@@ -105,7 +105,7 @@ def _whole(predicted, found: list[SyntheticPerson], skeleton) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--motion", required=True, help="npz of clips, see lidarpose.body.clips")
+    parser.add_argument("--motion", required=True, help="npz of clips, see lidarpose.body.mocap.motion")
     parser.add_argument("--subjects", default="006,007", help="subjects kept out of training")
     parser.add_argument("--weights", default=DEFAULT)
     parser.add_argument("--people", type=int, default=1000)

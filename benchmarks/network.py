@@ -53,7 +53,7 @@ from runners import (
 )
 from threadpoolctl import threadpool_limits
 
-from lidarpose.train.feed import BATCHES
+from lidarpose.train.data_loader import BATCHES
 
 SECTIONS = ("latency", "forward", "training", "scaling", "memory")
 POINTS, SCALING_POINTS = (128, 256, 512, 1024), (128, 256, 512, 1024, 2048)

@@ -20,7 +20,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
-from lidarpose.lidar.catalog import sensor as named_sensor
+from lidarpose.lidar.presets import sensor as named_sensor
 from lidarpose.lidar.raycast import find_window, scan
 from lidarpose.lidar.raycast_people import scan_people
 from lidarpose.lidar.raycast_reference import cast_ray_list_reference

@@ -17,13 +17,13 @@ from pathlib import Path
 import numpy as np
 
 import lidarpose
-from lidarpose.infer.files import TTA
-from lidarpose.infer.predictor import Predictor
-from lidarpose.infer.results import PersonPose
+from lidarpose.inference.predict_file import TTA
+from lidarpose.inference.predictor import Predictor
+from lidarpose.inference.results import PersonPose
 from lidarpose.io.files import write_atomic
-from lidarpose.model.bundled import DEFAULT
+from lidarpose.models.bundled import DEFAULT
 from lidarpose.skeleton import SMPL24
-from lidarpose.view.person import facing
+from lidarpose.viz.person_view import facing
 
 # a limb's half thickness with clothes and the noise of a range, m
 NEAR = 0.15

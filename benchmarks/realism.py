@@ -23,15 +23,15 @@ import numpy as np
 
 from lidarpose.geometry import rotation_about
 from lidarpose.io.boxes import read_boxes
-from lidarpose.io.formats import read_points
-from lidarpose.lidar.catalog import sensor
-from lidarpose.lidar.pattern import RayPattern
-from lidarpose.lidar.pattern_scan import scan_pattern
+from lidarpose.io.point_cloud import read_points
+from lidarpose.lidar.presets import sensor
+from lidarpose.lidar.ray_pattern import RayPattern
+from lidarpose.lidar.ray_pattern_scan import scan_pattern
 from lidarpose.lidar.raycast import scan
 from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import Box
 from lidarpose.synth.bodies import draw_bodies
-from lidarpose.synth.generate import Generator
+from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import SCENES
 
 LEAST = 50

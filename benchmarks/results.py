@@ -26,10 +26,10 @@ from ablation_tables import figures, own_lines
 from ablations import VARIANTS
 from against_paper import WAYS
 
-from lidarpose.evaluate.result import Line, Scores, read_scores
+from lidarpose.eval.scores import Line, Scores, read_scores
 from lidarpose.io.files import content_digest, write_atomic
-from lidarpose.model.bundled import BUNDLED, DEFAULT, bundled_path
-from lidarpose.model.header import read_header, runs_of
+from lidarpose.models.bundled import BUNDLED, DEFAULT, bundled_path
+from lidarpose.models.header import read_header, runs_of
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -20,18 +20,18 @@ import torch
 from backbones import Draft, GroupedViT, PointNet2, count
 from torch import nn
 
-from lidarpose.model.batch import Batch
-from lidarpose.model.network import PoseNet
-from lidarpose.model.plan import plan
-from lidarpose.model.presets import preset
+from lidarpose.models.batch import Batch
+from lidarpose.models.config import preset
+from lidarpose.models.posenet import PoseNet
+from lidarpose.models.voxelize import plan
 from lidarpose.skeleton import BODY26
-from lidarpose.synth.generate import Generator
+from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
 from lidarpose.train.example import Example, example
-from lidarpose.train.optimize import average, optimizers
-from lidarpose.train.pose_task import PoseTask
+from lidarpose.train.objective import total
+from lidarpose.train.optim import average, optimizers
+from lidarpose.train.posenet_objective import PoseTask
 from lidarpose.train.recipes import Pretrain
-from lidarpose.train.task import total
 
 SIZES = ("tiny", "small", "base", "paper")
 # median points a person of those who come as in training
@@ -76,7 +76,7 @@ def _resampled(one: Example, n: int, rng: np.random.Generator) -> Example:
 
 
 def batches(people: list[Example], size: int, number: int) -> list[list[Example]]:
-    """`number` batches of `size`, sorted by voxels as `train.feed` sorts a chunk; of too many people every k-th."""
+    """`number` batches of `size`, sorted by voxels as `train.data_loader` sorts a chunk; every k-th of too many."""
     order = sorted(people, key=lambda e: len(np.unique(np.floor(e.points * 10), axis=0)))
     picked = [order[k * len(order) // (size * number)] for k in range(size * number)]
     return [picked[k * size : (k + 1) * size] for k in range(number)]
@@ -193,17 +193,17 @@ class Onnx(Runner):
     trains = False
 
     def __init__(self, ours: Ours, path: Path, threads: int):
-        from lidarpose.infer import backend
-        from lidarpose.model import decode, onnx_file
+        from lidarpose.inference import backend
+        from lidarpose.models import decode, onnx
 
         super().__init__(f"{ours.name} ONNX", None)
         self.parameters = ours.parameters
         self.plan = ours.plan
-        self.file, self.backend = onnx_file, backend
-        self.session = onnx_file.open_onnx(path, threads=threads)[0]
+        self.file, self.backend = onnx, backend
+        self.session = onnx.open_onnx(path, threads=threads)[0]
         self.decoder = decode.decoder("window")
         # parts are of no use to the predictor: what is not asked for is not computed
-        self.outputs = [name for name in onnx_file.OUTPUTS if name != "part"]
+        self.outputs = [name for name in onnx.OUTPUTS if name != "part"]
 
     def tables(self, people):
         arrays = self.file.network_inputs(self.plan(people))
@@ -248,9 +248,9 @@ class Paper(Runner):
     """The paper's network at full size."""
 
     def __init__(self, device: str = "cpu"):
-        from lidarpose.model.dapt.config import named_config
-        from lidarpose.model.dapt.network import DaptBatch, DaptNet
-        from lidarpose.model.dapt.tables import build_tables
+        from lidarpose.models.dapt.dapt_config import named_config
+        from lidarpose.models.dapt.dapt_net import DaptBatch, DaptNet
+        from lidarpose.models.dapt.voxel_tables import build_tables
 
         torch.manual_seed(0)
         self.config = named_config("paper")
@@ -349,8 +349,8 @@ def _from_files(ours: Ours, folder: Path, threads: int, left_out: list[str]) -> 
     """What ONNX Runtime runs of a network, and the public predictors of the smallest one."""
     weights, path = folder / f"{ours.name}.safetensors", folder / f"{ours.name}.onnx"
     try:
-        from lidarpose.model.checkpoint import save_checkpoint
-        from lidarpose.model.export import export
+        from lidarpose.models.checkpoint import save_checkpoint
+        from lidarpose.models.export import export
 
         say(f"exporting {ours.name} to ONNX")
         save_checkpoint(weights, ours.network, card={})
@@ -365,7 +365,7 @@ def _from_files(ours: Ours, folder: Path, threads: int, left_out: list[str]) -> 
         return
     for backend in ("torch", "onnx"):
         try:
-            from lidarpose.infer.predictor import load
+            from lidarpose.inference.predictor import load
 
             if backend == "onnx" and "backend" not in inspect.signature(load).parameters:
                 raise ImportError("this version's predictor has no ONNX backend")

@@ -3,7 +3,7 @@
     python benchmarks/test_time.py tiny --limit 1000 --out docs/scores/test_time.json
 
 Passes: each but the first is about the pelvis that the one before found. Looks: the last pass is repeated with the
-person mirrored, turned by quarters, or shifted in the grid of voxels, and joints are averaged (`infer/tta.py`), or
+person mirrored, turned by quarters, or shifted in the grid of voxels, and joints are averaged (`inference/tta.py`), or
 heatmaps are (as logarithms, brought to the mean vote). Rejection: the error of the most confident people and joints.
 """
 
@@ -17,9 +17,9 @@ import numpy as np
 from ablation_tables import figures
 
 from lidarpose import evaluation
-from lidarpose.infer.backend import Estimates, Raw, estimates
-from lidarpose.infer.predictor import PASSES, Predictor, load
-from lidarpose.infer.tta import LOOKS, Look, averaged, shown
+from lidarpose.inference.backend import Estimates, Raw, estimates
+from lidarpose.inference.predictor import PASSES, Predictor, load
+from lidarpose.inference.tta import LOOKS, Look, averaged, shown
 from lidarpose.io.files import write_atomic
 from lidarpose.skeleton import BODY26
 

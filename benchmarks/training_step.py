@@ -12,17 +12,17 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from lidarpose.model.batch import Batch, Targets
-from lidarpose.model.network import PoseNet
-from lidarpose.model.presets import preset
-from lidarpose.synth.generate import Generator
+from lidarpose.models.batch import Batch, Targets
+from lidarpose.models.config import preset
+from lidarpose.models.posenet import PoseNet
+from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
 from lidarpose.train.example import example
 from lidarpose.train.losses import losses
-from lidarpose.train.optimize import optimizers
-from lidarpose.train.pose_task import PoseTask
+from lidarpose.train.objective import total
+from lidarpose.train.optim import optimizers
+from lidarpose.train.posenet_objective import PoseTask
 from lidarpose.train.recipes import Pretrain
-from lidarpose.train.task import total
 
 ROUNDS = 5
 

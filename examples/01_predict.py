@@ -5,7 +5,7 @@ Run: python examples/01_predict.py    (needs, in the clone: pip install '.[synth
 """
 
 import lidarpose
-from lidarpose.synth.generate import Generator
+from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
 
 points = Generator(scene=scene_config("wild").eased(0.0)).person(seed=3, index=5).sample.points

@@ -11,7 +11,7 @@ import numpy as np
 import lidarpose
 from lidarpose.lidar.raycast import scan
 from lidarpose.synth.bodies import draw_bodies
-from lidarpose.synth.mesh import Mesh, quad, union
+from lidarpose.synth.environment.mesh import Mesh, quad, union
 
 # ---- a sweep: three people on flat ground about a sensor 1.7 m above it
 

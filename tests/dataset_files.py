@@ -11,7 +11,7 @@ import motion_files
 import numpy as np
 from test_smpl import synthetic
 
-from lidarpose.body.retarget import rotation_vector
+from lidarpose.body.mocap.retarget import rotation_vector
 from lidarpose.body.smpl import load_body
 from lidarpose.geometry import axis_angle_to_matrix
 from lidarpose.skeleton import HUMAN15, SMPL24

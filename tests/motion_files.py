@@ -4,7 +4,9 @@ import json
 
 import numpy as np
 
-from lidarpose.body import motion, retarget, rig
+from lidarpose.body import rig
+from lidarpose.body.mocap import retarget
+from lidarpose.body.pose_prior import sampling
 from lidarpose.geometry import UP_AXES, rotation_about
 from lidarpose.skeleton import SMPL24
 
@@ -15,7 +17,7 @@ C = UP_AXES["y"]
 def a_clip(frames=6, seed=0):
     """Rotations (F, 24, 3, 3) of several poses that face anywhere, and a walk of the pelvis (F, 3) m, z up."""
     rng = np.random.default_rng(seed)
-    rotations = motion.sample_rotations(rng, frames, mix={"walk": 2, "idle": 2, "run": 1}).rotations.astype(float)
+    rotations = sampling.sample_rotations(rng, frames, mix={"walk": 2, "idle": 2, "run": 1}).rotations.astype(float)
     rotations[:, 0] = rotation_about("z", rng.uniform(-3, 3, frames)) @ rotations[:, 0]
     way = np.cumsum(rng.uniform(-0.1, 0.1, (frames, 3)), 0) + [1.0, 2.0, 0.95]
     return rotations, way

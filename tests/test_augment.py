@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 
 from lidarpose.geometry import unit
 from lidarpose.sample import Box
-from lidarpose.synth import augment
+from lidarpose.synth import noise
+from lidarpose.synth.environment.mesh import Mesh
 from lidarpose.synth.mask import direction_mask
-from lidarpose.synth.mesh import Mesh
-from lidarpose.synth.spoil import range_errors, spoil, spoil_points
+from lidarpose.synth.noise_kernels import range_errors, spoil, spoil_points
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -25,13 +25,13 @@ def seen(n=4000, seed=0):
 def calls(points, ring, part, normals):
     """Every augmentation by name, as a function of the generator."""
     return {
-        "random_keep": lambda rng: augment.random_keep(len(points), share=0.2, rng=rng),
-        "reference_clusters": lambda rng: augment.reference_clusters(points.mean(0), rng=rng),
-        "half_space_keep": lambda rng: augment.half_space_keep(points, most=0.9, rng=rng),
+        "random_keep": lambda rng: noise.random_keep(len(points), share=0.2, rng=rng),
+        "reference_clusters": lambda rng: noise.reference_clusters(points.mean(0), rng=rng),
+        "half_space_keep": lambda rng: noise.half_space_keep(points, most=0.9, rng=rng),
         "direction_mask": lambda rng: direction_mask(points, keep=0.6, rng=rng),
-        "noise_clusters": lambda rng: augment.noise_clusters(points.mean(0), most=150, rng=rng),
-        "part_removal": lambda rng: augment.part_removal(part, rng=rng),
-        "jitter": lambda rng: augment.jitter(points, sigma=0.01, clip=0.02, rng=rng),
+        "noise_clusters": lambda rng: noise.noise_clusters(points.mean(0), most=150, rng=rng),
+        "part_removal": lambda rng: noise.part_removal(part, rng=rng),
+        "jitter": lambda rng: noise.jitter(points, sigma=0.01, clip=0.02, rng=rng),
     }
 
 
@@ -57,7 +57,7 @@ def test_no_points_are_legal(name):
 @given(seeds, st.integers(0, 150))
 def test_noise_clusters_are_one_or_two_small_blobs(seed, most):
     center = np.array([3.0, -7, 0.5])
-    stray = augment.noise_clusters(center, most=most, rng=np.random.default_rng(seed))
+    stray = noise.noise_clusters(center, most=most, rng=np.random.default_rng(seed))
     assert stray.shape[1:] == (3,) and len(stray) <= 2 * most
     assert (np.abs(stray - center) <= np.array([0.4, 0.4, 0.8]) + 0.3).all()
     # the first point's blob is within its diameter, whatever is left is the other blob
@@ -70,7 +70,7 @@ def test_noise_clusters_are_one_or_two_small_blobs(seed, most):
 
 def test_noise_clusters_of_both_kinds_and_sizes_occur():
     rng = np.random.default_rng(6)
-    sizes = np.array([len(augment.noise_clusters(np.zeros(3), most=100, rng=rng)) for _ in range(400)])
+    sizes = np.array([len(noise.noise_clusters(np.zeros(3), most=100, rng=rng)) for _ in range(400)])
     # the mean of one or two blobs of 0 to 100 points
     assert sizes.mean() == pytest.approx(75, rel=0.12)
     assert sizes.max() > 110 and sizes.min() < 10
@@ -80,7 +80,7 @@ def test_noise_clusters_of_both_kinds_and_sizes_occur():
 @given(seeds, st.lists(st.integers(0, 24), max_size=60))
 def test_part_removal_takes_exactly_one_part_that_is_there(seed, part):
     part = np.array(part, np.uint8)
-    keep = augment.part_removal(part, rng=np.random.default_rng(seed))
+    keep = noise.part_removal(part, rng=np.random.default_rng(seed))
     assert keep.dtype == bool and keep.shape == part.shape
     gone = set(part[~keep])
     if not part.any():
@@ -93,7 +93,7 @@ def test_part_removal_takes_exactly_one_part_that_is_there(seed, part):
 def test_part_removal_takes_every_part_in_turn():
     part = np.array([0, 3, 3, 7, 24], np.uint8)
     rng = np.random.default_rng(7)
-    gone = [int(part[~augment.part_removal(part, rng=rng)][0]) for _ in range(300)]
+    gone = [int(part[~noise.part_removal(part, rng=rng)][0]) for _ in range(300)]
     assert sorted(set(gone)) == [3, 7, 24]
     # parts alike, not points alike
     assert gone.count(3) / 300 == pytest.approx(1 / 3, abs=0.1)
@@ -101,10 +101,10 @@ def test_part_removal_takes_every_part_in_turn():
 
 def test_jitter_is_normal_and_cut():
     points = np.zeros((20000, 3))
-    step = augment.jitter(points, sigma=0.005, clip=0.02, rng=np.random.default_rng(8))
+    step = noise.jitter(points, sigma=0.005, clip=0.02, rng=np.random.default_rng(8))
     np.testing.assert_allclose(step.std(0), 0.005, rtol=0.03)
     np.testing.assert_allclose(step.mean(0), 0, atol=2e-4)
-    cut = augment.jitter(points, sigma=0.05, clip=0.02, rng=np.random.default_rng(8))
+    cut = noise.jitter(points, sigma=0.05, clip=0.02, rng=np.random.default_rng(8))
     assert np.abs(cut).max() == 0.02
     assert (np.abs(cut) == 0.02).mean() == pytest.approx(0.689, abs=0.02)
 
@@ -121,26 +121,26 @@ def facing(points, degrees):
 
 def test_weak_returns_follow_the_range_equation():
     near, far = np.array([[5.0, 0, 0]]), np.array([[60.0, 0, 0]])
-    assert augment.weak_loss(far, facing(far, 0), range_max=120)[0] == pytest.approx(0.5)
-    assert augment.weak_loss(near, facing(near, 60), range_max=120)[0] < 1e-3
+    assert noise.weak_loss(far, facing(far, 0), range_max=120)[0] == pytest.approx(0.5)
+    assert noise.weak_loss(near, facing(near, 60), range_max=120)[0] < 1e-3
     # the same power: four times as far is a sixteenth, as is a cosine of a sixteenth
-    slanted = augment.weak_loss(near * 4, facing(near, np.degrees(np.arccos(1 / 16))), range_max=100)
-    assert slanted[0] == pytest.approx(augment.weak_loss(near * 16, facing(near, 0), range_max=100)[0])
+    slanted = noise.weak_loss(near * 4, facing(near, np.degrees(np.arccos(1 / 16))), range_max=100)
+    assert slanted[0] == pytest.approx(noise.weak_loss(near * 16, facing(near, 0), range_max=100)[0])
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.floats(0.5, 80), st.floats(0, 89), st.floats(0.5, 80), st.floats(0, 89))
 def test_farther_and_more_grazing_is_weaker(r, a, more, turn):
     point = np.array([[r, 0, 0]])
-    loss = augment.weak_loss(point, facing(point, a), range_max=100)
+    loss = noise.weak_loss(point, facing(point, a), range_max=100)
     assert 0 <= loss[0] <= 1
-    assert augment.weak_loss(point * (1 + more / r), facing(point, a), range_max=100)[0] >= loss[0]
-    assert augment.weak_loss(point, facing(point, min(a + turn, 90)), range_max=100)[0] >= loss[0] - 1e-12
+    assert noise.weak_loss(point * (1 + more / r), facing(point, a), range_max=100)[0] >= loss[0]
+    assert noise.weak_loss(point, facing(point, min(a + turn, 90)), range_max=100)[0] >= loss[0] - 1e-12
 
 
 def test_random_keep_loses_its_share():
-    assert augment.random_keep(20000, share=0.3, rng=np.random.default_rng(11)).mean() == pytest.approx(0.7, abs=0.015)
-    assert augment.random_keep(50, share=0.0, rng=np.random.default_rng(11)).all()
+    assert noise.random_keep(20000, share=0.3, rng=np.random.default_rng(11)).mean() == pytest.approx(0.7, abs=0.015)
+    assert noise.random_keep(50, share=0.0, rng=np.random.default_rng(11)).all()
 
 
 # --- the compiled twin
@@ -169,14 +169,14 @@ def test_the_compiled_twin_agrees_draw_by_draw(seed, dropout, weak, range_max):
     rng = np.random.default_rng(seed)
     keep, chance = rng.random(len(points)) < 0.8, rng.random(len(points))
     error = rng.normal(0, 0.03, len(points))
-    slow, slow_kept = augment.spoil_reference(
+    slow, slow_kept = noise.spoil_reference(
         *(points.astype(float), normals_of(mesh, face), keep, error, chance),
         dropout=dropout,
         weak=weak,
         range_max=range_max,
     )
     fast, fast_kept = spoil_points(
-        *(points, face, mesh.vertices, mesh.faces, keep, error, chance, dropout, weak, augment.REACH * range_max)
+        *(points, face, mesh.vertices, mesh.faces, keep, error, chance, dropout, weak, noise.REACH * range_max)
     )
     np.testing.assert_array_equal(fast_kept, slow_kept)
     np.testing.assert_allclose(fast, slow, atol=2e-6)
@@ -240,7 +240,7 @@ def test_a_ring_s_error_is_drawn_once():
 
 def test_reference_clusters_have_the_released_code_s_law():
     center = np.array([3.0, -7, 0.5])
-    draws = [augment.reference_clusters(center, rng=np.random.default_rng(seed)) for seed in range(300)]
+    draws = [noise.reference_clusters(center, rng=np.random.default_rng(seed)) for seed in range(300)]
     sizes = np.array([len(d) for d in draws])
     assert sizes.mean() == pytest.approx(149, rel=0.06) and sizes.max() > 200
     assert all((np.abs(d - center) <= np.array([0.7, 0.7, 1.1])).all() for d in draws)
@@ -255,7 +255,7 @@ def test_reference_clusters_have_the_released_code_s_law():
 def test_a_half_space_leaves_most_of_the_extent(seed, most, n):
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(n, 3))
-    keep = augment.half_space_keep(points, most=most, rng=rng)
+    keep = noise.half_space_keep(points, most=most, rng=rng)
     assert keep.shape == (n,) and keep.any()
     if most == 0:
         assert keep.all()
@@ -264,7 +264,7 @@ def test_a_half_space_leaves_most_of_the_extent(seed, most, n):
 def test_a_half_space_cuts_a_straight_edge():
     # a ball: the centers of both sides of a plane lie on its normal
     points = unit(np.random.default_rng(0).normal(size=(4000, 3)))
-    keep = augment.half_space_keep(points, most=0.9, rng=np.random.default_rng(12))
+    keep = noise.half_space_keep(points, most=0.9, rng=np.random.default_rng(12))
     assert 0.05 < (~keep).mean() < 0.95
     # the kept and the lost are separated by a plane: the line between their centers
     line = points[keep].mean(0) - points[~keep].mean(0)
@@ -276,7 +276,7 @@ def test_a_half_space_cuts_a_straight_edge():
 @given(seeds, st.floats(0, 0.9), st.floats(-3, 3))
 def test_a_cut_box_lies_inside_the_box_and_loses_one_side(seed, most, yaw):
     whole = Box(center=[4.0, 1, 0.2], size=[0.7, 0.9, 1.8], yaw=yaw, id="x")
-    cut = augment.cut_box(whole, most=most, rng=np.random.default_rng(seed))
+    cut = noise.cut_box(whole, most=most, rng=np.random.default_rng(seed))
     lost = 1 - cut.size / whole.size
     assert (lost >= -1e-12).all() and (lost > 1e-12).sum() <= 1 and lost.max() <= most + 1e-12
     assert cut.yaw == whole.yaw and cut.id == "x"
@@ -292,7 +292,7 @@ def test_a_cut_box_lies_inside_the_box_and_loses_one_side(seed, most, yaw):
 def test_cuts_of_boxes_take_feet_heads_and_sides():
     whole = Box(center=[4.0, 1, 0.2], size=[0.7, 0.9, 1.8], yaw=0.3)
     rng = np.random.default_rng(5)
-    cuts = [augment.cut_box(whole, rng=rng) for _ in range(600)]
+    cuts = [noise.cut_box(whole, rng=rng) for _ in range(600)]
     raised = np.mean([c.center[2] > 0.2 + 1e-9 for c in cuts])
     lowered = np.mean([c.center[2] < 0.2 - 1e-9 for c in cuts])
     assert raised == pytest.approx(1 / 3, abs=0.06) and lowered == pytest.approx(1 / 6, abs=0.05)
@@ -327,5 +327,5 @@ def test_a_half_space_cuts_up_to_its_share_and_seldom_all_of_it():
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     rng = np.random.default_rng(1)
     # of a sphere a plane takes as large a share of the surface as of the extent
-    lost = np.array([1 - augment.half_space_keep(points, most=0.4, rng=rng).mean() for _ in range(300)])
+    lost = np.array([1 - noise.half_space_keep(points, most=0.4, rng=rng).mean() for _ in range(300)])
     assert lost.max() < 0.43 and lost.mean() == pytest.approx(0.2, abs=0.03) and lost.min() < 0.03

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from lidarpose.model.network import PoseNet
-from lidarpose.model.presets import preset
+from lidarpose.models.config import preset
+from lidarpose.models.posenet import PoseNet
 
 PATH = Path(__file__).parents[1] / "benchmarks" / "backbones.py"
 spec = importlib.util.spec_from_file_location("backbones", PATH)

@@ -15,19 +15,19 @@ import torch
 
 import lidarpose
 from lidarpose.errors import InputError, MissingExtra
-from lidarpose.infer.backend import Raw, estimates
-from lidarpose.infer.predictor import Predictor, load
+from lidarpose.inference.backend import Raw, estimates
+from lidarpose.inference.predictor import Predictor, load
 from lidarpose.io.files import content_digest
-from lidarpose.model import decode, heads, onnx_file
-from lidarpose.model.bundled import DEFAULT, bundled_path
-from lidarpose.model.checkpoint import load_checkpoint, save_checkpoint
-from lidarpose.model.dapt.config import DaptConfig
-from lidarpose.model.dapt.network import DaptNet
-from lidarpose.model.dapt.released import import_released
-from lidarpose.model.header import Header, read_header
-from lidarpose.model.onnx_file import usable_threads
-from lidarpose.model.plan import view_features
-from lidarpose.model.presets import BIN, NetworkConfig
+from lidarpose.models import decode, heads, onnx
+from lidarpose.models.bundled import DEFAULT, bundled_path
+from lidarpose.models.checkpoint import load_checkpoint, save_checkpoint
+from lidarpose.models.config import BIN, NetworkConfig
+from lidarpose.models.dapt.dapt_config import DaptConfig
+from lidarpose.models.dapt.dapt_net import DaptNet
+from lidarpose.models.dapt.import_weights import import_released
+from lidarpose.models.header import Header, read_header
+from lidarpose.models.onnx import usable_threads
+from lidarpose.models.voxelize import view_features
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14
 
 DAPT = Path(__file__).parent / "parity" / "dapt_tiny.safetensors"
@@ -332,7 +332,7 @@ def test_a_runtime_that_cannot_be_loaded_is_not_the_file_s_fault(monkeypatch):
         def load_module(name):
             raise error
 
-        monkeypatch.setattr(onnx_file, "import_module", load_module)
+        monkeypatch.setattr(onnx, "import_module", load_module)
 
     for error in (ImportError("DLL load failed:\nnot found"), OSError("libgomp.so.1: cannot open")):
         fails(error)
@@ -524,7 +524,7 @@ print(*[name for name in {heavy} if name in sys.modules])
 
 
 def test_the_demo_and_the_generator_need_no_torch(tmp_path):
-    code = "import lidarpose.demo, lidarpose.synth.generate, lidarpose.synth.write, lidarpose.view.report"
+    code = "import lidarpose.cli.demo, lidarpose.synth.generator, lidarpose.synth.shard_job, lidarpose.viz.html"
     assert without(["torch"], code, tmp_path).returncode == 0
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from lidarpose.errors import InputError
-from lidarpose.evaluate import bench as module
-from lidarpose.evaluate.bench import SHA256, bench_path, facing, floors, load_bench, plain
+from lidarpose.eval import bench as module
+from lidarpose.eval.bench import SHA256, bench_path, facing, floors, load_bench, plain
 from lidarpose.geometry import rotation_about
 from lidarpose.sample import Box
 from lidarpose.skeleton import BODY26, HUMAN15

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from motion_files import joints_of
 
-from lidarpose.body.clips import Motion
+from lidarpose.body.mocap.motion import Motion
 from lidarpose.geometry import rotation_about
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth import bodies
 from lidarpose.synth.actor import draw_actor
 from lidarpose.synth.bodies import PoseBank, draw_bodies
-from lidarpose.synth.generate import Generator
+from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import SCENES
 
 SEED = 11

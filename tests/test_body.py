@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpose.body import person
-from lidarpose.body.person import MAX_CLOTHING, clothing, sample_people
+from lidarpose.body import shape
 from lidarpose.body.rig import (
     forward_kinematics,
     load_rig,
@@ -17,6 +16,7 @@ from lidarpose.body.rig import (
     vertex_normals,
     vertex_normals_reference,
 )
+from lidarpose.body.shape import MAX_CLOTHING, clothing, sample_people
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix, rotation_about
 from lidarpose.skeleton import BODY26, SMPL24
@@ -268,8 +268,8 @@ def test_fast_folds_equal_reference(seed, n):
     phase = rng.random((n, 4)).astype(np.float32)
     fast = rng.uniform(0, 0.03, (n, len(rig.template))).astype(np.float32)
     slow = fast.copy()
-    person._fold(rig.template, direction, phase, fast)
-    person._fold_reference(rig.template, direction, phase, slow)
+    shape._fold(rig.template, direction, phase, fast)
+    shape._fold_reference(rig.template, direction, phase, slow)
     np.testing.assert_allclose(fast, slow, atol=1e-6)
 
 
@@ -291,6 +291,6 @@ def test_wrong_shapes_are_explained(rig, some):
 
 
 def test_neighbors_share_sex(rig):
-    weight, near = person._table()
+    weight, near = shape._table()
     assert (rig.sex[near] == rig.sex[:, None]).all()
     assert weight.sum() == pytest.approx(1)

@@ -11,13 +11,13 @@ from safetensors.torch import load_file, save_file
 
 from lidarpose._version import __version__
 from lidarpose.errors import InputError
-from lidarpose.model.checkpoint import load_checkpoint, save_checkpoint
-from lidarpose.model.dapt.config import DaptConfig
-from lidarpose.model.dapt.network import DaptNet
-from lidarpose.model.dapt.released import import_released
-from lidarpose.model.header import SCHEMA, Header, parameter_count, read_header
-from lidarpose.model.network import PoseNet
-from lidarpose.model.presets import preset
+from lidarpose.models.checkpoint import load_checkpoint, save_checkpoint
+from lidarpose.models.config import preset
+from lidarpose.models.dapt.dapt_config import DaptConfig
+from lidarpose.models.dapt.dapt_net import DaptNet
+from lidarpose.models.dapt.import_weights import import_released
+from lidarpose.models.header import SCHEMA, Header, parameter_count, read_header
+from lidarpose.models.posenet import PoseNet
 from lidarpose.skeleton import HUMAN15
 
 CARD = {"command": "lidarpose pretrain run", "people_seen": 12, "scores": {"mpjpe": 0.1}}

@@ -14,14 +14,13 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from lidarpose import demo
-from lidarpose.cli import main
+from lidarpose.cli import demo, main
 from lidarpose.errors import InputError
-from lidarpose.infer import info, predictor
-from lidarpose.model.bundled import DEFAULT, bundled_path
-from lidarpose.synth.generate import Generator
+from lidarpose.inference import info, predictor
+from lidarpose.models.bundled import DEFAULT, bundled_path
+from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
-from lidarpose.view import sheet
+from lidarpose.viz import contact_sheet
 
 DAPT = Path(__file__).parent / "parity" / "dapt_tiny.safetensors"
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("[0-9]*.py"))
@@ -225,7 +224,7 @@ def test_export_names_its_file(tmp_path, monkeypatch, capsys, words, name, forma
         Path(out).write_bytes(bytes(1_500_000))
 
     called = []
-    monkeypatch.setattr("lidarpose.model.export.export", export)
+    monkeypatch.setattr("lidarpose.models.export.export", export)
     monkeypatch.chdir(tmp_path)
     assert run("export", *words) == 0
     assert called == [(name, format, out)]
@@ -396,14 +395,14 @@ def test_a_closed_stderr_leaves_the_json_alone(crop, monkeypatch, capsys):
 def test_what_the_output_cannot_show_is_escaped(monkeypatch):
     written = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding="cp932"))
-    monkeypatch.setattr(sheet, "draw_dataset", lambda *args, **more: Path(os.fsdecode(b"caf\xe9 \xc2\xb7.png")))
+    monkeypatch.setattr(contact_sheet, "draw_dataset", lambda *args, **more: Path(os.fsdecode(b"caf\xe9 \xc2\xb7.png")))
     assert run("view", "streetlife") == 0
     assert written.getvalue().split() == [rb"caf\udce9", rb"\xb7.png"]
 
 
 def test_a_full_memory_is_one_line(monkeypatch, capsys):
     # more than any machine has
-    monkeypatch.setattr(sheet, "draw_dataset", lambda *args, **more: np.empty(2**60, np.uint8))
+    monkeypatch.setattr(contact_sheet, "draw_dataset", lambda *args, **more: np.empty(2**60, np.uint8))
     assert run("view", "streetlife") == 2
     assert "the memory is full (Unable to allocate 1.00 EiB" in one_line(capsys)
 

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from motion_files import joints_of
 
-from lidarpose.body import clips, motion, retarget
+from lidarpose.body.mocap import motion, retarget
+from lidarpose.body.pose_prior import sampling
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix, rotation_about
 from lidarpose.skeleton import SMPL24
@@ -25,7 +26,7 @@ def a_motion(lengths=(8, 1, 13), fps=20.0, seed=0):
         turn = axis_angle_to_matrix(rng.normal(0, 1, (1, 24, 3)) * time)
         rotations.append(axis_angle_to_matrix(rng.normal(0, 0.5, (24, 3))) @ turn)
         translation.append(rng.normal(size=3) + time[:, 0] * rng.normal(size=3))
-    return clips.Motion(
+    return motion.Motion(
         rotations=np.concatenate(rotations).astype(np.float32),
         translation=np.concatenate(translation).astype(np.float32),
         names=tuple(f"{k:03d}_01" for k in range(len(lengths))),
@@ -64,7 +65,7 @@ def test_even_turns_stay_even_at_another_rate():
 )
 def test_cuts_stay_inside_their_clips(lengths, fps, hz, frames, step, dt):
     lengths = np.array(lengths, int)
-    empty = clips.Motion(
+    empty = motion.Motion(
         rotations=np.zeros((0, 24, 3, 3), np.float32), translation=np.zeros((0, 3), np.float32),
         names=(), start=np.zeros(0, int), length=np.zeros(0, int), fps=fps, source="",
     )  # fmt: skip
@@ -89,7 +90,7 @@ def test_pairs_are_what_happens_next():
     rotations = np.broadcast_to(np.eye(3), (31, 24, 3, 3)).copy()
     rotations[:, 0] = rotation_about("z", angle)
     way = np.cumsum(np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1) * 0.05, 0)
-    one = clips.Motion(
+    one = motion.Motion(
         rotations=rotations.astype(np.float32), translation=way.astype(np.float32),
         names=("a",), start=np.array([0]), length=np.array([31]), fps=30.0, source="",
     )  # fmt: skip
@@ -100,7 +101,7 @@ def test_pairs_are_what_happens_next():
     assert (pairs.step[:, 0] > 0.14).all() and (pairs.step[:, 1] > 0).all()
     np.testing.assert_allclose(one.pairs(0).moved, one.poses(), atol=1e-6)
     windows = one.windows(16)
-    turned, moved = clips.facing_x(one.rotations[windows], one.translation[windows])
+    turned, moved = motion.facing_x(one.rotations[windows], one.translation[windows])
     np.testing.assert_allclose(retarget.heading(turned[:, 0]), 0, atol=1e-5)
     np.testing.assert_allclose(moved[:, 0], 0, atol=1e-6)
     np.testing.assert_allclose(retarget.heading(turned[:, -1]), 0.75, atol=1e-5)
@@ -111,7 +112,7 @@ def test_a_subject_whose_number_goes_on_is_another_one():
     """CMU's subjects go from 01 to 144: who trains on 10 must not meet 102, who is kept for judging."""
     names = ("1_01", "10_01", "102_03", "walk01", "02/02_01")
     at, each = np.arange(len(names)), np.ones(len(names), int)
-    some = clips.Clips(joints=np.zeros((5, 24, 3), np.float32), names=names, start=at, length=each, fps=30.0)
+    some = motion.Clips(joints=np.zeros((5, 24, 3), np.float32), names=names, start=at, length=each, fps=30.0)
     assert some.of("10").names == ("10_01",) and some.of("1").names == ("1_01",)
     assert some.of(("walk", "02")).names == ("walk01", "02/02_01")
     with pytest.raises(InputError, match="no clip starts with '0'"):
@@ -125,7 +126,7 @@ def test_clips_are_chosen_and_joined():
     np.testing.assert_array_equal(chosen.rotations, np.concatenate([one.rotations[:4], one.rotations[6:]]))
     with pytest.raises(InputError, match="no clip starts with '9': there are 000, 001, 002"):
         one.of("9")
-    both = clips.join([one, two], source="both")
+    both = motion.join([one, two], source="both")
     assert both.fps == 10 and tuple(both.length) == (2, 1, 3, 7) and both.source == "both"
     np.testing.assert_array_equal(both.rotations[both.frames(3)], two.rotations)
     np.testing.assert_allclose(both.rotations[both.frames(2)], one.rotations[[6, 8, 10]], atol=1e-6)
@@ -139,10 +140,10 @@ def test_clips_are_chosen_and_joined():
         (lambda m: m.windows(0), "frames >= 1"),
         (lambda m: m.windows(4, step=0), "step >= 1"),
         (lambda m: m.pairs(-1), "0 s or more"),
-        (lambda m: clips.join([], source="x"), "no motion"),
-        (lambda m: clips.Motion(**{**vars(m), "fps": np.inf}), "frames a second"),
-        (lambda m: clips.Motion(**{**vars(m), "translation": m.translation[1:]}), re.escape("(21, 3)")),
-        (lambda m: clips.Motion(**{**vars(m), "rotations": m.rotations * np.nan}), "finite"),
+        (lambda m: motion.join([], source="x"), "no motion"),
+        (lambda m: motion.Motion(**{**vars(m), "fps": np.inf}), "frames a second"),
+        (lambda m: motion.Motion(**{**vars(m), "translation": m.translation[1:]}), re.escape("(21, 3)")),
+        (lambda m: motion.Motion(**{**vars(m), "rotations": m.rotations * np.nan}), "finite"),
     ],
 )
 def test_what_is_wrong_with_a_motion_is_said(call, message):
@@ -214,7 +215,7 @@ def test_retargeting_anything_gives_rotations(seed):
 
 
 def test_a_bone_without_length_is_named():
-    joints = joints_of(motion.sample_rotations(np.random.default_rng(0), 3).rotations)
+    joints = joints_of(sampling.sample_rotations(np.random.default_rng(0), 3).rotations)
     joints[1, J["left_knee"]] = joints[1, J["left_hip"]]
     with pytest.raises(InputError, match="left_hip -> left_knee has no length in frame 1"):
         retarget.retarget_positions(joints)

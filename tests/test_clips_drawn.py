@@ -7,17 +7,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpose.body import gait, latents, motion, retarget, solid
-from lidarpose.body.contact import sole_points
+from lidarpose.body.mocap import retarget
+from lidarpose.body.pose_prior import capsules, gait, latents, sampling
+from lidarpose.body.pose_prior.ground_contact import sole_points
 from lidarpose.errors import InputError
 
-J = {name: i for i, name in enumerate(motion.SMPL24.joints)}
+J = {name: i for i, name in enumerate(sampling.SMPL24.joints)}
 HZ = 40.0
 
 
 @cache
 def clips(kind, n=12, frames=80, hz=HZ, seed=0):
-    return motion.sample_clips(np.random.default_rng(seed), n, frames=frames, hz=hz, mix={kind: 1})
+    return sampling.sample_clips(np.random.default_rng(seed), n, frames=frames, hz=hz, mix={kind: 1})
 
 
 def placed(drawn):
@@ -25,7 +26,7 @@ def placed(drawn):
     n, frames = drawn.rotations.shape[:2]
     flat = drawn.rotations.reshape(-1, 24, 3, 3)
     soles = sole_points(flat).reshape(n, frames, 8, 3)
-    joints = solid.body_frames(flat)[1].reshape(n, frames, 24, 3)
+    joints = capsules.body_frames(flat)[1].reshape(n, frames, 24, 3)
     way = drawn.translation[:, :, None]
     ground = drawn.clearance[:, 0] - soles[:, 0, :, 2].min(1)
     return joints + way + [0, 0, 1] * ground[:, None, None, None], soles + way + [0, 0, 1] * ground[:, None, None, None]
@@ -34,7 +35,7 @@ def placed(drawn):
 @settings(max_examples=12, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(0, 9), frames=st.integers(0, 7))
 def test_shapes_and_rotations(seed, n, frames):
-    drawn = motion.sample_clips(np.random.default_rng(seed), n, frames=frames)
+    drawn = sampling.sample_clips(np.random.default_rng(seed), n, frames=frames)
     assert drawn.rotations.shape == (n, frames, 24, 3, 3) and drawn.rotations.dtype == np.float32
     assert drawn.translation.shape == (n, frames, 3) and drawn.clearance.shape == (n, frames)
     product = drawn.rotations @ np.swapaxes(drawn.rotations, -1, -2)
@@ -45,7 +46,7 @@ def test_shapes_and_rotations(seed, n, frames):
     assert (drawn.clearance >= 0).all()
 
 
-@pytest.mark.parametrize("kind", motion.KINDS)
+@pytest.mark.parametrize("kind", sampling.KINDS)
 def test_people_move_as_fast_as_people(kind):
     joints, _ = placed(clips(kind))
     speed = np.linalg.norm(np.diff(joints, axis=1), axis=-1) * HZ
@@ -111,23 +112,25 @@ def test_a_fall_ends_on_the_ground():
 
 
 def test_faster_clips_show_the_same_motion():
-    slow, fast = (motion.sample_clips(np.random.default_rng(3), 20, frames=f, hz=h) for f, h in ((6, 5.0), (11, 10.0)))
+    slow, fast = (
+        sampling.sample_clips(np.random.default_rng(3), 20, frames=f, hz=h) for f, h in ((6, 5.0), (11, 10.0))
+    )
     np.testing.assert_array_equal(slow.kind, fast.kind)
     np.testing.assert_allclose(fast.rotations[:, ::2], slow.rotations, atol=1e-5)
-    goes = np.isin(slow.kind, [motion.KINDS.index(k) for k in ("walk", "run", "push", "cycle")])
+    goes = np.isin(slow.kind, [sampling.KINDS.index(k) for k in ("walk", "run", "push", "cycle")])
     np.testing.assert_allclose(fast.translation[goes, ::2, :2], slow.translation[goes, :, :2], atol=1e-2)
 
 
 def test_moved_poses_are_those_of_the_pose_itself_later():
-    still, moved = (motion.sample_rotations(np.random.default_rng(5), 200, dt=dt) for dt in (0.0, 0.1))
+    still, moved = (sampling.sample_rotations(np.random.default_rng(5), 200, dt=dt) for dt in (0.0, 0.1))
     np.testing.assert_allclose(moved.rotations, still.rotations, atol=1e-6)
     np.testing.assert_array_equal(moved.kind, still.kind)
     np.testing.assert_array_equal(still.moved, still.rotations)
     assert not still.step.any()
-    hands = [solid.body_frames(r)[1] for r in (moved.rotations, moved.moved)]
+    hands = [capsules.body_frames(r)[1] for r in (moved.rotations, moved.moved)]
     far = np.linalg.norm(hands[1] - hands[0], axis=-1).max(1)
     assert 0.001 < np.median(far) < 0.2 and far.max() < 1.0
-    walk = motion.sample_rotations(np.random.default_rng(5), 200, mix={"walk": 1}, dt=0.1)
+    walk = sampling.sample_rotations(np.random.default_rng(5), 200, mix={"walk": 1}, dt=0.1)
     assert 0.07 < np.median(walk.step[:, 0]) < 0.15
     # a foot on the ground stays there while the body goes on
     here, there = sole_points(walk.rotations).reshape(200, 8, 3), sole_points(walk.moved).reshape(200, 8, 3)
@@ -145,32 +148,32 @@ def test_a_stride_takes_and_comes_round():
     walk = np.full(40, gait.GAITS.index("walk"))
     one, next_one = gait.strides(walk, phase, style, base), gait.strides(walk, phase + 3, style, base)
     np.testing.assert_allclose(one.angles, next_one.angles, atol=1e-9)
-    knee = one.angles[:, motion.ANGLES.index("left_knee")]
+    knee = one.angles[:, sampling.ANGLES.index("left_knee")]
     assert 0.6 < phase[knee.argmax()] < 0.85 and knee.max() > 45 and knee[(phase > 0.2) & (phase < 0.4)].max() < 30
     assert np.ptp(one.pace) < 1e-9 and 0.7 < one.pace[0] < 1.8
 
 
 def test_latents_are_taken_together():
     rng = np.random.default_rng(0)
-    drawn = latents.draw_latents(rng, rng.choice(len(motion.KINDS), 300, p=motion.SHARES))
+    drawn = latents.draw_latents(rng, rng.choice(len(sampling.KINDS), 300, p=sampling.SHARES))
     rows = rng.permutation(300)[:80]
-    np.testing.assert_array_equal(motion._angles(drawn.take(rows)).angles, motion._angles(drawn).angles[rows])
+    np.testing.assert_array_equal(sampling._angles(drawn.take(rows)).angles, sampling._angles(drawn).angles[rows])
 
 
 def test_few_clips_pass_through_themselves_and_the_mix_is_kept():
-    drawn = motion.sample_clips(np.random.default_rng(1), 800, frames=6)
-    ends = solid.capsule_ends(*solid.body_frames(drawn.rotations.reshape(-1, 24, 3, 3)))
-    assert (solid.depths(ends).max(1) > 0.02).mean() < 0.02
-    shares = np.bincount(drawn.kind, minlength=len(motion.KINDS)) / 800
-    np.testing.assert_allclose(shares, motion.SHARES, atol=0.045)
+    drawn = sampling.sample_clips(np.random.default_rng(1), 800, frames=6)
+    ends = capsules.capsule_ends(*capsules.body_frames(drawn.rotations.reshape(-1, 24, 3, 3)))
+    assert (capsules.depths(ends).max(1) > 0.02).mean() < 0.02
+    shares = np.bincount(drawn.kind, minlength=len(sampling.KINDS)) / 800
+    np.testing.assert_allclose(shares, sampling.SHARES, atol=0.045)
 
 
 def test_wrong_clips_are_refused():
     rng = np.random.default_rng(0)
     for n, frames, hz, message in ((-1, 3, 10.0, "n must"), (1, -3, 10.0, "frames must"), (1, 3, 0.0, "hz > 0")):
         with pytest.raises(InputError, match=message):
-            motion.sample_clips(rng, n, frames=frames, hz=hz)
+            sampling.sample_clips(rng, n, frames=frames, hz=hz)
     with pytest.raises(InputError, match="did you mean walk"):
-        motion.sample_clips(rng, 1, frames=2, mix={"wakl": 1})
+        sampling.sample_clips(rng, 1, frames=2, mix={"wakl": 1})
     with pytest.raises(InputError, match="0 or more"):
-        motion.sample_rotations(rng, 1, dt=-0.1)
+        sampling.sample_rotations(rng, 1, dt=-0.1)

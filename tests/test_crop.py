@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpose.synth.crop import draw_box
-from lidarpose.synth.placing import Place
+from lidarpose.synth.placement import Place
 from lidarpose.synth.scene import SCENES
 
 BODY = np.array([[x, y, z] for x in (-0.2, 0.3) for y in (-0.35, 0.35) for z in (0.0, 1.7)], np.float32)

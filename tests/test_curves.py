@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
-from lidarpose.model.dapt.curves import CURVES, MAX_BITS, curve, dilated, hilbert, z_order
+from lidarpose.models.dapt.space_filling_curves import CURVES, MAX_BITS, curve, dilated, hilbert, z_order
 
 
 def cube(bits):

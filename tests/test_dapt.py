@@ -14,12 +14,12 @@ from safetensors.torch import load_file, save_file
 from torch.nn import functional as F
 
 from lidarpose.errors import InputError
-from lidarpose.model import decode
-from lidarpose.model.dapt.config import CONFIGS, WAYMO_JOINTS, DaptConfig, named_config
-from lidarpose.model.dapt.layers import DropPath, PatchAttention, RowNorm, Stage, SubmanifoldConvolution
-from lidarpose.model.dapt.network import DaptBatch, DaptNet
-from lidarpose.model.dapt.released import import_dapt
-from lidarpose.model.dapt.tables import LAYOUTS, build_tables
+from lidarpose.models import decode
+from lidarpose.models.dapt.blocks import DropPath, PatchAttention, RowNorm, Stage, SubmanifoldConvolution
+from lidarpose.models.dapt.dapt_config import CONFIGS, WAYMO_JOINTS, DaptConfig, named_config
+from lidarpose.models.dapt.dapt_net import DaptBatch, DaptNet
+from lidarpose.models.dapt.import_weights import import_dapt
+from lidarpose.models.dapt.voxel_tables import LAYOUTS, build_tables
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14
 
 PARITY = Path(__file__).parent / "parity"
@@ -551,7 +551,7 @@ def test_attention_equals_its_formula():
 
 
 def test_tables_and_decoders_need_no_torch():
-    code = "import sys, lidarpose.model.decode, lidarpose.model.dapt.tables; sys.exit('torch' in sys.modules)"
+    code = "import sys, lidarpose.models.decode, lidarpose.models.dapt.voxel_tables; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
 
 

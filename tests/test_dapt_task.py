@@ -11,17 +11,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
-from lidarpose.model.checkpoint import save_checkpoint
-from lidarpose.model.dapt.config import named_config
-from lidarpose.model.dapt.network import DaptBatch, DaptNet, DaptOutputs
-from lidarpose.model.dapt.tables import LAYOUTS
-from lidarpose.model.network import PoseNet
-from lidarpose.model.presets import preset
+from lidarpose.models.checkpoint import save_checkpoint
+from lidarpose.models.config import preset
+from lidarpose.models.dapt.dapt_config import named_config
+from lidarpose.models.dapt.dapt_net import DaptBatch, DaptNet, DaptOutputs
+from lidarpose.models.dapt.voxel_tables import LAYOUTS
+from lidarpose.models.posenet import PoseNet
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14
 from lidarpose.train.dapt_losses import DaptTargets, finetuning, log_gaussian, pretraining
-from lidarpose.train.dapt_task import DaptTask, finetuning_config, pretraining_config, small, transferred
+from lidarpose.train.dapt_objective import DaptTask, finetuning_config, pretraining_config, small, transferred
 from lidarpose.train.example import Example
-from lidarpose.train.task import alone, total
+from lidarpose.train.objective import alone, total
 
 TINY = {
     "encoder_depths": (1, 1, 1),

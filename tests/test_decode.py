@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
-from lidarpose.model import decode
-from lidarpose.model.dapt.config import named_config
+from lidarpose.models import decode
+from lidarpose.models.dapt.dapt_config import named_config
 
 ORACLE = np.load(Path(__file__).parent / "parity" / "dapt_tiny.npz")
 WAYMO = named_config("waymo")

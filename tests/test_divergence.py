@@ -5,8 +5,8 @@ import pytest
 from raycast_meshes import body, ground, join, soup
 
 from lidarpose.errors import InputError
-from lidarpose.lidar.catalog import sensor
-from lidarpose.lidar.divergence import cast_wide_ray_list, footprint, scan_wide, spread
+from lidarpose.lidar.beam_divergence import cast_wide_ray_list, footprint, scan_wide, spread
+from lidarpose.lidar.presets import sensor
 from lidarpose.lidar.raycast import Hits, cast_ray_list, scan
 from lidarpose.lidar.raycast_reference import cast_ray_list_reference, merge_echoes_reference
 from lidarpose.lidar.sensor import Window

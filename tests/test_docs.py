@@ -18,7 +18,7 @@ def test_the_table_of_the_paper_s_method_is_read():
 
 @pytest.mark.parametrize("path, name", NAMED, ids=[f"{path}:{name}" for path, name in NAMED])
 def test_what_stands_beside_the_paper_is_there(path, name):
-    file = next((p for p in (SOURCE / "model" / path, SOURCE / path) if p.is_file()), None)
+    file = next((p for p in (SOURCE / "models" / path, SOURCE / path) if p.is_file()), None)
     assert file is not None, path
     text = file.read_text()
     for part in name.split("."):

@@ -22,19 +22,20 @@ from lidarpose.cli import evaluating, main
 from lidarpose.data.prepare import prepare
 from lidarpose.data.shards import open_dataset, read_rows, shard_path
 from lidarpose.errors import InputError
-from lidarpose.evaluate import bootstrap, stability
-from lidarpose.evaluate.bench import load_bench
-from lidarpose.evaluate.lines import lines_of, span_rows, triples, turned_round
-from lidarpose.evaluate.people import open_people, spread
-from lidarpose.evaluate.protocols import cropped, jittered
-from lidarpose.evaluate.run import judge, task_of
+from lidarpose.eval import robustness
+from lidarpose.eval.bench import load_bench
+from lidarpose.eval.dataset import open_people, spread
+from lidarpose.eval.metric_rows import lines_of, span_rows, triples, turned_round
+from lidarpose.eval.metrics import bootstrap
+from lidarpose.eval.protocols import cropped, jittered
+from lidarpose.eval.run import judge, task_of
 from lidarpose.geometry import rotation_about
-from lidarpose.infer.backend import Estimates
-from lidarpose.infer.results import PersonPose, Poses
-from lidarpose.model.bundled import DEFAULT
+from lidarpose.inference.backend import Estimates
+from lidarpose.inference.results import PersonPose, Poses
+from lidarpose.models.bundled import DEFAULT
 from lidarpose.sample import Box, Pose, center_of
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14, Skeleton
-from lidarpose.synth.write import Job, write_dataset
+from lidarpose.synth.shard_job import Job, write_dataset
 
 
 class Fake:
@@ -491,7 +492,7 @@ def test_who_the_released_code_leaves_out_is_counted(sets, tmp_path):
     assert after.skipped["people without the center 'trans'"]["count"] == 1
     # nor are they disturbed
     task = task_of(Fake(standing), open_people(tmp_path / "leaking"), protocol="dapt")
-    assert len(stability.to_disturb(task)) == after.counts["people"]
+    assert len(robustness.to_disturb(task)) == after.counts["people"]
 
 
 def test_the_released_protocol_is_one_look(sets):

@@ -14,18 +14,18 @@ from test_evaluate import Fake, standing
 
 from lidarpose.data.prepare import prepare
 from lidarpose.data.shards import open_dataset
-from lidarpose.evaluate import stability as module
-from lidarpose.evaluate.disturb import DISTURBANCES
-from lidarpose.evaluate.judged import gathered
-from lidarpose.evaluate.people import open_people
-from lidarpose.evaluate.run import Task, judge, task_of
-from lidarpose.evaluate.stability import end_errors, study, to_json
+from lidarpose.eval import robustness as module
+from lidarpose.eval.charts import draw_stability
+from lidarpose.eval.dataset import open_people
+from lidarpose.eval.perturb import DISTURBANCES
+from lidarpose.eval.predictions import gathered
+from lidarpose.eval.robustness import end_errors, study, to_json
+from lidarpose.eval.run import Task, judge, task_of
 from lidarpose.sample import Box, center_of
 from lidarpose.skeleton import BODY26, HUMAN15
-from lidarpose.synth.augment import noise_clusters, stray_cluster
-from lidarpose.synth.generate import LEAST_POINTS
-from lidarpose.synth.write import Job, write_dataset
-from lidarpose.view.charts import draw_stability
+from lidarpose.synth.generator import LEAST_POINTS
+from lidarpose.synth.noise import noise_clusters, stray_cluster
+from lidarpose.synth.shard_job import Job, write_dataset
 
 
 def cloud(seed, n):

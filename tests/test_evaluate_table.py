@@ -7,7 +7,7 @@ import pytest
 from lidarpose import evaluation
 from lidarpose.cli import main
 from lidarpose.errors import InputError
-from lidarpose.evaluate.result import Line, Result, Scores, Setting
+from lidarpose.eval.scores import Line, Result, Scores, Setting
 
 
 def scores(folder, *, method="mine", kind="waymo", protocol="clean", value=70.0, digest="ab" * 32, **more):

@@ -10,15 +10,15 @@ import torch
 
 import lidarpose
 from lidarpose.errors import InputError, LidarPoseError, MissingExtra
-from lidarpose.infer.backend import OnnxBackend, exported_beside
-from lidarpose.infer.backend_torch import TorchBackend
+from lidarpose.inference.backend import OnnxBackend, exported_beside
+from lidarpose.inference.torch_backend import TorchBackend
 from lidarpose.io.files import content_digest
-from lidarpose.model import export as exporting
-from lidarpose.model.checkpoint import load_checkpoint, save_checkpoint
-from lidarpose.model.export import PlanModule, check, export
-from lidarpose.model.header import read_header
-from lidarpose.model.network import PoseNet
-from lidarpose.model.onnx_file import (
+from lidarpose.models import export as exporting
+from lidarpose.models.checkpoint import load_checkpoint, save_checkpoint
+from lidarpose.models.config import NetworkConfig
+from lidarpose.models.export import PlanModule, check, export
+from lidarpose.models.header import read_header
+from lidarpose.models.onnx import (
     OUTPUTS,
     expected_inputs,
     input_name,
@@ -27,7 +27,7 @@ from lidarpose.model.onnx_file import (
     open_session,
     plan_people,
 )
-from lidarpose.model.presets import NetworkConfig
+from lidarpose.models.posenet import PoseNet
 
 CARD = {"command": "none", "note": "random"}
 # every kind of layer, few of each: what is traced takes as long as there are layers
@@ -270,7 +270,7 @@ def test_what_cannot_be_exported_is_one_line(folder, tmp_path, monkeypatch):
             export(folder / "net.safetensors", tmp_path / name, format=format)
     (tmp_path / "file").write_text("")
     # at once, not after a minute of tracing
-    monkeypatch.setattr("lidarpose.model.export.onnx_bytes", None)
+    monkeypatch.setattr("lidarpose.models.export.onnx_bytes", None)
     with pytest.raises(InputError, match="a part of the path is a file"):
         export(folder / "net.safetensors", tmp_path / "file" / "out.onnx")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from lidarpose.body.activities import KINDS
-from lidarpose.data.facts import facts_of
+from lidarpose.body.pose_prior.activities import KINDS
+from lidarpose.data.synthetic_info import facts_of
 from lidarpose.sample import Pose, Sample
 from lidarpose.skeleton import BODY26
 

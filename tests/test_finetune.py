@@ -16,21 +16,21 @@ from lidarpose.cli import main
 from lidarpose.data.prepare import READERS, prepare
 from lidarpose.data.shards import open_dataset, shard_path
 from lidarpose.errors import InputError
-from lidarpose.evaluate.people import open_people
-from lidarpose.infer.predictor import load
-from lidarpose.model.checkpoint import load_checkpoint
-from lidarpose.model.header import read_header
+from lidarpose.eval.dataset import open_people
+from lidarpose.inference.predictor import load
+from lidarpose.models.checkpoint import load_checkpoint
+from lidarpose.models.header import read_header
 from lidarpose.sample import Box, center_of
 from lidarpose.skeleton import BODY26, HUMAN15, skeleton
-from lidarpose.synth.generate import Generator
-from lidarpose.synth.write import Job, write_dataset
-from lidarpose.train import job as jobs
-from lidarpose.train import loop, runs
+from lidarpose.synth.generator import Generator
+from lidarpose.synth.shard_job import Job, write_dataset
+from lidarpose.train import loop, run_dir
+from lidarpose.train import setup as jobs
 from lidarpose.train.augment import AUGMENTATIONS, Augmentation, augmentation, augmented
-from lidarpose.train.crowd import StoredPerson, crowd_of
 from lidarpose.train.example import BLIND, PELVIS_ERROR, example, seen
-from lidarpose.train.job import job_of
+from lidarpose.train.labeled_dataset import StoredPerson, crowd_of
 from lidarpose.train.recipes import Finetune, Pretrain
+from lidarpose.train.setup import job_of
 from lidarpose.train.sources import MixedSource, StoredSource, SyntheticSource
 
 FEW = 16
@@ -407,7 +407,7 @@ def test_pretraining_takes_nobody_who_is_kept_for_testing(datasets, tmp_path):
 def test_pretraining_on_shards(synthetic, tmp_path):
     recipe = Pretrain(shards=(str(synthetic),), people=32, batch=4, workers=0, pictures=0, validate=1000, scene="paper")
     loop.train(recipe, tmp_path / "run")
-    assert read_header(tmp_path / "run" / runs.MODEL).card["recipe"]["shards"] == ["people"]
+    assert read_header(tmp_path / "run" / run_dir.MODEL).card["recipe"]["shards"] == ["people"]
 
 
 @pytest.mark.parametrize("name, epochs", [("humanm3", 16), ("lidarhuman26m", 40), ("sloper4d", 60), ("waymo", 40)])
@@ -445,7 +445,7 @@ def test_the_paper_s_two_stages(datasets, tmp_path, capsys, monkeypatch, keep):
     assert first.config.coordinates and not first.config.bins and first.config.parts == 25
     assert second.config.bins == (140, 140, 220) and not (second.config.coordinates or second.config.parts)
     assert second.config.joints == HUMAN15.joints and not second.config.legacy
-    begun = job_of(runs.stored_recipe(tmp_path / "second", Finetune)).network().state_dict()
+    begun = job_of(run_dir.stored_recipe(tmp_path / "second", Finetune)).network().state_dict()
     anchors = "backbone.keypoint_embedding"
     kept = torch.equal(begun[anchors], load_checkpoint("first/model.safetensors")[0].state_dict()[anchors])
     assert kept == (keep == "true")
@@ -481,7 +481,7 @@ def test_a_run_on_a_dataset_is_taken_up(datasets, tmp_path, monkeypatch):
     loop.train(replace(recipe, data=(str(moved),)), tmp_path / "run", resume=True)
     with pytest.raises(InputError, match="a run keeps its recipe"):
         loop.train(replace(recipe, data=(str(datasets["sloper4d"]),)), tmp_path / "run", resume=True)
-    whole, broken = (runs.read_log(tmp_path / name) for name in ("whole", "run"))
+    whole, broken = (run_dir.read_log(tmp_path / name) for name in ("whole", "run"))
     assert len(whole) == len(broken) == 3
     for a, b in zip(whole, broken, strict=True):
         a.pop("seconds"), b.pop("seconds")

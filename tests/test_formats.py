@@ -19,7 +19,7 @@ from hypothesis.extra import numpy as hnp
 
 from lidarpose.errors import InputError
 from lidarpose.io.boxes import read_boxes
-from lidarpose.io.formats import SUFFIXES, Cloud, read_points
+from lidarpose.io.point_cloud import SUFFIXES, Cloud, read_points
 
 REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "real"
 
@@ -645,7 +645,7 @@ def test_damaged_files_read_or_fail_in_one_line(folder, data):
 
 def test_import_loads_no_heavy_library():
     heavy = {"pandas", "trimesh", "pypcd4", "lzf", "torch"}
-    code = f"import sys, lidarpose.io.formats; print(sorted({heavy} & set(sys.modules)))"
+    code = f"import sys, lidarpose.io.point_cloud; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

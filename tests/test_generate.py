@@ -7,16 +7,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lidarpose.body.person import sample_people
+from lidarpose.body.shape import sample_people
 from lidarpose.errors import InputError
-from lidarpose.lidar.catalog import sensor
+from lidarpose.lidar.presets import sensor
 from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import center_of
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth import actor
 from lidarpose.synth.actor import draw_actor
 from lidarpose.synth.bodies import draw_bodies
-from lidarpose.synth.generate import BLOCK, LEAST_POINTS, Generator
+from lidarpose.synth.generator import BLOCK, LEAST_POINTS, Generator
 from lidarpose.synth.scene import SCENES, scene_config
 
 SEED = 11

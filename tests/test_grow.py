@@ -7,20 +7,20 @@ import pytest
 import torch
 
 from lidarpose.errors import InputError
-from lidarpose.model.batch import Batch
-from lidarpose.model.bundled import bundled_path
-from lidarpose.model.checkpoint import load_checkpoint, save_checkpoint
-from lidarpose.model.grow import grown
-from lidarpose.model.network import PoseNet
-from lidarpose.model.presets import preset
-from lidarpose.synth.generate import Generator
+from lidarpose.models.batch import Batch
+from lidarpose.models.bundled import bundled_path
+from lidarpose.models.checkpoint import load_checkpoint, save_checkpoint
+from lidarpose.models.config import preset
+from lidarpose.models.expand import grown
+from lidarpose.models.posenet import PoseNet
+from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
 from lidarpose.train.example import example
-from lidarpose.train.job import job_of
-from lidarpose.train.optimize import optimizers
-from lidarpose.train.pose_task import PoseTask
+from lidarpose.train.objective import total
+from lidarpose.train.optim import optimizers
+from lidarpose.train.posenet_objective import PoseTask
 from lidarpose.train.recipes import Pretrain
-from lidarpose.train.task import total
+from lidarpose.train.setup import job_of
 
 
 @pytest.fixture(scope="module")

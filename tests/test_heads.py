@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from lidarpose.errors import InputError
-from lidarpose.lidar.catalog import sensor
-from lidarpose.lidar.divergence import scan_wide
+from lidarpose.lidar.beam_divergence import scan_wide
+from lidarpose.lidar.presets import sensor
 from lidarpose.lidar.raycast import scan
 from lidarpose.lidar.raycast_people import scan_people
 from lidarpose.lidar.raycast_reference import cast_ray_list_reference
-from lidarpose.synth.mesh import box
+from lidarpose.synth.environment.mesh import box
 
 AV2 = sensor("av2")
 

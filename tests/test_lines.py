@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from lidarpose.evaluate.judged import gathered
-from lidarpose.evaluate.lines import lines_of
-from lidarpose.evaluate.result import Result, Setting
+from lidarpose.eval import charts
+from lidarpose.eval.metric_rows import lines_of
+from lidarpose.eval.predictions import gathered
+from lidarpose.eval.scores import Result, Setting
 from lidarpose.skeleton import HUMAN15
-from lidarpose.view import charts
 
 
 def four():

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from lidarpose.geometry import rotation_about
-from lidarpose.lidar.catalog import sensor
-from lidarpose.synth.look import Conditions, Layer, count_alone, draw_conditions, look
-from lidarpose.synth.mesh import box, quad
-from lidarpose.synth.placing import Place
+from lidarpose.lidar.presets import sensor
+from lidarpose.synth.environment.mesh import box, quad
+from lidarpose.synth.placement import Place
 from lidarpose.synth.scene import SCENES
+from lidarpose.synth.simulate import Conditions, Layer, count_alone, draw_conditions, look
 
 NO_FAULTS = replace(SCENES["paper"].faults, mask=0.0, stray=0.0)
 PLAIN = replace(SCENES["paper"], faults=NO_FAULTS)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lidarpose.synth.mesh import Mesh, box, prism, quad, union
+from lidarpose.synth.environment.mesh import Mesh, box, prism, quad, union
 
 
 def volume(mesh):

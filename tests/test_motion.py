@@ -11,7 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from motion_files import joints_of
 
-from lidarpose.body import activities, angles, captured, clips, latents, motion, retarget, rig
+from lidarpose.body import rig
+from lidarpose.body.mocap import motion, retarget
+from lidarpose.body.pose_prior import activities, joint_angles, latents, mixture, sampling
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.skeleton import SMPL24
@@ -21,13 +23,13 @@ MAIN = [J[n] for n in SMPL24.joints if not n.endswith(("foot", "hand"))]
 
 
 def drawn(n=1500, seed=0, **mix):
-    return motion.sample_rotations(np.random.default_rng(seed), n, mix=mix or None)
+    return sampling.sample_rotations(np.random.default_rng(seed), n, mix=mix or None)
 
 
 def latents_of(n, seed, **mix):
     """The mix's latents, as they are drawn before anything is drawn anew."""
     rng = np.random.default_rng(seed)
-    return latents.draw_latents(rng, rng.choice(len(motion.KINDS), n, p=motion._shares(mix or None)))
+    return latents.draw_latents(rng, rng.choice(len(sampling.KINDS), n, p=sampling._shares(mix or None)))
 
 
 def angle_at(joints, a, b, c):
@@ -58,13 +60,13 @@ def test_the_same_generator_gives_the_same_poses():
 def test_euler_angles_against_the_product_of_three_rotations():
     euler = np.random.default_rng(0).uniform(-3, 3, (40, 3))
     reference = rotation_about("y", euler[:, 0]) @ rotation_about("x", euler[:, 1]) @ rotation_about("z", euler[:, 2])
-    np.testing.assert_allclose(angles._from_euler(euler), reference, atol=1e-12)
+    np.testing.assert_allclose(joint_angles._from_euler(euler), reference, atol=1e-12)
 
 
 def test_angles_come_back_from_rotations():
-    drawn_angles = motion._angles(latents_of(1000, 3)).angles
-    rotations = motion.rotations_from_angles(drawn_angles)
-    again = motion.rotations_from_angles(angles.angles_from_rotations(rotations))
+    drawn_angles = sampling._angles(latents_of(1000, 3)).angles
+    rotations = sampling.rotations_from_angles(drawn_angles)
+    again = sampling.rotations_from_angles(joint_angles.angles_from_rotations(rotations))
     # where an arm points straight out, raise and inward turn are not told apart, but the pose is the same
     np.testing.assert_allclose(again, rotations, atol=0.02)
 
@@ -87,11 +89,11 @@ def test_hinges_bend_one_way_and_not_too_far():
 def test_knees_point_forward_and_hands_reach_in_front():
     """Signs, seen in space: a bent knee leads its ankle, a bent elbow lifts the hand forward."""
     bent = np.zeros((1, 27))
-    name = {n: i for i, n in enumerate(motion.ANGLES)}
+    name = {n: i for i, n in enumerate(sampling.ANGLES)}
     for side in ("left", "right"):
         bent[:, name[f"{side}_knee"]] = bent[:, name[f"{side}_elbow"]] = 80
         bent[:, name[f"{side}_abd"]] = bent[:, name[f"{side}_out"]] = 15
-    p = joints_of(motion.rotations_from_angles(bent))[0]
+    p = joints_of(sampling.rotations_from_angles(bent))[0]
     for side, left in (("left", 1), ("right", -1)):
         assert p[J[f"{side}_ankle"], 0] < p[J[f"{side}_knee"], 0] - 0.2
         assert p[J[f"{side}_wrist"], 0] > p[J[f"{side}_elbow"], 0] + 0.15
@@ -106,7 +108,7 @@ def test_knees_point_forward_and_hands_reach_in_front():
     ):
         forward = bent.copy()
         forward[:, name[positive]] = 40
-        q, r = joints_of(motion.rotations_from_angles(forward))[0], joints_of(motion.rotations_from_angles(bent))[0]
+        q, r = joints_of(sampling.rotations_from_angles(forward))[0], joints_of(sampling.rotations_from_angles(bent))[0]
         assert q[J[joint], 0] > r[J[joint], 0] + 0.1, positive
 
 
@@ -134,7 +136,7 @@ def test_standing_people_are_in_balance():
 def test_arms_swing_against_the_legs():
     walkers = latents_of(24, 4, walk=1)
     walkers = replace(walkers, arm=np.full((24, 2), activities.OWN_ARMS), captured=np.zeros((0, 2, 27)))
-    for walk in motion._motion(walkers, np.arange(60) / 40).rotations:
+    for walk in sampling._motion(walkers, np.arange(60) / 40).rotations:
         p = joints_of(walk)
         for side, across in (("left", "right"), ("right", "left")):
             arm = (p[:, J[f"{side}_elbow"]] - p[:, J[f"{side}_shoulder"]])[:, 0]
@@ -148,12 +150,12 @@ def test_arms_swing_against_the_legs():
 
 
 def test_a_mirrored_pose_is_the_mirror_image():
-    one = motion._angles(latents_of(200, 6)).angles
-    mirrored = motion.mirror_angles(one)
+    one = sampling._angles(latents_of(200, 6)).angles
+    mirrored = sampling.mirror_angles(one)
     assert (mirrored >= activities.LIMITS[0]).all() and (mirrored <= activities.LIMITS[1]).all()
-    p, q = (joints_of(motion.rotations_from_angles(a)) for a in (one, mirrored))
+    p, q = (joints_of(sampling.rotations_from_angles(a)) for a in (one, mirrored))
     np.testing.assert_allclose(q, p[:, SMPL24.flip] * [1, -1, 1], atol=0.02)
-    np.testing.assert_allclose(motion.mirror_angles(mirrored), one)
+    np.testing.assert_allclose(sampling.mirror_angles(mirrored), one)
 
 
 def test_both_sides_are_alike_on_average():
@@ -178,8 +180,8 @@ def test_hands_stay_out_of_the_trunk():
 
 
 def test_the_mix_is_obeyed_and_checked():
-    assert set(drawn(300, 0, sit=1, walk=3).kind) == {motion.KINDS.index("sit"), motion.KINDS.index("walk")}
-    counts = np.bincount(drawn(20000, 0).kind, minlength=len(motion.KINDS)) / 20000
+    assert set(drawn(300, 0, sit=1, walk=3).kind) == {sampling.KINDS.index("sit"), sampling.KINDS.index("walk")}
+    counts = np.bincount(drawn(20000, 0).kind, minlength=len(sampling.KINDS)) / 20000
     np.testing.assert_allclose(counts, activities.SHARES, atol=0.015)
     with pytest.raises(InputError, match="did you mean walk"):
         drawn(3, 0, wakl=1)
@@ -194,14 +196,14 @@ def test_the_mix_is_obeyed_and_checked():
 
 
 def test_sample_poses():
-    a, b = motion.sample_poses(40, 3), motion.sample_poses(40, 3)
+    a, b = sampling.sample_poses(40, 3), sampling.sample_poses(40, 3)
     assert a.shape == (40, 24, 3) and a.dtype == np.float32
     np.testing.assert_array_equal(a, b)
     np.testing.assert_allclose(a[:, 0], 0, atol=1e-6)
     assert (np.linalg.norm(a, axis=-1) < 1.6).all()
     for n, seed, message in ((3, -1, "seed must be a whole number"), (2.5, 0, "n must be a whole number")):
         with pytest.raises(InputError, match=message):
-            motion.sample_poses(n, seed)
+            sampling.sample_poses(n, seed)
 
 
 def test_kneeling_people_have_a_knee_on_the_ground():
@@ -215,21 +217,21 @@ def test_kneeling_people_have_a_knee_on_the_ground():
 
 
 def test_features_come_back_as_the_same_pose():
-    rotations = motion.rotations_from_angles(motion._angles(latents_of(500, 2)).angles)
-    again = motion.rotations_from_angles(captured.from_features(captured.to_features(rotations)))
+    rotations = sampling.rotations_from_angles(sampling._angles(latents_of(500, 2)).angles)
+    again = sampling.rotations_from_angles(mixture.from_features(mixture.to_features(rotations)))
     np.testing.assert_allclose(again, rotations, atol=0.02)
 
 
 def test_captured_poses_are_people_upright():
-    drawn_angles = captured.captured_angles(np.random.default_rng(0), 500)
-    assert drawn_angles.shape == (500, 2, 27) and captured.captured_angles(np.random.default_rng(0), 0).shape == (
+    drawn_angles = mixture.captured_angles(np.random.default_rng(0), 500)
+    assert drawn_angles.shape == (500, 2, 27) and mixture.captured_angles(np.random.default_rng(0), 0).shape == (
         0,
         2,
         27,
     )
     p = joints_of(drawn(500, 15, captured=1).rotations)
     assert (p[:, J["neck"], 2] > p[:, J["pelvis"], 2]).mean() > 0.95
-    assert Path(captured.__file__).with_name("assets").joinpath("motion_prior.npz").stat().st_size < 60_000
+    assert Path(mixture.__file__).with_name("assets").joinpath("motion_prior.npz").stat().st_size < 60_000
 
 
 def test_the_fit_finds_a_known_mixture(tmp_path):
@@ -245,7 +247,7 @@ def test_the_fit_finds_a_known_mixture(tmp_path):
     np.testing.assert_allclose(weights[order], [0.7, 0.3], atol=0.05)
     np.testing.assert_allclose(means[order], far, atol=1.5)
     assert np.linalg.eigvalsh(covariances).min() > fit._RIDGE * 0.9
-    captured.save_mixture(tmp_path / "mixture.npz", weights, means, covariances)
+    mixture.save_mixture(tmp_path / "mixture.npz", weights, means, covariances)
     stored = np.load(tmp_path / "mixture.npz")
     assert stored["roots"].shape == (2, 27 * 28 // 2)
 
@@ -324,7 +326,7 @@ def stored(tmp_path, **changes):
 
 def test_clips_are_read_and_selected(tmp_path):
     path, joints = stored(tmp_path)
-    loaded = clips.load_clips(path)
+    loaded = motion.load_clips(path)
     assert len(loaded) == 3 and loaded.fps == 10 and loaded.names == ("002_01", "005_01", "002_02")
     np.testing.assert_array_equal(loaded[1], joints[4:6])
     chosen = loaded.of(["002"])
@@ -354,7 +356,7 @@ def test_clips_are_read_and_selected(tmp_path):
 def test_a_wrong_clips_file_is_named(tmp_path, changes, message):
     path, _ = stored(tmp_path, **changes)
     with pytest.raises(InputError, match=message):
-        clips.load_clips(path)
+        motion.load_clips(path)
 
 
 @settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -367,7 +369,7 @@ def test_a_damaged_clips_file_is_read_or_told(tmp_path, at, bit, keep):
     data[at % len(data)] ^= 1 << bit
     path.write_bytes(data if keep % 2 else data[: keep % len(data)])
     try:
-        clips.load_clips(path)
+        motion.load_clips(path)
     except InputError as error:
         assert "clips.npz" in str(error)
 
@@ -381,22 +383,22 @@ def test_cuts_of_any_whole_numbers(tmp_path, kind):
         tmp_path, joints=joints, clip=np.array(["a", "b"]), clip_start=np.array(start, kind),
         clip_length=np.array(length, kind),
     )  # fmt: skip
-    loaded = clips.load_clips(path)
+    loaded = motion.load_clips(path)
     assert [len(loaded[k]) for k in range(2)] == [120, 120]
     path, _ = stored(
         tmp_path, joints=joints[:100], clip=np.array(["a"]), clip_start=np.array([100], kind),
         clip_length=np.array([120], kind),
     )  # fmt: skip
     with pytest.raises(InputError, match="inside the 100 frames, got up to frame 220"):
-        clips.load_clips(path)
+        motion.load_clips(path)
 
 
 def test_not_a_clips_file(tmp_path):
     with pytest.raises(InputError, match="no such file"):
-        clips.load_clips(tmp_path / "none.npz")
+        motion.load_clips(tmp_path / "none.npz")
     (tmp_path / "text.npz").write_text("hello")
     with pytest.raises(InputError, match="not an npz"):
-        clips.load_clips(tmp_path / "text.npz")
+        motion.load_clips(tmp_path / "text.npz")
     np.save(tmp_path / "one.npy", np.zeros(3))
     with pytest.raises(InputError, match="not an npz"):
-        clips.load_clips(tmp_path / "one.npy")
+        motion.load_clips(tmp_path / "one.npy")

@@ -11,21 +11,21 @@ from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
-from lidarpose.model.batch import Batch, Targets
-from lidarpose.model.decode import HALF_WIDTH
-from lidarpose.model.heads import REACH, VoteHead, bin_centers, decode, encode
-from lidarpose.model.layers import Convolution, CrossAttention, Places, key_bias, wave_numbers
-from lidarpose.model.network import PoseNet
-from lidarpose.model.plan import plan, view_features
-from lidarpose.model.presets import BIN, NetworkConfig, preset
-from lidarpose.synth.generate import Generator
+from lidarpose.models.batch import Batch, Targets
+from lidarpose.models.config import BIN, NetworkConfig, preset
+from lidarpose.models.decode import HALF_WIDTH
+from lidarpose.models.heads import REACH, VoteHead, bin_centers, decode, encode
+from lidarpose.models.layers import Convolution, CrossAttention, Places, key_bias, wave_numbers
+from lidarpose.models.posenet import PoseNet
+from lidarpose.models.voxelize import plan, view_features
+from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import SCENES
 from lidarpose.train.example import SEEN, example, seen
 from lidarpose.train.losses import SIGMA, losses
-from lidarpose.train.optimize import optimizers
-from lidarpose.train.pose_task import MAX_VOXELS, PoseTask
+from lidarpose.train.objective import total
+from lidarpose.train.optim import optimizers
+from lidarpose.train.posenet_objective import MAX_VOXELS, PoseTask
 from lidarpose.train.recipes import Pretrain
-from lidarpose.train.task import total
 
 TINY = preset("tiny")
 TINY_PARAMETERS = 456_371

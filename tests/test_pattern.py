@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
-from lidarpose.lidar.catalog import sensor
-from lidarpose.lidar.pattern import PATTERNS, RayPattern
-from lidarpose.lidar.pattern_scan import scan_pattern
+from lidarpose.lidar.presets import sensor
+from lidarpose.lidar.ray_pattern import PATTERNS, RayPattern
+from lidarpose.lidar.ray_pattern_scan import scan_pattern
 from lidarpose.lidar.raycast_reference import cast_ray_list_reference
-from lidarpose.synth.mesh import box
+from lidarpose.synth.environment.mesh import box
 
 BY_NAME = {p.name: p for p in PATTERNS}
 

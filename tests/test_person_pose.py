@@ -2,9 +2,9 @@
 
 import numpy as np
 
-import lidarpose.view.picture as picture
+import lidarpose.viz.draw as picture
 from lidarpose.geometry import UP_AXES
-from lidarpose.infer.results import PersonPose
+from lidarpose.inference.results import PersonPose
 from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import SMPL24
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpose.lidar.catalog import SENSORS, sensor
+from lidarpose.lidar.presets import SENSORS, sensor
 from lidarpose.lidar.sensor import Sensor
-from lidarpose.synth.placing import draw_distance, draw_height, draw_place
+from lidarpose.synth.placement import draw_distance, draw_height, draw_place
 from lidarpose.synth.scene import SCENES
 
 WILD = SCENES["wild"]

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
-from lidarpose.model.plan import WINDOW, plan, view_features
-from lidarpose.model.plan_reference import plan_reference
+from lidarpose.models.voxelize import WINDOW, plan, view_features
+from lidarpose.models.voxelize_reference import plan_reference
 
 seeds = st.integers(0, 2**32 - 1)
 people = st.lists(st.integers(0, 90), min_size=1, max_size=4)

@@ -13,16 +13,25 @@ import torch
 import lidarpose
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about
-from lidarpose.infer import people as people_module
-from lidarpose.infer.backend import Raw
-from lidarpose.infer.files import _inside
-from lidarpose.infer.people import MAX_POINTS, as_origin, as_points, candidates, clean, flat_axis, lies, unit_warning
-from lidarpose.infer.predictor import Predictor
+from lidarpose.inference import inputs as people_module
+from lidarpose.inference.backend import Raw
+from lidarpose.inference.inputs import (
+    MAX_POINTS,
+    as_origin,
+    as_points,
+    candidates,
+    clean,
+    flat_axis,
+    lies,
+    unit_warning,
+)
+from lidarpose.inference.predict_file import _inside
+from lidarpose.inference.predictor import Predictor
 from lidarpose.io.boxes import read_boxes
-from lidarpose.lidar.catalog import sensor
+from lidarpose.lidar.presets import sensor
 from lidarpose.sample import Box
 from lidarpose.skeleton import SKELETONS
-from lidarpose.synth.generate import Generator
+from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
 
 REAL = Path(__file__).parents[2] / "shared" / "data" / "real"
@@ -575,7 +584,7 @@ def test_boxes_of_a_tilted_file_crop_in_its_own_frame(model, tmp_path, points):
 
 
 def test_pictures_stand_upright_whatever_the_axes(model, tmp_path, points, monkeypatch):
-    import lidarpose.view.picture as picture
+    import lidarpose.viz.draw as picture
 
     drawn = {}
     monkeypatch.setattr(picture, "draw_people", lambda panels, path=None, *, title="": drawn.update(panel=panels[0]))
@@ -616,7 +625,7 @@ def test_a_sweep_of_another_up_axis_is_told(model, tmp_path, points):
 
 
 def test_load_takes_names_and_paths(model, points, tmp_path, monkeypatch):
-    from lidarpose.model.bundled import DEFAULT, bundled_path
+    from lidarpose.models.bundled import DEFAULT, bundled_path
 
     copy = tmp_path / "mine.safetensors"
     copy.write_bytes(bundled_path().read_bytes())

@@ -16,13 +16,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shard_files import write_shard
 
-from lidarpose.data import jobs
-from lidarpose.data.labelled import item_of, labelled_row
+from lidarpose.data import writer
+from lidarpose.data.labeled import item_of, labelled_row
 from lidarpose.data.prepare import READERS, PartWriter, prepare
+from lidarpose.data.readers.base import SEEN, UNLABELED, Item
 from lidarpose.data.readers.humanm3 import HumanM3
-from lidarpose.data.readers.items import SEEN, UNLABELED, Item
 from lidarpose.data.shards import open_dataset, read_rows
-from lidarpose.data.split_rules import SplitRule, _published, split_rule
+from lidarpose.data.splits import SplitRule, _published, split_rule
 from lidarpose.data.summary import lines_of
 from lidarpose.errors import InputError
 from lidarpose.sample import Box, Pose, Sample, center_of
@@ -238,7 +238,7 @@ class Slow:
 
 
 def test_workers_end_when_the_run_is_stopped(tmp_path):
-    made = jobs.make_shards(Slow(tmp_path), [0, 1], workers=2)
+    made = writer.make_shards(Slow(tmp_path), [0, 1], workers=2)
     for _, people in made:
         if people and len(list(tmp_path.iterdir())) == 2:
             break

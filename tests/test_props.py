@@ -5,15 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpose.body.activities import KINDS
-from lidarpose.body.person import sample_people
+from lidarpose.body.pose_prior.activities import KINDS
 from lidarpose.body.rig import load_rig
+from lidarpose.body.shape import sample_people
 from lidarpose.geometry import rotation_about
 from lidarpose.skeleton import BODY26
-from lidarpose.synth import carried, prop_meshes
 from lidarpose.synth.bodies import draw_bodies
-from lidarpose.synth.garments import girth, skirt
-from lidarpose.synth.props import draw_props
+from lidarpose.synth.props import carried, meshes
+from lidarpose.synth.props.draw_props import draw_props
+from lidarpose.synth.props.garments import girth, skirt
 
 J = {name: i for i, name in enumerate(BODY26.joints)}
 HANDS = [J["left_hand"], J["right_hand"]]
@@ -66,10 +66,10 @@ def volumes(mesh):
 
 
 MESHES = {
-    **{name: getattr(prop_meshes, name)() for name in (
+    **{name: getattr(meshes, name)() for name in (
         "unit_box", "tube", "bag", "pack", "ball", "umbrella", "suitcase", "pram", "cart", "chair", "bench",
         "wheelchair", "bicycle")},
-    "cap": prop_meshes.hat(0.0), "brim": prop_meshes.hat(0.5), "rim": prop_meshes.rim(0.3, 0.02, sides=11),
+    "cap": meshes.hat(0.0), "brim": meshes.hat(0.5), "rim": meshes.rim(0.3, 0.02, sides=11),
 }  # fmt: skip
 
 

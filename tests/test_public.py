@@ -2,6 +2,7 @@
 
 import ast
 import graphlib
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -9,23 +10,27 @@ from pathlib import Path
 import pytest
 
 import lidarpose
+from lidarpose import _renamed
 
 SOURCE = Path(lidarpose.__file__).parent
 MODULES = sorted(SOURCE.rglob("*.py"))
 
 # the house from the ground up: a room imports its own floor and those below
 FLOORS = (
-    {"skeleton", "geometry", "sample", "errors", "_version"},
+    {"skeleton", "geometry", "sample", "errors", "_version", "_renamed"},
     {"io"},
     {"body", "lidar"},
     {"data"},
     {"synth"},
-    {"model"},
-    {"train", "evaluate"},
-    {"infer", "view", "demo", "cli", "metrics", "evaluation", "__init__", "__main__"},
+    {"models"},
+    {"viz"},
+    {"inference"},
+    {"eval"},
+    {"train"},
+    {"cli", "metrics", "evaluation", "__init__", "__main__"},
 )
 NO_TORCH = ({"torch", "safetensors"}, set().union(*FLOORS[:5]))
-STRANGERS = {("body", "lidar"), ("lidar", "body"), *(("model", room) for room in ("body", "lidar", "data", "synth"))}
+STRANGERS = {("body", "lidar"), ("lidar", "body"), *(("models", room) for room in ("body", "lidar", "data", "synth"))}
 
 
 def loaded_by(code):
@@ -66,11 +71,20 @@ def test_no_public_name_is_hidden_by_a_module():
     assert not rooms & set(lidarpose.__all__)
 
 
+@pytest.mark.parametrize("old, new", _renamed.RENAMED.items())
+def test_old_module_paths_import_what_has_moved(old, new):
+    spec = importlib.import_module(f"lidarpose.{new}").__spec__
+    with pytest.warns(DeprecationWarning, match=f"lidarpose.{new}"):
+        sys.modules.pop(f"lidarpose.{old}", None)
+        module = importlib.import_module(f"lidarpose.{old}")
+    assert module is importlib.import_module(f"lidarpose.{new}") and module.__spec__ is spec
+
+
 # ---- the floors
 
 
 def room(module):
-    """ "lidarpose.model.plan" -> "model"."""
+    """ "lidarpose.models.voxelize" -> "models"."""
     parts = module.split(".")
     return parts[1] if len(parts) > 1 else "__init__"
 
@@ -137,4 +151,4 @@ def test_no_two_rooms_need_each_other():
 def test_numba_is_imported_by_its_own_files_only(path):
     # so that everything but synthesis works without the extra
     if any(name.split(".")[0] == "numba" for name in imports(path)):
-        assert path.stem in ("raycast_kernels", "rig_numba", "crop_kernels", "spoil")
+        assert path.stem in ("raycast_kernels", "rig_kernels", "crop_kernels", "noise_kernels")

@@ -10,8 +10,8 @@ from raycast_meshes import body, ground, join, soup, sphere
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
-from lidarpose.lidar.catalog import SENSORS, sensor
-from lidarpose.lidar.divergence import scan_wide
+from lidarpose.lidar.beam_divergence import scan_wide
+from lidarpose.lidar.presets import SENSORS, sensor
 from lidarpose.lidar.raycast import cast_ray_list, cast_rays, cast_window, find_window, scan
 from lidarpose.lidar.raycast_kernels import raster
 from lidarpose.lidar.raycast_reference import cast_ray_list_reference, cast_rays_reference

@@ -10,7 +10,7 @@ from raycast_meshes import body, ground, join, soup, sphere
 from lidarpose.body.rig import load_rig
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
-from lidarpose.lidar.catalog import SENSORS, sensor
+from lidarpose.lidar.presets import SENSORS, sensor
 from lidarpose.lidar.raycast import Hits, cast_window, find_window, is_closed, scan
 from lidarpose.lidar.raycast_people import scan_people
 from lidarpose.lidar.sensor import Sensor, Window

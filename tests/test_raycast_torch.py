@@ -5,7 +5,7 @@ from raycast_meshes import body, ground
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
-from lidarpose.lidar.catalog import SENSORS, sensor
+from lidarpose.lidar.presets import SENSORS, sensor
 from lidarpose.lidar.raycast_people import scan_people
 from lidarpose.lidar.raycast_torch import scan_people_torch
 from lidarpose.lidar.sensor import Sensor

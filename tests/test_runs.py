@@ -16,14 +16,14 @@ from safetensors.torch import load_file
 
 from lidarpose.cli import main
 from lidarpose.errors import InputError
-from lidarpose.model.bundled import weights_path
-from lidarpose.model.checkpoint import load_checkpoint
-from lidarpose.model.network import PoseNet
-from lidarpose.model.presets import preset
-from lidarpose.train import job, loop, runs
-from lidarpose.train.feed import BATCHES, lanes_of
-from lidarpose.train.optimize import optimizers, rate_factor
-from lidarpose.train.pose_task import PoseTask
+from lidarpose.models.bundled import weights_path
+from lidarpose.models.checkpoint import load_checkpoint
+from lidarpose.models.config import preset
+from lidarpose.models.posenet import PoseNet
+from lidarpose.train import loop, run_dir, setup
+from lidarpose.train.data_loader import BATCHES, lanes_of
+from lidarpose.train.optim import optimizers, rate_factor
+from lidarpose.train.posenet_objective import PoseTask
 from lidarpose.train.recipes import Finetune, Pretrain, recipe
 from lidarpose.train.sources import SyntheticSource
 from lidarpose.train.validation import Validation
@@ -40,12 +40,12 @@ FEW = 16
 def few_to_validate_on():
     """So that a run of seconds is not all validation."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(job, "VALIDATION", FEW)
+        patch.setattr(setup, "VALIDATION", FEW)
         yield
 
 
 def log_of(folder):
-    lines = [json.loads(line) for line in (folder / runs.LOG).read_text().splitlines()]
+    lines = [json.loads(line) for line in (folder / run_dir.LOG).read_text().splitlines()]
     for line in lines:
         assert line.pop("seconds") >= 0
     return lines
@@ -56,7 +56,7 @@ def assert_same_run(a, b):
     assert [line["people"] for line in left] == [line["people"] for line in right] == [16, 32, 48]
     for x, y in zip(left, right, strict=True):
         assert x == pytest.approx(y, abs=2e-4)
-    for name in (runs.MODEL, runs.STATE):
+    for name in (run_dir.MODEL, run_dir.STATE):
         one, other = load_file(a / name), load_file(b / name)
         assert one.keys() == other.keys()
         for key in one:
@@ -66,7 +66,7 @@ def assert_same_run(a, b):
 @pytest.fixture(scope="module")
 def unbroken(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run") / "whole"
-    assert loop.train(RECIPE, folder) == folder / runs.MODEL
+    assert loop.train(RECIPE, folder) == folder / run_dir.MODEL
     return folder
 
 
@@ -100,7 +100,7 @@ def test_what_is_saved_is_the_running_mean_of_the_weights(unbroken, tmp_path):
     loop.train(replace(RECIPE, ema=0.0), tmp_path / "run")
     for line, other in zip(log_of(unbroken), log_of(tmp_path / "run"), strict=True):
         assert line["joints"] == pytest.approx(other["joints"], abs=2e-4)
-    mean, last = (load_file(folder / runs.MODEL) for folder in (unbroken, tmp_path / "run"))
+    mean, last = (load_file(folder / run_dir.MODEL) for folder in (unbroken, tmp_path / "run"))
     assert max((mean[name] - last[name]).abs().max() for name in mean) > 1e-3
 
 
@@ -109,18 +109,18 @@ def test_gradients_are_clipped(clip, moves, tmp_path):
     """Adam divides by the gradient's size, but not by less than its epsilon."""
     recipe = replace(RECIPE, init="tiny", people=16, clip=clip, muon_rate=0.0, decay=0.0, ema=0.0)
     loop.train(recipe, tmp_path / "run")
-    before, after = (load_file(path) for path in (weights_path("tiny"), tmp_path / "run" / runs.MODEL))
+    before, after = (load_file(path) for path in (weights_path("tiny"), tmp_path / "run" / run_dir.MODEL))
     moved = max((after[name].float() - before[name].float()).abs().max() for name in before)
     assert moved > 1e-3 if moves else moved < 1e-5
 
 
 def test_an_unbroken_run(unbroken):
-    names = [runs.BEST, runs.CONFIG, runs.LOG, runs.MODEL, runs.STATE]
+    names = [run_dir.BEST, run_dir.CONFIG, run_dir.LOG, run_dir.MODEL, run_dir.STATE]
     assert sorted(p.name for p in unbroken.iterdir()) == sorted(names)
-    config = json.loads((unbroken / runs.CONFIG).read_text())
-    assert config["schema"] == runs.SCHEMA and config["kind"] == "pretrain"
+    config = json.loads((unbroken / run_dir.CONFIG).read_text())
+    assert config["schema"] == run_dir.SCHEMA and config["kind"] == "pretrain"
     assert config["recipe"] == json.loads(json.dumps(RECIPE.to_dict()))
-    _, header = load_checkpoint(unbroken / runs.MODEL)
+    _, header = load_checkpoint(unbroken / run_dir.MODEL)
     assert header.card["people_seen"] == 48 and header.card["recipe"]["seed"] == 5
     lines = log_of(unbroken)
     assert lines[-1]["vote"] < lines[0]["vote"]
@@ -141,7 +141,7 @@ def test_an_unbroken_run(unbroken):
 def test_a_killed_run_goes_on_to_the_same_end(monkeypatch, tmp_path, unbroken, name, call, saved):
     folder = tmp_path / "run"
     broken(monkeypatch, folder, name, call)
-    assert (folder / runs.STATE).exists() == bool(saved)
+    assert (folder / run_dir.STATE).exists() == bool(saved)
     loop.train(RECIPE, folder, resume=True)
     assert_same_run(folder, unbroken)
 
@@ -149,7 +149,7 @@ def test_a_killed_run_goes_on_to_the_same_end(monkeypatch, tmp_path, unbroken, n
 def test_half_a_line_in_the_log_is_no_obstacle(monkeypatch, tmp_path, unbroken):
     folder = tmp_path / "run"
     broken(monkeypatch, folder, "_step", BATCHES)
-    with open(folder / runs.LOG, "a") as log:
+    with open(folder / run_dir.LOG, "a") as log:
         log.write('{"people": 32, "sec')
     loop.train(RECIPE, folder, resume=True)
     assert_same_run(folder, unbroken)
@@ -157,7 +157,7 @@ def test_half_a_line_in_the_log_is_no_obstacle(monkeypatch, tmp_path, unbroken):
 
 def test_a_finished_run_stays_as_it_is(tmp_path, unbroken):
     before = {p.name: p.read_bytes() for p in unbroken.iterdir()}
-    assert loop.train(RECIPE, unbroken, resume=True) == unbroken / runs.MODEL
+    assert loop.train(RECIPE, unbroken, resume=True) == unbroken / run_dir.MODEL
     assert before == {p.name: p.read_bytes() for p in unbroken.iterdir()}
     with pytest.raises(InputError, match="expected a new or empty folder"):
         loop.train(RECIPE, unbroken)
@@ -167,10 +167,10 @@ def test_a_finished_run_stays_as_it_is(tmp_path, unbroken):
 def test_what_a_run_begins_with_may_have_been_moved(tmp_path):
     """The weights it was begun with are read again: it could not go on without them."""
     begun = Pretrain(init=str(tmp_path / "old/model.safetensors"))
-    runs.check_same(tmp_path, begun, replace(begun, init=str(tmp_path / "new/model.safetensors")))
+    run_dir.check_same(tmp_path, begun, replace(begun, init=str(tmp_path / "new/model.safetensors")))
     for other in (str(tmp_path / "new/best.safetensors"), ""):
         with pytest.raises(InputError, match="the run has init = .* a run keeps its recipe"):
-            runs.check_same(tmp_path, begun, replace(begun, init=other))
+            run_dir.check_same(tmp_path, begun, replace(begun, init=other))
 
 
 @pytest.mark.parametrize("change", [{"seed": 6}, {"batch": 16}, {"rate": 1e-3}, {"scene": "wild"}, {"muon_rate": 0.0}])
@@ -196,7 +196,7 @@ def test_a_longer_run_sees_everybody(monkeypatch, tmp_path):
     folder, seen = tmp_path / "run", []
     original = SyntheticSource.example
     monkeypatch.setattr(SyntheticSource, "example", lambda self, index: seen.append(index) or original(self, index))
-    monkeypatch.setattr(job, "VALIDATION", 0)
+    monkeypatch.setattr(setup, "VALIDATION", 0)
     loop.train(replace(RECIPE, people=6), folder)
     assert sorted(set(seen)) == list(range(6))
     loop.train(replace(RECIPE, people=32), folder, resume=True)
@@ -222,7 +222,7 @@ def test_a_gradient_that_is_not_finite_never_reaches_what_is_saved(monkeypatch, 
     monkeypatch.setattr(loop, "SAVE_EVERY", -1.0)
     with pytest.raises(InputError, match="its gradient is not finite in batch"):
         loop.train(RECIPE, folder)
-    for name in (runs.STATE, runs.MODEL):
+    for name in (run_dir.STATE, run_dir.MODEL):
         assert all(
             torch.isfinite(value).all() for value in load_file(folder / name).values() if value.is_floating_point()
         )
@@ -241,7 +241,7 @@ def test_killed_for_good_with_workers_and_taken_up(tmp_path):
     words = [sys.executable, "-c", code, json.dumps(recipe.to_dict()), str(tmp_path / "run")]
     process = subprocess.Popen(words, env=os.environ | {"OMP_NUM_THREADS": "1"}, start_new_session=True)
     deadline = time.monotonic() + 120
-    while len(runs.read_log(tmp_path / "run")) < 2:
+    while len(run_dir.read_log(tmp_path / "run")) < 2:
         assert time.monotonic() < deadline and process.poll() is None
         time.sleep(0.05)
     process.kill()
@@ -254,7 +254,7 @@ def test_killed_for_good_with_workers_and_taken_up(tmp_path):
             break
         assert time.monotonic() < deadline, "a worker lives on"
         time.sleep(0.1)
-    done = max(line["people"] for line in runs.read_log(tmp_path / "run"))
+    done = max(line["people"] for line in run_dir.read_log(tmp_path / "run"))
     longer = replace(recipe, people=max(done + 2 * BATCHES * 2, 48), workers=0)
     loop.train(longer, tmp_path / "run", resume=True)
     assert not [path.name for path in (tmp_path / "run").iterdir() if path.name.startswith(".")]
@@ -270,7 +270,7 @@ def test_what_a_kill_leaves_is_no_obstacle(tmp_path, unbroken):
     assert_same_run(folder, unbroken)
     assert not (folder / ".123-0-config.json").exists()
     # a power cut may leave zeros in the log, and half of a file
-    with open(folder / runs.LOG, "ab") as log:
+    with open(folder / run_dir.LOG, "ab") as log:
         log.write(b"\0\0\0\0" + b'{"people": 12}\n[1]\n{"seconds": 3}\n')
     (folder / ".123-1-model.safetensors").write_bytes(b"half")
     loop.train(RECIPE, folder, resume=True)
@@ -289,20 +289,20 @@ def test_a_dead_worker_is_one_line(tmp_path, monkeypatch):
 
 
 def test_a_run_has_one_process_at_a_time(monkeypatch, tmp_path, unbroken):
-    monkeypatch.setattr(runs, "LOCK_WAIT", 0.0)
+    monkeypatch.setattr(run_dir, "LOCK_WAIT", 0.0)
     folder = copied(unbroken, tmp_path / "run")
     longer = replace(RECIPE, people=RECIPE.people + 2 * BATCHES * 2)
     before = {p.name: p.read_bytes() for p in folder.iterdir()}
-    with runs.held(folder):
+    with run_dir.held(folder):
         with pytest.raises(InputError, match="another process trains there: stop it") as caught:
             loop.train(longer, folder, resume=True)
         assert "\n" not in str(caught.value)
-        assert before == {p.name: p.read_bytes() for p in folder.iterdir() if p.name != runs.LOCK}
+        assert before == {p.name: p.read_bytes() for p in folder.iterdir() if p.name != run_dir.LOCK}
     loop.train(longer, folder, resume=True)
     assert log_of(folder)[-1]["people"] == longer.people
     # that of a process that was killed is no obstacle
     (tmp_path / "other").mkdir()
-    (tmp_path / "other" / runs.LOCK).touch()
+    (tmp_path / "other" / run_dir.LOCK).touch()
     loop.train(RECIPE, tmp_path / "other")
     assert_same_run(tmp_path / "other", unbroken)
 
@@ -343,7 +343,7 @@ def copied(unbroken, folder):
     return folder
 
 
-@pytest.mark.parametrize("name", [runs.STATE, runs.CONFIG])
+@pytest.mark.parametrize("name", [run_dir.STATE, run_dir.CONFIG])
 @pytest.mark.parametrize("content", [b"", b"rubbish", b"{}", b"[1]", None])
 def test_a_damaged_run_says_so(tmp_path, unbroken, name, content):
     folder = copied(unbroken, tmp_path / "run")
@@ -356,14 +356,14 @@ def test_a_damaged_run_says_so(tmp_path, unbroken, name, content):
 
 def test_the_state_of_another_network_is_refused(tmp_path, unbroken):
     folder = copied(unbroken, tmp_path / "run")
-    (folder / runs.STATE).write_bytes((folder / runs.MODEL).read_bytes())
+    (folder / run_dir.STATE).write_bytes((folder / run_dir.MODEL).read_bytes())
     with pytest.raises(InputError, match="damaged"):
         loop.train(RECIPE, folder, resume=True)
     other = replace(TINY, channels=(32, 32, 32))
     network = PoseNet(other)
     mean = dict(network.named_parameters())
     progress = {"steps": 8, "seconds": 0.0, "best": None}
-    loop.save_state(folder / runs.STATE, network, mean, optimizers(network, RECIPE), progress)
+    loop.save_state(folder / run_dir.STATE, network, mean, optimizers(network, RECIPE), progress)
     with pytest.raises(InputError, match="not of this network") as caught:
         loop.train(RECIPE, folder, resume=True)
     assert "\n" not in str(caught.value)
@@ -387,7 +387,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_last_good_state(m
         with pytest.raises(InputError, match=told):
             loop.train(RECIPE, folder)
     assert [line["people"] for line in log_of(folder)] == [16]
-    assert all(torch.isfinite(value).all() for value in load_file(folder / runs.STATE).values())
+    assert all(torch.isfinite(value).all() for value in load_file(folder / run_dir.STATE).values())
     # the state is as good as new
     loop.train(RECIPE, folder, resume=True)
     assert_same_run(folder, unbroken)
@@ -402,15 +402,15 @@ def test_the_command_line_trains_and_goes_on(tmp_path, capsys):
     folder = tmp_path / "run"
     words = ["pretrain", str(folder), "--people", "8", "--batch", "2", "--scene", "paper", "--workers", "0"]
     assert not main(words)
-    assert str(folder / runs.MODEL) in capsys.readouterr().out
-    command = load_checkpoint(folder / runs.MODEL)[1].card["command"]
+    assert str(folder / run_dir.MODEL) in capsys.readouterr().out
+    command = load_checkpoint(folder / run_dir.MODEL)[1].card["command"]
     assert command == "lidarpose pretrain --batch 2 --workers 0 --scene paper --people 8"
     assert main(words) == 2
     assert "expected a new or empty folder" in capsys.readouterr().err
     # what is not said again stays as it was
     assert not main(["pretrain", str(folder), "--resume", "--people", "32"])
     assert not capsys.readouterr().err
-    longer = load_checkpoint(folder / runs.MODEL)[1].card["command"]
+    longer = load_checkpoint(folder / run_dir.MODEL)[1].card["command"]
     assert longer == f"{command}; then lidarpose pretrain --people 32 --resume"
     assert main(["pretrain", str(folder), "--resume", "--batch", "4"]) == 2
     assert "the run has batch = 2, got 4" in capsys.readouterr().err
@@ -418,7 +418,7 @@ def test_the_command_line_trains_and_goes_on(tmp_path, capsys):
     assert "leave --recipe away" in capsys.readouterr().err
     assert main(["finetune", "some", "--out", str(folder), "--resume"]) == 2
     assert "`lidarpose pretrain`" in capsys.readouterr().err
-    pictures = sorted(path.name for path in (folder / runs.PICTURES).iterdir())
+    pictures = sorted(path.name for path in (folder / run_dir.PICTURES).iterdir())
     assert pictures and all(name.endswith(".png") for name in pictures)
 
 
@@ -426,15 +426,15 @@ def test_runs_without_a_name_are_numbered(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words = ["pretrain", "--people", "4", "--batch", "2", "--scene", "paper", "--workers", "0", "--pictures", "0"]
     assert not main(words) and not main(words)
-    assert sorted(path.name for path in (tmp_path / runs.RUNS).iterdir()) == ["pretrain-001", "pretrain-002"]
-    assert runs.latest("pretrain").name == "pretrain-002"
+    assert sorted(path.name for path in (tmp_path / run_dir.RUNS).iterdir()) == ["pretrain-001", "pretrain-002"]
+    assert run_dir.latest("pretrain").name == "pretrain-002"
     assert not main(["pretrain", "--resume"])
-    assert capsys.readouterr().out.split()[-1] == str(runs.Path(runs.RUNS) / "pretrain-002" / runs.MODEL)
+    assert capsys.readouterr().out.split()[-1] == str(run_dir.Path(run_dir.RUNS) / "pretrain-002" / run_dir.MODEL)
     with pytest.raises(InputError, match="has no run finetune-... to resume"):
-        runs.latest("finetune")
+        run_dir.latest("finetune")
     # a name that is taken meanwhile is passed over
-    (tmp_path / runs.RUNS / "pretrain-003").mkdir()
-    assert runs.numbered("pretrain").name == "pretrain-004"
+    (tmp_path / run_dir.RUNS / "pretrain-003").mkdir()
+    assert run_dir.numbered("pretrain").name == "pretrain-004"
 
 
 @pytest.mark.parametrize(
@@ -521,7 +521,7 @@ def test_two_processes_take_the_same_steps_as_one(tmp_path):
     assert [line["people"] for line in two] == [line["people"] for line in one] == [32, 64]
     for a, b in zip(one, two, strict=True):
         assert b == pytest.approx(a, rel=2e-3, abs=2e-4)
-    weights = [load_file(tmp_path / name / runs.MODEL) for name in ("one", "two")]
+    weights = [load_file(tmp_path / name / run_dir.MODEL) for name in ("one", "two")]
     for name, value in weights[0].items():
         torch.testing.assert_close(weights[1][name], value, atol=3e-4, rtol=1e-2, msg=name)
 
@@ -539,7 +539,7 @@ def test_the_card_s_command_is_as_it_was_typed(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ["--batch", "2", "--workers", "0", "--scene", "paper", "--people", "2", "--motion", str(motion)]
     assert not main(["pretrain", "run", *words, "--subjects", "My Walk"])
-    config = json.loads((tmp_path / "run" / runs.CONFIG).read_text())
+    config = json.loads((tmp_path / "run" / run_dir.CONFIG).read_text())
     typed = shlex.split(config["command"])
     assert typed[typed.index("--motion") + 1] == motion.name and typed[typed.index("--subjects") + 1] == "My Walk"
 
@@ -570,7 +570,7 @@ def test_the_best_validation_is_kept_across_a_resume(monkeypatch, tmp_path):
     folder = tmp_path / "run"
 
     def best():
-        card = load_checkpoint(folder / runs.BEST)[1].card
+        card = load_checkpoint(folder / run_dir.BEST)[1].card
         return card["validation_mm"], card["people_seen"]
 
     often = replace(RECIPE, validate=16)

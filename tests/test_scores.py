@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from lidarpose import metrics
 from lidarpose.errors import InputError
-from lidarpose.evaluate import bootstrap
-from lidarpose.evaluate.bootstrap import LEAST_UNITS
+from lidarpose.eval.metrics import bootstrap
+from lidarpose.eval.metrics.bootstrap import LEAST_UNITS
 from lidarpose.skeleton import HUMAN15, SKELETONS, WAYMO14
 
 quick = settings(max_examples=40, deadline=None)

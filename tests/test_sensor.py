@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from lidarpose.errors import InputError
-from lidarpose.lidar.catalog import SENSORS, sensor
+from lidarpose.lidar.presets import SENSORS, sensor
 from lidarpose.lidar.sensor import Sensor, Window
-from lidarpose.lidar.tables import load_sensor
+from lidarpose.lidar.sensor_file import load_sensor
 
 ROWS = {
     "dapt64": 64, "vlp-16": 16, "vlp-32c": 32, "hdl-32e": 32, "hdl-64e": 64, "os1-64": 64, "os1-128": 128,

@@ -10,16 +10,8 @@ from pyarrow import parquet
 from shard_files import write_shard
 
 from lidarpose.data import shards
-from lidarpose.data.facts import Facts
-from lidarpose.data.shards import (
-    Card,
-    open_dataset,
-    person_row,
-    read_card,
-    read_rows,
-    sample_of,
-    write_card,
-)
+from lidarpose.data.shards import Card, open_dataset, person_row, read_card, read_rows, sample_of, write_card
+from lidarpose.data.synthetic_info import Facts
 from lidarpose.errors import InputError
 from lidarpose.sample import Box, Pose, Sample
 from lidarpose.skeleton import BODY26

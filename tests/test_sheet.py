@@ -8,16 +8,16 @@ import pytest
 from lidarpose.cli import main
 from lidarpose.data.prepare import prepare
 from lidarpose.errors import InputError
-from lidarpose.synth import write
-from lidarpose.synth.write import Job, write_dataset
-from lidarpose.view.sheet import draw_dataset
+from lidarpose.synth import shard_job
+from lidarpose.synth.shard_job import Job, write_dataset
+from lidarpose.viz.contact_sheet import draw_dataset
 
 PNG = b"\x89PNG\r\n"
 
 
 @pytest.fixture
 def dataset(tmp_path, monkeypatch):
-    monkeypatch.setattr(write, "PER_SHARD", {"people": 8, "clips": 1, "streets": 1})
+    monkeypatch.setattr(shard_job, "PER_SHARD", {"people": 8, "clips": 1, "streets": 1})
     write_dataset(Job(what="people", count=20, sensors=("os1-64",)), tmp_path / "streetlife")
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -34,7 +34,7 @@ def test_a_sheet_and_a_page_in_the_current_folder(dataset, capsys):
 
 def test_people_are_spread_over_the_dataset(dataset):
     from lidarpose.data.shards import open_dataset
-    from lidarpose.view.sheet import _spread
+    from lidarpose.viz.contact_sheet import _spread
 
     rows = _spread(open_dataset("streetlife"), 6)
     index = [row["index"] for row in rows]

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from lidarpose.body.sources import asf_amc, bvh, load_motion, tree, units
+from lidarpose.body.mocap import acclaim, bvh, joint_tree, load_motion, units
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES
 
@@ -93,8 +93,8 @@ def test_skeletons_with_less(tmp_path):
     positions = JOINTS.copy()
     found = {n: i for n, i in J.items() if n.endswith(("hip", "knee", "ankle", "shoulder", "elbow", "wrist"))}
     found["head"] = J["head"]
-    less = tree.Tree(names=list(J), parents=[-1, *[0] * 23], positions=positions)
-    motion = tree.tree_motion("x", less, name="x", fps=10, up="z", kind="test", found=found)
+    less = joint_tree.Tree(names=list(J), parents=[-1, *[0] * 23], positions=positions)
+    motion = joint_tree.tree_motion("x", less, name="x", fps=10, up="z", kind="test", found=found)
     error = errors(motion)
     assert error[:, [J[f"{s}_{n}"] for s in ("left", "right") for n in ("hip", "knee", "elbow")]].mean() < 0.09
 
@@ -104,8 +104,8 @@ def test_an_amc_comes_back(tmp_path, length):
     skeleton, axes = files.asf_text(length=length)
     written(tmp_path, skeleton, "02.asf")
     path = written(tmp_path, files.amc_text(ROTATIONS, WAY, axes, length=length), "02_05.amc")
-    bones, parents, scale, degrees = asf_amc._skeleton(tmp_path / "02.asf")
-    positions = asf_amc._positions(path, bones, parents, asf_amc._motion(path), degrees) * scale @ UP_AXES["y"].T
+    bones, parents, scale, degrees = acclaim._skeleton(tmp_path / "02.asf")
+    positions = acclaim._positions(path, bones, parents, acclaim._motion(path), degrees) * scale @ UP_AXES["y"].T
     for i, bone in enumerate(bones):
         if bone.name in files.ASF_ENDS:
             np.testing.assert_allclose(positions[:, i], JOINTS[:, J[files.ASF_ENDS[bone.name]]], atol=1e-4)

@@ -7,9 +7,9 @@ import motion_files as files
 import numpy as np
 import pytest
 
-from lidarpose.body.sources import digest, load_motion
+from lidarpose.body.mocap import digest, load_motion
 from lidarpose.errors import InputError
-from lidarpose.synth.write import Job
+from lidarpose.synth.shard_job import Job
 
 
 def check_same(motion, rotations, way):

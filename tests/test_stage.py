@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from walkers import HEADINGS, goer
 
-from lidarpose.lidar.catalog import sensor
+from lidarpose.lidar.presets import sensor
 from lidarpose.sample import Sample
 from lidarpose.skeleton import BODY26
-from lidarpose.synth import augment, generate
-from lidarpose.synth.attach import fixed
-from lidarpose.synth.generate import Generator
-from lidarpose.synth.look import Conditions, Returns
-from lidarpose.synth.mesh import box
-from lidarpose.synth.placing import Place
+from lidarpose.synth import generator, noise
+from lidarpose.synth.environment.mesh import box
+from lidarpose.synth.generator import Generator
+from lidarpose.synth.placement import Place
+from lidarpose.synth.props.attachment import fixed
 from lidarpose.synth.scene import SCENES, scene_config
+from lidarpose.synth.simulate import Conditions, Returns
 
 SEED = 11
 PAPER = SCENES["paper"]
@@ -60,8 +60,8 @@ def test_easy_people_have_nothing_of_what_hides_or_spoils():
 @pytest.mark.parametrize("released", [False, True])
 def test_stray_points_are_nobody_s_and_of_the_preset_s_law(released, monkeypatch):
     laws = {False: "noise_clusters", True: "reference_clusters"}
-    monkeypatch.setattr(augment, laws[released], lambda center, rng, **more: center + rng.uniform(-0.1, 0.1, (7, 3)))
-    monkeypatch.setattr(augment, laws[not released], None)
+    monkeypatch.setattr(noise, laws[released], lambda center, rng, **more: center + rng.uniform(-0.1, 0.1, (7, 3)))
+    monkeypatch.setattr(noise, laws[not released], None)
     scenes = [replace(CLEAN, faults=replace(NO_FAULTS, stray=share, released=released)) for share in (0.0, 1.0)]
     for index in range(3):
         bare, strayed = (Generator(scene=scene, measure=False).person(SEED, index).sample for scene in scenes)
@@ -84,13 +84,13 @@ STAND = fixed("stand", box((0.1, 0.1, 0.1)), at_the_hip, lift=0.25)
 def stage(device, *props):
     place = Place(feet=np.array([6.0, 1.0, -1.2]), yaw=0.7, distance=6.08, R_sensor_level=None)
     calm = Conditions(sigma=0.0, bias=0.0, weak=0.0, divergence=0.0, keep=1.0, phase=0)
-    return generate._Stage(device=sensor(device), place=place, conditions=calm, things=[], props=list(props))
+    return generator._Stage(device=sensor(device), place=place, conditions=calm, things=[], props=list(props))
 
 
 def test_clothes_are_the_person_s_and_things_are_not_and_both_go_along():
     actor, where = goer(), stage("dapt64", CLOTH, STAND)
     for frame in range(3):
-        body, cloth, thing = generate._layers(where, actor, frame)
+        body, cloth, thing = generator._layers(where, actor, frame)
         np.testing.assert_array_equal(body.part, actor.face_part)
         np.testing.assert_array_equal(cloth.part, CLOTH.face_part)
         assert thing.part is None
@@ -104,10 +104,10 @@ def test_pose_box_and_body_of_a_frame_are_in_one_place(props):
     actor, where = goer(), stage("dapt64", *props)
     tight = replace(PAPER, crop=replace(SCENES["wild"].crop, jitter=1e-9, loose=0.0, cut=0.0))
     for frame, heading in enumerate(HEADINGS):
-        body = generate._layers(where, actor, frame)[0].vertices
+        body = generator._layers(where, actor, frame)[0].vertices
         returns = Returns(points=body, ring=np.zeros(8, np.int32), part=np.ones(8, np.uint8))
         for seed in range(4):
-            sample = generate._crop(tight, where, actor, frame, returns, np.random.default_rng(seed))
+            sample = generator._crop(tight, where, actor, frame, returns, np.random.default_rng(seed))
             assert abs((sample.box.yaw - where.place.yaw - heading + np.pi) % (2 * np.pi) - np.pi) < 1e-6
             assert (sample.box.size[:2] < [0.3 + 0.26, 0.9 + 0.26]).all()
             # the bottom edge may lie above the soles
@@ -119,7 +119,7 @@ def test_pose_box_and_body_of_a_frame_are_in_one_place(props):
 def test_a_rosette_goes_on_with_its_pattern_from_frame_to_frame():
     actor, where = goer(still=True), stage("livox-avia")
     first, again, second = (
-        generate._sample(CLEAN, where, actor, frame, np.random.default_rng(0)).points for frame in (0, 0, 1)
+        generator._sample(CLEAN, where, actor, frame, np.random.default_rng(0)).points for frame in (0, 0, 1)
     )
     np.testing.assert_array_equal(first, again)
     assert len(second) > 50 and (first.shape != second.shape or np.abs(first - second).max() > 0.01)
@@ -140,8 +140,8 @@ def test_every_try_is_nearer_and_easier_and_the_best_counts(monkeypatch):
         points = np.full((count, 3), stage, np.float32)
         return Sample(points=points, center=np.zeros(3), part=np.ones(count, np.uint8))
 
-    monkeypatch.setattr(generate, "_draw_stage", drawn)
-    monkeypatch.setattr(generate, "_sample", sample)
+    monkeypatch.setattr(generator, "_draw_stage", drawn)
+    monkeypatch.setattr(generator, "_sample", sample)
     person = Generator(scene=PAPER, measure=False).person(SEED, 0)
     np.testing.assert_allclose(seen, [(1 - k / 7, 0.8**k) for k in range(8)], atol=1e-12)
     assert len(person.sample.points) == 9 and (person.sample.points == 1).all()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarpose.errors import InputError
-from lidarpose.lidar.catalog import sensor
+from lidarpose.lidar.presets import sensor
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.street import samples, street
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from walkers import HEADINGS, goer
 
-from lidarpose.lidar.catalog import sensor
+from lidarpose.lidar.presets import sensor
 from lidarpose.sample import Box
 from lidarpose.synth import street
-from lidarpose.synth.mesh import quad
+from lidarpose.synth.environment.mesh import quad
 from lidarpose.synth.street import Street, StreetFrame, _box, _Walker, samples
 
 

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpose.lidar.raycast import cast_rays
-from lidarpose.synth.mesh import prism, union
+from lidarpose.synth.environment.mesh import prism, union
+from lidarpose.synth.environment.surroundings import ground, occluder, surroundings
 from lidarpose.synth.scene import SCENES
-from lidarpose.synth.surroundings import ground, occluder, surroundings
 
 RNG = np.random.default_rng
 FEET = np.array([8.0, 3.0, -1.5])

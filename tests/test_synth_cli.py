@@ -17,13 +17,13 @@ from torch.utils.data import DataLoader
 from lidarpose.cli import main
 from lidarpose.data.shards import open_dataset, read_rows
 from lidarpose.errors import InputError
-from lidarpose.lidar.catalog import listing
-from lidarpose.synth import street, write
-from lidarpose.synth.generate import Generator
+from lidarpose.lidar.presets import listing
+from lidarpose.synth import shard_job, street
+from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
+from lidarpose.synth.shard_job import Job, Maker, write_dataset
 from lidarpose.synth.street import Street
-from lidarpose.synth.write import Job, Maker, write_dataset
-from lidarpose.train.people import ShardPeople, SyntheticPeople
+from lidarpose.train.torch_dataset import ShardPeople, SyntheticPeople
 
 COUNT, PER_SHARD = 60, 10
 WORDS = ["-n", str(COUNT), "--per-shard", str(PER_SHARD), "--sensor", "os1-64,vlp-16", "--seed", "5"]
@@ -235,7 +235,7 @@ def test_a_sensor_s_file_counts_by_content(tmp_path, capsys):
 
 
 def test_streets_hold_everybody_of_a_turn(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(write, "STREET_FRAMES", 2)
+    monkeypatch.setattr(shard_job, "STREET_FRAMES", 2)
     assert synth(tmp_path / "s", "-n", 1, "--scenes", "--sensor", "vlp-16") == 0
     assert "1 street made -> " in capsys.readouterr().err
     data = open_dataset(tmp_path / "s")

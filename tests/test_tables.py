@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
-from lidarpose.lidar.catalog import SENSORS, listing, sensor
-from lidarpose.lidar.tables import load_sensor
+from lidarpose.lidar.presets import SENSORS, listing, sensor
+from lidarpose.lidar.sensor_file import load_sensor
 
 ANGLES = [15.0, 5.0, -5.0, -15.0]
 

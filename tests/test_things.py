@@ -6,30 +6,30 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpose.lidar.raycast import cast_rays
-from lidarpose.synth import things
-from lidarpose.synth.mesh import box, boxes, cone, loft, prism, quad, union
+from lidarpose.synth.environment import obstacles
+from lidarpose.synth.environment.mesh import box, boxes, cone, loft, prism, quad, union
 
 RNG = np.random.default_rng
 
 # name -> mesh, its extent in x, y, z (None: not given by its arguments)
 SIZED = {
-    "pole": (things.pole(0.1, 3.0), (None, None, 3.0)),
-    "wheeled_bin": (things.wheeled_bin(0.6, 1.1), (0.6, 0.6, 1.1)),
-    "wall": (things.wall(3.0, 2.5, thick=0.2), (0.2, 3.0, 2.5)),
-    "wall with a window": (things.wall(3.0, 2.5, opening=(-0.5, 0.7, 0.9, 2.0)), (0.2, 3.0, 2.5)),
-    "wall with a door": (things.wall(3.0, 2.5, opening=(-0.5, 0.7, 0.0, 2.0)), (0.2, 3.0, 2.5)),
-    "bench": (things.bench(1.6), (None, 1.6, 0.86)),
-    "bench without a back": (things.bench(1.6, back=False), (0.42, 1.6, 0.46)),
-    "table": (things.table(0.8, 1.4, 0.75), (0.8, 1.4, 0.75)),
-    "sign": (things.sign(2.2, 0.6), (None, 0.6, 2.2)),
-    "traffic_cone": (things.traffic_cone(0.7), (0.35, 0.35, 0.7)),
-    "car": (things.car(4.3, 1.8, 1.5), (4.3, 1.8, 1.5)),
-    "van": (things.van(5.2, 2.0, 2.2), (5.2, 2.0, 2.2)),
-    "bonnet": (things.bonnet(1.7, 0.9, 1.0), (1.0, None, 0.9)),
-    "rail_fence": (things.rail_fence(3.0, 1.0, 3), (0.06, None, 1.0)),
-    "lattice_fence": (things.lattice_fence(2.4, 1.2, 0.12, 0.03), (0.0, 2.4, 1.2)),
-    "foliage": (things.foliage((0.8, 1.5, 1.2), 100, 0.1, RNG(0)), (None, None, None)),
-    "grass": (things.grass(0.6, 0.2, 60, RNG(0)), (None, None, None)),
+    "pole": (obstacles.pole(0.1, 3.0), (None, None, 3.0)),
+    "wheeled_bin": (obstacles.wheeled_bin(0.6, 1.1), (0.6, 0.6, 1.1)),
+    "wall": (obstacles.wall(3.0, 2.5, thick=0.2), (0.2, 3.0, 2.5)),
+    "wall with a window": (obstacles.wall(3.0, 2.5, opening=(-0.5, 0.7, 0.9, 2.0)), (0.2, 3.0, 2.5)),
+    "wall with a door": (obstacles.wall(3.0, 2.5, opening=(-0.5, 0.7, 0.0, 2.0)), (0.2, 3.0, 2.5)),
+    "bench": (obstacles.bench(1.6), (None, 1.6, 0.86)),
+    "bench without a back": (obstacles.bench(1.6, back=False), (0.42, 1.6, 0.46)),
+    "table": (obstacles.table(0.8, 1.4, 0.75), (0.8, 1.4, 0.75)),
+    "sign": (obstacles.sign(2.2, 0.6), (None, 0.6, 2.2)),
+    "traffic_cone": (obstacles.traffic_cone(0.7), (0.35, 0.35, 0.7)),
+    "car": (obstacles.car(4.3, 1.8, 1.5), (4.3, 1.8, 1.5)),
+    "van": (obstacles.van(5.2, 2.0, 2.2), (5.2, 2.0, 2.2)),
+    "bonnet": (obstacles.bonnet(1.7, 0.9, 1.0), (1.0, None, 0.9)),
+    "rail_fence": (obstacles.rail_fence(3.0, 1.0, 3), (0.06, None, 1.0)),
+    "lattice_fence": (obstacles.lattice_fence(2.4, 1.2, 0.12, 0.03), (0.0, 2.4, 1.2)),
+    "foliage": (obstacles.foliage((0.8, 1.5, 1.2), 100, 0.1, RNG(0)), (None, None, None)),
+    "grass": (obstacles.grass(0.6, 0.2, 60, RNG(0)), (None, None, None)),
 }
 
 
@@ -81,11 +81,11 @@ def test_boxes_and_prisms_join():
 
 
 def test_what_is_built_once_is_not_changed_by_its_users():
-    first = things.car(4.0, 1.8, 1.5)
+    first = obstacles.car(4.0, 1.8, 1.5)
     moved = first.moved(np.array([1.0, 2, 3]), 0.4)
     moved.vertices[:] = 0
     first.vertices[:, 2] += 1
-    np.testing.assert_allclose(things.car(4.0, 1.8, 1.5).vertices[:, 2].min(), 0, atol=1e-6)
+    np.testing.assert_allclose(obstacles.car(4.0, 1.8, 1.5).vertices[:, 2].min(), 0, atol=1e-6)
     pillar = prism(0.2, 1.0)
     union([pillar, quad(1.0, np.zeros(2))]).vertices[:] = 9
     assert prism(0.2, 1.0).vertices.max() == 1.0
@@ -103,19 +103,22 @@ def hit_share(mesh, distance=6.0):
 
 
 def test_beams_pass_fences_and_leaves_and_no_wall():
-    assert hit_share(things.wall(2.0, 1.5)) > 0.97
-    assert 0.1 < hit_share(things.lattice_fence(2.4, 1.2, 0.12, 0.03)) < 0.5
-    assert 0.05 < hit_share(things.rail_fence(3.0, 1.0, 3)) < 0.4
-    thin, thick = (hit_share(things.foliage((0.8, 1.0, 1.0), n, 0.12, RNG(0))) for n in (40, 120))
+    assert hit_share(obstacles.wall(2.0, 1.5)) > 0.97
+    assert 0.1 < hit_share(obstacles.lattice_fence(2.4, 1.2, 0.12, 0.03)) < 0.5
+    assert 0.05 < hit_share(obstacles.rail_fence(3.0, 1.0, 3)) < 0.4
+    thin, thick = (hit_share(obstacles.foliage((0.8, 1.0, 1.0), n, 0.12, RNG(0))) for n in (40, 120))
     assert 0.15 < thin < thick < 0.9
-    whole, holed = hit_share(things.wall(2.0, 2.0)), hit_share(things.wall(2.0, 2.0, opening=(-0.5, 0.5, 0.5, 1.5)))
+    whole, holed = (
+        hit_share(obstacles.wall(2.0, 2.0)),
+        hit_share(obstacles.wall(2.0, 2.0, opening=(-0.5, 0.5, 0.5, 1.5))),
+    )
     assert whole - holed == pytest.approx(0.25, abs=0.06)
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 120), st.floats(0.3, 2), st.floats(0.02, 0.2))
 def test_foliage_stays_about_its_ellipsoid(seed, leaves, size, leaf):
-    mesh = things.foliage((size, size / 2, 1.5 * size), leaves, leaf, RNG(seed))
+    mesh = obstacles.foliage((size, size / 2, 1.5 * size), leaves, leaf, RNG(seed))
     assert len(mesh.faces) == leaves
     beyond = np.abs(mesh.vertices - [0, 0, 0.75 * size]) - np.array([size, size / 2, 1.5 * size]) / 2
     assert beyond.max() < 4 * leaf and mesh.vertices[:, 2].min() >= 0
@@ -124,7 +127,7 @@ def test_foliage_stays_about_its_ellipsoid(seed, leaves, size, leaf):
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 100), st.floats(0.1, 1), st.floats(0.02, 0.3))
 def test_grass_stands_on_its_disc(seed, blades, radius, height):
-    mesh = things.grass(radius, height, blades, RNG(seed))
+    mesh = obstacles.grass(radius, height, blades, RNG(seed))
     assert len(mesh.faces) == blades
     assert np.hypot(*mesh.vertices[:, :2].T).max() < radius + 0.12
     assert 0 <= mesh.vertices[:, 2].min() and mesh.vertices[:, 2].max() <= height + 1e-6

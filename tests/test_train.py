@@ -12,24 +12,24 @@ import torch
 from motion_files import a_clip, write_amass
 
 from lidarpose.errors import InputError
-from lidarpose.model.batch import Targets
-from lidarpose.model.heads import REACH, Outputs, encode
-from lidarpose.model.network import PoseNet
-from lidarpose.model.presets import BIN, preset
+from lidarpose.models.batch import Targets
+from lidarpose.models.config import BIN, preset
+from lidarpose.models.heads import REACH, Outputs, encode
+from lidarpose.models.posenet import PoseNet
 from lidarpose.sample import center_of
 from lidarpose.skeleton import BODY26, SMPL24
-from lidarpose.synth.generate import Generator
+from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import SCENES
 from lidarpose.train.augment import disturbed
-from lidarpose.train.feed import BATCHES, Chunks, loader
-from lidarpose.train.job import job_of
+from lidarpose.train.data_loader import BATCHES, Chunks, loader
 from lidarpose.train.losses import CONFIDENCE, HEATMAP, JOINTS, LEVEL, SIGMA, SPREAD, VOTE, losses
-from lidarpose.train.optimize import average, optimizers, rate_factor
-from lidarpose.train.pose_task import PoseTask
+from lidarpose.train.objective import total
+from lidarpose.train.optim import average, optimizers, rate_factor
+from lidarpose.train.posenet_objective import PoseTask
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.recipes import recipe as recipe_of
+from lidarpose.train.setup import job_of
 from lidarpose.train.sources import SyntheticSource
-from lidarpose.train.task import total
 from lidarpose.train.validation import Validation
 
 # three chunks of `BATCHES` batches

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 
 import lidarpose
 from lidarpose.errors import InputError
-from lidarpose.infer.backend import Estimates
-from lidarpose.infer.tta import LOOKS, Look, averaged, brought_back, looks_of, shown
+from lidarpose.inference.backend import Estimates
+from lidarpose.inference.tta import LOOKS, Look, averaged, brought_back, looks_of, shown
 from lidarpose.skeleton import HUMAN15
-from lidarpose.synth.generate import Generator
+from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
 
 LEFT = np.array([name.startswith("left_") for name in HUMAN15.joints])

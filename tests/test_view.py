@@ -17,10 +17,10 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14, Skeleton
-from lidarpose.view import picture, report
-from lidarpose.view.person import bone_sides, describe, facing, project, side, thinned, view_directions
-from lidarpose.view.picture import MAX_PEOPLE, Panel, _shortened, draw_people
-from lidarpose.view.report import MAX_POINTS, ReportPerson, render_report, write_report
+from lidarpose.viz import draw, html
+from lidarpose.viz.draw import MAX_PEOPLE, Panel, _shortened, draw_people
+from lidarpose.viz.html import MAX_POINTS, ReportPerson, render_report, write_report
+from lidarpose.viz.person_view import bone_sides, describe, facing, project, side, thinned, view_directions
 
 BLUE, ORANGE = (0x00, 0x72, 0xB2), (0xE0, 0x70, 0x00)
 
@@ -203,7 +203,7 @@ def test_a_title_of_digits_ends_on_the_sheet():
 
 
 def test_only_so_many_people_fit(monkeypatch):
-    monkeypatch.setattr(picture, "MAX_PEOPLE", 6)
+    monkeypatch.setattr(draw, "MAX_PEOPLE", 6)
     people = [Panel(points=np.ones((1, 3)) * i, label=str(i)) for i in range(7)]
     full, over = decoded(draw_people(people[:-1], title="t")), decoded(draw_people(people, title="t"))
     assert over.shape == full.shape
@@ -230,7 +230,7 @@ def test_picture_ignores_the_settings_of_the_user():
 
 def test_importing_is_light_and_drawing_leaves_pyplot_alone():
     code = (
-        "import sys, numpy as np; from lidarpose.view import picture, report; assert 'matplotlib' not in sys.modules;"
+        "import sys, numpy as np; from lidarpose.viz import picture, report; assert 'matplotlib' not in sys.modules;"
         "picture.draw_people([picture.Panel(points=np.ones((9, 3)))]);"
         "assert 'matplotlib.pyplot' not in sys.modules and 'torch' not in sys.modules"
     )
@@ -415,10 +415,10 @@ def test_numbers_of_a_table_end_without_needless_zeros():
 
 
 def test_points_have_the_colors_that_the_legend_says():
-    left, right = picture._part_colors(np.array([1 + BODY26.index("left_knee"), 1 + BODY26.index("right_knee")]))
+    left, right = draw._part_colors(np.array([1 + BODY26.index("left_knee"), 1 + BODY26.index("right_knee")]))
     assert left[2] > left[0] + 0.2 and right[0] > right[2] + 0.2
-    near, far = picture._depth_colors(np.array([1.0, -1.0]))
-    np.testing.assert_allclose([near, far], [picture._NEAR, picture._FAR])
+    near, far = draw._depth_colors(np.array([1.0, -1.0]))
+    np.testing.assert_allclose([near, far], [draw._NEAR, draw._FAR])
 
 
 def test_a_report_says_the_side_of_every_joint_and_point():
@@ -426,9 +426,9 @@ def test_a_report_says_the_side_of_every_joint_and_point():
     points = np.arange(15.0).reshape(5, 3)
     points[1] = np.nan
     pose = Pose(joints=np.zeros((26, 3)), skeleton=BODY26)
-    sides = report._skeleton_data(BODY26)["sides"]
+    sides = html._skeleton_data(BODY26)["sides"]
     for name, letter in (("left_hand", "l"), ("right_hip", "r"), ("neck", "c")):
         assert sides[BODY26.index(name)] == letter
     assert [sides.count(letter) for letter in "lrc"] == [9, 9, 8]
     person = ReportPerson(label="a", points=points, pose=pose, part=part)
-    assert report._person_data(person, 100)["sides"] == "nlrr"
+    assert html._person_data(person, 100)["sides"] == "nlrr"

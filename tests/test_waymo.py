@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from lidarpose.data.prepare import prepare, reader
 from lidarpose.data.readers import protobuf, waymo_parquet
-from lidarpose.data.readers.items import HIDDEN, SEEN, UNLABELED, Item, Skipped
+from lidarpose.data.readers.base import HIDDEN, SEEN, UNLABELED, Item, Skipped
 from lidarpose.data.readers.protobuf import Message
 from lidarpose.data.readers.tfrecord import crc32c, masked_checksum, records
 from lidarpose.data.readers.waymo import COMPONENTS, Waymo, WaymoV1, WaymoV2

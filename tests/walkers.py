@@ -4,7 +4,7 @@ import numpy as np
 
 from lidarpose.geometry import rotation_about
 from lidarpose.synth.actor import Actor
-from lidarpose.synth.mesh import box
+from lidarpose.synth.environment.mesh import box
 
 HEADINGS, STEP = (0.0, 1.2, -2.0), 1.5
 

@@ -2,16 +2,16 @@
 
     python tools/fit_motion.py CLIPS.npz --subjects 002 005 --out src/lidarpose/body/assets/motion_prior.npz
 
-CLIPS.npz is laid out as `lidarpose.body.clips` says. Only the mixture's parameters are kept, never a pose.
+CLIPS.npz is laid out as `lidarpose.body.mocap.motion` says. Only the mixture's parameters are kept, never a pose.
 """
 
 import argparse
 
 import numpy as np
 
-from lidarpose.body.captured import save_mixture, to_features
-from lidarpose.body.clips import load_clips
-from lidarpose.body.retarget import retarget_positions, without_yaw
+from lidarpose.body.mocap.motion import load_clips
+from lidarpose.body.mocap.retarget import retarget_positions, without_yaw
+from lidarpose.body.pose_prior.mixture import save_mixture, to_features
 
 _ITERATIONS = 60
 _RIDGE = 3.0**2  # degrees squared added to every variance: a pose is known no better, and none is stored exactly

@@ -19,11 +19,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lidarpose._version import __version__
-from lidarpose.evaluate.bench import METADATA, NAME, schema
+from lidarpose.eval.bench import METADATA, NAME, schema
 from lidarpose.io.files import atomic_path
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import PoseBank
-from lidarpose.synth.generate import Generator, SyntheticPerson
+from lidarpose.synth.generator import Generator, SyntheticPerson
 from lidarpose.synth.scene import CropErrors, SceneConfig, scene_config
 
 # training counts its seeds from 0, the held-out benchmarks use those about 90,000

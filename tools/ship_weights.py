@@ -10,10 +10,10 @@ import json
 import tempfile
 from pathlib import Path
 
-from lidarpose.infer.predictor import load
+from lidarpose.inference.predictor import load
 from lidarpose.io.files import write_atomic
-from lidarpose.model.checkpoint import load_checkpoint, save_checkpoint
-from lidarpose.model.export import export
+from lidarpose.models.checkpoint import load_checkpoint, save_checkpoint
+from lidarpose.models.export import export
 
 GOLDEN = Path(__file__).parents[1] / "tests" / "golden_poses.json"
 

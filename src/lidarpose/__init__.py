@@ -9,23 +9,24 @@ Names are loaded when first used: importing the package costs no torch and no nu
 
 from importlib import import_module
 
+from lidarpose import _renamed
 from lidarpose._version import __version__
 from lidarpose.errors import missing_extra
 
 # public name -> where it lives
 _HOMES = {
-    "load": "lidarpose.infer.predictor",
-    "Predictor": "lidarpose.infer.predictor",
-    "predict": "lidarpose.infer.files",
-    "export": "lidarpose.model.export",
-    "import_dapt": "lidarpose.model.dapt.released",
-    "PersonPose": "lidarpose.infer.results",
-    "Poses": "lidarpose.infer.results",
+    "load": "lidarpose.inference.predictor",
+    "Predictor": "lidarpose.inference.predictor",
+    "predict": "lidarpose.inference.predict_file",
+    "export": "lidarpose.models.export",
+    "import_dapt": "lidarpose.models.dapt.import_weights",
+    "PersonPose": "lidarpose.inference.results",
+    "Poses": "lidarpose.inference.results",
     "cast_rays": "lidarpose.lidar.raycast",
-    "sensor": "lidarpose.lidar.catalog",
+    "sensor": "lidarpose.lidar.presets",
     "Sensor": "lidarpose.lidar.sensor",
-    "sample_poses": "lidarpose.body.motion",
-    "read_points": "lidarpose.io.formats",
+    "sample_poses": "lidarpose.body.pose_prior.sampling",
+    "read_points": "lidarpose.io.point_cloud",
     "read_boxes": "lidarpose.io.boxes",
     "Box": "lidarpose.sample",
     "Pose": "lidarpose.sample",
@@ -35,6 +36,8 @@ _HOMES = {
     "LidarPoseError": "lidarpose.errors",
     "InputError": "lidarpose.errors",
 }
+
+_renamed.install()
 
 # modules of their own, for `lidarpose.metrics.mpjpe`
 _MODULES = ("metrics", "evaluation")

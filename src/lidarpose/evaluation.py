@@ -19,18 +19,18 @@ from typing import Any
 import numpy as np
 
 from lidarpose._version import __version__
-from lidarpose.data.columns import pyarrow
+from lidarpose.data.schema import pyarrow
 from lidarpose.errors import InputError
-from lidarpose.evaluate.judged import Judged, read_poses, write_poses
-from lidarpose.evaluate.people import BENCH, open_people
-from lidarpose.evaluate.protocols import PROTOCOLS
-from lidarpose.evaluate.result import FILE, Line, Result, Scores, Setting, read_scores, scores_path
-from lidarpose.evaluate.run import Evaluation, Model, Task, judge, task_of
-from lidarpose.evaluate.stability import Stability, study, to_disturb, to_json
-from lidarpose.evaluate.table import published, table
-from lidarpose.infer.predictor import load
+from lidarpose.eval.dataset import BENCH, open_people
+from lidarpose.eval.paper_table import published, table
+from lidarpose.eval.predictions import Judged, read_poses, write_poses
+from lidarpose.eval.protocols import PROTOCOLS
+from lidarpose.eval.robustness import Stability, study, to_disturb, to_json
+from lidarpose.eval.run import Evaluation, Model, Task, judge, task_of
+from lidarpose.eval.scores import FILE, Line, Result, Scores, Setting, read_scores, scores_path
+from lidarpose.inference.predictor import load
 from lidarpose.io.files import atomic_path, check_writable, content_digest, file_error, listed
-from lidarpose.model.bundled import weights_path
+from lidarpose.models.bundled import weights_path
 from lidarpose.sample import Pose
 
 __all__ = [
@@ -189,7 +189,7 @@ def check_folder(folder: str | os.PathLike) -> Path:
 def write(run: Run, folder: str | os.PathLike) -> list[Path]:
     """Writes scores.json, poses.parquet, pictures and, where there are studies, stability.json into a new or empty
     folder, all of them or none, and returns their paths. Raises InputError where the folder holds something."""
-    from lidarpose.view import charts
+    from lidarpose.eval import charts
 
     folder = check_folder(folder)
     files: dict[str, bytes] = {FILE: run.scores.to_json().encode()}
@@ -215,7 +215,7 @@ def write(run: Run, folder: str | os.PathLike) -> list[Path]:
 
 
 def _worst(one: Evaluation) -> bytes:
-    from lidarpose.view.picture import Panel, draw_people
+    from lidarpose.viz.draw import Panel, draw_people
 
     judged, setting = one.judged, one.result.setting
     errors = judged.errors()

@@ -10,9 +10,10 @@
 Metres in; millimetres or percent out. docs/metrics.md defines every figure.
 """
 
-from lidarpose.evaluate.bootstrap import Interval, interval, paired_interval
-from lidarpose.evaluate.groups import GROUPS, by_group, joint_groups
-from lidarpose.evaluate.metrics import (
+from lidarpose.eval.metrics.aggregate import AVERAGES, Score, mean
+from lidarpose.eval.metrics.bootstrap import Interval, interval, paired_interval
+from lidarpose.eval.metrics.groups import GROUPS, by_group, joint_groups
+from lidarpose.eval.metrics.joint_errors import (
     LEAST_ALIGNED,
     TORSO,
     acceleration_error,
@@ -26,9 +27,8 @@ from lidarpose.evaluate.metrics import (
     pa_mpjpe,
     pck,
 )
-from lidarpose.evaluate.scores import AVERAGES, Score, mean
-from lidarpose.evaluate.slices import DISTANCE_EDGES, OCCLUSION_EDGES, POINT_EDGES, Slice, by_span
-from lidarpose.evaluate.waymo import (
+from lidarpose.eval.metrics.slices import DISTANCE_EDGES, OCCLUSION_EDGES, POINT_EDGES, Slice, by_span
+from lidarpose.eval.metrics.waymo_metrics import (
     OKS_THRESHOLDS,
     PCK_THRESHOLDS,
     PENALTY,

@@ -134,7 +134,7 @@ def pose_bodies(
     """
     rotations, translation = _checked(rest, rotations, translation)
     try:
-        from lidarpose.body.rig_numba import pose_people
+        from lidarpose.body.rig_kernels import pose_people
     except ImportError:
         return pose_bodies_reference(rig, rest, rotations, translation)
     vertices, joints = np.empty_like(rest.vertices), np.empty_like(rest.joints)
@@ -166,7 +166,7 @@ def vertex_normals(faces: np.ndarray, vertices: np.ndarray) -> np.ndarray:
     """
     vertices = np.ascontiguousarray(vertices, np.float32)
     try:
-        from lidarpose.body.rig_numba import normals_of_people
+        from lidarpose.body.rig_kernels import normals_of_people
     except ImportError:
         return vertex_normals_reference(faces, vertices)
     normals = np.empty_like(vertices)

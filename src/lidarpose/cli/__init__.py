@@ -7,7 +7,7 @@ from contextlib import suppress
 
 from lidarpose._version import __version__
 from lidarpose.cli import datasets, evaluating, predicting, training, weights
-from lidarpose.cli.words import tell
+from lidarpose.cli.terminal import tell
 from lidarpose.errors import InputError, LidarPoseError, missing_extra
 
 # options whose value may start with a minus sign, which argparse would take for another option

@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Callable
 from contextlib import ExitStack
 
-from lidarpose.cli.words import is_watched, names, tell
+from lidarpose.cli.terminal import is_watched, names, tell
 
 
 def add(commands) -> None:
@@ -88,7 +88,7 @@ def add(commands) -> None:
 
 def _synth(options: argparse.Namespace) -> None:
     from lidarpose.data.shards import counted
-    from lidarpose.synth.write import Job, write_dataset
+    from lidarpose.synth.shard_job import Job, write_dataset
 
     job = Job(
         what="clips" if options.clips else "streets" if options.scenes else "people",
@@ -144,12 +144,12 @@ def _prepare(options: argparse.Namespace) -> None:
 
 
 def _sensors(options: argparse.Namespace) -> None:
-    from lidarpose.lidar.catalog import listing
+    from lidarpose.lidar.presets import listing
 
     print("\n".join(listing()))
 
 
 def _view(options: argparse.Namespace) -> None:
-    from lidarpose.view.sheet import draw_dataset
+    from lidarpose.viz.contact_sheet import draw_dataset
 
     print(draw_dataset(options.folder, count=options.count, html=options.html, out=options.out))

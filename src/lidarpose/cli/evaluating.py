@@ -5,8 +5,8 @@ import shlex
 from collections.abc import Iterator
 from contextlib import ExitStack
 
-from lidarpose.cli.words import is_watched, tell
-from lidarpose.model.bundled import BUNDLED
+from lidarpose.cli.terminal import is_watched, tell
+from lidarpose.models.bundled import BUNDLED
 
 # groups of lines that the terminal shows; the others are in scores.json
 _SHOWN = ("condition", "plain", "joints", "distance, m", "points", "hidden share")

@@ -5,8 +5,8 @@ import os
 from contextlib import ExitStack
 from pathlib import Path
 
-from lidarpose.cli.words import is_watched, tell
-from lidarpose.model.bundled import DEFAULT, NAMES
+from lidarpose.cli.terminal import is_watched, tell
+from lidarpose.models.bundled import DEFAULT, NAMES
 
 # people named by a warning that several share, and characters of an id
 _MOST_NAMED, _LONGEST_ID = 3, 40
@@ -85,8 +85,8 @@ def add(commands) -> None:
 
 
 def _predict(options: argparse.Namespace) -> None:
-    from lidarpose.infer.files import TTA, predict
-    from lidarpose.infer.predictor import load
+    from lidarpose.inference.predict_file import TTA, predict
+    from lidarpose.inference.predictor import load
     from lidarpose.io.files import atomic_path, check_apart, check_writable
 
     file = Path(options.file)
@@ -154,6 +154,6 @@ def _warnings(poses) -> list[str]:
 
 
 def _demo(options: argparse.Namespace) -> None:
-    from lidarpose.demo import run
+    from lidarpose.cli.demo import run
 
     run(options.out, seed=options.seed, weights=options.weights)

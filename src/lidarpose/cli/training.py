@@ -6,7 +6,7 @@ import shlex
 from dataclasses import fields
 from pathlib import Path
 
-from lidarpose.cli.words import names
+from lidarpose.cli.terminal import names
 from lidarpose.errors import InputError
 from lidarpose.train.recipes import Finetune, Pretrain, Recipe
 
@@ -59,9 +59,9 @@ def _add(parser, kind: type[Recipe]) -> None:
 
 def _train(options: argparse.Namespace) -> None:
     from lidarpose.train.loop import train
+    from lidarpose.train.pictures import draw_examples
     from lidarpose.train.recipes import recipe
-    from lidarpose.train.runs import latest, stored_recipe
-    from lidarpose.view.progress import draw_examples
+    from lidarpose.train.run_dir import latest, stored_recipe
 
     kind: type[Recipe] = options.kind
     name = kind.__name__.lower()

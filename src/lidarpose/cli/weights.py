@@ -3,8 +3,8 @@
 import argparse
 from pathlib import Path
 
-from lidarpose.cli.words import tell
-from lidarpose.model.bundled import DEFAULT
+from lidarpose.cli.terminal import tell
+from lidarpose.models.bundled import DEFAULT
 
 
 def add(commands) -> None:
@@ -38,14 +38,14 @@ def add(commands) -> None:
 
 
 def _info(options: argparse.Namespace) -> None:
-    from lidarpose.infer.info import lines
+    from lidarpose.inference.info import lines
 
     print("\n".join(lines()))
 
 
 def _export(options: argparse.Namespace) -> None:
-    from lidarpose.model.bundled import weights_path
-    from lidarpose.model.export import FORMATS, export
+    from lidarpose.models.bundled import weights_path
+    from lidarpose.models.export import FORMATS, export
 
     path = weights_path(options.weights)
     out = options.out or path.stem + FORMATS.get(options.format, "")
@@ -54,7 +54,7 @@ def _export(options: argparse.Namespace) -> None:
 
 
 def _import(options: argparse.Namespace) -> None:
-    from lidarpose.model.dapt.released import import_released
+    from lidarpose.models.dapt.import_weights import import_released
 
     header = import_released(options.file, options.out, config=options.config)
     tell(f"{header.config.name}, joints of {header.skeleton.name} -> {options.out}")

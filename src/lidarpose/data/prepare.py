@@ -14,12 +14,12 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from lidarpose.data.jobs import clean_folder, make_shards, open_folder
-from lidarpose.data.labelled import labelled_row
-from lidarpose.data.readers.items import Item, Reader, Skipped
+from lidarpose.data.labeled import labelled_row
+from lidarpose.data.readers.base import Item, Reader, Skipped
 from lidarpose.data.shards import CARD, SENSOR_FRAME, Card, open_dataset, shard_path, shard_writer, write_card
-from lidarpose.data.split_rules import SplitRule, split_rule
+from lidarpose.data.splits import SplitRule, split_rule
 from lidarpose.data.summary import summarize
+from lidarpose.data.writer import clean_folder, make_shards, open_folder
 from lidarpose.errors import InputError, check_name
 from lidarpose.io.files import file_error, one_line
 

@@ -11,7 +11,7 @@ person in one frame; columns (`PEOPLE`):
     center                  origin of the person's own frame, found from the points
     box_center, box_size, box_yaw    a detector's box: m, m, rad
     source, frame_id        as in `Sample`
-    sensor, kind, ...       what is known besides, see `data.facts.Facts`; null where it was not measured
+    sensor, kind, ...       what is known besides, see `data.synthetic_info.Facts`; null where it was not measured
 
 Datasets of real people, which `lidarpose prepare` wrote, have a part of the raw files (a sequence, a file) in each
 shard: labelled-*.parquet (columns as above where they mean the same, see `columns.TABLES`; index numbers the part) with
@@ -39,9 +39,9 @@ from typing import Any
 import numpy as np
 
 from lidarpose._version import __version__
-from lidarpose.data.columns import FACTS, TABLES, arrays_of, pyarrow, rows_of, schema_of
-from lidarpose.data.labelled import item_of
-from lidarpose.data.readers.items import Item
+from lidarpose.data.labeled import item_of
+from lidarpose.data.readers.base import Item
+from lidarpose.data.schema import FACTS, TABLES, arrays_of, pyarrow, rows_of, schema_of
 from lidarpose.errors import InputError
 from lidarpose.io.files import atomic_path, file_error, read_bytes, write_atomic
 from lidarpose.sample import Box, Pose, Sample

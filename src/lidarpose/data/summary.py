@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.data.readers.items import HIDDEN, SEEN, UNLABELED
+from lidarpose.data.readers.base import HIDDEN, SEEN, UNLABELED
 from lidarpose.data.shards import Dataset, read_rows, shard_path
-from lidarpose.data.split_rules import SplitRule
+from lidarpose.data.splits import SplitRule
 from lidarpose.skeleton import skeleton
 
 _COLUMNS = ("sequence", "frame", "split", "source", "joints", "joint_labels", "center")

@@ -26,8 +26,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from lidarpose.errors import InputError
-from lidarpose.lidar.heads import scan_heads
 from lidarpose.lidar.hits import Hits
+from lidarpose.lidar.multi_origin import scan_heads
 from lidarpose.lidar.raycast_input import (
     as_angles,
     as_culled,

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarpose.body.activities import KINDS
-from lidarpose.body.contact import stand
-from lidarpose.body.motion import sample_clips
-from lidarpose.body.person import clothing, sample_people
+from lidarpose.body.pose_prior.activities import KINDS
+from lidarpose.body.pose_prior.ground_contact import stand
+from lidarpose.body.pose_prior.sampling import sample_clips
 from lidarpose.body.rig import RestBody, load_rig
+from lidarpose.body.shape import clothing, sample_people
 from lidarpose.geometry import rotation_about
 from lidarpose.synth.bodies import CLIP_HZ, Bodies, PoseBank, dressed, extents, strides
 

@@ -6,19 +6,19 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.body.activities import KINDS
-from lidarpose.body.clips import Motion, facing_x
-from lidarpose.body.motion import sample_rotations
-from lidarpose.body.person import clothing, sample_people
-from lidarpose.body.retarget import mean_adult_joints
+from lidarpose.body.mocap import load_motion
+from lidarpose.body.mocap.motion import Motion, facing_x
+from lidarpose.body.mocap.retarget import mean_adult_joints
+from lidarpose.body.pose_prior.activities import KINDS
+from lidarpose.body.pose_prior.sampling import sample_rotations
 from lidarpose.body.rig import RestBody, load_rig, pose_bodies
-from lidarpose.body.sources import load_motion
+from lidarpose.body.shape import clothing, sample_people
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.geometry import axis_angle_to_matrix
 from lidarpose.skeleton import SMPL24
 
 try:
-    from lidarpose.body.rig_numba import dress_people
+    from lidarpose.body.rig_kernels import dress_people
 except ImportError as error:  # pragma: no cover - numba is an optional extra
     raise MissingExtra("synthesis", "synth") from error
 
@@ -35,7 +35,8 @@ _MIRROR = np.diag([1.0, -1.0, 1.0])
 @dataclass(frozen=True, kw_only=True)
 class PoseBank:
     """Captured poses in the rest frame of `body.rig`: local rotations (n, 24, 3, 3) float32, facing +x; moved
-    (n, 24, 3, 3) and step (n, 3) m, `FRAME_TIME` s later (see `body.clips.Moves`); clips: the motion they are of."""
+    (n, 24, 3, 3) and step (n, 3) m, `FRAME_TIME` s later (see `body.mocap.motion.Moves`); clips: their
+    motion."""
 
     rotations: np.ndarray
     moved: np.ndarray
@@ -52,7 +53,7 @@ class PoseBank:
 
     @classmethod
     def from_clips(cls, path: str | Path, subjects: tuple[str, ...] | None = None) -> "PoseBank":
-        """A file or folder of motion of any format of `body.sources`; the clips whose names begin with one of
+        """A file or folder of motion of any format of `body.mocap`; the clips whose names begin with one of
         `subjects`, by default all."""
         motion = load_motion(path)
         # more frames a second are hardly more poses

@@ -5,8 +5,8 @@ from math import cos, sin
 import numpy as np
 
 from lidarpose.sample import Box
-from lidarpose.synth.augment import cut_box
-from lidarpose.synth.placing import Place
+from lidarpose.synth.noise import cut_box
+from lidarpose.synth.placement import Place
 from lidarpose.synth.scene import CropErrors
 
 # what every box adds to the body's extent, and at most as much again at random, m

@@ -14,23 +14,23 @@ import numpy as np
 
 from lidarpose.errors import InputError, whole
 from lidarpose.geometry import rotation_about
-from lidarpose.lidar.catalog import sensor as named_sensor
-from lidarpose.lidar.pattern import RayPattern
-from lidarpose.lidar.pattern_scan import scan_pattern
+from lidarpose.lidar.presets import sensor as named_sensor
+from lidarpose.lidar.ray_pattern import RayPattern
+from lidarpose.lidar.ray_pattern_scan import scan_pattern
 from lidarpose.lidar.raycast import Hits, scan
 from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import Box, Pose, Sample, center_of
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.actor import Actor, draw_actor
-from lidarpose.synth.augment import REACH
-from lidarpose.synth.mesh import Mesh, union
-from lidarpose.synth.spoil import range_errors, spoil_points
-from lidarpose.synth.street_scenery import RAIL, Plan, draw_plan, scenery
+from lidarpose.synth.environment.mesh import Mesh, union
+from lidarpose.synth.environment.streetscape import RAIL, Plan, draw_plan, scenery
+from lidarpose.synth.noise import REACH
+from lidarpose.synth.noise_kernels import range_errors, spoil_points
 
 # people start within these distances of the sensor, m, and keep apart from it and from each other by so much
 _NEAREST, _FARTHEST, _APART = 2.5, 28.0, 0.75
 _PLACE_TRIES = 200
-# what people do in streets, of `body.activities.KINDS`, and how often another is drawn for it
+# what people do in streets, of `body.pose_prior.activities.KINDS`, and how often another is drawn for it
 _STREET_KINDS = ("walk", "idle", "run", "push", "step")
 _KIND_TRIES = 12
 # share of what is weak that is lost, and the standard deviation of a ring's own range error, m

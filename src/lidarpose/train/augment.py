@@ -8,16 +8,16 @@ from typing import TypeVar
 
 import numpy as np
 
-from lidarpose.data.released import released_view
+from lidarpose.data.dapt_crops import released_view
 from lidarpose.errors import check_name
-from lidarpose.evaluate.protocols import jittered
+from lidarpose.eval.protocols import jittered
 from lidarpose.geometry import rotation_about
-from lidarpose.model.plan import view_features
+from lidarpose.models.voxelize import view_features
 from lidarpose.sample import Sample, center_of
 from lidarpose.skeleton import BODY26, SMPL24
-from lidarpose.synth.augment import half_space_keep, jitter, noise_clusters, random_keep
-from lidarpose.train.crowd import StoredPerson
+from lidarpose.synth.noise import half_space_keep, jitter, noise_clusters, random_keep
 from lidarpose.train.example import BLIND, PELVIS_ERROR, REFINED, Example, seen
+from lidarpose.train.labeled_dataset import StoredPerson
 
 # a person of fewer points after the crop is shown whole
 LEAST_POINTS = 5

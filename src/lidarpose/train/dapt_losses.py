@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from lidarpose.model.dapt.network import DaptOutputs
-from lidarpose.train.task import Share, alone
+from lidarpose.models.dapt.dapt_net import DaptOutputs
+from lidarpose.train.objective import Share, alone
 
 # width of a heatmap's target, bins
 SIGMA = 2.0

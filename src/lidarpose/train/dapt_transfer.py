@@ -7,9 +7,9 @@ from torch import Tensor
 
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
-from lidarpose.model.checkpoint import load_checkpoint
-from lidarpose.model.dapt.config import DaptConfig
-from lidarpose.model.dapt.network import DaptNet
+from lidarpose.models.checkpoint import load_checkpoint
+from lidarpose.models.dapt.dapt_config import DaptConfig
+from lidarpose.models.dapt.dapt_net import DaptNet
 
 _ANCHORS = "keypoint_embedding"
 # settings that no tensor's shape betrays, but without which its numbers mean something else

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarpose.model.plan import view_features
+from lidarpose.models.voxelize import view_features
 from lidarpose.sample import Sample
 from lidarpose.skeleton import BODY26
 

@@ -20,12 +20,12 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from lidarpose.errors import InputError, check_name
-from lidarpose.model.checkpoint import save_checkpoint
-from lidarpose.train.feed import BATCHES, Chunks, chunks_of, lanes_of, loader
-from lidarpose.train.job import Job, job_of
-from lidarpose.train.optimize import average, optimizers, set_rates
+from lidarpose.models.checkpoint import save_checkpoint
+from lidarpose.train.data_loader import BATCHES, Chunks, chunks_of, lanes_of, loader
+from lidarpose.train.objective import total
+from lidarpose.train.optim import average, optimizers, set_rates
 from lidarpose.train.recipes import Recipe
-from lidarpose.train.runs import (
+from lidarpose.train.run_dir import (
     BEST,
     LOG,
     MODEL,
@@ -43,8 +43,8 @@ from lidarpose.train.runs import (
     stored_command,
     stored_recipe,
 )
-from lidarpose.train.state import load_state, save_state
-from lidarpose.train.task import total
+from lidarpose.train.setup import Job, job_of
+from lidarpose.train.train_state import load_state, save_state
 from lidarpose.train.validation import Draw, Validation
 
 # of Accelerate's, those that are known to work with a run's folder

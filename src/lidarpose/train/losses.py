@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from lidarpose.model.batch import Targets
-from lidarpose.model.heads import Outputs, encode
-from lidarpose.model.presets import BIN
+from lidarpose.models.batch import Targets
+from lidarpose.models.config import BIN
+from lidarpose.models.heads import Outputs, encode
 from lidarpose.sample import HIT
 from lidarpose.skeleton import BODY26
-from lidarpose.train.task import Share, alone
+from lidarpose.train.objective import Share, alone
 
 # weights; distances are in metres, so a weight of 10 brings 10 cm to order one
 VOTE, JOINTS, LEVEL, HEATMAP, PART, CONFIDENCE, SPREAD, VISIBLE = 10.0, 5.0, 2.0, 0.25, 0.25, 0.1, 0.05, 0.05

@@ -11,11 +11,11 @@ from typing import Protocol
 import numpy as np
 
 from lidarpose.synth.bodies import PoseBank
-from lidarpose.synth.generate import Generator
+from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
 from lidarpose.train.augment import Augmentation, augmented, disturbed
-from lidarpose.train.crowd import Crowd
 from lidarpose.train.example import REFINED, Example, example
+from lidarpose.train.labeled_dataset import Crowd
 
 # scenes whose every person is as the paper says, masked always
 _OF_ONE_DIFFICULTY = ("paper", "reference")

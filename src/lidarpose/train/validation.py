@@ -10,9 +10,9 @@ from torch import nn
 from lidarpose.io.files import write_atomic
 from lidarpose.skeleton import Skeleton
 from lidarpose.train.example import Example
-from lidarpose.train.job import Job
 from lidarpose.train.recipes import Recipe
-from lidarpose.train.runs import PICTURES
+from lidarpose.train.run_dir import PICTURES
+from lidarpose.train.setup import Job
 
 # people in their own frames, predicted joints (N, 26, 3) m of body26, the skeleton to draw, a title -> PNG
 Draw = Callable[[list[Example], np.ndarray, Skeleton, str], bytes]

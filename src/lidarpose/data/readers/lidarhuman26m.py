@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.items import Item, Skipped
+from lidarpose.data.readers.base import Item, Skipped
 from lidarpose.data.readers.level import leveling
-from lidarpose.data.readers.raw import numbered, numbers, read_cloud, read_json, wrong_root
+from lidarpose.data.readers.raw_files import numbered, numbers, read_cloud, read_json, wrong_root
 from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_item
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error

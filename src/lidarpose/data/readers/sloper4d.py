@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.items import Item, Skipped
-from lidarpose.data.readers.raw import as_cloud, numbers, wrong_root
+from lidarpose.data.readers.base import Item, Skipped
+from lidarpose.data.readers.raw_files import as_cloud, numbers, wrong_root
 from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_item
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about

@@ -9,7 +9,7 @@ import numpy as np
 
 from lidarpose.body.rig import forward_kinematics
 from lidarpose.body.smpl import SmplBody, load_body
-from lidarpose.data.readers.items import SEEN, Item, Skipped
+from lidarpose.data.readers.base import SEEN, Item, Skipped
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix
 from lidarpose.io.files import content_digest, file_error

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.data.readers.items import Item, Reader, Skipped
-from lidarpose.data.readers.raw import numbers, wrong_root
+from lidarpose.data.readers.base import Item, Reader, Skipped
+from lidarpose.data.readers.raw_files import numbers, wrong_root
 from lidarpose.data.readers.waymo_frames import (
     BAD_FRAME,
     BAD_IMAGE,

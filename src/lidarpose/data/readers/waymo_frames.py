@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.data.readers.items import HIDDEN, SEEN, UNLABELED, Item, Skipped
+from lidarpose.data.readers.base import HIDDEN, SEEN, UNLABELED, Item, Skipped
 from lidarpose.errors import InputError
 from lidarpose.geometry import from_spherical
 from lidarpose.sample import Box, Pose, Sample, center_of, within_reach

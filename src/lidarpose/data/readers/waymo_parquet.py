@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.data.columns import pyarrow
 from lidarpose.data.readers.waymo_frames import LASERS, is_image
+from lidarpose.data.schema import pyarrow
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
 

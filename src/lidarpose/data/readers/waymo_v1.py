@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.items import Item, Skipped
+from lidarpose.data.readers.base import Item, Skipped
 from lidarpose.data.readers.protobuf import Message
 from lidarpose.data.readers.tfrecord import records
 from lidarpose.data.readers.waymo_frames import (

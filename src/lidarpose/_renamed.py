@@ -1,0 +1,64 @@
+"""Module paths of 0.2 that README and docs named, kept importable until 1.0 under their new places."""
+
+import importlib
+import sys
+import warnings
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+
+# old path below `lidarpose.` -> new one
+RENAMED = {
+    "body.clips": "body.mocap.motion",
+    "body.motion": "body.pose_prior.sampling",
+    "body.retarget": "body.mocap.retarget",
+    "body.sources": "body.mocap",
+    "evaluate": "eval",
+    "evaluate.metrics": "eval.metrics.joint_errors",
+    "infer": "inference",
+    "infer.files": "inference.predict_file",
+    "infer.predictor": "inference.predictor",
+    "infer.results": "inference.results",
+    "io.formats": "io.point_cloud",
+    "lidar.catalog": "lidar.presets",
+    "lidar.pattern": "lidar.ray_pattern",
+    "model": "models",
+    "model.bundled": "models.bundled",
+    "model.checkpoint": "models.checkpoint",
+    "model.export": "models.export",
+    "model.header": "models.header",
+    "model.network": "models.posenet",
+    "model.plan": "models.voxelize",
+    "model.presets": "models.config",
+    "synth.generate": "synth.generator",
+    "synth.mesh": "synth.environment.mesh",
+    "train.job": "train.setup",
+    "train.people": "train.torch_dataset",
+    "view": "viz",
+    "view.picture": "viz.draw",
+}
+
+
+class RenamedModules(MetaPathFinder, Loader):
+    """Imports a module by its old path: the module object is that of the new path."""
+
+    def find_spec(self, fullname: str, path=None, target=None) -> ModuleSpec | None:
+        old = fullname.removeprefix("lidarpose.")
+        return ModuleSpec(fullname, self) if old != fullname and old in RENAMED else None
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        new = "lidarpose." + RENAMED[spec.name.removeprefix("lidarpose.")]
+        warnings.warn(f"{spec.name} is now {new}", DeprecationWarning, stacklevel=2)
+        module = importlib.import_module(new)
+        # importlib sets the spec of what it gets here to the old one
+        spec.loader_state = module.__spec__
+        return module
+
+    def exec_module(self, module: ModuleType) -> None:
+        module.__spec__ = module.__spec__.loader_state
+
+
+def install() -> None:
+    """Makes the old paths importable."""
+    if not any(isinstance(finder, RenamedModules) for finder in sys.meta_path):
+        sys.meta_path.insert(0, RenamedModules())

@@ -1,0 +1,136 @@
+"""Files of captured motion, whatever their format, as the body's rotations: `load_motion`.
+
+    format           what it reads
+    clips            .npz of this package's joint positions (see `body.mocap.motion`); retargeted
+    amass            .npz of SMPL, SMPL+H or SMPL-X poses
+    bvh              .bvh of any skeleton whose joints have usual names; retargeted
+    amc              .amc beside its .asf; retargeted
+    sloper4d         SLOPER4D's _labels.pkl
+    lidarhuman26m    a folder of numbered pose .json files
+A folder is searched for all of these.
+"""
+
+import hashlib
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from lidarpose.body.mocap.acclaim import load_amc
+from lidarpose.body.mocap.amass import load_npz
+from lidarpose.body.mocap.bvh import load_bvh
+from lidarpose.body.mocap.lidarhuman26m import load_pose_json, pose_files
+from lidarpose.body.mocap.motion import Motion, join
+from lidarpose.body.mocap.sloper4d import load_sloper4d
+from lidarpose.errors import check_name
+from lidarpose.geometry import UP_AXES
+from lidarpose.io.files import content_digest, file_error, read_bytes
+
+FORMATS: dict[str, Callable[..., Motion]] = {
+    "clips": load_npz,
+    "amass": load_npz,
+    "bvh": load_bvh,
+    "amc": load_amc,
+    "sloper4d": load_sloper4d,
+    "lidarhuman26m": load_pose_json,
+}
+_BY_SUFFIX = {".npz": "amass", ".bvh": "bvh", ".amc": "amc", ".pkl": "sloper4d", ".json": "lidarhuman26m"}
+# what lies beside the motion in AMASS's folders and holds none
+_NO_MOTION = ("shape.npz", "stagei.npz")
+
+
+def load_motion(
+    path: str | os.PathLike,
+    *,
+    format: str | None = None,
+    up: str | None = None,
+    fps: float | None = None,
+    hz: float | None = None,
+) -> Motion:
+    """The motion of a file, or of all files in a folder and its folders, as rotations of the shipped body.
+
+    format: a name of `FORMATS`, by default told by the file; up: the axis of the recording that is up, "x", "y" or "z",
+    with a minus where it points down, by default what its format says (BVH: the one people stand along); fps: the
+    recording's frames a second, by default what the file says; hz: resample each file to so many. A folder's clips are
+    named by their paths in it, and get the lowest rate among its files unless `hz` says one. Frames that are no numbers
+    are left out and counted.
+
+    Rotation formats (AMASS, LiDARHuman26M, SLOPER4D) keep every turn; the others are retargeted by positions.
+    Raises InputError, naming the file, for everything that cannot be read.
+    """
+    if format is not None:
+        check_name("format of motion", format, FORMATS)
+    if up is not None:
+        check_name("up axis", up, UP_AXES)
+    for name, rate in (("fps", fps), ("hz", hz)):
+        if rate is not None and not 0 < rate < float("inf"):
+            raise file_error(path, f"{name} must be frames a second, above 0, got {rate}")
+    try:
+        path = Path(path)
+        folder = path.is_dir()
+    except (TypeError, ValueError) as error:
+        raise file_error(repr(path), f"expected the path of a file or folder of motion ({error})") from None
+    if not folder and format is None and path.suffix.lower() not in _BY_SUFFIX:
+        # says whether there is such a file at all
+        read_bytes(path, expected=f"a file of motion ({' '.join(_BY_SUFFIX)}) or a folder of them")
+    if not folder or (format == "lidarhuman26m" and pose_files(path)):
+        return _load(path, format, up=up, fps=fps, hz=hz)
+    motions = []
+    for source in _sources(path, format):
+        motion = _load(source, format, up=up, fps=fps, hz=hz)
+        motions.append(replace(motion, names=tuple(_placed(name, source, path) for name in motion.names)))
+    if not motions:
+        raise file_error(path, f"holds no file of motion; read are {', '.join(_BY_SUFFIX)} in it or its folders")
+    return join(motions, source=f"{len(motions)} files: {path}")
+
+
+def _load(path: Path, format: str | None, *, up: str | None, fps: float | None, hz: float | None) -> Motion:
+    format = format or ("lidarhuman26m" if path.is_dir() else _BY_SUFFIX.get(path.suffix.lower()))
+    if format is None:
+        raise file_error(
+            path,
+            f"expected a file of motion, one of {', '.join(_BY_SUFFIX)}, or a folder: convert it, or in Python give "
+            "format=",
+        )
+    motion = FORMATS[format](path, up=up, fps=fps)
+    return motion if hz is None else motion.resampled(hz)
+
+
+def _sources(folder: Path, format: str | None) -> list[Path]:
+    """Files of motion in a folder and its folders, and its folders of pose files, in the order of their names."""
+    suffixes = {s for s, name in _BY_SUFFIX.items() if format in (None, name) or (s, format) == (".npz", "clips")}
+    found = []
+    for here, folders, files in os.walk(folder):
+        folders.sort()
+        for name in sorted(files):
+            suffix = Path(name).suffix.lower()
+            if suffix in suffixes - {".json"} and not name.lower().endswith(_NO_MOTION):
+                found.append(Path(here, name))
+        if ".json" in suffixes and pose_files(Path(here)):
+            found.append(Path(here))
+    return sorted(found)
+
+
+def digest(path: str | os.PathLike) -> str:
+    """16 hexadecimal digits that tell one recording from another: of a file its content's, of a folder those of the
+    files of motion in it and its folders and of the skeletons beside them. Raises InputError."""
+    path = Path(path)
+    if not path.is_dir():
+        return content_digest(path, expected="motion")[:16]
+    wanted = {*_BY_SUFFIX, ".asf"}
+    files = sorted(Path(here, name) for here, _, names in os.walk(path) for name in names)
+    told = [
+        f"{file.relative_to(path).as_posix()} {content_digest(file, expected='motion')}"
+        for file in files
+        if file.suffix.lower() in wanted
+    ]
+    return hashlib.sha256("\n".join(told).encode("utf-8", "surrogateescape")).hexdigest()[:16]
+
+
+def _placed(name: str, source: Path, folder: Path) -> str:
+    """A clip's name with the place of its file in the folder that is read: 02_01 of 02/02_01.bvh -> 02/02_01."""
+    if source == folder:
+        return name
+    stem = source.name if source.is_dir() else source.stem
+    place = source.relative_to(folder).with_name(stem).as_posix()
+    return place + name.removeprefix(stem) if name.startswith(stem) else f"{place}/{name}"

@@ -1,0 +1,163 @@
+"""The 27 angles of a pose (`activities.ANGLES`, degrees) and the rotations of the body's 24 bones."""
+
+import numpy as np
+
+from lidarpose.body.pose_prior.activities import ANGLES
+from lidarpose.geometry import rotation_about
+from lidarpose.skeleton import SMPL24
+
+_A = {name: i for i, name in enumerate(ANGLES)}
+_J = {name: i for i, name in enumerate(SMPL24.joints)}
+_SIDES = (("left", 1.0), ("right", -1.0))
+
+# scapulohumeral rhythm: over 45 degrees of elevation the collar takes part of the arm's angle
+_COLLAR_FROM, _COLLAR_SHARE = 45.0, 0.15
+_SHOULDERS = np.array([_J["left_shoulder"], _J["right_shoulder"]])
+_COLLAR_LIFTS = 3 * np.array([_J["left_collar"], _J["right_collar"]]) + 1
+_LIFT_SIGNS = np.array([1, -1], np.float32)
+_RAISED_OUT = np.array([[_A[f"{side}_raise"], _A[f"{side}_out"]] for side, _ in _SIDES])
+_INWARD = np.array([_A[f"{side}_in"] for side, _ in _SIDES])
+_LIFT_STEPS = 6  # fixed-point steps that take the collar's share out of the upper arm
+
+
+def rotations_from_angles(angles: np.ndarray) -> np.ndarray:
+    """angles (n, 27) degrees in the order of `ANGLES` -> local rotations (n, 24, 3, 3) float32."""
+    angles = np.asarray(angles, np.float32)
+    euler = angles @ _TO_EULER + _AT_ZERO
+    euler[:, _COLLAR_LIFTS] += _LIFT_SIGNS * _lift(angles[:, _RAISED_OUT])
+    rotations = _from_euler(np.radians(euler.reshape(len(angles), 24, 3)))
+    inward = np.radians(angles[:, _INWARD])
+    turn = np.zeros((len(angles), 2, 3, 3), np.float32)
+    turn[..., 0, 0] = turn[..., 2, 2] = np.cos(inward)
+    turn[..., 0, 2] = np.sin(inward)
+    turn[..., 2, 0] = -turn[..., 0, 2]
+    turn[..., 1, 1] = 1
+    rotations[:, _SHOULDERS] = rotations[:, _SHOULDERS] @ turn
+    return rotations
+
+
+def angles_from_rotations(rotations: np.ndarray) -> np.ndarray:
+    """The angles (n, 27), degrees, nearest to local rotations (n, 24, 3, 3): the inverse of `rotations_from_angles`.
+
+    What the angles cannot say is dropped: turns of wrists and hands, unlike shares of the spine's joints, and of the
+    collars all but where they take the upper arms.
+    """
+    rotations = np.asarray(rotations, float)
+    angles = np.zeros((len(rotations), len(ANGLES)))
+
+    def put(names: tuple[str, ...], joints: tuple[str, ...]) -> None:
+        # joints that share an angle turn by the same small rotation: add their Euler angles
+        total = sum(_to_euler(rotations[:, _J[joint]]) for joint in joints)
+        angles[:, [_A[name] for name in names]] = total
+
+    put(("tilt", "roll", "yaw"), ("pelvis",))
+    put(("bend", "side", "twist"), ("spine1", "spine2", "spine3"))
+    put(("nod", "neck_side", "neck_twist"), ("neck", "head"))
+    for side, sign in _SIDES:
+        hip = _to_euler(rotations[:, _J[f"{side}_hip"]]) * [-1, sign, sign]
+        angles[:, [_A[f"{side}_{name}"] for name in ("hip", "abd", "rot")]] = hip
+        angles[:, _A[f"{side}_knee"]] = _to_euler(rotations[:, _J[f"{side}_knee"]])[:, 0]
+        angles[:, _A[f"{side}_ankle"]] = -_to_euler(rotations[:, _J[f"{side}_ankle"]])[:, 0]
+        angles[:, _A[f"{side}_elbow"]] = -sign * _to_euler(rotations[:, _J[f"{side}_elbow"]])[:, 2]
+        upper_arm = rotations[:, _J[f"{side}_collar"]] @ rotations[:, _J[f"{side}_shoulder"]]
+        arm = shoulder_angles(upper_arm, sign)
+        for _ in range(_LIFT_STEPS):
+            arm = shoulder_angles(rotation_about("x", -sign * np.radians(_lift(arm[:, :2]))) @ upper_arm, sign)
+        angles[:, [_A[f"{side}_{name}"] for name in ("raise", "out", "in")]] = arm
+    return angles
+
+
+def shoulder_angles(matrix: np.ndarray, sign: float) -> np.ndarray:
+    """Shoulder rotations (n, 3, 3), sign 1 for the left and -1 for the right -> (n, 3) degrees: raise, out, in."""
+    # R_y(-raise) R_x(sign (out - 90)) R_y(in): the middle row and column hold the angles
+    out = np.arcsin(np.clip(matrix[:, 1, 1], -1, 1))
+    raised = np.arctan2(sign * matrix[:, 0, 1], -sign * matrix[:, 2, 1])
+    inward = np.arctan2(-sign * matrix[:, 1, 0], sign * matrix[:, 1, 2])
+    return np.degrees(np.stack([raised, out, inward], -1))
+
+
+def shoulder_matrix(arm: np.ndarray, sign: float) -> np.ndarray:
+    """The inverse of `shoulder_angles`: arm (n, 3) degrees -> rotations (n, 3, 3)."""
+    raised, out, inward = np.radians(arm).T
+    return rotation_about("y", -raised) @ rotation_about("x", sign * (out - np.pi / 2)) @ rotation_about("y", inward)
+
+
+def _lift(arm: np.ndarray) -> np.ndarray:
+    """The collar's turn (...) degrees upwards, for an arm's raise and out (..., 2) degrees."""
+    elevation = np.degrees(np.arccos(np.clip(np.cos(np.radians(arm)).prod(-1), -1, 1)))
+    return _COLLAR_SHARE * np.clip(elevation - _COLLAR_FROM, 0, None)
+
+
+def _to_euler(matrix: np.ndarray) -> np.ndarray:
+    """R_y R_x R_z (n, 3, 3) -> (n, 3) degrees about y, x, z; x in +-90."""
+    y = np.arctan2(matrix[:, 0, 2], matrix[:, 2, 2])
+    x = -np.arcsin(np.clip(matrix[:, 1, 2], -1, 1))
+    z = np.arctan2(matrix[:, 1, 0], matrix[:, 1, 1])
+    return np.degrees(np.stack([y, x, z], -1))
+
+
+def _from_euler(euler: np.ndarray) -> np.ndarray:
+    """(..., 3) rad about y, x, z -> R_y R_x R_z (..., 3, 3): twist first, then sideways, then forward."""
+    (ca, cb, cc), (sa, sb, sc) = (np.moveaxis(f(euler), -1, 0) for f in (np.cos, np.sin))
+    matrix = np.empty(euler.shape + (3,), euler.dtype)
+    sbsc, sbcc = sb * sc, sb * cc
+    matrix[..., 0, 0] = ca * cc + sa * sbsc
+    matrix[..., 0, 1] = sa * sbcc - ca * sc
+    matrix[..., 0, 2] = sa * cb
+    matrix[..., 1, 0] = cb * sc
+    matrix[..., 1, 1] = cb * cc
+    matrix[..., 1, 2] = -sb
+    matrix[..., 2, 0] = ca * sbsc - sa * cc
+    matrix[..., 2, 1] = sa * sc + ca * sbcc
+    matrix[..., 2, 2] = ca * cb
+    return matrix
+
+
+def _euler_map() -> tuple[np.ndarray, np.ndarray]:
+    """The linear map from `ANGLES` to 24 x (y, x, z) Euler angles, (27, 72), and its value at zero (72,), degrees."""
+    matrix, zero = np.zeros((len(ANGLES), 24, 3), np.float32), np.zeros((24, 3), np.float32)
+    y, x, z = 0, 1, 2
+    for names, axis in (("tilt", y), ("roll", x), ("yaw", z)):
+        matrix[_A[names], _J["pelvis"], axis] = 1
+    for names, joints in (
+        (("bend", "side", "twist"), ("spine1", "spine2", "spine3")),
+        (("nod", "neck_side", "neck_twist"), ("neck", "head")),
+    ):
+        for axis, name in enumerate(names):
+            for joint in joints:
+                matrix[_A[name], _J[joint], axis] = 1 / len(joints)
+    for side, sign in (("left", 1), ("right", -1)):
+        for name, joint, axis, gain in (
+            ("hip", "hip", y, -1),
+            ("abd", "hip", x, sign),
+            ("rot", "hip", z, sign),
+            ("knee", "knee", y, 1),
+            ("ankle", "ankle", y, -1),
+            ("raise", "shoulder", y, -1),
+            ("out", "shoulder", x, sign),
+            ("elbow", "elbow", z, -sign),
+        ):
+            matrix[_A[f"{side}_{name}"], _J[f"{side}_{joint}"], axis] = gain
+        zero[_J[f"{side}_shoulder"], x] = -90 * sign  # from the T-pose to a hanging arm
+    return matrix.reshape(len(ANGLES), 72), zero.reshape(72)
+
+
+_TO_EULER, _AT_ZERO = _euler_map()
+
+
+def _mirror() -> tuple[np.ndarray, np.ndarray]:
+    across = {"left": "right", "right": "left"}
+    index = []
+    for name in ANGLES:
+        side, _, rest = name.partition("_")
+        index.append(_A[f"{across[side]}_{rest}"] if side in across else _A[name])
+    odd = ("roll", "yaw", "side", "twist", "neck_side", "neck_twist")
+    return np.array(index), np.array([-1.0 if name in odd else 1.0 for name in ANGLES])
+
+
+_MIRROR_INDEX, _MIRROR_SIGN = _mirror()
+
+
+def mirror_angles(angles: np.ndarray) -> np.ndarray:
+    """Left and right exchanged. angles (n, 27) -> (n, 27)."""
+    return angles[:, _MIRROR_INDEX] * _MIRROR_SIGN

@@ -1,0 +1,162 @@
+"""What is random about a pose of the prior, and how it goes on in time.
+
+Everything but the activity itself drifts: a gait's phase advances, the place between the two ends of an activity's
+range swings to and fro, each angle's noise sways a little. All of it is smooth in time, and at t = 0 nothing has moved.
+"""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from lidarpose.body.pose_prior.activities import (
+    ANGLES,
+    ARM_NAMES,
+    ARM_PACE,
+    ARMS_OF_KIND,
+    CAPTURED_ARMS,
+    KINDS,
+    LIMITS,
+    PACE,
+)
+from lidarpose.body.pose_prior.gait import CADENCE
+from lidarpose.body.pose_prior.mixture import captured_angles
+
+_CAPTURED, _FALL, _CYCLE = (KINDS.index(name) for name in ("captured", "fall", "cycle"))
+# how often both arms do the same thing, and how far a paired arm strays from the other, as a share of its range
+_PAIRED_ARMS, _PAIR_SPREAD = 0.45, 0.15
+# sway of an angle: share of its noise's range, and rates in turns a second
+_SWAY, _SWAY_SLOW, _SWAY_FAST = 0.06, 0.15, 0.5
+# captured poses: the angle that turns farthest on the way from one to the next turns so fast, degrees a second
+_CAPTURED_RATE = 90.0
+# people who go change their pace by up to this share and their heading by up to so many rad/s, this many times a second
+_HURRY, _TURN, _DRIFT = 0.08, 0.35, 0.17
+# a fall from standing to the ground, s: a body tips over in about 1 s (inverted pendulum of a person's height)
+_FALL_TIME = 1.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Latents:
+    """Everything random about n poses.
+
+    kind (n,) into KINDS; arm (n, 2) into ARM_NAMES, left and right, 0 = the activity's own; where (n, 3) in [0, 1]:
+    place in the range of the activity and of either arm; noise (n, 27) in about [-1, 1]; phase (n,) strides, 0 is the
+    left heel's strike; style (n, 8) in [0, 1]: the gait's parameters; mirror (n,) bool; tempo (n, 4) in [0, 1]: pace,
+    direction of the swing at first, curve of the path, change of speed; captured (m, 2, 27) degrees: the angles of
+    the m poses that are captured or have such an arm (`from_capture`), and of those they go to.
+    """
+
+    kind: np.ndarray
+    arm: np.ndarray
+    where: np.ndarray
+    noise: np.ndarray
+    phase: np.ndarray
+    style: np.ndarray
+    mirror: np.ndarray
+    tempo: np.ndarray
+    captured: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+    @property
+    def from_capture(self) -> np.ndarray:
+        """(n,) bool: whose angles, or an arm's, are those of `captured`."""
+        return _from_capture(self.kind, self.arm)
+
+    def take(self, rows: np.ndarray) -> "Latents":
+        """The poses of these rows (k,), in their order."""
+        order, uses = np.cumsum(self.from_capture) - 1, self.from_capture[rows]
+        taken = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "captured"}
+        return Latents(**taken, captured=self.captured[order[rows[uses]]])
+
+    def repeated(self, times: int) -> "Latents":
+        """Each pose `times` times, one after the other."""
+        return Latents(**{f.name: np.repeat(getattr(self, f.name), times, 0) for f in fields(self)})
+
+    def at(self, t: np.ndarray) -> "Latents":
+        """The same people t (n,) seconds after these latents, which must be as drawn."""
+        t = np.broadcast_to(np.asarray(t, float), self.kind.shape)
+        eager = np.where(self.kind == _CYCLE, 1.0, 0.7 + 0.6 * self.tempo[:, 0])
+        pace = np.concatenate([_PACES[self.kind][:, None], _ARM_PACES[self.arm]], 1) * eager[:, None]
+        # to and fro between the ends from where they are, half of the people back first
+        start = np.arccos(np.clip(1 - 2 * self.where, -1, 1)) * np.where(self.tempo[:, 1:2] < 0.5, 1, -1)
+        where = (1 - np.cos(start + pace * t[:, None])) / 2
+        falling = self.kind == _FALL
+        where[falling, 0] = np.clip(self.where[falling, 0] + t[falling] / _FALL_TIME, 0, 1)
+        return replace(
+            self,
+            where=where,
+            noise=self.noise + _SWAY * self._sway(t),
+            phase=self.phase + self.strides(t),
+            captured=self._captured(t),
+        )
+
+    def strides(self, t: np.ndarray) -> np.ndarray:
+        """Strides made, or turns of a bicycle's cranks, by t (n,) or (n, T) s; 0 for who does not go anywhere.
+
+        The pace rises and falls by `_HURRY`.
+        """
+        base, more = _CADENCES[self.kind].T
+        cadence, begin = base + more * self.style[:, 0], 2 * np.pi * self.tempo[:, 3]
+        if np.ndim(t) == 2:
+            cadence, begin = cadence[:, None], begin[:, None]
+        rate = 2 * np.pi * _DRIFT
+        return cadence * (t + _HURRY / rate * (np.sin(begin + rate * t) - np.sin(begin)))
+
+    def course(self, times: np.ndarray) -> np.ndarray:
+        """Heading (n, T) rad at times (T,) s of those who go, 0 at t = 0: people walk in slight curves."""
+        most = _TURN * (2 * self.tempo[:, 2] - 1)
+        rate, begin = 2 * np.pi * _DRIFT, 7 * np.pi * self.tempo[:, 3]
+        return (most / rate)[:, None] * (np.sin(begin[:, None] + rate * times) - np.sin(begin)[:, None])
+
+    def _sway(self, t: np.ndarray) -> np.ndarray:
+        """(n, 27), 0 at t = 0: each angle's own slow swing; the noise itself says how fast and where it stands."""
+        rate = 2 * np.pi * (_SWAY_SLOW + (_SWAY_FAST - _SWAY_SLOW) * np.mod(self.noise * 17.0, 1.0))
+        begin = 2 * np.pi * np.mod(self.noise * 29.0, 1.0)
+        return np.sin(begin + rate * t[:, None]) - np.sin(begin)
+
+    def _captured(self, t: np.ndarray) -> np.ndarray:
+        rows = self.from_capture
+        here, there = self.captured[:, 0], self.captured[:, 1]
+        # at its fastest a cosine is pi / 2 times its mean
+        rate = np.pi * _CAPTURED_RATE / np.maximum(np.abs(there - here).max(1, initial=0), 20.0)
+        share = (1 - np.cos(rate * (0.6 + 0.4 * self.tempo[rows, 0]) * t[rows])) / 2
+        moved = here + share[:, None] * (there - here)
+        return np.stack([moved, there], 1)
+
+
+_PACES = np.array([PACE.get(name, 0.0) for name in KINDS])
+_ARM_PACES = np.array([ARM_PACE.get(name, 0.0) for name in ARM_NAMES])
+_CADENCES = np.array([CADENCE.get(name, (0.0, 0.0)) for name in KINDS])
+_CADENCES[KINDS.index("cycle")] = PACE["cycle"] / (2 * np.pi), 0.0
+_ODDS = np.cumsum(ARMS_OF_KIND, 1)
+
+
+def _from_capture(kind: np.ndarray, arm: np.ndarray) -> np.ndarray:
+    return (kind == _CAPTURED) | (arm == CAPTURED_ARMS).any(1)
+
+
+def draw_latents(rng: np.random.Generator, kind: np.ndarray) -> Latents:
+    """Poses of the kinds (n,), indices into KINDS."""
+    n = len(kind)
+    arm = (rng.random((n, 2, 1)) >= _ODDS[kind][:, None, :-1]).sum(2)
+    where = rng.random((n, 3))
+    paired = rng.random(n) < _PAIRED_ARMS
+    arm[paired, 1] = arm[paired, 0]
+    stray = where[:, 1] + _PAIR_SPREAD * rng.uniform(-1, 1, n)
+    where[paired, 2] = np.clip(stray, 0, 1)[paired]
+    # the sum of two uniform numbers: most near the middle, none far out
+    noise = rng.random((2, n, len(ANGLES))).sum(0) - 1
+    phase, style, mirror, tempo = rng.random(n), rng.random((n, 8)), rng.random(n) < 0.5, rng.random((n, 4))
+    captured = np.clip(captured_angles(rng, int(_from_capture(kind, arm).sum())), *LIMITS)
+    return Latents(
+        kind=kind,
+        arm=arm,
+        where=where,
+        noise=noise,
+        phase=phase,
+        style=style,
+        mirror=mirror,
+        tempo=tempo,
+        captured=captured,
+    )

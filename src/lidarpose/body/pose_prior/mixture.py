@@ -1,0 +1,87 @@
+"""Poses after captured motion: a mixture of Gaussians over the angles of a pose, fitted by tools/fit_motion.py.
+
+Its features (27, degrees) are `ANGLES` with each shoulder's three angles replaced by the rotation vector from a
+hanging arm, which is smooth where arms usually are. The mixture was fitted to subjects 2 and 5 of the CMU Graphics
+Lab Motion Capture Database (mocap.cs.cmu.edu, NSF EIA-0196217); no pose of it is stored.
+"""
+
+from functools import cache
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+from lidarpose.body.mocap.retarget import rotation_vector
+from lidarpose.body.pose_prior.activities import ANGLES, ARM_ANGLES
+from lidarpose.body.pose_prior.joint_angles import angles_from_rotations, shoulder_angles, shoulder_matrix
+from lidarpose.geometry import axis_angle_to_matrix
+
+_SHOULDERS = tuple(
+    (slice(ANGLES.index(f"{side}_raise"), ANGLES.index(f"{side}_raise") + 3), sign)
+    for side, sign in (("left", 1.0), ("right", -1.0))
+)
+# deviations are drawn this much smaller than fitted: the fit's ridge and few components make it wider than the motion
+_SPREAD = 0.75
+# an arm is another pose's this often: one subject's poses then cover another's better
+_OTHER_ARM = 0.4
+_ARMS = tuple(
+    [i for i, name in enumerate(ANGLES) if name in {f"{side}_{a}" for a in ARM_ANGLES}] for side in ("left", "right")
+)
+_LOWER = np.tril_indices(len(ANGLES))
+
+
+def captured_angles(rng: np.random.Generator, n: int) -> np.ndarray:
+    """n pairs of poses of one component of the mixture: angles (n, 2, 27), degrees, in the order of `ANGLES`; limits
+    are not applied. The first of a pair is distributed as the mixture; to move is to go towards the second."""
+    if not n:
+        return np.zeros((0, 2, len(ANGLES)))
+    cumulative, means, roots = _mixture()
+    component = np.searchsorted(cumulative, rng.random(n))
+    normal = rng.standard_normal((n, 2, len(ANGLES)))
+    features = means[component, None] + _SPREAD * normal @ np.swapaxes(roots[component], -1, -2)
+    for shift, arm in enumerate(_ARMS, 1):
+        rows = np.flatnonzero(rng.random(n) < _OTHER_ARM)
+        features[np.ix_(rows, (0, 1), arm)] = features[np.ix_((rows + shift) % n, (0, 1), arm)]
+    return from_features(features.reshape(-1, len(ANGLES))).reshape(n, 2, len(ANGLES))
+
+
+def to_features(rotations: np.ndarray) -> np.ndarray:
+    """Local rotations (n, 24, 3, 3) -> the mixture's features (n, 27)."""
+    features = angles_from_rotations(rotations)
+    for part, sign in _SHOULDERS:
+        turn = shoulder_matrix(features[:, part], sign) @ _hanging(sign).T
+        features[:, part] = np.degrees(rotation_vector(turn))
+    return features
+
+
+def from_features(features: np.ndarray) -> np.ndarray:
+    """The mixture's features (n, 27) -> angles (n, 27), degrees."""
+    angles = np.array(features, float)
+    for part, sign in _SHOULDERS:
+        angles[:, part] = shoulder_angles(axis_angle_to_matrix(np.radians(angles[:, part])) @ _hanging(sign), sign)
+    return angles
+
+
+def save_mixture(path: str | Path, weights: np.ndarray, means: np.ndarray, covariances: np.ndarray) -> None:
+    """Writes weights (K,), means (K, 27) and covariances (K, 27, 27), the last as their Cholesky factors."""
+    roots = np.linalg.cholesky(covariances)[:, *_LOWER]
+    np.savez_compressed(
+        path, weights=weights.astype(np.float32), means=means.astype(np.float16), roots=roots.astype(np.float16)
+    )
+
+
+def _hanging(sign: float) -> np.ndarray:
+    return shoulder_matrix(np.zeros((1, 3)), sign)[0]
+
+
+@cache
+def _mixture() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cumulative weights (K,), means (K, 27) and Cholesky factors (K, 27, 27), degrees."""
+    with resources.files("lidarpose.body").joinpath("assets/motion_prior.npz").open("rb") as file:
+        stored = dict(np.load(file, allow_pickle=False))
+    weights = stored["weights"].astype(float)
+    roots = np.zeros((len(weights), len(ANGLES), len(ANGLES)))
+    roots[:, *_LOWER] = stored["roots"]
+    cumulative = np.cumsum(weights / weights.sum())
+    cumulative[-1] = 1.0
+    return cumulative, stored["means"].astype(float), roots

@@ -1,0 +1,185 @@
+"""Who the person is: body shapes with the mix of a street, and the clothes on them.
+
+Shapes come from the rig's table of sampled people. The table's source has too many thin adults, so rows are drawn
+with weights that bring heights and BMI near those of real adults, then mixed with a similar row so that no two people
+are the same.
+
+n people, V vertices. Lengths in metres.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from lidarpose.body.rig import load_rig
+from lidarpose.skeleton import BODY26, SMPL24
+
+CHILD_SHARE = 0.12
+ADULT_AGE = 18.0
+
+# adult stature (mean, deviation) in m: chosen a little below US means, for streets of several continents
+HEIGHT = {"male": (1.74, 0.075), "female": (1.615, 0.070)}
+# adult BMI, log-normal (median in kg/m2, deviation of the logarithm): chosen, 5th to 95th percentile about 18 to 33
+BMI = {"male": (25.0, 0.16), "female": (24.5, 0.19)}
+# streets see fewer of the old (chosen): full share until 60 years, 40 % at 80
+OLD_FROM, OLD_TO, OLD_SHARE = 60.0, 80.0, 0.4
+# no row of the table is drawn more often than this many times its equal share
+WEIGHT_CAP = 6.0
+# a person is a row of the table mixed with one of its nearest rows, the first counting at least half
+NEIGHBORS = 8
+
+MAX_CLOTHING = 0.04
+
+
+@dataclass(frozen=True, kw_only=True)
+class People:
+    """n people: coefficients (n, S) float32 for `Rig.rest`, sex (n,) "female" or "male", age (n,) years, height (n,) m,
+    bmi (n,) kg/m2."""
+
+    coefficients: np.ndarray
+    sex: np.ndarray
+    age: np.ndarray
+    height: np.ndarray
+    bmi: np.ndarray
+
+
+def sample_people(rng: np.random.Generator, n: int) -> People:
+    """n people: 88 % adults of 18 to 80 years, 12 % children of 4 to 18, half of them female."""
+    rig = load_rig()
+    weight, near = _table()
+    first = rng.choice(len(weight), size=n, p=weight)
+    second = near[first, rng.integers(0, near.shape[1], n)]
+    share = rng.uniform(0.0, 0.5, n).astype(np.float32)
+
+    def mix(table: np.ndarray) -> np.ndarray:
+        s = share.reshape(-1, *[1] * (table.ndim - 1))
+        return (1 - s) * table[first] + s * table[second]
+
+    return People(
+        coefficients=mix(rig.coefficients),
+        sex=rig.sex[first],
+        age=mix(rig.age),
+        height=mix(rig.height),
+        bmi=mix(rig.bmi),
+    )
+
+
+@cache
+def _table() -> tuple[np.ndarray, np.ndarray]:
+    """Probability (N,) of each row of the rig's table, and its nearest rows (N, NEIGHBORS) of the same sex."""
+    rig = load_rig()
+    adult, log_bmi = rig.age >= ADULT_AGE, np.log(rig.bmi)
+    weight = np.where(adult, np.interp(rig.age, [OLD_FROM, OLD_TO], [1.0, OLD_SHARE]), 1.0)
+    near = np.empty((len(weight), NEIGHBORS), int)
+    for sex in ("male", "female"):
+        for grown in (True, False):
+            group = np.flatnonzero((rig.sex == sex) & (adult == grown))
+            if grown:
+                median, spread = BMI[sex]
+                weight[group] *= _ratio(rig.height[group], *HEIGHT[sex])
+                weight[group] *= _ratio(log_bmi[group], np.log(median), spread)
+            weight[group] = np.minimum(weight[group], WEIGHT_CAP * weight[group].mean())
+            weight[group] *= (1 - CHILD_SHARE if grown else CHILD_SHARE) / 2 / weight[group].sum()
+            # one unit each: 5 cm, 10 % of BMI, 15 years (3 for children, who change faster)
+            place = np.stack(
+                [rig.height[group] / 0.05, log_bmi[group] / 0.1, rig.age[group] / (15 if grown else 3)], -1
+            )
+            apart = ((place[:, None] - place) ** 2).sum(-1)
+            np.fill_diagonal(apart, np.inf)
+            near[group] = group[np.argsort(apart, 1)[:, :NEIGHBORS]]
+    return weight / weight.sum(), near
+
+
+def _ratio(value: np.ndarray, mean: float, spread: float) -> np.ndarray:
+    """Density of a normal distribution over that of the normal distribution fitted to `value`."""
+    target = (value - mean) / spread
+    found = (value - value.mean()) / value.std()
+    return np.exp((found**2 - target**2) / 2)
+
+
+def clothing(rng: np.random.Generator, n: int) -> np.ndarray:
+    """How far clothes, hair and shoes stand off the skin along its normals: (n, V) float32 m in [0, 0.04].
+
+    Smooth over the body. A torso's mean is about 1.5 cm; a tenth of the people wear next to nothing, a tenth bulky
+    coats; hands and faces stay bare but for a few gloves.
+    """
+    dense, scalp, place = _regions()
+    strength = _outfit(rng, n)
+    offset = strength @ dense.T
+    hair = rng.uniform(0.0, 0.03, (n, 1)) + rng.choice([0.0, 0.012], (n, 1), p=[0.8, 0.2])
+    offset += hair.astype(np.float32) * scalp
+    # folds: a few waves of 15 to 60 cm length that thicken and thin the cloth by about a quarter
+    waves = 4
+    direction = rng.normal(size=(n, waves, 3))
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True) * rng.uniform(0.15, 0.6, (n, waves, 1))
+    phase = rng.random((n, waves))
+    _fold(place, direction.astype(np.float32), phase.astype(np.float32), offset)
+    return np.clip(offset, 0, MAX_CLOTHING)
+
+
+# how much a wave of folds thickens cloth
+_FOLD = np.float32(0.18)
+
+
+def _fold(place: np.ndarray, direction: np.ndarray, phase: np.ndarray, offset: np.ndarray) -> None:
+    """Thickens offset (n, V) in place by waves; see `rig_numba.folds_of_people`."""
+    try:
+        from lidarpose.body.rig_kernels import folds_of_people
+    except ImportError:
+        _fold_reference(place, direction, phase, offset)
+    else:
+        folds_of_people(place, direction, phase, _FOLD, offset)
+
+
+def _fold_reference(place: np.ndarray, direction: np.ndarray, phase: np.ndarray, offset: np.ndarray) -> None:
+    """`_fold` in numpy."""
+    turns = direction @ place.T + phase[..., None]
+    u = turns - np.floor(turns) - np.float32(0.5)
+    offset *= 1 + _FOLD * (8 * u * (1 - 2 * np.abs(u))).sum(1)
+
+
+@cache
+def _regions() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Dense weights (V, 24), hair's share of each vertex (V,), and the mean body's vertices (V, 3)."""
+    rig = load_rig()
+    dense = rig.dense_weight
+    from_center = rig.template - rig.joint_template[BODY26.index("head_center")]
+    # hair: above and behind a plane that rises forwards from below the ears to the brow, 4 cm of transition
+    behind = from_center @ np.array([-0.6, 0.0, 0.8], np.float32)
+    scalp = np.clip(behind / 0.04 + 0.5, 0, 1) * dense[:, SMPL24.index("head")]
+    return dense, scalp.astype(np.float32), rig.template
+
+
+def _outfit(rng: np.random.Generator, n: int) -> np.ndarray:
+    """(n, 24) float32 m: what a person wears on each joint's part of the body."""
+    top = _pick(rng, n, [0.12, 0.40, 0.36, 0.12], [(0.0, 0.005), (0.006, 0.018), (0.014, 0.028), (0.026, 0.038)])
+    thick = top > 0.014
+    sleeve = top * np.where(thick | (rng.random(n) < 0.4), rng.uniform(0.5, 0.9, n), 0.0)
+    leg_kind = rng.choice(4, size=n, p=[0.22, 0.52, 0.13, 0.13])
+    tight, shorts, skirt = leg_kind == 0, leg_kind == 2, leg_kind == 3
+    thigh = np.select(
+        [tight, skirt],
+        [rng.uniform(0.001, 0.006, n), rng.uniform(0.015, 0.035, n)],
+        rng.uniform(0.008, 0.02, n),
+    )
+    shank = np.select([tight, shorts, skirt], [thigh, 0.0, 0.0], thigh * rng.uniform(0.8, 1.4, n))
+    shank = np.where(skirt & (rng.random(n) < 0.3), thigh, shank)
+    # long coats reach over the thighs
+    thigh = np.where((top > 0.024) & (rng.random(n) < 0.6), np.maximum(thigh, 0.9 * top), thigh)
+    neck = np.where(rng.random(n) < 0.15, rng.uniform(0.01, 0.03, n), 0.3 * top)
+    glove = np.where(thick & (rng.random(n) < 0.2), rng.uniform(0.002, 0.006, n), 0.0)
+    shoe = rng.uniform(0.004, 0.014, n)
+    worn = {
+        "pelvis": np.maximum(0.9 * top, 0.8 * thigh), "hip": thigh, "knee": shank, "ankle": shoe, "foot": shoe,
+        "spine1": 1.05 * top, "spine2": top, "spine3": 0.9 * top, "neck": neck, "collar": 0.8 * top,
+        "shoulder": np.maximum(0.75 * top, sleeve), "elbow": sleeve, "wrist": glove, "hand": glove,
+    }  # fmt: skip
+    nothing = np.zeros(n)
+    return np.stack([worn.get(name.split("_")[-1], nothing) for name in SMPL24.joints], -1).astype(np.float32)
+
+
+def _pick(rng: np.random.Generator, n: int, shares: list[float], ranges: list[tuple[float, float]]) -> np.ndarray:
+    """(n,) values, uniform within one of the ranges, which are chosen by their shares."""
+    low, high = np.array(ranges)[rng.choice(len(shares), size=n, p=shares)].T
+    return rng.uniform(low, high)

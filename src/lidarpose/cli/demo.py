@@ -1,0 +1,107 @@
+"""`lidarpose demo`: people that three LiDARs see, predicted with the bundled weights, beside the truth."""
+
+import time
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from lidarpose.errors import InputError, MissingExtra
+from lidarpose.inference.predict_file import TTA
+from lidarpose.inference.predictor import Predictor, load
+from lidarpose.io.files import atomic_path, check_writable
+from lidarpose.models.bundled import DEFAULT
+
+SENSORS = ("vlp-32c", "os1-128", "hdl-64e")
+PEOPLE_EACH = 4
+# milder than what the network learned from, so that most people can be seen by eye
+_HARD = 0.4
+
+
+def run(folder: str | Path, *, seed: int, weights: str = DEFAULT) -> None:
+    """Synthesizes, predicts, prints a table, and writes index.html and a PNG a sensor to `folder`, all or none.
+
+    Raises MissingExtra without numba; InputError for a negative seed or a folder that cannot be written.
+    """
+    if seed < 0:
+        raise InputError(f"expected a seed of at least 0, got {seed}")
+    try:
+        from lidarpose.synth.generator import Generator
+        from lidarpose.synth.scene import scene_config
+    except MissingExtra:
+        raise MissingExtra("the demo synthesizes people and", "synth") from None
+    folder = Path(folder)
+    names = ["index.html", *(f"{name}.png" for name in SENSORS)]
+    # a folder without write access is known at once; files are opened when there is something to write, since whoever
+    # is killed leaves them
+    for name in names:
+        check_writable(folder / name)
+    model = load(weights, tta=TTA)
+    print("synthesizing people (the first time compiles the ray caster: some ten seconds) ...", flush=True)
+    scene = scene_config("wild").eased(_HARD)
+    people = []
+    for k, name in enumerate(SENSORS):
+        generator = Generator(scene=replace(scene, sensors=(name,), distance=(3.0, 20.0)))
+        people += [generator.person(seed, k * PEOPLE_EACH + i) for i in range(PEOPLE_EACH)]
+    rows, contents = _report(model, people)
+    with ExitStack() as stack:
+        for name, content in contents.items():
+            stack.enter_context(atomic_path(folder / name)).write_bytes(content)
+    print(_table(rows))
+    print(f"open {folder / 'index.html'} to turn the people in 3D; pictures: {folder}/*.png")
+
+
+def _report(model: Predictor, people: list) -> tuple[list[dict], dict[str, bytes]]:
+    """Predicts synthetic people. Returns the table's rows, and the report and the pictures by their files' names."""
+    from lidarpose.viz.draw import Panel, draw_people
+    from lidarpose.viz.html import ReportPerson, render_report
+
+    clouds = [person.sample.points for person in people]
+    # the sensor of a sample is the origin of its frame; the first call warms the network up
+    model.predict(clouds[:2], sensor_origin=(0, 0, 0))
+    started = time.perf_counter()
+    poses = model.predict(clouds, sensor_origin=(0, 0, 0))
+    milliseconds = (time.perf_counter() - started) * 1e3 / len(people)
+
+    rows, panels, cards = [], [], []
+    for person, pose in zip(people, poses, strict=True):
+        truth = person.sample.pose.to(pose.skeleton)
+        error = float(np.linalg.norm(pose.joints - truth.joints, axis=-1).mean() * 1e3)
+        facts = person.facts
+        label = f"{facts.sensor}, {facts.distance:.1f} m"
+        rows.append(
+            {
+                "LiDAR": facts.sensor,
+                "points": len(person.sample.points),
+                "distance m": round(facts.distance, 1),
+                "visible %": round(facts.visible * 100),
+                "MPJPE mm": round(error),
+                "ms a person": round(milliseconds, 1),
+            }
+        )
+        panels.append(Panel(points=person.sample.points, pose=pose.pose, truth=truth, label=label))
+        caption = f"{len(person.sample.points)} points, {facts.visible:.0%} visible, MPJPE {error:.0f} mm"
+        cards.append(
+            ReportPerson(label=label, points=person.sample.points, pose=pose.pose, truth=truth, caption=caption)
+        )
+    contents = {}
+    for k, name in enumerate(SENSORS):
+        shown = panels[k * PEOPLE_EACH : (k + 1) * PEOPLE_EACH]
+        contents[f"{name}.png"] = draw_people(shown, title=f"{name}: predicted, and the truth dashed")
+    title = "lidarpose demo: synthesized people, predicted and true"
+    contents["index.html"] = render_report(cards, title=title, summary=rows).encode()
+    return rows, contents
+
+
+def _table(rows: list[dict]) -> str:
+    """Rows of the same keys as text, numbers to the right."""
+    names = list(rows[0])
+    cells = [names] + [[str(row[name]) for name in names] for row in rows]
+    widths = [max(len(line[k]) for line in cells) for k in range(len(names))]
+    return "\n".join(
+        "  ".join(
+            f"{cell:<{w}}" if k == 0 else f"{cell:>{w}}" for k, (cell, w) in enumerate(zip(line, widths, strict=True))
+        )
+        for line in cells
+    )

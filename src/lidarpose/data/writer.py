@@ -1,0 +1,159 @@
+"""Shards by several processes, restartable: what is missing of a folder, who makes it, and what killed runs left.
+
+Behind `lidarpose synth` and `prepare`. A shard is written whole or not at all, and its content depends on the settings
+and its number alone. So nothing else need be remembered: what is missing is made, whoever makes it, and the folder ends
+up the same byte for byte.
+"""
+
+import multiprocessing
+import os
+import re
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, suppress
+from pathlib import Path
+
+from lidarpose.data.schema import TABLES
+from lidarpose.data.shards import CARD, Card, check_settings, read_card, rows_of_shard, shard_path
+from lidarpose.errors import InputError
+from lidarpose.io.files import file_error
+
+# makes and writes a shard, by its number; yields how many people, clips or streets are done since it last did
+Make = Callable[[int], Iterator[int]]
+
+# how often progress is told, s
+_TICK = 0.5
+# a temporary file nobody wrote to for so long is of a run that is no more, s
+_STALE = 600.0
+# the temporary names of `files.atomic_path`
+_LEFT = re.compile(rf"\.(\d+)-\d+-(?:(?:{'|'.join(TABLES)})-\d{{5}}\.parquet|{re.escape(CARD)})")
+
+
+def open_folder(folder: Path, card: Card, rows: Mapping[str, int] | None = None) -> list[int]:
+    """The numbers of the shards that are missing, damaged or, by `rows`, not whole.
+
+    rows: by table, how many rows each one of `card.count` has, where that is known. Raises InputError unless the folder
+    is missing, empty or of this very dataset.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise file_error(folder, "is a file; give a folder for the dataset")
+    if (folder / CARD).is_file():
+        check_settings(folder, read_card(folder), card)
+    elif folder.is_dir() and any(not _LEFT.fullmatch(path.name) for path in folder.iterdir()):
+        raise file_error(folder, f"holds other files and no {CARD}; give a new or empty folder for the dataset")
+    return [shard for shard in range(card.shards) if not _is_whole(folder, card, shard, rows or {})]
+
+
+def _is_whole(folder: Path, card: Card, shard: int, rows: Mapping[str, int]) -> bool:
+    for table in card.tables:
+        found = rows_of_shard(shard_path(folder, table, shard))
+        if found is None or table in rows and found != rows[table] * card.size(shard):
+            return False
+    return True
+
+
+def clean_folder(folder: Path) -> None:
+    """Removes temporary files whose process is gone, or that nobody wrote to for long."""
+    for path in folder.iterdir() if folder.is_dir() else ():
+        left = _LEFT.fullmatch(path.name)
+        with suppress(OSError):
+            # a number of a process may have been given to another one
+            if left and (not _is_alive(int(left[1])) or time.time() - path.stat().st_mtime > _STALE):
+                path.unlink()
+
+
+def _is_alive(process: int) -> bool:
+    if process == os.getpid():
+        return False
+    if os.name != "posix":
+        # asking would end it there
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def make_shards(make: Make, shards: list[int], *, workers: int = 1) -> Iterator[tuple[int, int]]:
+    """Makes shards, here or in other processes; yields how many shards, and how many of what `make` counts, are done
+    since it last did.
+
+    With several workers `make` is pickled once for each; they end with this process, however it ends. Raises what
+    `make` raises, and InputError where a worker dies.
+    """
+    workers = min(workers, len(shards))
+    if workers > 1:
+        yield from _by_processes(make, shards, workers)
+        return
+    for shard in shards:
+        with closing(_counts(make, shard)) as counts:
+            for count in counts:
+                yield 0, count
+        yield 1, 0
+
+
+def _by_processes(make: Make, shards: list[int], workers: int) -> Iterator[tuple[int, int]]:
+    # a fresh interpreter: threads and open files of this one are none of theirs
+    context = multiprocessing.get_context("spawn")
+    done, stop = context.Value("q", 0), context.Event()
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_start, initargs=(make, done, stop)) as pool:
+        try:
+            told, waiting = 0, {pool.submit(_shard, shard) for shard in shards}
+            while waiting:
+                ready, waiting = wait(waiting, timeout=_TICK, return_when=FIRST_COMPLETED)
+                for future in ready:
+                    future.result()
+                now = done.value
+                yield len(ready), now - told
+                told = now
+        except BrokenProcessPool:
+            raise InputError(
+                f"a worker process died, of {workers}: give fewer --workers if memory ran out; "
+                "the same command goes on where it stopped"
+            ) from None
+        finally:
+            stop.set()
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+# of a worker process: what makes a shard, the count of what all have done, and whether to stop
+_mine: tuple = ()
+
+
+def _start(make: Make, done, stop) -> None:
+    global _mine
+    # the parent says when to stop
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_leave_with_parent, daemon=True).start()
+    _mine = (make, done, stop)
+
+
+def _leave_with_parent() -> None:
+    multiprocessing.parent_process().join()
+    os._exit(1)
+
+
+def _shard(shard: int) -> None:
+    make, done, stop = _mine
+    with closing(_counts(make, shard)) as counts:
+        for count in counts:
+            with done.get_lock():
+                done.value += count
+            if stop.is_set():
+                return
+
+
+def _counts(make: Make, shard: int) -> Iterator[int]:
+    """As `make`, on one thread: in products of a few thousand numbers threads of BLAS only get in each other's way.
+    What `make` does before it returns, such as reading what all shards need, has them all."""
+    from threadpoolctl import threadpool_limits
+
+    with closing(make(shard)) as counts, threadpool_limits(limits=1, user_api="blas"):
+        yield from counts

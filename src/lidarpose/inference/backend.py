@@ -1,0 +1,172 @@
+"""What runs a network: from people's points to raw outputs as arrays. This file needs no torch.
+
+Legend: B people, J joints, W bins of a heatmap.
+
+A backend has a `name`, the network's `header`, `batch` (people a call) and `run(clouds, view)`. There are two: ONNX
+Runtime, here, and torch (`backend_torch`).
+"""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from lidarpose.errors import whole
+from lidarpose.io.files import content_digest, file_error
+from lidarpose.models.config import BIN
+from lidarpose.models.decode import Decoder, out_of_range
+from lidarpose.models.header import Header, read_header
+from lidarpose.models.onnx import OUTPUTS, input_name, network_inputs, open_onnx, plan_people
+from lidarpose.sample import HIT
+
+# people a call; more fill the memory without being faster
+_BATCH = 64
+# log of the largest spread that is told, m: an untrained network may say anything
+_LARGEST_LOG_SPREAD = 5.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Raw:
+    """A network's outputs in the person's frame, joints in the order of its skeleton.
+
+    vote (B, J, 3) m: where the heatmaps' origin lies; heatmaps: logits (B, J, W) of x, y and z, None for a network
+    without; low, step (3,) m: where bin 0 of each axis lies about the vote and how far apart bins are. Of networks that
+    say so: confidence (B, J) logit of an error under `HIT`, log_spread (B, J) log of the expected error in m, visible
+    (B, J) logit of being seen.
+    """
+
+    vote: np.ndarray
+    heatmaps: tuple[np.ndarray, ...] | None
+    low: np.ndarray
+    step: np.ndarray
+    confidence: np.ndarray | None = None
+    log_spread: np.ndarray | None = None
+    visible: np.ndarray | None = None
+
+    @classmethod
+    def from_pose(cls, outputs: dict[str, np.ndarray]) -> "Raw":
+        """From the outputs of a `PoseNet` by name."""
+        heatmap = outputs["heatmap"]
+        bins = heatmap.shape[-1]
+        return cls(
+            vote=outputs["vote"],
+            heatmaps=tuple(heatmap[:, :, axis] for axis in range(3)) if bins else None,
+            # bins are known by their middles
+            low=np.full(3, (0.5 - bins / 2) * BIN),
+            step=np.full(3, BIN),
+            confidence=outputs["confidence"],
+            log_spread=outputs["log_spread"],
+            visible=outputs["visible"],
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Estimates:
+    """Joints of B people about their centers: joints (B, J, 3) m, confidence (B, J), spread (B, J) m, visible (B, J),
+    in_range (B, J) bool, as in `Pose`; None for what the network does not say."""
+
+    joints: np.ndarray
+    confidence: np.ndarray | None
+    spread: np.ndarray | None
+    visible: np.ndarray | None
+    in_range: np.ndarray | None
+
+
+class Backend(Protocol):
+    """clouds: B arrays (n, 3) m, each about its person's center, n = 0 is legal; view (B, 5): see `plan.Plan`."""
+
+    name: str
+    header: Header
+    batch: int
+
+    def run(self, clouds: list[np.ndarray], view: np.ndarray) -> Raw: ...
+
+
+class OnnxBackend:
+    """A file that `lidarpose export` wrote, run by ONNX Runtime on the CPU. threads: None for all usable ones."""
+
+    name = "onnx"
+    batch = _BATCH
+
+    def __init__(self, path: str | os.PathLike, *, threads: int | None = None):
+        if threads is not None:
+            threads = whole("threads", threads, least=1)
+        self._opened = {"path": os.path.abspath(path), "threads": threads}
+        self.session, self.header, self.source = open_onnx(path, threads=threads)
+        # parts are of no use here: what is not asked for is not computed
+        self._outputs = [name for name in OUTPUTS if name != "part"]
+
+    def __getstate__(self) -> dict:
+        # a session cannot go to another process, which opens the file anew
+        return self._opened
+
+    def __setstate__(self, state: dict) -> None:
+        self.__init__(**state)
+
+    def run(self, clouds: list[np.ndarray], view: np.ndarray) -> Raw:
+        inputs = network_inputs(plan_people(clouds, view, self.header.config))
+        values = self.session.run(self._outputs, {input_name(name): array for name, array in inputs.items()})
+        return Raw.from_pose(dict(zip(self._outputs, values, strict=True)))
+
+
+def exported_beside(path: str | os.PathLike, *, threads: int | None = None) -> OnnxBackend:
+    """The backend of the .onnx file beside a checkpoint.
+
+    Raises InputError where there is none, or it was made from other weights.
+    """
+    path = Path(path)
+    header = read_header(path)
+    if header.network != "pose":
+        raise file_error(path, "the paper's network does not run as ONNX: leave --backend away, or say torch")
+    beside = path.with_suffix(".onnx")
+    make = f"make it with `lidarpose export {path} --out {beside}`, or use --backend torch"
+    if not beside.is_file():
+        raise file_error(path, f"ONNX Runtime needs {beside.name} beside it, which does not exist: {make}")
+    backend = OnnxBackend(beside, threads=threads)
+    if backend.source != content_digest(path, expected="a checkpoint"):
+        raise file_error(beside, f"made from other weights than {path.name} beside it: {make}")
+    return backend
+
+
+def estimates(raw: Raw, decoder: Decoder) -> Estimates:
+    """Joints and what is known of them from raw outputs; `decoder` reads the heatmaps."""
+    joints, in_range = raw.vote.astype(float), None
+    if raw.heatmaps is not None:
+        joints = joints + _decoded(raw, decoder)
+        # a vote can be too far off on any axis
+        in_range = ~np.any([out_of_range(heatmap) for heatmap in raw.heatmaps], axis=0)
+    confidence = None if raw.confidence is None else _probability(raw.confidence)
+    spread = None if raw.log_spread is None else np.exp(np.minimum(raw.log_spread.astype(float), _LARGEST_LOG_SPREAD))
+    if confidence is None and raw.heatmaps is not None:
+        confidence, spread = _from_heatmaps(raw, joints - raw.vote)
+    visible = None if raw.visible is None else _probability(raw.visible)
+    return Estimates(joints=joints, confidence=confidence, spread=spread, visible=visible, in_range=in_range)
+
+
+def _decoded(raw: Raw, decoder: Decoder) -> np.ndarray:
+    """(B, J, 3) m about the vote."""
+    axes = zip(raw.heatmaps, raw.low, raw.step, strict=True)
+    return np.stack([decoder(heatmap, low=low, step=step) for heatmap, low, step in axes], -1)
+
+
+def _from_heatmaps(raw: Raw, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Confidence and spread (B, J) of a network that tells neither, from its heatmaps about `offset` (B, J, 3) m.
+
+    Confidence is the share of the heatmaps within `HIT` of the joint, axes taken as independent; spread the root of
+    their mean square distance. Neither is calibrated.
+    """
+    share, square = 1.0, 0.0
+    for axis, heatmap in enumerate(raw.heatmaps):
+        weight = np.exp(heatmap.astype(float) - heatmap.max(-1, keepdims=True))
+        weight /= weight.sum(-1, keepdims=True)
+        distance = raw.low[axis] + np.arange(heatmap.shape[-1]) * raw.step[axis] - offset[..., axis, None]
+        share = share * np.clip((weight * (np.abs(distance) < HIT)).sum(-1), 0, 1)
+        square = square + (weight * distance**2).sum(-1)
+    return share, np.sqrt(square)
+
+
+def _probability(logit: np.ndarray) -> np.ndarray:
+    # as a logistic function, without overflow
+    return 0.5 * (1 + np.tanh(0.5 * logit.astype(float)))

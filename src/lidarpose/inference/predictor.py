@@ -1,0 +1,254 @@
+"""`load` a network and `predict` poses of clouds: any number type, one or many, empty ones too."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from lidarpose.errors import InputError, check_name, missing_extra, whole
+from lidarpose.inference.backend import Backend, Estimates, OnnxBackend, estimates, exported_beside
+from lidarpose.inference.inputs import as_origin, as_points, candidates, clean, is_few, unit_warning
+from lidarpose.inference.results import PersonPose, Poses
+from lidarpose.inference.tta import Look, averaged, brought_back, looks_of, shown
+from lidarpose.io.files import file_error
+from lidarpose.models.bundled import BUNDLED, DEFAULT, weights_path
+from lidarpose.models.decode import decoder
+from lidarpose.models.header import read_header
+from lidarpose.models.voxelize import WINDOW
+from lidarpose.sample import MIN_POINTS, PER_JOINT, Pose, center_of
+from lidarpose.skeleton import SMPL24, Skeleton
+from lidarpose.skeleton import skeleton as skeleton_of
+
+BACKENDS = ("onnx", "torch")
+# passes: the second is centered on the pelvis that the first one found
+PASSES = 2
+# to which a found center is rounded, m: backends differ by less than a micrometre, and a point on the border of a voxel
+# must not fall on another side for that
+_CENTER_STEP = 0.01
+# joints named by a warning
+_MOST_NAMED = 3
+
+
+def load(
+    weights: str | os.PathLike = DEFAULT,
+    *,
+    device: str = "cpu",
+    backend: str | None = None,
+    decode: str = "window",
+    compile: bool = False,
+    threads: int | None = None,
+    tta: int = 1,
+) -> "Predictor":
+    """The bundled network, or the checkpoint or exported file at a path, ready to predict.
+
+    backend: "onnx" (ONNX Runtime, on the CPU) or "torch"; None takes onnx for bundled weights and .onnx files, torch
+    for other paths and devices. decode: how heatmaps are read, "window" (the mean about the mode), "argmax" or "dark"
+    (the released DAPT code's); where two peaks are equally high, rounding decides. compile: by `torch.compile`, backend
+    torch only. threads: of ONNX Runtime, None for all processors; backend onnx only. tta: test-time augmentation, the
+    number of looks at each person (1 to 8), averaged. A person costs one pass to center the cloud and one pass a look,
+    so 1 look takes two passes, 4 looks five. Raises InputError for an unknown name, a file that is no checkpoint, or a
+    device that is not there; MissingExtra where torch is needed and not installed.
+    """
+    decoder(decode)
+    looks_of(tta)
+    if threads is not None:
+        threads = whole("threads", threads, least=1)
+    if backend is not None:
+        check_name("backend", backend, BACKENDS)
+    path = weights_path(weights)
+    bundled = os.fspath(weights) in BUNDLED
+    exported = path.suffix.lower() == ".onnx"
+    if backend is None:
+        elsewhere = device != "cpu" or compile
+        backend = "onnx" if exported or bundled and not elsewhere else "torch"
+    if backend == "torch":
+        if exported:
+            raise file_error(path, "torch runs a .safetensors file, not .onnx: name the one that it was made from")
+        if threads is not None:
+            raise InputError("threads are of the backend onnx: for torch call torch.set_num_threads")
+        chosen = _torch_backend(path, device, compile)
+    else:
+        if device != "cpu" or compile:
+            asked = "torch.compile" if compile else f"device {device!r}"
+            raise InputError(f"{asked} needs the backend torch and a .safetensors file, got the backend onnx")
+        if bundled:
+            path = path.with_suffix(".onnx")
+        chosen = OnnxBackend(path, threads=threads) if bundled or exported else exported_beside(path, threads=threads)
+    return Predictor(chosen, name=path.stem, decode=decode, tta=tta)
+
+
+def _torch_backend(path: Path, device: str, compile: bool) -> Backend:
+    # what is wrong with the file is told even where torch is not installed, and at once
+    read_header(path)
+    try:
+        from lidarpose.inference.torch_backend import torch_backend
+    except ModuleNotFoundError as error:
+        raise missing_extra(error, f"running {path.name} with torch") from None
+    return torch_backend(path, device=device, compile=compile)
+
+
+class Predictor:
+    """A network ready to use. `predict` is kind; `outputs` is raw, of one look. model: what results tell of it."""
+
+    def __init__(self, backend: Backend, *, name: str, decode: str = "window", tta: int = 1):
+        self.backend = backend
+        self.header = backend.header
+        self.skeleton = backend.header.skeleton
+        self.model = {"name": name, "version": self.header.version, "backend": backend.name, "decode": decode}
+        if tta > 1:
+            self.model["tta"] = tta
+        self._decoder, self._tta, self._passes = decoder(decode), looks_of(tta), PASSES
+        # the middle of a person: the pelvis, or half way between the hips where the skeleton has none
+        root = ("pelvis",) if "pelvis" in self.skeleton.joints else ("left_hip", "right_hip")
+        self._root = [self.skeleton.index(joint) for joint in root]
+
+    def in_skeleton(self, name: str | None) -> Skeleton:
+        """A skeleton by name; None is smpl24 where the network has its joints, else the network's own.
+
+        Raises InputError for an unknown name, or one of a joint that the network lacks.
+        """
+        own = self.skeleton
+        if name is None:
+            return SMPL24 if set(SMPL24.joints) <= set(own.joints) else own
+        wanted = skeleton_of(name)
+        own.map_to(wanted)
+        return wanted
+
+    def predict(
+        self,
+        points,
+        *,
+        sensor_origin: np.ndarray | tuple[float, float, float] | str | None = None,
+        skeleton: str | None = None,
+        progress: bool = False,
+    ) -> PersonPose | Poses:
+        """One cloud (n, 3+) -> `PersonPose`; a list of clouds -> `Poses`, in their order.
+
+        points: x, y, z in metres, z up, any frame, each cloud one person, ground and clutter allowed; more columns are
+        ignored, those of tables and records are taken by name. sensor_origin (3,) m: where the sensor stood in that
+        frame, None or "unknown" if that is not known. skeleton: see `in_skeleton`. A cloud of under 5 different points
+        gets a result without joints and a warning. Raises InputError for arrays of another shape or type.
+        """
+        wanted = self.in_skeleton(skeleton)
+        origin = as_origin(sensor_origin)
+        if not _is_many(points):
+            return self._people([as_points(points)], origin, wanted, False)[0]
+        clouds = [as_points(cloud, f"points[{i}]") for i, cloud in enumerate(points)]
+        people = self._people(clouds, origin, wanted, progress)
+        return Poses(people=tuple(people), skeleton=wanted, model=self.model)
+
+    def _people(self, clouds, origin, wanted, progress) -> list[PersonPose]:
+        cleaned = [clean(cloud) for cloud in clouds]
+        results = [
+            PersonPose(pose=None, skeleton=wanted, points=points, warnings=tuple(notes), model=self.model)
+            for points, notes in cleaned
+        ]
+        clouds, owner = [], []
+        for i, (points, _) in enumerate(cleaned):
+            if is_few(points):
+                points_of = "points" if len(points) < MIN_POINTS else "different points"
+                results[i] = _warned(results[i], f"no pose: under {MIN_POINTS} {points_of}")
+                continue
+            if warning := unit_warning(np.ptp(points, axis=0), what="the person"):
+                results[i] = _warned(results[i], warning)
+            found = candidates(points)
+            clouds += found
+            owner += [i] * len(found)
+        answers: list[Pose | None] = [None] * len(clouds)
+        batch = self.backend.batch
+        # people of like size together: a batch costs as much as if all were its largest
+        order = sorted(range(len(clouds)), key=lambda k: len(clouds[k]))
+        for start in _shown(range(0, len(clouds), batch), progress):
+            part = order[start : start + batch]
+            for k, pose in zip(part, self._poses([clouds[k] for k in part], origin), strict=True):
+                answers[k] = pose
+        best: dict[int, Pose] = {}
+        # a person's first candidate is the whole cloud
+        for i, pose in zip(owner, answers, strict=True):
+            if pose is not None and (i not in best or _surer(pose, best[i])):
+                best[i] = pose
+        for i in sorted(set(owner)):
+            if i in best:
+                results[i] = replace(results[i], pose=best[i].to(wanted))
+                if names := results[i].out_of_range:
+                    results[i] = _warned(results[i], _range_warning(names))
+            else:
+                note = f"no pose: under {MIN_POINTS} points within {WINDOW:.0f} m of the person's middle"
+                results[i] = _warned(results[i], note)
+        return results
+
+    def _poses(self, clouds: list[np.ndarray], origin: np.ndarray | None) -> list[Pose | None]:
+        """The pose of each cloud (n, 3) m, None where too little of it is near its middle."""
+        centers = np.stack([center_of(points) for points in clouds])
+        for _ in range(self._passes - 1):
+            root = self.outputs(clouds, centers, origin).joints[:, self._root].mean(1)
+            # an answer that is no number stays one
+            centers = centers + np.round(np.clip(root, -WINDOW / 2, WINDOW / 2) / _CENTER_STEP) * _CENTER_STEP
+        found = self._looks(clouds, centers, origin)
+        poses = []
+        for k, points in enumerate(clouds):
+            near = (np.abs(points - centers[k]) < WINDOW).all(1).sum()
+            if near < MIN_POINTS or not np.isfinite(found.joints[k]).all():
+                poses.append(None)
+                continue
+            values = {name: getattr(found, name) for name in PER_JOINT}
+            told = {name: None if value is None else value[k] for name, value in values.items()}
+            poses.append(Pose(joints=found.joints[k] + centers[k], skeleton=self.skeleton, **told))
+        return poses
+
+    def outputs(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Estimates:
+        """What the network says of clouds (n, 3) m seen about centers (B, 3), from a sensor at origin (3,) or None."""
+        return self._look(Look(), clouds, centers, origin)
+
+    def _looks(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Estimates:
+        """The mean of all looks, of which the first is the plain one."""
+        others = [self._look(look, clouds, centers, origin) for look in self._tta[1:]]
+        return averaged([self.outputs(clouds, centers, origin), *others])
+
+    def _look(self, look: Look, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Estimates:
+        about, view = shown(look, clouds, centers, origin)
+        found = estimates(self.backend.run(about, view), self._decoder)
+        return brought_back(found, look, self.skeleton)
+
+
+def _shown(starts: range, progress: bool):
+    """The same with a progress bar, if it takes longer than a second."""
+    if not progress:
+        return starts
+    from tqdm import tqdm
+
+    return tqdm(starts, unit=" batches", delay=1, leave=False)
+
+
+def _surer(pose: Pose, best: Pose) -> bool:
+    """A network that does not tell its confidence has its first answer, that of the whole cloud, taken."""
+    return pose.confidence is not None and pose.confidence.mean() > best.confidence.mean()
+
+
+def _range_warning(names: list[str]) -> str:
+    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+    return (
+        f"at the end of the heatmap's range, so perhaps farther out than given: {', '.join(names[:_MOST_NAMED])}{more}"
+    )
+
+
+def _is_many(points) -> bool:
+    """A list of clouds, rather than one cloud, be it written as a list of rows."""
+    if isinstance(points, list | tuple):
+        return len(points) == 0 or not _is_row(points[0])
+    return getattr(points, "ndim", 0) == 3
+
+
+def _is_row(value) -> bool:
+    """One point: a flat list or array of numbers. Anything ragged is none, and what is empty is a cloud."""
+    if isinstance(value, list | tuple):
+        flat = not any(isinstance(entry, list | tuple) or getattr(entry, "ndim", 0) for entry in value)
+    else:
+        # records are a cloud
+        flat = getattr(value, "ndim", 0) == 1 and not getattr(getattr(value, "dtype", None), "names", None)
+    return flat and len(value) > 0
+
+
+def _warned(person: PersonPose, warning: str) -> PersonPose:
+    return replace(person, warnings=(*person.warnings, warning))

@@ -1,0 +1,98 @@
+"""Networks run by torch: any device, the paper's network too."""
+
+import os
+
+import numpy as np
+import torch
+
+from lidarpose.errors import InputError
+from lidarpose.inference.backend import Backend, Raw
+from lidarpose.models.checkpoint import load_checkpoint
+from lidarpose.models.export import PlanModule
+from lidarpose.models.header import Header
+from lidarpose.models.onnx import OUTPUTS, network_inputs, plan_people
+from lidarpose.models.voxelize import WINDOW
+
+# people a call; the paper's network is a hundred times as large
+_BATCH, _DAPT_BATCH = 64, 8
+
+
+def torch_backend(path: str | os.PathLike, *, device: str = "cpu", compile: bool = False) -> Backend:
+    """The backend of a checkpoint; compile: by `torch.compile`, which takes about a minute at the first call.
+
+    Raises InputError for a file that is no checkpoint, or a device that is not there.
+    """
+    network, header = load_checkpoint(path)
+    try:
+        network = network.to(device)
+        # there are devices, "meta", from which no number comes back
+        torch.zeros(1, device=device).cpu()
+    except (RuntimeError, AssertionError) as error:
+        # torch raises either, or a NotImplementedError, which is a RuntimeError, for an unknown or a missing device
+        reason = str(error).partition("\n")[0]
+        raise InputError(
+            f"device {device!r} cannot be used ({reason}); expected cpu, or cuda where torch has it"
+        ) from None
+    if header.network == "pose":
+        return TorchBackend(network, header, device=device, compile=compile)
+    if compile:
+        raise InputError("torch.compile is not offered for the paper's network: leave compile away")
+    return DaptBackend(network, header)
+
+
+class TorchBackend:
+    """A `PoseNet` that torch runs."""
+
+    name = "torch"
+    batch = _BATCH
+
+    def __init__(self, network: torch.nn.Module, header: Header, *, device: str = "cpu", compile: bool = False):
+        self.network = network.to(device).eval()
+        self.header = header
+        self.device = device
+        self._compile = compile
+        self._module = None
+
+    def __getstate__(self) -> dict:
+        # what torch compiled stays in its process
+        return {**self.__dict__, "_module": None}
+
+    @torch.inference_mode()
+    def run(self, clouds: list[np.ndarray], view: np.ndarray) -> Raw:
+        arrays = network_inputs(plan_people(clouds, view, self.header.config))
+        tensors = [torch.as_tensor(array).to(self.device) for array in arrays.values()]
+        if self._module is None:
+            module = PlanModule(self.network, tuple(arrays))
+            self._module = torch.compile(module, dynamic=True) if self._compile else module
+        try:
+            values = self._module(*tensors)
+        except torch._dynamo.exc.TorchDynamoException as error:
+            reason = " ".join(str(error).split())[:160]
+            raise InputError(f"torch.compile failed ({reason}): leave compile away") from None
+        return Raw.from_pose({name: value.cpu().numpy() for name, value in zip(OUTPUTS, values, strict=True)})
+
+
+class DaptBackend:
+    """The paper's network, its joints brought into the order of its skeleton. What it sees of a person is what this
+    package's own networks see, the points within `WINDOW`; it has no use for the sensor's place."""
+
+    name = "torch"
+    batch = _DAPT_BATCH
+
+    def __init__(self, network: torch.nn.Module, header: Header):
+        self.network = network.eval()
+        self.header = header
+
+    def run(self, clouds: list[np.ndarray], view: np.ndarray) -> Raw:
+        config = self.header.config
+        near = [cloud[(np.abs(cloud) < WINDOW).all(1)] for cloud in clouds]
+        out = self.network.outputs(near)
+        order = config.order_in(self.header.skeleton)
+        if "logits_x" not in out:
+            return Raw(vote=out["coordinates"][:, order], heatmaps=None, low=np.zeros(3), step=np.ones(3))
+        return Raw(
+            vote=np.zeros((len(clouds), len(order), 3), np.float32),
+            heatmaps=tuple(out[f"logits_{axis}"][:, order] for axis in "xyz"),
+            low=config.low,
+            step=config.step,
+        )

@@ -1,0 +1,291 @@
+"""Sizes of the paper's network, its joints and heatmaps, and the configurations by name. Numpy only.
+
+Legend: L levels (0 = the finest), J joints, W heatmap bins an axis.
+"""
+
+from dataclasses import asdict, dataclass, fields
+
+import numpy as np
+
+from lidarpose.errors import InputError, check_name
+from lidarpose.models.config import MOST
+from lidarpose.models.dapt.space_filling_curves import CURVES
+from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, Skeleton
+
+# the order in which the released Waymo network knows its joints: Waymo's own numbers, limb after limb
+WAYMO_JOINTS = tuple(
+    """nose left_shoulder left_elbow left_wrist left_hip left_knee left_ankle
+    right_shoulder right_elbow right_wrist right_hip right_knee right_ankle head_center""".split()
+)
+# SMPL's 24 parts and 0 = not body
+PARTS = 25
+# cells are counted in so many bits along each axis
+CELL_BITS = 16
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DaptConfig:
+    """The network: a Point Transformer V3 U-Net, joint anchors that read every level of its decoder, heads.
+
+    name: of the configuration; joints: names in the network's own order; bins, ranges: heatmap bins (W) and (low, high)
+    in metres for x, y and z, both empty where there are no heatmaps; encoder_*: one entry a level; decoder_*: one entry
+    a level but the last; anchor_channels: width of the anchors after each level's exchange, the last where they begin;
+    anchor_heads, anchor_dropout: of the exchanges; patch: voxels within which attention is full; grid: edge of a voxel
+    of level 0, metres; strides: how many times wider the next level's voxels are; orders: curves for people of more
+    than `patch` voxels; drop_path: the last block's; parts: classes of the part head, 0 for no such head; coordinates:
+    a head that reads x, y, z off each anchor (the paper's pre-training); auxiliary: a head that reads all joints off
+    the bottleneck (the released fine-tuning); legacy: True for the released weights, which need the data flow that they
+    were trained with (see `network`).
+    """
+
+    name: str
+    joints: tuple[str, ...]
+    bins: tuple[int, ...] = ()
+    ranges: tuple[Range, ...] = ()
+    encoder_depths: tuple[int, ...] = (2, 2, 2, 6, 2)
+    encoder_channels: tuple[int, ...] = (32, 64, 128, 256, 512)
+    encoder_heads: tuple[int, ...] = (2, 4, 8, 16, 32)
+    decoder_depths: tuple[int, ...] = (2, 2, 2, 2)
+    decoder_channels: tuple[int, ...] = (128, 128, 128, 256)
+    decoder_heads: tuple[int, ...] = (8, 8, 8, 16)
+    anchor_channels: tuple[int, ...] = (128, 128, 128, 256, 256)
+    anchor_heads: int = 4
+    anchor_dropout: float = 0.1
+    mlp_ratio: int = 4
+    patch: int = 1024
+    grid: float = 0.01
+    strides: tuple[int, ...] = (2, 2, 2, 2)
+    orders: tuple[str, ...] = ("z", "z-trans", "hilbert", "hilbert-trans")
+    drop_path: float = 0.3
+    parts: int = 0
+    coordinates: bool = False
+    auxiliary: bool = False
+    legacy: bool = False
+
+    def __post_init__(self):
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, list):
+                value = tuple(tuple(x) if isinstance(x, list) else x for x in value)
+                object.__setattr__(self, field.name, value)
+        self._check_sizes()
+        self._check_heads()
+
+    def _check_sizes(self) -> None:
+        levels = len(self.encoder_depths) if isinstance(self.encoder_depths, tuple) else 0
+        lengths = {"encoder_channels": levels, "encoder_heads": levels, "anchor_channels": levels}
+        lengths |= dict.fromkeys(("decoder_depths", "decoder_channels", "decoder_heads", "strides"), levels - 1)
+        for name, length in ({"encoder_depths": max(levels, 2)} | lengths).items():
+            value = getattr(self, name)
+            if not isinstance(value, tuple) or len(value) != length or not all(map(_is_count, value)):
+                raise InputError(
+                    f"{name} must be {length} whole numbers from 1 to {MOST} (encoder_depths has {levels}), "
+                    f"got {value!r}"
+                )
+        for name in ("anchor_heads", "mlp_ratio", "patch"):
+            if not _is_count(getattr(self, name)):
+                raise InputError(f"{name} must be a whole number from 1 to {MOST}, got {getattr(self, name)!r}")
+        if not set(self.strides) <= {2, 4, 8} or np.prod(self.strides, dtype=float) > 1 << CELL_BITS:
+            raise InputError(f"strides must be 2, 4 or 8 each and {1 << CELL_BITS} in all at most, got {self.strides}")
+        for part in ("encoder", "decoder"):
+            widths, heads = getattr(self, f"{part}_channels"), getattr(self, f"{part}_heads")
+            if any(c % h for c, h in zip(widths, heads, strict=True)):
+                raise InputError(f"{part}_channels must divide by {part}_heads, got {widths} and {heads}")
+        if any(c % self.anchor_heads for c in self.decoder_channels):
+            raise InputError(
+                f"decoder_channels must divide by anchor_heads, got {self.decoder_channels} and {self.anchor_heads}"
+            )
+        if not (_is_number(self.grid) and self.grid > 0):
+            raise InputError(f"grid must be a positive number of metres, got {self.grid!r}")
+        for name in ("drop_path", "anchor_dropout"):
+            if not (_is_number(getattr(self, name)) and 0 <= getattr(self, name) < 1):
+                raise InputError(f"{name} must be a probability below 1, got {getattr(self, name)!r}")
+        if not self.orders:
+            raise InputError(f"orders must name at least one curve of {', '.join(CURVES)}, got none")
+        for order in self.orders:
+            check_name("curve", order, CURVES)
+
+    def _check_heads(self) -> None:
+        if not isinstance(self.joints, tuple) or not self.joints or len(set(self.joints)) != len(self.joints):
+            raise InputError(f"joints must be joint names, each once, got {self.joints!r}")
+        for joint in self.joints:
+            BODY26.index(joint)
+        if self.bins or self.ranges:
+            if not isinstance(self.bins, tuple) or len(self.bins) != 3 or not all(map(_is_count, self.bins)):
+                raise InputError(
+                    f"bins must be three whole numbers (x, y, z) from 1 to {MOST}, or none, got {self.bins!r}"
+                )
+            if not isinstance(self.ranges, tuple) or len(self.ranges) != 3 or not all(map(_is_range, self.ranges)):
+                raise InputError(f"ranges must be three pairs (low, high) of metres, or none, got {self.ranges!r}")
+        elif not self.coordinates:
+            raise InputError("a network needs heatmaps (bins and ranges) or coordinates=True: it would predict nothing")
+        if not isinstance(self.parts, int) or not 0 <= self.parts <= MOST or self.parts == 1:
+            raise InputError(f"parts must be 0 (no part head) or from 2 to {MOST}, got {self.parts!r}")
+        for name in ("coordinates", "auxiliary", "legacy"):
+            if not isinstance(getattr(self, name), bool):
+                raise InputError(f"{name} must be true or false, got {getattr(self, name)!r}")
+
+    @property
+    def layers(self) -> int:
+        """Blocks of all levels, encoder and decoder."""
+        return sum(self.encoder_depths) + sum(self.decoder_depths)
+
+    @property
+    def low(self) -> np.ndarray:
+        """(3,) m: where bin 0 of each axis lies."""
+        return np.array([low for low, _ in self.ranges])
+
+    @property
+    def step(self) -> np.ndarray:
+        """(3,) m: how far apart the bins of each axis are. position = low + index * step, as in the released code."""
+        return np.array([(high - low) / n for (low, high), n in zip(self.ranges, self.bins, strict=True)])
+
+    def order_in(self, skeleton: Skeleton) -> np.ndarray:
+        """(len(skeleton),) int: for each joint of `skeleton` its place among this network's joints.
+
+        `values[:, config.order_in(WAYMO14)]` brings (B, J, ...) into the skeleton's order. Raises InputError where the
+        network lacks one.
+        """
+        missing = [joint for joint in skeleton.joints if joint not in self.joints]
+        if missing:
+            raise InputError(
+                f"the network {self.name} has no {', '.join(missing)}, which {skeleton.name} needs: "
+                f"use a skeleton of its joints, {', '.join(self.joints)}"
+            )
+        return np.array([self.joints.index(joint) for joint in skeleton.joints])
+
+    def to_dict(self) -> dict:
+        """Plain values, for a file's header: `DaptConfig(**entries)` reads them back, from JSON too."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, entries: dict) -> "DaptConfig":
+        """From `to_dict`'s entries, or from the constructor arguments of the authors' backbone.
+
+        The latter are known by their `enc_depths`; `grid`, their heatmap arguments, with "size" and "range", means a
+        fine-tuned network (heatmaps and auxiliary head), no `grid` a pre-trained one (coordinates and parts). Joints
+        follow from `num_keypoints`: 14 Waymo's, 15 HumanM3's, 24 SMPL's, unless `joints` names them; name, parts,
+        coordinates, auxiliary and legacy may be added. Raises InputError for what does not fit.
+        """
+        if "enc_depths" in entries:
+            entries = _from_reference(entries)
+        known = [field.name for field in fields(cls)]
+        for entry in entries:
+            check_name("setting of the network", entry, known)
+        for needed in ("name", "joints"):
+            if needed not in entries:
+                raise InputError(f"a configuration needs the entry {needed!r}, got only {', '.join(entries) or 'none'}")
+        return cls(**entries)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= MOST
+
+
+def _is_range(value: object) -> bool:
+    return isinstance(value, tuple) and len(value) == 2 and all(map(_is_number, value)) and value[0] < value[1]
+
+
+# the authors' names of what this package names otherwise
+_REFERENCE = {
+    "enc_depths": "encoder_depths",
+    "enc_channels": "encoder_channels",
+    "enc_num_head": "encoder_heads",
+    "dec_depths": "decoder_depths",
+    "dec_channels": "decoder_channels",
+    "dec_num_head": "decoder_heads",
+    "dec_kp_channels": "anchor_channels",
+    "mlp_ratio": "mlp_ratio",
+    "stride": "strides",
+    "order": "orders",
+    "drop_path": "drop_path",
+    "grid_size": "grid",
+}
+# what the authors' arguments must be for this network to be theirs
+_FIXED = {
+    "in_channels": 3,
+    "pre_norm": True,
+    "enable_rpe": False,
+    "dec_kp_mixer": "attn",
+    "num_extra": 0,
+    "qkv_bias": True,
+    "cls_mode": False,
+    "pdnorm_bn": False,
+    "pdnorm_ln": False,
+}
+_JOINTS_BY_COUNT = {len(joints): joints for joints in (WAYMO_JOINTS, HUMAN15.joints, SMPL24.joints)}
+
+
+def _several(entries: dict, name: str) -> tuple:
+    value = entries.get(name, [1024])
+    return tuple(value) if isinstance(value, list | tuple) else (value,)
+
+
+def _from_reference(entries: dict) -> dict:
+    for name, value in _FIXED.items():
+        if entries.get(name, value) != value:
+            raise InputError(f"{name} must be {value!r} for the paper's network, got {entries[name]!r}")
+    patches = {*_several(entries, "enc_patch_size"), *_several(entries, "dec_patch_size")}
+    if len(patches) != 1:
+        raise InputError(f"enc_patch_size and dec_patch_size must be one number throughout, got {sorted(patches)}")
+    out = {ours: entries[theirs] for theirs, ours in _REFERENCE.items() if theirs in entries}
+    count = entries.get("num_keypoints", 14)
+    if not _is_count(count) or "joints" not in entries and count not in _JOINTS_BY_COUNT:
+        raise InputError(f"num_keypoints must be 14, 15 or 24 where no joints are named, got {count!r}: add 'joints'")
+    out |= {"joints": _JOINTS_BY_COUNT.get(count), "patch": patches.pop(), "legacy": True}
+    heatmaps = entries.get("grid")
+    if heatmaps is None:
+        out |= {"name": "pretrain", "coordinates": True, "parts": PARTS}
+    else:
+        try:
+            out |= {"name": "released", "auxiliary": True, "bins": heatmaps["size"], "ranges": heatmaps["range"]}
+        except (KeyError, TypeError):
+            raise InputError(f"grid must be {{'size': ..., 'range': ...}} of the heatmaps, got {heatmaps!r}") from None
+    # what their arguments do not say
+    ours = ("name", "joints", "parts", "coordinates", "auxiliary", "legacy")
+    return out | {name: entries[name] for name in ours if name in entries}
+
+
+def _released(name: str, joints: tuple[str, ...], bins: tuple[int, int], reach: Range) -> DaptConfig:
+    """bins and half widths in metres of (x and y, z)."""
+    across, up = ((-r, r) for r in reach)
+    return DaptConfig(
+        name=name,
+        joints=joints,
+        bins=(bins[0], *bins),
+        ranges=(across, across, up),
+        auxiliary=True,
+        legacy=True,
+    )
+
+
+# `paper`: the paper's network for the superset skeleton, every head of both stages, so that none is thrown away between
+# pre-training and fine-tuning; the others: what the authors' own files hold
+CONFIGS = {
+    "paper": DaptConfig(
+        name="paper",
+        joints=BODY26.joints,
+        bins=(220, 220, 220),
+        ranges=((-1.1, 1.1),) * 3,
+        parts=PARTS,
+        coordinates=True,
+        auxiliary=True,
+    ),
+    "waymo": _released("waymo", WAYMO_JOINTS, (72, 120), (0.9, 1.5)),
+    "humanm3": _released("humanm3", HUMAN15.joints, (140, 220), (0.7, 1.1)),
+    "lidarhuman26m": _released("lidarhuman26m", SMPL24.joints, (220, 220), (1.1, 1.1)),
+    "sloper4d": _released("sloper4d", SMPL24.joints, (100, 100), (1.0, 1.0)),
+    "pretrain": DaptConfig(name="pretrain", joints=HUMAN15.joints, parts=PARTS, coordinates=True, legacy=True),
+}
+
+
+def named_config(name: str) -> DaptConfig:
+    """A configuration by name: paper, or one of the released waymo, humanm3, lidarhuman26m, sloper4d and pretrain."""
+    check_name("DAPT configuration", name, CONFIGS)
+    return CONFIGS[name]

@@ -1,0 +1,134 @@
+"""The authors' weights: a safetensors file of theirs, checked tensor by tensor, becomes a `DaptNet`.
+
+Only safetensors is read. What the authors published as .pth or .bin is a pickle, which can run any program when it is
+opened, so its conversion is left to whoever trusts it.
+"""
+
+import json
+import os
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+
+from lidarpose.errors import InputError
+from lidarpose.io.files import check_apart, check_suffix, file_error
+from lidarpose.models.checkpoint import as_stored, save_checkpoint, shapes
+from lidarpose.models.dapt.dapt_config import CONFIGS, DaptConfig, named_config
+from lidarpose.models.dapt.dapt_net import DaptNet
+from lidarpose.models.header import Header
+
+# what a wrapper for several GPUs puts before every name
+_PREFIX = "module."
+_PICKLES = (".pth", ".pt", ".bin", ".ckpt", ".pkl")
+
+
+def import_dapt(path: str | os.PathLike, config: DaptConfig | dict | str | None = None) -> DaptNet:
+    """The released network in evaluation mode, float32 on the CPU, with the data flow that it was trained with.
+
+    config: a `DaptConfig`, its entries or the authors' constructor arguments as a dict (`DaptConfig.from_dict`), or a
+    name (waymo, humanm3, lidarhuman26m, sloper4d, pretrain); None reads the file's header, entry "config". The legacy
+    data flow is on unless a `DaptConfig` or a dict says otherwise. Names of tensors may all begin with "module.".
+    Raises InputError, one line that names the file and the tensor, for all that does not fit.
+    """
+    path = Path(path)
+    with _opened(path) as file:
+        config = _config(path, file.metadata(), config)
+        stored = {name: name for name in file.keys()}
+        if stored and all(name.startswith(_PREFIX) for name in stored):
+            stored = {name.removeprefix(_PREFIX): name for name in stored}
+        source = f"the configuration {config.name}"
+        remedy = f"name the configuration that it was trained with ({', '.join(CONFIGS)})"
+        wanted = shapes(path, config, len(stored), by=source, remedy=remedy)
+        missing = [name for name in wanted if name not in stored]
+        extra = sorted(set(stored) - set(wanted))
+        # a head that only one side knows says more about a wrong configuration than a tensor of it
+        if missing:
+            raise file_error(path, f"tensor {missing[0]} is missing, which {source} has: {remedy}")
+        if extra:
+            raise file_error(path, f"unknown tensor {extra[0]}, which {source} has not: {remedy}")
+        loaded = {}
+        for name, value in wanted.items():
+            shape = tuple(file.get_slice(stored[name]).get_shape())
+            if shape != tuple(value.shape):
+                raise file_error(
+                    path, f"tensor {name} should be {tuple(value.shape)} by {source}, got {shape}: {remedy}"
+                )
+            loaded[name] = as_stored(path, name, file.get_tensor(stored[name]), value.dtype)
+    _check_ranges(path, config, loaded)
+    network = DaptNet(config)
+    network.load_state_dict(loaded)
+    return network.eval()
+
+
+def import_released(source: str | os.PathLike, out: str | os.PathLike, *, config: str | None = None) -> Header:
+    """Writes the authors' weights at `source` as a checkpoint of this package; config: as `import_dapt` takes it.
+
+    Raises InputError, one line that names the file and the tensor, for all that does not fit; then nothing is written.
+    """
+    check_suffix(out, ".safetensors")
+    check_apart(out, source)
+    network = import_dapt(source, config)
+    named = "" if config is None else f" --config {config}"
+    card = {
+        "command": f"lidarpose import {Path(source).name}{named}",
+        "note": "released DAPT weights; confidence and spread are read off its heatmaps and not calibrated",
+    }
+    save_checkpoint(out, network, card=card)
+    return Header(config=network.config, card=card)
+
+
+def _opened(path: Path):
+    if path.suffix.lower() in _PICKLES:
+        raise file_error(
+            path,
+            "expected a .safetensors file, got a pickle, which can run programs: if you trust it, convert it once with "
+            "safetensors.torch.save_file(torch.load(FILE, map_location='cpu', weights_only=True), 'dapt.safetensors')",
+        )
+    if not path.is_file():
+        what = "is a folder" if path.is_dir() else "there is no such file"
+        raise file_error(path, f"expected a .safetensors file of DAPT's weights, but {what}: check the path")
+    try:
+        return safe_open(str(path), framework="pt")
+    except (SafetensorError, OSError, ValueError) as error:
+        raise file_error(
+            path, f"expected a .safetensors file, but it is damaged or something else ({error}): get it again"
+        ) from None
+
+
+def _config(path: Path, metadata: dict[str, str] | None, config: DaptConfig | dict | str | None) -> DaptConfig:
+    if isinstance(config, DaptConfig):
+        return config
+    if isinstance(config, str):
+        return named_config(config)
+    where = "its header's configuration"
+    if config is None:
+        raw = (metadata or {}).get("config")
+        if raw is None:
+            raise file_error(path, f"its header has no configuration: name one of {', '.join(CONFIGS)} (config=...)")
+        try:
+            config = json.loads(raw)
+        except (ValueError, RecursionError) as error:
+            raise file_error(path, f"{where} is not JSON ({error}): name one of {', '.join(CONFIGS)}") from None
+    else:
+        where = "the configuration given"
+    if not isinstance(config, dict):
+        raise file_error(path, f"{where} should be a dict, a name or a DaptConfig, got {type(config).__name__}")
+    try:
+        return DaptConfig.from_dict({"legacy": True} | config)
+    # TypeError: lists and dicts where numbers and names belong
+    except (InputError, TypeError) as error:
+        raise file_error(path, f"{where} does not fit: {error}") from None
+
+
+def _check_ranges(path: Path, config: DaptConfig, loaded: dict[str, torch.Tensor]) -> None:
+    """The released heatmap head carries its ranges: they must be those that its logits will be read with."""
+    stored = loaded.get("heads.query.coord_range")
+    if stored is not None and not torch.allclose(stored, torch.tensor(config.ranges), atol=1e-4):
+        said = stored.double().round(decimals=4).tolist()
+        due = [list(reach) for reach in config.ranges]
+        raise file_error(
+            path,
+            f"tensor heads.query.coord_range says {said} m, the configuration {config.name} {due}: "
+            "name the configuration that it was trained with",
+        )

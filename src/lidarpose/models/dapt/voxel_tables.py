@@ -1,0 +1,259 @@
+"""From people's points to integer tables: voxels, levels, neighbours, patches. Numpy only.
+
+Legend: B people, n points of a cloud, M voxels of all people at a level, one after the other, T taps of a kernel,
+P pairs of neighbours, W children at most, N voxels a person at most, Q patches, K voxels a patch at most, O curves.
+
+Voxels stand in Z-order within each person, at every level: the order of points never matters, and the children of a
+parent are neighbours in memory. A person without points is given one voxel at the center: every level then has a row
+for everybody, and nobody's batch mates need to know.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarpose.errors import InputError, check_name
+from lidarpose.models.dapt.dapt_config import CELL_BITS, DaptConfig
+from lidarpose.models.dapt.space_filling_curves import curve, dilated, z_order
+
+# bits an axis of a cell, and of a neighbour's cell: one more, so that a step across the edge meets no cell
+_BITS, _WIDE = CELL_BITS, CELL_BITS + 1
+_MOST_PEOPLE = 1 << (63 - 3 * _WIDE)
+# how convolutions and attention run: see `build_tables`
+LAYOUTS = ("ragged", "padded")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Neighbours:
+    """The occupied cells about each voxel, taps in the order of a kernel's (x, y, z) offsets, the middle tap left out.
+
+    ragged: source (P,) rows of the neighbours, tap after tap; counts (T,) pairs of each tap (0 for the middle one);
+    target (P,) the rows that they are neighbours of. padded: table (M, T) rows, M for an empty cell; else None.
+    """
+
+    source: np.ndarray | None = None
+    target: np.ndarray | None = None
+    counts: np.ndarray | None = None
+    table: np.ndarray | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Level:
+    """Voxels of one width.
+
+    lengths (B,): voxels of each person, at least 1; near: neighbours of 3 x 3 x 3; parent (M,): row of the next level,
+    None at the last; children (M', W): rows of this level under each row of the next, the first repeated, None at the
+    last; slots (B, N): rows of each person, the first repeated; valid (B, N) bool.
+
+    Patches: sequence (O, M) rows in the order of each curve, O = 1 where nobody exceeds the patch; patch_lengths (Q,):
+    how many each patch holds, one after the other; in the padded layout patch_slots (O, Q, K) rows, patch_valid (Q, K)
+    and patch_place (O, M), the place of each row among the Q * K.
+    """
+
+    lengths: np.ndarray
+    near: Neighbours
+    parent: np.ndarray | None
+    children: np.ndarray | None
+    slots: np.ndarray
+    valid: np.ndarray
+    sequence: np.ndarray
+    patch_lengths: np.ndarray
+    patch_slots: np.ndarray | None
+    patch_valid: np.ndarray | None
+    patch_place: np.ndarray | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tables:
+    """What the network reads of a batch of people.
+
+    features (M, 3) float32 m: the kept point of each voxel of level 0; stem: its neighbours of 5 x 5 x 5; levels, fine
+    to coarse; kept (M,): index of the kept point among all points, -1 for the stand-in of a person without points;
+    point_voxel (all points,): each point's row of level 0.
+    """
+
+    features: np.ndarray
+    stem: Neighbours
+    levels: tuple[Level, ...]
+    kept: np.ndarray
+    point_voxel: np.ndarray
+
+
+def build_tables(
+    clouds: list[np.ndarray],
+    config: DaptConfig,
+    *,
+    layout: str = "ragged",
+    rng: np.random.Generator | None = None,
+) -> Tables:
+    """Tables of people's clouds, each (n, 3) m in its person's frame, n = 0 included.
+
+    layout: "ragged", pair lists and one patch after the other, for CPUs; "padded", gather tables and one block of
+    patches, for accelerators: the same results. One point a voxel is kept and curves go from block to block in the
+    configuration's order; with `rng` the point is a random one and the curves are shuffled, as in training; without, it
+    is the one nearest the voxel's middle. Cells are floor(p / grid); with `config.legacy` the cloud's own minimum is
+    subtracted, so that an outlier decides which voxels share a parent. Raises InputError for clouds wider than the
+    cells can count, and for more people than a batch can hold.
+    """
+    check_name("layout", layout, LAYOUTS)
+    lengths = np.array([len(cloud) for cloud in clouds], np.int64)
+    if not 1 <= len(clouds) < _MOST_PEOPLE:
+        raise InputError(f"a batch holds 1 to {_MOST_PEOPLE - 1} people, got {len(clouds)}: split it")
+    points = np.concatenate([np.asarray(cloud, np.float32).reshape(-1, 3) for cloud in clouds])
+    person = np.repeat(np.arange(len(clouds)), lengths)
+    cells = _cells(points, lengths, config)
+    key = person << (3 * _WIDE) | z_order(cells, _BITS)
+
+    kept, point_voxel = _one_a_voxel(key, points, config.grid, rng)
+    features, key, cells = points[kept], key[kept], cells[kept]
+    empty = np.flatnonzero(lengths == 0)
+    if len(empty):
+        # stand-ins: a voxel that no neighbour or parent can tell from a real one, of a point at the center
+        place = np.searchsorted(key, empty << (3 * _WIDE))
+        features = np.insert(features, place, 0, axis=0)
+        cells = np.insert(cells, place, 1 << (_BITS - 1), axis=0)
+        kept = np.insert(kept, place, -1)
+        point_voxel = point_voxel + np.searchsorted(empty, person)
+        key = np.insert(key, place, empty << (3 * _WIDE) | z_order(cells[:1] * 0 + (1 << (_BITS - 1)), _BITS))
+
+    levels = []
+    stem = _neighbours(key, cells, 2, 0, layout)
+    bits = 0
+    for level in range(len(config.encoder_depths)):
+        last = level == len(config.encoder_depths) - 1
+        shift = 0 if last else config.strides[level].bit_length() - 1
+        parent_key, first, parent = _grouped(key >> (3 * shift))
+        owner = key >> (3 * (_WIDE - bits))
+        near = _neighbours(key, cells, 1, bits, layout)
+        levels.append(
+            Level(
+                near=near,
+                parent=None if last else parent,
+                children=None if last else _spread(first, len(key)),
+                **_people(owner, len(clouds), cells, config, layout, rng),
+            )
+        )
+        key, cells, bits = parent_key, cells[first] >> shift, bits + shift
+    return Tables(features=features, stem=stem, levels=tuple(levels), kept=kept, point_voxel=point_voxel)
+
+
+def _cells(points: np.ndarray, lengths: np.ndarray, config: DaptConfig) -> np.ndarray:
+    """(M, 3) int64 in [0, 2**_BITS)."""
+    scaled = np.floor(points / config.grid)
+    if not np.isfinite(scaled).all():
+        raise InputError("points must be finite numbers of metres, got NaN or infinity: drop those points first")
+    middle = 1 << (_BITS - 1)
+    if config.legacy:
+        filled = lengths > 0
+        low = np.zeros((len(lengths), 3))
+        starts = np.cumsum(lengths)[filled] - lengths[filled]
+        if len(starts):
+            low[filled] = np.minimum.reduceat(scaled, starts)
+        scaled = scaled - np.repeat(low, lengths, axis=0)
+    else:
+        scaled = scaled + middle
+    if scaled.size and not (scaled.min() >= 0 and scaled.max() < 2 * middle):
+        reach = middle * config.grid
+        limit = f"span {2 * reach:.0f} m at most" if config.legacy else f"lie within {reach:.0f} m of their person"
+        raise InputError(f"points must {limit}, got some beyond: crop to one person")
+    return scaled.astype(np.int64)
+
+
+def _one_a_voxel(
+    key: np.ndarray, points: np.ndarray, grid: float, rng: np.random.Generator | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Indices (M,) of one point a voxel, in order of the keys, and each point's voxel."""
+    order = np.argsort(key, kind="stable")
+    _, first, voxel = _grouped(key[order])
+    if len(first) < len(key):
+        # of several points the random or the nearest one comes first; coordinates settle ties, whatever the input order
+        if rng is not None:
+            order = np.lexsort((rng.random(len(key)), key))
+        else:
+            off = (points / grid - np.floor(points / grid) - 0.5).astype(np.float64)
+            order = np.lexsort((*points.T, (off**2).sum(1), key))
+    point_voxel = np.empty(len(key), np.int64)
+    point_voxel[order] = voxel
+    return order[first], point_voxel
+
+
+def _grouped(key: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sorted keys (n,) -> the distinct ones (m,), where each begins (m,), and which one each is (n,)."""
+    begins = np.ones(len(key), bool)
+    begins[1:] = key[1:] != key[:-1]
+    first = np.flatnonzero(begins)
+    return key[first], first, np.cumsum(begins) - 1
+
+
+def _spread(first: np.ndarray, rows: int) -> np.ndarray:
+    """(m, W) rows of groups that begin at `first` and end where the next begins, the first row repeated."""
+    lengths = np.diff(first, append=rows)
+    column = np.arange(lengths.max())
+    return first[:, None] + np.where(column < lengths[:, None], column, 0)
+
+
+def _neighbours(key: np.ndarray, cells: np.ndarray, reach: int, bits: int, layout: str) -> Neighbours:
+    """Neighbours within `reach` cells an axis of rows whose sorted `key` has lost `bits` bits an axis."""
+    side = 2 * reach + 1
+    taps, rows = side**3, len(key)
+    wide = _WIDE - bits
+    # of each axis, one after the other: its bits for every step, in the places of the code
+    x, y, z = (
+        np.stack([dilated(cells[:, k] + step & (1 << wide) - 1) << 2 - k for step in range(-reach, reach + 1)])
+        for k in range(3)
+    )
+    half = np.arange(taps // 2)
+    codes = x[half // side**2] | y[half // side % side] | z[half % side]
+    codes |= key >> (3 * wide) << (3 * wide)
+    found = np.searchsorted(key, codes.ravel())
+    found[found == rows] = 0
+    hit = np.flatnonzero(key[found] == codes.ravel())
+    # the second half of the taps is the first one mirrored, seen from the neighbour
+    tap, target, source = hit // rows, hit % rows, found[hit]
+    if layout == "padded":
+        table = np.full((rows, taps), rows)
+        table[target, tap] = source
+        table[source, taps - 1 - tap] = target
+        return Neighbours(table=table)
+    counts = np.bincount(tap, minlength=taps // 2)
+    mirrored = np.argsort(-tap, kind="stable")
+    return Neighbours(
+        source=np.concatenate([source, target[mirrored]]),
+        target=np.concatenate([target, source[mirrored]]),
+        counts=np.concatenate([counts, [0], counts[::-1]]),
+    )
+
+
+def _people(
+    owner: np.ndarray,
+    people: int,
+    cells: np.ndarray,
+    config: DaptConfig,
+    layout: str,
+    rng: np.random.Generator | None,
+) -> dict[str, np.ndarray | None]:
+    """The entries of a `Level` about whose rows are whose, and which attend to each other."""
+    lengths = np.bincount(owner, minlength=people)
+    first = np.cumsum(lengths) - lengths
+    slots = _spread(first, len(owner))
+    out = {"lengths": lengths, "slots": slots, "valid": np.arange(slots.shape[1]) < lengths[:, None]}
+    if lengths.max() <= config.patch:
+        sequence, patch_lengths = np.arange(len(owner))[None], lengths
+    else:
+        orders = list(config.orders) if rng is None else rng.permutation(config.orders)
+        sequence = np.stack([np.lexsort((curve(str(order))(cells), owner)) for order in orders])
+        patch_lengths = np.concatenate([_cut(int(length), config.patch) for length in lengths])
+    out |= {"sequence": sequence, "patch_lengths": patch_lengths}
+    if layout == "ragged":
+        return out | dict.fromkeys(("patch_slots", "patch_valid", "patch_place"))
+    begins = np.cumsum(patch_lengths) - patch_lengths
+    places = _spread(begins, len(owner))
+    valid = np.arange(places.shape[1]) < patch_lengths[:, None]
+    place = np.empty_like(sequence)
+    np.put_along_axis(place, sequence, np.flatnonzero(valid)[None], 1)
+    return out | {"patch_slots": sequence[:, places], "patch_valid": valid, "patch_place": place}
+
+
+def _cut(length: int, patch: int) -> list[int]:
+    """Lengths of the patches of a person of `length` voxels: full ones, and what is left."""
+    return [patch] * (length // patch) + [length % patch] * (length % patch > 0)

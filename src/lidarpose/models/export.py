@@ -1,0 +1,217 @@
+"""Networks as files that run elsewhere: ONNX, or a program of `torch.export`. Checked before they are written."""
+
+import contextlib
+import io
+import logging
+import os
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from lidarpose.errors import InputError, LidarPoseError, check_name, missing_extra
+from lidarpose.io.files import atomic_path, check_apart, check_suffix, check_writable, content_digest, write_atomic
+from lidarpose.models.batch import Batch
+from lidarpose.models.checkpoint import load_checkpoint
+from lidarpose.models.header import ENTRY, Header
+from lidarpose.models.onnx import OUTPUTS, SOURCE, input_name, network_inputs, open_session, plan_people
+from lidarpose.models.posenet import PoseNet
+
+# of each format, the suffix of its files
+FORMATS = {"onnx": ".onnx", "torch": ".pt2"}
+_OPSET = 18
+# points a person: of the example that is traced, where 0 and 1 would be taken for constants, and of what is checked
+_TRACED, _CHECKED = (300, 60, 700), ((1, 2000, 37, 0, 9), (1,))
+# an exported network may differ from torch's by rounding; its logits are of order ten
+_TOLERANCE = 1e-3
+# an array of fewer numbers is not worth a node
+_WORTH = 64
+
+
+class PlanModule(nn.Module):
+    """A network as a function of the plan's arrays, named `names`, one after the other, giving `OUTPUTS` in order."""
+
+    def __init__(self, network: PoseNet, names: tuple[str, ...]):
+        super().__init__()
+        self.network = network
+        self.names = names
+
+    def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
+        out = self.network(Batch.from_arrays(dict(zip(self.names, tensors, strict=True)), tensors[0].device))
+        return tuple(getattr(out, name) for name in OUTPUTS)
+
+
+def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = "onnx") -> None:
+    """Writes the checkpoint at `weights` as a file of another format, computing in float32, whole or not at all.
+
+    format: "onnx", a self-contained file that ONNX Runtime and this package run without torch, no larger than the
+    checkpoint where that keeps float16; or "torch", a program (.pt2) for `torch.export.load`. Both take any number of
+    people and points; `onnx_file` tells the inputs. Raises InputError for a file that is no checkpoint of this
+    package's own networks and for an `out` that ends in another suffix than `FORMATS` says, MissingExtra without
+    onnx.
+    """
+    check_name("format", format, FORMATS)
+    check_apart(out, weights)
+    check_suffix(out, FORMATS[format])
+    network, header = load_checkpoint(weights)
+    if header.network != "pose":
+        raise InputError(
+            f"{os.fspath(weights)}: the paper's network ({header.config.name}) is not offered as {format}: "
+            "it runs with torch, and networks that `lidarpose pretrain` trains are exported"
+        )
+    # tracing takes a minute
+    check_writable(out)
+    metadata = {ENTRY: header.to_json(), SOURCE: content_digest(weights, expected="a checkpoint")}
+    if format == "onnx":
+        content = onnx_bytes(network, metadata)
+        session = open_session(content, threads=1)
+
+        def run(arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
+            return session.run(list(OUTPUTS), {input_name(name): array for name, array in arrays.items()})
+
+        check(network, run)
+        write_atomic(out, content)
+        return
+    program = trace(network)
+    module = program.module()
+    check(network, lambda arrays: [value.detach().numpy() for value in module(*map(torch.as_tensor, arrays.values()))])
+    with atomic_path(out) as path:
+        with path.open("wb") as file:
+            torch.export.save(program, file, extra_files=metadata)
+
+
+def trace(network: PoseNet) -> torch.export.ExportedProgram:
+    """The network as a program whose numbers of people and rows are free."""
+    arrays = _people(network, _TRACED)
+    module = PlanModule(network.eval(), tuple(arrays))
+    with torch.no_grad():
+        program = torch.export.export(module, _tensors(arrays), dynamic_shapes=_free(arrays))
+    for node in program.graph.nodes:
+        # paths of the machine that traced it
+        node.meta.pop("stack_trace", None)
+    return program
+
+
+def onnx_bytes(network: PoseNet, metadata: dict[str, str]) -> bytes:
+    """The network as the content of an ONNX file. Raises MissingExtra without onnx or onnxscript."""
+    try:
+        import onnx
+        import onnxscript  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise missing_extra(error, "export to ONNX") from None
+    arrays = _people(network, _TRACED)
+    with _silence(), torch.no_grad():
+        program = torch.onnx.export(
+            PlanModule(network.eval(), tuple(arrays)),
+            _tensors(arrays),
+            dynamic_shapes=_free(arrays),
+            input_names=[input_name(name) for name in arrays],
+            output_names=list(OUTPUTS),
+            opset_version=_OPSET,
+            dynamo=True,
+            verbose=False,
+        )
+    model = program.model_proto
+    # where each node was traced from: a third of the file, and paths of the machine that made it
+    for node in [*model.graph.node, *(node for function in model.functions for node in function.node)]:
+        del node.metadata_props[:]
+        node.ClearField("doc_string")
+    for value in [*model.graph.input, *model.graph.output, *model.graph.initializer]:
+        del value.metadata_props[:]
+    del model.graph.metadata_props[:], model.graph.value_info[:]
+    _name_axes(model.graph, list(arrays))
+    _pack(model.graph)
+    onnx.helper.set_model_props(model, metadata)
+    model.producer_name, model.producer_version = "lidarpose", Header(config=network.config, card={}).version
+    onnx.checker.check_model(model)
+    return model.SerializeToString(deterministic=True)
+
+
+def check(network: PoseNet, run: Callable[[dict[str, np.ndarray]], list[np.ndarray]]) -> None:
+    """Raises LidarPoseError where `run` does not give what the network does, on people of other sizes."""
+    for sizes in _CHECKED:
+        arrays = _people(network, sizes)
+        with torch.inference_mode():
+            expected = PlanModule(network.eval(), tuple(arrays))(*_tensors(arrays))
+        for name, due, got in zip(OUTPUTS, expected, run(arrays), strict=True):
+            due = due.numpy()
+            off = float(np.abs(got - due).max(initial=0)) if got.shape == due.shape else np.inf
+            if not off <= _TOLERANCE:
+                raise LidarPoseError(
+                    f"the exported network's {name} is off by {off:g}, so nothing was written: report this with the "
+                    f"versions that `lidarpose info` prints"
+                )
+
+
+def _people(network: PoseNet, sizes: tuple[int, ...]) -> dict[str, np.ndarray]:
+    """What the network reads of random people of so many points."""
+    rng = np.random.default_rng(0)
+    clouds = [rng.normal(0, (0.2, 0.2, 0.5), (size, 3)) for size in sizes]
+    return network_inputs(plan_people(clouds, rng.normal(size=(len(sizes), 5)), network.config))
+
+
+def _tensors(arrays: dict[str, np.ndarray]) -> tuple[Tensor, ...]:
+    return tuple(torch.as_tensor(array) for array in arrays.values())
+
+
+def _free(arrays: dict[str, np.ndarray]) -> tuple:
+    """Which axes may have any length: people, and rows of a level."""
+    free = torch.export.Dim.DYNAMIC
+    return (tuple({0: free} if name == "view" else {0: free, 1: free} for name in arrays),)
+
+
+def _pack(graph) -> None:
+    """Keeps weights as float16 where that loses nothing, as of a checkpoint in float16: half the file.
+
+    A node brings each back to float32; runtimes do that once, when they open the file.
+    """
+    from onnx import TensorProto, helper, numpy_helper
+
+    casts = []
+    for weight in graph.initializer:
+        if weight.data_type != TensorProto.FLOAT:
+            continue
+        values = numpy_helper.to_array(weight)
+        with np.errstate(over="ignore"):
+            half = values.astype(np.float16)
+        if values.size < _WORTH or not np.array_equal(half.astype(np.float32), values):
+            continue
+        name = weight.name
+        weight.CopyFrom(numpy_helper.from_array(half, f"{name}.half"))
+        casts.append(helper.make_node("Cast", [weight.name], [name], to=TensorProto.FLOAT))
+    nodes = [*casts, *graph.node]
+    del graph.node[:]
+    graph.node.extend(nodes)
+
+
+def _name_axes(graph, names: list[str]) -> None:
+    """Gives the free axes of an ONNX graph, which the exporter numbers, the names of what they count."""
+    called = {}
+    for name, value in zip(names, graph.input, strict=True):
+        level = name.partition(".")[0] if "." in name else "fine"
+        for axis, what in zip(value.type.tensor_type.shape.dim, ("people", f"{level}_rows"), strict=False):
+            if axis.dim_param:
+                called[axis.dim_param] = what
+    for value in [*graph.input, *graph.output]:
+        for axis in value.type.tensor_type.shape.dim:
+            if axis.dim_param:
+                axis.dim_param = called[axis.dim_param]
+
+
+@contextlib.contextmanager
+def _silence():
+    """Without what the exporter tells of its steps; errors are raised all the same."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with (
+            warnings.catch_warnings(),
+            contextlib.redirect_stdout(io.StringIO()),
+            contextlib.redirect_stderr(io.StringIO()),
+        ):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(before)

@@ -1,0 +1,148 @@
+"""`PoseNet`: a point-transformer U-Net over voxels whose joint anchors gather evidence at every density level.
+
+Legend: B people, F / M / N rows of the fine, mid and coarse level (padded), J joints, C channels.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from lidarpose.models.batch import Batch
+from lidarpose.models.config import BIN, NetworkConfig
+from lidarpose.models.exchange import Exchange
+from lidarpose.models.heads import REACH, JointHead, Outputs, VoteHead
+from lidarpose.models.layers import PLACE_FEATURES, Block, Convolution, FeedForward, Places, key_bias, membership
+from lidarpose.skeleton import skeleton
+
+# what a fine voxel knows besides its place: offset in the cell (3), deviation (3), log counts of itself and its parents
+VOXEL_FEATURES = 9
+VIEW_FEATURES = 5
+
+
+class PoseNet(nn.Module):
+    """Points of people, planned into a `Batch`, to raw `Outputs`. A pure function of the batch's tensors."""
+
+    def __init__(self, config: NetworkConfig):
+        super().__init__()
+        self.config = config
+        self.skeleton = skeleton(config.skeleton)
+        joints = len(self.skeleton)
+        fine, mid, coarse = config.channels
+        width, heads = mid, mid // config.head_channels
+        encoder, bottleneck, decoder = config.blocks
+
+        self.stem = _Stem(fine)
+        self.down_mid, self.down_coarse = _Down(fine, mid), _Down(mid, coarse)
+        self.encoder = _Stage(mid, config.head_channels, encoder, config.convolution)
+        self.bottleneck = _Stage(coarse, config.head_channels, bottleneck, config.convolution)
+        self.decoder = _Stage(mid, config.head_channels, decoder, config.convolution)
+        self.up_mid, self.up_fine = nn.Linear(coarse, mid), nn.Linear(mid, fine)
+        self.fine_norm, self.fine_feed = nn.LayerNorm(fine), FeedForward(fine)
+
+        self.anchors = nn.Parameter(torch.randn(joints, width) * 0.02)
+        self.anchor_view = nn.Linear(VIEW_FEATURES, width)
+        self.exchanges = nn.ModuleList(Exchange(width, heads, channels) for channels in (coarse, mid, fine))
+        self.level_joints = nn.ModuleList(nn.Linear(width, 3) for _ in range(2))
+
+        self.vote = None if config.heatmap == "full" else VoteHead(width, fine, joints)
+        bins = round(2 * REACH[config.heatmap] / BIN) if config.heatmap in REACH else 0
+        self.joint = JointHead(width, fine if self.vote is not None else 0, bins)
+        self.part = nn.Linear(fine, config.parts)
+
+    def forward(self, batch: Batch) -> Outputs:
+        fine, mid, coarse = batch.fine, batch.mid, batch.coarse
+        dtype = batch.view.dtype
+        fine_bias, mid_bias, coarse_bias = (key_bias(level.valid, dtype) for level in (fine, mid, coarse))
+        fine_places, mid_places, coarse_places = (Places(level.position) for level in (fine, mid, coarse))
+        mid_of_fine = membership(fine.parent, fine.valid, mid.valid.shape[1], dtype)
+        coarse_of_mid = membership(mid.parent, mid.valid, coarse.valid.shape[1], dtype)
+
+        fine_rows = self.stem(self._features(batch, fine_places, mid_of_fine, coarse_of_mid), batch.view)
+        mid_rows = self.down_mid(fine_rows, mid_of_fine, mid_places)
+        mid_rows = self.encoder(mid_rows, mid_places, mid_bias, mid.neighbours)
+        coarse_rows = self.down_coarse(mid_rows, coarse_of_mid, coarse_places)
+        coarse_rows = self.bottleneck(coarse_rows, coarse_places, coarse_bias, coarse.neighbours)
+
+        anchors = self.anchors + self.anchor_view(batch.view)[:, None]
+        believed = Places(torch.zeros_like(anchors[..., :3]))
+        anchors = self.exchanges[0](anchors, believed, coarse_rows, coarse_places, coarse.log_count, coarse_bias)
+        level_joints = [self.level_joints[0](anchors)]
+
+        mid_rows = mid_rows + coarse_of_mid.transpose(1, 2) @ self.up_mid(coarse_rows)
+        mid_rows = self.decoder(mid_rows, mid_places, mid_bias, mid.neighbours)
+        believed = Places(level_joints[0].detach())
+        anchors = self.exchanges[1](anchors, believed, mid_rows, mid_places, mid.log_count, mid_bias)
+        level_joints.append(self.level_joints[1](anchors))
+
+        fine_rows = fine_rows + mid_of_fine.transpose(1, 2) @ self.up_fine(mid_rows)
+        fine_rows = fine_rows + self.fine_feed(self.fine_norm(fine_rows))
+        believed = Places(level_joints[1].detach())
+        anchors = self.exchanges[2](anchors, believed, fine_rows, fine_places, fine.log_count, fine_bias)
+
+        vote, felt = torch.zeros_like(level_joints[0]), anchors[..., :0]
+        if self.vote is not None:
+            vote, felt = self.vote(anchors, fine_rows, fine.position, fine_bias)
+        heatmap, confidence, log_spread, visible = self.joint(anchors, felt, vote)
+        return Outputs(
+            vote=vote,
+            heatmap=heatmap,
+            part=self.part(fine_rows),
+            confidence=confidence,
+            log_spread=log_spread,
+            visible=visible,
+            level_joints=tuple(level_joints),
+            has_votes=self.vote is not None,
+        )
+
+    def _features(self, batch: Batch, places: Places, mid_of_fine: Tensor, coarse_of_mid: Tensor) -> Tensor:
+        """(B, F, ...): place, spread of the points inside, and density at three scales."""
+        coarse_count = coarse_of_mid.transpose(1, 2) @ batch.coarse.log_count[..., None]
+        parents = torch.cat([batch.mid.log_count[..., None], coarse_count], -1)
+        density = torch.cat([batch.fine.log_count[..., None], mid_of_fine.transpose(1, 2) @ parents], -1)
+        # deviations inside a cell are a few centimetres: brought to order one
+        return torch.cat([places.features(), batch.offset, batch.deviation / self.config.grid, density], -1)
+
+
+class _Stem(nn.Module):
+    """What a fine voxel is made of, and from where the person is seen, to the first features."""
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.voxel = nn.Linear(PLACE_FEATURES + VOXEL_FEATURES, 2 * channels)
+        # the same for all of a person's voxels, so it is added, not repeated beside them
+        self.view = nn.Linear(VIEW_FEATURES, 2 * channels, bias=False)
+        self.act = nn.SiLU()
+        self.out = nn.Linear(2 * channels, channels)
+
+    def forward(self, features: Tensor, view: Tensor) -> Tensor:
+        return self.out(self.act(self.voxel(features) + self.view(view)[:, None]))
+
+
+class _Down(nn.Module):
+    """Voxels of one level to their parents: the mean of the children, and where the parent lies."""
+
+    def __init__(self, channels: int, wider: int):
+        super().__init__()
+        self.norm = nn.LayerNorm(channels)
+        self.mix = nn.Linear(channels, wider)
+        self.place = nn.Linear(PLACE_FEATURES, wider)
+
+    def forward(self, rows: Tensor, member: Tensor, places: Places) -> Tensor:
+        mean = (member @ rows) / member.sum(-1, keepdim=True).clamp(min=1)
+        return self.mix(self.norm(mean)) + self.place(places.features())
+
+
+class _Stage(nn.Module):
+    """The blocks of one level, a convolution before each where asked for."""
+
+    def __init__(self, channels: int, head_channels: int, count: int, convolution: int):
+        super().__init__()
+        self.blocks = nn.ModuleList(Block(channels, channels // head_channels) for _ in range(count))
+        convolutions = count if convolution else 0
+        self.convolutions = nn.ModuleList(Convolution(channels, convolution) for _ in range(convolutions))
+
+    def forward(self, rows: Tensor, places: Places, bias: Tensor, neighbours: Tensor | None) -> Tensor:
+        for k, block in enumerate(self.blocks):
+            if self.convolutions:
+                rows = self.convolutions[k](rows, neighbours)
+            rows = block(rows, places, bias)
+        return rows

@@ -1,0 +1,285 @@
+"""What is drawn around a person: things near them, something before them, the ground they stand on.
+
+Everything lies in the level frame at the sensor (sensor at the origin, x forward, y left, z up); the person stands at
+feet (3,) m. The `config` is a `scene.SceneConfig`: its probabilities `clutter` and `occluder` are scaled by `hard`.
+Numbers are drawn as vectors of uniforms: a call of a generator costs as much as a mesh.
+"""
+
+from functools import lru_cache
+from math import atan2, cos, hypot, log, pi, sin, sqrt, tan
+
+import numpy as np
+
+from lidarpose.synth.environment import obstacles
+from lidarpose.synth.environment.mesh import Mesh, box, quad, union
+from lidarpose.synth.scene import SceneConfig
+
+# Paper: a square of ground of half width 1 m; elsewhere it reaches beyond any crop
+_PAPER_HALF = 1.0
+_WILD_HALF = 3.0
+# presets that have the paper's ground
+_BARE = ("paper", "reference")
+# share of grounds, at full difficulty, that have a kerb by the feet, that are rough, that have grass, for clutter 1
+_KERB, _ROUGH, _GRASS = 0.35, 0.45, 0.15
+# which draws of a kind are walls and cars, and the share of all directions from the person, away from the sensor,
+# that they may stand in
+_WALLS, _BESIDE = (0.50, 0.70), 0.62
+# what hides the legs stands at least so far before the feet, m
+_BEFORE = 0.6
+# cells of a rough ground along a side, and standard deviation of its height, m
+_CELLS = 7
+_ROUGHNESS = 0.018
+
+
+def surroundings(config: SceneConfig, feet: np.ndarray, radius: float, rng: np.random.Generator) -> list[Mesh]:
+    """Things near a person who stands at feet (3,) m and reaches `radius` m to the sides; none of them a person.
+
+    With probability clutter * hard one to three, their near sides 5 to 60 cm from the person's reach, or luggage that
+    touches the body. A sensor within them is avoided: what would reach it is left out.
+    """
+    if rng.random() >= config.clutter * config.hard:
+        return []
+    draws = rng.random((1 + int(3 * rng.random()), 8)).tolist()
+    found = [_thing(feet, radius, draw, rng) for draw in draws]
+    return [mesh for mesh in found if mesh is not None]
+
+
+def _thing(feet: np.ndarray, radius: float, draw: list[float], rng: np.random.Generator) -> Mesh | None:
+    kind, around, apart, shift, a, b, c, yaw = draw
+    angle, gap = (2 * around - 1) * pi, radius + 0.05 + 0.55 * apart
+    if _WALLS[0] <= kind < _WALLS[1]:
+        # beside or behind the person: before them they would hide all
+        angle = atan2(feet[1], feet[0]) + _BESIDE * angle
+    if kind < 0.16:
+        # hand luggage, parcels and what lies about: touches the body
+        mesh = box((0.12 + 0.38 * a, 0.12 + 0.18 * b, 0.12 + 0.38 * c))
+        near = (0.6 + 0.4 * apart) * radius
+        place = (feet[0] + near * cos(angle), feet[1] + near * sin(angle), feet[2] + 0.9 * shift)
+        return mesh.moved(place, 2 * pi * yaw)
+    if kind < 0.32:
+        mesh, deep, long, slack = obstacles.pole(0.02 + 0.16 * a * a, 0.8 + 2.7 * b), 0.02 + 0.16 * a * a, 0.0, 0.0
+    elif kind < 0.40:
+        size = 0.45 + 0.35 * a
+        mesh, deep, long, slack = obstacles.wheeled_bin(size, 0.8 + 0.4 * b), size / 2, size, 0.2
+    elif kind < _WALLS[0]:
+        mesh, deep, long, slack = box((0.2 + 0.4 * a, 0.2 + 0.7 * b, 0.2 + 0.9 * c)), 0.1 + 0.2 * a, 0.3, 0.3
+    elif kind < 0.60:
+        mesh, deep, long, slack = _wall(a, b, c)
+    elif kind < _WALLS[1]:
+        mesh, deep, long, slack = _car(a, b, c)
+    elif kind < 0.76:
+        long = 1.2 + 2 * a
+        rails = b < 0.5
+        mesh = obstacles.rail_fence(long, 0.8 + 0.4 * c, 2 + int(2 * b)) if rails else _lattice(long, b, c)
+        deep, slack = 0.03, 0.05
+    elif kind < 0.88:
+        size = (0.4 + 0.6 * a, 0.5 + 1.5 * b, 0.4 + 1.4 * c)
+        mesh = obstacles.foliage(size, 50 + int(70 * b), 0.07 + 0.08 * yaw, rng)
+        deep, long, slack = size[0] / 2, size[1], 0.2
+    elif kind < 0.92:
+        long = 1.2 + 0.8 * a
+        mesh, deep, slack = obstacles.bench(long, back=b < 0.6), 0.22, 0.3
+    elif kind < 0.96:
+        long, deep = 0.8 + 0.9 * a, 0.3 + 0.15 * b
+        mesh, slack = obstacles.table(2 * deep, long, 0.7 + 0.35 * c * c), 0.2
+    elif kind < 0.98:
+        mesh, deep, long, slack = obstacles.sign(1.6 + 1.0 * a, 0.4 + 0.4 * b), 0.05, 0.3, 1.0
+    else:
+        mesh, deep, long, slack = obstacles.traffic_cone(0.45 + 0.35 * a), 0.12, 0.0, 1.0
+    # the near side at the gap, the length across the way there, give or take, and shifted along itself
+    gap += deep
+    along = (shift - 0.5) * 0.7 * long
+    x = feet[0] + gap * cos(angle) - along * sin(angle)
+    y = feet[1] + gap * sin(angle) + along * cos(angle)
+    if hypot(x, y) < deep + long / 2 + 0.3:
+        return None
+    return mesh.moved((x, y, feet[2]), angle + pi + slack * (2 * yaw - 1))
+
+
+def _wall(a: float, b: float, c: float) -> tuple[Mesh, float, float, float]:
+    long, high = 1.0 + 3.0 * a, 0.5 + 2.5 * b
+    opening = None
+    if high > 1.8 and c < 0.4:
+        opening = (-0.25 * long, (0.5 * c) * long, 0.0 if c < 0.1 else 0.9, 0.85 * high)
+    return obstacles.wall(long, high, thick=0.15, opening=opening), 0.08, long, 0.15
+
+
+def _car(a: float, b: float, c: float) -> tuple[Mesh, float, float, float]:
+    """A car or a van whose side, front or back is towards the person."""
+    wide = 1.65 + 0.25 * a
+    if c < 0.75:
+        long, mesh = 3.7 + b, obstacles.car(3.7 + b, wide, 1.4 + 0.3 * a)
+    else:
+        long, wide = 4.6 + b, wide + 0.2
+        mesh = obstacles.van(long, wide, 1.9 + 0.4 * a)
+    if b < 0.35:
+        # end on
+        return mesh, long / 2, wide, 0.15
+    return mesh.moved((0, 0, 0), pi / 2), wide / 2, long, 0.1
+
+
+def _lattice(long: float, b: float, c: float) -> Mesh:
+    return obstacles.lattice_fence(long, 0.8 + 1.0 * c, 0.10 + 0.10 * b, 0.02 + 0.04 * c)
+
+
+def occluder(config: SceneConfig, feet: np.ndarray, tall: float, rng: np.random.Generator) -> Mesh | None:
+    """Something between the sensor and a person of `tall` m at feet (3,) m, who stay visible beside, above or through
+    it, or None. With probability occluder * hard.
+
+    It stands on the person's ground at 0.5 to 0.85 of their distance; what hides the legs, as a parapet,
+    may stand right before them. What lies between is seen larger: sizes are chosen at the person and shrunk.
+    """
+    if rng.random() >= config.occluder * config.hard:
+        return None
+    near, kind, hide, side, a, b, c = rng.random(7).tolist()
+    share = 0.5 + 0.35 * near
+    distance = max(hypot(feet[0], feet[1]), 1e-6)
+    heading = atan2(feet[1], feet[0])
+    if kind < 0.55:
+        # hides the legs up to a share of the height: its top lies on the beam to that height
+        share = min(0.5 + 0.47 * near, 1 - _BEFORE / max(distance, 2 * _BEFORE))
+        top = share * (feet[2] + tall * (0.15 + 0.40 * hide)) - feet[2]
+        mesh = _low(max(top, 0.1), share, a, b, c, rng)
+        return mesh.moved((feet[0] * share, feet[1] * share, feet[2]), heading + 0.5 * (side - 0.5))
+    if kind < 0.8:
+        # hides one side, from a hand's breadth beyond the middle to the shoulder
+        sign = 1.0 if side < 0.5 else -1.0
+        edge = (-0.05 + 0.30 * hide) * share
+        mesh, half = _tall(distance, share, tall, a, b, c, rng)
+        across = sign * (edge + half)
+    else:
+        # hides a strip
+        mesh, across = _strip(share, tall, a, b, c, rng), (side + hide - 1) * 0.5 * share
+    place = (feet[0] * share - across * feet[1] / distance, feet[1] * share + across * feet[0] / distance, feet[2])
+    return mesh.moved(place, heading)
+
+
+def _low(top: float, share: float, a: float, b: float, c: float, rng: np.random.Generator) -> Mesh:
+    """A bonnet, a parapet, a hedge or a fence, `top` m high."""
+    if a < 0.35:
+        return obstacles.bonnet(1.7, top, min(0.5 + 0.5 * b, share))
+    if a < 0.55:
+        return box((0.3, (1.0 + 2.0 * b) * share, top))
+    if a < 0.75:
+        return obstacles.foliage((0.4, (1.2 + 1.5 * b) * share, 1.1 * top), 90 + int(30 * c), 0.06 + 0.08 * c, rng)
+    if a < 0.88:
+        return obstacles.rail_fence(3.0 * share, top, 2 + int(2 * c))
+    # what is seen through may be taller
+    return obstacles.lattice_fence(2.4 * share, top * (1 + b), 0.10 + 0.08 * b, 0.02 + 0.03 * c)
+
+
+def _tall(
+    distance: float, share: float, tall: float, a: float, b: float, c: float, rng: np.random.Generator
+) -> tuple[Mesh, float]:
+    """The edge of a wall, a van or a hedge that is higher than anybody, or of a parked car, and its half width."""
+    room = distance * min(share, 1 - share)
+    if a < 0.3 and room > 1.2:
+        wide = 1.7 + 0.2 * b
+        # end on: the person stands beside it
+        if room > 2.8:
+            mesh = obstacles.car(3.8 + c, wide, 1.45) if b < 0.5 else obstacles.van(4.6 + c, wide, 2.0 + 0.4 * c)
+            return mesh, wide / 2
+        return obstacles.van(1.6, 1.6 + c, 2.2).moved((0, 0, 0), pi / 2), 0.8
+    if a < 0.5:
+        wide = 0.8 + 0.6 * b
+        return obstacles.foliage((0.5, wide, tall + 0.3 + c), 120, 0.10 + 0.10 * b, rng), 0.45 * wide
+    return box((0.2, 1.5, tall + 2)), 0.75
+
+
+def _strip(share: float, tall: float, a: float, b: float, c: float, rng: np.random.Generator) -> Mesh:
+    """A pole, a trunk, a signpost, a branch that hangs down or a pillar."""
+    radius = (0.03 + 0.17 * b * b) * share
+    if a < 0.6:
+        return obstacles.pole(radius, tall + 2)
+    if a < 0.7:
+        return obstacles.sign(1.3 + 0.8 * c, 0.35 * share + 0.2 * b)
+    if a < 0.85:
+        # down to a height between the hips and the head
+        mesh = obstacles.foliage((0.4, 0.6 * share + 0.4 * b, 1.0), 60 + int(60 * c), 0.08 + 0.06 * b, rng)
+        stem = obstacles.pole(0.02, 0.6)
+        return union([stem, mesh.moved((0, 0, 0.55 + 0.5 * c))])
+    return box((0.3, (0.15 + 0.25 * b) * share, tall + 2))
+
+
+def ground(config: SceneConfig, feet: np.ndarray, rng: np.random.Generator) -> Mesh:
+    """The ground about the feet (3,) m. Paper: a square of half width 1 m, its tilt normal, any direction.
+
+    Else a square of half width 3 m, and by `hard` now and then a kerb (the person on either side of it), a rough
+    surface, which is lowest at the feet's level, or grass about the ankles.
+    """
+    normal, kind, around, a, b, c = _normal_and_uniforms(rng)
+    heading = (2 * around - 1) * pi
+    tilt = tan(config.slope * normal)
+    slope = (tilt * cos(heading), tilt * sin(heading))
+    if config.name in _BARE:
+        return quad(_PAPER_HALF, slope).moved(feet)
+    uneven = config.clutter * config.hard
+    if kind < _KERB * uneven:
+        return _kerb(slope, a, b, c).moved(feet)
+    kind -= _KERB * uneven
+    if kind < _ROUGH * uneven:
+        return _rough(slope, a, rng).moved(feet)
+    kind -= _ROUGH * uneven
+    if kind < _GRASS * uneven:
+        lawn = obstacles.grass(0.5 + 0.3 * a, 0.05 + 0.15 * b, 40 + int(40 * c), rng)
+        lawn.vertices[:, 2] += lawn.vertices[:, :2] @ np.array(slope, np.float32)
+        return union([quad(_WILD_HALF, slope), lawn]).moved(feet)
+    return quad(_WILD_HALF, slope).moved(feet)
+
+
+def _normal_and_uniforms(rng: np.random.Generator) -> list[float]:
+    """A standard normal and five uniforms, of one call. Box and Muller 1958."""
+    u = rng.random(7).tolist()
+    return [sqrt(-2 * log(1 - u[0])) * cos(2 * pi * u[1])] + u[2:]
+
+
+def _kerb(slope: tuple[float, float], a: float, b: float, c: float) -> Mesh:
+    """Two levels with an edge 0.2 to 0.9 m from the feet; the feet's level is 0."""
+    turn, edge = 2 * pi * a, 0.2 + 0.7 * b
+    step = (0.04 + 0.14 * abs(2 * c - 1)) * (1 if c < 0.5 else -1)
+    far = _WILD_HALF
+    strip = [[-far, -far, 0], [edge, -far, 0], [edge, far, 0], [-far, far, 0]]
+    riser = [[edge, -far, 0], [edge, -far, step], [edge, far, step], [edge, far, 0]]
+    beyond = [[edge, -far, step], [far, -far, step], [far, far, step], [edge, far, step]]
+    vertices = np.array(strip + riser + beyond, np.float32)
+    turned = Mesh(vertices, _KERB_FACES).moved((0, 0, 0), turn).vertices
+    turned[:, 2] += turned[:, :2] @ np.array(slope, np.float32)
+    return Mesh(turned, _KERB_FACES)
+
+
+_KERB_FACES = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7], [8, 9, 10], [8, 10, 11]], np.int32)
+
+
+def _rough(slope: tuple[float, float], a: float, rng: np.random.Generator) -> Mesh:
+    """A field of heights, finer towards the feet, where it is 0 or below."""
+    flat, faces = _grid()
+    vertices = flat.copy()
+    height = rng.standard_normal(len(flat), np.float32) * np.float32(_ROUGHNESS * (0.5 + a))
+    # nobody's soles are buried
+    np.minimum(height, 0, out=height, where=_beneath())
+    vertices[:, 2] = height * _away() + flat[:, :2] @ np.array(slope, np.float32)
+    return Mesh(vertices, faces)
+
+
+@lru_cache
+def _grid() -> tuple[np.ndarray, np.ndarray]:
+    """Vertices ((cells + 1)^2, 3), flat, closer to each other near the middle, and two triangles a cell."""
+    at = np.linspace(-1, 1, _CELLS + 1)
+    at = _WILD_HALF * np.sign(at) * np.abs(at) ** 1.7
+    x, y = np.meshgrid(at, at, indexing="ij")
+    number = np.arange((_CELLS + 1) ** 2).reshape(_CELLS + 1, _CELLS + 1)
+    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+    faces = np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)], -2).reshape(-1, 3)
+    return np.stack([x, y, 0 * x], -1).reshape(-1, 3).astype(np.float32), faces.astype(np.int32)
+
+
+@lru_cache
+def _away() -> np.ndarray:
+    """How much the heights of the grid's vertices vary, for 1 at the feet."""
+    return 1 + 0.4 * np.abs(_grid()[0][:, :2]).sum(1)
+
+
+@lru_cache
+def _beneath() -> np.ndarray:
+    """Which vertices of the grid lie under or beside the feet."""
+    return np.hypot(*_grid()[0][:, :2].T) < 0.6

@@ -1,0 +1,178 @@
+"""Clothes that stand away from the body: skirts, dresses and long coats that bridge the legs, hats and helmets.
+
+An offset along the skin's normals (`body.shape.clothing`) cannot bridge; these are meshes of their own, whose faces
+count as the part of the body they hang on.
+"""
+
+from functools import lru_cache
+from math import hypot, pi
+
+import numpy as np
+
+from lidarpose.skeleton import BODY26
+from lidarpose.synth.environment.mesh import Mesh
+
+_J = {name: i for i, name in enumerate(BODY26.joints)}
+Point = list[float]
+# Girths of the shipped body's skin from lengths between its joints, m: weights of `_LENGTHS`, then a constant. Fitted
+# to 1,500 people of `body.shape.sample_people`; what is left is 3 mm of the back, 4 of the width, 7 and 5 of the rest.
+_LENGTHS = (
+    ("left_hip", "right_hip"), ("spine3", "left_collar"), ("head", "nose"), ("left_knee", "left_ankle"),
+    ("left_shoulder", "left_elbow"), ("pelvis", "left_hip"),
+)  # fmt: skip
+_GIRTHS = {
+    "back": (0.583, -1.599, 3.697, -0.311, 0.0, 0.0, -0.127),
+    "hip_side": (1.737, 0.0, 0.0, -0.143, 0.0, 0.0, -0.012),
+    "hip_front": (1.480, 0.0, 3.027, 0.0, -1.509, 0.0, -0.120),
+    "hip_back": (2.250, 0.0, 2.298, -0.224, 0.0, -2.695, -0.098),
+}
+
+
+def girth(points: list[Point], name: str) -> float:
+    """A girth of the body, m: `back` from spine3 to the skin behind it, `hip_side`, `hip_front` and `hip_back` from
+    the middle of the hips. points: the joints, 26 of BODY26."""
+    *weights, constant = _GIRTHS[name]
+    for (a, b), weight in zip(_LENGTHS, weights, strict=True):
+        if weight:
+            constant += weight * distance(points[_J[a]], points[_J[b]])
+    return constant
+
+
+def distance(a: Point, b: Point) -> float:
+    return ((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2) ** 0.5
+
+
+def heading(points: list[Point]) -> tuple[float, float]:
+    """Unit x, y of where the hips face."""
+    left, right = points[_J["left_hip"]], points[_J["right_hip"]]
+    x, y = left[1] - right[1], right[0] - left[0]
+    long = max(hypot(x, y), 1e-6)
+    return x / long, y / long
+
+
+# --- skirts and coats
+
+_SIDES = 14
+_TURN = 2 * pi * np.arange(_SIDES) / _SIDES
+# rings of a skirt: at the waist, around the hips, half way down, the hem
+_RINGS = 4
+# cloth stands this far off the skin, m
+_EASE = 0.015
+# a leg's radius at the knee and below it, as a share of the thigh's
+_KNEE, _CALF = 0.58, 0.6
+
+
+@lru_cache
+def _skirt_faces() -> np.ndarray:
+    k = np.arange(_SIDES)
+    n = (k + 1) % _SIDES
+    faces = []
+    for a in range(0, _SIDES * (_RINGS - 1), _SIDES):
+        faces += [np.stack([a + _SIDES + k, a + _SIDES + n, a + n], 1), np.stack([a + _SIDES + k, a + n, a + k], 1)]
+    return np.concatenate(faces).astype(np.int32)
+
+
+@lru_cache
+def _skirt_parts(below_knee: tuple[bool, ...]) -> np.ndarray:
+    """1 + SMPL joint of each face: the pelvis above the hips, then the thigh or, below the knee, the shank."""
+    middle = _TURN[np.arange(_SIDES)] + pi / _SIDES
+    left = np.sin(middle) > 0
+    rows = []
+    for row in range(_RINGS - 1):
+        names = ("left_knee", "right_knee") if below_knee[row] else ("left_hip", "right_hip")
+        part = np.where(left, 1 + _J[names[0]], 1 + _J[names[1]]) if row else np.full(_SIDES, 1 + _J["pelvis"])
+        rows += [part, part]
+    return np.concatenate(rows).astype(np.uint8)
+
+
+def skirt(points: list[Point], u: list[float]) -> tuple[object, Mesh, np.ndarray]:
+    """A skirt, a dress or a long coat: (how its vertices are found for a pose, its mesh, parts of its faces).
+
+    u: four uniforms, its length, flare, ease and whether it is a coat.
+    """
+    # length in thighs, then shanks: 1 is the knee, 2 the ankle
+    hem = 0.35 + 1.35 * u[0] if u[3] < 0.6 else 0.5 + 0.7 * u[0]
+    flare = 0.02 + 0.16 * u[1] ** 2 if u[3] < 0.6 else 0.01 + 0.05 * u[1]
+    ease = _EASE + (0.02 * u[2] if u[3] < 0.6 else 0.01 + 0.025 * u[2])
+    half = hem / 2
+    # which rows of faces begin and end below the knee, by their middles
+    parts = _skirt_parts((False, half / 2 > 1, (half + hem) / 2 > 1))
+
+    def vertices(points: list[Point]) -> np.ndarray:
+        x, y = heading(points)
+        left, right = points[_J["left_hip"]], points[_J["right_hip"]]
+        side, front, back = (girth(points, g) + ease for g in ("hip_side", "hip_front", "hip_back"))
+        thigh = side - distance(left, right) / 2
+        deep, ahead = (front + back) / 2, (front - back) / 2
+        hips = [(a + b) / 2 for a, b in zip(left, right, strict=True)]
+        pelvis = points[_J["pelvis"]]
+        across = (max(side - deep, 0.0) * -y, max(side - deep, 0.0) * x, 0.0)
+        shifted = (hips[0] + ahead * x, hips[1] + ahead * y, hips[2])
+        waist = (pelvis[0] + 0.8 * ahead * x, pelvis[1] + 0.8 * ahead * y, pelvis[2] + 0.04)
+        rings = [(waist, across, 0.92 * deep), (shifted, across, deep)]
+        for at, share in ((half, 0.5), (hem, 1.0)):
+            legs = [_leg(points, name, at) for name in ("left", "right")]
+            radius = thigh * (1 + (_KNEE - 1) * min(at, 1.0) if at < 1 else _CALF) + ease + flare * share
+            middle = tuple((a + b) / 2 for a, b in zip(*legs, strict=True))
+            apart = tuple((a - b) / 2 for a, b in zip(*legs, strict=True))
+            rings.append((middle, apart, max(radius, 0.6 * deep * (1 - 0.3 * at))))
+        centers, halves, radii = (np.array(part) for part in zip(*rings, strict=True))
+        around = np.stack([x * np.cos(_TURN) - y * np.sin(_TURN), y * np.cos(_TURN) + x * np.sin(_TURN)], 1)
+        # the hull of two circles: each vertex goes with the leg on its side
+        long = np.maximum(np.hypot(halves[:, 0], halves[:, 1]), 1e-6)
+        toward = np.clip(2.5 * (halves[:, :2] / long[:, None]) @ around.T, -1, 1)
+        found = centers[:, None] + toward[..., None] * halves[:, None]
+        found[..., :2] += (radii[:, None] * _FOLDS)[..., None] * around
+        found[..., 2] = np.maximum(found[..., 2], 0.02)
+        return found.reshape(-1, 3).astype(np.float32)
+
+    return vertices, Mesh(vertices(points), _skirt_faces()), parts
+
+
+# folds towards the hem
+_FOLDS = 1 + np.array([0.0, 0.0, 0.03, 0.06])[:, None] * np.where(np.arange(_SIDES) % 2, 1, -1)
+
+
+def _leg(points: list[Point], side: str, at: float) -> tuple[float, float, float]:
+    """The point `at` thighs, then shanks, down a leg."""
+    hip, knee, ankle = (points[_J[f"{side}_{name}"]] for name in ("hip", "knee", "ankle"))
+    a, b, t = (hip, knee, at) if at < 1 else (knee, ankle, at - 1)
+    return (a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1]), a[2] + t * (b[2] - a[2]))
+
+
+# --- hats
+
+# the skull about the middle of the head, as multiples of the distance from there to the nose: half its length, half
+# its width, how high the crown is, and how far ahead its middle is
+_SKULL = (0.89, 0.75, 1.08, 0.05)
+
+
+def hat_frame(points: list[Point], edge: float) -> tuple[list[list[float]], Point]:
+    """Rows and origin that put `prop_meshes.hat` on the head: the edge `edge` of the way from the ears to the crown."""
+    nose, center, base = (points[_J[name]] for name in ("nose", "head_center", "head"))
+    n = [a - b for a, b in zip(nose, center, strict=True)]
+    up = [a - b for a, b in zip(center, base, strict=True)]
+    size = max(distance(nose, center), 1e-6)
+    # the nose's line is 10 degrees below the level of the head; up is made square to it
+    n = [a / size for a in n]
+    along = sum(a * b for a, b in zip(n, up, strict=True))
+    up = [a - along * b for a, b in zip(up, n, strict=True)]
+    long = max(sum(a * a for a in up) ** 0.5, 1e-6)
+    up = [a / long for a in up]
+    ahead = [0.985 * a + 0.17 * b for a, b in zip(n, up, strict=True)]
+    up = [0.985 * b - 0.17 * a for a, b in zip(n, up, strict=True)]
+    left = [
+        up[1] * ahead[2] - up[2] * ahead[1],
+        up[2] * ahead[0] - up[0] * ahead[2],
+        up[0] * ahead[1] - up[1] * ahead[0],
+    ]
+    length, width, crown, forward = (size * s for s in _SKULL)
+    rise = edge * crown
+    rows = [[(length + _HAIR) * a for a in ahead], [(width + _HAIR) * a for a in left]]
+    rows.append([(crown - rise + _HAIR) * a for a in up])
+    origin = [c + forward * a + rise * u for c, a, u in zip(center, ahead, up, strict=True)]
+    return rows, origin
+
+
+# hair and the hat's own thickness, m
+_HAIR = 0.02

@@ -1,0 +1,239 @@
+"""The job behind `lidarpose synth`: people, clips or streets into Parquet shards; see `data.writer` for how."""
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidarpose.body.mocap import digest as motion_digest
+from lidarpose.data.shards import CARD, Card, person_row, shard_path, shard_writer, write_card
+from lidarpose.data.writer import clean_folder, make_shards, open_folder
+from lidarpose.errors import InputError
+from lidarpose.io.files import content_digest, file_error
+from lidarpose.lidar.presets import SENSORS, sensor
+from lidarpose.synth.scene import scene_config
+
+# persons, clips or streets a shard
+PER_SHARD = {"people": 2000, "clips": 125, "streets": 2}
+_TABLES = {"people": ("people",), "clips": ("people",), "streets": ("people", "frames")}
+CLIP_FRAMES = 16
+STREET_FRAMES = 10
+# rows of a table that one of them has, where that is known
+_ROWS = {"people": {"people": 1}, "clips": {"people": CLIP_FRAMES}}
+# how often a shard tells how far it is
+_TOLD = 50
+# share of captured poses where a file of them is given
+_CAPTURED = 0.5
+# as many as names of five digits can number
+_MOST_SHARDS = 100_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """What to make. what: people, clips or streets; count of them; scene: a preset's name; sensors: names or files of
+    tables, None: the scene's; hard in [0, 1]; motion: a file of captured clips whose poses make up a share `captured`
+    of all (None: half), subjects: which of them; per_shard: persons, clips or streets a file, None: as `PER_SHARD`."""
+
+    what: str
+    count: int
+    scene: str = "wild"
+    sensors: tuple[str, ...] | None = None
+    seed: int = 0
+    hard: float = 1.0
+    motion: str | None = None
+    subjects: tuple[str, ...] | None = None
+    captured: float | None = None
+    per_shard: int | None = None
+
+    def __post_init__(self):
+        if self.what not in PER_SHARD:
+            raise InputError(f"what to make must be one of {', '.join(PER_SHARD)}, got {self.what!r}")
+        if self.count < 1:
+            raise InputError(f"expected at least 1 of {self.what}, got {self.count}")
+        if self.per_shard is not None and self.per_shard < 1:
+            raise InputError(f"expected at least 1 of {self.what} a shard, got {self.per_shard}")
+        if self.what == "streets" and (self.scene != "wild" or self.hard != 1 or self.motion is not None):
+            raise InputError("streets have scene, difficulty and walkers of their own: leave these options out")
+        if -(-self.count // (self.per_shard or PER_SHARD[self.what])) > _MOST_SHARDS:
+            raise InputError(
+                f"{self.count:,} {self.what} would take more than {_MOST_SHARDS:,} shards: give a larger --per-shard"
+            )
+        if self.motion is None and (self.subjects is not None or self.captured is not None):
+            raise InputError("--subjects and --captured are of captured clips: name their file with --motion too")
+        if self.subjects is not None and not self.subjects:
+            raise InputError("expected the subjects of clips, got none: leave --subjects away for all of them")
+        if self.captured is not None and not 0 <= self.captured <= 1:
+            raise InputError(f"expected a share of captured poses between 0 and 1, got {self.captured}")
+        if self.seed < 0:
+            raise InputError(f"expected a seed of at least 0, got {self.seed}")
+        scene_config(self.scene).eased(self.hard)
+        for name in self.sensors or ():
+            sensor(name)
+        if self.sensors is not None and not self.sensors:
+            raise InputError("expected the names of sensors, got none; lidarpose sensors lists them")
+
+    @property
+    def share(self) -> float:
+        """Of the poses, how many are captured."""
+        return 0.0 if self.motion is None else _CAPTURED if self.captured is None else self.captured
+
+    def card(self) -> Card:
+        """The dataset's card: all that decides its content."""
+        sensors = self.sensors or scene_config(self.scene).sensors
+        settings: dict[str, Any] = {
+            "what": self.what,
+            "sensors": [name if name in SENSORS else Path(name).name for name in sensors],
+            "seed": self.seed,
+        }
+        if self.what != "streets":
+            settings |= {"scene": self.scene, "hard": self.hard}
+        # files by content, so that another file of the same name is noticed and the same one elsewhere is not
+        tables = [name for name in dict.fromkeys(sensors) if name not in SENSORS]
+        if tables:
+            settings["tables"] = [content_digest(name, expected="a sensor's table")[:16] for name in tables]
+        if self.motion is not None:
+            settings["motion"] = motion_digest(self.motion)
+            settings["captured"] = self.share
+            settings["subjects"] = list(self.subjects) if self.subjects else None
+        per_shard = self.per_shard or PER_SHARD[self.what]
+        return Card(settings=settings, count=self.count, per_shard=per_shard, tables=_TABLES[self.what])
+
+
+def write_dataset(
+    job: Job, folder: str | Path, *, workers: int = 1, progress: Callable[[int, int], None] | None = None
+) -> int:
+    """Makes what is missing of a dataset; returns how many persons, clips or streets were made now.
+
+    workers: processes; progress(done, total) is called at the start and as they are done. Raises InputError where the
+    folder holds another dataset or something else, or cannot be written, MissingExtra without numba or pyarrow.
+    """
+    if workers < 1:
+        raise InputError(f"expected at least 1 worker, got {workers}")
+    folder, card = Path(folder), job.card()
+    missing = open_folder(folder, card, _ROWS.get(job.what))
+    left = sum(card.size(shard) for shard in missing)
+    done = card.count - left
+    make = Maker(job=job, card=card, folder=folder)
+    if missing:
+        # before anything is written, so that motion that cannot be read leaves no folder
+        make.get_ready()
+    clean_folder(folder)
+    is_new, has_card = not folder.exists(), (folder / CARD).is_file()
+    if not has_card:
+        write_card(folder, card)
+    if progress is not None:
+        progress(done, card.count)
+    try:
+        for _, count in make_shards(make, missing, workers=workers):
+            done += count
+            if progress is not None:
+                progress(done, card.count)
+    except InputError:
+        if not has_card:
+            _give_up(folder, is_new)
+        raise
+    clean_folder(folder)
+    return left
+
+
+def _give_up(folder: Path, is_new: bool) -> None:
+    """Takes the card of settings that made nothing away again, so that others can follow."""
+    clean_folder(folder)
+    with suppress(OSError):
+        if {path.name for path in folder.iterdir()} == {CARD}:
+            (folder / CARD).unlink()
+            if is_new:
+                folder.rmdir()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Maker:
+    """Makes the shards of a job and writes them: called with a shard's number, yields counts of persons, clips or
+    streets as they are done. Written when the last one was yielded. May be pickled."""
+
+    job: Job
+    card: Card
+    folder: Path
+
+    def __getstate__(self) -> dict[str, Any]:
+        # each process reads the poses itself
+        return {name: value for name, value in vars(self).items() if name != "_generator"}
+
+    def get_ready(self) -> None:
+        """Reads what all shards need, once. Raises InputError where it cannot be read, MissingExtra without numba."""
+        self._generator  # noqa: B018
+
+    def __call__(self, shard: int) -> Iterator[int]:
+        self.get_ready()
+        return self._shard(shard)
+
+    @cached_property
+    def _generator(self):
+        from lidarpose.synth.bodies import CLIP_HZ, PoseBank
+        from lidarpose.synth.generator import Generator
+
+        job = self.job
+        scene = scene_config(job.scene).eased(job.hard)
+        if job.sensors is not None:
+            scene = replace(scene, sensors=job.sensors)
+        bank = PoseBank.from_clips(job.motion, job.subjects) if job.motion is not None else None
+        if job.what == "clips" and job.share and not len(bank.clips.windows(CLIP_FRAMES + 1)):
+            raise file_error(
+                job.motion, f"no clip lasts {CLIP_FRAMES / CLIP_HZ:g} s: give longer motion, or leave --clips away"
+            )
+        return Generator(scene=scene, bank=bank, captured=job.share)
+
+    def _shard(self, shard: int) -> Iterator[int]:
+        rows_of = {"people": self._person, "clips": self._clip, "streets": self._street}[self.job.what]
+        first, size = shard * self.card.per_shard, self.card.size(shard)
+        told, step = 0, max(1, self.card.per_shard // _TOLD)
+        with ExitStack() as stack:
+            add = {
+                table: stack.enter_context(shard_writer(shard_path(self.folder, table, shard), table))
+                for table in self.card.tables
+            }
+            for k in range(size):
+                for table, rows in rows_of(first + k).items():
+                    for row in rows:
+                        add[table](row)
+                if (k + 1) % step == 0 and k + 1 < size:
+                    yield k + 1 - told
+                    told = k + 1
+        yield size - told
+
+    def _person(self, index: int) -> dict[str, list]:
+        person = self._generator.person(self.job.seed, index)
+        return {"people": [person_row(person.sample, index=index, facts=person.facts)]}
+
+    def _clip(self, index: int) -> dict[str, list]:
+        clip = self._generator.clip(self.job.seed, index, frames=CLIP_FRAMES)
+        return {"people": [person_row(p.sample, index=index, frame=f, facts=p.facts) for f, p in enumerate(clip)]}
+
+    def _street(self, index: int) -> dict[str, list]:
+        from lidarpose.synth.street import samples, street
+
+        seed, sensors = self.job.seed, self._generator.scene.sensors
+        found = street(seed, index, sensor=sensors[index % len(sensors)], frames=STREET_FRAMES)
+        people = []
+        for frame, sample in samples(found, np.random.default_rng([seed, 5, index])):
+            people.append(person_row(sample, index=index, frame=frame, track=int(sample.box.id)))
+        frames = [
+            {
+                "index": index,
+                "frame": number,
+                "sensor": found.sensor,
+                "points": frame.points.ravel(),
+                "ring": frame.ring,
+                "person": frame.person,
+                "part": frame.part,
+                "track": [box.id for box in frame.boxes],
+                "box": [np.concatenate([box.center, box.size, [box.yaw]]) for box in frame.boxes],
+                "joints": frame.joints,
+            }
+            for number, frame in enumerate(found.frames)
+        ]
+        return {"people": people, "frames": frames}

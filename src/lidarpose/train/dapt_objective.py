@@ -1,0 +1,203 @@
+"""`DaptTask`: what the loop must know of the paper's network, in either of its stages.
+
+Legend: B people, J joints of the network, M voxels of level 0.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lidarpose.errors import InputError, check_name
+from lidarpose.models.dapt.dapt_config import PARTS, DaptConfig, named_config
+from lidarpose.models.dapt.dapt_net import DaptBatch, DaptNet, DaptOutputs
+from lidarpose.models.dapt.voxel_tables import LAYOUTS, Tables, build_tables
+from lidarpose.skeleton import BODY26, HUMAN15
+from lidarpose.train.dapt_losses import DaptTargets, finetuning, pretraining
+from lidarpose.train.dapt_transfer import transferred
+from lidarpose.train.example import UNKNOWN_PART, Example
+from lidarpose.train.objective import Share, alone
+
+__all__ = ["DaptArrays", "DaptTask", "finetuning_config", "pretraining_config", "small", "transferred"]
+
+STAGES = ("pretrain", "finetune")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DaptArrays:
+    """A batch of people.
+
+    tables: what the network reads; joints (B, J, 3) float32 m in the network's order, NaN where there is no label;
+    weight (B, J) float32: 1 for a label, else 0; part (M,) int64: the part most of a voxel's points are of, -1 where
+    none is known; None in fine-tuning.
+    """
+
+    tables: Tables
+    joints: np.ndarray
+    weight: np.ndarray
+    part: np.ndarray | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class DaptTask:
+    """A `Task` of a `DaptNet` with this configuration.
+
+    stage: "pretrain", which needs coordinates and parts, or "finetune", which needs heatmaps; layout: of the tables,
+    "ragged" for CPUs and "padded" for accelerators; regression, segmentation, auxiliary: weights, see `dapt_losses`.
+    Heads that a stage does not ask get a gradient of zero. Raises InputError where the configuration lacks a head.
+    """
+
+    config: DaptConfig
+    stage: str
+    layout: str = "ragged"
+    regression: float = 0.5
+    segmentation: float = 1.0
+    auxiliary: float = 0.0
+
+    def __post_init__(self):
+        config = self.config
+        check_name("stage of training", self.stage, STAGES)
+        check_name("layout", self.layout, LAYOUTS)
+        for name in ("regression", "segmentation", "auxiliary"):
+            if not 0 <= getattr(self, name) < float("inf"):
+                raise InputError(f"{name} must be a weight of at least 0, got {getattr(self, name)}")
+        if self.stage == "pretrain" and not (config.coordinates and config.parts == PARTS):
+            raise InputError(
+                f"pre-training needs coordinates and {PARTS} parts, {config.name} has coordinates={config.coordinates} "
+                f"and parts={config.parts}: see pretraining_config"
+            )
+        if self.stage == "finetune" and not config.bins:
+            raise InputError(f"fine-tuning needs heatmaps, {config.name} has no bins and ranges: see finetuning_config")
+        if self.stage == "finetune" and self.auxiliary and not config.auxiliary:
+            raise InputError(
+                f"auxiliary={self.auxiliary} needs the auxiliary head, which {config.name} lacks: set auxiliary=True "
+                "in its configuration"
+            )
+
+    def network(self) -> DaptNet:
+        return DaptNet(self.config)
+
+    def collate(self, examples: list[Example]) -> DaptArrays:
+        """Of each voxel one random point is kept, as in the released code, drawn from the person's own seed.
+
+        So nobody depends on batch mates, nor on the order of their own points. The curves of people of more than
+        `config.patch` voxels are shuffled by all seeds of the batch; smaller people attend in full, whatever the curve.
+        A voxel's part is that of most of its points, where the released code takes the kept point's.
+        """
+        thinned = [_thinned(one, self.config.grid) for one in examples]
+        tables = build_tables(
+            [points for points, _ in thinned],
+            self.config,
+            layout=self.layout,
+            rng=np.random.default_rng([one.seed for one in examples]),
+        )
+        # the last entry: of the stand-in for somebody without points
+        part = np.concatenate([*(part for _, part in thinned), [UNKNOWN_PART]])
+        order = [BODY26.index(name) for name in self.config.joints]
+        joints = np.stack([one.joints for one in examples])[:, order].astype(np.float32)
+        return DaptArrays(
+            tables=tables,
+            joints=joints,
+            weight=np.isfinite(joints).all(-1).astype(np.float32),
+            part=part[tables.kept] if self.stage == "pretrain" else None,
+        )
+
+    def terms(
+        self, network: Callable, arrays: DaptArrays, *, device: torch.device | str = "cpu", share: Share = alone
+    ) -> dict[str, Tensor]:
+        """`dapt_losses.pretraining` or `finetuning`. A joint's weight is 1 where it is labelled, seen or not, as in the
+        released code."""
+        outputs, targets = network(DaptBatch.from_tables(arrays.tables, device)), _targets(arrays, device)
+        if self.stage == "pretrain":
+            terms = pretraining(
+                outputs, targets, regression=self.regression, segmentation=self.segmentation, share=share
+            )
+            return terms | {"regression": terms["regression"] + self._idle(outputs)}
+        terms = finetuning(outputs, targets, auxiliary=self.auxiliary, share=share)
+        return terms | {"heatmap": terms["heatmap"] + self._idle(outputs)}
+
+    def _idle(self, outputs: DaptOutputs) -> Tensor | float:
+        """Zero, of the heads that the stage does not ask: processes that average gradients wait for everybody's."""
+        asked = ("coordinates", "parts") if self.stage == "pretrain" else ("logits_x", "logits_y", "logits_z")
+        if self.stage == "finetune" and self.auxiliary:
+            asked += ("inter",)
+        heads = ("logits_x", "logits_y", "logits_z", "inter", "parts", "coordinates")
+        values = [getattr(outputs, name) for name in heads if name not in asked]
+        return sum(value.float().sum() * 0 for value in values if value is not None)
+
+    @torch.no_grad()
+    def joints(self, network: Callable, arrays: DaptArrays, *, device: torch.device | str = "cpu") -> np.ndarray:
+        """Of the heatmaps; in pre-training of the coordinates, which are what it teaches."""
+        outputs = network(DaptBatch.from_tables(arrays.tables, device))
+        own = outputs.coordinates if self.stage == "pretrain" else outputs.joints()
+        joints = np.full((len(arrays.joints), len(BODY26), 3), np.nan, np.float32)
+        joints[:, [BODY26.index(name) for name in self.config.joints]] = own.float().cpu().numpy()
+        return joints
+
+
+def pretraining_config(joints: tuple[str, ...] = HUMAN15.joints) -> DaptConfig:
+    """The paper's network before fine-tuning, with the corrected data flow; joints: its 15, or any of body26."""
+    return replace(named_config("pretrain"), joints=joints, legacy=False)
+
+
+def finetuning_config(dataset: str, *, auxiliary: bool = False) -> DaptConfig:
+    """The paper's network for a dataset, with the corrected data flow: waymo, humanm3, lidarhuman26m or sloper4d.
+
+    auxiliary: with the head of the released code's other term. Raises InputError for another name.
+    """
+    return replace(named_config(dataset), auxiliary=auxiliary, legacy=False)
+
+
+def small(config: DaptConfig) -> DaptConfig:
+    """The same design, joints and heads with a fortieth of the weights: levels of 4, 8 and 16 cm. For CPUs."""
+    return replace(
+        config,
+        name=f"small-{config.name}",
+        encoder_depths=(1, 1, 2),
+        encoder_channels=(32, 48, 96),
+        encoder_heads=(2, 3, 6),
+        decoder_depths=(1, 1),
+        decoder_channels=(48, 64),
+        decoder_heads=(3, 4),
+        anchor_channels=(48, 64, 64),
+        strides=(2, 2),
+        grid=0.04,
+        drop_path=0.1,
+    )
+
+
+def _targets(arrays: DaptArrays, device: torch.device | str) -> DaptTargets:
+    return DaptTargets(
+        joints=torch.as_tensor(np.where(arrays.weight[..., None] > 0, arrays.joints, 0)).to(device),
+        weight=torch.as_tensor(arrays.weight).to(device),
+        part=None if arrays.part is None else torch.as_tensor(arrays.part).to(device),
+    )
+
+
+def _thinned(one: Example, grid: float) -> tuple[np.ndarray, np.ndarray]:
+    """A random point of each voxel (m, 3), and the part that most of the voxel's points are of (m,).
+
+    Cells as in `build_tables`, which then finds one point in each.
+    """
+    points = np.asarray(one.points, np.float32).reshape(-1, 3)
+    part = np.asarray(one.part, np.int64)
+    if len(part) != len(points) or part.size and part.max() >= PARTS:
+        most = part.max() if part.size else "none"
+        raise InputError(
+            f"each of {len(points)} points needs a part below {PARTS}, got {len(part)}, the highest {most}"
+        )
+    cells = np.floor(points / grid)
+    order = np.lexsort((*points.T, *cells.T))
+    cells = cells[order]
+    begins = np.ones(len(cells), bool)
+    begins[1:] = (cells[1:] != cells[:-1]).any(1)
+    first = np.flatnonzero(begins)
+    counts = np.diff(first, append=len(cells))
+    rng = np.random.default_rng(one.seed)
+    kept = order[first + (rng.random(len(first)) * counts).astype(np.int64)]
+    voxel, part = np.cumsum(begins) - 1, part[order]
+    told = part >= 0
+    votes = np.bincount(voxel[told] * PARTS + part[told], minlength=len(first) * PARTS).reshape(-1, PARTS)
+    return points[kept], np.where(votes.any(1), votes.argmax(1), UNKNOWN_PART)

@@ -1,0 +1,111 @@
+"""People of a dataset on a contact sheet, or on a page to turn them in 3D."""
+
+from pathlib import Path
+
+import numpy as np
+
+from lidarpose.data.shards import CARD, Dataset, counted, open_dataset, shard_path
+from lidarpose.errors import InputError
+from lidarpose.io.files import check_apart, file_error
+from lidarpose.viz.draw import MAX_PEOPLE, Panel, draw_people
+from lidarpose.viz.html import ReportPerson, write_report
+
+
+def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out: str | Path | None = None) -> Path:
+    """Draws `count` people of a dataset, evenly spread over it, and returns the file's path.
+
+    out: the file, by default the folder's name with .png or .html in the current folder. Raises InputError for a
+    folder that is no dataset or has no shard yet, and a file that cannot be written.
+    """
+    most = 400 if html else MAX_PEOPLE
+    if not 1 <= count <= most:
+        raise InputError(f"expected 1 to {most} people to draw, got {count}")
+    dataset = open_dataset(folder)
+    name = Path(folder).resolve().name
+    path = Path(out) if out is not None else Path(f"{name}.{'html' if html else 'png'}")
+    check_apart(path, dataset.folder / CARD, *dataset.folder.glob("*.parquet"))
+    rows = _spread(dataset, count)
+    settings = dataset.card.settings
+    title = f"{name}: {counted(dataset.card.count, settings.get('what', 'people'))}"
+    if "scene" in settings:
+        title += f", scene {settings['scene']}"
+    if (written := len(_written(dataset))) < dataset.card.shards:
+        title += f", {written:,} of {dataset.card.shards:,} shards written so far"
+    if html:
+        lines = [_line(row, dataset) for row in rows]
+        write_report(path, [_card(row, dataset) for row in rows], title=title, summary=lines)
+    else:
+        draw_people([_panel(row, dataset) for row in rows], path, title=title)
+    return path
+
+
+def _written(dataset: Dataset) -> list[int]:
+    """Numbers of the shards of people that are there."""
+    return [k for k in range(dataset.card.shards) if shard_path(dataset.folder, dataset.card.people, k).is_file()]
+
+
+def _spread(dataset: Dataset, count: int) -> list[dict]:
+    """`count` rows, evenly spread over the shards that are there; of a smaller dataset all rows."""
+    there = _written(dataset)
+    if not there:
+        raise file_error(
+            dataset.folder, f"holds no shard yet; wait for the first one, or run {dataset.card.writer} again"
+        )
+    sizes = [dataset.rows_of(dataset.card.people, shard) for shard in there]
+    total = sum(sizes)
+    count = min(count, total)
+    # each in the middle of an equal share of the rows
+    wanted = ((2 * np.arange(count) + 1) * total // (2 * count)).tolist()
+    rows, first = [], 0
+    for shard, size in zip(there, sizes, strict=True):
+        here = {w - first for w in wanted if first <= w < first + size}
+        if here:
+            found = dataset.rows(dataset.card.people, range(shard, shard + 1))
+            rows += [row for k, row in enumerate(found) if k in here]
+        first += size
+    return rows
+
+
+def _label(row: dict, dataset: Dataset) -> str:
+    """As "#12 os1-128"; of clips and streets with the frame and the track."""
+    words = [f"#{row['index']}"]
+    if dataset.card.settings.get("what") in ("clips", "streets"):
+        words.append(f"frame {row['frame']}")
+    if "frames" in dataset.card.tables:
+        words.append(f"track {row['track']}")
+    return " ".join([*words, row.get("sensor") or row["source"].rpartition("/")[2]])
+
+
+def _panel(row: dict, dataset: Dataset) -> Panel:
+    sample = dataset.sample(row)
+    return Panel(
+        points=sample.points,
+        truth=sample.pose,
+        part=sample.part,
+        label=_label(row, dataset),
+        distance=row.get("distance"),
+    )
+
+
+def _card(row: dict, dataset: Dataset) -> ReportPerson:
+    sample = dataset.sample(row)
+    caption = f"{len(sample.points):,} points"
+    if row.get("distance") is not None:
+        # as in the table above
+        caption += f" · {row['distance']:.1f} m"
+    return ReportPerson(
+        label=_label(row, dataset), points=sample.points, truth=sample.pose, part=sample.part, caption=caption
+    )
+
+
+def _line(row: dict, dataset: Dataset) -> dict:
+    line = {"person": _label(row, dataset), "points": len(row["points"]) // 3}
+    # synthetic people have facts beside their distance
+    if row.get("kind") is not None:
+        line["does"] = row["kind"]
+    if row.get("distance") is not None:
+        line["distance m"] = round(row["distance"], 1)
+    for name in ("visible", "clutter"):
+        if row.get(name) is not None:
+            line[f"{name} %"] = round(100 * row[name])
+    return line

@@ -1,0 +1,199 @@
+"""One HTML file that shows people in turnable 3D views, under a table of numbers. It loads nothing from a network."""
+
+import json
+import math
+from dataclasses import dataclass
+from html import escape
+from importlib import resources
+from numbers import Integral, Real
+from pathlib import Path
+
+import numpy as np
+
+from lidarpose._version import __version__
+from lidarpose.sample import Pose, within_reach
+from lidarpose.skeleton import SMPL24, Skeleton
+from lidarpose.viz.person_view import (
+    bone_sides,
+    check_person,
+    confidences,
+    describe,
+    facing,
+    is_known,
+    middle,
+    missing_pose,
+    side,
+    thinned,
+)
+
+MAX_POINTS = 60_000  # of all people together: about 0.9 MB of text
+_FEWEST_POINTS = 150  # a person keeps these, however many people there are
+_SCHEMA = 1
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ReportPerson:
+    """One person of a report: points (n, 3) m, z up, n = 0 is legal; pose and truth of one person, joints (J, 3) m in
+    the points' frame; caption is a line of the caller's (sensor, distance, error), by default the number of points,
+    the distance from the frame's origin and the mean confidence; part (n,) int, 0 = not body, 1 + j = the bone of
+    SMPL-24's joint j, colors the points by side. Raises InputError on a wrong shape."""
+
+    label: str
+    points: np.ndarray
+    pose: Pose | None = None
+    truth: Pose | None = None
+    caption: str = ""
+    part: np.ndarray | None = None
+
+    def __post_init__(self):
+        check_person(self, "ReportPerson")
+
+
+def write_report(path: str | Path, people: list[ReportPerson], *, title: str, summary: list[dict]) -> None:
+    """Writes the report to `path`, whole or not at all.
+
+    `summary` holds the rows of the table on top; its columns are the rows' keys in order of appearance, and a column
+    of numbers is aligned to the right. More than 60,000 points in all are thinned evenly for the views.
+    """
+    from lidarpose.io.files import check_suffix, write_atomic
+
+    check_suffix(path, ".html", ".htm")
+    write_atomic(path, render_report(people, title=title, summary=summary).encode("utf-8", "replace"))
+
+
+def render_report(people: list[ReportPerson], *, title: str, summary: list[dict]) -> str:
+    """The text of `write_report`'s file; the same input gives the same text."""
+    people = list(people)
+    skeletons = {pose.skeleton.name: pose.skeleton for p in people for pose in (p.pose, p.truth) if pose is not None}
+    limit = max(_FEWEST_POINTS, MAX_POINTS // max(len(people), 1))
+    drawn = [_person_data(p, limit) for p in people]
+    data = {
+        "schema": _SCHEMA,
+        "unit": "mm",
+        "skeletons": {name: _skeleton_data(s) for name, s in skeletons.items()},
+        "people": drawn,
+    }
+    # inside a script element only "<" could end the element early
+    blob = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    cards = [_card(i, p, len(d["points"]) // 3) for i, (p, d) in enumerate(zip(people, drawn, strict=True))]
+    fields = {
+        "TITLE": escape(title),
+        "VERSION": escape(__version__),
+        "STYLE": _asset("report.css"),
+        "SCRIPT": _asset("report.js"),
+        "SUMMARY": _table(summary),
+        "CARDS": "\n".join(cards) or '<p class="none">no people</p>',
+        "DATA": blob,
+    }
+    # split once, so that a text of the caller's that looks like a field is left alone
+    pieces = _asset("report.html").split("%%")
+    return "".join(fields[piece] if i % 2 else piece for i, piece in enumerate(pieces))
+
+
+def _asset(name: str) -> str:
+    return (resources.files("lidarpose.viz") / "assets" / name).read_text(encoding="utf-8").rstrip("\n")
+
+
+def _skeleton_data(skeleton: Skeleton) -> dict:
+    """Joints' names and sides, bones as [parent, child, side]."""
+    bones = [[a, b, s[0]] for (a, b), s in zip(skeleton.bones, bone_sides(skeleton), strict=True)]
+    return {"joints": skeleton.joints, "sides": "".join(side(j)[0] for j in skeleton.joints), "bones": bones}
+
+
+def _person_data(person: ReportPerson, limit: int) -> dict:
+    """Millimetres as integers about the person's middle, so that a point costs some 14 letters."""
+    center = middle(person)
+    center = np.zeros(3) if center is None else center
+    points = np.asarray(person.points, float)
+    # points that are somewhere
+    kept = np.flatnonzero(within_reach(points))
+    kept = kept[thinned(len(kept), limit)]
+    points = points[kept]
+    forward = facing(person.pose)
+    forward = facing(person.truth) if forward is None else forward
+    data = {
+        "points": np.rint((points - center) * 1000).astype(int).ravel().tolist(),
+        "facing": None if forward is None else round(math.atan2(forward[1], forward[0]), 4),
+        "pose": _pose_data(person.pose, center),
+        "truth": _pose_data(person.truth, center),
+    }
+    if person.part is not None:
+        data["sides"] = "".join(_PART_SIDES[np.clip(person.part[kept], 0, len(SMPL24))])
+    return data
+
+
+# a letter a part: n = not body, else the body side's
+_PART_SIDES = np.array(["n"] + [side(joint)[0] for joint in SMPL24.joints])
+
+
+def _pose_data(pose: Pose | None, center: np.ndarray) -> dict | None:
+    if not is_known(pose):
+        return None
+    joints = np.asarray(pose.joints, float)
+    known = np.isfinite(joints).all(-1)
+    placed = [
+        np.rint((j - center) * 1000).astype(int).tolist() if k else None for j, k in zip(joints, known, strict=True)
+    ]
+    data = {"skeleton": pose.skeleton.name, "joints": placed}
+    if pose.confidence is not None:
+        data["confidence"] = confidences(pose).round(3).tolist()
+    return data
+
+
+def _card(i: int, person: ReportPerson, drawn: int) -> str:
+    """drawn: how many of the person's points are."""
+    notes = [missing_pose(person)]
+    if drawn < len(person.points):
+        notes.append(f"{drawn:,} of {len(person.points):,} points drawn")
+    note = "".join(f'<p class="note">{escape(n)}</p>' for n in notes if n)
+    label = escape(person.label)
+    return (
+        f'<figure class="card"><canvas data-person="{i}" tabindex="0" role="img" aria-label="3D view of {label}">'
+        f"</canvas>{note}<figcaption><strong>{label}</strong>"
+        f"<span>{escape(person.caption or describe(person))}</span></figcaption></figure>"
+    )
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool | np.bool_)
+
+
+def _is_missing(value: object) -> bool:
+    return value is None or (_is_number(value) and not math.isfinite(value))
+
+
+def _decimals(values: list) -> int:
+    """So many that the column's largest number shows four digits, at most three, and none that only adds zeros."""
+    values = [abs(float(v)) for v in values if not isinstance(v, Integral)]
+    largest = max(values, default=0.0)
+    most = int(np.clip(3 - math.floor(math.log10(largest)), 0, 3)) if largest > 0 else 3
+    return next((d for d in range(most) if all(round(v, d) == round(v, most) for v in values)), most)
+
+
+def _table(rows: list[dict]) -> str:
+    """An HTML table: columns of numbers to the right, `–` where a row has nothing, yes and no for truth values."""
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    if not columns:
+        return ""
+    classes, decimals = {}, {}
+    for key in columns:
+        values = [row[key] for row in rows if not _is_missing(row.get(key))]
+        numeric = bool(values) and all(_is_number(v) for v in values)
+        classes[key] = ' class="number"' if numeric else ""
+        decimals[key] = _decimals(values) if numeric else 3
+
+    def cell(row: dict, key: str) -> str:
+        value = row.get(key)
+        if _is_missing(value):
+            text = "–"
+        elif isinstance(value, bool | np.bool_):
+            text = "yes" if value else "no"
+        elif isinstance(value, Integral) or not _is_number(value):
+            text = str(value)
+        else:
+            text = f"{float(value):.{decimals[key]}f}"
+        return f"<td{classes[key]}>{escape(text)}</td>"
+
+    head = "".join(f"<th{classes[key]} scope=col>{escape(str(key))}</th>" for key in columns)
+    body = "\n".join("<tr>" + "".join(cell(row, key) for key in columns) + "</tr>" for row in rows)
+    return f'<div class="wide"><table><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table></div>'
