@@ -230,8 +230,8 @@ def test_picture_ignores_the_settings_of_the_user():
 
 def test_importing_is_light_and_drawing_leaves_pyplot_alone():
     code = (
-        "import sys, numpy as np; from lidarpose.viz import picture, report; assert 'matplotlib' not in sys.modules;"
-        "picture.draw_people([picture.Panel(points=np.ones((9, 3)))]);"
+        "import sys, numpy as np; from lidarpose.viz import draw, html; assert 'matplotlib' not in sys.modules;"
+        "draw.draw_people([draw.Panel(points=np.ones((9, 3)))]);"
         "assert 'matplotlib.pyplot' not in sys.modules and 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
