@@ -17,9 +17,9 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from lidarpose.eval.metrics.joint_errors import auroc, calibration_error
 from lidarpose.inference.predictor import load
 from lidarpose.io.files import write_atomic
+from lidarpose.metrics import auroc, calibration_error
 from lidarpose.models.bundled import DEFAULT
 from lidarpose.sample import HIT
 from lidarpose.skeleton import BODY26

@@ -13,9 +13,9 @@ import time
 
 import numpy as np
 
-from lidarpose.eval.metrics.joint_errors import auroc, calibration_error, mpjpe, pa_mpjpe
 from lidarpose.geometry import rotation_about
 from lidarpose.inference.predictor import load
+from lidarpose.metrics import auroc, calibration_error, mpjpe, pa_mpjpe
 from lidarpose.models.bundled import DEFAULT
 from lidarpose.sample import HIT
 from lidarpose.skeleton import HUMAN15, SMPL24, WAYMO14

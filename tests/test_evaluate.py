@@ -12,7 +12,7 @@ import dataset_files as files
 import numpy as np
 import pytest
 import waymo_files
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from shard_files import write_shard
 
@@ -25,7 +25,7 @@ from lidarpose.errors import InputError
 from lidarpose.eval import robustness
 from lidarpose.eval.bench import load_bench
 from lidarpose.eval.dataset import open_people, spread
-from lidarpose.eval.metric_rows import lines_of, span_rows, triples, turned_round
+from lidarpose.eval.metric_rows import lines_of, triples, turned_round
 from lidarpose.eval.metrics import bootstrap
 from lidarpose.eval.protocols import cropped, jittered
 from lidarpose.eval.run import judge, task_of
@@ -371,23 +371,6 @@ def test_sequences_are_drawn_whole(sets, monkeypatch):
     means = [np.nanmean(table[found.judged.sequence == name]) for name in ("test/b", "test/c")]
     # of two sequences the extreme draws are one of them twice
     assert (line.low, line.high) == pytest.approx((min(means), max(means)))
-
-
-@settings(max_examples=60)
-@given(
-    values=st.lists(
-        st.floats(0, 60) | st.just(float("nan")) | st.sampled_from([0.0, 10.0, 20.0]), min_size=1, max_size=30
-    )
-)
-def test_spans_are_those_of_by_span(values):
-    values = np.array(values)
-    table = np.arange(len(values), dtype=float)
-    for edges in (metrics.DISTANCE_EDGES, (0.0, 10.0, 20.0)):
-        wanted = metrics.by_span(table, values, edges)
-        found = span_rows(values, edges)
-        assert {k: v.score for k, v in wanted.items() if v.score.people and k != "elsewhere"} == {
-            name: metrics.mean(table[rows]) for name, rows in found.items()
-        }
 
 
 def _moving(sets, frames):

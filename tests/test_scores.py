@@ -172,7 +172,7 @@ def test_draws_against_a_loop(seed, average, clustered):
     table = drawn(seed, n=12, joints=3, labelled=0.4)
     table[0] = 1.0
     clusters = np.random.default_rng(seed).integers(4, size=12) if clustered else np.arange(12)
-    fast, units = bootstrap.draw_means(
+    fast, units = bootstrap.bootstrap_means(
         table, np.random.default_rng(seed), average, clusters=clusters if clustered else None, repeats=20
     )
     np.testing.assert_allclose(fast, slow_means(table, np.random.default_rng(seed), average, clusters, 20))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from lidarpose import metrics
 from lidarpose.errors import InputError
-from lidarpose.eval.metrics.matching import assign, distance_to_boxes, match_people
+from lidarpose.eval.metrics.keypoints import assign, distance_to_boxes, match_people
 from lidarpose.sample import Box
 from lidarpose.skeleton import BODY26, WAYMO14
 

@@ -14,7 +14,7 @@ RENAMED = {
     "body.retarget": "body.mocap.retarget",
     "body.sources": "body.mocap",
     "evaluate": "eval",
-    "evaluate.metrics": "eval.metrics.joint_errors",
+    "evaluate.metrics": "metrics",
     "infer": "inference",
     "infer.files": "inference.predict_file",
     "infer.predictor": "inference.predictor",

@@ -7,28 +7,35 @@
     metrics.by_group(table, "human15")["wrists"]
     metrics.interval(table, np.random.default_rng(0), clusters=sequence)
 
-Metres in; millimetres or percent out. docs/metrics.md defines every figure.
+Meters in; millimeters or percent out. docs/metrics.md defines every metric.
 """
 
 from lidarpose.eval.metrics.aggregate import AVERAGES, Score, mean
 from lidarpose.eval.metrics.bootstrap import Interval, interval, paired_interval
-from lidarpose.eval.metrics.groups import GROUPS, by_group, joint_groups
+from lidarpose.eval.metrics.calibration import auroc, calibration_error
+from lidarpose.eval.metrics.groups import (
+    DISTANCE_EDGES,
+    GROUPS,
+    OCCLUSION_EDGES,
+    POINT_EDGES,
+    Slice,
+    by_group,
+    by_span,
+    joint_groups,
+)
 from lidarpose.eval.metrics.joint_errors import (
     LEAST_ALIGNED,
     TORSO,
     acceleration_error,
     acceleration_errors,
     aligned_errors,
-    auroc,
-    calibration_error,
     joint_errors,
     joint_hits,
     mpjpe,
     pa_mpjpe,
     pck,
 )
-from lidarpose.eval.metrics.slices import DISTANCE_EDGES, OCCLUSION_EDGES, POINT_EDGES, Slice, by_span
-from lidarpose.eval.metrics.waymo_metrics import (
+from lidarpose.eval.metrics.keypoints import (
     OKS_THRESHOLDS,
     PCK_THRESHOLDS,
     PENALTY,
@@ -43,41 +50,9 @@ from lidarpose.eval.metrics.waymo_metrics import (
 )
 
 __all__ = [
-    "AVERAGES",
-    "DISTANCE_EDGES",
-    "GROUPS",
-    "Interval",
-    "LEAST_ALIGNED",
-    "OCCLUSION_EDGES",
-    "OKS_THRESHOLDS",
-    "PCK_THRESHOLDS",
-    "PENALTY",
-    "POINT_EDGES",
-    "Pem",
-    "Score",
-    "Slice",
-    "TORSO",
-    "acceleration_error",
-    "acceleration_errors",
-    "aligned_errors",
-    "auroc",
-    "box_hits",
-    "by_group",
-    "by_span",
-    "calibration_error",
-    "interval",
-    "joint_errors",
-    "joint_groups",
-    "joint_hits",
-    "mean",
-    "mpjpe",
-    "oks",
-    "oks_ap",
-    "oks_hits",
-    "oks_sigmas",
-    "pa_mpjpe",
-    "paired_interval",
-    "pck",
-    "pck_box",
-    "pem",
-]
+    "AVERAGES", "DISTANCE_EDGES", "GROUPS", "Interval", "LEAST_ALIGNED", "OCCLUSION_EDGES", "OKS_THRESHOLDS",
+    "PCK_THRESHOLDS", "PENALTY", "POINT_EDGES", "Pem", "Score", "Slice", "TORSO", "acceleration_error",
+    "acceleration_errors", "aligned_errors", "auroc", "box_hits", "by_group", "by_span", "calibration_error",
+    "interval", "joint_errors", "joint_groups", "joint_hits", "mean", "mpjpe", "oks", "oks_ap", "oks_hits",
+    "oks_sigmas", "pa_mpjpe", "paired_interval", "pck", "pck_box", "pem",
+]  # fmt: skip

@@ -15,16 +15,10 @@ from lidarpose.errors import InputError
 from lidarpose.eval.dataset import hidden_share
 from lidarpose.eval.metrics.aggregate import mean
 from lidarpose.eval.metrics.bootstrap import interval
-from lidarpose.eval.metrics.groups import joint_groups
-from lidarpose.eval.metrics.joint_errors import (
-    acceleration_errors,
-    aligned_errors,
-    auroc,
-    calibration_error,
-    joint_hits,
-)
-from lidarpose.eval.metrics.slices import DISTANCE_EDGES, OCCLUSION_EDGES, POINT_EDGES
-from lidarpose.eval.metrics.waymo_metrics import PCK_THRESHOLDS, box_hits, oks, oks_hits, oks_sigmas, pem
+from lidarpose.eval.metrics.calibration import auroc, calibration_error
+from lidarpose.eval.metrics.groups import DISTANCE_EDGES, OCCLUSION_EDGES, POINT_EDGES, joint_groups, span_rows
+from lidarpose.eval.metrics.joint_errors import acceleration_errors, aligned_errors, joint_hits
+from lidarpose.eval.metrics.keypoints import PCK_THRESHOLDS, box_hits, oks, oks_hits, oks_sigmas, pem
 from lidarpose.eval.predictions import Judged
 from lidarpose.eval.scores import RELEASED, Line, Setting, number
 from lidarpose.sample import HIT
@@ -168,21 +162,10 @@ def _by_people(figures: _Figures) -> Iterator[Line]:
     spans["hidden share"] = (hidden, OCCLUSION_EDGES)
     groups = [*_conditions(judged)]
     for title, (values, edges) in spans.items():
-        groups += ((title, of, rows) for of, rows in span_rows(values, edges).items())
+        groups += ((title, of, rows) for of, rows in span_rows(values, edges).items() if rows.any())
     for title, of, rows in groups:
         for figure in ("mpjpe", "pa_mpjpe"):
             yield from figures.lines(figure, title, of, rows)
-
-
-def span_rows(values: np.ndarray, edges: tuple[float, ...]) -> dict[str, np.ndarray]:
-    """Span -> (N,) bool, named as `slices.by_span` names them; spans of nobody, and people whose value is unknown, are
-    left out. A span holds its lower edge, the last one its upper edge too."""
-    out = {}
-    for k, (low, high) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
-        rows = (values >= low) & ((values <= high) if k == len(edges) - 2 else (values < high))
-        if rows.any():
-            out[f"{low:g} and more" if np.isinf(high) else f"{low:g} to {high:g}"] = rows
-    return out
 
 
 def _waymo(figures: _Figures) -> Iterator[Line]:

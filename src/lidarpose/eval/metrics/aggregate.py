@@ -1,7 +1,7 @@
-"""From figures of joints to one figure. Tables are plain arrays.
+"""From errors of joints to one score. Tables are plain arrays.
 
-A table is (n, J), one row a person, one column a joint, in millimetres or percent, or (n,) for a figure of the whole
-person. NaN stands where there is nothing to judge: a joint without a label.
+A table is (n, J), a row a person and a column a joint, in millimeters or percent, or (n,) for a value of the whole
+person. NaN stands where there is nothing to score: a joint without a label.
 """
 
 import numpy as np
@@ -13,10 +13,10 @@ AVERAGES = ("person", "joint")
 
 
 class Score(float):
-    """A figure in millimetres or percent that knows what it is a mean of.
+    """A score in millimeters or percent with the number of people and joints behind it.
 
-    people: how many it was taken over; joints: how many labelled joints of theirs; skipped: people without anything to
-    judge, who are not part of it. A score of nobody is NaN.
+    people: how many it is a mean of; joints: how many labeled joints of theirs; skipped: people without anything to
+    score, who are not part of it. A score of nobody is NaN.
     """
 
     people: int
@@ -29,7 +29,7 @@ class Score(float):
         return score
 
 
-def table_of(table: np.ndarray) -> np.ndarray:
+def as_table(table: np.ndarray) -> np.ndarray:
     """A table as (n, J) float; raises InputError for another shape or for infinite entries."""
     try:
         table = np.asarray(table, float)
@@ -43,27 +43,24 @@ def table_of(table: np.ndarray) -> np.ndarray:
 
 
 def person_sums(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Table (n, J) -> (n,) sum over each person's labelled joints, (n,) their number."""
-    known = ~np.isnan(table)
-    return np.where(known, table, 0.0).sum(1), known.sum(1)
-
-
-def checked_average(average: str) -> str:
-    """The name of an average; raises InputError for an unknown one."""
-    check_name("average", average, AVERAGES)
-    return average
+    """Table (n, J) -> (n,) sum over each person's labeled joints, (n,) their number."""
+    labeled = ~np.isnan(table)
+    return np.where(labeled, table, 0.0).sum(1), labeled.sum(1)
 
 
 def mean(table: np.ndarray, average: str = "person", *, empty: float | None = None) -> Score:
     """The mean of a table (n, J) or (n,).
 
-    average: "person", the mean over people of the mean over each one's labelled joints; "joint", the mean over all
-    labelled joints of everybody, so that who has more of them weighs more. empty: what a person without labelled
-    joints counts as in the mean over people; None leaves these people out and counts them.
+    Args:
+        average: "person", the mean over people of the mean over each one's labeled joints; "joint", the mean over all
+            labeled joints of everybody, so that who has more of them weighs more.
+        empty: what a person without labeled joints counts as in the mean over people; None leaves these people out
+            and counts them as skipped.
     """
-    total, count = person_sums(table_of(table))
+    check_name("average", average, AVERAGES)
+    total, count = person_sums(as_table(table))
     seen = count > 0
-    if checked_average(average) == "joint":
+    if average == "joint":
         if empty is not None:
             raise InputError('empty is for average="person": people without labelled joints add none to the other')
         value = total.sum() / count.sum() if seen.any() else np.nan

@@ -1,0 +1,357 @@
+"""The Waymo Open Dataset's pose metrics: PCK by box size, object keypoint similarity (OKS), the Pose Estimation Metric.
+
+Definitions: docs/pose_estimation_metric.md and keypoint_metrics.py of github.com/waymo-research/waymo-open-dataset,
+commits 419b532 and 7275bc1 (pose challenge, 2023). Its means over joints are over everybody's labeled joints at once,
+so average="joint" is the default. Meters in; millimeters or percent out.
+"""
+
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass
+
+import numpy as np
+
+from lidarpose.errors import InputError
+from lidarpose.eval.metrics.aggregate import Score, mean
+from lidarpose.eval.metrics.joint_errors import as_flags, as_numbers, check_positive, checked_poses, joint_errors
+from lidarpose.skeleton import WAYMO14, Skeleton, skeleton
+
+# spread of each joint in units of the box's scale; twice COCO's sigmas, the head's center by the same method
+SIGMAS = {
+    "nose": 0.052,
+    "head_center": 0.158,
+    "shoulder": 0.158,
+    "elbow": 0.144,
+    "wrist": 0.124,
+    "hip": 0.214,
+    "knee": 0.174,
+    "ankle": 0.178,
+}
+OKS_THRESHOLDS = (0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95)
+PCK_THRESHOLDS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
+# cost of a keypoint that is missed or made up, and farthest distance of a match, m
+PENALTY = 0.25
+# nearer than this to a box counts as within it, m
+_WITHIN = 1e-5
+
+
+def oks_sigmas(of: Skeleton | str = WAYMO14) -> np.ndarray:
+    """(J,) Waymo's sigmas for a skeleton's joints; raises InputError where Waymo has none for a joint."""
+    of = skeleton(of) if isinstance(of, str) else of
+    sigmas = [SIGMAS.get(name.removeprefix("left_").removeprefix("right_")) for name in of.joints]
+    if None in sigmas:
+        missing = ", ".join(name for name, sigma in zip(of.joints, sigmas, strict=True) if sigma is None)
+        raise InputError(f"Waymo has no sigma for {missing} of {of.name}: pick waymo14's joints, or give sigmas")
+    return np.array(sigmas)
+
+
+def box_hits(
+    pred: np.ndarray,
+    true: np.ndarray,
+    size: np.ndarray,
+    visible: np.ndarray | None = None,
+    *,
+    threshold: float = 0.2,
+    sigmas: Sequence[float] | None = None,
+) -> np.ndarray:
+    """(n, J) percent: 100 where a joint is within threshold times its box's scale of the truth, else 0; NaN without
+    label. size (n, 3) m; sigmas (J,): times these, too, which Waymo's code does and its text does not."""
+    check_positive("threshold", threshold)
+    error = joint_errors(pred, true, visible)
+    reach = threshold * _box_scale(size, len(error)) * 1e3
+    if sigmas is not None:
+        reach = reach * _checked_sigmas(sigmas, error.shape[1])
+    return np.where(np.isnan(error), np.nan, 100.0 * (error <= reach))
+
+
+def pck_box(
+    pred: np.ndarray,
+    true: np.ndarray,
+    size: np.ndarray,
+    visible: np.ndarray | None = None,
+    *,
+    threshold: float = 0.2,
+    sigmas: Sequence[float] | None = None,
+    average: str = "joint",
+) -> Score:
+    """Percentage of joints within `threshold` times the cube root of their person's box volume: see `box_hits`."""
+    return mean(box_hits(pred, true, size, visible, threshold=threshold, sigmas=sigmas), average)
+
+
+def oks(
+    pred: np.ndarray,
+    true: np.ndarray,
+    size: np.ndarray,
+    visible: np.ndarray | None = None,
+    *,
+    sigmas: Sequence[float] | None = None,
+) -> np.ndarray:
+    """(n,) object keypoint similarity in [0, 1]; NaN for people without a labeled joint.
+
+    The mean over a person's labeled joints of exp(-d^2 / (2 (sigma s)^2)): d the distance, s the cube root of the
+    box's volume, sigma the joint's own. size (n, 3) m; sigmas (J,): Waymo's for the joints of waymo14 by default.
+    """
+    error = joint_errors(pred, true, visible) / 1e3
+    if sigmas is None:
+        if error.shape[1] != len(WAYMO14):
+            raise InputError(f"OKS of {error.shape[1]} joints needs sigmas, such as oks_sigmas(skeleton)")
+        sigmas = oks_sigmas()
+    spread = _box_scale(size, len(error)) * _checked_sigmas(sigmas, error.shape[1])
+    labeled = ~np.isnan(error)
+    similarity = np.where(labeled, np.exp(-(np.where(labeled, error, 0) ** 2) / (2 * spread**2)), 0)
+    count = labeled.sum(1)
+    return np.where(count > 0, similarity.sum(1) / np.maximum(count, 1), np.nan)
+
+
+def oks_hits(similarity: np.ndarray, thresholds: Sequence[float] = OKS_THRESHOLDS) -> np.ndarray:
+    """OKS (n,) -> (n,) percent: the share of the thresholds that it is above; NaN stays. One threshold: P at it."""
+    similarity, thresholds = as_numbers("similarity", similarity), np.atleast_1d(as_numbers("thresholds", thresholds))
+    if similarity.ndim != 1 or not thresholds.size:
+        raise InputError(f"similarity must be (people,) and thresholds one or more, got {similarity.shape}")
+    above = 100.0 * (np.nan_to_num(similarity)[:, None] > thresholds).mean(1)
+    return np.where(np.isnan(similarity), np.nan, above)
+
+
+def oks_ap(
+    pred: np.ndarray,
+    true: np.ndarray,
+    size: np.ndarray,
+    visible: np.ndarray | None = None,
+    *,
+    sigmas: Sequence[float] | None = None,
+    thresholds: Sequence[float] = OKS_THRESHOLDS,
+) -> Score:
+    """Percent: the share of people whose OKS is above a threshold, averaged over the thresholds. Waymo's OKS-AP is this
+    precision of matched people; it ranks nothing by confidence."""
+    return mean(oks_hits(oks(pred, true, size, visible, sigmas=sigmas), thresholds))
+
+
+def _box_scale(size: np.ndarray, people: int) -> np.ndarray:
+    """size (n, 3) m, length, width and height of each person's box -> (n, 1) m: the cube root of its volume."""
+    size = as_numbers("size", size)
+    size = size.reshape(1, 3) if size.size == 3 else size
+    if size.shape != (people, 3):
+        raise InputError(f"size must be ({people}, 3), length, width and height of each person's box, got {size.shape}")
+    if not (np.isfinite(size) & (size > 0)).all():
+        raise InputError("size must be positive and finite, meters")
+    return np.cbrt(size.prod(1))[:, None]
+
+
+def _checked_sigmas(sigmas: Sequence[float], joints: int) -> np.ndarray:
+    sigmas = as_numbers("sigmas", sigmas)
+    if sigmas.shape != (joints,) or not (np.isfinite(sigmas) & (sigmas > 0)).all():
+        raise InputError(f"sigmas must be ({joints},) positive numbers, one a joint, got {sigmas.shape}")
+    return sigmas
+
+
+# ---- PEM
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pem:
+    """The Pose Estimation Metric and what it is made of.
+
+    pem: mm; matched_error: mm, mean of the matched keypoints' distances, each at most the penalty; both NaN where there
+    is nothing. Keypoints: matched, missed (labeled, not predicted), extra (predicted, not labeled). People: people
+    matched, people_missed, people_extra, people_excused, who were predicted in the box of somebody without labels.
+    """
+
+    pem: float
+    matched_error: float
+    matched: int
+    missed: int
+    extra: int
+    people: int
+    people_missed: int
+    people_extra: int
+    people_excused: int
+
+
+def pem(
+    pred: Sequence[np.ndarray],
+    true: Sequence[np.ndarray],
+    boxes: Sequence[np.ndarray],
+    visible: Sequence[np.ndarray] | None = None,
+    *,
+    predicted: Sequence[np.ndarray] | None = None,
+    penalty: float = PENALTY,
+) -> Pem:
+    """Waymo's PEM over frames: the mean, over all keypoints of all frames, of the matched ones' distances and of
+    `penalty` for each one that is missed or made up.
+
+    Args: one entry a frame of each:
+        pred: (P, J, 3) m, the people that were found, their number free.
+        true: (G, J, 3) m. boxes: (G, 7) of the true people: center, (length, width, height), yaw.
+        visible: (G, J) labeled and not occluded.
+        predicted: (P, J) False where a joint is not claimed, by default all are.
+        penalty: m. Matching is `match_people`'s.
+    """
+    check_positive("penalty", penalty)
+    columns = {"pred": pred, "true": true, "boxes": boxes, "visible": visible, "predicted": predicted}
+    lengths = {name: len(value) for name, value in columns.items() if value is not None}
+    if len(set(lengths.values())) != 1:
+        raise InputError(f"PEM needs one entry a frame of everything, got {lengths}")
+    totals = np.zeros(8)
+    for k in range(lengths["pred"]):
+        frame = {name: None if value is None else value[k] for name, value in columns.items()}
+        try:
+            totals += _frame_totals(**frame, penalty=penalty)
+        except InputError as error:
+            raise InputError(f"frame {k}: {error}") from None
+    distance, matched, missed, extra = totals[:4].tolist()
+    count = matched + missed + extra
+    names = ("matched", "missed", "extra", "people", "people_missed", "people_extra", "people_excused")
+    return Pem(
+        pem=(distance + penalty * (missed + extra)) / count * 1e3 if count else np.nan,
+        matched_error=distance / matched * 1e3 if matched else np.nan,
+        **dict(zip(names, totals[1:].astype(int).tolist(), strict=True)),
+    )
+
+
+def _frame_totals(pred, true, boxes, visible, predicted, penalty: float) -> np.ndarray:
+    """(8,): sum of matched distances m; keypoints matched, missed, extra; people matched, missed, extra, excused."""
+    pred, true = _people("pred", pred), _people("true", true)
+    counts = {len(people[0]) for people in (pred, true) if len(people)}
+    if not counts:
+        return np.zeros(8)
+    if len(counts) > 1:
+        raise InputError(f"pred and true must have the same joints, got {pred.shape} and {true.shape}")
+    (joints,) = counts
+    pred, true = pred.reshape(-1, joints, 3), true.reshape(-1, joints, 3)
+    checked_poses(pred, pred, None)
+    _, true, labeled = checked_poses(np.zeros_like(true), true, visible if len(true) else None)
+    given = predicted is not None and len(pred)
+    predicted = as_flags("predicted", predicted, pred.shape[:2]) if given else np.ones(pred.shape[:2], bool)
+    boxes = as_numbers("boxes", boxes)
+    boxes = boxes.reshape(0, 7) if not boxes.size else boxes
+    if boxes.shape != (len(true), 7) or not np.isfinite(boxes).all() or not (boxes[:, 3:6] > 0).all():
+        raise InputError(
+            f"boxes must be ({len(true)}, 7), center, positive (length, width, height) and yaw, got {boxes.shape}"
+        )
+    matches = match_people(pred, true, boxes, predicted, labeled, penalty=penalty)
+    g, p = matches.pairs.T
+    cost = keypoint_costs(pred[p], true[g], predicted[p], labeled[g], penalty)
+    both = predicted[p] & labeled[g]
+    missed = (labeled[g] & ~predicted[p]).sum() + labeled[matches.missed].sum()
+    extra = (predicted[p] & ~labeled[g]).sum() + predicted[matches.extra].sum()
+    return np.array([cost[both].sum(), both.sum(), missed, extra, *map(len, astuple(matches))])
+
+
+def _people(name: str, value: np.ndarray) -> np.ndarray:
+    value = as_numbers(name, value)
+    if value.size and (value.ndim != 3 or value.shape[-1] != 3):
+        raise InputError(f"{name} must be (people, joints, 3), got {value.shape}")
+    return value if value.size else np.empty((0, 0, 3))
+
+
+# ---- matching
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Of one frame: pairs (k, 2) of (true, predicted) rows; missed: true rows with labels that nobody predicted; extra:
+    predicted rows of nobody; excused: predicted rows of people without labels, which neither help nor harm."""
+
+    pairs: np.ndarray
+    missed: np.ndarray
+    extra: np.ndarray
+    excused: np.ndarray
+
+
+def match_people(
+    pred: np.ndarray,
+    true: np.ndarray,
+    boxes: np.ndarray,
+    predicted: np.ndarray,
+    labeled: np.ndarray,
+    *,
+    penalty: float = PENALTY,
+) -> Matches:
+    """Matches the predictions of one frame with its people.
+
+    pred (P, J, 3), true (G, J, 3) m, boxes (G, 7) of the people: center, (length, width, height), yaw; predicted
+    (P, J), labeled (G, J) bool. First, people without labels take away the predictions that lie in their boxes and
+    near nobody else's labels, as many keypoints as possible. Then predictions and labeled people are matched so that
+    the sum of the mean keypoint costs is least, among pairs with a predicted keypoint within `penalty` meters of the
+    box.
+    """
+    has_label = labeled.any(1)
+    distance = np.where(predicted[None], distance_to_boxes(pred, boxes), np.inf)
+    # (G, P, J)
+    near = np.linalg.norm(pred[None] - np.where(labeled[..., None], true, np.inf)[:, None], axis=-1) < penalty
+    near_label = (near & predicted[None]).any((0, 2))
+    inside = np.where(~has_label[:, None] & ~near_label, (distance < _WITHIN).sum(-1), 0)
+    excused = np.array([p for g, p in assign(-inside.astype(float)) if inside[g, p] > 0], int)
+
+    free = predicted.any(1)
+    free[excused] = False
+    people, candidates = np.flatnonzero(has_label), np.flatnonzero(free)
+    cost = keypoint_costs(
+        pred[None, candidates], true[people, None], predicted[None, candidates], labeled[people, None], penalty
+    )
+    # joints that neither has count as free of error, so that the mean is over all J
+    total = np.nan_to_num(cost).mean(-1)
+    total[distance[np.ix_(people, candidates)].min(-1, initial=np.inf) > penalty] = penalty
+    pairs = np.array([(g, p) for g, p in assign(total) if total[g, p] < penalty], int).reshape(-1, 2)
+    pairs = np.stack([people[pairs[:, 0]], candidates[pairs[:, 1]]], -1)
+    missed, extra = np.setdiff1d(people, pairs[:, 0]), np.setdiff1d(candidates, pairs[:, 1])
+    return Matches(pairs, missed, extra, np.sort(excused))
+
+
+def keypoint_costs(
+    pred: np.ndarray, true: np.ndarray, predicted: np.ndarray, labeled: np.ndarray, penalty: float
+) -> np.ndarray:
+    """(..., J) m: a joint's distance, at most `penalty`, where it is labeled and predicted; `penalty` where it is only
+    one of both; NaN where it is neither. The arguments broadcast."""
+    offset = np.where(labeled[..., None], pred - np.where(labeled[..., None], true, 0), 0)
+    near = np.minimum(np.linalg.norm(offset, axis=-1), penalty)
+    return np.where(predicted & labeled, near, np.where(predicted | labeled, penalty, np.nan))
+
+
+def distance_to_boxes(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """points (..., 3) m, boxes (B, 7): center, (length, width, height), yaw -> (B, ...) m, 0 inside."""
+    tail = (len(boxes),) + (1,) * (points.ndim - 1)
+    x, y, z = np.moveaxis(points[None] - boxes[:, :3].reshape(*tail, 3), -1, 0)
+    c, s = np.cos(boxes[:, 6]).reshape(tail), np.sin(boxes[:, 6]).reshape(tail)
+    local = np.stack([c * x + s * y, c * y - s * x, z], -1)
+    return np.linalg.norm(np.maximum(np.abs(local) - boxes[:, 3:6].reshape(*tail, 3) / 2, 0), axis=-1)
+
+
+def assign(cost: np.ndarray) -> np.ndarray:
+    """The assignment of least total cost: cost (n, m) finite -> (min(n, m), 2) of (row, column), rows rising.
+
+    The Hungarian method (Kuhn 1955) by shortest augmenting paths (Jonker & Volgenant 1987).
+    """
+    cost = np.asarray(cost, float)
+    if cost.ndim != 2 or not np.isfinite(cost).all():
+        raise InputError(f"costs must be (rows, columns) of finite numbers, got shape {cost.shape}")
+    if cost.shape[0] > cost.shape[1]:
+        swapped = assign(cost.T)[:, ::-1]
+        return swapped[np.argsort(swapped[:, 0])]
+    n, m = cost.shape
+    row_price, column_price = np.zeros(n), np.zeros(m)
+    row_of = np.full(m, -1)
+    for start in range(n):
+        # Dijkstra over columns: reduced costs are never negative
+        length, before = np.full(m, np.inf), np.full(m, -1)
+        settled = np.zeros(m, bool)
+        row, here, reached = start, -1, 0.0
+        while True:
+            onward = reached + cost[row] - row_price[row] - column_price
+            shorter = ~settled & (onward < length)
+            length[shorter], before[shorter] = onward[shorter], here
+            here = int(np.argmin(np.where(settled, np.inf, length)))
+            reached = length[here]
+            settled[here] = True
+            if row_of[here] < 0:
+                break
+            row = row_of[here]
+        passed = settled & (row_of >= 0)
+        row_price[start] += reached
+        row_price[row_of[passed]] += reached - length[passed]
+        column_price[passed] -= reached - length[passed]
+        while here >= 0:
+            row_of[here] = row_of[before[here]] if before[here] >= 0 else start
+            here = before[here]
+    columns = np.flatnonzero(row_of >= 0)
+    pairs = np.stack([row_of[columns], columns], -1)
+    return pairs[np.argsort(pairs[:, 0])]
