@@ -1,7 +1,7 @@
-"""The compiled inner loops of `rig`: importing this module needs numba. Reference twins live in `rig`.
+"""The compiled inner loops of `rig` and `shape`: importing this module needs numba.
 
 All arrays are float32 and C-contiguous. Every kernel works on one core without the interpreter lock, so threads can
-pose people side by side; `pose_person` and `normals_of_person` may be called from other compiled code.
+pose people side by side. Slow twins: tests/reference/rig.py.
 """
 
 import numba
@@ -87,8 +87,9 @@ def pose_people(rest_vertices, rest_joints, rotations, translation, parents, wei
 
 
 @_jit
-def normals_of_person(faces, vertices, normals):
-    """Fills normals (V, 3) with the unit normals of one mesh: faces (F, 3), vertices (V, 3)."""
+def vertex_normals(faces, vertices, normals):
+    """Fills normals (V, 3) with the outward unit normals of one mesh, area-weighted means over the faces around a
+    vertex: faces (F, 3) int32, vertices (V, 3)."""
     normals[:] = 0
     for f in range(faces.shape[0]):
         i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
@@ -108,19 +109,12 @@ def normals_of_person(faces, vertices, normals):
 
 
 @_jit
-def normals_of_people(faces, vertices, normals):
-    """`normals_of_person` for n people: vertices and normals (n, V, 3)."""
-    for i in range(vertices.shape[0]):
-        normals_of_person(faces, vertices[i], normals[i])
-
-
-@_jit
 def dress_people(faces, vertices, offset, low, high):
     """Moves vertices (n, V, 3) by offset (n, V) m along their normals, in place, and fills low and high (n, 3) with
     their least and greatest x, y, z afterwards."""
     normals = np.empty(vertices.shape[1:], np.float32)
     for i in range(vertices.shape[0]):
-        normals_of_person(faces, vertices[i], normals)
+        vertex_normals(faces, vertices[i], normals)
         for a in range(3):
             low[i, a], high[i, a] = np.inf, -np.inf
         for v in range(vertices.shape[1]):
@@ -131,19 +125,20 @@ def dress_people(faces, vertices, offset, low, high):
 
 
 @_jit
-def folds_of_people(place, direction, phase, share, offset):
-    """Multiplies offset (n, V) in place by 1 + share times the sum of a person's waves at place (V, 3): W waves along
-    direction (n, W, 3), turns a metre, begun at phase (n, W) turns. A wave is made of parabolas, much like a sine."""
+def fold_clothing(template, direction, phase, gain, offset):
+    """Multiplies offset (n, V) in place by 1 + gain times the sum of a person's waves at template (V, 3) m: W waves
+    along direction (n, W, 3), periods a meter, at phase (n, W) periods. A wave is made of parabolas, much like a
+    sine."""
     for i in range(offset.shape[0]):
         for v in range(offset.shape[1]):
             total = np.float32(0)
             for w in range(direction.shape[1]):
                 t = (
-                    direction[i, w, 0] * place[v, 0]
-                    + direction[i, w, 1] * place[v, 1]
-                    + direction[i, w, 2] * place[v, 2]
+                    direction[i, w, 0] * template[v, 0]
+                    + direction[i, w, 1] * template[v, 1]
+                    + direction[i, w, 2] * template[v, 2]
                     + phase[i, w]
                 )
                 u = t - np.floor(t) - np.float32(0.5)
                 total += np.float32(8) * u * (np.float32(1) - np.float32(2) * abs(u))
-            offset[i, v] *= np.float32(1) + share * total
+            offset[i, v] *= np.float32(1) + gain * total

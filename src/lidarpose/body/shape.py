@@ -4,7 +4,7 @@ Shapes come from the rig's table of sampled people. The table's source has too m
 with weights that bring heights and BMI near those of real adults, then mixed with a similar row so that no two people
 are the same.
 
-n people, V vertices. Lengths in metres.
+n people, V vertices. Lengths in meters.
 """
 
 from dataclasses import dataclass
@@ -30,6 +30,8 @@ WEIGHT_CAP = 6.0
 NEIGHBORS = 8
 
 MAX_CLOTHING = 0.04
+# how much a wave of folds thickens cloth
+FOLD_GAIN = np.float32(0.18)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,11 +47,11 @@ class People:
 
 
 def sample_people(rng: np.random.Generator, n: int) -> People:
-    """n people: 88 % adults of 18 to 80 years, 12 % children of 4 to 18, half of them female."""
+    """Draws n people: 88 % adults of 18 to 80 years, 12 % children of 4 to 18, half of them female."""
     rig = load_rig()
-    weight, near = _table()
-    first = rng.choice(len(weight), size=n, p=weight)
-    second = near[first, rng.integers(0, near.shape[1], n)]
+    probability, neighbors = _sampling_table()
+    first = rng.choice(len(probability), size=n, p=probability)
+    second = neighbors[first, rng.integers(0, neighbors.shape[1], n)]
     share = rng.uniform(0.0, 0.5, n).astype(np.float32)
 
     def mix(table: np.ndarray) -> np.ndarray:
@@ -66,47 +68,52 @@ def sample_people(rng: np.random.Generator, n: int) -> People:
 
 
 @cache
-def _table() -> tuple[np.ndarray, np.ndarray]:
+def _sampling_table() -> tuple[np.ndarray, np.ndarray]:
     """Probability (N,) of each row of the rig's table, and its nearest rows (N, NEIGHBORS) of the same sex."""
     rig = load_rig()
     adult, log_bmi = rig.age >= ADULT_AGE, np.log(rig.bmi)
     weight = np.where(adult, np.interp(rig.age, [OLD_FROM, OLD_TO], [1.0, OLD_SHARE]), 1.0)
-    near = np.empty((len(weight), NEIGHBORS), int)
+    neighbors = np.empty((len(weight), NEIGHBORS), int)
     for sex in ("male", "female"):
-        for grown in (True, False):
-            group = np.flatnonzero((rig.sex == sex) & (adult == grown))
-            if grown:
+        for is_adult, share, years in ((True, 1 - CHILD_SHARE, 15), (False, CHILD_SHARE, 3)):
+            rows = np.flatnonzero((rig.sex == sex) & (adult == is_adult))
+            if is_adult:
                 median, spread = BMI[sex]
-                weight[group] *= _ratio(rig.height[group], *HEIGHT[sex])
-                weight[group] *= _ratio(log_bmi[group], np.log(median), spread)
-            weight[group] = np.minimum(weight[group], WEIGHT_CAP * weight[group].mean())
-            weight[group] *= (1 - CHILD_SHARE if grown else CHILD_SHARE) / 2 / weight[group].sum()
+                weight[rows] *= _density_ratio(rig.height[rows], *HEIGHT[sex])
+                weight[rows] *= _density_ratio(log_bmi[rows], np.log(median), spread)
+            weight[rows] = np.minimum(weight[rows], WEIGHT_CAP * weight[rows].mean())
+            weight[rows] *= share / 2 / weight[rows].sum()
             # one unit each: 5 cm, 10 % of BMI, 15 years (3 for children, who change faster)
-            place = np.stack(
-                [rig.height[group] / 0.05, log_bmi[group] / 0.1, rig.age[group] / (15 if grown else 3)], -1
-            )
-            apart = ((place[:, None] - place) ** 2).sum(-1)
-            np.fill_diagonal(apart, np.inf)
-            near[group] = group[np.argsort(apart, 1)[:, :NEIGHBORS]]
-    return weight / weight.sum(), near
+            features = np.stack([rig.height[rows] / 0.05, log_bmi[rows] / 0.1, rig.age[rows] / years], -1)
+            distance = ((features[:, None] - features) ** 2).sum(-1)
+            np.fill_diagonal(distance, np.inf)
+            neighbors[rows] = rows[np.argsort(distance, 1)[:, :NEIGHBORS]]
+    return weight / weight.sum(), neighbors
 
 
-def _ratio(value: np.ndarray, mean: float, spread: float) -> np.ndarray:
+def _density_ratio(value: np.ndarray, mean: float, spread: float) -> np.ndarray:
     """Density of a normal distribution over that of the normal distribution fitted to `value`."""
     target = (value - mean) / spread
-    found = (value - value.mean()) / value.std()
-    return np.exp((found**2 - target**2) / 2)
+    fitted = (value - value.mean()) / value.std()
+    return np.exp((fitted**2 - target**2) / 2)
 
 
 def clothing(rng: np.random.Generator, n: int) -> np.ndarray:
-    """How far clothes, hair and shoes stand off the skin along its normals: (n, V) float32 m in [0, 0.04].
+    """Draws clothes: how far clothes, hair and shoes stand off the skin along its normals, smooth over the body.
 
-    Smooth over the body. A torso's mean is about 1.5 cm; a tenth of the people wear next to nothing, a tenth bulky
-    coats; hands and faces stay bare but for a few gloves.
+    A torso's mean is about 1.5 cm; a tenth of the people wear next to nothing, a tenth bulky coats; hands and faces
+    stay bare but for a few gloves.
+
+    Returns:
+        (n, V) float32 m in [0, `MAX_CLOTHING`].
+
+    Raises:
+        ModuleNotFoundError: without numba.
     """
-    dense, scalp, place = _regions()
-    strength = _outfit(rng, n)
-    offset = strength @ dense.T
+    from lidarpose.body.rig_kernels import fold_clothing
+
+    dense, scalp, template = _regions()
+    offset = _outfit(rng, n) @ dense.T
     hair = rng.uniform(0.0, 0.03, (n, 1)) + rng.choice([0.0, 0.012], (n, 1), p=[0.8, 0.2])
     offset += hair.astype(np.float32) * scalp
     # folds: a few waves of 15 to 60 cm length that thicken and thin the cloth by about a quarter
@@ -114,29 +121,8 @@ def clothing(rng: np.random.Generator, n: int) -> np.ndarray:
     direction = rng.normal(size=(n, waves, 3))
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True) * rng.uniform(0.15, 0.6, (n, waves, 1))
     phase = rng.random((n, waves))
-    _fold(place, direction.astype(np.float32), phase.astype(np.float32), offset)
+    fold_clothing(template, direction.astype(np.float32), phase.astype(np.float32), FOLD_GAIN, offset)
     return np.clip(offset, 0, MAX_CLOTHING)
-
-
-# how much a wave of folds thickens cloth
-_FOLD = np.float32(0.18)
-
-
-def _fold(place: np.ndarray, direction: np.ndarray, phase: np.ndarray, offset: np.ndarray) -> None:
-    """Thickens offset (n, V) in place by waves; see `rig_numba.folds_of_people`."""
-    try:
-        from lidarpose.body.rig_kernels import folds_of_people
-    except ImportError:
-        _fold_reference(place, direction, phase, offset)
-    else:
-        folds_of_people(place, direction, phase, _FOLD, offset)
-
-
-def _fold_reference(place: np.ndarray, direction: np.ndarray, phase: np.ndarray, offset: np.ndarray) -> None:
-    """`_fold` in numpy."""
-    turns = direction @ place.T + phase[..., None]
-    u = turns - np.floor(turns) - np.float32(0.5)
-    offset *= 1 + _FOLD * (8 * u * (1 - 2 * np.abs(u))).sum(1)
 
 
 @cache
@@ -175,8 +161,8 @@ def _outfit(rng: np.random.Generator, n: int) -> np.ndarray:
         "spine1": 1.05 * top, "spine2": top, "spine3": 0.9 * top, "neck": neck, "collar": 0.8 * top,
         "shoulder": np.maximum(0.75 * top, sleeve), "elbow": sleeve, "wrist": glove, "hand": glove,
     }  # fmt: skip
-    nothing = np.zeros(n)
-    return np.stack([worn.get(name.split("_")[-1], nothing) for name in SMPL24.joints], -1).astype(np.float32)
+    bare = np.zeros(n)
+    return np.stack([worn.get(name.split("_")[-1], bare) for name in SMPL24.joints], -1).astype(np.float32)
 
 
 def _pick(rng: np.random.Generator, n: int, shares: list[float], ranges: list[tuple[float, float]]) -> np.ndarray:

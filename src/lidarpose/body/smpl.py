@@ -1,7 +1,7 @@
 """The user's own SMPL, SMPL+H or SMPL-X file as a body: shapes, pose-dependent shapes and linear blend skinning.
 
-Frames. SMPL's own has y up; at rest the body stands in a T-pose, looks along +z, its left is +x. The house's has z up;
-the body of `body.rig` looks along +x. With C the change between them, local rotations are R_smpl = C^-1 R_house C.
+Frames. SMPL's own has y up; at rest the body stands in a T-pose, faces +z, its left is +x. The level frame has z up;
+the body of `body.rig` faces +x. With C = R_level_smpl, local rotations are R_smpl = C^-1 R_level C.
 
 n people, V vertices, F faces, J joints (24 for SMPL, 52 for SMPL+H, 55 for SMPL-X), S shape coefficients.
 Model: Loper et al. 2015, SMPL; the equation numbers below are of that paper.
@@ -18,11 +18,11 @@ import numpy as np
 from lidarpose.body.rig import forward_kinematics
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix
-from lidarpose.io.files import file_error, read_bytes
+from lidarpose.io.files import file_error, read_npz
 from lidarpose.io.pickles import Unread, load_pickle
 from lidarpose.skeleton import SMPL24
 
-_TO_HOUSE = UP_AXES["y"]
+_R_LEVEL_SMPL = UP_AXES["y"]
 _KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
 # all of the family share these joints; then come hands, and in SMPL-X the jaw and the eyes
 _SHARED = SMPL24.index("left_hand")
@@ -32,13 +32,13 @@ _HANDS = {SMPL24.index(f"{side}_wrist"): SMPL24.index(f"{side}_hand") for side i
 _EXPRESSIONS = {(55, 400): 300, (55, 20): 10}
 # how far the weights of a vertex, and of a joint's regressor, may be from 1: files keep them rounded
 _SUM_TOLERANCE = 1e-2
-# a body in other units than metres is larger or smaller than this
+# a body in other units than meters is larger or smaller than this
 _HEIGHTS = (0.3, 3.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SmplBody:
-    """A body of the SMPL family. Arrays are read-only, metres, SMPL's frame.
+    """A body of the SMPL family. Arrays are read-only, meters, SMPL's frame.
 
     template (V, 3); shapes (V, 3, S), per unit of coefficient; pose_shapes (V, 3, 9 (J - 1)); regressor (J, V): the
     joints of a shape; weights (V, J), rows sum to 1; parents (J,), -1 for the root; faces (F, 3) int32; face_part (F,)
@@ -67,7 +67,10 @@ class SmplBody:
         return self.shapes.shape[-1]
 
     def rest(self, betas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """T-posed vertices (n, V, 3) and joints (n, J, 3) of shapes betas (n, <= S), SMPL's frame. Eq. 8 and 10."""
+        """T-posed vertices (n, V, 3) and joints (n, J, 3) m of shapes betas (n, <= S), in SMPL's frame.
+
+        Source: Loper et al. 2015, Eq. 8 and 10.
+        """
         betas = np.asarray(betas, float)
         if betas.ndim != 2 or betas.shape[1] > self.shape_count or not np.isfinite(betas).all():
             raise InputError(f"betas must be finite, (n, up to {self.shape_count}), got {betas.shape}")
@@ -77,85 +80,104 @@ class SmplBody:
     def pose(
         self, betas: np.ndarray, rotations: np.ndarray, translation: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices (n, V, 3) and joints (n, J, 3) float64, m, in SMPL's frame, as the published model has them.
+        """Poses the published model, in SMPL's frame.
 
-        betas (n, <= S); rotations local, as matrices (n, 24 or J, 3, 3), axis-angles (n, 24 or J, 3) or rows of these
-        (n, 72 or 3 J) rad; translation (n, 3) m, by default 0, is added to everything: the pelvis goes to its rest
-        position plus translation. With 24 rotations on SMPL+H and SMPL-X, the hands' turn all fingers at their bases,
-        face and fingers rest. Raises InputError for other shapes.
+        Args:
+            betas: (n, <= S) shape coefficients.
+            rotations: Local, as matrices (n, 24 or J, 3, 3), axis-angles (n, 24 or J, 3) or rows of these
+                (n, 72 or 3 J) rad. With 24 rotations on SMPL+H and SMPL-X, the hands' turn all fingers at their
+                bases; face and fingers rest.
+            translation: (n, 3) m, by default 0, added to everything: the pelvis goes to its rest position plus it.
+
+        Returns:
+            Vertices (n, V, 3) and joints (n, J, 3), float64 m.
+
+        Raises:
+            InputError: For other shapes and for values that are not finite.
         """
         vertices, joints = self.rest(betas)
-        rotations = self._rotations(rotations, len(vertices))
-        translation = np.zeros((len(vertices), 3)) if translation is None else np.asarray(translation, float)
-        if translation.shape != (len(vertices), 3):
-            raise InputError(f"translation must be ({len(vertices)}, 3), got {translation.shape}")
-        return self._posed(vertices, joints, rotations, joints[:, 0] + translation)[:2]
+        rotations = self._all_rotations(rotations, len(vertices))
+        root = joints[:, 0] + self._checked_translation(translation, len(vertices))
+        return self._posed(vertices, joints, rotations, root)[:2]
 
     def pose_house(
         self, betas: np.ndarray, rotations: np.ndarray, translation: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices (n, V, 3) and joints (n, 26, 3) float32, m, in the house's frame: what `body.rig` gives.
+        """Poses the model in the level frame (x forward, y left, z up), as `body.rig.pose_bodies` does.
 
-        betas (n, <= S); rotations (n, 24, 3, 3) local, in the rest frame of `body.rig`; translation (n, 3) m, where the
-        pelvis goes. Joints come in BODY26's order. nose is the foremost vertex of the head at rest, head_center the
-        middle of its leftmost and its rightmost (the ears), both carried by the head; the hands of SMPL+H and SMPL-X
-        are the mean of the fingers' bases, without the thumb's.
+        Args:
+            betas: (n, <= S) shape coefficients.
+            rotations: (n, 24, 3, 3) local, in the rest frame of `body.rig`.
+            translation: (n, 3) m, where the pelvis goes.
+
+        Returns:
+            Vertices (n, V, 3) and joints (n, 26, 3), float32 m, the joints in BODY26's order. nose is the foremost
+            vertex of the head at rest, head_center the middle of its leftmost and its rightmost (the ears), both
+            carried by the head; the hands of SMPL+H and SMPL-X are the mean of the fingers' bases, without the thumb's.
+
+        Raises:
+            InputError: For other shapes and for values that are not finite.
         """
         vertices, joints = self.rest(betas)
-        rotations, translation = np.asarray(rotations, float), np.asarray(translation, float)
-        if rotations.shape != (len(vertices), 24, 3, 3) or translation.shape != (len(vertices), 3):
-            raise InputError(
-                f"{len(vertices)} bodies need rotations ({len(vertices)}, 24, 3, 3) and translation "
-                f"({len(vertices)}, 3), got {rotations.shape} and {translation.shape}"
-            )
+        rotations = np.asarray(rotations, float)
+        if rotations.shape[1:] != (24, 3, 3):
+            raise InputError(f"rotations must be ({len(vertices)}, 24, 3, 3), got {rotations.shape}")
+        local = self._all_rotations(_R_LEVEL_SMPL.T @ rotations @ _R_LEVEL_SMPL, len(vertices))
+        root = self._checked_translation(translation, len(vertices)) @ _R_LEVEL_SMPL
         nose, ears = self._head_vertices
         points = np.stack([vertices[:, nose], vertices[:, ears].mean(1)], 1) - joints[:, None, _HEAD]
-        local = self._rotations(_TO_HOUSE.T @ rotations @ _TO_HOUSE, len(vertices))
-        posed, place, turned = self._posed(vertices, joints, local, translation @ _TO_HOUSE)
-        hands = [place[:, bases].mean(1) for bases in self._hand_joints]
-        head = place[:, None, _HEAD] + points @ np.swapaxes(turned[:, _HEAD], -1, -2)
-        named = np.concatenate([place[:, :_SHARED], np.stack(hands, 1), head], 1)
-        return tuple((x @ _TO_HOUSE.T).astype(np.float32) for x in (posed, named))
+        posed, positions, global_rotations = self._posed(vertices, joints, local, root)
+        hands = [positions[:, bases].mean(1) for bases in self._hand_joints]
+        head = positions[:, None, _HEAD] + points @ np.swapaxes(global_rotations[:, _HEAD], -1, -2)
+        body26 = np.concatenate([positions[:, :_SHARED], np.stack(hands, 1), head], 1)
+        return tuple((x @ _R_LEVEL_SMPL.T).astype(np.float32) for x in (posed, body26))
 
     def _posed(
         self, vertices: np.ndarray, joints: np.ndarray, rotations: np.ndarray, root: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Vertices (n, V, 3), joints (n, J, 3) and their global rotations; Eq. 9 and 2 to 4."""
-        turned, place = forward_kinematics(self.parents, joints, rotations, root)
+        global_rotations, positions = forward_kinematics(self.parents, joints, rotations, root)
         bend = (rotations[:, 1:] - np.eye(3)).reshape(len(rotations), -1)
-        shift = place - (turned @ joints[..., None])[..., 0]
+        shift = positions - (global_rotations @ joints[..., None])[..., 0]
         # a bone's motion as rows (R | t), so that one product blends both
-        motion = np.concatenate([turned, shift[..., None]], -1).reshape(len(turned), len(self.parents), 12)
+        motion = np.concatenate([global_rotations, shift[..., None]], -1).reshape(len(positions), len(self.parents), 12)
         posed = np.empty_like(vertices)
         # one person at a time: the blended motions of all would fill the memory
         for i, rest in enumerate(vertices):
             blend = (self.weights @ motion[i]).reshape(-1, 3, 4)
             rest = rest + self.pose_shapes @ bend[i]
             posed[i] = (blend[..., :3] @ rest[..., None])[..., 0] + blend[..., 3]
-        return posed, place, turned
+        return posed, positions, global_rotations
 
-    def _rotations(self, given: np.ndarray, count: int) -> np.ndarray:
+    @staticmethod
+    def _checked_translation(translation: np.ndarray | None, count: int) -> np.ndarray:
+        translation = np.zeros((count, 3)) if translation is None else np.asarray(translation, float)
+        if translation.shape != (count, 3):
+            raise InputError(f"translation must be ({count}, 3), got {translation.shape}")
+        return translation
+
+    def _all_rotations(self, rotations: np.ndarray, count: int) -> np.ndarray:
         """(n, J, 3, 3) from any of the forms of `pose`."""
         try:
-            given = np.asarray(given, float)
+            rotations = np.asarray(rotations, float)
         except (TypeError, ValueError):
             raise InputError("rotations must be an array of numbers") from None
         total = len(self.parents)
-        if given.shape in ((count, 72), (count, 3 * total)):
-            given = given.reshape(count, -1, 3)
-        if given.shape in ((count, 24, 3), (count, total, 3)):
-            given = axis_angle_to_matrix(given)
-        if given.shape not in ((count, 24, 3, 3), (count, total, 3, 3)) or not np.isfinite(given).all():
+        if rotations.shape in ((count, 72), (count, 3 * total)):
+            rotations = rotations.reshape(count, -1, 3)
+        if rotations.shape in ((count, 24, 3), (count, total, 3)):
+            rotations = axis_angle_to_matrix(rotations)
+        if rotations.shape not in ((count, 24, 3, 3), (count, total, 3, 3)) or not np.isfinite(rotations).all():
             raise InputError(
                 f"rotations must be finite, ({count}, {total} or 24, 3, 3) or axis-angles ({count}, {total} or 24, 3), "
-                f"got {given.shape}"
+                f"got {rotations.shape}"
             )
-        if given.shape[1] == total:
-            return given
+        if rotations.shape[1] == total:
+            return rotations
         full = np.broadcast_to(np.eye(3), (count, total, 3, 3)).copy()
-        full[:, :_SHARED] = given[:, :_SHARED]
+        full[:, :_SHARED] = rotations[:, :_SHARED]
         for wrist, hand in _HANDS.items():
-            full[:, self._fingers(wrist)] = given[:, hand, None]
+            full[:, self._fingers(wrist)] = rotations[:, hand, None]
         return full
 
     def _fingers(self, wrist: int) -> np.ndarray:
@@ -176,49 +198,28 @@ class SmplBody:
 
 
 def load_body(path: str | os.PathLike) -> SmplBody:
-    """The body of a user's file: SMPL (.pkl or .npz), SMPL+H or SMPL-X (.npz or .pkl).
+    """Reads the body of a user's file: SMPL, SMPL+H or SMPL-X, .pkl or .npz. Nothing in the file is run.
 
-    Raises InputError, on one line that names the file: for a missing or damaged file, a missing key, arrays whose
-    shapes do not fit together, numbers that are none, a tree that is not SMPL's, and another unit than metres.
+    Raises:
+        InputError: For a missing or damaged file, a missing key, arrays whose shapes do not fit together, values that
+            are not finite, a tree that is not SMPL's, and units other than meters.
     """
     suffix = Path(os.fspath(path)).suffix.lower() if isinstance(path, str | os.PathLike) else ""
-    if suffix not in (".npz", ".pkl"):
+    if suffix == ".npz":
+        # SMPL-X's files also have keys of Python objects, which are not read
+        arrays, names = read_npz(path, _KEYS, expected="an SMPL .npz")
+    elif suffix == ".pkl":
+        arrays = load_pickle(path)
+        if not isinstance(arrays, dict):
+            raise file_error(path, f"expected a dict of SMPL's arrays, got {type(arrays).__name__}")
+        names = sorted(map(str, arrays))
+    else:
         raise file_error(path, "expected a body of the SMPL family, .npz or .pkl")
-    return _body(path, _npz(path) if suffix == ".npz" else _pickled(path))
-
-
-def _pickled(path: object) -> dict[str, np.ndarray]:
-    found = load_pickle(path)
-    if not isinstance(found, dict):
-        raise file_error(path, f"expected a dict of SMPL's arrays, got {type(found).__name__}")
-    _check_keys(path, found)
-    return {key: found[key] for key in _KEYS}
-
-
-def _npz(path: object) -> dict[str, np.ndarray]:
-    if not read_bytes(path, expected="an SMPL .npz").startswith(b"PK"):
-        raise file_error(path, "is not an npz: was it copied completely?")
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            _check_keys(path, stored)
-            # SMPL-X's files also have keys of Python objects, which are not read
-            return {key: stored[key] for key in _KEYS}
-    except InputError:
-        raise
-    except MemoryError:
-        raise file_error(path, "does not fit in memory") from None
-    # numpy and zipfile raise many kinds for damaged archives, zlib.error and struct.error among them
-    except Exception as error:
-        objects = isinstance(error, ValueError) and "allow_pickle" in str(error)
-        why = "keeps Python objects" if objects else f"cannot be read ({type(error).__name__})"
-        raise file_error(path, f"{why}: save its arrays as plain numbers, or copy it again") from None
-
-
-def _check_keys(path: object, found: Mapping) -> None:
-    missing = [key for key in _KEYS if key not in found]
+    missing = [key for key in _KEYS if key not in arrays]
     if missing:
-        has = ", ".join(sorted(map(str, found))[:12]) or "nothing"
-        raise file_error(path, f"is no body of the SMPL family: {', '.join(missing)} missing; it has {has}")
+        listed = ", ".join(names[:12]) or "nothing"
+        raise file_error(path, f"is no body of the SMPL family: {', '.join(missing)} missing; it has {listed}")
+    return _body(path, arrays)
 
 
 def _body(path: object, raw: Mapping) -> SmplBody:
@@ -246,21 +247,21 @@ def _body(path: object, raw: Mapping) -> SmplBody:
             raise file_error(path, f"the rows of {key} must sum to 1; was the file changed?")
     height = np.ptp(template[:, 1])
     if not _HEIGHTS[0] < height < _HEIGHTS[1]:
-        raise file_error(path, f"v_template is {height:.3g} high along y; expected metres, y up")
-    owned = on_smpl(weights, parents)
-    if not (owned.argmax(1) == _HEAD).any():
+        raise file_error(path, f"v_template is {height:.3g} high along y; expected meters, y up")
+    joint_weights = on_smpl(weights, parents)
+    if not (joint_weights.argmax(1) == _HEAD).any():
         raise file_error(path, "no vertex belongs to the head; was the file changed?")
     faces = faces.astype(np.int32)
     return SmplBody(
         template=template,
-        # small numbers: half the memory costs nanometres
+        # small numbers: half the memory costs nanometers
         shapes=shapes[..., : _EXPRESSIONS.get((total, shape_count), shape_count)].astype(np.float32),
         pose_shapes=bends.astype(np.float32),
         regressor=regressor,
         weights=weights,
         parents=parents,
         faces=faces,
-        face_part=(1 + owned[faces].sum(1).argmax(1)).astype(np.uint8),
+        face_part=(1 + joint_weights[faces].sum(1).argmax(1)).astype(np.uint8),
         source=str(path),
     )
 
@@ -280,7 +281,7 @@ def _numbers(path: object, key: str, value: object) -> np.ndarray:
     except (TypeError, ValueError, OverflowError):
         raise file_error(path, f"{key} must be an array of numbers, got {type(value).__name__}: ask for npz") from None
     if not np.isfinite(array).all():
-        raise file_error(path, f"{key} has values that are no numbers; was the file copied completely?")
+        raise file_error(path, f"{key} has values that are not finite; was the file copied completely?")
     return array
 
 

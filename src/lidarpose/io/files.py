@@ -6,6 +6,7 @@ Every failure that the user can cause is an `InputError` of one line that names 
 import difflib
 import errno
 import hashlib
+import io
 import os
 import reprlib
 import stat
@@ -13,8 +14,12 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lidarpose.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
 
 # part of a temporary file's name beside the process id, so that threads of one process never share a name
 _serial = count()
@@ -101,6 +106,36 @@ def read_bytes(path: str | os.PathLike, *, expected: str) -> bytes:
     if not data:
         raise file_error(path, f"is empty; expected {expected}: was it copied completely?")
     return data
+
+
+def read_npz(
+    path: str | os.PathLike, wanted: Iterable[str], *, expected: str
+) -> "tuple[dict[str, np.ndarray], list[str]]":
+    """Arrays of an npz file, without running anything that is pickled in it.
+
+    Args:
+        wanted: Names of the arrays to read; those that are missing are left out.
+        expected: As of `read_bytes`.
+
+    Returns:
+        The arrays by name, and all names in the file, sorted.
+
+    Raises:
+        InputError: For a missing, damaged or truncated file, Python objects among the arrays, too large a file.
+    """
+    # the command line's help imports this module, and does without numpy
+    import numpy as np
+
+    data = read_bytes(path, expected=expected)
+    try:
+        if not data.startswith(b"PK"):
+            raise ValueError("no zip archive")
+        with np.load(io.BytesIO(data), allow_pickle=False) as file:
+            return {name: file[name] for name in wanted if name in file.files}, sorted(file.files)
+    except MemoryError:
+        raise file_error(path, "does not fit in memory; split it first") from None
+    except Exception as error:  # numpy, zipfile and zlib raise many kinds for a damaged archive
+        raise file_error(path, f"not an npz of plain arrays ({error}); was it copied completely?") from None
 
 
 def _nearest(path: str | os.PathLike) -> str:
