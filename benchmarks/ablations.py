@@ -63,7 +63,7 @@ class Variant:
     scene: SceneConfig = _WILD
 
 
-_CALM = replace(_WILD, clutter=0.0, company=0.0, occluder=0.0, faults=replace(_WILD.faults, stray=0.0))
+_CALM = replace(_WILD, clutter=0.0, company=0.0, occluder=0.0, noise=replace(_WILD.noise, clutter=0.0))
 VARIANTS = {
     "base": Variant("base", "`tiny` without convolutions"),
     # the six that matter
@@ -87,11 +87,11 @@ VARIANTS = {
     "coarse alone": Variant("levels", "anchors read 24 cm alone", network=reading("coarse")),
     "fine alone": Variant("levels", "anchors read 6 cm alone", network=reading("fine")),
     "coarse and mid": Variant("levels", "anchors read 24 and 12 cm", network=reading("coarse", "mid")),
-    "no mask": Variant("mask", "no laser-level masking", scene=replace(_WILD, faults=replace(_WILD.faults, mask=0.0))),
+    "no mask": Variant("mask", "no laser-level masking", scene=replace(_WILD, noise=replace(_WILD.noise, mask=0.0))),
     "always mask": Variant(
         "mask",
         "two in three masked, 60 % kept; the paper masks everybody",
-        scene=replace(_WILD, faults=replace(_WILD.faults, mask=1.0, keep=0.6, keep_most=0.6)),
+        scene=replace(_WILD, noise=replace(_WILD.noise, mask=1.0, mask_keep=(0.6, 0.6))),
     ),
     "paper's scene": Variant("scene", "the paper's scene", scene=SCENES["paper"]),
     "one sensor": Variant("scene", "the paper's sensor alone", scene=replace(_WILD, sensors=("dapt64",))),

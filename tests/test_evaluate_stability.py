@@ -24,7 +24,7 @@ from lidarpose.eval.run import Task, judge, task_of
 from lidarpose.sample import Box, center_of
 from lidarpose.skeleton import BODY26, HUMAN15
 from lidarpose.synth.generator import LEAST_POINTS
-from lidarpose.synth.noise import noise_clusters, stray_cluster
+from lidarpose.synth.noise import noise_cluster, noise_clusters
 from lidarpose.synth.shard_job import Job, write_dataset
 
 
@@ -127,7 +127,7 @@ def test_a_cluster_alone_is_one_of_those_of_training(seed):
     found = noise_clusters(np.zeros(3), most=60, rng=rng)
     slow = []
     for _ in range(twin.integers(1, 3)):
-        slow.append(stray_cluster(np.zeros(3), count=int(twin.integers(0, 61)), rng=twin))
+        slow.append(noise_cluster(np.zeros(3), count=int(twin.integers(0, 61)), rng=twin))
     np.testing.assert_array_equal(found, np.concatenate(slow))
 
 

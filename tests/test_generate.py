@@ -13,15 +13,14 @@ from lidarpose.lidar.presets import sensor
 from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import center_of
 from lidarpose.skeleton import BODY26, SMPL24
-from lidarpose.synth import actor
-from lidarpose.synth.actor import draw_actor
-from lidarpose.synth.bodies import draw_bodies
+from lidarpose.synth import bodies
+from lidarpose.synth.bodies import draw_bodies, draw_moving_body
 from lidarpose.synth.generator import BLOCK, LEAST_POINTS, Generator
 from lidarpose.synth.scene import SCENES, scene_config
 
 SEED = 11
 # no mask, no noise, nothing in between: all that a dense sensor sees of a person
-CLEAN = replace(SCENES["paper"], faults=replace(SCENES["paper"].faults, mask=0.0), hard=0.0, distance=(4.0, 8.0))
+CLEAN = replace(SCENES["paper"], noise=replace(SCENES["paper"].noise, mask=0.0), hard=0.0, distance=(4.0, 8.0))
 
 
 @cache
@@ -263,9 +262,9 @@ def test_the_paper_s_distances():
 
 def test_the_paper_s_preset_is_the_paper_s():
     paper = scene_config("paper")
-    faults = paper.faults
-    assert (paper.distance, faults.keep, faults.mask, paper.sensors) == ((4.0, 20.0), 0.6, 1.0, ("dapt64",))
-    assert not faults.released and faults.stray == faults.missing == paper.margin == 0
+    noise = paper.noise
+    assert (paper.distance, paper.sensors, noise.mask_keep, noise.mask) == ((4.0, 20.0), ("dapt64",), (0.6, 0.6), 1.0)
+    assert not noise.dapt_compat and noise.clutter == noise.missing_part == paper.margin == 0
     device = sensor("dapt64")
     assert len(device.elevations) == 64 and device.columns in (2649, 2650)
     with pytest.raises(InputError, match="unknown scene 'papr'"):
@@ -302,10 +301,10 @@ def test_a_clip_is_one_person_who_moves_before_things_that_do_not():
 def test_feet_stay_where_they_stand_however_long_the_legs(which, monkeypatch):
     crowd = sample_people(np.random.default_rng(0), 200)
     one = crowd.coefficients[which(crowd.height)][None]
-    monkeypatch.setattr(actor, "sample_people", lambda rng, n: SimpleNamespace(coefficients=one))
+    monkeypatch.setattr(bodies, "sample_people", lambda rng, n: SimpleNamespace(coefficients=one))
     slides, walks = [], 0
     for seed in range(60):
-        somebody = draw_actor(None, 0.0, 8, np.random.default_rng(seed))
+        somebody = draw_moving_body(None, 0.0, 8, np.random.default_rng(seed))
         if somebody.kind == "walk":
             walks += 1
             feet = somebody.joints[:, [BODY26.index("left_foot"), BODY26.index("right_foot")], :2]
@@ -316,13 +315,13 @@ def test_feet_stay_where_they_stand_however_long_the_legs(which, monkeypatch):
 
 def test_bodies_move_while_a_rosette_looks():
     """The points of somebody who cycles past lie between where they were and where they went."""
-    bodies = draw_bodies(None, 0.0, BLOCK, SEED, 3)
-    row = bodies.kinds.index("cycle") if "cycle" in bodies.kinds else bodies.kinds.index("walk")
-    vertices, joints = bodies.moved(row)
-    step = joints[0] - bodies.joints[row, 0]
+    block = draw_bodies(None, 0.0, BLOCK, SEED, 3)
+    row = block.kinds.index("cycle") if "cycle" in block.kinds else block.kinds.index("walk")
+    vertices, joints = block.moved(row)
+    step = joints[0] - block.joints[row, 0]
     assert 0.02 < np.linalg.norm(step) < 0.6 and step[0] > 0.02
-    assert vertices.shape == bodies.vertices[row].shape
+    assert vertices.shape == block.vertices[row].shape
     still = draw_bodies(None, 0.0, BLOCK, SEED, 3, moving=False)
     with pytest.raises(InputError, match="draw them with moving=True"):
         still.moved(0)
-    np.testing.assert_allclose(still.vertices, bodies.vertices, atol=1e-5)
+    np.testing.assert_allclose(still.vertices, block.vertices, atol=1e-5)

@@ -10,13 +10,13 @@ from lidarpose.lidar.presets import sensor
 from lidarpose.sample import Box
 from lidarpose.synth import street
 from lidarpose.synth.environment.mesh import quad
-from lidarpose.synth.street import Street, StreetFrame, _box, _Walker, samples
+from lidarpose.synth.street import Street, StreetFrame, _Walker, samples
 
 
 def test_who_passes_by_does_what_people_do_in_streets(monkeypatch):
     kinds = iter(["sit", "cycle", "lie", "run", "walk"])
-    monkeypatch.setattr(street, "draw_actor", lambda *given: replace(goer(), kind=next(kinds)))
-    assert street._passer_by(4, np.random.default_rng(0)).kind == "run"
+    monkeypatch.setattr(street, "draw_moving_body", lambda *given: replace(goer(), kind=next(kinds)))
+    assert street._draw_pedestrian(4, np.random.default_rng(0)).kind == "run"
 
 
 def test_a_rosette_goes_on_with_its_pattern_in_a_street():
@@ -27,10 +27,10 @@ def test_a_rosette_goes_on_with_its_pattern_in_a_street():
 
 def motionless_street():
     actor = goer(still=True)
-    walker = _Walker(actor=actor, start=np.array([5.0, 0.0, -1.2]), yaw=0.0)
+    walker = _Walker(body=actor, start=np.array([5.0, 0.0, -1.2]), yaw=0.0)
     still = quad(20.0, np.zeros(2)).moved((0, 0, -1.2))
     ring_error = np.zeros(256, np.float32)
-    return lambda frame: street._look(
+    return lambda frame: street._scan_turn(
         sensor("livox-avia"), still, [walker], frame, ring_error, np.random.default_rng(0)
     )
 
@@ -55,9 +55,9 @@ def test_the_parts_of_a_street_s_sample_are_its_own_person_s():
 @pytest.mark.parametrize("frame", range(3))
 def test_a_street_s_box_lies_along_its_person(frame):
     actor, yaw = goer(), 0.7
-    walker = _Walker(actor=actor, start=np.array([5.0, 2.0, -1.5]), yaw=yaw)
+    walker = _Walker(body=actor, start=np.array([5.0, 2.0, -1.5]), yaw=yaw)
     vertices = walker.placed(actor.vertices[frame])
-    found = _box(walker, vertices, frame, 4)
+    found = walker.box(vertices, frame, 4)
     np.testing.assert_allclose(found.size, [0.4, 1.0, 1.8], atol=1e-4)
     assert found.id == 4 and found.contains(vertices).all() and found.contains(walker.placed(actor.joints[frame])).all()
     assert abs((found.yaw - yaw - HEADINGS[frame] + np.pi) % (2 * np.pi) - np.pi) < 1e-6

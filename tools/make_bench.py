@@ -36,22 +36,22 @@ LEAST, LEAST_BODY = 20, 10
 
 
 def conditions() -> dict[str, SceneConfig]:
-    """clean: nothing but the sensor's own faults and a detector's box 3 cm off; each other one adds its own trouble."""
+    """clean: nothing but the sensor's own noise and a detector's box 3 cm off; each other one adds its own trouble."""
     wild = scene_config("wild")
-    whole = replace(wild.faults, mask=0.0, stray=0.0, missing=0.0)
+    whole = replace(wild.noise, mask=0.0, clutter=0.0, missing_part=0.0)
     clean = replace(
         wild,
         distance=(2.0, 40.0),
         clutter=0.0,
         occluder=0.0,
         company=0.0,
-        faults=whole,
+        noise=whole,
         crop=CropErrors(jitter=0.03, loose=0.0, cut=0.0),
     )
     return {
         "clean": clean,
-        "occluded": replace(clean, occluder=1.0, faults=replace(whole, mask=0.5, missing=0.25)),
-        "cluttered": replace(clean, clutter=1.0, faults=replace(whole, stray=0.5)),
+        "occluded": replace(clean, occluder=1.0, noise=replace(whole, mask=0.5, missing_part=0.25)),
+        "cluttered": replace(clean, clutter=1.0, noise=replace(whole, clutter=0.5)),
         "crop": replace(clean, crop=CropErrors(jitter=0.16, loose=0.25, cut=0.35)),
         "company": replace(clean, company=1.0),
     }

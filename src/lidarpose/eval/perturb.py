@@ -10,7 +10,7 @@ import numpy as np
 
 from lidarpose.geometry import axis_angle_to_matrix
 from lidarpose.sample import Box, center_of
-from lidarpose.synth.noise import jitter, random_keep, stray_cluster
+from lidarpose.synth.noise import jitter, noise_cluster, random_keep
 
 # of the paper's: two clusters, as in its released code
 _CLUSTERS = 2
@@ -42,7 +42,7 @@ def with_clusters(points: np.ndarray, box: Box | None, amount: float, rng: np.ra
     """Two clusters of `amount` stray points each about the person."""
     center = center_of(points)
     # the places stay where they are while the clusters grow
-    clusters = [stray_cluster(center, count=int(amount), rng=own) for own in rng.spawn(_CLUSTERS)]
+    clusters = [noise_cluster(center, count=int(amount), rng=own) for own in rng.spawn(_CLUSTERS)]
     return np.concatenate([points, *clusters])
 
 

@@ -256,7 +256,7 @@ def _sensors(task: Task, progress: Callable[[int], None] | None) -> Curve:
         # uniform: the law of counts would bring people nearer to coarser sensors
         median_points=0,
         **dict.fromkeys(("clutter", "occluder", "company"), 0.0),
-        faults=replace(scene.faults, mask=0.0, stray=0.0, missing=0.0),
+        noise=replace(scene.noise, mask=0.0, clutter=0.0, missing_part=0.0),
         crop=replace(scene.crop, jitter=0.03, loose=0.0, cut=0.0),
     )
     pick = BODY26.map_to(task.people.skeleton)

@@ -1,6 +1,6 @@
 """Posed, clothed bodies for the generator: blocks of single poses, and clips of one person who moves."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,11 +10,12 @@ from lidarpose.body.mocap import load_motion
 from lidarpose.body.mocap.motion import Motion, facing_x
 from lidarpose.body.mocap.retarget import mean_adult_joints
 from lidarpose.body.pose_prior.activities import KINDS
-from lidarpose.body.pose_prior.sampling import sample_rotations
+from lidarpose.body.pose_prior.ground_contact import stand
+from lidarpose.body.pose_prior.sampling import sample_clips, sample_rotations
 from lidarpose.body.rig import RestBody, load_rig, pose_bodies
 from lidarpose.body.shape import clothing, sample_people
 from lidarpose.errors import InputError, MissingExtra
-from lidarpose.geometry import axis_angle_to_matrix
+from lidarpose.geometry import axis_angle_to_matrix, rotation_about
 from lidarpose.skeleton import SMPL24
 
 try:
@@ -30,6 +31,11 @@ _MOST_HZ = 30.0
 # spread of the small turns that make two draws of one captured pose differ, rad
 _VARIATION = 0.06
 _MIRROR = np.diag([1.0, -1.0, 1.0])
+# how high a captured foot may be above its clip's lowest and still stand on the ground, m
+_JUMP = 0.06
+
+# least and greatest x, y, z, m
+Extent = tuple[list[float], list[float]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,39 +79,80 @@ class PoseBank:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Bodies:
-    """Posed, clothed bodies that face +x with their lowest point at z = 0: vertices (n, V, 3), joints (n, 26, 3) m;
-    kinds (n,) names of what they do ("captured" for poses of a bank); extent: see `extents`; faces (F, 3) and
-    face_part (F,) as in `body.rig`.
+class Body:
+    """One person's frames in their own frame: the first on the origin, facing +x, the ground at z = 0.
 
-    The rest is what `moved` needs: rest bodies, clothes (n, V) m, moved_rotations (n, 24, 3, 3), step (n, 3) m and
-    lift (n,) m; None are moved_rotations and step of bodies that do not move.
+    Args:
+        vertices: (F, V, 3) m.
+        joints: (F, 26, 3) m, BODY26.
+        heading: (F,) rad.
+        extent: of each frame, least and greatest x, y, z along its heading, m.
+        at_frame_end: frame -> vertices (V, 3) and joints (26, 3) `FRAME_TIME` s after the frame begins.
+        kind: the activity, a name of `body.pose_prior.activities.KINDS`.
+        faces: (Q, 3).
+        face_part: (Q,) as in `body.rig`.
+    """
+
+    vertices: np.ndarray
+    joints: np.ndarray
+    heading: tuple[float, ...]
+    extent: tuple[Extent, ...]
+    at_frame_end: Callable[[int], tuple[np.ndarray, np.ndarray]]
+    kind: str
+    faces: np.ndarray
+    face_part: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bodies:
+    """A block of posed, clothed bodies that face +x with their lowest point at z = 0.
+
+    Args:
+        vertices: (n, V, 3) m.
+        joints: (n, 26, 3) m, BODY26.
+        kinds: (n,) names of activities, "captured" for poses of a bank.
+        extent: of each body, least and greatest x, y, z, m.
+        faces, face_part: (Q, 3) and (Q,) as in `body.rig`.
+        rest: T-posed bodies.
+        clothes: (n, V) m, how far cloth stands off the skin.
+        next_rotations: (n, 24, 3, 3), the poses `FRAME_TIME` s later; None for bodies that do not move.
+        step: (n, 3) m, how far the pelvis goes meanwhile; None for bodies that do not move.
+        lift: (n,) m, how far the vertices were lowered onto the ground.
     """
 
     vertices: np.ndarray
     joints: np.ndarray
     kinds: tuple[str, ...]
-    extent: tuple[tuple[list[float], list[float]], ...]
+    extent: tuple[Extent, ...]
     faces: np.ndarray
     face_part: np.ndarray
     rest: RestBody
     clothes: np.ndarray
-    moved_rotations: np.ndarray | None
+    next_rotations: np.ndarray | None
     step: np.ndarray | None
     lift: np.ndarray
+
+    def body(self, row: int) -> Body:
+        """Body `row`, in one frame."""
+        return Body(
+            vertices=self.vertices[row : row + 1],
+            joints=self.joints[row : row + 1],
+            heading=(0.0,),
+            extent=(self.extent[row],),
+            at_frame_end=lambda frame: self.moved(row),
+            kind=self.kinds[row],
+            faces=self.faces,
+            face_part=self.face_part,
+        )
 
     def moved(self, row: int) -> tuple[np.ndarray, np.ndarray]:
         """Vertices (V, 3) and joints (26, 3) of body `row`, `FRAME_TIME` s later. Raises InputError where the block was
         drawn with moving=False."""
-        if self.moved_rotations is None or self.step is None:
+        if self.next_rotations is None or self.step is None:
             raise InputError("these bodies do not move: draw them with moving=True")
-        one = slice(row, row + 1)
-        vertices, joints, _, _ = dressed(
-            RestBody(vertices=self.rest.vertices[one], joints=self.rest.joints[one]),
-            self.clothes[one],
-            self.moved_rotations[one],
-            self.step[one],
-        )
+        rows = slice(row, row + 1)
+        rest = RestBody(vertices=self.rest.vertices[rows], joints=self.rest.joints[rows])
+        vertices, joints, _, _ = _dressed(rest, self.clothes[rows], self.next_rotations[rows], self.step[rows])
         down = np.array([0, 0, self.lift[row]], np.float32)
         return vertices[0] - down, joints[0] - down
 
@@ -120,12 +167,19 @@ def draw_bodies(
     moving: bool = True,
     clothes: float = 1.0,
 ) -> Bodies:
-    """The `count` bodies of a block; a function of (seed, block) and of where poses come from. Unless `moving`, they
-    cannot be `moved`; clothes: see `SceneConfig`."""
+    """The bodies of a block; a function of (seed, block) and of where poses come from.
+
+    Args:
+        bank: captured poses, or None.
+        captured: share of the poses that comes from the bank.
+        count: number of bodies.
+        moving: whether they can be `moved`.
+        clothes: see `SceneConfig`.
+    """
     rng = np.random.default_rng([seed, 0, block])
     rig = load_rig()
     prior = sample_rotations(rng, count, dt=FRAME_TIME if moving else 0.0)
-    rotations, moved, step = prior.rotations, prior.moved, prior.step
+    rotations, next_rotations, step = prior.rotations, prior.moved, prior.step
     kinds = np.array(KINDS)[prior.kind]
     if bank is not None:
         picked = rng.integers(len(bank.rotations), size=count)
@@ -134,45 +188,87 @@ def draw_bodies(
         mask = chosen[:, None, None, None]
         rotations = np.where(mask, both[:, 0], rotations)
         if moving:
-            moved, step = np.where(mask, both[:, 1], moved), np.where(chosen[:, None], way[:, 0], step)
+            next_rotations = np.where(mask, both[:, 1], next_rotations)
+            step = np.where(chosen[:, None], way[:, 0], step)
         kinds = np.where(chosen, "captured", kinds)
     rest = rig.rest(sample_people(rng, count).coefficients)
     worn = clothing(rng, count) * np.float32(clothes)
-    vertices, joints, low, high = dressed(rest, worn, rotations, np.zeros((count, 3), np.float32))
+    vertices, joints, low, high = _dressed(rest, worn, rotations, np.zeros((count, 3), np.float32))
     lift = low[:, 2].copy()
-    vertices[..., 2] -= lift[:, None]
-    joints[..., 2] -= lift[:, None]
+    for heights in (vertices[..., 2], joints[..., 2]):
+        heights -= lift[:, None]
     low[:, 2], high[:, 2] = 0, high[:, 2] - lift
     return Bodies(
         vertices=vertices,
         joints=joints,
         kinds=tuple(kinds.tolist()),
-        extent=extents(low, high),
+        extent=_extents(low, high),
         faces=rig.faces,
         face_part=rig.face_part,
         rest=rest,
         clothes=worn,
-        moved_rotations=moved if moving else None,
-        step=step * strides(rest, kinds) if moving else None,
+        next_rotations=next_rotations if moving else None,
+        step=step * _stride_ratio(rest, kinds) if moving else None,
         lift=lift,
     )
 
 
-def strides(rest: RestBody, kinds: Sequence[str]) -> np.ndarray:
-    """(n, 1) float32: how long the steps of people (n) are beside the mean adult's, whose way all motion has: as their
+def draw_moving_body(
+    bank: PoseBank | None, captured: float, frames: int, rng: np.random.Generator, *, clothes: float = 1.0
+) -> Body:
+    """A person who moves, at `CLIP_HZ`: from the prior, or with a chance of `captured` from the clips of a bank.
+
+    clothes: see `SceneConfig`.
+    """
+    rig = load_rig()
+    clip = bank.clip(frames + 1, rng) if bank is not None and rng.random() < captured else None
+    if clip is not None:
+        (rotations, translation), kind, clearance = clip, "captured", None
+    else:
+        drawn = sample_clips(rng, 1, frames=frames + 1, hz=CLIP_HZ)
+        rotations, translation = drawn.rotations[0], drawn.translation[0] * np.float32([1, 1, 0])
+        kind, clearance = KINDS[drawn.kind[0]], drawn.clearance[0]
+    person = rig.rest(sample_people(rng, 1).coefficients)
+    translation = translation * [*_stride_ratio(person, [kind]).repeat(2), 1]
+    rest = RestBody(vertices=np.repeat(person.vertices, frames + 1, 0), joints=np.repeat(person.joints, frames + 1, 0))
+    worn = np.repeat(clothing(rng, 1) * np.float32(clothes), frames + 1, 0)
+    vertices, joints, low, _ = _dressed(rest, worn, rotations, translation)
+    lowest = low[:, 2]
+    if clearance is None:
+        # the body is not as tall as who was captured: what is little above the lowest frame stands on the ground
+        clearance = np.maximum(lowest - lowest.min() - _JUMP, 0)
+    rise = stand(lowest, clearance)[:, None, None] * np.array([0, 0, 1], np.float32)
+    vertices, joints = vertices + rise, joints + rise
+    # where the pelvis's x axis points
+    heading = np.arctan2(rotations[:frames, 0, 1, 0], rotations[:frames, 0, 0, 0])
+    turned = vertices[:frames] @ rotation_about("z", heading).astype(np.float32)
+    return Body(
+        vertices=vertices[:frames],
+        joints=joints[:frames],
+        heading=tuple(heading.tolist()),
+        extent=_extents(turned.min(1), turned.max(1)),
+        at_frame_end=lambda frame: (vertices[frame + 1], joints[frame + 1]),
+        kind=kind,
+        faces=rig.faces,
+        face_part=rig.face_part,
+    )
+
+
+def _stride_ratio(rest: RestBody, kinds: Sequence[str]) -> np.ndarray:
+    """(n, 1) float32: length of people's steps relative to the mean adult's, whose way all motion has: as their
     legs, or feet would slide. Cyclists' are as long."""
-    mean = _legs(mean_adult_joints()[None])
+    mean = _leg_length(mean_adult_joints()[None])
     rolls = np.array([kind == "cycle" for kind in kinds])
-    return np.where(rolls, 1.0, _legs(rest.joints) / mean)[:, None].astype(np.float32)
+    return np.where(rolls, 1.0, _leg_length(rest.joints) / mean)[:, None].astype(np.float32)
 
 
-def _legs(joints: np.ndarray) -> np.ndarray:
+def _leg_length(joints: np.ndarray) -> np.ndarray:
     """(n,) m: from the left hip over the knee to the ankle."""
     hip, knee, ankle = (joints[:, SMPL24.index(f"left_{name}")] for name in ("hip", "knee", "ankle"))
     return np.linalg.norm(hip - knee, axis=-1) + np.linalg.norm(knee - ankle, axis=-1)
 
 
-def dressed(
+def _dressed(
     rest: RestBody, clothes: np.ndarray, rotations: np.ndarray, translation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Vertices (n, V, 3) and joints (n, 26, 3) m of posed bodies whose clothes stand off (n, V) m; the vertices' least
@@ -184,8 +280,7 @@ def dressed(
     return vertices, joints, low, high
 
 
-def extents(low: np.ndarray, high: np.ndarray) -> tuple[tuple[list[float], list[float]], ...]:
-    """Of each of the bodies, whose least and greatest x, y, z are low and high (n, 3) m: these, as lists."""
+def _extents(low: np.ndarray, high: np.ndarray) -> tuple[Extent, ...]:
     return tuple(zip(low.tolist(), high.tolist(), strict=True))
 
 

@@ -1,95 +1,72 @@
-"""What happens to points after the cast, each a small pure function of (points, ..., rng).
+"""What goes wrong with points, laser grids and boxes, in numpy: each a pure function of its arguments and a generator.
 
-What is drawn for every point can also be handed in (`error`, `chance`), so that a fast twin can be held against these.
-Legend: n points; parts are 0 for what is not body, 1 + j for the bone of SMPL-24's joint j. All frames are the
-sensor's: it stands at the origin.
+Legend: n points; parts are 0 for what is not body, 1 + j for the bone of SMPL-24's joint j.
 """
 
 from dataclasses import replace
+from math import cos, sin
 
 import numpy as np
 
 from lidarpose.sample import Box
+from lidarpose.synth.placement import Place
+from lidarpose.synth.scene import CropErrors
+
+# --- the paper's laser-level mask: patches of the laser grid go missing, as behind something in the foreground
+
+# Paper: section "Laser-level masking": the shorter side of the window is this many patches
+_PATCHES = 8
+# without a grid, at most so many patches along the longer side
+_LONGEST = 64
 
 
-def along_beams(points: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """points (n, 3) m moved away from the sensor by error (n,) m."""
-    distance = np.linalg.norm(points, axis=1)
-    return points * (1 + error / np.maximum(distance, _NEAREST))[:, None]
+def laser_mask(columns: int, rows: int, *, keep: float, rng: np.random.Generator) -> np.ndarray:
+    """(columns, rows) bool: which beams of the effective window survive.
 
-
-# what is nearer to the sensor is not moved by more than its share, m
-_NEAREST = 1e-3
-
-
-# makers' range limits hold for targets that reflect about 80 percent; clothes at 20 percent are seen half as far
-REACH = 0.5
-
-
-def weak_loss(points: np.ndarray, normals: np.ndarray, *, range_max: float) -> np.ndarray:
-    """(n,) probability that a return is too weak to be seen.
-
-    The power that comes back from a matt surface larger than the beam goes with cos(incidence) / range^2 (the LiDAR
-    range equation for extended Lambertian targets). At half of the sensor's range_max m, half of what faces it comes
-    back; clothes differ in reflectivity, which makes the step soft: 1 / (1 + power^2), power 1 there.
+    Paper: section "Laser-level masking". The window is cut into square patches of s_p beams,
+    s_p = floor(min(columns, rows) / 8), at least 1 (the released code divides by zero on windows of under 8 beams);
+    a share 1 - keep of all patches is masked.
     """
-    reach = REACH * range_max
-    squared = (points**2).sum(1)
-    power = _cosine(points, normals) * reach**2 / np.maximum(squared, _NEAREST**2)
-    return 1 / (1 + power**2)
+    patch = max(min(columns, rows) // _PATCHES, 1)
+    across, down = -(-columns // patch), -(-rows // patch)
+    kept = _kept_patches(across * down, keep, rng)
+    return kept.reshape(across, down).repeat(patch, 0).repeat(patch, 1)[:columns, :rows]
 
 
-def random_keep(count: int, *, share: float, rng: np.random.Generator) -> np.ndarray:
-    """(count,) bool: all but a random `share` of the returns, each on its own."""
-    return rng.random(count) >= share
+def direction_mask(directions: np.ndarray, *, keep: float, rng: np.random.Generator) -> np.ndarray:
+    """(n,) bool: the same for beams without a grid, such as a rosette's.
 
+    The window is what the directions span in azimuth and elevation; patches are squares of an eighth of its shorter
+    side. A share 1 - keep of all patches is masked.
 
-def _cosine(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    beam = points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-6)
-    return np.abs((beam * normals).sum(1))
-
-
-def spoil_reference(
-    points: np.ndarray,
-    normals: np.ndarray,
-    keep: np.ndarray,
-    error: np.ndarray,
-    chance: np.ndarray,
-    *,
-    dropout: float,
-    weak: float,
-    range_max: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """All that happens to returns on the way, in one go; `spoil.spoil` is the compiled twin.
-
-    points (n, 3) m, normals (n, 3) unit, keep (n,) bool: what is left of them; error (n,) m of the ranges; chance (n,)
-    uniform draws. A return survives where its chance is above the probability that it is lost at random (`dropout`)
-    or for weakness (`weak` times `weak_loss`). Returns the kept points (k, 3) with their errors and their indices (k,).
+    Args:
+        directions: (n, 3) beams of the window, of any length > 0, for instance the points they hit.
     """
-    lost = 1 - (1 - dropout) * (1 - weak * weak_loss(points, normals, range_max=range_max))
-    kept = np.flatnonzero(keep & (chance >= lost))
-    return along_beams(points[kept], error[kept]), kept
+    if len(directions) == 0:
+        return np.zeros(0, bool)
+    x, y, z = np.asarray(directions, np.float32).T
+    c, s = x.mean(), y.mean()
+    # azimuths about the window's own middle: no seam
+    azimuth = np.arctan2(c * y - s * x, c * x + s * y)
+    elevation = np.arctan2(z, np.sqrt(x * x + y * y))
+    azimuth -= azimuth.min()
+    elevation -= elevation.min()
+    wide, tall = float(azimuth.max()), float(elevation.max())
+    # a window that is a line has no shorter side
+    patch = max(min(wide, tall) / _PATCHES, max(wide, tall) / _LONGEST, 1e-6)
+    across, up = int(wide / patch) + 1, int(tall / patch) + 1
+    cell = (azimuth / np.float32(patch)).astype(np.int32) * up + (elevation / np.float32(patch)).astype(np.int32)
+    return _kept_patches(across * up, keep, rng)[np.minimum(cell, across * up - 1)]
 
 
-def noise_clusters(center: np.ndarray, *, most: int, rng: np.random.Generator) -> np.ndarray:
-    """(k, 3) m: up to two blobs of stray points about `center`, as the paper's stability study adds them.
-
-    Each has 0 to `most` points within 0.3 m of a place up to 0.4 m (0.8 m in height) from the center.
-    """
-    blobs = []
-    for _ in range(rng.integers(1, 3)):
-        count = int(rng.integers(0, most + 1))
-        blobs.append(stray_cluster(center, count=count, rng=rng))
-    return np.concatenate(blobs)
+def _kept_patches(patches: int, keep: float, rng: np.random.Generator) -> np.ndarray:
+    """(patches,) bool: a share `keep` of them, rounded down, drawn at random."""
+    kept = np.zeros(patches, bool)
+    kept[rng.permutation(patches)[: int(patches * keep)]] = True
+    return kept
 
 
-def stray_cluster(center: np.ndarray, *, count: int, rng: np.random.Generator) -> np.ndarray:
-    """(count, 3) m: one blob of stray points, within 0.3 m of a place up to 0.4 m (0.8 m in height) from `center`."""
-    place = center + rng.uniform(-1, 1, 3) * _CLUSTER_REACH
-    direction = rng.normal(size=(count, 3))
-    direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
-    return place + direction * rng.uniform(0, _CLUSTER_RADIUS, (count, 1))
-
+# --- clutter points
 
 # half the extents of where clusters may lie and their radius, m: the released code's
 _CLUSTER_REACH = np.array([0.4, 0.4, 0.8])
@@ -97,7 +74,24 @@ _CLUSTER_RADIUS = 0.3
 _CLUSTER_POINTS = 150
 
 
-def reference_clusters(center: np.ndarray, *, rng: np.random.Generator) -> np.ndarray:
+def noise_clusters(center: np.ndarray, *, most: int, rng: np.random.Generator) -> np.ndarray:
+    """(k, 3) m: one or two `noise_cluster`s of 0 to `most` points, as the paper's stability study adds them."""
+    clusters = []
+    for _ in range(rng.integers(1, 3)):
+        count = int(rng.integers(0, most + 1))
+        clusters.append(noise_cluster(center, count=count, rng=rng))
+    return np.concatenate(clusters)
+
+
+def noise_cluster(center: np.ndarray, *, count: int, rng: np.random.Generator) -> np.ndarray:
+    """(count, 3) m: points within 0.3 m of a place up to 0.4 m (0.8 m in height) from `center`."""
+    place = center + rng.uniform(-1, 1, 3) * _CLUSTER_REACH
+    direction = rng.normal(size=(count, 3))
+    direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
+    return place + direction * rng.uniform(0, _CLUSTER_RADIUS, (count, 1))
+
+
+def dapt_clusters(center: np.ndarray, *, rng: np.random.Generator) -> np.ndarray:
     """(k, 3) m: the released code's law. Two areas, each of 0 to 149 points about a place within +-0.4 m (+-0.8 m in
     height) of `center`; spherical coordinates uniform: radius to 0.3 m, polar angle, azimuth (denser at the poles)."""
     places = center + rng.uniform(-1, 1, (2, 3)) * _CLUSTER_REACH
@@ -105,6 +99,14 @@ def reference_clusters(center: np.ndarray, *, rng: np.random.Generator) -> np.nd
     radius, polar, azimuth = rng.random((3, len(place))) * [[_CLUSTER_RADIUS], [np.pi], [2 * np.pi]]
     flat = radius * np.sin(polar)
     return place + np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), radius * np.cos(polar)], 1)
+
+
+# --- loss and jitter of points
+
+
+def random_keep(count: int, *, share: float, rng: np.random.Generator) -> np.ndarray:
+    """(count,) bool: all but a random `share` of the returns, each on its own."""
+    return rng.random(count) >= share
 
 
 def part_removal(part: np.ndarray, *, rng: np.random.Generator) -> np.ndarray:
@@ -119,7 +121,7 @@ def part_removal(part: np.ndarray, *, rng: np.random.Generator) -> np.ndarray:
 def half_space_keep(points: np.ndarray, *, most: float, rng: np.random.Generator) -> np.ndarray:
     """(n,) bool: what lies on one side of a random plane that cuts up to a share `most` off the cloud's extent.
 
-    As behind the end of a wall, or where a neighbour's box has taken its share. The plane is upright, lies flat or
+    As behind the end of a wall, or where a neighbor's box has taken its share. The plane is upright, lies flat or
     leans; the share is of the extent along its normal, and never all points go.
     """
     if len(points) == 0:
@@ -128,6 +130,70 @@ def half_space_keep(points: np.ndarray, *, most: float, rng: np.random.Generator
     along = points @ (normal / np.linalg.norm(normal))
     low, high = along.min(), along.max()
     return along >= low + (high - low) * most * rng.random()
+
+
+def jitter(points: np.ndarray, *, sigma: float, clip: float, rng: np.random.Generator) -> np.ndarray:
+    """points (n, 3) m, each moved by a normal step of `sigma` m an axis, cut at +-`clip` m."""
+    return points + np.clip(rng.normal(0, sigma, points.shape), -clip, clip)
+
+
+# --- the box about a person as a detector draws it
+
+# what every box adds to the body's extent, and at most as much again at random, m
+_ROOM, _MORE = 0.05, 0.2
+# a box that is far too large adds between these, m
+_LOOSE = (0.1, 0.8)
+# the bottom edge: how often it is above the soles and how often in the ground, and between which depths, m
+_RAISED, _RAISED_BY = 0.2, (0.03, 0.15)
+_SUNK, _SUNK_BY = 0.3, (0.03, 0.25)
+# no box is smaller, m
+_LEAST_SIZE = 0.4
+# what a crop without errors adds on each side, m
+_ALL = 2.5
+
+
+def draw_box(
+    errors: CropErrors,
+    difficulty: float,
+    extent: tuple[list[float], list[float]],
+    place: Place,
+    rng: np.random.Generator,
+    heading: float = 0.0,
+) -> Box:
+    """The box of a body, level frame, with the errors of a detector.
+
+    Without errors the box has much room: nothing is cut but what the window of beams had not, as the paper crops
+    nothing.
+
+    Args:
+        difficulty: in [0, 1], scales how often a box is cut.
+        extent: the body's least and greatest x, y, z in m along its `heading` rad, in its own frame.
+        place: of the body.
+    """
+    (x0, y0, z0), (x1, y1, z1) = extent
+    yaw, cut = place.yaw + heading, 1.0
+    if not errors.jitter:
+        x0, y0, z0, x1, y1, z1 = x0 - _ALL, y0 - _ALL, z0 - _ALL, x1 + _ALL, y1 + _ALL, z1 + _ALL
+    else:
+        a, b, c, loose, how_loose, bottom, deep, cut = rng.random(8).tolist()
+        dx, dy, dz, turn = (errors.jitter * rng.standard_normal(4)).tolist()
+        more = _LOOSE[0] + how_loose * (_LOOSE[1] - _LOOSE[0]) if loose < errors.loose else 0.0
+        if bottom < _RAISED:
+            z0 += _RAISED_BY[0] + deep * (_RAISED_BY[1] - _RAISED_BY[0])
+        elif bottom < _RAISED + _SUNK:
+            z0 -= _SUNK_BY[0] + deep * (_SUNK_BY[1] - _SUNK_BY[0])
+        a, b, c = ((_ROOM + _MORE * u + more) / 2 for u in (a, b, c))
+        # heights are estimated better than places
+        dz /= 2
+        x0, y0, z0, x1, y1, z1 = x0 - a + dx, y0 - b + dy, z0 - c + dz, x1 + a + dx, y1 + b + dy, z1 + c + dz
+        yaw += turn
+    # the extent's middle, along the true heading
+    c, s = cos(place.yaw + heading), sin(place.yaw + heading)
+    x, y, z = (x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2
+    center = place.feet + np.array([c * x - s * y, s * x + c * y, z])
+    size = np.array([max(high - low, _LEAST_SIZE) for low, high in ((x0, x1), (y0, y1), (z0, z1))])
+    box = Box(center=center, size=size, yaw=yaw)
+    return cut_box(box, rng=rng) if cut < errors.cut * difficulty else box
 
 
 def cut_box(box: Box, *, most: float = 0.3, rng: np.random.Generator) -> Box:
@@ -144,8 +210,3 @@ def cut_box(box: Box, *, most: float = 0.3, rng: np.random.Generator) -> Box:
     c, s = np.cos(box.yaw), np.sin(box.yaw)
     turned = np.array([c * shift[0] - s * shift[1], s * shift[0] + c * shift[1], shift[2]])
     return replace(box, center=box.center + turned, size=size)
-
-
-def jitter(points: np.ndarray, *, sigma: float, clip: float, rng: np.random.Generator) -> np.ndarray:
-    """points (n, 3) m, each moved by a normal step of `sigma` m an axis, cut at +-`clip` m."""
-    return points + np.clip(rng.normal(0, sigma, points.shape), -clip, clip)

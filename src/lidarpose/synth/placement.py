@@ -35,7 +35,7 @@ class Place:
     feet: np.ndarray
     yaw: float
     distance: float
-    R_sensor_level: np.ndarray | None
+    R_sensor_level: np.ndarray | None = None
 
     def of_body(self, points: np.ndarray) -> np.ndarray:
         """Points (n, 3) of a body that faces +x on the origin, where it stands: in the level frame."""

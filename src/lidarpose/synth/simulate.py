@@ -1,181 +1,225 @@
-"""What a sensor returns of a scene: the cast, and what goes wrong with it."""
+"""What a sensor returns of a person's scene: its triangles, the cast, and the sensor's noise."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lidarpose.lidar.beam_divergence import scan_wide
+from lidarpose.lidar.hits import Hits
 from lidarpose.lidar.ray_pattern import RayPattern
 from lidarpose.lidar.ray_pattern_scan import scan_pattern
-from lidarpose.lidar.raycast import Hits
 from lidarpose.lidar.sensor import Sensor
-from lidarpose.synth.environment.mesh import Mesh
-from lidarpose.synth.mask import direction_mask, laser_mask
-from lidarpose.synth.noise_kernels import spoil
+from lidarpose.synth.bodies import Body
+from lidarpose.synth.environment.mesh import Mesh, union
+from lidarpose.synth.noise import direction_mask, laser_mask
 from lidarpose.synth.placement import Place
+from lidarpose.synth.props.attachment import Prop
+from lidarpose.synth.sample_kernels import REACH, lose_returns, range_errors
 from lidarpose.synth.scene import SceneConfig
 
-
-@dataclass(frozen=True, kw_only=True)
-class Layer:
-    """A mesh of a scene. vertices (V, 3) m; moved (V, 3) where they are when the sensor's frame ends, None: where they
-    were; part (F,) uint8 of its faces, 0 = not the person, None: all 0."""
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    moved: np.ndarray | None = None
-    part: np.ndarray | None = None
-
-    @classmethod
-    def still(cls, mesh: Mesh) -> "Layer":
-        return cls(vertices=mesh.vertices, faces=mesh.faces)
+# full divergence of beams, rad: 3 to 6 cm at 20 m
+_DIVERGENCE = (0.0015, 0.003)
+# ranges of the released code are too long by up to this, m
+_DAPT_NOISE = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
-class Returns:
-    """Points (n, 3) float32 m in the level frame, with their faults; ring (n,); part (n,) uint8."""
+class ScanConditions:
+    """A sensor's noise, the same for all frames of a clip.
+
+    Args:
+        sigma: of a range, m.
+        bias: standard deviation of an error that a ring's points share, m.
+        intensity_dropout: in [0, 1], how much is lost that grazes or is far.
+        divergence: of a beam, rad; 0: a line.
+        keep: share of patches that the laser-level mask keeps; 1: no mask.
+        phase: a pattern's first frame.
+    """
+
+    sigma: float = 0.0
+    bias: float = 0.0
+    intensity_dropout: float = 0.0
+    divergence: float = 0.0
+    keep: float = 1.0
+    phase: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """What stays while a person moves.
+
+    Args:
+        config: the scene's configuration, at its difficulty.
+        sensor: a spinning sensor or a ray pattern.
+        place: of the person, and the sensor's mount.
+        conditions: the sensor's noise.
+        background: meshes in the level frame at the sensor: ground, things, another person.
+        props: what the person wears and uses.
+    """
+
+    config: SceneConfig
+    sensor: Sensor | RayPattern
+    place: Place
+    conditions: ScanConditions
+    background: list[Mesh]
+    props: list[Prop]
+
+    @property
+    def body_place(self) -> Place:
+        """Where the body is: above the ground by what it stands on."""
+        lift = max((prop.lift for prop in self.props), default=0.0)
+        return replace(self.place, feet=self.place.feet + [0, 0, lift]) if lift else self.place
+
+    @property
+    def is_smeared(self) -> bool:
+        """Whether the sensor takes so long for a frame that people move meanwhile."""
+        return isinstance(self.sensor, RayPattern) and self.sensor.duration > 0
+
+    def meshes(self, body: Body, frame: int) -> list[Mesh]:
+        """All triangles of a frame, level frame: the body first, then its props, then the background."""
+        place, joints, faces = self.body_place, body.joints[frame], body.faces
+        later = later_joints = None
+        if self.is_smeared:
+            later, later_joints = body.at_frame_end(frame)
+            later = place.of_body(later)
+        meshes = [Mesh(place.of_body(body.vertices[frame]), faces, part=body.face_part, later=later)]
+        for prop in self.props:
+            later = place.of_body(prop.place(later_joints).vertices) if self.is_smeared else None
+            prop_mesh = prop.place(joints)
+            vertices = place.of_body(prop_mesh.vertices)
+            meshes.append(Mesh(vertices, prop_mesh.faces, part=prop.face_part, later=later))
+        return meshes + self.background
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scan:
+    """Points (n, 3) float32 m in the level frame, with noise; ring (n,); part (n,) uint8, 0: not the person."""
 
     points: np.ndarray
     ring: np.ndarray
     part: np.ndarray
 
 
-@dataclass(frozen=True, kw_only=True)
-class Conditions:
-    """What a sensor's day is like, the same for all frames of a clip.
-
-    sigma m of a range; bias m of a ring; weak in [0, 1]: how much is lost that grazes or is far; divergence rad of a
-    beam, 0 = a line; keep: share of patches that the mask keeps, 1 = no mask; phase: a pattern's first frame.
-    """
-
-    sigma: float
-    bias: float
-    weak: float
-    divergence: float
-    keep: float
-    phase: int
-
-
-def draw_conditions(config: SceneConfig, device: Sensor | RayPattern, rng: np.random.Generator) -> Conditions:
+def draw_conditions(config: SceneConfig, sensor: Sensor | RayPattern, rng: np.random.Generator) -> ScanConditions:
     """Conditions of a scene; of them the mask alone is as frequent as the scene is difficult."""
-    faults = config.faults
-    noise, bias, weak, wide, divergence, mask, keep, phase = rng.random(8).tolist()
-    sigma = 0.0 if faults.released else device.range_sigma * _between(faults.sigma, noise)
-    return Conditions(
-        sigma=sigma,
-        bias=_between(faults.ring_bias, bias),
-        weak=faults.weak * weak,
-        divergence=_between(_DIVERGENCE, divergence) if wide < faults.wide else 0.0,
-        keep=faults.keep + (faults.keep_most - faults.keep) * keep if mask < faults.mask * config.hard else 1.0,
+    noise = config.noise
+    sigma, bias, dropout, wide, divergence, mask, keep, phase = rng.random(8).tolist()
+    return ScanConditions(
+        sigma=0.0 if noise.dapt_compat else sensor.range_sigma * _between(noise.sigma, sigma),
+        bias=_between(noise.ring_bias, bias),
+        intensity_dropout=noise.intensity_dropout * dropout,
+        divergence=_between(_DIVERGENCE, divergence) if wide < noise.beam_divergence else 0.0,
+        keep=_between(noise.mask_keep, keep) if mask < noise.mask * config.hard else 1.0,
         phase=int(1e6 * phase),
     )
-
-
-# full divergence of beams, rad: 3 to 6 cm at 20 m
-_DIVERGENCE = (0.0015, 0.003)
 
 
 def _between(ends: tuple[float, float], share: float) -> float:
     return ends[0] + share * (ends[1] - ends[0])
 
 
-def look(
-    layers: list[Layer],
-    device: Sensor | RayPattern,
-    place: Place,
-    conditions: Conditions,
-    config: SceneConfig,
-    rng: np.random.Generator,
-    *,
-    frame: int = 0,
-) -> Returns:
-    """The returns of `layers` (level frame), the first of which is the body that the window of beams is about.
+def simulate_scan(scene: Scene, meshes: list[Mesh], rng: np.random.Generator, *, frame: int = 0) -> Scan:
+    """What the scene's sensor returns.
 
-    frame: how many frames after a pattern's first one.
+    Args:
+        meshes: all triangles in the level frame; the window of beams is about the first one, the body.
+        frame: how many frames after a pattern's first one.
     """
-    hits, vertices, faces, part = _cast(layers, device, place, conditions, config, frame)
-    points, kept = spoil(
-        hits.points,
-        hits.face,
-        vertices,
-        faces,
-        hits.ring,
-        keep=_unmasked(hits, device, conditions, rng),
+    sensor, conditions, dapt_compat = scene.sensor, scene.conditions, scene.config.noise.dapt_compat
+    hits, mesh = _cast(scene, meshes, frame)
+    points, kept = add_sensor_noise(
+        hits,
+        mesh,
+        keep=_laser_level_mask(hits, sensor, conditions.keep, rng),
         sigma=conditions.sigma,
         bias=conditions.bias,
-        dropout=device.dropout,
-        weak=conditions.weak,
-        range_max=device.range_max,
-        one_sided=_RELEASED_NOISE if config.faults.released else 0.0,
+        dropout=sensor.dropout,
+        intensity_dropout=conditions.intensity_dropout,
+        range_max=sensor.range_max,
+        one_sided=_DAPT_NOISE if dapt_compat else 0.0,
         rng=rng,
     )
-    ring, part = hits.ring[kept], part[hits.face[kept]]
-    if config.faults.released and isinstance(device, Sensor):
-        twice = np.flatnonzero((hits.column[kept] + hits.column0) % device.columns == 0)
-        points, ring, part = (np.concatenate([a, a[twice]]) for a in (points, ring, part))
-    return Returns(points=place.to_level(points), ring=ring, part=part)
+    ring, part = hits.ring[kept], mesh.part[hits.face[kept]]
+    if dapt_compat and isinstance(sensor, Sensor):
+        seam = np.flatnonzero((hits.column[kept] + hits.column0) % sensor.columns == 0)
+        points, ring, part = (np.concatenate([a, a[seam]]) for a in (points, ring, part))
+    return Scan(points=scene.place.to_level(points), ring=ring, part=part)
 
 
-# ranges of the released code are too long by up to this, m
-_RELEASED_NOISE = 0.02
-
-
-def _unmasked(
-    hits: Hits, device: Sensor | RayPattern, conditions: Conditions, rng: np.random.Generator
-) -> np.ndarray | None:
-    """(n,) bool: which hits the laser-level mask leaves, None for all."""
-    if conditions.keep >= 1:
-        return None
-    if isinstance(device, RayPattern):
-        return direction_mask(hits.points, keep=conditions.keep, rng=rng)
-    mask = laser_mask(hits.columns, hits.rows, keep=conditions.keep, rng=rng)
-    return mask[hits.column, hits.ring - hits.row0]
-
-
-def count_alone(
-    body: Layer, device: Sensor | RayPattern, place: Place, conditions: Conditions, config: SceneConfig, frame: int
-) -> int:
+def count_alone(scene: Scene, body: Mesh, frame: int) -> int:
     """How many beams would meet a body with nothing else around."""
-    return len(_cast([body], device, place, conditions, config, frame)[0].face)
+    return len(_cast(scene, [body], frame)[0].face)
 
 
-def _cast(
-    layers: list[Layer],
-    device: Sensor | RayPattern,
-    place: Place,
-    conditions: Conditions,
-    config: SceneConfig,
-    frame: int,
-) -> tuple[Hits, np.ndarray, np.ndarray, np.ndarray]:
-    """The hits, and vertices (sensor frame), faces and the faces' parts of all layers as one mesh."""
-    vertices, moved, faces, part = _joined(layers, isinstance(device, RayPattern) and device.duration > 0)
-    vertices = place.to_sensor(vertices)
-    body = vertices[: len(layers[0].vertices)]
-    margin = config.margin + np.arctan2(config.around, place.distance)
-    if isinstance(device, Sensor):
-        hits = scan_wide(vertices, faces, device, divergence=conditions.divergence, window_vertices=body, margin=margin)
-        return hits, vertices, faces, part
+def _cast(scene: Scene, meshes: list[Mesh], frame: int) -> tuple[Hits, Mesh]:
+    """The hits, and all meshes as one, in the sensor's frame."""
+    mesh, place, sensor = union(meshes), scene.place, scene.sensor
+    mesh = replace(mesh, vertices=place.to_sensor(mesh.vertices))
+    body_vertices = len(meshes[0].vertices)
+    margin = scene.config.margin + np.arctan2(scene.config.around, place.distance)
+    if isinstance(sensor, Sensor):
+        body, divergence = mesh.vertices[:body_vertices], scene.conditions.divergence
+        hits = scan_wide(mesh.vertices, mesh.faces, sensor, divergence=divergence, window_vertices=body, margin=margin)
+        return hits, mesh
     hits = scan_pattern(
-        vertices,
-        faces,
-        device,
-        (conditions.phase + frame) % device.frames,
-        moved=place.to_sensor(moved) if device.duration else None,
-        body_vertices=len(body),
+        mesh.vertices,
+        mesh.faces,
+        sensor,
+        (scene.conditions.phase + frame) % sensor.frames,
+        moved=place.to_sensor(mesh.later) if mesh.later is not None else None,
+        body_vertices=body_vertices,
         margin=margin,
     )
-    return hits, vertices, faces, part
+    return hits, mesh
 
 
-def _joined(layers: list[Layer], moving: bool) -> tuple[np.ndarray, np.ndarray | None, np.ndarray, np.ndarray]:
-    """vertices, moved (None unless `moving`), faces and the faces' parts of all layers as one mesh."""
-    start, faces = 0, []
-    for layer in layers:
-        faces.append(layer.faces + np.int32(start))
-        start += len(layer.vertices)
-    part = [np.zeros(len(layer.faces), np.uint8) if layer.part is None else layer.part for layer in layers]
-    vertices = np.concatenate([layer.vertices for layer in layers])
-    moved = None
-    if moving:
-        moved = np.concatenate([layer.vertices if layer.moved is None else layer.moved for layer in layers])
-    return vertices, moved, np.concatenate(faces), np.concatenate(part)
+def _laser_level_mask(
+    hits: Hits, sensor: Sensor | RayPattern, keep: float, rng: np.random.Generator
+) -> np.ndarray | None:
+    """(n,) bool: which hits the laser-level mask leaves, None for all."""
+    if keep >= 1:
+        return None
+    if isinstance(sensor, RayPattern):
+        return direction_mask(hits.points, keep=keep, rng=rng)
+    return laser_mask(hits.columns, hits.rows, keep=keep, rng=rng)[hits.column, hits.ring - hits.row0]
+
+
+def add_sensor_noise(
+    hits: Hits,
+    mesh: Mesh,
+    *,
+    keep: np.ndarray | None = None,
+    sigma: float,
+    bias: float,
+    dropout: float,
+    intensity_dropout: float,
+    range_max: float,
+    one_sided: float = 0.0,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The returns that come back, with the errors of their ranges.
+
+    Args:
+        hits: of a cast of `mesh`, in the sensor's frame.
+        keep: (n,) bool, what is left of them so far; None: all.
+        sigma: standard deviation of a range, symmetric, m.
+        bias: of an error that a ring's points share, m.
+        dropout, intensity_dropout: see `sample_kernels.lose_returns`.
+        range_max: of the sensor, m.
+        one_sided: range errors uniform in [0, one_sided) m besides, as in the released code.
+
+    Returns:
+        Points (k, 3) float32 m and their indices (k,).
+    """
+    count = len(hits.points)
+    # the last of the normals are the rings'
+    normals = rng.standard_normal(count + int(hits.ring.max(initial=-1)) + 1, np.float32)
+    chance = rng.random(count, np.float32)
+    error = range_errors(hits.ring, normals, sigma, bias)
+    if one_sided:
+        error += one_sided * rng.random(count, np.float32)
+    keep = np.ones(count, np.bool_) if keep is None else keep
+    return lose_returns(
+        *(hits.points, hits.face, mesh.vertices, mesh.faces, keep, error, chance),
+        *(dropout, intensity_dropout, REACH * range_max),
+    )

@@ -17,15 +17,14 @@ from lidarpose.geometry import rotation_about
 from lidarpose.lidar.presets import sensor as named_sensor
 from lidarpose.lidar.ray_pattern import RayPattern
 from lidarpose.lidar.ray_pattern_scan import scan_pattern
-from lidarpose.lidar.raycast import Hits, scan
+from lidarpose.lidar.raycast import scan
 from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import Box, Pose, Sample, center_of
 from lidarpose.skeleton import BODY26
-from lidarpose.synth.actor import Actor, draw_actor
+from lidarpose.synth.bodies import Body, draw_moving_body
 from lidarpose.synth.environment.mesh import Mesh, union
-from lidarpose.synth.environment.streetscape import RAIL, Plan, draw_plan, scenery
-from lidarpose.synth.noise import REACH
-from lidarpose.synth.noise_kernels import range_errors, spoil_points
+from lidarpose.synth.environment.streetscape import RAIL, StreetPlan, draw_plan, scenery
+from lidarpose.synth.sample_kernels import REACH, lose_returns, range_errors
 
 # people start within these distances of the sensor, m, and keep apart from it and from each other by so much
 _NEAREST, _FARTHEST, _APART = 2.5, 28.0, 0.75
@@ -33,8 +32,8 @@ _PLACE_TRIES = 200
 # what people do in streets, of `body.pose_prior.activities.KINDS`, and how often another is drawn for it
 _STREET_KINDS = ("walk", "idle", "run", "push", "step")
 _KIND_TRIES = 12
-# share of what is weak that is lost, and the standard deviation of a ring's own range error, m
-_WEAK, _RING_BIAS = 0.6, 0.008
+# share of weak returns that is lost, and the standard deviation of a ring's own range error, m
+_INTENSITY_DROPOUT, _RING_BIAS = 0.6, 0.008
 # that errors are drawn for, if the sensor has no more: so what is drawn after them does not depend on the sensor
 _RINGS = 256
 # what a label's box adds to the body's extent, m
@@ -83,8 +82,8 @@ def street(
     still = union(scenery(plan, rng)).moved((0, 0, 0), plan.turn)
     walkers = _draw_walkers(plan, int(rng.integers(least, most + 1)), frames, rng)
     ring_error = rng.standard_normal(max(_RINGS, device.rows if isinstance(device, Sensor) else 0), np.float32)
-    seen = tuple(_look(device, still, walkers, frame, ring_error, rng) for frame in range(frames))
-    return Street(frames=seen, sensor=device.name, height=plan.height)
+    turns = tuple(_scan_turn(device, still, walkers, frame, ring_error, rng) for frame in range(frames))
+    return Street(frames=turns, sensor=device.name, height=plan.height)
 
 
 # --- the people
@@ -92,22 +91,37 @@ def street(
 
 @dataclass(frozen=True, kw_only=True)
 class _Walker:
-    """Somebody's frames, where they start (3,) m in the level frame at the sensor, and which way they turned, rad."""
+    """A body, where it starts (3,) m in the level frame at the sensor, and its yaw there, rad."""
 
-    actor: Actor
+    body: Body
     start: np.ndarray
     yaw: float
 
     def placed(self, points: np.ndarray) -> np.ndarray:
-        """Points (n, 3) of the actor's own frame in the level frame at the sensor."""
+        """Points (n, 3) of the body's own frame in the level frame at the sensor."""
         return points @ rotation_about("z", self.yaw).T.astype(np.float32) + self.start.astype(np.float32)
 
     def path(self) -> np.ndarray:
         """(F, 2) m: where the pelvis is."""
-        return np.stack([self.placed(joints[:1])[0, :2] for joints in self.actor.joints])
+        return np.stack([self.placed(joints[:1])[0, :2] for joints in self.body.joints])
+
+    def mesh(self, frame: int, *, is_smeared: bool) -> Mesh:
+        """The body of a frame; if `is_smeared`, also as it is at the frame's end."""
+        body, later = self.body, None
+        if is_smeared:
+            later = self.placed(body.at_frame_end(frame)[0].astype(np.float32))
+        return Mesh(self.placed(body.vertices[frame]), body.faces, body.face_part, later)
+
+    def box(self, vertices: np.ndarray, frame: int, track: int) -> Box:
+        """Around the placed body (V, 3), along its heading."""
+        yaw = self.yaw + self.body.heading[frame]
+        local = vertices.astype(float) @ rotation_about("z", yaw)
+        low, high = local.min(0), local.max(0)
+        center = rotation_about("z", yaw) @ ((low + high) / 2)
+        return Box(center=center, size=high - low + _BOX_ROOM, yaw=float((yaw + pi) % (2 * pi) - pi), id=track)
 
 
-def _draw_walkers(plan: Plan, count: int, frames: int, rng: np.random.Generator) -> list[_Walker]:
+def _draw_walkers(plan: StreetPlan, count: int, frames: int, rng: np.random.Generator) -> list[_Walker]:
     """People on the pavements and on the road, apart from each other at all times; fewer where there is no room.
 
     Who walks too far to stay on one surface in any of the first half of the tries may leave it in the others.
@@ -115,9 +129,9 @@ def _draw_walkers(plan: Plan, count: int, frames: int, rng: np.random.Generator)
     walkers: list[_Walker] = []
     paths: list[np.ndarray] = []
     for _ in range(count):
-        actor = _passer_by(frames, rng)
+        body = _draw_pedestrian(frames, rng)
         for attempt in range(_PLACE_TRIES):
-            walker, stays = _placed(plan, actor, rng)
+            walker, stays = _place_walker(plan, body, rng)
             path = walker.path()
             if np.linalg.norm(path, axis=1).min() < _NEAREST - 1:
                 continue
@@ -130,17 +144,17 @@ def _draw_walkers(plan: Plan, count: int, frames: int, rng: np.random.Generator)
     return walkers
 
 
-def _passer_by(frames: int, rng: np.random.Generator) -> Actor:
+def _draw_pedestrian(frames: int, rng: np.random.Generator) -> Body:
     """Somebody who does what people do in streets: nobody sits without a seat."""
     for _ in range(_KIND_TRIES):
-        actor = draw_actor(None, 0.0, frames, rng)
-        if actor.kind in _STREET_KINDS:
+        body = draw_moving_body(None, 0.0, frames, rng)
+        if body.kind in _STREET_KINDS:
             break
-    return actor
+    return body
 
 
-def _placed(plan: Plan, actor: Actor, rng: np.random.Generator) -> tuple[_Walker, bool]:
-    """The actor somewhere, and whether they stay on one surface and out of the rows at the kerbs."""
+def _place_walker(plan: StreetPlan, body: Body, rng: np.random.Generator) -> tuple[_Walker, bool]:
+    """The body somewhere, and whether it stays on one surface and out of the rows at the kerbs."""
     where, far, across, way, lean = rng.random(5)
     turn = rotation_about("z", plan.turn)
     x = (1 if far < 0.5 or plan.ahead else -1) * (_NEAREST - 1 + (_FARTHEST - _NEAREST) * abs(2 * far - 1) ** 1.5)
@@ -157,7 +171,7 @@ def _placed(plan: Plan, actor: Actor, rng: np.random.Generator) -> tuple[_Walker
         y = bounds[0] + across * (bounds[1] - bounds[0])
         yaw = (pi / 2 if way < 0.5 else -pi / 2) + 1.2 * (lean - 0.5)
     start = turn @ np.array([x, y - plan.sensor_y, z - plan.height])
-    walker = _Walker(actor=actor, start=start, yaw=float(yaw + plan.turn))
+    walker = _Walker(body=body, start=start, yaw=float(yaw + plan.turn))
     path = walker.path() @ turn[:2, :2]
     inside = (path[:, 1] + plan.sensor_y > bounds[0] - 0.1) & (path[:, 1] + plan.sensor_y < bounds[1] + 0.1)
     return walker, bool(inside.all())
@@ -166,7 +180,7 @@ def _placed(plan: Plan, actor: Actor, rng: np.random.Generator) -> tuple[_Walker
 # --- a turn of the sensor
 
 
-def _look(
+def _scan_turn(
     device: Sensor | RayPattern,
     still: Mesh,
     walkers: list[_Walker],
@@ -174,73 +188,37 @@ def _look(
     ring_error: np.ndarray,
     rng: np.random.Generator,
 ) -> StreetFrame:
-    bodies = [walker.placed(walker.actor.vertices[frame]) for walker in walkers]
-    joints = [walker.placed(walker.actor.joints[frame]) for walker in walkers]
-    faces = [walker.actor.faces for walker in walkers]
-    scene = union([Mesh(v, f) for v, f in zip(bodies, faces, strict=True)] + [still])
+    is_pattern = isinstance(device, RayPattern)
+    people = [walker.mesh(frame, is_smeared=is_pattern) for walker in walkers]
+    scene = union([*people, still])
     R_sensor_level = rotation_about("y", -device.tilt).astype(np.float32)
     vertices = scene.vertices @ R_sensor_level.T
-    if isinstance(device, Sensor):
-        hits = scan(vertices, scene.faces, device)
+    if is_pattern:
+        moved = (scene.vertices if scene.later is None else scene.later) @ R_sensor_level.T
+        hits = scan_pattern(vertices, scene.faces, device, frame % device.frames, moved=moved)
     else:
-        hits = _pattern_hits(device, vertices, scene, walkers, frame, R_sensor_level)
-    # the bodies' faces come first, one after the other
-    owner = np.repeat(np.arange(len(walkers), dtype=np.int16), [len(f) for f in faces])
-    face_part = np.concatenate([walker.actor.face_part for walker in walkers] or [np.zeros(0, np.uint8)])
-    count, people = len(hits.face), len(owner)
+        hits = scan(vertices, scene.faces, device)
+    count = len(hits.face)
     normals = np.concatenate([rng.standard_normal(count, np.float32), ring_error])
-    points, kept = spoil_points(
-        hits.points,
-        hits.face,
-        vertices,
-        scene.faces,
-        np.ones(count, np.bool_),
-        range_errors(hits.ring, normals, device.range_sigma, _RING_BIAS),
-        rng.random(count, np.float32),
-        device.dropout,
-        _WEAK,
-        REACH * device.range_max,
+    error = range_errors(hits.ring, normals, device.range_sigma, _RING_BIAS)
+    points, kept = lose_returns(
+        *(hits.points, hits.face, vertices, scene.faces, np.ones(count, np.bool_), error),
+        *(rng.random(count, np.float32), device.dropout, _INTENSITY_DROPOUT, REACH * device.range_max),
     )
     face = hits.face[kept]
-    of_person = face < people
-    person, part = np.full(len(face), -1, np.int16), np.zeros(len(face), np.uint8)
-    person[of_person], part[of_person] = owner[face[of_person]], face_part[face[of_person]]
+    # the people's faces come first, one person after the other
+    owner = np.full(len(scene.faces), -1, np.int16)
+    owner[: sum(len(mesh.faces) for mesh in people)] = np.repeat(
+        np.arange(len(people), dtype=np.int16), [len(mesh.faces) for mesh in people]
+    )
     return StreetFrame(
         points=points @ R_sensor_level,
         ring=hits.ring[kept],
-        person=person,
-        part=part,
-        boxes=tuple(_box(w, v, frame, track) for track, (w, v) in enumerate(zip(walkers, bodies, strict=True))),
-        joints=np.array(joints, np.float32).reshape(-1, len(BODY26), 3),
+        person=owner[face],
+        part=np.zeros(len(face), np.uint8) if scene.part is None else scene.part[face],
+        boxes=tuple(w.box(m.vertices, frame, track) for track, (w, m) in enumerate(zip(walkers, people, strict=True))),
+        joints=np.array([w.placed(w.body.joints[frame]) for w in walkers], np.float32).reshape(-1, len(BODY26), 3),
     )
-
-
-def _box(walker: _Walker, vertices: np.ndarray, frame: int, track: int) -> Box:
-    """Around a body (V, 3), along its heading."""
-    yaw = walker.yaw + walker.actor.heading[frame]
-    local = vertices.astype(float) @ rotation_about("z", yaw)
-    low, high = local.min(0), local.max(0)
-    center = rotation_about("z", yaw) @ ((low + high) / 2)
-    return Box(center=center, size=high - low + _BOX_ROOM, yaw=float((yaw + pi) % (2 * pi) - pi), id=track)
-
-
-def _pattern_hits(
-    device: RayPattern,
-    vertices: np.ndarray,
-    scene: Mesh,
-    walkers: list[_Walker],
-    frame: int,
-    R_sensor_level: np.ndarray,
-) -> Hits:
-    """What a rosette sees while the people move on; vertices (V, 3) are the scene's in the sensor's frame."""
-    later = [walker.placed(walker.actor.moved(frame)[0].astype(np.float32)) for walker in walkers]
-    moved = scene.vertices.copy()
-    start = 0
-    for there in later:
-        moved[start : start + len(there)] = there
-        start += len(there)
-    moved = moved @ R_sensor_level.T
-    return scan_pattern(vertices, scene.faces, device, frame % device.frames, moved=moved)
 
 
 # --- people of a street as samples
@@ -253,12 +231,11 @@ def samples(scene: Street, rng: np.random.Generator, *, least: int = 15) -> list
     """
     found = []
     for number, frame in enumerate(scene.frames):
-        for track, truth in enumerate(frame.boxes):
-            off, grown, turned = rng.normal(0, _OFF, 3), rng.uniform(*_GROWN, 3), rng.normal(0, _TURNED)
-            crop = Box(
-                center=truth.center + off * [1, 1, 0.5], size=truth.size + grown, yaw=truth.yaw + turned, id=truth.id
-            )
-            inside = crop.contains(frame.points)
+        for track, label in enumerate(frame.boxes):
+            shift, room, turn = rng.normal(0, _OFF, 3), rng.uniform(*_GROWN, 3), rng.normal(0, _TURNED)
+            center = label.center + shift * [1, 1, 0.5]
+            box = Box(center=center, size=label.size + room, yaw=label.yaw + turn, id=label.id)
+            inside = box.contains(frame.points)
             own = inside & (frame.person == track)
             if np.count_nonzero(own) < least:
                 continue
@@ -270,7 +247,7 @@ def samples(scene: Street, rng: np.random.Generator, *, least: int = 15) -> list
                 part=np.where(own, frame.part, 0)[inside].astype(np.uint8),
                 ring=frame.ring[inside],
                 pose=Pose(joints=frame.joints[track], skeleton=BODY26, frame="sensor"),
-                box=crop,
+                box=box,
                 source=f"synth/street/{scene.sensor}",
                 frame_id=f"{number}/{track}",
             )

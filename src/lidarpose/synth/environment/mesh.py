@@ -12,10 +12,19 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Mesh:
-    """vertices (V, 3) float32 m, faces (F, 3) int32."""
+    """Triangles.
+
+    Args:
+        vertices: (V, 3) float32 m.
+        faces: (F, 3) int32.
+        part: (F,) uint8 of the body that a face belongs to, 0: not the person; None: all 0.
+        later: (V, 3) m, the vertices when the sensor's frame ends; None: they stand still.
+    """
 
     vertices: np.ndarray
     faces: np.ndarray
+    part: np.ndarray | None = None
+    later: np.ndarray | None = None
 
     def moved(self, translation: np.ndarray, yaw: float = 0.0) -> "Mesh":
         """Turned by `yaw` rad about z, then moved by `translation` (3,) m."""
@@ -23,25 +32,29 @@ class Mesh:
         if yaw:
             c, s = cos(yaw), sin(yaw)
             vertices = vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], np.float32)
-        return Mesh(vertices + np.asarray(translation, np.float32), self.faces)
+        return Mesh(vertices + np.asarray(translation, np.float32), self.faces, self.part)
 
     def scaled(self, size: tuple[float, float, float] | np.ndarray) -> "Mesh":
         """Stretched along x, y and z."""
-        return Mesh(self.vertices * np.asarray(size, np.float32), self.faces)
+        return Mesh(self.vertices * np.asarray(size, np.float32), self.faces, self.part)
 
     def placed(self, rows: list, origin: list) -> "Mesh":
         """In another frame: rows (3, 3) say where x, y and z go, then `origin` (3,) m is added."""
-        return Mesh(self.vertices @ np.array(rows, np.float32) + np.array(origin, np.float32), self.faces)
+        return Mesh(self.vertices @ np.array(rows, np.float32) + np.array(origin, np.float32), self.faces, self.part)
 
 
 def union(meshes: list[Mesh]) -> Mesh:
     """All meshes as one; their faces stand one mesh after the other."""
-    faces, start = [], 0
+    faces, start, part, later = [], 0, None, None
     for mesh in meshes:
-        faces.append(mesh.faces + start if start else mesh.faces)
+        faces.append(mesh.faces + np.int32(start) if start else mesh.faces)
         start += len(mesh.vertices)
     vertices = np.concatenate([m.vertices for m in meshes]).astype(np.float32, copy=False)
-    return Mesh(vertices, np.concatenate(faces).astype(np.int32, copy=False))
+    if any(m.part is not None for m in meshes):
+        part = np.concatenate([np.zeros(len(m.faces), np.uint8) if m.part is None else m.part for m in meshes])
+    if any(m.later is not None for m in meshes):
+        later = np.concatenate([m.vertices if m.later is None else m.later for m in meshes])
+    return Mesh(vertices, np.concatenate(faces).astype(np.int32, copy=False), part, later)
 
 
 QUAD_FACES = np.array([[0, 1, 2], [0, 2, 3]], np.int32)

@@ -20,7 +20,7 @@ _LENGTH = 45.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class StreetPlan:
     """Sizes in m, in the street's frame: the sensor stands on (0, sensor_y), the road reaches from -road to road, the
     pavements on to +-front, `kerb` high; height of the sensor above the road; turn rad of the street about it; ahead:
     people are on the x > 0 side, where a sensor that does not turn looks."""
@@ -34,7 +34,7 @@ class Plan:
     ahead: bool
 
 
-def draw_plan(device: Sensor | RayPattern, rng: np.random.Generator) -> Plan:
+def draw_plan(device: Sensor | RayPattern, rng: np.random.Generator) -> StreetPlan:
     a, b, c, d, e, f, g = rng.random(7)
     road = 2.8 + 1.7 * a
     front = road + 2.2 + 2.3 * b
@@ -44,7 +44,7 @@ def draw_plan(device: Sensor | RayPattern, rng: np.random.Generator) -> Plan:
     sensor_y = (2 * e - 1) * (road - 2.0) if on_road else (road + front) / 2 * (1 if e < 0.5 else -1)
     height = device.height + 0.15 * (2 * g - 1) + (0 if on_road else kerb)
     ahead = isinstance(device, RayPattern) and device.azimuths[1] - device.azimuths[0] < 2 * pi - 1e-3
-    return Plan(
+    return StreetPlan(
         road=road,
         front=front,
         kerb=kerb,
@@ -55,7 +55,7 @@ def draw_plan(device: Sensor | RayPattern, rng: np.random.Generator) -> Plan:
     )
 
 
-def scenery(plan: Plan, rng: np.random.Generator) -> list[Mesh]:
+def scenery(plan: StreetPlan, rng: np.random.Generator) -> list[Mesh]:
     """All that stands still, in the street's frame moved so that the sensor is the origin."""
     found = [_ground(plan)]
     for side in (-1, 1):
@@ -73,7 +73,7 @@ def _around(mesh: Mesh) -> bool:
     return bool((low[:2] < 1.0).all() and (high[:2] > -1.0).all())
 
 
-def _ground(plan: Plan) -> Mesh:
+def _ground(plan: StreetPlan) -> Mesh:
     """The road, two risers, two pavements."""
     strips = []
     for y0, z0, y1, z1 in (
@@ -88,7 +88,7 @@ def _ground(plan: Plan) -> Mesh:
     return union(strips)
 
 
-def _front(plan: Plan, side: int, rng: np.random.Generator) -> list[Mesh]:
+def _front(plan: StreetPlan, side: int, rng: np.random.Generator) -> list[Mesh]:
     """House fronts with doors and windows, hedges, fences and gaps, one after the other behind a pavement."""
     found, x = [], -_LENGTH
     while x < _LENGTH:
@@ -119,7 +119,7 @@ def _front(plan: Plan, side: int, rng: np.random.Generator) -> list[Mesh]:
     return found
 
 
-def _row(plan: Plan, side: int, rng: np.random.Generator) -> list[Mesh]:
+def _row(plan: StreetPlan, side: int, rng: np.random.Generator) -> list[Mesh]:
     """Parked cars at the kerb and furniture on the pavement beside it."""
     found, x = [], -_LENGTH + 4 * rng.random()
     parked = rng.random() < 0.8

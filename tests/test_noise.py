@@ -1,23 +1,31 @@
-"""What happens to points after the cast: pure functions with known statistics."""
+"""What goes wrong with points, laser grids and boxes: pure functions with known statistics."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference.sensor_noise import intensity_loss, lose_returns_reference
 
 from lidarpose.geometry import unit
+from lidarpose.lidar.hits import Hits
 from lidarpose.sample import Box
 from lidarpose.synth import noise
 from lidarpose.synth.environment.mesh import Mesh
-from lidarpose.synth.mask import direction_mask
-from lidarpose.synth.noise_kernels import range_errors, spoil, spoil_points
+from lidarpose.synth.noise import draw_box, laser_mask
+from lidarpose.synth.placement import Place
+from lidarpose.synth.sample_kernels import REACH, lose_returns, range_errors
+from lidarpose.synth.scene import SCENES
+from lidarpose.synth.simulate import add_sensor_noise
 
+RNG = np.random.default_rng
 seeds = st.integers(0, 2**32 - 1)
 
 
 def seen(n=4000, seed=0):
     """Points (n, 3) m about 8 m away, their rings, parts and outward normals."""
-    rng = np.random.default_rng(seed)
+    rng = RNG(seed)
     points = np.array([8.0, 1, 0]) + rng.normal(0, 0.4, (n, 3))
     return points, rng.integers(0, 32, n), rng.integers(0, 25, n).astype(np.uint8), unit(rng.normal(size=(n, 3)))
 
@@ -26,9 +34,9 @@ def calls(points, ring, part, normals):
     """Every augmentation by name, as a function of the generator."""
     return {
         "random_keep": lambda rng: noise.random_keep(len(points), share=0.2, rng=rng),
-        "reference_clusters": lambda rng: noise.reference_clusters(points.mean(0), rng=rng),
+        "dapt_clusters": lambda rng: noise.dapt_clusters(points.mean(0), rng=rng),
         "half_space_keep": lambda rng: noise.half_space_keep(points, most=0.9, rng=rng),
-        "direction_mask": lambda rng: direction_mask(points, keep=0.6, rng=rng),
+        "direction_mask": lambda rng: noise.direction_mask(points, keep=0.6, rng=rng),
         "noise_clusters": lambda rng: noise.noise_clusters(points.mean(0), most=150, rng=rng),
         "part_removal": lambda rng: noise.part_removal(part, rng=rng),
         "jitter": lambda rng: noise.jitter(points, sigma=0.01, clip=0.02, rng=rng),
@@ -40,28 +48,28 @@ def test_inputs_stay_as_they_are_and_the_generator_decides(name):
     given_arrays = seen(200)
     kept = [a.copy() for a in given_arrays]
     call = calls(*given_arrays)[name]
-    first, again, other = (call(np.random.default_rng(seed)) for seed in (1, 1, 2))
+    first, again, other = (call(RNG(seed)) for seed in (1, 1, 2))
     for array, copy in zip(given_arrays, kept, strict=True):
         np.testing.assert_array_equal(array, copy)
     np.testing.assert_array_equal(first, again)
     assert first.shape != other.shape or (first != other).any()
 
 
-@pytest.mark.parametrize("name", sorted(set(calls(*seen(1))) - {"noise_clusters", "reference_clusters"}))
+@pytest.mark.parametrize("name", sorted(set(calls(*seen(1))) - {"noise_clusters", "dapt_clusters"}))
 def test_no_points_are_legal(name):
     call = calls(*(a[:0] for a in seen(1)))[name]
-    assert len(call(np.random.default_rng(0))) == 0
+    assert len(call(RNG(0))) == 0
 
 
 @settings(max_examples=60, deadline=None)
 @given(seeds, st.integers(0, 150))
 def test_noise_clusters_are_one_or_two_small_blobs(seed, most):
     center = np.array([3.0, -7, 0.5])
-    stray = noise.noise_clusters(center, most=most, rng=np.random.default_rng(seed))
-    assert stray.shape[1:] == (3,) and len(stray) <= 2 * most
-    assert (np.abs(stray - center) <= np.array([0.4, 0.4, 0.8]) + 0.3).all()
+    clutter = noise.noise_clusters(center, most=most, rng=RNG(seed))
+    assert clutter.shape[1:] == (3,) and len(clutter) <= 2 * most
+    assert (np.abs(clutter - center) <= np.array([0.4, 0.4, 0.8]) + 0.3).all()
     # the first point's blob is within its diameter, whatever is left is the other blob
-    left = stray
+    left = clutter
     for _ in range(2):
         if len(left):
             left = left[np.linalg.norm(left - left[0], axis=1) > 0.6]
@@ -69,7 +77,7 @@ def test_noise_clusters_are_one_or_two_small_blobs(seed, most):
 
 
 def test_noise_clusters_of_both_kinds_and_sizes_occur():
-    rng = np.random.default_rng(6)
+    rng = RNG(6)
     sizes = np.array([len(noise.noise_clusters(np.zeros(3), most=100, rng=rng)) for _ in range(400)])
     # the mean of one or two blobs of 0 to 100 points
     assert sizes.mean() == pytest.approx(75, rel=0.12)
@@ -80,7 +88,7 @@ def test_noise_clusters_of_both_kinds_and_sizes_occur():
 @given(seeds, st.lists(st.integers(0, 24), max_size=60))
 def test_part_removal_takes_exactly_one_part_that_is_there(seed, part):
     part = np.array(part, np.uint8)
-    keep = noise.part_removal(part, rng=np.random.default_rng(seed))
+    keep = noise.part_removal(part, rng=RNG(seed))
     assert keep.dtype == bool and keep.shape == part.shape
     gone = set(part[~keep])
     if not part.any():
@@ -92,7 +100,7 @@ def test_part_removal_takes_exactly_one_part_that_is_there(seed, part):
 
 def test_part_removal_takes_every_part_in_turn():
     part = np.array([0, 3, 3, 7, 24], np.uint8)
-    rng = np.random.default_rng(7)
+    rng = RNG(7)
     gone = [int(part[~noise.part_removal(part, rng=rng)][0]) for _ in range(300)]
     assert sorted(set(gone)) == [3, 7, 24]
     # parts alike, not points alike
@@ -101,10 +109,10 @@ def test_part_removal_takes_every_part_in_turn():
 
 def test_jitter_is_normal_and_cut():
     points = np.zeros((20000, 3))
-    step = noise.jitter(points, sigma=0.005, clip=0.02, rng=np.random.default_rng(8))
+    step = noise.jitter(points, sigma=0.005, clip=0.02, rng=RNG(8))
     np.testing.assert_allclose(step.std(0), 0.005, rtol=0.03)
     np.testing.assert_allclose(step.mean(0), 0, atol=2e-4)
-    cut = noise.jitter(points, sigma=0.05, clip=0.02, rng=np.random.default_rng(8))
+    cut = noise.jitter(points, sigma=0.05, clip=0.02, rng=RNG(8))
     assert np.abs(cut).max() == 0.02
     assert (np.abs(cut) == 0.02).mean() == pytest.approx(0.689, abs=0.02)
 
@@ -121,40 +129,41 @@ def facing(points, degrees):
 
 def test_weak_returns_follow_the_range_equation():
     near, far = np.array([[5.0, 0, 0]]), np.array([[60.0, 0, 0]])
-    assert noise.weak_loss(far, facing(far, 0), range_max=120)[0] == pytest.approx(0.5)
-    assert noise.weak_loss(near, facing(near, 60), range_max=120)[0] < 1e-3
+    assert intensity_loss(far, facing(far, 0), range_max=120)[0] == pytest.approx(0.5)
+    assert intensity_loss(near, facing(near, 60), range_max=120)[0] < 1e-3
     # the same power: four times as far is a sixteenth, as is a cosine of a sixteenth
-    slanted = noise.weak_loss(near * 4, facing(near, np.degrees(np.arccos(1 / 16))), range_max=100)
-    assert slanted[0] == pytest.approx(noise.weak_loss(near * 16, facing(near, 0), range_max=100)[0])
+    slanted = intensity_loss(near * 4, facing(near, np.degrees(np.arccos(1 / 16))), range_max=100)
+    assert slanted[0] == pytest.approx(intensity_loss(near * 16, facing(near, 0), range_max=100)[0])
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.floats(0.5, 80), st.floats(0, 89), st.floats(0.5, 80), st.floats(0, 89))
 def test_farther_and_more_grazing_is_weaker(r, a, more, turn):
     point = np.array([[r, 0, 0]])
-    loss = noise.weak_loss(point, facing(point, a), range_max=100)
+    loss = intensity_loss(point, facing(point, a), range_max=100)
     assert 0 <= loss[0] <= 1
-    assert noise.weak_loss(point * (1 + more / r), facing(point, a), range_max=100)[0] >= loss[0]
-    assert noise.weak_loss(point, facing(point, min(a + turn, 90)), range_max=100)[0] >= loss[0] - 1e-12
+    assert intensity_loss(point * (1 + more / r), facing(point, a), range_max=100)[0] >= loss[0]
+    assert intensity_loss(point, facing(point, min(a + turn, 90)), range_max=100)[0] >= loss[0] - 1e-12
 
 
 def test_random_keep_loses_its_share():
-    assert noise.random_keep(20000, share=0.3, rng=np.random.default_rng(11)).mean() == pytest.approx(0.7, abs=0.015)
-    assert noise.random_keep(50, share=0.0, rng=np.random.default_rng(11)).all()
+    assert noise.random_keep(20000, share=0.3, rng=RNG(11)).mean() == pytest.approx(0.7, abs=0.015)
+    assert noise.random_keep(50, share=0.0, rng=RNG(11)).all()
 
 
 # --- the compiled twin
 
 
 def surface(seed, n=300):
-    """A mesh of random triangles about 8 m away, and points on n of its faces with their rings."""
-    rng = np.random.default_rng(seed)
+    """A mesh of random triangles about 8 m away, and hits on n of its faces."""
+    rng = RNG(seed)
     corners = np.array([8.0, 1, 0]) + rng.normal(0, 0.5, (40, 3, 3))
     mesh = Mesh(corners.reshape(-1, 3).astype(np.float32), np.arange(120, dtype=np.int32).reshape(40, 3))
     face = rng.integers(0, 40, n).astype(np.int32)
     weight = rng.dirichlet(np.ones(3), n)
     points = (mesh.vertices[mesh.faces[face]] * weight[..., None]).sum(1).astype(np.float32)
-    return mesh, face, points, rng.integers(0, 64, n).astype(np.int32)
+    ring = rng.integers(0, 64, n).astype(np.int32)
+    return mesh, Hits(points=points, face=face, column=face, ring=ring, columns=0, rows=0, column0=0, row0=0)
 
 
 def normals_of(mesh, face):
@@ -165,54 +174,49 @@ def normals_of(mesh, face):
 @settings(max_examples=60, deadline=None)
 @given(seeds, st.floats(0, 0.9), st.floats(0, 1), st.floats(1, 300))
 def test_the_compiled_twin_agrees_draw_by_draw(seed, dropout, weak, range_max):
-    mesh, face, points, _ = surface(seed)
-    rng = np.random.default_rng(seed)
-    keep, chance = rng.random(len(points)) < 0.8, rng.random(len(points))
-    error = rng.normal(0, 0.03, len(points))
-    slow, slow_kept = noise.spoil_reference(
-        *(points.astype(float), normals_of(mesh, face), keep, error, chance),
-        dropout=dropout,
-        weak=weak,
-        range_max=range_max,
+    mesh, hits = surface(seed)
+    rng = RNG(seed)
+    keep, chance = rng.random(len(hits.face)) < 0.8, rng.random(len(hits.face))
+    error = rng.normal(0, 0.03, len(hits.face))
+    losses = dict(dropout=dropout, intensity_dropout=weak, range_max=range_max)
+    slow, slow_kept = lose_returns_reference(
+        hits.points.astype(float), normals_of(mesh, hits.face), keep, error, chance, **losses
     )
-    fast, fast_kept = spoil_points(
-        *(points, face, mesh.vertices, mesh.faces, keep, error, chance, dropout, weak, noise.REACH * range_max)
+    fast, fast_kept = lose_returns(
+        *(hits.points, hits.face, mesh.vertices, mesh.faces, keep, error, chance, dropout, weak, REACH * range_max)
     )
     np.testing.assert_array_equal(fast_kept, slow_kept)
     np.testing.assert_allclose(fast, slow, atol=2e-6)
 
 
-def test_spoiling_nothing_changes_nothing():
-    mesh, face, points, ring = surface(1)
-    copy = points.copy()
-    moved, kept = spoil(
-        *(points, face, mesh.vertices, mesh.faces, ring),
-        **dict(sigma=0.0, bias=0.0, dropout=0.0, weak=0.0, range_max=1.0, rng=np.random.default_rng(0)),
-    )
-    np.testing.assert_array_equal(kept, np.arange(len(points)))
+def test_a_perfect_sensor_changes_nothing():
+    mesh, hits = surface(1)
+    copy = hits.points.copy()
+    perfect = dict(sigma=0.0, bias=0.0, dropout=0.0, intensity_dropout=0.0, range_max=1.0)
+    moved, kept = add_sensor_noise(hits, mesh, **perfect, rng=RNG(0))
+    np.testing.assert_array_equal(kept, np.arange(len(copy)))
     np.testing.assert_allclose(moved, copy, atol=1e-6)
-    np.testing.assert_array_equal(points, copy)
-    none = spoil(
-        *(points[:0], face[:0], mesh.vertices, mesh.faces, ring[:0]),
-        **dict(sigma=0.1, bias=0.1, dropout=0.5, weak=1.0, range_max=9.0, one_sided=0.1, rng=np.random.default_rng(0)),
-    )
-    assert none[0].shape == (0, 3) and none[1].shape == (0,)
+    np.testing.assert_array_equal(hits.points, copy)
+    empty = replace(hits, points=hits.points[:0], face=hits.face[:0], ring=hits.ring[:0])
+    noisy = dict(sigma=0.1, bias=0.1, dropout=0.5, intensity_dropout=1.0, range_max=9.0, one_sided=0.1)
+    points, kept = add_sensor_noise(empty, mesh, **noisy, rng=RNG(0))
+    assert points.shape == (0, 3) and kept.shape == (0,)
 
 
-def test_spoiled_ranges_have_the_law_of_the_sensor():
-    mesh, face, points, ring = surface(2, n=20000)
-    calm = dict(dropout=0.0, weak=0.0, range_max=100.0)
+def test_ranges_have_the_law_of_the_sensor():
+    mesh, hits = surface(2, n=20000)
 
     def error(**noise):
-        moved, _ = spoil(
-            *(points, face, mesh.vertices, mesh.faces, ring), **calm, **noise, rng=np.random.default_rng(3)
-        )
-        return np.linalg.norm(moved.astype(float), axis=1) - np.linalg.norm(points.astype(float), axis=1)
+        calm = dict(dropout=0.0, intensity_dropout=0.0, range_max=100.0)
+        moved, _ = add_sensor_noise(hits, mesh, **calm, **noise, rng=RNG(3))
+        return np.linalg.norm(moved.astype(float), axis=1) - np.linalg.norm(hits.points.astype(float), axis=1)
 
     own = error(sigma=0.02, bias=0.0)
     assert own.std() == pytest.approx(0.02, rel=0.03) and abs(own.mean()) < 6e-4
     shared = error(sigma=0.0, bias=0.01)
-    np.testing.assert_allclose(shared, np.array([shared[ring == r].mean() for r in range(64)])[ring], atol=2e-6)
+    np.testing.assert_allclose(
+        shared, np.array([shared[hits.ring == r].mean() for r in range(64)])[hits.ring], atol=2e-6
+    )
     outwards = error(sigma=0.0, bias=0.0, one_sided=0.02)
     assert outwards.min() > -2e-6 and outwards.max() < 0.0201
     assert outwards.mean() == pytest.approx(0.01, rel=0.03)
@@ -222,7 +226,7 @@ def test_a_surface_without_area_returns_nothing_where_weak_returns_are_lost():
     vertices = np.full((3, 3), 5.0, np.float32)
     face, faces = np.zeros(40, np.int32), np.array([[0, 1, 2]], np.int32)
     points = np.full((40, 3), 5.0, np.float32)
-    moved, _ = spoil_points(
+    moved, _ = lose_returns(
         points, face, vertices, faces, np.ones(40, bool), np.zeros(40), np.full(40, 0.99), 0.0, 1.0, 50.0
     )
     assert len(moved) == 0
@@ -235,12 +239,12 @@ def test_a_ring_s_error_is_drawn_once():
     np.testing.assert_allclose(range_errors(ring, normals, 1.0, 0.0), normals[:4])
 
 
-# --- stray points, cuts, masks without a grid
+# --- clutter points, cuts, masks without a grid
 
 
-def test_reference_clusters_have_the_released_code_s_law():
+def test_dapt_clusters_have_the_released_code_s_law():
     center = np.array([3.0, -7, 0.5])
-    draws = [noise.reference_clusters(center, rng=np.random.default_rng(seed)) for seed in range(300)]
+    draws = [noise.dapt_clusters(center, rng=RNG(seed)) for seed in range(300)]
     sizes = np.array([len(d) for d in draws])
     assert sizes.mean() == pytest.approx(149, rel=0.06) and sizes.max() > 200
     assert all((np.abs(d - center) <= np.array([0.7, 0.7, 1.1])).all() for d in draws)
@@ -253,7 +257,7 @@ def test_reference_clusters_have_the_released_code_s_law():
 @settings(max_examples=60, deadline=None)
 @given(seeds, st.floats(0, 0.9), st.integers(1, 200))
 def test_a_half_space_leaves_most_of_the_extent(seed, most, n):
-    rng = np.random.default_rng(seed)
+    rng = RNG(seed)
     points = rng.normal(size=(n, 3))
     keep = noise.half_space_keep(points, most=most, rng=rng)
     assert keep.shape == (n,) and keep.any()
@@ -263,8 +267,8 @@ def test_a_half_space_leaves_most_of_the_extent(seed, most, n):
 
 def test_a_half_space_cuts_a_straight_edge():
     # a ball: the centers of both sides of a plane lie on its normal
-    points = unit(np.random.default_rng(0).normal(size=(4000, 3)))
-    keep = noise.half_space_keep(points, most=0.9, rng=np.random.default_rng(12))
+    points = unit(RNG(0).normal(size=(4000, 3)))
+    keep = noise.half_space_keep(points, most=0.9, rng=RNG(12))
     assert 0.05 < (~keep).mean() < 0.95
     # the kept and the lost are separated by a plane: the line between their centers
     line = points[keep].mean(0) - points[~keep].mean(0)
@@ -276,7 +280,7 @@ def test_a_half_space_cuts_a_straight_edge():
 @given(seeds, st.floats(0, 0.9), st.floats(-3, 3))
 def test_a_cut_box_lies_inside_the_box_and_loses_one_side(seed, most, yaw):
     whole = Box(center=[4.0, 1, 0.2], size=[0.7, 0.9, 1.8], yaw=yaw, id="x")
-    cut = noise.cut_box(whole, most=most, rng=np.random.default_rng(seed))
+    cut = noise.cut_box(whole, most=most, rng=RNG(seed))
     lost = 1 - cut.size / whole.size
     assert (lost >= -1e-12).all() and (lost > 1e-12).sum() <= 1 and lost.max() <= most + 1e-12
     assert cut.yaw == whole.yaw and cut.id == "x"
@@ -291,7 +295,7 @@ def test_a_cut_box_lies_inside_the_box_and_loses_one_side(seed, most, yaw):
 
 def test_cuts_of_boxes_take_feet_heads_and_sides():
     whole = Box(center=[4.0, 1, 0.2], size=[0.7, 0.9, 1.8], yaw=0.3)
-    rng = np.random.default_rng(5)
+    rng = RNG(5)
     cuts = [noise.cut_box(whole, rng=rng) for _ in range(600)]
     raised = np.mean([c.center[2] > 0.2 + 1e-9 for c in cuts])
     lowered = np.mean([c.center[2] < 0.2 - 1e-9 for c in cuts])
@@ -301,11 +305,11 @@ def test_cuts_of_boxes_take_feet_heads_and_sides():
 @settings(max_examples=60, deadline=None)
 @given(seeds, st.floats(0, 1), st.floats(-np.pi, np.pi))
 def test_the_mask_without_a_grid_keeps_its_share_in_patches(seed, keep, azimuth):
-    rng = np.random.default_rng(seed)
+    rng = RNG(seed)
     angle = azimuth + rng.uniform(-0.1, 0.1, 4000)
     up = rng.uniform(-0.3, 0.3, 4000)
     beams = np.stack([np.cos(angle) * np.cos(up), np.sin(angle) * np.cos(up), np.sin(up)], 1) * 7
-    kept = direction_mask(beams, keep=keep, rng=rng)
+    kept = noise.direction_mask(beams, keep=keep, rng=rng)
     # 8 x 24 patches of equal numbers of beams, but for the rim
     assert kept.mean() == pytest.approx(keep, abs=0.06)
     if 0.2 < keep < 0.8:
@@ -316,16 +320,111 @@ def test_the_mask_without_a_grid_keeps_its_share_in_patches(seed, keep, azimuth)
 
 
 def test_the_mask_without_a_grid_takes_single_beams_and_lines():
-    rng = np.random.default_rng(0)
-    assert direction_mask(np.array([[1.0, 0, 0]]), keep=1.0, rng=rng).all()
+    rng = RNG(0)
+    assert noise.direction_mask(np.array([[1.0, 0, 0]]), keep=1.0, rng=rng).all()
     line = np.column_stack([np.ones(500), np.linspace(-0.2, 0.2, 500), np.zeros(500)])
-    assert direction_mask(line, keep=0.5, rng=rng).mean() == pytest.approx(0.5, abs=0.05)
+    assert noise.direction_mask(line, keep=0.5, rng=rng).mean() == pytest.approx(0.5, abs=0.05)
 
 
 def test_a_half_space_cuts_up_to_its_share_and_seldom_all_of_it():
-    points = np.random.default_rng(0).normal(size=(2000, 3))
+    points = RNG(0).normal(size=(2000, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
-    rng = np.random.default_rng(1)
+    rng = RNG(1)
     # of a sphere a plane takes as large a share of the surface as of the extent
     lost = np.array([1 - noise.half_space_keep(points, most=0.4, rng=rng).mean() for _ in range(300)])
     assert lost.max() < 0.43 and lost.mean() == pytest.approx(0.2, abs=0.03) and lost.min() < 0.03
+
+
+# --- the laser-level mask of a grid
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 90), st.integers(1, 70), st.floats(0, 1))
+def test_the_mask_is_made_of_square_patches_of_the_paper_s_size(seed, columns, rows, keep):
+    mask = laser_mask(columns, rows, keep=keep, rng=RNG(seed))
+    assert mask.shape == (columns, rows) and mask.dtype == bool
+    patch = max(min(columns, rows) // 8, 1)
+    kept = total = 0
+    for i in range(0, columns, patch):
+        for j in range(0, rows, patch):
+            cell = mask[i : i + patch, j : j + patch]
+            assert cell.all() or not cell.any()
+            kept += cell.any()
+            total += 1
+    assert kept == int(total * keep)
+
+
+def test_the_mask_keeps_about_its_share_of_the_beams():
+    rng = RNG(5)
+    for columns, rows in ((77, 61), (39, 27), (20, 9), (5, 30)):
+        share = np.mean([laser_mask(columns, rows, keep=0.6, rng=rng).mean() for _ in range(300)])
+        assert share == pytest.approx(0.6, abs=0.02)
+
+
+def test_the_mask_of_a_window_without_beams_is_empty():
+    assert laser_mask(0, 0, keep=0.6, rng=RNG(0)).shape == (0, 0)
+
+
+# --- boxes as detectors draw them
+
+BODY = np.array([[x, y, z] for x in (-0.2, 0.3) for y in (-0.35, 0.35) for z in (0.0, 1.7)], np.float32)
+EXTENT = (BODY.min(0).tolist(), BODY.max(0).tolist())
+WILD = SCENES["wild"].crop
+
+
+def place(yaw=0.0, feet=(6.0, -2.0, -1.5)):
+    return Place(feet=np.array(feet), yaw=yaw, distance=6.3)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(-3, 3), st.floats(-3, 3))
+def test_without_cuts_and_jitter_a_box_holds_the_body_along_its_heading(seed, yaw, turned):
+    where = place(yaw)
+    c, s = np.cos(turned), np.sin(turned)
+    body = BODY @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], np.float32)  # turned by `turned`
+    errors = replace(WILD, jitter=1e-9, loose=0.0, cut=0.0)
+    box = draw_box(errors, 1.0, EXTENT, where, RNG(seed), heading=turned)
+    offset = where.of_body(body.astype(float)) - box.center
+    c, s = np.cos(box.yaw), np.sin(box.yaw)
+    local = np.stack([c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]], -1)
+    # aside from the bottom edge, which may lie above the soles
+    assert (np.abs(local) <= box.size[:2] / 2 + 1e-5).all()
+    assert (box.size[:2] < [0.5 + 0.26, 0.7 + 0.26]).all()
+    assert offset[:, 2].max() <= box.size[2] / 2 + 1e-5
+
+
+def test_the_bottom_edge_is_now_above_the_soles_now_in_the_ground():
+    rng = RNG(0)
+    errors = replace(WILD, jitter=1e-9, loose=0.0, cut=0.0)
+    boxes = [draw_box(errors, 1.0, EXTENT, place(), rng) for _ in range(600)]
+    bottom = np.array([b.center[2] - b.size[2] / 2 + 1.5 for b in boxes])
+    assert 0.05 < (bottom > 0).mean() < 0.3
+    assert 0.15 < (bottom < -0.15).mean() < 0.5
+    assert bottom.min() > -0.5 and bottom.max() < 0.2
+
+
+def test_errors_are_as_large_as_configured():
+    rng = RNG(1)
+    boxes = [draw_box(replace(WILD, loose=0.0, cut=0.0), 1.0, EXTENT, place(1.0), rng) for _ in range(800)]
+    yaw = np.array([b.yaw for b in boxes]) - 1.0
+    assert abs(yaw.std() - WILD.jitter) < 0.01 and abs(yaw.mean()) < 0.01
+    loose = [draw_box(WILD, 0.0, EXTENT, place(), rng) for _ in range(800)]
+    assert abs(np.mean([b.size[0] > 0.5 + 0.3 for b in loose]) - WILD.loose) < 0.04
+
+
+def test_cuts_come_with_difficulty():
+    rng = RNG(2)
+    always = replace(WILD, jitter=1e-9, loose=0.0, cut=1.0)
+    easy, hard = (
+        np.array([draw_box(always, how, EXTENT, place(), rng).size for _ in range(400)]) for how in (0.0, 1.0)
+    )
+    assert easy[:, 2].min() > 1.5
+    # a cut takes 15 percent of a height or a side on average, heights in half of the cases
+    lost = 1 - hard.mean(0) / easy.mean(0)
+    assert 0.04 < lost[2] < 0.12 and 0.02 < lost[1] < 0.09 and 0.005 < lost[0] < 0.06
+
+
+def test_the_paper_cuts_nothing():
+    box = draw_box(SCENES["paper"].crop, 1.0, EXTENT, place(0.7), RNG(3))
+    assert box.contains(place(0.7).of_body(BODY.astype(float))).all()
+    assert (box.size > 4).all()

@@ -1,0 +1,262 @@
+"""A person's scene: what stands where frame by frame, what a sensor returns of it, and whose points are whose."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from walkers import HEADINGS, goer
+
+from lidarpose.geometry import rotation_about
+from lidarpose.lidar.presets import sensor
+from lidarpose.sample import Sample
+from lidarpose.skeleton import BODY26
+from lidarpose.synth import generator, noise
+from lidarpose.synth.environment.mesh import Mesh, box, quad
+from lidarpose.synth.generator import Generator
+from lidarpose.synth.placement import Place
+from lidarpose.synth.props.attachment import fixed
+from lidarpose.synth.scene import SCENES, scene_config
+from lidarpose.synth.simulate import Scan, ScanConditions, Scene, count_alone, draw_conditions, simulate_scan
+
+SEED = 11
+PAPER = SCENES["paper"]
+NO_NOISE = replace(PAPER.noise, mask=0.0)
+PLAIN = replace(PAPER, noise=NO_NOISE)
+CLEAN = replace(PLAIN, distance=(4.0, 8.0))
+DAPT = replace(PLAIN, noise=replace(NO_NOISE, dapt_compat=True))
+SIZE = np.array([0.4, 0.6, 1.2])
+PARTS = np.arange(1, 13, dtype=np.uint8)
+
+
+def scene(device="dapt64", azimuth=0.4, mount=None, config=PLAIN, props=(), **conditions):
+    """A box of a person 6 m away, before a sensor without noise but for `conditions`."""
+    feet = np.array([6 * np.cos(azimuth), 6 * np.sin(azimuth), -0.5])
+    return Scene(
+        config=config, sensor=sensor(device), conditions=ScanConditions(**conditions), background=[],
+        place=Place(feet=feet, yaw=azimuth, distance=6.0, R_sensor_level=mount), props=list(props),
+    )  # fmt: skip
+
+
+def body(where):
+    mesh = box(SIZE)
+    return Mesh(where.place.of_body(mesh.vertices), mesh.faces, PARTS)
+
+
+def scan(where, *things, seed=0):
+    return simulate_scan(where, [body(where), *things], np.random.default_rng(seed))
+
+
+def local(points, where):
+    """In the box's own frame."""
+    c, s = np.cos(where.place.yaw), np.sin(where.place.yaw)
+    return (points.astype(float) - where.place.feet) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.1, 0.3])
+def test_points_lie_on_the_surface_whatever_the_mount(tilt):
+    mount = rotation_about("x", 0.03) @ rotation_about("y", -tilt) if tilt else None
+    where = scene("os1-64", 0.2, mount)
+    seen = scan(where)
+    assert len(seen.points) > 60 and seen.points.dtype == np.float32
+    there = local(seen.points, where)
+    assert np.abs((np.abs(there - [0, 0, SIZE[2] / 2]) - SIZE / 2).max(1)).max() < 1e-4
+    # the side that looks at the sensor
+    assert np.median(there[:, 0]) == pytest.approx(-SIZE[0] / 2, abs=1e-4)
+    # its two triangles
+    assert len(np.unique(seen.part)) >= 2 and seen.part.min() >= 1
+
+
+@pytest.mark.parametrize("dapt_compat", [True, False])
+def test_the_released_noise_is_one_sided_and_the_symmetric_one_is_not(dapt_compat):
+    where = scene(config=DAPT) if dapt_compat else scene(sigma=0.01)
+    there = local(scan(where, seed=1).points, where)
+    error = (there[:, 0] + SIZE[0] / 2)[np.abs(there[:, 1]) < 0.25]
+    assert len(error) > 200
+    if dapt_compat:
+        assert error.min() > -1e-3 and error.max() < 0.0201 and error.mean() == pytest.approx(0.01, abs=0.002)
+    else:
+        assert abs(error.mean()) < 0.002 and error.std() == pytest.approx(0.01, abs=0.002)
+
+
+def test_the_released_code_casts_the_seam_s_beams_twice():
+    at_seam, elsewhere = (
+        [len(scan(scene(azimuth=azimuth, config=config)).points) for config in (PLAIN, DAPT)]
+        for azimuth in (np.pi, 1.0)
+    )
+    # one column of a box 1.2 m tall at 5.8 m
+    assert 20 < at_seam[1] - at_seam[0] < 50 and elsewhere[0] == elsewhere[1]
+
+
+def test_what_stands_before_the_body_hides_it_and_is_no_part_of_it():
+    where = scene()
+    feet = where.place.feet
+    wall = box(np.array([0.1, 3.0, 0.6])).moved(feet * [0.6, 0.6, 1], where.place.yaw)
+    ground = quad(1.0, np.zeros(2)).moved(feet)
+    alone, seen = scan(where), scan(where, wall, ground)
+    assert 0.2 < np.count_nonzero(seen.part) / len(alone.points) < 0.9
+    assert np.count_nonzero(seen.part == 0) > 50
+    # no beam meets the body below the line over the wall's edge
+    assert seen.points[seen.part > 0][:, 2].min() > feet[2] + 0.55
+    assert count_alone(where, body(where), 0) == len(alone.points)
+
+
+def test_wide_beams_fatten_the_silhouette():
+    lines, wide = (len(scan(scene("os1-128", divergence=d)).points) for d in (0.0, 0.003))
+    assert lines < wide < 1.15 * lines
+
+
+def test_a_mask_keeps_its_share():
+    whole = len(scan(scene()).points)
+    shares = [len(scan(scene(keep=0.6), seed=k).points) / whole for k in range(60)]
+    assert np.mean(shares) == pytest.approx(0.6, abs=0.02) and np.std(shares) > 0.005
+
+
+def test_conditions_follow_the_preset_and_its_difficulty():
+    rng, device, noise = np.random.default_rng(5), sensor("os1-64"), SCENES["wild"].noise
+    paper = [draw_conditions(PAPER, device, rng) for _ in range(50)]
+    assert {c.keep for c in paper} == {0.6} and {c.intensity_dropout for c in paper} == {0.0}
+    assert {c.sigma for c in paper} == {device.range_sigma} and {c.divergence for c in paper} == {0.0}
+    wild = [draw_conditions(SCENES["wild"], device, rng) for _ in range(600)]
+    assert np.mean([c.keep < 1 for c in wild]) == pytest.approx(noise.mask, abs=0.06)
+    assert min(c.keep for c in wild) >= noise.mask_keep[0]
+    assert np.mean([c.divergence > 0 for c in wild]) == pytest.approx(noise.beam_divergence, abs=0.06)
+    easy = [draw_conditions(SCENES["wild"].eased(0.0), device, rng) for _ in range(100)]
+    assert {c.keep for c in easy} == {1.0}
+
+
+def test_the_window_has_the_scene_s_margin():
+    def width(margin):
+        where = scene(azimuth=0.0, config=replace(PLAIN, margin=margin))
+        points = scan(where, quad(1.0, np.zeros(2)).moved(where.place.feet)).points
+        return np.ptp(np.arctan2(points[:, 1], points[:, 0]))
+
+    assert width(0.05) - width(0.0) == pytest.approx(0.1, abs=0.006)
+
+
+# --- people and what is about them
+
+
+def bone_gap(points, joints):
+    """(n,) m: from points (n, 3) to the nearest bone."""
+    a, b = joints[[p for p, _ in BODY26.bones]], joints[[c for _, c in BODY26.bones]]
+    along = b - a
+    t = ((points[:, None] - a) * along).sum(-1) / np.maximum((along**2).sum(-1), 1e-9)
+    return np.linalg.norm(points[:, None] - a - np.clip(t, 0, 1)[..., None] * along, axis=-1).min(1)
+
+
+def test_another_person_in_the_crop_is_not_this_one():
+    maker, strangers = Generator(scene=replace(CLEAN, company=1.0, margin=0.1), measure=False), 0
+    for index in range(12):
+        sample = maker.person(SEED, index).sample
+        own = sample.points[sample.part > 0].astype(float)
+        assert bone_gap(own, sample.pose.joints).max() < 0.32
+        above = sample.points[sample.part == 0][:, 2] > sample.pose.joints[:, 2].min() + 0.4
+        strangers += np.count_nonzero(above) > 10
+    assert strangers >= 6
+
+
+def test_easy_people_have_nothing_of_what_hides_or_spoils():
+    def config(share):
+        wild = replace(SCENES["wild"], sensors=("os1-64",), distance=(4.0, 8.0), company=share, carry=share)
+        return replace(wild, noise=replace(wild.noise, clutter=share, missing_part=share))
+
+    never, always = (Generator(scene=config(share), measure=False) for share in (0.0, 1.0))
+    differ = 0
+    for index in range(4):
+        a, b = (maker.person(SEED, index, hard=0.0).sample for maker in (never, always))
+        np.testing.assert_array_equal(a.points, b.points)
+        np.testing.assert_array_equal(a.part, b.part)
+        differ += len(always.person(SEED, index, hard=1.0).sample.points) != len(b.points)
+    assert differ >= 2
+
+
+@pytest.mark.parametrize("dapt_compat", [False, True])
+def test_clutter_points_are_nobody_s_and_of_the_preset_s_law(dapt_compat, monkeypatch):
+    laws = {False: "noise_clusters", True: "dapt_clusters"}
+    monkeypatch.setattr(noise, laws[dapt_compat], lambda center, rng, **more: center + rng.uniform(-0.1, 0.1, (7, 3)))
+    monkeypatch.setattr(noise, laws[not dapt_compat], None)
+    scenes = [replace(CLEAN, noise=replace(NO_NOISE, clutter=share, dapt_compat=dapt_compat)) for share in (0.0, 1.0)]
+    for index in range(3):
+        bare, cluttered = (Generator(scene=scene, measure=False).person(SEED, index).sample for scene in scenes)
+        assert len(cluttered.points) == len(bare.points) + 7 and len(cluttered.ring) == len(cluttered.part)
+        np.testing.assert_array_equal(cluttered.points[cluttered.part > 0], bare.points[bare.part > 0])
+
+
+# --- a person who turns and goes, in clips
+
+
+def at_the_hip(points):
+    x, y, z = points[0]
+    return [[1, 0, 0], [0, 1, 0], [0, 0, 1]], [x, y, z]
+
+
+CLOTH = fixed("cloth", box((0.1, 0.1, 0.1)), at_the_hip, face_part=np.full(12, 5, np.uint8))
+STAND = fixed("stand", box((0.1, 0.1, 0.1)), at_the_hip, lift=0.25)
+
+
+def test_clothes_are_the_person_s_and_things_are_not_and_both_go_along():
+    actor, where = goer(), scene(props=[CLOTH, STAND])
+    for frame in range(3):
+        person, cloth, thing = where.meshes(actor, frame)
+        np.testing.assert_array_equal(person.part, actor.face_part)
+        np.testing.assert_array_equal(cloth.part, CLOTH.face_part)
+        assert thing.part is None
+        hip = where.body_place.of_body(actor.joints[frame][:1])[0] + [0, 0, 0.05]
+        for mesh in (cloth, thing):
+            np.testing.assert_allclose(mesh.vertices.mean(0), hip, atol=1e-5)
+
+
+@pytest.mark.parametrize("props", [(), (STAND,)], ids=["on the ground", "lifted"])
+def test_pose_box_and_body_of_a_frame_are_in_one_place(props):
+    tight = replace(PAPER, crop=replace(SCENES["wild"].crop, jitter=1e-9, loose=0.0, cut=0.0))
+    actor, where = goer(), scene(config=tight, props=props)
+    for frame, heading in enumerate(HEADINGS):
+        person = where.meshes(actor, frame)[0].vertices
+        seen = Scan(points=person, ring=np.zeros(8, np.int32), part=np.ones(8, np.uint8))
+        for seed in range(4):
+            sample = generator._crop(where, actor, frame, seen, np.random.default_rng(seed))
+            assert abs((sample.box.yaw - where.place.yaw - heading + np.pi) % (2 * np.pi) - np.pi) < 1e-6
+            assert (sample.box.size[:2] < [0.3 + 0.26, 0.9 + 0.26]).all()
+            # the bottom edge may lie above the soles
+            assert sample.box.contains(person + [0, 0, 0.3] * (person[:, 2:] < 0.2)).all()
+            joints = where.place.of_body(actor.joints[frame]) + [0, 0, 0.25 if props else 0.0]
+            np.testing.assert_allclose(sample.pose.joints, joints, atol=1e-5)
+
+
+def test_a_rosette_goes_on_with_its_pattern_from_frame_to_frame():
+    actor, where = goer(still=True), scene("livox-avia", 0.16, config=CLEAN)
+    first, again, second = (
+        generator._draw_sample(where, actor, frame, np.random.default_rng(0)).points for frame in (0, 0, 1)
+    )
+    np.testing.assert_array_equal(first, again)
+    assert len(second) > 50 and (first.shape != second.shape or np.abs(first - second).max() > 0.01)
+
+
+# --- another try
+
+
+def test_every_try_is_nearer_and_easier_and_the_best_counts(monkeypatch):
+    seen, counts = [], iter([3, 9, 5, 0, 2, 8, 1, 4])
+
+    def draw_scene(config, body, bodies, row, nearer, rng):
+        seen.append((config.hard, nearer))
+        return len(seen) - 1
+
+    def draw_sample(attempt, body, frame, rng):
+        count = next(counts)
+        points = np.full((count, 3), attempt, np.float32)
+        return Sample(points=points, center=np.zeros(3), part=np.ones(count, np.uint8))
+
+    monkeypatch.setattr(generator, "_draw_scene", draw_scene)
+    monkeypatch.setattr(generator, "_draw_sample", draw_sample)
+    person = Generator(scene=PAPER, measure=False).person(SEED, 0)
+    np.testing.assert_allclose(seen, [(1 - k / 7, 0.8**k) for k in range(8)], atol=1e-12)
+    assert len(person.sample.points) == 9 and (person.sample.points == 1).all()
+
+
+def test_the_reference_preset_is_the_released_code_s():
+    reference = scene_config("reference")
+    noise = reference.noise
+    assert reference.distance == (5.0, 20.0) and np.degrees(reference.margin) == pytest.approx(1.8)
+    assert noise.dapt_compat and (noise.clutter, noise.missing_part, noise.mask) == (0.5, 0.5, 1.0)
+    assert noise.mask_keep == (0.6, 0.6)
