@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lidarpose.body.pose_prior.activities import KINDS
-from lidarpose.data.synthetic_info import facts_of
+from lidarpose.data.synthetic_info import person_info
 from lidarpose.sample import Pose, Sample
 from lidarpose.skeleton import BODY26
 
@@ -15,5 +15,5 @@ def test_clutter_is_what_stands_above_the_ground_and_is_not_the_body():
     points = np.stack([0 * z + 5, 0 * z, z], 1)
     pose = Pose(joints=np.zeros((26, 3)), skeleton=BODY26)
     sample = Sample(points=points, center=np.zeros(3), part=part, pose=pose)
-    facts = facts_of(sample, sensor="a", kind=KINDS[0], distance=5.0, alone=8, soles=-1.6, tall=1.84)
+    facts = person_info(sample, sensor="a", kind=KINDS[0], distance=5.0, alone=8, soles=-1.6, tall=1.84)
     assert facts.clutter == 2 / 8 and facts.visible == 4 / 8 and facts.height_seen == pytest.approx(0.75)

@@ -62,23 +62,23 @@ def raw(tmp_path_factory):
 def test_lidarhuman26m_is_turned_level(raw):
     root, smpl, truth = raw
     kept, leveled = (list(reader("lidarhuman26m", smpl, level=level).read(root, "5")) for level in (False, True))
-    assert {item.sample.source for item in kept} == {"lidarhuman26m"}
-    assert {item.sample.source for item in leveled} == {"lidarhuman26m, turned level by 15 deg"}
+    assert {item.source for item in kept} == {"lidarhuman26m"}
+    assert {item.source for item in leveled} == {"lidarhuman26m, turned level by 15 deg"}
     for a, b in zip(kept, leveled, strict=True):
-        np.testing.assert_allclose(a.sample.pose.joints, truth["5", a.frame, "0"] @ tilt(15).T, atol=1e-4)
+        np.testing.assert_allclose(a.joints, truth["5", a.frame, "0"] @ tilt(15).T, atol=1e-4)
         # one rotation about the LiDAR for points, joints and trans; heights come out as they were to 2 degrees
-        np.testing.assert_allclose(b.sample.pose.joints[:, 2], truth["5", a.frame, "0"][:, 2], atol=15 * 0.035)
+        np.testing.assert_allclose(b.joints[:, 2], truth["5", a.frame, "0"][:, 2], atol=15 * 0.035)
         for before, after in (
-            (a.sample.points, b.sample.points),
-            (a.sample.pose.joints, b.sample.pose.joints),
+            (a.points, b.points),
+            (a.joints, b.joints),
             (a.centers["trans"], b.centers["trans"]),
         ):
             np.testing.assert_allclose(np.linalg.norm(after, axis=-1), np.linalg.norm(before, axis=-1), atol=1e-4)
         # and all together: trans stays where it is on the person
-        before, after = (np.linalg.norm(x.sample.pose.joints - x.centers["trans"], axis=-1) for x in (a, b))
+        before, after = (np.linalg.norm(x.joints - x.centers["trans"], axis=-1) for x in (a, b))
         np.testing.assert_allclose(after, before, atol=1e-4)
         # the points stay on the person
-        apart = np.linalg.norm(b.sample.points[:, None] - b.sample.pose.joints, axis=-1).min(1)
+        apart = np.linalg.norm(b.points[:, None] - b.joints, axis=-1).min(1)
         assert np.median(apart) < 0.3
 
 

@@ -17,15 +17,14 @@ from hypothesis import strategies as st
 from shard_files import write_shard
 
 from lidarpose.data import writer
-from lidarpose.data.labeled import item_of, labelled_row
+from lidarpose.data.labeled import labeled_row, sample_of
 from lidarpose.data.prepare import READERS, PartWriter, prepare
-from lidarpose.data.readers.base import SEEN, UNLABELED, Item
 from lidarpose.data.readers.humanm3 import HumanM3
 from lidarpose.data.shards import open_dataset, read_rows
 from lidarpose.data.splits import SplitRule, _published, split_rule
 from lidarpose.data.summary import lines_of
 from lidarpose.errors import InputError
-from lidarpose.sample import Box, Pose, Sample, center_of
+from lidarpose.sample import SEEN, UNLABELED, Box, LabeledSample, Pose, center_of
 from lidarpose.skeleton import HUMAN15, WAYMO14
 
 
@@ -62,13 +61,13 @@ def test_items_come_back_from_the_shards(raw, prepared):
     assert summary["people"] == len(items) == len(raw[1])
     for item in items:
         joints = raw[1][item.sequence, item.frame, item.track]
-        assert np.abs(item.sample.pose.joints - joints).max() < 1e-3
-        assert item.sample.pose.skeleton is HUMAN15 and item.sample.box.id == item.track
-        np.testing.assert_allclose(item.centers["joints_box"], item.sample.box.center)
-        np.testing.assert_array_equal(item.sample.center, center_of(item.sample.points))
+        assert np.abs(item.joints - joints).max() < 1e-3
+        assert item.skeleton is HUMAN15 and item.box.id == item.track
+        np.testing.assert_allclose(item.centers["joints_box"], item.box.center)
+        np.testing.assert_array_equal(item.center, center_of(item.points))
         assert item.joint_labels.dtype == np.uint8 and (item.joint_labels == SEEN).all()
     for sample, item in zip(dataset, items, strict=True):
-        np.testing.assert_array_equal(sample.points, item.sample.points)
+        np.testing.assert_array_equal(sample.points, item.points)
     tests = list(dataset.items("test"))
     assert {item.sequence for item in tests} == {"test/c"} and len(tests) == 6
     with pytest.raises(InputError, match="nobody in the split 'val'"):
@@ -118,43 +117,46 @@ def test_any_item_comes_back_as_it_was(tmp_path_factory, seed, count, boxed, rin
     joints = rng.normal(0, 1, (14, 3)).astype(np.float32)
     labels = rng.integers(0, 3, 14).astype(np.uint8)
     joints[labels == UNLABELED] = np.nan
-    sample = Sample(
+    box = Box(center=rng.normal(0, 1, 3), size=rng.uniform(0.1, 2, 3), yaw=0.25, id="ab") if boxed else None
+    sample = LabeledSample(
         points=rng.normal(0, 1, (count, 3)).astype(np.float32),
         center=rng.normal(0, 1, 3),
         ring=rng.integers(0, 64, count).astype(np.int32) if rings else None,
         pose=Pose(joints=joints, skeleton=WAYMO14, frame="sensor"),
-        box=Box(center=rng.normal(0, 1, 3), size=rng.uniform(0.1, 2, 3), yaw=0.25, id="ab") if boxed else None,
+        box=box,
         source="waymo",
         frame_id="f",
+        joint_labels=labels,
+        sequence="s",
+        frame=1_550_083_467_346_370,
+        track="ab",
+        time=1.5,
+        centers={"box": box.center} if boxed else {},
+        split="val",
     )
-    centers = {"box": sample.box.center} if boxed else {}
-    item = Item(
-        sample=sample, joint_labels=labels, sequence="s", frame=1_550_083_467_346_370, track="ab", time=1.5,
-        centers=centers,
-    )  # fmt: skip
-    path = tmp_path_factory.mktemp("item") / "a.parquet"
-    other = replace(item, time=float("nan"), centers={"trans": np.ones(3)})
-    write_shard(path, "labelled", [labelled_row(item, index=0, split="val"), labelled_row(other, index=0)])
-    rows = list(read_rows(path, "labelled"))
-    found = item_of(rows[0], "waymo14")
-    for a, b in ((found.sample.points, sample.points), (found.sample.pose.joints, joints), (found.joint_labels, labels),
-                 (found.sample.center, sample.center)):  # fmt: skip
-        np.testing.assert_array_equal(a, b)
-        assert a.dtype == b.dtype
-    assert (found.sample.ring is None) == (not rings) and (not rings or (found.sample.ring == sample.ring).all())
-    assert found.sample.part is None and (found.sample.box is None) == (not boxed)
-    assert found.centers.keys() == centers.keys() and (found.frame, found.track) == (item.frame, "ab")
+    path = tmp_path_factory.mktemp("sample") / "a.parquet"
+    other = replace(sample, time=float("nan"), centers={"trans": np.ones(3)}, split=None, sensor_known=False)
+    write_shard(path, "labelled", [labeled_row(one, index=0) for one in (sample, other)])
+    found, second = (sample_of(row, "waymo14", "parts") for row in read_rows(path, "labelled"))
+    for name in ("points", "joints", "joint_labels", "center"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(sample, name))
+        assert getattr(found, name).dtype == getattr(sample, name).dtype
+    assert (found.ring is None) == (not rings) and (not rings or (found.ring == sample.ring).all())
+    assert found.part is None and (found.box is None) == (not boxed)
+    for name in ("sequence", "frame", "track", "time", "split", "sensor_known", "distance", "source", "frame_id"):
+        assert getattr(found, name) == getattr(sample, name)
+    assert found.centers.keys() == sample.centers.keys() and found.info is None
     if boxed:
-        np.testing.assert_array_equal(found.sample.box.size, sample.box.size)
-        assert found.sample.box.yaw == 0.25 and found.sample.box.id == "ab"
-    second = item_of(rows[1], "waymo14")
-    assert np.isnan(second.time) and rows[1]["split"] is None and second.centers.keys() == {"trans"}
+        np.testing.assert_array_equal(found.box.size, sample.box.size)
+        assert found.box.yaw == 0.25 and found.box.id == "ab"
+    assert np.isnan(second.time) and second.split is None and second.centers.keys() == {"trans"}
+    assert not second.sensor_known and np.isnan(second.distance)
 
 
 def test_only_columns_that_have_a_place_are_written(raw):
     item = next(one for one in _reader().read(raw[0], "train/a"))
     with pytest.raises(InputError, match="names trans, box, joints_box, got mean"):
-        labelled_row(replace(item, centers={"mean": np.zeros(3)}), index=0)
+        labeled_row(replace(item, centers={"mean": np.zeros(3)}), index=0)
 
 
 def _reader():
@@ -485,14 +487,14 @@ def test_nobody_at_all_is_told(tmp_path, smpl):
     assert list(open_dataset(tmp_path / "out")) == []
 
 
-def test_synthetic_datasets_have_no_items(tmp_path, people_dataset):
+def test_synthetic_datasets_have_no_splits(tmp_path, people_dataset):
     with pytest.raises(InputError, match="holds synthetic people"):
-        list(open_dataset(people_dataset).items())
+        list(open_dataset(people_dataset).samples("test"))
 
 
 @pytest.fixture
 def people_dataset(tmp_path):
-    from lidarpose.data.shards import Card, write_card
+    from lidarpose.data.shards import DatasetCard, write_card
 
-    write_card(tmp_path, Card(settings={"what": "people"}, count=1, per_shard=1, tables=("people",)))
+    write_card(tmp_path, DatasetCard(settings={"what": "people"}, count=1, per_shard=1, tables=("people",)))
     return tmp_path

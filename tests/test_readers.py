@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 
 from lidarpose.body.smpl import load_body
 from lidarpose.data.prepare import READERS, reader
-from lidarpose.data.readers.base import SEEN, UNLABELED, Item, Skipped
+from lidarpose.data.readers.base import Skipped
 from lidarpose.data.readers.raw_files import find_below, numbered, numbers, read_cloud
 from lidarpose.data.readers.sloper4d import _heading
 from lidarpose.data.readers.smpl_joints import SmplJoints
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix, rotation_about
-from lidarpose.sample import center_of
+from lidarpose.sample import SEEN, UNLABELED, LabeledSample, center_of
 
 WRITERS = {
     "humanm3": files.write_humanm3,
@@ -44,7 +44,7 @@ def everything(name, root, smpl):
     """(items, skipped) of all parts."""
     source = made(name, smpl)
     found = [one for part in source.parts(root) for one in source.read(root, part)]
-    return [x for x in found if isinstance(x, Item)], [x for x in found if isinstance(x, Skipped)]
+    return [x for x in found if isinstance(x, LabeledSample)], [x for x in found if isinstance(x, Skipped)]
 
 
 def check(items, truth):
@@ -53,10 +53,10 @@ def check(items, truth):
     assert len(found) == len(items) and found.keys() == truth.keys()
     for key, joints in truth.items():
         item = found[key]
-        assert np.abs(item.sample.pose.joints - joints).max() < 1e-3, key
-        points = item.sample.points
+        assert np.abs(item.joints - joints).max() < 1e-3, key
+        points = item.points
         assert np.median(np.linalg.norm(points[:, None] - joints, axis=-1).min(1)) < 0.3
-        np.testing.assert_array_equal(item.sample.center, center_of(points))
+        np.testing.assert_array_equal(item.center, center_of(points))
 
 
 def reasons(skipped):
@@ -69,13 +69,13 @@ def test_joints_come_out_where_they_went_in(name, tmp_path, smpl):
     items, _ = everything(name, tmp_path, smpl)
     check(items, truth)
     source = made(name, smpl)
-    assert {len(item.joint_labels) for item in items} == {len(items[0].sample.pose.skeleton)}
-    assert all(item.sample.pose.skeleton.name == source.skeleton for item in items)
+    assert {len(item.joint_labels) for item in items} == {len(items[0].skeleton)}
+    assert all(item.skeleton.name == source.skeleton for item in items)
     assert source.about["licence"] and source.about["get"] and source.about["notes"]
     # the same again, in the same order
     again, _ = everything(name, tmp_path, smpl)
     for a, b in zip(items, again, strict=True):
-        np.testing.assert_array_equal(a.sample.points, b.sample.points)
+        np.testing.assert_array_equal(a.points, b.points)
 
 
 # --- HumanM3
@@ -94,10 +94,10 @@ def test_humanm3_boxes_are_of_the_joints_and_crop_the_points(tmp_path, smpl):
     files.write_humanm3(tmp_path, smpl)
     items, _ = everything("humanm3", tmp_path, smpl)
     for item in items:
-        joints, box = item.sample.pose.joints, item.sample.box
+        joints, box = item.joints, item.box
         np.testing.assert_allclose(box.size, np.ptp(joints, 0) + 0.4, atol=1e-5)
         np.testing.assert_array_equal(item.centers["joints_box"], box.center)
-        assert box.contains(item.sample.points, 0.3001).all() and len(item.sample.points) >= 150
+        assert box.contains(item.points, 0.3001).all() and len(item.points) >= 150
 
 
 def test_humanm3_s_database_has_everybody_once(tmp_path, smpl):
@@ -113,8 +113,8 @@ def test_humanm3_s_database_has_everybody_once(tmp_path, smpl):
     items = list(source.read(tmp_path, "train.pkl"))
     assert len(items) == len(folders) == len(truth)
     for a, b in zip(sorted(items, key=lambda item: item.sequence), folders, strict=True):
-        np.testing.assert_array_equal(a.sample.points, b.sample.points)
-        np.testing.assert_array_equal(a.sample.pose.joints, b.sample.pose.joints)
+        np.testing.assert_array_equal(a.points, b.points)
+        np.testing.assert_array_equal(a.joints, b.joints)
         assert (a.sequence, a.frame) == (b.sequence, b.frame)
     (tmp_path / "train.pkl").unlink()
     with pytest.raises(InputError, match="got .*plaza/seg0 without pose_calib"):
@@ -151,10 +151,10 @@ def test_humanm3_s_database_alone_is_a_root(tmp_path, smpl):
         for path in (tmp_path / "x" / sequence / "pointcloud").iterdir():
             path.rename(target / path.name)
     found = list(made("humanm3", smpl).read(tmp_path / "only", "test.pkl"))
-    items = [one for one in found if isinstance(one, Item)]
+    items = [one for one in found if isinstance(one, LabeledSample)]
     # one camera that sees a joint is enough
     assert [int((item.joint_labels == UNLABELED).sum()) for item in items] == [1, 0, 0, 0]
-    assert np.isnan(items[0].sample.pose.joints[5]).all()
+    assert np.isnan(items[0].joints[5]).all()
     assert [one.reason for one in found if isinstance(one, Skipped)] == [
         "entry of another form", "labels without a cloud"
     ]  # fmt: skip
@@ -167,7 +167,7 @@ def test_humanm3_s_clouds_may_lie_beside_its_database(tmp_path, smpl):
     root.mkdir()
     (tmp_path / "train.pkl").rename(root / "train.pkl")
     next((tmp_path / "x").rglob("*.pcd")).rename(root / "000007.pcd")
-    items = [one for one in made("humanm3", smpl).read(root, "train.pkl") if isinstance(one, Item)]
+    items = [one for one in made("humanm3", smpl).read(root, "train.pkl") if isinstance(one, LabeledSample)]
     assert len(items) == 2 and {item.sequence for item in items} == {"."}
 
 
@@ -254,8 +254,8 @@ def test_points_out_of_reach_are_left_out(tmp_path, smpl, bad):
     path.write_bytes(pickle.dumps(entries))
     for name, count in (("lidarhuman26m", 150), ("sloper4d", 149), ("lipd", 149)):
         (item,), skipped = everything(name, tmp_path / name, smpl)
-        assert len(item.sample.points) == count and not skipped
-        assert np.abs(item.sample.center - item.sample.pose.joints.mean(0)).max() < 1
+        assert len(item.points) == count and not skipped
+        assert np.abs(item.center - item.joints.mean(0)).max() < 1
 
 
 def test_lidarhuman26m_labels_and_clouds_are_paired_by_number(tmp_path, smpl):
@@ -283,7 +283,7 @@ def test_lidarhuman26m_s_trans_is_a_center(tmp_path, smpl):
     for item in items:
         path = tmp_path / f"labels/3d/pose/{item.sequence}/{item.frame:06d}.json"
         assert item.centers["trans"].tolist() == json.loads(path.read_text())["trans"]
-        apart = np.linalg.norm(item.centers["trans"] - item.sample.pose.joints[0])
+        apart = np.linalg.norm(item.centers["trans"] - item.joints[0])
         assert 0.01 < apart < 0.5 and (item.joint_labels == SEEN).all()
     assert [item.sequence for item in items] == ["5"] * 3 + ["7"] * 3 and items[1].time == pytest.approx(0.1)
 
@@ -314,7 +314,7 @@ def test_sloper4d_reads_refined_poses_and_else_the_others(tmp_path, smpl):
         items, skipped = everything("sloper4d", root, smpl)
         # frames 3 and 4 are beyond total_frames
         check(items, {key: value for key, value in truth.items() if key[1] < 115})
-        assert {item.sample.source for item in items} == {f"sloper4d/{which}, male"}
+        assert {item.source for item in items} == {f"sloper4d/{which}, male"}
         assert reasons(skipped) == {"labels without a cloud": 2, "frame beyond total_frames": 4}
         assert [item.time for item in items[:2]] == pytest.approx([0.0, 0.1], abs=1e-6)
 
@@ -324,9 +324,9 @@ def test_sloper4d_is_level_and_about_the_sensor(tmp_path, smpl):
     items, _ = everything("sloper4d", tmp_path, smpl)
     for item in items:
         # the head is above the feet, whatever the sensor's tilt, and the person some metres away
-        joints = item.sample.pose.joints
+        joints = item.joints
         assert joints[15, 2] > joints[[10, 11], 2].max() + 0.8
-        assert 1 < np.linalg.norm(item.sample.center) < 8
+        assert 1 < np.linalg.norm(item.center) < 8
 
 
 def test_sloper4d_takes_the_gender_s_own_body(tmp_path):
@@ -337,7 +337,7 @@ def test_sloper4d_takes_the_gender_s_own_body(tmp_path):
     truth |= files.write_sloper4d(root, tmp_path / "SMPL_NEUTRAL.npz", sequences=("seq003_",), gender="female")
     items, _ = everything("sloper4d", root, tmp_path)
     check(items, truth)
-    assert {item.sample.source.partition(", ")[2] for item in items} == {
+    assert {item.source.partition(", ")[2] for item in items} == {
         "male by the male body", "female by the neutral body"
     }  # fmt: skip
     (tmp_path / "SMPL_NEUTRAL.npz").unlink()
@@ -376,7 +376,7 @@ def test_sloper4d_skips_are_counted(tmp_path, smpl):
     write_labels(tmp_path, content)
     items, skipped = everything("sloper4d", tmp_path, smpl)
     # nine points are kept: protocols leave them out later
-    assert [(item.frame, len(item.sample.points)) for item in items] == [(125, 9)]
+    assert [(item.frame, len(item.points)) for item in items] == [(125, 9)]
     assert reasons(skipped) == {
         "empty cloud": 2, "cloud cannot be read": 2, "cloud without a pose": 1, "cloud without the LiDAR's place": 1,
         "cloud of a frame without labels": 1,
@@ -424,7 +424,7 @@ def test_sloper4d_labels_that_are_wrong_are_one_line(tmp_path, smpl, change, mes
 def test_lipd_places_joints_by_the_points_and_says_how(tmp_path, smpl):
     files.write_lipd(tmp_path, smpl)
     items, skipped = everything("lipd", tmp_path, smpl)
-    assert [item.sample.source for item in items] == [
+    assert [item.source for item in items] == [
         "lipd/gt_joint + trans", "lipd/gt_joint + trans + mean", "lipd/gt_joint"
     ]  # fmt: skip
     assert reasons(skipped) == {"joints are not where the points are": 1}
@@ -561,7 +561,7 @@ def test_humanm3_s_points_reach_beyond_the_box(tmp_path):
     # the box is 20 cm larger than the joints, and points are taken within 30 cm of it
     files.write_pcd(path, [(low + high) / 2 + [0, 0, (high - low)[2] / 2 + 0.2 + more] for more in (0.0, 0.28, 0.32)])
     (item,) = (one for one in reader("humanm3").read(tmp_path, "train/a") if hasattr(one, "sample"))
-    assert len(item.sample.points) == 2
+    assert len(item.points) == 2
 
 
 def test_the_longest_end_of_a_path_is_the_cloud(tmp_path):

@@ -10,13 +10,13 @@ from pyarrow import parquet
 from shard_files import write_shard
 
 from lidarpose.data import shards
-from lidarpose.data.shards import Card, open_dataset, person_row, read_card, read_rows, sample_of, write_card
-from lidarpose.data.synthetic_info import Facts
+from lidarpose.data.labeled import person_row, sample_of
+from lidarpose.data.shards import DatasetCard, open_dataset, read_card, read_rows, write_card
 from lidarpose.errors import InputError
-from lidarpose.sample import Box, Pose, Sample
+from lidarpose.sample import Box, PersonInfo, Pose, Sample
 from lidarpose.skeleton import BODY26
 
-FACTS = Facts(sensor="os1-64", kind="walk", distance=7.5, visible=0.5, height_seen=0.9, clutter=0.1, upright=True)
+FACTS = PersonInfo(sensor="os1-64", kind="walk", distance=7.5, visible=0.5, height_seen=0.9, clutter=0.1, upright=True)
 
 
 def sample(rng, count):
@@ -40,7 +40,7 @@ def people():
 
 @pytest.fixture
 def folder(tmp_path, people):
-    write_card(tmp_path, Card(settings={"what": "people"}, count=4, per_shard=3, tables=("people",)))
+    write_card(tmp_path, DatasetCard(settings={"what": "people"}, count=4, per_shard=3, tables=("people",)))
     rows = [person_row(p, index=k, frame=k % 2, facts=FACTS if k else None) for k, p in enumerate(people)]
     write_shard(tmp_path / "people-00000.parquet", "people", rows[:3])
     write_shard(tmp_path / "people-00001.parquet", "people", rows[3:])
@@ -150,8 +150,8 @@ def test_a_flipped_bit_among_the_points_is_told(folder, people):
 
 
 def test_facts_are_all_kept():
-    kept = [name for name in shards.TABLES["people"] if name in Facts.__dataclass_fields__]
-    assert kept == list(Facts.__dataclass_fields__)
+    kept = [name for name in shards.TABLES["people"] if name in PersonInfo.__dataclass_fields__]
+    assert kept == list(PersonInfo.__dataclass_fields__)
 
 
 def test_settings_that_differ_are_named(folder):
@@ -200,7 +200,7 @@ def test_every_fact_is_a_column_and_older_shards_may_lack_one(tmp_path, people):
     path = tmp_path / "a.parquet"
     write_shard(path, "people", [person_row(people[0], index=0, facts=FACTS)])
     row = next(read_rows(path, "people"))
-    for fact in fields(Facts):
+    for fact in fields(PersonInfo):
         assert row[fact.name] == pytest.approx(getattr(FACTS, fact.name))
     parquet.write_table(parquet.read_table(path).drop_columns(["kind"]), path)
     row = next(read_rows(path, "people"))

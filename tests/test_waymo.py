@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from lidarpose.data.prepare import prepare, reader
 from lidarpose.data.readers import protobuf, waymo_parquet
-from lidarpose.data.readers.base import HIDDEN, SEEN, UNLABELED, Item, Skipped
+from lidarpose.data.readers.base import Skipped
 from lidarpose.data.readers.protobuf import Message
 from lidarpose.data.readers.tfrecord import crc32c, masked_checksum, records
 from lidarpose.data.readers.waymo import COMPONENTS, Waymo, WaymoV1, WaymoV2
@@ -25,6 +25,7 @@ from lidarpose.data.readers.waymo_frames import MARGIN, Calibration, Frame, pers
 from lidarpose.data.shards import open_dataset
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
+from lidarpose.sample import HIDDEN, SEEN, UNLABELED, LabeledSample
 
 SEGMENT = "10017090168044687777_6380_000_6400_000"
 TFRECORD = f"training/segment-{SEGMENT}_with_camera_labels.tfrecord"
@@ -59,7 +60,7 @@ def everything(root, source=None):
     """(items, skipped) of all parts."""
     source = source or Waymo()
     found = [one for part in source.parts(root) for one in source.read(root, part)]
-    return [x for x in found if isinstance(x, Item)], [x for x in found if isinstance(x, Skipped)]
+    return [x for x in found if isinstance(x, LabeledSample)], [x for x in found if isinstance(x, Skipped)]
 
 
 def truth():
@@ -72,7 +73,7 @@ def check(items):
     want = truth()
     assert [(item.frame, item.track) for item in items] == sorted(want)
     for item in items:
-        one, sample = want[item.frame, item.track], item.sample
+        one, sample = want[item.frame, item.track], item
         ring = [39 - rows if laser == 1 else rows * 0 - 1 for (laser, _), (_, rows) in sorted(one.points.items())]
         np.testing.assert_array_equal(sample.ring, np.concatenate(ring))
         start = 0
@@ -93,9 +94,9 @@ def same(a, b):
     assert len(a) == len(b)
     for x, y in zip(a, b, strict=True):
         assert (x.sequence, x.frame, x.track, x.time) == (y.sequence, y.frame, y.track, y.time)
-        np.testing.assert_allclose(x.sample.points, y.sample.points, atol=1e-6)
-        np.testing.assert_array_equal(x.sample.ring, y.sample.ring)
-        np.testing.assert_array_equal(x.sample.pose.joints, y.sample.pose.joints)
+        np.testing.assert_allclose(x.points, y.points, atol=1e-6)
+        np.testing.assert_array_equal(x.ring, y.ring)
+        np.testing.assert_array_equal(x.joints, y.joints)
         np.testing.assert_array_equal(x.joint_labels, y.joint_labels)
 
 
@@ -169,8 +170,8 @@ def test_the_margin_is_around_the_box(v2):
     tight, _ = everything(v2, WaymoV2(margin=-0.1))
     wide, _ = everything(v2, Waymo(margin=0.2))
     for a, b in zip(tight, wide, strict=True):
-        inside = b.sample.box.contains(b.sample.points, -0.1)
-        np.testing.assert_array_equal(a.sample.points, b.sample.points[inside])
+        inside = b.box.contains(b.points, -0.1)
+        np.testing.assert_array_equal(a.points, b.points[inside])
         assert 0 < inside.sum() < len(inside)
     assert MARGIN == 0.2 and WaymoV1(margin=0.3).about["settings"] == {"box_margin_m": 0.3}
 
@@ -345,7 +346,7 @@ def test_images_added_in_any_order_are_the_same_and_twice_is_once():
             image = np.full((3, 4), 2.0 + 0.1 * which)
             frame.add(laser, which, image, np.zeros((3, 4, 6)) if laser == 1 else None)
         (item,) = frame.found()
-        results.append(item.sample)
+        results.append(item)
     assert len(results[0].points) and set(results[0].ring.tolist()) == {-1, 0, 1, 2}
     for sample in results[1:]:
         np.testing.assert_array_equal(sample.points, results[0].points)
@@ -513,7 +514,7 @@ def test_a_missing_second_return_is_none(copy):
     for item in items:
         points = truth()[item.frame, item.track].points
         want = np.concatenate([points[key][0] for key in sorted(points) if key[1] == 1]) - TOP
-        np.testing.assert_allclose(item.sample.points, want, atol=1e-3)
+        np.testing.assert_allclose(item.points, want, atol=1e-3)
 
 
 @pytest.mark.parametrize("size", [[1, 2, 3], [1, None, 3]])

@@ -4,7 +4,7 @@ All are frozen, keyword-only and validated when built, and equal to nothing but 
 Lengths in metres, angles in radians, z up.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from numbers import Integral, Real
 
 import numpy as np
@@ -20,6 +20,8 @@ HIT = 0.1
 MIN_POINTS = 5
 # what a pose may say of each joint
 PER_JOINT = ("confidence", "spread", "visible", "in_range")
+# the label of a joint: not labeled (its position is NaN), labeled though hidden or uncertain, labeled and seen
+UNLABELED, HIDDEN, SEEN = 0, 1, 2
 
 
 def within_reach(points: np.ndarray) -> np.ndarray:
@@ -139,6 +141,86 @@ class Sample:
             value = getattr(self, name)
             if value is not None and value.shape != (len(self.points),):
                 raise InputError(f"Sample.{name} must be ({len(self.points)},), one a point, got {value.shape}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PersonInfo:
+    """What is known of a synthetic person besides the sample; NaN, "" and False where nothing was measured.
+
+    sensor: name; kind: what the person does, a name of `body.pose_prior.activities.KINDS`; distance m; visible: returns
+    of body and clothes, as a share (at most 1) of those that the body alone has without any loss: what range or slant
+    lost counts as hidden too; height_seen: share of the body's height between its lowest and highest return; clutter:
+    share of the points that are neither body nor ground; upright: stands or walks.
+    """
+
+    sensor: str = ""
+    kind: str = ""
+    distance: float = np.nan
+    visible: float = np.nan
+    height_seen: float = np.nan
+    clutter: float = np.nan
+    upright: bool = False
+
+    @property
+    def plain(self) -> bool:
+        """Upright, whole and uncluttered, most of the height seen."""
+        return bool(is_plain(self.upright, self.visible, self.clutter) and self.height_seen > 0.85)
+
+
+def is_plain(upright, visible, clutter):
+    """Bools for arrays (N,) or one person's, as in `PersonInfo`: upright, whole, uncluttered. NaN is not plain."""
+    return upright & (visible > 0.8) & (clutter < 0.05)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LabeledSample(Sample):
+    """A sample of a dataset: what its reader yields, a shard stores, fine-tuning learns from and evaluation scores.
+
+    Of `Sample` the pose is required: joints (J, 3) m of the dataset's own skeleton, NaN where a joint is not labeled.
+    joint_labels (J,) uint8: `UNLABELED`, `HIDDEN` or `SEEN`; sequence, frame, track: where it comes from; time: seconds
+    since the sequence's beginning, NaN if unknown; centers: other origins that published protocols use, (3,) m by
+    name ("trans", "box", "joints_box"); sensor_known: whether the origin of the frame is the sensor; split: "train",
+    "val", "test" or None; info: of a synthetic person, None of a real one.
+    """
+
+    joint_labels: np.ndarray
+    sequence: str = ""
+    frame: int = 0
+    track: str = "0"
+    time: float = np.nan
+    centers: dict[str, np.ndarray] = field(default_factory=dict)
+    sensor_known: bool = True
+    split: str | None = None
+    info: PersonInfo | None = None
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.pose is None or self.joint_labels.shape != (len(self.pose.skeleton),):
+            raise InputError(f"LabeledSample needs a pose and a label per joint, got {self.joint_labels.shape} labels")
+        if (np.isnan(self.pose.joints).any(-1) != (self.joint_labels == UNLABELED)).any():
+            raise InputError("LabeledSample: a joint is NaN exactly where its label is UNLABELED")
+
+    @property
+    def joints(self) -> np.ndarray:
+        """(J, 3) m, those of the pose."""
+        return self.pose.joints
+
+    @property
+    def skeleton(self) -> Skeleton:
+        return self.pose.skeleton
+
+    @property
+    def distance(self) -> float:
+        """Of the person from the sensor, m; NaN where it is not known."""
+        if self.info is not None:
+            return self.info.distance
+        # as precise as shards store it, so that a score is the same from memory and from a file
+        return float(np.float32(np.linalg.norm(self.center))) if self.sensor_known else np.nan
+
+    @property
+    def sample(self) -> "LabeledSample":
+        """The sample itself: what readers yielded until 0.2 held it beside its labels."""
+        return self
 
 
 def _as_arrays(self: Pose | Sample, *names: str) -> None:

@@ -6,22 +6,24 @@ read again: to have a repaired file read, delete its two shards and run the same
 
 import hashlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from importlib import import_module
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
-from lidarpose.data.labeled import labelled_row
-from lidarpose.data.readers.base import Item, Reader, Skipped
-from lidarpose.data.shards import CARD, SENSOR_FRAME, Card, open_dataset, shard_path, shard_writer, write_card
+from lidarpose.data.labeled import labeled_row
+from lidarpose.data.readers.base import Reader, Skipped
+from lidarpose.data.shards import CARD, SENSOR_FRAME, DatasetCard, open_dataset, shard_path, shard_writer, write_card
 from lidarpose.data.splits import SplitRule, split_rule
 from lidarpose.data.summary import summarize
 from lidarpose.data.writer import clean_folder, make_shards, open_folder
 from lidarpose.errors import InputError, check_name
 from lidarpose.io.files import file_error, one_line
+from lidarpose.sample import LabeledSample
 
 # dataset -> module and class of its reader, and whether that takes the user's SMPL
 READERS: dict[str, tuple[str, str, bool]] = {
@@ -114,7 +116,6 @@ def prepare(
         parts=tuple(parts),
         rule=rule,
         only=split,
-        sensor_known=bool(about.get("sensor_known", True)),
     )
     with ExitStack() as stack:
         bar = _bar(stack, len(parts), len(missing)) if progress else None
@@ -145,7 +146,7 @@ def _of_split(name: str, parts: list[str], rule: SplitRule | None, split: str | 
 
 def _card(
     name: str, source: Reader, parts: list[str], rule: SplitRule | None, split: str | None, about: dict[str, Any]
-) -> Card:
+) -> DatasetCard:
     # the names themselves would fill the line that says what differs
     digest = hashlib.sha256("\n".join(parts).encode("utf-8", "backslashreplace")).hexdigest()[:12]
     settings: dict[str, Any] = {"what": "parts", "dataset": name, "parts": digest}
@@ -155,7 +156,7 @@ def _card(
     told = {key: value for key, value in about.items() if key not in ("frame", "settings")}
     if rule is not None:
         told["split"] = f"{rule.name}: {rule.source}" + (f"; LEAKS: {rule.leaks}" if rule.leaks else "")
-    return Card(
+    return DatasetCard(
         settings=settings | about.get("settings", {}),
         count=len(parts),
         per_shard=1,
@@ -179,7 +180,6 @@ class PartWriter:
     parts: tuple[str, ...]
     rule: SplitRule | None
     only: str | None
-    sensor_known: bool
 
     @cached_property
     def _reader(self) -> Reader:
@@ -192,31 +192,32 @@ class PartWriter:
                 table: stack.enter_context(shard_writer(shard_path(self.out, table, number), table))
                 for table in reversed(_TABLES)
             }
-            for found, split in self._found(self.parts[number]):
+            for found in self._found(self.parts[number]):
                 if isinstance(found, Skipped):
                     add["skipped"]({"index": number, "reason": found.reason, "where": found.where})
-                elif self.only in (None, split):
-                    row = labelled_row(found, index=number, split=split, sensor_known=self.sensor_known)
-                    add["labelled"](row)
+                elif self.only in (None, found.split):
+                    add["labelled"](labeled_row(found, index=number))
                     people, waiting = people + 1, waiting + 1
                 if waiting == _TOLD:
                     yield waiting
                     waiting = 0
         yield waiting
 
-    def _found(self, part: str) -> Iterator[tuple[Item | Skipped, str | None]]:
+    def _found(self, part: str) -> Iterator[LabeledSample | Skipped]:
         """Everybody in a part, with the split."""
-        found = self._read(part)
-        if self.rule is None or self.rule.by_part:
-            split = None if self.rule is None else self.rule.of_part(part)
-            yield from ((one, split) for one in found)
+        if self.rule is None:
+            yield from self._read(part)
             return
-        everyone = list(found)
-        splits = iter(self.rule.of_chunks(part, sum(isinstance(one, Item) for one in everyone)))
-        for one in everyone:
-            yield one, next(splits) if isinstance(one, Item) else None
+        found: Iterable[LabeledSample | Skipped] = self._read(part)
+        if self.rule.by_part:
+            splits = repeat(self.rule.of_part(part))
+        else:
+            found = list(found)
+            splits = iter(self.rule.of_chunks(part, sum(isinstance(one, LabeledSample) for one in found)))
+        for one in found:
+            yield replace(one, split=next(splits)) if isinstance(one, LabeledSample) else one
 
-    def _read(self, part: str) -> Iterator[Item | Skipped]:
+    def _read(self, part: str) -> Iterator[LabeledSample | Skipped]:
         """As the reader, but a part that turns out to be unreadable ends there, which is counted."""
         try:
             yield from self._reader.read(self.root, part)

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.data.synthetic_info import Facts
 from lidarpose.errors import MissingExtra
+from lidarpose.sample import PersonInfo
 
 Kind = str | list[str]
 
-# a fact more is a column more, which older shards have not
-FACTS = {fact.name: {str: "string", float: "float32", bool: "bool", int: "int32"}[fact.type] for fact in fields(Facts)}
+# a field more is a column more, which older shards have not
+FACTS = {info.name: {str: "string", float: "float32", bool: "bool"}[info.type] for info in fields(PersonInfo)}
 
 _PEOPLE: dict[str, Kind] = {
     "index": "int64",

@@ -11,10 +11,10 @@ person in one frame; columns (`PEOPLE`):
     center                  origin of the person's own frame, found from the points
     box_center, box_size, box_yaw    a detector's box: m, m, rad
     source, frame_id        as in `Sample`
-    sensor, kind, ...       what is known besides, see `data.synthetic_info.Facts`; null where it was not measured
+    sensor, kind, ...       what is known besides, see `lidarpose.sample.PersonInfo`; null where it was not measured
 
 Datasets of real people, which `lidarpose prepare` wrote, have a part of the raw files (a sequence, a file) in each
-shard: labelled-*.parquet (columns as above where they mean the same, see `columns.TABLES`; index numbers the part) with
+shard: labelled-*.parquet (columns as above where they mean the same, see `schema.TABLES`; index numbers the part) with
 
     sequence, time, split   of the raw dataset; s since the sequence's beginning; train, val, test or null
     track                   text; the person in the sequence
@@ -32,19 +32,16 @@ of everybody in the street, seen or not, track (P,), box (P, 7: center, size, ya
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, is_dataclass, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from lidarpose._version import __version__
-from lidarpose.data.labeled import item_of
-from lidarpose.data.readers.base import Item
+from lidarpose.data.labeled import sample_of
 from lidarpose.data.schema import FACTS, TABLES, arrays_of, pyarrow, rows_of, schema_of
 from lidarpose.errors import InputError
 from lidarpose.io.files import atomic_path, file_error, read_bytes, write_atomic
-from lidarpose.sample import Box, Pose, Sample
+from lidarpose.sample import LabeledSample
 from lidarpose.skeleton import BODY26, skeleton
 
 SCHEMA = 1
@@ -64,7 +61,7 @@ def counted(count: int, what: str) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Card:
+class DatasetCard:
     """What dataset.json says: settings, all that decides the content; count of persons, clips, streets or parts;
     per_shard; tables; skeleton's name; version of the package that wrote it; frame of points and joints; about: of a
     real dataset, its licence, quirks and parts; summary: what a finished one holds."""
@@ -118,7 +115,7 @@ class Card:
         return json.dumps(named, indent=2) + "\n"
 
 
-def read_card(folder: str | Path) -> Card:
+def read_card(folder: str | Path) -> DatasetCard:
     """The card of a dataset's folder. Raises InputError where it is missing, damaged or of another schema."""
     path = Path(folder) / CARD
     if not path.is_file():
@@ -131,7 +128,7 @@ def read_card(folder: str | Path) -> Card:
                 f"is of schema {found['schema']!r}, this lidarpose reads {SCHEMA}: "
                 f"install lidarpose {found.get('version', 'of the version that wrote it')}",
             )
-        card = Card(
+        card = DatasetCard(
             settings=dict(found["settings"]),
             count=int(found["count"]),
             per_shard=int(found["per_shard"]),
@@ -153,50 +150,13 @@ def read_card(folder: str | Path) -> Card:
     return card
 
 
-def write_card(folder: str | Path, card: Card) -> None:
+def write_card(folder: str | Path, card: DatasetCard) -> None:
     """Writes dataset.json, whole or not at all."""
     write_atomic(Path(folder) / CARD, card.to_json())
 
 
 def shard_path(folder: str | Path, table: str, shard: int) -> Path:
     return Path(folder) / f"{table}-{shard:05d}.parquet"
-
-
-def person_row(
-    sample: Sample, *, index: int, frame: int = 0, track: int = 0, facts: object | None = None
-) -> dict[str, Any]:
-    """A row of the people table. The sample needs pose (body26), part, ring and box."""
-    known = asdict(facts) if is_dataclass(facts) else {}
-    return {
-        "index": index,
-        "frame": frame,
-        "track": track,
-        "points": sample.points.ravel(),
-        "part": sample.part,
-        "ring": sample.ring,
-        "joints": np.asarray(sample.pose.joints, np.float32).ravel(),
-        "center": sample.center,
-        "box_center": sample.box.center,
-        "box_size": sample.box.size,
-        "box_yaw": float(sample.box.yaw),
-        "source": sample.source,
-        "frame_id": sample.frame_id,
-        **{name: known.get(name) for name in FACTS},
-    }
-
-
-def sample_of(row: dict[str, Any], skeleton_name: str = BODY26.name) -> Sample:
-    """The sample of a row, as `read_rows` gives it."""
-    return Sample(
-        points=row["points"].reshape(-1, 3),
-        center=row["center"],
-        part=row["part"],
-        ring=row["ring"],
-        pose=Pose(joints=row["joints"].reshape(-1, 3), skeleton=skeleton(skeleton_name), frame="sensor"),
-        box=Box(center=row["box_center"], size=row["box_size"], yaw=row["box_yaw"]),
-        source=row["source"],
-        frame_id=row["frame_id"],
-    )
 
 
 @contextmanager
@@ -261,11 +221,11 @@ def read_rows(path: str | Path, table: str, columns: tuple[str, ...] | None = No
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dataset:
+class DatasetReader:
     """A folder of shards, read as it is iterated: its samples in order. card: what dataset.json says."""
 
     folder: Path
-    card: Card
+    card: DatasetCard
 
     def rows(self, table: str | None = None, shards: range | None = None) -> Iterator[dict[str, Any]]:
         """The rows of a table, of some shards or of all; see `TABLES`. By default those of people."""
@@ -287,55 +247,42 @@ class Dataset:
             raise file_error(path, f"{problem}; run the same {self.card.writer} again")
         return rows
 
-    def __iter__(self) -> Iterator[Sample]:
+    def __iter__(self) -> Iterator[LabeledSample]:
         return (self.sample(row) for row in self.rows())
 
-    def sample(self, row: dict[str, Any]) -> Sample:
-        """The sample of a row of people; of streets and of real people its box's id is the track. Raises InputError
-        for a row that is none."""
-        if self.card.people == "labelled":
-            return self.item(row).sample
-        try:
-            sample = sample_of(row, self.card.skeleton)
-            if "frames" in self.card.tables:
-                sample = replace(sample, box=replace(sample.box, id=row["track"]))
-            return sample
-        except (ValueError, TypeError, AttributeError) as error:
-            raise self._no_sample(row, error) from None
+    def samples(self, split: str | None = None) -> Iterator[LabeledSample]:
+        """Everybody with what is labeled, or of a dataset of real people those of a split ("train", "val", "test").
 
-    def items(self, split: str | None = None) -> Iterator[Item]:
-        """The people of a real dataset with what was labelled, all or those of a split ("train", "val", "test").
-
-        Raises InputError for a dataset of synthetic people, and for a split that nobody is in.
+        Raises InputError for a split of synthetic people, and for one that nobody is in.
         """
-        if self.card.people != "labelled":
-            raise file_error(self.folder, "holds synthetic people; items are of datasets that lidarpose prepare wrote")
+        if split is not None and self.card.people != "labelled":
+            raise file_error(self.folder, f"holds synthetic people, which have no split {split!r}: leave it out")
         none = True
         for row in self.rows():
             if split is None or row["split"] == split:
                 none = False
-                yield self.item(row)
+                yield self.sample(row)
         if none and split is not None:
             raise file_error(self.folder, f"has nobody in the split {split!r}; prepare says which splits it has")
 
-    def item(self, row: dict[str, Any]) -> Item:
-        """The item of a row of "labelled". Raises InputError for a row that is none."""
+    # the name until 0.2
+    items = samples
+
+    def sample(self, row: dict[str, Any]) -> LabeledSample:
+        """The sample of a row of people. Raises InputError for a row that is none."""
         try:
-            return item_of(row, self.card.skeleton)
+            return sample_of(row, self.card.skeleton, self.card.settings.get("what", "people"))
         except (ValueError, TypeError, AttributeError, KeyError) as error:
-            raise self._no_sample(row, error) from None
-
-    def _no_sample(self, row: dict[str, Any], error: Exception) -> InputError:
-        return file_error(self.folder, f"row {row['index']} is no sample ({error}); write it again")
+            raise file_error(self.folder, f"row {row['index']} is no sample ({error}); write it again") from None
 
 
-def open_dataset(folder: str | Path) -> Dataset:
+def open_dataset(folder: str | Path) -> DatasetReader:
     """A dataset that `lidarpose synth` or `prepare` wrote. Raises InputError for none, MissingExtra without pyarrow."""
     pyarrow()
-    return Dataset(folder=Path(folder), card=read_card(folder))
+    return DatasetReader(folder=Path(folder), card=read_card(folder))
 
 
-def check_settings(folder: str | Path, found: Card, wanted: Card) -> None:
+def check_settings(folder: str | Path, found: DatasetCard, wanted: DatasetCard) -> None:
     """Raises InputError that names the settings in which a dataset differs from what is wanted."""
     old, new = (
         {"count": c.count, "per_shard": c.per_shard, "version": c.version, **c.settings} for c in (found, wanted)

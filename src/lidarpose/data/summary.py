@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.data.readers.base import HIDDEN, SEEN, UNLABELED
-from lidarpose.data.shards import Dataset, read_rows, shard_path
+from lidarpose.data.shards import DatasetReader, read_rows, shard_path
 from lidarpose.data.splits import SplitRule
+from lidarpose.sample import HIDDEN, SEEN, UNLABELED
 from lidarpose.skeleton import skeleton
 
 _COLUMNS = ("sequence", "frame", "split", "source", "joints", "joint_labels", "center")
@@ -18,7 +18,7 @@ _FAR = 1.0
 
 
 def summarize(
-    dataset: Dataset, *, parts: list[str], absent: dict[str, list[str]], rule: SplitRule | None
+    dataset: DatasetReader, *, parts: list[str], absent: dict[str, list[str]], rule: SplitRule | None
 ) -> dict[str, Any]:
     """The summary of `prepare`: counts, and warnings of what looks wrong. absent: split -> sequences not there."""
     labels, splits, sources, reasons = Counter(), Counter(), Counter(), Counter()

@@ -18,7 +18,7 @@ from contextlib import closing, suppress
 from pathlib import Path
 
 from lidarpose.data.schema import TABLES
-from lidarpose.data.shards import CARD, Card, check_settings, read_card, rows_of_shard, shard_path
+from lidarpose.data.shards import CARD, DatasetCard, check_settings, read_card, rows_of_shard, shard_path
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
 
@@ -33,7 +33,7 @@ _STALE = 600.0
 _LEFT = re.compile(rf"\.(\d+)-\d+-(?:(?:{'|'.join(TABLES)})-\d{{5}}\.parquet|{re.escape(CARD)})")
 
 
-def open_folder(folder: Path, card: Card, rows: Mapping[str, int] | None = None) -> list[int]:
+def open_folder(folder: Path, card: DatasetCard, rows: Mapping[str, int] | None = None) -> list[int]:
     """The numbers of the shards that are missing, damaged or, by `rows`, not whole.
 
     rows: by table, how many rows each one of `card.count` has, where that is known. Raises InputError unless the folder
@@ -48,7 +48,7 @@ def open_folder(folder: Path, card: Card, rows: Mapping[str, int] | None = None)
     return [shard for shard in range(card.shards) if not _is_whole(folder, card, shard, rows or {})]
 
 
-def _is_whole(folder: Path, card: Card, shard: int, rows: Mapping[str, int]) -> bool:
+def _is_whole(folder: Path, card: DatasetCard, shard: int, rows: Mapping[str, int]) -> bool:
     for table in card.tables:
         found = rows_of_shard(shard_path(folder, table, shard))
         if found is None or table in rows and found != rows[table] * card.size(shard):

@@ -21,11 +21,10 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.synthetic_info import is_plain
 from lidarpose.errors import missing_extra
 from lidarpose.geometry import rotation_about
 from lidarpose.io.files import file_error, read_bytes
-from lidarpose.sample import center_of
+from lidarpose.sample import center_of, is_plain
 from lidarpose.skeleton import BODY26
 
 NAME = "lidarpose-bench-1"

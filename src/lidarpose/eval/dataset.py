@@ -8,13 +8,11 @@ from typing import Protocol
 
 import numpy as np
 
-from lidarpose.data.readers.base import HIDDEN, SEEN, UNLABELED
-from lidarpose.data.shards import Dataset, open_dataset, read_rows, rows_of_shard, shard_path
-from lidarpose.data.synthetic_info import is_plain
+from lidarpose.data.shards import DatasetReader, open_dataset, read_rows, rows_of_shard, shard_path
 from lidarpose.errors import InputError, whole
 from lidarpose.eval.bench import NAME, PLAIN_POINTS, Bench, load_bench, plain
 from lidarpose.io.files import file_error
-from lidarpose.sample import Box
+from lidarpose.sample import HIDDEN, SEEN, UNLABELED, Box, is_plain
 from lidarpose.skeleton import BODY26, HUMAN15, Skeleton, skeleton
 
 # the word for the set that ships with the package
@@ -116,7 +114,7 @@ def spread(total: int, limit: int | None) -> np.ndarray:
 class FolderPeople:
     """A folder of shards. wanted: shard -> its rows to judge; damaged: what could not even be opened. See `People`."""
 
-    dataset: Dataset
+    dataset: DatasetReader
     name: str
     kind: str
     skeleton: Skeleton
@@ -209,7 +207,7 @@ class FolderPeople:
                     note(self.skipped, "rows that are no sample", f"{path.name}, row {k}: {error}")
 
     def _labelled(self, shard: int, k: int, row: dict) -> Person:
-        item = self.dataset.item(row)
+        item = self.dataset.sample(row)
         known = row["distance"] is not None
         return Person(
             shard=shard,
@@ -253,7 +251,7 @@ class FolderPeople:
         )
 
 
-def _splits(dataset: Dataset, damaged: dict[str, dict]) -> dict[int, list[str | None]]:
+def _splits(dataset: DatasetReader, damaged: dict[str, dict]) -> dict[int, list[str | None]]:
     """Shard -> the split of each row. Damaged shards are left out and counted; raises InputError for a missing one."""
     table, found = dataset.card.people, {}
     for shard in range(dataset.card.shards):

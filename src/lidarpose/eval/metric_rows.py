@@ -10,7 +10,6 @@ from functools import cached_property
 
 import numpy as np
 
-from lidarpose.data.readers.base import SEEN
 from lidarpose.errors import InputError
 from lidarpose.eval.dataset import hidden_share
 from lidarpose.eval.metrics.aggregate import mean
@@ -21,7 +20,7 @@ from lidarpose.eval.metrics.joint_errors import acceleration_errors, aligned_err
 from lidarpose.eval.metrics.keypoints import PCK_THRESHOLDS, box_hits, oks, oks_hits, oks_sigmas, pem
 from lidarpose.eval.predictions import Judged
 from lidarpose.eval.scores import RELEASED, Line, Setting, number
-from lidarpose.sample import HIT
+from lidarpose.sample import HIT, SEEN
 
 # people of fewer points do not tell where they face
 PLENTY = 100

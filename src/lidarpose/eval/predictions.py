@@ -26,10 +26,10 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.base import UNLABELED
 from lidarpose.data.schema import pyarrow
 from lidarpose.eval.metrics.joint_errors import joint_errors
 from lidarpose.io.files import file_error, read_bytes
+from lidarpose.sample import UNLABELED
 from lidarpose.skeleton import Skeleton
 
 # key of the joints' names in the file's metadata

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.data.readers.base import SEEN
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.eval.dataset import BENCH, Person, spread
 from lidarpose.eval.metrics.aggregate import mean
@@ -21,7 +20,7 @@ from lidarpose.eval.perturb import DISTURBANCES
 from lidarpose.eval.predictions import Judged, gathered
 from lidarpose.eval.run import Task
 from lidarpose.eval.scores import Setting, number
-from lidarpose.sample import Box
+from lidarpose.sample import SEEN, Box
 from lidarpose.skeleton import BODY26
 
 SCHEMA = "lidarpose.stability/1"

@@ -7,7 +7,6 @@ from typing import Any, Protocol
 import numpy as np
 
 from lidarpose.data.dapt_crops import released_box
-from lidarpose.data.readers.base import UNLABELED
 from lidarpose.errors import InputError, whole
 from lidarpose.eval.bench import floors
 from lidarpose.eval.dataset import BENCH, BenchPeople, People, Person, note
@@ -17,7 +16,7 @@ from lidarpose.eval.predictions import Judged, gathered, subset
 from lidarpose.eval.protocols import RELEASED, centring, check_protocol, crop, cropped, detector_box, released_center
 from lidarpose.eval.scores import Line, Result, Setting
 from lidarpose.models.header import runs_of
-from lidarpose.sample import Box
+from lidarpose.sample import UNLABELED, Box
 from lidarpose.skeleton import BODY26, Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
 

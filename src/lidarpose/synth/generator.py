@@ -10,11 +10,11 @@ from functools import cached_property, lru_cache, partial
 
 import numpy as np
 
-from lidarpose.data.synthetic_info import Facts, facts_of
+from lidarpose.data.synthetic_info import person_info
 from lidarpose.errors import InputError, whole
 from lidarpose.lidar.presets import sensor
 from lidarpose.lidar.ray_pattern import RayPattern
-from lidarpose.sample import Pose, Sample
+from lidarpose.sample import PersonInfo, Pose, Sample
 from lidarpose.skeleton import BODY26
 from lidarpose.synth import noise
 from lidarpose.synth.bodies import Bodies, Body, PoseBank, draw_bodies, draw_moving_body
@@ -40,7 +40,7 @@ class SyntheticPerson:
     """A sample with its true pose (body26, the level frame at the sensor) and parts, and the facts if asked for."""
 
     sample: Sample
-    facts: Facts | None
+    facts: PersonInfo | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,9 +208,9 @@ def _crop(scene: Scene, body: Body, frame: int, scan: Scan, rng: np.random.Gener
     )
 
 
-def _measure(sample: Sample, scene: Scene, body: Body, frame: int) -> Facts:
+def _measure(sample: Sample, scene: Scene, body: Body, frame: int) -> PersonInfo:
     low, high = body.extent[frame]
-    return facts_of(
+    return person_info(
         sample,
         sensor=scene.sensor.name,
         kind=body.kind,

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from lidarpose.body.mocap import digest as motion_digest
-from lidarpose.data.shards import CARD, Card, person_row, shard_path, shard_writer, write_card
+from lidarpose.data.labeled import person_row
+from lidarpose.data.shards import CARD, DatasetCard, shard_path, shard_writer, write_card
 from lidarpose.data.writer import clean_folder, make_shards, open_folder
 from lidarpose.errors import InputError
 from lidarpose.io.files import content_digest, file_error
@@ -81,7 +82,7 @@ class Job:
         """Of the poses, how many are captured."""
         return 0.0 if self.motion is None else _CAPTURED if self.captured is None else self.captured
 
-    def card(self) -> Card:
+    def card(self) -> DatasetCard:
         """The dataset's card: all that decides its content."""
         sensors = self.sensors or scene_config(self.scene).sensors
         settings: dict[str, Any] = {
@@ -100,7 +101,7 @@ class Job:
             settings["captured"] = self.share
             settings["subjects"] = list(self.subjects) if self.subjects else None
         per_shard = self.per_shard or PER_SHARD[self.what]
-        return Card(settings=settings, count=self.count, per_shard=per_shard, tables=_TABLES[self.what])
+        return DatasetCard(settings=settings, count=self.count, per_shard=per_shard, tables=_TABLES[self.what])
 
 
 def write_dataset(
@@ -156,7 +157,7 @@ class Maker:
     streets as they are done. Written when the last one was yielded. May be pickled."""
 
     job: Job
-    card: Card
+    card: DatasetCard
     folder: Path
 
     def __getstate__(self) -> dict[str, Any]:

@@ -13,11 +13,10 @@ from lidarpose.errors import check_name
 from lidarpose.eval.protocols import jittered
 from lidarpose.geometry import rotation_about
 from lidarpose.models.voxelize import view_features
-from lidarpose.sample import Sample, center_of
+from lidarpose.sample import LabeledSample, Sample, center_of
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth.noise import half_space_keep, jitter, noise_clusters, random_keep
 from lidarpose.train.example import BLIND, PELVIS_ERROR, REFINED, Example, seen
-from lidarpose.train.labeled_dataset import StoredPerson
 
 # a person of fewer points after the crop is shown whole
 LEAST_POINTS = 5
@@ -25,7 +24,7 @@ LEAST_POINTS = 5
 _STRAYS = 60
 # of a synthetic person's, and steps on their coordinates, m
 _MOST_STRAYS, _NOISE = 200, (0.005, 0.08)
-_Somebody = TypeVar("_Somebody", Sample, StoredPerson)
+_Sample = TypeVar("_Sample", bound=Sample)
 _FLIP_PART = np.array([-1, 0, *(1 + np.array(SMPL24.flip))], np.int16)
 
 
@@ -67,13 +66,13 @@ def augmentation(name: str) -> Augmentation:
     return AUGMENTATIONS[name]
 
 
-def augmented(person: StoredPerson, kind: Augmentation, rng: np.random.Generator) -> Example:
+def augmented(person: LabeledSample, kind: Augmentation, rng: np.random.Generator) -> Example:
     """A stored person as a step of training shows them. Labels that are missing stay missing."""
     person, center = _view(person, kind, rng)
     origin = np.zeros(3) if person.sensor_known and rng.random() >= BLIND else None
     view = view_features(center, origin)
     points, joints, part = person.points - center, person.joints - center, person.part
-    visible = person.visible
+    visible = person.pose.visible
     R = _turn(kind, rng) * (1 + kind.scale * rng.uniform(-1, 1))
     mirrors = rng.random(2) < kind.flip
     R = np.diag([*np.where(mirrors, -1.0, 1.0), 1.0]) @ R
@@ -102,7 +101,7 @@ def augmented(person: StoredPerson, kind: Augmentation, rng: np.random.Generator
     )
 
 
-def disturbed(one: _Somebody, *, strays: float, noise: float, rng: np.random.Generator) -> _Somebody:
+def disturbed(one: _Sample, *, strays: float, noise: float, rng: np.random.Generator) -> _Sample:
     """A synthetic person whose points are worse than a sensor's: with probability `strays` blobs of stray points, which
     no box has cut, and with probability `noise` normal steps of 0.5 to 8 cm on every coordinate.
 
@@ -121,11 +120,10 @@ def disturbed(one: _Somebody, *, strays: float, noise: float, rng: np.random.Gen
     if points is one.points:
         return one
     # strays come from no ring
-    rest = {"ring": None} if isinstance(one, Sample) else {}
-    return replace(one, points=points, part=part, center=center_of(points), **rest)
+    return replace(one, points=points, part=part, ring=None, center=center_of(points))
 
 
-def _view(person: StoredPerson, kind: Augmentation, rng: np.random.Generator) -> tuple[StoredPerson, np.ndarray]:
+def _view(person: LabeledSample, kind: Augmentation, rng: np.random.Generator) -> tuple[LabeledSample, np.ndarray]:
     """The person's crop and its center (3,) m."""
     if kind.released:
         kept, center = released_view(person.points, person.joints, person.centers, person.box)
@@ -143,16 +141,17 @@ def _view(person: StoredPerson, kind: Augmentation, rng: np.random.Generator) ->
     return person, center
 
 
-def _kept(person: StoredPerson, keep: np.ndarray) -> StoredPerson:
+def _kept(person: LabeledSample, keep: np.ndarray) -> LabeledSample:
     if keep.all() or keep.sum() < LEAST_POINTS:
         return person
     # a joint whose points are all gone is not seen any more
     gone = _near(person, np.ones_like(keep)) & ~_near(person, keep)
-    visible = np.where(gone & (person.visible == 1), np.float32(0), person.visible)
-    return replace(person, points=person.points[keep], part=person.part[keep], visible=visible)
+    visible = np.where(gone & (person.pose.visible == 1), np.float32(0), person.pose.visible)
+    pose = replace(person.pose, visible=visible)
+    return replace(person, points=person.points[keep], part=person.part[keep], pose=pose)
 
 
-def _near(person: StoredPerson, keep: np.ndarray) -> np.ndarray:
+def _near(person: LabeledSample, keep: np.ndarray) -> np.ndarray:
     """(26,) bool: some point of the body, or of which nothing is known, lies near the joint; keep (n,): which count."""
     return seen(person.joints, person.points[keep & (person.part != 0)])
 

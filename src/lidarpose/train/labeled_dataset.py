@@ -1,6 +1,6 @@
-"""People of datasets in memory, in one frame each, joints by the names of body26.
+"""Datasets in memory, joints by the names of body26.
 
-Legend: N people, M points of all of them.
+Legend: N samples, M points of all of them.
 """
 
 from collections.abc import Iterator, Sequence
@@ -9,37 +9,24 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.base import HIDDEN, SEEN
 from lidarpose.data.schema import CENTERS
-from lidarpose.data.shards import Dataset, open_dataset, shard_path
+from lidarpose.data.shards import DatasetReader, open_dataset, shard_path
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error, listed
-from lidarpose.sample import Box
-from lidarpose.skeleton import BODY26, skeleton
+from lidarpose.sample import HIDDEN, SEEN, UNLABELED, Box, LabeledSample, Pose
+from lidarpose.skeleton import BODY26
 from lidarpose.train.example import UNKNOWN_PART, seen
 
 
 @dataclass(frozen=True, kw_only=True)
-class StoredPerson:
-    """One stored person, sensor's frame. points (n, 3) m; part (n,) int16, -1 unknown; joints (26, 3) m, NaN without
-    a label; visible (26,) 1, 0 or NaN; center (3,) m from the points; centers: others by name, as in `Item`; box or
-    None; sensor_known: whether the frame's origin is the sensor."""
+class InMemoryDataset:
+    """Labeled samples of one or more datasets, each with the joints of body26.
 
-    points: np.ndarray
-    part: np.ndarray
-    joints: np.ndarray
-    visible: np.ndarray
-    center: np.ndarray
-    centers: dict[str, np.ndarray]
-    box: Box | None
-    sensor_known: bool
-
-
-@dataclass(frozen=True, kw_only=True)
-class Crowd:
-    """Everybody. start, end (N,): where a person's points begin and end; visible (N, 26): as in `StoredPerson`;
-    centers: (N, 3) m by name, NaN for none; box (N, 7), NaN for none; sequence (N,): numbers of `sequences`; dataset:
-    name of the first one, "" if synthetic; damaged: what could not be read; the rest as in `StoredPerson`."""
+    points (M, 3) float32 m; part (M,) int16, -1 unknown; start, end (N,): where a sample's points begin and end; joints
+    (N, 26, 3) m, NaN without a label; visible (N, 26): 1 seen, 0 hidden, NaN unknown; center (N, 3) m; centers: by name
+    (N, 3) m, NaN for none; box (N, 7), NaN for none; sensor_known (N,); sequence (N,): of `sequences`; skeleton:
+    name of the datasets'; dataset: name of the first one, "" if synthetic; damaged: shards that cannot be read.
+    """
 
     points: np.ndarray
     part: np.ndarray
@@ -57,25 +44,82 @@ class Crowd:
     dataset: str
     damaged: tuple[str, ...]
 
+    @classmethod
+    def load(cls, folders: Sequence[str | Path], *, split: str | None = None, interval: int = 1) -> "InMemoryDataset":
+        """All samples with points and a label of datasets that `lidarpose prepare` or `synth` wrote.
+
+        split: of real datasets, None for all; interval: only every so many of a person's frames in a sequence, as
+        published recipes thin out. A shard that is damaged is left out and named in `damaged`.
+        Raises InputError where no sample is left, for a folder that is no dataset, and for different skeletons.
+        """
+        folders = [Path(folder) for folder in listed(folders)]
+        samples: list[LabeledSample] = []
+        damaged: list[str] = []
+        skeletons = {}
+        for folder in folders:
+            dataset = open_dataset(folder)
+            skeletons[dataset.card.skeleton] = folder
+            if split is not None and dataset.card.people != "labelled":
+                raise file_error(folder, f"holds synthetic people, which have no split {split!r}: say --split all")
+            own = [_to_body26(sample) for sample in _thinned(_samples(dataset, split, damaged), interval)]
+            if not any((sample.pose.visible == 0).any() for sample in own):
+                # a dataset that never says hidden tells nothing of what is seen
+                unknown = np.full(len(BODY26), np.nan, np.float32)
+                own = [replace(sample, pose=replace(sample.pose, visible=unknown)) for sample in own]
+            samples += (sample for sample in own if sample.joint_labels.any())
+        if len(skeletons) > 1:
+            raise InputError(
+                f"datasets that are learned together need one skeleton, got {', '.join(sorted(skeletons))}"
+            )
+        if not samples:
+            where = ", ".join(map(str, folders))
+            why = f" ({len(damaged)} shards cannot be read: {damaged[0]})" if damaged else ""
+            what = "labelled people" if split is None else f"labelled people in the split {split!r}"
+            raise InputError(f"{where}: expected {what}, found none{why}; lidarpose prepare says what is there")
+        names = sorted({sample.sequence for sample in samples})
+        number = {name: k for k, name in enumerate(names)}
+        counts = np.array([len(sample.points) for sample in samples])
+        ends = counts.cumsum()
+        nowhere = np.full(3, np.nan)
+        return cls(
+            points=np.concatenate([sample.points for sample in samples]),
+            part=np.concatenate([sample.part for sample in samples]),
+            start=ends - counts,
+            end=ends,
+            joints=np.stack([sample.joints for sample in samples]),
+            visible=np.stack([sample.pose.visible for sample in samples]),
+            center=np.stack([sample.center for sample in samples]),
+            centers={name: np.stack([s.centers.get(name, nowhere) for s in samples]) for name in CENTERS},
+            box=np.stack([_box_row(sample.box) for sample in samples]),
+            sensor_known=np.array([sample.sensor_known for sample in samples]),
+            sequence=np.array([number[sample.sequence] for sample in samples]),
+            sequences=tuple(names),
+            skeleton=next(iter(skeletons)),
+            dataset=str(open_dataset(folders[0]).card.settings.get("dataset", "")),
+            damaged=tuple(damaged),
+        )
+
     def __len__(self) -> int:
         return len(self.center)
 
-    def person(self, row: int) -> StoredPerson:
+    def sample(self, row: int) -> LabeledSample:
+        """A sample in the sensor's frame; its pose says which joints are visible: 1, 0 or NaN where unknown."""
         own = slice(self.start[row], self.end[row])
-        box = self.box[row]
-        return StoredPerson(
+        joints, box = self.joints[row], self.box[row]
+        return LabeledSample(
             points=self.points[own],
             part=self.part[own],
-            joints=self.joints[row],
-            visible=self.visible[row],
             center=self.center[row],
+            pose=Pose(joints=joints, visible=self.visible[row], skeleton=BODY26, frame="sensor"),
+            joint_labels=_joint_labels(joints, self.visible[row]),
             centers={name: at[row] for name, at in self.centers.items() if not np.isnan(at[row]).any()},
             box=None if np.isnan(box).any() else Box(center=box[:3], size=box[3:6], yaw=float(box[6])),
             sensor_known=bool(self.sensor_known[row]),
+            sequence=self.sequences[self.sequence[row]],
         )
 
-    def without(self, sequences: Sequence[str]) -> "Crowd":
-        """Everybody but those of some sequences; the points are shared."""
+    def without(self, sequences: Sequence[str]) -> "InMemoryDataset":
+        """The samples that are not of some sequences; the points are shared."""
         left = [name for name in self.sequences if name not in sequences]
         number = np.array([left.index(name) if name in left else -1 for name in self.sequences], int)
         rows = np.flatnonzero(number[self.sequence] >= 0)
@@ -89,67 +133,9 @@ class Crowd:
         )
 
 
-def crowd_of(folders: Sequence[str | Path], *, split: str | None = None, interval: int = 1) -> Crowd:
-    """Everybody with points and a label in datasets that `lidarpose prepare` or `synth` wrote.
-
-    split: of real datasets, None for all; interval: only every so many of a person's frames in a sequence, as published
-    recipes thin out. A shard that is damaged is left out and named in `damaged`.
-    Raises InputError where nobody is left, for a folder that is no dataset, and for datasets of different skeletons.
-    """
-    folders = [Path(folder) for folder in listed(folders)]
-    rows: list[dict] = []
-    damaged: list[str] = []
-    skeletons = {}
-    for folder in folders:
-        dataset = open_dataset(folder)
-        skeletons[dataset.card.skeleton] = folder
-        if split is not None and dataset.card.people != "labelled":
-            raise file_error(folder, f"holds synthetic people, which have no split {split!r}: say --split all")
-        frames: dict[tuple, int] = {}
-        first = len(rows)
-        for row in _rows(dataset, damaged):
-            if split is not None and row["split"] != split:
-                continue
-            # frames are numbered by anything, time stamps too; a synthetic clip has a number instead of a sequence
-            whose = row.get("sequence", row["index"]), row["track"]
-            frames[whose] = frames.get(whose, -1) + 1
-            if frames[whose] % interval == 0 and len(row["points"]):
-                rows.append(_kept(row, dataset))
-        if not any((row["visible"] == 0).any() for row in rows[first:]):
-            # a dataset that never says hidden tells nothing of what is seen
-            for row in rows[first:]:
-                row["visible"] = np.full_like(row["visible"], np.nan)
-    if len(skeletons) > 1:
-        raise InputError(f"datasets that are learned together need one skeleton, got {', '.join(sorted(skeletons))}")
-    rows = [row for row in rows if not np.isnan(row["joints"]).all()]
-    if not rows:
-        where = ", ".join(map(str, folders))
-        told = f" ({len(damaged)} shards cannot be read: {damaged[0]})" if damaged else ""
-        what = "labelled people" if split is None else f"labelled people in the split {split!r}"
-        raise InputError(f"{where}: expected {what}, found none{told}; lidarpose prepare says what is there")
-    names = sorted({row["sequence"] for row in rows})
-    number = {name: k for k, name in enumerate(names)}
-    counts = np.array([len(row["points"]) for row in rows])
-    ends = counts.cumsum()
-    stacked = ("joints", "visible", "center", "box", "sensor_known")
-    return Crowd(
-        points=np.concatenate([row["points"] for row in rows]),
-        part=np.concatenate([row["part"] for row in rows]),
-        start=ends - counts,
-        end=ends,
-        sequence=np.array([number[row["sequence"]] for row in rows]),
-        sequences=tuple(names),
-        skeleton=next(iter(skeletons)),
-        dataset=str(open_dataset(folders[0]).card.settings.get("dataset", "")),
-        damaged=tuple(damaged),
-        centers={name: np.stack([row["centers"][name] for row in rows]) for name in CENTERS},
-        **{name: np.stack([row[name] for row in rows]) for name in stacked},
-    )
-
-
-def _rows(dataset: Dataset, damaged: list[str]) -> Iterator[dict]:
-    """The rows of people, shard by shard, but for shards that are damaged. Raises InputError where one is missing: the
-    dataset is not finished."""
+def _samples(dataset: DatasetReader, split: str | None, damaged: list[str]) -> Iterator[LabeledSample]:
+    """The samples of a split, shard by shard, but for shards that are damaged. Raises InputError where one is missing:
+    the dataset is not finished."""
     for shard in range(dataset.card.shards):
         there = shard_path(dataset.folder, dataset.card.people, shard).is_file()
         try:
@@ -159,40 +145,47 @@ def _rows(dataset: Dataset, damaged: list[str]) -> Iterator[dict]:
                 raise
             damaged.append(str(error))
         else:
-            yield from rows
+            yield from (dataset.sample(row) for row in rows if split is None or row["split"] == split)
 
 
-def _kept(row: dict, dataset: Dataset) -> dict:
-    of = skeleton(dataset.card.skeleton)
-    place = [BODY26.index(joint) for joint in of.joints]
+def _thinned(samples: Iterator[LabeledSample], interval: int) -> Iterator[LabeledSample]:
+    """Those with points of every `interval`th frame of a person, however frames are numbered: time stamps too."""
+    frames: dict[tuple[str, str], int] = {}
+    for sample in samples:
+        person = sample.sequence, sample.track
+        frames[person] = frames.get(person, -1) + 1
+        if frames[person] % interval == 0 and len(sample.points):
+            yield sample
+
+
+def _to_body26(sample: LabeledSample) -> LabeledSample:
+    """The sample with body26's joints, NaN where its skeleton lacks them, and their visibility."""
+    columns = [BODY26.index(joint) for joint in sample.skeleton.joints]
     joints = np.full((len(BODY26), 3), np.nan, np.float32)
     visible = np.full(len(BODY26), np.nan, np.float32)
-    real = "joint_labels" in row
-    try:
-        joints[place] = row["joints"].reshape(-1, 3)
-        if real:
-            visible[place] = np.select([row["joint_labels"] == SEEN, row["joint_labels"] == HIDDEN], [1.0, 0.0], np.nan)
-    except (ValueError, AttributeError) as error:
-        problem = f"row {row['index']} has not the {len(of)} joints of its card ({error}); write it again"
-        raise file_error(dataset.folder, problem) from None
-    points = row["points"].reshape(-1, 3)
-    part = np.full(len(points), UNKNOWN_PART, np.int16) if row["part"] is None else row["part"].astype(np.int16)
-    if not real and row["part"] is not None:
+    joints[columns] = sample.joints
+    part = np.full(len(sample.points), UNKNOWN_PART, np.int16) if sample.part is None else sample.part.astype(np.int16)
+    if sample.info is None:
+        visible[columns] = np.select([sample.joint_labels == SEEN, sample.joint_labels == HIDDEN], [1.0, 0.0], np.nan)
+    elif sample.part is not None:
         # parts tell it, as of people made meanwhile
-        visible[place] = seen(joints[place], points[part > 0])
-    nowhere = np.full(3, np.nan)
-    centers = {name: row.get(f"center_{name}") for name in CENTERS}
-    box = np.full(7, np.nan)
-    if row["box_center"] is not None:
-        box = np.array([*row["box_center"], *row["box_size"], row["box_yaw"]])
-    return {
-        "points": points,
-        "part": part,
-        "joints": joints,
-        "visible": visible,
-        "center": np.asarray(row["center"], float),
-        "centers": {name: nowhere if at is None else np.asarray(at, float) for name, at in centers.items()},
-        "box": box,
-        "sensor_known": not real or row["distance"] is not None,
-        "sequence": f"{row['sequence']}" if real else "",
-    }
+        visible[columns] = seen(joints[columns], sample.points[part > 0])
+    return replace(
+        sample,
+        part=part,
+        ring=None,
+        pose=Pose(joints=joints, visible=visible, skeleton=BODY26, frame="sensor"),
+        joint_labels=_joint_labels(joints, visible),
+        sequence=sample.sequence if sample.info is None else "",
+    )
+
+
+def _joint_labels(joints: np.ndarray, visible: np.ndarray) -> np.ndarray:
+    """(26,) uint8; a joint of which nothing says whether it is visible counts as seen."""
+    labels = np.where(visible == 0, HIDDEN, SEEN)
+    return np.where(np.isnan(joints).any(-1), UNLABELED, labels).astype(np.uint8)
+
+
+def _box_row(box: Box | None) -> np.ndarray:
+    """(7,): center, size, yaw; NaN for no box."""
+    return np.full(7, np.nan) if box is None else np.array([*box.center, *box.size, box.yaw])

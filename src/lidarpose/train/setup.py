@@ -20,7 +20,7 @@ from lidarpose.models.posenet import PoseNet
 from lidarpose.skeleton import HUMAN15, SMPL24, Skeleton, skeleton
 from lidarpose.train.augment import Augmentation, augmentation, augmented
 from lidarpose.train.example import Example
-from lidarpose.train.labeled_dataset import Crowd, crowd_of
+from lidarpose.train.labeled_dataset import InMemoryDataset
 from lidarpose.train.objective import Task
 from lidarpose.train.posenet_objective import PoseTask
 from lidarpose.train.recipes import PAPER, SMALL_PAPER, Finetune, Pretrain, Recipe
@@ -73,10 +73,10 @@ def _pretraining(recipe: Pretrain) -> Job:
     warnings: tuple[str, ...] = ()
     if recipe.shards:
         _check_no_test(recipe.shards)
-        crowd = crowd_of(recipe.shards)
+        dataset = InMemoryDataset.load(recipe.shards)
         worse = {"strays": recipe.strays, "noise": recipe.noise}
-        source = StoredSource(crowd=crowd, seed=recipe.seed, augmentation=Augmentation(turn=1.0, flip=0.5), **worse)
-        warnings = _about(crowd)
+        source = StoredSource(dataset=dataset, seed=recipe.seed, augmentation=Augmentation(turn=1.0, flip=0.5), **worse)
+        warnings = _about(dataset)
     else:
         source = SyntheticSource(seed=recipe.seed, easy=recipe.easy * recipe.people, **scene)
 
@@ -128,12 +128,12 @@ def _grown(init: str, config: NetworkConfig) -> tuple[Callable[[], nn.Module], d
     return partial(grown, smaller, config), header.card
 
 
-def _about(crowd: Crowd) -> tuple[str, ...]:
+def _about(dataset: InMemoryDataset) -> tuple[str, ...]:
     """What is left out of a dataset, in a line."""
-    if not crowd.damaged:
+    if not dataset.damaged:
         return ()
-    first, more = crowd.damaged[0], len(crowd.damaged) - 1
-    return (f"left out {len(crowd.damaged)} damaged shards: {first}" + (f", and {more} more" if more else ""),)
+    first, more = dataset.damaged[0], len(dataset.damaged) - 1
+    return (f"left out {len(dataset.damaged)} damaged shards: {first}" + (f", and {more} more" if more else ""),)
 
 
 def _finetuning(recipe: Finetune) -> Job:
@@ -144,28 +144,28 @@ def _finetuning(recipe: Finetune) -> Job:
     network, header = load_checkpoint(path)
     split = None if recipe.split == "all" else recipe.split
     kind = augmentation(recipe.augment)
-    everybody = crowd_of(recipe.data, split=split, interval=recipe.interval)
+    everybody = InMemoryDataset.load(recipe.data, split=split, interval=recipe.interval)
     held_out, watched = _held_out(recipe, split, everybody)
-    crowd = everybody.without(held_out)
-    people = StoredSource(crowd=crowd, seed=recipe.seed, augmentation=kind)
+    dataset = everybody.without(held_out)
+    people = StoredSource(dataset=dataset, seed=recipe.seed, augmentation=kind)
     source: Source = people
     if recipe.mix:
         other = SyntheticSource(scene=recipe.scene, seed=recipe.seed)
         source = MixedSource(main=people, other=other, share=recipe.mix)
-    joints = skeleton(crowd.skeleton)
-    task, begun = _begun(recipe, network, header, joints, crowd.dataset)
+    joints = skeleton(dataset.skeleton)
+    task, begun = _begun(recipe, network, header, joints, dataset.dataset)
 
     def validation() -> list[Example]:
         # a box with a detector's errors where people have one, centered on the points
         quiet = Augmentation(released=kind.released, box=kind.box, refined=0.0)
         rows = np.unique(np.linspace(0, len(watched) - 1, min(VALIDATION, len(watched))).astype(int)) if watched else ()
-        return [augmented(watched.person(k), quiet, np.random.default_rng([recipe.seed, k])) for k in rows]
+        return [augmented(watched.sample(k), quiet, np.random.default_rng([recipe.seed, k])) for k in rows]
 
     return Job(
         task=task,
         source=source,
         # those that are mixed in come on top
-        people=max(round(recipe.epochs * len(crowd) / (1 - recipe.mix)), 1),
+        people=max(round(recipe.epochs * len(dataset) / (1 - recipe.mix)), 1),
         network=begun,
         validation=validation,
         joints=joints,
@@ -174,18 +174,20 @@ def _finetuning(recipe: Finetune) -> Job:
             "init_card": header.card,
             "data": folder_names(recipe.data),
             "held_out_sequences": list(held_out),
-            "damaged": list(crowd.damaged),
+            "damaged": list(dataset.damaged),
         },
-        warnings=_about(crowd) + (() if watched else (_UNWATCHED,)),
+        warnings=_about(dataset) + (() if watched else (_UNWATCHED,)),
     )
 
 
-def _held_out(recipe: Finetune, split: str | None, everybody: Crowd) -> tuple[tuple[str, ...], Crowd | None]:
+def _held_out(
+    recipe: Finetune, split: str | None, everybody: InMemoryDataset
+) -> tuple[tuple[str, ...], InMemoryDataset | None]:
     """Sequences not to learn from, and whom to validate on: the split val where there is one, else those sequences."""
     if split not in (None, "val"):
         # there may be no such split
         with suppress(InputError):
-            return (), crowd_of(recipe.data, split="val", interval=recipe.interval)
+            return (), InMemoryDataset.load(recipe.data, split="val", interval=recipe.interval)
     if not recipe.hold_out or len(everybody.sequences) < _LEAST_SEQUENCES:
         return (), None
     number = max(round(recipe.hold_out * len(everybody.sequences)), 1)

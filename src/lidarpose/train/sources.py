@@ -15,7 +15,7 @@ from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
 from lidarpose.train.augment import Augmentation, augmented, disturbed
 from lidarpose.train.example import REFINED, Example, example
-from lidarpose.train.labeled_dataset import Crowd
+from lidarpose.train.labeled_dataset import InMemoryDataset
 
 # scenes whose every person is as the paper says, masked always
 _OF_ONE_DIFFICULTY = ("paper", "reference")
@@ -76,20 +76,20 @@ class SyntheticSource:
 class StoredSource:
     """The people of datasets, all of them once an epoch in an order of the epoch's own, each time augmented anew.
 
-    crowd: see `crowd.crowd_of`; strays, noise: see `disturbed`.
+    dataset: see `InMemoryDataset.load`; strays, noise: see `disturbed`.
     """
 
-    crowd: Crowd
+    dataset: InMemoryDataset
     seed: int
     augmentation: Augmentation
     strays: float = 0.0
     noise: float = 0.0
 
     def example(self, index: int) -> Example:
-        epoch, place = divmod(index, len(self.crowd))
-        row = int(_order(self.seed, epoch, len(self.crowd))[place])
+        epoch, place = divmod(index, len(self.dataset))
+        row = int(_order(self.seed, epoch, len(self.dataset))[place])
         rng = np.random.default_rng([self.seed, _STORED, index])
-        person = self.crowd.person(row)
+        person = self.dataset.sample(row)
         if self.strays or self.noise:
             person = disturbed(person, strays=self.strays, noise=self.noise, rng=rng)
         return augmented(person, self.augmentation, rng)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from torch.utils.data import IterableDataset, get_worker_info
 
-from lidarpose.data.shards import Dataset, open_dataset
+from lidarpose.data.shards import DatasetReader, open_dataset
 from lidarpose.errors import InputError
 from lidarpose.sample import Sample
 from lidarpose.synth.bodies import PoseBank
@@ -70,7 +70,7 @@ class ShardPeople(IterableDataset):
 
     folder: str | Path
     batch: int = 1
-    dataset: Dataset = field(init=False, repr=False)
+    dataset: DatasetReader = field(init=False, repr=False)
 
     def __post_init__(self):
         _check_batch(self.batch)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.shards import CARD, Dataset, counted, open_dataset, shard_path
+from lidarpose.data.shards import CARD, DatasetReader, counted, open_dataset, shard_path
 from lidarpose.errors import InputError
 from lidarpose.io.files import check_apart, file_error
 from lidarpose.viz.draw import MAX_PEOPLE, Panel, draw_people
@@ -39,12 +39,12 @@ def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out
     return path
 
 
-def _written(dataset: Dataset) -> list[int]:
+def _written(dataset: DatasetReader) -> list[int]:
     """Numbers of the shards of people that are there."""
     return [k for k in range(dataset.card.shards) if shard_path(dataset.folder, dataset.card.people, k).is_file()]
 
 
-def _spread(dataset: Dataset, count: int) -> list[dict]:
+def _spread(dataset: DatasetReader, count: int) -> list[dict]:
     """`count` rows, evenly spread over the shards that are there; of a smaller dataset all rows."""
     there = _written(dataset)
     if not there:
@@ -66,7 +66,7 @@ def _spread(dataset: Dataset, count: int) -> list[dict]:
     return rows
 
 
-def _label(row: dict, dataset: Dataset) -> str:
+def _label(row: dict, dataset: DatasetReader) -> str:
     """As "#12 os1-128"; of clips and streets with the frame and the track."""
     words = [f"#{row['index']}"]
     if dataset.card.settings.get("what") in ("clips", "streets"):
@@ -76,7 +76,7 @@ def _label(row: dict, dataset: Dataset) -> str:
     return " ".join([*words, row.get("sensor") or row["source"].rpartition("/")[2]])
 
 
-def _panel(row: dict, dataset: Dataset) -> Panel:
+def _panel(row: dict, dataset: DatasetReader) -> Panel:
     sample = dataset.sample(row)
     return Panel(
         points=sample.points,
@@ -87,7 +87,7 @@ def _panel(row: dict, dataset: Dataset) -> Panel:
     )
 
 
-def _card(row: dict, dataset: Dataset) -> ReportPerson:
+def _card(row: dict, dataset: DatasetReader) -> ReportPerson:
     sample = dataset.sample(row)
     caption = f"{len(sample.points):,} points"
     if row.get("distance") is not None:
@@ -98,7 +98,7 @@ def _card(row: dict, dataset: Dataset) -> ReportPerson:
     )
 
 
-def _line(row: dict, dataset: Dataset) -> dict:
+def _line(row: dict, dataset: DatasetReader) -> dict:
     line = {"person": _label(row, dataset), "points": len(row["points"]) // 3}
     # synthetic people have facts beside their distance
     if row.get("kind") is not None:

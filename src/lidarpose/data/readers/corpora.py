@@ -16,12 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.base import Item, Skipped
+from lidarpose.data.readers.base import Skipped
 from lidarpose.data.readers.raw_files import as_cloud, find_below, numbers, read_cloud, wrong_root
 from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_item
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
 from lidarpose.io.pickles import load_pickle
+from lidarpose.sample import LabeledSample
 from lidarpose.skeleton import SMPL24
 
 # points are this close to the nearest joint in the median where labels and clouds fit, m: a trunk is 0.2 m thick
@@ -35,6 +36,7 @@ class _Corpus(ABC):
     name = ""
     skeleton = SMPL24.name
     get = ""
+    about: dict
 
     def parts(self, root: Path) -> list[str]:
         """The pickles of the root. Raises InputError where there are none."""
@@ -44,7 +46,7 @@ class _Corpus(ABC):
             raise wrong_root(root, self.name, "a folder of its .pkl files", f"got {there}", self.get)
         return found
 
-    def read(self, root: Path, part: str) -> Iterator[Item | Skipped]:
+    def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         """Everybody in a file, in its order."""
         content = load_pickle(root / part)
         if not isinstance(content, list):
@@ -60,12 +62,14 @@ class _Corpus(ABC):
             yield from self._entry(root, entry, where, f"{part}/{sequence}", frame)
 
     @abstractmethod
-    def _entry(self, root: Path, entry: dict, where: str, sequence: str, frame: int) -> Iterator[Item | Skipped]:
+    def _entry(
+        self, root: Path, entry: dict, where: str, sequence: str, frame: int
+    ) -> Iterator[LabeledSample | Skipped]:
         """Everybody in an entry."""
 
     def _item(
         self, points: np.ndarray, joints: np.ndarray, where: str, sequence: str, frame: int, track: str, source: str
-    ) -> Item | Skipped:
+    ) -> LabeledSample | Skipped:
         if not len(points):
             return Skipped(reason="empty cloud", where=where)
         if _apart(points, joints) > _NEAR:
@@ -80,6 +84,7 @@ class _Corpus(ABC):
             time=frame / _FPS,
             source=source,
             centers={},
+            sensor_known=self.about.get("sensor_known", True),
         )
 
 
@@ -101,7 +106,9 @@ class Lipd(_Corpus):
         ],
     }
 
-    def _entry(self, root: Path, entry: dict, where: str, sequence: str, frame: int) -> Iterator[Item | Skipped]:
+    def _entry(
+        self, root: Path, entry: dict, where: str, sequence: str, frame: int
+    ) -> Iterator[LabeledSample | Skipped]:
         try:
             joints = numbers(where, entry["gt_joint"], (24, 3), "gt_joint")
             points = _points(root, entry["pc"], where)
@@ -141,7 +148,9 @@ class FreeMotion(_Corpus):
             ],
         }
 
-    def _entry(self, root: Path, entry: dict, where: str, sequence: str, frame: int) -> Iterator[Item | Skipped]:
+    def _entry(
+        self, root: Path, entry: dict, where: str, sequence: str, frame: int
+    ) -> Iterator[LabeledSample | Skipped]:
         try:
             pose = numbers(where, entry["gt"], (self._poses, 72), "gt")[self._which]
             betas = numbers(where, entry["shape"], (self._poses, 10), "shape")[self._which]

@@ -17,12 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.base import SEEN, UNLABELED, Item, Skipped
+from lidarpose.data.readers.base import Skipped
 from lidarpose.data.readers.raw_files import find_below, numbered, numbers, read_cloud, read_json, wrong_root
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
 from lidarpose.io.pickles import load_pickle
-from lidarpose.sample import Box, Pose, Sample, center_of
+from lidarpose.sample import SEEN, UNLABELED, Box, LabeledSample, Pose, center_of
 from lidarpose.skeleton import HUMAN15
 
 # frames a second of the fused clouds
@@ -94,11 +94,11 @@ class HumanM3:
                 if below.is_dir():
                     yield from self._folders(below, depth - 1)
 
-    def read(self, root: Path, part: str) -> Iterator[Item | Skipped]:
+    def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         """Everybody in a sequence by frame, or in a database in its order."""
         return self._read_database(root, part) if part.endswith(".pkl") else self._read_folder(root, part)
 
-    def _read_folder(self, root: Path, part: str) -> Iterator[Item | Skipped]:
+    def _read_folder(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         folder = root / part
         clouds = numbered(folder / "pointcloud", ".pcd")
         labels = numbered(folder / "pose_calib", ".json")
@@ -128,7 +128,7 @@ class HumanM3:
                     yield Skipped(reason="not 15 joints", where=str(error))
             yield from _people(clouds[frame][0], people, part, frame, (frame - first) / _FPS)
 
-    def _read_database(self, root: Path, part: str) -> Iterator[Item | Skipped]:
+    def _read_database(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         content = load_pickle(root / part)
         if not isinstance(content, dict) or not isinstance(content.get("db"), list):
             raise file_error(root / part, 'is not HumanM3\'s database: expected {"db": [...]}, made by its own code')
@@ -170,7 +170,7 @@ def _without_copies(info: list[dict], where: str) -> dict[str, np.ndarray]:
 
 def _people(
     path: Path, people: dict[str, np.ndarray], sequence: str, frame: int, time: float
-) -> Iterator[Item | Skipped]:
+) -> Iterator[LabeledSample | Skipped]:
     if not people:
         yield Skipped(reason="frame without people", where=f"{sequence}/{frame}")
         return
@@ -197,20 +197,18 @@ def _people(
             yield Skipped(reason="no points in the box", where=f"{frame_id}/{track}")
             continue
         points = points.astype(np.float32)
-        sample = Sample(
+        yield LabeledSample(
             points=points,
             center=center_of(points),
             pose=Pose(joints=joints.astype(np.float32), skeleton=HUMAN15, frame="sensor"),
             box=box,
             source="humanm3",
             frame_id=frame_id,
-        )
-        yield Item(
-            sample=sample,
             joint_labels=np.where(labeled, SEEN, UNLABELED).astype(np.uint8),
             sequence=sequence,
             frame=frame,
             track=track,
             time=time,
             centers={"joints_box": box.center},
+            sensor_known=False,
         )

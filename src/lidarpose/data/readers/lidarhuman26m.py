@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.base import Item, Skipped
+from lidarpose.data.readers.base import Skipped
 from lidarpose.data.readers.level import leveling
 from lidarpose.data.readers.raw_files import numbered, numbers, read_cloud, read_json, wrong_root
 from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_item
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
-from lidarpose.sample import within_reach
+from lidarpose.sample import LabeledSample, within_reach
 from lidarpose.skeleton import SMPL24
 
 # frames a second of the LiDAR
@@ -71,7 +71,7 @@ class LidarHuman26M:
             raise wrong_root(root, "LiDARHuman26M", _EXPECTED, f"got no sequence in {_POSE}", _GET)
         return sorted(names, key=lambda name: (int(name) if name.isdecimal() else -1, name))
 
-    def read(self, root: Path, part: str) -> Iterator[Item | Skipped]:
+    def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         """The person of a sequence, frame by frame."""
         poses, clouds = numbered(root / _POSE / part, ".json"), numbered(root / _SEGMENT / part, ".ply")
         first = min(poses, default=0)
@@ -118,7 +118,7 @@ def _labels(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _item(
     path: Path, joints: np.ndarray, trans: np.ndarray, part: str, frame: int, time: float, turn: np.ndarray | None
-) -> Item | Skipped:
+) -> LabeledSample | Skipped:
     """turn: R_level_sensor, None to stay in the sensor's frame."""
     try:
         points = read_cloud(path)

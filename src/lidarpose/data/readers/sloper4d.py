@@ -17,13 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.base import Item, Skipped
+from lidarpose.data.readers.base import Skipped
 from lidarpose.data.readers.raw_files import as_cloud, numbers, wrong_root
 from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_item
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.io.files import file_error
 from lidarpose.io.pickles import load_pickle
+from lidarpose.sample import LabeledSample
 from lidarpose.skeleton import SMPL24
 
 _SUFFIX = "_labels.pkl"
@@ -71,7 +72,7 @@ class Sloper4D:
             raise file_error(root, f"has {twice}{_SUFFIX} twice: move one of them away")
         return sorted(names)
 
-    def read(self, root: Path, part: str) -> Iterator[Item | Skipped]:
+    def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         """The person of a sequence, frame by frame."""
         path = next(path for path in _files(root) if path.name == part + _SUFFIX)
         labels = _labels(path)
@@ -197,7 +198,9 @@ def _heading(quaternion: np.ndarray) -> np.ndarray:
     return np.where(unit, np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)), np.nan)
 
 
-def _item(labels: _Labels, index: int, cloud: np.ndarray, joints: np.ndarray, source: str, part: str) -> Item | Skipped:
+def _item(
+    labels: _Labels, index: int, cloud: np.ndarray, joints: np.ndarray, source: str, part: str
+) -> LabeledSample | Skipped:
     R_sensor_world = rotation_about("z", -labels.heading[index])
     points, joints, trans = (
         (x - labels.position[index]) @ R_sensor_world.T for x in (cloud, joints, labels.trans[index])

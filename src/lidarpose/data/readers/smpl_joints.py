@@ -9,11 +9,11 @@ import numpy as np
 
 from lidarpose.body.rig import forward_kinematics
 from lidarpose.body.smpl import SmplBody, load_body
-from lidarpose.data.readers.base import SEEN, Item, Skipped
+from lidarpose.data.readers.base import Skipped
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix
 from lidarpose.io.files import content_digest, file_error
-from lidarpose.sample import FARTHEST, Pose, Sample, center_of, within_reach
+from lidarpose.sample import FARTHEST, SEEN, LabeledSample, Pose, center_of, within_reach
 from lidarpose.skeleton import SMPL24
 
 # what the published files are called: SMPL_MALE.pkl, basicmodel_m_lbs_10_207_0_v1.1.0.pkl, basicModel_f_lbs_...
@@ -79,27 +79,26 @@ def smpl_item(
     time: float,
     source: str,
     centers: dict[str, np.ndarray],
-) -> Item | Skipped:
+    sensor_known: bool = True,
+) -> LabeledSample | Skipped:
     """A person of whom points (n, 3) m and SMPL's joints (24, 3) m are known, which all count as seen; the rest as in
-    `Item` and `Sample`. Skipped where the parameters put joints out of reach."""
+    `LabeledSample`. Skipped where the parameters put joints out of reach."""
     if not within_reach(joints).all():
         return Skipped(reason="joints out of reach", where=f"{frame_id}/{track}: beyond {FARTHEST:g} m")
     points = points.astype(np.float32)
-    sample = Sample(
+    return LabeledSample(
         points=points,
         center=center_of(points),
         pose=Pose(joints=joints.astype(np.float32), skeleton=SMPL24, frame="sensor"),
         source=source,
         frame_id=frame_id,
-    )
-    return Item(
-        sample=sample,
         joint_labels=np.full(len(SMPL24), SEEN, np.uint8),
         sequence=sequence,
         frame=frame,
         track=track,
         time=time,
         centers=centers,
+        sensor_known=sensor_known,
     )
 
 

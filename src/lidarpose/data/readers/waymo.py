@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.data.readers.base import Item, Reader, Skipped
+from lidarpose.data.readers.base import Reader, Skipped
 from lidarpose.data.readers.raw_files import numbers, wrong_root
 from lidarpose.data.readers.waymo_frames import (
     BAD_FRAME,
@@ -44,6 +44,7 @@ from lidarpose.data.readers.waymo_parquet import (
 from lidarpose.data.readers.waymo_v1 import SPLITS, WaymoV1
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
+from lidarpose.sample import LabeledSample
 from lidarpose.skeleton import WAYMO14
 
 COMPONENTS = ("lidar_hkp", "lidar_box", "lidar_calibration", "vehicle_pose", "lidar", "lidar_pose")
@@ -82,7 +83,7 @@ class Waymo:
         InputError where there are both, neither, or a component is missing."""
         return self._version(root).parts(root)
 
-    def read(self, root: Path, part: str) -> Iterator[Item | Skipped]:
+    def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         """Everybody with keypoints in a part, frame by frame."""
         return (self._v1 if part.endswith(".tfrecord") else self._v2).read(root, part)
 
@@ -132,7 +133,7 @@ class WaymoV2:
             raise file_error(root, "has no segment with laser keypoints: only some have any; fetch all of lidar_hkp")
         return sorted(found)
 
-    def read(self, root: Path, part: str) -> Iterator[Item | Skipped]:
+    def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         """Everybody with keypoints in a segment, in the order of time, then of track. Raises InputError where the
         labels cannot be read; where the range images cannot, everybody is skipped."""
         split, _, segment = part.partition("/")

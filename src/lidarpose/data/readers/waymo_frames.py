@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.data.readers.base import HIDDEN, SEEN, UNLABELED, Item, Skipped
+from lidarpose.data.readers.base import Skipped
 from lidarpose.errors import InputError
 from lidarpose.geometry import from_spherical
-from lidarpose.sample import Box, Pose, Sample, center_of, within_reach
+from lidarpose.sample import HIDDEN, SEEN, UNLABELED, Box, LabeledSample, Pose, center_of, within_reach
 from lidarpose.skeleton import WAYMO14
 
 LASERS = {"TOP": 1, "FRONT": 2, "SIDE_LEFT": 3, "SIDE_RIGHT": 4, "REAR": 5}
@@ -241,7 +241,7 @@ class Frame:
                 inside = one.box.contains(points, self.margin)
                 self._crops.setdefault(k, []).append(((laser, which), points[inside], ring[inside]))
 
-    def found(self) -> Iterator[Item | Skipped]:
+    def found(self) -> Iterator[LabeledSample | Skipped]:
         """Everybody, in the order of their tracks, once all images are there."""
         if self.wanted and not any(laser == TOP for laser, _ in self._seen):
             self.fail(NO_IMAGE)
@@ -258,12 +258,12 @@ class Frame:
             reason, why = problem
             yield Skipped(reason=reason, where=f"{where}: {why}" if why else where)
 
-    def _item(self, one: LabelledPerson, points: np.ndarray, ring: np.ndarray) -> Item:
+    def _item(self, one: LabelledPerson, points: np.ndarray, ring: np.ndarray) -> LabeledSample:
         # the sensor is at the origin
         origin = self.calibrations[TOP].T_vehicle_laser[:3, 3]
         points = (points - origin).astype(np.float32)
         box = Box(center=one.box.center - origin, size=one.box.size, yaw=one.box.yaw, id=one.track)
-        sample = Sample(
+        return LabeledSample(
             points=points,
             center=center_of(points),
             ring=ring.astype(np.int32),
@@ -271,9 +271,6 @@ class Frame:
             box=box,
             source=f"waymo/{_KINDS.get(one.kind, 'unknown')}",
             frame_id=f"{self.sequence}/{self.timestamp}",
-        )
-        return Item(
-            sample=sample,
             joint_labels=one.labels,
             sequence=self.sequence,
             frame=self.timestamp,

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.base import Item, Skipped
+from lidarpose.data.readers.base import Skipped
 from lidarpose.data.readers.protobuf import Message
 from lidarpose.data.readers.tfrecord import records
 from lidarpose.data.readers.waymo_frames import (
@@ -31,6 +31,7 @@ from lidarpose.data.readers.waymo_frames import (
 )
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
+from lidarpose.sample import LabeledSample
 from lidarpose.skeleton import WAYMO14
 
 SPLITS = ("training", "validation")
@@ -72,7 +73,7 @@ class WaymoV1:
             raise file_error(root, "has no training/*.tfrecord or validation/*.tfrecord")
         return sorted(found)
 
-    def read(self, root: Path, part: str) -> Iterator[Item | Skipped]:
+    def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         """Everybody with keypoints in a file, frame by frame. After a damaged record the rest is given up."""
         start = None
         try:
