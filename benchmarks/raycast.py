@@ -1,19 +1,21 @@
-"""How long one cast of a body takes, beside the slow twin and, where installed, Embree and Open3D.
+"""How long one cast of a body takes, beside the slow twin of the tests and, where installed, Embree and Open3D.
 
     python benchmarks/raycast.py [--rounds 5] [--sensor dapt64] [--rings 60] [--plot docs/raycast.png]
 
 30 scenes from one seed: 5 distances x 6 closed meshes, each with a ground quad. The ways take turns, one scene each,
-so that a busy machine slows all alike: read the ratios. A cast is `scan`: window, cast and packed points, with faces
-of both sides or with the backs of the body culled; the others get the window's rays ready made. "open3d" goes by a
-legacy mesh, as the released code of the paper does, "open3d direct" hands its tensors over; each builds its tree for
-every body. The slow twin casts a sample of the rays and is scaled up. All on one thread.
+so that a busy machine slows all alike: read the ratios. A cast is `scan`: window, cast and packed points; the others
+get the window's rays ready made. "open3d" goes by a legacy mesh, as the released code of the paper does, "open3d
+direct" hands its tensors over; each builds its tree for every body. The slow twin casts a sample of the rays and is
+scaled up. All on one thread.
 
     pip install embreex open3d-cpu matplotlib    # optional; Open3D also wants libusb-1.0-0 and libgl1 of the system
 """
 
 import argparse
 import os
+import sys
 import time
+from pathlib import Path
 
 # before numpy and Open3D start their threads
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -21,9 +23,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from lidarpose.lidar.presets import sensor as named_sensor
-from lidarpose.lidar.raycast import find_window, scan
-from lidarpose.lidar.raycast_people import scan_people
-from lidarpose.lidar.raycast_reference import cast_ray_list_reference
+from lidarpose.lidar.raycast import scan
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from reference.raycast_reference import cast_ray_list_reference, window_rays  # noqa: E402
 
 DISTANCES = (4.0, 7.0, 10.0, 15.0, 20.0)
 MESHES = 6
@@ -69,24 +72,6 @@ def scenes(sensor, rings):
     return made
 
 
-def rays_of(sensor, window):
-    a = sensor.azimuths(window)
-    e = np.broadcast_to(sensor.elevations[window.row0 : window.row0 + window.rows], a.shape)
-    return np.stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)], -1).reshape(-1, 3)
-
-
-def own_ways(sensor):
-    """Name -> function(vertices, faces, rays, body, closed)."""
-
-    def two_sided(vertices, faces, rays, body, closed):
-        return scan(vertices, faces, sensor, window_vertices=vertices[:body])
-
-    def culled(vertices, faces, rays, body, closed):
-        return scan(vertices, faces, sensor, window_vertices=vertices[:body], cull=closed)
-
-    return {"scan": two_sided, "scan, culled": culled}
-
-
 def other_ways():
     """Name -> function(vertices, faces, rays, ...); each builds its tree and casts, as a new body needs."""
     ways = {}
@@ -130,16 +115,15 @@ def other_ways():
 def measure(made, sensor, ways, rounds, *, reference=False):
     """Way -> least seconds of each scene (scenes,), and the number of hits of each."""
     best = {way: np.full(len(made), np.inf) for way in (*ways, *([REFERENCE] if reference else []))}
-    hits = np.zeros(len(made))
+    counts = np.zeros(len(made))
     rng = np.random.default_rng(0)
     for turn in range(rounds + 1):  # the first turn warms up
         for i, (_, vertices, faces, body) in enumerate(made):
-            rays = rays_of(sensor, find_window(vertices[:body], sensor))
-            closed = np.arange(len(faces)) < len(faces) - 2
-            hits[i] = len(scan(vertices, faces, sensor, window_vertices=vertices[:body]).points)
+            hits = scan(vertices, faces, sensor, window_vertices=vertices[:body])
+            rays, counts[i] = window_rays(hits, sensor).reshape(-1, 3), len(hits.points)
             for name, way in ways.items():
                 start = time.perf_counter()
-                way(vertices, faces, rays, body, closed)
+                way(vertices, faces, rays, body)
                 if turn:
                     best[name][i] = min(best[name][i], time.perf_counter() - start)
             if reference and turn == 1:
@@ -147,22 +131,7 @@ def measure(made, sensor, ways, rounds, *, reference=False):
                 start = time.perf_counter()
                 cast_ray_list_reference(vertices, faces, sample)
                 best[REFERENCE][i] = (time.perf_counter() - start) * len(rays) / max(1, len(sample))
-    return best, hits
-
-
-def threads(made, sensor, rounds):
-    """People a second of `scan_people`, culled, on one thread and on two."""
-    vertices = np.stack([scene[1] for scene in made] * 4)
-    body, faces = made[0][3], made[0][2]
-    extra = vertices[:, body:], faces[-2:] - body
-    closed = np.arange(len(faces)) < len(faces) - 2
-    least = {1: np.inf, 2: np.inf}
-    for _ in range(rounds + 1):
-        for count in least:
-            start = time.perf_counter()
-            scan_people(vertices[:, :body], faces[:-2], sensor, extra=extra, cull=closed, threads=count)
-            least[count] = min(least[count], time.perf_counter() - start)
-    return {count: len(vertices) / seconds for count, seconds in least.items()}
+    return best, counts
 
 
 def plot(path, sensor, by_distance, by_count):
@@ -192,30 +161,25 @@ def main():
     parser.add_argument("--plot", help="also draw cost by distance and by number of triangles to this PNG")
     arguments = parser.parse_args()
     sensor = named_sensor(arguments.sensor)
-    ways = {**own_ways(sensor), **other_ways()}
+
+    def own(vertices, faces, rays, body):
+        return scan(vertices, faces, sensor, window_vertices=vertices[:body])
+
+    ways = {"scan": own, **other_ways()}
     made = scenes(sensor, arguments.rings)
     best, hits = measure(made, sensor, ways, arguments.rounds, reference=True)
     distances = np.array([scene[0] for scene in made])
     print(f"{sensor.name}, {len(made[0][2]):,} triangles, best of {arguments.rounds}; ms a cast by distance")
-    print(
-        f"{'way':14s}"
-        + "".join(f"{d:9.0f} m" for d in DISTANCES)
-        + f"{'mean':>11s}{'casts/s':>10s}{'x scan':>10s}{'x culled':>10s}"
-    )
+    print(f"{'way':14s}" + "".join(f"{d:9.0f} m" for d in DISTANCES) + f"{'mean':>11s}{'casts/s':>10s}{'x scan':>10s}")
     for way, seconds in best.items():
         by_distance = [seconds[distances == d].mean() * 1e3 for d in DISTANCES]
         mean = seconds.mean()
         print(
             f"{way:14s}"
             + "".join(f"{ms:11.3f}" for ms in by_distance)
-            + f"{mean * 1e3:11.3f}{1 / mean:10,.0f}"
-            + "".join(f"{mean / best[own].mean():10.1f}" for own in ("scan", "scan, culled"))
+            + f"{mean * 1e3:11.3f}{1 / mean:10,.0f}{mean / best['scan'].mean():10.1f}"
         )
     print(f"{'hits':14s}" + "".join(f"{hits[distances == d].mean():11.0f}" for d in DISTANCES))
-    rates = threads(made, sensor, arguments.rounds)
-    print(
-        f"scan_people, culled: {rates[1]:,.0f} people/s on 1 thread, {rates[2]:,.0f} on 2, x{rates[2] / rates[1]:.2f}"
-    )
     if arguments.plot:
         drawn = {way: best[way] for way in ways}
         by_distance = {d: {way: drawn[way][distances == d].mean() for way in ways} for d in DISTANCES}

@@ -26,8 +26,7 @@ from lidarpose.io.boxes import read_boxes
 from lidarpose.io.point_cloud import read_points
 from lidarpose.lidar.presets import sensor
 from lidarpose.lidar.ray_pattern import RayPattern
-from lidarpose.lidar.ray_pattern_scan import scan_pattern
-from lidarpose.lidar.raycast import scan
+from lidarpose.lidar.raycast import scan, scan_pattern
 from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import Box
 from lidarpose.synth.bodies import draw_bodies

@@ -1,4 +1,4 @@
-"""Made-up meshes for the tests of the casters: vertices (V, 3) m and faces (F, 3)."""
+"""Made-up meshes for the tests of the casters, vertices (V, 3) m and faces (F, 3), and what equal hits are."""
 
 import numpy as np
 
@@ -50,3 +50,19 @@ def join(*meshes):
 def ground(half: float, z: float, x: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     corners = np.array([[x - half, -half, z], [x + half, -half, z], [x + half, half, z], [x - half, half, z]])
     return corners, np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def assert_same(got, want):
+    """The same hits (range float32, face int32), the same ranges; other faces only at ties."""
+    distance, face = got
+    expected, expected_face = want
+    assert distance.dtype == np.float32 and face.dtype == np.int32 and distance.shape == expected.shape
+    hit = np.isfinite(expected)
+    assert (np.isfinite(distance) & ~hit).sum() == 0, "extra hits"
+    assert (~np.isfinite(distance) & hit).sum() == 0, "missed hits"
+    assert ((face >= 0) == hit).all()
+    error = np.abs(distance[hit] - expected[hit])
+    assert (error <= 1e-4).all(), f"ranges differ by up to {error.max()} m"
+    other = face[hit] != expected_face[hit]
+    assert (error[other] <= 1e-5).all()
+    assert other.mean() < 0.01 if other.size > 200 else other.sum() <= 2

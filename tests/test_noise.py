@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from reference.sensor_noise import intensity_loss, lose_returns_reference
 
 from lidarpose.geometry import unit
-from lidarpose.lidar.hits import Hits
+from lidarpose.lidar.raycast import Hits
 from lidarpose.sample import Box
 from lidarpose.synth import noise
 from lidarpose.synth.environment.mesh import Mesh

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference.raycast_reference import cast_ray_list_reference
 
 from lidarpose.errors import InputError
 from lidarpose.lidar.presets import sensor
 from lidarpose.lidar.ray_pattern import PATTERNS, RayPattern
-from lidarpose.lidar.ray_pattern_scan import scan_pattern
-from lidarpose.lidar.raycast_reference import cast_ray_list_reference
+from lidarpose.lidar.raycast import scan_pattern
 from lidarpose.synth.environment.mesh import box
 
 BY_NAME = {p.name: p for p in PATTERNS}
@@ -138,7 +138,7 @@ def test_frames_are_the_same_every_time_and_negative_ones_count_from_the_end():
     assert pattern.frame(-1) is pattern.frame(pattern.frames - 1)
 
 
-def brute(vertices, faces, pattern, frame, moved, steps=None):
+def brute(vertices, faces, pattern, frame, moved):
     """All rays of the frame against the triangles as each ray finds them."""
     rays = pattern.frame(frame)
     distance = np.full(len(rays.time), np.inf)

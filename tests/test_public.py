@@ -119,8 +119,7 @@ def test_every_room_has_a_floor():
 def test_imports_go_downwards(path):
     here = where(path)
     for name in imports(path):
-        # the caster for GPUs is imported by whoever asks for it
-        if name.split(".")[0] in NO_TORCH[0] and path.stem != "raycast_torch":
+        if name.split(".")[0] in NO_TORCH[0]:
             assert here not in NO_TORCH[1], f"{here} imports {name}"
         if name.split(".")[0] != "lidarpose":
             continue

@@ -6,16 +6,22 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from raycast_meshes import body, ground, join, soup, sphere
+from raycast_meshes import assert_same, body, ground, join, soup, sphere
+from reference.raycast_reference import (
+    cast_ray_list_reference,
+    cast_rays_reference,
+    window_ranges,
+    window_rays,
+    window_reference,
+)
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
-from lidarpose.lidar.beam_divergence import scan_wide
+from lidarpose.lidar.beam_divergence import scan_divergent
 from lidarpose.lidar.presets import SENSORS, sensor
-from lidarpose.lidar.raycast import cast_ray_list, cast_rays, cast_window, find_window, scan
+from lidarpose.lidar.raycast import cast_ray_list, cast_rays, scan
 from lidarpose.lidar.raycast_kernels import raster
-from lidarpose.lidar.raycast_reference import cast_ray_list_reference, cast_rays_reference
-from lidarpose.lidar.sensor import Sensor, Window
+from lidarpose.lidar.sensor import Sensor
 
 PARITY = Path(__file__).parent / "parity" / "raycast.npz"
 FULL_TURN = np.linspace(-np.pi, np.pi, 41)
@@ -23,20 +29,11 @@ FULL_TURN = np.linspace(-np.pi, np.pi, 41)
 ALL_ELEVATIONS = np.linspace(-1.5, 1.5, 24)
 
 
-def assert_same(got, want, *, ties: float = 1e-5):
-    """Same hits, same ranges; other faces only at ties."""
-    distance, face = got
-    expected, expected_face = want
-    assert distance.dtype == np.float32 and face.dtype == np.int32 and distance.shape == expected.shape
-    hit = np.isfinite(expected)
-    assert (np.isfinite(distance) & ~hit).sum() == 0, "extra hits"
-    assert (~np.isfinite(distance) & hit).sum() == 0, "missed hits"
-    assert ((face >= 0) == hit).all()
-    error = np.abs(distance[hit] - expected[hit])
-    assert (error <= 1e-4).all(), f"ranges differ by up to {error.max()} m"
-    other = face[hit] != expected_face[hit]
-    assert (error[other] <= ties).all()
-    assert other.mean() < 0.01 if other.size > 200 else other.sum() <= 2
+SPINNING = [name for name, s in SENSORS.items() if isinstance(s, Sensor)]
+
+
+def window_of(hits):
+    return hits.column0, hits.columns, hits.row0, hits.rows
 
 
 @pytest.mark.parametrize("scene", range(6))
@@ -59,36 +56,52 @@ def test_the_first_cast_compiles_once(dtype):
     vertices.setflags(write=False)
     s = sensor("vlp-16")
     hits = scan(vertices, faces, s)
-    assert len(hits.points) and len(scan_wide(vertices, faces, s, divergence=0.003).points)
-    cast_window(vertices, faces, s, find_window(vertices, s))
+    assert len(hits.points) and len(scan_divergent(vertices, faces, s, divergence=0.003).points)
     cast_rays(vertices, faces, FULL_TURN, ALL_ELEVATIONS)
     assert len(raster.signatures) == 1
 
 
-@pytest.mark.parametrize("name", [name for name, s in SENSORS.items() if isinstance(s, Sensor)])
+@pytest.mark.parametrize("name", [name for name in SPINNING if not SENSORS[name].origins])
 @pytest.mark.parametrize("distance, azimuth", [(2.5, np.pi), (8.0, -np.pi + 1e-3), (20.0, 0.7)])
-def test_window_same_as_reference(name, distance, azimuth):
-    s = sensor(name)
+def test_scan_same_as_reference(name, distance, azimuth):
+    s = replace(sensor(name), range_min=0.0)
     rng = np.random.default_rng(3)
     person = body(rng)
     # turned, since the slow twin may lose a ray that runs along an edge
     person = person[0] @ rotation_about("z", 0.1234).T, person[1]
     there = np.array([np.cos(azimuth), np.sin(azimuth), 0]) * distance + [0, 0, 0.9 - s.height]
     vertices, faces = join((person[0] + there, person[1]), (ground(1.0, 0)[0] + there - [0, 0, 0.9], ground(1, 0)[1]))
-    window = find_window(vertices, s)
-    got = cast_window(vertices.astype(np.float32), faces.astype(np.int32), s, window)
-    azimuths, rings = s.azimuths(window), slice(window.row0, window.row0 + window.rows)
-    e = np.broadcast_to(s.elevations[rings], azimuths.shape)
-    rays = np.stack([np.cos(azimuths) * np.cos(e), np.sin(azimuths) * np.cos(e), np.sin(e)], -1).reshape(-1, 3)
-    pick = np.arange(len(rays))
-    if len(rays) > 3000:
-        pick = rng.permutation(len(rays))[:3000]
-    want = cast_ray_list_reference(vertices.astype(np.float32), faces, rays[pick])
-    assert_same((got[0].reshape(-1)[pick], got[1].reshape(-1)[pick]), want)
+    vertices = vertices.astype(np.float32)
+    hits = scan(vertices, faces.astype(np.int32), s)
+    assert window_of(hits) == window_reference(vertices, s)
+    distances, face = window_ranges(hits)
+    rays = window_rays(hits, s)
+    pick = rng.permutation(face.size)[:3000]
+    want = cast_ray_list_reference(vertices, faces, rays.reshape(-1, 3)[pick])
+    assert_same((distances.reshape(-1)[pick], face.reshape(-1)[pick]), want)
     if s.azimuth_offsets is None:
-        assert_same(got, cast_rays(vertices.astype(np.float32), faces, azimuths[:, 0], s.elevations[rings]))
+        azimuths = np.arctan2(rays[:, 0, 1], rays[:, 0, 0])
+        grid = cast_rays(vertices, faces, azimuths, s.elevations[hits.row0 : hits.row0 + hits.rows])
+        assert_same((distances, face), grid)
     if distance < 10:
-        assert (got[1] >= 0).sum() > 20
+        assert (face >= 0).sum() > 20
+
+
+@pytest.mark.parametrize("name", [name for name in SPINNING if not SENSORS[name].origins])
+def test_the_window_of_a_scan_holds_the_body_and_no_more(name):
+    s = sensor(name)
+    for i in range(25):
+        rng = np.random.default_rng(i)
+        azimuth, distance = rng.uniform(-np.pi, np.pi), rng.choice([0.0, 0.8, 2.0, 5.0, 12.0, 25.0])
+        there = [distance * np.cos(azimuth), distance * np.sin(azimuth), 0.9 - s.height]
+        vertices, faces = body(rng)
+        hits = scan(vertices + there, faces[:0], s, margin=0.001 * i)
+        assert window_of(hits) == window_reference(vertices + there, s, margin=0.001 * i) and len(hits.face) == 0
+    # -pi and +pi are one column, a body around the sensor gets the whole turn, one above it no row
+    behind = scan(np.array([[-1.0, -0.01, 0], [-1.0, 0.01, 0]]), faces[:0], s)
+    assert behind.column0 + behind.columns > s.columns and behind.columns < 12
+    assert scan(vertices, faces[:0], s).columns == s.columns
+    assert scan(vertices + [1.0, 0, 90.0], faces[:0], s).rows == 0
 
 
 @pytest.mark.parametrize(
@@ -208,8 +221,6 @@ def test_empty_input_gives_empty_output():
         assert cast_ray_list(*mesh, np.eye(3))[1].tolist() == [-1, -1, -1]
         assert len(scan(*mesh, sensor("vlp-16")).points) == 0
     assert cast_ray_list(vertices, faces, none)[0].shape == (0,)
-    nothing = Window(column0=3, columns=0, row0=2, rows=5)
-    assert cast_window(vertices, faces, sensor("vlp-16"), nothing)[0].shape == (0, 5)
 
 
 @pytest.mark.parametrize(
@@ -235,11 +246,19 @@ def test_bad_input_says_what_is_wrong(change, message):
         cast_rays(**{**good, **change})
 
 
-def test_bad_rays_and_margins():
+def test_bad_scans_and_rays_say_what_is_wrong():
+    vertices, faces = ground(1, -1)
     with pytest.raises(InputError, match="number 1 is zero"):
-        cast_ray_list(*ground(1, -1), [[1, 0, 0], [0, 0, 0]])
-    with pytest.raises(InputError, match="margin"):
-        scan(*ground(1, -1), sensor("vlp-16"), margin=np.nan)
+        cast_ray_list(vertices, faces, [[1, 0, 0], [0, 0, 0]])
+    for change, message in (
+        ({"margin": np.nan}, "margin must be a finite angle"),
+        ({"vertices": vertices * [1, np.nan, 1]}, "vertices must be finite and below .* but 4 of 4"),
+        ({"window_vertices": np.full((2, 3), np.inf)}, "window_vertices must be finite"),
+        ({"faces": np.array([[0, 1, 10_000]], np.int32)}, "faces must index the 4 vertices from 0, got 0 to 10000"),
+        ({"faces": np.array([[0, 1, -1]])}, "faces must index the 4 vertices from 0, got -1 to 1"),
+    ):
+        with pytest.raises(InputError, match=message):
+            scan(**{"vertices": vertices, "faces": faces, "sensor": sensor("vlp-16"), **change})
 
 
 def test_scan_points_lie_on_the_faces_in_the_beams():
@@ -253,18 +272,13 @@ def test_scan_points_lie_on_the_faces_in_the_beams():
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     assert np.abs(((hits.points - corners[:, 0]) * normal).sum(1)).max() < 1e-5
-    window = Window(column0=hits.column0, columns=hits.columns, row0=hits.row0, rows=hits.rows)
-    assert window == find_window(vertices[: len(person[0])], s)
-    azimuth = s.azimuths(window)[hits.column, hits.ring - hits.row0]
-    seen = np.arctan2(hits.points[:, 1], hits.points[:, 0])
-    assert np.abs(np.angle(np.exp(1j * (seen - azimuth)))).max() < 1e-6
-    elevation = np.arctan2(hits.points[:, 2], np.hypot(hits.points[:, 0], hits.points[:, 1]))
-    assert elevation == pytest.approx(s.elevations[hits.ring], abs=1e-6)
+    body_vertices = vertices[: len(person[0])]
+    assert window_of(hits) == window_reference(body_vertices, s)
+    beam = window_rays(hits, s)[hits.column, hits.ring - hits.row0]
+    along = np.linalg.norm(hits.points, axis=1, keepdims=True) * beam
+    assert np.abs(hits.points - along).max() < 1e-5
     order = hits.column.astype(int) * s.rows + hits.ring
     assert (np.diff(order) > 0).all()
-    distance, face = cast_window(vertices, faces, s, window)
-    assert (face[hits.column, hits.ring - hits.row0] == hits.face).all() and len(hits.face) == (face >= 0).sum()
-    assert np.linalg.norm(hits.points, axis=1) == pytest.approx(distance[distance < np.inf], abs=1e-5)
 
 
 def test_nothing_of_the_body_is_seen_outside_its_window():

@@ -2,31 +2,22 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from raycast_meshes import assert_same, soup
+from reference.raycast_reference import cast_ray_list_reference
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.lidar.raycast import cast_ray_list
-from lidarpose.lidar.raycast_reference import cast_ray_list_reference
 
 TETRAHEDRON = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], float)
 TETRAHEDRON_FACES = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
-
-
-def assert_same(got, want):
-    assert got[0].dtype == np.float32 and got[1].dtype == np.int32
-    assert (np.isfinite(got[0]) == np.isfinite(want[0])).all() and ((got[1] >= 0) == np.isfinite(got[0])).all()
-    hit = got[1] >= 0
-    error = np.abs(got[0][hit] - want[0][hit])
-    assert (error <= 1e-4).all() and (error[got[1][hit] != want[1][hit]] <= 1e-5).all()
 
 
 @settings(deadline=None, max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1), spread=st.floats(0.1, 10), size=st.floats(0.05, 5), speed=st.floats(0, 5))
 def test_moving_soups_same_as_reference(seed, spread, size, speed):
     rng = np.random.default_rng(seed)
-    count = int(rng.integers(1, 30))
-    vertices = (rng.normal(0, spread, (count, 1, 3)) + rng.normal(0, size, (count, 3, 3))).reshape(-1, 3)
-    faces = np.arange(3 * count).reshape(count, 3)
+    vertices, faces = soup(rng, int(rng.integers(1, 30)), spread, size)
     moved, rays, time = vertices + rng.normal(0, speed, vertices.shape), rng.normal(size=(80, 3)), rng.random(80)
     got = cast_ray_list(vertices, faces, rays, moved=moved, time=time)
     assert_same(got, cast_ray_list_reference(vertices, faces, rays, moved=moved, time=time))

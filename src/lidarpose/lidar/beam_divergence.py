@@ -9,17 +9,18 @@ middle's at half the divergence, as makers state it. What the rays meet comes ba
     3. The strongest echo is the beam's return ("strongest return", the usual mode of spinning sensors), if it is as
        strong as a whole beam's from the sensor's greatest range. It lies on the beam's axis.
 So silhouettes grow by up to half the divergence, thin things are seen from farther, edges are smeared.
+
+Letters as in `raycast`; S sub-beams along a side, K = S * S of a beam. A change in `raycast_kernels` or `raycast_scan`
+does not renew what is cached of this module: remove its __pycache__ after one.
 """
 
 import numpy as np
 
 from lidarpose.errors import InputError
-from lidarpose.geometry import unit
-from lidarpose.lidar.beam_divergence_kernels import merge_echoes, scan_diverging
-from lidarpose.lidar.hits import Hits
-from lidarpose.lidar.multi_origin import scan_heads
-from lidarpose.lidar.raycast import beams_of, cast_ray_list, scan
-from lidarpose.lidar.raycast_input import as_culled, as_directions, as_mesh, as_points, as_times, check_margin
+from lidarpose.lidar.raycast import Hits, compiled_beams, scan, scan_multi_origin
+from lidarpose.lidar.raycast_input import as_mesh, as_points, check_margin
+from lidarpose.lidar.raycast_kernels import compiled, raster
+from lidarpose.lidar.raycast_scan import collect, sector_columns, window_of
 from lidarpose.lidar.sensor import Sensor
 
 # m: c tau / 2 of a pulse of 5 ns, as spinning sensors send it
@@ -27,9 +28,11 @@ PULSE = 0.75
 _MOST_SUB_BEAMS = 15
 # rad: a lamp, not a LiDAR
 _WIDEST = 0.1
+# no beam beyond the zenith
+_ZENITH = np.pi / 2 - 1e-6
 
 
-def scan_wide(
+def scan_divergent(
     vertices: np.ndarray,
     faces: np.ndarray,
     sensor: Sensor,
@@ -39,66 +42,46 @@ def scan_wide(
     pulse: float = PULSE,
     window_vertices: np.ndarray | None = None,
     margin: float = 0.0,
-    cull: bool | np.ndarray | None = None,
 ) -> Hits:
-    """`raycast.scan` with beams of a full divergence in rad, 0.0015 to 0.003 for most sensors; 0 is `scan` itself.
+    """`raycast.scan` with beams of a width. Takes about sub_beams times as long.
 
     A hit's face is that of the nearest surface in the returned echo. The window reaches half the divergence farther
-    than without. In azimuth the footprint is that at the horizon. Takes about sub_beams times as long. pulse m: how
-    far apart in range two echoes must be to be told apart. The rest is as in `scan`. Raises InputError.
+    than without. In azimuth the footprint is that at the horizon.
+
+    Args:
+        divergence: full, rad; 0.0015 to 0.003 for most sensors; 0 is `scan` itself.
+        sub_beams: along a side of the footprint.
+        pulse: m, how far apart in range two echoes must be to be told apart.
+        vertices, faces, sensor, window_vertices, margin: as in `scan`.
+
+    Raises InputError.
     """
     _check(divergence, sub_beams, pulse)
     if divergence == 0:
-        return scan(vertices, faces, sensor, window_vertices=window_vertices, margin=margin, cull=cull)
-    if sensor.heads:
-        more = {"divergence": divergence, "sub_beams": sub_beams, "pulse": pulse, "margin": margin, "cull": cull}
-        return scan_heads(
-            lambda v, head, w: scan_wide(v, faces, head, window_vertices=w, **more), vertices, sensor, window_vertices
+        return scan(vertices, faces, sensor, window_vertices=window_vertices, margin=margin)
+    if sensor.origins:
+        options = {"divergence": divergence, "sub_beams": sub_beams, "pulse": pulse, "margin": margin}
+        return scan_multi_origin(
+            lambda v, single, w: scan_divergent(v, faces, single, window_vertices=w, **options),
+            vertices,
+            sensor,
+            window_vertices,
         )
     check_margin(margin)
     vertices, faces = as_mesh(vertices, faces)
     window_vertices = vertices if window_vertices is None else as_points("window_vertices", window_vertices)
     offsets, weights = footprint(divergence, sub_beams)
-    (points, face, column, ring), (column0, columns, row0, rows) = scan_diverging(
-        vertices, faces, as_culled(cull, faces), window_vertices, beams_of(sensor), margin + divergence / 2,
-        offsets, weights, float(pulse),
-    )  # fmt: skip
-    return Hits(
-        points=points, face=face, column=column, ring=ring, columns=columns, rows=rows, column0=column0, row0=row0
+    packed, window = _scan_divergent(
+        vertices,
+        faces,
+        window_vertices,
+        compiled_beams(sensor),
+        margin + divergence / 2,
+        offsets,
+        weights,
+        float(pulse),
     )
-
-
-def cast_wide_ray_list(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    directions: np.ndarray,
-    *,
-    divergence: float,
-    sub_beams: int = 3,
-    pulse: float = PULSE,
-    range_max: float = np.inf,
-    moved: np.ndarray | None = None,
-    time: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """`raycast.cast_ray_list` with beams of a full divergence in rad: range (N,) float32 m and face (N,) int32.
-
-    range_max m: a whole beam's return from there is the weakest that is seen. Takes about sub_beams^2 times as long.
-    The rest is as in `scan_wide`. Raises InputError.
-    """
-    _check(divergence, sub_beams, pulse)
-    if not range_max > 0:
-        raise InputError(f"range_max must be greater than 0 m, got {range_max}")
-    if divergence == 0:
-        return cast_ray_list(vertices, faces, directions, moved=moved, time=time)
-    offsets, weights = footprint(divergence, sub_beams)
-    directions = as_directions(directions)
-    rays = spread(directions, offsets)
-    time = None if time is None else np.repeat(as_times(time, len(directions)), rays.shape[1])
-    distance, face = cast_ray_list(vertices, faces, rays.reshape(-1, 3), moved=moved, time=time)
-    return merge_echoes(
-        distance.reshape(rays.shape[:2]).astype(float), face.reshape(rays.shape[:2]), weights.reshape(-1),
-        float(pulse), float(range_max),
-    )  # fmt: skip
+    return Hits.from_arrays(packed, window)
 
 
 def footprint(divergence: float, sub_beams: int) -> tuple[np.ndarray, np.ndarray]:
@@ -109,17 +92,6 @@ def footprint(divergence: float, sub_beams: int) -> tuple[np.ndarray, np.ndarray
     return offsets, weights / weights.sum()
 
 
-def spread(directions: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Directions (N, S * S, 3) of the sub-beams at offsets (S,) rad around beams along directions (N, 3)."""
-    directions = unit(directions)
-    left = unit(np.stack([-directions[:, 1], directions[:, 0], np.zeros(len(directions))], -1))
-    # straight up or down
-    left = np.where((left == 0).all(1, keepdims=True), [0.0, 1.0, 0.0], left)
-    up = np.cross(directions, left)
-    side, rise = (step.reshape(-1, 1) for step in np.meshgrid(np.tan(offsets), np.tan(offsets), indexing="ij"))
-    return directions[:, None] + left[:, None] * side + up[:, None] * rise
-
-
 def _check(divergence: float, sub_beams: int, pulse: float) -> None:
     if not 0 <= divergence <= _WIDEST:
         raise InputError(f"divergence must be between 0 and {_WIDEST} rad, got {divergence}: is it in mrad?")
@@ -127,3 +99,101 @@ def _check(divergence: float, sub_beams: int, pulse: float) -> None:
         raise InputError(f"sub_beams must be a whole number from 1 to {_MOST_SUB_BEAMS}, got {sub_beams}")
     if not 0 <= pulse < np.inf:
         raise InputError(f"pulse must be a length >= 0 m, got {pulse}")
+
+
+@compiled
+def strongest_echo(distance, weights, order, pulse, farthest):
+    """Range and number of the nearest sub-beam of the strongest echo of sub-beams (K,), inf and -1 for none.
+
+    distance (K,) m, inf where nothing is met; weights (K,) in all 1; order (K,) is overwritten.
+    """
+    n = 0
+    for k in range(len(distance)):
+        if distance[k] == np.inf:
+            continue
+        # by range: few and often in order
+        i = n
+        while i > 0 and distance[order[i - 1]] > distance[k]:
+            order[i] = order[i - 1]
+            i -= 1
+        order[i] = k
+        n += 1
+    best, best_range, best_face = 0.0, np.inf, -1
+    start = 0
+    while start < n:
+        power, sum_range, end = 0.0, 0.0, start
+        while end < n and (end == start or distance[order[end]] - distance[order[end - 1]] <= pulse):
+            r = distance[order[end]]
+            received = weights[order[end]] / (r * r)
+            power += received
+            sum_range += received * r
+            end += 1
+        if power > best:
+            best, best_range, best_face = power, sum_range / power, order[start]
+        start = end
+    if best * farthest * farthest < 1:
+        return np.inf, -1
+    return best_range, best_face
+
+
+@compiled
+def _scan_divergent(vertices, faces, window_vertices, beams, margin, offsets, weights, pulse):
+    """As `raycast_scan.scan_checked` of checked arrays: sub-beams at offsets (S,) in azimuth and elevation, of weights
+    (S, S)."""
+    window = window_of(window_vertices, beams, margin)
+    column0, columns, row0, rows = window
+    subs = len(offsets)
+    # sub-columns apart, sub-rows together with the rows
+    inverse_x = np.zeros((subs, columns, rows * subs))
+    face = np.full((subs, columns, rows * subs), -1, np.int32)
+    scale, merged, merged_face = np.ones(columns), np.zeros((columns, rows)), np.full((columns, rows), -1, np.int32)
+    most = min(columns, beams.sector)
+    tan, cos, index = np.empty(most), np.empty(most), np.empty(most, np.int64)
+    row_tan, row_index = np.empty(rows * subs), np.empty(rows * subs, np.int64)
+    lift = np.empty(rows * subs)
+    for g in range(len(beams.group_shift)):
+        n = 0
+        for ring in beams.group_ring[beams.group_start[g] : beams.group_start[g + 1]]:
+            if row0 <= ring < row0 + rows:
+                for b in range(subs):
+                    row = (ring - row0) * subs + b
+                    row_tan[n] = np.tan(min(max(beams.elevations[ring] + offsets[b], -_ZENITH), _ZENITH))
+                    row_index[n] = row
+                    lift[row] = np.sqrt(1 + row_tan[n] * row_tan[n])
+                    n += 1
+        if not n:
+            continue
+        # the sub-rows of rows that are near one another mix: almost in order as they are
+        for m in range(1, n):
+            tangent, row, i = row_tan[m], row_index[m], m
+            while i > 0 and row_tan[i - 1] > tangent:
+                row_tan[i], row_index[i] = row_tan[i - 1], row_index[i - 1]
+                i -= 1
+            row_tan[i], row_index[i] = tangent, row
+        for start in range(0, columns, beams.sector):
+            count = sector_columns(beams, start, columns, index, tan, cos, scale)
+            center = beams.start + (column0 + start + (count - 1) / 2) * beams.step + beams.group_shift[g]
+            for a in range(subs):
+                raster(
+                    vertices, faces, center + offsets[a], tan[:count], cos[:count], row_tan[:n],
+                    index[:count], row_index, inverse_x[a], face[a],
+                )  # fmt: skip
+    distance, flat = np.empty(subs * subs), weights.copy().reshape(-1)
+    order = np.empty(subs * subs, np.int64)
+    for k in range(columns):
+        for r in range(rows):
+            met = False
+            for a in range(subs):
+                for b in range(subs):
+                    near = inverse_x[a, k, r * subs + b]
+                    met |= near > 0
+                    distance[a * subs + b] = scale[k] * lift[r * subs + b] / near if near > 0 else np.inf
+            if not met:
+                continue
+            range_, sub = strongest_echo(distance, flat, order, pulse, beams.farthest)
+            if sub >= 0:
+                # as if the beam's axis had met it
+                tangent = beams.tangents[row0 + r]
+                merged[k, r] = scale[k] * np.sqrt(1 + tangent * tangent) / range_
+                merged_face[k, r] = face[sub // subs, k, r * subs + sub % subs]
+    return collect(merged, merged_face, scale, beams, column0, row0), window

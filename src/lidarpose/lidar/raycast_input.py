@@ -1,20 +1,17 @@
-"""What the casters accept: checks of their arguments, each with an InputError that says what is wrong."""
+"""What the casters accept: checks of their arguments, each with an InputError that says what is wrong.
+
+Arrays come out in one type each, so that compiled code is compiled once.
+"""
 
 import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.sample import FARTHEST
 
-_NO_FACES = np.zeros(0, bool)
-_NO_FACES.setflags(write=False)
-
 
 def as_points(name: str, values: np.ndarray) -> np.ndarray:
-    """A copy (n, 3) float64, C-contiguous, finite; writable, as what compiled code makes: one type to compile for."""
-    try:
-        values = np.array(values, np.float64, order="C")
-    except (TypeError, ValueError):
-        raise InputError(f"{name} must be an (n, 3) array of numbers, got {type(values).__name__}") from None
+    """A copy (n, 3) float64, C-contiguous, finite; writable, as what compiled code makes."""
+    values = _as_floats(name, values, "an (n, 3) array of numbers")
     if values.ndim != 2 or values.shape[1] != 3:
         raise InputError(f"{name} must be (n, 3), got {values.shape}")
     if values.size and not (values.max() < FARTHEST and values.min() > -FARTHEST):
@@ -36,42 +33,19 @@ def as_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     """A copy of vertices (V, 3) float64, and faces (F, 3) int32 that index them, read-only; C-contiguous."""
     vertices = as_points("vertices", vertices)
     faces = as_faces(faces, len(vertices))
-    if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
-        raise _out_of_range(faces, len(vertices))
+    _check_range(faces, len(vertices))
     return vertices, faces
 
 
 def as_faces(faces: np.ndarray, count: int) -> np.ndarray:
-    """faces (F, 3) as int32, C-contiguous, read-only. Those that were int32 are not looked at."""
+    """faces (F, 3) as int32, C-contiguous, read-only. The values of those that were int32 are not looked at."""
     faces = np.asarray(faces)
-    check_faces(faces)
-    if faces.dtype != np.int32:
-        if faces.size and (faces.min() < 0 or faces.max() >= count):
-            raise _out_of_range(faces, count)
-        faces = faces.astype(np.int32)
-    return read_only(faces)
-
-
-def check_faces(faces: np.ndarray) -> None:
-    """faces are (F, 3) integers."""
     if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
         raise InputError(f"faces must be (F, 3) integers, got {faces.shape} {faces.dtype}")
-
-
-def _out_of_range(faces: np.ndarray, count: int) -> InputError:
-    return InputError(f"faces must index the {count} vertices from 0, got {faces.min()} to {faces.max()}")
-
-
-def as_culled(cull: bool | np.ndarray | None, faces: np.ndarray) -> np.ndarray:
-    """(F,) bool, empty for none, read-only."""
-    if cull is None or cull is False:
-        return _NO_FACES
-    cull = np.asarray(cull)
-    if cull.ndim == 0 and cull.dtype == bool:
-        return read_only(np.full(len(faces), cull))
-    if cull.shape != (len(faces),) or cull.dtype != bool:
-        raise InputError(f"cull must be True, False or ({len(faces)},) bool, one a face, got {cull.shape} {cull.dtype}")
-    return read_only(cull)
+    if faces.dtype != np.int32:
+        _check_range(faces, count)
+        faces = faces.astype(np.int32)
+    return read_only(faces)
 
 
 def read_only(values: np.ndarray) -> np.ndarray:
@@ -98,24 +72,33 @@ def as_directions(directions: np.ndarray) -> np.ndarray:
 
 def as_times(time: np.ndarray, count: int) -> np.ndarray:
     """A copy (count,) float64 in [0, 1]."""
-    try:
-        time = np.array(time, np.float64, order="C")
-    except (TypeError, ValueError):
-        raise InputError(f"time must be ({count},) numbers, one a ray, got {type(time).__name__}") from None
+    time = _as_floats("time", time, f"({count},) numbers, one a ray")
     if time.shape != (count,):
         raise InputError(f"time must be ({count},), one a ray, got {time.shape}")
-    if not ((time >= 0) & (time <= 1)).all():
-        bad = np.flatnonzero(~((time >= 0) & (time <= 1)))[0]
-        raise InputError(f"time must be within 0 and 1, the ends of the motion, got {time[bad]} for ray {bad}")
+    outside = np.flatnonzero(~((time >= 0) & (time <= 1)))
+    if len(outside):
+        raise InputError(
+            f"time must be within 0 and 1, the ends of the motion, got {time[outside[0]]} for ray {outside[0]}"
+        )
     return time
 
 
 def as_angles(name: str, values: np.ndarray) -> np.ndarray:
-    """(n,) float64, finite."""
-    try:
-        values = np.asarray(values, np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} must be a list of finite angles in radians, got {type(values).__name__}") from None
+    """A copy (n,) float64, finite."""
+    expected = "a list of finite angles in radians"
+    values = _as_floats(name, values, expected)
     if values.ndim != 1 or not np.isfinite(values).all():
-        raise InputError(f"{name} must be a list of finite angles in radians, got shape {values.shape}")
+        raise InputError(f"{name} must be {expected}, got shape {values.shape}")
     return values
+
+
+def _as_floats(name: str, values: np.ndarray, expected: str) -> np.ndarray:
+    try:
+        return np.array(values, np.float64, order="C")
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must be {expected}, got {type(values).__name__}") from None
+
+
+def _check_range(faces: np.ndarray, count: int) -> None:
+    if faces.size and (faces.min() < 0 or faces.max() >= count):
+        raise InputError(f"faces must index the {count} vertices from 0, got {faces.min()} to {faces.max()}")

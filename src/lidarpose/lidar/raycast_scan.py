@@ -15,13 +15,12 @@ from lidarpose.sample import FARTHEST
 SECTOR = np.radians(92.0)
 
 _MOST = np.int64(2**63 - 1)
-
 # what `scan_checked` found
 GOOD, BAD_VERTICES, BAD_FACES = 0, 1, 2
 
 
 class Beams(NamedTuple):
-    """A spinning sensor as compiled code reads it; angles in rad. Built by `raycast.beams_of`.
+    """A spinning sensor as compiled code reads it; angles in rad. Built by `raycast.compiled_beams`.
 
     elevations, tangents, shifts (E,): of the rings; group_shift (G,): the different shifts; group_ring (E,): the
     rings, group by group, ascending; group_start (G + 1,): where each group starts in it; half_tan, half_cos: of
@@ -98,11 +97,10 @@ def bounds(vertices):
 
 @compiled
 def window_of(vertices, beams, margin):
-    """column0, columns, row0, rows of the smallest window that holds the vertices, as `raycast.find_window`."""
+    """column0, columns, row0, rows of the smallest window that holds the vertices, `margin` rad wider on each side."""
     if not len(vertices):
         return 0, 0, 0, 0
     center, left, right, low, high = bounds(vertices)
-    # the same sums in the same order as in `Sensor.window`
     left, right, low, high = center + left - margin, center + right + margin, low - margin, high + margin
     least = most = beams.shifts[0]
     for shift in beams.shifts:
@@ -134,7 +132,7 @@ def sector_columns(beams, start, columns, index, tan, cos, scale):
 
 
 @compiled
-def cast_grid(vertices, faces, culled, beams, column0, columns, row0, rows):
+def cast_grid(vertices, faces, beams, column0, columns, row0, rows):
     """1/x (C, R) in the sectors' frames, face (C, R), 1/cos(azimuth - the sector's middle) (C,) of a window."""
     inverse_x = np.zeros((columns, rows))
     face = np.full((columns, rows), -1, np.int32)
@@ -154,7 +152,7 @@ def cast_grid(vertices, faces, culled, beams, column0, columns, row0, rows):
             count = sector_columns(beams, start, columns, index, tan, cos, scale)
             center = beams.start + (column0 + start + (count - 1) / 2) * beams.step + beams.group_shift[g]
             raster(
-                vertices, faces, culled, center, tan[:count], cos[:count], row_tan[:n], index[:count], row_index,
+                vertices, faces, center, tan[:count], cos[:count], row_tan[:n], index[:count], row_index,
                 inverse_x, face,
             )  # fmt: skip
     return inverse_x, face, scale
@@ -199,19 +197,7 @@ def collect(inverse_x, face, scale, beams, column0, row0):
 
 
 @compiled
-def scan_mesh(vertices, faces, culled, window_vertices, beams, margin):
-    """points, face, column, ring and the window (column0, columns, row0, rows) of one mesh, as `raycast.scan`.
-
-    vertices (V, 3), window_vertices (M, 3) float64, finite; faces (F, 3) int32, within the vertices; culled (F,) bool
-    or empty.
-    """
-    window = window_of(window_vertices, beams, margin)
-    inverse_x, face, scale = cast_grid(vertices, faces, culled, beams, *window)
-    return collect(inverse_x, face, scale, beams, window[0], window[2]), window
-
-
-@compiled
-def copy_checked(vertices, copy):
+def _copy_checked(vertices, copy):
     """Fills copy (V, 3) float64 with the vertices. Returns whether all are finite and near enough."""
     given, taken, good = vertices.reshape(-1), copy.reshape(-1), 0
     for i in range(len(given)):
@@ -221,7 +207,7 @@ def copy_checked(vertices, copy):
 
 
 @compiled
-def faces_within(faces, count):
+def _faces_within(faces, count):
     """Whether all faces (F, 3) int32 index `count` vertices."""
     corners, most = faces.reshape(-1), np.uint32(0)
     for i in range(len(corners)):
@@ -231,51 +217,20 @@ def faces_within(faces, count):
 
 
 @compiled
-def scan_checked(vertices, faces, culled, window_vertices, beams, margin):
-    """`scan_mesh` of vertices of any float type, and GOOD, or what is wrong with them."""
+def scan_checked(vertices, faces, window_vertices, beams, margin):
+    """points, face, column, ring; the window (column0, columns, row0, rows); and GOOD or what is wrong with the mesh.
+
+    As `raycast.scan`: vertices (V, 3), window_vertices (M, 3) of any float type; faces (F, 3) int32. Of a bad mesh
+    nothing is cast.
+    """
     copy, window_copy = np.empty(vertices.shape), np.empty(window_vertices.shape)
     fault = GOOD
-    if not copy_checked(vertices, copy) or not copy_checked(window_vertices, window_copy):
+    if not _copy_checked(vertices, copy) or not _copy_checked(window_vertices, window_copy):
         fault = BAD_VERTICES
-    elif not faces_within(faces, len(vertices)):
+    elif not _faces_within(faces, len(vertices)):
         fault = BAD_FACES
     if fault:
         copy, window_copy, faces = copy[:0], window_copy[:0], faces[:0]
-    return scan_mesh(copy, faces, culled, window_copy, beams, margin), fault
-
-
-@compiled
-def scan_chunk(vertices, extra, faces, culled, beams, margin, first, last):
-    """`scan_mesh` of people first to last - 1: vertices (B, V, 3) and extra (B, X, 3) of any float type, whose
-    faces (F, 3) count on from V. The window is about a person's own vertices.
-
-    Returns points (n, 3), face, column, ring (n,) of all, each one's number of hits, its window (people, 4), and the
-    first person with bad vertices or -1: nothing is cast from there on.
-    """
-    count = vertices.shape[1]
-    joined = np.empty((count + extra.shape[1], 3))
-    room, n = 1024, 0
-    points, numbers = np.empty((room, 3), np.float32), np.empty((3, room), np.int32)
-    hits, windows = np.zeros(last - first, np.int64), np.zeros((last - first, 4), np.int64)
-    fault = -1
-    for i in range(first, last):
-        if not copy_checked(vertices[i], joined[:count]) or not copy_checked(extra[i], joined[count:]):
-            fault = i
-            break
-        (one, face, column, ring), window = scan_mesh(joined, faces, culled, joined[:count], beams, margin)
-        if n + len(one) > room:
-            room = 2 * (n + len(one))
-            more, more_numbers = np.empty((room, 3), np.float32), np.empty((3, room), np.int32)
-            for m in range(n):
-                for j in range(3):
-                    more[m, j], more_numbers[j, m] = points[m, j], numbers[j, m]
-            points, numbers = more, more_numbers
-        for m in range(len(one)):
-            for j in range(3):
-                points[n + m, j] = one[m, j]
-            numbers[0, n + m], numbers[1, n + m], numbers[2, n + m] = face[m], column[m], ring[m]
-        hits[i - first] = len(one)
-        for j in range(4):
-            windows[i - first, j] = window[j]
-        n += len(one)
-    return points[:n], numbers[0, :n], numbers[1, :n], numbers[2, :n], hits, windows, fault
+    window = window_of(window_copy, beams, margin)
+    inverse_x, face, scale = cast_grid(copy, faces, beams, *window)
+    return collect(inverse_x, face, scale, beams, window[0], window[2]), window, fault

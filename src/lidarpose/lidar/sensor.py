@@ -1,4 +1,4 @@
-"""Spinning LiDAR sensors: their beams, and a window of them.
+"""Spinning LiDAR sensors: their beams.
 
 A sensor's columns lie `azimuth_step` apart and start at azimuth -pi; its rings are numbered from the lowest. Sensor
 frame: x forward, y left, z up, the origin is where the beams meet.
@@ -11,15 +11,7 @@ import numpy as np
 
 from lidarpose.errors import InputError, check_finite
 
-
-@dataclass(frozen=True, kw_only=True)
-class Window:
-    """A block of beams: columns [column0, column0 + columns), modulo the turn, and rows [row0, row0 + rows)."""
-
-    column0: int
-    columns: int
-    row0: int
-    rows: int
+_ANGLES = "angles in radians"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,7 +22,7 @@ class Sensor:
     rad: a ring's beam leaves at its column's azimuth plus this (None: all rings in line); range_min, range_max m:
     nearer and farther surfaces return nothing; range_sigma m: standard deviation of the range; dropout: share of
     returns lost at random; height m above the ground; tilt rad about y, positive looks down; origin_heights (E,) m:
-    how far above the sensor's origin a ring's beams leave, for stacks of several heads (None: all from the origin).
+    how far above the sensor's origin a ring's beams leave, for stacks of several sensors (None: all from the origin).
 
     Offsets are split into whole columns, which only say when a beam fires, and the rest, which says where: columns
     are numbered by azimuth, as in an image whose rows have been shifted into line.
@@ -50,7 +42,7 @@ class Sensor:
     origin_heights: np.ndarray | None = None
 
     def __post_init__(self):
-        elevations = _frozen("elevations", self.elevations)
+        elevations = _frozen("elevations", self.elevations, _ANGLES)
         if not len(elevations):
             raise InputError("Sensor.elevations must hold at least one ring, got none")
         if (np.abs(elevations) >= np.pi / 2).any():
@@ -61,16 +53,13 @@ class Sensor:
         if (np.diff(elevations) < 0).any():
             raise InputError("Sensor.elevations must ascend: sort them, and the azimuth offsets with them")
         object.__setattr__(self, "elevations", elevations)
-        if self.azimuth_offsets is not None:
-            offsets = _frozen("azimuth_offsets", self.azimuth_offsets)
-            if offsets.shape != elevations.shape:
-                raise InputError(f"Sensor.azimuth_offsets must be {elevations.shape}, one a ring, got {offsets.shape}")
-            object.__setattr__(self, "azimuth_offsets", offsets)
-        if self.origin_heights is not None:
-            heights = _frozen("origin_heights", self.origin_heights, "heights in metres")
-            if heights.shape != elevations.shape:
-                raise InputError(f"Sensor.origin_heights must be {elevations.shape}, one a ring, got {heights.shape}")
-            object.__setattr__(self, "origin_heights", heights)
+        for name, kind in (("azimuth_offsets", _ANGLES), ("origin_heights", "heights in meters")):
+            if getattr(self, name) is None:
+                continue
+            values = _frozen(name, getattr(self, name), kind)
+            if values.shape != elevations.shape:
+                raise InputError(f"Sensor.{name} must be {elevations.shape}, one a ring, got {values.shape}")
+            object.__setattr__(self, name, values)
         check_finite("Sensor.azimuth_step", self.azimuth_step)
         turn = 2 * np.pi / self.azimuth_step if self.azimuth_step > 0 else 0
         if turn < 1 or abs(turn - round(turn)) > 1e-3:
@@ -114,32 +103,17 @@ class Sensor:
         return tuple((float(shift), np.flatnonzero(ring == i)) for i, shift in enumerate(shifts))
 
     @cached_property
-    def heads(self) -> tuple[tuple[float, "Sensor", np.ndarray], ...]:
+    def origins(self) -> tuple[tuple[float, "Sensor", np.ndarray], ...]:
         """(height m, the sensor of its rings alone, their numbers) of each origin; none if all beams share one."""
         if self.origin_heights is None:
             return ()
-        found = []
+        origins = []
         for height in np.unique(self.origin_heights):
             rings = np.flatnonzero(self.origin_heights == height)
             offsets = None if self.azimuth_offsets is None else self.azimuth_offsets[rings]
-            head = replace(self, elevations=self.elevations[rings], azimuth_offsets=offsets, origin_heights=None)
-            found.append((float(height), head, rings))
-        return tuple(found)
-
-    def window(self, left: float, right: float, low: float, high: float) -> Window:
-        """The beams with azimuth in [left, right] and elevation in [low, high], rad; left <= right, unwrapped."""
-        first = int(np.ceil((left - self.azimuth_start - self.azimuth_shifts.max()) / self.azimuth_step))
-        last = int(np.floor((right - self.azimuth_start - self.azimuth_shifts.min()) / self.azimuth_step))
-        count = max(0, last - first + 1)
-        if count >= self.columns:
-            first, count = 0, self.columns
-        row0, end = np.searchsorted(self.elevations, low), np.searchsorted(self.elevations, high, side="right")
-        return Window(column0=first % self.columns, columns=count, row0=int(row0), rows=max(0, int(end) - int(row0)))
-
-    def azimuths(self, window: Window) -> np.ndarray:
-        """(C, R) rad: azimuth of each beam of a window, not wrapped at the seam."""
-        columns = self.azimuth_start + (window.column0 + np.arange(window.columns)) * self.azimuth_step
-        return columns[:, None] + self.azimuth_shifts[window.row0 : window.row0 + window.rows]
+            single = replace(self, elevations=self.elevations[rings], azimuth_offsets=offsets, origin_heights=None)
+            origins.append((float(height), single, rings))
+        return tuple(origins)
 
 
 def check_limits(sensor: object) -> None:
@@ -155,12 +129,12 @@ def check_limits(sensor: object) -> None:
         )
 
 
-def _frozen(name: str, values: np.ndarray, what: str = "angles in radians") -> np.ndarray:
+def _frozen(name: str, values: np.ndarray, kind: str) -> np.ndarray:
     try:
         values = np.array(values, float)
     except (TypeError, ValueError):
-        raise InputError(f"Sensor.{name} must be a list of finite {what}, got {values!r}") from None
+        raise InputError(f"Sensor.{name} must be a list of finite {kind}, got {values!r}") from None
     if values.ndim != 1 or not np.isfinite(values).all():
-        raise InputError(f"Sensor.{name} must be a list of finite {what}, got shape {values.shape}")
+        raise InputError(f"Sensor.{name} must be a list of finite {kind}, got shape {values.shape}")
     values.setflags(write=False)
     return values

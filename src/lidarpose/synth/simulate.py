@@ -4,10 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidarpose.lidar.beam_divergence import scan_wide
-from lidarpose.lidar.hits import Hits
+from lidarpose.lidar.beam_divergence import scan_divergent
 from lidarpose.lidar.ray_pattern import RayPattern
-from lidarpose.lidar.ray_pattern_scan import scan_pattern
+from lidarpose.lidar.raycast import Hits, scan_pattern
 from lidarpose.lidar.sensor import Sensor
 from lidarpose.synth.bodies import Body
 from lidarpose.synth.environment.mesh import Mesh, union
@@ -159,7 +158,9 @@ def _cast(scene: Scene, meshes: list[Mesh], frame: int) -> tuple[Hits, Mesh]:
     margin = scene.config.margin + np.arctan2(scene.config.around, place.distance)
     if isinstance(sensor, Sensor):
         body, divergence = mesh.vertices[:body_vertices], scene.conditions.divergence
-        hits = scan_wide(mesh.vertices, mesh.faces, sensor, divergence=divergence, window_vertices=body, margin=margin)
+        hits = scan_divergent(
+            mesh.vertices, mesh.faces, sensor, divergence=divergence, window_vertices=body, margin=margin
+        )
         return hits, mesh
     hits = scan_pattern(
         mesh.vertices,

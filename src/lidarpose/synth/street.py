@@ -16,8 +16,7 @@ from lidarpose.errors import InputError, whole
 from lidarpose.geometry import rotation_about
 from lidarpose.lidar.presets import sensor as named_sensor
 from lidarpose.lidar.ray_pattern import RayPattern
-from lidarpose.lidar.ray_pattern_scan import scan_pattern
-from lidarpose.lidar.raycast import scan
+from lidarpose.lidar.raycast import scan, scan_pattern
 from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import Box, Pose, Sample, center_of
 from lidarpose.skeleton import BODY26
