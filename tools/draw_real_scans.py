@@ -2,9 +2,9 @@
 
     python tools/draw_real_scans.py STREET.npz WALL.npz BICYCLE.npz --out docs/images/real.png
 
-The recordings are `OS-1-32-G_v2.1.1_1024x10`, `OS-0-32-U1_v2.2.0_1024x10` and `OS-0-128-U1_v2.3.0_1024x10`, test data of
-Ouster's SDK (https://github.com/ouster-lidar/ouster-sdk, BSD-3-Clause). Each npz holds the first frame of one of them as
-`xyz`, (..., 3) meters in the sensor frame, z up, 0,0,0 where nothing was returned; with the package `ouster-sdk`:
+The recordings are `OS-1-32-G_v2.1.1_1024x10`, `OS-0-32-U1_v2.2.0_1024x10` and `OS-0-128-U1_v2.3.0_1024x10`,
+test data of Ouster's SDK (https://github.com/ouster-lidar/ouster-sdk, BSD-3-Clause). Each npz holds the first frame of
+one of them as `xyz`, (..., 3) meters in the sensor frame, z up, 0,0,0 where nothing was returned; with `ouster-sdk`:
 
     for frames in ouster.sdk.open_source("OS-1-32-G_v2.1.1_1024x10.pcap"):
         xyz = ouster.sdk.core.XYZLut(frames[0].sensor_info, False)(frames[0])

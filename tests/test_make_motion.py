@@ -1,0 +1,81 @@
+"""tools/make_motion.py: an archive's files become the file of captured motion that training takes."""
+
+import importlib.util
+from pathlib import Path
+
+import motion_files as files
+import numpy as np
+import pytest
+
+from lidarpose.body.mocap import load_motion
+
+_SPEC = importlib.util.spec_from_file_location("make_motion", Path(__file__).parents[1] / "tools/make_motion.py")
+make_motion = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(make_motion)
+
+
+def write_archive(folder):
+    """Two subjects of the CMU database at 120 Hz, one of HDM05: 25 frames, every frame the first's pose held still."""
+    rotations, way = files.a_clip(1)
+    rotations, way = np.repeat(rotations, 25, axis=0), np.repeat(way, 25, axis=0)
+    asf, axes = files.asf_text()
+    amc = files.amc_text(rotations, way, axes)
+    for name, skeleton in (("02/02_01", "02/02"), ("02/02_10", "02/02"), ("05/05_02", "05/05")):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / f"{skeleton}.asf").write_text(asf)
+        (folder / f"{name}.amc").write_text(amc)
+    (folder / "hdm05").mkdir()
+    (folder / "hdm05/HDM_bd.asf").write_text(asf)
+    (folder / "hdm05/HDM_bd_squat1Reps_001_120.amc").write_text(amc)
+    (folder / "hdm05/readme.txt").write_text("not motion")
+    return files.joints_of(rotations[:1], way[:1])
+
+
+def test_an_archive_becomes_a_file_that_training_reads(tmp_path, capsys):
+    joints = write_archive(tmp_path / "archive")
+    out = tmp_path / "motion.npz"
+    assert make_motion.main([str(tmp_path / "archive"), "--out", str(out)]) == 0
+    assert "4 clips, 12 frames at 10 a second" in capsys.readouterr().out
+    motion = load_motion(out)
+    assert motion.names == ("002_01", "002_10", "005_02", "bd_squat1Reps_001") and motion.fps == 10
+    assert motion.length.tolist() == [3, 3, 3, 3]
+    with np.load(out) as stored:
+        # 25 mm: what retargeting onto the mean adult leaves
+        np.testing.assert_allclose(stored["joints"], np.repeat(joints, 12, axis=0), atol=0.025)
+    played = files.joints_of(motion.rotations, motion.translation)
+    np.testing.assert_allclose(played, np.repeat(joints, 12, axis=0), atol=0.04)
+
+
+def test_subjects_are_chosen_with_or_without_zeros_and_files_of_others_are_not_opened(tmp_path):
+    write_archive(tmp_path)
+    (tmp_path / "05/05_03.amc").write_text("broken")
+    assert list(make_motion.read_clips([tmp_path], ["2", "bd"])) == ["002_01", "002_10", "bd_squat1Reps_001"]
+    # a file made before can be extended
+    make_motion.save_clips(tmp_path / "more/clips.npz", make_motion.read_clips([tmp_path / "02"], []))
+    both = make_motion.read_clips([tmp_path / "more", tmp_path / "hdm05"], ["002", "bd"])
+    assert list(both) == ["002_01", "002_10", "bd_squat1Reps_001"]
+
+
+def test_recordings_of_another_rate_are_resampled_by_it(tmp_path):
+    write_archive(tmp_path)
+    assert len(make_motion.read_clips([tmp_path], ["2"], fps=60)["002_01"]) == 5
+
+
+@pytest.mark.parametrize(
+    "folders, subjects, message",
+    [
+        (["nowhere"], [], "expected a folder"),
+        (["."], ["2", "77"], "no clip of subject 77"),
+        (["hdm05/empty"], [], "no .amc, .bvh, .npz file"),
+        (["02", "02"], [], "two clips 002_01"),
+    ],
+)
+def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(tmp_path, capsys, folders, subjects, message):
+    write_archive(tmp_path)
+    (tmp_path / "hdm05/empty").mkdir()
+    out = tmp_path / "motion.npz"
+    arguments = [*(str(tmp_path / folder) for folder in folders), "--out", str(out)]
+    assert make_motion.main([*arguments, *(["--subjects", *subjects] if subjects else [])]) == 2
+    error = capsys.readouterr().err
+    assert message in error and len(error.splitlines()) == 1
+    assert not out.exists()

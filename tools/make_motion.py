@@ -1,0 +1,133 @@
+"""The file of captured motion that `--motion` takes, from the archives of motion capture as they are downloaded.
+
+    python tools/make_motion.py cmu/subjects --subjects 2 5 --out cmu_motion.npz
+
+FOLDER (several may be given) is searched for .amc beside its .asf, .bvh and .npz files. The file's layout is in
+`lidarpose.body.mocap.motion`: SMPL's 24 joints in meters, z up, at 10 frames a second. Positions are those of the mean
+adult body playing the motion; retargeting them once more moves a joint by 4 mm on average.
+
+The bundled weights learned from all trials of subjects 2 and 5 of the CMU database; the bench's captured poses are of
+subjects 6 and 7. Nothing is downloaded here. Archives, and what a clip of theirs is called:
+
+    CMU         mocap.cs.cmu.edu, subjects/02/02.asf and 02_01.amc          002_01
+    HDM05       resources.mpi-inf.mpg.de/HDM05, HDM_bd.asf and              bd_squat1Reps_001
+                HDM_bd_squat1Reps_001_120.amc
+    others      .bvh of any common skeleton                                 the file's name
+
+A subject is the part of a clip's name before the first `_`; numbers may be given without their zeros.
+"""
+
+import argparse
+import io
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from lidarpose.body.mocap import load_motion
+from lidarpose.body.mocap.retarget import mean_adult_joints
+from lidarpose.body.rig import forward_kinematics
+from lidarpose.errors import InputError
+from lidarpose.io.files import write_atomic
+from lidarpose.skeleton import SMPL24
+
+SUFFIXES = (".amc", ".bvh", ".npz")
+HZ = 10.0
+
+
+def clip_name(name: str) -> str:
+    """The clip's name of a file's: 02_01 -> 002_01, HDM_bd_squat1Reps_001_120 -> bd_squat1Reps_001."""
+    if name.startswith("HDM_"):
+        name = name.removeprefix("HDM_").removesuffix("_120")
+    subject, separator, rest = name.partition("_")
+    return subject.zfill(3) + separator + rest if subject.isdecimal() else name
+
+
+def is_of(name: str, subjects: list[str]) -> bool:
+    """Whether a clip is of one of the subjects; of anybody where none is named."""
+    wanted = {subject.zfill(3) if subject.isdecimal() else subject for subject in subjects}
+    return not wanted or name.partition("_")[0] in wanted
+
+
+def read_clips(
+    folders: list[Path], subjects: list[str], *, fps: float | None = None, up: str | None = None
+) -> dict[str, np.ndarray]:
+    """Joints of the mean adult by the clip's name.
+
+    Args:
+        folders: searched for files of `SUFFIXES`.
+        subjects: whose clips are read; all clips if empty.
+        fps: frames a second of recordings that do not say it; None: 120, CMU's and HDM05's.
+        up: the recordings' up axis, None: as `load_motion` finds it.
+
+    Returns:
+        (frames, 24, 3) float32 m each, z up, at `HZ` frames a second, in the order of the names.
+
+    Raises:
+        InputError: a folder or a subject is missing, a file cannot be read, or two clips have one name.
+    """
+    clips: dict[str, np.ndarray] = {}
+    for folder in folders:
+        if not folder.is_dir():
+            raise InputError(f"{folder}: expected a folder of {', '.join(SUFFIXES)} files; give the unpacked archive")
+        for path in sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES):
+            # an npz names its clips itself
+            if path.suffix.lower() != ".npz" and not is_of(clip_name(path.stem), subjects):
+                continue
+            motion = load_motion(path, hz=HZ, fps=fps, up=up)
+            for c, name in enumerate(map(clip_name, motion.names)):
+                if not is_of(name, subjects):
+                    continue
+                if name in clips:
+                    raise InputError(f"{path}: there are two clips {name}; give each recording once")
+                frames = motion.frames(c)
+                clips[name] = mean_adult(motion.rotations[frames], motion.translation[frames])
+    missing = [subject for subject in subjects if not any(is_of(name, [subject]) for name in clips)]
+    if missing or not clips:
+        what = f"clip of subject {', '.join(missing)}" if missing else f"{', '.join(SUFFIXES)} file"
+        raise InputError(f"{', '.join(map(str, folders))}: no {what} there")
+    return dict(sorted(clips.items()))
+
+
+def mean_adult(rotations: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """(frames, 24, 3) float32 m: the joints of the mean adult in these poses."""
+    rest = mean_adult_joints()[None].astype(np.float32)
+    return forward_kinematics(SMPL24.parents, rest, rotations, translation)[1].astype(np.float32)
+
+
+def save_clips(path: Path, clips: dict[str, np.ndarray]) -> None:
+    length = np.array([len(joints) for joints in clips.values()])
+    content = io.BytesIO()
+    np.savez_compressed(
+        content,
+        joints=np.concatenate(list(clips.values())),
+        joint_names=np.array(SMPL24.joints),
+        clip=np.array(list(clips)),
+        clip_start=np.cumsum(length) - length,
+        clip_length=length,
+        fps=np.array(HZ),
+    )
+    write_atomic(path, content.getvalue())
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER")
+    parser.add_argument("--subjects", nargs="+", default=[], metavar="SUBJECT", help="default: everybody")
+    parser.add_argument("--fps", type=float, help="frames a second of recordings that do not say it (default: 120)")
+    parser.add_argument("--up", help="up axis of the recordings (default: what their format says)")
+    parser.add_argument("--out", required=True, type=Path, metavar="FILE.npz")
+    args = parser.parse_args(arguments)
+    try:
+        clips = read_clips(args.folders, args.subjects, fps=args.fps, up=args.up)
+        save_clips(args.out, clips)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    frames = sum(map(len, clips.values()))
+    print(f"{args.out}: {len(clips)} clips, {frames:,} frames at {HZ:g} a second")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
