@@ -36,122 +36,67 @@ _PANDAR64_OFFSETS = -_degrees("-1.042 " * 10 + "-3.125 -5.208 5.208 3.125 1.042 
 
 _AV2_ORDER = np.argsort(np.concatenate([_VLP_32C, -_VLP_32C]), kind="stable")
 
+
+def _spinning(name: str, elevations: np.ndarray, columns: int, **fields: object) -> Sensor:
+    """A sensor of elevations rad and so many columns a turn."""
+    return Sensor(name=name, elevations=elevations, azimuth_step=_turn(columns), **fields)
+
+
 # Range noise is the makers' typical one-sigma figure or the middle of theirs; heights are those of the usual mount.
-SENSORS: dict[str, Sensor | RayPattern] = {
-    sensor.name: sensor
-    for sensor in (
-        *PATTERNS,
-        # Paper: implementation details (64 lines, 2650 angles); the fan and the height are the released code's. Its
-        # 2650 azimuths run from -pi to +pi with both ends, so 2649 of them differ.
-        Sensor(
-            name="dapt64",
-            elevations=np.radians(np.linspace(-10, 10, 64)),
-            azimuth_step=_turn(2649),
-            range_sigma=0.01,
-            dropout=0.0,
-            height=0.5,
-        ),
-        # Waymo Open Dataset (arXiv:1912.04838, table 2): 64 rings over -17.6..+2.4 deg, 2650 columns. Even spacing is
-        # a stand-in: the true inclinations are in each segment's calibration.
-        Sensor(
-            name="waymo-top",
-            elevations=np.radians(np.linspace(-17.6, 2.4, 64)),
-            azimuth_step=_turn(2650),
-            range_max=75.0,
-            height=2.0,
-        ),
-        # Velodyne VLP-16 manual: 16 rings 2 deg apart; 0.2 deg at 10 Hz; +-3 cm
-        Sensor(name="vlp-16", elevations=np.radians(np.arange(-15.0, 16, 2)), azimuth_step=_turn(1800), height=0.7),
-        # +-3 cm; 0.2 deg at 10 Hz. Its lasers stand 1.4 and 4.2 deg to either side: 7 and 21 whole columns.
-        Sensor(
-            name="vlp-32c",
-            elevations=_VLP_32C,
-            azimuth_step=_turn(1800),
-            range_min=1.0,
-            range_max=200.0,
-            height=1.8,
-        ),
-        # Velodyne HDL-32E manual: 32 rings 4/3 deg apart from -30.67 to +10.67; 0.16 deg at 10 Hz; +-2 cm
-        Sensor(
-            name="hdl-32e",
-            elevations=np.radians(np.linspace(-92 / 3, 32 / 3, 32)),
-            azimuth_step=_turn(2250),
-            range_min=1.0,
-            range_max=100.0,
-            height=1.8,
-        ),
-        # Velodyne HDL-64E manual: upper block 1/3 deg apart from +2 down, lower block 1/2 deg apart to -24.33;
-        # 0.1728 deg at 10 Hz. Nominal: each unit has its own table (one published calibration, an S2.1's, reaches from
-        # -24.8 to +5.0 deg), and its two blocks have origins 10 cm apart.
-        Sensor(
-            name="hdl-64e",
-            elevations=np.radians(np.concatenate([np.linspace(-24.33, -8.83, 32), np.linspace(-8.83 + 0.5, 2, 32)])),
-            azimuth_step=_turn(2083),
-            range_min=0.9,
-            range_max=120.0,
-            height=1.73,
-        ),
-        # Ouster OS1, OS0 and OS2, uniform. Beams of a column leave in four azimuth groups 8 columns of 1024 apart:
-        # whole columns, so they shift when a beam fires, not where it points. Real units deviate by some 0.01 deg.
-        Sensor(
-            name="os1-64",
-            elevations=np.radians(np.linspace(-22.5, 22.5, 64)),
-            azimuth_step=_turn(1024),
-            range_max=120.0,
-            height=1.5,
-        ),
-        Sensor(
-            name="os1-128",
-            elevations=np.radians(np.linspace(-22.5, 22.5, 128)),
-            azimuth_step=_turn(2048),
-            range_max=120.0,
-            height=1.5,
-        ),
-        Sensor(
-            name="os0-128",
-            elevations=np.radians(np.linspace(-45, 45, 128)),
-            azimuth_step=_turn(2048),
-            range_min=0.3,
-            range_max=50.0,
-            height=1.5,
-        ),
-        Sensor(
-            name="os2-128",
-            elevations=np.radians(np.linspace(-11.25, 11.25, 128)),
-            azimuth_step=_turn(2048),
-            range_min=1.0,
-            range_max=240.0,
-            height=1.8,
-        ),
-        # Hesai's default correction file; 0.2 deg at 10 Hz
-        Sensor(
-            name="pandar64",
-            elevations=_PANDAR64,
-            azimuth_step=_turn(1800),
-            azimuth_offsets=_PANDAR64_OFFSETS,
-            range_min=0.3,
-            range_max=200.0,
-            height=1.8,
-        ),
-        # Argoverse 2 (Wilson et al. 2021): two VLP-32C stacked on the roof, one upside down: rings at the table's
-        # angles and at their negatives. In its sweeps the second one's beams meet 11 cm below the first's, and the
-        # ground lies 2 m below. That its columns lie half a step further is a stand-in for a free phase.
-        Sensor(
-            name="av2",
-            elevations=np.concatenate([_VLP_32C, -_VLP_32C])[_AV2_ORDER],
-            azimuth_step=_turn(1800),
-            azimuth_offsets=np.repeat([0.0, _turn(3600)], 32)[_AV2_ORDER],
-            origin_heights=np.repeat([0.0, -0.11], 32)[_AV2_ORDER],
-            range_min=1.0,
-            range_max=200.0,
-            height=2.0,
-        ),
-    )
-}
+_SENSORS = (
+    *PATTERNS,
+    # Paper: implementation details (64 lines, 2650 angles); the fan and the height are the released code's. Its
+    # 2650 azimuths run from -pi to +pi with both ends, so 2649 of them differ.
+    _spinning("dapt64", np.radians(np.linspace(-10, 10, 64)), 2649, range_sigma=0.01, dropout=0.0, height=0.5),
+    # Waymo Open Dataset (arXiv:1912.04838, table 2): 64 rings over -17.6..+2.4 deg, 2650 columns. Even spacing is
+    # a stand-in: the true inclinations are in each segment's calibration.
+    _spinning("waymo-top", np.radians(np.linspace(-17.6, 2.4, 64)), 2650, range_max=75.0, height=2.0),
+    # Velodyne VLP-16 manual: 16 rings 2 deg apart; 0.2 deg at 10 Hz; +-3 cm
+    _spinning("vlp-16", np.radians(np.arange(-15.0, 16, 2)), 1800, height=0.7),
+    # +-3 cm; 0.2 deg at 10 Hz. Its lasers stand 1.4 and 4.2 deg to either side: 7 and 21 whole columns.
+    _spinning("vlp-32c", _VLP_32C, 1800, range_min=1.0, range_max=200.0, height=1.8),
+    # Velodyne HDL-32E manual: 32 rings 4/3 deg apart from -30.67 to +10.67; 0.16 deg at 10 Hz; +-2 cm
+    _spinning("hdl-32e", np.radians(np.linspace(-92 / 3, 32 / 3, 32)), 2250, range_min=1.0, height=1.8),
+    # Velodyne HDL-64E manual: upper block 1/3 deg apart from +2 down, lower block 1/2 deg apart to -24.33;
+    # 0.1728 deg at 10 Hz. Nominal: each unit has its own table (one published calibration, an S2.1's, reaches from
+    # -24.8 to +5.0 deg), and its two blocks have origins 10 cm apart.
+    _spinning(
+        "hdl-64e",
+        np.radians(np.concatenate([np.linspace(-24.33, -8.83, 32), np.linspace(-8.83 + 0.5, 2, 32)])),
+        2083,
+        range_min=0.9,
+        range_max=120.0,
+        height=1.73,
+    ),
+    # Ouster OS1, OS0 and OS2, uniform. Beams of a column leave in four azimuth groups 8 columns of 1024 apart:
+    # whole columns, so they shift when a beam fires, not where it points. Real units deviate by some 0.01 deg.
+    _spinning("os1-64", np.radians(np.linspace(-22.5, 22.5, 64)), 1024, range_max=120.0, height=1.5),
+    _spinning("os1-128", np.radians(np.linspace(-22.5, 22.5, 128)), 2048, range_max=120.0, height=1.5),
+    _spinning("os0-128", np.radians(np.linspace(-45, 45, 128)), 2048, range_min=0.3, range_max=50.0, height=1.5),
+    _spinning("os2-128", np.radians(np.linspace(-11.25, 11.25, 128)), 2048, range_min=1.0, range_max=240.0, height=1.8),
+    # Hesai's default correction file; 0.2 deg at 10 Hz
+    _spinning(
+        "pandar64", _PANDAR64, 1800, azimuth_offsets=_PANDAR64_OFFSETS, range_min=0.3, range_max=200.0, height=1.8
+    ),
+    # Argoverse 2 (Wilson et al. 2021): two VLP-32C stacked on the roof, one upside down: rings at the table's
+    # angles and at their negatives. In its sweeps the second one's beams meet 11 cm below the first's, and the
+    # ground lies 2 m below. That its columns lie half a step further is a stand-in for a free phase.
+    _spinning(
+        "av2",
+        np.concatenate([_VLP_32C, -_VLP_32C])[_AV2_ORDER],
+        1800,
+        azimuth_offsets=np.repeat([0.0, _turn(3600)], 32)[_AV2_ORDER],
+        origin_heights=np.repeat([0.0, -0.11], 32)[_AV2_ORDER],
+        range_min=1.0,
+        range_max=200.0,
+        height=2.0,
+    ),
+)
+SENSORS: dict[str, Sensor | RayPattern] = {sensor.name: sensor for sensor in _SENSORS}
 
 
 def sensor(name: str | os.PathLike) -> Sensor | RayPattern:
-    """A named sensor, or that of a .json or .csv file (`tables.load_sensor`), which is read again once it has
+    """A named sensor, or that of a .json or .csv file (`sensor_file.load_sensor`), which is read again once it has
     changed: a `Sensor`, or a `RayPattern` for what does not spin. An unknown name raises an InputError that lists the
     nearest ones."""
     name = os.fspath(name) if isinstance(name, os.PathLike) else str(name)
@@ -171,11 +116,11 @@ def _of_file(path: str, *stamp: object) -> Sensor:
 def _stamp(path: str) -> tuple[object, ...]:
     """What tells a file from another of its name, or from itself after a change."""
     try:
-        found = os.stat(path)
+        stat = os.stat(path)
     except (OSError, ValueError):
         # reading it says why
         return ()
-    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
+    return stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns
 
 
 # where the beams of a sensor come from: its maker's table, a paper, or the maker's field of view in equal steps

@@ -173,6 +173,7 @@ def _avia(frame: int):
 # Mid-360: a mirror under a head that bends the beam turns a little faster than the head: the azimuth runs round 182
 # times a second while the elevation swings down and up again ten times.
 _MID360_MIRROR, _MID360_HEAD = 10_945, 10_345
+_MID360_ELEVATIONS = (np.radians(-7.2), np.radians(52.0))
 _MID360_STARTS = np.radians([90.65, 91.21])
 _MID360_LEAN = np.radians(124.164)
 # how the head bends the beam, deg as a vector across it: parts that turn m times the head's lag behind the mirror
@@ -214,56 +215,23 @@ def _pinhole(frame: int, *, columns: int = 320, rows: int = 240, wide: float = 5
     return np.arctan2(y, 1.0), np.arctan2(z, np.hypot(1.0, y)), np.zeros(len(y)), line
 
 
-def _half(degrees: float) -> tuple[float, float]:
+def _fan(degrees: float) -> tuple[float, float]:
     return -np.radians(degrees) / 2, np.radians(degrees) / 2
+
+
+def _livox(name: str, rays: Callable, azimuths: tuple[float, float], elevations: tuple[float, float], **fields: float):
+    return RayPattern(
+        name=name, rays=rays, frames=_KEPT, duration=_FRAME, azimuths=azimuths, elevations=elevations, **fields
+    )
 
 
 # Rates and ranges are the makers', for targets of 80 percent; fields of view too, widened by up to 0.2 deg to what the
 # patterns fill; heights of usual mounts.
 PATTERNS = (
-    RayPattern(
-        name="livox-mid40",
-        rays=_mid40,
-        frames=_KEPT,
-        duration=0.1,
-        azimuths=_half(38.4),
-        elevations=_half(38.4),
-        range_min=1.0,
-        range_max=260.0,
-        height=1.5,
-    ),
-    RayPattern(
-        name="livox-mid100",
-        rays=_mid100,
-        frames=_KEPT,
-        duration=0.1,
-        azimuths=_half(98.4),
-        elevations=_half(38.4),
-        range_min=1.0,
-        range_max=260.0,
-        height=2.0,
-    ),
-    RayPattern(
-        name="livox-avia",
-        rays=_avia,
-        frames=_KEPT,
-        duration=0.1,
-        azimuths=_half(70.6),
-        elevations=_half(77.2),
-        range_min=1.0,
-        range_max=320.0,
-        height=1.5,
-    ),
-    RayPattern(
-        name="livox-mid360",
-        rays=_mid360,
-        frames=_KEPT,
-        duration=0.1,
-        azimuths=(-np.pi, np.pi),
-        elevations=(np.radians(-7.2), np.radians(52.0)),
-        range_max=70.0,
-        height=0.5,
-    ),
+    _livox("livox-mid40", _mid40, _fan(38.4), _fan(38.4), range_min=1.0, range_max=260.0, height=1.5),
+    _livox("livox-mid100", _mid100, _fan(98.4), _fan(38.4), range_min=1.0, range_max=260.0, height=2.0),
+    _livox("livox-avia", _avia, _fan(70.6), _fan(77.2), range_min=1.0, range_max=320.0, height=1.5),
+    _livox("livox-mid360", _mid360, (-np.pi, np.pi), _MID360_ELEVATIONS, range_max=70.0, height=0.5),
     # fields of view and ranges of usual structured-light and time-of-flight cameras, a quarter of their pixels. Noise
     # is one figure here, that of 2 to 4 m; a structured-light camera's grows with the square of the range.
     RayPattern(
@@ -271,8 +239,8 @@ PATTERNS = (
         rays=_pinhole,
         frames=1,
         duration=0.0,
-        azimuths=_half(58.4),
-        elevations=_half(45.5),
+        azimuths=_fan(58.4),
+        elevations=_fan(45.5),
         range_min=0.3,
         range_max=8.0,
         range_sigma=0.012,
