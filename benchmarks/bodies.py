@@ -1,6 +1,6 @@
-"""The figures of docs/bodies.md: where the joints are, who is drawn, what clothes and props cost and look like.
+"""The figures of docs/synthesis.md: where the joints are, who is drawn, what clothes and props cost and look like.
 
-python benchmarks/bodies.py [--people 4000] [--sheet docs/props.png]
+python benchmarks/bodies.py [--people 4000] [--sheet docs/images/props.png]
 
 joints        of the mean adult, standing in the T-pose: height above the soles, to the left and ahead of the
               pelvis, and the distance to the skin, cm

@@ -1,7 +1,7 @@
 """Whether a joint's confidence, spread and visibility can be taken at their word, on held-out synthetic people.
 
     python benchmarks/calibration.py --motion cmu_motion.npz \\
-        --out docs/reliability.png --json docs/scores/calibration.json
+        --out docs/images/reliability.png --json docs/scores/calibration.json
 
 The people of benchmarks/heldout.py under another seed. Confidence says how likely a joint is within 10 cm, `visible`
 how likely a point of the body lies within 18 cm of it, `spread` how far off it is on average. Expected calibration

@@ -1,6 +1,6 @@
 """How long one cast of a body takes, beside the slow twin of the tests and, where installed, Embree and Open3D.
 
-    python benchmarks/raycast.py [--rounds 5] [--sensor dapt64] [--rings 60] [--plot docs/raycast.png]
+    python benchmarks/raycast.py [--rounds 5] [--sensor dapt64] [--rings 60] [--plot docs/images/raycast.png]
 
 30 scenes from one seed: 5 distances x 6 closed meshes, each with a ground quad. The ways take turns, one scene each,
 so that a busy machine slows all alike: read the ratios. A cast is `scan`: window, cast and packed points; the others

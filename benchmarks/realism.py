@@ -1,6 +1,6 @@
 """How much synthetic people look like real ones: counts, rings, surfaces, ground, boxes.
 
-    python benchmarks/realism.py [FOLDER] [--people 60] [--picture docs/realism.png] [--crops crops.png]
+    python benchmarks/realism.py [FOLDER] [--people 60] [--picture docs/images/realism.png] [--crops crops.png]
 
 FOLDER holds real sweeps of Argoverse 2 as `benchmarks/real.py` takes them (sweep_N.pcd, .bin or .ply, and beside each
 a sweep_N.json of boxes); without it only the published averages are compared. Each real person of at least 50 points

@@ -1,4 +1,4 @@
-"""The tables of docs/results.md, evaluation.md, model.md and the model cards in docs/cards, from docs/scores.
+"""The tables of docs/results.md, evaluate.md, method.md and the model cards in docs/cards, from docs/scores.
 
     python benchmarks/results.py --collect runs/ablations     # runs' scores.json into docs/scores/ablations.json
     python benchmarks/results.py                              # docs/scores -> the tables of the pages
@@ -35,7 +35,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 SCORES = DOCS / "scores"
 PAGES = (
-    *(DOCS / f"{page}.md" for page in ("results", "evaluation", "model")),
+    *(DOCS / f"{page}.md" for page in ("results", "evaluate", "method")),
     *(DOCS / "cards" / f"{name}.md" for name in BUNDLED),
 )
 RUNS = "ablations"

@@ -9,7 +9,7 @@ import lidarpose
 
 SOURCE = Path(lidarpose.__file__).parent
 DOCS = Path(__file__).parents[1] / "docs"
-NAMED = sorted(set(re.findall(r"`([\w/]+\.py): ([\w.]+)", (DOCS / "model.md").read_text())))
+NAMED = sorted(set(re.findall(r"`([\w/]+\.py): ([\w.]+)", (DOCS / "method.md").read_text())))
 
 
 def test_the_table_of_the_paper_s_method_is_read():

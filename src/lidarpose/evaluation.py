@@ -6,7 +6,7 @@
     evaluation.write(evaluation.run("small", ["bench"]), "evaluation/small")
     print(evaluation.table(["evaluation/small"]))
 
-docs/evaluation.md tells the protocols and the files.
+docs/evaluate.md tells the protocols and the files.
 """
 
 import os

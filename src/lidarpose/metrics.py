@@ -7,7 +7,7 @@
     metrics.by_group(table, "human15")["wrists"]
     metrics.interval(table, np.random.default_rng(0), clusters=sequence)
 
-Meters in; millimeters or percent out. docs/metrics.md defines every metric.
+Meters in; millimeters or percent out. docs/evaluate.md defines every metric.
 """
 
 from lidarpose.eval.metrics.aggregate import AVERAGES, Score, mean

@@ -285,7 +285,7 @@ def _motion(judged: Judged, setting: Setting) -> Iterator[Line]:
 
 
 def _legacy(figures: _Figures) -> Iterator[Line]:
-    """The released code's arithmetic on people with a pose; see docs/metrics.md for what differs."""
+    """The released code's arithmetic on people with a pose; see docs/evaluate.md for what differs."""
     judged = figures.judged
     tables = {name: table[judged.posed] for name, table in figures.tables.items()}
     some = judged.of(judged.posed)

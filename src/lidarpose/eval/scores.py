@@ -12,7 +12,7 @@ from lidarpose.io.files import file_error, read_bytes
 
 SCHEMA = "lidarpose.scores/1"
 FILE = "scores.json"
-# whose arithmetic: this package's, or the paper's released code's, see docs/metrics.md
+# whose arithmetic: this package's, or the paper's released code's, see docs/evaluate.md
 OURS, RELEASED = "lidarpose", "released"
 
 

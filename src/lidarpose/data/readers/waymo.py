@@ -4,7 +4,7 @@
 
 Six of the components are read: lidar_hkp and lidar_box (keypoints and boxes), lidar and lidar_pose (range images of
 five lasers, two returns each, and where the car was when a pixel of the top laser was measured), lidar_calibration and
-vehicle_pose. They are joined on their key columns. See docs/waymo.md for the frames of reference and the quirks.
+vehicle_pose. They are joined on their key columns. See docs/data.md for the frames of reference and the quirks.
 Source: waymo-research/waymo-open-dataset src/waymo_open_dataset/v2.
 """
 

@@ -7,7 +7,7 @@ poses.
 
 A score is the `mean` of a table (n, J) of joints; the tables are public too, for groups, slices and intervals.
 dapt_compat=True (`legacy` is its old name): the arithmetic of the paper's released code, faults included;
-docs/metrics.md says which.
+docs/evaluate.md says which.
 """
 
 import numpy as np
