@@ -268,10 +268,10 @@ def test_hostile_arrays(refused):
     head = b"\x80\x02"
     for old, new, hint in (
         (b"K\x01K\x03\x85", b"K\x01K\x04\x85", "shape (4,) with 24 bytes"),
-        (b"K\x01K\x03\x85", b"K\x01J\xfd\xff\xff\xff\x85", "without type or shape"),
+        (b"K\x01K\x03\x85", b"K\x01J\xfd\xff\xff\xff\x85", "shape (-3,)"),
         (b"K\x01K\x03\x85", b"K\x01\x8a\x08" + b"\xff" * 7 + b"\x7f\x85", "with 24 bytes"),
         (b"K\x01K\x03\x85", b"K\x01]", "without type or shape"),
-        (b"U\x02f8", b"U\x01O", "with other contents"),
+        (b"U\x02f8", b"U\x01O", "an array of a bytes"),
         (b"U\x02f8", b"U\x02M8", "of type 'M8'"),
         (b"U\x02f8", b"U\x02V8", "of type 'V8'"),
         (b"U\x02f8", b"U\x02U0", "with 24 bytes"),
@@ -285,6 +285,39 @@ def test_hostile_arrays(refused):
         line = refused(head + good.replace(old, new, 1) + b".")
         assert any(part in line for part in hint.split("|")), (new, line)
     assert "without content" in refused(head + good[: good.index(b"R(") + 1] + b".")
+
+
+def test_memory_and_time_stay_in_proportion_to_the_file(load, refused, monkeypatch):
+    """A few bytes each refer to what was read before, have one hash with all others, or make an object."""
+
+    def list_of(shared: bytes, part: bytes, count: int) -> bytes:
+        return b"\x80\x02(" + shared + b"q\x01" + part * count + b"l."
+
+    array = old_array(np.zeros(1, np.uint8), b"u1")
+    array = array[: array.index(b"T\x01")].replace(b"K\x01\x85", b"J" + struct.pack("<i", 20_000) + b"\x85")
+    content = b"T" + struct.pack("<i", 20_000) + bytes(20_000)
+    text = b"X" + struct.pack("<I", 20_000) + b"a" * 20_000
+    assert len(load(list_of(content, array + b"h\x01tb", 6))) == 7
+    for data in (
+        list_of(content, array + b"h\x01tb", 60),
+        list_of(text, b"c_codecs\nencode\nh\x01U\x06latin1\x86R", 60),
+        list_of(b"(" + b"N" * 9_000 + b"t", b"c__builtin__\nlist\nh\x01\x85R", 60),
+    ):
+        assert "arrays of more than 8 times its size" in refused(data)
+    # -1 and -2 have one hash, and so have all tuples of them
+    tuples = [tuple(-1 - (i >> k & 1) for k in range(11)) for i in range(1_500)]
+    assert len({hash(key) for key in tuples}) == 1
+    for keys in (tuples, range(30_000), [float(i) for i in range(30_000)]):
+        for data in (dict.fromkeys(keys), set(keys), frozenset(keys)):
+            for protocol in (0, 2, 4):
+                assert "as keys" in refused(pickle.dumps(data, protocol))
+    # text is hashed with a secret, alone and within a tuple
+    many = {key: None for i in range(30_000) for key in (str(i), ("a", i))}
+    assert load(pickle.dumps(many)) == many
+    monkeypatch.setattr(pickles, "_STEPS", 1_000)
+    assert load(b"(" + b"K\x01" * 1_900 + b"l.") == [1] * 1_900
+    for part in (b"\x8f", b"]", b"(", b"N\x94"):
+        assert "too many small parts" in refused(b"\x80\x04(" + part * 3_000 + b"l.")
 
 
 def test_files(load, refused, tmp_path):

@@ -1,13 +1,16 @@
 """Reading pickles of data without running them: SMPL's `.pkl`, SLOPER4D's and Human-M3's labels.
 
-A pickle may call any function of the machine it is read on. `load_pickle` knows only the names of `_MEANINGS`, of
-chumpy and of scipy.sparse; whatever else a file names is refused, and nothing of the file is ever imported or called.
+A pickle may call any function of the machine it is read on. Here Python's own unpickler gets a mark, `Unread`, for
+every name on a list and an error for every other one. What a call of such a name means is decided below, so nothing
+of the file is ever imported or called. Memory and time stay in proportion to the size of the file.
 """
 
+import io
 import math
 import os
+import pickle
 import re
-from collections.abc import Callable
+import struct
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -15,7 +18,6 @@ import numpy as np
 
 from lidarpose.io.files import file_error, read_bytes
 from lidarpose.io.headers import Problem, shorten
-from lidarpose.io.pickle_machine import PLAIN, Call, Named, run
 
 # larger files do not hold labels or a body; they would be in memory three times
 MAX_BYTES = 4 * 2**30
@@ -23,11 +25,22 @@ MAX_BYTES = 4 * 2**30
 MAX_DEPTH = 100
 # sparse matrices become dense ones, together of at most so many numbers: SMPL-X's largest has 0.6 million
 MAX_DENSE = 20_000_000
+# keys without text have hashes that a file can make equal: so many cost a second at most, whatever they are
+MAX_NUMBER_KEYS, MAX_TUPLE_KEYS = 20_000, 1_000
+# instructions that a file of no size may have, and bytes for each further one; one can take 0.2 kB of memory
+_STEPS, _BYTES_PER_STEP = 2_000_000, 2
+# arrays and lists are copied out of the file, some of them twice or three times: Python 2 kept them as text
+_FREE_COPIES, _COPIES = 4096, 8
+
+_TEXT = (str, bytes)
+# values without parts
+_PLAIN = frozenset({type(None), bool, int, float, complex, str, bytes})
+_REMEDY = "copy it again, or ask for npz"
 
 
 @dataclass(frozen=True)
 class Unread:
-    """Stands for an object that holds no numbers which can be read, of the class or function "module.name"."""
+    """Stands for a class or function "module.name", or for an object of it that holds no numbers which can be read."""
 
     name: str
 
@@ -39,7 +52,7 @@ def load_pickle(path: str | os.PathLike) -> object:
     OrderedDict and defaultdict as dict, an expression of chumpy as `Unread`.
 
     Raises InputError, on one line: a file that is missing, empty, cut off, damaged or over 4 GiB; a class or function
-    that is not on the list, by its name; data that contains itself.
+    that is not on the list, by its name; data that contains itself, or that grows far beyond the file's size.
     """
     size = 0
     with suppress(OSError, TypeError, ValueError):
@@ -49,79 +62,275 @@ def load_pickle(path: str | os.PathLike) -> object:
             path, f"has {size / 2**30:.1f} GiB, {MAX_BYTES / 2**30:g} GiB are read at most: split it first"
         )
     data = read_bytes(path, expected="a pickle")
-    if data.startswith(_ZIP):
+    if data.startswith(b"PK\x03\x04"):
         raise file_error(path, "expected a pickle, got a zip archive: an npz, if so name it .npz")
     try:
-        return _Reader().value(run(data, _is_allowed), 0)
+        content = _DataUnpickler(data).load()
+        _check_levels(content, {}, 0)
+        return content
     except Problem as problem:
         raise file_error(path, problem) from None
     except MemoryError:
         raise file_error(path, "does not fit in memory: ask for npz, or split it") from None
-    # what numpy says to wrong shapes and types
-    except (ValueError, TypeError, OverflowError, IndexError) as error:
-        raise file_error(path, f"holds a wrong array ({shorten(str(error))}): copy it again, or ask for npz") from None
+    except (EOFError, struct.error):
+        raise file_error(path, f"is cut off: the pickle has no end; {_REMEDY}") from None
+    # a damaged file can make the unpickler and numpy raise anything
+    except Exception as error:
+        reason = shorten(str(error)) or type(error).__name__
+        raise file_error(path, f"is damaged or no pickle ({reason}): {_REMEDY}") from None
 
 
-class _Reader:
-    """What the pickle's values mean. Each is looked at once, however often it is referred to."""
+class _Stub(Unread):
+    """What a call made that still lacks its state; `value` is set with the state."""
 
-    def __init__(self):
-        self.done: dict[int, object] = {}
-        self.dense = 0
+    def __init__(self, name: str, args: tuple):
+        super().__init__(name)
+        self.args, self.value = args, None
 
-    def value(self, found: object, depth: int) -> object:
-        if type(found) in PLAIN:
-            return found
-        if isinstance(found, Named):
-            return Unread(_canonical(found.name))
-        if depth > MAX_DEPTH:
-            raise Problem(f"is nested more than {MAX_DEPTH} levels deep: ask for npz")
-        key = id(found)
-        if key not in self.done:
-            self.done[key] = _BEGUN
-            self.done[key] = self._made(found, depth + 1)
-        elif self.done[key] is _BEGUN:
-            raise Problem("holds a list or dict that contains itself: ask for npz")
-        return self.done[key]
 
-    def _made(self, found: object, depth: int) -> object:
-        if isinstance(found, dict):
-            return self._dict(found.items(), depth)
-        if isinstance(found, list | tuple | set | frozenset):
-            items = [x if type(x) in PLAIN else self.value(x, depth) for x in found]
-            if isinstance(found, set | frozenset):
-                items = [_key(x) for x in items]
-            return type(found)(items)
-        return self._called(found, depth)
+class _Memo(dict):
+    """The unpickler's memo, in which what has got its state is the value that it became."""
 
-    def _dict(self, pairs, depth: int) -> dict:
-        return {_key(self.value(key, depth)): self.value(value, depth) for key, value in pairs}
+    def __getitem__(self, key: int) -> object:
+        value = super().__getitem__(key)
+        return value.value if type(value) is _Stub and value.value is not None else value
 
-    def _called(self, call: Call, depth: int) -> object:
-        name = _canonical(call.what.name)
-        args, state = self.value(call.args, depth), self.value(call.state, depth)
-        if name in _NEW and args and isinstance(args[0], Unread):
-            name, args = args[0].name, args[1:]
+
+class _DataUnpickler(pickle._Unpickler):
+    """Python's unpickler, in which every instruction that touches an object is replaced by one that knows plain data.
+
+    The pure Python class, since it takes no memory for announced sizes and lets instructions be replaced.
+    """
+
+    dispatch = dict(pickle._Unpickler.dispatch)
+
+    def __init__(self, data: bytes):
+        self.file = io.BytesIO(data)
+        super().__init__(self.file, encoding="latin1")
+        self.memo = _Memo()
+        self.steps = _STEPS + len(data) // _BYTES_PER_STEP
+        self.copies_left = _FREE_COPIES + _COPIES * len(data)
+        self.dense_left = MAX_DENSE
+        self.key_share = 0.0
+
+    def load(self) -> object:
+        """The data. Raises EOFError where the file ends before it, and Problem."""
+        read = self.read = self.file.read
+        self.readline = self.file.readline
+        self.metastack, self.stack = [], []
+        self.append = self.stack.append
+        for _ in range(self.steps):
+            code = read(1)
+            if not code:
+                raise EOFError
+            if code == pickle.STOP:
+                return self.stack.pop()
+            self.dispatch[code[0]](self)
+        raise Problem("is a pickle of too many small parts for its size: ask for npz, or split it")
+
+    # --- what only its maker has
+
+    def find_class(self, module: str, name: str) -> Unread:
+        name = _canonical(f"{module}.{name}")
+        if name not in _KNOWN and not name.startswith("chumpy.") and not _SPARSE.fullmatch(name):
+            raise Problem(
+                f"its pickle wants {shorten(name)}, which is not on the list of plain data (arrays, lists, dicts, "
+                "chumpy, scipy.sparse): nothing was run; ask for npz"
+            )
+        return Unread(name)
+
+    def persistent_load(self, pid: object) -> None:
+        raise Problem("its pickle wants an object by a persistent id, which only its maker has: ask for npz")
+
+    def get_extension(self, code: int) -> None:
+        raise Problem("its pickle wants a class by a registered number, which only its maker has: ask for npz")
+
+    def load_buffer(self) -> None:
+        raise Problem("its pickle wants a buffer outside of the file, which only its maker has: ask for npz")
+
+    # --- calls
+
+    def _instantiate(self, klass: object, args: list) -> None:
+        self.append(self.call(klass, args))
+
+    def load_call(self) -> None:
+        args = self.stack.pop()
+        self.append(self.call(self.stack.pop(), args))
+
+    def load_call_with_names(self) -> None:
+        if self.stack.pop():
+            raise TypeError("a call with named arguments")
+        self.load_call()
+
+    def load_state(self) -> None:
+        state, stub = self.stack.pop(), self.stack[-1]
+        if type(stub) is not _Stub or stub.value is not None:
+            raise TypeError(f"a state of a {type(stub).__name__}")
+        stub.value = self.stack[-1] = self.build(stub.name, stub.args, state)
+
+    def call(self, what: object, args: object) -> object:
+        """What `what(*args)` would return, or a stub where that lacks its state."""
+        if type(what) is not Unread or not isinstance(args, tuple | list):
+            raise TypeError("a call of something that is no name")
+        name = what.name
+        if name in _NEW and args and type(args[0]) is Unread:
+            name, args = args[0].name, ()
         if name in _DICTS:
-            return {_key(k): v for k, v in _pairs(name, args)} | self._dict(call.pairs, depth)
-        if call.pairs or call.items:
-            raise Problem(f"adds items to a {name}: copy it again, or ask for npz")
+            pairs = args[name == "collections.defaultdict" :] or [()]
+            pairs = pairs[0].items() if isinstance(pairs[0], dict) else pairs[0]
+            made = self.updated({}, [part for key, value in pairs for part in (key, value)])
+        elif name in _ITEMS:
+            items = args[0] if args else ()
+            if len(args) > 1 or not isinstance(items, list | tuple | set | frozenset):
+                raise TypeError(f"a {name} of something else than items")
+            made = _ITEMS[name](self.keys(items) if "set" in name else items)
+        elif name in _CALLS:
+            made = _CALLS[name](*args)
+        elif name in ("numpy.ndarray", "builtins.object") or name in _NEW:
+            raise TypeError(f"a call of {name}")
+        else:
+            return _Stub(name, args)
+        return self.charged(made)
+
+    def build(self, name: str, args: tuple, state: object) -> object:
+        """What a stub becomes with its state."""
+        if name == "numpy.dtype":
+            return _dtype(args, state)
+        if name == _RECONSTRUCT:
+            if not args or args[0] != Unread("numpy.ndarray") or not isinstance(state, tuple) or len(state) != 5:
+                raise Problem(f"has an array of an unknown class or without content: {_REMEDY}")
+            _, shape, dtype, fortran, data = state
+            return self.charged(_array(data, dtype, shape, "F" if fortran else "C"))
         if name.startswith("chumpy."):
-            return _chumpy(name, state)
-        if _SPARSE.fullmatch(name):
-            made = _dense(name, state, MAX_DENSE - self.dense)
-            self.dense += made.size
-            return made
-        if name not in _MEANINGS:
-            return Unread(name)
-        return _MEANINGS[name](args, state)
+            return self.charged(_chumpy(name, state))
+        dense = _dense(name, state, self.dense_left)
+        self.dense_left -= dense.size
+        return dense
+
+    def charged(self, made: object) -> object:
+        """The value, once it is sure that all values together do not outgrow the file."""
+        self.copies_left -= (
+            made.nbytes if isinstance(made, np.ndarray) else len(made) if hasattr(made, "__len__") else 0
+        )
+        if self.copies_left < 0:
+            raise Problem(f"has arrays of more than {_COPIES} times its size: ask for npz")
+        return made
+
+    # --- containers
+
+    def extended(self, items: list) -> None:
+        if type(self.stack[-1]) is not list:
+            raise TypeError(f"items of a {type(self.stack[-1]).__name__}")
+        self.stack[-1].extend(items)
+
+    def updated(self, target: object, items: list) -> dict:
+        if type(target) is not dict:
+            raise TypeError(f"values by key of a {type(target).__name__}")
+        target.update(zip(self.keys(items[::2]), items[1::2], strict=True))
+        return target
+
+    def load_dict(self) -> None:
+        items = self.pop_mark()
+        self.append(self.updated({}, items))
+
+    def load_frozenset(self) -> None:
+        items = self.pop_mark()
+        self.append(frozenset(self.keys(items)))
+
+    def load_setitem(self) -> None:
+        value, key = self.stack.pop(), self.stack.pop()
+        self.updated(self.stack[-1], [key, value])
+
+    def load_setitems(self) -> None:
+        items = self.pop_mark()
+        self.updated(self.stack[-1], items)
+
+    def load_additems(self) -> None:
+        items = self.pop_mark()
+        if type(self.stack[-1]) is not set:
+            raise TypeError(f"items of a {type(self.stack[-1]).__name__}")
+        self.stack[-1].update(self.keys(items))
+
+    def keys(self, items: object) -> object:
+        """The items, once each can be a key: a nested one could overflow the interpreter's stack, and numbers can be
+        made to share one hash, which takes time by the square of their count."""
+        for item in items:
+            if type(item) is str and item:
+                continue
+            parts = item if type(item) is tuple else (item,)
+            for part in parts:
+                if type(part) not in _PLAIN and not isinstance(part, np.generic):
+                    raise TypeError(f"a {type(item).__name__} as a key")
+                if type(part) is int and abs(part) >= 2**63:
+                    raise TypeError("a number of more than 64 bits as a key")
+            # text is hashed with a secret
+            if not any(isinstance(part, _TEXT) and part for part in parts):
+                self.key_share += 1 / (MAX_TUPLE_KEYS if type(item) is tuple else MAX_NUMBER_KEYS)
+                if self.key_share > 1:
+                    raise Problem(f"has over {MAX_NUMBER_KEYS} numbers or {MAX_TUPLE_KEYS} tuples as keys: ask for npz")
+        return items
 
 
-_ZIP = b"PK\x03\x04"
-# in `_Reader.done` while a value is being made
-_BEGUN = object()
+_DataUnpickler.dispatch |= {
+    code[0]: handler
+    for handler, codes in {
+        # frames only say how much to read ahead
+        lambda self: self.read(8): [pickle.FRAME],
+        _DataUnpickler.load_buffer: [pickle.NEXT_BUFFER, pickle.READONLY_BUFFER],
+        _DataUnpickler.load_call: [pickle.REDUCE, pickle.NEWOBJ],
+        _DataUnpickler.load_call_with_names: [pickle.NEWOBJ_EX],
+        _DataUnpickler.load_state: [pickle.BUILD],
+        _DataUnpickler.load_dict: [pickle.DICT],
+        _DataUnpickler.load_setitem: [pickle.SETITEM],
+        _DataUnpickler.load_setitems: [pickle.SETITEMS],
+        _DataUnpickler.load_additems: [pickle.ADDITEMS],
+        lambda self: self.extended([self.stack.pop()]): [pickle.APPEND],
+        lambda self: self.extended(self.pop_mark()): [pickle.APPENDS],
+        _DataUnpickler.load_frozenset: [pickle.FROZENSET],
+        # Python's own takes the announced memory before it reads
+        pickle._Unpickler.load_binbytes8: [pickle.BYTEARRAY8],
+    }.items()
+    for code in codes
+}
+
+
+def _check_levels(value: object, levels: dict[int, int | None], depth: int) -> int:
+    """How many levels of containers a value has. levels: by id, of those seen before, None while they are counted.
+
+    Raises Problem for too many, for a container in itself, and for an object that never got its state.
+    """
+    if type(value) in _PLAIN:
+        return 0
+    if id(value) in levels:
+        if levels[id(value)] is None:
+            raise Problem("holds a list or dict that contains itself: ask for npz")
+        return levels[id(value)]
+    if type(value) is _Stub:
+        if not value.name.startswith("chumpy."):
+            raise Problem(f"has a {value.name} without content: {_REMEDY}")
+        return 0
+    if depth > MAX_DEPTH:
+        raise Problem(f"is nested more than {MAX_DEPTH} levels deep: ask for npz")
+    parts = ()
+    if isinstance(value, list | tuple | set | frozenset):
+        parts = value
+    elif isinstance(value, dict):
+        # keys have no parts that have parts
+        parts = value.values()
+    elif isinstance(value, np.ndarray) and value.dtype.kind == "O":
+        parts = value.flat
+    levels[id(value)] = None
+    count = 1 + max((_check_levels(p, levels, depth + 1) for p in parts if type(p) not in _PLAIN), default=0)
+    if count > MAX_DEPTH:
+        raise Problem(f"is nested more than {MAX_DEPTH} levels deep: ask for npz")
+    levels[id(value)] = count
+    return count
+
+
 _NEW = ("copyreg._reconstructor", "copyreg.__newobj__")
 _DICTS = ("collections.OrderedDict", "collections.defaultdict", "builtins.dict")
+_ITEMS = {f"builtins.{kind.__name__}": kind for kind in (list, tuple, set, frozenset)}
+_RECONSTRUCT = "numpy.core.multiarray._reconstruct"
 _SPARSE = re.compile(r"scipy\.sparse\.([a-z_]+\.)?(csc|csr)_(matrix|array)")
 
 
@@ -133,35 +342,7 @@ def _canonical(name: str) -> str:
     return name
 
 
-def _is_allowed(name: str) -> bool:
-    name = _canonical(name)
-    known = name in _MEANINGS or name in _NEW or name in _DICTS or name in ("numpy.ndarray", "builtins.object")
-    return known or name.startswith("chumpy.") or _SPARSE.fullmatch(name) is not None
-
-
-def _key(value: object) -> object:
-    parts = value if isinstance(value, tuple) else (value,)
-    if not all(type(part) in PLAIN or isinstance(part, np.generic) for part in parts):
-        raise Problem(f"has a {type(value).__name__} as a key: ask for npz")
-    return value
-
-
-def _pairs(name: str, args: tuple) -> list:
-    """What a dict is made from: pairs or nothing; a defaultdict's factory is left out."""
-    if name == "collections.defaultdict":
-        args = args[1:]
-    pairs = args[0] if args else []
-    pairs = list(pairs.items()) if isinstance(pairs, dict) else pairs
-    if (
-        len(args) > 1
-        or not isinstance(pairs, list)
-        or not all(isinstance(p, list | tuple) and len(p) == 2 for p in pairs)
-    ):
-        raise Problem(f"makes a {name} of something else than pairs: copy it again, or ask for npz")
-    return pairs
-
-
-# --- numpy
+# --- numpy and Python's own
 
 
 def _dtype(args: tuple, state: object) -> np.dtype:
@@ -170,65 +351,70 @@ def _dtype(args: tuple, state: object) -> np.dtype:
         r"[|<>=]?(b1|[iu][1248]|f(2|4|8|16)|c(8|16|32)|[SU]\d{1,9}|O\d*|\?)", code
     ):
         raise Problem(f"has arrays of type {shorten(repr(code))}; numbers and text are read: ask for npz")
-    if code[-1] == "O" or "O" in code:
+    if "O" in code:
         return np.dtype(object)
-    order = ""
-    if state is not None:
-        if not isinstance(state, tuple) or len(state) < 5 or any(x is not None for x in state[2:5]):
-            raise Problem(f"has arrays of a type derived from {code}; plain numbers and text are read: ask for npz")
-        order = state[1] if isinstance(state[1], str) and state[1] in ("<", ">", "|", "=") else ""
+    if not isinstance(state, tuple) or len(state) < 5 or any(x is not None for x in state[2:5]):
+        raise Problem(f"has arrays of a type derived from {code}; plain numbers and text are read: ask for npz")
+    order = state[1] if state[1] in ("<", ">", "|", "=") else ""
     return np.dtype(order + code.lstrip("|<>="))
 
 
-def _bytes(data: object) -> bytes:
-    """An array's content; Python 2 kept it as text."""
+def _array(data: object, dtype: object, shape: object, order: str) -> np.ndarray:
+    if not isinstance(dtype, np.dtype) or not isinstance(shape, tuple) or any(type(n) is not int for n in shape):
+        raise Problem(f"has an array without type or shape: {_REMEDY}")
+    # Python 2 kept the content as text
     data = data.encode("latin1") if isinstance(data, str) else data
-    if not isinstance(data, bytes | bytearray):
-        raise Problem(f"has an array of {type(data).__name__}: copy it again, or ask for npz")
-    return data
-
-
-def _array_of(data: object, dtype: object, shape: object, order: str) -> np.ndarray:
-    if (
-        not isinstance(dtype, np.dtype)
-        or not isinstance(shape, tuple)
-        or not all(type(n) is int and n >= 0 for n in shape)
-    ):
-        raise Problem("has an array without type or shape: copy it again, or ask for npz")
+    is_object = dtype.kind == "O"
+    if not isinstance(data, list if is_object else bytes):
+        raise Problem(f"has an array of a {type(data).__name__}: {_REMEDY}")
     count = math.prod(shape)
-    if dtype.kind == "O":
-        if not isinstance(data, list) or len(data) != count:
-            raise Problem(f"has an array of shape {shape} with other contents: copy it again, or ask for npz")
-        flat = np.empty(count, object)
+    if any(n < 0 for n in shape) or len(data) != count * (1 if is_object else dtype.itemsize):
+        came = f"{shorten(str(shape))} with {len(data)} {'items' if is_object else 'bytes'}"
+        raise Problem(f"has an array of the shape {came}: {_REMEDY}")
+    if is_object or not data:
+        flat = np.empty(count, dtype)
         for i, item in enumerate(data):
             flat[i] = item
     else:
-        data = _bytes(data)
-        if len(data) != count * dtype.itemsize or (count and not dtype.itemsize):
-            raise Problem(f"has an array of shape {shape} with {len(data)} bytes: copy it again, or ask for npz")
-        flat = np.frombuffer(data, dtype).copy() if count else np.empty(0, dtype)
+        flat = np.frombuffer(data, dtype).copy()
     return flat.reshape(shape, order=order)
 
 
-def _array(args: tuple, state: object) -> np.ndarray:
-    if not args or args[0] != Unread("numpy.ndarray"):
-        raise Problem("has an array of an unknown class: ask for npz")
-    if not isinstance(state, tuple) or len(state) != 5:
-        raise Problem("has an array without content: copy it again, or ask for npz")
-    _, shape, dtype, fortran, data = state
-    return _array_of(data, dtype, shape, "F" if fortran else "C")
+def _from_buffer(data: object, dtype: object, shape: object, order: object) -> np.ndarray:
+    return _array(data, dtype, shape, "F" if order == "F" else "C")
 
 
-def _array_from_buffer(args: tuple, state: object) -> np.ndarray:
-    data, dtype, shape, order = args
-    return _array_of(data, dtype, shape, "F" if order == "F" else "C")
-
-
-def _scalar(args: tuple, state: object) -> np.generic:
-    dtype, data = args
+def _scalar(dtype: object, data: object) -> np.generic:
     if not isinstance(dtype, np.dtype) or dtype.kind == "O":
         raise Problem("has a number of type object: ask for npz")
-    return _array_of(data, dtype, (), "C")[()]
+    return _array(data, dtype, (), "C")[()]
+
+
+def _encode(text: object = b"", encoding: object = "latin1") -> bytes:
+    """How Python 3 writes bytes for Python 2: as text and its encoding."""
+    if isinstance(text, bytes):
+        return text
+    if not isinstance(text, str) or encoding not in ("latin1", "latin-1"):
+        raise Problem(f"makes bytes of something else than latin-1 text: {_REMEDY}")
+    return text.encode("latin1")
+
+
+def _complex(real: object, imaginary: object) -> complex:
+    if type(real) not in (int, float) or type(imaginary) not in (int, float):
+        raise Problem(f"makes a complex number of something else than numbers: {_REMEDY}")
+    return complex(real, imaginary)
+
+
+# what can be made at once, without a state
+_CALLS = {
+    "numpy.core.multiarray.scalar": _scalar,
+    "numpy.core.numeric._frombuffer": _from_buffer,
+    "_codecs.encode": _encode,
+    "builtins.bytes": _encode,
+    "builtins.bytearray": _encode,
+    "builtins.complex": _complex,
+}
+_KNOWN = {"numpy.dtype", "numpy.ndarray", "builtins.object", _RECONSTRUCT, *_NEW, *_DICTS, *_ITEMS, *_CALLS}
 
 
 # --- chumpy and scipy
@@ -238,10 +424,11 @@ def _chumpy(name: str, state: object) -> np.ndarray | Unread:
     """A Ch holds its numbers as `x`; a Select is a choice from another, by flat indices."""
     if not isinstance(state, dict):
         return Unread(name)
-    if name == "chumpy.reordering.Select" and isinstance(state.get("a"), np.ndarray):
-        picked = state["a"].ravel()[np.asarray(state.get("idxs"), np.int64)]
+    parts = [state.get(key) for key in ("a", "idxs")]
+    if name == "chumpy.reordering.Select" and all(isinstance(part, np.ndarray) for part in parts):
+        selected = parts[0].flat[parts[1].astype(np.int64)]
         shape = state.get("preferred_shape")
-        return picked if shape is None else picked.reshape(shape)
+        return selected if shape is None else selected.reshape(shape)
     return state["x"] if isinstance(state.get("x"), np.ndarray) else Unread(name)
 
 
@@ -255,7 +442,7 @@ def _dense(name: str, state: object, most: int) -> np.ndarray:
         or len(shape) != 2
         or not all(isinstance(p, np.ndarray) and p.ndim == 1 for p in pieces)
     ):
-        raise Problem(f"has a {name} without its parts: copy it again, or ask for npz")
+        raise Problem(f"has a {name} without its parts: {_REMEDY}")
     rows, columns = (int(n) for n in shape)
     by_column = "csc" in name
     lines, across = (columns, rows) if by_column else (rows, columns)
@@ -272,53 +459,7 @@ def _dense(name: str, state: object, most: int) -> np.ndarray:
         wrong or index.dtype.kind not in "iu" or start[0] != 0 or start[-1] != len(data) or (np.diff(start) < 0).any()
     )
     if wrong or (len(index) and not 0 <= index.min() <= index.max() < across):
-        raise Problem(f"has a {name} whose parts do not fit together: copy it again, or ask for npz")
+        raise Problem(f"has a {name} whose parts do not fit together: {_REMEDY}")
     dense = np.zeros((lines, across), data.dtype)
     np.add.at(dense, (np.repeat(np.arange(lines), np.diff(start)), index), data)
     return dense.T.copy() if by_column else dense
-
-
-# --- Python's own
-
-
-def _items(kind: type) -> Callable[[tuple, object], object]:
-    def make(args: tuple, state: object):
-        items = args[0] if args else ()
-        if len(args) > 1 or not isinstance(items, list | tuple | set | frozenset):
-            raise Problem(f"makes a {kind.__name__} of something else than items: copy it again, or ask for npz")
-        return kind(_key(x) for x in items) if kind in (set, frozenset) else kind(items)
-
-    return make
-
-
-def _encoded(args: tuple, state: object) -> bytes:
-    """How Python 3 writes bytes for Python 2: as text and its encoding."""
-    if not args or isinstance(args[0], bytes):
-        return args[0] if args else b""
-    if len(args) != 2 or not isinstance(args[0], str) or args[1] not in ("latin1", "latin-1"):
-        raise Problem("makes bytes of something else than latin-1 text: copy it again, or ask for npz")
-    return args[0].encode("latin1")
-
-
-def _complex(args: tuple, state: object) -> complex:
-    real, imaginary = args
-    if type(real) not in (int, float) or type(imaginary) not in (int, float):
-        raise Problem("makes a complex number of something else than numbers: copy it again, or ask for npz")
-    return complex(real, imaginary)
-
-
-# what the names on the list mean: (arguments, state) -> value
-_MEANINGS = {
-    "numpy.dtype": _dtype,
-    "numpy.core.multiarray._reconstruct": _array,
-    "numpy.core.multiarray.scalar": _scalar,
-    "numpy.core.numeric._frombuffer": _array_from_buffer,
-    "_codecs.encode": _encoded,
-    "builtins.bytes": _encoded,
-    "builtins.bytearray": _encoded,
-    "builtins.complex": _complex,
-    "builtins.list": _items(list),
-    "builtins.tuple": _items(tuple),
-    "builtins.set": _items(set),
-    "builtins.frozenset": _items(frozenset),
-}
