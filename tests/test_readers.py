@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from lidarpose.body.smpl import load_body
 from lidarpose.data.prepare import READERS, reader
-from lidarpose.data.readers.base import Skipped
-from lidarpose.data.readers.raw_files import find_below, numbered, numbers, read_cloud
+from lidarpose.data.readers.base import Skipped, find_below, numbered, numbers, read_cloud
 from lidarpose.data.readers.sloper4d import _heading
 from lidarpose.data.readers.smpl_joints import SmplJoints
 from lidarpose.errors import InputError

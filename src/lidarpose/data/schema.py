@@ -80,7 +80,7 @@ def pyarrow():
         import pyarrow
         import pyarrow.parquet
     except ImportError:
-        raise MissingExtra("Parquet shards", "synth") from None
+        raise MissingExtra("reading and writing Parquet", "synth") from None
     return pyarrow, pyarrow.parquet
 
 

@@ -16,8 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.base import Skipped
-from lidarpose.data.readers.raw_files import as_cloud, find_below, numbers, read_cloud, wrong_root
+from lidarpose.data.readers.base import Skipped, as_cloud, find_below, numbers, read_cloud, wrong_root
 from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_item
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error

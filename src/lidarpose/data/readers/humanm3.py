@@ -17,8 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.base import Skipped
-from lidarpose.data.readers.raw_files import find_below, numbered, numbers, read_cloud, read_json, wrong_root
+from lidarpose.data.readers.base import Skipped, find_below, numbered, numbers, read_cloud, read_json, wrong_root
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
 from lidarpose.io.pickles import load_pickle

@@ -17,8 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.base import Skipped
-from lidarpose.data.readers.raw_files import as_cloud, numbers, wrong_root
+from lidarpose.data.readers.base import Skipped, as_cloud, numbers, wrong_root
 from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_item
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about

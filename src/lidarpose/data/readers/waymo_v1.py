@@ -2,20 +2,22 @@
 
     ROOT/{training,validation}/segment-NAME_with_camera_labels.tfrecord
 
-Read without TensorFlow and without generated code, by the numbers of the fields that are needed. Source:
+Read without TensorFlow: the fields that are needed are declared here, protobuf skips the others. Source:
 waymo-research/waymo-open-dataset dataset.proto, label.proto, protos/keypoint.proto, protos/vector.proto.
+
+A TFRecord file is a row of records: length (uint64, little-endian), its checksum (uint32), data, its checksum. A
+checksum is the CRC-32C of the bytes, rotated right by 15 bits, plus a constant.
 """
 
 import reprlib
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from lidarpose.data.readers.base import Skipped
-from lidarpose.data.readers.protobuf import Message
-from lidarpose.data.readers.tfrecord import records
 from lidarpose.data.readers.waymo_frames import (
     BAD_FRAME,
     BAD_IMAGE,
@@ -29,31 +31,98 @@ from lidarpose.data.readers.waymo_frames import (
     person,
     transform,
 )
-from lidarpose.errors import InputError
+from lidarpose.errors import InputError, MissingExtra
 from lidarpose.io.files import file_error
 from lidarpose.sample import LabeledSample
 from lidarpose.skeleton import WAYMO14
 
+try:
+    import google_crc32c
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+    from google.protobuf.message import DecodeError
+except ImportError:
+    raise MissingExtra("reading Waymo", "synth") from None
+
 SPLITS = ("training", "validation")
 
-# numbers of fields, by message
-_FRAME_CONTEXT, _FRAME_TIME, _FRAME_POSE, _FRAME_LASERS, _FRAME_LABELS = 1, 2, 3, 5, 6
-_CONTEXT_NAME, _CONTEXT_LASERS = 1, 3
-_CALIBRATION_LASER, _CALIBRATION_BEAMS, _CALIBRATION_LOW, _CALIBRATION_HIGH, _CALIBRATION_EXTRINSIC = 1, 2, 3, 4, 5
-_TRANSFORM_VALUES = 1
-_LASER_NAME, _LASER_RETURNS = 1, (2, 3)
-_IMAGE_COMPRESSED, _IMAGE_POSES = 2, 4
-_MATRIX_DATA, _MATRIX_SHAPE, _SHAPE_SIZES = 1, 2, 1
-_LABEL_BOX, _LABEL_TYPE, _LABEL_ID, _LABEL_COUNT, _LABEL_KEYPOINTS = 1, 3, 4, 7, 8
-# center x, y, z, length, width, height, heading: width comes before length
-_BOX = (1, 2, 3, 5, 4, 6, 7)
-_KEYPOINTS_EACH = 1
-_KEYPOINT_TYPE, _KEYPOINT_3D = 1, 2
-_3D_PLACE, _3D_VISIBILITY, _VISIBILITY_OCCLUDED = 1, 2, 1
-_PLACE = (1, 2, 3)
+# Protobuf holds a repeated field in up to twenty times its bytes: what no frame needs is refused before it is parsed.
+# Frames have about 5 MB; images of the top laser 64 x 2650 pixels of up to 6 values, and shapes 3 sizes.
+_LARGEST_FRAME = 1 << 25
+_LARGEST_IMAGE = 4 << 24
+_LARGEST_SHAPE = 1 << 16
 
-# a range image of the top laser has 64 x 2650 pixels; what is far larger is damaged
-_MOST_VALUES = 1 << 24
+# message -> (field, number, type) that are read of it; "*" marks a repeated field
+_MESSAGES = {
+    "Frame": [
+        ("context", 1, "Context"),
+        ("timestamp_micros", 2, "int64"),
+        ("pose", 3, "Transform"),
+        ("lasers", 5, "*Laser"),
+        ("laser_labels", 6, "*Label"),
+    ],
+    "Context": [("name", 1, "bytes"), ("laser_calibrations", 3, "*LaserCalibration")],
+    "Transform": [("transform", 1, "*double")],
+    "LaserCalibration": [
+        ("name", 1, "int64"),
+        ("beam_inclinations", 2, "*double"),
+        ("beam_inclination_min", 3, "double"),
+        ("beam_inclination_max", 4, "double"),
+        ("extrinsic", 5, "Transform"),
+    ],
+    "Laser": [("name", 1, "int64"), ("ri_return1", 2, "RangeImage"), ("ri_return2", 3, "RangeImage")],
+    "RangeImage": [("range_image_compressed", 2, "bytes"), ("range_image_pose_compressed", 4, "bytes")],
+    # data is packed, as dataset.proto says: its bytes are the array
+    "MatrixFloat": [("data", 1, "bytes"), ("shape", 2, "bytes")],
+    "Shape": [("dims", 1, "*int64")],
+    "Label": [
+        ("box", 1, "Box"),
+        ("type", 3, "int64"),
+        ("id", 4, "bytes"),
+        ("num_lidar_points_in_box", 7, "int64"),
+        ("laser_keypoints", 8, "LaserKeypoints"),
+    ],
+    "Box": [
+        (name, number, "double")
+        for number, name in enumerate("center_x center_y center_z width length height heading".split(), 1)
+    ],
+    "LaserKeypoints": [("keypoint", 1, "*LaserKeypoint")],
+    "LaserKeypoint": [("type", 1, "int64"), ("keypoint_3d", 2, "Keypoint3d")],
+    "Keypoint3d": [("location_m", 1, "Vec3d"), ("visibility", 2, "Visibility")],
+    "Vec3d": [("x", 1, "double"), ("y", 2, "double"), ("z", 3, "double")],
+    "Visibility": [("is_occluded", 1, "bool")],
+}
+
+
+def _message_classes() -> dict[str, Any]:
+    """The class of each message, in a pool of its own: Waymo's generated code may be loaded too."""
+    file = descriptor_pb2.FileDescriptorProto(name="waymo.proto", package="waymo", syntax="proto2")
+    of = descriptor_pb2.FieldDescriptorProto
+    for message, fields in _MESSAGES.items():
+        declared = file.message_type.add(name=message)
+        for name, number, kind in fields:
+            label = of.LABEL_REPEATED if kind.startswith("*") else of.LABEL_OPTIONAL
+            kind = kind.removeprefix("*")
+            if kind in _MESSAGES:
+                typed = {"type": of.TYPE_MESSAGE, "type_name": f".waymo.{kind}"}
+            else:
+                typed = {"type": getattr(of, f"TYPE_{kind.upper()}")}
+            declared.field.add(name=name, number=number, label=label, **typed)
+    pool = descriptor_pool.DescriptorPool()
+    pool.AddSerializedFile(file.SerializeToString())
+    return {name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"waymo.{name}")) for name in _MESSAGES}
+
+
+_CLASSES = _message_classes()
+
+
+def parse(message: str, data: bytes, largest: int) -> Any:
+    """A message of `_MESSAGES` of at most so many bytes. Raises InputError where it is larger, cut off or damaged."""
+    if len(data) > largest:
+        raise InputError(f"message {message} has {len(data):,} bytes, more than {largest:,}: damaged, or not Waymo's")
+    try:
+        return _CLASSES[message].FromString(data)
+    except DecodeError:
+        raise InputError(f"message {message} is cut off or damaged") from None
 
 
 class WaymoV1:
@@ -79,7 +148,7 @@ class WaymoV1:
         try:
             for number, data in enumerate(records(root / part)):
                 try:
-                    frame = _frame(Message(data), start, self.margin)
+                    frame = _frame(parse("Frame", data, _LARGEST_FRAME), start, self.margin)
                 except InputError as error:
                     yield Skipped(reason=BAD_FRAME, where=f"{part}: record {number}: {error}")
                     continue
@@ -89,26 +158,55 @@ class WaymoV1:
             yield Skipped(reason=BAD_REST, where=f"{part}: {error}")
 
 
-def _frame(message: Message, start: int | None, margin: float) -> Frame:
-    """A frame with the points of its people. start: timestamp of the file's first frame, None where it is this one.
+def records(path: Path) -> Iterator[bytes]:
+    """The records of a TFRecord file, one in memory at a time. Raises InputError where one is cut off or damaged: what
+    follows cannot be found, since only a record tells where the next begins."""
+    try:
+        size = path.stat().st_size
+        with open(path, "rb") as file:
+            number = 0
+            while head := file.read(12):
+                if len(head) < 12:
+                    raise file_error(path, f"is cut off in record {number}; copy it again")
+                length = int.from_bytes(head[:8], "little")
+                if _masked_checksum(head[:8]) != int.from_bytes(head[8:], "little"):
+                    what = "is no TFRecord file" if number == 0 else f"is damaged at record {number}"
+                    raise file_error(path, f"{what} (the checksum of a length is wrong); copy it again")
+                if file.tell() + length + 4 > size:
+                    raise file_error(path, f"is cut off in record {number}; copy it again")
+                data, checksum = file.read(length), file.read(4)
+                if _masked_checksum(data) != int.from_bytes(checksum, "little"):
+                    raise file_error(path, f"is damaged in record {number} (its checksum is wrong); copy it again")
+                yield data
+                number += 1
+    except OSError as error:
+        raise file_error(path, f"cannot be read ({error.strerror or error}); check the path and its rights") from None
+
+
+def _masked_checksum(data: bytes) -> int:
+    crc = google_crc32c.value(data)
+    return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
+
+
+def _frame(message: Any, start: int | None, margin: float) -> Frame:
+    """A frame with its range images. start: timestamp of the segment's first frame, None where it is this one.
 
     Raises InputError where its labels cannot be read.
     """
-    context, time = message.message(_FRAME_CONTEXT), message.integer(_FRAME_TIME)
-    name = None if context is None else context.text(_CONTEXT_NAME)
-    if not name or time is None:
+    name = message.context.name.decode("utf-8", "replace")
+    if not name or not message.HasField("timestamp_micros"):
         raise InputError("is no frame of Waymo's perception dataset: it has no segment or no time")
-    people = [_person(label) for label in message.messages(_FRAME_LABELS) if _LABEL_KEYPOINTS in label]
+    people = [_person(label) for label in message.laser_labels if label.HasField("laser_keypoints")]
     frame = Frame(
         sequence=name,
-        timestamp=time,
-        start=time if start is None else start,
+        timestamp=message.timestamp_micros,
+        start=message.timestamp_micros if start is None else start,
         people=people,
-        calibrations=_calibrations(context) if people else {},
-        T_world_vehicle=_transform(message.message(_FRAME_POSE), "the vehicle's pose") if people else None,
+        calibrations=_calibrations(message.context.laser_calibrations) if people else {},
+        T_world_vehicle=_transform(message, "pose", "the vehicle's pose") if people else None,
         margin=margin,
     )
-    for laser in message.messages(_FRAME_LASERS) if frame.wanted else ():
+    for laser in message.lasers if frame.wanted else ():
         try:
             _add_images(frame, laser)
         except InputError as error:
@@ -116,70 +214,61 @@ def _frame(message: Message, start: int | None, margin: float) -> Frame:
     return frame
 
 
-def _person(label: Message) -> LabelledPerson:
-    box = label.message(_LABEL_BOX)
-    keypoints = []
-    for keypoint in label.message(_LABEL_KEYPOINTS).messages(_KEYPOINTS_EACH):
-        found = keypoint.message(_KEYPOINT_3D)
-        place = None if found is None else found.message(_3D_PLACE)
-        if place is None:
-            continue
-        visibility = found.message(_3D_VISIBILITY)
-        hidden = visibility is not None and bool(visibility.integer(_VISIBILITY_OCCLUDED))
-        # numbers that are zero may be left out
-        keypoints.append((keypoint.integer(_KEYPOINT_TYPE) or 0, [place.double(n) or 0.0 for n in _PLACE], hidden))
-    return person(
-        label.text(_LABEL_ID) or "",
-        keypoints,
-        None if box is None else [box.double(n) or 0.0 for n in _BOX],
-        label.integer(_LABEL_TYPE) or 0,
-        label.integer(_LABEL_COUNT),
-    )
+def _person(label: Any) -> LabelledPerson:
+    keypoints, box = [], None
+    for keypoint in label.laser_keypoints.keypoint:
+        if keypoint.keypoint_3d.HasField("location_m"):
+            at = keypoint.keypoint_3d.location_m
+            keypoints.append((keypoint.type, (at.x, at.y, at.z), keypoint.keypoint_3d.visibility.is_occluded))
+    if label.HasField("box"):
+        b = label.box
+        box = (b.center_x, b.center_y, b.center_z, b.length, b.width, b.height, b.heading)
+    counted = label.num_lidar_points_in_box if label.HasField("num_lidar_points_in_box") else None
+    return person(label.id.decode("utf-8", "replace"), keypoints, box, label.type, counted)
 
 
-def _transform(message: Message | None, what: str) -> np.ndarray | None:
-    return None if message is None else transform(message.doubles(_TRANSFORM_VALUES), what)
+def _transform(message: Any, field: str, what: str) -> np.ndarray | None:
+    return transform(getattr(message, field).transform, what) if message.HasField(field) else None
 
 
-def _calibrations(context: Message) -> dict[int, Calibration]:
+def _calibrations(messages: Any) -> dict[int, Calibration]:
     found = {}
-    for one in context.messages(_CONTEXT_LASERS):
-        laser, beams = one.integer(_CALIBRATION_LASER) or 0, one.doubles(_CALIBRATION_BEAMS)
-        extrinsic = _transform(one.message(_CALIBRATION_EXTRINSIC), f"the extrinsic of laser {laser}")
-        low, high = one.double(_CALIBRATION_LOW), one.double(_CALIBRATION_HIGH)
-        if extrinsic is None or not len(beams) and (low is None or high is None):
-            raise InputError(f"the calibration of laser {laser} lacks its extrinsic or its beam inclinations")
-        found[laser] = Calibration(
-            laser=laser, T_vehicle_laser=extrinsic, inclinations=beams if len(beams) else None, low=low, high=high
+    for one in messages:
+        beams = np.array(one.beam_inclinations)
+        extrinsic = _transform(one, "extrinsic", f"the extrinsic of laser {one.name}")
+        low, high = one.beam_inclination_min, one.beam_inclination_max
+        has_range = one.HasField("beam_inclination_min") and one.HasField("beam_inclination_max")
+        if extrinsic is None or not len(beams) and not has_range:
+            raise InputError(f"the calibration of laser {one.name} lacks its extrinsic or its beam inclinations")
+        found[one.name] = Calibration(
+            laser=one.name, T_vehicle_laser=extrinsic, inclinations=beams if len(beams) else None, low=low, high=high
         )
     return found
 
 
-def _add_images(frame: Frame, message: Message) -> None:
+def _add_images(frame: Frame, laser: Any) -> None:
     """Adds both returns of a laser; the pixels' poses are beside the first."""
-    laser = message.integer(_LASER_NAME) or 0
-    first, *_ = returns = [message.message(n) for n in _LASER_RETURNS]
-    poses = None if first is None else _matrix(first.data(_IMAGE_POSES))
-    for which, image in enumerate(returns, 1):
-        values = None if image is None else _matrix(image.data(_IMAGE_COMPRESSED))
+    poses = _matrix(laser.ri_return1.range_image_pose_compressed)
+    for which, image in enumerate((laser.ri_return1, laser.ri_return2), 1):
+        values = _matrix(image.range_image_compressed)
         if values is not None:
-            frame.add(laser, which, values[..., 0], poses)
+            frame.add(laser.name, which, values[..., 0], poses)
 
 
-def _matrix(compressed: memoryview | None) -> np.ndarray | None:
+def _matrix(compressed: bytes) -> np.ndarray | None:
     """A zlib-compressed MatrixFloat -> (H, W, C) float32; None where there is none."""
     if not compressed:
         return None
     inflate = zlib.decompressobj()
     try:
-        content = inflate.decompress(compressed, 4 * _MOST_VALUES)
+        content = inflate.decompress(compressed, _LARGEST_IMAGE)
     except zlib.error as error:
         raise InputError(f"a range image cannot be decompressed ({error})") from None
     if not inflate.eof:
         raise InputError("a range image is cut off, or far larger than any")
-    message = Message(content)
-    values, shape = message.floats(_MATRIX_DATA), message.message(_MATRIX_SHAPE)
-    sizes = [] if shape is None else shape.integers(_SHAPE_SIZES)
-    if not is_image(sizes, len(values)):
-        raise InputError(f"a range image of {len(values)} values says it is {reprlib.repr(sizes)}")
-    return values.reshape(sizes)
+    matrix = parse("MatrixFloat", content, _LARGEST_IMAGE)
+    sizes = list(parse("Shape", matrix.shape, _LARGEST_SHAPE).dims)
+    count, rest = divmod(len(matrix.data), 4)
+    if rest or not is_image(sizes, count):
+        raise InputError(f"a range image of {count} values says it is {reprlib.repr(sizes)}")
+    return np.frombuffer(matrix.data, "<f4").reshape(sizes)
