@@ -60,10 +60,9 @@ def test_even_turns_stay_even_at_another_rate():
     fps=st.sampled_from([10.0, 29.97, 120.0]),
     hz=st.floats(1, 200),
     frames=st.integers(1, 6),
-    step=st.integers(1, 3),
     dt=st.integers(0, 50).map(lambda n: n / 100),
 )
-def test_cuts_stay_inside_their_clips(lengths, fps, hz, frames, step, dt):
+def test_cuts_stay_inside_their_clips(lengths, fps, hz, frames, dt):
     lengths = np.array(lengths, int)
     empty = motion.Motion(
         rotations=np.zeros((0, 24, 3, 3), np.float32), translation=np.zeros((0, 3), np.float32),
@@ -75,8 +74,8 @@ def test_cuts_stay_inside_their_clips(lengths, fps, hz, frames, step, dt):
     assert ((found.length - 1) / hz <= (lengths - 1) / fps + 1e-5)[lengths > 0].all()
     product = found.rotations @ np.swapaxes(found.rotations, -1, -2)
     np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-5)
-    windows = one.windows(frames, step=step)
-    assert windows.shape == (sum(len(range(0, n - frames + 1, step)) for n in lengths if n >= frames), frames)
+    windows = one.windows(frames)
+    assert windows.shape == (sum(len(range(n - frames + 1)) for n in lengths if n >= frames), frames)
     clip_of = np.repeat(np.arange(len(lengths)), lengths)
     assert (clip_of[windows] == clip_of[windows][:, :1]).all() and (np.diff(windows, axis=1) == 1).all()
     pairs = one.pairs(dt)
@@ -99,7 +98,7 @@ def test_pairs_are_what_happens_next():
     np.testing.assert_allclose(retarget.heading(pairs.moved), 0.15, atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(pairs.step, axis=-1), 0.15, atol=1e-3)
     assert (pairs.step[:, 0] > 0.14).all() and (pairs.step[:, 1] > 0).all()
-    np.testing.assert_allclose(one.pairs(0).moved, one.poses(), atol=1e-6)
+    np.testing.assert_allclose(one.pairs(0).moved, retarget.without_yaw(one.rotations), atol=1e-6)
     windows = one.windows(16)
     turned, moved = motion.facing_x(one.rotations[windows], one.translation[windows])
     np.testing.assert_allclose(retarget.heading(turned[:, 0]), 0, atol=1e-5)
@@ -137,9 +136,6 @@ def test_clips_are_chosen_and_joined():
     [
         (lambda m: m.resampled(0), "above 0, got 0"),
         (lambda m: m.resampled(np.nan), "above 0"),
-        (lambda m: m.windows(0), "frames >= 1"),
-        (lambda m: m.windows(4, step=0), "step >= 1"),
-        (lambda m: m.pairs(-1), "0 s or more"),
         (lambda m: motion.join([], source="x"), "no motion"),
         (lambda m: motion.Motion(**{**vars(m), "fps": np.inf}), "frames a second"),
         (lambda m: motion.Motion(**{**vars(m), "translation": m.translation[1:]}), re.escape("(21, 3)")),

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from lidarpose.body.mocap import acclaim, bvh, joint_tree, load_motion, units
+from lidarpose.body.mocap import asf_amc, bvh, joint_positions, joint_tree, load_motion
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES
 
@@ -51,17 +51,12 @@ def test_a_bvh_of_any_names_comes_back(tmp_path, skeleton):
 
 
 @pytest.mark.parametrize("order", ["ZXY", "XYZ", "YXZ", "ZYX", "YZX", "XZY"])
-def test_a_bvh_has_its_joints_where_they_were(order):
-    """The tree's own positions, in centimetres and y up, without retargeting."""
-    lines = bvh._lines(files.bvh_text(ROTATIONS, WAY, order=order))
-    at = lines.index("MOTION")
-    joints = bvh._hierarchy("x", lines[1:at])
-    values, rate = bvh._frames("x", lines[at + 1 :], 3 + 3 * 24)
+def test_a_bvh_has_its_joints_where_they_were(tmp_path, order):
+    """The tree's own positions, in centimeters and y up, without retargeting."""
+    tree, values, rate = bvh.read_bvh(written(tmp_path, files.bvh_text(ROTATIONS, WAY, order=order)))
     assert rate == pytest.approx(30)
-    positions = bvh._positions(joints, values)
-    names = [joint.name for joint in joints]
-    index = [names.index(name) for name in J]
-    np.testing.assert_allclose(positions[:, index] / 100 @ UP_AXES["y"].T, JOINTS, atol=1e-4)
+    index = [tree.names.index(name) for name in J]
+    np.testing.assert_allclose(tree.positions(values)[:, index] / 100 @ UP_AXES["y"].T, JOINTS, atol=1e-4)
 
 
 @pytest.mark.parametrize("unit, up", [(1.0, "y"), (0.01, "z"), (0.0254, "y"), (0.001, "x"), (0.0254 / 0.45, "y")])
@@ -74,8 +69,8 @@ def test_units_and_up_are_found(tmp_path, unit, up):
 def test_children_and_tall_people_keep_their_unit():
     rest = JOINTS[:1]
     for size in (0.62, 0.8, 1.0, 1.2):
-        for name, metres in units.UNITS.items():
-            assert units.metres_of("x", rest * size / metres) == metres, (size, name)
+        for name, meters in joint_positions.UNITS.items():
+            assert joint_positions.meters_per_unit("x", rest * size / meters) == meters, (size, name)
 
 
 def test_skeletons_with_less(tmp_path):
@@ -90,11 +85,10 @@ def test_skeletons_with_less(tmp_path):
     error = errors(motion)
     sure = [j for j in MAIN if "ankle" not in list(J)[j]]
     assert error[:, sure].mean() < 0.012 and error[:, [J["left_foot"], J["right_foot"]]].mean() < 0.12
-    positions = JOINTS.copy()
-    found = {n: i for n, i in J.items() if n.endswith(("hip", "knee", "ankle", "shoulder", "elbow", "wrist"))}
-    found["head"] = J["head"]
-    less = joint_tree.Tree(names=list(J), parents=[-1, *[0] * 23], positions=positions)
-    motion = joint_tree.tree_motion("x", less, name="x", fps=10, up="z", kind="test", found=found)
+    matched = {n: i for n, i in J.items() if n.endswith(("hip", "knee", "ankle", "shoulder", "elbow", "wrist"))}
+    matched["head"] = J["head"]
+    less = joint_tree.JointTree(names=list(J), parents=[-1, *[0] * 23], offsets=np.zeros((24, 3)), channels=[])
+    motion = joint_tree.tree_motion("x", less, JOINTS, fps=10, up="z", kind="test", matched=matched)
     error = errors(motion)
     assert error[:, [J[f"{s}_{n}"] for s in ("left", "right") for n in ("hip", "knee", "elbow")]].mean() < 0.09
 
@@ -104,11 +98,11 @@ def test_an_amc_comes_back(tmp_path, length):
     skeleton, axes = files.asf_text(length=length)
     written(tmp_path, skeleton, "02.asf")
     path = written(tmp_path, files.amc_text(ROTATIONS, WAY, axes, length=length), "02_05.amc")
-    bones, parents, scale, degrees = acclaim._skeleton(tmp_path / "02.asf")
-    positions = acclaim._positions(path, bones, parents, acclaim._motion(path), degrees) * scale @ UP_AXES["y"].T
-    for i, bone in enumerate(bones):
-        if bone.name in files.ASF_ENDS:
-            np.testing.assert_allclose(positions[:, i], JOINTS[:, J[files.ASF_ENDS[bone.name]]], atol=1e-4)
+    tree, values, unit_m = asf_amc.read_amc(path)
+    positions = tree.positions(values) * unit_m @ UP_AXES["y"].T
+    for i, bone in enumerate(tree.names):
+        if bone in files.ASF_ENDS:
+            np.testing.assert_allclose(positions[:, i], JOINTS[:, J[files.ASF_ENDS[bone]]], atol=1e-4)
     motion = load_motion(path)
     assert motion.names == ("02_05",) and motion.fps == 120
     # both collars are one point in this format
@@ -162,17 +156,17 @@ ROW = BVH.splitlines()[-1]
         (re.sub("Frame Time: .*", "Frame Time: 0", BVH), "no frame time above 0"),
         (re.sub("Frame Time: .*", "Frame Time: x", BVH), "no frame time above 0"),
         (re.sub("Frame Time: .*", "Frame Time: 1e-300", BVH), "no frame time above 0"),
-        (BVH.replace(ROW, ROW.replace(ROW.split()[7], "abc")), "must hold numbers"),
+        (BVH.replace(ROW, ROW.replace(ROW.split()[7], "abc")), "MOTION must be numbers"),
         (re.sub(r"OFFSET.*", "OFFSET 0 0 0", BVH), "have no length"),
-        (changed(BVH, "OFFSET", "OFFSET nan"), "three numbers"),
-        (changed(BVH, "OFFSET", "OFFSETS"), "expected ROOT, JOINT"),
+        (changed(BVH, "OFFSET", "OFFSET nan"), "3 finite numbers"),
+        (changed(BVH, "OFFSET", "OFFSETS"), "stands where it cannot; expected one ROOT"),
         (changed(BVH, "CHANNELS 3 Zrotation", "CHANNELS 3 Wrotation"), "the channel 'Wrotation'"),
         (changed(BVH, "CHANNELS 3", "CHANNELS 4"), "a count and as many names"),
-        (changed(BVH, "{", ""), "stands where it cannot|expected ROOT|has a }"),
+        (changed(BVH, "{", ""), "stands where it cannot"),
         (changed(BVH, "}", ""), "not complete"),
-        (changed(BVH, "\nMOTION", "\n}\nMOTION"), "a } too many"),
+        (changed(BVH, "\nMOTION", "\n}\nMOTION"), "stands where it cannot"),
         (changed(BVH, "JOINT", "ROOT"), "stands where it cannot"),
-        (changed(BVH, "HIERARCHY", "HIERARCHY\n{"), "without a joint"),
+        (changed(BVH, "HIERARCHY", "HIERARCHY\n{"), "stands where it cannot"),
         (BVH.replace("LeftUpLeg", "Banana").replace("RightForeArm", "Apple"), "joint for left_hip, right_elbow among"),
         (BVH.replace("Head", "Skulptur"), "no joint for head among Hips, .*; needed are"),
         (files.bvh_text(ROTATIONS, WAY, unit=0.5), "times as tall as an adult; known units are m, cm"),
@@ -241,7 +235,7 @@ def test_bad_frames_of_a_bvh_are_left_out(tmp_path):
         (ASF + "  root ltibia\n", AMC, "ltibia twice"),
         (ASF.replace("ltibia", "lshin"), AMC.replace("ltibia", "lshin"), "s.asf: has no bone ltibia among"),
         (re.sub(r"     length \S+", "     length 0", ASF), AMC, "have no length"),
-        (re.sub(r"     length (\S+)", "     length 1e300", ASF), AMC, "expected|adult"),
+        (re.sub(r"     length (\S+)", "     length 1e300", ASF), AMC, "expected joints at finite positions"),
     ],
 )  # fmt: skip
 def test_a_wrong_amc_or_asf_is_named(tmp_path, asf, amc, message):

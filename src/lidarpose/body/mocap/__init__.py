@@ -16,15 +16,21 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from lidarpose.body.mocap.acclaim import load_amc
-from lidarpose.body.mocap.amass import load_npz
+from lidarpose.body.mocap.asf_amc import load_amc
 from lidarpose.body.mocap.bvh import load_bvh
-from lidarpose.body.mocap.lidarhuman26m import load_pose_json, pose_files
+from lidarpose.body.mocap.joint_positions import load_clip_positions
 from lidarpose.body.mocap.motion import Motion, join
-from lidarpose.body.mocap.sloper4d import load_sloper4d
+from lidarpose.body.mocap.smpl_poses import load_amass, load_lidarhuman26m, load_sloper4d, pose_files
 from lidarpose.errors import check_name
 from lidarpose.geometry import UP_AXES
-from lidarpose.io.files import content_digest, file_error, read_bytes
+from lidarpose.io.files import content_digest, file_error, read_bytes, read_npz
+
+
+def load_npz(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
+    """The motion of an npz file: this package's clips of joint positions, or AMASS's."""
+    names = read_npz(path, (), expected="an npz file of motion")[1]
+    return (load_clip_positions if "joints" in names else load_amass)(path, up=up, fps=fps)
+
 
 FORMATS: dict[str, Callable[..., Motion]] = {
     "clips": load_npz,
@@ -32,7 +38,7 @@ FORMATS: dict[str, Callable[..., Motion]] = {
     "bvh": load_bvh,
     "amc": load_amc,
     "sloper4d": load_sloper4d,
-    "lidarhuman26m": load_pose_json,
+    "lidarhuman26m": load_lidarhuman26m,
 }
 _BY_SUFFIX = {".npz": "amass", ".bvh": "bvh", ".amc": "amc", ".pkl": "sloper4d", ".json": "lidarhuman26m"}
 # what lies beside the motion in AMASS's folders and holds none
@@ -52,7 +58,7 @@ def load_motion(
     format: a name of `FORMATS`, by default told by the file; up: the axis of the recording that is up, "x", "y" or "z",
     with a minus where it points down, by default what its format says (BVH: the one people stand along); fps: the
     recording's frames a second, by default what the file says; hz: resample each file to so many. A folder's clips are
-    named by their paths in it, and get the lowest rate among its files unless `hz` says one. Frames that are no numbers
+    named by their paths in it, and get the lowest rate among its files unless `hz` says one. Frames that are not finite
     are left out and counted.
 
     Rotation formats (AMASS, LiDARHuman26M, SLOPER4D) keep every turn; the others are retargeted by positions.

@@ -1,22 +1,21 @@
-"""Any captured skeleton -> SMPL's 24 joints, by the names and the tree of its joints.
+"""Any captured skeleton: forward kinematics of a file's tree of joints, and SMPL's 24 joints by their names.
 
-What a skeleton has under another name is found; a spine that is cut differently is cut anew, at the shares of the
+Joints are matched by the usual names of exporters; a spine that is cut differently is cut anew, at the shares of the
 line hips -> neck at which the shipped body has its spine's joints; and what only ends a limb (hand, foot, collar) is
-made up where it is missing. The rest is needed.
+estimated where it is missing. The rest is needed.
 """
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from lidarpose.body.mocap.motion import Motion
-from lidarpose.body.mocap.positions import played
-from lidarpose.body.mocap.retarget import SHORTEST_BONE, mean_adult_joints, shortest_bone
-from lidarpose.body.mocap.segments import cut
-from lidarpose.body.mocap.units import check_speed, metres_of
-from lidarpose.geometry import rotation_from_up, unit
+from lidarpose.body.mocap.joint_positions import motion_from_joints
+from lidarpose.body.mocap.motion import Motion, usable_clips
+from lidarpose.body.mocap.retarget import mean_adult_joints
+from lidarpose.geometry import rotation_about, unit
 from lidarpose.io.files import file_error
 from lidarpose.skeleton import SMPL24
 
@@ -46,99 +45,128 @@ _CENTRAL = {
     "neck": ("neck", "neck1", "neck01", "lowerneck"),
     "head": ("head", "head1", "skull"),
 }
-_MADE_UP = ("foot", "hand", "collar")
+_ESTIMATED = ("foot", "hand", "collar")
 _PREFIX = re.compile(r"mixamorig\d*|bip\d+|biped|character\d*|def|[mf]|avg|smpl")  # what exporters put in front
 _WORDS = frozenset(word for known in _SIDED.values() for word in known)
-_SIDES = ("left", "right")
+_SIDES = ("left_", "right_")
 # ends of limbs that have no name are called after their parent, with this behind
 END = " (end)"
 
-_STANDS = 0.7  # mean share of the trunk along the axis that is taken for up
-
 
 @dataclass(frozen=True, kw_only=True)
-class Tree:
-    """Joints of a source: names (N,), parents (N,) -1 for the root, parents before children; positions (F, N, 3) in
-    its own unit and axes. Frames that are no numbers are NaN."""
+class JointTree:
+    """N joints of a file, parents before children, in its own unit and axes.
+
+    names (N,); parents (N,), -1 for the root; offsets (N, 3): from the parent's place, in the parent's axes; bones
+    (N, 3): added to that, in the joint's own axes; axes (N, 3, 3): the axes that the joint's channels turn about;
+    channels (N,): what a frame's numbers are in order, "tx", "ty", "tz" for translations, "rx", "ry", "rz" for
+    rotations; fixed_axes: later rotations of a joint turn about axes that stay (ASF), not about turned ones (BVH);
+    degrees: unit of the rotations.
+    """
 
     names: Sequence[str]
     parents: Sequence[int]
-    positions: np.ndarray
+    offsets: np.ndarray
+    channels: Sequence[Sequence[str]]
+    bones: np.ndarray | None = None
+    axes: np.ndarray | None = None
+    fixed_axes: bool = False
+    degrees: bool = True
+
+    def positions(self, values: np.ndarray) -> np.ndarray:
+        """Joints (F, N, 3) of frames of channels (F, C), C those of all joints in order; NaN in frames with values
+        that are not finite."""
+        finite = np.isfinite(values).all(1)
+        columns = iter(values[finite].T)
+        count = int(finite.sum())
+        rotations, places = [], []
+        for j, parent in enumerate(self.parents):
+            rotation = np.broadcast_to(np.eye(3), (count, 3, 3))
+            offset = np.repeat(self.offsets[j][None], count, 0)
+            for kind, axis in self.channels[j]:
+                value = next(columns)
+                if kind == "t":
+                    offset[:, "xyz".index(axis)] += value
+                    continue
+                turn = rotation_about(axis, np.radians(value) if self.degrees else value)
+                rotation = turn @ rotation if self.fixed_axes else rotation @ turn
+            if self.axes is not None:
+                rotation = self.axes[j] @ rotation @ self.axes[j].T
+            with np.errstate(over="ignore", invalid="ignore"):
+                if parent >= 0:
+                    offset = (rotations[parent] @ offset[..., None])[..., 0]
+                    rotation = rotations[parent] @ rotation
+                if self.bones is not None:
+                    offset = rotation @ self.bones[j] + offset
+                places.append(places[parent] + offset if parent >= 0 else offset)
+            rotations.append(rotation)
+        positions = np.full((len(values), len(self.parents), 3), np.nan)
+        positions[finite] = np.stack(places, 1)
+        return positions
 
 
 def tree_motion(
     path: object,
-    tree: Tree,
+    tree: JointTree,
+    positions: np.ndarray,
     *,
-    name: str,
     fps: float,
     up: str | None,
     kind: str,
     unit_m: float | None = None,
-    found: dict[str, int] | None = None,
+    matched: dict[str, int] | None = None,
 ) -> Motion:
-    """One clip of any skeleton as the body plays it.
+    """The motion of one clip of any skeleton, named as the file.
 
-    up: the axis that is up, by default the one along which people stand (y where they do not stand); unit_m: metres
-    of a file's number, by default the unit that gives the person the most usual size; found: joints of the
-    tree by SMPL's names, where names are not to be guessed. Raises InputError for a skeleton that is nobody's.
+    Args:
+        positions: (F, N, 3) in the file's unit and axes, NaN in frames without.
+        up: The axis that is up, by default the one along which people stand (y where they do not stand).
+        unit_m: Meters of a file's number, by default the unit that gives the person the most usual size.
+        matched: Joints of the tree by SMPL's names, where names are not to be guessed.
+
+    Raises:
+        InputError: For a skeleton that is nobody's, and what `motion_from_joints` refuses.
     """
-    if not 0 < fps < np.inf:
-        raise file_error(path, f"the frame rate must be above 0, got {fps}; give load_motion fps=")
-    found = match_joints(path, tree.names, tree.parents) if found is None else found
-    good = np.isfinite(tree.positions).all((1, 2))
-    cut(path, name, good)
+    matched = match_joints(path, tree.names, tree.parents) if matched is None else matched
+    name, finite = Path(path).stem, np.isfinite(positions).all((1, 2))
+    usable_clips(path, [name], [len(finite)], finite)
+    joints = np.full((len(finite), 24, 3), np.nan)
     with np.errstate(over="ignore", invalid="ignore"):
-        joints = smpl_joints(tree, found, tree.positions[good])
-        joints = joints * metres_of(path, joints, unit_m)
-        if not np.abs(joints).max() < 1e5:
-            raise file_error(path, "joints lie farther than 100 km from the origin; expected one unit throughout")
-    joints = joints @ rotation_from_up(up or _upwards(path, joints)).T
-    length, which = shortest_bone(joints)
-    if (length <= SHORTEST_BONE).all():
-        raise file_error(path, f"{which[0]} has no length; every limb needs a length to have a direction")
-    good[good] = length > SHORTEST_BONE
-    joints = joints[length > SHORTEST_BONE]
-    names, start, count = cut(path, name, good)
-    check_speed(path, joints, start, fps)
-    rotations, translation = played(joints)
-    return Motion(
-        rotations=rotations,
-        translation=translation,
-        names=names,
-        start=start,
-        length=count,
-        fps=float(fps),
-        source=f"{kind}: {path}",
-        dropped=int((~good).sum()),
-    )
+        joints[finite] = smpl_joints(tree.parents, matched, positions[finite])
+    return motion_from_joints(path, joints, [name], [len(finite)], fps=fps, up=up, kind=kind, unit_m=unit_m)
+
+
+def parse_numbers(path: object, what: str, words: Sequence[str], count: int | None = None) -> np.ndarray:
+    """Words of a text file as floats, finite ones where a count is given. Raises InputError naming `what`."""
+    try:
+        numbers = np.array(words, float)
+    except ValueError:
+        numbers = np.zeros(0)
+    if not len(numbers) or (count is not None and (len(numbers) != count or not np.isfinite(numbers).all())):
+        expected = f"{count} finite numbers" if count else "numbers"
+        raise file_error(path, f"{what} must be {expected}, got {' '.join(words)[:60]!r}")
+    return numbers
 
 
 def match_joints(path: object, names: Sequence[str], parents: Sequence[int]) -> dict[str, int]:
-    """SMPL's joints, as far as there are any, without the spine. Raises InputError naming what is missing."""
-    central, sided = {}, {side: {} for side in _SIDES}
+    """Indices of SMPL's joints, as far as there are any, without the spine. Raises InputError for missing ones."""
+    by_word: dict[tuple[str, str], int] = {}
     for i, name in enumerate(names):
-        side, word = _word(name)
-        (sided[side] if side else central).setdefault(word, i)
-    found: dict[str, int] = {}
-    for side, words in sided.items():
-        used: set[int] = set()
-        for joint, known in _SIDED.items():
-            i = next((words[word] for word in known if word in words and words[word] not in used), None)
+        by_word.setdefault(_side_and_word(name), i)
+    matched: dict[str, int] = {}
+    for side, known in (("left_", _SIDED), ("right_", _SIDED), ("", _CENTRAL)):
+        for joint, words in known.items():
+            candidates = (by_word.get((side, word)) for word in words)
+            i = next((i for i in candidates if i is not None and i not in matched.values()), None)
             if i is not None:
-                used.add(i)
-                found[f"{side}_{joint}"] = i
-    for joint, known in _CENTRAL.items():
-        i = next((central[word] for word in known if word in central), None)
-        if i is not None:
-            found[joint] = i
+                matched[side + joint] = i
     ends = {parents[i]: i for i, name in enumerate(names) if name.endswith(END)}
-    for side in sided:
-        for tip, base in (("foot", "ankle"), ("hand", "wrist")):
-            if f"{side}_{tip}" not in found and found.get(f"{side}_{base}") in ends:
-                found[f"{side}_{tip}"] = ends[found[f"{side}_{base}"]]
-    needed = [j for j in SMPL24.joints if j not in (*_SPINE, "pelvis", "neck") and not j.endswith(_MADE_UP)]
-    missing = [joint for joint in needed if joint not in found]
+    for tip, base in (("foot", "ankle"), ("hand", "wrist")):
+        for side in _SIDES:
+            if side + tip not in matched and matched.get(side + base) in ends:
+                matched[side + tip] = ends[matched[side + base]]
+    needed = [j for j in SMPL24.joints if j not in (*_SPINE, "pelvis", "neck") and not j.endswith(_ESTIMATED)]
+    missing = [joint for joint in needed if joint not in matched]
     if missing:
         listed = ", ".join(n for n in names if not n.endswith(END))
         raise file_error(
@@ -146,57 +174,47 @@ def match_joints(path: object, names: Sequence[str], parents: Sequence[int]) -> 
             f"found no joint for {', '.join(missing)} among {listed or 'no joints'}; needed are left and right "
             "hip/UpLeg, knee/Leg, ankle/Foot, shoulder/Arm, elbow/ForeArm, wrist/Hand, and Head",
         )
-    return found
+    return matched
 
 
-def smpl_joints(tree: Tree, found: dict[str, int], positions: np.ndarray) -> np.ndarray:
+def smpl_joints(parents: Sequence[int], matched: dict[str, int], positions: np.ndarray) -> np.ndarray:
     """SMPL's joints (F, 24, 3) of a tree's positions (F, N, 3), in the same unit and axes."""
-    joints = np.zeros((len(positions), 24, 3))
-    for joint, i in found.items():
-        joints[:, _J[joint]] = positions[:, i]
-    hips = (joints[:, _J["left_hip"]] + joints[:, _J["right_hip"]]) / 2
-    shoulders = (joints[:, _J["left_shoulder"]] + joints[:, _J["right_shoulder"]]) / 2
-    if "neck" not in found:
-        joints[:, _J["neck"]] = shoulders
-    if "pelvis" not in found:
-        joints[:, _J["pelvis"]] = hips
-    spine = _spine(tree, found, hips, joints[:, _J["neck"]], positions)
-    for joint, value in zip(_SPINE, spine, strict=True):
-        joints[:, _J[joint]] = value
-    ahead = np.cross(joints[:, _J["left_hip"]] - hips, joints[:, _J["neck"]] - hips)
-    rest = mean_adult_joints()
-    foot_share, hand_share = (_reach(rest, chain) for chain in (("knee", "ankle", "foot"), ("elbow", "wrist", "hand")))
-    for side in ("left", "right"):
-        elbow, wrist, knee, ankle = (joints[:, _J[f"{side}_{n}"]] for n in ("elbow", "wrist", "knee", "ankle"))
-        if f"{side}_collar" not in found:
-            joints[:, _J[f"{side}_collar"]] = joints[:, _J["neck"]]
-        hand, foot = joints[:, _J[f"{side}_hand"]], joints[:, _J[f"{side}_foot"]]
-        if f"{side}_hand" not in found or _short(hand - wrist, wrist - elbow):
-            joints[:, _J[f"{side}_hand"]] = wrist + hand_share * (wrist - elbow)
-        if f"{side}_foot" not in found or _short(foot - ankle, ankle - knee):
+    joints = {joint: positions[:, i] for joint, i in matched.items()}
+    hips = (joints["left_hip"] + joints["right_hip"]) / 2
+    joints.setdefault("neck", (joints["left_shoulder"] + joints["right_shoulder"]) / 2)
+    joints.setdefault("pelvis", hips)
+    joints |= zip(_SPINE, _spine(parents, matched, hips, joints["neck"], positions), strict=True)
+    forward = np.cross(joints["left_hip"] - hips, joints["neck"] - hips)
+    for side in _SIDES:
+        elbow, wrist, knee, ankle = (joints[side + name] for name in ("elbow", "wrist", "knee", "ankle"))
+        joints.setdefault(f"{side}collar", joints["neck"])
+        hand, foot = joints.get(f"{side}hand"), joints.get(f"{side}foot")
+        if hand is None or _is_short(hand - wrist, wrist - elbow):
+            joints[f"{side}hand"] = wrist + _length_ratio("elbow", "wrist", "hand") * (wrist - elbow)
+        if foot is None or _is_short(foot - ankle, ankle - knee):
             shank = ankle - knee
-            across = ahead - (ahead * unit(shank)).sum(-1, keepdims=True) * unit(shank)
-            length = foot_share * np.linalg.norm(shank, axis=-1, keepdims=True)
-            joints[:, _J[f"{side}_foot"]] = ankle + length * unit(across)
-    return joints
+            across = forward - (forward * unit(shank)).sum(-1, keepdims=True) * unit(shank)
+            length = _length_ratio("knee", "ankle", "foot") * np.linalg.norm(shank, axis=-1, keepdims=True)
+            joints[f"{side}foot"] = ankle + length * unit(across)
+    return np.stack([joints[name] for name in SMPL24.joints], 1)
 
 
 def _spine(
-    tree: Tree, found: dict[str, int], hips: np.ndarray, neck: np.ndarray, positions: np.ndarray
+    parents: Sequence[int], matched: dict[str, int], hips: np.ndarray, neck: np.ndarray, positions: np.ndarray
 ) -> list[np.ndarray]:
-    """Spine1-3 (F, 3): the three joints between pelvis and neck, or where our body's lie along the line of the joints
-    that are there."""
+    """Spine1-3 (F, 3): the three joints between pelvis and neck, or points on the line through the joints that are
+    there, at the shipped body's shares of its length."""
     between: list[int] = []
-    i = found.get("neck", found["head"])
-    while (i := tree.parents[i]) >= 0 and i != found.get("pelvis"):
+    i = matched.get("neck", matched["head"])
+    while (i := parents[i]) >= 0 and i != matched.get("pelvis"):
         between.insert(0, i)
     line = np.stack([hips, *(positions[:, i] for i in between), neck])
     bones = np.median(np.linalg.norm(np.diff(line, axis=0), axis=-1), axis=1)
     if len(between) == 3 and (bones[1:] > _SAME_JOINT * bones.sum()).all():
         return [positions[:, i] for i in between]
     rest = mean_adult_joints()
-    ours = np.stack([rest[[_J["left_hip"], _J["right_hip"]]].mean(0), *(rest[_J[s]] for s in (*_SPINE, "neck"))])
-    shares = np.cumsum(np.linalg.norm(np.diff(ours, axis=0), axis=-1))
+    body_line = np.stack([rest[[_J["left_hip"], _J["right_hip"]]].mean(0), *(rest[_J[s]] for s in (*_SPINE, "neck"))])
+    shares = np.cumsum(np.linalg.norm(np.diff(body_line, axis=0), axis=-1))
     along = np.concatenate([[0], np.cumsum(bones)])
     at = shares[:3] / shares[3] * along[-1]
     k = np.clip(np.searchsorted(along, at, side="right") - 1, 0, len(bones) - 1)
@@ -204,41 +222,30 @@ def _spine(
     return [line[n] + p * (line[n + 1] - line[n]) for n, p in zip(k, part, strict=True)]
 
 
-def _upwards(path: object, joints: np.ndarray) -> str:
-    hips = (joints[:, _J["left_hip"]] + joints[:, _J["right_hip"]]) / 2
-    trunk = unit(joints[:, _J["neck"]] - hips).mean(0)
-    axis = int(np.abs(trunk).argmax())
-    if trunk[axis] < -_STANDS:
-        stands = "xyz"[axis]
-        remedy = f"give load_motion up='-{stands}', or up={stands!r} if they are upside down"
-        raise file_error(path, f"people stand along -{stands}; {remedy}")
-    return "xyz"[axis] if trunk[axis] > _STANDS else "y"
-
-
-def _reach(rest: np.ndarray, chain: Iterable[str]) -> float:
-    a, b, c = (rest[_J[f"left_{name}"]] for name in chain)
+def _length_ratio(start: str, middle: str, end: str) -> float:
+    """Length of the bone middle -> end over that of start -> middle, on the shipped body."""
+    a, b, c = (mean_adult_joints()[_J[f"left_{name}"]] for name in (start, middle, end))
     return float(np.linalg.norm(c - b) / np.linalg.norm(b - a))
 
 
-def _short(bone: np.ndarray, whole: np.ndarray) -> bool:
+def _is_short(bone: np.ndarray, limb: np.ndarray) -> bool:
     """Whether a limb's last bone is too short for its direction to be of use."""
-    return bool(np.median(np.linalg.norm(bone, axis=-1)) < _SAME_JOINT * np.median(np.linalg.norm(whole, axis=-1)))
+    return bool(np.median(np.linalg.norm(bone, axis=-1)) < _SAME_JOINT * np.median(np.linalg.norm(limb, axis=-1)))
 
 
-def _word(name: str) -> tuple[str | None, str]:
-    """Side and plain word of a joint's name: "mixamorig:LeftUpLeg" and "Bip01 L_up_leg" -> ("left", "upleg")."""
+def _side_and_word(name: str) -> tuple[str, str]:
+    """Side and plain word of a joint's name: "mixamorig:LeftUpLeg" and "Bip01 L_up_leg" -> ("left_", "upleg")."""
     plain = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=^[LR])(?=[A-Z][a-z])", "_", name.rpartition(":")[2])
     parts = [part for part in re.split(r"[^a-z0-9]+", plain.lower()) if part]
     while len(parts) > 1 and _PREFIX.fullmatch(parts[0]):
         parts.pop(0)
-    for side in _SIDES:
-        for part in (side, side[0]):
-            if part in parts and len(parts) > 1:
-                parts.remove(part)
-                return side, "".join(parts)
+    marks = [(side, mark) for side in _SIDES for mark in (side[:-1], side[0])]
+    for side, mark in marks:
+        if mark in parts and len(parts) > 1:
+            parts.remove(mark)
+            return side, "".join(parts)
     word = "".join(parts)
-    for side in _SIDES:
-        for part in (side, side[0]):
-            if word.startswith(part) and word.removeprefix(part) in _WORDS:
-                return side, word.removeprefix(part)
-    return None, word
+    for side, mark in marks:
+        if word.startswith(mark) and word.removeprefix(mark) in _WORDS:
+            return side, word.removeprefix(mark)
+    return "", word

@@ -5,115 +5,113 @@ A file of clips is an npz with `joints` (F, 24, 3) m, z up, all clips one after 
 `body.mocap` reads this and the usual formats of motion capture.
 """
 
-import os
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from os import PathLike
+from typing import ClassVar, Self
 
 import numpy as np
 
 from lidarpose.body.mocap.retarget import heading, rotation_vector, without_yaw
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix, rotation_about
-from lidarpose.io.files import file_error
+from lidarpose.io.files import file_error, read_npz
 from lidarpose.skeleton import SMPL24
 
 _KEYS = ("joints", "clip", "clip_start", "clip_length", "fps")
 # frames that are interpolated at once, to bound the memory
 _BLOCK = 4096
+# a larger share of frames that cannot be used: the file is broken, not the odd frame
+_MOST_DROPPED = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
-class Clips:
-    """Captured motion. joints (F, 24, 3) float32 m, SMPL's joints, z up; clip c, named names[c], is the frames
-    start[c] to start[c] + length[c]; fps in frames a second."""
+class _ClipTable:
+    """F frames of several clips: clip c, named names[c], is the frames start[c] to start[c] + length[c], one every
+    1 / fps s."""
 
-    joints: np.ndarray
     names: tuple[str, ...]
     start: np.ndarray
     length: np.ndarray
     fps: float
 
-    def __post_init__(self):
-        if self.joints.ndim != 3 or self.joints.shape[1:] != (24, 3):
-            raise InputError(f"clips need joints (frames, 24, 3), SMPL's joints in metres, got {self.joints.shape}")
-        if not np.isfinite(self.joints).all():
-            raise InputError("clips need finite joints; drop the frames with missing ones")
-        _check_cuts(self, len(self.joints))
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def __getitem__(self, clip: int) -> np.ndarray:
-        """The joints (length, 24, 3) of one clip."""
-        return self.joints[self.start[clip] : self.start[clip] + self.length[clip]]
-
-    def of(self, subjects: str | Iterable[str]) -> "Clips":
-        """The clips whose names start with one of `subjects`, such as "002", which "0021_03" does not. Raises
-        InputError for one without."""
-        chosen, frames, start = _chosen(self, subjects)
-        return replace(
-            self,
-            joints=self.joints[frames],
-            names=tuple(self.names[c] for c in chosen),
-            start=start,
-            length=self.length[chosen],
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Motion:
-    """Captured motion as the body plays it.
-
-    rotations (F, 24, 3, 3) float32, local, in the rest frame of `body.rig`, any heading; translation (F, 3) float32 m,
-    the pelvis, z up; clip c, named names[c], is the frames start[c] to start[c] + length[c], one every 1 / fps s;
-    source: what it was read from; dropped: frames that were left out for values that are no numbers.
-    """
-
-    rotations: np.ndarray
-    translation: np.ndarray
-    names: tuple[str, ...]
-    start: np.ndarray
-    length: np.ndarray
-    fps: float
-    source: str
-    dropped: int = 0
+    # the arrays with a row a frame, and the shape of a row
+    ROWS: ClassVar[dict[str, tuple[int, ...]]]
 
     def __post_init__(self):
-        frames = len(self.rotations)
-        if self.rotations.shape != (frames, 24, 3, 3) or self.translation.shape != (frames, 3):
-            raise InputError(
-                "motion needs rotations (frames, 24, 3, 3) and translation (frames, 3), "
-                f"got {self.rotations.shape} and {self.translation.shape}"
-            )
-        if not (np.isfinite(self.rotations).all() and np.isfinite(self.translation).all()):
-            raise InputError("motion needs finite rotations and translation; drop the frames without")
-        _check_cuts(self, frames)
+        arrays = {name: getattr(self, name) for name in self.ROWS}
+        frames = len(next(iter(arrays.values())))
+        for name, array in arrays.items():
+            if array.shape != (frames, *self.ROWS[name]):
+                wanted = ", ".join(map(str, self.ROWS[name]))
+                raise InputError(f"{name} must be (frames, {wanted}), {frames} frames, got {array.shape}")
+            if not np.isfinite(array).all():
+                raise InputError(f"{name} must be finite; drop the frames that are not")
+        for name in ("start", "length"):
+            value = getattr(self, name)
+            if value.shape != (len(self),) or value.dtype.kind not in "iu":
+                expected = f"one whole number a clip, ({len(self)})"
+                raise InputError(f"clip_{name} needs {expected}, got {value.dtype} {value.shape}")
+            # in narrow or unsigned numbers an end could overflow
+            object.__setattr__(self, name, value.astype(np.int64))
+        ends = self.start + self.length
+        if len(ends) and (min(self.start.min(), self.length.min()) < 0 or ends.max() > frames):
+            raise InputError(f"clips must lie inside the {frames} frames, got up to frame {ends.max()}")
+        if not 0 < self.fps < np.inf:
+            raise InputError(f"fps must be frames a second, above 0, got {self.fps}")
 
     def __len__(self) -> int:
         return len(self.names)
 
     def frames(self, clip: int) -> slice:
-        """The frames of one clip, to cut `rotations` and `translation` with."""
+        """The frames of one clip, to cut the arrays with."""
         return slice(int(self.start[clip]), int(self.start[clip] + self.length[clip]))
 
-    def of(self, subjects: str | Iterable[str]) -> "Motion":
+    def of(self, subjects: str | Iterable[str]) -> Self:
         """The clips whose names start with one of `subjects`, such as "002", which "0021_03" does not. Raises
         InputError for one without."""
-        chosen, frames, start = _chosen(self, subjects)
-        return replace(
-            self,
-            rotations=self.rotations[frames],
-            translation=self.translation[frames],
-            names=tuple(self.names[c] for c in chosen),
-            start=start,
-            length=self.length[chosen],
-        )
+        subjects = (subjects,) if isinstance(subjects, str) else tuple(subjects)
+        for subject in subjects:
+            if not any(_is_of(name, subject) for name in self.names):
+                known = ", ".join(sorted({name.partition("_")[0] for name in self.names}))
+                raise InputError(f"no clip starts with {subject!r}: there are {known}")
+        chosen = [c for c, name in enumerate(self.names) if any(_is_of(name, subject) for subject in subjects)]
+        length = self.length[chosen]
+        arrays = {
+            name: np.concatenate([getattr(self, name)[:0], *(getattr(self, name)[self.frames(c)] for c in chosen)])
+            for name in self.ROWS
+        }
+        names = tuple(self.names[c] for c in chosen)
+        return replace(self, **arrays, names=names, start=np.cumsum(length) - length, length=length)
 
-    def poses(self) -> np.ndarray:
-        """The poses (F, 24, 3, 3) of all frames, each turned about z to face +x."""
-        return without_yaw(self.rotations)
+
+@dataclass(frozen=True, kw_only=True)
+class Clips(_ClipTable):
+    """Captured positions: joints (F, 24, 3) float32 m, SMPL's joints, z up."""
+
+    joints: np.ndarray
+
+    ROWS = {"joints": (24, 3)}
+
+    def __getitem__(self, clip: int) -> np.ndarray:
+        """The joints (length, 24, 3) of one clip."""
+        return self.joints[self.frames(clip)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion(_ClipTable):
+    """Captured motion as the body plays it.
+
+    rotations (F, 24, 3, 3) float32, local, in the rest frame of `body.rig`, any heading; translation (F, 3) float32 m,
+    the pelvis, z up; source: what it was read from; dropped: frames that were left out because they could not be used.
+    """
+
+    rotations: np.ndarray
+    translation: np.ndarray
+    source: str
+    dropped: int = 0
+
+    ROWS = {"rotations": (24, 3, 3), "translation": (3,)}
 
     def resampled(self, hz: float) -> "Motion":
         """The same clips with `hz` frames a second: a clip keeps its first frame and loses less than a frame at its
@@ -127,40 +125,29 @@ class Motion:
         when = [c + np.arange(n) * (self.fps / hz) for c, n in zip(self.start, length, strict=True)]
         last = np.repeat(self.start + np.maximum(self.length, 1) - 1, length)
         rotations, translation = self._between(np.concatenate([*when, np.zeros(0)]), last)
-        return replace(
-            self,
-            rotations=rotations,
-            translation=translation,
-            start=np.cumsum(length) - length,
-            length=length,
-            fps=float(hz),
-        )
+        start = np.cumsum(length) - length
+        return replace(self, rotations=rotations, translation=translation, start=start, length=length, fps=float(hz))
 
-    def windows(self, frames: int, *, step: int = 1) -> np.ndarray:
-        """Which frames make clips of `frames`: (n, frames) int, every `step`-th start, none across the end of a clip.
+    def windows(self, frames: int) -> np.ndarray:
+        """Which frames make clips of `frames`: (n, frames) int, none across the end of a clip.
 
         `motion.rotations[motion.resampled(10).windows(16)]` would mix rates: cut the motion that was resampled.
         """
-        if frames < 1 or step < 1:
-            raise InputError(f"windows need frames >= 1 and step >= 1, got {frames} and {step}")
-        first = [s + np.arange(0, n - frames + 1, step) for s, n in zip(self.start, self.length, strict=True)]
+        first = [s + np.arange(0, n - frames + 1) for s, n in zip(self.start, self.length, strict=True)]
         return np.concatenate([*first, np.zeros(0, int)]).astype(int)[:, None] + np.arange(frames)
 
     def pairs(self, dt: float) -> "Moves":
         """All poses that have one `dt` seconds later in their clip, with that one. dt >= 0."""
-        if not 0 <= dt < np.inf:
-            raise InputError(f"dt must be 0 s or more, got {dt}")
-        ahead = dt * self.fps
+        spans = [np.arange(s, s + n) for s, n in zip(self.start, self.length, strict=True)]
+        frame = np.concatenate([*spans, np.zeros(0, int)]).astype(int)
         ends = np.repeat(self.start + self.length - 1, self.length)
-        frame = np.concatenate([np.arange(self.frames(c).start, self.frames(c).stop) for c in range(len(self))] or [[]])
-        frame = frame.astype(int)
-        kept = frame + ahead <= ends + 1e-6
-        frame, ends = frame[kept], ends[kept]
-        later, way = self._between(frame + ahead, ends)
+        has_later = frame + dt * self.fps <= ends + 1e-6
+        frame, ends = frame[has_later], ends[has_later]
+        later, translation = self._between(frame + dt * self.fps, ends)
         first = self.rotations[frame]
-        back = rotation_about("z", -heading(first))
-        step = (back @ (way - self.translation[frame])[..., None])[..., 0]
-        later[:, 0] = back @ later[:, 0]
+        unyaw = rotation_about("z", -heading(first))
+        step = (unyaw @ (translation - self.translation[frame])[..., None])[..., 0]
+        later[:, 0] = unyaw @ later[:, 0]
         return Moves(rotations=without_yaw(first), moved=later, step=step.astype(np.float32))
 
     def _between(self, when: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -211,42 +198,26 @@ def join(motions: Iterable[Motion], *, source: str) -> Motion:
 def facing_x(rotations: np.ndarray, translation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Clips (n, F, 24, 3, 3) and (n, F, 3) turned about z and moved, so that each begins over the origin (its z is
     kept) and faces +x. Cut them with `Motion.windows`."""
-    back = rotation_about("z", -heading(rotations[:, 0]))[:, None]
-    turned = np.array(rotations)
-    turned[:, :, 0] = back @ turned[:, :, 0]
+    unyaw = rotation_about("z", -heading(rotations[:, 0]))[:, None]
+    rotations = np.array(rotations)
+    rotations[:, :, 0] = unyaw @ rotations[:, :, 0]
     way = translation - translation[:, :1] * [1, 1, 0]
-    return turned, (back @ way[..., None])[..., 0].astype(np.float32)
+    return rotations, (unyaw @ way[..., None])[..., 0].astype(np.float32)
 
 
-@contextmanager
-def archive(path: str | os.PathLike) -> Iterator[None]:
-    """Around the reading of an npz: InputError, naming the file, for all that goes wrong there."""
-    try:
-        yield
-    except InputError:
-        raise
-    except FileNotFoundError:
-        raise file_error(path, "no such file") from None
-    except MemoryError:
-        raise file_error(path, "does not fit in memory; split it first") from None
-    except Exception as error:  # numpy and zlib raise many kinds for a broken archive
-        raise file_error(path, f"not an npz of plain arrays ({error}); was it copied completely?") from None
-
-
-def load_clips(path: str | Path) -> Clips:
+def load_clips(path: str | PathLike) -> Clips:
     """Reads a clips file (its layout is at the top of this module). Raises InputError where it is another."""
-    with archive(path), np.load(path, allow_pickle=False) as file:
-        missing = [key for key in _KEYS if key not in file]
-        if missing:
-            raise InputError(f"{path}: clips need {', '.join(_KEYS)}; {', '.join(missing)} is missing")
-        stored = {key: file[key] for key in file.files if key in (*_KEYS, "joint_names")}
+    stored, names = read_npz(path, (*_KEYS, "joint_names"), expected="an npz file of clips")
+    missing = [key for key in _KEYS if key not in stored]
+    if missing:
+        raise file_error(path, f"clips need {', '.join(_KEYS)}; {', '.join(missing)} is missing")
     order = stored.get("joint_names")
     if order is not None and tuple(map(str, np.ravel(order))) != SMPL24.joints:
-        raise InputError(f"{path}: joint_names must be SMPL's 24 in SMPL's order, got {', '.join(map(str, order))}")
+        raise file_error(path, f"joint_names must be SMPL's 24 in SMPL's order, got {', '.join(map(str, order))}")
     if stored["fps"].size != 1 or stored["fps"].dtype.kind not in "iuf":
-        raise InputError(f"{path}: fps must be one number, got {stored['fps'].tolist()}")
+        raise file_error(path, f"fps must be one number, got {stored['fps'].tolist()}")
     if stored["joints"].dtype.kind not in "iuf":
-        raise InputError(f"{path}: joints must be numbers, got {stored['joints'].dtype}")
+        raise file_error(path, f"joints must be numbers, got {stored['joints'].dtype}")
     try:
         return Clips(
             joints=stored["joints"].astype(np.float32),
@@ -256,37 +227,43 @@ def load_clips(path: str | Path) -> Clips:
             fps=float(stored["fps"].item()),
         )
     except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        raise file_error(path, error) from None
 
 
-def _check_cuts(clips: Clips | Motion, frames: int) -> None:
-    """Raises InputError unless the clips lie inside the frames and have a rate."""
-    for name in ("start", "length"):
-        value = getattr(clips, name)
-        if value.shape != (len(clips.names),) or value.dtype.kind not in "iu":
-            raise InputError(
-                f"clip_{name} needs one whole number a clip, ({len(clips.names)}), got {value.dtype} {value.shape}"
+def usable_clips(
+    path: object, names: Sequence[str], length: Sequence[int], good: np.ndarray, number: np.ndarray | None = None
+) -> dict:
+    """Cuts clips at frames that cannot be used, so that no motion jumps over a gap.
+
+    Args:
+        names, length: Of the clips, one after the other.
+        good: (F,) bool, frames that can be used.
+        number: (F,) the frames' numbers in the recording, by default without gaps.
+
+    Returns:
+        names, start and length of the clips among the good frames; a piece after the first is called NAME#2 and so on.
+
+    Raises:
+        InputError: Without frames, or where too large a share of a clip cannot be used.
+    """
+    number = np.arange(len(good)) if number is None else number
+    pieces: list[tuple[str, int]] = []
+    for name, end, count in zip(names, np.cumsum(length), length, strict=True):
+        frames = slice(end - count, end)
+        bad = count - int(good[frames].sum())
+        if bad > _MOST_DROPPED * count:
+            raise file_error(
+                path,
+                f"{bad} of {count} frames have values that are not finite or bones without length "
+                f"(at most {_MOST_DROPPED:.0%} can be left out); repair the recording",
             )
-        # in narrow or unsigned numbers an end could overflow
-        object.__setattr__(clips, name, value.astype(np.int64))
-    ends = clips.start + clips.length
-    if len(ends) and (min(clips.start.min(), clips.length.min()) < 0 or ends.max() > frames):
-        raise InputError(f"clips must lie inside the {frames} frames, got up to frame {ends.max()}")
-    if not 0 < clips.fps < np.inf:
-        raise InputError(f"fps must be frames a second, above 0, got {clips.fps}")
-
-
-def _chosen(clips: Clips | Motion, subjects: str | Iterable[str]) -> tuple[list[int], np.ndarray, np.ndarray]:
-    """Which clips start with one of `subjects`, which frames those are, and where each clip starts among them."""
-    subjects = (subjects,) if isinstance(subjects, str) else tuple(subjects)
-    for subject in subjects:
-        if not any(_is_of(name, subject) for name in clips.names):
-            known = ", ".join(sorted({name.partition("_")[0] for name in clips.names}))
-            raise InputError(f"no clip starts with {subject!r}: there are {known}")
-    chosen = [c for c, name in enumerate(clips.names) if any(_is_of(name, subject) for subject in subjects)]
-    frames = [np.arange(clips.start[c], clips.start[c] + clips.length[c]) for c in chosen]
-    length = clips.length[chosen]
-    return chosen, np.concatenate([*frames, np.zeros(0, int)]).astype(int), np.cumsum(length) - length
+        gaps = np.flatnonzero(np.diff(number[frames][good[frames]]) != 1) + 1
+        for k, piece in enumerate(np.diff([0, *gaps, count - bad]) if count else ()):
+            pieces.append((name if k == 0 else f"{name}#{k + 1}", int(piece)))
+    if not pieces:
+        raise file_error(path, "holds no frame of motion")
+    counts = np.array([count for _, count in pieces])
+    return {"names": tuple(name for name, _ in pieces), "start": np.cumsum(counts) - counts, "length": counts}
 
 
 def _is_of(name: str, subject: str) -> bool:

@@ -1,31 +1,58 @@
-"""SMPL's axis-angle poses on the shipped body, without SMPL.
+"""SMPL's axis-angle poses on the shipped body, without SMPL: AMASS, SLOPER4D, LiDARHuman26M.
 
-Both bodies have the same 24 joints and rest in a T-pose; SMPL's looks along +z with y up and its left along +x. With
-C the change of axes from SMPL's rest pose to the house's, and W from the recording's world to the house's,
+Both bodies have the same 24 joints and rest in a T-pose; SMPL's faces +z with y up and its left along +x. With C the
+change of axes from SMPL's rest pose to the level frame's, and W from the recording's world to the level frame,
 
-    R_house[j] = C R_smpl[j] C^-1        R_house[root] = W R_smpl[root] C^-1
+    R_level[j] = C R_smpl[j] C^-1        R_level[root] = W R_smpl[root] C^-1
+
+SMPL's pelvis is at `trans` plus its rest position, which only SMPL's own file knows: a constant of the person, about
+0.24 m along the recording's y axis, is missing from `Motion.translation`. Shapes, fingers and faces are not used.
+
+AMASS: npz of `poses` (N, 156 or 165; 66 and 72 are read too) or `root_orient` (N, 3) and `pose_body` (N, 63), rad;
+`trans` (N, 3) m; `mocap_framerate` or `mocap_frame_rate`; z up. Source: Mahmood et al. 2019, the README on the layout.
+
+SLOPER4D: <sequence>_labels.pkl of `framerate`, and for `first_person` and `second_person` `pose` (n, 72) rad and
+`trans` (n, 3) m, world, z up; the refined `opt_pose` and `opt_trans` where there are any. Source: Dai et al. 2023,
+the published loader.
+
+LiDARHuman26M: a folder of one JSON file a frame, labels/3d/pose/<sequence>/<frame>.json, with `pose` (72) rad and
+`trans` (3) m in the sensor's frame. Source: LiDARCap, Li et al. 2022, the data set's page and published loaders.
 """
+
+import json
+import os
+import re
+import reprlib
+from pathlib import Path
 
 import numpy as np
 
-from lidarpose.body.mocap.motion import Motion
-from lidarpose.body.mocap.segments import cut
+from lidarpose.body.mocap.motion import Motion, join, usable_clips
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_from_up
-from lidarpose.io.files import file_error
+from lidarpose.io.files import file_error, read_bytes, read_npz
+from lidarpose.io.pickles import load_pickle
 
-_TO_HOUSE = UP_AXES["y"]
+_R_LEVEL_SMPL = UP_AXES["y"]
 # rotations beyond this are degrees, rad
 _MOST_TURN = 4 * np.pi
 # nobody is as far from the origin of a recording, m
 _FARTHEST = 1e5
 # mean share of the trunk along an axis from which people are said to stand along it
-_STANDS = 0.7
+_UPRIGHT = 0.7
+
+_RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
+_BODY = 66  # the root and SMPL's 21 joints of the body, 3 numbers each; SMPL has two hands more, the others fingers
+_SMPL = 72
+_PEOPLE = ("first_person", "second_person")
+# frames a second of the LiDAR that LiDARHuman26M's labels belong to
+LIDARHUMAN26M_FPS = 10.0
+_FRAME = re.compile("[0-9]{1,12}")
 
 
-def smpl_motion(
+def motion_from_smpl(
     path: object,
-    pose: np.ndarray,
-    trans: np.ndarray,
+    pose: object,
+    trans: object,
     *,
     name: str,
     fps: float,
@@ -33,59 +60,144 @@ def smpl_motion(
     kind: str,
     number: np.ndarray | None = None,
 ) -> Motion:
-    """One clip of SMPL poses: pose (F, 72) rad, the root first, trans (F, 3) m, world with the axis `up` upwards, z
-    where nobody says.
+    """The motion of one clip of SMPL poses.
 
-    SMPL's pelvis is at `trans` plus its rest position, which only SMPL's own file knows: a constant of the person,
-    about 0.24 m along the recording's y axis, is missing from `Motion.translation`. number (F,) numbers the frames.
-    Raises InputError for other shapes, for degrees, for far-off positions, and, unless `up` is said, where people do
-    not stand along z: those whose `up` is said may lie.
+    Args:
+        pose: (F, 72) axis-angles, rad, the root first.
+        trans: (F, 3) m, in a world whose axis `up` is upwards, by default z.
+        number: (F,) the frames' numbers in the recording, by default without gaps.
+
+    Raises:
+        InputError: For other shapes, degrees, far-off positions and, unless `up` is given, where people do not stand
+            along z: those whose `up` is given may lie.
     """
     world = rotation_from_up(up or "z")
-    pose, trans = (_numbers(path, value, what) for value, what in ((pose, "pose"), (trans, "trans")))
-    if pose.ndim != 2 or pose.shape[1] != 72 or trans.shape != (len(pose), 3):
+    try:
+        pose, trans = np.asarray(pose, float), np.asarray(trans, float)
+    except (TypeError, ValueError, OverflowError, MemoryError):
+        raise file_error(path, "pose and trans must be numbers in rows of equal length") from None
+    if pose.ndim != 2 or pose.shape[1] != _SMPL or trans.shape != (len(pose), 3):
         raise file_error(path, f"{kind} needs pose (frames, 72) and trans (frames, 3), got {pose.shape}, {trans.shape}")
     if not 0 < fps < np.inf:
         raise file_error(path, f"the frame rate must be above 0, got {fps}; give load_motion fps=")
     good = np.isfinite(pose).all(1) & np.isfinite(trans).all(1)
-    names, start, length = cut(path, name, good, number)
+    clips = usable_clips(path, [name], [len(good)], good, number)
     pose, trans = pose[good].reshape(-1, 24, 3), trans[good]
     with np.errstate(over="ignore"):
         most, far = np.linalg.norm(pose, axis=-1).max(), np.linalg.norm(trans, axis=-1).max()
     if most > _MOST_TURN:
         raise file_error(path, f"pose has a turn of {most:.4g} rad; {kind} has axis-angles in radians, not degrees")
     if far > _FARTHEST:
-        raise file_error(path, f"trans is {far:.4g} m from the origin; expected metres")
+        raise file_error(path, f"trans is {far:.4g} m from the origin; expected meters")
 
     rotations = np.empty((len(pose), 24, 3, 3), np.float32)
-    rotations[:, 1:] = _TO_HOUSE @ axis_angle_to_matrix(pose[:, 1:]) @ _TO_HOUSE.T
+    rotations[:, 1:] = _R_LEVEL_SMPL @ axis_angle_to_matrix(pose[:, 1:]) @ _R_LEVEL_SMPL.T
     root = axis_angle_to_matrix(pose[:, 0])
-    rotations[:, 0] = world @ root @ _TO_HOUSE.T
+    rotations[:, 0] = world @ root @ _R_LEVEL_SMPL.T
     if up is None:
         _check_upright(path, root[..., 1].mean(0))
     return Motion(
         rotations=rotations,
         translation=(trans @ world.T).astype(np.float32),
-        names=names,
-        start=start,
-        length=length,
         fps=float(fps),
         source=f"{kind}: {path}",
         dropped=int((~good).sum()),
+        **clips,
     )
 
 
 def _check_upright(path: object, trunk: np.ndarray) -> None:
     """Raises InputError where the mean direction of the trunk lies along another axis than z."""
     axis = int(np.abs(trunk).argmax())
-    stands = "xyz"[axis]
-    if stands != "z" and abs(trunk[axis]) > _STANDS:
-        stands = f"-{stands}" if trunk[axis] < 0 else stands
-        raise file_error(path, f"people stand along {stands}, not z; give load_motion up={stands!r}")
+    name = "xyz"[axis]
+    if name != "z" and abs(trunk[axis]) > _UPRIGHT:
+        name = f"-{name}" if trunk[axis] < 0 else name
+        raise file_error(path, f"people stand along {name}, not z; give load_motion up={name!r}")
 
 
-def _numbers(path: object, value: object, what: str) -> np.ndarray:
+def load_amass(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
+    """The motion of an AMASS file as one clip, named as the file."""
+    stored, names = read_npz(
+        path, ("poses", "root_orient", "pose_body", "trans", *_RATES), expected="an npz file of motion"
+    )
+    poses = stored.get("poses")
+    if poses is None and {"root_orient", "pose_body"} <= stored.keys():
+        parts = stored["root_orient"], stored["pose_body"]
+        if [part.shape[1:] for part in parts] != [(3,), (63,)] or len(parts[0]) != len(parts[1]):
+            raise file_error(
+                path, f"needs root_orient (N, 3) and pose_body (N, 63), got {parts[0].shape}, {parts[1].shape}"
+            )
+        poses = np.concatenate(parts, 1)
+    if poses is None or "trans" not in stored:
+        raise file_error(
+            path,
+            f"holds {', '.join(names) or 'nothing'}; an npz of motion needs poses (or root_orient and "
+            "pose_body), trans and mocap_framerate (AMASS), or joints, clip, clip_start, clip_length and fps",
+        )
+    if poses.dtype.kind not in "iuf" or poses.ndim != 2 or poses.shape[1] < _BODY:
+        raise file_error(path, f"poses must be numbers (N, 66 or more) as (N, 156), got {poses.dtype} {poses.shape}")
+    if fps is None:
+        fps = _frame_rate(path, next((stored[key] for key in _RATES if key in stored), None), _RATES[0])
+    width = _SMPL if poses.shape[1] == _SMPL else _BODY
+    pose = np.zeros((len(poses), _SMPL))
+    pose[:, :width] = poses[:, :width]
+    return motion_from_smpl(path, pose, stored["trans"], name=Path(path).stem, fps=fps, up=up, kind="AMASS")
+
+
+def load_sloper4d(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
+    """The motion of a SLOPER4D label file: a clip for each person that has poses, NAME_first and NAME_second."""
+    labels = load_pickle(path)
+    if not isinstance(labels, dict):
+        raise file_error(path, f"expected SLOPER4D's labels, a dict, got {type(labels).__name__}")
+    motions = []
+    for person in (p for p in _PEOPLE if isinstance(labels.get(p), dict)):
+        pairs = [(labels[person].get(f"{prefix}pose"), labels[person].get(f"{prefix}trans")) for prefix in ("opt_", "")]
+        poses = next((pair for pair in pairs if pair[0] is not None and pair[1] is not None), None)
+        if poses is not None:
+            rate = fps or _frame_rate(path, labels.get("framerate"), "framerate")
+            name = f"{Path(path).stem}_{person.removesuffix('_person')}"
+            motions.append(motion_from_smpl(path, *poses, name=name, fps=rate, up=up, kind="SLOPER4D"))
+    if not motions:
+        keys = ", ".join(map(str, labels)) or "nothing"
+        raise file_error(path, f"expected second_person with pose (n, 72) and trans (n, 3), got {keys}")
+    return join(motions, source=f"SLOPER4D: {path}")
+
+
+def _frame_rate(path: object, rate: object, key: str) -> float:
     try:
-        return np.asarray(value, dtype=float)
-    except (TypeError, ValueError, OverflowError, MemoryError):
-        raise file_error(path, f"{what} must be numbers in rows of equal length") from None
+        return float(np.asarray(rate).item())
+    except (TypeError, ValueError, OverflowError):
+        raise file_error(path, f"does not give its frame rate as one number ({key}); give load_motion fps=") from None
+
+
+def pose_files(folder: Path) -> list[Path]:
+    """The JSON files of a folder that are numbered as frames are, in the order of their numbers."""
+    return sorted((p for p in folder.glob("*.json") if _FRAME.fullmatch(p.stem)), key=lambda p: int(p.stem))
+
+
+def load_lidarhuman26m(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
+    """The motion of a folder of numbered pose files, or of a single file; z is up unless `up` says otherwise. A number
+    that is missing ends a clip."""
+    path = Path(path)
+    files = pose_files(path) if path.is_dir() else [path]
+    if not files:
+        raise file_error(path, "holds no numbered JSON file such as 000001.json")
+    poses, trans = zip(*(_read_pose_file(file) for file in files), strict=True)
+    number = np.array([int(file.stem) for file in files]) if path.is_dir() else None
+    fps = fps or LIDARHUMAN26M_FPS
+    return motion_from_smpl(path, poses, trans, name=path.stem, fps=fps, up=up, kind="LiDARHuman26M", number=number)
+
+
+def _read_pose_file(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    data = read_bytes(path, expected="a JSON file with pose and trans")
+    try:
+        content = json.loads(data.decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise file_error(path, f"is not JSON ({error}); was it copied completely?") from None
+    try:
+        pose, trans = (np.asarray(content[key], float).ravel() for key in ("pose", "trans"))
+    except (TypeError, KeyError, IndexError, ValueError, OverflowError):
+        pose = trans = np.zeros(0)
+    if len(pose) != _SMPL or len(trans) != 3:
+        raise file_error(path, f"expected pose (72 numbers) and trans (3 numbers), got {reprlib.repr(content)}")
+    return pose, trans
