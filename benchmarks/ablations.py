@@ -41,9 +41,9 @@ from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import SCENES, SceneConfig
 from lidarpose.train.example import Example
 from lidarpose.train.loop import train
-from lidarpose.train.posenet_objective import PoseTask
+from lidarpose.train.posenet_objective import PoseNetObjective
 from lidarpose.train.recipes import Pretrain, recipe
-from lidarpose.train.setup import Job, job_of
+from lidarpose.train.setup import TrainSetup, make_setup
 from lidarpose.train.sources import SyntheticSource
 
 _WILD = SCENES["wild"]
@@ -110,8 +110,8 @@ VARIANTS = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class VariantTask(PoseTask):
-    """`PoseTask` of a network that may lack something."""
+class VariantTask(PoseNetObjective):
+    """`PoseNetObjective` of a network that may lack something."""
 
     made: Callable[[NetworkConfig], nn.Module]
 
@@ -153,9 +153,9 @@ def configuration(variant: Variant, init: str) -> NetworkConfig:
     return replace(preset(variant.size), **{"convolution": kept} | variant.config)
 
 
-def job(variant: Variant, settings: Pretrain) -> Job:
+def job(variant: Variant, settings: Pretrain) -> TrainSetup:
     """What the variant comes to."""
-    usual = job_of(settings)
+    usual = make_setup(settings)
     config = configuration(variant, settings.init)
     task = VariantTask(config=config, made=variant.network)
     values = {name: value for name, value in vars(usual.source).items() if not name.startswith("_")}
@@ -178,7 +178,7 @@ def run(options: argparse.Namespace, name: str, seed: int, folder: Path) -> dict
     settings = recipe(Pretrain, **changes | variant.recipe)
     started, used = time.perf_counter(), time.process_time()
     own = job(variant, settings)
-    model = train(settings, folder, job=own)
+    model = train(settings, folder, setup=own)
     taken = {"seconds": time.perf_counter() - started, "processor_seconds": time.process_time() - used}
     network = own.task.network()
     with opened(model, framework="pt") as file:

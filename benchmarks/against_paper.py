@@ -21,10 +21,10 @@ from lidarpose import evaluation
 from lidarpose.inference.predictor import load
 from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.dapt.dapt_config import DaptConfig
-from lidarpose.train.dapt_objective import DaptTask, finetuning_config, pretraining_config, small, transferred
+from lidarpose.train.dapt_objective import DaptObjective, finetuning_config, pretraining_config, small, transferred
 from lidarpose.train.loop import train
 from lidarpose.train.recipes import Pretrain, recipe
-from lidarpose.train.setup import job_of
+from lidarpose.train.setup import make_setup
 
 
 @dataclass(frozen=True)
@@ -70,20 +70,20 @@ def run(options: argparse.Namespace, name: str, seed: int, folder: Path) -> dict
     changes = {"size": "paper-small", "motion": options.motion, "subjects": subjects, "people": people // 2}
     changes |= {"workers": 0, "pictures": 0, "validate": people, "scene": way.scene} | (way.recipe or {})
     changes |= {"strays": 0.2, "noise": 0.15} if way.scene == "wild" else {}
-    first = DaptTask(config=sized(pretraining_config()), stage="pretrain")
+    first = DaptObjective(config=sized(pretraining_config()), stage="pretrain")
     settings = recipe(Pretrain, "paper", **changes, seed=seed, rate=way.rates[0])
-    own = replace(job_of(settings), task=first, network=first.network)
-    model = train(settings, folder / "pretrain", job=own)
+    own = replace(make_setup(settings), task=first, network=first.network)
+    model = train(settings, folder / "pretrain", setup=own)
     # other people than those of the first half
     settings = replace(settings, seed=seed + 1_000, rate=way.rates[1])
-    second = DaptTask(config=sized(finetuning_config("humanm3")), stage="finetune")
+    second = DaptObjective(config=sized(finetuning_config("humanm3")), stage="finetune")
     trained, _ = load_checkpoint(model)
 
     def begun():
         return transferred(trained, second.config, keep_anchors=way.anchors)
 
-    own = replace(job_of(settings), task=second, network=begun)
-    model = train(settings, folder / "finetune", job=own)
+    own = replace(make_setup(settings), task=second, network=begun)
+    model = train(settings, folder / "finetune", setup=own)
     taken = {"seconds": time.perf_counter() - started, "processor_seconds": time.process_time() - used}
     results = [evaluation.run(load(model, decode=way_), ["bench"]).scores.results[0] for way_ in ("dark", "window")]
     best = min((figures(result) for result in results), key=lambda found: found["all"]["value"])

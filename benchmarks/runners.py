@@ -30,7 +30,7 @@ from lidarpose.synth.scene import scene_config
 from lidarpose.train.example import Example, example
 from lidarpose.train.objective import total
 from lidarpose.train.optim import average, optimizers
-from lidarpose.train.posenet_objective import PoseTask
+from lidarpose.train.posenet_objective import PoseNetObjective
 from lidarpose.train.recipes import Pretrain
 
 SIZES = ("tiny", "small", "base", "paper")
@@ -145,7 +145,7 @@ class Ours(Runner):
     def __init__(self, size: str, device: str = "cpu"):
         torch.manual_seed(0)
         self.config = preset(size)
-        self.task = PoseTask(config=self.config)
+        self.task = PoseNetObjective(config=self.config)
         super().__init__(size, PoseNet(self.config), device)
         self.mean = {name: value.detach().clone() for name, value in self.network.named_parameters()}
         self.made = None

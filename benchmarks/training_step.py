@@ -21,7 +21,7 @@ from lidarpose.train.example import example
 from lidarpose.train.losses import losses
 from lidarpose.train.objective import total
 from lidarpose.train.optim import optimizers
-from lidarpose.train.posenet_objective import PoseTask
+from lidarpose.train.posenet_objective import PoseNetObjective
 from lidarpose.train.recipes import Pretrain
 
 ROUNDS = 5
@@ -46,7 +46,7 @@ def main() -> None:
     for blas, times in made_in.items():
         print(f"a person made, {blas} BLAS threads: {np.median(times):.2f} ms")
     rng = np.random.default_rng(0)
-    arrays = PoseTask(config=config).collate([example(person.sample, rng) for person in people])
+    arrays = PoseNetObjective(config=config).collate([example(person.sample, rng) for person in people])
     batch = Batch.from_arrays(arrays)
     targets = Targets.from_arrays(arrays)
     network = PoseNet(config)

@@ -19,7 +19,7 @@ from lidarpose.models.dapt.voxel_tables import LAYOUTS
 from lidarpose.models.posenet import PoseNet
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14
 from lidarpose.train.dapt_losses import DaptTargets, finetuning, log_gaussian, pretraining
-from lidarpose.train.dapt_objective import DaptTask, finetuning_config, pretraining_config, small, transferred
+from lidarpose.train.dapt_objective import DaptObjective, finetuning_config, pretraining_config, small, transferred
 from lidarpose.train.example import Example
 from lidarpose.train.objective import alone, total
 
@@ -37,9 +37,10 @@ TINY = {
     "drop_path": 0.0,
     "anchor_dropout": 0.0,
 }
-PRETRAIN = DaptTask(config=replace(pretraining_config(), **TINY), stage="pretrain")
+PRETRAIN = DaptObjective(config=replace(pretraining_config(), **TINY), stage="pretrain")
 # with the head of the released code's other term
-FINETUNE = DaptTask(config=replace(finetuning_config("waymo", auxiliary=True), **TINY), stage="finetune", auxiliary=0.2)
+_WAYMO = replace(finetuning_config("waymo", auxiliary=True), **TINY)
+FINETUNE = DaptObjective(config=_WAYMO, stage="finetune", auxiliary=0.2)
 BOTH = pytest.mark.parametrize("task", [PRETRAIN, FINETUNE], ids=["pretrain", "finetune"])
 
 
@@ -301,7 +302,7 @@ def test_joints_are_body26s():
 
 def test_joints_of_a_network_with_every_head_are_those_that_the_stage_teaches():
     config = replace(named_config("paper"), **TINY)
-    task = DaptTask(config=config, stage="pretrain")
+    task = DaptObjective(config=config, stage="pretrain")
     net, arrays = network(task).eval(), task.collate([person(70)])
     with torch.no_grad():
         outputs = net(DaptBatch.from_tables(arrays.tables))
@@ -377,7 +378,7 @@ def test_people_without_labels_or_points(task):
 
 @pytest.mark.parametrize("stage", ["pretrain", "finetune"])
 def test_heads_that_a_stage_does_not_ask_have_a_gradient_of_zero(stage):
-    task = DaptTask(config=replace(named_config("paper"), **TINY), stage=stage)
+    task = DaptObjective(config=replace(named_config("paper"), **TINY), stage=stage)
     net = network(task)
     found = gradients(net, task.terms(net, task.collate([person(60), person(9, 1)])))
     still = {name.split(".")[1] for name, value in found.items() if (value == 0).all()}
@@ -557,8 +558,8 @@ def test_configurations():
     for dataset in ("waymo", "humanm3", "lidarhuman26m", "sloper4d"):
         config = finetuning_config(dataset)
         assert not config.legacy and not config.auxiliary and config.bins == named_config(dataset).bins
-        DaptTask(config=small(config), stage="finetune")
-    DaptTask(config=small(pretraining_config()), stage="pretrain")
+        DaptObjective(config=small(config), stage="finetune")
+    DaptObjective(config=small(pretraining_config()), stage="pretrain")
     weights = [sum(v.numel() for v in DaptNet(c).parameters()) for c in (small(pretraining_config()), PRETRAIN.config)]
     assert 50e6 / 45 < weights[0] < 50e6 / 35 and weights[1] < weights[0]
 

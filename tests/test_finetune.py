@@ -30,7 +30,7 @@ from lidarpose.train.augment import AUGMENTATIONS, Augmentation, augmentation, a
 from lidarpose.train.example import BLIND, PELVIS_ERROR, example, seen
 from lidarpose.train.labeled_dataset import InMemoryDataset
 from lidarpose.train.recipes import Finetune, Pretrain
-from lidarpose.train.setup import job_of
+from lidarpose.train.setup import make_setup
 from lidarpose.train.sources import MixedSource, StoredSource, SyntheticSource
 
 FEW = 16
@@ -138,7 +138,7 @@ def test_synthesized_shards_tell_what_is_seen_and_can_be_disturbed(synthetic):
         wanted = example(item, np.random.default_rng(0)).visible
         np.testing.assert_array_equal(dataset.sample(row).pose.visible, wanted)
     assert {0.0, 1.0} == set(dataset.visible.ravel())
-    plain, other = (job_of(Pretrain(shards=synthetic, strays=s, noise=s)).source for s in (0.0, 1.0))
+    plain, other = (make_setup(Pretrain(shards=synthetic, strays=s, noise=s)).source for s in (0.0, 1.0))
     for index in range(len(dataset)):
         a, b = plain.example(index), other.example(index)
         assert len(b.points) > len(a.points) and (b.part[len(a.part) :] == 0).all()
@@ -175,7 +175,7 @@ def test_a_damaged_shard_is_left_out_and_named(datasets, tmp_path):
     dataset = InMemoryDataset.load([folder])
     assert len(dataset) == len(InMemoryDataset.load([datasets["humanm3"]])) * 3 // 4
     assert len(dataset.damaged) == 1 and str(broken) in dataset.damaged[0]
-    warning, _ = job_of(Finetune(data=(str(folder),), mix=0.0)).warnings
+    warning, _ = make_setup(Finetune(data=(str(folder),), mix=0.0)).warnings
     assert str(broken) in warning and warning.startswith("left out 1 damaged shards: ")
     # a missing one is something else: the dataset is not finished
     broken.unlink()
@@ -373,17 +373,17 @@ def test_synthesized_people_are_mixed_in_by_their_share(datasets):
 
 
 def test_sequences_are_held_out_unless_the_dataset_has_a_split_for_it(datasets):
-    job = job_of(Finetune(data=(str(datasets["humanm3"]),), mix=0.0))
+    job = make_setup(Finetune(data=(str(datasets["humanm3"]),), mix=0.0))
     assert job.card["held_out_sequences"] == ["train/c"]
     assert set(job.source.dataset.sequences) == {"train/a", "train/b"} and len(job.validation()) == 6
     # Waymo has one
-    job = job_of(Finetune(data=(str(datasets["waymo"]),), mix=0.0))
+    job = make_setup(Finetune(data=(str(datasets["waymo"]),), mix=0.0))
     assert not job.card["held_out_sequences"] and len(job.validation()) == 4
     # but whoever learns from that one is not judged on it
-    job = job_of(Finetune(data=(str(datasets["waymo"]),), mix=0.0, split="val"))
+    job = make_setup(Finetune(data=(str(datasets["waymo"]),), mix=0.0, split="val"))
     assert not job.validation()
     # and one sequence for training leaves nobody
-    job = job_of(Finetune(data=(str(datasets["sloper4d"]),), mix=0.0))
+    job = make_setup(Finetune(data=(str(datasets["sloper4d"]),), mix=0.0))
     assert not job.card["held_out_sequences"] and not job.validation()
     assert job.warnings == (
         "nobody is left to validate on: no split val, and no sequence is held out (--hold-out, or too few of them)",
@@ -395,21 +395,23 @@ def test_a_dataset_is_remembered_by_the_name_that_an_evaluation_gives_it(dataset
     (tmp_path / "link").symlink_to(folder)
     monkeypatch.chdir(folder)
     for folder in (".", tmp_path / "link"):
-        assert job_of(Finetune(data=(folder,), init="tiny")).card["data"] == [open_people(folder).name] == ["humanm3"]
+        assert (
+            make_setup(Finetune(data=(folder,), init="tiny")).card["data"] == [open_people(folder).name] == ["humanm3"]
+        )
 
 
 def test_pretraining_takes_nobody_who_is_kept_for_testing(datasets, tmp_path):
     with pytest.raises(InputError, match="has people for testing, by the split official.*--split train") as error:
-        job_of(Pretrain(shards=(datasets["humanm3"],)))
+        make_setup(Pretrain(shards=(datasets["humanm3"],)))
     assert "\n" not in str(error.value)
     raw = datasets["humanm3"].parent / "raw-humanm3"
     prepare("humanm3", raw, tmp_path / "train", split="train", progress=False)
-    dataset = job_of(Pretrain(shards=(tmp_path / "train",))).source.dataset
+    dataset = make_setup(Pretrain(shards=(tmp_path / "train",))).source.dataset
     assert dataset.sequences == ("train/a", "train/b", "train/c")
     # a corpus has no split
     files.write_lipd(tmp_path / "raw", files.write_smpl(tmp_path / "SMPL_NEUTRAL.npz"))
     prepare("lipd", tmp_path / "raw", tmp_path / "corpus", progress=False)
-    assert len(job_of(Pretrain(shards=(tmp_path / "corpus",))).source.dataset)
+    assert len(make_setup(Pretrain(shards=(tmp_path / "corpus",))).source.dataset)
 
 
 # --- runs
@@ -456,7 +458,7 @@ def test_the_paper_s_two_stages(datasets, tmp_path, capsys, monkeypatch, keep):
     assert first.config.coordinates and not first.config.bins and first.config.parts == 25
     assert second.config.bins == (140, 140, 220) and not (second.config.coordinates or second.config.parts)
     assert second.config.joints == HUMAN15.joints and not second.config.legacy
-    begun = job_of(run_dir.stored_recipe(tmp_path / "second", Finetune)).network().state_dict()
+    begun = make_setup(run_dir.stored_recipe(tmp_path / "second", Finetune)).network().state_dict()
     anchors = "backbone.keypoint_embedding"
     kept = torch.equal(begun[anchors], load_checkpoint("first/model.safetensors")[0].state_dict()[anchors])
     assert kept == (keep == "true")
@@ -480,9 +482,9 @@ def test_a_run_on_a_dataset_is_taken_up(datasets, tmp_path, monkeypatch):
         patch.setattr(loop, "SAVE_EVERY", -1.0)
         original, calls = loop._Run._chunk, []
 
-        def counted(self, batches):
+        def counted(self, *args):
             calls.append(1)
-            return original(self, batches) if len(calls) < 3 else killed()
+            return original(self, *args) if len(calls) < 3 else killed()
 
         patch.setattr(loop._Run, "_chunk", counted)
         with pytest.raises(Killed):
@@ -571,5 +573,5 @@ def test_points_are_jittered_and_strays_are_added():
 
 def test_everybody_is_seen_as_often_as_epochs_say(datasets):
     for mix, people in ((0.0, 72), (0.25, 96)):
-        job = job_of(Finetune(data=(str(datasets["humanm3"]),), epochs=6, mix=mix, hold_out=0.34))
+        job = make_setup(Finetune(data=(str(datasets["humanm3"]),), epochs=6, mix=mix, hold_out=0.34))
         assert len(job.source.dataset if not mix else job.source.main.dataset) == 12 and job.people == people

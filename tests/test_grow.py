@@ -18,9 +18,9 @@ from lidarpose.synth.scene import scene_config
 from lidarpose.train.example import example
 from lidarpose.train.objective import total
 from lidarpose.train.optim import optimizers
-from lidarpose.train.posenet_objective import PoseTask
+from lidarpose.train.posenet_objective import PoseNetObjective
 from lidarpose.train.recipes import Pretrain
-from lidarpose.train.setup import job_of
+from lidarpose.train.setup import make_setup
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def arrays():
     generator, rng = Generator(scene=scene_config("wild"), measure=False), np.random.default_rng(0)
     people = [example(generator.person(77, k).sample, rng, refined=0.0) for k in range(24)]
     # with the tables that convolutions read; others leave them
-    return PoseTask(config=preset("tiny")).collate(people)
+    return PoseNetObjective(config=preset("tiny")).collate(people)
 
 
 def told(network, arrays):
@@ -67,7 +67,7 @@ def test_all_that_is_new_learns(arrays):
     before = {name: value.clone() for name, value in larger.named_parameters()}
     made = optimizers(larger, Pretrain())
     rows = arrays["joints"]
-    targets = PoseTask(config=preset("small"))
+    targets = PoseNetObjective(config=preset("small"))
     for _ in range(3):
         terms = targets.terms(larger, arrays)
         total(terms).backward()
@@ -100,7 +100,7 @@ def test_growing_needs_room_and_the_same_meaning():
 
 
 def test_pretraining_goes_on_from_weights(tmp_path):
-    job = job_of(Pretrain(size="small", init="tiny"))
+    job = make_setup(Pretrain(size="small", init="tiny"))
     torch.manual_seed(0)
     network = job.network()
     assert network.config == preset("small") and network.training
@@ -108,10 +108,10 @@ def test_pretraining_goes_on_from_weights(tmp_path):
     torch.manual_seed(0)
     assert all(map(torch.equal, network.state_dict().values(), job.network().state_dict().values()))
     with pytest.raises(InputError, match="cannot begin as this tiny one: grid"):
-        job_of(Pretrain(size="base", init="tiny"))
+        make_setup(Pretrain(size="base", init="tiny"))
     with pytest.raises(InputError, match="the paper's begins at random"):
         Pretrain(size="paper-small", init="tiny")
     path = tmp_path / "small.safetensors"
     save_checkpoint(path, network, card={})
     with pytest.raises(InputError, match="none may shrink"):
-        job_of(Pretrain(size="tiny", init=str(path)))
+        make_setup(Pretrain(size="tiny", init=str(path)))

@@ -24,7 +24,7 @@ from lidarpose.train.example import SEEN, example, seen
 from lidarpose.train.losses import SIGMA, losses
 from lidarpose.train.objective import total
 from lidarpose.train.optim import optimizers
-from lidarpose.train.posenet_objective import MAX_VOXELS, PoseTask
+from lidarpose.train.posenet_objective import MAX_VOXELS, PoseNetObjective
 from lidarpose.train.recipes import Pretrain
 
 TINY = preset("tiny")
@@ -428,7 +428,7 @@ def test_a_joint_is_seen_where_points_lie_near_it():
 
 def test_collated_targets_are_the_examples_and_the_majority_of_parts():
     shown = [example(known.sample, np.random.default_rng(k)) for k, known in enumerate(people())]
-    arrays = PoseTask(config=TINY).collate(shown)
+    arrays = PoseNetObjective(config=TINY).collate(shown)
     assert arrays["fine.valid"].shape[1] <= MAX_VOXELS and "point_voxel" not in arrays
     assert (arrays["part"][~arrays["fine.valid"]] == -1).all()
     assert ((arrays["part"] >= 0) == arrays["fine.valid"]).all()
@@ -449,7 +449,7 @@ def test_eight_people_can_be_learned_by_heart():
     torch.manual_seed(0)
     maker = Generator(scene=SCENES["wild"], measure=False)
     rng = np.random.default_rng(0)
-    arrays = PoseTask(config=TINY).collate([example(maker.person(0, index).sample, rng) for index in range(8)])
+    arrays = PoseNetObjective(config=TINY).collate([example(maker.person(0, index).sample, rng) for index in range(8)])
     model, recipe, steps = PoseNet(TINY), Pretrain(), 300
     made = optimizers(model, recipe)
     for step in range(steps):

@@ -2,7 +2,9 @@
 
 import json
 import os
+import re
 import shlex
+import signal
 import subprocess
 import sys
 import time
@@ -12,7 +14,8 @@ import numpy as np
 import pytest
 import torch
 from motion_files import a_clip, write_amass
-from safetensors.torch import load_file
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
 from lidarpose.cli import main
 from lidarpose.errors import InputError
@@ -22,8 +25,9 @@ from lidarpose.models.config import preset
 from lidarpose.models.posenet import PoseNet
 from lidarpose.train import loop, run_dir, setup
 from lidarpose.train.data_loader import BATCHES, lanes_of
+from lidarpose.train.interruption import Interrupted, StopRequest
 from lidarpose.train.optim import optimizers, rate_factor
-from lidarpose.train.posenet_objective import PoseTask
+from lidarpose.train.posenet_objective import PoseNetObjective
 from lidarpose.train.recipes import Finetune, Pretrain, recipe
 from lidarpose.train.sources import SyntheticSource
 from lidarpose.train.validation import Validation
@@ -208,7 +212,7 @@ def test_a_longer_run_sees_everybody(monkeypatch, tmp_path):
 def test_a_gradient_that_is_not_finite_never_reaches_what_is_saved(monkeypatch, tmp_path, step):
     """Not even in the last step of a chunk, or of the run, whose loss is still good."""
     folder, calls = tmp_path / "run", [0]
-    original = PoseTask.terms
+    original = PoseNetObjective.terms
 
     def poisoned(self, network, arrays, **kwargs):
         calls[0] += 1
@@ -218,7 +222,7 @@ def test_a_gradient_that_is_not_finite_never_reaches_what_is_saved(monkeypatch, 
             terms["vote"] = terms["vote"] + (terms["vote"] - terms["vote"]).abs().sqrt()
         return terms
 
-    monkeypatch.setattr(PoseTask, "terms", poisoned)
+    monkeypatch.setattr(PoseNetObjective, "terms", poisoned)
     monkeypatch.setattr(loop, "SAVE_EVERY", -1.0)
     with pytest.raises(InputError, match="its gradient is not finite in batch"):
         loop.train(RECIPE, folder)
@@ -234,8 +238,8 @@ def test_killed_for_good_with_workers_and_taken_up(tmp_path):
     recipe = replace(RECIPE, workers=1, people=40 * BATCHES * 2)
     code = (
         "import sys, json, torch; torch.set_num_threads(1)\n"
-        "from lidarpose.train import job, loop; from lidarpose.train.recipes import Pretrain\n"
-        f"loop.SAVE_EVERY, job.VALIDATION = -1.0, {FEW}\n"
+        "from lidarpose.train import loop, setup; from lidarpose.train.recipes import Pretrain\n"
+        f"loop.SAVE_EVERY, setup.VALIDATION = -1.0, {FEW}\n"
         "loop.train(Pretrain(**json.loads(sys.argv[1])), sys.argv[2])"
     )
     words = [sys.executable, "-c", code, json.dumps(recipe.to_dict()), str(tmp_path / "run")]
@@ -354,6 +358,74 @@ def test_a_damaged_run_says_so(tmp_path, unbroken, name, content):
     assert "\n" not in str(caught.value) and str(folder / name) in str(caught.value)
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_config_in_another_unicode_encoding_is_read(tmp_path, unbroken, encoding):
+    folder = copied(unbroken, tmp_path / "run")
+    text = (folder / run_dir.CONFIG).read_text("utf-8")
+    (folder / run_dir.CONFIG).write_bytes(text.encode(encoding))
+    loop.train(RECIPE, folder, resume=True)
+    assert_same_run(folder, unbroken)
+
+
+@pytest.mark.parametrize("change", [{"steps": None}, {"steps": 1.5}, {"seconds": -1}, {"best": "low"}, []])
+def test_damaged_progress_of_a_state_is_one_line(tmp_path, unbroken, change):
+    folder = copied(unbroken, tmp_path / "run")
+    progress = {"steps": 16, "seconds": 1.0, "best": None, "validation": None}
+    progress = change if change == [] else progress | change
+    save_file(load_file(folder / run_dir.STATE), folder / run_dir.STATE, metadata={"progress": json.dumps(progress)})
+    with pytest.raises(InputError, match=f"{re.escape(str(folder / run_dir.STATE))}: .*damaged") as caught:
+        loop.train(RECIPE, folder, resume=True)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("entry", ["step", "exp_avg"])
+def test_a_state_whose_optimizer_lacks_an_entry_is_refused(tmp_path, unbroken, entry):
+    folder = copied(unbroken, tmp_path / "run")
+    with safe_open(folder / run_dir.STATE, framework="pt") as file:
+        metadata = file.metadata()
+    tensors = load_file(folder / run_dir.STATE)
+    del tensors[next(name for name in tensors if name.endswith(f".{entry}"))]
+    save_file(tensors, folder / run_dir.STATE, metadata=metadata)
+    with pytest.raises(InputError, match=f"optimizer's memory is damaged .*{entry}"):
+        loop.train(RECIPE, folder, resume=True)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_run_that_is_told_to_stop_saves_and_goes_on_to_the_same_losses(monkeypatch, tmp_path, unbroken, number):
+    folder, original = tmp_path / "run", PoseNetObjective.terms
+
+    def interrupted(*args, **kwargs):
+        # once
+        monkeypatch.setattr(PoseNetObjective, "terms", original)
+        os.kill(os.getpid(), number)
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr(PoseNetObjective, "terms", interrupted)
+    message = f"stopped after 16 samples, saved: go on with lidarpose pretrain {re.escape(str(folder))} --resume"
+    with pytest.raises(Interrupted, match=message) as stop:
+        loop.train(RECIPE, folder)
+    assert stop.value.status == 128 + number and signal.getsignal(number) is not None
+    assert [line["people"] for line in log_of(folder)] == [16]
+    loop.train(RECIPE, folder, resume=True)
+    assert_same_run(folder, unbroken)
+
+
+def test_a_second_request_stops_at_once():
+    with pytest.raises(KeyboardInterrupt), StopRequest() as stop:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.number == signal.SIGTERM
+        os.kill(os.getpid(), signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_run_without_a_state_says_that_it_starts_over(tmp_path, unbroken, capsys):
+    folder = copied(unbroken, tmp_path / "run")
+    (folder / run_dir.STATE).unlink()
+    loop.train(RECIPE, folder, resume=True)
+    assert "the run starts over" in capsys.readouterr().err
+    assert_same_run(folder, unbroken)
+
+
 def test_the_state_of_another_network_is_refused(tmp_path, unbroken):
     folder = copied(unbroken, tmp_path / "run")
     (folder / run_dir.STATE).write_bytes((folder / run_dir.MODEL).read_bytes())
@@ -372,7 +444,7 @@ def test_the_state_of_another_network_is_refused(tmp_path, unbroken):
 def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_last_good_state(monkeypatch, tmp_path, unbroken):
     folder, calls = tmp_path / "run", [0]
 
-    original = PoseTask.terms
+    original = PoseNetObjective.terms
 
     def poisoned(*args, **kwargs):
         calls[0] += 1
@@ -380,7 +452,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_last_good_state(m
         return terms | {"vote": terms["vote"] * float("nan")} if calls[0] > BATCHES + 3 else terms
 
     with monkeypatch.context() as patch:
-        patch.setattr(PoseTask, "terms", poisoned)
+        patch.setattr(PoseNetObjective, "terms", poisoned)
         patch.setattr(loop, "SAVE_EVERY", -1.0)
         told = "not finite in batch 3 of the 8 from person 16 on: start in another folder with a lower --rate; "
         told += "state.safetensors is kept"

@@ -25,16 +25,16 @@ from lidarpose.train.data_loader import BATCHES, Chunks, loader
 from lidarpose.train.losses import CONFIDENCE, HEATMAP, JOINTS, LEVEL, SIGMA, SPREAD, VOTE, losses
 from lidarpose.train.objective import total
 from lidarpose.train.optim import average, optimizers, rate_factor
-from lidarpose.train.posenet_objective import PoseTask
+from lidarpose.train.posenet_objective import PoseNetObjective
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.recipes import recipe as recipe_of
-from lidarpose.train.setup import job_of
+from lidarpose.train.setup import make_setup
 from lidarpose.train.sources import SyntheticSource
 from lidarpose.train.validation import Validation
 
 # three chunks of `BATCHES` batches
 RECIPE = Pretrain(scene="paper", people=3 * BATCHES * 2, batch=2, workers=0, seed=5, easy=0.15, pictures=0)
-TASK = PoseTask(config=preset("tiny"))
+TASK = PoseNetObjective(config=preset("tiny"))
 TINY = preset("tiny")
 WINDOW = REACH["window"]
 BINS = round(2 * WINDOW / BIN)
@@ -265,7 +265,7 @@ def assert_same_chunks(a, b):
 
 def chunks(recipe, start=0, steps=3 * BATCHES):
     people = Chunks(
-        source=job_of(recipe).source, task=TASK, batch=recipe.batch, seed=recipe.seed, start=start, steps=steps
+        source=make_setup(recipe).source, task=TASK, batch=recipe.batch, seed=recipe.seed, start=start, steps=steps
     )
     return list(loader(people, workers=recipe.workers))
 
@@ -288,7 +288,14 @@ def test_the_last_chunk_may_be_short():
 @pytest.mark.parametrize("ranks", [2, 4])
 def test_processes_share_every_batch_out(ranks):
     """Together they show the people of one process, batch by batch, and nobody twice."""
-    common = {"source": job_of(RECIPE).source, "task": TASK, "batch": 8, "seed": 5, "start": 0, "steps": BATCHES + 1}
+    common = {
+        "source": make_setup(RECIPE).source,
+        "task": TASK,
+        "batch": 8,
+        "seed": 5,
+        "start": 0,
+        "steps": BATCHES + 1,
+    }
     (alone,) = (list(loader(Chunks(**common), workers=0)),)
     shared = [list(loader(Chunks(**common, rank=rank, ranks=ranks), workers=0)) for rank in range(ranks)]
     for c, batches in enumerate(alone):

@@ -44,9 +44,11 @@ def main(arguments: list[str] | None = None) -> int:
     except MemoryError as error:
         reason = f" ({error})" if str(error) else ""
         return _failed(InputError(f"the memory is full{reason}: give less at once, as fewer points or people"))
-    except KeyboardInterrupt:
-        tell("lidarpose: stopped")
-        return 130
+    except KeyboardInterrupt as stopped:
+        # training says how to go on
+        if os.environ.get("RANK", "0") == "0":
+            tell(f"lidarpose: {stopped}" if str(stopped) else "lidarpose: stopped")
+        return getattr(stopped, "status", 130)
     return 0
 
 

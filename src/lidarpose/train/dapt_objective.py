@@ -1,4 +1,4 @@
-"""`DaptTask`: what the loop must know of the paper's network, in either of its stages.
+"""`DaptObjective`: what the loop must know of the paper's network, in either of its stages.
 
 Legend: B people, J joints of the network, M voxels of level 0.
 """
@@ -20,7 +20,7 @@ from lidarpose.train.dapt_transfer import transferred
 from lidarpose.train.example import UNKNOWN_PART, Example
 from lidarpose.train.objective import Share, alone
 
-__all__ = ["DaptArrays", "DaptTask", "finetuning_config", "pretraining_config", "small", "transferred"]
+__all__ = ["DaptArrays", "DaptObjective", "finetuning_config", "pretraining_config", "small", "transferred"]
 
 STAGES = ("pretrain", "finetune")
 
@@ -41,8 +41,8 @@ class DaptArrays:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DaptTask:
-    """A `Task` of a `DaptNet` with this configuration.
+class DaptObjective:
+    """A `Objective` of a `DaptNet` with this configuration.
 
     stage: "pretrain", which needs coordinates and parts, or "finetune", which needs heatmaps; layout: of the tables,
     "ragged" for CPUs and "padded" for accelerators; regression, segmentation, auxiliary: weights, see `dapt_losses`.

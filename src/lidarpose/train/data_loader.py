@@ -7,6 +7,7 @@ all of them together are the same however many there are.
 """
 
 import os
+import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -21,7 +22,7 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from lidarpose.errors import InputError
 from lidarpose.train.example import Example
-from lidarpose.train.objective import Task
+from lidarpose.train.objective import Objective
 from lidarpose.train.sources import Source
 
 # batches a chunk
@@ -43,7 +44,7 @@ class Chunks(IterableDataset):
     """
 
     source: Source
-    task: Task
+    task: Objective
     batch: int
     seed: int
     start: int
@@ -120,4 +121,6 @@ def _end_with(parent: int, worker: int) -> None:
             time.sleep(_LOOK)
         os._exit(1)
 
+    # Ctrl-C reaches workers too, and the parent still needs them for the batches that it finishes
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=watch, daemon=True).start()

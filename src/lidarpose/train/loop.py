@@ -6,6 +6,8 @@ launcher; each makes its share of every batch, and together they take the same s
 
 import json
 import os
+import shlex
+import signal
 import sys
 import time
 from collections.abc import Iterator
@@ -22,6 +24,7 @@ from tqdm import tqdm
 from lidarpose.errors import InputError, check_name
 from lidarpose.models.checkpoint import save_checkpoint
 from lidarpose.train.data_loader import BATCHES, Chunks, chunks_of, lanes_of, loader
+from lidarpose.train.interruption import Interrupted, StopRequest
 from lidarpose.train.objective import total
 from lidarpose.train.optim import average, optimizers, set_rates
 from lidarpose.train.recipes import Recipe
@@ -43,7 +46,7 @@ from lidarpose.train.run_dir import (
     stored_command,
     stored_recipe,
 )
-from lidarpose.train.setup import Job, job_of
+from lidarpose.train.setup import TrainSetup, make_setup
 from lidarpose.train.train_state import load_state, save_state
 from lidarpose.train.validation import Draw, Validation
 
@@ -61,7 +64,8 @@ def train(
     recipe: Recipe,
     folder: str | Path | None = None,
     *,
-    job: Job | None = None,
+    setup: TrainSetup | None = None,
+    job: TrainSetup | None = None,
     resume: bool = False,
     command: str = "",
     device: str | None = None,
@@ -70,11 +74,12 @@ def train(
 ) -> Path:
     """Trains as the recipe says and returns the path of model.safetensors.
 
-    job: people or a network of one's own instead of those that the recipe comes to (`job.job_of`); the run is as long
-    as it says. folder: a new one (None: the next number in `runs`), or with `resume` that of a run with the same recipe
-    (its length may differ). device: "cpu", or None for what Accelerate finds; tracker: "tensorboard" or "wandb", which
-    must be installed; draw: what makes pictures of validation people, None for none. Raises InputError where the folder
-    or the recipe does not fit, or where the loss stops being finite: the last good state then stays.
+    setup: samples or a network of your own instead of the recipe's (`setup.make_setup`); the run is as long as it says.
+    job: the old name of `setup`. folder: a new one (None: the next number in `runs`), or with `resume` that of a run
+    with the same recipe (its length may differ). device: "cpu", or None for what Accelerate finds; tracker:
+    "tensorboard" or "wandb", which must be installed; draw: what makes pictures of validation people, None for none.
+    Raises InputError where the folder or the recipe does not fit, or where the loss stops being finite: the last good
+    state then stays. Raises `Interrupted` after SIGINT or SIGTERM, once the state is saved.
     """
     _check(device, tracker)
     kind = type(recipe)
@@ -87,18 +92,18 @@ def train(
         raise InputError("several processes need to know the run's folder: name it")
     elif folder is not None:
         check_new(Path(folder))
-    job = job_of(recipe, on_cpu=_on_cpu(device)) if job is None else job
+    setup = setup or job or make_setup(recipe, on_cpu=_on_cpu(device))
     accelerator = _accelerator(recipe, device, tracker)
     lanes_of(recipe.batch, accelerator.num_processes)
     # every process has looked before the first one writes
     accelerator.wait_for_everyone()
     folder = numbered(kind.__name__.lower()) if folder is None else Path(folder)
     accelerator.project_configuration.set_directories(str(folder))
-    run = _Run(recipe, job, folder, accelerator, command, draw)
+    run = _Run(recipe, setup, folder, accelerator, command, draw)
     if accelerator.is_main_process:
-        for warning in job.warnings:
-            print(f"lidarpose: warning: {warning}", file=sys.stderr)
-    with held(folder) if accelerator.is_main_process else nullcontext():
+        for warning in setup.warnings:
+            _warn(warning)
+    with held(folder) if accelerator.is_main_process else nullcontext(), StopRequest() as stop:
         if resume:
             run.take_up()
         elif accelerator.is_main_process:
@@ -108,11 +113,15 @@ def train(
             settings = {name: value for name, value in recipe.to_dict().items() if isinstance(value, int | float | str)}
             accelerator.init_trackers("lidarpose", config=settings)
         try:
-            run.go()
+            run.go(stop)
         finally:
             if tracker is not None:
                 accelerator.end_training()
     return folder / MODEL
+
+
+def _warn(text: str) -> None:
+    print(f"lidarpose: warning: {text}", file=sys.stderr)
 
 
 def _accelerator(recipe: Recipe, device: str | None, tracker: str | None) -> Accelerator:
@@ -144,19 +153,19 @@ class _Run:
     """A run that goes on: the network, the mean of its weights, its optimizers, how far it is."""
 
     def __init__(
-        self, recipe: Recipe, job: Job, folder: Path, accelerator: Accelerator, command: str, draw: Draw | None
+        self, recipe: Recipe, setup: TrainSetup, folder: Path, accelerator: Accelerator, command: str, draw: Draw | None
     ):
-        self.recipe, self.job, self.folder, self.command = recipe, job, folder, command
+        self.recipe, self.setup, self.folder, self.command = recipe, setup, folder, command
         self.accelerator = accelerator
         torch.manual_seed(_number(recipe.seed, _INIT))
-        self.network: nn.Module = job.network().to(accelerator.device).train()
+        self.network: nn.Module = setup.network().to(accelerator.device).train()
         self.mean = {name: value.detach().clone() for name, value in self.network.named_parameters()}
         self.optimizers = optimizers(self.network, recipe)
         self.wrapped = accelerator.prepare(self.network) if accelerator.num_processes > 1 else self.network
-        self.steps = -(-job.people // recipe.batch)
+        self.steps = -(-setup.people // recipe.batch)
         self.chunks = chunks_of(self.steps)
         self.chunk, self.seconds, self.best = 0, 0.0, float("inf")
-        self.validation = Validation(job, recipe, folder, draw)
+        self.validation = Validation(setup, recipe, folder, draw)
 
     def take_up(self) -> None:
         """The state of the run that was stopped; the beginning, where it was killed before its first was saved."""
@@ -166,12 +175,14 @@ class _Run:
             if done > self.steps:
                 seen = done * self.recipe.batch
                 raise InputError(
-                    f"{self.folder}: the run has seen {seen:,} people already, got {self.job.people:,} in all"
+                    f"{self.folder}: the run has seen {seen:,} people already, got {self.setup.people:,} in all"
                 )
             # a longer run makes the last chunk of a shorter one anew, whole
             self.chunk = self.chunks if done == self.steps else done // BATCHES
             self.best = float("inf") if progress["best"] is None else progress["best"]
-            self.validation.last = progress.get("validation")
+            self.validation.last = progress["validation"]
+        elif self.accelerator.is_main_process:
+            _warn(f"{self.folder} has no {STATE}, it was stopped before its first was saved: the run starts over")
         if self.accelerator.is_main_process:
             clean(self.folder)
             cut_log(self.folder, self.seen)
@@ -186,12 +197,12 @@ class _Run:
         """People of all chunks that are done."""
         return self.taken * self.recipe.batch
 
-    def go(self) -> None:
-        """All that is left of the run."""
+    def go(self, stop: StopRequest) -> None:
+        """All that is left of the run, or until `stop` is asked for. Raises `Interrupted` in the latter case."""
         main = self.accelerator.is_main_process
         people = Chunks(
-            source=self.job.source,
-            task=self.job.task,
+            source=self.setup.source,
+            task=self.setup.task,
             batch=self.recipe.batch,
             seed=self.recipe.seed,
             start=self.chunk,
@@ -199,7 +210,7 @@ class _Run:
             rank=self.accelerator.process_index,
             ranks=self.accelerator.num_processes,
         )
-        due = self.recipe.validate or max(self.job.people // _VALIDATIONS, 1)
+        due = self.recipe.validate or max(self.setup.people // _VALIDATIONS, 1)
         started = saved = time.monotonic()
         before = self.seconds
         with ExitStack() as stack:
@@ -207,26 +218,34 @@ class _Run:
             bar = stack.enter_context(self._bar())
             for batches in self._chunks(people):
                 before_it = self.seen
-                line = self._chunk(batches)
+                line, stopping = self._chunk(batches, stop)
                 self.seconds = before + time.monotonic() - started
-                told = {"people": self.seen, "seconds": round(self.seconds, 1)} | line
+                entry = {"people": self.seen, "seconds": round(self.seconds, 1)} | line
                 last = self.chunk == self.chunks
                 if last or self.seen // due > before_it // due:
-                    told |= self._validated(self.seen)
+                    entry |= self._validated(self.seen)
                 if main:
-                    log.write(json.dumps(told) + "\n")
+                    log.write(json.dumps(entry) + "\n")
                     log.flush()
-                self.accelerator.log({k: v for k, v in told.items() if k != "people"}, step=told["people"])
+                self.accelerator.log({k: v for k, v in entry.items() if k != "people"}, step=entry["people"])
                 bar.update(min(self.seen, bar.total) - bar.n)
                 shown = {"loss": f"{sum(v for k, v in line.items() if k not in ('mpjpe', 'gradient')):.3f}"}
                 shown |= {"mpjpe": f"{line['mpjpe'] * 1e3:.0f} mm"}
                 shown |= {"validation": f"{self.validation.last:.0f} mm"} if self.validation.last is not None else {}
                 bar.set_postfix(shown)
-                if main and (last or time.monotonic() - saved > SAVE_EVERY):
+                if main and (last or stopping or time.monotonic() - saved > SAVE_EVERY):
                     # the state must not be on the disk before the log
                     os.fsync(log.fileno())
                     self._save()
                     saved = time.monotonic()
+                if stopping and not last:
+                    # all processes take this branch: the request was shared with the losses
+                    kind, where = type(self.recipe).__name__.lower(), shlex.quote(str(self.folder))
+                    where = where if kind == "pretrain" else f"--out {where}"
+                    raise Interrupted(
+                        f"stopped after {self.seen:,} samples, saved: go on with lidarpose {kind} {where} --resume",
+                        stop.number or signal.SIGTERM,
+                    )
         self.accelerator.wait_for_everyone()
 
     def _chunks(self, people: Chunks) -> Iterator[list]:
@@ -243,17 +262,18 @@ class _Run:
 
     def _bar(self) -> tqdm:
         shown = self.accelerator.is_main_process and sys.stderr is not None and sys.stderr.isatty()
-        done = min(self.seen, self.job.people)
-        return tqdm(total=self.job.people, initial=done, unit=" people", smoothing=0.1, disable=not shown)
+        done = min(self.seen, self.setup.people)
+        return tqdm(total=self.setup.people, initial=done, unit=" people", smoothing=0.1, disable=not shown)
 
-    def _chunk(self, batches: list) -> dict[str, float]:
-        """Takes the steps of a chunk; returns the mean of each term and of the gradient's norm over them. Raises
-        InputError where one is not finite."""
+    def _chunk(self, batches: list, stop: StopRequest) -> tuple[dict[str, float], bool]:
+        """Takes the steps of a chunk; returns the mean of each term and of the gradient's norm over them, and whether
+        any process was asked to stop. Raises InputError where a term is not finite."""
         terms = [self._step(arrays, k) for k, arrays in enumerate(batches)]
         names = list(terms[0])
-        told = torch.stack([torch.stack([t[name] for name in names]) for t in terms])
-        told = self.accelerator.reduce(told, "mean").cpu()
-        broken = (~told.isfinite().all(1)).nonzero().flatten().tolist()
+        values = torch.stack([torch.stack([t[name] for name in names]) for t in terms])
+        asked = values.new_full((len(values), 1), float(stop.number > 0))
+        values, asked = self.accelerator.reduce(torch.cat([values, asked], 1), "mean").cpu().split((len(names), 1), 1)
+        broken = (~values.isfinite().all(1)).nonzero().flatten().tolist()
         if broken:
             first = self.seen
             kept = f"{STATE} is kept" if (self.folder / STATE).is_file() else "nothing was saved before"
@@ -262,7 +282,8 @@ class _Run:
                 f"{first} on: start in another folder with a lower --rate; {kept}"
             )
         self.chunk += 1
-        return {name: round(value, 5) for name, value in zip(names, told.mean(0).tolist(), strict=True)}
+        means = {name: round(value, 5) for name, value in zip(names, values.mean(0).tolist(), strict=True)}
+        return means, bool(asked.any())
 
     def _step(self, arrays: object, k: int) -> dict[str, Tensor]:
         step, recipe, accelerator = self.chunk * BATCHES + k, self.recipe, self.accelerator
@@ -272,7 +293,7 @@ class _Run:
         for optimizer in self.optimizers:
             optimizer.zero_grad(set_to_none=True)
         with accelerator.autocast():
-            terms = self.job.task.terms(self.wrapped, arrays, device=accelerator.device, share=self._share)
+            terms = self.setup.task.terms(self.wrapped, arrays, device=accelerator.device, share=self._share)
         accelerator.backward(total(terms))
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), recipe.clip or float("inf"))
         for optimizer in self.optimizers:
@@ -285,7 +306,7 @@ class _Run:
 
     def _averaged(self) -> nn.Module:
         """A network with the mean weights, in evaluation mode."""
-        network = self.job.task.network().to(self.accelerator.device)
+        network = self.setup.task.network().to(self.accelerator.device)
         network.load_state_dict(self.network.state_dict() | self.mean)
         return network.eval()
 
@@ -324,7 +345,7 @@ class _Run:
         }
         if self.validation.last is not None:
             card["validation_mm"] = round(more.get("validation", self.validation.last), 2)
-        save_checkpoint(self.folder / name, network, card=card | self.job.card)
+        save_checkpoint(self.folder / name, network, card=card | self.setup.card)
 
 
 def _number(*words: int) -> int:

@@ -22,7 +22,7 @@ def alone(count: Tensor) -> Tensor:
     return count
 
 
-class Task(Protocol):
+class Objective(Protocol):
     """A kind of network to train. Is pickled into the loader's workers, so it holds settings and no tensors."""
 
     config: Any

@@ -1,4 +1,4 @@
-"""`PoseTask`: what the loop must know of the package's own network."""
+"""`PoseNetObjective`: what the loop must know of the package's own network."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,8 +20,8 @@ MAX_VOXELS = 224
 
 
 @dataclass(frozen=True, kw_only=True)
-class PoseTask:
-    """A `Task` of a `PoseNet` with this configuration. bone, symmetry: weights, see `losses`."""
+class PoseNetObjective:
+    """A `Objective` of a `PoseNet` with this configuration. bone, symmetry: weights, see `losses`."""
 
     config: NetworkConfig
     bone: float = 0.0

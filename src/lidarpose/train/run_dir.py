@@ -134,7 +134,8 @@ def stored_recipe(folder: Path, kind: type[Recipe]) -> Recipe:
 
 def stored_command(folder: Path) -> str:
     """The command that began a run; the folder's config has been read by `stored_recipe`."""
-    return str(json.loads((folder / CONFIG).read_text()).get("command", ""))
+    # as bytes, of which json knows every Unicode encoding
+    return str(json.loads((folder / CONFIG).read_bytes()).get("command", ""))
 
 
 def check_same(folder: Path, stored: Recipe, wanted: Recipe) -> None:

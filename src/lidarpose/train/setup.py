@@ -21,8 +21,8 @@ from lidarpose.skeleton import HUMAN15, SMPL24, Skeleton, skeleton
 from lidarpose.train.augment import Augmentation, augmentation, augmented
 from lidarpose.train.example import Example
 from lidarpose.train.labeled_dataset import InMemoryDataset
-from lidarpose.train.objective import Task
-from lidarpose.train.posenet_objective import PoseTask
+from lidarpose.train.objective import Objective
+from lidarpose.train.posenet_objective import PoseNetObjective
 from lidarpose.train.recipes import PAPER, SMALL_PAPER, Finetune, Pretrain, Recipe
 from lidarpose.train.run_dir import folder_names
 from lidarpose.train.sources import MixedSource, Source, StoredSource, SyntheticSource
@@ -36,11 +36,11 @@ _LEAST_SEQUENCES = 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class Job:
+class TrainSetup:
     """people: how many are seen in all; validation: whom to validate on, made once, none for nobody; joints: the
     skeleton to draw them in; card: what the checkpoint tells besides the recipe; warnings: lines for the user."""
 
-    task: Task
+    task: Objective
     source: Source
     people: int
     network: Callable[[], nn.Module]
@@ -50,24 +50,28 @@ class Job:
     warnings: tuple[str, ...] = ()
 
 
-def job_of(recipe: Recipe, *, on_cpu: bool = True) -> Job:
+# the name in 0.2
+Job = TrainSetup
+
+
+def make_setup(recipe: Recipe, *, on_cpu: bool = True) -> TrainSetup:
     """on_cpu: where the network will run, which decides the layout of the paper's tables. Raises InputError, one line,
     where the recipe names what is not there."""
-    job = _pretraining(recipe) if isinstance(recipe, Pretrain) else _finetuning(recipe)
-    if isinstance(job.task, PoseTask) or on_cpu:
-        return job
-    return replace(job, task=replace(job.task, layout="padded"))
+    setup = _pretraining(recipe) if isinstance(recipe, Pretrain) else _finetuning(recipe)
+    if isinstance(setup.task, PoseNetObjective) or on_cpu:
+        return setup
+    return replace(setup, task=replace(setup.task, layout="padded"))
 
 
-def _pretraining(recipe: Pretrain) -> Job:
+def _pretraining(recipe: Pretrain) -> TrainSetup:
     if recipe.size in (PAPER, SMALL_PAPER):
-        from lidarpose.train.dapt_objective import DaptTask, pretraining_config, small
+        from lidarpose.train.dapt_objective import DaptObjective, pretraining_config, small
 
         config = pretraining_config()
-        task = DaptTask(config=config if recipe.size == PAPER else small(config), stage="pretrain")
+        task = DaptObjective(config=config if recipe.size == PAPER else small(config), stage="pretrain")
     else:
         check_name("network size", recipe.size, (*SIZES, PAPER, SMALL_PAPER))
-        task = PoseTask(config=preset(recipe.size), bone=recipe.bone, symmetry=recipe.symmetry)
+        task = PoseNetObjective(config=preset(recipe.size), bone=recipe.bone, symmetry=recipe.symmetry)
     names = ("scene", "motion", "subjects", "captured", "strays", "noise")
     scene = {name: getattr(recipe, name) for name in names}
     warnings: tuple[str, ...] = ()
@@ -85,12 +89,12 @@ def _pretraining(recipe: Pretrain) -> Job:
         held_out = SyntheticSource(seed=_VALIDATION_SEED, refined=0.0, **scene)
         return [held_out.example(index) for index in range(VALIDATION)]
 
-    joints = SMPL24 if isinstance(task, PoseTask) else HUMAN15
+    joints = SMPL24 if isinstance(task, PoseNetObjective) else HUMAN15
     card = {"motion": None if recipe.motion is None else Path(recipe.motion).name}
     network = task.network
     if recipe.init:
         network, card["init_card"] = _grown(recipe.init, task.config)
-    return Job(
+    return TrainSetup(
         task=task,
         source=source,
         people=recipe.people,
@@ -136,7 +140,7 @@ def _about(dataset: InMemoryDataset) -> tuple[str, ...]:
     return (f"left out {len(dataset.damaged)} damaged shards: {first}" + (f", and {more} more" if more else ""),)
 
 
-def _finetuning(recipe: Finetune) -> Job:
+def _finetuning(recipe: Finetune) -> TrainSetup:
     from lidarpose.models.bundled import weights_path
     from lidarpose.models.checkpoint import load_checkpoint
 
@@ -161,7 +165,7 @@ def _finetuning(recipe: Finetune) -> Job:
         rows = np.unique(np.linspace(0, len(watched) - 1, min(VALIDATION, len(watched))).astype(int)) if watched else ()
         return [augmented(watched.sample(k), quiet, np.random.default_rng([recipe.seed, k])) for k in rows]
 
-    return Job(
+    return TrainSetup(
         task=task,
         source=source,
         # those that are mixed in come on top
@@ -199,7 +203,7 @@ def _held_out(
 
 def _begun(
     recipe: Finetune, network: nn.Module, header: Header, joints: Skeleton, dataset: str
-) -> tuple[Task, Callable[[], nn.Module]]:
+) -> tuple[Objective, Callable[[], nn.Module]]:
     """The task and the network with the weights that it begins with."""
     if header.network == "pose":
         if not recipe.keep_anchors:
@@ -207,8 +211,8 @@ def _begun(
                 "keep_anchors=false is for the paper's network, and --init names one of the package's own: name a "
                 "checkpoint of pretrain --recipe paper, or leave --recipe paper and --keep-anchors away"
             )
-        return PoseTask(config=header.config, bone=recipe.bone, symmetry=recipe.symmetry), lambda: network
-    from lidarpose.train.dapt_objective import DaptTask, transferred
+        return PoseNetObjective(config=header.config, bone=recipe.bone, symmetry=recipe.symmetry), lambda: network
+    from lidarpose.train.dapt_objective import DaptObjective, transferred
 
     recipe.check_no_lengths()
     alike = [c for c in CONFIGS.values() if c.bins and set(c.joints) == set(joints.joints)]
@@ -218,7 +222,7 @@ def _begun(
     own = header.config
     if recipe.keep_anchors and (own.joints, own.bins, own.ranges) == (like.joints, like.bins, like.ranges):
         # a network of this dataset already, as released ones are
-        return DaptTask(config=own, stage="finetune"), lambda: network
+        return DaptObjective(config=own, stage="finetune"), lambda: network
     # the paper fine-tunes by heatmaps alone
     config = replace(
         header.config,
@@ -231,6 +235,6 @@ def _begun(
         auxiliary=False,
     )
     return (
-        DaptTask(config=config, stage="finetune"),
+        DaptObjective(config=config, stage="finetune"),
         lambda: transferred(network, config, keep_anchors=recipe.keep_anchors),
     )

@@ -1,7 +1,9 @@
 """The state of a run on disk, from which it goes on to the same losses: weights, their mean, the optimizers' memory."""
 
 import json
+from math import inf
 from pathlib import Path
+from types import NoneType
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -10,9 +12,13 @@ from torch import Tensor, nn
 
 from lidarpose.errors import InputError
 from lidarpose.io.files import write_atomic
+from lidarpose.train.muon import Muon
 
-# what a state tells of the run besides tensors: steps taken, seconds, error of the best validation or None
-_PROGRESS = {"steps", "seconds", "best"}
+# progress of a run besides tensors: steps taken, seconds, error of the best and of the last validation in mm or None
+_ERROR = (int, float, NoneType)
+_PROGRESS = {"steps": (int,), "seconds": (int, float), "best": _ERROR, "validation": _ERROR}
+# entries that an optimizer cannot go on without
+MEMORY = {torch.optim.AdamW: ("step", "exp_avg", "exp_avg_sq"), Muon: ("momentum_buffer",)}
 
 
 def save_state(
@@ -35,10 +41,14 @@ def load_state(
     try:
         with safe_open(str(path), framework="pt") as file:
             progress = json.loads((file.metadata() or {})["progress"])
-            if missing := _PROGRESS - set(progress):
-                raise ValueError(f"it does not tell {', '.join(sorted(missing))}")
+            # states of 0.1 lack the last validation
+            progress.setdefault("validation", None)
+            for entry, types in _PROGRESS.items():
+                value = progress.get(entry)
+                if entry not in progress or type(value) not in types or value is not None and not 0 <= value < inf:
+                    raise ValueError(f"its {entry} is {value!r}")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
-    except (SafetensorError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(f"{path}: expected the state of a run, but it is damaged ({error}): start a new run") from None
     stored_mean = _part(tensors, "mean.")
     try:
@@ -49,12 +59,28 @@ def load_state(
         reason = str(error).splitlines()[0]
         raise InputError(f"{path}: the state is not of this network ({reason}): start a new run") from None
     for k, optimizer in enumerate(optimizers):
-        memory: dict[int, dict[str, Tensor]] = {}
+        optimizer.load_state_dict(optimizer.state_dict() | {"state": _memory(path, tensors, k, optimizer)})
+    return progress
+
+
+def _memory(
+    path: Path, tensors: dict[str, Tensor], k: int, optimizer: torch.optim.Optimizer
+) -> dict[int, dict[str, Tensor]]:
+    """What optimizer k remembers of each parameter. Raises InputError where an entry lacks or has another shape."""
+    memory: dict[int, dict[str, Tensor]] = {}
+    try:
         for name, value in _part(tensors, f"optimizer.{k}.").items():
             index, _, entry = name.partition(".")
             memory.setdefault(int(index), {})[entry] = value
-        optimizer.load_state_dict(optimizer.state_dict() | {"state": memory})
-    return progress
+        for index, parameter in enumerate(p for group in optimizer.param_groups for p in group["params"]):
+            # a parameter without a gradient so far has no memory
+            for entry in MEMORY[type(optimizer)] if index in memory else ():
+                shape = memory[index][entry].shape
+                if entry != "step" and shape != parameter.shape:
+                    raise ValueError(f"{entry} of parameter {index} has the shape {tuple(shape)}")
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{path}: the optimizer's memory is damaged ({error}): start a new run") from None
+    return memory
 
 
 def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -12,7 +12,7 @@ from lidarpose.skeleton import Skeleton
 from lidarpose.train.example import Example
 from lidarpose.train.recipes import Recipe
 from lidarpose.train.run_dir import PICTURES
-from lidarpose.train.setup import Job
+from lidarpose.train.setup import TrainSetup
 
 # people in their own frames, predicted joints (N, 26, 3) m of body26, the skeleton to draw, a title -> PNG
 Draw = Callable[[list[Example], np.ndarray, Skeleton, str], bytes]
@@ -21,8 +21,8 @@ Draw = Callable[[list[Example], np.ndarray, Skeleton, str], bytes]
 class Validation:
     """draw: what makes the pictures, None for none; last: the error of the last validation in mm, None before."""
 
-    def __init__(self, job: Job, recipe: Recipe, folder: Path, draw: Draw | None = None):
-        self.job, self.recipe, self.folder, self.draw = job, recipe, folder, draw
+    def __init__(self, setup: TrainSetup, recipe: Recipe, folder: Path, draw: Draw | None = None):
+        self.setup, self.recipe, self.folder, self.draw = setup, recipe, folder, draw
         self.last: float | None = None
         self._people: list[Example] | None = None
 
@@ -30,7 +30,7 @@ class Validation:
         """MPJPE in mm of a network in evaluation mode over the labelled joints that it has; None with nobody to
         validate on. people: seen so far, which names the picture."""
         if self._people is None:
-            self._people = self.job.validation()
+            self._people = self.setup.validation()
         if not self._people:
             return None
         joints = self.predicted(network, self._people, device)
@@ -46,10 +46,12 @@ class Validation:
         """(N, 26, 3) m."""
         size = self.recipe.batch
         parts = [people[k : k + size] for k in range(0, len(people), size)]
-        return np.concatenate([self.job.task.joints(network, self.job.task.collate(p), device=device) for p in parts])
+        return np.concatenate(
+            [self.setup.task.joints(network, self.setup.task.collate(p), device=device) for p in parts]
+        )
 
     def _drawn(self, joints: np.ndarray, people: int) -> None:
         chosen = np.unique(np.linspace(0, len(joints) - 1, min(self.recipe.pictures, len(joints))).astype(int))
         shown = [self._people[k] for k in chosen]
-        picture = self.draw(shown, joints[chosen], self.job.joints, f"after {people:,} people")
+        picture = self.draw(shown, joints[chosen], self.setup.joints, f"after {people:,} people")
         write_atomic(self.folder / PICTURES / f"people-{people:09d}.png", picture)
