@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from walkers import piece_volumes
 
 from lidarpose.body.pose_prior.activities import KINDS
 from lidarpose.body.rig import load_rig
@@ -11,8 +12,7 @@ from lidarpose.body.shape import sample_people
 from lidarpose.geometry import rotation_about
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import draw_bodies
-from lidarpose.synth.props import carried, meshes
-from lidarpose.synth.props.draw_props import draw_props
+from lidarpose.synth.props.attachments import _CARRIED, _carried_prop, _free_hands, draw_props
 from lidarpose.synth.props.garments import girth, skirt
 
 J = {name: i for i, name in enumerate(BODY26.joints)}
@@ -40,51 +40,6 @@ def drawn(bodies):
     return found
 
 
-def edges_match(faces):
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    directed = {tuple(e) for e in edges.tolist()}
-    return len(directed) == len(edges) and directed == {(b, a) for a, b in directed}
-
-
-def volumes(mesh):
-    """The volume of each piece: negative where its faces look inwards."""
-    piece = np.arange(len(mesh.vertices))
-    for _ in range(len(piece)):
-        least = piece.copy()
-        for k in range(3):
-            np.minimum.at(least, mesh.faces[:, k], piece[mesh.faces].min(1))
-        if (least == piece).all():
-            break
-        piece = least
-    corners = mesh.vertices.astype(float)
-    found = []
-    for one in np.unique(piece):
-        faces = mesh.faces[piece[mesh.faces[:, 0]] == one]
-        a, b, c = np.moveaxis(corners[faces] - corners[piece == one].mean(0), 1, 0)
-        found.append((np.cross(a, b) * c).sum() / 6)
-    return found
-
-
-MESHES = {
-    **{name: getattr(meshes, name)() for name in (
-        "unit_box", "tube", "bag", "pack", "ball", "umbrella", "suitcase", "pram", "cart", "chair", "bench",
-        "wheelchair", "bicycle")},
-    "cap": meshes.hat(0.0), "brim": meshes.hat(0.5), "rim": meshes.rim(0.3, 0.02, sides=11),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", MESHES)
-def test_meshes_are_closed_look_outwards_and_have_few_faces(name):
-    mesh = MESHES[name]
-    assert edges_match(mesh.faces) and mesh.faces.max() == len(mesh.vertices) - 1
-    assert min(volumes(mesh)) > 0
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces].astype(float), 1, 0)
-    assert len(mesh.faces) <= (300 if name in ("wheelchair", "bicycle") else 160)
-    assert mesh.vertices.dtype == np.float32 and mesh.faces.dtype == np.int32
-    # no doubled vertices in place, no faces without area
-    assert np.linalg.norm(np.cross(b - a, c - a), axis=-1).min() > 1e-7
-
-
 def test_every_thing_is_drawn_and_is_within_reach(drawn, bodies):
     assert THINGS | {"skirt", "hat"} == set(drawn)
     for name, props in drawn.items():
@@ -97,7 +52,7 @@ def test_every_thing_is_drawn_and_is_within_reach(drawn, bodies):
             assert gap < (0.6 if name == "chair" else 0.3), name
             assert len(mesh.faces) <= 310 and (prop.face_part is None) == (name in THINGS)
             if name != "skirt":
-                assert min(volumes(mesh)) > 0, f"{name}: a piece is inside out"
+                assert min(piece_volumes(mesh)) > 0, f"{name}: a piece is inside out"
 
 
 def test_shares(bodies):
@@ -332,9 +287,8 @@ def test_either_hand_carries(name):
         for joint, place in (("elbow", (0, 0.22, 0.15)), ("wrist", (0, 0.24, -0.1)), ("hand", (0, 0.24, -0.18))):
             joints[J[f"{side}_{joint}"]] = np.multiply(place, [1, sign, 1])
     joints = joints + [0, 0, -joints[:, 2].min()]
-    arms = carried._arms(joints.tolist())
-    assert arms.hanging == HANDS
-    make = {"bag": carried._bag, "suitcase": carried._suitcase}[name]
+    hands = _free_hands(joints.tolist())[_CARRIED[name].hands]
+    assert hands == HANDS
     for share, sign in ((0.2, 1), (0.8, -1)):
-        u = [0.5, 0.5, share, *[0.5] * 9]
-        assert sign * make(joints.tolist(), arms, u).place(joints).vertices[:, 1].mean() > 0.15
+        prop = _carried_prop(name, joints.tolist(), hands, [0.5, 0.5, share, *[0.5] * 9])
+        assert sign * prop.place(joints).vertices[:, 1].mean() > 0.15

@@ -14,7 +14,7 @@ from lidarpose.synth import generator, noise
 from lidarpose.synth.environment.mesh import Mesh, box, quad
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.placement import Place
-from lidarpose.synth.props.attachment import fixed
+from lidarpose.synth.props.attachments import rigid_prop
 from lidarpose.synth.scene import SCENES, scene_config
 from lidarpose.synth.simulate import Scan, ScanConditions, Scene, count_alone, draw_conditions, simulate_scan
 
@@ -190,8 +190,8 @@ def at_the_hip(points):
     return [[1, 0, 0], [0, 1, 0], [0, 0, 1]], [x, y, z]
 
 
-CLOTH = fixed("cloth", box((0.1, 0.1, 0.1)), at_the_hip, face_part=np.full(12, 5, np.uint8))
-STAND = fixed("stand", box((0.1, 0.1, 0.1)), at_the_hip, lift=0.25)
+CLOTH = rigid_prop("cloth", box((0.1, 0.1, 0.1)), at_the_hip, face_part=np.full(12, 5, np.uint8))
+STAND = rigid_prop("stand", box((0.1, 0.1, 0.1)), at_the_hip, lift=0.25)
 
 
 def test_clothes_are_the_person_s_and_things_are_not_and_both_go_along():

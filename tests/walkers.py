@@ -1,4 +1,4 @@
-"""Somebody simple for scenes: a box that goes and turns."""
+"""Shared by tests of scenes: a box that goes and turns, and volumes of meshes."""
 
 import numpy as np
 
@@ -25,3 +25,22 @@ def goer(still=False):
         at_frame_end=lambda frame: (vertices[frame], joints[frame]), kind="walk", faces=mesh.faces,
         face_part=np.full(12, 3, np.uint8),
     )  # fmt: skip
+
+
+def piece_volumes(mesh):
+    """The volume of each piece: negative where its faces look inwards."""
+    piece = np.arange(len(mesh.vertices))
+    for _ in range(len(piece)):
+        least = piece.copy()
+        for k in range(3):
+            np.minimum.at(least, mesh.faces[:, k], piece[mesh.faces].min(1))
+        if (least == piece).all():
+            break
+        piece = least
+    corners = mesh.vertices.astype(float)
+    found = []
+    for number in np.unique(piece):
+        faces = mesh.faces[piece[mesh.faces[:, 0]] == number]
+        a, b, c = np.moveaxis(corners[faces] - corners[piece == number].mean(0), 1, 0)
+        found.append((np.cross(a, b) * c).sum() / 6)
+    return found

@@ -21,7 +21,7 @@ from lidarpose.synth.bodies import Bodies, Body, PoseBank, draw_bodies, draw_mov
 from lidarpose.synth.environment.mesh import Mesh
 from lidarpose.synth.environment.surroundings import ground, occluder, surroundings
 from lidarpose.synth.placement import Place, draw_place
-from lidarpose.synth.props.draw_props import draw_props
+from lidarpose.synth.props.attachments import draw_props
 from lidarpose.synth.sample_kernels import center_of_cells, crop_points
 from lidarpose.synth.scene import SceneConfig, scene_config
 from lidarpose.synth.simulate import Scan, Scene, count_alone, draw_conditions, simulate_scan

@@ -1,10 +1,13 @@
-"""Plain triangle meshes for scenes: quads, boxes, prisms, lofts, and their union.
+"""Triangle meshes for scenes: primitives, their union, and what stands about in streets and rooms.
 
-A mesh of a kind is built once with unit size and then scaled: every person of the generator draws some.
+Things look as a LiDAR sees them: few triangles, right outlines. All stand on the origin, their front along +x, their
+length along y where they have one; sizes in metres. What is called with an rng is random in shape, all else is a
+function of its sizes. A mesh of a kind is built once with unit size and then scaled: every person draws some.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
+from importlib import resources
 from math import cos, sin
 
 import numpy as np
@@ -97,13 +100,9 @@ def repeated(count: int, corners: int, piece: str) -> np.ndarray:
     return faces
 
 
-def prism(radius: float, height: float, sides: int = 7) -> Mesh:
-    """An upright prism of `sides` faces standing on the origin: a pole, a trunk, a bin. Open at the bottom."""
-    return _unit_prism(sides, 1.0).scaled((radius, radius, height))
-
-
-def cone(radius: float, height: float, sides: int = 8, top: float = 0.15) -> Mesh:
-    """As a prism, `top` times as wide at the top as at the bottom."""
+def prism(radius: float, height: float, sides: int = 7, *, top: float = 1.0) -> Mesh:
+    """An upright prism of `sides` faces standing on the origin: a pole, a trunk, a bin. Open at the bottom; `top` times
+    as wide at the top."""
     return _unit_prism(sides, top).scaled((radius, radius, height))
 
 
@@ -117,30 +116,127 @@ def _unit_prism(sides: int, top: float) -> Mesh:
     n = (k + 1) % sides
     rows = ((k, n, n + sides), (k, n + sides, k + sides), (k + sides, n + sides, 0 * k + 2 * sides))
     faces = np.concatenate([np.stack(row, 1) for row in rows])
-    return _fixed(vertices, faces)
+    return Mesh(vertices.astype(np.float32), faces.astype(np.int32))
 
 
-def loft(stations: tuple[tuple[float, float, float, float, float], ...]) -> Mesh:
-    """A closed hull through cross-sections along x: stations (x, half width at the bottom, half width at the top,
-    bottom, top), x ascending. Built once for each tuple; its arrays are read-only."""
-    return _loft(tuple(stations))
+# --- shipped meshes
+
+
+def shape(name: str, x: float = 1.0, y: float = 1.0, z: float = 1.0) -> Mesh:
+    """A fixed mesh of `tools/make_meshes.py`, stretched. Of unit size are "car" and "van" (heading along +x), "table",
+    "wheeled bin", "traffic cone" (high as 1) and "bonnet"; "bench" and "bench without back" are 1 along y."""
+    return shipped_meshes()[name].scaled((x, y, z))
+
+
+@cache
+def shipped_meshes() -> dict[str, Mesh]:
+    """All of them by name, read once; read-only."""
+    with resources.files("lidarpose.synth").joinpath("assets/meshes.npz").open("rb") as file:
+        stored = dict(np.load(file, allow_pickle=False))
+    names = [key.removesuffix("/faces") for key in stored if key.endswith("/faces")]
+    meshes = {name: Mesh(stored[f"{name}/vertices"], stored[f"{name}/faces"].astype(np.int32)) for name in names}
+    for mesh in meshes.values():
+        mesh.vertices.setflags(write=False)
+        mesh.faces.setflags(write=False)
+    return meshes
+
+
+# --- meshes of a few sizes each
+
+
+def wall(length: float, height: float, *, thick: float = 0.2, opening: tuple | None = None) -> Mesh:
+    """A wall along y. opening: (from, to, sill, top) of a window or a door, the first two in y, all in metres."""
+    if opening is None:
+        return box(np.array([thick, length, height]))
+    left, right, sill, top = opening
+    half = length / 2
+    pieces = [
+        ((-half + left) / 2, 0.0, left + half, height),
+        ((right + half) / 2, 0.0, half - right, height),
+        ((left + right) / 2, top, right - left, height - top),
+    ]
+    if sill > 0:
+        pieces.append(((left + right) / 2, 0.0, right - left, sill))
+    middle = [(0.0, y, z) for y, z, _, _ in pieces]
+    return boxes(np.array(middle), np.array([(thick, wide, tall) for _, _, wide, tall in pieces]))
+
+
+def sign(height: float, wide: float) -> Mesh:
+    """A traffic sign: a plate `wide` m across, facing +x, on a post of `height` m."""
+    plate = np.array([0.02, wide, wide])
+    return union([prism(0.03, height, 5), box(plate).moved(np.array([0.04, 0, height - wide]))])
+
+
+def rail_fence(length: float, height: float, rails: int) -> Mesh:
+    """Posts 1.5 m apart or less along y, and `rails` bars between them: beams pass between."""
+    posts = max(2, int(np.ceil(length / 1.5)) + 1)
+    at = np.linspace(-length / 2, length / 2, posts)
+    middle, size = np.zeros((posts + rails, 3)), np.empty((posts + rails, 3))
+    middle[:posts, 1] = at
+    size[:posts] = (0.06, 0.06, height)
+    middle[posts:, 2] = (np.arange(rails) + 0.6) * (height / (rails + 0.2)) - 0.02
+    size[posts:] = (0.04, length, 0.05)
+    return boxes(middle, size)
+
+
+def lattice_fence(length: float, height: float, pitch: float, slat: float) -> Mesh:
+    """Upright slats `slat` m wide every `pitch` m along y, and two thin rails: what stands behind shows through."""
+    count = max(2, int(length / pitch))
+    y = (np.arange(count) - (count - 1) / 2) * pitch
+    vertices = np.zeros((count + 2, 4, 3), np.float32)
+    half = np.array([-1, 1, 1, -1]) * (slat / 2)
+    vertices[:count, :, 1] = y[:, None] + half
+    vertices[:count, 2:, 2] = height
+    vertices[count:, 1:3, 1] = length / 2
+    vertices[count:, ::3, 1] = -length / 2
+    for row, z in ((count, 0.15), (count + 1, 0.9)):
+        vertices[row, :2, 2] = z * height
+        vertices[row, 2:, 2] = z * height + 0.04
+    return Mesh(vertices.reshape(-1, 3), repeated(count + 2, 4, "quad"))
+
+
+# leaves of a cloud of foliage, drawn once: unit balls of triangles
+_LEAF_BALLS = 8
+_LEAVES = 120
+
+
+def foliage(size: np.ndarray, leaves: int, leaf: float, rng: np.random.Generator) -> Mesh:
+    """A bush or a hedge: `leaves` (at most 120) triangles of about `leaf` m in an ellipsoid of size (3,) m that
+    stands on the origin; some beams pass."""
+    pick, turn, flip = rng.random(3).tolist()
+    center, shape = _leaf_balls()[int(pick * _LEAF_BALLS)]
+    c, s = np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn)
+    turned = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1 if flip < 0.5 else -1]], np.float32)
+    half = np.asarray(size, np.float32) / 2
+    # a leaf may not stick out of the ellipsoid by more than itself, nor into the ground
+    vertices = ((center[:leaves] @ turned) * half)[:, None] + shape[:leaves] * np.float32(leaf)
+    vertices[..., 2] = np.maximum(vertices[..., 2] + half[2], 0)
+    return Mesh(vertices.reshape(-1, 3), repeated(min(leaves, _LEAVES), 3, "triangle"))
 
 
 @lru_cache
-def _loft(stations: tuple) -> Mesh:
-    vertices = np.array([[[x, -b, low], [x, b, low], [x, t, top], [x, -t, top]] for x, b, t, low, top in stations])
-    faces = [[0, 2, 1], [0, 3, 2]]
-    for first in range(0, 4 * (len(stations) - 1), 4):
-        for k in range(4):
-            a, b = first + k, first + (k + 1) % 4
-            faces += [[a, b, b + 4], [a, b + 4, a + 4]]
-    last = 4 * (len(stations) - 1)
-    faces += [[last, last + 1, last + 2], [last, last + 2, last + 3]]
-    return _fixed(vertices.reshape(-1, 3), np.array(faces))
+def _leaf_balls() -> list[tuple[np.ndarray, np.ndarray]]:
+    """Centers (120, 3) in the unit ball, denser at the rim as leaves are, and shapes (120, 3, 3) of about 1 m."""
+    balls = []
+    for number in range(_LEAF_BALLS):
+        rng = np.random.default_rng([number, 120])
+        center = rng.normal(size=(_LEAVES, 3))
+        center *= (rng.random((_LEAVES, 1)) ** 0.25) / np.linalg.norm(center, axis=1, keepdims=True)
+        shape = rng.normal(0, 0.7, (_LEAVES, 3, 3))
+        balls.append((center.astype(np.float32), (shape - shape.mean(1, keepdims=True)).astype(np.float32)))
+    return balls
 
 
-def _fixed(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    mesh = Mesh(vertices.astype(np.float32), faces.astype(np.int32))
-    mesh.vertices.setflags(write=False)
-    mesh.faces.setflags(write=False)
-    return mesh
+def grass(radius: float, height: float, blades: int, rng: np.random.Generator) -> Mesh:
+    """`blades` upright thin triangles on a disc of `radius` m, up to `height` m high."""
+    angle, far, tall, lean, wide = rng.random((5, blades))
+    far = radius * np.sqrt(far)
+    angle = angle * (2 * np.pi)
+    foot = np.stack([far * np.cos(angle), far * np.sin(angle)], 1)
+    across = np.stack([np.sin(7 * angle), np.cos(7 * angle)], 1) * (0.008 + 0.03 * wide[:, None])
+    vertices = np.zeros((blades, 3, 3), np.float32)
+    vertices[:, 0, :2] = foot - across
+    vertices[:, 1, :2] = foot + across
+    vertices[:, 2, :2] = foot + (lean[:, None] - 0.5) * 0.1
+    vertices[:, 2, 2] = height * (0.4 + 0.6 * tall)
+    return Mesh(vertices.reshape(-1, 3), repeated(blades, 3, "triangle"))

@@ -10,8 +10,19 @@ import numpy as np
 
 from lidarpose.lidar.ray_pattern import RayPattern
 from lidarpose.lidar.sensor import Sensor
-from lidarpose.synth.environment import obstacles
-from lidarpose.synth.environment.mesh import QUAD_FACES, Mesh, box, union
+from lidarpose.synth.environment.mesh import (
+    QUAD_FACES,
+    Mesh,
+    box,
+    foliage,
+    lattice_fence,
+    prism,
+    rail_fence,
+    shape,
+    sign,
+    union,
+    wall,
+)
 
 # furniture stands so far behind the kerb, m
 RAIL = 0.45
@@ -57,12 +68,12 @@ def draw_plan(device: Sensor | RayPattern, rng: np.random.Generator) -> StreetPl
 
 def scenery(plan: StreetPlan, rng: np.random.Generator) -> list[Mesh]:
     """All that stands still, in the street's frame moved so that the sensor is the origin."""
-    found = [_ground(plan)]
+    meshes = [_ground(plan)]
     for side in (-1, 1):
-        found += _front(plan, side, rng)
-        found += _row(plan, side, rng)
+        meshes += _front(plan, side, rng)
+        meshes += _row(plan, side, rng)
     shift = np.array([0, -plan.sensor_y, -plan.height])
-    moved = [mesh.moved(shift) for mesh in found]
+    moved = [mesh.moved(shift) for mesh in meshes]
     # the sensor is not in a car
     clear = [m for m in moved[1:] if np.hypot(*m.vertices[:, :2].T).min() > 1.2 and not _around(m)]
     return moved[:1] + clear
@@ -90,7 +101,7 @@ def _ground(plan: StreetPlan) -> Mesh:
 
 def _front(plan: StreetPlan, side: int, rng: np.random.Generator) -> list[Mesh]:
     """House fronts with doors and windows, hedges, fences and gaps, one after the other behind a pavement."""
-    found, x = [], -_LENGTH
+    meshes, x = [], -_LENGTH
     while x < _LENGTH:
         a, b, c, d = rng.random(4).tolist()
         long = 4.0 + 6.0 * a
@@ -102,54 +113,52 @@ def _front(plan: StreetPlan, side: int, rng: np.random.Generator) -> list[Mesh]:
             for bay in range(bays):
                 sill, top = (0.0, 2.1) if (bay + int(10 * d)) % 3 == 0 else (0.9, 2.2)
                 opening = (-0.25 * wide, 0.25 * wide, sill, top)
-                wall = obstacles.wall(wide, 3.5 + 3 * d, thick=0.3, opening=opening)
-                found.append(wall.moved((x + (bay + 0.5) * wide, y, plan.kerb), pi / 2))
+                front = wall(wide, 3.5 + 3 * d, thick=0.3, opening=opening)
+                meshes.append(front.moved((x + (bay + 0.5) * wide, y, plan.kerb), pi / 2))
             # rooms end somewhere
-            found.append(box((long, 0.1, 3.5)).moved((middle[0], y + side * (1.5 + 3 * d), plan.kerb)))
+            meshes.append(box((long, 0.1, 3.5)).moved((middle[0], y + side * (1.5 + 3 * d), plan.kerb)))
         elif c < 0.75:
             for k in range(int(long)):
-                bush = obstacles.foliage((1.3, 0.9, 0.9 + d), 120, 0.11, rng)
-                found.append(bush.moved((x + k + 0.5, y, plan.kerb)))
+                bush = foliage((1.3, 0.9, 0.9 + d), 120, 0.11, rng)
+                meshes.append(bush.moved((x + k + 0.5, y, plan.kerb)))
         elif c < 0.9:
-            fence = (
-                obstacles.rail_fence(long, 1.0, 3) if d < 0.4 else obstacles.lattice_fence(long, 0.8 + d, 0.14, 0.04)
-            )
-            found.append(fence.moved(middle, pi / 2))
+            fence = rail_fence(long, 1.0, 3) if d < 0.4 else lattice_fence(long, 0.8 + d, 0.14, 0.04)
+            meshes.append(fence.moved(middle, pi / 2))
         x += long + (0 if c < 0.6 else 0.5 + d)
-    return found
+    return meshes
 
 
 def _row(plan: StreetPlan, side: int, rng: np.random.Generator) -> list[Mesh]:
     """Parked cars at the kerb and furniture on the pavement beside it."""
-    found, x = [], -_LENGTH + 4 * rng.random()
+    meshes, x = [], -_LENGTH + 4 * rng.random()
     parked = rng.random() < 0.8
     while parked and x < _LENGTH - 6:
         a, b, c, d = rng.random(4).tolist()
         long = 3.7 + 1.2 * a
         if b < 0.6:
             ahead = 0.0 if side < 0 else pi
-            body = obstacles.car(long, 1.8, 1.45 + 0.2 * c) if c < 0.8 else obstacles.van(long + 1, 2.0, 2.0 + 0.4 * d)
-            found.append(body.moved((x + long / 2, side * (plan.road - 1.05), 0.0), ahead + 0.04 * (d - 0.5)))
+            car = shape("car", long, 1.8, 1.45 + 0.2 * c) if c < 0.8 else shape("van", long + 1, 2.0, 2.0 + 0.4 * d)
+            meshes.append(car.moved((x + long / 2, side * (plan.road - 1.05), 0.0), ahead + 0.04 * (d - 0.5)))
         x += long + 1.6 + 1.5 * d
     x = -_LENGTH + 6 * rng.random()
     while x < _LENGTH:
         a, b, c, d = rng.random(4).tolist()
         place, inwards = (x, side * (plan.road + RAIL), plan.kerb), -side * pi / 2
         if a < 0.25:
-            found.append(obstacles.pole(0.05 + 0.06 * b, 5.0).moved(place))
+            meshes.append(prism(0.05 + 0.06 * b, 5.0).moved(place))
         elif a < 0.5:
             # a tree: trunk and crown
-            crown = obstacles.foliage((2.2 + b, 2.2 + b, 2.0), 120, 0.28, rng)
-            found += [obstacles.pole(0.10 + 0.10 * c, 2.6).moved(place), crown.moved((x, place[1], plan.kerb + 2.2))]
+            crown = foliage((2.2 + b, 2.2 + b, 2.0), 120, 0.28, rng)
+            meshes += [prism(0.10 + 0.10 * c, 2.6).moved(place), crown.moved((x, place[1], plan.kerb + 2.2))]
         elif a < 0.62:
-            found.append(obstacles.sign(2.0 + 0.6 * b, 0.5).moved(place, inwards))
+            meshes.append(sign(2.0 + 0.6 * b, 0.5).moved(place, inwards))
         elif a < 0.75:
-            found.append(obstacles.wheeled_bin(0.5 + 0.2 * b, 1.0 + 0.1 * c).moved(place, 2 * pi * d))
+            meshes.append(shape("wheeled bin", 0.5 + 0.2 * b, 0.5 + 0.2 * b, 1.0 + 0.1 * c).moved(place, 2 * pi * d))
         elif a < 0.82:
-            found.append(obstacles.bench(1.6).moved(place, inwards))
+            meshes.append(shape("bench", 1.0, 1.6).moved(place, inwards))
         elif a < 0.9:
-            found.append(obstacles.foliage((0.8, 0.8, 0.7 + b), 100, 0.1, rng).moved(place))
+            meshes.append(foliage((0.8, 0.8, 0.7 + b), 100, 0.1, rng).moved(place))
         else:
-            found.append(obstacles.traffic_cone(0.6).moved((x, side * (plan.road - 0.3), 0.0)))
+            meshes.append(shape("traffic cone", 0.6, 0.6, 0.6).moved((x, side * (plan.road - 0.3), 0.0)))
         x += 3.0 + 7.0 * d
-    return found
+    return meshes

@@ -5,13 +5,26 @@ feet (3,) m. The `config` is a `scene.SceneConfig`: its probabilities `clutter` 
 Numbers are drawn as vectors of uniforms: a call of a generator costs as much as a mesh.
 """
 
-from functools import lru_cache
+from functools import cache
 from math import atan2, cos, hypot, log, pi, sin, sqrt, tan
 
 import numpy as np
 
-from lidarpose.synth.environment import obstacles
-from lidarpose.synth.environment.mesh import Mesh, box, quad, union
+from lidarpose.synth.environment.mesh import (
+    Mesh,
+    box,
+    foliage,
+    grass,
+    lattice_fence,
+    prism,
+    quad,
+    rail_fence,
+    repeated,
+    shape,
+    sign,
+    union,
+    wall,
+)
 from lidarpose.synth.scene import SceneConfig
 
 # Paper: a square of ground of half width 1 m; elsewhere it reaches beyond any crop
@@ -40,11 +53,11 @@ def surroundings(config: SceneConfig, feet: np.ndarray, radius: float, rng: np.r
     if rng.random() >= config.clutter * config.hard:
         return []
     draws = rng.random((1 + int(3 * rng.random()), 8)).tolist()
-    found = [_thing(feet, radius, draw, rng) for draw in draws]
-    return [mesh for mesh in found if mesh is not None]
+    meshes = [_place_thing(feet, radius, draw, rng) for draw in draws]
+    return [mesh for mesh in meshes if mesh is not None]
 
 
-def _thing(feet: np.ndarray, radius: float, draw: list[float], rng: np.random.Generator) -> Mesh | None:
+def _place_thing(feet: np.ndarray, radius: float, draw: list[float], rng: np.random.Generator) -> Mesh | None:
     kind, around, apart, shift, a, b, c, yaw = draw
     angle, gap = (2 * around - 1) * pi, radius + 0.05 + 0.55 * apart
     if _WALLS[0] <= kind < _WALLS[1]:
@@ -56,36 +69,7 @@ def _thing(feet: np.ndarray, radius: float, draw: list[float], rng: np.random.Ge
         near = (0.6 + 0.4 * apart) * radius
         place = (feet[0] + near * cos(angle), feet[1] + near * sin(angle), feet[2] + 0.9 * shift)
         return mesh.moved(place, 2 * pi * yaw)
-    if kind < 0.32:
-        mesh, deep, long, slack = obstacles.pole(0.02 + 0.16 * a * a, 0.8 + 2.7 * b), 0.02 + 0.16 * a * a, 0.0, 0.0
-    elif kind < 0.40:
-        size = 0.45 + 0.35 * a
-        mesh, deep, long, slack = obstacles.wheeled_bin(size, 0.8 + 0.4 * b), size / 2, size, 0.2
-    elif kind < _WALLS[0]:
-        mesh, deep, long, slack = box((0.2 + 0.4 * a, 0.2 + 0.7 * b, 0.2 + 0.9 * c)), 0.1 + 0.2 * a, 0.3, 0.3
-    elif kind < 0.60:
-        mesh, deep, long, slack = _wall(a, b, c)
-    elif kind < _WALLS[1]:
-        mesh, deep, long, slack = _car(a, b, c)
-    elif kind < 0.76:
-        long = 1.2 + 2 * a
-        rails = b < 0.5
-        mesh = obstacles.rail_fence(long, 0.8 + 0.4 * c, 2 + int(2 * b)) if rails else _lattice(long, b, c)
-        deep, slack = 0.03, 0.05
-    elif kind < 0.88:
-        size = (0.4 + 0.6 * a, 0.5 + 1.5 * b, 0.4 + 1.4 * c)
-        mesh = obstacles.foliage(size, 50 + int(70 * b), 0.07 + 0.08 * yaw, rng)
-        deep, long, slack = size[0] / 2, size[1], 0.2
-    elif kind < 0.92:
-        long = 1.2 + 0.8 * a
-        mesh, deep, slack = obstacles.bench(long, back=b < 0.6), 0.22, 0.3
-    elif kind < 0.96:
-        long, deep = 0.8 + 0.9 * a, 0.3 + 0.15 * b
-        mesh, slack = obstacles.table(2 * deep, long, 0.7 + 0.35 * c * c), 0.2
-    elif kind < 0.98:
-        mesh, deep, long, slack = obstacles.sign(1.6 + 1.0 * a, 0.4 + 0.4 * b), 0.05, 0.3, 1.0
-    else:
-        mesh, deep, long, slack = obstacles.traffic_cone(0.45 + 0.35 * a), 0.12, 0.0, 1.0
+    mesh, deep, long, slack = _draw_thing(kind, a, b, c, yaw, rng)
     # the near side at the gap, the length across the way there, give or take, and shifted along itself
     gap += deep
     along = (shift - 0.5) * 0.7 * long
@@ -96,30 +80,62 @@ def _thing(feet: np.ndarray, radius: float, draw: list[float], rng: np.random.Ge
     return mesh.moved((x, y, feet[2]), angle + pi + slack * (2 * yaw - 1))
 
 
-def _wall(a: float, b: float, c: float) -> tuple[Mesh, float, float, float]:
+def _draw_thing(
+    kind: float, a: float, b: float, c: float, d: float, rng: np.random.Generator
+) -> tuple[Mesh, float, float, float]:
+    """A mesh, half its depth and its length, m, and how far it may be turned aside, rad."""
+    if kind < 0.32:
+        radius = 0.02 + 0.16 * a * a
+        return prism(radius, 0.8 + 2.7 * b), radius, 0.0, 0.0
+    if kind < 0.40:
+        size = 0.45 + 0.35 * a
+        return shape("wheeled bin", size, size, 0.8 + 0.4 * b), size / 2, size, 0.2
+    if kind < _WALLS[0]:
+        return box((0.2 + 0.4 * a, 0.2 + 0.7 * b, 0.2 + 0.9 * c)), 0.1 + 0.2 * a, 0.3, 0.3
+    if kind < 0.60:
+        return _draw_wall(a, b, c)
+    if kind < _WALLS[1]:
+        return _draw_car(a, b, c)
+    if kind < 0.76:
+        long = 1.2 + 2 * a
+        if b < 0.5:
+            return rail_fence(long, 0.8 + 0.4 * c, 2 + int(2 * b)), 0.03, long, 0.05
+        return lattice_fence(long, 0.8 + 1.0 * c, 0.10 + 0.10 * b, 0.02 + 0.04 * c), 0.03, long, 0.05
+    if kind < 0.88:
+        size = (0.4 + 0.6 * a, 0.5 + 1.5 * b, 0.4 + 1.4 * c)
+        return foliage(size, 50 + int(70 * b), 0.07 + 0.08 * d, rng), size[0] / 2, size[1], 0.2
+    if kind < 0.92:
+        long = 1.2 + 0.8 * a
+        return shape("bench" if b < 0.6 else "bench without back", 1.0, long), 0.22, long, 0.3
+    if kind < 0.96:
+        long, deep = 0.8 + 0.9 * a, 0.3 + 0.15 * b
+        return shape("table", 2 * deep, long, 0.7 + 0.35 * c * c), deep, long, 0.2
+    if kind < 0.98:
+        return sign(1.6 + 1.0 * a, 0.4 + 0.4 * b), 0.05, 0.3, 1.0
+    high = 0.45 + 0.35 * a
+    return shape("traffic cone", high, high, high), 0.12, 0.0, 1.0
+
+
+def _draw_wall(a: float, b: float, c: float) -> tuple[Mesh, float, float, float]:
     long, high = 1.0 + 3.0 * a, 0.5 + 2.5 * b
     opening = None
     if high > 1.8 and c < 0.4:
         opening = (-0.25 * long, (0.5 * c) * long, 0.0 if c < 0.1 else 0.9, 0.85 * high)
-    return obstacles.wall(long, high, thick=0.15, opening=opening), 0.08, long, 0.15
+    return wall(long, high, thick=0.15, opening=opening), 0.08, long, 0.15
 
 
-def _car(a: float, b: float, c: float) -> tuple[Mesh, float, float, float]:
+def _draw_car(a: float, b: float, c: float) -> tuple[Mesh, float, float, float]:
     """A car or a van whose side, front or back is towards the person."""
     wide = 1.65 + 0.25 * a
     if c < 0.75:
-        long, mesh = 3.7 + b, obstacles.car(3.7 + b, wide, 1.4 + 0.3 * a)
+        long, mesh = 3.7 + b, shape("car", 3.7 + b, wide, 1.4 + 0.3 * a)
     else:
         long, wide = 4.6 + b, wide + 0.2
-        mesh = obstacles.van(long, wide, 1.9 + 0.4 * a)
+        mesh = shape("van", long, wide, 1.9 + 0.4 * a)
     if b < 0.35:
         # end on
         return mesh, long / 2, wide, 0.15
     return mesh.moved((0, 0, 0), pi / 2), wide / 2, long, 0.1
-
-
-def _lattice(long: float, b: float, c: float) -> Mesh:
-    return obstacles.lattice_fence(long, 0.8 + 1.0 * c, 0.10 + 0.10 * b, 0.02 + 0.04 * c)
 
 
 def occluder(config: SceneConfig, feet: np.ndarray, tall: float, rng: np.random.Generator) -> Mesh | None:
@@ -143,10 +159,9 @@ def occluder(config: SceneConfig, feet: np.ndarray, tall: float, rng: np.random.
         return mesh.moved((feet[0] * share, feet[1] * share, feet[2]), heading + 0.5 * (side - 0.5))
     if kind < 0.8:
         # hides one side, from a hand's breadth beyond the middle to the shoulder
-        sign = 1.0 if side < 0.5 else -1.0
         edge = (-0.05 + 0.30 * hide) * share
         mesh, half = _tall(distance, share, tall, a, b, c, rng)
-        across = sign * (edge + half)
+        across = edge + half if side < 0.5 else -(edge + half)
     else:
         # hides a strip
         mesh, across = _strip(share, tall, a, b, c, rng), (side + hide - 1) * 0.5 * share
@@ -157,15 +172,15 @@ def occluder(config: SceneConfig, feet: np.ndarray, tall: float, rng: np.random.
 def _low(top: float, share: float, a: float, b: float, c: float, rng: np.random.Generator) -> Mesh:
     """A bonnet, a parapet, a hedge or a fence, `top` m high."""
     if a < 0.35:
-        return obstacles.bonnet(1.7, top, min(0.5 + 0.5 * b, share))
+        return shape("bonnet", min(0.5 + 0.5 * b, share), 1.7, top)
     if a < 0.55:
         return box((0.3, (1.0 + 2.0 * b) * share, top))
     if a < 0.75:
-        return obstacles.foliage((0.4, (1.2 + 1.5 * b) * share, 1.1 * top), 90 + int(30 * c), 0.06 + 0.08 * c, rng)
+        return foliage((0.4, (1.2 + 1.5 * b) * share, 1.1 * top), 90 + int(30 * c), 0.06 + 0.08 * c, rng)
     if a < 0.88:
-        return obstacles.rail_fence(3.0 * share, top, 2 + int(2 * c))
+        return rail_fence(3.0 * share, top, 2 + int(2 * c))
     # what is seen through may be taller
-    return obstacles.lattice_fence(2.4 * share, top * (1 + b), 0.10 + 0.08 * b, 0.02 + 0.03 * c)
+    return lattice_fence(2.4 * share, top * (1 + b), 0.10 + 0.08 * b, 0.02 + 0.03 * c)
 
 
 def _tall(
@@ -177,12 +192,12 @@ def _tall(
         wide = 1.7 + 0.2 * b
         # end on: the person stands beside it
         if room > 2.8:
-            mesh = obstacles.car(3.8 + c, wide, 1.45) if b < 0.5 else obstacles.van(4.6 + c, wide, 2.0 + 0.4 * c)
+            mesh = shape("car", 3.8 + c, wide, 1.45) if b < 0.5 else shape("van", 4.6 + c, wide, 2.0 + 0.4 * c)
             return mesh, wide / 2
-        return obstacles.van(1.6, 1.6 + c, 2.2).moved((0, 0, 0), pi / 2), 0.8
+        return shape("van", 1.6, 1.6 + c, 2.2).moved((0, 0, 0), pi / 2), 0.8
     if a < 0.5:
         wide = 0.8 + 0.6 * b
-        return obstacles.foliage((0.5, wide, tall + 0.3 + c), 120, 0.10 + 0.10 * b, rng), 0.45 * wide
+        return foliage((0.5, wide, tall + 0.3 + c), 120, 0.10 + 0.10 * b, rng), 0.45 * wide
     return box((0.2, 1.5, tall + 2)), 0.75
 
 
@@ -190,13 +205,13 @@ def _strip(share: float, tall: float, a: float, b: float, c: float, rng: np.rand
     """A pole, a trunk, a signpost, a branch that hangs down or a pillar."""
     radius = (0.03 + 0.17 * b * b) * share
     if a < 0.6:
-        return obstacles.pole(radius, tall + 2)
+        return prism(radius, tall + 2)
     if a < 0.7:
-        return obstacles.sign(1.3 + 0.8 * c, 0.35 * share + 0.2 * b)
+        return sign(1.3 + 0.8 * c, 0.35 * share + 0.2 * b)
     if a < 0.85:
         # down to a height between the hips and the head
-        mesh = obstacles.foliage((0.4, 0.6 * share + 0.4 * b, 1.0), 60 + int(60 * c), 0.08 + 0.06 * b, rng)
-        stem = obstacles.pole(0.02, 0.6)
+        mesh = foliage((0.4, 0.6 * share + 0.4 * b, 1.0), 60 + int(60 * c), 0.08 + 0.06 * b, rng)
+        stem = prism(0.02, 0.6)
         return union([stem, mesh.moved((0, 0, 0.55 + 0.5 * c))])
     return box((0.3, (0.15 + 0.25 * b) * share, tall + 2))
 
@@ -221,7 +236,7 @@ def ground(config: SceneConfig, feet: np.ndarray, rng: np.random.Generator) -> M
         return _rough(slope, a, rng).moved(feet)
     kind -= _ROUGH * uneven
     if kind < _GRASS * uneven:
-        lawn = obstacles.grass(0.5 + 0.3 * a, 0.05 + 0.15 * b, 40 + int(40 * c), rng)
+        lawn = grass(0.5 + 0.3 * a, 0.05 + 0.15 * b, 40 + int(40 * c), rng)
         lawn.vertices[:, 2] += lawn.vertices[:, :2] @ np.array(slope, np.float32)
         return union([quad(_WILD_HALF, slope), lawn]).moved(feet)
     return quad(_WILD_HALF, slope).moved(feet)
@@ -241,45 +256,31 @@ def _kerb(slope: tuple[float, float], a: float, b: float, c: float) -> Mesh:
     strip = [[-far, -far, 0], [edge, -far, 0], [edge, far, 0], [-far, far, 0]]
     riser = [[edge, -far, 0], [edge, -far, step], [edge, far, step], [edge, far, 0]]
     beyond = [[edge, -far, step], [far, -far, step], [far, far, step], [edge, far, step]]
-    vertices = np.array(strip + riser + beyond, np.float32)
-    turned = Mesh(vertices, _KERB_FACES).moved((0, 0, 0), turn).vertices
-    turned[:, 2] += turned[:, :2] @ np.array(slope, np.float32)
-    return Mesh(turned, _KERB_FACES)
-
-
-_KERB_FACES = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7], [8, 9, 10], [8, 10, 11]], np.int32)
+    kerb = Mesh(np.array(strip + riser + beyond, np.float32), repeated(3, 4, "quad")).moved((0, 0, 0), turn)
+    kerb.vertices[:, 2] += kerb.vertices[:, :2] @ np.array(slope, np.float32)
+    return kerb
 
 
 def _rough(slope: tuple[float, float], a: float, rng: np.random.Generator) -> Mesh:
     """A field of heights, finer towards the feet, where it is 0 or below."""
-    flat, faces = _grid()
+    flat, faces, spread, beneath = _grid()
     vertices = flat.copy()
     height = rng.standard_normal(len(flat), np.float32) * np.float32(_ROUGHNESS * (0.5 + a))
     # nobody's soles are buried
-    np.minimum(height, 0, out=height, where=_beneath())
-    vertices[:, 2] = height * _away() + flat[:, :2] @ np.array(slope, np.float32)
+    np.minimum(height, 0, out=height, where=beneath)
+    vertices[:, 2] = height * spread + flat[:, :2] @ np.array(slope, np.float32)
     return Mesh(vertices, faces)
 
 
-@lru_cache
-def _grid() -> tuple[np.ndarray, np.ndarray]:
-    """Vertices ((cells + 1)^2, 3), flat, closer to each other near the middle, and two triangles a cell."""
+@cache
+def _grid() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices ((cells + 1)^2, 3), flat, closer to each other near the middle, and two triangles a cell; how much a
+    vertex's height varies, 1 at the feet; which vertices lie under or beside the feet."""
     at = np.linspace(-1, 1, _CELLS + 1)
     at = _WILD_HALF * np.sign(at) * np.abs(at) ** 1.7
     x, y = np.meshgrid(at, at, indexing="ij")
     number = np.arange((_CELLS + 1) ** 2).reshape(_CELLS + 1, _CELLS + 1)
     a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
     faces = np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)], -2).reshape(-1, 3)
-    return np.stack([x, y, 0 * x], -1).reshape(-1, 3).astype(np.float32), faces.astype(np.int32)
-
-
-@lru_cache
-def _away() -> np.ndarray:
-    """How much the heights of the grid's vertices vary, for 1 at the feet."""
-    return 1 + 0.4 * np.abs(_grid()[0][:, :2]).sum(1)
-
-
-@lru_cache
-def _beneath() -> np.ndarray:
-    """Which vertices of the grid lie under or beside the feet."""
-    return np.hypot(*_grid()[0][:, :2].T) < 0.6
+    flat = np.stack([x, y, 0 * x], -1).reshape(-1, 3).astype(np.float32)
+    return flat, faces.astype(np.int32), 1 + 0.4 * np.abs(flat[:, :2]).sum(1), np.hypot(*flat[:, :2].T) < 0.6

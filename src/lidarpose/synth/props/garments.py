@@ -12,8 +12,9 @@ import numpy as np
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.environment.mesh import Mesh
 
-_J = {name: i for i, name in enumerate(BODY26.joints)}
+JOINT = {name: i for i, name in enumerate(BODY26.joints)}
 Point = list[float]
+Points = list[Point]
 # Girths of the shipped body's skin from lengths between its joints, m: weights of `_LENGTHS`, then a constant. Fitted
 # to 1,500 people of `body.shape.sample_people`; what is left is 3 mm of the back, 4 of the width, 7 and 5 of the rest.
 _LENGTHS = (
@@ -28,13 +29,13 @@ _GIRTHS = {
 }
 
 
-def girth(points: list[Point], name: str) -> float:
+def girth(points: Points, name: str) -> float:
     """A girth of the body, m: `back` from spine3 to the skin behind it, `hip_side`, `hip_front` and `hip_back` from
     the middle of the hips. points: the joints, 26 of BODY26."""
     *weights, constant = _GIRTHS[name]
     for (a, b), weight in zip(_LENGTHS, weights, strict=True):
         if weight:
-            constant += weight * distance(points[_J[a]], points[_J[b]])
+            constant += weight * distance(points[JOINT[a]], points[JOINT[b]])
     return constant
 
 
@@ -42,9 +43,13 @@ def distance(a: Point, b: Point) -> float:
     return ((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2) ** 0.5
 
 
-def heading(points: list[Point]) -> tuple[float, float]:
+def middle(a: Point, b: Point) -> Point:
+    return [(p + q) / 2 for p, q in zip(a, b, strict=True)]
+
+
+def heading(points: Points) -> tuple[float, float]:
     """Unit x, y of where the hips face."""
-    left, right = points[_J["left_hip"]], points[_J["right_hip"]]
+    left, right = points[JOINT["left_hip"]], points[JOINT["right_hip"]]
     x, y = left[1] - right[1], right[0] - left[0]
     long = max(hypot(x, y), 1e-6)
     return x / long, y / long
@@ -80,12 +85,12 @@ def _skirt_parts(below_knee: tuple[bool, ...]) -> np.ndarray:
     rows = []
     for row in range(_RINGS - 1):
         names = ("left_knee", "right_knee") if below_knee[row] else ("left_hip", "right_hip")
-        part = np.where(left, 1 + _J[names[0]], 1 + _J[names[1]]) if row else np.full(_SIDES, 1 + _J["pelvis"])
+        part = np.where(left, 1 + JOINT[names[0]], 1 + JOINT[names[1]]) if row else np.full(_SIDES, 1 + JOINT["pelvis"])
         rows += [part, part]
     return np.concatenate(rows).astype(np.uint8)
 
 
-def skirt(points: list[Point], u: list[float]) -> tuple[object, Mesh, np.ndarray]:
+def skirt(points: Points, u: list[float]) -> tuple[object, Mesh, np.ndarray]:
     """A skirt, a dress or a long coat: (how its vertices are found for a pose, its mesh, parts of its faces).
 
     u: four uniforms, its length, flare, ease and whether it is a coat.
@@ -98,14 +103,14 @@ def skirt(points: list[Point], u: list[float]) -> tuple[object, Mesh, np.ndarray
     # which rows of faces begin and end below the knee, by their middles
     parts = _skirt_parts((False, half / 2 > 1, (half + hem) / 2 > 1))
 
-    def vertices(points: list[Point]) -> np.ndarray:
+    def vertices(points: Points) -> np.ndarray:
         x, y = heading(points)
-        left, right = points[_J["left_hip"]], points[_J["right_hip"]]
+        left, right = points[JOINT["left_hip"]], points[JOINT["right_hip"]]
         side, front, back = (girth(points, g) + ease for g in ("hip_side", "hip_front", "hip_back"))
         thigh = side - distance(left, right) / 2
         deep, ahead = (front + back) / 2, (front - back) / 2
-        hips = [(a + b) / 2 for a, b in zip(left, right, strict=True)]
-        pelvis = points[_J["pelvis"]]
+        hips = middle(left, right)
+        pelvis = points[JOINT["pelvis"]]
         across = (max(side - deep, 0.0) * -y, max(side - deep, 0.0) * x, 0.0)
         shifted = (hips[0] + ahead * x, hips[1] + ahead * y, hips[2])
         waist = (pelvis[0] + 0.8 * ahead * x, pelvis[1] + 0.8 * ahead * y, pelvis[2] + 0.04)
@@ -113,9 +118,8 @@ def skirt(points: list[Point], u: list[float]) -> tuple[object, Mesh, np.ndarray
         for at, share in ((half, 0.5), (hem, 1.0)):
             legs = [_leg(points, name, at) for name in ("left", "right")]
             radius = thigh * (1 + (_KNEE - 1) * min(at, 1.0) if at < 1 else _CALF) + ease + flare * share
-            middle = tuple((a + b) / 2 for a, b in zip(*legs, strict=True))
             apart = tuple((a - b) / 2 for a, b in zip(*legs, strict=True))
-            rings.append((middle, apart, max(radius, 0.6 * deep * (1 - 0.3 * at))))
+            rings.append((tuple(middle(*legs)), apart, max(radius, 0.6 * deep * (1 - 0.3 * at))))
         centers, halves, radii = (np.array(part) for part in zip(*rings, strict=True))
         around = np.stack([x * np.cos(_TURN) - y * np.sin(_TURN), y * np.cos(_TURN) + x * np.sin(_TURN)], 1)
         # the hull of two circles: each vertex goes with the leg on its side
@@ -133,9 +137,9 @@ def skirt(points: list[Point], u: list[float]) -> tuple[object, Mesh, np.ndarray
 _FOLDS = 1 + np.array([0.0, 0.0, 0.03, 0.06])[:, None] * np.where(np.arange(_SIDES) % 2, 1, -1)
 
 
-def _leg(points: list[Point], side: str, at: float) -> tuple[float, float, float]:
+def _leg(points: Points, side: str, at: float) -> tuple[float, float, float]:
     """The point `at` thighs, then shanks, down a leg."""
-    hip, knee, ankle = (points[_J[f"{side}_{name}"]] for name in ("hip", "knee", "ankle"))
+    hip, knee, ankle = (points[JOINT[f"{side}_{name}"]] for name in ("hip", "knee", "ankle"))
     a, b, t = (hip, knee, at) if at < 1 else (knee, ankle, at - 1)
     return (a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1]), a[2] + t * (b[2] - a[2]))
 
@@ -147,9 +151,10 @@ def _leg(points: list[Point], side: str, at: float) -> tuple[float, float, float
 _SKULL = (0.89, 0.75, 1.08, 0.05)
 
 
-def hat_frame(points: list[Point], edge: float) -> tuple[list[list[float]], Point]:
-    """Rows and origin that put `prop_meshes.hat` on the head: the edge `edge` of the way from the ears to the crown."""
-    nose, center, base = (points[_J[name]] for name in ("nose", "head_center", "head"))
+def hat_frame(points: Points, edge: float) -> tuple[list[list[float]], Point]:
+    """Rows and origin that put the mesh "hat" or "cap" on the head: the edge `edge` of the way from the ears to the
+    crown."""
+    nose, center, base = (points[JOINT[name]] for name in ("nose", "head_center", "head"))
     n = [a - b for a, b in zip(nose, center, strict=True)]
     up = [a - b for a, b in zip(center, base, strict=True)]
     size = max(distance(nose, center), 1e-6)

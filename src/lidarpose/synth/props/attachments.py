@@ -1,0 +1,435 @@
+"""What people carry, wear, push, sit on and ride: meshes attached to a body's joints, drawn to suit its pose.
+
+A prop knows where its mesh is for a pose: it is asked again for the next pose, so what is carried moves along. Bodies
+stand on z = 0; frames are the body's own: rows say where the prop's x, y and z go, then its origin.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from math import cos, hypot, sin
+
+import numpy as np
+
+from lidarpose.synth.environment.mesh import Mesh, shape, union
+from lidarpose.synth.props.garments import JOINT, Point, Points, distance, girth, hat_frame, heading, middle, skirt
+
+PELVIS = JOINT["pelvis"]
+HANDS = (JOINT["left_hand"], JOINT["right_hand"])
+# from a hand's joint to its elbow's
+_ELBOW = JOINT["left_elbow"] - JOINT["left_hand"]
+_HEAD_PART = np.uint8(1 + JOINT["head"])
+Frame = Callable[[Points], tuple[list, list]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prop:
+    """A thing or a garment of a person.
+
+    Args:
+        name: as in `_CARRIED` and `_RIDES`, or "skirt" or "hat".
+        mesh: in the prop's own frame; for clothes and bicycles, as it was when drawn.
+        where: joints, 26 lists of x, y, z -> the vertices (V, 3) m there.
+        face_part: (F,) uint8 = 1 + SMPL joint for clothes; None for things, which are not the person.
+        lift: how far the body stands above the ground for it, as a cyclist does, m.
+    """
+
+    name: str
+    mesh: Mesh
+    where: Callable[[Points], np.ndarray]
+    face_part: np.ndarray | None = None
+    lift: float = 0.0
+
+    def place(self, joints: np.ndarray) -> Mesh:
+        """The mesh for a pose: joints (26, 3) m in BODY26's order."""
+        return Mesh(self.where(joints.tolist()), self.mesh.faces)
+
+
+def rigid_prop(name: str, mesh: Mesh, frame: Frame, **more: object) -> Prop:
+    """A prop that keeps its shape."""
+    return Prop(name=name, mesh=mesh, where=lambda points: mesh.placed(*frame(points)).vertices, **more)
+
+
+def draw_props(rng: np.random.Generator, *, kind: str, joints: np.ndarray) -> list[Prop]:
+    """What somebody has with them: usually nothing; cyclists ride, many sit on chairs, about one in three who stand or
+    walk carries something that their arms can carry.
+
+    Args:
+        kind: the activity, a name of `body.pose_prior.activities.KINDS`.
+        joints: (26, 3) m, the pose.
+    """
+    u = rng.random(12).tolist()
+    carries, rides = _CARRIES.get(kind, _OTHERS_CARRY), _RIDES.get(kind)
+    dressed = kind in _ON_FEET and u[8] < _DRESSED
+    if rides is None and u[0] >= carries and not dressed and u[9] >= _HATS:
+        return []
+    points = joints.tolist()
+    props: list[Prop | None] = []
+    if rides:
+        make = next((make for share, make in rides if u[0] < share), None)
+        props.append(make(points, u) if make else None)
+    elif u[0] < carries:
+        props += _draw_carried(points, u, kind)
+    if dressed:
+        vertices, mesh, parts = skirt(points, u[4:8])
+        props.append(Prop(name="skirt", mesh=mesh, where=vertices, face_part=parts))
+    if (u[9] < (_HELMETS if kind == "cycle" else _HATS)) and kind not in ("lie", "fall"):
+        mesh, edge = shape("cap" if kind == "cycle" or u[11] < 0.6 else "hat"), 0.25 + 0.3 * u[6]
+        part = np.full(len(mesh.faces), _HEAD_PART)
+        props.append(rigid_prop("hat", mesh, lambda p: hat_frame(p, edge), face_part=part))
+    return [prop for prop in props if prop is not None]
+
+
+def upright(points: Points, size: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> list:
+    """Rows: ahead, left, up, each as long as `size`."""
+    x, y = heading(points)
+    a, b, c = size
+    return [[a * x, a * y, 0.0], [-b * y, b * x, 0.0], [0.0, 0.0, c]]
+
+
+def rod_rows(start: tuple, end: tuple, radius: float) -> tuple[list, list]:
+    """Rows (3, 3) and an origin that put the mesh "tube" or "rod" between two points (x, y, z)."""
+    dx, dy, dz = (b - a for a, b in zip(start, end, strict=True))
+    long = max((dx * dx + dy * dy + dz * dz) ** 0.5, 1e-6)
+    flat = hypot(dx, dy)
+    aside = (-dy / flat, dx / flat, 0.0) if flat > 1e-3 * long else (0.0, 1.0, 0.0)
+    x, y, z = aside
+    over = (z * dy / long - y * dz / long, x * dz / long - z * dx / long, y * dx / long - x * dy / long)
+    return [[radius * a for a in aside], [radius * a for a in over], [dx, dy, dz]], list(start)
+
+
+def _ahead_of_pelvis(points: Points, at: Point) -> float:
+    """How far a point is ahead of the pelvis, m."""
+    x, y = heading(points)
+    return (at[0] - points[PELVIS][0]) * x + (at[1] - points[PELVIS][1]) * y
+
+
+# --- what is carried: each a frame from the pose, the hand that carries, and uniforms
+
+
+def _bag(points: Points, hand: int, u: list[float]) -> Frame:
+    """A shopping bag or a briefcase, straight down from a hanging hand."""
+    tall = min(0.3 + 0.3 * u[3], points[hand][2] - 0.05)
+    size = (0.22 + 0.22 * u[4], 0.07 + 0.13 * u[5], tall)
+    return lambda p: (upright(p, size), [*p[hand][:2], max(p[hand][2] - 0.01, tall + 0.01)])
+
+
+def _shoulder_bag(points: Points, hand: int, u: list[float]) -> Frame:
+    """At a hip, below the hanging hand's side."""
+    sign = 1.0 if u[2] < 0.5 else -1.0
+    deep, tall = 0.08 + 0.07 * u[3], 0.2 + 0.15 * u[4]
+    size, back = (0.25 + 0.15 * u[5], deep, tall), -0.05
+
+    def frame(p: Points):
+        (x, y), hip = heading(p), p[PELVIS]
+        aside = sign * (girth(p, "hip_side") + 0.015 + deep / 2)
+        origin = [hip[0] - aside * y + back * x, hip[1] + aside * x + back * y, hip[2] - 0.12 - tall / 2]
+        return upright(p, size), origin
+
+    return frame
+
+
+# the spine's joints lean this much from the line of the back, rad; how far below the neck a rucksack ends, m
+_SPINE_LEAN, _BELOW_NECK = 0.18, 0.02
+
+
+def _rucksack(points: Points, hand: int, u: list[float]) -> Frame:
+    """On the back, from below the neck."""
+    size = (0.13 + 0.17 * u[2], 0.26 + 0.1 * u[3], 0.36 + 0.22 * u[4])
+    c, s = cos(_SPINE_LEAN), sin(_SPINE_LEAN)
+
+    def frame(p: Points):
+        spine, neck = p[JOINT["spine3"]], p[JOINT["neck"]]
+        up = np.array([n - s for n, s in zip(neck, spine, strict=True)])
+        across = np.array([a - b for a, b in zip(p[JOINT["left_collar"]], p[JOINT["right_collar"]], strict=True)])
+        up /= max(float(np.sqrt(up @ up)), 1e-6)
+        across -= (across @ up) * up
+        across /= max(float(np.sqrt(across @ across)), 1e-6)
+        (a0, a1, a2), (u0, u1, u2) = across.tolist(), up.tolist()
+        ahead = np.array([a1 * u2 - a2 * u1, a2 * u0 - a0 * u2, a0 * u1 - a1 * u0])
+        # the back is upright where the spine's joints lean forward
+        up, ahead = up * c - ahead * s, ahead * c + up * s
+        behind = girth(p, "back") + 0.01
+        origin = np.array(spine) - behind * ahead + (distance(neck, spine) - _BELOW_NECK - size[2]) * up
+        return [ahead * size[0], across * size[1], up * size[2]], origin
+
+    return frame
+
+
+def _phone(points: Points, hand: int, u: list[float]) -> Frame:
+    return lambda p: (upright(p, (0.012, 0.075, 0.155)), [*p[hand][:2], p[hand][2] - 0.02])
+
+
+def _ball(points: Points, hand: int, u: list[float]) -> Frame:
+    """Held: beyond the hand along the forearm, not in the ground."""
+    hand, radius = HANDS[u[2] < 0.5], 0.1 + 0.03 * u[3]
+
+    def frame(p: Points):
+        at, wrist = p[hand], p[hand - 2]
+        long = max(distance(at, wrist), 1e-6)
+        x, y, z = (a + 0.9 * radius * (a - w) / long for a, w in zip(at, wrist, strict=True))
+        return [[radius, 0, 0], [0, radius, 0], [0, 0, radius]], [x, y, max(z, radius)]
+
+    return frame
+
+
+def _parcel(points: Points, hand: int, u: list[float]) -> Frame:
+    """A box between the hands or on them, before the body."""
+    apart = distance(points[HANDS[0]], points[HANDS[1]])
+    deep, tall = 0.2 + 0.2 * u[2], 0.15 + 0.25 * u[3]
+    size, under = (deep, max(apart - 0.04, 0.25), tall), apart < 0.29
+
+    def frame(p: Points):
+        (x, y), at = heading(p), middle(p[HANDS[0]], p[HANDS[1]])
+        # behind its back is the belly
+        push = max(0.0, girth(p, "hip_front") + 0.04 + deep / 2 - _ahead_of_pelvis(p, at))
+        low = at[2] + 0.02 if under else at[2] - 0.4 * tall
+        return upright(p, size), [at[0] + push * x, at[1] + push * y, low]
+
+    return frame
+
+
+def _stick(points: Points, hand: int, u: list[float]) -> Frame:
+    """From a hand to the ground a little ahead: a cane, a crutch, a pole."""
+    lean, radius, above = 0.02 + 0.25 * u[3], 0.011 + 0.007 * u[4], 0.03 + (0.3 * u[5] if u[6] < 0.3 else 0.0)
+
+    def frame(p: Points):
+        (x, y), top = heading(p), p[hand]
+        foot = (top[0] + lean * x, top[1] + lean * y, 0.0)
+        over = 1 + above / max(top[2], 0.1)
+        return rod_rows(foot, tuple(f + over * (t - f) for f, t in zip(foot, top, strict=True)), radius)
+
+    return frame
+
+
+def _umbrella(points: Points, hand: int, u: list[float]) -> Frame:
+    """Open, its shaft through a raised hand, leaning to above the head."""
+    wide, low = 0.9 + 0.3 * u[3], 0.12
+
+    def frame(p: Points):
+        at, head = p[hand], p[JOINT["head_center"]]
+        top = [at[0] + 0.55 * (head[0] - at[0]), at[1] + 0.55 * (head[1] - at[1]), max(head[2] + 0.32, at[2] + 0.5)]
+        long = distance(top, at)
+        start = tuple(a - low * ((t - a) / long) for t, a in zip(top, at, strict=True))
+        # the canopy is as wide as it is, however long the shaft
+        (x, y, z), origin = rod_rows(start, tuple(top), 1.0)
+        return [[wide * a for a in x], [wide * a for a in y], z], origin
+
+    return frame
+
+
+def _suitcase(points: Points, hand: int, u: list[float]) -> Frame:
+    """On wheels behind a hand that pulls it, or upright beside who stands."""
+    behind, wide = 0.05 + 0.4 * u[3], 0.8 + 0.35 * u[4]
+
+    def frame(p: Points):
+        (x, y), top = heading(p), p[hand]
+        tall = max(top[2], 0.3)
+        rows = [[wide * x, wide * y, wide * behind / tall], [-wide * y, wide * x, 0.0], [behind * x, behind * y, tall]]
+        return rows, [top[0] - behind * x, top[1] - behind * y, wide * 0.28 * behind / tall]
+
+    return frame
+
+
+@dataclass(frozen=True)
+class _Carried:
+    """A mesh, how often it is carried beside the others where the hands it needs and the activity suit, how it is
+    attached; for other activities, `otherwise`."""
+
+    mesh: str
+    share: float
+    attach: Callable[[Points, int, list[float]], Frame]
+    hands: str = "any"
+    kinds: tuple[str, ...] = ()
+    otherwise: float = 0.0
+
+
+_CARRIED = {
+    "rucksack": _Carried("pack", 0.26, _rucksack),
+    "shoulder bag": _Carried("box", 0.14, _shoulder_bag),
+    "bag": _Carried("bag", 0.24, _bag, "hanging"),
+    "suitcase": _Carried("suitcase", 0.07, _suitcase, "hanging", ("walk", "idle")),
+    "stick": _Carried("tube", 0.08, _stick, "leaning", ("walk", "idle", "step", "bend")),
+    "phone": _Carried("box", 0.30, _phone, "raised"),
+    "umbrella": _Carried("umbrella", 0.20, _umbrella, "raised", ("walk", "idle")),
+    "box": _Carried("box", 0.4, _parcel, "both"),
+    "ball": _Carried("ball", 0.5, _ball, "any", ("sport",), 0.02),
+}
+
+
+def _draw_carried(points: Points, u: list[float], kind: str) -> list[Prop]:
+    """One of the things that the arms can carry; a few carry two."""
+    hands = _free_hands(points)
+    shares = {
+        name: (row.share if not row.kinds or kind in row.kinds else row.otherwise) if hands[row.hands] else 0.0
+        for name, row in _CARRIED.items()
+    }
+    pick = u[1] * sum(shares.values())
+    for name, share in shares.items():
+        if pick < share:
+            names = [name, "rucksack"] if name != "rucksack" and u[10] < 0.12 else [name]
+            return [_carried_prop(name, points, hands[_CARRIED[name].hands], u) for name in names]
+        pick -= share
+    return []
+
+
+def _carried_prop(name: str, points: Points, hands: list[int], u: list[float]) -> Prop:
+    row = _CARRIED[name]
+    return rigid_prop(name, shape(row.mesh), row.attach(points, hands[int(u[2] * len(hands))], u))
+
+
+def _free_hands(points: Points) -> dict[str, list[int]]:
+    """Hands (joint indices) that hang, that are raised above their elbows, and that could lean on something; both, if
+    they hold something ahead of the body."""
+    pelvis = points[PELVIS][2]
+    left, right = (points[hand] for hand in HANDS)
+    ahead = {hand: _ahead_of_pelvis(points, points[hand]) for hand in HANDS}
+    both = abs(left[2] - right[2]) < 0.2 and 0.12 < distance(left, right) < 0.7 and 0.6 < left[2] < 1.5
+    z = {joint: points[joint][2] for hand in HANDS for joint in (hand, hand + _ELBOW)}
+    return {
+        "any": list(HANDS),
+        "hanging": [h for h in HANDS if 0.4 < z[h] < pelvis + 0.12 and z[h] < z[h + _ELBOW]],
+        "raised": [h for h in HANDS if z[h] > z[h + _ELBOW] + 0.05],
+        "leaning": [h for h in HANDS if 0.5 < z[h] < 1.2 and z[h] < pelvis + 0.3 and ahead[h] > -0.2],
+        "both": list(HANDS) if both and min(ahead.values()) > 0.15 else [],
+    }
+
+
+# --- what people push and sit on
+
+
+def _pram(points: Points, u: list[float]) -> Prop | None:
+    return _pushed("pram", points)
+
+
+def _trolley(points: Points, u: list[float]) -> Prop | None:
+    return _pushed("trolley", points)
+
+
+def _pushed(name: str, points: Points) -> Prop | None:
+    """Its handle is at the hands that are ahead, at their height."""
+    hands = [hand for hand in HANDS if _ahead_of_pelvis(points, points[hand]) > 0.15]
+    if not hands:
+        return None
+
+    def frame(p: Points):
+        at = middle(p[hands[0]], p[hands[-1]])
+        if len(hands) == 1:
+            # the middle of the handle is before the middle of the body
+            x, y = heading(p)
+            aside = (p[PELVIS][1] - at[1]) * x - (p[PELVIS][0] - at[0]) * y
+            at = [at[0] - aside * y, at[1] + aside * x, at[2]]
+        return upright(p, (1.0, 1.0, min(max(at[2], 0.75), 1.2))), [at[0], at[1], 0.0]
+
+    return rigid_prop(name, shape(name), frame)
+
+
+# what one sits on is so far below the middle of the hips: a share of the thigh's radius, and m. Fitted to the drawn
+# bodies that sit: 1.3 cm are left
+_THIGH_SHARE, _BELOW_HIPS = 0.75, 0.034
+
+
+def _hips(points: Points) -> Point:
+    return middle(points[JOINT["left_hip"]], points[JOINT["right_hip"]])
+
+
+def _seat_height(points: Points) -> float:
+    thigh = girth(points, "hip_side") - distance(points[JOINT["left_hip"]], points[JOINT["right_hip"]]) / 2
+    return _hips(points)[2] - _THIGH_SHARE * thigh - _BELOW_HIPS
+
+
+def _under_hips(size: tuple[float, float, float], z: float) -> Frame:
+    return lambda p: (upright(p, size), [*_hips(p)[:2], z])
+
+
+def _seat(points: Points, u: list[float]) -> Prop | None:
+    """A chair, a stool or a bench from the ground to the thighs; nothing for who sits on the ground."""
+    high = _seat_height(points)
+    if high < 0.2:
+        return None
+    wide = 0.42 + (1.3 * u[2] if u[1] < 0.3 else 0.08 * u[2])
+    return rigid_prop("chair", shape("chair" if u[3] < 0.65 else "seat"), _under_hips((1.0, wide, high), 0.0))
+
+
+# a wheelchair's foot rests are this high, m, and its seat is at 0.5 of the mesh's
+_FOOT_REST, _WHEELCHAIR_SEAT = 0.08, 0.5
+
+
+def _wheelchair(points: Points, u: list[float]) -> Prop | None:
+    high = _seat_height(points) + _FOOT_REST
+    if not 0.4 < high < 0.6:
+        return None
+    # the foot rest is where the feet are
+    (x, y), hips = heading(points), _hips(points)
+    foot = middle(points[JOINT["left_foot"]], points[JOINT["right_foot"]])
+    forward = min(max((foot[0] - hips[0]) * x + (foot[1] - hips[1]) * y, 0.25), 0.75)
+    size = high / _WHEELCHAIR_SEAT
+    rest = shape("box", 0.24, 0.36, 0.025).moved(((forward - 0.04) / size, 0, 0.05))
+    frame = _under_hips((size, size, size), -_FOOT_REST)
+    return rigid_prop("wheelchair", union([shape("wheelchair"), rest]), frame, lift=_FOOT_REST)
+
+
+# --- bicycles
+
+# of the mesh, on the ground, the saddle above the origin: where (x, z) its parts are, m
+_SADDLE, CRANK, REAR_AXLE, FRONT_AXLE, NECK = (0.0, 0.97), (0.17, 0.28), (-0.29, 0.34), (0.77, 0.34), (0.6, 0.84)
+# a pedal at its lowest is this high above the ground, the saddle this far below the middle of the hips, m
+_PEDAL, _BELOW_SADDLE = 0.1, 0.05
+# radius of the bars and cranks, of a bicycle of full size, m
+_TUBE = 0.016
+
+
+def _bicycle(points: Points, u: list[float]) -> Prop:
+    """As large as the rider needs: saddle under the hips, pedals under the feet, bars at the hands."""
+    size = min(max((_hips(points)[2] - _BELOW_SADDLE + _PEDAL) / _SADDLE[1], 0.45), 1.15)
+    hands = [_in_bicycle(points, points[hand], size) for hand in HANDS]
+    # hands that are where bars can be; else straight ones
+    held = [h for h in hands if 0.25 < h[0] < 0.9 and 0.75 < h[2] < 1.4]
+    bar_x, bar_z = (sum(h[0] for h in held) / len(held), sum(h[2] for h in held) / len(held)) if held else (0.52, 1.05)
+    bars = shape("box", 0.04, 0.56, 0.035).moved((bar_x, 0, bar_z - 0.03))
+    still = union([shape("bicycle"), bars, _rod((NECK[0], 0.0, NECK[1]), (bar_x, 0.0, bar_z))])
+
+    def mesh(p: Points) -> Mesh:
+        """In the bicycle's frame, the pedals where the feet are."""
+        return union([still, *_pedals([_in_bicycle(p, p[JOINT[f"{side}_foot"]], size) for side in ("left", "right")])])
+
+    frame = _under_hips((size, size, size), -_PEDAL)
+    return Prop(name="bicycle", mesh=mesh(points), where=lambda p: mesh(p).placed(*frame(p)).vertices, lift=_PEDAL)
+
+
+def _in_bicycle(points: Points, point: Point, size: float) -> tuple[float, float, float]:
+    """A point in the frame of the bicycle that is under these joints."""
+    hips, (x, y) = _hips(points), heading(points)
+    dx, dy = point[0] - hips[0], point[1] - hips[1]
+    return ((dx * x + dy * y) / size, (dy * x - dx * y) / size, (point[2] + _PEDAL) / size)
+
+
+def _pedals(feet: list[tuple[float, float, float]]) -> Iterator[Mesh]:
+    """Left and right pedal and their cranks, on a circle about the axle, as near to the feet as it comes."""
+    ax, az = CRANK
+    for side, (px, _, pz) in zip((0.1, -0.1), feet, strict=True):
+        dx, dz = px - ax, pz - 0.03 - az
+        long = max((dx * dx + dz * dz) ** 0.5, 1e-6)
+        pedal = (ax + 0.17 * dx / long, side, az + 0.17 * dz / long)
+        yield shape("box", 0.09, 0.09, 0.025).moved(pedal)
+        yield _rod((ax, 0.6 * side, az), (pedal[0], 0.6 * side, pedal[2]))
+
+
+def _rod(start: tuple, end: tuple) -> Mesh:
+    return shape("rod").placed(*rod_rows(start, end, _TUBE))
+
+
+# by activity: (cumulative share, what they use)
+_RIDES = {
+    "cycle": ((1.0, _bicycle),),
+    "push": ((0.5, _pram), (0.95, _trolley)),
+    "sit": ((0.12, _wheelchair), (0.85, _seat)),
+}
+# how often somebody of an activity carries something
+_CARRIES = {
+    **dict.fromkeys(("walk", "idle"), 0.36),
+    **{"step": 0.3, "captured": 0.15, "run": 0.12, "sport": 0.2, "lie": 0.0, "fall": 0.05},
+}
+_OTHERS_CARRY = 0.12
+# skirts, dresses and long coats of those on their feet; hats; helmets of cyclists
+_DRESSED, _HATS, _HELMETS = 0.15, 0.12, 0.5
+_ON_FEET = ("walk", "idle", "step", "push")
