@@ -8,10 +8,30 @@ Names are loaded when first used: importing the package costs no torch and no nu
 """
 
 from importlib import import_module
+from typing import TYPE_CHECKING
 
 from lidarpose import _renamed
 from lidarpose._version import __version__
 from lidarpose.errors import missing_extra
+
+if TYPE_CHECKING:
+    # what the names below are, for editors and type checkers
+    from lidarpose import evaluation as evaluation
+    from lidarpose import metrics as metrics
+    from lidarpose.body.pose_prior.sampling import sample_poses as sample_poses
+    from lidarpose.errors import LidarPoseError as LidarPoseError, InputError as InputError
+    from lidarpose.inference.predict_file import predict as predict
+    from lidarpose.inference.predictor import load as load, Predictor as Predictor
+    from lidarpose.inference.results import PersonPose as PersonPose, Poses as Poses
+    from lidarpose.io.boxes import read_boxes as read_boxes
+    from lidarpose.io.point_cloud import read_points as read_points
+    from lidarpose.lidar.presets import sensor as sensor
+    from lidarpose.lidar.raycast import cast_rays as cast_rays
+    from lidarpose.lidar.sensor import Sensor as Sensor
+    from lidarpose.models.dapt.import_weights import import_dapt as import_dapt
+    from lidarpose.models.export import export as export
+    from lidarpose.sample import Box as Box, Pose as Pose, Sample as Sample
+    from lidarpose.skeleton import Skeleton as Skeleton, SKELETONS as SKELETONS
 
 # public name -> where it lives
 _HOMES = {
