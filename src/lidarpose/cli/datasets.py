@@ -80,7 +80,12 @@ def add(commands) -> None:
     view.set_defaults(run=_view)
     view.add_argument("folder", metavar="DIR", help="a dataset's folder")
     view.add_argument(
-        "-n", "--count", type=int, default=24, metavar="N", help="number of people, evenly spread (default 24)"
+        "-n",
+        "--count",
+        type=int,
+        default=24,
+        metavar="N",
+        help="people, or at most 12 streets, evenly spread (default 24)",
     )
     view.add_argument("--html", action="store_true", help="write an interactive 3D page instead of a picture")
     view.add_argument("--out", metavar="FILE", help="default DIR.png or DIR.html, in the current folder")

@@ -7,12 +7,16 @@ import numpy as np
 from lidarpose.data.shards import CARD, DatasetReader, counted, open_dataset, shard_path
 from lidarpose.errors import InputError
 from lidarpose.io.files import check_apart, file_error
+from lidarpose.sample import Box, Pose
+from lidarpose.skeleton import skeleton
+from lidarpose.viz.bird_eye import MAX_SCANS, ScanPanel, draw_scans
 from lidarpose.viz.draw import MAX_PEOPLE, Panel, draw_people
 from lidarpose.viz.html import ReportPerson, write_report
 
 
 def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out: str | Path | None = None) -> Path:
-    """Draws `count` people of a dataset, evenly spread over it, and returns the file's path.
+    """Draws `count` people of a dataset, evenly spread over it, and returns the file's path. A picture of streets shows
+    at most 12 of them from above.
 
     out: the file, by default the folder's name with .png or .html in the current folder. Raises InputError for a
     folder that is no dataset or has no shard yet, and a file that cannot be written.
@@ -24,14 +28,17 @@ def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out
     name = Path(folder).resolve().name
     path = Path(out) if out is not None else Path(f"{name}.{'html' if html else 'png'}")
     check_apart(path, dataset.folder / CARD, *dataset.folder.glob("*.parquet"))
-    rows = _spread(dataset, count)
+    is_streets = "frames" in dataset.card.tables and not html
+    rows = [] if is_streets else _spread(dataset, count)
     settings = dataset.card.settings
     title = f"{name}: {counted(dataset.card.count, settings.get('what', 'people'))}"
     if "scene" in settings:
         title += f", scene {settings['scene']}"
     if (written := len(_written(dataset))) < dataset.card.shards:
         title += f", {written:,} of {dataset.card.shards:,} shards written so far"
-    if html:
+    if is_streets:
+        draw_scans(_street_panels(dataset, min(count, MAX_SCANS)), path, title=title)
+    elif html:
         lines = [_line(row, dataset) for row in rows]
         write_report(path, [_card(row, dataset) for row in rows], title=title, summary=lines)
     else:
@@ -39,18 +46,49 @@ def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out
     return path
 
 
-def _written(dataset: DatasetReader) -> list[int]:
-    """Numbers of the shards of people that are there."""
-    return [k for k in range(dataset.card.shards) if shard_path(dataset.folder, dataset.card.people, k).is_file()]
+def _street_panels(dataset: DatasetReader, count: int) -> list[ScanPanel]:
+    """`count` streets, evenly spread over the shards that are there, in their first frame."""
+    there = _written(dataset, "frames")
+    streets = [(shard, k) for shard in there for k in range(dataset.card.size(shard))]
+    chosen = [streets[k] for k in np.linspace(0, len(streets) - 1, min(count, len(streets))).round().astype(int)]
+    panels = []
+    for shard in sorted({shard for shard, _ in chosen}):
+        frames: dict[int, list[dict]] = {}
+        for row in dataset.rows("frames", range(shard, shard + 1)):
+            frames.setdefault(row["index"] - shard * dataset.card.per_shard, []).append(row)
+        panels += [_street_panel(frames[k], dataset) for number, k in chosen if number == shard and k in frames]
+    return panels
+
+
+def _street_panel(rows: list[dict], dataset: DatasetReader) -> ScanPanel:
+    first, boxes = rows[0], np.stack([row["box"].reshape(-1, 7) for row in rows])
+    joints = first["joints"].reshape(len(first["track"]), -1, 3)
+    return ScanPanel(
+        points=first["points"].reshape(-1, 3),
+        boxes=[
+            Box(center=box[:3], size=box[3:6], yaw=float(box[6]), id=track)
+            for track, box in zip(first["track"].tolist(), boxes[0], strict=True)
+        ],
+        poses=Pose(joints=joints, skeleton=skeleton(dataset.card.skeleton)) if len(joints) else None,
+        tracks=list(boxes[:, :, :2].swapaxes(0, 1)),
+        label=f"#{first['index']} {first['sensor']}: {counted(len(joints), 'people')}, {len(rows)} frames",
+    )
+
+
+def _written(dataset: DatasetReader, table: str | None = None) -> list[int]:
+    """Numbers of the shards of a table, by default of people, that are there. Raises InputError where none is."""
+    table = table or dataset.card.people
+    there = [k for k in range(dataset.card.shards) if shard_path(dataset.folder, table, k).is_file()]
+    if not there:
+        raise file_error(
+            dataset.folder, f"holds no shard yet; wait for the first one, or run {dataset.card.writer} again"
+        )
+    return there
 
 
 def _spread(dataset: DatasetReader, count: int) -> list[dict]:
     """`count` rows, evenly spread over the shards that are there; of a smaller dataset all rows."""
     there = _written(dataset)
-    if not there:
-        raise file_error(
-            dataset.folder, f"holds no shard yet; wait for the first one, or run {dataset.card.writer} again"
-        )
     sizes = [dataset.rows_of(dataset.card.people, shard) for shard in there]
     total = sum(sizes)
     count = min(count, total)

@@ -1,0 +1,143 @@
+"""Whole scans from above: points colored by height, people's boxes, ids, headings, skeletons and tracks.
+
+Drawn with matplotlib's object interface, as in `draw`: no global state is touched.
+"""
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lidarpose.sample import Box, Pose
+from lidarpose.viz.draw import SIDE_COLORS
+from lidarpose.viz.person_view import bone_sides, is_known, thinned
+
+MAX_SCANS = 12
+_MAX_POINTS = 120_000  # a scan; more only cover each other at this size
+_DPI, _PANEL, _TITLE = 110, 7.6, 0.45  # inches
+_MARGIN, _LEAST_SPAN = 3.0, 16.0  # m about the people, and of a view's side at least
+_BELOW, _ABOVE = 0.25, 2.5  # heights above the lowest points over which the colors run, m
+_GROUND, _HIGH, _INK, _FAINT, _BOX = "#d5d9de", "#eceff2", "#1f2328", "#7a828c", "#b3261e"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ScanPanel:
+    """One scan to draw; everything in one frame, z up, m.
+
+    Args:
+        points: (n, 3).
+        boxes: of people; an id is printed beside its box, the side that a box faces is marked.
+        poses: joints (P, J, 3).
+        tracks: positions (F, 2) or (F, 3) of people over time.
+        label: printed above.
+        sensor: x, y of the sensor, None where nobody knows it.
+    """
+
+    points: np.ndarray
+    boxes: Sequence[Box] = ()
+    poses: Pose | None = None
+    tracks: Sequence[np.ndarray] = ()
+    label: str = ""
+    sensor: tuple[float, float] | None = (0.0, 0.0)
+
+
+def draw_scans(panels: Sequence[ScanPanel], path: str | Path | None = None, *, title: str = "") -> bytes:
+    """Scans from above side by side, at most the first 12. Returns the PNG's bytes; writes `path` too where given."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from lidarpose.io.files import check_suffix, write_atomic
+
+    if path is not None:
+        check_suffix(path, ".png")
+    panels = list(panels)[:MAX_SCANS]
+    columns = min(2, max(len(panels), 1))
+    rows = -(-max(len(panels), 1) // columns)
+    width, height = columns * _PANEL, rows * _PANEL + _TITLE
+    figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white")
+    figure.text(0.15 / width, 1 - 0.15 / height, title, fontsize=13, weight="bold", va="top", parse_math=False)
+    note = "arrow: facing; dotted: the way over the frames; left limbs blue, right ones orange"
+    figure.text(1 - 0.15 / width, 1 - 0.2 / height, note, fontsize=8, color=_FAINT, va="top", ha="right")
+    for number, panel in enumerate(panels):
+        row, column = divmod(number, columns)
+        place = ((column * _PANEL + 0.55) / width, (height - _TITLE - (row + 1) * _PANEL + 0.45) / height)
+        _draw_panel(figure.add_axes((*place, (_PANEL - 0.7) / width, (_PANEL - 0.75) / height)), panel)
+    buffer = io.BytesIO()
+    FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
+    if path is not None:
+        write_atomic(path, buffer.getvalue())
+    return buffer.getvalue()
+
+
+def _draw_panel(ax, panel: ScanPanel) -> None:
+    points = panel.points[np.isfinite(panel.points).all(-1)]
+    (left, bottom), span = _window(panel, points)
+    ax.set(xlim=(left, left + span), ylim=(bottom, bottom + span), aspect="equal")
+    ax.set_xlabel("x, m", fontsize=7, color=_FAINT, labelpad=1)
+    ax.set_ylabel("y, m", fontsize=7, color=_FAINT, labelpad=-1)
+    ax.set_title(panel.label, fontsize=10, parse_math=False)
+    ax.tick_params(labelsize=7, color=_FAINT, labelcolor=_FAINT)
+    ax.spines[:].set_color(_HIGH)
+    inside = points[(np.abs(points[:, :2] - [left + span / 2, bottom + span / 2]) <= span / 2).all(1)]
+    _draw_points(ax, inside[thinned(len(inside), _MAX_POINTS)])
+    if panel.sensor is not None:
+        ax.plot(*panel.sensor, ls="", marker="^", ms=8, color=_INK, mec="white", zorder=5)
+        ax.annotate("sensor", panel.sensor, (7, -3), textcoords="offset points", fontsize=8, zorder=5)
+    for track in panel.tracks:
+        ax.plot(track[:, 0], track[:, 1], color=_BOX, lw=1.2, ls=":", zorder=4)
+        ax.plot(*track[-1, :2], ls="", marker="o", ms=2.5, color=_BOX, zorder=4)
+    for box in panel.boxes:
+        _draw_box(ax, box)
+    if is_known(panel.poses):
+        sides = bone_sides(panel.poses.skeleton)
+        for joints in panel.poses.joints.reshape(-1, len(panel.poses.skeleton), 3):
+            for (a, b), side in zip(panel.poses.skeleton.bones, sides, strict=True):
+                ax.plot(*joints[[a, b], :2].T, color=SIDE_COLORS[side], lw=1.6, zorder=6, solid_capstyle="round")
+
+
+def _window(panel: ScanPanel, points: np.ndarray) -> tuple[np.ndarray, float]:
+    """The lower left corner and the side of a square that holds the people, their tracks and the sensor, else most
+    points."""
+    shown = [box.center[None, :2] for box in panel.boxes] + [np.asarray(track)[:, :2] for track in panel.tracks]
+    if shown and panel.sensor is not None:
+        shown.append(np.array([panel.sensor]))
+    if not shown:
+        shown = [np.percentile(points[:, :2], (2, 98), axis=0) if len(points) else np.zeros((1, 2))]
+    low, high = np.concatenate(shown).min(0), np.concatenate(shown).max(0)
+    span = max(float((high - low).max()) + 2 * _MARGIN, _LEAST_SPAN)
+    return (low + high) / 2 - span / 2, span
+
+
+def _draw_points(ax, points: np.ndarray) -> None:
+    """The ground light gray, what stands on it by height, what is higher than people fainter still."""
+    height = points[:, 2] - (np.percentile(points[:, 2], 2) if len(points) else 0)
+    low, high = height < _BELOW, height > _ABOVE
+    size = float(np.clip(20_000 / max(len(points), 1), 0.3, 4))
+    for chosen, color, order in ((low, _GROUND, 1), (high, _HIGH, 2)):
+        ax.scatter(*points[chosen, :2].T, s=size, color=color, linewidths=0, zorder=order)
+    middle = ~low & ~high
+    dots = ax.scatter(
+        *points[middle, :2].T, s=1.5 * size, c=height[middle], cmap="viridis_r", vmin=0, vmax=_ABOVE, linewidths=0,
+        zorder=3,
+    )  # fmt: skip
+    bar = ax.figure.colorbar(dots, cax=ax.inset_axes((0.02, 0.05, 0.012, 0.2)))
+    bar.set_label("height, m", fontsize=7)
+    bar.ax.tick_params(labelsize=6)
+    bar.outline.set_visible(False)
+
+
+def _draw_box(ax, box: Box) -> None:
+    """Its outline, the way it faces, and its id."""
+    c, s = np.cos(box.yaw), np.sin(box.yaw)
+    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]]) * box.size[:2] / 2
+    outline = corners @ np.array([[c, s], [-s, c]]) + box.center[:2]
+    ax.plot(*outline.T, color=_BOX, lw=1.1, zorder=5)
+    nose = box.center[:2] + np.array([c, s]) * (box.size[0] / 2 + 0.6)
+    ax.annotate("", nose, box.center[:2], arrowprops={"arrowstyle": "->", "color": _BOX, "lw": 1.1}, zorder=5)
+    if box.id is not None:
+        ax.annotate(
+            str(box.id), box.center[:2], (9, 9), textcoords="offset points", fontsize=9, weight="bold", color=_BOX,
+            zorder=7, parse_math=False, bbox={"fc": "white", "ec": "none", "alpha": 0.7, "pad": 0.8},
+        )  # fmt: skip
