@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpose.body.mocap import retarget
-from lidarpose.body.pose_prior import capsules, gait, latents, sampling
-from lidarpose.body.pose_prior.ground_contact import sole_points
+from lidarpose.body.pose_prior import contact, gait, latents, sampling
+from lidarpose.body.pose_prior.contact import sole_points
 from lidarpose.errors import InputError
 
 J = {name: i for i, name in enumerate(sampling.SMPL24.joints)}
@@ -26,7 +26,7 @@ def placed(drawn):
     n, frames = drawn.rotations.shape[:2]
     flat = drawn.rotations.reshape(-1, 24, 3, 3)
     soles = sole_points(flat).reshape(n, frames, 8, 3)
-    joints = capsules.body_frames(flat)[1].reshape(n, frames, 24, 3)
+    joints = contact.body_frames(flat)[1].reshape(n, frames, 24, 3)
     way = drawn.translation[:, :, None]
     ground = drawn.clearance[:, 0] - soles[:, 0, :, 2].min(1)
     return joints + way + [0, 0, 1] * ground[:, None, None, None], soles + way + [0, 0, 1] * ground[:, None, None, None]
@@ -127,7 +127,7 @@ def test_moved_poses_are_those_of_the_pose_itself_later():
     np.testing.assert_array_equal(moved.kind, still.kind)
     np.testing.assert_array_equal(still.moved, still.rotations)
     assert not still.step.any()
-    hands = [capsules.body_frames(r)[1] for r in (moved.rotations, moved.moved)]
+    hands = [contact.body_frames(r)[1] for r in (moved.rotations, moved.moved)]
     far = np.linalg.norm(hands[1] - hands[0], axis=-1).max(1)
     assert 0.001 < np.median(far) < 0.2 and far.max() < 1.0
     walk = sampling.sample_rotations(np.random.default_rng(5), 200, mix={"walk": 1}, dt=0.1)
@@ -146,7 +146,7 @@ def test_a_stride_takes_and_comes_round():
     phase = np.linspace(0, 1, 40, endpoint=False)
     base, style = np.zeros((40, 27)), np.full((40, 8), 0.5)
     walk = np.full(40, gait.GAITS.index("walk"))
-    one, next_one = gait.strides(walk, phase, style, base), gait.strides(walk, phase + 3, style, base)
+    one, next_one = gait.add_stride(walk, phase, style, base), gait.add_stride(walk, phase + 3, style, base)
     np.testing.assert_allclose(one.angles, next_one.angles, atol=1e-9)
     knee = one.angles[:, sampling.ANGLES.index("left_knee")]
     assert 0.6 < phase[knee.argmax()] < 0.85 and knee.max() > 45 and knee[(phase > 0.2) & (phase < 0.4)].max() < 30
@@ -162,8 +162,8 @@ def test_latents_are_taken_together():
 
 def test_few_clips_pass_through_themselves_and_the_mix_is_kept():
     drawn = sampling.sample_clips(np.random.default_rng(1), 800, frames=6)
-    ends = capsules.capsule_ends(*capsules.body_frames(drawn.rotations.reshape(-1, 24, 3, 3)))
-    assert (capsules.depths(ends).max(1) > 0.02).mean() < 0.02
+    ends = contact.capsule_ends(*contact.body_frames(drawn.rotations.reshape(-1, 24, 3, 3)))
+    assert (contact.self_collision(ends).max(1) > 0.02).mean() < 0.02
     shares = np.bincount(drawn.kind, minlength=len(sampling.KINDS)) / 800
     np.testing.assert_allclose(shares, sampling.SHARES, atol=0.045)
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from lidarpose.body import rig
 from lidarpose.body.mocap import retarget
-from lidarpose.body.pose_prior import balance, capsules, ground_contact, sampling
+from lidarpose.body.pose_prior import balance, contact, latents, sampling
 from lidarpose.geometry import axis_angle_to_matrix
 from lidarpose.skeleton import SMPL24
 
@@ -18,7 +18,7 @@ def drawn(kind, n=600, seed=0):
 
 def test_frames_are_forward_kinematics():
     rotations = sampling.sample_rotations(np.random.default_rng(0), 200).rotations
-    turned, joints = capsules.body_frames(rotations)
+    turned, joints = contact.body_frames(rotations)
     rest = retarget.mean_adult_joints()[None]
     slow_turned, slow_joints = rig.forward_kinematics(SMPL24.parents, rest, rotations, np.zeros((200, 3)))
     np.testing.assert_allclose(turned, slow_turned, atol=1e-5)
@@ -32,22 +32,22 @@ def test_soles_are_the_meshs():
     rotations = drawn("walk", 60)
     rest = body.rest(np.repeat(mean, 60, 0))
     vertices = rig.pose_bodies(body, rest, rotations, np.zeros((60, 3)))[0]
-    points = ground_contact.sole_points(rotations).reshape(60, 8, 3)
+    points = contact.sole_points(rotations).reshape(60, 8, 3)
     np.testing.assert_allclose(points[..., 2].min(1), vertices[..., 2].min(1), atol=0.012)
 
 
 @pytest.mark.parametrize("kind", balance.STATIC)
 def test_standing_and_kneeling_people_are_in_balance(kind):
     rotations = drawn(kind)
-    joints = capsules.body_frames(rotations)[1]
+    joints = contact.body_frames(rotations)[1]
     points = balance._ground_points(rotations, joints)
-    off = np.linalg.norm(balance.overhang(capsules.mass_center(joints), points, 0.0), axis=1)
+    off = np.linalg.norm(balance.overhang(contact.mass_center(joints), points, 0.0), axis=1)
     assert (off > 0.005).mean() < 0.01
 
 
 @pytest.mark.parametrize("kind, usual, most", [("idle", 0.003, 0.01), ("crouch", 0.015, 0.06), ("bend", 0.01, 0.03)])
 def test_both_feet_are_on_the_ground(kind, usual, most):
-    low = ground_contact.sole_points(drawn(kind))[..., 2].min(2)
+    low = contact.sole_points(drawn(kind))[..., 2].min(2)
     apart = np.abs(low[:, 0] - low[:, 1])
     assert np.percentile(apart, 95) < usual and np.percentile(apart, 99) < most
 
@@ -56,17 +56,17 @@ def test_what_balance_changes():
     """Without it bending people topple; others keep their angles."""
     rng = np.random.default_rng(1)
     kind = np.repeat([sampling.KINDS.index("bend"), sampling.KINDS.index("sport")], 200)
-    angles = sampling._angles(sampling.draw_latents(rng, kind)).angles
+    angles = sampling._angles(latents.draw_latents(rng, kind)).angles
     before = angles.copy()
-    after = balance.settled(angles, kind)
+    after = balance.balanced(angles, kind)
     np.testing.assert_array_equal(angles, before)
     np.testing.assert_array_equal(after[200:], before[200:])
 
     def off(angles):
         rotations = sampling.rotations_from_angles(angles[:200])
-        joints = capsules.body_frames(rotations)[1]
+        joints = contact.body_frames(rotations)[1]
         points = balance._ground_points(rotations, joints)
-        return np.linalg.norm(balance.overhang(capsules.mass_center(joints), points, 0.0), axis=1)
+        return np.linalg.norm(balance.overhang(contact.mass_center(joints), points, 0.0), axis=1)
 
     assert (off(before) > 0.01).mean() > 0.4 and (off(after) > 0.01).mean() < 0.02
 
@@ -85,9 +85,9 @@ def test_overhang_of_a_square():
 def test_the_center_of_mass_of_the_rest_pose():
     """Of a standing adult 55 to 58 % of the height, arms up a little more; the shares sum to one."""
     joints = retarget.mean_adult_joints()[None]
-    height = capsules.mass_center(joints)[0, 2] + 0.97
+    height = contact.mass_center(joints)[0, 2] + 0.97
     assert 0.55 < height / 1.70 < 0.61
-    np.testing.assert_allclose(capsules.mass_center(joints + [1.0, 2, 3]) - capsules.mass_center(joints), [[1, 2, 3]])
+    np.testing.assert_allclose(contact.mass_center(joints + [1.0, 2, 3]) - contact.mass_center(joints), [[1, 2, 3]])
 
 
 # self-penetration
@@ -104,29 +104,29 @@ def apart_reference(a, b, steps=400):
 @given(seed=st.integers(0, 2**32 - 1))
 def test_distances_of_segments(seed):
     a, b = np.random.default_rng(seed).normal(size=(2, 2, 3))
-    found = capsules._segments_apart(a[None].astype(np.float32), b[None].astype(np.float32))[0]
+    found = contact._segment_distance(a[None].astype(np.float32), b[None].astype(np.float32))[0]
     assert abs(found - apart_reference(a, b)) < 0.02
 
 
 def test_a_hand_in_the_belly_is_deep_and_the_rest_pose_is_free():
     rest = np.repeat(np.eye(3, dtype=np.float32)[None, None], 24, 1)
-    assert capsules.depths(capsules.capsule_ends(*capsules.body_frames(rest))).max() < 0
+    assert contact.self_collision(contact.capsule_ends(*contact.body_frames(rest))).max() < 0
     bent = rest.copy()
     shoulder, elbow = SMPL24.index("left_shoulder"), SMPL24.index("left_elbow")
     bent[0, shoulder] = axis_angle_to_matrix(np.array([-1.4, 0, 0]))
     bent[0, elbow] = axis_angle_to_matrix(np.array([0, 0, -0.3]))
     bent[0, elbow] = axis_angle_to_matrix(np.array([-1.5, 0, 0])) @ bent[0, elbow]
-    assert capsules.depths(capsules.capsule_ends(*capsules.body_frames(bent))).max() > 0.05
+    assert contact.self_collision(contact.capsule_ends(*contact.body_frames(bent))).max() > 0.05
 
 
 def test_few_bodies_pass_through_themselves():
     rotations = sampling.sample_rotations(np.random.default_rng(3), 5000).rotations
-    depth = capsules.depths(capsules.capsule_ends(*capsules.body_frames(rotations))).max(1)
+    depth = contact.self_collision(contact.capsule_ends(*contact.body_frames(rotations))).max(1)
     assert (depth > 0.02).mean() < 0.01
     rng = np.random.default_rng(3)
-    raw = sampling._angles(sampling.draw_latents(rng, rng.choice(len(sampling.KINDS), 5000, p=sampling.SHARES))).angles
-    ends = capsules.capsule_ends(*capsules.body_frames(sampling.rotations_from_angles(raw)))
-    assert (capsules.depths(ends).max(1) > 0.02).mean() > 0.05  # so there is something to do
+    raw = sampling._angles(latents.draw_latents(rng, rng.choice(len(sampling.KINDS), 5000, p=sampling.SHARES))).angles
+    ends = contact.capsule_ends(*contact.body_frames(sampling.rotations_from_angles(raw)))
+    assert (contact.self_collision(ends).max(1) > 0.02).mean() > 0.05  # so there is something to do
 
 
 def test_what_does_not_slide_carries_the_body():
@@ -134,10 +134,10 @@ def test_what_does_not_slide_carries_the_body():
     t = np.linspace(0, 1, 11)
     planted = np.stack([0.3 - t, 0.1 + 0 * t, -1 + 0 * t], -1)
     swinging = np.stack([t, -0.1 + 0 * t, -0.9 + 0 * t], -1)
-    way = ground_contact.pinned(np.stack([planted, swinging], 1)[None])
+    way = contact.planted_way(np.stack([planted, swinging], 1)[None])
     np.testing.assert_allclose(way[0], np.stack([t, 0 * t, 0 * t], -1), atol=1e-4)
 
 
-def test_stand_is_the_height_over_the_lowest_vertex():
-    np.testing.assert_allclose(ground_contact.stand(np.array([-0.9, -0.8]), np.array([0.0, 0.03])), [0.9, 0.83])
-    assert ground_contact.stand(-0.97) == 0.97
+def test_the_ground_offset_is_the_height_over_the_lowest_vertex():
+    np.testing.assert_allclose(contact.ground_offset(np.array([-0.9, -0.8]), np.array([0.0, 0.03])), [0.9, 0.83])
+    assert contact.ground_offset(-0.97) == 0.97

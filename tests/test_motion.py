@@ -29,7 +29,7 @@ def drawn(n=1500, seed=0, **mix):
 def latents_of(n, seed, **mix):
     """The mix's latents, as they are drawn before anything is drawn anew."""
     rng = np.random.default_rng(seed)
-    return latents.draw_latents(rng, rng.choice(len(sampling.KINDS), n, p=sampling._shares(mix or None)))
+    return latents.draw_latents(rng, rng.choice(len(sampling.KINDS), n, p=sampling._kind_shares(mix or None)))
 
 
 def angle_at(joints, a, b, c):
@@ -135,7 +135,7 @@ def test_standing_people_are_in_balance():
 
 def test_arms_swing_against_the_legs():
     walkers = latents_of(24, 4, walk=1)
-    walkers = replace(walkers, arm=np.full((24, 2), activities.OWN_ARMS), captured=np.zeros((0, 2, 27)))
+    walkers = replace(walkers, arm=np.full((24, 2), activities.OWN_ARMS), captured=np.zeros((24, 2, 27)))
     for walk in sampling._motion(walkers, np.arange(60) / 40).rotations:
         p = joints_of(walk)
         for side, across in (("left", "right"), ("right", "left")):

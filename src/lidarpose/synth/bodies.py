@@ -10,7 +10,7 @@ from lidarpose.body.mocap import load_motion
 from lidarpose.body.mocap.motion import Motion, facing_x
 from lidarpose.body.mocap.retarget import mean_adult_joints
 from lidarpose.body.pose_prior.activities import KINDS
-from lidarpose.body.pose_prior.ground_contact import stand
+from lidarpose.body.pose_prior.contact import ground_offset
 from lidarpose.body.pose_prior.sampling import sample_clips, sample_rotations
 from lidarpose.body.rig import RestBody, load_rig, pose_bodies
 from lidarpose.body.shape import clothing, sample_people
@@ -237,7 +237,7 @@ def draw_moving_body(
     if clearance is None:
         # the body is not as tall as who was captured: what is little above the lowest frame stands on the ground
         clearance = np.maximum(lowest - lowest.min() - _JUMP, 0)
-    rise = stand(lowest, clearance)[:, None, None] * np.array([0, 0, 1], np.float32)
+    rise = ground_offset(lowest, clearance)[:, None, None] * np.array([0, 0, 1], np.float32)
     vertices, joints = vertices + rise, joints + rise
     # where the pelvis's x axis points
     heading = np.arctan2(rotations[:frames, 0, 1, 0], rotations[:frames, 0, 0, 0])

@@ -1,7 +1,7 @@
 """People who stand or kneel: both feet on the floor, the weight over them.
 
 Corrections are continuous in the pose, so they may be made moment by moment. Angles (n, 27) in degrees, in the order
-of `activities.ANGLES`; lengths in metres, of the mean adult.
+of `activities.ANGLES`; lengths in meters, of the mean adult.
 """
 
 from functools import cache
@@ -9,9 +9,8 @@ from functools import cache
 import numpy as np
 
 from lidarpose.body.mocap.retarget import mean_adult_joints
-from lidarpose.body.pose_prior.activities import ANGLES, KINDS, LIMITS
-from lidarpose.body.pose_prior.capsules import body_frames, mass_center
-from lidarpose.body.pose_prior.ground_contact import sole_points
+from lidarpose.body.pose_prior.activities import ANGLE_INDEX, KINDS, LIMITS
+from lidarpose.body.pose_prior.contact import body_frames, mass_center, sole_points
 from lidarpose.body.pose_prior.joint_angles import rotations_from_angles
 from lidarpose.skeleton import SMPL24
 
@@ -19,11 +18,9 @@ from lidarpose.skeleton import SMPL24
 STATIC = ("idle", "crouch", "bend", "kneel")
 _STATIC = np.array([name in STATIC for name in KINDS])
 _KNEEL = KINDS.index("kneel")
-_A = {name: i for i, name in enumerate(ANGLES)}
 _HIP, _KNEE, _ANKLE, _ABD = (
-    np.array([_A[f"{side}_{name}"] for side in ("left", "right")]) for name in ("hip", "knee", "ankle", "abd")
+    np.array([ANGLE_INDEX[f"{side}_{name}"] for side in ("left", "right")]) for name in ("hip", "knee", "ankle", "abd")
 )
-_TILT = _A["tilt"]
 _LEGS = np.array([[SMPL24.index(f"{side}_{name}") for side in ("left", "right")] for name in ("hip", "knee", "ankle")])
 _KNEE_RADIUS = 0.055  # m, of the shipped body in front of the joint
 _MARGIN = 0.03  # m: the center of mass stays so far inside the feet's outline
@@ -35,7 +32,7 @@ _AROUND = np.stack([f(np.arange(16) * np.pi / 8) for f in (np.cos, np.sin)]).ast
 _TRUNK_LEAN = 0.27
 
 
-def settled(angles: np.ndarray, kind: np.ndarray) -> np.ndarray:
+def balanced(angles: np.ndarray, kind: np.ndarray) -> np.ndarray:
     """The poses (n, 27) with those of the static kinds on both feet (or a foot and a knee) and in balance.
 
     The body leans about its ankles (kneeling: its trunk about the hips) until its center of mass is over the outline
@@ -54,10 +51,10 @@ def settled(angles: np.ndarray, kind: np.ndarray) -> np.ndarray:
     # the lean changes the feet's heights too: the soles stay level to the front
     points[:, :8, 2] -= np.repeat(joints[:, _LEGS[2], 0], 4, 1) * lean[:, :1]
     points[:, :8, 2] -= (points[:, :8, 1] - np.repeat(joints[:, _LEGS[0], 1], 4, 1)) * lean[:, 1:]
-    _level(part, joints, points, kneel)
-    settled = angles.copy()
-    settled[rows] = np.clip(part, LIMITS[0], LIMITS[1])
-    return settled
+    _level_feet(part, joints, points, kneel)
+    angles = angles.copy()
+    angles[rows] = np.clip(part, LIMITS[0], LIMITS[1])
+    return angles
 
 
 def overhang(center: np.ndarray, points: np.ndarray, margin: float = _MARGIN) -> np.ndarray:
@@ -83,8 +80,6 @@ def _ground_points(rotations: np.ndarray, joints: np.ndarray) -> np.ndarray:
 def _bearing_points(part: np.ndarray, points: np.ndarray, kneel: np.ndarray) -> np.ndarray:
     """The points that will bear the body when it is level: of one that kneels both soles and the knee behind."""
     rows = np.flatnonzero(kneel)
-    if not len(rows):
-        return points
     points = points.copy()
     points[rows, :, 2] = 0
     points[rows, 8 + part[rows][:, _HIP].argmax(1), 2] = 1
@@ -98,13 +93,13 @@ def _lengths() -> tuple[float, float]:
     return float(thigh), float(shank)
 
 
-def _level(part: np.ndarray, joints: np.ndarray, points: np.ndarray, kneel: np.ndarray) -> None:
+def _level_feet(part: np.ndarray, joints: np.ndarray, points: np.ndarray, kneel: np.ndarray) -> None:
     """Bends legs, in place, so that both feet, or the front foot and the other knee, are equally low."""
     thigh, shank = _lengths()
     low = np.stack([points[:, :4, 2].min(1), points[:, 4:8, 2].min(1)], 1)
     up = low.max(1, keepdims=True) - low
-    if kneel.any():
-        i = np.flatnonzero(kneel)
+    i = np.flatnonzero(kneel)
+    if len(i):
         front = part[i][:, _HIP].argmax(1)
         rear = 1 - front
         floor = points[i, 8 + rear, 2]
@@ -135,7 +130,7 @@ def _lean(part: np.ndarray, way: np.ndarray, center: np.ndarray, joints: np.ndar
     height = np.maximum(center[:, 2] - joints[:, _LEGS[2], 2].min(1), 0.3)
     forward, left = way[:, 0] / np.where(kneel, _TRUNK_LEAN, height), way[:, 1] / height
     degrees = np.degrees(forward)
-    part[:, _TILT] += degrees
+    part[:, ANGLE_INDEX["tilt"]] += degrees
     # the body turns about its ankles, or the trunk about the hips
     part[:, _ANKLE] += np.where(kneel, 0, degrees)[:, None]
     part[:, _HIP] += np.where(kneel, degrees, 0)[:, None]

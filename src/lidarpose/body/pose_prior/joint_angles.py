@@ -2,11 +2,10 @@
 
 import numpy as np
 
-from lidarpose.body.pose_prior.activities import ANGLES
+from lidarpose.body.pose_prior.activities import ANGLE_INDEX, ANGLES
 from lidarpose.geometry import rotation_about
 from lidarpose.skeleton import SMPL24
 
-_A = {name: i for i, name in enumerate(ANGLES)}
 _J = {name: i for i, name in enumerate(SMPL24.joints)}
 _SIDES = (("left", 1.0), ("right", -1.0))
 
@@ -15,8 +14,8 @@ _COLLAR_FROM, _COLLAR_SHARE = 45.0, 0.15
 _SHOULDERS = np.array([_J["left_shoulder"], _J["right_shoulder"]])
 _COLLAR_LIFTS = 3 * np.array([_J["left_collar"], _J["right_collar"]]) + 1
 _LIFT_SIGNS = np.array([1, -1], np.float32)
-_RAISED_OUT = np.array([[_A[f"{side}_raise"], _A[f"{side}_out"]] for side, _ in _SIDES])
-_INWARD = np.array([_A[f"{side}_in"] for side, _ in _SIDES])
+_RAISED_OUT = np.array([[ANGLE_INDEX[f"{side}_raise"], ANGLE_INDEX[f"{side}_out"]] for side, _ in _SIDES])
+_INWARD = np.array([ANGLE_INDEX[f"{side}_in"] for side, _ in _SIDES])
 _LIFT_STEPS = 6  # fixed-point steps that take the collar's share out of the upper arm
 
 
@@ -43,27 +42,14 @@ def angles_from_rotations(rotations: np.ndarray) -> np.ndarray:
     collars all but where they take the upper arms.
     """
     rotations = np.asarray(rotations, float)
-    angles = np.zeros((len(rotations), len(ANGLES)))
-
-    def put(names: tuple[str, ...], joints: tuple[str, ...]) -> None:
-        # joints that share an angle turn by the same small rotation: add their Euler angles
-        total = sum(_to_euler(rotations[:, _J[joint]]) for joint in joints)
-        angles[:, [_A[name] for name in names]] = total
-
-    put(("tilt", "roll", "yaw"), ("pelvis",))
-    put(("bend", "side", "twist"), ("spine1", "spine2", "spine3"))
-    put(("nod", "neck_side", "neck_twist"), ("neck", "head"))
+    # joints that share an angle turn by the same small rotation: their Euler angles are added
+    angles = _to_euler(rotations).reshape(len(rotations), 72) @ np.sign(_TO_EULER).T
     for side, sign in _SIDES:
-        hip = _to_euler(rotations[:, _J[f"{side}_hip"]]) * [-1, sign, sign]
-        angles[:, [_A[f"{side}_{name}"] for name in ("hip", "abd", "rot")]] = hip
-        angles[:, _A[f"{side}_knee"]] = _to_euler(rotations[:, _J[f"{side}_knee"]])[:, 0]
-        angles[:, _A[f"{side}_ankle"]] = -_to_euler(rotations[:, _J[f"{side}_ankle"]])[:, 0]
-        angles[:, _A[f"{side}_elbow"]] = -sign * _to_euler(rotations[:, _J[f"{side}_elbow"]])[:, 2]
         upper_arm = rotations[:, _J[f"{side}_collar"]] @ rotations[:, _J[f"{side}_shoulder"]]
         arm = shoulder_angles(upper_arm, sign)
         for _ in range(_LIFT_STEPS):
             arm = shoulder_angles(rotation_about("x", -sign * np.radians(_lift(arm[:, :2]))) @ upper_arm, sign)
-        angles[:, [_A[f"{side}_{name}"] for name in ("raise", "out", "in")]] = arm
+        angles[:, [ANGLE_INDEX[f"{side}_{name}"] for name in ("raise", "out", "in")]] = arm
     return angles
 
 
@@ -89,10 +75,10 @@ def _lift(arm: np.ndarray) -> np.ndarray:
 
 
 def _to_euler(matrix: np.ndarray) -> np.ndarray:
-    """R_y R_x R_z (n, 3, 3) -> (n, 3) degrees about y, x, z; x in +-90."""
-    y = np.arctan2(matrix[:, 0, 2], matrix[:, 2, 2])
-    x = -np.arcsin(np.clip(matrix[:, 1, 2], -1, 1))
-    z = np.arctan2(matrix[:, 1, 0], matrix[:, 1, 1])
+    """R_y R_x R_z (..., 3, 3) -> (..., 3) degrees about y, x, z; x in +-90."""
+    y = np.arctan2(matrix[..., 0, 2], matrix[..., 2, 2])
+    x = -np.arcsin(np.clip(matrix[..., 1, 2], -1, 1))
+    z = np.arctan2(matrix[..., 1, 0], matrix[..., 1, 1])
     return np.degrees(np.stack([y, x, z], -1))
 
 
@@ -117,27 +103,22 @@ def _euler_map() -> tuple[np.ndarray, np.ndarray]:
     """The linear map from `ANGLES` to 24 x (y, x, z) Euler angles, (27, 72), and its value at zero (72,), degrees."""
     matrix, zero = np.zeros((len(ANGLES), 24, 3), np.float32), np.zeros((24, 3), np.float32)
     y, x, z = 0, 1, 2
-    for names, axis in (("tilt", y), ("roll", x), ("yaw", z)):
-        matrix[_A[names], _J["pelvis"], axis] = 1
-    for names, joints in (
-        (("bend", "side", "twist"), ("spine1", "spine2", "spine3")),
-        (("nod", "neck_side", "neck_twist"), ("neck", "head")),
-    ):
+    # the joints that share angles about y, x and z, evenly
+    shared = {
+        ("tilt", "roll", "yaw"): ("pelvis",),
+        ("bend", "side", "twist"): ("spine1", "spine2", "spine3"),
+        ("nod", "neck_side", "neck_twist"): ("neck", "head"),
+    }
+    for names, joints in shared.items():
         for axis, name in enumerate(names):
-            for joint in joints:
-                matrix[_A[name], _J[joint], axis] = 1 / len(joints)
-    for side, sign in (("left", 1), ("right", -1)):
+            matrix[ANGLE_INDEX[name], [_J[joint] for joint in joints], axis] = 1 / len(joints)
+    for side, sign in _SIDES:
         for name, joint, axis, gain in (
-            ("hip", "hip", y, -1),
-            ("abd", "hip", x, sign),
-            ("rot", "hip", z, sign),
-            ("knee", "knee", y, 1),
-            ("ankle", "ankle", y, -1),
-            ("raise", "shoulder", y, -1),
-            ("out", "shoulder", x, sign),
+            ("hip", "hip", y, -1), ("abd", "hip", x, sign), ("rot", "hip", z, sign), ("knee", "knee", y, 1),
+            ("ankle", "ankle", y, -1), ("raise", "shoulder", y, -1), ("out", "shoulder", x, sign),
             ("elbow", "elbow", z, -sign),
-        ):
-            matrix[_A[f"{side}_{name}"], _J[f"{side}_{joint}"], axis] = gain
+        ):  # fmt: skip
+            matrix[ANGLE_INDEX[f"{side}_{name}"], _J[f"{side}_{joint}"], axis] = gain
         zero[_J[f"{side}_shoulder"], x] = -90 * sign  # from the T-pose to a hanging arm
     return matrix.reshape(len(ANGLES), 72), zero.reshape(72)
 
@@ -146,11 +127,9 @@ _TO_EULER, _AT_ZERO = _euler_map()
 
 
 def _mirror() -> tuple[np.ndarray, np.ndarray]:
-    across = {"left": "right", "right": "left"}
-    index = []
-    for name in ANGLES:
-        side, _, rest = name.partition("_")
-        index.append(_A[f"{across[side]}_{rest}"] if side in across else _A[name])
+    other = {"left": "right_", "right": "left_"}
+    parts = [name.partition("_") for name in ANGLES]
+    index = [ANGLE_INDEX[other[a] + c if a in other else a + b + c] for a, b, c in parts]
     odd = ("roll", "yaw", "side", "twist", "neck_side", "neck_twist")
     return np.array(index), np.array([-1.0 if name in odd else 1.0 for name in ANGLES])
 

@@ -10,15 +10,14 @@ import numpy as np
 
 from lidarpose.body.pose_prior.activities import (
     ANGLES,
-    ARM_NAMES,
+    ARM_ODDS,
     ARM_PACE,
-    ARMS_OF_KIND,
     CAPTURED_ARMS,
+    KIND_PACE,
     KINDS,
     LIMITS,
-    PACE,
+    TABLES,
 )
-from lidarpose.body.pose_prior.gait import CADENCE
 from lidarpose.body.pose_prior.mixture import captured_angles
 
 _CAPTURED, _FALL, _CYCLE = (KINDS.index(name) for name in ("captured", "fall", "cycle"))
@@ -34,6 +33,12 @@ _HURRY, _TURN, _DRIFT = 0.08, 0.35, 0.17
 _FALL_TIME = 1.1
 
 
+# strides a second, least and how much more with the longest stride; a bicycle's cranks turn with its activity's pace
+_CADENCES = np.array([TABLES["gaits"].get(name, {}).get("cadence", (0.0, 0.0)) for name in KINDS])
+_CADENCES[_CYCLE] = KIND_PACE[_CYCLE] / (2 * np.pi), 0.0
+_CUMULATIVE_ODDS = np.cumsum(ARM_ODDS, 1)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Latents:
     """Everything random about n poses.
@@ -41,8 +46,8 @@ class Latents:
     kind (n,) into KINDS; arm (n, 2) into ARM_NAMES, left and right, 0 = the activity's own; where (n, 3) in [0, 1]:
     place in the range of the activity and of either arm; noise (n, 27) in about [-1, 1]; phase (n,) strides, 0 is the
     left heel's strike; style (n, 8) in [0, 1]: the gait's parameters; mirror (n,) bool; tempo (n, 4) in [0, 1]: pace,
-    direction of the swing at first, curve of the path, change of speed; captured (m, 2, 27) degrees: the angles of
-    the m poses that are captured or have such an arm (`from_capture`), and of those they go to.
+    direction of the swing at first, curve of the path, change of speed; captured (n, 2, 27) degrees: the angles of
+    poses that are captured or have such an arm, and of those they go to, 0 of others.
     """
 
     kind: np.ndarray
@@ -58,26 +63,15 @@ class Latents:
     def __len__(self) -> int:
         return len(self.kind)
 
-    @property
-    def from_capture(self) -> np.ndarray:
-        """(n,) bool: whose angles, or an arm's, are those of `captured`."""
-        return _from_capture(self.kind, self.arm)
-
     def take(self, rows: np.ndarray) -> "Latents":
         """The poses of these rows (k,), in their order."""
-        order, uses = np.cumsum(self.from_capture) - 1, self.from_capture[rows]
-        taken = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "captured"}
-        return Latents(**taken, captured=self.captured[order[rows[uses]]])
-
-    def repeated(self, times: int) -> "Latents":
-        """Each pose `times` times, one after the other."""
-        return Latents(**{f.name: np.repeat(getattr(self, f.name), times, 0) for f in fields(self)})
+        return Latents(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
     def at(self, t: np.ndarray) -> "Latents":
         """The same people t (n,) seconds after these latents, which must be as drawn."""
         t = np.broadcast_to(np.asarray(t, float), self.kind.shape)
         eager = np.where(self.kind == _CYCLE, 1.0, 0.7 + 0.6 * self.tempo[:, 0])
-        pace = np.concatenate([_PACES[self.kind][:, None], _ARM_PACES[self.arm]], 1) * eager[:, None]
+        pace = np.concatenate([KIND_PACE[self.kind][:, None], ARM_PACE[self.arm]], 1) * eager[:, None]
         # to and fro between the ends from where they are, half of the people back first
         start = np.arccos(np.clip(1 - 2 * self.where, -1, 1)) * np.where(self.tempo[:, 1:2] < 0.5, 1, -1)
         where = (1 - np.cos(start + pace * t[:, None])) / 2
@@ -116,47 +110,28 @@ class Latents:
         return np.sin(begin + rate * t[:, None]) - np.sin(begin)
 
     def _captured(self, t: np.ndarray) -> np.ndarray:
-        rows = self.from_capture
-        here, there = self.captured[:, 0], self.captured[:, 1]
+        start, end = self.captured[:, 0], self.captured[:, 1]
         # at its fastest a cosine is pi / 2 times its mean
-        rate = np.pi * _CAPTURED_RATE / np.maximum(np.abs(there - here).max(1, initial=0), 20.0)
-        share = (1 - np.cos(rate * (0.6 + 0.4 * self.tempo[rows, 0]) * t[rows])) / 2
-        moved = here + share[:, None] * (there - here)
-        return np.stack([moved, there], 1)
-
-
-_PACES = np.array([PACE.get(name, 0.0) for name in KINDS])
-_ARM_PACES = np.array([ARM_PACE.get(name, 0.0) for name in ARM_NAMES])
-_CADENCES = np.array([CADENCE.get(name, (0.0, 0.0)) for name in KINDS])
-_CADENCES[KINDS.index("cycle")] = PACE["cycle"] / (2 * np.pi), 0.0
-_ODDS = np.cumsum(ARMS_OF_KIND, 1)
-
-
-def _from_capture(kind: np.ndarray, arm: np.ndarray) -> np.ndarray:
-    return (kind == _CAPTURED) | (arm == CAPTURED_ARMS).any(1)
+        rate = np.pi * _CAPTURED_RATE / np.maximum(np.abs(end - start).max(1, initial=0), 20.0)
+        share = (1 - np.cos(rate * (0.6 + 0.4 * self.tempo[:, 0]) * t)) / 2
+        return np.stack([start + share[:, None] * (end - start), end], 1)
 
 
 def draw_latents(rng: np.random.Generator, kind: np.ndarray) -> Latents:
     """Poses of the kinds (n,), indices into KINDS."""
     n = len(kind)
-    arm = (rng.random((n, 2, 1)) >= _ODDS[kind][:, None, :-1]).sum(2)
+    arm = (rng.random((n, 2, 1)) >= _CUMULATIVE_ODDS[kind][:, None, :-1]).sum(2)
     where = rng.random((n, 3))
     paired = rng.random(n) < _PAIRED_ARMS
     arm[paired, 1] = arm[paired, 0]
-    stray = where[:, 1] + _PAIR_SPREAD * rng.uniform(-1, 1, n)
-    where[paired, 2] = np.clip(stray, 0, 1)[paired]
+    near_first = where[:, 1] + _PAIR_SPREAD * rng.uniform(-1, 1, n)
+    where[paired, 2] = np.clip(near_first, 0, 1)[paired]
     # the sum of two uniform numbers: most near the middle, none far out
     noise = rng.random((2, n, len(ANGLES))).sum(0) - 1
     phase, style, mirror, tempo = rng.random(n), rng.random((n, 8)), rng.random(n) < 0.5, rng.random((n, 4))
-    captured = np.clip(captured_angles(rng, int(_from_capture(kind, arm).sum())), *LIMITS)
+    captured, uses = np.zeros((n, 2, len(ANGLES))), (kind == _CAPTURED) | (arm == CAPTURED_ARMS).any(1)
+    captured[uses] = np.clip(captured_angles(rng, int(uses.sum())), *LIMITS)
     return Latents(
-        kind=kind,
-        arm=arm,
-        where=where,
-        noise=noise,
-        phase=phase,
-        style=style,
-        mirror=mirror,
-        tempo=tempo,
+        kind=kind, arm=arm, where=where, noise=noise, phase=phase, style=style, mirror=mirror, tempo=tempo,
         captured=captured,
-    )
+    )  # fmt: skip

@@ -16,17 +16,14 @@ from lidarpose.body.pose_prior.activities import ANGLES, ARM_ANGLES
 from lidarpose.body.pose_prior.joint_angles import angles_from_rotations, shoulder_angles, shoulder_matrix
 from lidarpose.geometry import axis_angle_to_matrix
 
-_SHOULDERS = tuple(
-    (slice(ANGLES.index(f"{side}_raise"), ANGLES.index(f"{side}_raise") + 3), sign)
-    for side, sign in (("left", 1.0), ("right", -1.0))
-)
+_FIRST_ARM_ANGLE = {side: ANGLES.index(f"{side}_raise") for side in ("left", "right")}
+# columns of each shoulder's three angles, and the side's sign
+_SHOULDERS = tuple((slice(i, i + 3), sign) for i, sign in zip(_FIRST_ARM_ANGLE.values(), (1.0, -1.0), strict=True))
 # deviations are drawn this much smaller than fitted: the fit's ridge and few components make it wider than the motion
 _SPREAD = 0.75
 # an arm is another pose's this often: one subject's poses then cover another's better
 _OTHER_ARM = 0.4
-_ARMS = tuple(
-    [i for i, name in enumerate(ANGLES) if name in {f"{side}_{a}" for a in ARM_ANGLES}] for side in ("left", "right")
-)
+_ARMS = tuple(list(range(i, i + len(ARM_ANGLES))) for i in _FIRST_ARM_ANGLE.values())
 _LOWER = np.tril_indices(len(ANGLES))
 
 

@@ -1,9 +1,8 @@
-"""The body as capsules: what may not pass through what, where it touches the ground, and where its weight is.
+"""The body as capsules and soles: self-collision, contact with the ground, and where the mass is.
 
-n poses on the mean adult, C capsules, Q pairs. Frame: x forward, y left, z up, the pelvis at the origin. Metres.
+n poses on the mean adult, C capsules, Q pairs. Frame: x forward, y left, z up, the pelvis at the origin. Meters.
 """
 
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -51,18 +50,15 @@ _MASS = (
 _J = {name: i for i, name in enumerate(SMPL24.joints)}
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Capsules:
-    """joint (C,), ends (C, 2, 3) and radius (C,) float32 m; pairs (Q, 2) and how near their axes may come, (Q,) m."""
-
-    joint: np.ndarray
-    ends: np.ndarray
-    radius: np.ndarray
-    pairs: np.ndarray
-    near: np.ndarray
+# the sole seen from the ankle joint, m: heel, inner and outer ball, toes; the left foot's, measured on the shipped mesh
+_SOLE = np.array([[-0.05, 0.0, -0.077], [0.10, -0.045, -0.077], [0.10, 0.045, -0.077], [0.19, -0.01, -0.074]])
+_LEGS = np.array([[_J[f"{side}_{name}"] for name in ("hip", "knee", "ankle")] for side in ("left", "right")])
+# a point bears weight within about this height of the lowest one, m
+_BEARING = 0.008
 
 
-def _capsules() -> _Capsules:
+def _capsules() -> tuple[np.ndarray, ...]:
+    """Joint (C,), ends (C, 2, 3) and radius (C,) m of the capsules; pairs (Q, 2) that could collide."""
     table = {name: (_J[joint], a, b, radius) for name, (joint, a, b, radius) in _TRUNK.items()}
     for side, sign in (("left", 1), ("right", -1)):
         for name, (joint, a, b, radius) in _LIMBS.items():
@@ -73,18 +69,11 @@ def _capsules() -> _Capsules:
     for side, other in (("left", "right"), ("right", "left")):
         pairs += [(names[f"{side}_{a}"], names[b if b in _TRUNK else f"{side}_{b}"]) for a, b in _SAME_SIDE]
         pairs += [(names[f"{side}_{a}"], names[f"{other}_{b}"]) for a, b in _ACROSS if side == "left" or a != b]
-    joint, *ends, radius = zip(*table.values(), strict=True)
-    radius, pairs = np.array(radius, np.float32), np.array(pairs)
-    return _Capsules(
-        joint=np.array(joint),
-        ends=np.stack([np.array(e, np.float32) for e in ends], 1),
-        radius=radius,
-        pairs=pairs,
-        near=radius[pairs].sum(1),
-    )
+    joint, *ends, radius = (np.array(column) for column in zip(*table.values(), strict=True))
+    return joint, np.stack(ends, 1).astype(np.float32), radius.astype(np.float32), np.array(pairs)
 
 
-_CAPSULES = _capsules()
+_JOINT, _ENDS, _RADIUS, _PAIRS = _capsules()
 
 
 def _mass_of_joints() -> np.ndarray:
@@ -137,23 +126,21 @@ def body_frames(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return frames[..., :3], frames[..., 3]
 
 
-def capsule_ends(turned: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """The capsules' ends (n, C, 2, 3) m of posed bodies (`body_frames`)."""
-    c = _CAPSULES
-    return joints[:, c.joint, None] + c.ends @ np.swapaxes(turned[:, c.joint], -1, -2)
+def capsule_ends(rotations: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    """The capsules' ends (n, C, 2, 3) m of posed bodies, from `body_frames`."""
+    return joints[:, _JOINT, None] + _ENDS @ np.swapaxes(rotations[:, _JOINT], -1, -2)
 
 
 def undersides(ends: np.ndarray) -> np.ndarray:
     """ends (n, C, 2, 3) -> (n, 2 C, 3) m: the lowest point of the ball at each end of each capsule."""
-    low = ends - _CAPSULES.radius[:, None, None] * np.array([0, 0, 1], np.float32)
-    return low.reshape(len(ends), 2 * len(_CAPSULES.joint), 3)
+    low = ends - _RADIUS[:, None, None] * np.array([0, 0, 1], np.float32)
+    return low.reshape(len(ends), 2 * len(_JOINT), 3)
 
 
-def depths(ends: np.ndarray) -> np.ndarray:
+def self_collision(ends: np.ndarray) -> np.ndarray:
     """How deep parts that should not touch are in each other, (n, Q) m, negative where they are apart."""
-    c = _CAPSULES
-    a, b = ends[:, c.pairs[:, 0]], ends[:, c.pairs[:, 1]]
-    return c.near - _segments_apart(a, b)
+    a, b = ends[:, _PAIRS[:, 0]], ends[:, _PAIRS[:, 1]]
+    return _RADIUS[_PAIRS].sum(1) - _segment_distance(a, b)
 
 
 def mass_center(joints: np.ndarray) -> np.ndarray:
@@ -162,17 +149,72 @@ def mass_center(joints: np.ndarray) -> np.ndarray:
     return np.einsum("j,njk->nk", _MASS_OF_JOINTS, joints)
 
 
-def _segments_apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _segment_distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Least distance (...) of segments a and b (..., 2, 3): nearest points of the lines, clamped (Ericson,
     Real-Time Collision Detection, 5.1.9)."""
     start, other = a[..., 0, :], b[..., 0, :]
     u, v, w = a[..., 1, :] - start, b[..., 1, :] - other, start - other
-    uu, vv, uv, uw, vw = ((x * y) @ _ONES for x, y in ((u, u), (v, v), (u, v), (u, w), (v, w)))
+    ones = np.ones(3, np.float32)
+    uu, vv, uv, uw, vw = ((x * y) @ ones for x, y in ((u, u), (v, v), (u, v), (u, w), (v, w)))
     s = np.clip((uv * vw - uw * vv) / np.maximum(uu * vv - uv * uv, 1e-9), 0, 1)
     t = np.clip((uv * s + vw) / vv, 0, 1)
     s = np.clip((uv * t - uw) / uu, 0, 1)
     apart = w + s[..., None] * u - t[..., None] * v
-    return np.sqrt((apart * apart) @ _ONES)
+    return np.sqrt((apart * apart) @ ones)
 
 
-_ONES = np.ones(3, np.float32)
+@cache
+def _leg_offsets() -> tuple[np.ndarray, ...]:
+    """Of the left and the right leg, float32 m: from the pelvis to the hip, from the hip to the knee, from the knee to
+    the ankle, each (2, 3), and from the ankle to the sole's points (2, 4, 3)."""
+    rest = mean_adult_joints()
+    hip, knee, ankle = (rest[_LEGS[:, k]] for k in range(3))
+    sole = np.stack([_SOLE, _SOLE * [1, -1, 1]])
+    return tuple(np.asarray(v, np.float32) for v in (hip, knee - hip, ankle - knee, sole))
+
+
+def sole_points(rotations: np.ndarray) -> np.ndarray:
+    """rotations (n, 24, 3, 3) -> (n, 2, 4, 3) float32 m: heel, inner and outer ball and toes of the left and the right
+    foot, seen from the pelvis; the foot is stiff."""
+    to_hip, to_knee, to_ankle, sole = _leg_offsets()
+    root = rotations[:, None, 0]
+    thigh = root @ rotations[:, _LEGS[:, 0]]
+    shank = thigh @ rotations[:, _LEGS[:, 1]]
+    foot = shank @ rotations[:, _LEGS[:, 2]]
+    ankle = (root @ to_hip[..., None] + thigh @ to_knee[..., None] + shank @ to_ankle[..., None])[..., 0]
+    return ankle[:, :, None] + sole @ np.swapaxes(foot, -1, -2)
+
+
+def bearing(points: np.ndarray) -> np.ndarray:
+    """points (..., P, 3) of a body -> (..., P): shares of the weight by height, the lowest most; they sum to 1."""
+    height = points[..., 2]
+    share = np.exp((height.min(-1, keepdims=True) - height) / np.float32(_BEARING))
+    return share / share.sum(-1, keepdims=True)
+
+
+def planted_way(points: np.ndarray) -> np.ndarray:
+    """The way (n, T, 3) m of the body if the points that bear it do not slide; z is 0.
+
+    points (n, T, P, 3) m seen from the pelvis in axes that do not turn, T close moments; the way starts at 0.
+    """
+    share = bearing(points)
+    share = (share[:, 1:] + share[:, :-1]) / 2
+    way = np.zeros((*points.shape[:2], 3), points.dtype)
+    np.cumsum(-np.einsum("ntp,ntpk->ntk", share, np.diff(points[..., :2], axis=1)), 1, out=way[:, 1:, :2])
+    return way
+
+
+def walked_way(pace: np.ndarray, strides: np.ndarray, course: np.ndarray) -> np.ndarray:
+    """The way (n, T, 2) m over the ground of people who make `pace` (n, T) m a stride, have made `strides` (n, T) and
+    head for `course` (n, T) rad."""
+    way = np.zeros((*pace.shape, 2))
+    middle = (course[:, 1:] + course[:, :-1]) / 2
+    step = (pace[:, 1:] + pace[:, :-1]) / 2 * np.diff(strides, axis=1)
+    np.cumsum(step[..., None] * np.stack([np.cos(middle), np.sin(middle)], -1), 1, out=way[:, 1:])
+    return way
+
+
+def ground_offset(lowest: np.ndarray, clearance: np.ndarray | float = 0.0) -> np.ndarray:
+    """Height m of the pelvis above flat ground, of bodies whose lowest vertex is at z = `lowest` (...) m seen from the
+    pelvis and `clearance` (...) m above the ground: 0 for who stands, more for a runner between two steps."""
+    return np.asarray(clearance) - np.asarray(lowest)
