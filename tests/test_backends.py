@@ -509,7 +509,7 @@ def test_a_bad_file_is_told_before_torch_is_asked_for(tmp_path):
 
 
 def test_predicting_loads_nothing_that_it_does_not_need(tmp_path):
-    heavy = ("torch", "numba", "pandas", "matplotlib", "trimesh", "pypcd4", "tqdm", "onnx", "scipy", "sympy")
+    heavy = ("torch", "numba", "pandas", "matplotlib", "tqdm", "onnx", "scipy", "sympy")
     done = without(
         (),
         CROP

@@ -19,6 +19,7 @@ from hypothesis.extra import numpy as hnp
 
 from lidarpose.errors import InputError
 from lidarpose.io.boxes import read_boxes
+from lidarpose.io.files import check_unpacked
 from lidarpose.io.point_cloud import SUFFIXES, Cloud, read_points
 
 REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "real"
@@ -55,6 +56,13 @@ def ply_header(points=3, form="binary_little_endian", kind="float", names="x y z
     ]
     lines += [f"property {kind} {name}" for name in names.split()] + after.split("\n")[:-1] + ["end_header", ""]
     return newline.join(lines).encode()
+
+
+def lzf_body(content):
+    """LZF without any back reference, in runs of at most 32 literal bytes."""
+    runs = [content[i : i + 32] for i in range(0, len(content), 32)]
+    packed = b"".join(bytes([len(run) - 1]) + run for run in runs)
+    return struct.pack("<II", len(packed), len(content)) + packed
 
 
 def npy(array, **options):
@@ -94,6 +102,17 @@ def same(cloud, expected=POINTS, fields=None, *, rtol=0.0):
     assert fields is None or cloud.fields == fields
 
 
+ELEMENTS = {
+    "f": st.floats(-1e6, 1e6, width=32, allow_subnormal=False),
+    "i": st.integers(-128, 127),
+    "u": st.integers(0, 255),
+}
+PLY_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
+    **{"double": "f8", "int64": "i8", "uint64": "u8", "float32": "f4"},
+}
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("clouds")
@@ -102,49 +121,83 @@ def folder(tmp_path_factory):
 # ---- round trips
 
 
+TYPES = ["<f4", "<f8", "i1", "<i2", "<i4", "<i8", "u1", "<u2", "<u4", "<u8"]
+
+
 @pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
 @settings(max_examples=40, deadline=None)
-@given(points=float32_points)
-def test_pcd_of_pypcd4(folder, encoding, points):
-    pypcd4 = pytest.importorskip("pypcd4")
-    path = folder / f"{encoding}.pcd"
-    pypcd4.PointCloud.from_xyzi_points(points).save(path, encoding=pypcd4.Encoding(encoding))
-    cloud = read_points(path)
-    assert cloud.fields == ("x", "y", "z", "intensity") and cloud.num_dropped == 0 and cloud.warnings == ()
-    # pypcd4 writes ten decimals in text
-    np.testing.assert_allclose(cloud.points, points[:, :3], rtol=0, atol=1e-10 if encoding == "ascii" else 0)
+@given(data=st.data(), names=st.permutations(["x", "Y", "z", "ring", "_"]), count=st.integers(1, 20))
+def test_pcd_of_any_types_and_order(folder, encoding, data, names, count):
+    types = {name: data.draw(st.sampled_from(TYPES)) for name in names}
+    columns = {name: data.draw(hnp.arrays(kind, (count,), elements=ELEMENTS[kind[-2]])) for name, kind in types.items()}
+    rows = np.rec.fromarrays(columns.values(), dtype=[(f"c{i}", kind) for i, kind in enumerate(types.values())])
+    header = pcd_header(
+        " ".join(names),
+        " ".join(kind[-1] for kind in types.values()),
+        " ".join(kind[-2].upper() for kind in types.values()),
+        "1 1 1 1 1",
+        count,
+        encoding,
+    )
+    content = {
+        "ascii": lambda: "".join(" ".join(map(repr, row)) + "\n" for row in rows.tolist()).encode(),
+        "binary": rows.tobytes,
+        "binary_compressed": lambda: lzf_body(b"".join(column.tobytes() for column in columns.values())),
+    }[encoding]()
+    expected = np.stack([columns[name] for name in "xYz"], -1)
+    same(read(folder, f"{encoding}.pcd", header + content), expected, tuple(names))
 
 
-@pytest.mark.parametrize("encoding", ["binary", "binary_compressed"])
-def test_pcd_of_pypcd4_with_mixed_types_and_order(folder, encoding):
-    pypcd4 = pytest.importorskip("pypcd4")
-    rng = np.random.default_rng(0)
-    xyz = rng.normal(size=(3, 500)) + [[5e5], [5e6], [0]]
-    ring = np.repeat(np.arange(5, dtype=np.uint8), 100)
-    columns = [ring, xyz[2], xyz[0], ring.astype(np.int16), xyz[1]]
-    types = (np.uint8, np.float64, np.float64, np.int16, np.float64)
-    path = folder / f"mixed_{encoding}.pcd"
-    made = pypcd4.PointCloud.from_points(columns, ("ring", "z", "x", "tag", "y"), types)
-    made.save(path, encoding=pypcd4.Encoding(encoding))
-    same(read_points(path), xyz.T, ("ring", "z", "x", "tag", "y"))
-
-
-@pytest.mark.parametrize("encoding", ["ascii", "binary"])
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
 @settings(max_examples=40, deadline=None)
-@given(points=float32_points)
-def test_ply_of_trimesh(folder, encoding, points):
-    trimesh = pytest.importorskip("trimesh")
-    path = folder / f"{encoding}.ply"
-    path.write_bytes(trimesh.PointCloud(points[:, :3]).export(file_type="ply", encoding=encoding))
-    # trimesh writes eight decimals in text
-    np.testing.assert_allclose(read_points(path).points, points[:, :3], rtol=0, atol=1e-8 if encoding == "ascii" else 0)
+@given(data=st.data(), names=st.permutations(["x", "y", "Z", "red"]), count=st.integers(1, 20))
+def test_ply_of_any_types_and_order(folder, encoding, data, names, count):
+    kinds = {name: data.draw(st.sampled_from(sorted(PLY_TYPES))) for name in names}
+    columns = {
+        name: data.draw(hnp.arrays(PLY_TYPES[kind], (count,), elements=ELEMENTS[PLY_TYPES[kind][0]]))
+        for name, kind in kinds.items()
+    }
+    order = ">" if "big" in encoding else "<"
+    dtype = [(f"c{i}", order + PLY_TYPES[kind]) for i, kind in enumerate(kinds.values())]
+    rows = np.rec.fromarrays(columns.values(), dtype=dtype)
+    header = ply_header(count, encoding, names="").replace(
+        b"end_header", "".join(f"property {kind} {name}\n" for name, kind in kinds.items()).encode() + b"end_header"
+    )
+    text = "".join(" ".join(map(repr, row)) + "\n" for row in rows.tolist())
+    content = text.encode() if encoding == "ascii" else rows.tobytes()
+    same(read(folder, f"{encoding}.ply", header + content), np.stack([columns[n] for n in "xyZ"], -1), tuple(names))
 
 
-def test_ply_mesh_with_faces(folder):
-    trimesh = pytest.importorskip("trimesh")
-    box = trimesh.creation.box()
-    for encoding in ("ascii", "binary"):
-        same(read(folder, "box.ply", box.export(file_type="ply", encoding=encoding)), box.vertices)
+# what pypcd4 1.5 and trimesh 5.2 write
+_PYPCD4 = (
+    "VERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH {0}\nHEIGHT 1\n"
+    "VIEWPOINT 0.0 0.0 0.0 1.0 0.0 0.0 0.0\nPOINTS {0}\nDATA {1}\n"
+)
+_TRIMESH = (
+    "ply\nformat {} 1.0\ncomment https://github.com/mikedh/trimesh\nelement vertex 3\nproperty float x\n"
+    "property float y\nproperty float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+)
+OTHER_WRITERS = {
+    "pypcd4 ascii.pcd": _PYPCD4.format(3, "ascii").encode() + b"1.5000000000 -2.2500000000 0.1250000000 7.0000000000\n"
+    b"10.0000000000 20.0000000000 -1.0000000000 8.0000000000\n3.0000000000 4.0000000000 5.0000000000 9.0000000000\n",
+    "pypcd4 compressed.pcd": _PYPCD4.format(12, "binary_compressed").encode()
+    + bytes.fromhex(
+        "3e000000c00000000c0000c03f000020410000404000e01c0b0410c00000a0202f0080202fe01b0b01003e202b00bf2033202fe01b0b00e04027205f00102003e0170b011041"
+    ),
+    "trimesh ascii.ply": _TRIMESH.format("ascii").encode()
+    + b"1.50000000 -2.25000000 0.12500000\n10.00000000 20.00000000 -1.00000000\n"
+    b"3.00000000 4.00000000 5.00000000\n3 0 1 2\n",
+    "trimesh binary.ply": _TRIMESH.format("binary_little_endian").encode()
+    + POINTS[:, :3].tobytes()
+    + struct.pack("<B3i", 3, 0, 1, 2),
+}
+
+
+@pytest.mark.parametrize("name", OTHER_WRITERS)
+def test_files_of_other_writers(folder, name):
+    cloud = read(folder, name, OTHER_WRITERS[name])
+    same(cloud, np.tile(POINTS, (len(cloud.points) // 3, 1)))
+    assert cloud.num_dropped == 0 and cloud.warnings == ()
 
 
 @settings(max_examples=40, deadline=None)
@@ -298,7 +351,7 @@ def test_bin_columns(folder):
     for rows in (7, 8):
         cloud = read(folder, "a.bin", nuscenes[:rows].tobytes())
         same(cloud, nuscenes[:rows], fields)
-        assert len(cloud.warnings) == 1 and "--columns 4" in cloud.warnings[0]
+        assert len(cloud.warnings) == 1 and "columns 4" in cloud.warnings[0]
     # the converse: 10 rows of KITTI's 4 are also 8 rows of 5
     kitti = np.hstack([rng.normal(scale=20, size=(10, 3)), rng.uniform(0, 1, (10, 1))]).astype(np.float32)
     cloud = read(folder, "a.bin", kitti.tobytes())
@@ -336,7 +389,7 @@ def test_bin_columns_are_told_by_the_values(folder, cloud, n):
             rows5 = np.column_stack([rows, np.broadcast_to(fifth, n)]).astype(np.float32)
             found = read(folder, "a.bin", rows5.tobytes())
             same(found, rows5, ("x", "y", "z", "intensity", "ring"))
-            assert len(found.warnings) == 1 and "--columns 4" in found.warnings[0]
+            assert len(found.warnings) == 1 and "columns 4" in found.warnings[0]
     if n % 4 == 0 and n >= 40:
         found = read(folder, "a.bin", xyz.astype(np.float32).tobytes())
         same(found, xyz.astype(np.float32), ("x", "y", "z"))
@@ -472,6 +525,11 @@ BAD = {
     "pcd compressed cut off": ("a.pcd", COMPRESSED + struct.pack("<II", 40, 48) + bytes(9), ["cut off"]),
     "pcd compressed no sizes": ("a.pcd", COMPRESSED + b"\x01", ["cut off"]),
     "pcd compressed damaged": ("a.pcd", COMPRESSED + struct.pack("<II", 9, 48) + b"\xff" * 9, ["a.pcd"]),
+    "pcd compressed zeros": (
+        "a.pcd",
+        pcd_header(points=2**24, data="binary_compressed") + struct.pack("<II", 2**22, 2**28) + bytes(2**22),
+        ["67108864 bytes or 32 times", "268435456 from 4194304", "LIDARPOSE_MAX_UNPACKED=268435456"],
+    ),
     "pcd compressed bomb": ("a.pcd", COMPRESSED + struct.pack("<II", 1, 2**32 - 1) + b"\x00", ["4294967295"]),
     "pcd negative count": ("a.pcd", pcd_header(points=-3) + ROWS, ["POINTS", "'-3'"]),
     "pcd float16": ("a.pcd", pcd_header(size="2 2 2 2") + ROWS, ["TYPE", "'f2'"]),
@@ -503,7 +561,7 @@ BAD = {
     "ply no points": ("a.ply", ply_header(0), ["has no points"]),
     "ply odd count": ("a.ply", ply_header("many") + ROWS, ["'many'"]),
     "bin odd size": ("a.bin", ROWS[:-1], ["47 bytes", "cut off"]),
-    "bin of three": ("a.bin", np.ones((7, 3), "f4").tobytes(), ["84 bytes", "--columns 3"]),
+    "bin of three": ("a.bin", np.ones((7, 3), "f4").tobytes(), ["84 bytes", "columns 3"]),
     "bin garbage": ("a.bin", np.random.default_rng(0).bytes(4000), ["beyond"]),
     "bin all nan": ("a.bin", np.full((3, 4), np.nan, "f4").tobytes(), ["NaN"]),
     "npy objects": ("a.npy", OBJECTS, ["dtype object"]),
@@ -549,6 +607,23 @@ BAD = {
     "xyz of bytes": ("a.xyz", bytes(range(128, 256)), ["UTF-8"]),
     "odd name": ("a\nb.pcd", b"", ["empty"]),
 }
+
+
+def test_archives_do_not_unpack_to_far_more_than_they_are(folder, monkeypatch):
+    zeros, file = np.zeros((2**20, 3), np.float32), io.BytesIO()
+    np.savez_compressed(file, points=zeros)
+    same(read(folder, "zeros.npz", file.getvalue()), zeros)
+    check_unpacked(2**30, 10**8 * 3 * 8)
+    monkeypatch.setenv("LIDARPOSE_MAX_UNPACKED", "1000000")
+    with pytest.raises(
+        InputError, match="a.npz: expected at most 1000000 bytes or 32 .*LIDARPOSE_MAX_UNPACKED=12583040"
+    ):
+        read(folder, "a.npz", file.getvalue())
+    monkeypatch.setenv("LIDARPOSE_MAX_UNPACKED", "12583040")
+    same(read(folder, "a.npz", file.getvalue()), zeros)
+    monkeypatch.setenv("LIDARPOSE_MAX_UNPACKED", "1 GB")
+    with pytest.raises(InputError, match="expected a number of bytes in LIDARPOSE_MAX_UNPACKED, got '1 GB'"):
+        read(folder, "a.npz", file.getvalue())
 
 
 def one_line(error, *names):
@@ -644,7 +719,7 @@ def test_damaged_files_read_or_fail_in_one_line(folder, data):
 
 
 def test_import_loads_no_heavy_library():
-    heavy = {"pandas", "trimesh", "pypcd4", "lzf", "torch"}
+    heavy = {"pandas", "lzf", "torch"}
     code = f"import sys, lidarpose.io.point_cloud; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
@@ -679,7 +754,7 @@ def test_more_values_than_the_header_names_are_refused(tmp_path, text):
 def test_raw_rows_of_another_width_are_told_all_that_fit(tmp_path):
     path = tmp_path / "xyz.bin"
     np.ones((102, 3), "f4").tofile(path)
-    with pytest.raises(InputError, match=r"say how many values a row has \(--columns 3 or 6\)"):
+    with pytest.raises(InputError, match=r"say how many values a row has \(columns 3 or 6\)"):
         read_points(path)
 
 

@@ -35,7 +35,7 @@ STRANGERS = {("body", "lidar"), ("lidar", "body"), *(("models", room) for room i
 
 def loaded_by(code):
     """Which of the heavy libraries a program loads."""
-    heavy = ("torch", "numba", "numpy", "pandas", "matplotlib", "trimesh", "pypcd4")
+    heavy = ("torch", "numba", "numpy", "pandas", "matplotlib", "lzf")
     tail = f"\nimport sys; print(*[name for name in {heavy} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code + tail], capture_output=True, text=True, timeout=60, check=True)
     return set(done.stdout.split("\n")[-2].split())

@@ -139,7 +139,7 @@ def _is_json(out: str) -> bool:
 
 def _warnings(poses) -> list[str]:
     """The input's warnings, and each of the people's once with the ids of those it is about."""
-    from lidarpose.io.headers import shorten
+    from lidarpose.io.files import shorten
 
     shared: dict[str, list[str]] = {}
     for person in poses:

@@ -18,8 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose.errors import InputError, check_name
-from lidarpose.io.files import file_error, read_bytes
-from lidarpose.io.headers import Problem
+from lidarpose.io.files import FormatError, file_error, read_bytes
 from lidarpose.io.text import decode
 
 # what a user's own lists are called
@@ -105,7 +104,7 @@ def _own(root: Path, parts: Sequence[str]) -> SplitRule | None:
         path = root / _LISTS[split]
         try:
             lines = decode(read_bytes(path, expected="names of sequences, one a line")).splitlines()
-        except Problem as problem:
+        except FormatError as problem:
             raise file_error(path, problem) from None
         # a line end at the end of the file is no sequence
         names = [line.strip() for line in lines if line.strip()]

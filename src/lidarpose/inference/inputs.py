@@ -6,8 +6,8 @@ import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import vector_of
-from lidarpose.io.files import one_line
-from lidarpose.io.headers import Problem, is_transposed, pick_xyz
+from lidarpose.io.files import FormatError, one_line
+from lidarpose.io.text import is_transposed, pick_xyz
 from lidarpose.sample import FARTHEST, MIN_POINTS, Pose, center_of, within_reach
 
 # joints that every skeleton has
@@ -82,7 +82,7 @@ def _by_name(points: object, what: str) -> object:
     try:
         chosen = [points[names[i]] for i in pick_xyz(names)]
         return (np.ma if isinstance(points, np.ma.MaskedArray) else np).stack(chosen, -1)
-    except (Problem, ValueError) as problem:
+    except (FormatError, ValueError) as problem:
         # two columns of one name cannot be told apart
         raise InputError(f"{what}: {problem}") from None
 

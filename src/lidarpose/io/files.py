@@ -39,6 +39,20 @@ _REMEDIES = {
 }
 
 
+# an archive may unpack to so many bytes, or to so many times its size: points take a tenth at the very least
+_UNPACKED_BYTES, _UNPACKED_RATIO = 64 * 2**20, 32
+
+
+class FormatError(Exception):
+    """What is wrong with a file's content and what to do, without the file's name, which its reader adds."""
+
+
+def shorten(text: str, limit: int = 80) -> str:
+    """The text on one line of at most `limit` characters."""
+    text = " ".join(text.split())
+    return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
 def one_line(text: str) -> str:
     """The text as one line that any terminal can print: what would break the line or steer the terminal is escaped."""
     text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(text.splitlines()))
@@ -136,6 +150,21 @@ def read_npz(
         raise file_error(path, "does not fit in memory; split it first") from None
     except Exception as error:  # numpy, zipfile and zlib raise many kinds for a damaged archive
         raise file_error(path, f"not an npz of plain arrays ({error}); was it copied completely?") from None
+
+
+def check_unpacked(packed: int, unpacked: int) -> None:
+    """Raises FormatError where so many packed bytes would unpack to more than a file of real data does.
+
+    The environment variable LIDARPOSE_MAX_UNPACKED raises the number of bytes that are unpacked in any case.
+    """
+    limit = os.environ.get("LIDARPOSE_MAX_UNPACKED", str(_UNPACKED_BYTES))
+    if not (limit.isascii() and limit.isdecimal()):
+        raise FormatError(f"expected a number of bytes in LIDARPOSE_MAX_UNPACKED, got {shorten(limit)!r}: correct it")
+    if unpacked > max(int(limit), _UNPACKED_RATIO * packed):
+        raise FormatError(
+            f"expected at most {limit} bytes or {_UNPACKED_RATIO} times its size when unpacked, got {unpacked} from "
+            f"{packed}: if you trust it, set the environment variable LIDARPOSE_MAX_UNPACKED={unpacked}"
+        )
 
 
 def _nearest(path: str | os.PathLike) -> str:

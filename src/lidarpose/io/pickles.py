@@ -16,8 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarpose.io.files import file_error, read_bytes
-from lidarpose.io.headers import Problem, shorten
+from lidarpose.io.files import FormatError, file_error, read_bytes, shorten
 
 # larger files do not hold labels or a body; they would be in memory three times
 MAX_BYTES = 4 * 2**30
@@ -68,7 +67,7 @@ def load_pickle(path: str | os.PathLike) -> object:
         content = _DataUnpickler(data).load()
         _check_levels(content, {}, 0)
         return content
-    except Problem as problem:
+    except FormatError as problem:
         raise file_error(path, problem) from None
     except MemoryError:
         raise file_error(path, "does not fit in memory: ask for npz, or split it") from None
@@ -114,7 +113,7 @@ class _DataUnpickler(pickle._Unpickler):
         self.key_share = 0.0
 
     def load(self) -> object:
-        """The data. Raises EOFError where the file ends before it, and Problem."""
+        """The data. Raises EOFError where the file ends before it, and FormatError."""
         read = self.read = self.file.read
         self.readline = self.file.readline
         self.metastack, self.stack = [], []
@@ -126,27 +125,27 @@ class _DataUnpickler(pickle._Unpickler):
             if code == pickle.STOP:
                 return self.stack.pop()
             self.dispatch[code[0]](self)
-        raise Problem("is a pickle of too many small parts for its size: ask for npz, or split it")
+        raise FormatError("is a pickle of too many small parts for its size: ask for npz, or split it")
 
     # --- what only its maker has
 
     def find_class(self, module: str, name: str) -> Unread:
         name = _canonical(f"{module}.{name}")
         if name not in _KNOWN and not name.startswith("chumpy.") and not _SPARSE.fullmatch(name):
-            raise Problem(
+            raise FormatError(
                 f"its pickle wants {shorten(name)}, which is not on the list of plain data (arrays, lists, dicts, "
                 "chumpy, scipy.sparse): nothing was run; ask for npz"
             )
         return Unread(name)
 
     def persistent_load(self, pid: object) -> None:
-        raise Problem("its pickle wants an object by a persistent id, which only its maker has: ask for npz")
+        raise FormatError("its pickle wants an object by a persistent id, which only its maker has: ask for npz")
 
     def get_extension(self, code: int) -> None:
-        raise Problem("its pickle wants a class by a registered number, which only its maker has: ask for npz")
+        raise FormatError("its pickle wants a class by a registered number, which only its maker has: ask for npz")
 
     def load_buffer(self) -> None:
-        raise Problem("its pickle wants a buffer outside of the file, which only its maker has: ask for npz")
+        raise FormatError("its pickle wants a buffer outside of the file, which only its maker has: ask for npz")
 
     # --- calls
 
@@ -198,7 +197,7 @@ class _DataUnpickler(pickle._Unpickler):
             return _dtype(args, state)
         if name == _RECONSTRUCT:
             if not args or args[0] != Unread("numpy.ndarray") or not isinstance(state, tuple) or len(state) != 5:
-                raise Problem(f"has an array of an unknown class or without content: {_REMEDY}")
+                raise FormatError(f"has an array of an unknown class or without content: {_REMEDY}")
             _, shape, dtype, fortran, data = state
             return self.charged(_array(data, dtype, shape, "F" if fortran else "C"))
         if name.startswith("chumpy."):
@@ -213,7 +212,7 @@ class _DataUnpickler(pickle._Unpickler):
             made.nbytes if isinstance(made, np.ndarray) else len(made) if hasattr(made, "__len__") else 0
         )
         if self.copies_left < 0:
-            raise Problem(f"has arrays of more than {_COPIES} times its size: ask for npz")
+            raise FormatError(f"has arrays of more than {_COPIES} times its size: ask for npz")
         return made
 
     # --- containers
@@ -267,7 +266,9 @@ class _DataUnpickler(pickle._Unpickler):
             if not any(isinstance(part, _TEXT) and part for part in parts):
                 self.key_share += 1 / (MAX_TUPLE_KEYS if type(item) is tuple else MAX_NUMBER_KEYS)
                 if self.key_share > 1:
-                    raise Problem(f"has over {MAX_NUMBER_KEYS} numbers or {MAX_TUPLE_KEYS} tuples as keys: ask for npz")
+                    raise FormatError(
+                        f"has over {MAX_NUMBER_KEYS} numbers or {MAX_TUPLE_KEYS} tuples as keys: ask for npz"
+                    )
         return items
 
 
@@ -297,20 +298,20 @@ _DataUnpickler.dispatch |= {
 def _check_levels(value: object, levels: dict[int, int | None], depth: int) -> int:
     """How many levels of containers a value has. levels: by id, of those seen before, None while they are counted.
 
-    Raises Problem for too many, for a container in itself, and for an object that never got its state.
+    Raises FormatError for too many, for a container in itself, and for an object that never got its state.
     """
     if type(value) in _PLAIN:
         return 0
     if id(value) in levels:
         if levels[id(value)] is None:
-            raise Problem("holds a list or dict that contains itself: ask for npz")
+            raise FormatError("holds a list or dict that contains itself: ask for npz")
         return levels[id(value)]
     if type(value) is _Stub:
         if not value.name.startswith("chumpy."):
-            raise Problem(f"has a {value.name} without content: {_REMEDY}")
+            raise FormatError(f"has a {value.name} without content: {_REMEDY}")
         return 0
     if depth > MAX_DEPTH:
-        raise Problem(f"is nested more than {MAX_DEPTH} levels deep: ask for npz")
+        raise FormatError(f"is nested more than {MAX_DEPTH} levels deep: ask for npz")
     parts = ()
     if isinstance(value, list | tuple | set | frozenset):
         parts = value
@@ -322,7 +323,7 @@ def _check_levels(value: object, levels: dict[int, int | None], depth: int) -> i
     levels[id(value)] = None
     count = 1 + max((_check_levels(p, levels, depth + 1) for p in parts if type(p) not in _PLAIN), default=0)
     if count > MAX_DEPTH:
-        raise Problem(f"is nested more than {MAX_DEPTH} levels deep: ask for npz")
+        raise FormatError(f"is nested more than {MAX_DEPTH} levels deep: ask for npz")
     levels[id(value)] = count
     return count
 
@@ -350,27 +351,27 @@ def _dtype(args: tuple, state: object) -> np.dtype:
     if not isinstance(code, str) or not re.fullmatch(
         r"[|<>=]?(b1|[iu][1248]|f(2|4|8|16)|c(8|16|32)|[SU]\d{1,9}|O\d*|\?)", code
     ):
-        raise Problem(f"has arrays of type {shorten(repr(code))}; numbers and text are read: ask for npz")
+        raise FormatError(f"has arrays of type {shorten(repr(code))}; numbers and text are read: ask for npz")
     if "O" in code:
         return np.dtype(object)
     if not isinstance(state, tuple) or len(state) < 5 or any(x is not None for x in state[2:5]):
-        raise Problem(f"has arrays of a type derived from {code}; plain numbers and text are read: ask for npz")
+        raise FormatError(f"has arrays of a type derived from {code}; plain numbers and text are read: ask for npz")
     order = state[1] if state[1] in ("<", ">", "|", "=") else ""
     return np.dtype(order + code.lstrip("|<>="))
 
 
 def _array(data: object, dtype: object, shape: object, order: str) -> np.ndarray:
     if not isinstance(dtype, np.dtype) or not isinstance(shape, tuple) or any(type(n) is not int for n in shape):
-        raise Problem(f"has an array without type or shape: {_REMEDY}")
+        raise FormatError(f"has an array without type or shape: {_REMEDY}")
     # Python 2 kept the content as text
     data = data.encode("latin1") if isinstance(data, str) else data
     is_object = dtype.kind == "O"
     if not isinstance(data, list if is_object else bytes):
-        raise Problem(f"has an array of a {type(data).__name__}: {_REMEDY}")
+        raise FormatError(f"has an array of a {type(data).__name__}: {_REMEDY}")
     count = math.prod(shape)
     if any(n < 0 for n in shape) or len(data) != count * (1 if is_object else dtype.itemsize):
         came = f"{shorten(str(shape))} with {len(data)} {'items' if is_object else 'bytes'}"
-        raise Problem(f"has an array of the shape {came}: {_REMEDY}")
+        raise FormatError(f"has an array of the shape {came}: {_REMEDY}")
     if is_object or not data:
         flat = np.empty(count, dtype)
         for i, item in enumerate(data):
@@ -386,7 +387,7 @@ def _from_buffer(data: object, dtype: object, shape: object, order: object) -> n
 
 def _scalar(dtype: object, data: object) -> np.generic:
     if not isinstance(dtype, np.dtype) or dtype.kind == "O":
-        raise Problem("has a number of type object: ask for npz")
+        raise FormatError("has a number of type object: ask for npz")
     return _array(data, dtype, (), "C")[()]
 
 
@@ -395,13 +396,13 @@ def _encode(text: object = b"", encoding: object = "latin1") -> bytes:
     if isinstance(text, bytes):
         return text
     if not isinstance(text, str) or encoding not in ("latin1", "latin-1"):
-        raise Problem(f"makes bytes of something else than latin-1 text: {_REMEDY}")
+        raise FormatError(f"makes bytes of something else than latin-1 text: {_REMEDY}")
     return text.encode("latin1")
 
 
 def _complex(real: object, imaginary: object) -> complex:
     if type(real) not in (int, float) or type(imaginary) not in (int, float):
-        raise Problem(f"makes a complex number of something else than numbers: {_REMEDY}")
+        raise FormatError(f"makes a complex number of something else than numbers: {_REMEDY}")
     return complex(real, imaginary)
 
 
@@ -442,12 +443,12 @@ def _dense(name: str, state: object, most: int) -> np.ndarray:
         or len(shape) != 2
         or not all(isinstance(p, np.ndarray) and p.ndim == 1 for p in pieces)
     ):
-        raise Problem(f"has a {name} without its parts: {_REMEDY}")
+        raise FormatError(f"has a {name} without its parts: {_REMEDY}")
     rows, columns = (int(n) for n in shape)
     by_column = "csc" in name
     lines, across = (columns, rows) if by_column else (rows, columns)
     if min(shape) < 0 or rows * columns > most:
-        raise Problem(f"has a {name} of {rows} x {columns}; up to {MAX_DENSE} numbers are read in all: ask for npz")
+        raise FormatError(f"has a {name} of {rows} x {columns}; up to {MAX_DENSE} numbers are read in all: ask for npz")
     start, index, data = pieces
     wrong = (
         len(start) != lines + 1
@@ -459,7 +460,7 @@ def _dense(name: str, state: object, most: int) -> np.ndarray:
         wrong or index.dtype.kind not in "iu" or start[0] != 0 or start[-1] != len(data) or (np.diff(start) < 0).any()
     )
     if wrong or (len(index) and not 0 <= index.min() <= index.max() < across):
-        raise Problem(f"has a {name} whose parts do not fit together: {_REMEDY}")
+        raise FormatError(f"has a {name} whose parts do not fit together: {_REMEDY}")
     dense = np.zeros((lines, across), data.dtype)
     np.add.at(dense, (np.repeat(np.arange(lines), np.diff(start)), index), data)
     return dense.T.copy() if by_column else dense

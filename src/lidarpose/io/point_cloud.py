@@ -4,9 +4,9 @@ The suffix, in any case, says the format. Coordinates stay as they are in the fi
 turned or scaled), in float64, since float32 rounds map coordinates such as UTM's to half a metre. Columns other than
 x, y and z are named in `Cloud.fields` and otherwise ignored.
 
-Libraries decode: pypcd4, trimesh, pandas and numpy. What they let through, a body shorter than its header says or a
-count that would fill the memory, is checked before they start. A parser takes a file's bytes and returns its x y z
-(n, 3), the names of its columns and warnings; it raises `Problem`, to which `read_points` adds the file's name.
+What a header announces is checked against the file before numpy, pandas or LZF decode it. A parser takes a file's bytes
+and returns its x y z (n, 3), the names of its columns and warnings; it raises `FormatError`, to which `read_points`
+adds the file's name.
 """
 
 import io
@@ -20,11 +20,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarpose.errors import whole
-from lidarpose.io.files import file_error, read_bytes
-from lidarpose.io.headers import FEW_ROWS, Problem, is_transposed, need_bytes, numbered, pick_xyz, shorten
+from lidarpose.io.files import FormatError, check_unpacked, file_error, read_bytes, shorten
 from lidarpose.io.pcd import parse_pcd
 from lidarpose.io.ply import parse_ply
-from lidarpose.io.text import parse_text
+from lidarpose.io.text import FEW_ROWS, check_bytes, is_transposed, numbered, parse_text, pick_xyz
 
 KITTI_FIELDS = ("x", "y", "z", "intensity")
 NUSCENES_FIELDS = ("x", "y", "z", "intensity", "ring")
@@ -42,31 +41,25 @@ _NARROWER = 0.4
 _FAR, _NARROWEST = 1e3, 1e-3
 
 # the first bytes of what users rename by mistake, with the remedy; long enough never to be float32 coordinates
-_FOREIGN = (
-    (re.compile(rb"\x1f\x8b\x08[\x00-\x1f]"), "is gzip-compressed: unpack it first (gunzip)"),
-    (re.compile(rb"PK\x03\x04"), "is a zip archive: unpack it first"),
-    (re.compile(rb"BZh[1-9]1AY&SY"), "is bzip2-compressed: unpack it first (bunzip2)"),
-    (re.compile(rb"\xfd7zXZ\x00"), "is xz-compressed: unpack it first (unxz)"),
-    (re.compile(rb"\x28\xb5\x2f\xfd"), "is zstd-compressed: unpack it first (unzstd)"),
-    (re.compile(rb"\x89PNG\r\n\x1a\n"), "is a PNG picture: expected a point cloud; name the cloud's own file"),
-    (
-        re.compile(rb"\xff\xd8\xff[\xdb\xe0\xe1\xee]"),
-        "is a JPEG picture: expected a point cloud; name the cloud's file",
-    ),
-    (re.compile(rb"LASF"), "is a LAS or LAZ file: convert it to .ply or .pcd first"),
-    (re.compile(rb"\x89HDF\r\n\x1a\n"), "is an HDF5 file: save the points as .npy first"),
-    (
-        re.compile(rb"(?i)\s*<(!doctype html|html|\?xml)"),
-        "is a web page or XML: expected a point cloud; download it anew",
-    ),
-    (re.compile(rb"version https://git-lfs"), "is a Git LFS pointer, not the data: run `git lfs pull`"),
-)
+_FOREIGN = {
+    rb"\x1f\x8b\x08[\x00-\x1f]": "is gzip-compressed: unpack it first (gunzip)",
+    rb"PK\x03\x04": "is a zip archive: unpack it first",
+    rb"BZh[1-9]1AY&SY": "is bzip2-compressed: unpack it first (bunzip2)",
+    rb"\xfd7zXZ\x00": "is xz-compressed: unpack it first (unxz)",
+    rb"\x28\xb5\x2f\xfd": "is zstd-compressed: unpack it first (unzstd)",
+    rb"\x89PNG\r\n\x1a\n": "is a PNG picture: expected a point cloud; name the cloud's own file",
+    rb"\xff\xd8\xff[\xdb\xe0\xe1\xee]": "is a JPEG picture: expected a point cloud; name the cloud's own file",
+    rb"LASF": "is a LAS or LAZ file: convert it to .ply or .pcd first",
+    rb"\x89HDF\r\n\x1a\n": "is an HDF5 file: save the points as .npy first",
+    rb"(?i)\s*<(!doctype html|html|\?xml)": "is a web page or XML: expected a point cloud; download it anew",
+    rb"version https://git-lfs": "is a Git LFS pointer, not the data: run `git lfs pull`",
+}
 _MAGIC = {
-    ".npy": re.compile(rb"\x93NUMPY"),
-    ".ply": re.compile(rb"ply[ \t]*[\r\n]"),
-    ".pcd": re.compile(rb"# \.PCD v"),
+    ".npy": rb"\x93NUMPY",
+    ".ply": rb"ply[ \t]*[\r\n]",
+    ".pcd": rb"# \.PCD v",
     # a zip archive whose first file is an array
-    ".npz": re.compile(rb"PK\x03\x04.{26}[^/]{1,200}?\.npy", re.DOTALL),
+    ".npz": rb"(?s)PK\x03\x04.{26}[^/]{1,200}?\.npy",
 }
 
 
@@ -117,10 +110,12 @@ def read_points(path: str | os.PathLike, *, columns: int | None = None) -> Cloud
             finite = np.isfinite(points).all(axis=1)
         num_dropped = len(points) - int(finite.sum())
         if not len(points):
-            raise Problem("has no points; expected at least one: was it saved completely?")
+            raise FormatError("has no points; expected at least one: was it saved completely?")
         if num_dropped == len(points):
-            raise Problem(f"expected finite x, y, z, got NaN or infinity in all {num_dropped} points: export it again")
-    except Problem as problem:
+            raise FormatError(
+                f"expected finite x, y, z, got NaN or infinity in all {num_dropped} points: export it again"
+            )
+    except FormatError as problem:
         raise file_error(path, problem) from None
     except MemoryError:
         raise file_error(path, "does not fit in memory; split it first") from None
@@ -136,17 +131,19 @@ def read_points(path: str | os.PathLike, *, columns: int | None = None) -> Cloud
 def _refuse_foreign(data: bytes, suffix: str) -> None:
     """Refuses content that is plainly something else than the suffix says, and suffixes nobody here can read."""
     for other, pattern in _MAGIC.items():
-        if pattern.match(data):
+        if re.match(pattern, data):
             if other != suffix:
-                raise Problem(
+                raise FormatError(
                     f"expected a {suffix or 'known'} file, got a {other} file's content: rename it to {other}"
                 )
             return
-    for pattern, problem in _FOREIGN:
-        if pattern.match(data):
-            raise Problem(problem)
+    for pattern, problem in _FOREIGN.items():
+        if re.match(pattern, data):
+            raise FormatError(problem)
     if suffix not in SUFFIXES:
-        raise Problem(f"expected one of {' '.join(SUFFIXES)}, got the suffix {suffix!r}: convert or rename the file")
+        raise FormatError(
+            f"expected one of {' '.join(SUFFIXES)}, got the suffix {suffix!r}: convert or rename the file"
+        )
 
 
 # ---- raw float32 rows
@@ -155,25 +152,25 @@ def _refuse_foreign(data: bytes, suffix: str) -> None:
 def _parse_bin(data: bytes, columns: int | None):
     # printable bytes alone may be a few float32: 837282 is " jLI"
     if re.fullmatch(rb"[\t\r\n -~]+", data[:1024]) and re.search(rb"[0-9][\s,;]+[-+.]?[0-9]", data[:1024]):
-        raise Problem("expected raw float32 rows, got text: rename it to .txt or .csv")
+        raise FormatError("expected raw float32 rows, got text: rename it to .txt or .csv")
     notes = ()
     if columns is None:
         columns, notes = _guess_columns(data)
     if len(data) % (4 * columns):
         fits = [str(c) for c in range(3, 9) if len(data) % (4 * c) == 0]
         remedy = (
-            f"say how many values a row has (--columns {' or '.join(fits)})"
+            f"say how many values a row has (columns {' or '.join(fits)})"
             if fits
             else "it is cut off or not raw float32, copy it again"
         )
         came = f"{len(data)} bytes, which do not divide by {4 * columns}"
-        raise Problem(f"expected rows of {columns} float32 (x y z first), got {came}: {remedy}")
+        raise FormatError(f"expected rows of {columns} float32 (x y z first), got {came}: {remedy}")
     points = np.frombuffer(data, "<f4").reshape(-1, columns)[:, :3].astype(np.float64)
     share = float((np.isfinite(points) & (np.abs(points) > _MAX_PLAUSIBLE)).any(axis=1).mean())
     if share > _MAX_IMPLAUSIBLE_SHARE:
         came = f"{share:.0%} of rows beyond {_MAX_PLAUSIBLE:g} m"
-        raise Problem(
-            f"expected rows of {columns} float32 in metres, got {came}: another format, or another --columns?"
+        raise FormatError(
+            f"expected rows of {columns} float32 in metres, got {came}: another format, or another number of columns?"
         )
     return points, {4: KITTI_FIELDS, 5: NUSCENES_FIELDS}.get(columns) or numbered(columns), notes
 
@@ -200,7 +197,7 @@ def _guess_columns(data: bytes) -> tuple[int, tuple[str, ...]]:
     if not why:
         return usual, ()
     names = {four: " (KITTI)", five: " (nuScenes)"}
-    remedy = f"give --columns {other}{names.get(other, '')} if that is wrong"
+    remedy = f"give columns {other}{names.get(other, '')} if that is wrong"
     return usual, (f"read as rows of {usual} float32{names.get(usual, '')}, since {why}; {remedy}",)
 
 
@@ -222,11 +219,11 @@ def _parse_npz(data: bytes):
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             key, content = _choose_array(archive)
-    except (Problem, MemoryError):
+    except (FormatError, MemoryError):
         raise
     except Exception as error:
         reason = shorten(str(error))
-        raise Problem(
+        raise FormatError(
             f"expected a NumPy .npz archive, got a damaged or cut off one ({reason}): save it again"
         ) from None
     return _points_of(_load_array(content), f"the array {shorten(key)!r}")
@@ -244,8 +241,10 @@ def _choose_array(archive: zipfile.ZipFile) -> tuple[str, bytes]:
                 named.append(key)
         if len(named) != 1:
             came = shorten(", ".join(keys)) or "no array"
-            raise Problem(f"expected 'points', 'xyz' or one (n, 3+) array alone, got {came}: save it with points=")
-    return named[0], archive.read(keys[named[0]])
+            raise FormatError(f"expected 'points', 'xyz' or one (n, 3+) array alone, got {came}: save it with points=")
+    member = archive.getinfo(keys[named[0]])
+    check_unpacked(member.compress_size, member.file_size)
+    return named[0], archive.read(member)
 
 
 def _array_header(file) -> tuple[tuple[int, ...], np.dtype]:
@@ -258,7 +257,9 @@ def _array_header(file) -> tuple[tuple[int, ...], np.dtype]:
         return shape, dtype
     except Exception as error:
         reason = shorten(str(error))
-        raise Problem(f"expected a NumPy .npy header, got another or a damaged one ({reason}): save it again") from None
+        raise FormatError(
+            f"expected a NumPy .npy header, got another or a damaged one ({reason}): save it again"
+        ) from None
 
 
 def _load_array(data: bytes) -> np.ndarray:
@@ -266,11 +267,11 @@ def _load_array(data: bytes) -> np.ndarray:
     file = io.BytesIO(data)
     shape, dtype = _array_header(file)
     if dtype.hasobject:
-        raise Problem("expected an array of numbers, got dtype object: save a float array with numpy.save")
+        raise FormatError("expected an array of numbers, got dtype object: save a float array with numpy.save")
     if any(n < 0 for n in shape):
-        raise Problem(f"expected an array (n, 3+), got the shape {shape}: save it again")
+        raise FormatError(f"expected an array (n, 3+), got the shape {shape}: save it again")
     count = math.prod(shape)
-    need_bytes(data, file.tell(), count * dtype.itemsize, shape[0] if shape else 1)
+    check_bytes(data, file.tell(), count * dtype.itemsize, shape[0] if shape else 1)
     return np.load(io.BytesIO(data), allow_pickle=False)
 
 
@@ -279,19 +280,19 @@ def _points_of(array: np.ndarray, what: str):
         names = array.dtype.names
         parts = [array[names[i]] for i in pick_xyz(names)]
         if any(part.ndim != 1 or part.dtype.kind not in "fiu" for part in parts):
-            raise Problem(
+            raise FormatError(
                 f"expected (n,) records with numbers x, y, z in {what}, got {array.shape}: save (n, 3) floats"
             )
         return np.stack([part.astype(np.float64) for part in parts], axis=-1), names, ()
     if array.dtype.kind not in "fiu":
-        raise Problem(f"expected numbers in {what}, got dtype {array.dtype}: save a float array")
+        raise FormatError(f"expected numbers in {what}, got dtype {array.dtype}: save a float array")
     if array.ndim != 2 or array.shape[1] < 3 or is_transposed(array.shape):
         remedy = "save x, y and z of each point" if array.ndim == 2 else "save a row for each point"
         if array.ndim == 2 and 3 <= array.shape[0] <= FEW_ROWS:
             remedy = "save its transpose, points.T"
         elif array.ndim > 2 and array.shape[-1] >= 3:
             remedy = f"save points.reshape(-1, {array.shape[-1]})"
-        raise Problem(f"expected {what} to have the shape (n, 3+), got {array.shape}: {remedy}")
+        raise FormatError(f"expected {what} to have the shape (n, 3+), got {array.shape}: {remedy}")
     return array[:, :3].astype(np.float64), numbered(array.shape[1]), ()
 
 

@@ -1,51 +1,83 @@
-"""Points in text: files of lines decoded by pandas, and the lines of ascii PCD and PLY bodies."""
+"""Columns and lines: which columns are x, y and z, files of text decoded by pandas, and ascii PCD and PLY bodies."""
 
 import csv
 import io
 import itertools
 import re
+from collections.abc import Sequence
 
 import numpy as np
 
-from lidarpose.io.headers import Problem, is_transposed, numbered, pick_xyz, shorten
+from lidarpose.io.files import FormatError, shorten
 
+# a table of so few rows and so many columns holds points as columns
+FEW_ROWS, _MANY_COLUMNS = 5, 50
 # what stands in text for a value that is not there, in the usual exports, in any case
 _MISSING = ("", "na", "n/a", "nan", "-nan", "+nan", "null", "none", "<na>")
 
 
-def parse_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
-    """x y z (n, 3), the names of the columns, and no warnings; raises Problem."""
-    text = decode(data)
-    skip, comment, first = 0, "", ""
-    lines = io.StringIO(text)
-    for line in lines:
-        first = line.split("#")[0].strip()
-        if first:
-            break
-        comment = line.lstrip("# \t").strip() or comment
-        skip += 1
-    else:
-        raise Problem("has no points; expected lines of x y z: was it saved completely?")
+def pick_xyz(names: Sequence[str]) -> list[int]:
+    """The positions of x, y and z among column names, in any case."""
+    low = [name.strip().lower() for name in names]
+    if not {"x", "y", "z"} <= set(low):
+        came = shorten(" ".join(names)) or "none"
+        raise FormatError(f"expected columns x, y and z, got {came}: export or rename x, y, z")
+    return [low.index(axis) for axis in "xyz"]
 
-    separator, decimal = _separator(first)
-    # CloudCompare marks its header by slashes
-    names = _split(first.removeprefix("//").strip(), separator)
-    has_header = not all(_is_number(cell, decimal) for cell in names)
-    if has_header:
-        if not {"x", "y", "z"} <= {name.lower() for name in names}:
-            raise Problem(
-                f"expected numbers, or a header with x, y and z, on line {skip + 1}, got {shorten(first)!r}: "
-                "export or rename x, y, z"
-            )
-    elif len(names) < 3:
-        came = f"{len(names)} on line {skip + 1}, {shorten(first)!r}"
-        raise Problem(f"expected at least 3 columns x y z, got {came}: export x, y and z")
-    else:
-        names = _names_above(comment, len(names))
+
+def numbered(columns: int) -> tuple[str, ...]:
+    """The names of columns that have none."""
+    return ("x", "y", "z", *(f"column_{i}" for i in range(4, columns + 1)))
+
+
+def is_transposed(shape: tuple[int, ...]) -> bool:
+    """Whether an array of this shape (rows, columns) holds points as columns: no format has so many values a point."""
+    return len(shape) == 2 and 3 <= shape[0] <= FEW_ROWS and shape[1] > _MANY_COLUMNS
+
+
+def parse_count(text: str, what: str) -> int:
+    """A number of a header, at most 18 digits."""
+    if not re.fullmatch(r"[0-9]{1,18}", text):
+        raise FormatError(f"expected a whole number as the header's {what}, got {shorten(text)!r}: export it again")
+    return int(text)
+
+
+def check_bytes(data: bytes, start: int, size: int, num_points: int) -> None:
+    """Raises FormatError where fewer than `size` bytes follow `start`."""
+    if len(data) - start < size:
+        came = max(len(data) - start, 0)
+        raise FormatError(f"is cut off: expected {size} bytes for {num_points} points, got {came}; copy it again")
+
+
+def parse_rows(text: str, num_rows: int, columns: list[int], num_cells: int, *, skip: int = 0) -> np.ndarray:
+    """The columns at three positions, (n, 3), of the `num_rows` lines of `num_cells` numbers after the first `skip`.
+
+    Blank lines do not count. Raises FormatError for fewer lines and for the first line that does not fit.
+    """
+    # a row takes two characters at least
+    if 2 * (num_rows + skip) > len(text) + 1:
+        raise FormatError(f"is cut off: expected {num_rows} points, got less text than that; export it again")
+    lines = (" ".join(line.split()) for line in io.StringIO(text))
+    rows = list(itertools.islice(filter(None, lines), skip, skip + num_rows))
+    if len(rows) < num_rows:
+        raise FormatError(f"is cut off: expected {num_rows} points, got {len(rows)}; copy or export it again")
+    for number, row in enumerate(rows, 1):
+        if row.count(" ") + 1 != num_cells:
+            came = f"{row.count(' ') + 1} in {shorten(row)!r} on line {number} of the points"
+            raise FormatError(f"expected {num_cells} values a row, as the header says, got {came}: export it again")
+    try:
+        return np.loadtxt(rows, np.float64, comments=None, usecols=columns, ndmin=2)
+    except ValueError as error:
+        raise _wrong_line(rows, columns, error, where=" of the points") from None
+
+
+def parse_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
+    """x y z (n, 3), the names of the columns, and no warnings; raises FormatError."""
+    text = decode(data)
+    names, num_skipped, has_header, separator, decimal = _find_columns(text)
     # lines that are blank but for a comment would count as rows without values; what is looked for behind keeps every
     # blank of a long run from being tried as the first
     text = re.sub(r"(?m)^[ \t]+$", "", re.sub(r"(?<![ \t])[ \t]*#.*", "", text))
-    num_skipped = skip + has_header
     parts = text.split("\n", num_skipped)
     # pandas knows double quotes alone; within a number a quote is something else
     body = re.sub(r"(?<![^,;\s])'|'(?![^,;\s])", "", parts[num_skipped]) if len(parts) > num_skipped else ""
@@ -57,19 +89,50 @@ def parse_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...
             decimal = ","
     if has_header:
         _check_width(body, names, separator, num_skipped)
-    points = _parse_rows(body, pick_xyz(names), separator=separator, decimal=decimal, num_skipped=num_skipped)
+    points = _read_csv(body, pick_xyz(names), separator=separator, decimal=decimal, num_skipped=num_skipped)
     if not has_header and is_transposed((len(points), len(names))):
-        raise Problem(f"expected a line of x y z for each point, got {len(points)} of {len(names)}: save its transpose")
+        came = f"{len(points)} of {len(names)}"
+        raise FormatError(f"expected a line of x y z for each point, got {came}: save its transpose")
     return points, tuple(names), ()
 
 
+def _find_columns(text: str) -> tuple[Sequence[str], int, bool, str | None, str]:
+    """(names of the columns, lines before the first row, whether a header names them, separator, decimal mark)."""
+    skip, comment = 0, ""
+    for line in io.StringIO(text):
+        first = line.split("#")[0].strip()
+        if first:
+            break
+        comment = line.lstrip("# \t").strip() or comment
+        skip += 1
+    else:
+        raise FormatError("has no points; expected lines of x y z: was it saved completely?")
+    separator, decimal = _separator(first)
+    # CloudCompare marks its header by slashes
+    cells = _split(first.removeprefix("//").strip(), separator)
+    came = f"on line {skip + 1}, {shorten(first)!r}"
+    if not all(_is_number(cell, decimal) for cell in cells):
+        if not {"x", "y", "z"} <= {cell.lower() for cell in cells}:
+            raise FormatError(
+                f"expected numbers, or a header with x, y and z, got others {came}: export or rename x, y, z"
+            )
+        return cells, skip + 1, True, separator, decimal
+    if len(cells) < 3:
+        raise FormatError(f"expected at least 3 columns x y z, got {len(cells)} {came}: export x, y and z")
+    # a comment above names them where it has as many words with x, y and z: numpy.savetxt writes its header so
+    for words in (_split(comment, mark) for mark in (None, ",", ";")):
+        if len(words) == len(cells) and {"x", "y", "z"} <= {word.lower() for word in words}:
+            return words, skip, False, separator, decimal
+    return numbered(len(cells)), skip, False, separator, decimal
+
+
 def _check_width(body: str, names: list[str], separator: str | None, num_skipped: int) -> None:
-    """Raises Problem where the first row has more cells than the header names: which column is x nobody knows then."""
+    """Raises FormatError where the first row has more cells than the header names: any of them could be x then."""
     for number, line in enumerate(io.StringIO(body), num_skipped + 1):
         if line.strip():
             cells = _split(line.strip(), separator)
             if any(cells[len(names) :]):
-                raise Problem(
+                raise FormatError(
                     f"expected {len(names)} values a row, as its header names, got {len(cells)} on line {number}, "
                     f"{shorten(line)!r}: name every column, row numbers too, or leave them away"
                 )
@@ -77,55 +140,38 @@ def _check_width(body: str, names: list[str], separator: str | None, num_skipped
 
 
 def decode(data: bytes) -> str:
-    """UTF-8 text whose lines end in \\n; raises Problem."""
+    """UTF-8 text whose lines end in \\n; raises FormatError."""
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        raise Problem("expected text in UTF-8, got UTF-16: save it as UTF-8")
+        raise FormatError("expected text in UTF-8, got UTF-16: save it as UTF-8")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise Problem(f"expected text in UTF-8, got other bytes at {error.start}: save it as UTF-8") from None
+        raise FormatError(f"expected text in UTF-8, got other bytes at {error.start}: save it as UTF-8") from None
     if "\x00" in text:
-        raise Problem("expected text, got zero bytes: is it another format?")
+        raise FormatError("expected text, got zero bytes: is it another format?")
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def number_lines(text: str, num_rows: int, *, skip: int = 0) -> list[str]:
-    """The `num_rows` lines after the first `skip`, leaving out blank ones, with single blanks between the cells.
-
-    Raises Problem where there are fewer.
-    """
-    # a row takes two characters at least
-    if 2 * (num_rows + skip) > len(text) + 1:
-        raise Problem(f"is cut off: expected {num_rows} points, got less text than that; export it again")
-    lines = (" ".join(line.split()) for line in io.StringIO(text))
-    found = list(itertools.islice((line for line in lines if line), skip, skip + num_rows))
-    if len(found) < num_rows:
-        raise Problem(f"is cut off: expected {num_rows} points, got {len(found)}; copy or export it again")
-    return found
-
-
-def wrong_line(
+def _wrong_line(
     lines: list[str],
     columns: list[int],
     reason: object,
     *,
     separator: str | None = None,
     decimal: str = ".",
-    num_skipped: int | None = None,
-) -> Problem:
-    """What to tell of lines that a library refused: the first one without numbers in `columns`, else its reason.
-
-    num_skipped: lines of the file before these, None where only the points' own lines are counted.
-    """
-    for number, line in enumerate(lines, (num_skipped or 0) + 1):
+    num_skipped: int = 0,
+    where: str = "",
+) -> FormatError:
+    """What to tell of lines that a library refused: the first one without numbers in `columns`, else its reason."""
+    for number, line in enumerate(lines, num_skipped + 1):
         cells = _split(line.strip(), separator)
         if line.strip() and not all(i < len(cells) and _is_number(cells[i], decimal) for i in columns):
-            came = f"{shorten(line)!r} on line {number}{' of the points' if num_skipped is None else ''}"
-            return Problem(f"expected numbers for x, y and z, got {came}: correct that line")
-    return Problem(f"expected rows of numbers ({shorten(str(reason))}): export it again")
+            came = f"{shorten(line)!r} on line {number}{where}"
+            return FormatError(f"expected numbers for x, y and z, got {came}: correct that line")
+    return FormatError(f"expected rows of numbers ({shorten(str(reason))}): export it again")
 
 
-def _parse_rows(text: str, columns: list[int], *, separator: str | None, decimal: str, num_skipped: int) -> np.ndarray:
+def _read_csv(text: str, columns: list[int], *, separator: str | None, decimal: str, num_skipped: int) -> np.ndarray:
     """The columns at three positions as (n, 3) float64; missing values are NaN. Separator None is any run of blanks."""
     import pandas as pd
 
@@ -146,7 +192,7 @@ def _parse_rows(text: str, columns: list[int], *, separator: str | None, decimal
     except pd.errors.EmptyDataError:
         return np.empty((0, 3))
     except ValueError as error:
-        raise wrong_line(text.splitlines(), columns, error, num_skipped=num_skipped, **style) from None
+        raise _wrong_line(text.splitlines(), columns, error, num_skipped=num_skipped, **style) from None
     return frame[columns].to_numpy(np.float64)
 
 
@@ -180,12 +226,3 @@ def _is_number(cell: str, decimal: str) -> bool:
     except ValueError:
         return False
     return "_" not in cell
-
-
-def _names_above(comment: str, count: int) -> tuple[str, ...]:
-    """Column names from the comment above the numbers where it names as many with x, y and z, else the usual ones."""
-    for separator in (None, ",", ";"):
-        names = _split(comment, separator)
-        if len(names) == count and {"x", "y", "z"} <= {name.lower() for name in names}:
-            return tuple(names)
-    return numbered(count)
