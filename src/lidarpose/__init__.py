@@ -19,10 +19,13 @@ if TYPE_CHECKING:
     from lidarpose import evaluation as evaluation
     from lidarpose import metrics as metrics
     from lidarpose.body.pose_prior.sampling import sample_poses as sample_poses
-    from lidarpose.errors import LidarPoseError as LidarPoseError, InputError as InputError
+    from lidarpose.errors import InputError as InputError
+    from lidarpose.errors import LidarPoseError as LidarPoseError
     from lidarpose.inference.predict_file import predict as predict
-    from lidarpose.inference.predictor import load as load, Predictor as Predictor
-    from lidarpose.inference.results import PersonPose as PersonPose, Poses as Poses
+    from lidarpose.inference.predictor import Predictor as Predictor
+    from lidarpose.inference.predictor import load as load
+    from lidarpose.inference.results import PersonPose as PersonPose
+    from lidarpose.inference.results import Poses as Poses
     from lidarpose.io.boxes import read_boxes as read_boxes
     from lidarpose.io.point_cloud import read_points as read_points
     from lidarpose.lidar.presets import sensor as sensor
@@ -30,8 +33,11 @@ if TYPE_CHECKING:
     from lidarpose.lidar.sensor import Sensor as Sensor
     from lidarpose.models.dapt.import_weights import import_dapt as import_dapt
     from lidarpose.models.export import export as export
-    from lidarpose.sample import Box as Box, Pose as Pose, Sample as Sample
-    from lidarpose.skeleton import Skeleton as Skeleton, SKELETONS as SKELETONS
+    from lidarpose.sample import Box as Box
+    from lidarpose.sample import Pose as Pose
+    from lidarpose.sample import Sample as Sample
+    from lidarpose.skeleton import SKELETONS as SKELETONS
+    from lidarpose.skeleton import Skeleton as Skeleton
 
 # public name -> where it lives
 _HOMES = {
