@@ -85,7 +85,9 @@ def run(options: argparse.Namespace, name: str, seed: int, folder: Path) -> dict
     own = replace(make_setup(settings), task=second, network=begun)
     model = train(settings, folder / "finetune", setup=own)
     taken = {"seconds": time.perf_counter() - started, "processor_seconds": time.process_time() - used}
-    results = [evaluation.run(load(model, decode=way_), ["bench"]).scores.results[0] for way_ in ("dark", "window")]
+    results = [
+        evaluation.run(load(model, decode=way_, tta=1), ["bench"]).scores.results[0] for way_ in ("dark", "window")
+    ]
     best = min((figures(result) for result in results), key=lambda found: found["all"]["value"])
     return record(
         name,

@@ -48,7 +48,7 @@ def main() -> None:
     options = parser.parse_args()
     bank = PoseBank.from_clips(options.motion, tuple(options.subjects.split(",")))
     found = heldout.people(bank, options.people, 50, heldout.SEED + 9)
-    model = load(options.weights)
+    model = load(options.weights, tta=1)
     predicted = model.predict([p.sample.points for p in found], sensor_origin=(0, 0, 0), skeleton="body26")
     true = np.stack([p.sample.pose.to(BODY26).joints for p in found])
     error = np.linalg.norm(np.stack([p.joints for p in predicted]) - true, axis=-1)

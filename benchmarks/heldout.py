@@ -116,7 +116,7 @@ def main() -> None:
 
     bank = PoseBank.from_clips(options.motion, tuple(options.subjects.split(",")))
     found = people(bank, options.people, options.least, options.seed)
-    model = load(options.weights)
+    model = load(options.weights, tta=1)
     clouds = [p.sample.points for p in found]
     results = {}
     for name, origin in (("sensor known", (0.0, 0.0, 0.0)), ("sensor unknown", None)):

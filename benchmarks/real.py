@@ -17,8 +17,7 @@ from pathlib import Path
 import numpy as np
 
 import lidarpose
-from lidarpose.inference.predict_file import TTA
-from lidarpose.inference.predictor import Predictor
+from lidarpose.inference.predictor import TTA, Predictor
 from lidarpose.inference.results import PersonPose
 from lidarpose.io.files import write_atomic
 from lidarpose.models.bundled import DEFAULT

@@ -372,7 +372,7 @@ def _from_files(ours: Ours, folder: Path, threads: int, left_out: list[str]) -> 
             wanted = {"backend": backend, "threads": threads}
             known = inspect.signature(load).parameters
             chosen = {name: value for name, value in wanted.items() if name in known}
-            yield Predict(f"tiny predict(), {backend}", load(weights, **chosen), ours.parameters)
+            yield Predict(f"tiny predict(), {backend}", load(weights, tta=1, **chosen), ours.parameters)
         except Exception as error:
             left_out.append(f"tiny predict(), {backend}: {reason(error)}")
 

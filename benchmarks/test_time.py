@@ -125,7 +125,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="a JSON file; other weights in it are kept")
     parser.add_argument("--limit", type=int, help="only so many people")
     options = parser.parse_args()
-    model = load(options.weights, threads=1)
+    model = load(options.weights, threads=1, tta=1)
     ways = []
     for way in WAYS:
         started = time.process_time()

@@ -91,7 +91,7 @@ def test_backends_agree_to_the_end(models):
 
 
 def test_the_bundled_twins_are_of_one_network():
-    model = load()
+    model = load(tta=1)
     assert model.backend.source == content_digest(bundled_path(), expected="a checkpoint")
     assert model.header == read_header(bundled_path())
 

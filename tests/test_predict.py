@@ -1,6 +1,7 @@
 """`predict` from Python: arrays, files, boxes, and what is told about odd inputs."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +16,7 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about
 from lidarpose.inference import inputs as people_module
 from lidarpose.inference.backend import Raw
+from lidarpose.inference.checks import rows_inside
 from lidarpose.inference.inputs import (
     MAX_POINTS,
     as_origin,
@@ -25,7 +27,6 @@ from lidarpose.inference.inputs import (
     lies,
     unit_warning,
 )
-from lidarpose.inference.predict_file import _inside
 from lidarpose.inference.predictor import Predictor
 from lidarpose.io.boxes import read_boxes
 from lidarpose.lidar.presets import sensor
@@ -39,7 +40,7 @@ REAL = Path(__file__).parents[2] / "shared" / "data" / "real"
 
 @pytest.fixture(scope="module")
 def model():
-    return lidarpose.load()
+    return lidarpose.load(tta=1)
 
 
 @pytest.fixture(scope="module")
@@ -401,7 +402,13 @@ def test_boxes_keep_their_order_and_ids(model, sweep):
         np.testing.assert_allclose(person.joints, alone.joints, atol=1e-3)
     document = json.loads(people.to_json())
     assert document["people"][0]["box"]["center"] == pytest.approx(boxes[1]["center"])
-    assert document["source"] == str(path) and set(document["timing_ms"]) == {"read", "load", "predict", "per_person"}
+    assert document["source"] == str(path) and set(document["timing_ms"]) == {
+        "read",
+        "load",
+        "crop",
+        "predict",
+        "per_person",
+    }
 
 
 def test_boxes_come_as_file_dict_list_or_objects(model, sweep, tmp_path):
@@ -444,7 +451,7 @@ def test_a_box_looks_at_few_of_many_points(monkeypatch):
     expected = [np.flatnonzero(box.contains(points)) for box in boxes]
     looked, contains = [], Box.contains
     monkeypatch.setattr(Box, "contains", lambda box, near: looked.append(len(near)) or contains(box, near))
-    for rows, wanted in zip(_inside(boxes, points), expected, strict=True):
+    for rows, wanted in zip(rows_inside(boxes, points), expected, strict=True):
         np.testing.assert_array_equal(rows, wanted)
     assert sum(map(len, expected)) > 50 and np.mean(looked) < 0.3 * len(points)
 
@@ -587,7 +594,9 @@ def test_pictures_stand_upright_whatever_the_axes(model, tmp_path, points, monke
     import lidarpose.viz.draw as picture
 
     drawn = {}
-    monkeypatch.setattr(picture, "draw_people", lambda panels, path=None, *, title="": drawn.update(panel=panels[0]))
+    monkeypatch.setattr(
+        picture, "draw_people", lambda panels, path=None, *, title="": drawn.update(panel=panels[0]) or b""
+    )
     for up in "zyx":
         np.save(tmp_path / "crop.npy", points @ UP_AXES[up])
         person = lidarpose.predict(tmp_path / "crop.npy", up=up, model=model)[0]
@@ -772,3 +781,62 @@ def test_without_confidence_the_whole_cloud_is_the_answer(points):
     assert len({len(one) for one in candidates(cloud)}) > 1
     joints = Predictor(Counting(), name="counting").predict(cloud).joints
     assert joints[1, 2] - joints[0, 2] == pytest.approx(len(cloud) * 1e-3, abs=1e-3)
+
+
+# ---- results in Python and in notebooks
+
+
+@pytest.fixture(scope="module")
+def poses(model, points):
+    return model.predict([points, points[:3], points + [0, 4, 0]])
+
+
+def test_results_are_short_to_read(model, poses):
+    assert repr(model).startswith("Predictor('small', body26, onnx, tta=1")
+    assert repr(poses) == "Poses(2 of 3 people, smpl24)"
+    assert re.fullmatch(r"PersonPose\(smpl24, confidence 0\.\d\d, 590 points\)", repr(poses[0]))
+    assert repr(replace(poses[1], id="b")) == "PersonPose(id='b', no pose, 3 points, 1 warning)"
+
+
+def test_notebooks_get_a_table_of_people_and_a_picture_of_a_person(poses):
+    picture = poses[0].picture()
+    assert poses[0]._repr_png_() == picture[:] == picture._repr_png_() and picture.startswith(b"\x89PNG")
+    assert isinstance(picture, bytes) and repr(picture) == f"<PNG, {len(picture):,} bytes>"
+    named = replace(poses, people=(replace(poses[0], id="<b>"), poses[1]))
+    assert "&lt;b&gt;" in named._repr_html_() and "no pose" in named._repr_html_()
+
+
+def test_people_by_id_and_slices(poses):
+    named = replace(poses, people=tuple(replace(p, id=i) for p, i in zip(poses, ("a", "b", 7), strict=True)))
+    assert named["b"] is named[1] and named["7"] is named[2]
+    assert isinstance(named[1:], type(poses)) and [p.id for p in named[1:]] == ["b", 7]
+    with pytest.raises(KeyError, match="nobody has the id 'c'"):
+        named["c"]
+
+
+def test_results_as_arrays_and_as_a_table(poses):
+    joints = poses.to_numpy()
+    assert joints.shape == (3, 24, 3) and np.isnan(joints[1]).all() and not poses[1].has_pose
+    np.testing.assert_array_equal(joints[0], poses[0].joints)
+    np.testing.assert_array_equal(poses[0].to_numpy(), poses[0].joints)
+    table = poses.to_dataframe()
+    assert list(table.person.unique()) == [0, 2] and len(table) == 48
+    np.testing.assert_array_equal(table[["x", "y", "z"]].to_numpy()[24:], poses[2].joints)
+    np.testing.assert_array_equal(table.confidence[:24], poses[0].confidence)
+
+
+def test_boxes_of_points_in_memory_and_of_a_file_give_the_same(model, points, tmp_path):
+    np.save(tmp_path / "sweep.npy", points)
+    box = {"center": points.mean(0).tolist(), "size": [1.5, 1.5, 2.2], "id": "a"}
+    of_file = lidarpose.predict(tmp_path / "sweep.npy", boxes=[box], model=model)
+    of_points = model.predict(points, boxes=[box])
+    assert of_points["a"].box.size.tolist() == box["size"]
+    np.testing.assert_array_equal(of_points.to_numpy(), of_file.to_numpy())
+
+
+def test_one_box_in_centimetres_among_boxes_in_metres_is_noticed(model, points):
+    metres = {"center": points.mean(0).tolist(), "size": [1.5, 1.5, 2.2]}
+    wrong = metres | {"size": [60, 60, 180], "id": "c"}
+    warnings = model.predict(points, boxes=[metres, wrong, metres]).warnings
+    assert any(line.startswith("box c is unlike the others: it is 180 m tall: are the units") for line in warnings)
+    assert not any("unlike" in line for line in model.predict(points, boxes=[metres, metres]).warnings)

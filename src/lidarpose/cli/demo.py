@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose.errors import InputError, MissingExtra
-from lidarpose.inference.predict_file import TTA
-from lidarpose.inference.predictor import Predictor, load
+from lidarpose.inference.predictor import TTA, Predictor, load
 from lidarpose.io.files import atomic_path, check_writable
 from lidarpose.models.bundled import DEFAULT
 

@@ -85,8 +85,8 @@ def add(commands) -> None:
 
 
 def _predict(options: argparse.Namespace) -> None:
-    from lidarpose.inference.predict_file import TTA, predict
-    from lidarpose.inference.predictor import load
+    from lidarpose.inference.predict_file import predict
+    from lidarpose.inference.predictor import TTA, load
     from lidarpose.io.files import atomic_path, check_apart, check_writable
 
     file = Path(options.file)

@@ -1,14 +1,16 @@
 """`load` a network and `predict` poses of clouds: any number type, one or many, empty ones too."""
 
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 
 from lidarpose.errors import InputError, check_name, missing_extra, whole
 from lidarpose.inference.backend import Backend, Estimates, OnnxBackend, estimates, exported_beside
-from lidarpose.inference.inputs import as_origin, as_points, candidates, clean, is_few, unit_warning
+from lidarpose.inference.inputs import as_origin, as_points, candidates, clean, is_few, only_returns, unit_warning
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.inference.tta import Look, averaged, brought_back, looks_of, shown
 from lidarpose.io.files import file_error
@@ -20,7 +22,14 @@ from lidarpose.sample import MIN_POINTS, PER_JOINT, Pose, center_of
 from lidarpose.skeleton import SMPL24, Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from lidarpose.sample import Box
+
 BACKENDS = ("onnx", "torch")
+# looks at each person where nobody says how many: nobody waits for milliseconds
+TTA = 4
 # passes: the second is centered on the pelvis that the first one found
 PASSES = 2
 # to which a found center is rounded, m: backends differ by less than a micrometre, and a point on the border of a voxel
@@ -38,7 +47,7 @@ def load(
     decode: str = "window",
     compile: bool = False,
     threads: int | None = None,
-    tta: int = 1,
+    tta: int = TTA,
 ) -> "Predictor":
     """The bundled network, or the checkpoint or exported file at a path, ready to predict.
 
@@ -115,22 +124,59 @@ class Predictor:
         own.map_to(wanted)
         return wanted
 
-    def predict(
+    def __repr__(self) -> str:
+        return f"Predictor({self.model['name']!r}, {self.skeleton.name}, {self.backend.name}, tta={len(self._tta)})"
+
+    @overload
+    def predict(  # type: ignore[overload-overlap]
         self,
-        points,
+        points: "Sequence[ArrayLike]",
         *,
-        sensor_origin: np.ndarray | tuple[float, float, float] | str | None = None,
+        boxes: None = None,
+        sensor_origin: "np.ndarray | Sequence[float] | str | None" = None,
         skeleton: str | None = None,
         progress: bool = False,
-    ) -> PersonPose | Poses:
-        """One cloud (n, 3+) -> `PersonPose`; a list of clouds -> `Poses`, in their order.
+    ) -> Poses: ...
+
+    @overload
+    def predict(
+        self,
+        points: "ArrayLike",
+        *,
+        boxes: None = None,
+        sensor_origin: "np.ndarray | Sequence[float] | str | None" = None,
+        skeleton: str | None = None,
+        progress: bool = False,
+    ) -> PersonPose: ...
+
+    @overload
+    def predict(
+        self,
+        points: "ArrayLike",
+        *,
+        boxes: "str | os.PathLike | dict | Box | Sequence[Box | dict] | np.ndarray",
+        sensor_origin: "np.ndarray | Sequence[float] | str | None" = None,
+        skeleton: str | None = None,
+        progress: bool = False,
+    ) -> Poses: ...
+
+    def predict(self, points, *, boxes=None, sensor_origin=None, skeleton=None, progress=False) -> PersonPose | Poses:
+        """One cloud (n, 3+) -> `PersonPose`; a list of clouds, or a cloud with boxes -> `Poses`, in their order.
 
         points: x, y, z in metres, z up, any frame, each cloud one person, ground and clutter allowed; more columns are
-        ignored, those of tables and records are taken by name. sensor_origin (3,) m: where the sensor stood in that
-        frame, None or "unknown" if that is not known. skeleton: see `in_skeleton`. A cloud of under 5 different points
+        ignored, those of tables and records are taken by name. boxes: the people of a whole scan, as in
+        `lidarpose.predict`. sensor_origin (3,) m: where the sensor stood in that frame, or "unknown"; None means
+        0, 0, 0 with boxes and unknown without. skeleton: see `in_skeleton`. A cloud of under 5 different points
         gets a result without joints and a warning. Raises InputError for arrays of another shape or type.
         """
         wanted = self.in_skeleton(skeleton)
+        if boxes is not None:
+            from lidarpose.inference.scan import Scan, as_boxes, pose_scan
+
+            cloud, notes = only_returns(as_points(points))
+            origin = np.zeros(3) if sensor_origin is None else as_origin(sensor_origin)
+            scan = Scan(points=cloud, boxes=as_boxes(boxes), origin=origin, warnings=tuple(notes))
+            return pose_scan(scan, self, skeleton=skeleton, progress=progress)
         origin = as_origin(sensor_origin)
         if not _is_many(points):
             return self._people([as_points(points)], origin, wanted, False)[0]

@@ -3,7 +3,9 @@
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from html import escape
 from pathlib import Path
+from typing import TYPE_CHECKING, cast, overload
 
 import numpy as np
 
@@ -11,7 +13,20 @@ from lidarpose.geometry import UP_AXES, rotation_from_up
 from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import Skeleton
 
+if TYPE_CHECKING:
+    import pandas
+
 SCHEMA = "lidarpose.poses/1"
+
+
+class Picture(bytes):
+    """The bytes of a PNG; a notebook shows the picture instead of printing them."""
+
+    def __repr__(self) -> str:
+        return f"<PNG, {len(self):,} bytes>"
+
+    def _repr_png_(self) -> bytes:
+        return bytes(self)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,29 +47,38 @@ class PersonPose:
     up: str = "z"
 
     @property
-    def joints(self) -> np.ndarray | None:
-        """(J, 3) m, or None."""
-        return None if self.pose is None else self.pose.joints
+    def has_pose(self) -> bool:
+        """Whether there is a pose: without one `joints` and the other values of joints are None."""
+        return self.pose is not None
+
+    # typed as arrays, which they are for every person with a pose
+    @property
+    def joints(self) -> np.ndarray:
+        """(J, 3) m."""
+        return self._of_pose("joints")
 
     @property
-    def confidence(self) -> np.ndarray | None:
-        """(J,): probability that the joint is within 10 cm."""
-        return None if self.pose is None else self.pose.confidence
+    def confidence(self) -> np.ndarray:
+        """(J,): probability that the joint is within 10 cm; None where the network does not say."""
+        return self._of_pose("confidence")
 
     @property
-    def spread(self) -> np.ndarray | None:
-        """(J,) m: expected distance between the joint and the truth."""
-        return None if self.pose is None else self.pose.spread
+    def spread(self) -> np.ndarray:
+        """(J,) m: expected distance between the joint and the truth; None where the network does not say."""
+        return self._of_pose("spread")
 
     @property
-    def visible(self) -> np.ndarray | None:
+    def visible(self) -> np.ndarray:
         """(J,): probability that the sensor sees the joint; None where the network does not say."""
-        return None if self.pose is None else self.pose.visible
+        return self._of_pose("visible")
 
     @property
-    def in_range(self) -> np.ndarray | None:
+    def in_range(self) -> np.ndarray:
         """(J,) bool: False where the joint may lie farther out than it says; None where the network does not say."""
-        return None if self.pose is None else self.pose.in_range
+        return self._of_pose("in_range")
+
+    def _of_pose(self, name: str) -> np.ndarray:
+        return cast(np.ndarray, None if self.pose is None else getattr(self.pose, name))
 
     @property
     def out_of_range(self) -> list[str]:
@@ -96,9 +120,30 @@ class PersonPose:
         """Writes `to_json` to a file, whole or not at all."""
         self.alone().save(path)
 
-    def picture(self, path: str | Path | None = None) -> bytes:
+    def picture(self, path: str | Path | None = None) -> Picture:
         """The person from the front and the side, as PNG; also written to `path` where given."""
         return self.alone().picture(path)
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """A row a joint: see `Poses.to_dataframe`."""
+        return self.alone().to_dataframe()
+
+    def to_numpy(self) -> np.ndarray:
+        """Joints (J, 3) m, NaN without a pose."""
+        return self.alone().to_numpy()[0]
+
+    def __repr__(self) -> str:
+        name = "" if self.id is None else f"id={self.id!r}, "
+        if self.pose is None:
+            answer = "no pose"
+        elif self.pose.confidence is None:
+            answer = self.skeleton.name
+        else:
+            answer = f"{self.skeleton.name}, confidence {self.confidence.mean():.2f}"
+        return f"PersonPose({name}{answer}, {self.num_points:,} points{_count(self.warnings, 'warning')})"
+
+    def _repr_png_(self) -> bytes:
+        return bytes(self.picture())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -119,8 +164,68 @@ class Poses(Sequence):
     def __len__(self) -> int:
         return len(self.people)
 
-    def __getitem__(self, index):
+    @overload
+    def __getitem__(self, index: int | str) -> PersonPose: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> "Poses": ...
+
+    def __getitem__(self, index: int | str | slice) -> "PersonPose | Poses":
+        """One person by place or by the text of their id, or a slice as `Poses`."""
+        if isinstance(index, slice):
+            return replace(self, people=self.people[index])
+        if isinstance(index, str):
+            named = [person for person in self.people if str(person.id) == index]
+            if not named:
+                raise KeyError(f"nobody has the id {index!r}: ids are {[person.id for person in self.people]}")
+            return named[0]
         return self.people[index]
+
+    def __repr__(self) -> str:
+        posed = sum(person.has_pose for person in self.people)
+        source = "" if self.source is None else f", from {self.source!r}"
+        return f"Poses({posed} of {len(self)} people, {self.skeleton.name}{source}{_count(self.warnings, 'warning')})"
+
+    def _repr_html_(self) -> str:
+        head = ("id", "points", "confidence", "warnings")
+        rows = [
+            (
+                "" if person.id is None else str(person.id),
+                f"{person.num_points:,}",
+                "no pose" if person.pose is None else _mean(person.pose.confidence),
+                "; ".join(person.warnings),
+            )
+            for person in self.people
+        ]
+        cells = [[f"<td>{escape(cell)}</td>" for cell in row] for row in rows]
+        body = "".join(f"<tr>{''.join(row)}</tr>" for row in cells)
+        title = "".join(f"<th>{name}</th>" for name in head)
+        return f"<p>{escape(repr(self))}</p><table><tr>{title}</tr>{body}</table>"
+
+    def to_numpy(self) -> np.ndarray:
+        """Joints (N, J, 3) m, NaN for a person without a pose."""
+        joints = np.full((len(self), len(self.skeleton), 3), np.nan)
+        for row, person in zip(joints, self.people, strict=True):
+            if person.pose is not None:
+                row[:] = person.pose.joints
+        return joints
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """A row for each joint of each person who has a pose: person (place in this sequence), id, joint, x, y, z (m),
+        confidence, spread (m), visible, in_range; NaN for what the network does not say."""
+        import pandas
+
+        names = ("confidence", "spread", "visible", "in_range")
+        columns = ("person", "id", "joint", "x", "y", "z", *names)
+        rows = []
+        for number, person in enumerate(self.people):
+            if person.pose is None:
+                continue
+            values = [getattr(person.pose, name) for name in names]
+            for j, joint in enumerate(self.skeleton.joints):
+                told = [np.nan if value is None else value[j] for value in values]
+                rows.append((number, person.id, joint, *person.pose.joints[j], *told))
+        return pandas.DataFrame(rows, columns=list(columns))
 
     def to_dict(self) -> dict:
         """The document of the schema lidarpose.poses/1; "warnings" beside it concern the whole input."""
@@ -156,7 +261,7 @@ class Poses(Sequence):
 
         write_atomic(path, self.to_json())
 
-    def picture(self, path: str | Path | None = None, *, title: str = "") -> bytes:
+    def picture(self, path: str | Path | None = None, *, title: str = "") -> Picture:
         """Everybody from the front and the side on one PNG; also written to `path` where given."""
         from lidarpose.viz.draw import Panel, draw_people
 
@@ -164,21 +269,30 @@ class Poses(Sequence):
         panels = [
             Panel(points=p.points, pose=p.pose, label="" if p.id is None else str(p.id), box=p.box) for p in upright
         ]
-        return draw_people(panels, path, title=title or (self.source or ""))
+        return Picture(draw_people(panels, path, title=title or (self.source or "")))
 
 
 def _upright(person: PersonPose, up: str) -> PersonPose:
     """The person with z up, as pictures are drawn. A box of a frame that leans would lean in them: it is left out."""
-    R_house_input = rotation_from_up(up)
+    R_level_input = rotation_from_up(up)
     pose, box = person.pose, person.box if up in UP_AXES else None
     return replace(
         person,
-        points=person.points @ R_house_input.T,
-        pose=pose and replace(pose, joints=pose.joints @ R_house_input.T),
-        box=box and replace(box, center=R_house_input @ box.center),
+        points=person.points @ R_level_input.T,
+        pose=pose and replace(pose, joints=pose.joints @ R_level_input.T),
+        box=box and replace(box, center=R_level_input @ box.center),
     )
 
 
 def _rounded(values: np.ndarray | None, digits: int) -> list:
     """Nothing for what is not known."""
     return [] if values is None else np.round(np.asarray(values, float), digits).tolist()
+
+
+def _count(items: Sequence[str], name: str) -> str:
+    """ ", 2 warnings", or nothing for none."""
+    return f", {len(items)} {name}{'s' * (len(items) > 1)}" if items else ""
+
+
+def _mean(values: np.ndarray | None) -> str:
+    return "" if values is None else f"{values.mean():.2f}"

@@ -1,0 +1,171 @@
+"""What looks wrong about an input and its answers: independent checks, each a line for the user or None.
+
+A check of a scan is a function of (`Scan`, `Poses` in the level frame); to add one, write it and append it to
+`SCAN_CHECKS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lidarpose.inference.inputs import flat_axis, lies, unit_warning
+from lidarpose.inference.results import Poses
+from lidarpose.sample import MIN_POINTS
+
+if TYPE_CHECKING:
+    from lidarpose.inference.scan import Scan
+
+# no LiDAR sees a person from farther away, m
+FARTHEST_PERSON = 500.0
+# boxes so much less tall than wide have their sizes in another order
+_TALL_TO_WIDE = 0.8
+# heights above a box's center, in its own height: the ground, and the chest and the top of a person who stands on the
+# center; at most this share of the points is elsewhere, and so few tell nothing
+_GROUND, _CHEST, _TOP = -0.1, 0.75, 1.1
+_ELSEWHERE, _FEWEST = 0.05, 20
+# boxes named by a warning
+_MOST_NAMED = 3
+
+
+def origin_warning(scan: Scan) -> str | None:
+    """The sensor is farther from the boxes than a LiDAR sees people."""
+    if scan.origin is None or not scan.boxes:
+        return None
+    distance = float(np.median([np.linalg.norm(box.center - scan.origin) for box in scan.boxes]))
+    if distance < FARTHEST_PERSON:
+        return None
+    at = ",".join(f"{value:g}" for value in scan.origin)
+    return (
+        f"the sensor at {at} is {distance:,.0f} m from the people, so its place is taken as unknown: "
+        "give it in the points' own frame and in metres (sensor_origin)"
+    )
+
+
+def box_units(scan: Scan, people: Poses) -> str | None:
+    """All boxes, or some of them, have sizes of other units than metres."""
+    if not scan.boxes:
+        return None
+    if warning := unit_warning(np.median([box.size for box in scan.boxes], axis=0), what="a person's box"):
+        return warning
+    wrong = [(person.id, unit_warning(box.size, what="it")) for person, box in zip(people, scan.boxes, strict=True)]
+    wrong = [(name, warning) for name, warning in wrong if warning]
+    if not wrong:
+        return None
+    names = ", ".join(str(name) for name, _ in wrong[:_MOST_NAMED])
+    more = f" and {len(wrong) - _MOST_NAMED} more" if len(wrong) > _MOST_NAMED else ""
+    return f"box {names}{more} is unlike the others: {wrong[0][1]}"
+
+
+def empty_boxes(scan: Scan, people: Poses) -> str | None:
+    """No box holds enough points: boxes and points are of different frames or units."""
+    if not scan.boxes or any(person.num_points >= MIN_POINTS for person in people):
+        return None
+    low, high = scan.points.min(0), scan.points.max(0)
+    centers = np.array([box.center for box in scan.boxes])
+    return (
+        f"no box holds {MIN_POINTS} points: expected boxes and points in one frame and in metres; points reach "
+        f"from {_place(low)} to {_place(high)}, centers of boxes from {_place(centers.min(0))} to "
+        f"{_place(centers.max(0))}"
+    )
+
+
+def wide_boxes(scan: Scan, people: Poses) -> str | None:
+    """Boxes are wider than tall: their sizes are in another order."""
+    if not scan.boxes:
+        return None
+    wide = np.median([box.size[:2].max() for box in scan.boxes])
+    tall = np.median([box.size[2] for box in scan.boxes])
+    if tall >= _TALL_TO_WIDE * wide:
+        return None
+    return f"boxes are wider ({wide:.1f} m) than tall ({tall:.1f} m): size is length, width, height"
+
+
+def boxes_at_feet(scan: Scan, people: Poses) -> str | None:
+    """People begin at the centers of their boxes: the centers are at the feet."""
+    if not scan.boxes:
+        return None
+    boxes, points = scan.level_boxes(), scan.box_points()
+    heights = _heights(boxes, points, scan.rows)
+    if (heights < _GROUND).sum() > _ELSEWHERE * len(heights):
+        return None
+    raised = [replace(box, center=box.center + [0, 0, box.size[2]]) for box in boxes]
+    above = 1 + _heights(raised, points, rows_inside(raised, points))
+    # a ceiling leaves room above the box, a tree goes on above the head
+    trunk, sky = (above < _CHEST).sum(), (above > _TOP).sum()
+    if trunk < max(_FEWEST, len(heights) / 4) or sky > _ELSEWHERE * len(above):
+        return None
+    return "people stand in the upper half of their boxes and above: is center at the feet? add half the height"
+
+
+def flat_along_another_axis(scan: Scan, people: Poses) -> str | None:
+    """The points of the whole scan hardly extend along another axis than the one said to be up."""
+    flat = flat_axis(scan.points)
+    if flat is None or flat == scan.upright_axis:
+        return None
+    return f"the points extend least along {flat}, so {scan.up} is hardly the input's up axis: try {_option(flat)}"
+
+
+def everybody_lies(scan: Scan, people: Poses) -> str | None:
+    """Everybody lies down, as where another axis is up. people: in the level frame."""
+    # people who are cut short by their boxes only seem to lie
+    if wide_boxes(scan, people) or boxes_at_feet(scan, people):
+        return None
+    posed = [person for person in people if person.pose is not None]
+    if not posed or not all(lies(person.pose, person.points) for person in posed):
+        return None
+    others = ", or ".join(_option(other) for other in "zyx" if other != scan.upright_axis)
+    who = "the person lies" if len(posed) == 1 else f"all {len(posed)} people lie"
+    return f"{who} down: if that is wrong, {scan.up} is not the input's up axis: try {others}"
+
+
+# the last ones give way to those before them: one wrong axis is one warning
+SCAN_CHECKS: tuple[Callable[[Scan, Poses], str | None], ...] = (
+    box_units,
+    empty_boxes,
+    wide_boxes,
+    boxes_at_feet,
+)
+AXIS_CHECKS: tuple[Callable[[Scan, Poses], str | None], ...] = (flat_along_another_axis, everybody_lies)
+
+
+def check_scan(scan: Scan, people: Poses) -> list[str]:
+    """The warnings of all checks. people: in the level frame, in the order of the scan's clouds."""
+    warnings = [check(scan, people) for check in SCAN_CHECKS]
+    warnings.append(next(filter(None, (check(scan, people) for check in AXIS_CHECKS)), None))
+    return [warning for warning in warnings if warning]
+
+
+def rows_inside(boxes: list, points: np.ndarray) -> list[np.ndarray]:
+    """points (n, 3) m, z up -> of each `Box` the rows (k,) of the points in it, ascending.
+
+    Sorted along x once, so that no box has to look at all of millions of points.
+    """
+    order = np.argsort(points[:, 0])
+    x = points[order, 0]
+    rows = []
+    for box in boxes:
+        # twice what a corner reaches, whatever the yaw
+        reach = np.hypot(*box.size[:2])
+        first, last = np.searchsorted(x, (box.center[0] - reach, box.center[0] + reach))
+        near = np.sort(order[first:last])
+        rows.append(near[box.contains(points[near])])
+    return rows
+
+
+def _heights(boxes: list, points: np.ndarray, rows: list[np.ndarray]) -> np.ndarray:
+    """(k,): how high above the centers of their boxes, in those boxes' heights, points lie."""
+    return np.concatenate(
+        [(points[own, 2] - box.center[2]) / box.size[2] for box, own in zip(boxes, rows, strict=True)]
+    )
+
+
+def _place(point: np.ndarray) -> str:
+    return "(" + ", ".join(f"{value:.1f}" for value in point) + ")"
+
+
+def _option(axis: str) -> str:
+    return "--up y, or --up -y where y points down (cameras)" if axis == "y" else f"--up {axis}"

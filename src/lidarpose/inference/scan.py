@@ -1,0 +1,134 @@
+"""A scan with people: points, their boxes or none for a crop of one person; cropped, posed, checked."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lidarpose.geometry import UP_AXES, rotation_from_up
+from lidarpose.inference.checks import check_scan, origin_warning, rows_inside
+from lidarpose.inference.results import PersonPose, Poses
+from lidarpose.io.boxes import read_boxes
+from lidarpose.sample import Box
+
+if TYPE_CHECKING:
+    from lidarpose.inference.predictor import Predictor
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scan:
+    """What is to be posed, in the input's frame.
+
+    points (n, 3) m; boxes: the people's, None for a crop of one person; origin: the sensor's position (3,) m or None;
+    up: the input's up axis or direction, see `rotation_from_up`; warnings: of reading; source: a name for reports.
+    Boxes stand along the input's own axis; where `up` is a direction, along z.
+    """
+
+    points: np.ndarray
+    boxes: list[Box] | None = None
+    origin: np.ndarray | None = None
+    up: str = "z"
+    warnings: tuple[str, ...] = ()
+    source: str | None = None
+
+    @cached_property
+    def R_level_input(self) -> np.ndarray:
+        return rotation_from_up(self.up)
+
+    @property
+    def upright_axis(self) -> str:
+        """The input's axis that is nearest to upright."""
+        return "xyz"[int(np.abs(self.R_level_input[2]).argmax())]
+
+    @property
+    def _R_boxes_input(self) -> np.ndarray:
+        return UP_AXES.get(self.up, UP_AXES["z"])
+
+    def level_boxes(self) -> list[Box]:
+        """The boxes with z up, in the frame of `box_points`."""
+        return [replace(box, center=self._R_boxes_input @ box.center) for box in self.boxes or []]
+
+    def box_points(self) -> np.ndarray:
+        """The points (n, 3) m in the frame in which boxes stand upright."""
+        return self.points @ self._R_boxes_input.T
+
+    @cached_property
+    def rows(self) -> list[np.ndarray]:
+        """Of each box the rows of the points in it."""
+        return rows_inside(self.level_boxes(), self.box_points())
+
+    def clouds(self) -> list[np.ndarray]:
+        """The points of each person in the level frame (z up); of a crop all points."""
+        level = self.points @ self.R_level_input.T
+        return [level] if self.boxes is None else [level[rows] for rows in self.rows]
+
+
+def as_boxes(boxes: object) -> list[Box]:
+    """Boxes in any form: a file, its content, a `Box` or several (see `io.boxes`)."""
+    if isinstance(boxes, Box):
+        return [boxes]
+    if isinstance(boxes, tuple):
+        boxes = list(boxes)
+    if isinstance(boxes, list) and any(isinstance(box, Box) for box in boxes):
+        return [box if isinstance(box, Box) else read_boxes([box])[0] for box in boxes]
+    return read_boxes(boxes)  # type: ignore[arg-type]
+
+
+def pose_scan(scan: Scan, predictor: Predictor, *, skeleton: str | None = None, progress: bool = False) -> Poses:
+    """Poses of the scan's people in the input's frame, with warnings; `timing_ms` has "crop" and "predict"."""
+    started = time.perf_counter()
+    clouds = scan.clouds()
+    cropped = time.perf_counter()
+    warnings = list(scan.warnings)
+    if warning := origin_warning(scan):
+        warnings.append(warning)
+        scan = replace(scan, origin=None)
+    level = predictor.predict(
+        clouds,
+        sensor_origin=None if scan.origin is None else scan.R_level_input @ scan.origin,
+        skeleton=skeleton,
+        progress=progress,
+    )
+    done = time.perf_counter()
+    level = replace(level, people=_named(level, scan.boxes))
+    warnings += check_scan(scan, level)
+    people = [_in_input(person, scan) for person in level]
+    if scan.boxes is None:
+        # a crop's warnings are its person's
+        people = [replace(people[0], warnings=(*scan.warnings, *people[0].warnings))]
+        warnings = warnings[len(scan.warnings) :]
+    posed = sum(person.pose is not None for person in people)
+    return Poses(
+        people=tuple(people),
+        skeleton=level.skeleton,
+        source=scan.source,
+        model=level.model,
+        warnings=tuple(warnings),
+        timing_ms={
+            "crop": (cropped - started) * 1e3,
+            "predict": (done - cropped) * 1e3,
+            "per_person": (done - cropped) * 1e3 / max(posed, 1),
+        },
+        up=scan.up,
+    )
+
+
+def _named(people: Sequence[PersonPose], boxes: list[Box] | None) -> tuple[PersonPose, ...]:
+    """People with the ids of their boxes, or their numbers."""
+    if boxes is None:
+        return (replace(people[0], id=0),)
+    return tuple(
+        replace(person, id=i if box.id is None else box.id, box=box)
+        for i, (person, box) in enumerate(zip(people, boxes, strict=True))
+    )
+
+
+def _in_input(person: PersonPose, scan: Scan) -> PersonPose:
+    R_level_input = scan.R_level_input
+    pose = person.pose and replace(person.pose, joints=person.pose.joints @ R_level_input)
+    return replace(person, pose=pose, points=person.points @ R_level_input, up=scan.up)
