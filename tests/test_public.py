@@ -94,8 +94,11 @@ def floor(name):
 
 
 def imports(path):
-    """All modules that a file imports, those inside functions too."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    """All modules that a file imports, those inside functions too, but for what only type checkers see."""
+    tree = ast.parse(path.read_text())
+    typing_only = [node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
+    tree.body = [node for node in tree.body if node not in typing_only]
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
