@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.eval.scores import OURS, Line, Result
+from lidarpose.eval.scores import OURS, MetricRow, Result
 
 BASE = "base"
 # two-sided 95 % points of Student's t by degrees of freedom
 _STUDENT = {1: 12.71, 2: 4.30, 3: 3.18, 4: 2.78, 5: 2.57, 6: 2.45, 7: 2.36, 8: 2.31, 10: 2.23, 12: 2.18, 15: 2.13}
 _STUDENT |= {20: 2.09, 30: 2.04, 60: 2.00}
-# figures of a run that tables show: (group, of, figure) of `eval.scores.Line`
+# figures of a run that tables show: (group, of, figure) of `eval.scores.MetricRow`
 FIGURES = {
     "all": ("all", "all", "mpjpe"),
     "plain": ("plain", None, "mpjpe"),
@@ -36,7 +36,7 @@ WORDS = {"company": "second person", "crop": "poor box", "turned round": "facing
 _HEADER = tuple(WORDS.get(name, name) for name in _SHOWN)
 
 
-def own_lines(result: Result) -> list[Line]:
+def own_lines(result: Result) -> list[MetricRow]:
     """The lines of what was judged, without the floors', by this package's arithmetic."""
     return [x for x in result.lines if x.method == result.setting.method and x.arithmetic == OURS]
 

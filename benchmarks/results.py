@@ -26,7 +26,7 @@ from ablation_tables import figures, own_lines
 from ablations import VARIANTS
 from against_paper import WAYS
 
-from lidarpose.eval.scores import Line, Scores, read_scores
+from lidarpose.eval.scores import MetricRow, Scores, read_scores
 from lidarpose.io.files import content_digest, write_atomic
 from lidarpose.models.bundled import BUNDLED, DEFAULT, bundled_path
 from lidarpose.models.header import read_header, runs_of
@@ -87,7 +87,7 @@ def shipped(model: str, group: str) -> str:
     return table((group.split("+")[-1], "MPJPE mm", "95 %", "people"), rows)
 
 
-def _interval(line: Line) -> str:
+def _interval(line: MetricRow) -> str:
     return "" if line.low is None else f"[{line.low:.1f}, {line.high:.1f}]"
 
 

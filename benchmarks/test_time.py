@@ -104,13 +104,13 @@ def _bins(logits: np.ndarray, index: np.ndarray) -> np.ndarray:
     return np.where(inside, np.take_along_axis(logits, np.clip(index, 0, logits.shape[-1] - 1), -1), _LEAST)
 
 
-def rejection(judged) -> list[dict]:
+def rejection(predictions) -> list[dict]:
     """Error of what is kept, the most confident first: whole people, and joints on their own."""
-    error = judged.errors()
+    error = predictions.errors()
     people, joints = [], []
     for score, value, rows in (
-        (judged.confidence.mean(1), error.mean(1), people),
-        (judged.confidence.ravel(), error.ravel(), joints),
+        (predictions.confidence.mean(1), error.mean(1), people),
+        (predictions.confidence.ravel(), error.ravel(), joints),
     ):
         order = np.argsort(-score)
         rows += [value[order[: max(round(share * len(order)), 1)]].mean() for share in (1.0, 0.9, 0.8, 0.7, 0.5)]
@@ -132,7 +132,7 @@ def main() -> None:
         done = evaluation.run(Averaging(model, way), ["bench"], limit=options.limit)
         seconds = time.process_time() - started
         if way is USUAL:
-            kept = rejection(done.evaluations[0].judged)
+            kept = rejection(done.evaluations[0].predictions)
         ways.append({"what": way.what, "usual": way is USUAL, "seconds": round(seconds, 2)})
         ways[-1]["figures"] = figures(done.scores.results[0])
         print(f"{way.what:<52} {ways[-1]['figures']['all']['value']:.1f} mm  {seconds:.1f} s", flush=True)

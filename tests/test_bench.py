@@ -8,7 +8,8 @@ import pytest
 
 from lidarpose.errors import InputError
 from lidarpose.eval import bench as module
-from lidarpose.eval.bench import SHA256, bench_path, facing, floors, load_bench, plain
+from lidarpose.eval.bench import SHA256, bench_path, facing, load_bench, mean_poses
+from lidarpose.eval.dataset import open_eval_dataset
 from lidarpose.geometry import rotation_about
 from lidarpose.sample import Box
 from lidarpose.skeleton import BODY26, HUMAN15
@@ -56,7 +57,7 @@ def test_a_damaged_file_is_told(monkeypatch, tmp_path):
 
 
 def test_floors_know_no_points():
-    found = floors(bench())
+    found = mean_poses(bench())
     people, pick = bench().people, BODY26.map_to(HUMAN15)
     true, alike = (found[name] - bench().joints for name in ("mean pose, true facing", "mean pose"))
     true, alike = (np.linalg.norm(away[people][:, pick], axis=-1).mean() for away in (true, alike))
@@ -75,8 +76,7 @@ def test_facing_turns_with_the_person():
 
 
 def test_plain_people_are_whole_and_of_many_points():
-    rows = np.flatnonzero(plain(bench()))
-    rows = rows[np.isin(rows, bench().people)]
+    rows = np.array([one.row for one in open_eval_dataset("bench") if one.plain and not one.moving])
     columns = bench().columns
     assert len(rows) == 706 and columns["num_points"][rows].min() >= 100
     assert (

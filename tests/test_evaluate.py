@@ -23,12 +23,13 @@ from lidarpose.data.prepare import prepare
 from lidarpose.data.shards import open_dataset, read_rows, shard_path
 from lidarpose.errors import InputError
 from lidarpose.eval import robustness
+from lidarpose.eval import run as run_module
 from lidarpose.eval.bench import load_bench
-from lidarpose.eval.dataset import open_people, spread
-from lidarpose.eval.metric_rows import lines_of, triples, turned_round
+from lidarpose.eval.dataset import open_eval_dataset, spread
+from lidarpose.eval.metric_rows import facing_flipped, metric_rows, triples
 from lidarpose.eval.metrics import bootstrap
-from lidarpose.eval.protocols import cropped, jittered
-from lidarpose.eval.run import judge, task_of
+from lidarpose.eval.protocols import cropped, eval_setup, jittered
+from lidarpose.eval.run import evaluate_dataset
 from lidarpose.geometry import rotation_about
 from lidarpose.inference.backend import Estimates
 from lidarpose.inference.results import PersonPose, Poses
@@ -85,7 +86,7 @@ def knowing(people, shift=(0.0, 0.0, 0.0)):
 
     def answer(cloud):
         one = people[int(np.argmin(np.linalg.norm(middles - np.median(cloud, axis=0), axis=1)))]
-        return np.nan_to_num(one.joints) + shift
+        return np.nan_to_num(one.sample.joints) + shift
 
     return answer
 
@@ -110,7 +111,7 @@ def sets(tmp_path_factory):
 
 def judged(sets, name, model, **options):
     split, limit = options.pop("split", None), options.pop("limit", None)
-    return judge(task_of(model, open_people(sets / name, split=split, limit=limit), **options))
+    return evaluate_dataset(eval_setup(model, open_eval_dataset(sets / name, split=split, limit=limit), **options))
 
 
 # ---- what the network is shown
@@ -119,14 +120,14 @@ def judged(sets, name, model, **options):
 def test_clean_shows_what_lies_in_a_displaced_box(sets):
     model = Fake(standing)
     found = judged(sets, "humanm3", model, seed=3)
-    people = list(open_people(sets / "humanm3"))
+    people = list(open_eval_dataset(sets / "humanm3"))
     assert len(model.clouds) == len(people) == 16
     for cloud, one in zip(model.clouds, people, strict=True):
-        box = jittered(one.box, np.random.default_rng([3, one.shard, one.row]))
+        box = jittered(one.sample.box, np.random.default_rng([3, one.shard, one.row]))
         np.testing.assert_array_equal(cloud, one.points[box.contains(one.points)])
     # some points are lost, some come in, and nobody's place is told
     assert any(
-        len(cloud) != one.box.contains(one.points).sum() for cloud, one in zip(model.clouds, people, strict=True)
+        len(cloud) != one.sample.box.contains(one.points).sum() for cloud, one in zip(model.clouds, people, strict=True)
     )
     assert model.origins == [None] * 16 and found.result.setting.sensor == "unknown"
     told = found.result.setting
@@ -137,7 +138,7 @@ def test_clean_shows_what_lies_in_a_displaced_box(sets):
 def test_clean_uses_no_label_of_who_was_segmented(sets):
     model = Fake(standing)
     found = judged(sets, "lidarhuman26m", model)
-    people = list(open_people(sets / "lidarhuman26m"))
+    people = list(open_eval_dataset(sets / "lidarhuman26m"))
     for cloud, origin, one in zip(model.clouds, model.origins, people, strict=True):
         np.testing.assert_array_equal(cloud, one.points)
         assert (origin == 0).all()
@@ -174,9 +175,9 @@ def test_a_detector_s_errors_are_as_told():
 def test_dapt_crops_and_centers_as_released(sets):
     model = Fake(standing)
     found = judged(sets, "humanm3", model, protocol="dapt")
-    people = list(open_people(sets / "humanm3"))
+    people = list(open_eval_dataset(sets / "humanm3"))
     for cloud, center, one in zip(model.clouds, model.centers, people, strict=True):
-        low, high = one.joints.min(0).astype(float), one.joints.max(0).astype(float)
+        low, high = one.sample.joints.min(0).astype(float), one.sample.joints.max(0).astype(float)
         half = 1.25 * (high - low) / 2
         inside = (np.abs(one.points - (low + high) / 2) <= half).all(1)
         np.testing.assert_allclose(cloud, one.points[inside])
@@ -186,18 +187,19 @@ def test_dapt_crops_and_centers_as_released(sets):
 
     model = Fake(standing)
     judged(sets, "waymo", model, protocol="dapt")
-    people = list(open_people(sets / "waymo"))
+    people = list(open_eval_dataset(sets / "waymo"))
     for cloud, center, one in zip(model.clouds, model.centers, people, strict=True):
-        np.testing.assert_array_equal(cloud, one.points[one.box.contains(one.points)])
-        np.testing.assert_array_equal(center, one.box.center)
-    small = replace(people[0], box=replace(people[0].box, size=people[0].box.size * 0.6))
+        np.testing.assert_array_equal(cloud, one.points[one.sample.box.contains(one.points)])
+        np.testing.assert_array_equal(center, one.sample.box.center)
+    box = people[0].sample.box
+    small = replace(people[0], sample=replace(people[0].sample, box=replace(box, size=box.size * 0.6)))
     kept = cropped("dapt", "waymo", small, 0).points
-    assert 0 < len(kept) < len(small.points) and small.box.contains(kept).all()
+    assert 0 < len(kept) < len(small.points) and small.sample.box.contains(kept).all()
 
     model = Fake(standing)
     found = judged(sets, "leaking", model, protocol="dapt")
-    for center, one in zip(model.centers, open_people(sets / "leaking"), strict=True):
-        np.testing.assert_array_equal(center, one.centers["trans"])
+    for center, one in zip(model.centers, open_eval_dataset(sets / "leaking"), strict=True):
+        np.testing.assert_array_equal(center, one.sample.centers["trans"])
     assert "neighbouring frames" in found.result.setting.leaks
     assert all(
         line.split == "test" and line.protocol == "dapt" and "SMPL" in line.centring for line in found.result.lines
@@ -238,18 +240,18 @@ def test_synthetic_sets_have_neither_splits_nor_oracles(sets):
 
 
 def test_splits_that_are_judged_by_default(sets):
-    assert open_people(sets / "waymo").split == "val"
-    assert open_people(sets / "humanm3").split == "test"
-    everybody = open_people(sets / "humanm3", split="all")
+    assert open_eval_dataset(sets / "waymo").split == "val"
+    assert open_eval_dataset(sets / "humanm3").split == "test"
+    everybody = open_eval_dataset(sets / "humanm3", split="all")
     assert everybody.split == "all" and everybody.count == 24
-    assert open_people("bench").split == "none"
+    assert open_eval_dataset("bench").split == "none"
 
 
 def test_train_alone_asks_for_a_split(sets, tmp_path):
     prepare("humanm3", sets / "a", tmp_path / "x", split="train")
     with pytest.raises(InputError, match="only in train: say --split"):
-        open_people(tmp_path / "x")
-    assert open_people(tmp_path / "x", split="train").count == 8
+        open_eval_dataset(tmp_path / "x")
+    assert open_eval_dataset(tmp_path / "x", split="train").count == 8
 
 
 @given(total=st.integers(1, 400), limit=st.none() | st.integers(1, 500))
@@ -265,7 +267,7 @@ def test_a_limit_is_spread_evenly(total, limit):
 
 
 def test_the_truth_has_no_error_and_a_step_its_length(sets):
-    people = list(open_people(sets / "humanm3"))
+    people = list(open_eval_dataset(sets / "humanm3"))
     pick = [HUMAN15.index(name) if name in HUMAN15.joints else 0 for name in BODY26.joints]
     for shift, error in (((0, 0, 0), 0), ((0.06, 0, 0.08), 100)):
         known = knowing(people, shift)
@@ -282,21 +284,26 @@ def test_the_truth_has_no_error_and_a_step_its_length(sets):
 
 def test_hidden_labels_count_and_missing_ones_do_not(sets):
     found = judged(sets, "waymo", Fake(standing))
-    people = list(open_people(sets / "waymo"))
-    labels = np.stack([one.labels for one in people])
+    people = list(open_eval_dataset(sets / "waymo"))
+    labels = np.stack([one.sample.joint_labels for one in people])
     assert (labels == 0).any() and (labels == 1).any()
     assert found.result.line("mpjpe").joints == (labels > 0).sum()
-    pred = found.judged.pred
+    pred = found.predictions.pred
     for name, of in (("mpjpe", metrics.mpjpe), ("pa_mpjpe", metrics.pa_mpjpe), ("pck3", metrics.pck)):
-        assert found.result.line(name).value == pytest.approx(of(pred, found.judged.true, labels > 0))
-    size = np.stack([one.box.size for one in people])
-    box = metrics.pck_box(pred, found.judged.true, size, labels > 0, threshold=0.2)
+        assert found.result.line(name).value == pytest.approx(of(pred, found.predictions.true, labels > 0))
+    size = np.stack([one.sample.box.size for one in people])
+    box = metrics.pck_box(pred, found.predictions.true, size, labels > 0, threshold=0.2)
     assert found.result.line("pck_box@0.2").value == pytest.approx(box)
-    hit = metrics.oks_ap(pred, found.judged.true, size, labels > 0)
+    hit = metrics.oks_ap(pred, found.predictions.true, size, labels > 0)
     assert found.result.line("oks_ap").value == pytest.approx(hit)
-    frames = [[k for k, one in enumerate(people) if one.frame == f] for f in sorted({one.frame for one in people})]
-    boxes = np.stack([[*one.box.center, *one.box.size, one.box.yaw] for one in people])
-    wanted = metrics.pem(*([value[rows] for rows in frames] for value in (pred, found.judged.true, boxes, labels == 2)))
+    frames = [
+        [k for k, one in enumerate(people) if one.sample.frame == f]
+        for f in sorted({one.sample.frame for one in people})
+    ]
+    boxes = np.stack([[*one.sample.box.center, *one.sample.box.size, one.sample.box.yaw] for one in people])
+    wanted = metrics.pem(
+        *([value[rows] for rows in frames] for value in (pred, found.predictions.true, boxes, labels == 2))
+    )
     assert found.result.line("pem").value == pytest.approx(wanted.pem)
 
 
@@ -339,7 +346,7 @@ def test_who_gets_no_pose_is_counted_and_in_no_figure(sets):
     line = found.result.line("mpjpe")
     assert 0 < missing < 16 and line.people == 16 - missing and line.no_pose == missing and line.skipped == 0
     assert found.result.line("mpjpe", "joints", "knees").no_pose == missing
-    assert line.value == pytest.approx(np.nanmean(found.judged.errors()))
+    assert line.value == pytest.approx(np.nanmean(found.predictions.errors()))
     nobody = judged(sets, "humanm3", Fake(lambda cloud: None)).result
     assert nobody.line("mpjpe").value is None and nobody.line("mpjpe").low is None
 
@@ -367,18 +374,18 @@ def test_few_sequences_have_no_interval(sets):
 def test_sequences_are_drawn_whole(sets, monkeypatch):
     monkeypatch.setattr(bootstrap, "LEAST_UNITS", 2)
     found = judged(sets, "humanm3", Fake(standing))
-    line, table = found.result.line("mpjpe"), found.judged.errors()
-    means = [np.nanmean(table[found.judged.sequence == name]) for name in ("test/b", "test/c")]
+    line, table = found.result.line("mpjpe"), found.predictions.errors()
+    means = [np.nanmean(table[found.predictions.sequence == name]) for name in ("test/b", "test/c")]
     # of two sequences the extreme draws are one of them twice
     assert (line.low, line.high) == pytest.approx((min(means), max(means)))
 
 
 def _moving(sets, frames):
     """People of one track at frames, every 0.1 s."""
-    base = judged(sets, "lidarhuman26m", Fake(standing)).judged
+    base = judged(sets, "lidarhuman26m", Fake(standing)).predictions
     rows = np.zeros(len(frames), int)
     frames = np.array(frames)
-    return replace(base.of(rows), frame=frames, time=frames * 0.1)
+    return replace(base.select(rows), frame=frames, time=frames * 0.1)
 
 
 def test_triples_follow_each_other_evenly(sets):
@@ -396,14 +403,14 @@ def test_triples_follow_each_other_evenly(sets):
 
 
 def test_turned_round_is_over_a_right_angle(sets):
-    base = judged(sets, "lidarhuman26m", Fake(standing)).judged
+    base = judged(sets, "lidarhuman26m", Fake(standing)).predictions
     true = base.true - base.true.mean(1, keepdims=True)
     # upright bodies, so that a turn about z turns their facing
     true = np.tile(SMPL_STANDING.astype(np.float32), (len(true), 1, 1))
-    for angle, wanted in ((0.0, 0), (1.4, 0), (-1.5, 0), (1.7, 1), (np.pi, 1)):
+    for angle, wanted in ((0.0, 0), (1.4, 0), (-1.5, 0), (1.7, 100), (np.pi, 100)):
         pred = (true @ rotation_about("z", angle).T).astype(np.float32)
-        assert (turned_round(replace(base, pred=pred, true=true)) == wanted).all()
-    assert np.isnan(turned_round(replace(base, pred=np.full_like(true, np.nan)))).all()
+        assert (facing_flipped(replace(base, pred=pred, true=true)) == wanted).all()
+    assert np.isnan(facing_flipped(replace(base, pred=np.full_like(true, np.nan)))).all()
 
 
 SMPL_STANDING = np.zeros((24, 3))
@@ -450,14 +457,17 @@ def test_a_shard_that_breaks_half_way_is_left_out_whole(copy):
     assert result.skipped["people of damaged shards"]["count"] == 8
     assert path.name in result.skipped["damaged shards"]["first"]
     # a second reading counts no more
-    task = task_of(Fake(standing), open_people(copy, split="all"))
-    assert judge(task).result == judge(task).result and judge(task).result.skipped == result.skipped
+    task = eval_setup(Fake(standing), open_eval_dataset(copy, split="all"))
+    assert (
+        evaluate_dataset(task).result == evaluate_dataset(task).result
+        and evaluate_dataset(task).result.skipped == result.skipped
+    )
 
 
 def test_a_missing_shard_is_an_unfinished_dataset(copy):
     shard_path(copy, "labelled", 0).unlink()
     with pytest.raises(InputError, match="not finished"):
-        open_people(copy)
+        open_eval_dataset(copy)
 
 
 def test_who_the_released_code_leaves_out_is_counted(sets, tmp_path):
@@ -474,8 +484,8 @@ def test_who_the_released_code_leaves_out_is_counted(sets, tmp_path):
     assert after.skipped["people of under 10 points, as the released code skips them"]["count"] == 1
     assert after.skipped["people without the center 'trans'"]["count"] == 1
     # nor are they disturbed
-    task = task_of(Fake(standing), open_people(tmp_path / "leaking"), protocol="dapt")
-    assert len(robustness.to_disturb(task)) == after.counts["people"]
+    task = eval_setup(Fake(standing), open_eval_dataset(tmp_path / "leaking"), protocol="dapt")
+    assert len(robustness.people_to_perturb(task)) == after.counts["people"]
 
 
 def test_the_released_protocol_is_one_look(sets):
@@ -498,7 +508,7 @@ def written(sets, tmp_path_factory):
 
 
 def test_what_cannot_be_written_or_disturbed_is_known_before_anybody_is_judged(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(evaluation, "judge", None)
+    monkeypatch.setattr(run_module, "evaluate_dataset", None)
     (tmp_path / "file").write_text("")
     for out in ("file", "file/deep"):
         assert main(["evaluate", "tiny", "bench", "--limit", "2", "--out", str(tmp_path / out)]) == 2
@@ -536,7 +546,7 @@ def test_every_figure_can_be_computed_from_the_poses(written):
     scores, people = evaluation.read_scores(folder), evaluation.read_poses(folder / "poses.parquet")
     assert list(people) == ["waymo", "humanm3", "lidarpose-bench-1"]
     for result in scores.results:
-        again = lines_of(people[result.setting.dataset], result.setting, legacy=True)
+        again = metric_rows(people[result.setting.dataset], result.setting, dapt_compat=True)
         own = tuple(line for line in result.lines if line.method == result.setting.method)
         assert again == own and len(own) > 30
     # and by anybody else, from the table alone
@@ -593,13 +603,12 @@ def test_all_files_or_none(written, tmp_path, monkeypatch):
         evaluation.write(run, folder)
     with pytest.raises(InputError, match="is a file; give a new or empty folder"):
         evaluation.write(run, folder / "scores.json")
-    import lidarpose.evaluation as module
 
     def broken(path, judged):
         path.write_bytes(b"half")
         raise InputError("no more")
 
-    monkeypatch.setattr(module, "write_poses", broken)
+    monkeypatch.setattr(run_module, "write_poses", broken)
     with pytest.raises(InputError, match="no more"):
         evaluation.write(run, tmp_path / "deep" / "new")
     assert not (tmp_path / "deep").exists()
@@ -687,16 +696,16 @@ def test_evaluate_hides_the_sensor():
 
 
 def test_dapt_s_poses_are_in_the_dataset_s_frame(sets):
-    people = list(open_people(sets / "humanm3"))
+    people = list(open_eval_dataset(sets / "humanm3"))
     pick = [HUMAN15.index(name) if name in HUMAN15.joints else 0 for name in BODY26.joints]
     known = knowing(people, (0.06, 0, 0.08))
-    task = task_of(Fake(lambda cloud: known(cloud)[pick]), open_people(sets / "humanm3"), protocol="dapt")
-    assert judge(task).result.line("mpjpe").value == pytest.approx(100, abs=1e-2)
+    task = eval_setup(Fake(lambda cloud: known(cloud)[pick]), open_eval_dataset(sets / "humanm3"), protocol="dapt")
+    assert evaluate_dataset(task).result.line("mpjpe").value == pytest.approx(100, abs=1e-2)
 
 
 def test_the_worst_are_the_worst(sets):
-    found = judge(task_of(Fake(standing), open_people(sets / "humanm3", split="all")))
-    error = found.judged.errors().mean(1)
+    found = evaluate_dataset(eval_setup(Fake(standing), open_eval_dataset(sets / "humanm3", split="all")))
+    error = found.predictions.errors().mean(1)
     assert len(error) == 24 and [k for _, k in found.worst] == np.argsort(-error, kind="stable").tolist()
 
 
@@ -723,13 +732,13 @@ def test_people_of_the_seed_that_a_network_learned_from_are_no_strangers(made, r
     """Person i of a seed has the same body, pose and place at any difficulty."""
     model = Fake(standing)
     model.header = SimpleNamespace(card={"recipe": {"seed": 5, "scene": "wild"}, "init_card": {"recipe": recipe}})
-    notes = judge(task_of(model, open_people(made))).result.notes
+    notes = evaluate_dataset(eval_setup(model, open_eval_dataset(made))).result.notes
     assert any("of seed 0, as these are" in note for note in notes) == knows
 
 
 def test_what_is_hidden_is_not_visible(made):
-    for one, row in zip(open_people(made), open_dataset(made).rows(), strict=True):
-        assert one.hidden == pytest.approx(1 - row["visible"], abs=1e-6)
+    for one, row in zip(open_eval_dataset(made), open_dataset(made).rows(), strict=True):
+        assert 1 - one.info.visible == pytest.approx(1 - row["visible"], abs=1e-6)
     visible = load_bench().columns["visible"]
-    for one in open_people("bench", limit=9):
-        assert one.hidden == pytest.approx(1 - visible[one.row], abs=1e-6)
+    for one in open_eval_dataset("bench", limit=9):
+        assert 1 - one.info.visible == pytest.approx(1 - visible[one.row], abs=1e-6)

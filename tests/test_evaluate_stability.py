@@ -16,11 +16,11 @@ from lidarpose.data.prepare import prepare
 from lidarpose.data.shards import open_dataset
 from lidarpose.eval import robustness as module
 from lidarpose.eval.charts import draw_stability
-from lidarpose.eval.dataset import open_people
-from lidarpose.eval.perturb import DISTURBANCES
-from lidarpose.eval.predictions import gathered
-from lidarpose.eval.robustness import end_errors, study, to_json
-from lidarpose.eval.run import Task, judge, task_of
+from lidarpose.eval.dataset import open_eval_dataset
+from lidarpose.eval.predictions import stack
+from lidarpose.eval.protocols import EvalSetup, eval_setup
+from lidarpose.eval.robustness import PERTURBATIONS, end_errors, study, to_json
+from lidarpose.eval.run import evaluate_dataset
 from lidarpose.sample import Box, center_of
 from lidarpose.skeleton import BODY26, HUMAN15
 from lidarpose.synth.generator import LEAST_POINTS
@@ -41,7 +41,7 @@ def box_of(points):
 
 
 def disturbed(name, points, amount, seed, box=None):
-    return DISTURBANCES[name].does(points, box, amount, np.random.default_rng(seed))
+    return PERTURBATIONS[name].apply(points, box, amount, np.random.default_rng(seed))
 
 
 def rows(points):
@@ -49,13 +49,13 @@ def rows(points):
 
 
 @settings(max_examples=40)
-@given(name=st.sampled_from(sorted(DISTURBANCES)), seed=st.integers(0, 99), n=st.integers(1, 300), boxed=st.booleans())
+@given(name=st.sampled_from(sorted(PERTURBATIONS)), seed=st.integers(0, 99), n=st.integers(1, 300), boxed=st.booleans())
 def test_nothing_changes_at_0_and_nothing_given_is_changed(name, seed, n, boxed):
     points = cloud(seed, n)
     before = points.copy()
     box = box_of(points) if boxed else None
     np.testing.assert_allclose(disturbed(name, points, 0.0, seed, box), points)
-    disturbed(name, points, DISTURBANCES[name].amounts[-1], seed, box)
+    disturbed(name, points, PERTURBATIONS[name].amounts[-1], seed, box)
     np.testing.assert_array_equal(points, before)
 
 
@@ -63,11 +63,11 @@ def test_nothing_changes_at_0_and_nothing_given_is_changed(name, seed, n, boxed)
 @given(name=st.sampled_from(["dropped", "occluder"]), seed=st.integers(0, 99), n=st.integers(1, 300))
 def test_what_is_lost_at_one_share_is_lost_at_each_larger_one(name, seed, n):
     points = cloud(seed, n)
-    kept = [rows(disturbed(name, points, amount, seed)) for amount in (0.0, *DISTURBANCES[name].amounts)]
+    kept = [rows(disturbed(name, points, amount, seed)) for amount in (0.0, *PERTURBATIONS[name].amounts)]
     for more, less in zip(kept[:-1], kept[1:], strict=True):
         assert less <= more
     if name == "occluder":
-        assert [n - len(one) for one in kept] == [round(a * n) for a in (0.0, *DISTURBANCES[name].amounts)]
+        assert [n - len(one) for one in kept] == [round(a * n) for a in (0.0, *PERTURBATIONS[name].amounts)]
 
 
 def test_dropped_are_as_many_as_said():
@@ -159,7 +159,7 @@ def people_of(error):
         pred[:, 0] = np.nan_to_num(error[k])
         true = np.where(np.isnan(error[k])[:, None], np.nan, np.zeros((15, 3)))
         out.append(told | {"row": k, "pred": pred, "true": true, "labels": np.where(np.isnan(error[k]), 0, 2)})
-    return gathered(HUMAN15, out)
+    return stack(HUMAN15, out)
 
 
 def test_end_joints_are_of_the_worst_people():
@@ -196,9 +196,9 @@ def test_plain_people_of_a_synthesized_folder_have_a_line(synthetic):
         row["upright"] and row["visible"] > 0.8 and row["clutter"] < 0.05 and len(row["points"]) >= 300
         for row in open_dataset(synthetic).rows()
     ]
-    people = open_people(synthetic)
+    people = open_eval_dataset(synthetic)
     assert [one.plain for one in people] == wanted and 0 < sum(wanted) < len(wanted)
-    judged = judge(task_of(Fake(standing), people))
+    judged = evaluate_dataset(eval_setup(Fake(standing), people))
     assert judged.result.line("mpjpe", "plain", "upright, whole, uncluttered, 100 points").people == sum(wanted)
 
 
@@ -211,17 +211,17 @@ def test_curves_say_what_was_done(synthetic, monkeypatch):
         return None if len(points) < 60 else standing(points)
 
     model = Fake(shy)
-    task = task_of(model, open_people(synthetic))
-    base = judge(task).judged
+    task = eval_setup(model, open_eval_dataset(synthetic))
+    base = evaluate_dataset(task).predictions
     done = []
     found = study(task, base, progress=done.append)
-    assert [curve.name for curve in found.curves] == [*DISTURBANCES, "sensors"]
+    assert [curve.name for curve in found.curves] == [*PERTURBATIONS, "sensors"]
     assert "12 people of people" in found.who and not found.notes
-    assert sum(done) == 12 * sum(len(one.amounts) for one in DISTURBANCES.values()) + 4
+    assert sum(done) == 12 * sum(len(one.amounts) for one in PERTURBATIONS.values()) + 4
     for curve in found.curves[:-1]:
         first = curve.points[0]
         assert (first.amount, first.increase) == (0.0, 0.0) and first.mpjpe == pytest.approx(np.nanmean(base.errors()))
-        assert [point.amount for point in curve.points[1:]] == list(DISTURBANCES[curve.name].amounts)
+        assert [point.amount for point in curve.points[1:]] == list(PERTURBATIONS[curve.name].amounts)
     dropped = next(curve for curve in found.curves if curve.name == "dropped").points
     assert dropped[-1].points < dropped[0].points * 0.1 and dropped[-1].no_pose > 0
     clusters = next(curve for curve in found.curves if curve.name == "clusters").points
@@ -236,31 +236,35 @@ def test_curves_say_what_was_done(synthetic, monkeypatch):
 
 
 def test_a_frame_out_of_level_moves_points_and_labels_alike(synthetic, monkeypatch):
-    monkeypatch.setattr(module, "DISTURBANCES", {"tilt": DISTURBANCES["tilt"]})
+    monkeypatch.setattr(module, "PERTURBATIONS", {"tilt": PERTURBATIONS["tilt"]})
     # who knows no up errs as much in any frame; who takes z for up does not
-    careless = task_of(Fake(lambda points: np.repeat(points.mean(0)[None], 26, 0)), open_people(synthetic))
-    (curve,) = study(careless, judge(careless).judged, sensors=False).curves
+    careless = eval_setup(Fake(lambda points: np.repeat(points.mean(0)[None], 26, 0)), open_eval_dataset(synthetic))
+    (curve,) = study(careless, evaluate_dataset(careless).predictions, sensors=False).curves
     assert [point.label for point in curve.points] == ["0", "5", "10", "15", "20", "30"]
     assert [point.mpjpe for point in curve.points] == pytest.approx([curve.points[0].mpjpe] * 6, abs=0.01)
-    upright = task_of(Fake(standing), open_people(synthetic))
-    (curve,) = study(upright, judge(upright).judged, sensors=False).curves
+    upright = eval_setup(Fake(standing), open_eval_dataset(synthetic))
+    (curve,) = study(upright, evaluate_dataset(upright).predictions, sensors=False).curves
     assert max(abs(point.increase) for point in curve.points) > 1
-    shown = module.to_disturb(upright)[0]
-    turned, before = module._disturbed(upright, shown, "tilt", np.radians(20)), shown.person
+    shown = module.people_to_perturb(upright)[0]
+    turned, before = module._perturbed(upright, shown, "tilt", np.radians(20)), shown.shown
     u, _, vt = np.linalg.svd((turned.points - turned.points.mean(0)).T @ (before.points - before.points.mean(0)))
     R = u @ vt
     assert np.degrees(np.arccos((np.trace(R) - 1) / 2)) == pytest.approx(20, abs=0.1)
-    np.testing.assert_allclose(turned.joints, before.joints @ R.T, atol=1e-3)
-    np.testing.assert_allclose(turned.box.center, R @ before.box.center, atol=1e-3)
+    np.testing.assert_allclose(turned.sample.joints, before.sample.joints @ R.T, atol=1e-3)
+    np.testing.assert_allclose(turned.sample.box.center, R @ before.sample.box.center, atol=1e-3)
+
+
+def setup_of_seed(seed):
+    return SimpleNamespace(setting=SimpleNamespace(seed=seed))
 
 
 def test_intervals_are_of_the_seed_and_nobody_posed_is_drawn(synthetic):
     error = np.random.default_rng(0).uniform(0, 1, (50, 1)) + np.zeros((50, 15))
-    args = people_of(error), 1e3 * error, 0.0, "0", [9] * 50
-    first, again, other = (module._point(*args, seed) for seed in (0, 0, 1))
+    args = people_of(error), 1e3 * error, 0.0, "0"
+    first, again, other = (module._point(*args, setup_of_seed(seed)) for seed in (0, 0, 1))
     assert first == again and first.mpjpe == other.mpjpe and first.low != other.low
-    nobody = task_of(Fake(lambda points: None), open_people(synthetic))
-    found = study(nobody, judge(nobody).judged, sensors=False)
+    nobody = eval_setup(Fake(lambda points: None), open_eval_dataset(synthetic))
+    found = study(nobody, evaluate_dataset(nobody).predictions, sensors=False)
     assert all(point.mpjpe is None for curve in found.curves for point in curve.points) and not found.ends
     sensors = replace(found.curves[0], name="sensors")
     assert draw_stability(replace(found, curves=(*found.curves, sensors)))[:4] == b"\x89PNG"
@@ -269,15 +273,15 @@ def test_intervals_are_of_the_seed_and_nobody_posed_is_drawn(synthetic):
 def test_a_displaced_box_lets_in_what_lies_around(tmp_path):
     files.write_humanm3(tmp_path / "raw", files.write_smpl(tmp_path / "smpl.npz"), sequences=("test/b",), frames=2)
     prepare("humanm3", tmp_path / "raw", tmp_path / "humanm3")
-    task = task_of(Fake(standing), open_people(tmp_path / "humanm3"))
+    task = eval_setup(Fake(standing), open_eval_dataset(tmp_path / "humanm3"))
     gained = 0
-    for shown in module.to_disturb(task):
-        np.testing.assert_array_equal(shown.person.points, shown.whole.points[shown.box.contains(shown.whole.points)])
+    for shown in module.people_to_perturb(task):
+        np.testing.assert_array_equal(shown.shown.points, shown.whole.points[shown.box.contains(shown.whole.points)])
         # a box so small that the person reaches beyond it
         small = replace(shown.box, size=shown.box.size * 0.6)
-        person = replace(shown.person, points=shown.whole.points[small.contains(shown.whole.points)])
-        shown = replace(shown, box=small, person=person)
-        found = rows(module._disturbed(task, shown, "crop", 0.2).points)
+        person = replace(shown.shown, points=shown.whole.points[small.contains(shown.whole.points)])
+        shown = replace(shown, box=small, shown=person)
+        found = rows(module._perturbed(task, shown, "crop", 0.2).points)
         # the same draws as of the disturbance
         seed = [0, zlib.crc32(b"crop"), person.shard, person.row]
         turn = np.random.default_rng(seed).uniform(0, 2 * np.pi)
@@ -288,39 +292,39 @@ def test_a_displaced_box_lets_in_what_lies_around(tmp_path):
     assert gained > 0
 
 
-def test_without_the_extra_other_sensors_are_left_out(synthetic, monkeypatch):
+def test_without_the_extra_other_sensor_curve_are_left_out(synthetic, monkeypatch):
     def missing(*_):
         raise ModuleNotFoundError("numba", name="numba")
 
-    monkeypatch.setattr(module, "_sensors", missing)
-    monkeypatch.setattr(module, "DISTURBANCES", {})
-    task = task_of(Fake(standing), open_people(synthetic))
-    found = study(task, judge(task).judged)
+    monkeypatch.setattr(module, "_sensor_curve", missing)
+    monkeypatch.setattr(module, "PERTURBATIONS", {})
+    task = eval_setup(Fake(standing), open_eval_dataset(synthetic))
+    found = study(task, evaluate_dataset(task).predictions)
     assert not found.curves and "'.[synth]'" in found.notes[0]
 
 
 def test_no_pose_stays_out_of_the_increase():
-    base = np.array([[100.0], [200.0], [300.0]])
+    base, setup = np.array([[100.0], [200.0], [300.0]]), setup_of_seed(0)
 
     def answers(*errors):
         errors = np.array(errors)[:, None]
-        return SimpleNamespace(errors=lambda: errors, posed=~np.isnan(errors[:, 0]))
+        return SimpleNamespace(errors=lambda: errors, posed=~np.isnan(errors[:, 0]), points=[5, 6, 7])
 
     found = answers(110.0, np.nan, 330.0)
-    point = module._point(found, base, 1.0, "1", [5, 6, 7], 0)
+    point = module._point(found, base, 1.0, "1", setup)
     assert (point.mpjpe, point.increase, point.no_pose, point.people, point.points) == (220.0, 20.0, 1, 3, 6.0)
     # whoever had none undisturbed has none here either
     base = np.array([[100.0], [np.nan], [300.0]])
-    assert module._point(answers(110.0, np.nan, np.nan), base, 1.0, "1", [5, 6, 7], 0).no_pose == 2
-    assert module._point(answers(100.0, np.nan, 300.0), base, 0.0, "0", [5, 6, 7], 0).no_pose == 1
-    alone = module._point(found, base, 1.0, "1", [5, 6, 7], 0, np.array(["a", "a", "a"]))
+    assert module._point(answers(110.0, np.nan, np.nan), base, 1.0, "1", setup).no_pose == 2
+    assert module._point(answers(100.0, np.nan, 300.0), base, 0.0, "0", setup).no_pose == 1
+    alone = module._point(found, base, 1.0, "1", setup, np.array(["a", "a", "a"]))
     assert alone.low is None and alone.increase_high is None
 
 
 def test_the_fake_answers_as_a_predictor_does(synthetic):
     model = Fake(standing)
     assert model.skeleton is BODY26 and isinstance(model.backend, SimpleNamespace)
-    found = judge(replace(task_of(model, open_people(synthetic)), sensor_unknown=True))
+    found = evaluate_dataset(replace(eval_setup(model, open_eval_dataset(synthetic)), sensor_unknown=True))
     assert model.origins == [None] * 12 and len(found.judged) == 12
 
 
@@ -334,13 +338,13 @@ def test_other_sensors_see_the_same_people_at_the_same_places(synthetic, monkeyp
         asked.append(people)
         return real(self, people)
 
-    real = Task.answered
-    monkeypatch.setattr(Task, "answered", answered)
-    curve = module._sensors(task_of(Fake(standing), open_people(synthetic)), None)
+    real = EvalSetup.predict
+    monkeypatch.setattr(EvalSetup, "predict", answered)
+    curve = module._sensor_curve(eval_setup(Fake(standing), open_eval_dataset(synthetic)), lambda count: None)
     for people in asked[1:]:
         for one, first in zip(people, asked[0], strict=True):
-            assert one.distance == pytest.approx(first.distance, abs=1.0)
-            np.testing.assert_allclose(one.joints[:, :2], first.joints[:, :2], atol=1e-3)
+            assert one.sample.distance == pytest.approx(first.sample.distance, abs=1.0)
+            np.testing.assert_allclose(one.sample.joints[:, :2], first.sample.joints[:, :2], atol=1e-3)
     assert min(len(one.points) for one in asked[1]) < LEAST_POINTS
     assert [point.people for point in curve.points] == [12, 12, 12]
 
@@ -350,7 +354,7 @@ def test_a_crop_moved_by_nothing_is_the_crop(tmp_path):
     files.write_humanm3(tmp_path / "raw", files.write_smpl(tmp_path / "smpl.npz"), sequences=("test/b",), frames=2)
     prepare("humanm3", tmp_path / "raw", tmp_path / "humanm3")
     for protocol in ("clean", "dapt"):
-        task = task_of(Fake(standing), open_people(tmp_path / "humanm3"), protocol=protocol)
-        for shown in module.to_disturb(task):
-            found = module._disturbed(task, shown, "crop", 0.0).points
-            np.testing.assert_array_equal(found, shown.person.points.astype(float))
+        task = eval_setup(Fake(standing), open_eval_dataset(tmp_path / "humanm3"), protocol=protocol)
+        for shown in module.people_to_perturb(task):
+            found = module._perturbed(task, shown, "crop", 0.0).points
+            np.testing.assert_array_equal(found, shown.shown.points.astype(float))

@@ -7,7 +7,7 @@ import pytest
 from lidarpose import evaluation
 from lidarpose.cli import main
 from lidarpose.errors import InputError
-from lidarpose.eval.scores import Line, Result, Scores, Setting
+from lidarpose.eval.scores import MetricRow, Result, Scores, Setting
 
 
 def scores(folder, *, method="mine", kind="waymo", protocol="clean", value=70.0, digest="ab" * 32, **more):
@@ -29,7 +29,7 @@ def scores(folder, *, method="mine", kind="waymo", protocol="clean", value=70.0,
         **told,
     )
     lines = [
-        Line(
+        MetricRow(
             method=who, figure=name, group="all", of="all", value=v, unit="mm", people=9, joints=18, skipped=0,
             arithmetic=a, **told,
         )

@@ -16,7 +16,7 @@ from lidarpose.cli import main
 from lidarpose.data.prepare import READERS, prepare
 from lidarpose.data.shards import open_dataset, shard_path
 from lidarpose.errors import InputError
-from lidarpose.eval.dataset import open_people
+from lidarpose.eval.dataset import open_eval_dataset
 from lidarpose.inference.predictor import load
 from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.header import read_header
@@ -396,7 +396,9 @@ def test_a_dataset_is_remembered_by_the_name_that_an_evaluation_gives_it(dataset
     monkeypatch.chdir(folder)
     for folder in (".", tmp_path / "link"):
         assert (
-            make_setup(Finetune(data=(folder,), init="tiny")).card["data"] == [open_people(folder).name] == ["humanm3"]
+            make_setup(Finetune(data=(folder,), init="tiny")).card["data"]
+            == [open_eval_dataset(folder).name]
+            == ["humanm3"]
         )
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from lidarpose.eval import charts
-from lidarpose.eval.metric_rows import lines_of
-from lidarpose.eval.predictions import gathered
+from lidarpose.eval.metric_rows import metric_rows
+from lidarpose.eval.predictions import stack
 from lidarpose.eval.scores import Result, Setting
 from lidarpose.skeleton import HUMAN15
 
@@ -33,11 +33,11 @@ def four():
         dataset="a", kind="synth", method="m", protocol="clean", centring="", crop="", split="none", split_source="",
         leaks="", joints=HUMAN15.joints, not_judged="", sensor="known", total=4, limit=None, clusters=False, seed=0,
     )  # fmt: skip
-    return gathered(HUMAN15, rows), setting
+    return stack(HUMAN15, rows), setting
 
 
 def test_lines_by_hand():
-    found = {(x.figure, x.group, x.of): x for x in lines_of(*four())}
+    found = {(x.figure, x.group, x.of): x for x in metric_rows(*four())}
     # steps of 0, 20 cm and -20 cm: second differences of 20 and, but for who is turned, 40 cm
     assert 200 < found["acceleration", "all", "frames in a row"].value < 450
     # one of three people of 100 points and more
@@ -53,7 +53,7 @@ def test_lines_by_hand():
 
 def test_charts_draw_what_the_lines_say(monkeypatch):
     judged, setting = four()
-    result = Result(setting=setting, counts={}, skipped={}, notes=(), lines=tuple(lines_of(judged, setting)))
+    result = Result(setting=setting, counts={}, skipped={}, notes=(), lines=tuple(metric_rows(judged, setting)))
     figures = []
     monkeypatch.setattr(charts, "_png", lambda canvas: figures.append(canvas.figure) or b"")
     charts.draw_errors(result)

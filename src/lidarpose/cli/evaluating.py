@@ -163,7 +163,7 @@ def _lines(result) -> Iterator[str]:
     wide = max(map(len, names), default=0)
     yield f"  {'':<{wide}}{'value':>8}  {'95 % interval':<16}{'people':>8}"
     for name, line in zip(names, shown, strict=True):
-        yield f"  {name:<{wide}}{_value(line):>8}  {_ends(line):<16}{line.people:>8,}  {setting.told}"
+        yield f"  {name:<{wide}}{_value(line):>8}  {_ends(line):<16}{line.people:>8,}  {setting.summary}"
 
 
 def _is_shown(line) -> bool:
@@ -192,7 +192,7 @@ def _ends(line) -> str:
 
 
 def _study(study) -> Iterator[str]:
-    yield f"{study.setting.method} disturbed: MPJPE in mm of {study.who} · {study.setting.told}"
+    yield f"{study.setting.method} disturbed: MPJPE in mm of {study.who} · {study.setting.summary}"
     for curve in study.curves:
         points = (f"{p.label}: {'-' if p.mpjpe is None else f'{p.mpjpe:.1f}'}" for p in curve.points)
         yield f"  {curve.title:<38} {'  '.join(points)}"

@@ -1,4 +1,4 @@
-"""lidarpose-bench: a frozen set of synthetic people and clips on which weights are judged.
+"""lidarpose-bench: a frozen set of synthetic people and clips on which weights are scored.
 
 One Parquet file that ships with the package and that no later version of the generator touches (`tools/make_bench.py`
 made it once). A row is one person in one frame:
@@ -6,7 +6,7 @@ made it once). A row is one person in one frame:
     clip, frame         number of the clip and frame of it; clip -1: a person alone
     condition           clean, occluded, cluttered, crop (a poor detector's box) or company (a second person)
     poses               prior (procedural) or captured (subjects kept out of all training)
-    sensor, kind, distance, visible, clutter, upright      as in `data.synthetic_info.Facts`
+    sensor, kind, distance, visible, clutter, upright      as in `sample.PersonInfo`
     origin              (3,) m in the level frame at the sensor; points_mm: x, y, z of all points from it, millimetres
     part                one a point: 0 = not body, 1 + j = the bone of SMPL-24's joint j
     joints              x, y, z of body26's joints, m, in the level frame at the sensor, which stands at its origin
@@ -21,15 +21,13 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.errors import missing_extra
+from lidarpose.data.schema import pyarrow
 from lidarpose.geometry import rotation_about
 from lidarpose.io.files import file_error, read_bytes
-from lidarpose.sample import center_of, is_plain
+from lidarpose.sample import center_of
 from lidarpose.skeleton import BODY26
 
 NAME = "lidarpose-bench-1"
-# plain people have so many points and more
-PLAIN_POINTS = 100
 # key of the card in the file's metadata
 METADATA = "lidarpose-bench"
 SHA256 = "8abcafc6628c7580b8bdf91f9c05992c7c6e4098d6922973c7cfc39d8fe0e0d2"
@@ -83,49 +81,37 @@ def bench_path() -> Path:
 
 def schema():
     """The file's Arrow schema."""
-    try:
-        import pyarrow as pa
-    except ModuleNotFoundError as error:
-        raise missing_extra(error, "reading Parquet files") from None
-
-    def type_of(kind):
-        return pa.list_(type_of(kind[0])) if isinstance(kind, list) else getattr(pa, kind.replace("bool", "bool_"))()
-
-    return pa.schema([(name, type_of(kind)) for name, kind in COLUMNS.items()])
+    pa, _ = pyarrow()
+    types = {
+        name: pa.list_(pa.type_for_alias(kind[0])) if isinstance(kind, list) else pa.type_for_alias(kind)
+        for name, kind in COLUMNS.items()
+    }
+    return pa.schema(list(types.items()))
 
 
 def load_bench() -> Bench:
     """The set. Raises InputError where the file is not the one that was frozen, MissingExtra without pyarrow."""
-    wanted = schema()
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
+    pa, parquet = pyarrow()
     path = bench_path()
     data = read_bytes(path, expected=f"{NAME}, a Parquet file")
     if hashlib.sha256(data).hexdigest() != SHA256:
         raise file_error(path, f"is not {NAME} as it was frozen: install lidarpose again")
-    table = pq.read_table(pa.BufferReader(data), schema=wanted)
-    card = json.loads(pq.read_schema(pa.BufferReader(data)).metadata[METADATA.encode()])
-    lists = {name: _lists(table[name]) for name, kind in COLUMNS.items() if isinstance(kind, list)}
-    origin = np.stack(lists["origin"])
-    points = tuple(
-        place + millimetres.reshape(-1, 3) / 1e3 for place, millimetres in zip(origin, lists["points_mm"], strict=True)
-    )
-    columns = {name: table[name].to_numpy() for name, kind in COLUMNS.items() if not isinstance(kind, list)}
-    columns |= {
-        "box": np.stack(lists["box"]),
-        "origin": origin,
-        "num_points": np.array([len(cloud) for cloud in points]),
-    }
-    return Bench(
-        points=points, joints=np.stack(lists["joints"]).reshape(-1, len(BODY26), 3), columns=columns, card=card
-    )
-
-
-def _lists(column) -> list[np.ndarray]:
-    whole = column.combine_chunks()
-    offsets = whole.offsets.to_numpy()
-    return np.split(whole.values.to_numpy(), offsets[1:-1])
+    table = parquet.read_table(pa.BufferReader(data), schema=schema())
+    card = json.loads(parquet.read_schema(pa.BufferReader(data)).metadata[METADATA.encode()])
+    columns = {}
+    for name, kind in COLUMNS.items():
+        # lists of all people lie in one array, one after the other
+        column = table[name].combine_chunks()
+        if isinstance(kind, list):
+            columns[name] = np.split(column.values.to_numpy(), column.offsets.to_numpy()[1:-1])
+        else:
+            columns[name] = column.to_numpy(zero_copy_only=False)
+    columns |= {name: np.stack(columns[name]) for name in ("origin", "joints", "box")}
+    shifts = zip(columns["origin"], columns.pop("points_mm"), strict=True)
+    points = tuple(origin + millimeters.reshape(-1, 3) / 1e3 for origin, millimeters in shifts)
+    columns["num_points"] = np.array([len(cloud) for cloud in points])
+    joints = columns.pop("joints").reshape(-1, len(BODY26), 3)
+    return Bench(points=points, joints=joints, columns=columns, card=card)
 
 
 def facing(joints: np.ndarray) -> np.ndarray:
@@ -136,24 +122,16 @@ def facing(joints: np.ndarray) -> np.ndarray:
     return np.arctan2(-left[:, 0], left[:, 1])
 
 
-def floors(bench: Bench) -> dict[str, np.ndarray]:
-    """What knows no points: joints (N, 26, 3) m of the mean skeleton about the points' center, turned to the true
-    facing ("mean pose, true facing") and not turned at all ("mean pose"). The means are over this set's own people."""
+def mean_poses(bench: Bench) -> dict[str, np.ndarray]:
+    """Baselines that know no points: joints (N, 26, 3) m of the mean skeleton about the points' center, turned to the
+    true facing ("mean pose, true facing") and not turned at all ("mean pose"). The means are over this set's people."""
     clouds = zip(bench.points, bench.columns["origin"], strict=True)
     center = np.stack([center_of(points) if len(points) else origin for points, origin in clouds])
-    away = bench.joints - center[:, None]
+    offset = bench.joints - center[:, None]
     R_level_person = rotation_about("z", facing(bench.joints))
     # row vectors: x_person = x_level @ R_level_person
-    own = (away @ R_level_person)[bench.people].mean(0)
-    plain = away[bench.people].mean(0)
+    turned = (offset @ R_level_person)[bench.people].mean(0)
     return {
-        "mean pose, true facing": center[:, None] + own @ np.swapaxes(R_level_person, -1, -2),
-        "mean pose": center[:, None] + plain,
+        "mean pose, true facing": center[:, None] + turned @ np.swapaxes(R_level_person, -1, -2),
+        "mean pose": center[:, None] + offset[bench.people].mean(0),
     }
-
-
-def plain(bench: Bench) -> np.ndarray:
-    """(N,) bool: upright, whole, uncluttered, of 100 points and more."""
-    columns = bench.columns
-    many = columns["num_points"] >= PLAIN_POINTS
-    return many & is_plain(columns["upright"], columns["visible"], columns["clutter"])

@@ -1,7 +1,6 @@
-"""Charts of an evaluation: errors by distance, points, hidden share and joint; reliability; stability.
+"""Charts of an evaluation: errors by group of people and joints, reliability, stability, the worst people.
 
-Drawn with matplotlib's Agg canvas through its object interface, as `picture` draws people; every function returns the
-bytes of a PNG.
+Drawn with matplotlib's Agg canvas through its object interface; every function returns the bytes of a PNG.
 """
 
 import io
@@ -9,17 +8,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lidarpose.eval.predictions import Judged
+from lidarpose.eval.dataset import EvalSample
+from lidarpose.eval.predictions import Predictions
 from lidarpose.eval.robustness import Curve, End, Stability
-from lidarpose.eval.scores import OURS, Line, Result
-from lidarpose.sample import HIT
+from lidarpose.eval.scores import BASELINE, OURS, MetricRow, Result, Setting
+from lidarpose.sample import HIT, Pose
+from lidarpose.viz.draw import Panel, draw_people
 
 # blue and orange of Okabe and Ito's color-blind-safe palette (2008), the orange darker to stand out on white
 _BLUE, _ORANGE = "#0072b2", "#e07000"
 _BAR, _GRAY, _INK, _FAINT, _HAIRLINE = "#c9deec", "#9aa3ad", "#1f2328", "#7a828c", "#e3e6ea"
 _DPI = 100
 _BINS = 10
-# edges of stated spread, m, in which it is held against the true error
+# edges of stated spread, m, in which it is compared with the true error
 _SPREADS = (0.0, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, np.inf)
 # points on a chart that stand for fewer joints say little
 _FEWEST = 20
@@ -28,108 +29,112 @@ _FEWEST = 20
 def draw_errors(result: Result) -> bytes:
     """MPJPE by distance, number of points, hidden share and joint, with intervals and numbers of people."""
     panels = {
-        "distance, m": ("by distance from the sensor, m", "the sensor's place is not known"),
+        "distance, m": ("by distance from the sensor, m", "the sensor's position is not known"),
         "points": ("by number of points", "nobody"),
         "hidden share": ("by share that is hidden", "the dataset does not tell what is hidden"),
         "joints": ("by joint", "nobody"),
     }
-    figure, canvas = _figure(9.6, 6.6)
-    _title(figure, f"{result.setting.dataset}: MPJPE of {result.setting.method}, mm", result.setting.told)
-    whole = result.line("mpjpe")
-    floors = [line for line in result.lines if line.figure == "mpjpe" and line.of == "all" and _is_floor(line, result)]
-    for axes, (group, (title, nothing)) in zip(figure.subplots(2, 2).ravel(), panels.items(), strict=True):
-        lines = [
-            line for line in result.lines if (line.figure, line.group) == ("mpjpe", group) and _is_own(line, result)
-        ]
-        lines = [line for line in lines if line.value is not None]
+    setting = result.setting
+    figure = _figure(9.6, 6.6, f"{setting.dataset}: MPJPE of {setting.method}, mm", setting.summary)
+    rows = [row for row in result.lines if row.figure == "mpjpe" and row.arithmetic == OURS and row.value is not None]
+    own = [row for row in rows if row.method == setting.method]
+    levels = [(row, f"all {row.value:.1f}", _INK) for row in own if row.group == "all"]
+    baselines = [row for row in rows if row.method != setting.method and row.group == "all"]
+    for axes, (group, (title, missing)) in zip(figure.subplots(2, 2).ravel(), panels.items(), strict=True):
         axes.set_title(title, fontsize=10, loc="left", color=_INK)
-        if not lines:
-            _nothing(axes, nothing)
+        shown = [row for row in own if row.group == group]
+        if not shown:
+            _empty(axes, missing)
             continue
-        _bars(axes, [line.of for line in lines], lines)
-        if whole.value is not None:
-            axes.axhline(whole.value, color=_INK, lw=0.8, ls=(0, (4, 3)), zorder=3)
-            _note(axes, whole.value, f"all {whole.value:.1f}")
-        for floor in floors:
-            if floor.value is not None and floor.value < axes.get_ylim()[1] * 1.6:
-                axes.set_ylim(0, max(axes.get_ylim()[1], floor.value * 1.12))
-                axes.axhline(floor.value, color=_ORANGE, lw=0.8, ls=(0, (1, 2)), zorder=3)
-                _note(axes, floor.value, floor.method.removeprefix("floor: "), _ORANGE)
-    return _png(canvas)
+        _bars(axes, shown)
+        for row, words, color in levels:
+            _level(axes, row.value, words, color)
+        for row in baselines:
+            if row.value < axes.get_ylim()[1] * 1.6:
+                axes.set_ylim(0, max(axes.get_ylim()[1], row.value * 1.12))
+                _level(axes, row.value, row.method.removeprefix(BASELINE), _ORANGE)
+    return _png(figure)
 
 
-def draw_reliability(judged: Judged, result: Result) -> bytes | None:
+def draw_reliability(predictions: Predictions, result: Result) -> bytes | None:
     """Stated confidence against the share of joints within 10 cm, and stated spread against the true error; None where
     the network states neither."""
-    some = judged.of(~judged.moving)
+    some = predictions.select(~predictions.moving)
     error = some.errors()
     known = ~np.isnan(error) & ~np.isnan(some.confidence) & ~np.isnan(some.spread)
     if not known.any():
         return None
     error, confidence, spread = error[known], some.confidence[known].astype(float), some.spread[known].astype(float)
-    figure, canvas = _figure(9.0, 4.3)
-    _title(figure, f"{result.setting.dataset}: what {result.setting.method} says of itself", result.setting.told)
-    left, right = figure.subplots(1, 2)
+    setting = result.setting
+    title = f"{setting.dataset}: confidence and spread that {setting.method} predicts"
+    left, right = (figure := _figure(9.0, 4.3, title, setting.summary)).subplots(1, 2)
     _confidence(left, confidence, error < 1e3 * HIT, result)
     _spread(right, spread * 1e3, error)
-    return _png(canvas)
+    return _png(figure)
 
 
 def draw_stability(study: Stability) -> bytes:
     """The curves of a study, the other sensors, and the errors of end joints over the worst people."""
     curves = [curve for curve in study.curves if curve.name != "sensors"]
-    sensors = next((curve for curve in study.curves if curve.name == "sensors"), None)
-    count = len(curves) + (sensors is not None) + bool(study.ends)
-    columns = 4
+    sensors = [curve for curve in study.curves if curve.name == "sensors"]
+    columns, count = 4, len(study.curves) + bool(study.ends)
     rows = -(-count // columns)
-    figure, canvas = _figure(13.6, 0.5 + 3.0 * rows)
-    _title(figure, f"{study.setting.method} disturbed: MPJPE of {study.who}, mm", study.setting.told)
-    axes = list(np.ravel(figure.subplots(rows, columns)))
+    title = f"{study.setting.method}, points perturbed: MPJPE of {study.who}, mm"
+    figure = _figure(13.6, 0.5 + 3.0 * rows, title, study.setting.summary)
+    axes = iter(np.ravel(figure.subplots(rows, columns)))
     values = [p.high or p.mpjpe for curve in curves for p in curve.points if p.mpjpe is not None]
-    top = 1.08 * max(values, default=1.0)
     for curve in curves:
-        _curve(axes.pop(0), curve, top)
-    if sensors is not None:
-        _sensors(axes.pop(0), sensors)
+        _curve(next(axes), curve, 1.08 * max(values, default=1.0))
+    for curve in sensors:
+        _sensors(next(axes), curve)
     if study.ends:
-        _ends(axes.pop(0), study.ends)
-    for one in axes:
-        one.set_axis_off()
-    return _png(canvas)
+        _end_joints(next(axes), study.ends)
+    for unused in axes:
+        unused.set_axis_off()
+    return _png(figure)
+
+
+def draw_worst(p: Predictions, setting: Setting, worst: Sequence[tuple[EvalSample, int]]) -> bytes:
+    """The people with the largest mean errors and their rows in the predictions: points, pose and truth."""
+    errors = p.errors()
+    panels = []
+    for one, k in worst:
+        where = f"{p.sequence[k]} {p.frame[k]} {p.track[k]}"
+        if p.sensor[k]:
+            where = f"#{p.row[k]} {p.condition[k] or p.sensor[k]}"
+        confidence = None if np.isnan(p.confidence[k]).any() else p.confidence[k].astype(float)
+        panels.append(
+            Panel(
+                points=one.points,
+                label=f"{np.nanmean(errors[k]):.0f} mm · {where}",
+                distance=float(p.distance[k]),
+                pose=Pose(joints=p.pred[k].astype(float), skeleton=p.skeleton, confidence=confidence),
+                truth=Pose(joints=p.true[k].astype(float), skeleton=p.skeleton),
+            )
+        )
+    title = f"{setting.dataset}: the {len(panels)} largest mean errors of {setting.method} · {setting.summary}"
+    return draw_people(panels, title=title)
 
 
 # ---- panels
 
 
-def _bars(axes, names: Sequence[str], lines: Sequence[Line]) -> None:
-    """A bar a line, its interval, its value, and below how many people it is of."""
-    at = np.arange(len(lines))
-    values = np.array([line.value for line in lines])
+def _bars(axes, rows: Sequence[MetricRow]) -> None:
+    """A bar a row, its interval, its value, and below how many people it is of."""
+    at, values = np.arange(len(rows)), np.array([row.value for row in rows])
+    low, high = _ends(values, rows)
     axes.bar(at, values, 0.7, color=_BAR, zorder=1)
-    ends = [
-        (line.value if line.low is None else line.low, line.value if line.high is None else line.high) for line in lines
-    ]
-    low, high = np.array(ends).T
     axes.vlines(at, low, high, color=_BLUE, lw=1.6, zorder=4)
     axes.plot(at, values, "o", ms=4, color=_BLUE, zorder=5)
     for x, value, top in zip(at, values, high, strict=True):
-        axes.annotate(
-            f"{value:.0f}",
-            (x, top),
-            (0, 4),
-            textcoords="offset points",
-            ha="center",
-            fontsize=8,
-            color=_INK,
-            zorder=6,
-            bbox={"fc": "white", "ec": "none", "alpha": 0.75, "pad": 0.6},
-        )
-    axes.set_xticks(at, [f"{name}\n{line.people:,}" for name, line in zip(names, lines, strict=True)], fontsize=7.5)
+        text = _text(axes, f"{value:.0f}", (x, top), (0, 4), zorder=6)
+        text.set_bbox({"fc": "white", "ec": "none", "alpha": 0.75, "pad": 0.6})
+    axes.set_xticks(at, [f"{row.of}\n{row.people:,}" for row in rows], fontsize=7.5)
     axes.set_ylim(0, 1.18 * high.max())
     # a single bar is no wider than one of four
-    spare = max(4 - len(lines), 0) / 2
-    axes.set_xlim(-0.6 - spare, len(lines) - 0.4 + spare)
-    _plain(axes)
+    spare = max(4 - len(rows), 0) / 2
+    axes.set_xlim(-0.6 - spare, len(rows) - 0.4 + spare)
+    _styled(axes)
 
 
 def _confidence(axes, stated: np.ndarray, hit: np.ndarray, result: Result) -> None:
@@ -138,170 +143,141 @@ def _confidence(axes, stated: np.ndarray, hit: np.ndarray, result: Result) -> No
     some = count >= _FEWEST
     mean = np.bincount(index, stated, _BINS)[some] / count[some]
     share = np.bincount(index, hit.astype(float), _BINS)[some] / count[some]
-    axes.bar(
-        (np.arange(_BINS) + 0.5) / _BINS, count / count.sum(), 0.092, color=_BAR, label="share of joints", zorder=1
-    )
+    centers = (np.arange(_BINS) + 0.5) / _BINS
+    axes.bar(centers, count / count.sum(), 0.092, color=_BAR, label="share of joints", zorder=1)
     axes.plot([0, 1], [0, 1], color=_GRAY, lw=0.9, zorder=2)
     axes.plot(mean, share, "o-", color=_BLUE, ms=4.5, lw=1.4, label="within 10 cm", zorder=3)
-    axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="stated confidence")
-    axes.tick_params(labelsize=8)
-    axes.xaxis.label.set_fontsize(9)
-    figures = {line.figure: line.value for line in result.lines if line.group == "all"}
-    told = [f"expected calibration error {figures['calibration_error']:.1f} %"]
-    if figures.get("auroc") is not None:
-        told.append(f"AUROC {figures['auroc'] / 100:.3f}")
-    axes.set_title(", ".join(told), fontsize=9.5, loc="left", color=_INK)
-    axes.legend(fontsize=8, loc="upper left", frameon=False)
-    _plain(axes)
+    axes.set(xlim=(0, 1), ylim=(0, 1))
+    values = {row.figure: row.value for row in result.lines if row.group == "all"}
+    title = f"expected calibration error {values['calibration_error']:.1f} %"
+    if values.get("auroc") is not None:
+        title += f", AUROC {values['auroc'] / 100:.3f}"
+    _styled(axes, title, xlabel="predicted confidence", legend=True)
 
 
 def _spread(axes, stated: np.ndarray, error: np.ndarray) -> None:
     edges = 1e3 * np.array(_SPREADS)
     index = np.digitize(stated, edges) - 1
-    bins = [index == k for k in range(len(edges) - 1)]
-    bins = [rows for rows in bins if rows.sum() >= _FEWEST]
-    mean = [stated[rows].mean() for rows in bins]
+    bins = [index == k for k in range(len(edges) - 1) if (index == k).sum() >= _FEWEST]
+    stated_means, means = (np.array([values[rows].mean() for rows in bins]) for values in (stated, error))
     quartiles = np.array([np.quantile(error[rows], [0.25, 0.75]) for rows in bins]).reshape(-1, 2)
-    top = 1.1 * max([*mean, *(error[rows].mean() for rows in bins), *quartiles[:, 1], 1.0])
+    top = 1.1 * max([*stated_means, *means, *quartiles[:, 1], 1.0])
     axes.plot([0, top], [0, top], color=_GRAY, lw=0.9, zorder=2)
-    axes.fill_between(mean, *quartiles.T, color=_BAR, lw=0, label="middle half", zorder=1)
-    axes.plot(mean, [error[rows].mean() for rows in bins], "o-", color=_BLUE, ms=4.5, lw=1.4, label="mean", zorder=3)
-    axes.set(xlim=(0, top), ylim=(0, top), xlabel="stated spread, mm", ylabel="true error, mm")
-    axes.tick_params(labelsize=8)
-    for label in (axes.xaxis.label, axes.yaxis.label):
-        label.set_fontsize(9)
-    axes.set_title(
-        f"spread {stated.mean():.0f} mm stated, {error.mean():.0f} mm true", fontsize=9.5, loc="left", color=_INK
-    )
-    axes.legend(fontsize=8, loc="upper left", frameon=False)
-    _plain(axes)
+    axes.fill_between(stated_means, *quartiles.T, color=_BAR, lw=0, label="middle half", zorder=1)
+    axes.plot(stated_means, means, "o-", color=_BLUE, ms=4.5, lw=1.4, label="mean", zorder=3)
+    axes.set(xlim=(0, top), ylim=(0, top))
+    title = f"spread {stated.mean():.0f} mm predicted, {error.mean():.0f} mm true"
+    _styled(axes, title, xlabel="predicted spread, mm", ylabel="true error, mm", legend=True)
 
 
 def _curve(axes, curve: Curve, top: float) -> None:
     points = [point for point in curve.points if point.mpjpe is not None]
     if not points:
-        axes.set_title(curve.title, fontsize=9.5, loc="left", color=_INK)
-        _nothing(axes, "nobody has a pose")
+        _empty(axes, "nobody has a pose", curve.title)
         return
     # amounts are not evenly apart, but each is one step of the study
     at = np.array([k for k, point in enumerate(curve.points) if point.mpjpe is not None])
     values = np.array([point.mpjpe for point in points])
-    ends = [(p.mpjpe if p.low is None else p.low, p.mpjpe if p.high is None else p.high) for p in points]
-    axes.fill_between(at, *np.array(ends).T, color=_BAR, lw=0, zorder=1)
+    axes.fill_between(at, *_ends(values, points), color=_BAR, lw=0, zorder=1)
     axes.plot(at, values, "o-", color=_BLUE, ms=4.5, lw=1.4, zorder=3)
     axes.axhline(values[0], color=_GRAY, lw=0.8, ls=(0, (4, 3)), zorder=2)
     for x, value in zip(at, values, strict=True):
-        axes.annotate(
-            f"{value:.0f}", (x, value), (0, 6), textcoords="offset points", ha="center", fontsize=8, color=_INK
-        )
-    lost = [f"\n({point.no_pose})" if point.no_pose else "" for point in curve.points]
-    names = [f"{point.label}{extra}" for point, extra in zip(curve.points, lost, strict=True)]
+        _text(axes, f"{value:.0f}", (x, value), (0, 6))
+    names = [point.label + (f"\n({point.no_pose})" if point.no_pose else "") for point in curve.points]
     axes.set_xticks(np.arange(len(names)), names, fontsize=8)
-    axes.set(ylim=(0, top), xlim=(-0.4, len(curve.points) - 0.6))
-    axes.set_title(curve.title + (" (no pose)" if any(lost) else ""), fontsize=9.5, loc="left", color=_INK)
-    _plain(axes)
+    axes.set(ylim=(0, top), xlim=(-0.4, len(names) - 0.6))
+    _styled(axes, curve.title + (" (no pose)" if any(point.no_pose for point in curve.points) else ""))
 
 
 def _sensors(axes, curve: Curve) -> None:
     points = sorted((p for p in curve.points if p.mpjpe is not None), key=lambda point: point.points)
     if not points:
-        axes.set_title(curve.title, fontsize=9.5, loc="left", color=_INK)
-        _nothing(axes, "nobody has a pose")
+        _empty(axes, "nobody has a pose", curve.title)
         return
-    at = np.arange(len(points))[::-1]
-    values = np.array([point.mpjpe for point in points])
+    at, values = np.arange(len(points))[::-1], np.array([point.mpjpe for point in points])
+    low, high = _ends(values, points)
     axes.barh(at, values, 0.72, color=_BAR, zorder=1)
-    axes.hlines(
-        at, [p.low or p.mpjpe for p in points], [p.high or p.mpjpe for p in points], color=_BLUE, lw=1.6, zorder=3
-    )
+    axes.hlines(at, low, high, color=_BLUE, lw=1.6, zorder=3)
     axes.plot(values, at, "o", ms=3.5, color=_BLUE, zorder=4)
-    for y, point in zip(at, points, strict=True):
-        axes.annotate(
-            f"{point.mpjpe:.0f}",
-            (point.high or point.mpjpe, y),
-            (4, -3),
-            textcoords="offset points",
-            fontsize=8,
-            color=_INK,
-        )
+    for y, value, end in zip(at, values, high, strict=True):
+        _text(axes, f"{value:.0f}", (end, y), (4, -3), ha="left")
     axes.set_yticks(at, [f"{point.label} · {point.points:.0f}" for point in points], fontsize=7.5)
-    axes.set_xlim(0, 1.15 * max(p.high or p.mpjpe for p in points))
-    axes.set_title("other sensors · points of half the people", fontsize=9.5, loc="left", color=_INK)
-    _plain(axes, grid="x")
+    axes.set_xlim(0, 1.15 * high.max())
+    _styled(axes, "other sensors · median number of points", grid="x")
 
 
-def _ends(axes, ends: Sequence[End]) -> None:
-    at = np.arange(len(ends))
+def _end_joints(axes, ends: Sequence[End]) -> None:
+    at, (low, middle, high) = np.arange(len(ends)), np.array([end.quartiles for end in ends]).T
+    tops = np.maximum(high, [end.mean for end in ends])
     axes.bar(at, [end.mean for end in ends], 0.6, color=_BAR, zorder=1)
-    axes.vlines(
-        at, [end.quartiles[0] for end in ends], [end.quartiles[2] for end in ends], color=_BLUE, lw=5, alpha=0.55
-    )
-    axes.plot(at, [end.quartiles[1] for end in ends], "o", ms=5, color=_BLUE, mec="white", zorder=4)
-    for x, end in zip(at, ends, strict=True):
-        axes.annotate(
-            f"{end.mean:.0f} ± {end.deviation:.0f}",
-            (x, max(end.mean, end.quartiles[2])),
-            (0, 4),
-            textcoords="offset points",
-            ha="center",
-            fontsize=8,
-            color=_INK,
-        )
+    axes.vlines(at, low, high, color=_BLUE, lw=5, alpha=0.55)
+    axes.plot(at, middle, "o", ms=5, color=_BLUE, mec="white", zorder=4)
+    for x, top, end in zip(at, tops, ends, strict=True):
+        _text(axes, f"{end.mean:.0f} ± {end.deviation:.0f}", (x, top), (0, 4))
     axes.set_xticks(at, [end.group for end in ends], fontsize=8.5)
-    axes.set_xlim(-0.6, len(ends) - 0.4)
-    axes.set_ylim(0, 1.15 * max(max(end.mean, end.quartiles[2]) for end in ends))
-    axes.set_title(f"end joints of the worst {ends[0].worst:,}: mean, quartiles", fontsize=9.5, loc="left", color=_INK)
-    _plain(axes)
+    axes.set(xlim=(-0.6, len(ends) - 0.4), ylim=(0, 1.15 * tops.max()))
+    _styled(axes, f"end joints of the worst {ends[0].worst:,}: mean, quartiles")
 
 
 # ---- the sheet
 
 
-def _figure(width: float, height: float):
+def _figure(width: float, height: float, title: str, subtitle: str):
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white", layout="constrained")
-    return figure, FigureCanvasAgg(figure)
+    FigureCanvasAgg(figure)
+    options = {"parse_math": False, "family": "DejaVu Sans"}
+    figure.suptitle(f"{title}\n{subtitle}", x=0.01, ha="left", fontsize=10.5, color=_INK, **options)
+    return figure
 
 
-def _title(figure, title: str, told: str) -> None:
-    words = {"parse_math": False, "family": "DejaVu Sans"}
-    figure.suptitle(f"{title}\n{told}", x=0.01, ha="left", fontsize=10.5, color=_INK, **words)
+def _ends(values: np.ndarray, rows: Sequence) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of the rows' intervals; the values themselves where there is none."""
+    low, high = (np.array([getattr(row, end) for row in rows], float) for end in ("low", "high"))
+    return np.where(np.isnan(low), values, low), np.where(np.isnan(high), values, high)
 
 
-def _plain(axes, grid: str = "y") -> None:
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        axes.spines[side].set_color(_GRAY)
+def _styled(
+    axes, title: str = "", *, grid: str = "y", xlabel: str = "", ylabel: str = "", legend: bool = False
+) -> None:
+    for name, spine in axes.spines.items():
+        spine.set_visible(name in ("left", "bottom"))
+        spine.set_color(_GRAY)
     axes.grid(axis=grid, color=_HAIRLINE, lw=0.8, zorder=0)
     axes.set_axisbelow(True)
     axes.tick_params(labelcolor=_INK, length=2.5, color=_GRAY)
-    axes.tick_params(axis="y" if grid == "y" else "x", labelsize=8)
+    axes.tick_params(axis="both" if xlabel else grid, labelsize=8)
+    if title:
+        axes.set_title(title, fontsize=9.5, loc="left", color=_INK)
+    axes.set_xlabel(xlabel, fontsize=9)
+    axes.set_ylabel(ylabel, fontsize=9)
+    if legend:
+        axes.legend(fontsize=8, loc="upper left", frameon=False)
 
 
-def _note(axes, y: float, words: str, color: str = _INK) -> None:
-    """Words above the right end of a level line."""
+def _text(axes, words: str, at: tuple[float, float], offset: tuple[float, float], *, ha: str = "center", **more):
+    return axes.annotate(words, at, offset, textcoords="offset points", ha=ha, fontsize=8, color=_INK, **more)
+
+
+def _level(axes, y: float, words: str, color: str) -> None:
+    """A level line with words above its right end."""
+    dashes = (4, 3) if color == _INK else (1, 2)
+    axes.axhline(y, color=color, lw=0.8, ls=(0, dashes), zorder=3)
     place = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "ha": "right"}
     axes.annotate(words, (1.0, y), (-2, 2), fontsize=7.5, color=color, zorder=7, **place)
 
 
-def _nothing(axes, words: str) -> None:
+def _empty(axes, words: str, title: str = "") -> None:
+    if title:
+        axes.set_title(title, fontsize=9.5, loc="left", color=_INK)
     axes.set_axis_off()
     axes.text(0.5, 0.5, words, transform=axes.transAxes, ha="center", va="center", fontsize=9, color=_FAINT)
 
 
-def _is_own(line: Line, result: Result) -> bool:
-    return line.method == result.setting.method and line.arithmetic == OURS
-
-
-def _is_floor(line: Line, result: Result) -> bool:
-    return line.method != result.setting.method and line.group == "all"
-
-
-def _png(canvas) -> bytes:
+def _png(figure) -> bytes:
     buffer = io.BytesIO()
     # print_figure would follow the user's savefig settings
-    canvas.print_png(buffer, metadata={"Software": None})
+    figure.canvas.print_png(buffer, metadata={"Software": None})
     return buffer.getvalue()

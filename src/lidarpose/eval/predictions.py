@@ -1,4 +1,4 @@
-"""What was predicted of a dataset's people, beside the truth, as arrays; and as poses.parquet, from which every figure
+"""What was predicted of a dataset's people, beside the truth, as arrays; and as poses.parquet, from which every metric
 can be computed again.
 
 A row is one person in one frame; columns:
@@ -23,6 +23,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -34,32 +35,29 @@ from lidarpose.skeleton import Skeleton
 
 # key of the joints' names in the file's metadata
 METADATA = "lidarpose.poses"
+# columns of one value a person
 _VALUES = {
-    "shard": np.int32,
-    "row": np.int64,
-    "sequence": str,
-    "frame": np.int64,
-    "track": str,
-    "time": np.float64,
-    "sensor": str,
-    "condition": str,
-    "poses": str,
-    "plain": bool,
-    "moving": bool,
-    "points": np.int32,
-    "distance": np.float32,
-    "hidden": np.float32,
+    **{"shard": np.int32, "row": np.int64, "sequence": str, "frame": np.int64, "track": str, "time": np.float64},
+    **{"sensor": str, "condition": str, "poses": str, "plain": bool, "moving": bool},
+    **{"points": np.int32, "distance": np.float32, "hidden": np.float32},
 }
-_OF_JOINTS = ("confidence", "spread", "visible")
-# box: center, size, yaw
-_BOX = 7
+# columns of a list a person: type, shape of one person's with J joints as -1
+_LISTS: dict[str, tuple[type, tuple[int, ...]]] = {
+    "box": (np.float64, (7,)),
+    "pred": (np.float32, (-1, 3)),
+    "true": (np.float32, (-1, 3)),
+    "labels": (np.uint8, (-1,)),
+    **dict.fromkeys(("confidence", "spread", "visible"), (np.float32, (-1,))),
+}
+# of these NaN all over is null in the file: there is none
+_NULLABLE = ("box", "pred", "confidence", "spread", "visible")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Judged:
+class Predictions:
     """N people in J joints, of `skeleton`. Columns as in poses.parquet: pred, true (N, J, 3) float32 m, pred NaN
-    without a pose; labels (N, J) uint8; confidence, spread, visible (N, J) float32, NaN where not told; box (N, 7), NaN
-    where there is none; the others (N,)."""
+    without a pose; labels (N, J) uint8; confidence, spread, visible (N, J) float32, NaN where not stated; box (N, 7),
+    NaN where there is none; the others (N,)."""
 
     skeleton: Skeleton
     pred: np.ndarray
@@ -93,39 +91,47 @@ class Judged:
         return np.isfinite(self.pred).all((1, 2))
 
     @property
-    def labelled(self) -> np.ndarray:
+    def boxed(self) -> np.ndarray:
+        """(N,) bool: has a box."""
+        return np.isfinite(self.box).all(1)
+
+    @property
+    def labeled(self) -> np.ndarray:
         """(N, J) bool: a joint that counts, hidden or seen, of a person with a pose."""
         return (self.labels != UNLABELED) & self.posed[:, None]
 
+    # names until 0.2
+    labelled = labeled
+
     @property
     def filled(self) -> np.ndarray:
-        """(N, J, 3): pred, 0 without a pose; such people have no labelled joints."""
+        """(N, J, 3): pred, 0 without a pose; such people have no labeled joints."""
         return np.where(self.posed[:, None, None], self.pred, 0)
 
     def errors(self) -> np.ndarray:
         """(N, J) mm; NaN without a label or a pose."""
-        return joint_errors(self.filled, self.true, self.labelled)
+        return joint_errors(self.filled, self.true, self.labeled)
 
-    def of(self, rows: np.ndarray) -> "Judged":
+    def select(self, rows: np.ndarray) -> "Predictions":
         """Some of the people."""
-        own = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "skeleton"}
-        return replace(self, **{name: values[rows] for name, values in own.items()})
+        return replace(self, **{f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "skeleton"})
+
+    of = select
 
 
-def gathered(skeleton: Skeleton, rows: Sequence[dict]) -> Judged:
-    """Judged people from one dict each, whose keys are the columns' names; numbers become as wide as in the file."""
-    count = len(skeleton)
-    stacked = {
-        name: np.array([row[name] for row in rows], kind) if rows else np.empty(0, kind)
-        for name, kind in _VALUES.items()
+def stack(skeleton: Skeleton, rows: Sequence[dict[str, Any]]) -> Predictions:
+    """Predictions from a dict a person, whose keys are the columns' names; None or nothing where the file
+    would have null; numbers become as wide as in the file."""
+    columns: dict[str, np.ndarray] = {
+        name: np.array([row[name] for row in rows], kind) for name, kind in _VALUES.items()
     }
-    for name in ("pred", "true"):
-        stacked[name] = np.array([row[name] for row in rows], np.float32).reshape(-1, count, 3)
-    for name in _OF_JOINTS:
-        stacked[name] = np.array([row[name] for row in rows], np.float32).reshape(-1, count)
-    stacked["labels"] = np.array([row["labels"] for row in rows], np.uint8).reshape(-1, count)
-    stacked["box"] = np.array([row["box"] for row in rows], float).reshape(-1, _BOX)
-    return Judged(skeleton=skeleton, **stacked)
+    for name, (kind, shape) in _LISTS.items():
+        shape = (len(rows), *(len(skeleton) if size == -1 else size for size in shape))
+        columns[name] = np.full(shape, 0 if kind is np.uint8 else np.nan, kind)
+        for k, row in enumerate(rows):
+            if (value := row.get(name) if name in _NULLABLE else row[name]) is not None:
+                columns[name][k] = np.reshape(value, shape[1:])
+    return Predictions(skeleton=skeleton, **columns)
 
 
 def subset(of: Skeleton, joints: Sequence[str]) -> Skeleton:
@@ -135,68 +141,53 @@ def subset(of: Skeleton, joints: Sequence[str]) -> Skeleton:
         return of
     parents = []
     for name in joints:
-        at = of.parents[of.index(name)]
-        while at >= 0 and of.joints[at] not in joints:
-            at = of.parents[at]
-        parents.append(joints.index(of.joints[at]) if at >= 0 else min(len(parents), 1) - 1)
+        parent = of.parents[of.index(name)]
+        while parent >= 0 and of.joints[parent] not in joints:
+            parent = of.parents[parent]
+        parents.append(joints.index(of.joints[parent]) if parent >= 0 else min(len(parents), 1) - 1)
     return Skeleton(name=f"{len(joints)} joints of {of.name}", joints=tuple(joints), parents=tuple(parents))
 
 
 # ---- poses.parquet
 
 
-def write_poses(path: str | Path, judged: dict[str, Judged]) -> None:
+def write_poses(path: str | Path, predictions: dict[str, Predictions]) -> None:
     """Writes poses.parquet, people of all datasets by their names, into a file that nothing else writes."""
     pa, parquet = pyarrow()
-    meta = {
-        name: {"skeleton": one.skeleton.name, "joints": one.skeleton.joints, "parents": one.skeleton.parents}
-        for name, one in judged.items()
-    }
     types = {str: pa.string(), bool: pa.bool_()}
-    of_joints = pa.list_(pa.float32())
-    schema = [("dataset", pa.string())]
-    schema += [(name, types[kind] if kind in types else pa.from_numpy_dtype(kind)) for name, kind in _VALUES.items()]
-    schema += [("box", pa.list_(pa.float64())), ("pred", of_joints), ("true", of_joints)]
-    schema += [("labels", pa.list_(pa.uint8())), *((name, of_joints) for name in _OF_JOINTS), ("error_mm", of_joints)]
-    schema = pa.schema(schema, metadata={METADATA: json.dumps({"unit": "m", "datasets": meta})})
+    columns = [("dataset", pa.string())]
+    columns += [(name, types[kind] if kind in types else pa.from_numpy_dtype(kind)) for name, kind in _VALUES.items()]
+    columns += [(name, pa.list_(pa.from_numpy_dtype(kind))) for name, (kind, _) in _LISTS.items()]
+    skeletons = {name: one.skeleton for name, one in predictions.items()}
+    about = {k: {"skeleton": of.name, "joints": of.joints, "parents": of.parents} for k, of in skeletons.items()}
+    schema = pa.schema(
+        [*columns, ("error_mm", pa.list_(pa.float32()))],
+        metadata={METADATA: json.dumps({"unit": "m", "datasets": about})},
+    )
     with parquet.ParquetWriter(path, schema, compression="zstd", write_page_checksum=True) as writer:
-        for name, one in judged.items():
-            columns = {"dataset": [name] * len(one)} | {key: getattr(one, key) for key in _VALUES}
-            lists = {key: getattr(one, key) for key in ("box", "pred", "true", "labels", *_OF_JOINTS)}
-            lists["error_mm"] = one.errors().astype(np.float32)
-            for key, values in lists.items():
-                flat = values.reshape(len(one), -1)
-                # NaN all over means that there is none; in the truth and the errors it is said joint by joint
-                null = np.isnan(flat).all(1) if key not in ("true", "labels", "error_mm") else np.zeros(len(one), bool)
-                columns[key] = [None if none else row for none, row in zip(null, flat, strict=True)]
-            writer.write_table(pa.Table.from_pydict(columns, schema=schema))
+        for name, one in predictions.items():
+            values: dict[str, Any] = {"dataset": [name] * len(one)} | {key: getattr(one, key) for key in _VALUES}
+            values["error_mm"] = list(one.errors().astype(np.float32))
+            for key in _LISTS:
+                flat = getattr(one, key).reshape(len(one), -1)
+                null = np.isnan(flat).all(1) & (key in _NULLABLE)
+                values[key] = [None if is_null else row for is_null, row in zip(null, flat, strict=True)]
+            writer.write_table(pa.Table.from_pydict(values, schema=schema))
 
 
-def read_poses(path: str | Path) -> dict[str, Judged]:
+def read_poses(path: str | Path) -> dict[str, Predictions]:
     """The people of poses.parquet by dataset. Raises InputError where it is none, MissingExtra without pyarrow."""
     pa, parquet = pyarrow()
     data = read_bytes(path, expected="poses.parquet of an evaluation")
     try:
         table = parquet.read_table(pa.BufferReader(data), page_checksum_verification=True)
-        meta = json.loads(table.schema.metadata[METADATA.encode()])["datasets"]
-        out = {}
-        for name, told in meta.items():
-            skeleton = Skeleton(name=told["skeleton"], joints=tuple(told["joints"]), parents=tuple(told["parents"]))
-            count = len(skeleton)
-            empty = {"pred": np.full((count, 3), np.nan), "box": np.full(_BOX, np.nan)}
-            empty |= {key: np.full(count, np.nan) for key in _OF_JOINTS}
+        about = json.loads(table.schema.metadata[METADATA.encode()])["datasets"]
+        predictions = {}
+        for name, entry in about.items():
+            joints, parents = tuple(entry["joints"]), tuple(entry["parents"])
             own = table.filter(pa.compute.equal(table["dataset"], name)).to_pylist()
-            rows = [
-                {
-                    key: empty[key] if value is None else value
-                    for key, value in row.items()
-                    if key in empty or value is not None
-                }
-                for row in own
-            ]
-            for row in rows:
-                row["pred"], row["true"] = (np.reshape(row[key], (count, 3)) for key in ("pred", "true"))
-            out[name] = gathered(skeleton, rows)
-        return out
+            rows = [{key: value for key, value in row.items() if value is not None} for row in own]
+            predictions[name] = stack(Skeleton(name=entry["skeleton"], joints=joints, parents=parents), rows)
+        return predictions
     except (pa.ArrowException, KeyError, TypeError, ValueError, AttributeError) as error:
         raise file_error(path, f"is no poses.parquet of an evaluation ({error}); evaluate again") from None

@@ -1,18 +1,25 @@
-"""How a person is cut out and centered before a network sees them: two protocols, whose figures are not comparable.
+"""A network before a dataset, under one of two protocols, whose scores are not comparable: how a person is cut out and
+centered before the network sees them.
 
-clean   what a user has: the crop is a detector's box (the labelled one, displaced, see `jittered`), the center comes
+clean   what a user has: the crop is a detector's box (the labeled one, displaced, see `jittered`), the center comes
         from the points alone, and no sequence is in both training and test
 dapt    what the paper's released code does: crop and center from the labels, one pass, its splits
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 
-from lidarpose.data.dapt_crops import released_view
-from lidarpose.errors import InputError, check_name
-from lidarpose.eval.dataset import Person
-from lidarpose.sample import Box
+from lidarpose.data.dapt_crops import released_box, released_view
+from lidarpose.errors import InputError, check_name, whole
+from lidarpose.eval.dataset import EvalDataset, EvalSample
+from lidarpose.eval.predictions import subset
+from lidarpose.eval.scores import Setting
+from lidarpose.sample import UNLABELED, Box
+from lidarpose.skeleton import Skeleton
+from lidarpose.skeleton import skeleton as skeleton_of
 
 PROTOCOLS = ("clean", "dapt")
 
@@ -23,43 +30,31 @@ _CUT = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Released:
-    """What the released code does with a dataset: center, the name in `Item.centers`; centring, the same in words; crop
-    in words; split: the name that prepare must have split by; least: points of people whom it judges; without: joints
-    that it leaves out of its means."""
+class DaptProtocol:
+    """What the released code does with a dataset: center, the name in `LabeledSample.centers`; centring, the same in
+    words; crop in words; split: the name that prepare must have split by; least: points of people whom it scores;
+    without: joints that it leaves out of its means."""
 
     center: str
     centring: str
     crop: str
-    split: str
+    split: str = "official"
     least: int = 1
     without: tuple[str, ...] = ()
 
 
-RELEASED = {
-    "waymo": Released(
-        center="box", centring="labelled box (oracle)", crop="points in the labelled box", split="official"
-    ),
-    "humanm3": Released(
+_SEGMENTED = "people as the dataset segmented them"
+DAPT = {
+    "waymo": DaptProtocol(center="box", centring="labelled box (oracle)", crop="points in the labelled box"),
+    "humanm3": DaptProtocol(
         center="joints_box",
         centring="box of the true joints (oracle)",
         crop="points in the box of the true joints, 1.25 times as large",
-        split="official",
         without=("pelvis",),
     ),
-    "lidarhuman26m": Released(
-        center="trans", centring="SMPL trans (oracle)", crop="people as the dataset segmented them", split="official"
-    ),
-    "sloper4d": Released(
-        center="trans",
-        centring="SMPL trans (oracle)",
-        crop="people as the dataset segmented them",
-        split="dapt",
-        least=10,
-    ),
+    "lidarhuman26m": DaptProtocol(center="trans", centring="SMPL trans (oracle)", crop=_SEGMENTED),
+    "sloper4d": DaptProtocol(center="trans", centring="SMPL trans (oracle)", crop=_SEGMENTED, split="dapt", least=10),
 }
-
-POINTS = "points alone"
 _CLEAN_CROPS = {
     "waymo": "labelled box with a detector's errors",
     "humanm3": "box about the true joints with a detector's errors",
@@ -68,13 +63,12 @@ _CLEAN_CROPS = {
 }
 # sets whose crops are a detector's already
 _OWN_CROP = ("bench", "synth")
-_SEGMENTED = "people as the dataset segmented them: there is no box, so none could be displaced"
 
 
-def check_protocol(protocol: str, kind: str, split_by: str | None, name: str) -> None:
-    """Raises InputError, one line, where the dataset cannot be judged by the protocol. kind: the raw dataset's name,
-    "synth" or "bench"; split_by: the split it was prepared with; name: what to call it."""
+def check_protocol(protocol: str, dataset: EvalDataset) -> None:
+    """Raises InputError, one line, where the dataset cannot be scored by the protocol."""
     check_name("protocol", protocol, PROTOCOLS)
+    name, kind, split_by = dataset.name, dataset.kind, dataset.split_by
     if protocol == "clean":
         if split_by == "dapt":
             raise InputError(
@@ -86,26 +80,21 @@ def check_protocol(protocol: str, kind: str, split_by: str | None, name: str) ->
         raise InputError(
             f"the protocol dapt centers on labels of real datasets, {name} is synthetic: use --protocol clean"
         )
-    if kind not in RELEASED:
-        raise InputError(
-            f"the released code evaluates {', '.join(RELEASED)}, not {kind}: use --protocol clean for {name}"
-        )
-    wanted = RELEASED[kind].split
-    if split_by != wanted:
+    if kind not in DAPT:
+        raise InputError(f"the released code evaluates {', '.join(DAPT)}, not {kind}: use --protocol clean for {name}")
+    if split_by != (wanted := DAPT[kind].split):
         raise InputError(
             f"{name} was split by {split_by or 'nothing'}, the protocol dapt is by {wanted}: run lidarpose prepare "
             f"{kind} RAW OUT --split-by {wanted} into another folder"
         )
 
 
-def centring(protocol: str, kind: str) -> str:
-    """What the center is found from, in words."""
-    return POINTS if protocol == "clean" else RELEASED[kind].centring
-
-
-def crop(protocol: str, kind: str) -> str:
-    """How the person was cut out, in words."""
-    return _CLEAN_CROPS.get(kind, _SEGMENTED) if protocol == "clean" else RELEASED[kind].crop
+def described(protocol: str, kind: str) -> dict[str, str]:
+    """What the center is found from (centring) and how the person was cut out (crop), in words."""
+    if protocol == "dapt":
+        return {"centring": DAPT[kind].centring, "crop": DAPT[kind].crop}
+    unboxed = f"{_SEGMENTED}: there is no box, so none could be displaced"
+    return {"centring": "points alone", "crop": _CLEAN_CROPS.get(kind, unboxed)}
 
 
 def jittered(box: Box, rng: np.random.Generator) -> Box:
@@ -121,23 +110,176 @@ def jittered(box: Box, rng: np.random.Generator) -> Box:
     )
 
 
-def detector_box(kind: str, person: Person, seed: int) -> Box | None:
+def detector_box(kind: str, one: EvalSample, seed: int) -> Box | None:
     """The displaced box that a person of a real dataset is cut out by in the protocol clean; None where they come as
-    they are. Whoever else is judged, it is the same."""
-    if kind in _OWN_CROP or kind not in _CLEAN_CROPS or person.box is None:
+    they are. It depends on `seed` and the person's place in the dataset alone."""
+    if kind in _OWN_CROP or kind not in _CLEAN_CROPS or one.sample.box is None:
         return None
-    return jittered(person.box, np.random.default_rng([seed, person.shard, person.row]))
+    return jittered(one.sample.box, np.random.default_rng([seed, one.shard, one.row]))
 
 
-def cropped(protocol: str, kind: str, person: Person, seed: int) -> Person:
+def crop_box(protocol: str, kind: str, one: EvalSample, seed: int) -> Box | None:
+    """The box of a person's crop: a detector's in the protocol clean, the released code's in dapt, else the dataset's,
+    if any."""
+    if protocol == "dapt":
+        return released_box(one.sample.joints, one.sample.centers, one.sample.box)
+    return detector_box(kind, one, seed) or one.sample.box
+
+
+def cropped(protocol: str, kind: str, one: EvalSample, seed: int) -> EvalSample:
     """The person with the points that the protocol lets the network see."""
     if protocol == "dapt":
-        kept, _ = released_view(person.points, person.joints, person.centers, person.box)
-        return replace(person, points=person.points[kept])
-    box = detector_box(kind, person, seed)
-    return person if box is None else replace(person, points=person.points[box.contains(person.points)])
+        inside, _ = released_view(one.points, one.sample.joints, one.sample.centers, one.sample.box)
+        return replace(one, points=one.points[inside])
+    box = detector_box(kind, one, seed)
+    return one if box is None else replace(one, points=one.points[box.contains(one.points)])
 
 
-def released_center(kind: str, person: Person) -> np.ndarray | None:
-    """(3,) m: what the released code subtracts; None where the dataset has none for this person."""
-    return person.centers.get(RELEASED[kind].center)
+def as_shown(protocol: str, kind: str, one: EvalSample, seed: int) -> tuple[EvalSample | None, str]:
+    """`cropped`; or None, and why the protocol leaves the person out."""
+    if protocol == "dapt":
+        rules = DAPT[kind]
+        if rules.center not in one.sample.centers:
+            return None, f"people without the center {rules.center!r}"
+        if kind == "humanm3" and (one.sample.joint_labels == UNLABELED).all():
+            return None, "people without a labelled joint, whom their box is made of"
+    shown = cropped(protocol, kind, one, seed)
+    if protocol == "dapt" and len(shown.points) < rules.least:
+        return None, f"people of under {rules.least} points, as the released code skips them"
+    return shown, ""
+
+
+# ---- a network before a dataset
+
+
+class Model(Protocol):
+    """What is evaluated: `lidarpose.Predictor`, or anything that answers as it does."""
+
+    skeleton: Skeleton
+    model: dict[str, Any]
+    backend: Any
+
+    def predict(self, points, *, sensor_origin=None, skeleton: str | None = None, progress: bool = False): ...
+
+    def outputs(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None): ...
+
+
+# ---- a network before a dataset
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalSetup:
+    """A network before a dataset, checked: see `eval_setup`. joints: those that are scored."""
+
+    model: Model
+    dataset: EvalDataset
+    setting: Setting
+    joints: Skeleton
+    sensor_unknown: bool
+
+    def shown(self, one: EvalSample) -> tuple[EvalSample | None, str]:
+        """The person as the protocol shows them; or None, and why it leaves them out."""
+        return as_shown(self.setting.protocol, self.setting.kind, one, self.setting.seed)
+
+    def crop_box(self, one: EvalSample) -> Box | None:
+        """The box of the person's crop, if any."""
+        return crop_box(self.setting.protocol, self.setting.kind, one, self.setting.seed)
+
+    def predict(self, samples: Sequence[EvalSample]) -> list[dict[str, Any]]:
+        """A row of `predictions.stack` for each person as the protocol shows them: what is known of them and what the
+        network answers."""
+        answers: list[dict] = [{} for _ in samples]
+        answer = self._predict_clean if self.setting.protocol == "clean" else self._predict_dapt
+        for known in (True, False):
+            origin = np.zeros(3) if known else None
+            rows = [k for k, s in enumerate(samples) if (s.sample.sensor_known and not self.sensor_unknown) == known]
+            for k, values in zip(rows, answer([samples[k] for k in rows], origin) if rows else (), strict=True):
+                answers[k] = values
+        return [self._known(one) | values for one, values in zip(samples, answers, strict=True)]
+
+    def _predict_clean(self, samples: list[EvalSample], origin: np.ndarray | None) -> Iterator[dict]:
+        clouds = [one.points for one in samples]
+        for person in self.model.predict(clouds, sensor_origin=origin, skeleton=self.model.skeleton.name):
+            yield {} if person.pose is None else self._picked(person.pose, ())
+
+    def _predict_dapt(self, samples: list[EvalSample], origin: np.ndarray | None) -> Iterator[dict]:
+        """One pass about the released code's center."""
+        batch = self.model.backend.batch
+        for start in range(0, len(samples), batch):
+            some = samples[start : start + batch]
+            centers = np.stack([one.sample.centers[DAPT[self.setting.kind].center] for one in some])
+            estimates = self.model.outputs([one.points.astype(float) for one in some], centers, origin)
+            for k, center in enumerate(centers):
+                values = self._picked(estimates, k)
+                values["pred"] = values["pred"] + center
+                yield values if np.isfinite(values["pred"]).all() else {}
+
+    def _picked(self, estimates, index) -> dict:
+        """Of a pose, or of person `index` of many: the scored joints."""
+        pick = self.model.skeleton.map_to(self.joints)
+        stated = {name: getattr(estimates, name) for name in ("confidence", "spread", "visible")}
+        stated = {name: value[index][..., pick] for name, value in stated.items() if value is not None}
+        return stated | {"pred": estimates.joints[index][..., pick, :]}
+
+    def _known(self, one: EvalSample) -> dict[str, Any]:
+        sample, box = one.sample, one.sample.box
+        pick = self.dataset.skeleton.map_to(self.joints)
+        return {
+            **{name: getattr(one, name) for name in ("shard", "row", "condition", "poses", "plain", "moving")},
+            **{name: getattr(sample, name) for name in ("sequence", "frame", "track", "time", "distance")},
+            "sensor": str(one.info.sensor),
+            "hidden": 1 - one.info.visible,
+            "points": len(one.points),
+            "box": None if box is None else [*box.center, *box.size, box.yaw],
+            "true": sample.joints[pick],
+            "labels": sample.joint_labels[pick],
+        }
+
+
+def eval_setup(
+    model: Model,
+    dataset: EvalDataset,
+    *,
+    protocol: str = "clean",
+    seed: int = 0,
+    skeleton: str | None = None,
+    sensor_unknown: bool = False,
+) -> EvalSetup:
+    """Puts a network before a dataset. Raises InputError, one line, where the protocol does not fit the dataset, the
+    dataset lacks joints of the `skeleton` asked for, or it and the network have no joint in common."""
+    seed = whole("seed", seed, least=0)
+    check_protocol(protocol, dataset)
+    if protocol == "dapt" and model.model.get("tta", 1) > 1:
+        raise InputError("the protocol dapt is one look at each person, as the released code's: leave --tta away")
+    wanted = dataset.scored
+    if skeleton is not None:
+        wanted = skeleton_of(skeleton)
+        if missing := [name for name in wanted.joints if name not in dataset.skeleton.joints]:
+            raise InputError(
+                f"{dataset.name} has no {', '.join(missing)}, which {wanted.name} asks for: its joints are "
+                f"{dataset.skeleton.name}"
+            )
+    own, without = model.skeleton.joints, DAPT[dataset.kind].without if protocol == "dapt" else ()
+    shared = tuple(name for name in wanted.joints if name in own and name not in without)
+    if not shared:
+        raise InputError(
+            f"{dataset.name} has the joints {', '.join(wanted.joints)}, the network {', '.join(own)}: none in common"
+        )
+    reasons = {
+        "the network has no": [name for name in wanted.joints if name not in own],
+        "the released means leave out": [name for name in wanted.joints if name in own and name in without],
+    }
+    told = ("split", "split_source", "leaks", "total", "limit", "clusters", "kind")
+    setting = Setting(
+        dataset=dataset.name,
+        method=str(model.model["name"]),
+        protocol=protocol,
+        joints=shared,
+        not_judged="; ".join(f"{reason} {', '.join(names)}" for reason, names in reasons.items() if names),
+        sensor="unknown" if sensor_unknown else "known",
+        seed=seed,
+        **described(protocol, dataset.kind),
+        **{name: getattr(dataset, name) for name in told},
+    )
+    joints = subset(wanted, shared)
+    return EvalSetup(model=model, dataset=dataset, setting=setting, joints=joints, sensor_unknown=sensor_unknown)

@@ -1,6 +1,7 @@
-"""The paper's stability study as curves, and what it left out: error against how much the points were disturbed.
+"""The paper's stability study as curves, and what it left out: error against how much the points were perturbed.
 
-Each amount is tried on the same people with the same random numbers, so a curve's points differ in the amount alone.
+Each amount is tried on the same people with the same random numbers, so a curve's points differ in the amount alone. To
+add a perturbation: write a pure function of (points, box, amount, rng) and add it to `PERTURBATIONS`.
 """
 
 import json
@@ -12,38 +13,156 @@ from typing import Any
 import numpy as np
 
 from lidarpose.errors import InputError, MissingExtra
-from lidarpose.eval.dataset import BENCH, Person, spread
+from lidarpose.eval.dataset import BENCH, EvalSample, spread
 from lidarpose.eval.metrics.aggregate import mean
 from lidarpose.eval.metrics.bootstrap import interval, paired_interval
 from lidarpose.eval.metrics.groups import joint_groups
-from lidarpose.eval.perturb import DISTURBANCES
-from lidarpose.eval.predictions import Judged, gathered
-from lidarpose.eval.run import Task
+from lidarpose.eval.predictions import Predictions, stack
+from lidarpose.eval.protocols import EvalSetup
 from lidarpose.eval.scores import Setting, number
-from lidarpose.sample import SEEN, Box
+from lidarpose.geometry import axis_angle_to_matrix
+from lidarpose.sample import SEEN, Box, LabeledSample, Pose, center_of
 from lidarpose.skeleton import BODY26
+from lidarpose.synth.noise import jitter, noise_cluster, random_keep
 
 SCHEMA = "lidarpose.stability/1"
-# people of a dataset that are disturbed, evenly spread, and people cast anew for each sensor
+# people of a dataset that are perturbed, evenly spread, and people simulated anew for each sensor
 PEOPLE, CAST = 1000, 200
 # the paper's statistics of end joints are of so many instances; of fewer people the worst share
 WORST, WORST_SHARE = 600, 0.3
 ENDS = ("head", "wrists", "hands", "ankles", "feet")
-# of the bench these alone are disturbed: the others have something wrong already
+# of the bench these alone are perturbed: the others have something wrong already
 _CLEAN = "clean"
 _REPEATS = 1000
-# sensors that people are cast for anew, with few beams first; seeds that neither training nor the bench uses
+# sensors that people are simulated for, with few beams first; seeds that neither training nor the bench uses
 SENSORS = (
     *("vlp-16", "hdl-32e", "vlp-32c", "os1-64", "hdl-64e", "os1-128", "pandar64", "waymo-top", "av2"),
     *("livox-mid360", "livox-avia"),
 )
 _SEED = 720_000
 _DISTANCE = (4.0, 20.0)
+# of the paper's perturbations: two clusters, as in its released code
+_CLUSTERS = 2
+# standard deviation of the jitter in units of its clip: of normal steps 4.6 % are cut
+_SIGMA = 0.5
+# what the points' own box has around them where a dataset has no box, m
+_MARGIN = 0.05
+
+
+# ---- perturbations: points (n, 3) m with the sensor at the origin, box, amount, rng -> points; 0 changes nothing
+
+
+def jittered_points(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
+    """Every coordinate moved by a normal step, cut at `amount` m, of half as much as standard deviation."""
+    return jitter(points, sigma=_SIGMA * amount, clip=amount, rng=rng)
+
+
+def with_clusters(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
+    """Two clusters of `amount` clutter points each about the person."""
+    center = center_of(points)
+    # the places stay where they are while the clusters grow
+    return np.concatenate([points, *(noise_cluster(center, count=int(amount), rng=r) for r in rng.spawn(_CLUSTERS))])
+
+
+def with_dropout(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
+    """All but a random share `amount` of the points; what is dropped at one share is dropped at each larger one."""
+    return points[random_keep(len(points), share=amount, rng=rng)]
+
+
+def behind_an_edge(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
+    """All but what lies behind one straight edge of something opaque, which hides a share `amount` of the points: the
+    end of a wall, a parapet, a car. The edge is straight as seen from the origin and has any direction."""
+    angle = rng.uniform(0, 2 * np.pi)
+    middle = points.mean(0)
+    # seen from the sensor: to the left and up, as tangents of angles from the middle of the points
+    forward = np.array([middle[0], middle[1], 0]) / max(np.hypot(middle[0], middle[1]), 1e-6)
+    depth = np.maximum(points @ forward, 1e-3)
+    left = points @ np.array([-forward[1], forward[0], 0]) / depth
+    along = np.cos(angle) * left + np.sin(angle) * points[:, 2] / depth
+    visible = np.ones(len(points), bool)
+    visible[np.argsort(along, kind="stable")[: int(round(amount * len(points)))]] = False
+    return points[visible]
+
+
+def box_moved(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
+    """What of the points lies in the person's box after that was moved by `amount` m in a level direction; without a
+    box, in that of the points with 5 cm of room."""
+    if box is None:
+        low, high = points.min(0) - _MARGIN, points.max(0) + _MARGIN
+        box = Box(center=(low + high) / 2, size=high - low)
+    angle = rng.uniform(0, 2 * np.pi)
+    moved = replace(box, center=box.center + amount * np.array([np.cos(angle), np.sin(angle), 0]))
+    return points[moved.contains(points)]
+
+
+def out_of_level(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
+    """Everything turned by `amount` rad about a random level axis through the sensor, as if that were mounted askew and
+    took its own axis for up."""
+    angle = rng.uniform(0, 2 * np.pi)
+    R_tilted_level = axis_angle_to_matrix(amount * np.array([np.cos(angle), np.sin(angle), 0.0]))
+    return points @ R_tilted_level.T
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """apply(points, box, amount, rng) -> points; title, with the unit of the amounts; amounts that a study tries;
+    says: what is done, in words; scale: amounts times this are printed; rigid: the whole frame is moved, labels too."""
+
+    apply: Callable[[np.ndarray, Box | None, float, np.random.Generator], np.ndarray]
+    title: str
+    amounts: tuple[float, ...]
+    says: str
+    scale: float = 100
+    rigid: bool = False
+
+
+PERTURBATIONS = {
+    "jitter": Perturbation(
+        jittered_points,
+        "point jitter, clip in cm",
+        (0.02, 0.05, 0.1, 0.15, 0.2),
+        "normal steps on every coordinate, cut at the clip, of half the clip as standard deviation",
+    ),
+    "clusters": Perturbation(
+        with_clusters,
+        "points in each of two noise clusters",
+        (10, 25, 50, 100, 200),
+        "two clusters within 0.3 m of places up to 0.4 m, in height 0.8 m, from the middle of the points",
+        scale=1,
+    ),
+    "dropped": Perturbation(
+        with_dropout, "points dropped, %", (0.25, 0.5, 0.75, 0.9, 0.95), "a random share of the points is gone"
+    ),
+    "occluder": Perturbation(
+        behind_an_edge,
+        "points behind an edge, %",
+        (0.1, 0.25, 0.4, 0.55, 0.7),
+        "all is gone that lies on one side of an edge, straight as the sensor sees it, of a random direction",
+    ),
+    "crop": Perturbation(
+        box_moved,
+        "box displaced, cm",
+        (0.05, 0.1, 0.2, 0.3, 0.4),
+        "the crop's box is moved in a random level direction; what it leaves is lost, nothing new comes in unless "
+        "the dataset holds points around the box",
+    ),
+    "tilt": Perturbation(
+        out_of_level,
+        "frame out of level, deg",
+        tuple(np.radians([5.0, 10.0, 15.0, 20.0, 30.0]).tolist()),
+        "the sensor is mounted askew, in a random direction, and its own axis is taken for up",
+        scale=180 / np.pi,
+        rigid=True,
+    ),
+}
+
+
+# ---- what a study says; the fields are the keys of stability.json
 
 
 @dataclass(frozen=True, kw_only=True)
 class Point:
-    """One amount. mpjpe mm with its 95 % interval; increase over the undisturbed, mm, of those who have a pose in both,
+    """One amount. mpjpe mm with its 95 % interval; increase over the unperturbed, mm, of those who have a pose in both,
     with its paired interval; people, of whom no_pose have no answer; points: the median number of a person's points."""
 
     amount: float
@@ -61,7 +180,7 @@ class Point:
 
 @dataclass(frozen=True, kw_only=True)
 class Curve:
-    """A disturbance's points, the first being the undisturbed (of sensors there is none: labels are their names)."""
+    """A perturbation's points, the first being the unperturbed (of sensors there is none: labels are their names)."""
 
     name: str
     title: str
@@ -72,7 +191,7 @@ class Curve:
 @dataclass(frozen=True, kw_only=True)
 class End:
     """Errors of an end joint's group in mm over the worst people: mean, standard deviation, quartiles; people; worst:
-    how many of all judged."""
+    how many of all scored."""
 
     group: str
     mean: float
@@ -84,7 +203,7 @@ class End:
 
 @dataclass(frozen=True, kw_only=True)
 class Stability:
-    """A study. who: the people disturbed, in words; notes: what could not be done."""
+    """A study. who: the people perturbed, in words; notes: what could not be done."""
 
     setting: Setting
     who: str
@@ -93,156 +212,167 @@ class Stability:
     notes: tuple[str, ...]
 
 
+def to_json(studies: Sequence[Stability], *, head: dict[str, Any]) -> str:
+    """stability.json; head: version, command, weights and seed, as in scores.json."""
+    return json.dumps({"schema": SCHEMA} | head | {"studies": [asdict(study) for study in studies]}, indent=1) + "\n"
+
+
+# ---- the study
+
+
+@dataclass(frozen=True, kw_only=True)
+class CroppedPerson:
+    """Somebody as the protocol shows them; whole: with all points that the dataset holds; box: that of the crop."""
+
+    shown: EvalSample
+    whole: EvalSample
+    box: Box | None
+
+
+def people_to_perturb(setup: EvalSetup) -> list[CroppedPerson]:
+    """Of lidarpose-bench its clean people, of other datasets at most `PEOPLE`, evenly spread. Raises InputError where
+    nobody has a point."""
+    if setup.setting.kind == BENCH:
+        chosen = [one for one in setup.dataset if one.condition == _CLEAN and not one.moving]
+    else:
+        rows = set(spread(setup.dataset.count, PEOPLE).tolist())
+        chosen = [one for k, one in enumerate(setup.dataset) if k in rows]
+    # who is not scored is not perturbed either
+    shown = [(setup.shown(one)[0], one) for one in chosen]
+    people = [
+        CroppedPerson(shown=seen, whole=one, box=setup.crop_box(one))
+        for seen, one in shown
+        if seen is not None and len(seen.points)
+    ]
+    if not people:
+        raise InputError(f"none of the {_who(setup)} has a point to disturb: judge more people, or no --stability")
+    return people
+
+
 def study(
-    task: Task,
-    judged: Judged,
+    setup: EvalSetup,
+    predictions: Predictions,
     *,
-    people: list["Shown"] | None = None,
+    people: list[CroppedPerson] | None = None,
     sensors: bool = True,
     progress: Callable[[int], None] | None = None,
 ) -> Stability:
-    """The study of a task's people, whom `judged` holds undisturbed; people: whom to disturb, by default `to_disturb`;
-    sensors: also people cast anew for other sensors."""
-    people = to_disturb(task) if people is None else people
-    undisturbed = _answers(task, [one.person for one in people])
-    base = undisturbed.errors()
-    clusters = np.array([one.person.sequence for one in people]) if task.setting.clusters else None
-    seed = task.setting.seed
-    whole = _point(undisturbed, base, 0.0, "0", [len(one.person.points) for one in people], seed, clusters)
+    """The study of a dataset's people, whom `predictions` holds unperturbed.
+
+    Args:
+        people: whom to perturb, by default `people_to_perturb`.
+        sensors: also people simulated anew for other sensors.
+        progress: progress(n) is called with every n people done.
+    """
+    people = people_to_perturb(setup) if people is None else people
+    progress = progress or (lambda count: None)
+    shown = [person.shown for person in people]
+    clusters = np.array([one.sample.sequence for one in shown]) if setup.setting.clusters else None
+    unperturbed = _predict(setup, shown)
+    base = unperturbed.errors()
+    first = _point(unperturbed, base, 0.0, "0", setup, clusters)
     curves = []
-    for name, disturbance in DISTURBANCES.items():
-        points = [whole]
-        for amount in disturbance.amounts:
-            shown = [_disturbed(task, one, name, amount) for one in people]
-            counts = [len(one.points) for one in shown]
-            label = f"{amount * disturbance.scale:.4g}"
-            points.append(_point(_answers(task, shown), base, amount, label, counts, seed, clusters))
-            if progress is not None:
-                progress(len(people))
-        curves.append(Curve(name=name, title=disturbance.title, says=disturbance.says, points=tuple(points)))
+    for name, perturbation in PERTURBATIONS.items():
+        points = [first]
+        for amount in perturbation.amounts:
+            perturbed = _predict(setup, [_perturbed(setup, person, name, amount) for person in people])
+            label = f"{amount * perturbation.scale:.4g}"
+            points.append(_point(perturbed, base, amount, label, setup, clusters))
+            progress(len(people))
+        curves.append(Curve(name=name, title=perturbation.title, says=perturbation.says, points=tuple(points)))
     notes = []
-    if sensors and task.setting.protocol == "clean":
+    if sensors and setup.setting.protocol == "clean":
         try:
-            curves.append(_sensors(task, progress))
+            curves.append(_sensor_curve(setup, progress))
         except (MissingExtra, ModuleNotFoundError):
             notes.append("other sensors need people cast anew: in the clone, pip install '.[synth]'")
     elif sensors:
         notes.append("other sensors: people cast anew have no released center")
-    who = f"{len(people):,} {_who(task.setting)}"
-    return Stability(setting=task.setting, who=who, curves=tuple(curves), ends=end_errors(judged), notes=tuple(notes))
+    who = f"{len(people):,} {_who(setup)}"
+    ends = end_errors(predictions)
+    return Stability(setting=setup.setting, who=who, curves=tuple(curves), ends=ends, notes=tuple(notes))
 
 
-def end_errors(judged: Judged) -> tuple[End, ...]:
+def end_errors(predictions: Predictions) -> tuple[End, ...]:
     """The errors of the end joints over the 600 people whose mean errors are largest, of fewer than 2,000 people the
     worst 30 %."""
-    table = judged.of(~judged.moving & judged.posed).errors()
+    table = predictions.select(~predictions.moving & predictions.posed).errors()
     table = table[~np.isnan(table).all(1)]
     worst = min(WORST, int(np.ceil(WORST_SHARE * len(table))))
     table = table[np.argsort(-np.nanmean(table, 1), kind="stable")[:worst]]
-    groups = joint_groups(judged.skeleton)
-    out = []
+    groups = joint_groups(predictions.skeleton)
+    ends = []
     for name in ENDS:
-        if name not in groups:
-            continue
-        error = table[:, groups[name]]
-        own = error[~np.isnan(error)]
-        if len(own):
-            low, middle, high = np.quantile(own, [0.25, 0.5, 0.75]).tolist()
-            people = int((~np.isnan(error)).any(1).sum())
-            told = {"mean": float(own.mean()), "deviation": float(own.std()), "quartiles": (low, middle, high)}
-            out.append(End(group=name, people=people, worst=worst, **told))
-    return tuple(out)
+        errors = table[:, groups.get(name, [])]
+        labeled = ~np.isnan(errors)
+        if labeled.any():
+            own = errors[labeled]
+            values = {"mean": float(own.mean()), "deviation": float(own.std())}
+            quartiles = tuple(np.quantile(own, [0.25, 0.5, 0.75]).tolist())
+            people = int(labeled.any(1).sum())
+            ends.append(End(group=name, **values, quartiles=quartiles, people=people, worst=worst))
+    return tuple(ends)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Shown:
-    """Somebody as the protocol shows them; whole: with all points that the dataset holds; box: that of the crop."""
-
-    person: Person
-    whole: Person
-    box: Box | None
+def _who(setup: EvalSetup) -> str:
+    return f"{'clean ' if setup.setting.kind == BENCH else ''}people of {setup.setting.dataset}"
 
 
-def to_disturb(task: Task) -> list[Shown]:
-    """Of lidarpose-bench its clean people, of other datasets at most `PEOPLE`, evenly spread. Raises InputError where
-    nobody has a point."""
-    setting = task.setting
-    if setting.kind == BENCH:
-        found = [one for one in task.people if one.condition == _CLEAN and not one.moving]
-    else:
-        chosen = set(spread(task.people.count, PEOPLE).tolist())
-        found = [one for k, one in enumerate(task.people) if k in chosen]
-    # who is not judged is not disturbed either
-    fit = [(task.fit(one)[0], one) for one in found]
-    shown = [
-        Shown(person=seen, whole=one, box=task.box(one)) for seen, one in fit if seen is not None and len(seen.points)
-    ]
-    if not shown:
-        raise InputError(f"none of the {_who(setting)} has a point to disturb: judge more people, or no --stability")
-    return shown
+def _predict(setup: EvalSetup, samples: list[EvalSample]) -> Predictions:
+    return stack(setup.joints, setup.predict(samples))
 
 
-def _who(setting: Setting) -> str:
-    return f"{'clean ' if setting.kind == BENCH else ''}people of {setting.dataset}"
-
-
-def _disturbed(task: Task, shown: Shown, name: str, amount: float) -> Person:
-    person = shown.person
-    seed = [task.setting.seed, zlib.crc32(name.encode()), person.shard, person.row]
+def _perturbed(setup: EvalSetup, person: CroppedPerson, name: str, amount: float) -> EvalSample:
+    shown, sample = person.shown, person.shown.sample
+    seed = [setup.setting.seed, zlib.crc32(name.encode()), shown.shard, shown.row]
     # a displaced box may let in what the dataset holds around the person
-    points = (shown.whole if name == "crop" else person).points.astype(float)
+    points = (person.whole if name == "crop" else shown).points.astype(float)
 
-    def does(places: np.ndarray) -> np.ndarray:
-        return DISTURBANCES[name].does(places, shown.box, amount, np.random.default_rng(seed))
+    def apply(places: np.ndarray) -> np.ndarray:
+        return PERTURBATIONS[name].apply(places, person.box, amount, np.random.default_rng(seed))
 
-    if not DISTURBANCES[name].rigid:
-        return replace(person, points=does(points))
-    return replace(
-        person,
-        points=does(points),
-        joints=does(person.joints),
-        box=person.box and replace(person.box, center=does(person.box.center)),
-        centers={name: does(center) for name, center in person.centers.items()},
-    )
-
-
-def _answers(task: Task, people: list[Person]) -> Judged:
-    return gathered(task.joints, task.answered(people))
+    if PERTURBATIONS[name].rigid:
+        sample = replace(
+            sample,
+            pose=replace(sample.pose, joints=apply(sample.joints)),
+            box=sample.box and replace(sample.box, center=apply(sample.box.center)),
+            centers={name: apply(center) for name, center in sample.centers.items()},
+        )
+    return replace(shown, points=apply(points), sample=sample)
 
 
 def _point(
-    answers: Judged,
+    predictions: Predictions,
     base: np.ndarray,
     amount: float,
     label: str,
-    counts: list[int],
-    seed: int,
+    setup: EvalSetup,
     clusters: np.ndarray | None = None,
 ) -> Point:
-    """One amount's point; base (n, J) mm: the errors of the same people undisturbed."""
-    rng = np.random.default_rng([zlib.crc32(label.encode()), seed])
+    """One amount's point; base (n, J) mm: the errors of the same people unperturbed."""
+    rng = np.random.default_rng([zlib.crc32(label.encode()), setup.setting.seed])
     # NaN without a label, a row of NaN without a pose
-    found = answers.errors()
-    both = ~np.isnan(found) & ~np.isnan(base)
-    first, second = np.where(both, found, np.nan), np.where(both, base, np.nan)
-    low, high = interval(found, rng, clusters=clusters, repeats=_REPEATS).stated
+    errors = predictions.errors()
+    both = ~np.isnan(errors) & ~np.isnan(base)
+    first, second = np.where(both, errors, np.nan), np.where(both, base, np.nan)
+    low, high = interval(errors, rng, clusters=clusters, repeats=_REPEATS).stated
     increase_low, increase_high = paired_interval(first, second, rng, clusters=clusters, repeats=_REPEATS).stated
     return Point(
         amount=amount,
         label=label,
-        mpjpe=number(mean(found)),
+        mpjpe=number(mean(errors)),
         low=low,
         high=high,
         increase=number(mean(first - second)),
         increase_low=increase_low,
         increase_high=increase_high,
-        people=len(found),
-        no_pose=int((~answers.posed).sum()),
-        points=float(np.median(counts)),
+        people=len(errors),
+        no_pose=int((~predictions.posed).sum()),
+        points=float(np.median(predictions.points)),
     )
 
 
-def _sensors(task: Task, progress: Callable[[int], None] | None) -> Curve:
+def _sensor_curve(setup: EvalSetup, progress: Callable[[int], None]) -> Curve:
     """The same bodies in the same poses at the same places before each sensor, however little it sees of them, nothing
     around them."""
     from lidarpose.synth.generator import Generator
@@ -258,34 +388,14 @@ def _sensors(task: Task, progress: Callable[[int], None] | None) -> Curve:
         noise=replace(scene.noise, mask=0.0, clutter=0.0, missing_part=0.0),
         crop=replace(scene.crop, jitter=0.03, loose=0.0, cut=0.0),
     )
-    pick = BODY26.map_to(task.people.skeleton)
     points = []
     for k, name in enumerate(SENSORS):
         generator = Generator(scene=replace(scene, sensors=(name,)), measure=False, redraw=False)
         samples = [generator.person(_SEED, index).sample for index in range(CAST)]
-        people = [
-            Person(
-                shard=k,
-                row=row,
-                points=sample.points,
-                joints=sample.pose.joints[pick],
-                labels=np.full(len(pick), SEEN, np.uint8),
-                box=sample.box,
-                sequence=str(row),
-                frame=0,
-                track="0",
-                time=np.nan,
-                distance=float(np.linalg.norm(sample.center)),
-                hidden=np.nan,
-            )
-            for row, sample in enumerate(samples)
-        ]
-        found = _answers(task, people)
-        counts = [len(one.points) for one in people]
-        made = _point(found, found.errors(), float(k), name, counts, task.setting.seed)
-        points.append(replace(made, increase=None, increase_low=None, increase_high=None))
-        if progress is not None:
-            progress(len(people))
+        predictions = _predict(setup, [_simulated(sample, setup, k, row) for row, sample in enumerate(samples)])
+        point = _point(predictions, predictions.errors(), float(k), name, setup)
+        points.append(replace(point, increase=None, increase_low=None, increase_high=None))
+        progress(len(samples))
     return Curve(
         name="sensors",
         title="other sensors",
@@ -295,7 +405,15 @@ def _sensors(task: Task, progress: Callable[[int], None] | None) -> Curve:
     )
 
 
-def to_json(studies: Sequence[Stability], *, head: dict[str, Any]) -> str:
-    """stability.json; head: version, command, weights and seed, as in scores.json."""
-    found = {"schema": SCHEMA} | head | {"studies": [asdict(study) for study in studies]}
-    return json.dumps(found, indent=1) + "\n"
+def _simulated(sample, setup: EvalSetup, shard: int, row: int) -> EvalSample:
+    """A simulated sample with the joints of the evaluated dataset, all of them seen."""
+    skeleton = setup.dataset.skeleton
+    labeled = LabeledSample(
+        points=sample.points,
+        center=sample.center,
+        pose=Pose(joints=sample.pose.joints[BODY26.map_to(skeleton)], skeleton=skeleton),
+        box=sample.box,
+        joint_labels=np.full(len(skeleton), SEEN, np.uint8),
+        sequence=str(row),
+    )
+    return EvalSample(sample=labeled, points=sample.points, shard=shard, row=row)

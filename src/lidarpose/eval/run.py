@@ -1,242 +1,107 @@
-"""Judging: from a network and a dataset's people to what was predicted and how good it is."""
+"""Evaluation: a network and a dataset's samples -> predictions -> metric rows -> a folder of results.
 
-from collections.abc import Callable, Iterator
+`lidarpose.evaluation` offers what is public here; docs/evaluate.md describes the protocols and the files.
+"""
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from lidarpose.data.dapt_crops import released_box
-from lidarpose.errors import InputError, whole
-from lidarpose.eval.bench import floors
-from lidarpose.eval.dataset import BENCH, BenchPeople, People, Person, note
-from lidarpose.eval.metric_rows import headline, lines_of
+from lidarpose._version import __version__
+from lidarpose.data.schema import pyarrow
+from lidarpose.errors import InputError
+from lidarpose.eval.bench import mean_poses
+from lidarpose.eval.dataset import BENCH, EvalDataset, EvalSample, count_skipped, open_eval_dataset
+from lidarpose.eval.metric_rows import baseline_rows, metric_rows
 from lidarpose.eval.metrics.bootstrap import LEAST_UNITS
-from lidarpose.eval.predictions import Judged, gathered, subset
-from lidarpose.eval.protocols import RELEASED, centring, check_protocol, crop, cropped, detector_box, released_center
-from lidarpose.eval.scores import Line, Result, Setting
+from lidarpose.eval.predictions import Predictions, stack, write_poses
+from lidarpose.eval.protocols import EvalSetup, Model, eval_setup
+from lidarpose.eval.robustness import Stability, people_to_perturb, study, to_json
+from lidarpose.eval.scores import BASELINE, FILE, MetricRow, Result, Scores, Setting
+from lidarpose.inference.predictor import load
+from lidarpose.io.files import atomic_path, check_writable, content_digest, file_error, listed
+from lidarpose.models.bundled import weights_path
 from lidarpose.models.header import runs_of
-from lidarpose.sample import UNLABELED, Box
-from lidarpose.skeleton import BODY26, Skeleton
-from lidarpose.skeleton import skeleton as skeleton_of
+from lidarpose.sample import UNLABELED
+from lidarpose.skeleton import BODY26
 
 # people predicted at once: so many clouds are in memory
 _CHUNK = 512
 # the worst people whose points are kept for pictures
 WORST = 24
+# where results go unless a folder is named
+FOLDER = "evaluation"
 
 
-class Model(Protocol):
-    """What is judged: `lidarpose.Predictor`, or anything that answers as it does."""
-
-    skeleton: Skeleton
-    model: dict[str, Any]
-    backend: Any
-
-    def predict(self, points, *, sensor_origin=None, skeleton: str | None = None, progress: bool = False): ...
-
-    def outputs(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None): ...
+# ---- one dataset
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """A dataset's result, what it was computed from, and the worst people with the points that the network saw."""
+    """A dataset's result, what it was computed from, and the worst people, as the network saw them, with their rows."""
 
     result: Result
-    judged: Judged
-    worst: tuple[tuple[Person, int], ...]
+    predictions: Predictions
+    worst: tuple[tuple[EvalSample, int], ...]
+
+    @property
+    def judged(self) -> Predictions:
+        """The predictions, by their name until 0.2."""
+        return self.predictions
 
 
-@dataclass(frozen=True, kw_only=True)
-class Task:
-    """A network before a dataset, all that can be wrong about the two being checked: see `task_of`."""
-
-    model: Model
-    people: People
-    setting: Setting
-    joints: Skeleton
-    sensor_unknown: bool
-
-    def prepared(self, person: Person) -> Person:
-        """The person as the protocol shows them to the network."""
-        setting = self.setting
-        return cropped(setting.protocol, setting.kind, person, setting.seed)
-
-    def box(self, person: Person) -> Box | None:
-        """The box that a crop is displaced from: a detector's in the protocol clean, the released code's in dapt, else
-        the dataset's, if any."""
-        setting = self.setting
-        if setting.protocol == "dapt":
-            return released_box(person.joints, person.centers, person.box)
-        return detector_box(setting.kind, person, setting.seed) or person.box
-
-    def fit(self, person: Person) -> tuple[Person | None, str]:
-        """The person as the protocol shows them; or None, and why it leaves them out."""
-        kind = self.setting.kind
-        if self.setting.protocol != "dapt":
-            return self.prepared(person), ""
-        released = RELEASED[kind]
-        if released_center(kind, person) is None:
-            return None, f"people without the center {released.center!r}"
-        if kind == "humanm3" and (person.labels == UNLABELED).all():
-            return None, "people without a labelled joint, whom their box is made of"
-        shown = self.prepared(person)
-        if len(shown.points) < released.least:
-            return None, f"people of under {released.least} points, as the released code skips them"
-        return shown, ""
-
-    def answered(self, people: list[Person]) -> list[dict]:
-        """Rows for `judged.gathered`: what the network says of people as the protocol shows them."""
-        return [_row(self, person, found) for person, found in zip(people, self.predict(people), strict=True)]
-
-    def predict(self, people: list[Person]) -> list[dict | None]:
-        """What the network says of people as the protocol shows them: pred (J, 3) m, confidence, spread and visible
-        (J,) of the judged joints, NaN for what it does not tell; None where it has no answer."""
-        out: list[dict | None] = [None] * len(people)
-        for known in (True, False):
-            rows = [k for k, one in enumerate(people) if (one.sensor_known and not self.sensor_unknown) == known]
-            origin = np.zeros(3) if known else None
-            answer = self._clean if self.setting.protocol == "clean" else self._released
-            for k, found in zip(rows, answer([people[k] for k in rows], origin), strict=True):
-                out[k] = found
-        return out
-
-    def _clean(self, people: list[Person], origin: np.ndarray | None) -> Iterator[dict | None]:
-        name = self.model.skeleton.name
-        if people:
-            clouds = [person.points for person in people]
-            for person in self.model.predict(clouds, sensor_origin=origin, skeleton=name):
-                yield None if person.pose is None else self._picked(person.pose, slice(None))
-
-    def _released(self, people: list[Person], origin: np.ndarray | None) -> Iterator[dict | None]:
-        """One pass about the released center."""
-        batch = self.model.backend.batch
-        for start in range(0, len(people), batch):
-            some = people[start : start + batch]
-            centers = np.stack([released_center(self.setting.kind, person) for person in some])
-            clouds = [person.points.astype(float) for person in some]
-            found = self.model.outputs(clouds, centers, origin)
-            for k, center in enumerate(centers):
-                answer = self._picked(found, k)
-                answer["pred"] = answer["pred"] + center
-                yield answer if np.isfinite(answer["pred"]).all() else None
-
-    def _picked(self, found, which) -> dict:
-        pick = self.model.skeleton.map_to(self.joints)
-        nothing = np.full(len(pick), np.nan)
-        told = {name: getattr(found, name) for name in ("confidence", "spread", "visible")}
-        told = {name: nothing if value is None else value[which][..., pick] for name, value in told.items()}
-        return {"pred": found.joints[which][..., pick, :]} | told
-
-
-def task_of(
-    model: Model,
-    people: People,
-    *,
-    protocol: str = "clean",
-    seed: int = 0,
-    skeleton: str | None = None,
-    sensor_unknown: bool = False,
-) -> Task:
-    """Puts a network before a dataset. Raises InputError, one line, where the protocol does not fit the dataset, the
-    dataset lacks joints of the `skeleton` asked for, or it and the network have no joint in common."""
-    seed = whole("seed", seed, least=0)
-    check_protocol(protocol, people.kind, people.split_by, people.name)
-    if protocol == "dapt" and model.model.get("tta", 1) > 1:
-        raise InputError("the protocol dapt is one look at each person, as the released code's: leave --tta away")
-    wanted = people.judged
-    if skeleton is not None:
-        wanted = skeleton_of(skeleton)
-        if missing := [name for name in wanted.joints if name not in people.skeleton.joints]:
-            raise InputError(
-                f"{people.name} has no {', '.join(missing)}, which {wanted.name} asks for: its joints are "
-                f"{people.skeleton.name}"
-            )
-    without = RELEASED[people.kind].without if protocol == "dapt" else ()
-    own = model.skeleton.joints
-    shared = [name for name in wanted.joints if name in own and name not in without]
-    if not shared:
-        raise InputError(
-            f"{people.name} has the joints {', '.join(wanted.joints)}, the network {', '.join(own)}: none in common"
-        )
-    reasons = {"the network has no": [name for name in wanted.joints if name not in own]}
-    reasons["the released means leave out"] = [name for name in wanted.joints if name in own and name in without]
-    setting = Setting(
-        dataset=people.name,
-        kind=people.kind,
-        method=str(model.model["name"]),
-        protocol=protocol,
-        centring=centring(protocol, people.kind),
-        crop=crop(protocol, people.kind),
-        split=people.split,
-        split_source=people.split_source,
-        leaks=people.leaks,
-        joints=tuple(shared),
-        not_judged="; ".join(f"{reason} {', '.join(names)}" for reason, names in reasons.items() if names),
-        sensor="unknown" if sensor_unknown else "known",
-        total=people.total,
-        limit=people.limit,
-        clusters=people.clusters,
-        seed=seed,
-    )
-    joints = subset(wanted, shared)
-    return Task(model=model, people=people, setting=setting, joints=joints, sensor_unknown=sensor_unknown)
-
-
-def judge(task: Task, *, legacy: bool = False, progress: Callable[[int], None] | None = None) -> Evaluation:
-    """Predicts everybody and judges it; progress(n) is told of every n people done. Raises InputError where nobody
+def evaluate_dataset(
+    setup: EvalSetup, *, dapt_compat: bool = False, progress: Callable[[int], None] | None = None
+) -> Evaluation:
+    """Predicts everybody and scores it; progress(n) is called with every n people done. Raises InputError where nobody
     could be read."""
-    setting, people = task.setting, task.people
-    rows: list[dict] = []
-    worst: list[tuple[float, int, Person]] = []
+    dataset, setting = setup.dataset, setup.setting
+    rows: list[dict[str, Any]] = []
+    worst: list[tuple[float, int, EvalSample]] = []
     unknown = 0
-    for chunk in _chunks(_fit(task)):
-        for person, row in zip(chunk, task.answered(chunk), strict=True):
-            unknown += not person.sensor_known
-            if (error := _mean_error(row)) is not None and not person.moving:
-                worst.append((error, len(rows), person))
+    for chunk in _chunks(setup):
+        for one, row in zip(chunk, setup.predict(chunk), strict=True):
+            unknown += not one.sample.sensor_known
+            if (error := _mean_error(row)) is not None and not one.moving:
+                worst.append((error, len(rows), one))
             rows.append(row)
-        worst = sorted(worst, key=lambda one: (-one[0], one[1]))[:WORST]
+        # the points of the worst people alone are kept
+        worst = sorted(worst, key=lambda entry: (-entry[0], entry[1]))[:WORST]
         if progress is not None:
             progress(len(chunk))
-    judged = gathered(task.joints, rows)
-    if not len(judged):
-        left = "; ".join(f"{reason}: {entry['first']}" for reason, entry in people.skipped.items())
-        raise InputError(f"nobody of {people.name} could be judged ({left})")
+    if not rows:
+        left = "; ".join(f"{reason}: {entry['first']}" for reason, entry in dataset.skipped.items())
+        raise InputError(f"nobody of {dataset.name} could be judged ({left})")
+    predictions = stack(setup.joints, rows)
     if setting.sensor == "known" and unknown:
-        told = "unknown" if unknown == len(judged) else "of some people"
-        setting = replace(setting, sensor=told)
-    lines = lines_of(judged, setting, legacy=legacy)
-    if isinstance(people, BenchPeople):
-        lines += _floor_lines(people, judged, setting)
-    alone = ~judged.moving
+        setting = replace(setting, sensor="unknown" if unknown == len(rows) else "of some people")
+    lines = metric_rows(predictions, setting, dapt_compat=dapt_compat)
+    if dataset.bench is not None:
+        lines += _baselines(dataset, predictions, setting)
+    alone = ~predictions.moving
     counts = {"people": int(alone.sum()), "frames of clips": int((~alone).sum())}
-    counts["without a pose"] = int((~judged.posed & alone).sum())
-    result = Result(
-        setting=setting,
-        counts=counts,
-        skipped={reason: dict(entry) for reason, entry in people.skipped.items()},
-        notes=tuple(_notes(task, setting, judged)),
-        lines=lines,
-    )
-    return Evaluation(result=result, judged=judged, worst=tuple((person, k) for _, k, person in worst))
+    counts["without a pose"] = int((~predictions.posed & alone).sum())
+    skipped = {reason: dict(entry) for reason, entry in dataset.skipped.items()}
+    notes = tuple(_notes(setup, setting, predictions))
+    result = Result(setting=setting, counts=counts, skipped=skipped, notes=notes, lines=lines)
+    return Evaluation(result=result, predictions=predictions, worst=tuple((one, k) for _, k, one in worst))
 
 
-def _fit(task: Task) -> Iterator[Person]:
+def _chunks(setup: EvalSetup) -> Iterator[list[EvalSample]]:
     """The people as the protocol shows them; who has nothing to show is counted."""
-    for person in task.people:
-        shown, why = task.fit(person)
+    chunk: list[EvalSample] = []
+    for one in setup.dataset:
+        shown, reason = setup.shown(one)
         if shown is None:
-            where = f"{person.sequence}, frame {person.frame}, track {person.track}"
-            note(task.people.skipped, why, where)
-        else:
-            yield shown
-
-
-def _chunks(people: Iterator[Person]) -> Iterator[list[Person]]:
-    chunk: list[Person] = []
-    for person in people:
-        chunk.append(person)
+            where = f"{one.sample.sequence}, frame {one.sample.frame}, track {one.sample.track}"
+            count_skipped(setup.dataset.skipped, reason, where)
+            continue
+        chunk.append(shown)
         if len(chunk) == _CHUNK:
             yield chunk
             chunk = []
@@ -244,83 +109,64 @@ def _chunks(people: Iterator[Person]) -> Iterator[list[Person]]:
         yield chunk
 
 
-def _row(task: Task, person: Person, answer: dict | None) -> dict:
-    pick = task.people.skeleton.map_to(task.joints)
-    nothing = np.full(len(pick), np.nan)
-    if answer is None:
-        answer = {"pred": np.full((len(pick), 3), np.nan), "confidence": nothing, "spread": nothing, "visible": nothing}
-    box = person.box
-    names = ("shard", "row", "sequence", "frame", "track", "time", "sensor", "condition", "poses", "plain", "moving")
-    return {name: getattr(person, name) for name in names} | {
-        "points": len(person.points),
-        "distance": person.distance,
-        "hidden": person.hidden,
-        "box": np.full(7, np.nan) if box is None else np.concatenate([box.center, box.size, [box.yaw]]),
-        "true": person.joints[pick],
-        "labels": person.labels[pick],
-        **answer,
-    }
-
-
-def _mean_error(row: dict) -> float | None:
-    """m, over the labelled joints."""
-    known = row["labels"] != UNLABELED
-    if not known.any() or np.isnan(row["pred"]).any():
+def _mean_error(row: dict[str, Any]) -> float | None:
+    """m, over the labeled joints."""
+    labeled = row["labels"] != UNLABELED
+    if "pred" not in row or not labeled.any():
         return None
-    return float(np.linalg.norm(row["pred"] - row["true"], axis=1)[known].mean())
+    return float(np.linalg.norm(row["pred"] - row["true"], axis=1)[labeled].mean())
 
 
-def _floor_lines(people: BenchPeople, judged: Judged, setting: Setting) -> tuple[Line, ...]:
-    """What knows no points, judged on the same people."""
-    pick = BODY26.map_to(judged.skeleton)
-    nothing = np.full(judged.confidence.shape, np.nan, np.float32)
-    out = ()
-    for name, joints in floors(people.bench).items():
-        pred = joints[judged.row][:, pick].astype(np.float32)
-        shown = replace(judged, pred=pred, confidence=nothing, spread=nothing, visible=nothing)
-        out += headline(shown, replace(setting, method=f"floor: {name}"))
-    return out
+def _baselines(dataset: EvalDataset, predictions: Predictions, setting: Setting) -> tuple[MetricRow, ...]:
+    """What knows no points, scored on the same people."""
+    pick = BODY26.map_to(predictions.skeleton)
+    unstated = np.full_like(predictions.confidence, np.nan)
+    rows: tuple[MetricRow, ...] = ()
+    for name, joints in mean_poses(dataset.bench).items():
+        pred = joints[predictions.row][:, pick].astype(np.float32)
+        baseline = replace(predictions, pred=pred, confidence=unstated, spread=unstated, visible=unstated)
+        rows += baseline_rows(baseline, replace(setting, method=f"{BASELINE}{name}"))
+    return rows
 
 
-def _notes(task: Task, setting: Setting, judged: Judged) -> Iterator[str]:
-    """What the reader must know; setting: the task's, as it turned out."""
-    yield from _acquainted(task)
+def _notes(setup: EvalSetup, setting: Setting, predictions: Predictions) -> Iterator[str]:
+    """What the reader must know; setting: the setup's, as it turned out."""
+    yield from _training_notes(setup)
     if setting.not_judged:
         yield f"judged are {', '.join(setting.joints)}; {setting.not_judged}"
     if setting.leaks:
         yield f"the split leaks: {setting.leaks}"
     if setting.protocol == "dapt":
         yield "crop and center are made of labels, as in the released code: not comparable with the protocol clean"
-        if task.people.level:
+        if setup.dataset.level:
             yield "sequences out of level were turned; for the released code's frame, prepare with --no-level"
-    if setting.kind == "waymo" and not (judged.labels == UNLABELED).all():
+    if setting.kind == "waymo" and not (predictions.labels == UNLABELED).all():
         yield "joints that are labelled as hidden count, but in PEM; people are predicted in their labelled boxes"
-    if setting.clusters and (sequences := len(np.unique(judged.sequence[~judged.moving]))) < LEAST_UNITS:
+    if setting.clusters and (sequences := len(np.unique(predictions.sequence[~predictions.moving]))) < LEAST_UNITS:
         few = "one sequence alone" if sequences == 1 else f"{sequences} sequences alone"
         yield f"{few}: no intervals, which take {LEAST_UNITS}, since frames of a sequence are not independent"
     if setting.kind == BENCH:
         yield "the floors know no points: the mean skeleton about the points' center, turned to the true facing or not"
 
 
-def _acquainted(task: Task) -> Iterator[str]:
-    """That the network knows these people, by what its checkpoint tells of the runs that made it."""
-    card = getattr(getattr(task.model, "header", None), "card", {})
-    yield from dict.fromkeys(note for run in runs_of(card) for note in _learned_by(run, task))
+def _training_notes(setup: EvalSetup) -> Iterator[str]:
+    """Whether the network was trained on these people, by what its checkpoint tells of the runs that made it."""
+    runs = runs_of(getattr(getattr(setup.model, "header", None), "card", {}))
+    yield from dict.fromkeys(note for run in runs for note in _notes_of_run(run, setup.dataset))
 
 
-def _learned_by(run: dict, task: Task) -> Iterator[str]:
-    """What one run, by its card, had of the people."""
-    recipe, people, judged = run.get("recipe"), task.people, task.setting.split
+def _notes_of_run(run: dict, dataset: EvalDataset) -> Iterator[str]:
+    recipe = run.get("recipe")
     if not isinstance(recipe, dict):
         return
     # pre-training on shards takes everybody
-    data, learned = run.get("data") or recipe.get("shards"), recipe.get("split", "all")
-    if isinstance(data, list) and people.name in data:
-        if learned == judged or "all" in (learned, judged):
-            yield f"the network learned from split {learned} of {people.name}: it is judged on people whom it knows"
-        elif judged == "val" and "validation_mm" in run:
+    data, split = run.get("data") or recipe.get("shards"), recipe.get("split", "all")
+    if isinstance(data, list) and dataset.name in data:
+        if split == dataset.split or "all" in (split, dataset.split):
+            yield f"the network learned from split {split} of {dataset.name}: it is judged on people whom it knows"
+        elif dataset.split == "val" and "validation_mm" in run:
             yield "the network's run was validated on this split: its best.safetensors was chosen by these people"
-    made = people.dataset.card.settings if people.kind == "synth" else {}
+    made = dataset.settings if dataset.kind == "synth" else {}
     synthesized = recipe["mix"] if "mix" in recipe else not recipe.get("shards")
     alike = made.get("what") == "people" and all(made.get(name) == recipe.get(name) for name in ("seed", "scene"))
     if synthesized and alike:
@@ -328,3 +174,163 @@ def _learned_by(run: dict, task: Task) -> Iterator[str]:
             f"the network learned from synthesized people of seed {made['seed']}, as these are: they may be the "
             "very same; make others by lidarpose synth --seed"
         )
+
+
+# ---- all of one call
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """All of one call: scores, what is in scores.json; evaluations, one a dataset; studies of their stability."""
+
+    scores: Scores
+    evaluations: tuple[Evaluation, ...]
+    studies: tuple[Stability, ...] = ()
+
+
+def evaluate(model: Model | str | os.PathLike, dataset: str | os.PathLike, **options: Any) -> Result:
+    """One dataset's result; `options` as of `run`."""
+    return run(model, [dataset], **options).scores.results[0]
+
+
+def run(
+    model: Model | str | os.PathLike,
+    datasets: Sequence[str | os.PathLike],
+    *,
+    protocol: str = "clean",
+    split: str | None = None,
+    skeleton: str | None = None,
+    limit: int | None = None,
+    stability: bool = False,
+    dapt_compat: bool = False,
+    sensor_unknown: bool = False,
+    seed: int = 0,
+    device: str = "cpu",
+    backend: str | None = None,
+    decode: str = "window",
+    tta: int = 1,
+    command: str = "",
+    progress: Callable[[str, int, int], None] | None = None,
+    legacy: bool = False,
+) -> Run:
+    """Scores a network on datasets. Everything is checked before anybody is predicted.
+
+    Args:
+        model: a `Predictor`, anything that answers as it does, or what `load` takes.
+        datasets: folders that `lidarpose prepare` or `synth` wrote, or "bench".
+        protocol: "clean" or "dapt".
+        split: by default test, else val, else "all", which is everybody.
+        skeleton: score its joints, by default the dataset's (of synthetic people human15's).
+        limit: so many people, evenly spread.
+        stability: perturb the points, too.
+        dapt_compat: also the released code's arithmetic; `legacy` is its old name.
+        sensor_unknown: do not tell where the sensor stood.
+        seed: of displaced boxes and intervals.
+        device, backend, decode, tta: as of `load`, for weights by name or path.
+        command: what scores.json says was run.
+        progress: progress(dataset, done, total) is called as people are predicted.
+
+    Raises:
+        InputError: one line, for what does not fit. MissingExtra: without pyarrow.
+    """
+    datasets = listed(datasets)
+    if not datasets:
+        raise InputError("expected a dataset to judge: a folder that lidarpose prepare or synth wrote, or bench")
+    pyarrow()
+    opened = [open_eval_dataset(dataset, split=split, limit=limit) for dataset in datasets]
+    names = [one.name for one in opened]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise InputError(f"two datasets are called {twice}: evaluate them one by one, or rename a folder")
+    predictor, weights = _loaded(model, device=device, backend=backend, decode=decode, tta=tta)
+    options: dict[str, Any] = {"protocol": protocol, "seed": seed, "skeleton": skeleton}
+    setups = [eval_setup(predictor, one, sensor_unknown=sensor_unknown, **options) for one in opened]
+    perturbed = [people_to_perturb(setup) if stability else None for setup in setups]
+    evaluations, studies = [], []
+    for setup, people in zip(setups, perturbed, strict=True):
+        done = _counter(setup.setting.dataset, setup.dataset.count, progress)
+        evaluations.append(evaluate_dataset(setup, dapt_compat=dapt_compat or legacy, progress=done))
+        if people is not None:
+            done = _counter(f"{setup.setting.dataset}, disturbed", 0, progress)
+            studies.append(study(setup, evaluations[-1].predictions, people=people, progress=done))
+    results = tuple(one.result for one in evaluations)
+    scores = Scores(weights=weights, command=command, seed=setups[0].setting.seed, results=results)
+    return Run(scores=scores, evaluations=tuple(evaluations), studies=tuple(studies))
+
+
+def _loaded(model: Model | str | os.PathLike, **options: Any) -> tuple[Model, dict[str, Any]]:
+    """The network, and what scores.json says of its weights."""
+    weights: dict[str, Any] = {}
+    if isinstance(model, str | os.PathLike):
+        path = weights_path(model)
+        # a missing file is for `load` to report
+        if path.is_file():
+            weights = {"file": path.name, "digest": content_digest(path, expected="a checkpoint")}
+        model = load(model, **options)
+    elif not hasattr(model, "predict"):
+        raise InputError(f"expected a network to judge, weights by name or path or a predictor, got {model!r}")
+    elif options != {"device": "cpu", "backend": None, "decode": "window", "tta": 1}:
+        raise InputError("device, backend, decode and tta are of weights by name or path: give them to load instead")
+    # whether a dataset's own sequences were trained on shows only in the checkpoint
+    card = getattr(getattr(model, "header", None), "card", {})
+    return model, dict(model.model) | weights | {"skeleton": model.skeleton.name, "trained by": card.get("command")}
+
+
+def _counter(name: str, total: int, progress: Callable[[str, int, int], None] | None) -> Callable[[int], None] | None:
+    done = 0
+
+    def add(more: int) -> None:
+        nonlocal done
+        done += more
+        progress(name, done, total)
+
+    return add if progress is not None else None
+
+
+# ---- the folder of results
+
+
+def new_folder(checkpoint: str | os.PathLike, folder: str | os.PathLike = FOLDER) -> Path:
+    """FOLDER/NAME of the checkpoint, or FOLDER/NAME-2, ..., the first that is not there."""
+    name = weights_path(checkpoint).stem
+    path, number = Path(folder) / name, 2
+    while path.exists():
+        path, number = Path(folder) / f"{name}-{number}", number + 1
+    return path
+
+
+def check_folder(folder: str | os.PathLike) -> Path:
+    """The folder to write to. Raises InputError unless it is new or empty, and can be written."""
+    path = Path(folder)
+    remedy = "give a new or empty folder for the results (--out DIR)"
+    if path.exists() and not path.is_dir():
+        raise file_error(path, f"is a file; {remedy}")
+    if path.is_dir() and any(path.iterdir()):
+        raise file_error(path, f"holds other files; {remedy}")
+    check_writable(path / FILE)
+    return path
+
+
+def write(run: Run, folder: str | os.PathLike) -> list[Path]:
+    """Writes scores.json, poses.parquet, pictures and, where there are studies, stability.json into a new or empty
+    folder, all of them or none, and returns their paths. Raises InputError where the folder holds something."""
+    from lidarpose.eval import charts
+
+    folder, scores = check_folder(folder), run.scores
+    files: dict[str, Any] = {FILE: scores.to_json().encode()}
+    for one in run.evaluations:
+        name = one.result.setting.dataset
+        files[f"{name}-errors.png"] = charts.draw_errors(one.result)
+        files[f"{name}-reliability.png"] = charts.draw_reliability(one.predictions, one.result)
+        files[f"{name}-worst.png"] = one.worst and charts.draw_worst(one.predictions, one.result.setting, one.worst)
+    for stability in run.studies:
+        files[f"{stability.setting.dataset}-stability.png"] = charts.draw_stability(stability)
+    if run.studies:
+        head = {"version": __version__, "command": scores.command, "seed": scores.seed, "weights": scores.weights}
+        files["stability.json"] = to_json(run.studies, head=head).encode()
+    files = {name: content for name, content in files.items() if content}
+    with ExitStack() as stack:
+        poses = {one.result.setting.dataset: one.predictions for one in run.evaluations}
+        write_poses(stack.enter_context(atomic_path(folder / "poses.parquet")), poses)
+        for name, content in files.items():
+            stack.enter_context(atomic_path(folder / name)).write_bytes(content)
+    return [folder / name for name in (*files, "poses.parquet")]

@@ -1,28 +1,37 @@
-"""What an evaluation says: lines, one a figure, each with the protocol that it was found by; and scores.json."""
+"""What an evaluation says: rows, each one metric of one group with the protocol it was found by; scores.json; and the
+paper's Table 1 with the results of such files beside it.
+"""
 
 import json
 import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from lidarpose._version import __version__
 from lidarpose.errors import InputError
-from lidarpose.io.files import file_error, read_bytes
+from lidarpose.io.files import file_error, listed, read_bytes
 
 SCHEMA = "lidarpose.scores/1"
 FILE = "scores.json"
 # whose arithmetic: this package's, or the paper's released code's, see docs/evaluate.md
 OURS, RELEASED = "lidarpose", "released"
+# in front of the name of a method that knows no points; what is shown calls it a baseline
+BASELINE = "floor: "
 
 
 @dataclass(frozen=True, kw_only=True)
 class Setting:
-    """How a dataset was judged. dataset: what it is called; kind: the raw dataset's name, "synth" or "bench"; method:
-    what predicted; protocol, centring, crop, split in words; split_source and leaks of the split, "" where there is
-    nothing to say; joints that were judged; not_judged: joints of the dataset, or asked for, that were not, and why;
-    sensor: "known", "unknown" or "of some people"; people of whom so many were `limit`ed to; clusters: intervals draw
-    whole sequences; seed of boxes and intervals."""
+    """How a dataset was scored, under the keys of scores.json.
+
+    dataset: its name; kind: the raw dataset's name, "synth" or "bench"; method: what predicted; protocol, centring (how
+    people are centered), crop, split in words; split_source and leaks of the split, "" where there is nothing to say;
+    joints that were scored; not_judged: joints of the dataset, or asked for, that were not scored, and why; sensor:
+    "known", "unknown" or "of some people"; total: people of whom `limit` were scored, None for all; clusters: intervals
+    draw whole sequences; seed of boxes and intervals.
+    """
 
     dataset: str
     kind: str
@@ -42,24 +51,27 @@ class Setting:
     seed: int
 
     @property
-    def told(self) -> str:
-        """Protocol, centring, split and limit, for a line: "clean · points alone · split test"."""
+    def summary(self) -> str:
+        """Protocol, centering, split and limit in a few words: "clean · points alone · split test"."""
         split = "no split" if self.split == "none" else f"split {self.split}{', leaks' if self.leaks else ''}"
         words = [self.protocol, self.centring, split]
         if self.limit is not None:
             words.append(f"{self.limit:,} of {self.total:,} people")
         return " · ".join(words)
 
+    # its name until 0.2
+    told = summary
+
 
 @dataclass(frozen=True, kw_only=True)
-class Line:
-    """One figure.
+class MetricRow:
+    """One metric of one group, under the keys of scores.json.
 
-    method; figure: its name, "mpjpe"; group and of: of whom or of what, ("all", "all"), ("joints", "wrists"),
-    ("distance, m", "0 to 10"); value in `unit`, None where nobody could be judged; low, high: ends of the 95 %
-    interval, None where there is none; people, joints that it is of (of oks_ap and turned_round, one a person);
-    skipped: people without a labelled joint; no_pose: people for whom the network had no answer; arithmetic;
-    protocol, centring, split, limit: as in `Setting`.
+    method; figure: the metric's name, "mpjpe"; group, of: of which people or joints, ("all", "all"), ("joints",
+    "wrists"), ("distance, m", "0 to 10"); value in `unit`, None of nobody; low, high: ends of the 95 % interval, None
+    where there is none; people, joints that it is of (of oks_ap and turned_round, one a person); skipped: people
+    without a labeled joint; no_pose: people for whom the network had no answer; arithmetic; protocol, centring, split,
+    limit: as in `Setting`.
     """
 
     method: str
@@ -83,23 +95,23 @@ class Line:
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """One dataset's lines. counts: people judged, frames of clips, without pose; skipped: reason -> count and the first
-    one; notes: what the reader must know."""
+    """One dataset's rows (`lines`, as in scores.json). counts: people scored, frames of clips, people without a pose;
+    skipped: reason -> count and the first one; notes: what the reader must know."""
 
     setting: Setting
     counts: dict[str, int]
     skipped: dict[str, dict]
     notes: tuple[str, ...]
-    lines: tuple[Line, ...]
+    lines: tuple[MetricRow, ...]
 
-    def line(self, figure: str, group: str = "all", of: str = "all", **more: str) -> Line:
-        """The line of a figure, of the network itself unless `method` or `arithmetic` say otherwise. Raises InputError
+    def line(self, figure: str, group: str = "all", of: str = "all", **more: str) -> MetricRow:
+        """The row of a metric, of the network itself unless `method` or `arithmetic` say otherwise. Raises InputError
         where there is none."""
         wanted = {"method": self.setting.method, "arithmetic": OURS} | more
         wanted |= {"figure": figure, "group": group, "of": of}
-        for line in self.lines:
-            if all(getattr(line, name) == value for name, value in wanted.items()):
-                return line
+        for row in self.lines:
+            if all(getattr(row, name) == value for name, value in wanted.items()):
+                return row
         raise InputError(f"{self.setting.dataset} has no line {', '.join(map(str, wanted.values()))}")
 
 
@@ -115,12 +127,21 @@ class Scores:
     version: str = __version__
 
     def to_json(self) -> str:
-        """One line of text a figure."""
+        """One line of text a row."""
         head = {"schema": SCHEMA, "version": self.version, "command": self.command, "seed": self.seed}
         head |= {"unit": {"mm": "millimetres", "%": "percent"}, "weights": self.weights}
-        rows = ",\n".join(f" {json.dumps(key)}: {json.dumps(value)}" for key, value in head.items())
-        results = ",\n".join(map(_result_json, self.results))
-        return f'{{\n{rows},\n "results": [\n{results}\n ]\n}}\n'
+        results = []
+        for result in self.results:
+            parts = {"setting": asdict(result.setting), "counts": result.counts, "skipped": result.skipped}
+            lines = ",\n".join(f"    {json.dumps(asdict(row))}" for row in result.lines)
+            keys = _json_lines(parts | {"notes": result.notes}, indent=3)
+            results.append(f'  {{\n{keys},\n   "lines": [\n{lines}\n   ]\n  }}')
+        content = ",\n".join(results)
+        return f'{{\n{_json_lines(head, indent=1)},\n "results": [\n{content}\n ]\n}}\n'
+
+
+def _json_lines(values: dict[str, Any], *, indent: int) -> str:
+    return ",\n".join(f"{' ' * indent}{json.dumps(key)}: {json.dumps(value)}" for key, value in values.items())
 
 
 def scores_path(path: str | Path) -> Path:
@@ -132,54 +153,193 @@ def scores_path(path: str | Path) -> Path:
 def read_scores(path: str | Path) -> Scores:
     """scores.json, or that of a folder. Raises InputError for a file that is none."""
     path = scores_path(path)
+    data = read_bytes(path, expected=f"{FILE} of lidarpose evaluate")
     try:
-        found = json.loads(read_bytes(path, expected=f"{FILE} of lidarpose evaluate"))
-        if found["schema"] != SCHEMA:
-            raise file_error(
-                path,
-                f"is of schema {found['schema']!r}, this lidarpose reads {SCHEMA}: evaluate again, or use the "
-                "lidarpose version that wrote it",
+        content = json.loads(data)
+        if content["schema"] == SCHEMA:
+            weights = dict(content["weights"])
+            if not isinstance(weights.get("digest") or "", str):
+                raise TypeError("the digest of the weights is no text")
+            return Scores(
+                weights=weights,
+                command=str(content["command"]),
+                seed=int(content["seed"]),
+                results=tuple(map(_result, content["results"])),
+                version=str(content["version"]),
             )
-        weights = dict(found["weights"])
-        if not isinstance(weights.get("digest") or "", str):
-            raise TypeError("the digest of the weights is no text")
-        return Scores(
-            weights=weights,
-            command=str(found["command"]),
-            seed=int(found["seed"]),
-            results=tuple(map(_result_of, found["results"])),
-            version=str(found["version"]),
-        )
-    except InputError:
-        raise
+        schema = content["schema"]
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         problem = f"{error} is missing" if isinstance(error, KeyError) else error
         raise file_error(path, f"is no {FILE} of lidarpose evaluate ({problem})") from None
+    remedy = "evaluate again, or use the lidarpose version that wrote it"
+    raise file_error(path, f"is of schema {schema!r}, this lidarpose reads {SCHEMA}: {remedy}")
 
 
-def number(value: float) -> float | None:
-    """A figure as it is written: NaN is None."""
-    return None if math.isnan(value) else float(value)
-
-
-def _result_json(result: Result) -> str:
-    lines = ",\n".join(f"    {json.dumps(asdict(line))}" for line in result.lines)
-    head = {"setting": asdict(result.setting), "counts": result.counts, "skipped": result.skipped}
-    head["notes"] = list(result.notes)
-    rows = ",\n".join(f"   {json.dumps(key)}: {json.dumps(value)}" for key, value in head.items())
-    return f'  {{\n{rows},\n   "lines": [\n{lines}\n   ]\n  }}'
-
-
-def _result_of(found: dict[str, Any]) -> Result:
-    setting = dict(found["setting"])
+def _result(content: dict[str, Any]) -> Result:
+    setting = dict(content["setting"])
     setting["joints"] = tuple(setting["joints"])
     for field in fields(Setting):
         if field.type is str and not isinstance(setting[field.name], str):
             raise TypeError(f"{field.name} is no text")
     return Result(
         setting=Setting(**setting),
-        counts=dict(found["counts"]),
-        skipped=dict(found["skipped"]),
-        notes=tuple(found["notes"]),
-        lines=tuple(Line(**line) for line in found["lines"]),
+        counts=dict(content["counts"]),
+        skipped=dict(content["skipped"]),
+        notes=tuple(content["notes"]),
+        lines=tuple(MetricRow(**row) for row in content["lines"]),
     )
+
+
+def number(value: float) -> float | None:
+    """A value as JSON has it: NaN is None."""
+    return None if math.isnan(value) else float(value)
+
+
+# ---- the paper's Table 1 with what was evaluated here beside it
+
+TABLE_SCHEMA = "lidarpose.table/1"
+FORMATS = ("markdown", "json")
+# metrics of the table: title and unit
+COLUMNS = {"mpjpe": ("MPJPE", "mm"), "pa_mpjpe": ("PA-MPJPE", "mm"), "pck3": ("PCK-3", "%"), "pck5": ("PCK-5", "%")}
+# the paper leaves PA-MPJPE out where labels are missing
+_WITHOUT_PA = ("waymo", "humanm3")
+_BLOCKS = {
+    "dapt": "Evaluated here, protocol dapt: crop and center from labels, as the released code. Nearest to the block "
+    "above; the notes tell what differs",
+    "clean": "Evaluated here, protocol clean: a detector's box and a center from the points alone. Not comparable with "
+    "the blocks above",
+}
+_OTHERS = "Evaluated here on sets that the paper does not have"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableEntry:
+    """One method's result on a dataset. row: the method's name in the table; figures: metric -> value or None; note:
+    what the reader must know; path of the scores.json; weights: their digest, None of baselines."""
+
+    row: str
+    kind: str
+    dataset: str
+    protocol: str
+    figures: dict[str, float | None]
+    note: str
+    path: str
+    weights: str | None
+
+
+def published() -> dict[str, Any]:
+    """The paper's results: source, note, datasets with their protocols, methods with theirs and their figures."""
+    return json.loads((resources.files("lidarpose.eval") / "assets" / "published.json").read_text("utf-8"))
+
+
+def table(paths: Sequence[str | Path], *, format: str = "markdown") -> str:
+    """The table of scores.json files, or of folders that hold one; ours come from these files alone, and results of
+    different protocols stand in different blocks. Raises InputError for an unknown format and for a file that is
+    none."""
+    if format not in FORMATS:
+        raise InputError(f"expected a table's format, {' or '.join(FORMATS)}, got {format!r}")
+    entries = [entry for path in listed(paths) for entry in _entries(str(path), read_scores(path))]
+    if format == "markdown":
+        return _markdown(entries)
+    units = {name: unit for name, (_, unit) in COLUMNS.items()}
+    content = {"schema": TABLE_SCHEMA, "unit": units, "published": published()}
+    return json.dumps(content | {"evaluated": [asdict(entry) for entry in entries]}, indent=1) + "\n"
+
+
+def _entries(path: str, scores: Scores) -> Iterator[TableEntry]:
+    digest = scores.weights.get("digest") or None
+    for result in scores.results:
+        setting = result.setting
+        overall = [row for row in result.lines if (row.group, row.of) == ("all", "all")]
+        for method, arithmetic in dict.fromkeys((row.method, row.arithmetic) for row in result.lines):
+            values = {row.figure: row.value for row in overall if (row.method, row.arithmetic) == (method, arithmetic)}
+            own = method == setting.method
+            weights = f"weights {digest[:12]}" if digest else ""
+            words = [
+                *_setting_words(result),
+                "arithmetic of the released code, faults included" if arithmetic == RELEASED else "",
+                weights if own else "knows no points",
+                path,
+            ]
+            yield TableEntry(
+                row=method if arithmetic == OURS else f"{method}, released arithmetic",
+                kind=setting.kind,
+                dataset=setting.dataset,
+                protocol=setting.protocol,
+                figures={name: values.get(name) for name in COLUMNS},
+                note="; ".join(word for word in words if word),
+                path=path,
+                weights=digest if own else None,
+            )
+
+
+def _setting_words(result: Result) -> Iterator[str]:
+    setting, no_pose = result.setting, result.counts["without a pose"]
+    split = setting.split
+    if split != "none":
+        split += f" ({setting.split_source})" if setting.split_source else ""
+    limited = "" if setting.limit is None else f", evenly picked from {setting.total:,}"
+    left_out = sum(entry["count"] for reason, entry in result.skipped.items() if reason.startswith("people"))
+    yield f"{setting.dataset}: protocol {setting.protocol}"
+    yield f"center: {setting.centring}"
+    yield f"crop: {setting.crop}"
+    yield f"split: {split}{', which leaks: ' + setting.leaks if setting.leaks else ''}"
+    yield f"{result.counts['people']:,} people{limited}"
+    yield f"{len(setting.joints)} joints{' (' + setting.not_judged + ')' if setting.not_judged else ''}"
+    yield "" if setting.sensor == "known" else f"the sensor's place is {setting.sensor}"
+    yield f"{no_pose:,} without a pose, not counted" if no_pose else ""
+    yield f"{left_out:,} left out" if left_out else ""
+
+
+def _markdown(entries: list[TableEntry]) -> str:
+    known = published()
+    notes: list[str] = []
+
+    def mark(note: str) -> str:
+        if note not in notes:
+            notes.append(note)
+        return f"[{notes.index(note) + 1}]"
+
+    titles = {kind: about["title"] for kind, about in known["datasets"].items()}
+    marked = {k: f"{titles[k]} {mark(f'{titles[k]}: ' + about['protocol'])}" for k, about in known["datasets"].items()}
+    rows = []
+    for method in known["methods"]:
+        name = method["method"]
+        cells = {(kind, m): _cell(value) for kind, values in method["figures"].items() for m, value in values.items()}
+        rows.append((f"{name} {mark(name + ': ' + method['protocol'])}" if method["protocol"] else name, cells))
+    lines = [f"**Published**: {known['source']}; {known['note']}", "", *_grid(marked, rows)]
+    for protocol, title in _BLOCKS.items():
+        if own := [entry for entry in entries if entry.protocol == protocol and entry.kind in titles]:
+            lines += ["", f"**{title}.**", "", *_grid(titles, _rows(own, "kind", mark))]
+    if others := [entry for entry in entries if entry.kind not in titles]:
+        columns = {entry.dataset: entry.dataset for entry in others}
+        lines += ["", f"**{_OTHERS}.**", "", *_grid(columns, _rows(others, "dataset", mark))]
+    lines += ["", "mm and percent; lower MPJPE and higher PCK are better.", ""]
+    return "\n".join([*lines, *(f"[{k}] {note}  " for k, note in enumerate(notes, 1))]) + "\n"
+
+
+def _rows(entries: list[TableEntry], by: str, mark: Callable[[str], str]) -> list[tuple[str, dict]]:
+    """Rows of (name, cells): one a method and its weights, another one where a column comes twice. by: what a column
+    is of, "kind" or "dataset"."""
+    rows: list[tuple[tuple[str, str | None], dict]] = []
+    for entry in entries:
+        key, column = (entry.row, entry.weights), getattr(entry, by)
+        cells = next((cells for own, cells in rows if own == key and (column, "mpjpe") not in cells), None)
+        if cells is None:
+            rows.append((key, cells := {}))
+        note = mark(entry.note)
+        cells |= {
+            (column, name): _cell(value, note if name == "mpjpe" else "") for name, value in entry.figures.items()
+        }
+    return [(name, cells) for (name, _), cells in rows]
+
+
+def _cell(value: float | None, note: str = "") -> str:
+    return "-" if value is None else f"{value:.2f} {note}".rstrip()
+
+
+def _grid(columns: dict[str, str], rows: list[tuple[str, dict]]) -> list[str]:
+    heads = [(kind, name) for kind in columns for name in COLUMNS if not (name == "pa_mpjpe" and kind in _WITHOUT_PA)]
+    lines = ["| | " + " | ".join(f"{columns[kind]} {COLUMNS[name][0]}" for kind, name in heads) + " |"]
+    lines.append("|---" * (len(heads) + 1) + "|")
+    return lines + [f"| {name} | " + " | ".join(cells.get(head, "-") for head in heads) + " |" for name, cells in rows]
