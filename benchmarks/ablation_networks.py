@@ -5,11 +5,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from lidarpose.models.batch import Batch
 from lidarpose.models.config import NetworkConfig
-from lidarpose.models.exchange import Exchange
-from lidarpose.models.layers import Places
-from lidarpose.models.posenet import PoseNet
+from lidarpose.models.layers import Exchange, RotaryEmbedding
+from lidarpose.models.posenet import Batch, PoseNet
 
 LEVELS = ("coarse", "mid", "fine")
 
@@ -23,7 +21,13 @@ class Unread(nn.Module):
         self.norm_feed, self.feed = exchange.norm_feed, exchange.feed
 
     def forward(
-        self, anchors: Tensor, believed: Places, voxels: Tensor, places: Places, log_count: Tensor, bias: Tensor
+        self,
+        anchors: Tensor,
+        believed: RotaryEmbedding,
+        voxels: Tensor,
+        places: RotaryEmbedding,
+        log_count: Tensor,
+        bias: Tensor,
     ) -> Tensor:
         anchors = anchors + self.read(voxels, bias)
         anchors = anchors + self.among(self.norm_self(anchors), None, None)

@@ -32,10 +32,9 @@ from lidarpose._version import __version__
 from lidarpose.inference.predictor import Predictor
 from lidarpose.inference.torch_backend import TorchBackend
 from lidarpose.io.files import write_atomic
-from lidarpose.models.checkpoint import load_checkpoint
+from lidarpose.models.checkpoint import Header, SafetensorsFile, load_checkpoint, read_header
 from lidarpose.models.config import NetworkConfig, preset
-from lidarpose.models.expand import grown
-from lidarpose.models.header import Header, opened, read_header
+from lidarpose.models.expand import expand_weights
 from lidarpose.models.posenet import PoseNet
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import SCENES, SceneConfig
@@ -164,7 +163,7 @@ def job(variant: Variant, settings: Pretrain) -> TrainSetup:
         values["easy"] = math.inf
     network = task.network
     if settings.init:
-        network = partial(grown, load_checkpoint(settings.init)[0], config)
+        network = partial(expand_weights, load_checkpoint(settings.init)[0], config)
     return replace(usual, task=task, source=SceneSource(config=variant.scene, **values), network=network)
 
 
@@ -181,8 +180,7 @@ def run(options: argparse.Namespace, name: str, seed: int, folder: Path) -> dict
     model = train(settings, folder, setup=own)
     taken = {"seconds": time.perf_counter() - started, "processor_seconds": time.process_time() - used}
     network = own.task.network()
-    with opened(model, framework="pt") as file:
-        network.load_state_dict({key: file.get_tensor(key) for key in file.keys()})  # noqa: SIM118
+    network.load_state_dict(SafetensorsFile.open(model).load(network.state_dict()))
     predictor = Predictor(TorchBackend(network, Header(config=own.task.config, card={})), name=name)
     result = evaluation.run(predictor, ["bench"]).scores.results[0]
     return record(

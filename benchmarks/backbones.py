@@ -16,8 +16,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lidarpose.models.layers import FeedForward, Places, SelfAttention, key_bias, wave_numbers
-from lidarpose.models.voxelize import Level, plan
+from lidarpose.models.layers import FeedForward, RotaryEmbedding, SelfAttention, head_frequencies, key_bias
+from lidarpose.models.voxelize import VoxelLevel, voxelize
 from lidarpose.skeleton import BODY26
 
 JOINTS = len(BODY26)
@@ -113,7 +113,7 @@ class Draft(nn.Module):
 
     def prepare(self, clouds: list[np.ndarray]) -> DraftTables:
         lengths = np.array([len(cloud) for cloud in clouds])
-        tables = plan(np.concatenate(clouds), lengths, grid=self.GRID, max_voxels=self.MOST)
+        tables = voxelize(np.concatenate(clouds), lengths, grid=self.GRID, max_voxels=self.MOST)
         levels = (tables.fine, tables.mid, tables.coarse)
         rows = tables.fine.valid
         features = np.concatenate(
@@ -125,7 +125,7 @@ class Draft(nn.Module):
     def forward(self, tables: DraftTables) -> Tensor:
         """Joints (B, J, 3) m."""
         levels = tables.levels
-        places = [Places(level.position) for level in levels]
+        places = [RotaryEmbedding(level.position) for level in levels]
         biases = [_bias(level.valid, tables.features.dtype) for level in levels]
         rows, skips = self.stem(tables.features), []
         for s, level in enumerate(levels):
@@ -156,9 +156,9 @@ class _RaggedBlock(nn.Module):
         self.norm_attention, self.norm_feed = nn.LayerNorm(channels), nn.LayerNorm(channels)
         self.qkv, self.out = nn.Linear(channels, 3 * channels), nn.Linear(channels, channels)
         self.feed = nn.Sequential(nn.Linear(channels, 4 * channels), nn.GELU(), nn.Linear(4 * channels, channels))
-        self.register_buffer("scale", wave_numbers(heads, channels // heads), persistent=False)
+        self.register_buffer("scale", head_frequencies(heads, channels // heads), persistent=False)
 
-    def forward(self, rows: Tensor, places: Places, level: DraftLevel, bias: Tensor | None) -> Tensor:
+    def forward(self, rows: Tensor, places: RotaryEmbedding, level: DraftLevel, bias: Tensor | None) -> Tensor:
         query, key, value = self.qkv(self.norm_attention(rows)).unflatten(-1, (3, self.heads, -1)).unbind(1)
         query, key, value = (
             _padded(x.flatten(1), level).unflatten(-1, (self.heads, -1)).transpose(1, 2)
@@ -190,7 +190,7 @@ def _padded(rows: Tensor, level: DraftLevel) -> Tensor:
     return rows.new_zeros(people * most, rows.shape[1]).index_copy(0, level.slot, rows).unflatten(0, (people, most))
 
 
-def _ragged(level: Level, above: Level | None) -> DraftLevel:
+def _ragged(level: VoxelLevel, above: VoxelLevel | None) -> DraftLevel:
     """A plan's padded level as ragged rows; `above`: the next coarser one."""
     children = parent = None
     if above is not None:
@@ -220,7 +220,7 @@ class Groups:
     """Centers of people's clouds and the points about each.
 
     center (B, G, 3) m; center_valid (B, G) bool: false where the person has fewer places than centers; index (B, G, K):
-    the neighbours' rows among the N; relative (B, G, K, 3) m: neighbours from their center; valid (B, G, K) bool.
+    the neighbors' rows among the N; relative (B, G, K, 3) m: neighbors from their center; valid (B, G, K) bool.
     """
 
     center: Tensor
@@ -256,7 +256,7 @@ class GroupedViT(nn.Module):
 
     @torch.no_grad()
     def prepare(self, clouds: list[np.ndarray]) -> Groups:
-        return grouped(*padded(clouds), centers=self.GROUPS, neighbours=self.NEIGHBOURS)
+        return grouped(*padded(clouds), centers=self.GROUPS, neighbors=self.NEIGHBOURS)
 
     def forward(self, groups: Groups) -> Tensor:
         """Joints (B, J, 3) m."""
@@ -316,8 +316,8 @@ class PointNet2(nn.Module):
     def prepare(self, clouds: list[np.ndarray]) -> tuple[Groups, ...]:
         points, valid = padded(clouds)
         out = []
-        for centers, neighbours, radius in self.SETS:
-            out.append(grouped(points, valid, centers=centers, neighbours=neighbours, radius=radius))
+        for centers, neighbors, radius in self.SETS:
+            out.append(grouped(points, valid, centers=centers, neighbors=neighbors, radius=radius))
             points, valid = out[-1].center, out[-1].center_valid
         return tuple(out)
 
@@ -373,14 +373,14 @@ def farthest(points: Tensor, valid: Tensor, centers: int) -> tuple[Tensor, Tenso
     return torch.stack(index, 1), torch.stack(fresh, 1)
 
 
-def grouped(points: Tensor, valid: Tensor, *, centers: int, neighbours: int, radius: float = float("inf")) -> Groups:
+def grouped(points: Tensor, valid: Tensor, *, centers: int, neighbors: int, radius: float = float("inf")) -> Groups:
     """points (B, N, 3) m, valid (B, N) -> farthest-point centers and their nearest points within `radius` m."""
     index, fresh = farthest(points, valid, centers)
     center = points.gather(1, index[..., None].expand(-1, -1, 3))
     # differences, not products: what is far from the origin is not less exact
     distance = torch.cdist(center, points, compute_mode="donot_use_mm_for_euclid_dist")
     distance = distance.masked_fill(~valid[:, None], torch.inf)
-    near, which = distance.topk(min(neighbours, points.shape[1]), largest=False)
+    near, which = distance.topk(min(neighbors, points.shape[1]), largest=False)
     found = points.gather(1, which.flatten(1)[..., None].expand(-1, -1, 3)).unflatten(1, which.shape[1:])
     return Groups(
         center=center,

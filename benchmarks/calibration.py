@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from lidarpose.inference.predictor import load
 from lidarpose.io.files import write_atomic
 from lidarpose.metrics import auroc, calibration_error
-from lidarpose.models.bundled import DEFAULT
+from lidarpose.models import DEFAULT
 from lidarpose.sample import HIT
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import PoseBank

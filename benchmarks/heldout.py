@@ -16,7 +16,7 @@ import numpy as np
 from lidarpose.geometry import rotation_about
 from lidarpose.inference.predictor import load
 from lidarpose.metrics import auroc, calibration_error, mpjpe, pa_mpjpe
-from lidarpose.models.bundled import DEFAULT
+from lidarpose.models import DEFAULT
 from lidarpose.sample import HIT
 from lidarpose.skeleton import HUMAN15, SMPL24, WAYMO14
 from lidarpose.synth.bodies import PoseBank

@@ -20,7 +20,7 @@ import lidarpose
 from lidarpose.inference.predictor import TTA, Predictor
 from lidarpose.inference.results import PersonPose
 from lidarpose.io.files import write_atomic
-from lidarpose.models.bundled import DEFAULT
+from lidarpose.models import DEFAULT
 from lidarpose.skeleton import SMPL24
 from lidarpose.viz.person_view import facing
 

@@ -28,8 +28,8 @@ from against_paper import WAYS
 
 from lidarpose.eval.scores import MetricRow, Scores, read_scores
 from lidarpose.io.files import content_digest, write_atomic
-from lidarpose.models.bundled import BUNDLED, DEFAULT, bundled_path
-from lidarpose.models.header import read_header, runs_of
+from lidarpose.models import BUNDLED, DEFAULT, bundled_path
+from lidarpose.models.checkpoint import read_header, runs_of
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -20,10 +20,9 @@ import torch
 from backbones import Draft, GroupedViT, PointNet2, count
 from torch import nn
 
-from lidarpose.models.batch import Batch
 from lidarpose.models.config import preset
-from lidarpose.models.posenet import PoseNet
-from lidarpose.models.voxelize import plan
+from lidarpose.models.posenet import Batch, PoseNet
+from lidarpose.models.voxelize import voxelize
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
@@ -151,18 +150,18 @@ class Ours(Runner):
         self.made = None
         self.steps = 0
 
-    def plan(self, people: list[Example]):
-        return plan(
+    def voxelize(self, people: list[Example]):
+        return voxelize(
             np.concatenate([one.points for one in people]),
             np.array([len(one.points) for one in people]),
             grid=self.config.grid,
             max_voxels=self.config.max_voxels,
             view=np.stack([one.view for one in people]),
-            neighbours=self.config.convolution,
+            neighbors=self.config.convolution,
         )
 
     def tables(self, people):
-        return Batch.from_plan(self.plan(people), self.device)
+        return Batch.from_pyramid(self.plan(people), self.device)
 
     @torch.inference_mode()
     def joints(self, tables):

@@ -12,9 +12,8 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from lidarpose.models.batch import Batch, Targets
 from lidarpose.models.config import preset
-from lidarpose.models.posenet import PoseNet
+from lidarpose.models.posenet import Batch, PoseNet, Targets
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
 from lidarpose.train.example import example

@@ -86,7 +86,7 @@ def test_every_parameter_learns(network):
 def test_far_points_are_in_no_ball_and_near_ones_are():
     points = torch.tensor([[[0.0, 0, 0], [0.1, 0, 0], [1, 0, 0], [9, 9, 9]]])
     valid = torch.tensor([[True, True, True, False]])
-    groups = backbones.grouped(points, valid, centers=4, neighbours=3, radius=0.2)
+    groups = backbones.grouped(points, valid, centers=4, neighbors=3, radius=0.2)
     assert groups.center[0, :3, 0].tolist() == pytest.approx([0, 1, 0.1])
     assert groups.center_valid.tolist() == [[True, True, True, False]]
     assert groups.valid.sum(-1)[0, :3].tolist() == [2, 1, 2]

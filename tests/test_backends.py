@@ -18,14 +18,12 @@ from lidarpose.errors import InputError, MissingExtra
 from lidarpose.inference.backend import Raw, estimates
 from lidarpose.inference.predictor import Predictor, load
 from lidarpose.io.files import content_digest
-from lidarpose.models import decode, heads, onnx
-from lidarpose.models.bundled import DEFAULT, bundled_path
-from lidarpose.models.checkpoint import load_checkpoint, save_checkpoint
+from lidarpose.models import DEFAULT, bundled_path, decode, heads, onnx
+from lidarpose.models.checkpoint import Header, load_checkpoint, read_header, save_checkpoint
 from lidarpose.models.config import BIN, NetworkConfig
 from lidarpose.models.dapt.dapt_config import DaptConfig
 from lidarpose.models.dapt.dapt_net import DaptNet
 from lidarpose.models.dapt.import_weights import import_released
-from lidarpose.models.header import Header, read_header
 from lidarpose.models.onnx import usable_threads
 from lidarpose.models.voxelize import view_features
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14
@@ -52,7 +50,7 @@ def models():
 
 def ties(model, clouds, centers, origin):
     """(B, J, 3) bool: heatmaps whose two highest bins are equal but for rounding, which then decides. Between the
-    runtimes the difference of two neighbouring bins differs by 5e-6 at most."""
+    runtimes the difference of two neighboring bins differs by 5e-6 at most."""
     view = np.stack([view_features(center, origin) for center in centers])
     raw = model.backend.run([cloud - center for cloud, center in zip(clouds, centers, strict=True)], view)
     highest = np.sort(np.stack(raw.heatmaps, 2), -1)

@@ -11,12 +11,11 @@ from safetensors.torch import load_file, save_file
 
 from lidarpose._version import __version__
 from lidarpose.errors import InputError
-from lidarpose.models.checkpoint import load_checkpoint, save_checkpoint
+from lidarpose.models.checkpoint import SCHEMA, Header, load_checkpoint, parameter_count, read_header, save_checkpoint
 from lidarpose.models.config import preset
 from lidarpose.models.dapt.dapt_config import DaptConfig
 from lidarpose.models.dapt.dapt_net import DaptNet
 from lidarpose.models.dapt.import_weights import import_released
-from lidarpose.models.header import SCHEMA, Header, parameter_count, read_header
 from lidarpose.models.posenet import PoseNet
 from lidarpose.skeleton import HUMAN15
 

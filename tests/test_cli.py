@@ -17,7 +17,7 @@ from safetensors.numpy import save_file
 from lidarpose.cli import demo, main
 from lidarpose.errors import InputError
 from lidarpose.inference import info, predictor
-from lidarpose.models.bundled import DEFAULT, bundled_path
+from lidarpose.models import DEFAULT, bundled_path
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
 from lidarpose.viz import contact_sheet

@@ -26,7 +26,7 @@ def test_codes_number_the_cells_of_a_cube(code, bits):
 
 
 @pytest.mark.parametrize("bits", [1, 2, 3, 4])
-def test_hilbert_steps_to_a_neighbour(bits):
+def test_hilbert_steps_to_a_neighbor(bits):
     cells = cube(bits)[np.argsort(hilbert(cube(bits), bits))]
     assert (np.abs(np.diff(cells, axis=0)).sum(1) == 1).all()
     assert (cells[0] == 0).all()
@@ -46,7 +46,7 @@ def test_z_order_is_bits_taken_in_turn(cells):
 @settings(max_examples=30)
 @given(st.integers(2, MAX_BITS), st.integers(0, 2**31))
 def test_hilbert_of_large_cubes(bits, seed):
-    # where the cube is too large to go through: distinct codes in range, and neighbours in code are neighbours in space
+    # where the cube is too large to go through: distinct codes in range, and neighbors in code are neighbors in space
     cells = np.random.default_rng(seed).integers(0, 1 << bits, (200, 3))
     codes = hilbert(cells, bits)
     assert len(np.unique(codes)) == len(np.unique(cells, axis=0)) and codes.min() >= 0 and codes.max() < 8**bits

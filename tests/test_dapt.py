@@ -362,9 +362,9 @@ def test_tables_against_dictionaries(legacy):
             assert {cell_of[row][0] for row in rows} == {b} and len(set(rows)) == level.lengths[b] == level.valid[
                 b
             ].sum()
-        assert_neighbours(level.near, row_of, 1)
+        assert_neighbors(level.near, row_of, 1)
         if depth == 0:
-            assert_neighbours(tables.stem, row_of, 2)
+            assert_neighbors(tables.stem, row_of, 2)
         if depth == len(tables.levels) - 1:
             assert level.parent is None and level.children is None
             break
@@ -379,7 +379,7 @@ def test_tables_against_dictionaries(legacy):
         row_of = coarser
 
 
-def assert_neighbours(near, row_of, reach):
+def assert_neighbors(near, row_of, reach):
     steps = list(itertools.product(range(-reach, reach + 1), repeat=3))
     want = {
         (tap, row, row_of[other])
@@ -431,7 +431,7 @@ def test_a_stray_point_moves_no_voxel_but_in_the_released_code():
 def test_bad_clouds():
     net = network()
     for cloud, message in (
-        (np.zeros((4, 4)), r"cloud 1: expected numbers of shape \(n, 3\), x y z in metres, got float64 of \(4, 4\)"),
+        (np.zeros((4, 4)), r"cloud 1: expected numbers of shape \(n, 3\), x y z in meters, got float64 of \(4, 4\)"),
         (np.zeros((4, 3), bool), "got bool of"),
         (np.array([["a", "b", "c"]]), "expected numbers of shape"),
         (np.full((4, 3), np.nan), "must be finite"),
@@ -779,14 +779,14 @@ def test_import_of_files_that_are_none(tmp_path):
     pickle.write_bytes(b"\x80\x04.")
     with pytest.raises(InputError, match=r"dapt.pth: .* pickle.*weights_only=True.*safetensors"):
         import_dapt(pickle)
-    with pytest.raises(InputError, match="no such file: check the path"):
+    with pytest.raises(InputError, match="does not exist: check the path"):
         import_dapt(tmp_path / "none.safetensors")
     with pytest.raises(InputError, match="is a folder"):
         import_dapt(tmp_path)
     whole = WEIGHTS.read_bytes()
     for content in (whole[: len(whole) // 2], whole[:100], b"", b"not a file of tensors at all"):
         (tmp_path / "cut.safetensors").write_bytes(content)
-        with pytest.raises(InputError, match="cut.safetensors: .*damaged.*get it again"):
+        with pytest.raises(InputError, match="cut.safetensors: .*(ends at byte .* get it again|is something else)"):
             import_dapt(tmp_path / "cut.safetensors")
     for entry, message in (
         ({}, "its header has no configuration: name one of paper, waymo"),

@@ -33,7 +33,7 @@ from lidarpose.eval.run import evaluate_dataset
 from lidarpose.geometry import rotation_about
 from lidarpose.inference.backend import Estimates
 from lidarpose.inference.results import PersonPose, Poses
-from lidarpose.models.bundled import DEFAULT
+from lidarpose.models import DEFAULT
 from lidarpose.sample import Box, Pose, center_of
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14, Skeleton
 from lidarpose.synth.shard_job import Job, write_dataset

@@ -14,10 +14,9 @@ from lidarpose.inference.backend import OnnxBackend, exported_beside
 from lidarpose.inference.torch_backend import TorchBackend
 from lidarpose.io.files import content_digest
 from lidarpose.models import export as exporting
-from lidarpose.models.checkpoint import load_checkpoint, save_checkpoint
+from lidarpose.models.checkpoint import load_checkpoint, read_header, save_checkpoint
 from lidarpose.models.config import NetworkConfig
-from lidarpose.models.export import PlanModule, check, export
-from lidarpose.models.header import read_header
+from lidarpose.models.export import ArrayModule, check, export
 from lidarpose.models.onnx import (
     OUTPUTS,
     expected_inputs,
@@ -25,7 +24,7 @@ from lidarpose.models.onnx import (
     network_inputs,
     open_onnx,
     open_session,
-    plan_people,
+    voxelize_people,
 )
 from lidarpose.models.posenet import PoseNet
 
@@ -102,7 +101,7 @@ def test_float16_weights_stay_float16(folder):
     whole = model.SerializeToString()
     parameters = sum(value.numel() for value in network.parameters())
     assert len(packed) < len(whole) - 1.5 * parameters
-    arrays = network_inputs(plan_people(*people(300, 5, 900), header.config))
+    arrays = network_inputs(voxelize_people(*people(300, 5, 900), header.config))
     given = {input_name(name): array for name, array in arrays.items()}
     for ours, due in zip(*(open_session(file, threads=1).run(None, given) for file in (packed, whole)), strict=True):
         np.testing.assert_array_equal(ours, due)
@@ -140,10 +139,10 @@ def test_weights_that_need_all_of_float32_keep_it():
 def test_a_program_of_torch_runs_at_other_sizes(folder, program, sizes):
     clouds, view = people(*sizes)
     network, header = load_checkpoint(folder / "net.safetensors")
-    arrays = network_inputs(plan_people(clouds, view, header.config))
+    arrays = network_inputs(voxelize_people(clouds, view, header.config))
     tensors = [torch.as_tensor(array) for array in arrays.values()]
     with torch.inference_mode():
-        due = PlanModule(network, tuple(arrays))(*tensors)
+        due = ArrayModule(network, tuple(arrays))(*tensors)
         for ours, theirs in zip(program[0](*tensors), due, strict=True):
             torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
 
@@ -296,7 +295,7 @@ def test_a_wrong_export_is_not_written(folder, tmp_path, monkeypatch):
     def run(network, change):
         return lambda arrays: [
             change(v.detach().numpy())
-            for v in PlanModule(network, tuple(arrays))(*map(torch.as_tensor, arrays.values()))
+            for v in ArrayModule(network, tuple(arrays))(*map(torch.as_tensor, arrays.values()))
         ]
 
     check(network, run(network, lambda value: value + 1e-5))

@@ -18,8 +18,7 @@ from lidarpose.data.shards import open_dataset, shard_path
 from lidarpose.errors import InputError
 from lidarpose.eval.dataset import open_eval_dataset
 from lidarpose.inference.predictor import load
-from lidarpose.models.checkpoint import load_checkpoint
-from lidarpose.models.header import read_header
+from lidarpose.models.checkpoint import load_checkpoint, read_header
 from lidarpose.sample import SEEN, UNLABELED, Box, LabeledSample, Pose, center_of
 from lidarpose.skeleton import BODY26, HUMAN15, skeleton
 from lidarpose.synth.generator import Generator

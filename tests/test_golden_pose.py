@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import lidarpose
-from lidarpose.models.bundled import BUNDLED, DEFAULT, bundled_path
+from lidarpose.models import BUNDLED, DEFAULT, bundled_path
 from lidarpose.skeleton import SMPL24
 
 GOLDEN = json.loads((Path(__file__).parent / "golden_poses.json").read_text())

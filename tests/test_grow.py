@@ -7,12 +7,11 @@ import pytest
 import torch
 
 from lidarpose.errors import InputError
-from lidarpose.models.batch import Batch
-from lidarpose.models.bundled import bundled_path
+from lidarpose.models import bundled_path
 from lidarpose.models.checkpoint import load_checkpoint, save_checkpoint
 from lidarpose.models.config import preset
-from lidarpose.models.expand import grown
-from lidarpose.models.posenet import PoseNet
+from lidarpose.models.expand import expand_weights
+from lidarpose.models.posenet import Batch, PoseNet
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
 from lidarpose.train.example import example
@@ -41,7 +40,7 @@ def test_more_blocks_and_convolutions_change_nothing(arrays, heatmap):
     torch.manual_seed(0)
     config = replace(preset("tiny"), heatmap=heatmap, convolution=0)
     small = PoseNet(config)
-    larger = grown(small, replace(config, size="deep", blocks=(2, 3, 2), convolution=8))
+    larger = expand_weights(small, replace(config, size="deep", blocks=(2, 3, 2), convolution=8))
     before, after = told(small, arrays), told(larger, arrays)
     for name in ("vote", "heatmap", "part", "confidence", "log_spread", "visible"):
         torch.testing.assert_close(getattr(after, name), getattr(before, name), atol=1e-5, rtol=1e-5)
@@ -51,7 +50,7 @@ def test_small_begins_where_tiny_is(arrays):
     """What is left is the norm of the joint head's two streams: joints move by next to nothing and are as good."""
     network, _ = load_checkpoint(bundled_path("tiny"))
     torch.manual_seed(0)
-    before, after = told(network, arrays).joints(), told(grown(network, preset("small")), arrays).joints()
+    before, after = told(network, arrays).joints(), told(expand_weights(network, preset("small")), arrays).joints()
     true = torch.as_tensor(arrays["joints"])
     errors = [float((joints - true).norm(dim=-1).mean()) for joints in (before, after)]
     moved = float((after - before).norm(dim=-1).mean())
@@ -63,7 +62,7 @@ def test_small_begins_where_tiny_is(arrays):
 def test_all_that_is_new_learns(arrays):
     torch.manual_seed(0)
     network, _ = load_checkpoint(bundled_path("tiny"))
-    larger = grown(network, preset("small"))
+    larger = expand_weights(network, preset("small"))
     before = {name: value.clone() for name, value in larger.named_parameters()}
     made = optimizers(larger, Pretrain())
     rows = arrays["joints"]
@@ -93,10 +92,10 @@ def test_growing_needs_room_and_the_same_meaning():
         ({"head_channels": 16}, "head_channels"),
     ):
         with pytest.raises(InputError, match=words):
-            grown(tiny, replace(preset("tiny"), **change))
+            expand_weights(tiny, replace(preset("tiny"), **change))
     for other in (0, 16):
         with pytest.raises(InputError, match=f"convolution is {other}, there 12"):
-            grown(tiny, replace(preset("tiny"), convolution=other))
+            expand_weights(tiny, replace(preset("tiny"), convolution=other))
 
 
 def test_pretraining_goes_on_from_weights(tmp_path):

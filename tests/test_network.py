@@ -11,13 +11,22 @@ from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
-from lidarpose.models.batch import Batch, Targets
 from lidarpose.models.config import BIN, NetworkConfig, preset
 from lidarpose.models.decode import HALF_WIDTH
-from lidarpose.models.heads import REACH, VoteHead, bin_centers, decode, encode
-from lidarpose.models.layers import Convolution, CrossAttention, Places, key_bias, wave_numbers
-from lidarpose.models.posenet import PoseNet
-from lidarpose.models.voxelize import plan, view_features
+from lidarpose.models.layers import (
+    REACH,
+    Convolution,
+    CrossAttention,
+    RotaryEmbedding,
+    VoteHead,
+    bin_centers,
+    decode,
+    encode,
+    head_frequencies,
+    key_bias,
+)
+from lidarpose.models.posenet import Batch, PoseNet, Targets
+from lidarpose.models.voxelize import view_features, voxelize
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import SCENES
 from lidarpose.train.example import SEEN, example, seen
@@ -54,7 +63,9 @@ def batch_of(clouds, max_voxels=TINY.max_voxels, known=True):
     view = np.stack([view_features(np.full(3, k), origin) for k in range(len(clouds))])
     lengths = np.array([len(c) for c in clouds])
     points = np.concatenate(clouds)
-    return Batch.from_plan(plan(points, lengths, grid=TINY.grid, max_voxels=max_voxels, view=view, neighbours=True))
+    return Batch.from_pyramid(
+        voxelize(points, lengths, grid=TINY.grid, max_voxels=max_voxels, view=view, neighbors=True)
+    )
 
 
 @torch.inference_mode()
@@ -152,7 +163,7 @@ SMALL_ONE = {"size": "x", "channels": [4, 8, 8], "head_channels": 8, "blocks": [
         ({"channels": 8}, r"channels must be three whole numbers \(fine, mid, coarse\) from 1 to 16384, got 8"),
         ({"channels": [4, 0, 8]}, "channels must be three whole numbers"),
         ({"blocks": (1, -1, 1)}, r"blocks must be three whole numbers \(mid encoder, coarse, mid decoder\)"),
-        ({"grid": 0}, "grid must be a positive number of metres, got 0"),
+        ({"grid": 0}, "grid must be a positive number of meters, got 0"),
         ({"max_voxels": 1.5}, "max_voxels must be a whole number"),
         ({"heatmap": "wide"}, "unknown heatmap 'wide'.*window"),
         ({"convolution": -1}, "convolution must be a whole number from 0 to 16384, got -1"),
@@ -176,8 +187,8 @@ def test_configurations():
 def test_sizes(size, parameters):
     made = PoseNet(preset(size))
     assert sum(p.numel() for p in made.parameters()) == parameters
-    tables = plan(person(50), np.array([50]), grid=TINY.grid, max_voxels=TINY.max_voxels, neighbours=True)
-    out = made(Batch.from_plan(tables))
+    tables = voxelize(person(50), np.array([50]), grid=TINY.grid, max_voxels=TINY.max_voxels, neighbors=True)
+    out = made(Batch.from_pyramid(tables))
     assert out.joints().shape == (1, 26, 3) and torch.isfinite(out.joints()).all()
 
 
@@ -194,15 +205,15 @@ def test_variants(change):
 
     def run_on(chosen):
         lengths = np.array([len(c) for c in chosen])
-        tables = plan(
+        tables = voxelize(
             np.concatenate(chosen),
             lengths,
             grid=config.grid,
             max_voxels=384,
             view=np.full((len(chosen), 5), 0.5),
-            neighbours=config.convolution,
+            neighbors=config.convolution,
         )
-        return made(Batch.from_plan(tables))
+        return made(Batch.from_pyramid(tables))
 
     out = run_on(clouds)
     assert_close(of_person(run_on(clouds[:1]), 0), of_person(out, 0))
@@ -229,23 +240,23 @@ def test_a_convolution_is_a_dense_one_on_a_full_grid():
     layer = Convolution(5, 3)
     axis = np.arange(8) * 0.06 + 0.03
     cube = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
-    tables = plan(cube, np.array([512]), grid=0.06, max_voxels=999, neighbours=True)
+    tables = voxelize(cube, np.array([512]), grid=0.06, max_voxels=999, neighbors=True)
     rows = torch.randn(1, 64, 5)
     kernel = layer.mix.weight.view(5, 3, 3, 3, 3).movedim(-1, 1)
     grid = layer.narrow(layer.norm(rows)).view(1, 4, 4, 4, 3).movedim(-1, 1)
     dense = torch.nn.functional.conv3d(grid, kernel, layer.mix.bias, padding=1).movedim(1, -1).reshape(1, 64, 5)
-    torch.testing.assert_close(layer(rows, torch.as_tensor(tables.mid.neighbours)), rows + dense, atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(layer(rows, torch.as_tensor(tables.mid.neighbors)), rows + dense, atol=1e-5, rtol=1e-4)
 
 
 def test_attention_sees_distances_not_places():
-    """Two vectors turned by their places have a product that only their difference in metres decides."""
+    """Two vectors turned by their places have a product that only their difference in meters decides."""
     torch.manual_seed(0)
     here, there = torch.randn(1, 1, 3), torch.randn(1, 1, 3)
     query, key = torch.randn(2, 1, 1, 3, 20)
-    shift, scale = torch.tensor([3.1, -0.7, 0.4]), wave_numbers(3, 20)
+    shift, scale = torch.tensor([3.1, -0.7, 0.4]), head_frequencies(3, 20)
 
     def product(a, b):
-        return (Places(a).turn(query, scale) * Places(b).turn(key, scale)).sum(-1)
+        return (RotaryEmbedding(a).turn(query, scale) * RotaryEmbedding(b).turn(key, scale)).sum(-1)
 
     torch.testing.assert_close(product(here, there), product(here + shift, there + shift), atol=1e-4, rtol=1e-4)
     assert (product(here, there) - product(here, there + shift)).abs().max() > 1e-2
@@ -259,12 +270,12 @@ def test_dense_voxels_weigh_as_points():
     with torch.no_grad():
         layer.density.fill_(1.0)
     anchors, voxels, position = torch.randn(1, 3, 8), torch.randn(1, 2, 8), torch.randn(1, 2, 3)
-    believed = Places(torch.zeros(1, 3, 3))
+    believed = RotaryEmbedding(torch.zeros(1, 3, 3))
     count = torch.tensor([[3.0, 1.0]])
     four = torch.tensor([0, 0, 0, 1])
     no_bias = torch.zeros(1, 1, 1, 1)
-    merged = layer(anchors, believed, voxels, Places(position), count.log(), no_bias)
-    apart = layer(anchors, believed, voxels[:, four], Places(position[:, four]), torch.zeros(1, 4), no_bias)
+    merged = layer(anchors, believed, voxels, RotaryEmbedding(position), count.log(), no_bias)
+    apart = layer(anchors, believed, voxels[:, four], RotaryEmbedding(position[:, four]), torch.zeros(1, 4), no_bias)
     torch.testing.assert_close(merged, apart, atol=1e-6, rtol=1e-5)
 
 
@@ -275,7 +286,14 @@ def test_an_anchor_reads_the_mean_of_the_voxels_values():
     anchors, believed = torch.randn(1, 3, 14), torch.randn(1, 3, 3)
     voxels, position, count = torch.randn(1, 4, 5), torch.randn(1, 4, 3), torch.tensor([[1.0, 5.0, 2.0, 9.0]])
     valid = torch.tensor([[True, True, True, False]])
-    found = layer(anchors, Places(believed), voxels, Places(position), count.log(), key_bias(valid, torch.float32))
+    found = layer(
+        anchors,
+        RotaryEmbedding(believed),
+        voxels,
+        RotaryEmbedding(position),
+        count.log(),
+        key_bias(valid, torch.float32),
+    )
     for j in range(3):
         mixed = []
         for h in range(2):
@@ -284,7 +302,7 @@ def test_an_anchor_reads_the_mean_of_the_voxels_values():
             for n in range(3):
                 key = layer.key(voxels[0, n])[channels]
                 turned = [
-                    Places(place[None, None]).turn(x[None, None, None], layer.scale[h : h + 1])[0, 0, 0]
+                    RotaryEmbedding(place[None, None]).turn(x[None, None, None], layer.scale[h : h + 1])[0, 0, 0]
                     for place, x in ((believed[0, j], query), (position[0, n], key))
                 ]
                 score.append(turned[0] @ turned[1] / 7**0.5 + layer.density[h] * count[0, n].log())

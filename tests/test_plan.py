@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference.voxelize_reference import voxelize_reference
 
 from lidarpose.errors import InputError
-from lidarpose.models.voxelize import WINDOW, plan, view_features
-from lidarpose.models.voxelize_reference import plan_reference
+from lidarpose.models.voxelize import WINDOW, view_features, voxelize
 
 seeds = st.integers(0, 2**32 - 1)
 people = st.lists(st.integers(0, 90), min_size=1, max_size=4)
@@ -45,16 +45,16 @@ def assert_plans_agree(a, b, atol=2e-6):
 def test_the_plan_is_what_its_twin_says(seed, lengths, grid, most, random):
     points, lengths = crowd(seed, lengths, spread=np.random.default_rng(seed).choice([0.1, 0.5, 1.2]))
     view = np.random.default_rng(seed).normal(size=(len(lengths), 5))
-    kwargs = {"grid": grid, "max_voxels": most, "view": view, "neighbours": bool(seed % 2)}
+    kwargs = {"grid": grid, "max_voxels": most, "view": view, "neighbors": bool(seed % 2)}
     kwargs |= {"seeds": seed + np.arange(len(lengths)) if random else None}
-    assert_plans_agree(plan(points, lengths, **kwargs), plan_reference(points, lengths, **kwargs))
+    assert_plans_agree(voxelize(points, lengths, **kwargs), voxelize_reference(points, lengths, **kwargs))
 
 
 @settings(max_examples=40, deadline=None)
 @given(seeds, people)
 def test_levels_hang_together(seed, lengths):
     points, lengths = crowd(seed, lengths)
-    tables = plan(points, lengths, grid=GRID, max_voxels=30)
+    tables = voxelize(points, lengths, grid=GRID, max_voxels=30)
     for level, above in ((tables.fine, tables.mid), (tables.mid, tables.coarse)):
         counts = np.where(level.valid, np.exp(level.log_count), 0)
         for b in range(len(lengths)):
@@ -79,8 +79,8 @@ def test_the_order_of_points_does_not_matter(seed):
     points, lengths = crowd(seed, [50, 80])
     rng = np.random.default_rng(seed)
     order = np.concatenate([rng.permutation(50), 50 + rng.permutation(80)])
-    a = plan(points, lengths, grid=GRID, max_voxels=30)
-    b = plan(points[order], lengths, grid=GRID, max_voxels=30)
+    a = voxelize(points, lengths, grid=GRID, max_voxels=30)
+    b = voxelize(points[order], lengths, grid=GRID, max_voxels=30)
     np.testing.assert_array_equal(a.point_voxel[order], b.point_voxel)
     for name, value in a.arrays().items():
         if name != "point_voxel":
@@ -91,9 +91,9 @@ def test_the_order_of_points_does_not_matter(seed):
 @given(seeds, people)
 def test_batch_mates_do_not_matter(seed, lengths):
     points, lengths = crowd(seed, lengths)
-    together = plan(points, lengths, grid=GRID, max_voxels=30).arrays()
+    together = voxelize(points, lengths, grid=GRID, max_voxels=30).arrays()
     for b, end in enumerate(np.cumsum(lengths)):
-        alone = plan(points[end - lengths[b] : end], lengths[b : b + 1], grid=GRID, max_voxels=30).arrays()
+        alone = voxelize(points[end - lengths[b] : end], lengths[b : b + 1], grid=GRID, max_voxels=30).arrays()
         for name, value in alone.items():
             if name in ("view", "point_voxel"):
                 continue
@@ -102,26 +102,26 @@ def test_batch_mates_do_not_matter(seed, lengths):
             assert not together[name][b, width:].any()
 
 
-def test_neighbours_lie_where_they_should():
+def test_neighbors_lie_where_they_should():
     axis = np.arange(8) * GRID + GRID / 2 - 4 * GRID
     cube = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
-    tables = plan(cube, np.array([len(cube)]), grid=GRID, max_voxels=999, neighbours=True)
-    assert tables.fine.neighbours is None
+    tables = voxelize(cube, np.array([len(cube)]), grid=GRID, max_voxels=999, neighbors=True)
+    assert tables.fine.neighbors is None
     # 4 x 4 x 4 mid voxels: a corner has 8 of the 27 cells, an inner one all
-    filled = (tables.mid.neighbours[0] < 64).sum(1)
+    filled = (tables.mid.neighbors[0] < 64).sum(1)
     np.testing.assert_array_equal(
         np.sort(filled), np.sort([a * b * c for a in (2, 3, 3, 2) for b in (2, 3, 3, 2) for c in (2, 3, 3, 2)])
     )
-    np.testing.assert_array_equal(tables.mid.neighbours[0, :, 13], np.arange(64))
+    np.testing.assert_array_equal(tables.mid.neighbors[0, :, 13], np.arange(64))
     # the first axis varies slowest: entry 22 is one step along x
-    ahead = tables.mid.neighbours[0, :, 22]
+    ahead = tables.mid.neighbors[0, :, 22]
     step = tables.mid.position[0, ahead[ahead < 64]] - tables.mid.position[0, ahead < 64]
     np.testing.assert_allclose(step, np.tile([2 * GRID, 0, 0], (48, 1)), atol=1e-6)
 
 
 def test_points_find_their_own_voxel():
     points, lengths = crowd(3, [200, 150], spread=0.9)
-    tables = plan(points, lengths, grid=GRID, max_voxels=384)
+    tables = voxelize(points, lengths, grid=GRID, max_voxels=384)
     inside = (np.abs(points) < WINDOW).all(1)
     np.testing.assert_array_equal(tables.point_voxel >= 0, inside)
     row = tables.fine.position.reshape(-1, 3)[tables.point_voxel[inside]]
@@ -131,17 +131,17 @@ def test_points_find_their_own_voxel():
 
 
 def test_nobody_empty_people_and_one_point():
-    none = plan(np.zeros((0, 3), np.float32), np.zeros(2, int), grid=GRID, max_voxels=9)
+    none = voxelize(np.zeros((0, 3), np.float32), np.zeros(2, int), grid=GRID, max_voxels=9)
     assert none.fine.valid.shape == (2, 1) and not none.fine.valid.any() and not none.coarse.valid.any()
     point = np.array([[0.07, -0.01, 0.5]], np.float32)
-    one = plan(point, np.array([0, 1, 0]), grid=GRID, max_voxels=9)
+    one = voxelize(point, np.array([0, 1, 0]), grid=GRID, max_voxels=9)
     np.testing.assert_array_equal(one.fine.valid[:, 0], [False, True, False])
     for level in (one.fine, one.mid, one.coarse):
         np.testing.assert_allclose(level.position[1, 0], point[0], atol=1e-7)
         assert level.log_count[1, 0] == 0
     np.testing.assert_allclose(one.offset[1, 0], point[0] / GRID - [1, -1, 8] - 0.5, atol=1e-4)
     assert not one.deviation.any()
-    outside = plan(point + 5, np.array([1]), grid=GRID, max_voxels=9)
+    outside = voxelize(point + 5, np.array([1]), grid=GRID, max_voxels=9)
     assert not outside.fine.valid.any() and outside.point_voxel.tolist() == [-1]
 
 
@@ -149,36 +149,36 @@ def test_strays_of_any_size_stay_outside_without_a_warning():
     points = np.array(
         [[0, 0, 0], [1e30, 0, 0], [np.nan, 0, 0], [0, -np.inf, 0], [2.0, 0, 0], [-1.9999, 0, 0]], np.float32
     )
-    tables = plan(points, np.array([6]), grid=GRID, max_voxels=9)
+    tables = voxelize(points, np.array([6]), grid=GRID, max_voxels=9)
     np.testing.assert_array_equal(tables.point_voxel >= 0, [True, False, False, False, False, True])
 
 
 def test_a_grid_too_fine_for_the_index_is_refused():
     points = np.array([[-1.99, 0, 0], [1.99, 1.99, -1.99]])
-    assert plan(points, np.array([2]), grid=WINDOW / 128, max_voxels=9).fine.valid.sum() == 2
+    assert voxelize(points, np.array([2]), grid=WINDOW / 128, max_voxels=9).fine.valid.sum() == 2
     with pytest.raises(InputError, match="grid must be at least"):
-        plan(points, np.array([2]), grid=0.01, max_voxels=9)
+        voxelize(points, np.array([2]), grid=0.01, max_voxels=9)
 
 
 @pytest.mark.parametrize("random", [False, True])
 def test_thinning_spares_the_small_and_spreads_over_the_large(random):
     small, large = crowd(1, [20])[0], crowd(2, [3000], spread=0.5)[0]
     numbers = np.array([3, 4]) if random else None
-    tables = plan(np.concatenate([small, large]), np.array([20, 3000]), grid=GRID, max_voxels=100, seeds=numbers)
+    tables = voxelize(np.concatenate([small, large]), np.array([20, 3000]), grid=GRID, max_voxels=100, seeds=numbers)
     assert tables.fine.valid[1].sum() == 100 and tables.fine.valid.shape == (2, 100)
-    assert tables.fine.valid[0].sum() == plan(small, np.array([20]), grid=GRID, max_voxels=100).fine.valid.sum()
+    assert tables.fine.valid[0].sum() == voxelize(small, np.array([20]), grid=GRID, max_voxels=100).fine.valid.sum()
     # what is kept covers the person, not one end of them: three standard errors of 100 draws of a spread of 0.5 m
     np.testing.assert_allclose(tables.fine.position[1].mean(0), large.mean(0), atol=0.15)
     np.testing.assert_allclose(tables.fine.position[1].std(0), large.std(0), rtol=0.21)
     # whoever else is in the batch
-    alone = plan(large, np.array([3000]), grid=GRID, max_voxels=100, seeds=None if numbers is None else numbers[1:])
+    alone = voxelize(large, np.array([3000]), grid=GRID, max_voxels=100, seeds=None if numbers is None else numbers[1:])
     np.testing.assert_array_equal(alone.fine.position[0], tables.fine.position[1])
 
 
 def test_inputs_stay_as_they_are():
     points, lengths = crowd(5, [100, 300])
     kept = points.copy(), lengths.copy()
-    plan(points, lengths, grid=GRID, max_voxels=30, seeds=np.array([1, 2]))
+    voxelize(points, lengths, grid=GRID, max_voxels=30, seeds=np.array([1, 2]))
     np.testing.assert_array_equal(points, kept[0])
     np.testing.assert_array_equal(lengths, kept[1])
 

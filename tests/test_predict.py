@@ -634,7 +634,7 @@ def test_a_sweep_of_another_up_axis_is_told(model, tmp_path, points):
 
 
 def test_load_takes_names_and_paths(model, points, tmp_path, monkeypatch):
-    from lidarpose.models.bundled import DEFAULT, bundled_path
+    from lidarpose.models import DEFAULT, bundled_path
 
     copy = tmp_path / "mine.safetensors"
     copy.write_bytes(bundled_path().read_bytes())

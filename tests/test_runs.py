@@ -19,7 +19,7 @@ from safetensors.torch import load_file, save_file
 
 from lidarpose.cli import main
 from lidarpose.errors import InputError
-from lidarpose.models.bundled import weights_path
+from lidarpose.models import weights_path
 from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.config import preset
 from lidarpose.models.posenet import PoseNet

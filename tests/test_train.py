@@ -12,10 +12,9 @@ import torch
 from motion_files import a_clip, write_amass
 
 from lidarpose.errors import InputError
-from lidarpose.models.batch import Targets
 from lidarpose.models.config import BIN, preset
-from lidarpose.models.heads import REACH, Outputs, encode
-from lidarpose.models.posenet import PoseNet
+from lidarpose.models.layers import REACH, encode
+from lidarpose.models.posenet import Outputs, PoseNet, Targets
 from lidarpose.sample import center_of
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth.generator import Generator

@@ -10,7 +10,7 @@ import numpy as np
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.inference.predictor import TTA, Predictor, load
 from lidarpose.io.files import atomic_path, check_writable
-from lidarpose.models.bundled import DEFAULT
+from lidarpose.models import DEFAULT
 
 SENSORS = ("vlp-32c", "os1-128", "hdl-64e")
 PEOPLE_EACH = 4

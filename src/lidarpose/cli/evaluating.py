@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 
 from lidarpose.cli.terminal import is_watched, tell
-from lidarpose.models.bundled import BUNDLED
+from lidarpose.models import BUNDLED
 
 # groups of lines that the terminal shows; the others are in scores.json
 _SHOWN = ("condition", "plain", "joints", "distance, m", "points", "hidden share")

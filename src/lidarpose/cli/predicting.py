@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from lidarpose.cli.terminal import is_watched, tell
-from lidarpose.models.bundled import DEFAULT, NAMES
+from lidarpose.models import DEFAULT, NAMES
 
 # people named by a warning that several share, and characters of an id
 _MOST_NAMED, _LONGEST_ID = 3, 40

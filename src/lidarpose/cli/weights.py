@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from lidarpose.cli.terminal import tell
-from lidarpose.models.bundled import DEFAULT
+from lidarpose.models import DEFAULT
 
 
 def add(commands) -> None:
@@ -44,7 +44,7 @@ def _info(options: argparse.Namespace) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
-    from lidarpose.models.bundled import weights_path
+    from lidarpose.models import weights_path
     from lidarpose.models.export import FORMATS, export
 
     path = weights_path(options.weights)

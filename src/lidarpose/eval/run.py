@@ -25,8 +25,8 @@ from lidarpose.eval.robustness import Stability, people_to_perturb, study, to_js
 from lidarpose.eval.scores import BASELINE, FILE, MetricRow, Result, Scores, Setting
 from lidarpose.inference.predictor import load
 from lidarpose.io.files import atomic_path, check_writable, content_digest, file_error, listed
-from lidarpose.models.bundled import weights_path
-from lidarpose.models.header import runs_of
+from lidarpose.models import weights_path
+from lidarpose.models.checkpoint import runs_of
 from lidarpose.sample import UNLABELED
 from lidarpose.skeleton import BODY26
 

@@ -15,10 +15,10 @@ import numpy as np
 
 from lidarpose.errors import whole
 from lidarpose.io.files import content_digest, file_error
+from lidarpose.models.checkpoint import Header, read_header
 from lidarpose.models.config import BIN
 from lidarpose.models.decode import Decoder, out_of_range
-from lidarpose.models.header import Header, read_header
-from lidarpose.models.onnx import OUTPUTS, input_name, network_inputs, open_onnx, plan_people
+from lidarpose.models.onnx import OUTPUTS, input_name, network_inputs, open_onnx, voxelize_people
 from lidarpose.sample import HIT
 
 # people a call; more fill the memory without being faster
@@ -106,7 +106,7 @@ class OnnxBackend:
         self.__init__(**state)
 
     def run(self, clouds: list[np.ndarray], view: np.ndarray) -> Raw:
-        inputs = network_inputs(plan_people(clouds, view, self.header.config))
+        inputs = network_inputs(voxelize_people(clouds, view, self.header.config))
         values = self.session.run(self._outputs, {input_name(name): array for name, array in inputs.items()})
         return Raw.from_pose(dict(zip(self._outputs, values, strict=True)))
 

@@ -5,8 +5,8 @@ from importlib import metadata
 from importlib.util import find_spec
 
 from lidarpose._version import __version__
-from lidarpose.models.bundled import BUNDLED, DEFAULT, bundled_path
-from lidarpose.models.header import parameter_count, read_header, runs_of
+from lidarpose.models import BUNDLED, DEFAULT, bundled_path
+from lidarpose.models.checkpoint import parameter_count, read_header, runs_of
 from lidarpose.models.onnx import usable_threads
 
 

@@ -15,7 +15,7 @@ from lidarpose.inference.results import Poses
 from lidarpose.inference.scan import Scan, as_boxes, pose_scan
 from lidarpose.io.files import file_error
 from lidarpose.io.point_cloud import Cloud, read_points
-from lidarpose.models.bundled import DEFAULT
+from lidarpose.models import DEFAULT
 from lidarpose.sample import FARTHEST, Box
 
 # a file of less than this across is taken for a crop, m

@@ -14,9 +14,9 @@ from lidarpose.inference.inputs import as_origin, as_points, candidates, clean, 
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.inference.tta import Look, averaged, brought_back, looks_of, shown
 from lidarpose.io.files import file_error
-from lidarpose.models.bundled import BUNDLED, DEFAULT, weights_path
+from lidarpose.models import BUNDLED, DEFAULT, weights_path
+from lidarpose.models.checkpoint import read_header
 from lidarpose.models.decode import decoder
-from lidarpose.models.header import read_header
 from lidarpose.models.voxelize import WINDOW
 from lidarpose.sample import MIN_POINTS, PER_JOINT, Pose, center_of
 from lidarpose.skeleton import SMPL24, Skeleton

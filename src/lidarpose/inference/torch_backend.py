@@ -7,10 +7,9 @@ import torch
 
 from lidarpose.errors import InputError
 from lidarpose.inference.backend import Backend, Raw
-from lidarpose.models.checkpoint import load_checkpoint
-from lidarpose.models.export import PlanModule
-from lidarpose.models.header import Header
-from lidarpose.models.onnx import OUTPUTS, network_inputs, plan_people
+from lidarpose.models.checkpoint import Header, load_checkpoint
+from lidarpose.models.export import ArrayModule
+from lidarpose.models.onnx import OUTPUTS, network_inputs, voxelize_people
 from lidarpose.models.voxelize import WINDOW
 
 # people a call; the paper's network is a hundred times as large
@@ -59,10 +58,10 @@ class TorchBackend:
 
     @torch.inference_mode()
     def run(self, clouds: list[np.ndarray], view: np.ndarray) -> Raw:
-        arrays = network_inputs(plan_people(clouds, view, self.header.config))
+        arrays = network_inputs(voxelize_people(clouds, view, self.header.config))
         tensors = [torch.as_tensor(array).to(self.device) for array in arrays.values()]
         if self._module is None:
-            module = PlanModule(self.network, tuple(arrays))
+            module = ArrayModule(self.network, tuple(arrays))
             self._module = torch.compile(module, dynamic=True) if self._compile else module
         try:
             values = self._module(*tensors)

@@ -1,26 +1,96 @@
-"""Weights on disk: one safetensors file that describes itself (see `header`).
+"""Weights on disk: one safetensors file that describes itself. Its header is read without torch.
 
-Loading is strict: every tensor must be there, no other, each of its shape and finite.
+The metadata of a checkpoint hold two entries. "lidarpose" is JSON: schema, package version, the kind of network, the
+network's configuration, and "card": what it was trained with (command, seed, people seen) and what it scores.
+"lidarpose.sha256" is a digest of everything else in the file. An exported ONNX file carries the same entries.
+
+Loading is strict: the digest must fit, every tensor must be there, no other, each of its shape and finite. Files are
+read, not mapped: a mapped file that is cut off meanwhile would end the process.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
+import math
 import os
+import struct
+import warnings
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
-import torch
-from safetensors.torch import save as to_bytes
-
-from lidarpose.io.files import file_error, write_atomic
+from lidarpose._version import __version__
+from lidarpose.errors import InputError, unknown_name
+from lidarpose.io.files import file_error, read_bytes, write_atomic
 from lidarpose.models.config import NetworkConfig
-from lidarpose.models.header import ENTRY, Header, opened, parse_header
-from lidarpose.models.posenet import PoseNet
+from lidarpose.skeleton import SKELETONS, Skeleton, skeleton
 
 if TYPE_CHECKING:
+    import torch
+
     from lidarpose.models.dapt.dapt_config import DaptConfig
     from lidarpose.models.dapt.dapt_net import DaptNet
+    from lidarpose.models.posenet import PoseNet
 
-_FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+ENTRY, DIGEST = "lidarpose", "lidarpose.sha256"
+SCHEMA = "lidarpose.checkpoint/2"
+_FAMILY = SCHEMA.rpartition("/")[0]
+# kinds of network: this package's own, and the paper's
+KINDS = ("pose", "dapt")
+_EXPECTED = "a checkpoint (.safetensors)"
+# bytes: what safetensors allows
+_MOST_HEADER = 100_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Header:
+    """What a checkpoint says of itself. card: plain JSON values; version: the package's that wrote it."""
+
+    config: NetworkConfig | DaptConfig
+    card: dict
+    version: str = __version__
+
+    @property
+    def network(self) -> str:
+        """The kind of network, one of `KINDS`."""
+        return "pose" if isinstance(self.config, NetworkConfig) else "dapt"
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """The joints that the network predicts. Raises InputError for a network whose joints make up no skeleton."""
+        if self.network == "pose":
+            return skeleton(self.config.skeleton)
+        own = set(self.config.joints)
+        inside = [candidate for candidate in SKELETONS.values() if set(candidate.joints) <= own]
+        if not inside:
+            raise InputError(
+                f"the network {self.config.name} predicts {', '.join(self.config.joints)}, which hold none of the "
+                f"skeletons {', '.join(SKELETONS)}: its joints cannot be drawn or named"
+            )
+        return max(inside, key=len)
+
+    def to_json(self) -> str:
+        entry = {"schema": SCHEMA, "version": self.version, "network": self.network}
+        return json.dumps(entry | {"config": self.config.to_dict(), "card": self.card})
+
+
+def runs_of(card: dict) -> list[dict]:
+    """The cards of the runs that made weights: the last one's, that of the weights it began with, and so on."""
+    before = card.get("init_card")
+    return [card, *(runs_of(before) if isinstance(before, dict) else [])]
+
+
+# ---- reading and writing
+
+
+def read_header(path: str | os.PathLike) -> Header:
+    """The header of a checkpoint. Raises InputError where the file is not a checkpoint of this package."""
+    return parse_header(path, SafetensorsFile.open(path, tensors=False).metadata.get(ENTRY))
+
+
+def parameter_count(path: str | os.PathLike) -> int:
+    """Numbers that a checkpoint holds. Raises InputError as `read_header` does."""
+    return sum(map(math.prod, SafetensorsFile.open(path, tensors=False).shapes.values()))
 
 
 def save_checkpoint(path: str | os.PathLike, network: PoseNet | DaptNet, *, card: dict, half: bool = False) -> None:
@@ -28,6 +98,9 @@ def save_checkpoint(path: str | os.PathLike, network: PoseNet | DaptNet, *, card
 
     Raises InputError for weights that are not finite, or too large for float16: nothing could load them.
     """
+    import torch
+    from safetensors.torch import save
+
     header = Header(config=network.config, card=card).to_json()
     dtype = torch.float16 if half else torch.float32
     tensors = {
@@ -39,57 +112,43 @@ def save_checkpoint(path: str | os.PathLike, network: PoseNet | DaptNet, *, card
         if not value.isfinite().all():
             kind = str(dtype).removeprefix("torch.")
             raise file_error(path, f"not written, since tensor {name} is not finite as {kind}")
-    write_atomic(path, to_bytes(tensors, metadata={ENTRY: header}))
+    write_atomic(path, with_digest(save(tensors, metadata={ENTRY: header})))
 
 
 def load_checkpoint(path: str | os.PathLike) -> tuple[PoseNet | DaptNet, Header]:
     """The network in evaluation mode, float32 on the CPU, and its header.
 
-    Raises InputError that names the file and the tensor for anything that does not fit.
+    Warns of a file without a digest. Raises InputError that names the file and the tensor for anything that does not
+    fit.
     """
-    with opened(path, framework="pt") as file:
-        header = parse_header(path, (file.metadata() or {}).get(ENTRY))
-        name = header.config.size if header.network == "pose" else header.config.name
-        stored = set(file.keys())
-        wanted = shapes(path, header.config, len(stored), by="its configuration", remedy="get the file again")
-        loaded = {}
-        for key, value in wanted.items():
-            if key not in stored:
-                raise file_error(path, f"tensor {key} is missing, so it is no whole {name} network: get the file again")
-            shape = tuple(file.get_slice(key).get_shape())
-            if shape != tuple(value.shape):
-                raise file_error(
-                    path,
-                    f"tensor {key} should be {tuple(value.shape)} by its configuration, got {shape}: get the file "
-                    f"again, or use the lidarpose version that wrote it ({header.version})",
-                )
-            loaded[key] = as_stored(path, key, file.get_tensor(key), value.dtype)
-        extra = sorted(stored - set(wanted))
-        if extra:
-            raise file_error(
-                path,
-                f"unknown tensor {extra[0]}, which no {name} network has: use the lidarpose version that wrote it "
-                f"({header.version})",
-            )
+    file = SafetensorsFile.open(path)
+    has_digest = file.check_digest()
+    header = parse_header(path, file.metadata.get(ENTRY))
+    name = header.config.size if header.network == "pose" else header.config.name
+    older = f"use the lidarpose version that wrote it ({header.version})"
+    again = "get the file again"
+    wanted = empty_state(path, header.config, len(file.shapes), by="its configuration", remedy=again)
+    file.check_tensors(
+        wanted,
+        missing=f"so it is no whole {name} network: {again}",
+        unknown=f"which no {name} network has: {older}",
+        shape=f"by its configuration, got {{}}: {again}, or {older}",
+    )
     network = build(header.config)
-    network.load_state_dict(loaded)
+    network.load_state_dict(file.load(wanted))
+    if not has_digest:
+        warn_without_digest(path)
     return network.eval(), header
 
 
-def as_stored(path: str | os.PathLike, name: str, tensor: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
-    """A file's tensor in the network's type. Raises InputError for anything but finite floats where it has such."""
-    cast = tensor.to(dtype)
-    if dtype.is_floating_point and (tensor.dtype not in _FLOATS or not cast.isfinite().all()):
-        raise file_error(path, f"tensor {name} holds numbers that are not finite or no floats: get the file again")
-    return cast
-
-
-def shapes(
+def empty_state(
     path: str | os.PathLike, config: NetworkConfig | DaptConfig, count: int, *, by: str, remedy: str
 ) -> dict[str, torch.Tensor]:
     """The tensors that a network of a configuration has, none of them in memory: whatever the header of a file of
     `count` tensors says, nothing is allocated for it before the file is known to hold it. Raises InputError, which says
     by what configuration, and what to do."""
+    import torch
+
     if config.layers > count:
         raise file_error(path, f"has {count} tensors, too few for {config.layers} layers by {by}: {remedy}")
     with torch.device("meta"):
@@ -99,7 +158,221 @@ def shapes(
 def build(config: NetworkConfig | DaptConfig) -> PoseNet | DaptNet:
     """A network of a configuration, its weights random."""
     if isinstance(config, NetworkConfig):
+        from lidarpose.models.posenet import PoseNet
+
         return PoseNet(config)
     from lidarpose.models.dapt.dapt_net import DaptNet
 
     return DaptNet(config)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SafetensorsFile:
+    """A safetensors file that is neither cut off nor something else.
+
+    metadata: texts by name; header: all of it; shapes: of the tensors, by the names that the network gives them;
+    content: the whole file, empty where only the header was wanted; prefix: of the names in the file.
+    """
+
+    path: str | os.PathLike
+    header: dict
+    content: bytes
+    prefix: str = ""
+
+    @classmethod
+    def open(cls, path: str | os.PathLike, *, tensors: bool = True, prefix: str = "") -> SafetensorsFile:
+        """prefix: dropped where all names of tensors begin with it. Raises InputError that names the damaged byte."""
+        kind = "is a folder" if os.path.isdir(path) else "" if os.path.isfile(path) else "does not exist"
+        if kind:
+            raise file_error(path, f"expected {_EXPECTED}, but it {kind}: check the path")
+        size = os.path.getsize(path)
+        # an empty file is one that ends at byte 0
+        content = read_bytes(path, expected=_EXPECTED) if tensors and size else _start_of(path)
+        header = _parse_safetensors(path, content, size)
+        names = [name for name in header if name != "__metadata__"]
+        is_wrapped = prefix and names and all(name.startswith(prefix) for name in names)
+        return cls(path=path, header=header, content=content if tensors else b"", prefix=prefix if is_wrapped else "")
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        return self.header.get("__metadata__", {})
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        entries = {name: entry for name, entry in self.header.items() if name != "__metadata__"}
+        return {name.removeprefix(self.prefix): tuple(entry["shape"]) for name, entry in entries.items()}
+
+    def check_digest(self) -> bool:
+        """Whether the header has a digest. Raises InputError where it is not the content's."""
+        expected = self.metadata.get(DIGEST)
+        if expected not in (None, _digest(self.header, _data_of(self.content))):
+            raise file_error(self.path, DAMAGED)
+        return expected is not None
+
+    def check_tensors(self, wanted: dict[str, torch.Tensor], *, missing: str, unknown: str, shape: str) -> None:
+        """Raises InputError for the first tensor that is missing, unknown or of another shape than wanted; the texts
+        say what that means and what to do, with {} for the shape in the file."""
+        shapes = self.shapes
+        if absent := next((name for name in wanted if name not in shapes), None):
+            raise file_error(self.path, f"tensor {absent} is missing, {missing}")
+        if extra := sorted(set(shapes) - set(wanted)):
+            raise file_error(self.path, f"unknown tensor {extra[0]}, {unknown}")
+        for name, value in wanted.items():
+            if shapes[name] != tuple(value.shape):
+                problem = f"tensor {name} should be {tuple(value.shape)} {shape.replace('{}', str(shapes[name]))}"
+                raise file_error(self.path, problem)
+
+    def load(self, wanted: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """The tensors in the types of those wanted. Raises InputError for anything but finite floats where a float is
+        wanted."""
+        from safetensors import SafetensorError
+        from safetensors.torch import load
+
+        try:
+            stored = load(self.content)
+        except (SafetensorError, ValueError, KeyError) as error:
+            raise file_error(self.path, f"its header is damaged ({error}): get the file again") from None
+        tensors = {}
+        for name, like in wanted.items():
+            value = stored[self.prefix + name]
+            tensors[name] = value.to(like.dtype)
+            is_float = value.is_floating_point() or not like.is_floating_point()
+            if not is_float or not tensors[name].isfinite().all():
+                problem = f"tensor {name} holds numbers that are not finite or no floats: get the file again"
+                raise file_error(self.path, problem)
+        return tensors
+
+
+def _start_of(path: str | os.PathLike) -> bytes:
+    """The length of the header and the header, as far as they are there."""
+    with open(path, "rb") as file:
+        start = file.read(8)
+        length = struct.unpack("<Q", start)[0] if len(start) == 8 else 0
+        return start + file.read(min(length, _MOST_HEADER) + 1)
+
+
+def _parse_safetensors(path: str | os.PathLike, content: bytes, size: int) -> dict:
+    """The header of a file of `size` bytes that begins with `content`: 8 bytes of a length, so much JSON, then the
+    tensors. Raises InputError that says what is wrong, and where."""
+    again = "it was not copied completely: get it again"
+    if size < 8:
+        raise file_error(path, f"expected {_EXPECTED}, but the file ends at byte {size}: {again}")
+    length = struct.unpack("<Q", content[:8])[0]
+    if content[8:9] not in (b"", b"{") or not 0 < length <= _MOST_HEADER:
+        raise file_error(path, f"expected {_EXPECTED}, but the file is something else: name a checkpoint")
+    if size < 8 + length:
+        raise file_error(path, f"the file ends at byte {size:,}, within its header of {length:,} bytes: {again}")
+    try:
+        header = json.loads(content[8 : 8 + length])
+        ends = [0]
+        for name, entry in header.items():
+            if name == "__metadata__":
+                if not all(isinstance(text, str) for text in entry.values()):
+                    raise TypeError("metadata that are no texts")
+                continue
+            start, end = entry["data_offsets"]
+            if not 0 <= start <= end or not all(isinstance(n, int) and n >= 0 for n in (start, *entry["shape"])):
+                raise ValueError(f"tensor {name}")
+            ends.append(end)
+    except json.JSONDecodeError as error:
+        problem = f"its header is damaged at byte {8 + error.pos:,} ({error.msg}): get the file again"
+        raise file_error(path, problem) from None
+    except (ValueError, AttributeError, KeyError, IndexError, TypeError, RecursionError) as error:
+        raise file_error(path, f"its header is damaged ({error}): get the file again") from None
+    if size != 8 + length + max(ends):
+        due = 8 + length + max(ends)
+        raise file_error(path, f"the file ends at byte {size:,} where its header says {due:,}: {again}")
+    return header
+
+
+# ---- digests
+
+DAMAGED = "is damaged: its content does not fit the SHA-256 digest in its header: get the file again"
+
+
+def warn_without_digest(path: str | os.PathLike) -> None:
+    """Says that a file of weights is from before there were digests."""
+    remedy = "if it may be damaged, get it again or write it anew with this version"
+    warnings.warn(f"{os.fspath(path)}: has no digest, so damage goes unnoticed: {remedy}", stacklevel=3)
+
+
+def with_digest(content: bytes) -> bytes:
+    """A safetensors file with the digest of its tensors and of the rest of its header in its metadata."""
+    data = _data_of(content)
+    header = json.loads(content[8 : len(content) - len(data)])
+    header["__metadata__"] = header.get("__metadata__", {}) | {DIGEST: _digest(header, data)}
+    text = json.dumps(header, separators=(",", ":")).encode()
+    # tensors begin at a multiple of 8
+    text += b" " * (-len(text) % 8)
+    return struct.pack("<Q", len(text)) + text + bytes(data)
+
+
+def _data_of(content: bytes) -> memoryview:
+    return memoryview(content)[8 + struct.unpack("<Q", content[:8])[0] :]
+
+
+def _digest(header: dict, data: memoryview) -> str:
+    metadata = {name: text for name, text in header.get("__metadata__", {}).items() if name != DIGEST}
+    signed = json.dumps(header | {"__metadata__": metadata}, sort_keys=True, separators=(",", ":"))
+    digest = hashlib.sha256(signed.encode())
+    digest.update(data)
+    return digest.hexdigest()
+
+
+# ---- the header's own entry
+
+
+def parse_header(path: str | os.PathLike, entry: str | None) -> Header:
+    """The header from its JSON entry, None where there is none; `path` names the file in errors. Raises InputError."""
+    if entry is None:
+        raise file_error(
+            path,
+            "not a checkpoint of lidarpose (its header has no entry for it): name one that `lidarpose pretrain` wrote; "
+            "weights of the released DAPT code come in by `lidarpose import`",
+        )
+    try:
+        header = json.loads(entry)
+        if header["schema"] != SCHEMA:
+            raise file_error(path, _other_schema(header["schema"], header.get("version")))
+        kind = header["network"]
+        if kind not in KINDS:
+            raise file_error(path, str(unknown_name("kind of network", kind, KINDS)))
+        config = _parse_config(path, kind, header["config"])
+        version, card = header["version"], header["card"]
+        if not isinstance(card, dict):
+            raise TypeError(f"card is a {type(card).__name__}")
+        return Header(version=str(version), config=config, card=card)
+    except InputError:
+        raise
+    # a number of thousands of digits is a plain ValueError
+    except (KeyError, TypeError, AttributeError, RecursionError, ValueError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise file_error(path, f"its header cannot be read ({reason}): get the file again, or train anew") from None
+
+
+def _other_schema(schema: object, version: object) -> str:
+    got = f"expected schema {SCHEMA}, got {schema}"
+    if schema == f"{_FAMILY}/1":
+        return (
+            f"{got}: written by lidarpose {version}, whose network this version ({__version__}) has replaced: "
+            f"use lidarpose {version} for it, or train anew"
+        )
+    by = f" of lidarpose {version}" if version else ""
+    return f"{got}{by}: use the lidarpose version that wrote it (this is {__version__})"
+
+
+def _parse_config(path: str | os.PathLike, kind: str, entries: dict) -> NetworkConfig | DaptConfig:
+    if not isinstance(entries, dict):
+        raise TypeError(f"config is a {type(entries).__name__}")
+    config_class = NetworkConfig
+    if kind == "dapt":
+        from lidarpose.models.dapt.dapt_config import DaptConfig as config_class
+    extra = sorted(set(entries) - {field.name for field in fields(config_class)})
+    if extra:
+        raise file_error(
+            path, f"unknown setting {extra[0]} in its configuration: update lidarpose, a newer version wrote it"
+        )
+    try:
+        return config_class(**entries)
+    except InputError as error:
+        raise file_error(path, f"its configuration does not fit: {error}") from None

@@ -18,7 +18,7 @@ class NetworkConfig:
     """Widths and depths.
 
     channels: of the fine, mid and coarse level; head_channels: a head of attention; blocks: attention blocks (mid
-    encoder, coarse, mid decoder); grid: edge of a fine voxel in metres (mid and coarse: 2 and 4 times); max_voxels:
+    encoder, coarse, mid decoder); grid: edge of a fine voxel in meters (mid and coarse: 2 and 4 times); max_voxels:
     fine voxels a person at the most; parts: body parts and 0; heatmap: one of `HEATMAPS`; convolution: channels
     of the submanifold convolutions before the blocks of the mid and coarse level, 0 for none.
     """
@@ -53,7 +53,7 @@ class NetworkConfig:
                 f"and {self.head_channels}"
             )
         if not isinstance(self.grid, int | float) or not self.grid > 0:
-            raise InputError(f"grid must be a positive number of metres, got {self.grid!r}")
+            raise InputError(f"grid must be a positive number of meters, got {self.grid!r}")
         check_name("heatmap", self.heatmap, HEATMAPS)
         skeleton(self.skeleton)
 

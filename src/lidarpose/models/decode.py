@@ -2,7 +2,7 @@
 
 Legend: ... leading axes (people, joints, axes of space), W bins.
 
-A decoder takes logits (..., W) and says where bin 0 lies (`low`) and how far apart bins are (`step`), in metres:
+A decoder takes logits (..., W) and says where bin 0 lies (`low`) and how far apart bins are (`step`), in meters:
 position = low + index * step. That serves both conventions of bins. The released DAPT code puts a bin at its left edge,
 index = (position - lo) * bins / (hi - lo), so low = lo and step = (hi - lo) / bins. A heatmap whose bins are known by
 their middles has low = lo + step / 2.

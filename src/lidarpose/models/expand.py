@@ -31,7 +31,7 @@ _READERS = (
 )
 
 
-def grown(network: PoseNet, config: NetworkConfig) -> PoseNet:
+def expand_weights(network: PoseNet, config: NetworkConfig) -> PoseNet:
     """A network of `config`, in training mode, that answers nearly as `network` does; of the same depth and width, the
     same. What is drawn comes from torch's global generator. Raises InputError, one line, where `config` is narrower or
     shallower, or of another grid, skeleton, heatmap, width of heads or of convolutions.

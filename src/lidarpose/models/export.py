@@ -13,11 +13,18 @@ from torch import Tensor, nn
 
 from lidarpose.errors import InputError, LidarPoseError, check_name, missing_extra
 from lidarpose.io.files import atomic_path, check_apart, check_suffix, check_writable, content_digest, write_atomic
-from lidarpose.models.batch import Batch
-from lidarpose.models.checkpoint import load_checkpoint
-from lidarpose.models.header import ENTRY, Header
-from lidarpose.models.onnx import OUTPUTS, SOURCE, input_name, network_inputs, open_session, plan_people
-from lidarpose.models.posenet import PoseNet
+from lidarpose.models.checkpoint import DIGEST, ENTRY, Header, load_checkpoint
+from lidarpose.models.onnx import (
+    NO_DIGEST,
+    OUTPUTS,
+    SOURCE,
+    input_name,
+    network_inputs,
+    open_session,
+    voxelize_people,
+    with_digest,
+)
+from lidarpose.models.posenet import Batch, PoseNet
 
 # of each format, the suffix of its files
 FORMATS = {"onnx": ".onnx", "torch": ".pt2"}
@@ -30,8 +37,8 @@ _TOLERANCE = 1e-3
 _WORTH = 64
 
 
-class PlanModule(nn.Module):
-    """A network as a function of the plan's arrays, named `names`, one after the other, giving `OUTPUTS` in order."""
+class ArrayModule(nn.Module):
+    """A network as a function of a pyramid's arrays, named `names`, one after the other, giving `OUTPUTS` in order."""
 
     def __init__(self, network: PoseNet, names: tuple[str, ...]):
         super().__init__()
@@ -65,7 +72,7 @@ def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = 
     check_writable(out)
     metadata = {ENTRY: header.to_json(), SOURCE: content_digest(weights, expected="a checkpoint")}
     if format == "onnx":
-        content = onnx_bytes(network, metadata)
+        content = with_digest(onnx_bytes(network, metadata | {DIGEST: NO_DIGEST}))
         session = open_session(content, threads=1)
 
         def run(arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
@@ -85,7 +92,7 @@ def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = 
 def trace(network: PoseNet) -> torch.export.ExportedProgram:
     """The network as a program whose numbers of people and rows are free."""
     arrays = _people(network, _TRACED)
-    module = PlanModule(network.eval(), tuple(arrays))
+    module = ArrayModule(network.eval(), tuple(arrays))
     with torch.no_grad():
         program = torch.export.export(module, _tensors(arrays), dynamic_shapes=_free(arrays))
     for node in program.graph.nodes:
@@ -104,7 +111,7 @@ def onnx_bytes(network: PoseNet, metadata: dict[str, str]) -> bytes:
     arrays = _people(network, _TRACED)
     with _silence(), torch.no_grad():
         program = torch.onnx.export(
-            PlanModule(network.eval(), tuple(arrays)),
+            ArrayModule(network.eval(), tuple(arrays)),
             _tensors(arrays),
             dynamic_shapes=_free(arrays),
             input_names=[input_name(name) for name in arrays],
@@ -134,7 +141,7 @@ def check(network: PoseNet, run: Callable[[dict[str, np.ndarray]], list[np.ndarr
     for sizes in _CHECKED:
         arrays = _people(network, sizes)
         with torch.inference_mode():
-            expected = PlanModule(network.eval(), tuple(arrays))(*_tensors(arrays))
+            expected = ArrayModule(network.eval(), tuple(arrays))(*_tensors(arrays))
         for name, due, got in zip(OUTPUTS, expected, run(arrays), strict=True):
             due = due.numpy()
             off = float(np.abs(got - due).max(initial=0)) if got.shape == due.shape else np.inf
@@ -149,7 +156,7 @@ def _people(network: PoseNet, sizes: tuple[int, ...]) -> dict[str, np.ndarray]:
     """What the network reads of random people of so many points."""
     rng = np.random.default_rng(0)
     clouds = [rng.normal(0, (0.2, 0.2, 0.5), (size, 3)) for size in sizes]
-    return network_inputs(plan_people(clouds, rng.normal(size=(len(sizes), 5)), network.config))
+    return network_inputs(voxelize_people(clouds, rng.normal(size=(len(sizes), 5)), network.config))
 
 
 def _tensors(arrays: dict[str, np.ndarray]) -> tuple[Tensor, ...]:

@@ -1,18 +1,24 @@
-"""The network's bricks: places as sines, attention that knows where and how dense, feed-forward, pooling.
+"""The network's layers: rotary positions, attention that knows where and how dense, exchange, pooling, joint heads.
 
-Legend: B people, N rows (padded), K keys (padded), C channels, H heads, D channels a head, P rotated pairs a head.
+Legend: B people, N rows (padded), K keys (padded), C channels, H heads, D channels a head, P rotated pairs a head, J
+joints, W heatmap bins.
 """
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-# wavelengths in metres of the position features and the rotary encoding: from a fine voxel to twice a person's height
+from lidarpose.models.config import BIN
+from lidarpose.models.decode import HALF_WIDTH
+
+# wavelengths in meters of the position features and the rotary encoding: from a fine voxel to twice a person's height
 WAVELENGTHS = (0.15, 0.25, 0.4, 0.65, 1.05, 1.7, 2.7, 4.4)
 PLACE_FEATURES = 3 + 6 * len(WAVELENGTHS)
+# half the width of a heatmap's range: about the vote, or about the person's center; meters
+REACH = {"window": 0.36, "full": 1.2}
 
 
-class Places:
+class RotaryEmbedding:
     """Where rows (B, N, 3) m stand, as sines and cosines that position features and rotary attention share."""
 
     def __init__(self, position: Tensor):
@@ -26,31 +32,31 @@ class Places:
         """(B, N, PLACE_FEATURES): the coordinates, their sines and their cosines."""
         return torch.cat([self.position, self.sin.flatten(-2), self.cos.flatten(-2)], -1)
 
-    def turn(self, x: Tensor, scale: Tensor) -> Tensor:
-        """Rotary encoding of x (B, N, H, D): P pairs of each head turn by the row's phases, `scale` as `wave_numbers`.
+    def rotate(self, x: Tensor, frequencies: Tensor) -> Tensor:
+        """Rotary encoding of x (B, N, H, D): P pairs of each head are rotated by the row's phases.
 
-        The product of two turned vectors depends on the difference of their places in metres alone. The D - 2 P
+        The product of two rotated vectors depends on the difference of their places in meters alone. The D - 2 P
         channels that are left see no place.
         """
-        sin, cos = self._waves(scale)
+        sin, cos = self._phases(frequencies)
         pairs = sin.shape[-1]
         a, b, rest = x.split([pairs, pairs, x.shape[-1] - 2 * pairs], -1)
         return torch.cat([a * cos - b * sin, a * sin + b * cos, rest], -1)
 
-    def _waves(self, scale: Tensor) -> tuple[Tensor, Tensor]:
+    def _phases(self, frequencies: Tensor) -> tuple[Tensor, Tensor]:
         """Sines and cosines (B, N, H, P) for a layout of heads, shared by all layers that read these rows."""
-        layout = scale.shape[0], scale.shape[2]
+        layout = frequencies.shape[0], frequencies.shape[2]
         if layout not in self._shared:
-            phase = (self.position[..., None, :, None] * scale).flatten(-2)
+            phase = (self.position[..., None, :, None] * frequencies).flatten(-2)
             self._shared[layout] = phase.sin(), phase.cos()
         return self._shared[layout]
 
 
-def wave_numbers(heads: int, width: int) -> Tensor:
+def head_frequencies(heads: int, width: int) -> Tensor:
     """(H, 1, P / 3) rad/m for heads of `width` channels, P = 3 * (width // 6): heads share out the wavelengths."""
     each = width // 6
-    numbers = [2 * torch.pi / WAVELENGTHS[k % len(WAVELENGTHS)] for k in range(heads * each)]
-    return torch.tensor(numbers).view(heads, 1, each)
+    frequencies = [2 * torch.pi / WAVELENGTHS[k % len(WAVELENGTHS)] for k in range(heads * each)]
+    return torch.tensor(frequencies).view(heads, 1, each)
 
 
 def key_bias(valid: Tensor, dtype: torch.dtype) -> Tensor:
@@ -71,14 +77,14 @@ class SelfAttention(nn.Module):
         self.key = nn.Linear(channels, channels)
         self.value = nn.Linear(channels, channels)
         self.out = nn.Linear(channels, channels)
-        self.register_buffer("scale", wave_numbers(heads, channels // heads), persistent=False)
+        self.register_buffer("frequencies", head_frequencies(heads, channels // heads), persistent=False)
 
-    def forward(self, rows: Tensor, places: Places | None, bias: Tensor | None) -> Tensor:
+    def forward(self, rows: Tensor, places: RotaryEmbedding | None, bias: Tensor | None) -> Tensor:
         query, key, value = (
             layer(rows).unflatten(-1, (self.heads, -1)) for layer in (self.query, self.key, self.value)
         )
         if places is not None:
-            query, key = places.turn(query, self.scale), places.turn(key, self.scale)
+            query, key = places.rotate(query, self.frequencies), places.rotate(key, self.frequencies)
         query, key, value = (x.transpose(1, 2) for x in (query, key, value))
         mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=bias)
         return self.out(mixed.transpose(1, 2).flatten(-2))
@@ -99,14 +105,20 @@ class CrossAttention(nn.Module):
         self.value = nn.Linear(key_channels, channels)
         self.out = nn.Linear(channels, channels)
         self.density = nn.Parameter(torch.linspace(0, 1, heads))
-        self.register_buffer("scale", wave_numbers(heads, channels // heads), persistent=False)
+        self.register_buffer("frequencies", head_frequencies(heads, channels // heads), persistent=False)
 
     def forward(
-        self, queries: Tensor, query_places: Places, keys: Tensor, places: Places, log_count: Tensor, bias: Tensor
+        self,
+        queries: Tensor,
+        query_places: RotaryEmbedding,
+        keys: Tensor,
+        places: RotaryEmbedding,
+        log_count: Tensor,
+        bias: Tensor,
     ) -> Tensor:
         query = self.query(queries).unflatten(-1, (self.heads, -1))
-        query = (query_places.turn(query, self.scale) * query.shape[-1] ** -0.5).transpose(1, 2)
-        key = places.turn(self.key(keys).unflatten(-1, (self.heads, -1)), self.scale).transpose(1, 2)
+        query = (query_places.rotate(query, self.frequencies) * query.shape[-1] ** -0.5).transpose(1, 2)
+        key = places.rotate(self.key(keys).unflatten(-1, (self.heads, -1)), self.frequencies).transpose(1, 2)
         dense = self.density[:, None, None].to(bias.dtype) * log_count[:, None, None, :]
         # few queries: written out, since the fused kernels give no gradient to a bias
         weight = (query @ key.transpose(-2, -1) + (bias + dense)).softmax(-1).to(keys.dtype)
@@ -134,16 +146,49 @@ class Block(nn.Module):
         self.norm_feed = nn.LayerNorm(channels)
         self.feed = FeedForward(channels)
 
-    def forward(self, rows: Tensor, places: Places, bias: Tensor) -> Tensor:
+    def forward(self, rows: Tensor, places: RotaryEmbedding, bias: Tensor) -> Tensor:
         rows = rows + self.attention(self.norm_attention(rows), places, bias)
         return rows + self.feed(self.norm_feed(rows))
 
 
+class Exchange(nn.Module):
+    """Multi-density exchange: anchors (B, J, C), a learned vector a joint, read voxels (B, K, E), then each other.
+
+    Paper: A_{m-1} = MDE_m(A_m, f_m), from the coarsest level to the finest. Deviations: pre-norm; the bottleneck is
+    read too (the released code begins one level above it); voxels are read by place, rotary and relative to where the
+    anchor believes its joint to be, and by density; anchors keep one width, so it is the keys that are brought to it.
+    """
+
+    def __init__(self, channels: int, heads: int, voxel_channels: int):
+        super().__init__()
+        self.norm_cross = nn.LayerNorm(channels)
+        self.norm_voxels = nn.LayerNorm(voxel_channels)
+        self.cross = CrossAttention(channels, heads, voxel_channels)
+        self.norm_self = nn.LayerNorm(channels)
+        self.among = SelfAttention(channels, heads)
+        self.norm_feed = nn.LayerNorm(channels)
+        self.feed = FeedForward(channels)
+
+    def forward(
+        self,
+        anchors: Tensor,
+        believed: RotaryEmbedding,
+        voxels: Tensor,
+        places: RotaryEmbedding,
+        log_count: Tensor,
+        bias: Tensor,
+    ) -> Tensor:
+        read = self.cross(self.norm_cross(anchors), believed, self.norm_voxels(voxels), places, log_count, bias)
+        anchors = anchors + read
+        anchors = anchors + self.among(self.norm_self(anchors), None, None)
+        return anchors + self.feed(self.norm_feed(anchors))
+
+
 class Convolution(nn.Module):
-    """A residual submanifold convolution, 3 x 3 x 3, of rows (B, N, C) by a table of neighbours (B, N, 27).
+    """A residual submanifold convolution, 3 x 3 x 3, of rows (B, N, C) by a table of neighbors (B, N, 27).
 
     The table holds row numbers, N where a cell is empty. After Point Transformer V3's conditional position encoding,
-    but that neighbours are seen through `narrow` channels: its cost is theirs.
+    but that neighbors are seen through `narrow` channels: its cost is theirs.
     """
 
     def __init__(self, channels: int, narrow: int):
@@ -152,12 +197,12 @@ class Convolution(nn.Module):
         self.narrow = nn.Linear(channels, narrow, bias=False)
         self.mix = nn.Linear(27 * narrow, channels)
 
-    def forward(self, rows: Tensor, neighbours: Tensor) -> Tensor:
+    def forward(self, rows: Tensor, neighbors: Tensor) -> Tensor:
         people, n, _ = rows.shape
         padded = F.pad(self.narrow(self.norm(rows)), (0, 0, 0, 1)).flatten(0, 1)
         # by row numbers of the whole batch: along dim 1 the gradient of gather is far slower on a CPU
         start = (n + 1) * torch.arange(people, device=rows.device)
-        index = (neighbours + start[:, None, None]).flatten()
+        index = (neighbors + start[:, None, None]).flatten()
         return rows + self.mix(padded.index_select(0, index).view(people, n, -1))
 
 
@@ -169,3 +214,88 @@ def membership(parent: Tensor, valid: Tensor, parents: int, dtype: torch.dtype) 
     """
     index = torch.arange(parents, device=parent.device)
     return ((parent[:, None, :] == index[:, None]) & valid[:, None, :]).to(dtype)
+
+
+# ---- from anchors and voxels to joints
+
+
+def bin_centers(bins: int, device: torch.device | None = None) -> Tensor:
+    """(W,) m: offsets from the heatmap's origin at the middle of each bin."""
+    return _offset(torch.arange(bins, device=device), bins)
+
+
+def _offset(at: Tensor, bins: int) -> Tensor:
+    """at (...) bins -> (...) m from the heatmap's origin, which is the middle of all bins."""
+    return (at + 0.5 - bins / 2) * BIN
+
+
+def decode(logits: Tensor) -> Tensor:
+    """logits (..., W) -> (...) m from the heatmap's origin: `mean_bin` as a length."""
+    return _offset(mean_bin(logits), logits.shape[-1])
+
+
+def mean_bin(logits: Tensor) -> Tensor:
+    """logits (..., W) -> (...) bins: expectation of the softmax within `HALF_WIDTH` bins of its mode, fewer at an edge.
+
+    A mean over all bins would fall between the two peaks of a left/right doubt; the window keeps to one of them. It has
+    as many bins on either side of the mode: a window that an edge cuts would lean inwards. Computed in float32, since
+    half types cannot tell bins of the hundreds apart. Twin in numpy, for whoever has no torch: `decode.window`.
+    """
+    bins = logits.shape[-1]
+    mode = logits.argmax(-1, keepdim=True)
+    reach = torch.minimum(mode, bins - 1 - mode).clamp(max=HALF_WIDTH)
+    index = torch.arange(bins, device=logits.device)
+    # finite: a softmax's gradient at -inf may not be a number
+    weight = logits.float().masked_fill((index - mode).abs() > reach, -1e4).softmax(-1)
+    return (weight * index).sum(-1)
+
+
+def encode(offset: Tensor, sigma: float, bins: int) -> Tensor:
+    """offset (...) m from the heatmap's origin -> (..., W): a Gaussian of `sigma` m over the bins, of sum 1."""
+    distance = (offset[..., None] - bin_centers(bins, offset.device)) / sigma
+    return torch.softmax(-0.5 * distance**2, -1)
+
+
+class VoteHead(nn.Module):
+    """Every voxel votes for every joint: its position plus an offset, weighted by a softmax over the voxels.
+
+    A voxel's offset is linear in its features, so the weighted mean of offsets is the offset of the weighted mean: no
+    voxel's own is ever needed. Offsets begin at zero, so an untrained head already puts joints among the points.
+    """
+
+    def __init__(self, channels: int, voxel_channels: int, joints: int):
+        super().__init__()
+        self.query = nn.Linear(channels, voxel_channels)
+        self.key = nn.Linear(voxel_channels, voxel_channels)
+        self.offset = nn.Parameter(torch.zeros(joints, voxel_channels, 3))
+        self.residual = nn.Linear(channels, 3)
+        nn.init.zeros_(self.residual.weight)
+        nn.init.zeros_(self.residual.bias)
+
+    def forward(self, anchors: Tensor, voxels: Tensor, position: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns vote (B, J, 3) m and what the voters felt, (B, J, C)."""
+        query = self.query(anchors) * voxels.shape[-1] ** -0.5
+        weight = torch.softmax(query @ self.key(voxels).transpose(1, 2) + bias[:, 0], -1)
+        felt = weight @ voxels
+        return weight @ position + (felt[:, :, None] @ self.offset).squeeze(2) + self.residual(anchors), felt
+
+
+class JointHead(nn.Module):
+    """Heatmaps, confidence, spread and visibility of each joint from its anchor, what its voters felt, and its vote."""
+
+    def __init__(self, channels: int, voxel_channels: int, bins: int):
+        super().__init__()
+        self.bins = bins
+        wide = channels + voxel_channels
+        self.norm = nn.LayerNorm(wide)
+        self.hidden = nn.Sequential(nn.Linear(wide + 3, 2 * channels), nn.SiLU())
+        self.heatmap = nn.Linear(2 * channels, 3 * bins) if bins else None
+        self.certainty = nn.Linear(2 * channels, 3)
+
+    def forward(self, anchors: Tensor, felt: Tensor, vote: Tensor) -> tuple[Tensor, ...]:
+        """Returns heatmap (B, J, 3, W), of no bins (B, J, 1, 0); confidence, log_spread, visible (B, J)."""
+        hidden = self.hidden(torch.cat([self.norm(torch.cat([anchors, felt], -1)), vote.detach()], -1))
+        certainty = self.certainty(hidden).unbind(-1)
+        if self.heatmap is None:
+            return hidden[..., None, :0], *certainty
+        return self.heatmap(hidden).unflatten(-1, (3, self.bins)), *certainty

@@ -1,10 +1,11 @@
 """How an exported network lies in an ONNX file, and how ONNX Runtime opens it. No torch.
 
-Inputs are the plan's arrays, "fine.position" by the name "in_fine_position": a bare "view" would be the name of a node
-too. Numbers of people and of rows are free. The file's metadata hold the checkpoint's header, and the SHA-256 of the
-checkpoint that it was made from.
+Inputs are a pyramid's arrays, "fine.position" by the name "in_fine_position": a bare "view" would be the name of a node
+too. Numbers of people and of rows are free. The file's metadata hold the checkpoint's header, the SHA-256 of the
+checkpoint that it was made from, and a digest: the SHA-256 of the file with zeros in the digest's place.
 """
 
+import hashlib
 import os
 from importlib import import_module
 
@@ -12,40 +13,45 @@ import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error, one_line, read_bytes
+from lidarpose.models.checkpoint import DAMAGED, DIGEST, ENTRY, Header, parse_header, warn_without_digest
 from lidarpose.models.config import NetworkConfig
-from lidarpose.models.header import ENTRY, Header, parse_header
-from lidarpose.models.voxelize import Plan, plan
+from lidarpose.models.voxelize import VoxelPyramid, voxelize
 
 SOURCE = "lidarpose.source"
+# what stands for a digest while it is computed
+NO_DIGEST = "0" * 64
+# a tensor in a file of its own: the key of where that lies, as protocol buffers write it
+_EXTERNAL = b"\n\x08location\x12"
 # what a network gives, in this order
 OUTPUTS = ("vote", "heatmap", "part", "confidence", "log_spread", "visible")
 # a network this small only waits for more threads than that
 _MOST_THREADS = 8
 
 
-def network_inputs(tables: Plan) -> dict[str, np.ndarray]:
-    """The arrays of a plan that a network reads, by dotted name, in the order that networks take them."""
-    arrays = tables.arrays()
+def network_inputs(pyramid: VoxelPyramid) -> dict[str, np.ndarray]:
+    """The arrays of a pyramid that a network reads, by dotted name, in the order that networks take them."""
+    arrays = pyramid.arrays()
     # which voxel a point fell into: for who has parts to bring back to points
     del arrays["point_voxel"]
     return arrays
 
 
-def plan_people(clouds: list[np.ndarray], view: np.ndarray | None, config: NetworkConfig) -> Plan:
-    """The plan of people's clouds (n, 3) m, each about its person's center, as `config` wants it; view (B, 5)."""
-    return plan(
+def voxelize_people(clouds: list[np.ndarray], view: np.ndarray | None, config: NetworkConfig) -> VoxelPyramid:
+    """The voxels of people's clouds (n, 3) m, each about its person's center, as `config` wants it; view (B, 5)."""
+    return voxelize(
         np.concatenate([np.zeros((0, 3)), *clouds]),
         np.array([len(cloud) for cloud in clouds], np.int64),
         grid=config.grid,
         max_voxels=config.max_voxels,
         view=view,
-        neighbours=config.convolution > 0,
+        neighbors=config.convolution > 0,
     )
 
 
 def input_name(name: str) -> str:
     """ "fine.position" -> "in_fine_position"."""
-    return "in_" + name.replace(".", "_")
+    # as spelled in files that are out there
+    return "in_" + name.replace(".", "_").replace("neighbors", "neighbours")
 
 
 def usable_threads() -> int:
@@ -85,9 +91,14 @@ def open_session(content: bytes, *, threads: int | None = None):
 def open_onnx(path: str | os.PathLike, *, threads: int | None = None) -> tuple[object, Header, str]:
     """The session of an exported network, its header, and the digest of the checkpoint that it was made from.
 
-    Raises InputError, one line, for a file that is cut off, something else, or another program's ONNX.
+    Warns of a file without a digest. Raises InputError, one line, for a file that is damaged, cut off, something else,
+    another program's ONNX, or one that keeps its weights elsewhere.
     """
     content = read_bytes(path, expected="an ONNX file (.onnx)")
+    if _EXTERNAL in content:
+        # they would be looked up in the current folder, whatever lies there
+        raise file_error(path, "keeps its weights in other files: make one file of it with `lidarpose export`")
+    has_digest = check_digest(path, content)
     # what is wrong with it is not the file's fault
     _runtime()
     try:
@@ -114,9 +125,39 @@ def open_onnx(path: str | os.PathLike, *, threads: int | None = None) -> tuple[o
             raise file_error(
                 path, f"{what} {wrong[0]} {problem}: make the file anew with `lidarpose export` of this version"
             )
+    if not has_digest:
+        warn_without_digest(path)
     return session, header, metadata.get(SOURCE, "")
+
+
+def with_digest(content: bytes) -> bytes:
+    """An ONNX file whose entry `DIGEST` is `NO_DIGEST`, with the digest there."""
+    start = _digest_start(content)
+    return content[:start] + _digest(content, start) + content[start + len(NO_DIGEST) :]
+
+
+def check_digest(path: str | os.PathLike, content: bytes) -> bool:
+    """Whether a file has a digest. Raises InputError where it is not the content's."""
+    start = _digest_start(content)
+    if start and content[start : start + len(NO_DIGEST)] != _digest(content, start):
+        raise file_error(path, DAMAGED)
+    return start > 0
+
+
+def _digest_start(content: bytes) -> int:
+    """Where the digest begins, 0 where there is none: a key, a tag and a length of one byte each, then its digits."""
+    key = DIGEST.encode()
+    at = content.rfind(key)
+    return at + len(key) + 2 if at >= 0 else 0
+
+
+def _digest(content: bytes, start: int) -> bytes:
+    digest = hashlib.sha256(memoryview(content)[:start])
+    digest.update(NO_DIGEST.encode())
+    digest.update(memoryview(content)[start + len(NO_DIGEST) :])
+    return digest.hexdigest().encode()
 
 
 def expected_inputs(config: NetworkConfig) -> list[str]:
     """Names of an exported network's inputs."""
-    return [input_name(name) for name in network_inputs(plan_people([np.zeros((1, 3))], None, config))]
+    return [input_name(name) for name in network_inputs(voxelize_people([np.zeros((1, 3))], None, config))]

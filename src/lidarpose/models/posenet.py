@@ -1,16 +1,30 @@
 """`PoseNet`: a point-transformer U-Net over voxels whose joint anchors gather evidence at every density level.
 
-Legend: B people, F / M / N rows of the fine, mid and coarse level (padded), J joints, C channels.
+Legend: B people, F / M / N rows of the fine, mid and coarse level (padded), J joints, C channels, W heatmap bins.
 """
 
+from dataclasses import dataclass, fields
+
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lidarpose.models.batch import Batch
 from lidarpose.models.config import BIN, NetworkConfig
-from lidarpose.models.exchange import Exchange
-from lidarpose.models.heads import REACH, JointHead, Outputs, VoteHead
-from lidarpose.models.layers import PLACE_FEATURES, Block, Convolution, FeedForward, Places, key_bias, membership
+from lidarpose.models.layers import (
+    PLACE_FEATURES,
+    REACH,
+    Block,
+    Convolution,
+    Exchange,
+    FeedForward,
+    JointHead,
+    RotaryEmbedding,
+    VoteHead,
+    decode,
+    key_bias,
+    membership,
+)
+from lidarpose.models.voxelize import VoxelLevel, VoxelPyramid
 from lidarpose.skeleton import skeleton
 
 # what a fine voxel knows besides its place: offset in the cell (3), deviation (3), log counts of itself and its parents
@@ -18,8 +32,82 @@ VOXEL_FEATURES = 9
 VIEW_FEATURES = 5
 
 
+@dataclass(frozen=True, kw_only=True)
+class Batch:
+    """What the network reads: the tables of a `voxelize.VoxelPyramid` as tensors."""
+
+    fine: VoxelLevel
+    mid: VoxelLevel
+    coarse: VoxelLevel
+    deviation: Tensor
+    offset: Tensor
+    view: Tensor
+
+    @classmethod
+    def from_pyramid(cls, pyramid: VoxelPyramid, device: torch.device | str = "cpu") -> "Batch":
+        return cls.from_arrays(pyramid.arrays(), device)
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, np.ndarray], device: torch.device | str = "cpu") -> "Batch":
+        """From arrays by dotted name, "fine.position"; names that a batch does not have are left out."""
+
+        def tensors(kind: type, prefix: str = "") -> dict[str, Tensor]:
+            names = [field.name for field in fields(kind) if prefix + field.name in arrays]
+            return {name: torch.as_tensor(arrays[prefix + name]).to(device) for name in names}
+
+        levels = {name: VoxelLevel(**tensors(VoxelLevel, f"{name}.")) for name in ("fine", "mid", "coarse")}
+        return cls(**levels, **tensors(cls))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Targets:
+    """What training compares with.
+
+    joints (B, J, 3) m in the person's frame; known (B, J) bool: false where the truth is not known, for a dataset that
+    labels some of the skeleton's joints; visible (B, J): 1 where some point lies near the joint, 0 where none does, NaN
+    where that is not known, see `train.example.seen`; part (B, F) int64, the majority part of each fine voxel's points,
+    -1 where padded or unknown.
+    """
+
+    joints: torch.Tensor
+    known: torch.Tensor
+    visible: torch.Tensor
+    part: torch.Tensor
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, np.ndarray], device: torch.device | str = "cpu") -> "Targets":
+        return cls(
+            **{name: torch.as_tensor(arrays[name]).to(device) for name in ("joints", "known", "visible", "part")}
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outputs:
+    """Raw results in the person's frame.
+
+    vote (B, J, 3) m; heatmap (B, J, 3, W) logits about the vote, or about the origin where the network has no votes
+    (vote is then zero), W = 0 where it has no heatmaps; part (B, N, P) logits of each fine voxel, 0 = not body;
+    confidence (B, J) logit of an error under 10 cm; log_spread (B, J) log of the expected error in m; visible (B, J)
+    logit of the joint being seen; level_joints: one (B, J, 3) m a coarser level, read off its anchors; has_votes:
+    whether the network votes at all.
+    """
+
+    vote: Tensor
+    heatmap: Tensor
+    part: Tensor
+    confidence: Tensor
+    log_spread: Tensor
+    visible: Tensor
+    level_joints: tuple[Tensor, ...]
+    has_votes: bool = True
+
+    def joints(self) -> Tensor:
+        """(B, J, 3) m: the vote plus the heatmap's offset."""
+        return self.vote + decode(self.heatmap) if self.heatmap.shape[-1] else self.vote
+
+
 class PoseNet(nn.Module):
-    """Points of people, planned into a `Batch`, to raw `Outputs`. A pure function of the batch's tensors."""
+    """Points of people, voxelized into a `Batch`, to raw `Outputs`. A pure function of the batch's tensors."""
 
     def __init__(self, config: NetworkConfig):
         super().__init__()
@@ -52,30 +140,30 @@ class PoseNet(nn.Module):
         fine, mid, coarse = batch.fine, batch.mid, batch.coarse
         dtype = batch.view.dtype
         fine_bias, mid_bias, coarse_bias = (key_bias(level.valid, dtype) for level in (fine, mid, coarse))
-        fine_places, mid_places, coarse_places = (Places(level.position) for level in (fine, mid, coarse))
+        fine_places, mid_places, coarse_places = (RotaryEmbedding(level.position) for level in (fine, mid, coarse))
         mid_of_fine = membership(fine.parent, fine.valid, mid.valid.shape[1], dtype)
         coarse_of_mid = membership(mid.parent, mid.valid, coarse.valid.shape[1], dtype)
 
         fine_rows = self.stem(self._features(batch, fine_places, mid_of_fine, coarse_of_mid), batch.view)
         mid_rows = self.down_mid(fine_rows, mid_of_fine, mid_places)
-        mid_rows = self.encoder(mid_rows, mid_places, mid_bias, mid.neighbours)
+        mid_rows = self.encoder(mid_rows, mid_places, mid_bias, mid.neighbors)
         coarse_rows = self.down_coarse(mid_rows, coarse_of_mid, coarse_places)
-        coarse_rows = self.bottleneck(coarse_rows, coarse_places, coarse_bias, coarse.neighbours)
+        coarse_rows = self.bottleneck(coarse_rows, coarse_places, coarse_bias, coarse.neighbors)
 
         anchors = self.anchors + self.anchor_view(batch.view)[:, None]
-        believed = Places(torch.zeros_like(anchors[..., :3]))
+        believed = RotaryEmbedding(torch.zeros_like(anchors[..., :3]))
         anchors = self.exchanges[0](anchors, believed, coarse_rows, coarse_places, coarse.log_count, coarse_bias)
         level_joints = [self.level_joints[0](anchors)]
 
         mid_rows = mid_rows + coarse_of_mid.transpose(1, 2) @ self.up_mid(coarse_rows)
-        mid_rows = self.decoder(mid_rows, mid_places, mid_bias, mid.neighbours)
-        believed = Places(level_joints[0].detach())
+        mid_rows = self.decoder(mid_rows, mid_places, mid_bias, mid.neighbors)
+        believed = RotaryEmbedding(level_joints[0].detach())
         anchors = self.exchanges[1](anchors, believed, mid_rows, mid_places, mid.log_count, mid_bias)
         level_joints.append(self.level_joints[1](anchors))
 
         fine_rows = fine_rows + mid_of_fine.transpose(1, 2) @ self.up_fine(mid_rows)
         fine_rows = fine_rows + self.fine_feed(self.fine_norm(fine_rows))
-        believed = Places(level_joints[1].detach())
+        believed = RotaryEmbedding(level_joints[1].detach())
         anchors = self.exchanges[2](anchors, believed, fine_rows, fine_places, fine.log_count, fine_bias)
 
         vote, felt = torch.zeros_like(level_joints[0]), anchors[..., :0]
@@ -93,12 +181,12 @@ class PoseNet(nn.Module):
             has_votes=self.vote is not None,
         )
 
-    def _features(self, batch: Batch, places: Places, mid_of_fine: Tensor, coarse_of_mid: Tensor) -> Tensor:
+    def _features(self, batch: Batch, places: RotaryEmbedding, mid_of_fine: Tensor, coarse_of_mid: Tensor) -> Tensor:
         """(B, F, ...): place, spread of the points inside, and density at three scales."""
         coarse_count = coarse_of_mid.transpose(1, 2) @ batch.coarse.log_count[..., None]
         parents = torch.cat([batch.mid.log_count[..., None], coarse_count], -1)
         density = torch.cat([batch.fine.log_count[..., None], mid_of_fine.transpose(1, 2) @ parents], -1)
-        # deviations inside a cell are a few centimetres: brought to order one
+        # deviations inside a cell are a few centimeters: brought to order one
         return torch.cat([places.features(), batch.offset, batch.deviation / self.config.grid, density], -1)
 
 
@@ -126,7 +214,7 @@ class _Down(nn.Module):
         self.mix = nn.Linear(channels, wider)
         self.place = nn.Linear(PLACE_FEATURES, wider)
 
-    def forward(self, rows: Tensor, member: Tensor, places: Places) -> Tensor:
+    def forward(self, rows: Tensor, member: Tensor, places: RotaryEmbedding) -> Tensor:
         mean = (member @ rows) / member.sum(-1, keepdim=True).clamp(min=1)
         return self.mix(self.norm(mean)) + self.place(places.features())
 
@@ -140,9 +228,9 @@ class _Stage(nn.Module):
         convolutions = count if convolution else 0
         self.convolutions = nn.ModuleList(Convolution(channels, convolution) for _ in range(convolutions))
 
-    def forward(self, rows: Tensor, places: Places, bias: Tensor, neighbours: Tensor | None) -> Tensor:
+    def forward(self, rows: Tensor, places: RotaryEmbedding, bias: Tensor, neighbors: Tensor | None) -> Tensor:
         for k, block in enumerate(self.blocks):
             if self.convolutions:
-                rows = self.convolutions[k](rows, neighbours)
+                rows = self.convolutions[k](rows, neighbors)
             rows = block(rows, places, bias)
         return rows

@@ -12,41 +12,41 @@ import numpy as np
 
 from lidarpose.errors import InputError
 
-# half width of the window around the center that reaches the network, metres: arm span plus a step
+# half width of the window around the center that reaches the network, meters: arm span plus a step
 WINDOW = 2.0
 # bits an axis of a voxel index: 2 * WINDOW / 0.04 m < 2 ** 7
 _BITS = 8
 
 
 @dataclass(frozen=True, kw_only=True)
-class Level:
+class VoxelLevel:
     """Voxels of one size, padded to the most a person has.
 
     position (B, N, 3) float32 m: mean of the points inside, in the person's frame; log_count (B, N) float32: log of the
     number of points; valid (B, N) bool; parent (B, N) int64: index into the next coarser level (0 where padded);
-    neighbours (B, N, 27) int64, where asked for: rows of the 3 x 3 x 3 cells around, N where there is no voxel.
+    neighbors (B, N, 27) int64, where asked for: rows of the 3 x 3 x 3 cells around, N where there is no voxel.
     """
 
     position: np.ndarray
     log_count: np.ndarray
     valid: np.ndarray
     parent: np.ndarray
-    neighbours: np.ndarray | None = None
+    neighbors: np.ndarray | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class VoxelPyramid:
     """All that the network reads of a batch of people, as arrays.
 
     deviation (B, F, 3) m: standard deviation of the points inside each fine voxel; offset (B, F, 3): mean of the points
-    from the voxel's center, in voxels; view (B, 5): unit vector to the sensor, log of the range in metres, 1 if the
+    from the voxel's center, in voxels; view (B, 5): unit vector to the sensor, log of the range in meters, 1 if the
     sensor's position is known (else all zero); point_voxel (M,): row of the padded (B * F) fine level of every point,
     -1 for a point outside the window or thinned away.
     """
 
-    fine: Level
-    mid: Level
-    coarse: Level
+    fine: VoxelLevel
+    mid: VoxelLevel
+    coarse: VoxelLevel
     deviation: np.ndarray
     offset: np.ndarray
     view: np.ndarray
@@ -57,7 +57,7 @@ class Plan:
         out = {}
         for field in fields(self):
             value = getattr(self, field.name)
-            if isinstance(value, Level):
+            if isinstance(value, VoxelLevel):
                 tables = {f"{field.name}.{f.name}": getattr(value, f.name) for f in fields(value)}
                 out |= {name: table for name, table in tables.items() if table is not None}
             else:
@@ -65,7 +65,7 @@ class Plan:
         return out
 
 
-def plan(
+def voxelize(
     points: np.ndarray,
     lengths: np.ndarray,
     *,
@@ -73,16 +73,16 @@ def plan(
     max_voxels: int,
     view: np.ndarray | None = None,
     seeds: np.ndarray | None = None,
-    neighbours: bool = False,
-) -> Plan:
+    neighbors: bool = False,
+) -> VoxelPyramid:
     """Voxels of people whose points (M, 3) m stand one after the other, `lengths` (B,) points each, person's frame.
 
-    grid: edge of a fine voxel in metres; the mid and coarse ones are 2 and 4 times as wide. A person of more than
+    grid: edge of a fine voxel in meters; the mid and coarse ones are 2 and 4 times as wide. A person of more than
     `max_voxels` fine voxels keeps that many: evenly spread ones, or with seeds (B,) whole numbers random ones, drawn
     from the person's own seed. Every person of at least one point inside the window has at least one voxel at every
-    level; one of none has only padding. neighbours: also make the tables of the mid and coarse level that convolutions
+    level; one of none has only padding. neighbors: also make the tables of the mid and coarse level that convolutions
     read.
-    Twin: `plan_reference`. Raises InputError for a grid too fine for the voxel index.
+    Twin: `voxelize_reference` of the tests. Raises InputError for a grid too fine for the voxel index.
     """
     if WINDOW / grid > 1 << (_BITS - 1):
         raise InputError(f"grid must be at least {WINDOW / (1 << (_BITS - 1)):.4f} m, got {grid}")
@@ -118,21 +118,21 @@ def plan(
     fine_slots, mid_slots, coarse_slots = (_Slots(k >> (3 * _BITS), people) for k in (voxel_key, mid_key, coarse_key))
     point_voxel = np.full(len(points), -1)
     point_voxel[kept] = fine_slots.row[voxel_of_point]
-    return Plan(
+    return VoxelPyramid(
         fine=_level(fine_slots, mean, count, mid_slots.slot[mid_of_fine]),
         mid=_level(
             mid_slots,
             mid_sum / mid_count[:, None],
             mid_count,
             coarse_slots.slot[coarse_of_mid],
-            _neighbours(mid_key, mid_slots) if neighbours else None,
+            _neighbors(mid_key, mid_slots) if neighbors else None,
         ),
         coarse=_level(
             coarse_slots,
             coarse_sum / coarse_count[:, None],
             coarse_count,
             np.zeros(len(coarse_key), np.int64),
-            _neighbours(coarse_key, coarse_slots) if neighbours else None,
+            _neighbors(coarse_key, coarse_slots) if neighbors else None,
         ),
         deviation=fine_slots.pad(deviation.astype(np.float32)),
         offset=fine_slots.pad(offset.astype(np.float32)),
@@ -142,7 +142,7 @@ def plan(
 
 
 def view_features(center: np.ndarray, sensor_origin: np.ndarray | None) -> np.ndarray:
-    """(5,) for `Plan.view`: unit vector from `center` to the sensor, log range, known; zeros for None."""
+    """(5,) for `VoxelPyramid.view`: unit vector from `center` to the sensor, log range, known; zeros for None."""
     if sensor_origin is None:
         return np.zeros(5, np.float32)
     toward = np.asarray(sensor_origin, float) - center
@@ -167,14 +167,14 @@ class _Slots:
 
 
 def _level(
-    slots: _Slots, mean: np.ndarray, count: np.ndarray, parent: np.ndarray, neighbours: np.ndarray | None = None
-) -> Level:
-    return Level(
+    slots: _Slots, mean: np.ndarray, count: np.ndarray, parent: np.ndarray, neighbors: np.ndarray | None = None
+) -> VoxelLevel:
+    return VoxelLevel(
         position=slots.pad(mean.astype(np.float32)),
         log_count=slots.pad(np.log(count).astype(np.float32)),
         valid=slots.pad(np.ones(len(count), bool)),
         parent=slots.pad(parent),
-        neighbours=None if neighbours is None else slots.pad(neighbours, slots.shape[1]),
+        neighbors=None if neighbors is None else slots.pad(neighbors, slots.shape[1]),
     )
 
 
@@ -183,7 +183,7 @@ def _cells(key: np.ndarray) -> np.ndarray:
     return np.stack([key >> shift & (1 << _BITS) - 1 for shift in (2 * _BITS, _BITS, 0)], 1) - (1 << (_BITS - 1))
 
 
-def _neighbours(key: np.ndarray, slots: _Slots) -> np.ndarray:
+def _neighbors(key: np.ndarray, slots: _Slots) -> np.ndarray:
     """(V, 27) int: slots of the voxels around each, x slowest; the padded width where there is none."""
     # cells reach neither end of their bits: no step runs over into another axis
     steps = np.array([[-1], [0], [1]]) * np.array([1 << (2 * _BITS), 1 << _BITS, 1])

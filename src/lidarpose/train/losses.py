@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from lidarpose.models.batch import Targets
 from lidarpose.models.config import BIN
-from lidarpose.models.heads import Outputs, encode
+from lidarpose.models.layers import encode
+from lidarpose.models.posenet import Outputs, Targets
 from lidarpose.sample import HIT
 from lidarpose.skeleton import BODY26
 from lidarpose.train.objective import Share, alone

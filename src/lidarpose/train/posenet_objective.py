@@ -7,10 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidarpose.models.batch import Batch, Targets
 from lidarpose.models.config import NetworkConfig
-from lidarpose.models.posenet import PoseNet
-from lidarpose.models.voxelize import Plan, plan
+from lidarpose.models.posenet import Batch, PoseNet, Targets
+from lidarpose.models.voxelize import VoxelPyramid, voxelize
 from lidarpose.train.example import Example
 from lidarpose.train.losses import losses
 from lidarpose.train.objective import Share, alone
@@ -32,14 +31,14 @@ class PoseNetObjective:
 
     def collate(self, examples: list[Example]) -> dict[str, np.ndarray]:
         """The arrays of a plan, and those of `Targets`."""
-        tables = plan(
+        tables = voxelize(
             np.concatenate([e.points for e in examples]),
             np.array([len(e.points) for e in examples]),
             grid=self.config.grid,
             max_voxels=MAX_VOXELS,
             view=np.stack([e.view for e in examples]),
             seeds=np.array([e.seed for e in examples]),
-            neighbours=self.config.convolution > 0,
+            neighbors=self.config.convolution > 0,
         )
         part = np.concatenate([e.part for e in examples]).astype(np.int64)
         joints, visible = np.stack([e.joints for e in examples]), np.stack([e.visible for e in examples])
@@ -63,7 +62,7 @@ class PoseNetObjective:
         return network(Batch.from_arrays(arrays, device)).joints().float().cpu().numpy()
 
 
-def _majority(tables: Plan, part: np.ndarray, parts: int) -> np.ndarray:
+def _majority(tables: VoxelPyramid, part: np.ndarray, parts: int) -> np.ndarray:
     """(B, N): the part most of a voxel's points are of; -1 where none is known and where there is no voxel."""
     shape = tables.fine.valid.shape
     told = (tables.point_voxel >= 0) & (part >= 0)

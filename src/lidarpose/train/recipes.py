@@ -10,7 +10,7 @@ from typing import Any
 
 from lidarpose.errors import InputError, check_finite, check_name
 from lidarpose.io.files import listed
-from lidarpose.models.bundled import DEFAULT
+from lidarpose.models import DEFAULT
 
 # rises, stays, falls to nothing; or rises and falls as a cosine
 SCHEDULES = ("plateau", "cosine")

@@ -14,8 +14,8 @@ from lidarpose.errors import InputError, check_name
 from lidarpose.io.files import file_error
 from lidarpose.models.config import SIZES, NetworkConfig, preset
 from lidarpose.models.dapt.dapt_config import CONFIGS
-from lidarpose.models.expand import grown
-from lidarpose.models.header import Header
+from lidarpose.models.expand import expand_weights
+from lidarpose.models.checkpoint import Header
 from lidarpose.models.posenet import PoseNet
 from lidarpose.skeleton import HUMAN15, SMPL24, Skeleton, skeleton
 from lidarpose.train.augment import Augmentation, augmentation, augmented
@@ -93,7 +93,7 @@ def _pretraining(recipe: Pretrain) -> TrainSetup:
     card = {"motion": None if recipe.motion is None else Path(recipe.motion).name}
     network = task.network
     if recipe.init:
-        network, card["init_card"] = _grown(recipe.init, task.config)
+        network, card["init_card"] = _expanded(recipe.init, task.config)
     return TrainSetup(
         task=task,
         source=source,
@@ -118,9 +118,9 @@ def _check_no_test(shards: tuple[str, ...]) -> None:
             )
 
 
-def _grown(init: str, config: NetworkConfig) -> tuple[Callable[[], nn.Module], dict]:
+def _expanded(init: str, config: NetworkConfig) -> tuple[Callable[[], nn.Module], dict]:
     """What makes a network of this configuration that begins as the weights named, and their card."""
-    from lidarpose.models.bundled import weights_path
+    from lidarpose.models import weights_path
     from lidarpose.models.checkpoint import load_checkpoint
 
     path = weights_path(init)
@@ -128,8 +128,8 @@ def _grown(init: str, config: NetworkConfig) -> tuple[Callable[[], nn.Module], d
     if not isinstance(smaller, PoseNet):
         raise file_error(path, "holds the paper's network: --init names one of the package's own")
     # tried at once, so that what does not fit is told before a folder is made
-    grown(smaller, config)
-    return partial(grown, smaller, config), header.card
+    expand_weights(smaller, config)
+    return partial(expand_weights, smaller, config), header.card
 
 
 def _about(dataset: InMemoryDataset) -> tuple[str, ...]:
@@ -141,7 +141,7 @@ def _about(dataset: InMemoryDataset) -> tuple[str, ...]:
 
 
 def _finetuning(recipe: Finetune) -> TrainSetup:
-    from lidarpose.models.bundled import weights_path
+    from lidarpose.models import weights_path
     from lidarpose.models.checkpoint import load_checkpoint
 
     path = weights_path(recipe.init)

@@ -1,6 +1,6 @@
 """The backbone's bricks on rows of voxels: submanifold convolution, attention in patches, blocks, pooling, exchange.
 
-Legend: B people, M voxels of all people at a level, T taps, P pairs of neighbours, H heads, D channels a head, C
+Legend: B people, M voxels of all people at a level, T taps, P pairs of neighbors, H heads, D channels a head, C
 channels, J joints, N voxels a person at most.
 
 Modules bear the names of the released weights, so that these load by name.
@@ -17,8 +17,8 @@ _EPS, _MOMENTUM = 1e-3, 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
-class NeighbourTensors:
-    """`tables.Neighbours` as tensors; counts are plain numbers."""
+class NeighborTensors:
+    """`tables.Neighbors` as tensors; counts are plain numbers."""
 
     source: Tensor | None
     target: Tensor | None
@@ -30,7 +30,7 @@ class NeighbourTensors:
 class LevelTensors:
     """`tables.Level` as tensors; sequence is None where rows already stand patch after patch."""
 
-    near: NeighbourTensors
+    near: NeighborTensors
     parent: Tensor | None
     children: Tensor | None
     slots: Tensor
@@ -81,7 +81,7 @@ class SubmanifoldConvolution(nn.Module):
         bound = (kernel**3 * channels) ** -0.5
         nn.init.uniform_(self.weight, -bound, bound)
 
-    def forward(self, rows: Tensor, near: NeighbourTensors) -> Tensor:
+    def forward(self, rows: Tensor, near: NeighborTensors) -> Tensor:
         """rows (M, C) -> (M, C')."""
         # unbound once: slicing tap after tap would give each slice's gradient the size of the whole weight
         weights = self.weight.flatten(1, 3).unbind(1)

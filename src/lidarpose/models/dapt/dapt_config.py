@@ -30,10 +30,10 @@ class DaptConfig:
     """The network: a Point Transformer V3 U-Net, joint anchors that read every level of its decoder, heads.
 
     name: of the configuration; joints: names in the network's own order; bins, ranges: heatmap bins (W) and (low, high)
-    in metres for x, y and z, both empty where there are no heatmaps; encoder_*: one entry a level; decoder_*: one entry
+    in meters for x, y and z, both empty where there are no heatmaps; encoder_*: one entry a level; decoder_*: one entry
     a level but the last; anchor_channels: width of the anchors after each level's exchange, the last where they begin;
     anchor_heads, anchor_dropout: of the exchanges; patch: voxels within which attention is full; grid: edge of a voxel
-    of level 0, metres; strides: how many times wider the next level's voxels are; orders: curves for people of more
+    of level 0, meters; strides: how many times wider the next level's voxels are; orders: curves for people of more
     than `patch` voxels; drop_path: the last block's; parts: classes of the part head, 0 for no such head; coordinates:
     a head that reads x, y, z off each anchor (the paper's pre-training); auxiliary: a head that reads all joints off
     the bottleneck (the released fine-tuning); legacy: True for the released weights, which need the data flow that they
@@ -98,7 +98,7 @@ class DaptConfig:
                 f"decoder_channels must divide by anchor_heads, got {self.decoder_channels} and {self.anchor_heads}"
             )
         if not (_is_number(self.grid) and self.grid > 0):
-            raise InputError(f"grid must be a positive number of metres, got {self.grid!r}")
+            raise InputError(f"grid must be a positive number of meters, got {self.grid!r}")
         for name in ("drop_path", "anchor_dropout"):
             if not (_is_number(getattr(self, name)) and 0 <= getattr(self, name) < 1):
                 raise InputError(f"{name} must be a probability below 1, got {getattr(self, name)!r}")
@@ -118,7 +118,7 @@ class DaptConfig:
                     f"bins must be three whole numbers (x, y, z) from 1 to {MOST}, or none, got {self.bins!r}"
                 )
             if not isinstance(self.ranges, tuple) or len(self.ranges) != 3 or not all(map(_is_range, self.ranges)):
-                raise InputError(f"ranges must be three pairs (low, high) of metres, or none, got {self.ranges!r}")
+                raise InputError(f"ranges must be three pairs (low, high) of meters, or none, got {self.ranges!r}")
         elif not self.coordinates:
             raise InputError("a network needs heatmaps (bins and ranges) or coordinates=True: it would predict nothing")
         if not isinstance(self.parts, int) or not 0 <= self.parts <= MOST or self.parts == 1:
@@ -253,7 +253,7 @@ def _from_reference(entries: dict) -> dict:
 
 
 def _released(name: str, joints: tuple[str, ...], bins: tuple[int, int], reach: Range) -> DaptConfig:
-    """bins and half widths in metres of (x and y, z)."""
+    """bins and half widths in meters of (x and y, z)."""
     across, up = ((-r, r) for r in reach)
     return DaptConfig(
         name=name,

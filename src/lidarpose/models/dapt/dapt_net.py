@@ -19,7 +19,7 @@ from lidarpose.models.dapt.blocks import (
     Block,
     Exchange,
     LevelTensors,
-    NeighbourTensors,
+    NeighborTensors,
     Perceptron,
     Pooling,
     RowNorm,
@@ -28,8 +28,8 @@ from lidarpose.models.dapt.blocks import (
     Unpooling,
 )
 from lidarpose.models.dapt.dapt_config import DaptConfig
-from lidarpose.models.dapt.voxel_tables import Level, Neighbours, Tables, build_tables
-from lidarpose.models.heads import mean_bin
+from lidarpose.models.dapt.voxel_tables import Level, Neighbors, Tables, build_tables
+from lidarpose.models.layers import mean_bin
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,7 @@ class DaptBatch:
     """What the network reads, as tensors; see `tables.Tables`."""
 
     features: Tensor
-    stem: NeighbourTensors
+    stem: NeighborTensors
     levels: tuple[LevelTensors, ...]
 
     @classmethod
@@ -46,7 +46,7 @@ class DaptBatch:
     ) -> "DaptBatch":
         return cls(
             features=torch.as_tensor(tables.features).to(device, dtype),
-            stem=_neighbours(tables.stem, device),
+            stem=_neighbors(tables.stem, device),
             levels=tuple(_level(level, device) for level in tables.levels),
         )
 
@@ -271,7 +271,7 @@ def _cloud(cloud: np.ndarray, number: int) -> np.ndarray:
     cloud = np.asarray(cloud)
     if cloud.ndim != 2 or cloud.shape[1] != 3 or cloud.dtype.kind not in "fiu":
         raise InputError(
-            f"cloud {number}: expected numbers of shape (n, 3), x y z in metres, got {cloud.dtype} of {cloud.shape}"
+            f"cloud {number}: expected numbers of shape (n, 3), x y z in meters, got {cloud.dtype} of {cloud.shape}"
         )
     return np.ascontiguousarray(cloud, np.float32)
 
@@ -280,8 +280,8 @@ def _array(values: Tensor) -> np.ndarray:
     return values.float().cpu().numpy()
 
 
-def _neighbours(near: Neighbours, device: torch.device | str) -> NeighbourTensors:
-    return NeighbourTensors(
+def _neighbors(near: Neighbors, device: torch.device | str) -> NeighborTensors:
+    return NeighborTensors(
         source=_tensor(near.source, device),
         target=_tensor(near.target, device),
         counts=() if near.counts is None else tuple(near.counts.tolist()),
@@ -292,7 +292,7 @@ def _neighbours(near: Neighbours, device: torch.device | str) -> NeighbourTensor
 def _level(level: Level, device: torch.device | str) -> LevelTensors:
     mask = level.patch_valid
     return LevelTensors(
-        near=_neighbours(level.near, device),
+        near=_neighbors(level.near, device),
         parent=_tensor(level.parent, device),
         children=_tensor(level.children, device),
         slots=_tensor(level.slots, device),

@@ -9,14 +9,12 @@ import os
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
 
 from lidarpose.errors import InputError
 from lidarpose.io.files import check_apart, check_suffix, file_error
-from lidarpose.models.checkpoint import as_stored, save_checkpoint, shapes
+from lidarpose.models.checkpoint import Header, SafetensorsFile, empty_state, save_checkpoint
 from lidarpose.models.dapt.dapt_config import CONFIGS, DaptConfig, named_config
 from lidarpose.models.dapt.dapt_net import DaptNet
-from lidarpose.models.header import Header
 
 # what a wrapper for several GPUs puts before every name
 _PREFIX = "module."
@@ -32,29 +30,24 @@ def import_dapt(path: str | os.PathLike, config: DaptConfig | dict | str | None 
     Raises InputError, one line that names the file and the tensor, for all that does not fit.
     """
     path = Path(path)
-    with _opened(path) as file:
-        config = _config(path, file.metadata(), config)
-        stored = {name: name for name in file.keys()}
-        if stored and all(name.startswith(_PREFIX) for name in stored):
-            stored = {name.removeprefix(_PREFIX): name for name in stored}
-        source = f"the configuration {config.name}"
-        remedy = f"name the configuration that it was trained with ({', '.join(CONFIGS)})"
-        wanted = shapes(path, config, len(stored), by=source, remedy=remedy)
-        missing = [name for name in wanted if name not in stored]
-        extra = sorted(set(stored) - set(wanted))
-        # a head that only one side knows says more about a wrong configuration than a tensor of it
-        if missing:
-            raise file_error(path, f"tensor {missing[0]} is missing, which {source} has: {remedy}")
-        if extra:
-            raise file_error(path, f"unknown tensor {extra[0]}, which {source} has not: {remedy}")
-        loaded = {}
-        for name, value in wanted.items():
-            shape = tuple(file.get_slice(stored[name]).get_shape())
-            if shape != tuple(value.shape):
-                raise file_error(
-                    path, f"tensor {name} should be {tuple(value.shape)} by {source}, got {shape}: {remedy}"
-                )
-            loaded[name] = as_stored(path, name, file.get_tensor(stored[name]), value.dtype)
+    if path.suffix.lower() in _PICKLES:
+        raise file_error(
+            path,
+            "expected a .safetensors file, got a pickle, which can run programs: if you trust it, convert it once with "
+            "safetensors.torch.save_file(torch.load(FILE, map_location='cpu', weights_only=True), 'dapt.safetensors')",
+        )
+    file = SafetensorsFile.open(path, prefix=_PREFIX)
+    config = _config(path, file.metadata, config)
+    source = f"the configuration {config.name}"
+    remedy = f"name the configuration that it was trained with ({', '.join(CONFIGS)})"
+    wanted = empty_state(path, config, len(file.shapes), by=source, remedy=remedy)
+    file.check_tensors(
+        wanted,
+        missing=f"which {source} has: {remedy}",
+        unknown=f"which {source} has not: {remedy}",
+        shape=f"by {source}, got {{}}: {remedy}",
+    )
+    loaded = file.load(wanted)
     _check_ranges(path, config, loaded)
     network = DaptNet(config)
     network.load_state_dict(loaded)
@@ -76,24 +69,6 @@ def import_released(source: str | os.PathLike, out: str | os.PathLike, *, config
     }
     save_checkpoint(out, network, card=card)
     return Header(config=network.config, card=card)
-
-
-def _opened(path: Path):
-    if path.suffix.lower() in _PICKLES:
-        raise file_error(
-            path,
-            "expected a .safetensors file, got a pickle, which can run programs: if you trust it, convert it once with "
-            "safetensors.torch.save_file(torch.load(FILE, map_location='cpu', weights_only=True), 'dapt.safetensors')",
-        )
-    if not path.is_file():
-        what = "is a folder" if path.is_dir() else "there is no such file"
-        raise file_error(path, f"expected a .safetensors file of DAPT's weights, but {what}: check the path")
-    try:
-        return safe_open(str(path), framework="pt")
-    except (SafetensorError, OSError, ValueError) as error:
-        raise file_error(
-            path, f"expected a .safetensors file, but it is damaged or something else ({error}): get it again"
-        ) from None
 
 
 def _config(path: Path, metadata: dict[str, str] | None, config: DaptConfig | dict | str | None) -> DaptConfig:

@@ -29,7 +29,7 @@ def z_order(cells: np.ndarray, bits: int = 16) -> np.ndarray:
 def hilbert(cells: np.ndarray, bits: int = 16) -> np.ndarray:
     """cells (n, 3) whole numbers in [0, 2**bits) -> (n,) int64 positions on a Hilbert curve through the cube.
 
-    Consecutive positions are neighbouring cells. Method: Skilling 2004, "Programming the Hilbert curve": the axes are
+    Consecutive positions are neighboring cells. Method: Skilling 2004, "Programming the Hilbert curve": the axes are
     turned into the transposed Gray code in place. Raises InputError for a cell outside.
     """
     axes = list(_checked(cells, bits))

@@ -1,10 +1,10 @@
-"""From people's points to integer tables: voxels, levels, neighbours, patches. Numpy only.
+"""From people's points to integer tables: voxels, levels, neighbors, patches. Numpy only.
 
 Legend: B people, n points of a cloud, M voxels of all people at a level, one after the other, T taps of a kernel,
-P pairs of neighbours, W children at most, N voxels a person at most, Q patches, K voxels a patch at most, O curves.
+P pairs of neighbors, W children at most, N voxels a person at most, Q patches, K voxels a patch at most, O curves.
 
 Voxels stand in Z-order within each person, at every level: the order of points never matters, and the children of a
-parent are neighbours in memory. A person without points is given one voxel at the center: every level then has a row
+parent are neighbors in memory. A person without points is given one voxel at the center: every level then has a row
 for everybody, and nobody's batch mates need to know.
 """
 
@@ -16,7 +16,7 @@ from lidarpose.errors import InputError, check_name
 from lidarpose.models.dapt.dapt_config import CELL_BITS, DaptConfig
 from lidarpose.models.dapt.space_filling_curves import curve, dilated, z_order
 
-# bits an axis of a cell, and of a neighbour's cell: one more, so that a step across the edge meets no cell
+# bits an axis of a cell, and of a neighbor's cell: one more, so that a step across the edge meets no cell
 _BITS, _WIDE = CELL_BITS, CELL_BITS + 1
 _MOST_PEOPLE = 1 << (63 - 3 * _WIDE)
 # how convolutions and attention run: see `build_tables`
@@ -24,11 +24,11 @@ LAYOUTS = ("ragged", "padded")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Neighbours:
+class Neighbors:
     """The occupied cells about each voxel, taps in the order of a kernel's (x, y, z) offsets, the middle tap left out.
 
-    ragged: source (P,) rows of the neighbours, tap after tap; counts (T,) pairs of each tap (0 for the middle one);
-    target (P,) the rows that they are neighbours of. padded: table (M, T) rows, M for an empty cell; else None.
+    ragged: source (P,) rows of the neighbors, tap after tap; counts (T,) pairs of each tap (0 for the middle one);
+    target (P,) the rows that they are neighbors of. padded: table (M, T) rows, M for an empty cell; else None.
     """
 
     source: np.ndarray | None = None
@@ -41,7 +41,7 @@ class Neighbours:
 class Level:
     """Voxels of one width.
 
-    lengths (B,): voxels of each person, at least 1; near: neighbours of 3 x 3 x 3; parent (M,): row of the next level,
+    lengths (B,): voxels of each person, at least 1; near: neighbors of 3 x 3 x 3; parent (M,): row of the next level,
     None at the last; children (M', W): rows of this level under each row of the next, the first repeated, None at the
     last; slots (B, N): rows of each person, the first repeated; valid (B, N) bool.
 
@@ -51,7 +51,7 @@ class Level:
     """
 
     lengths: np.ndarray
-    near: Neighbours
+    near: Neighbors
     parent: np.ndarray | None
     children: np.ndarray | None
     slots: np.ndarray
@@ -67,13 +67,13 @@ class Level:
 class Tables:
     """What the network reads of a batch of people.
 
-    features (M, 3) float32 m: the kept point of each voxel of level 0; stem: its neighbours of 5 x 5 x 5; levels, fine
+    features (M, 3) float32 m: the kept point of each voxel of level 0; stem: its neighbors of 5 x 5 x 5; levels, fine
     to coarse; kept (M,): index of the kept point among all points, -1 for the stand-in of a person without points;
     point_voxel (all points,): each point's row of level 0.
     """
 
     features: np.ndarray
-    stem: Neighbours
+    stem: Neighbors
     levels: tuple[Level, ...]
     kept: np.ndarray
     point_voxel: np.ndarray
@@ -108,7 +108,7 @@ def build_tables(
     features, key, cells = points[kept], key[kept], cells[kept]
     empty = np.flatnonzero(lengths == 0)
     if len(empty):
-        # stand-ins: a voxel that no neighbour or parent can tell from a real one, of a point at the center
+        # stand-ins: a voxel that no neighbor or parent can tell from a real one, of a point at the center
         place = np.searchsorted(key, empty << (3 * _WIDE))
         features = np.insert(features, place, 0, axis=0)
         cells = np.insert(cells, place, 1 << (_BITS - 1), axis=0)
@@ -117,14 +117,14 @@ def build_tables(
         key = np.insert(key, place, empty << (3 * _WIDE) | z_order(cells[:1] * 0 + (1 << (_BITS - 1)), _BITS))
 
     levels = []
-    stem = _neighbours(key, cells, 2, 0, layout)
+    stem = _neighbors(key, cells, 2, 0, layout)
     bits = 0
     for level in range(len(config.encoder_depths)):
         last = level == len(config.encoder_depths) - 1
         shift = 0 if last else config.strides[level].bit_length() - 1
         parent_key, first, parent = _grouped(key >> (3 * shift))
         owner = key >> (3 * (_WIDE - bits))
-        near = _neighbours(key, cells, 1, bits, layout)
+        near = _neighbors(key, cells, 1, bits, layout)
         levels.append(
             Level(
                 near=near,
@@ -141,7 +141,7 @@ def _cells(points: np.ndarray, lengths: np.ndarray, config: DaptConfig) -> np.nd
     """(M, 3) int64 in [0, 2**_BITS)."""
     scaled = np.floor(points / config.grid)
     if not np.isfinite(scaled).all():
-        raise InputError("points must be finite numbers of metres, got NaN or infinity: drop those points first")
+        raise InputError("points must be finite numbers of meters, got NaN or infinity: drop those points first")
     middle = 1 << (_BITS - 1)
     if config.legacy:
         filled = lengths > 0
@@ -192,8 +192,8 @@ def _spread(first: np.ndarray, rows: int) -> np.ndarray:
     return first[:, None] + np.where(column < lengths[:, None], column, 0)
 
 
-def _neighbours(key: np.ndarray, cells: np.ndarray, reach: int, bits: int, layout: str) -> Neighbours:
-    """Neighbours within `reach` cells an axis of rows whose sorted `key` has lost `bits` bits an axis."""
+def _neighbors(key: np.ndarray, cells: np.ndarray, reach: int, bits: int, layout: str) -> Neighbors:
+    """Neighbors within `reach` cells an axis of rows whose sorted `key` has lost `bits` bits an axis."""
     side = 2 * reach + 1
     taps, rows = side**3, len(key)
     wide = _WIDE - bits
@@ -208,16 +208,16 @@ def _neighbours(key: np.ndarray, cells: np.ndarray, reach: int, bits: int, layou
     found = np.searchsorted(key, codes.ravel())
     found[found == rows] = 0
     hit = np.flatnonzero(key[found] == codes.ravel())
-    # the second half of the taps is the first one mirrored, seen from the neighbour
+    # the second half of the taps is the first one mirrored, seen from the neighbor
     tap, target, source = hit // rows, hit % rows, found[hit]
     if layout == "padded":
         table = np.full((rows, taps), rows)
         table[target, tap] = source
         table[source, taps - 1 - tap] = target
-        return Neighbours(table=table)
+        return Neighbors(table=table)
     counts = np.bincount(tap, minlength=taps // 2)
     mirrored = np.argsort(-tap, kind="stable")
-    return Neighbours(
+    return Neighbors(
         source=np.concatenate([source, target[mirrored]]),
         target=np.concatenate([target, source[mirrored]]),
         counts=np.concatenate([counts, [0], counts[::-1]]),

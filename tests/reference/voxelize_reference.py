@@ -4,12 +4,12 @@ from collections import defaultdict
 
 import numpy as np
 
-from lidarpose.models.voxelize import WINDOW, Level, Plan
+from lidarpose.models.voxelize import WINDOW, VoxelLevel, VoxelPyramid
 
 Cell = tuple[int, int, int]
 
 
-def plan_reference(
+def voxelize_reference(
     points: np.ndarray,
     lengths: np.ndarray,
     *,
@@ -17,8 +17,8 @@ def plan_reference(
     max_voxels: int,
     view: np.ndarray | None = None,
     seeds: np.ndarray | None = None,
-    neighbours: bool = False,
-) -> Plan:
+    neighbors: bool = False,
+) -> VoxelPyramid:
     """The same arguments and result as `plan.plan`; with `seeds` it draws the same numbers."""
     fine, mid, coarse = [], [], []
     start = 0
@@ -42,10 +42,10 @@ def plan_reference(
             deviation[b, n] = inside.std(0)
             offset[b, n] = inside.mean(0) / grid - cell - 0.5
             point_voxel[members] = b * shape[1] + n
-    return Plan(
+    return VoxelPyramid(
         fine=_level(points, fine, mid),
-        mid=_level(points, mid, coarse, neighbours),
-        coarse=_level(points, coarse, None, neighbours),
+        mid=_level(points, mid, coarse, neighbors),
+        coarse=_level(points, coarse, None, neighbors),
         deviation=deviation,
         offset=offset,
         view=np.zeros((len(lengths), 5), np.float32) if view is None else view.astype(np.float32),
@@ -73,7 +73,7 @@ def _parent(cell: Cell) -> Cell:
     return tuple(x // 2 for x in cell)
 
 
-def _level(points: np.ndarray, people: list[dict], parents: list[dict] | None, neighbours: bool = False) -> Level:
+def _level(points: np.ndarray, people: list[dict], parents: list[dict] | None, neighbors: bool = False) -> VoxelLevel:
     shape = (len(people), max([1, *map(len, people)]))
     position, log_count = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)
     valid, parent = np.zeros(shape, bool), np.zeros(shape, np.int64)
@@ -84,8 +84,8 @@ def _level(points: np.ndarray, people: list[dict], parents: list[dict] | None, n
             valid[b, n] = True
             if parents is not None:
                 parent[b, n] = list(parents[b]).index(_parent(cell))
-    around = _around(people, shape) if neighbours else None
-    return Level(position=position, log_count=log_count, valid=valid, parent=parent, neighbours=around)
+    around = _around(people, shape) if neighbors else None
+    return VoxelLevel(position=position, log_count=log_count, valid=valid, parent=parent, neighbors=around)
 
 
 def _around(people: list[dict], shape: tuple[int, int]) -> np.ndarray:

@@ -1,0 +1,37 @@
+"""Gives checkpoints from before there were digests one each, and their ONNX twins; not a bit of a tensor changes.
+
+python tools/add_digests.py src/lidarpose/models/weights/*.safetensors
+"""
+
+import argparse
+from pathlib import Path
+
+import onnx
+
+from lidarpose.io.files import content_digest, write_atomic
+from lidarpose.models import onnx as onnx_files
+from lidarpose.models.checkpoint import DIGEST, with_digest
+
+
+def add_digests(path: Path) -> None:
+    """Rewrites a checkpoint, and its .onnx file where there is one beside it."""
+    write_atomic(path, with_digest(path.read_bytes()))
+    twin = path.with_suffix(".onnx")
+    if not twin.is_file():
+        return
+    model = onnx.load(twin)
+    metadata = {entry.key: entry.value for entry in model.metadata_props}
+    metadata |= {onnx_files.SOURCE: content_digest(path, expected="a checkpoint"), DIGEST: onnx_files.NO_DIGEST}
+    onnx.helper.set_model_props(model, metadata)
+    write_atomic(twin, onnx_files.with_digest(model.SerializeToString(deterministic=True)))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("checkpoints", nargs="+", type=Path)
+    for path in parser.parse_args().checkpoints:
+        add_digests(path)
+
+
+if __name__ == "__main__":
+    main()
