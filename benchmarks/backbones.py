@@ -156,13 +156,13 @@ class _RaggedBlock(nn.Module):
         self.norm_attention, self.norm_feed = nn.LayerNorm(channels), nn.LayerNorm(channels)
         self.qkv, self.out = nn.Linear(channels, 3 * channels), nn.Linear(channels, channels)
         self.feed = nn.Sequential(nn.Linear(channels, 4 * channels), nn.GELU(), nn.Linear(4 * channels, channels))
-        self.register_buffer("scale", head_frequencies(heads, channels // heads), persistent=False)
+        self.register_buffer("frequencies", head_frequencies(heads, channels // heads), persistent=False)
 
     def forward(self, rows: Tensor, places: RotaryEmbedding, level: DraftLevel, bias: Tensor | None) -> Tensor:
         query, key, value = self.qkv(self.norm_attention(rows)).unflatten(-1, (3, self.heads, -1)).unbind(1)
         query, key, value = (
             _padded(x.flatten(1), level).unflatten(-1, (self.heads, -1)).transpose(1, 2)
-            for x in (places.turn(query, self.scale), places.turn(key, self.scale), value)
+            for x in (places.rotate(query, self.frequencies), places.rotate(key, self.frequencies), value)
         )
         mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=bias)
         rows = rows + self.out(mixed.transpose(1, 2).flatten(2).flatten(0, 1)[level.slot])

@@ -18,7 +18,7 @@ from lidarpose.errors import InputError, MissingExtra
 from lidarpose.inference.backend import Raw, estimates
 from lidarpose.inference.predictor import Predictor, load
 from lidarpose.io.files import content_digest
-from lidarpose.models import DEFAULT, bundled_path, decode, heads, onnx
+from lidarpose.models import DEFAULT, bundled_path, decode, layers, onnx
 from lidarpose.models.checkpoint import Header, load_checkpoint, read_header, save_checkpoint
 from lidarpose.models.config import BIN, NetworkConfig
 from lidarpose.models.dapt.dapt_config import DaptConfig
@@ -135,15 +135,15 @@ def test_a_failed_compilation_is_one_line(monkeypatch):
 # ---- from raw outputs to joints
 
 
-@pytest.mark.parametrize("kind", heads.REACH)
+@pytest.mark.parametrize("kind", layers.REACH)
 def test_numpy_and_torch_decode_alike(kind):
-    bins = round(2 * heads.REACH[kind] / BIN)
+    bins = round(2 * layers.REACH[kind] / BIN)
     rng = np.random.default_rng(0)
     logits = rng.normal(0, 3, (50, 26, 3, bins)).astype(np.float32)
     logits[..., 0] += 4 * (rng.random((50, 26, 3)) < 0.2)
     raw = raw_of(logits)
     found = estimates(raw, decode.window)
-    due = raw.vote + heads.decode(torch.from_numpy(logits)).numpy()
+    due = raw.vote + layers.decode(torch.from_numpy(logits)).numpy()
     np.testing.assert_allclose(found.joints, due, atol=2e-6)
     ends = (logits.argmax(-1) % (bins - 1) == 0).any(-1)
     np.testing.assert_array_equal(found.in_range, ~ends)

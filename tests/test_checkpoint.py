@@ -2,16 +2,29 @@
 
 import copy
 import json
+import warnings
 from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from lidarpose._version import __version__
 from lidarpose.errors import InputError
-from lidarpose.models.checkpoint import SCHEMA, Header, load_checkpoint, parameter_count, read_header, save_checkpoint
+from lidarpose.models import BUNDLED, bundled_path
+from lidarpose.models.checkpoint import (
+    SCHEMA,
+    Header,
+    SafetensorsFile,
+    load_checkpoint,
+    parameter_count,
+    read_header,
+    save_checkpoint,
+    with_digest,
+)
 from lidarpose.models.config import preset
 from lidarpose.models.dapt.dapt_config import DaptConfig
 from lidarpose.models.dapt.dapt_net import DaptNet
@@ -110,6 +123,63 @@ def test_another_kind_of_file(tmp_path, content):
     path = tmp_path / "other.safetensors"
     path.write_bytes(content)
     assert_one_line(path, "something else", "name a checkpoint")
+
+
+@settings(max_examples=120, deadline=None)
+@given(at=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
+def test_a_flipped_bit_is_noticed(stored, tmp_path_factory, at, bit):
+    content = bytearray(stored.read_bytes())
+    content[int(at * len(content))] ^= 1 << bit
+    path = tmp_path_factory.mktemp("flip") / "x.safetensors"
+    path.write_bytes(content)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            network, header = load_checkpoint(path)
+        except InputError as error:
+            assert str(path) in str(error) and "\n" not in str(error)
+            return
+    # of the digest's own name, of a blank at the header's end, or one that JSON reads as the same: nothing is lost
+    due, expected = load_checkpoint(stored)
+    assert header == expected
+    for name, value in due.state_dict().items():
+        assert torch.equal(network.state_dict()[name], value)
+
+
+def test_a_flipped_bit_of_a_weight_names_the_digest(stored, tmp_path):
+    content = bytearray(stored.read_bytes())
+    # a high bit of an exponent: still a finite number
+    content[-1] ^= 0x08
+    path = tmp_path / "x.safetensors"
+    path.write_bytes(content)
+    assert_one_line(path, "does not fit the SHA-256 digest", "get the file again")
+
+
+def test_a_file_without_a_digest_loads_with_a_note(stored, tmp_path):
+    older = rewritten(stored, tmp_path / "older.safetensors")
+    with pytest.warns(UserWarning, match="older.safetensors: has no digest, so damage goes unnoticed"):
+        network, header = load_checkpoint(older)
+    again = tmp_path / "again.safetensors"
+    again.write_bytes(with_digest(older.read_bytes()))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        same, _ = load_checkpoint(again)
+        # what has one keeps it
+        assert with_digest(again.read_bytes()) == again.read_bytes()
+        for name in BUNDLED:
+            load_checkpoint(bundled_path(name))
+    assert all(torch.equal(value, same.state_dict()[name]) for name, value in network.state_dict().items())
+
+
+def test_a_file_may_be_cut_off_once_it_is_read(stored, tmp_path):
+    """A mapped file would end the process."""
+    path = tmp_path / "x.safetensors"
+    path.write_bytes(stored.read_bytes())
+    file = SafetensorsFile.open(path)
+    path.write_bytes(b"")
+    network = PoseNet(preset("tiny"))
+    loaded = file.load(network.state_dict())
+    assert file.check_digest() and all(torch.isfinite(value).all() for value in loaded.values())
 
 
 def test_somebody_else_s_safetensors(tmp_path):

@@ -1,24 +1,29 @@
 """Networks as files that run elsewhere: the same answers at other sizes, and one line for every fault."""
 
 import json
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import onnx
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import lidarpose
 from lidarpose.errors import InputError, LidarPoseError, MissingExtra
 from lidarpose.inference.backend import OnnxBackend, exported_beside
 from lidarpose.inference.torch_backend import TorchBackend
 from lidarpose.io.files import content_digest
+from lidarpose.models import BUNDLED, bundled_path
 from lidarpose.models import export as exporting
-from lidarpose.models.checkpoint import load_checkpoint, read_header, save_checkpoint
+from lidarpose.models.checkpoint import DAMAGED, DIGEST, load_checkpoint, read_header, save_checkpoint
 from lidarpose.models.config import NetworkConfig
 from lidarpose.models.export import ArrayModule, check, export
 from lidarpose.models.onnx import (
     OUTPUTS,
+    check_digest,
     expected_inputs,
     input_name,
     network_inputs,
@@ -190,8 +195,9 @@ def assert_one_line(path, *parts, read=OnnxBackend):
 
 
 def changed(folder, path, change):
-    """The exported file, its protocol buffer changed in place."""
+    """The exported file, its protocol buffer changed in place, without the digest, which would not fit."""
     model = onnx.load(folder / "net.onnx")
+    with_entry(DIGEST, None)(model)
     change(model)
     path.write_bytes(model.SerializeToString())
     return path
@@ -214,6 +220,56 @@ def test_a_truncated_onnx_file(folder, tmp_path, keep, capfd):
     path.write_bytes(content[:keep])
     assert_one_line(path)
     assert capfd.readouterr() == ("", "")
+
+
+@settings(max_examples=120, deadline=None)
+@given(at=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
+def test_a_flipped_bit_is_noticed(folder, at, bit):
+    content = bytearray((folder / "net.onnx").read_bytes())
+    content[int(at * len(content))] ^= 1 << bit
+    try:
+        has_digest = check_digest("x.onnx", bytes(content))
+    except InputError as error:
+        assert str(error) == f"x.onnx: {DAMAGED}"
+        return
+    # of the digest's own name
+    assert not has_digest
+
+
+def test_a_file_without_a_digest_loads_with_a_note(folder, tmp_path):
+    older = changed(folder, tmp_path / "older.onnx", lambda model: None)
+    with pytest.warns(UserWarning, match="older.onnx: has no digest, so damage goes unnoticed"):
+        open_onnx(older, threads=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        open_onnx(folder / "net.onnx", threads=1)
+        for name in BUNDLED:
+            assert check_digest(name, bundled_path(name, ".onnx").read_bytes())
+
+
+def test_weights_in_other_files_are_refused(folder, tmp_path, monkeypatch):
+    """They would be looked up in the current folder."""
+    model = onnx.load(folder / "net.onnx")
+    path = tmp_path / "x.onnx"
+    onnx.save(model, path, save_as_external_data=True, location="weights.bin", size_threshold=0)
+    monkeypatch.chdir(tmp_path)
+    assert (tmp_path / "weights.bin").is_file()
+    assert_one_line(path, "keeps its weights in other files", "lidarpose export")
+
+
+def test_weights_that_are_no_numbers_are_said_to_be_damaged(folder, tmp_path):
+    def spoil(model):
+        for weight in model.graph.initializer:
+            values = onnx.numpy_helper.to_array(weight)
+            if values.dtype.kind == "f":
+                weight.CopyFrom(onnx.numpy_helper.from_array(np.full_like(values, np.nan), weight.name))
+
+    path = changed(folder, tmp_path / "nan.onnx", spoil)
+    with pytest.warns(UserWarning, match="has no digest"):
+        model = lidarpose.load(path)
+    (cloud,), _ = people(300)
+    with pytest.raises(InputError, match="no numbers.*weights are damaged"):
+        model.predict(cloud)
 
 
 @pytest.mark.parametrize("content", [b"hello world, this is text", bytes(64), b"\x80\x02}q\x00."])

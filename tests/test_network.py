@@ -256,7 +256,7 @@ def test_attention_sees_distances_not_places():
     shift, scale = torch.tensor([3.1, -0.7, 0.4]), head_frequencies(3, 20)
 
     def product(a, b):
-        return (RotaryEmbedding(a).turn(query, scale) * RotaryEmbedding(b).turn(key, scale)).sum(-1)
+        return (RotaryEmbedding(a).rotate(query, scale) * RotaryEmbedding(b).rotate(key, scale)).sum(-1)
 
     torch.testing.assert_close(product(here, there), product(here + shift, there + shift), atol=1e-4, rtol=1e-4)
     assert (product(here, there) - product(here, there + shift)).abs().max() > 1e-2
@@ -297,15 +297,15 @@ def test_an_anchor_reads_the_mean_of_the_voxels_values():
     for j in range(3):
         mixed = []
         for h in range(2):
-            channels = slice(7 * h, 7 * h + 7)
+            channels, frequencies = slice(7 * h, 7 * h + 7), layer.frequencies[h : h + 1]
             query, score = layer.query(anchors[0, j])[channels], []
             for n in range(3):
                 key = layer.key(voxels[0, n])[channels]
-                turned = [
-                    RotaryEmbedding(place[None, None]).turn(x[None, None, None], layer.scale[h : h + 1])[0, 0, 0]
+                rotated = [
+                    RotaryEmbedding(place[None, None]).rotate(x[None, None, None], frequencies)[0, 0, 0]
                     for place, x in ((believed[0, j], query), (position[0, n], key))
                 ]
-                score.append(turned[0] @ turned[1] / 7**0.5 + layer.density[h] * count[0, n].log())
+                score.append(rotated[0] @ rotated[1] / 7**0.5 + layer.density[h] * count[0, n].log())
             weight = torch.stack(score).softmax(0)
             mixed.append(sum(w * layer.value(voxels[0, n])[channels] for n, w in enumerate(weight)))
         torch.testing.assert_close(found[0, j], layer.out(torch.cat(mixed)), atol=1e-5, rtol=1e-4)

@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from lidarpose.errors import whole
+from lidarpose.errors import InputError, whole
 from lidarpose.io.files import content_digest, file_error
 from lidarpose.models.checkpoint import Header, read_header
 from lidarpose.models.config import BIN
@@ -131,12 +131,17 @@ def exported_beside(path: str | os.PathLike, *, threads: int | None = None) -> O
 
 
 def estimates(raw: Raw, decoder: Decoder) -> Estimates:
-    """Joints and what is known of them from raw outputs; `decoder` reads the heatmaps."""
+    """Joints and what is known of them from raw outputs; `decoder` reads the heatmaps.
+
+    Raises InputError where not one is a number.
+    """
     joints, in_range = raw.vote.astype(float), None
     if raw.heatmaps is not None:
         joints = joints + _decoded(raw, decoder)
         # a vote can be too far off on any axis
         in_range = ~np.any([out_of_range(heatmap) for heatmap in raw.heatmaps], axis=0)
+    if joints.size and not np.isfinite(joints).any():
+        raise InputError("the network answers with no numbers: its weights are damaged, get the file again")
     confidence = None if raw.confidence is None else _probability(raw.confidence)
     spread = None if raw.log_spread is None else np.exp(np.minimum(raw.log_spread.astype(float), _LARGEST_LOG_SPREAD))
     if confidence is None and raw.heatmaps is not None:

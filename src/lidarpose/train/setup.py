@@ -12,10 +12,10 @@ from torch import nn
 from lidarpose.data.shards import read_card
 from lidarpose.errors import InputError, check_name
 from lidarpose.io.files import file_error
+from lidarpose.models.checkpoint import Header
 from lidarpose.models.config import SIZES, NetworkConfig, preset
 from lidarpose.models.dapt.dapt_config import CONFIGS
 from lidarpose.models.expand import expand_weights
-from lidarpose.models.checkpoint import Header
 from lidarpose.models.posenet import PoseNet
 from lidarpose.skeleton import HUMAN15, SMPL24, Skeleton, skeleton
 from lidarpose.train.augment import Augmentation, augmentation, augmented
