@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from reference.sensor_noise import intensity_loss, lose_returns_reference
 
 from lidarpose.geometry import unit
+from lidarpose.lidar.presets import sensor
 from lidarpose.lidar.raycast import Hits
 from lidarpose.sample import Box
 from lidarpose.synth import noise
@@ -17,7 +18,7 @@ from lidarpose.synth.noise import draw_box, laser_mask
 from lidarpose.synth.placement import Place
 from lidarpose.synth.sample_kernels import REACH, lose_returns, range_errors
 from lidarpose.synth.scene import SCENES
-from lidarpose.synth.simulate import add_sensor_noise
+from lidarpose.synth.simulate import ScanConditions, add_sensor_noise
 
 RNG = np.random.default_rng
 seeds = st.integers(0, 2**32 - 1)
@@ -189,17 +190,19 @@ def test_the_compiled_twin_agrees_draw_by_draw(seed, dropout, weak, range_max):
     np.testing.assert_allclose(fast, slow, atol=2e-6)
 
 
+PERFECT = replace(sensor("os1-64"), dropout=0.0, range_max=100.0)
+
+
 def test_a_perfect_sensor_changes_nothing():
     mesh, hits = surface(1)
     copy = hits.points.copy()
-    perfect = dict(sigma=0.0, bias=0.0, dropout=0.0, intensity_dropout=0.0, range_max=1.0)
-    moved, kept = add_sensor_noise(hits, mesh, **perfect, rng=RNG(0))
+    moved, kept = add_sensor_noise(hits, mesh, PERFECT, ScanConditions(), RNG(0))
     np.testing.assert_array_equal(kept, np.arange(len(copy)))
     np.testing.assert_allclose(moved, copy, atol=1e-6)
     np.testing.assert_array_equal(hits.points, copy)
     empty = replace(hits, points=hits.points[:0], face=hits.face[:0], ring=hits.ring[:0])
-    noisy = dict(sigma=0.1, bias=0.1, dropout=0.5, intensity_dropout=1.0, range_max=9.0, one_sided=0.1)
-    points, kept = add_sensor_noise(empty, mesh, **noisy, rng=RNG(0))
+    noisy = ScanConditions(sigma=0.1, bias=0.1, intensity_dropout=1.0, one_sided=0.1)
+    points, kept = add_sensor_noise(empty, mesh, replace(PERFECT, dropout=0.5), noisy, RNG(0))
     assert points.shape == (0, 3) and kept.shape == (0,)
 
 
@@ -207,17 +210,15 @@ def test_ranges_have_the_law_of_the_sensor():
     mesh, hits = surface(2, n=20000)
 
     def error(**noise):
-        calm = dict(dropout=0.0, intensity_dropout=0.0, range_max=100.0)
-        moved, _ = add_sensor_noise(hits, mesh, **calm, **noise, rng=RNG(3))
+        moved, _ = add_sensor_noise(hits, mesh, PERFECT, ScanConditions(**noise), RNG(3))
         return np.linalg.norm(moved.astype(float), axis=1) - np.linalg.norm(hits.points.astype(float), axis=1)
 
-    own = error(sigma=0.02, bias=0.0)
+    own = error(sigma=0.02)
     assert own.std() == pytest.approx(0.02, rel=0.03) and abs(own.mean()) < 6e-4
-    shared = error(sigma=0.0, bias=0.01)
-    np.testing.assert_allclose(
-        shared, np.array([shared[hits.ring == r].mean() for r in range(64)])[hits.ring], atol=2e-6
-    )
-    outwards = error(sigma=0.0, bias=0.0, one_sided=0.02)
+    shared = error(bias=0.01)
+    of_ring = np.array([shared[hits.ring == r].mean() for r in range(64)])
+    np.testing.assert_allclose(shared, of_ring[hits.ring], atol=2e-6)
+    outwards = error(one_sided=0.02)
     assert outwards.min() > -2e-6 and outwards.max() < 0.0201
     assert outwards.mean() == pytest.approx(0.01, rel=0.03)
 

@@ -68,7 +68,7 @@ def test_points_lie_on_the_surface_whatever_the_mount(tilt):
 
 @pytest.mark.parametrize("dapt_compat", [True, False])
 def test_the_released_noise_is_one_sided_and_the_symmetric_one_is_not(dapt_compat):
-    where = scene(config=DAPT) if dapt_compat else scene(sigma=0.01)
+    where = scene(one_sided=0.02) if dapt_compat else scene(sigma=0.01)
     there = local(scan(where, seed=1).points, where)
     error = (there[:, 0] + SIZE[0] / 2)[np.abs(there[:, 1]) < 0.25]
     assert len(error) > 200

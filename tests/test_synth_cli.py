@@ -336,7 +336,7 @@ def test_streets_take_turns_with_the_sensors(monkeypatch, tmp_path):
     job = Job(what="streets", count=5, sensors=("os1-64", "vlp-16"))
     maker = Maker(job=job, card=job.card(), folder=tmp_path)
     for index in range(5):
-        maker._street(index)
+        maker._street_rows(index)
     assert asked == [(k, ("os1-64", "vlp-16")[k % 2]) for k in range(5)]
 
 

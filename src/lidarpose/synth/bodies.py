@@ -115,8 +115,8 @@ class Bodies:
         faces, face_part: (Q, 3) and (Q,) as in `body.rig`.
         rest: T-posed bodies.
         clothes: (n, V) m, how far cloth stands off the skin.
-        next_rotations: (n, 24, 3, 3), the poses `FRAME_TIME` s later; None for bodies that do not move.
-        step: (n, 3) m, how far the pelvis goes meanwhile; None for bodies that do not move.
+        next_rotations: (n, 24, 3, 3), the poses `FRAME_TIME` s later.
+        step: (n, 3) m, how far the pelvis goes meanwhile.
         lift: (n,) m, how far the vertices were lowered onto the ground.
     """
 
@@ -128,8 +128,8 @@ class Bodies:
     face_part: np.ndarray
     rest: RestBody
     clothes: np.ndarray
-    next_rotations: np.ndarray | None
-    step: np.ndarray | None
+    next_rotations: np.ndarray
+    step: np.ndarray
     lift: np.ndarray
 
     def body(self, row: int) -> Body:
@@ -146,10 +146,7 @@ class Bodies:
         )
 
     def moved(self, row: int) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices (V, 3) and joints (26, 3) of body `row`, `FRAME_TIME` s later. Raises InputError where the block was
-        drawn with moving=False."""
-        if self.next_rotations is None or self.step is None:
-            raise InputError("these bodies do not move: draw them with moving=True")
+        """Vertices (V, 3) and joints (26, 3) of body `row`, `FRAME_TIME` s later."""
         rows = slice(row, row + 1)
         rest = RestBody(vertices=self.rest.vertices[rows], joints=self.rest.joints[rows])
         vertices, joints, _, _ = _dressed(rest, self.clothes[rows], self.next_rotations[rows], self.step[rows])
@@ -173,27 +170,23 @@ def draw_bodies(
         bank: captured poses, or None.
         captured: share of the poses that comes from the bank.
         count: number of bodies.
-        moving: whether they can be `moved`.
+        moving: False is faster; then nobody goes anywhere.
         clothes: see `SceneConfig`.
     """
     rng = np.random.default_rng([seed, 0, block])
     rig = load_rig()
     prior = sample_rotations(rng, count, dt=FRAME_TIME if moving else 0.0)
-    rotations, next_rotations, step = prior.rotations, prior.moved, prior.step
-    kinds = np.array(KINDS)[prior.kind]
+    poses, step, kinds = np.stack([prior.rotations, prior.moved], 1), prior.step, np.array(KINDS)[prior.kind]
     if bank is not None:
         picked = rng.integers(len(bank.rotations), size=count)
         both, (way,) = _vary(np.stack([bank.rotations[picked], bank.moved[picked]], 1), rng, bank.step[picked, None])
         chosen = rng.random(count) < captured
-        mask = chosen[:, None, None, None]
-        rotations = np.where(mask, both[:, 0], rotations)
-        if moving:
-            next_rotations = np.where(mask, both[:, 1], next_rotations)
-            step = np.where(chosen[:, None], way[:, 0], step)
+        poses = np.where(chosen[:, None, None, None, None], both if moving else both[:, :1], poses)
+        step = np.where(chosen[:, None], way[:, 0] if moving else 0, step)
         kinds = np.where(chosen, "captured", kinds)
     rest = rig.rest(sample_people(rng, count).coefficients)
     worn = clothing(rng, count) * np.float32(clothes)
-    vertices, joints, low, high = _dressed(rest, worn, rotations, np.zeros((count, 3), np.float32))
+    vertices, joints, low, high = _dressed(rest, worn, poses[:, 0], np.zeros((count, 3), np.float32))
     lift = low[:, 2].copy()
     for heights in (vertices[..., 2], joints[..., 2]):
         heights -= lift[:, None]
@@ -207,8 +200,8 @@ def draw_bodies(
         face_part=rig.face_part,
         rest=rest,
         clothes=worn,
-        next_rotations=next_rotations if moving else None,
-        step=step * _stride_ratio(rest, kinds) if moving else None,
+        next_rotations=poses[:, 1],
+        step=step * _stride_ratio(rest, kinds),
         lift=lift,
     )
 

@@ -25,8 +25,6 @@ CLIP_FRAMES = 16
 STREET_FRAMES = 10
 # rows of a table that one of them has, where that is known
 _ROWS = {"people": {"people": 1}, "clips": {"people": CLIP_FRAMES}}
-# how often a shard tells how far it is
-_TOLD = 50
 # share of captured poses where a file of them is given
 _CAPTURED = 0.5
 # as many as names of five digits can number
@@ -189,52 +187,46 @@ class Maker:
         return Generator(scene=scene, bank=bank, captured=job.share)
 
     def _shard(self, shard: int) -> Iterator[int]:
-        rows_of = {"people": self._person, "clips": self._clip, "streets": self._street}[self.job.what]
+        rows_of = self._street_rows if self.job.what == "streets" else self._people_rows
         first, size = shard * self.card.per_shard, self.card.size(shard)
-        told, step = 0, max(1, self.card.per_shard // _TOLD)
         with ExitStack() as stack:
             add = {
                 table: stack.enter_context(shard_writer(shard_path(self.folder, table, shard), table))
                 for table in self.card.tables
             }
-            for k in range(size):
-                for table, rows in rows_of(first + k).items():
+            for index in range(first, first + size):
+                if index > first:
+                    yield 1
+                for table, rows in rows_of(index).items():
                     for row in rows:
                         add[table](row)
-                if (k + 1) % step == 0 and k + 1 < size:
-                    yield k + 1 - told
-                    told = k + 1
-        yield size - told
+        yield 1
 
-    def _person(self, index: int) -> dict[str, list]:
-        person = self._generator.person(self.job.seed, index)
-        return {"people": [person_row(person.sample, index=index, facts=person.facts)]}
+    def _people_rows(self, index: int) -> dict[str, list]:
+        generator, seed = self._generator, self.job.seed
+        if self.job.what == "people":
+            people = [generator.person(seed, index)]
+        else:
+            people = generator.clip(seed, index, frames=CLIP_FRAMES)
+        return {"people": [person_row(p.sample, index=index, frame=f, facts=p.facts) for f, p in enumerate(people)]}
 
-    def _clip(self, index: int) -> dict[str, list]:
-        clip = self._generator.clip(self.job.seed, index, frames=CLIP_FRAMES)
-        return {"people": [person_row(p.sample, index=index, frame=f, facts=p.facts) for f, p in enumerate(clip)]}
-
-    def _street(self, index: int) -> dict[str, list]:
+    def _street_rows(self, index: int) -> dict[str, list]:
         from lidarpose.synth.street import samples, street
 
         seed, sensors = self.job.seed, self._generator.scene.sensors
-        found = street(seed, index, sensor=sensors[index % len(sensors)], frames=STREET_FRAMES)
-        people = []
-        for frame, sample in samples(found, np.random.default_rng([seed, 5, index])):
-            people.append(person_row(sample, index=index, frame=frame, track=int(sample.box.id)))
+        scene = street(seed, index, sensor=sensors[index % len(sensors)], frames=STREET_FRAMES)
+        people = [
+            person_row(sample, index=index, frame=frame, track=int(sample.box.id))
+            for frame, sample in samples(scene, np.random.default_rng([seed, 5, index]))
+        ]
         frames = [
             {
-                "index": index,
-                "frame": number,
-                "sensor": found.sensor,
-                "points": frame.points.ravel(),
-                "ring": frame.ring,
-                "person": frame.person,
-                "part": frame.part,
+                **{"index": index, "frame": number, "sensor": scene.sensor},
+                **{"points": frame.points.ravel(), "ring": frame.ring, "person": frame.person, "part": frame.part},
                 "track": [box.id for box in frame.boxes],
                 "box": [np.concatenate([box.center, box.size, [box.yaw]]) for box in frame.boxes],
                 "joints": frame.joints,
             }
-            for number, frame in enumerate(found.frames)
+            for number, frame in enumerate(scene.frames)
         ]
         return {"people": people, "frames": frames}

@@ -31,6 +31,7 @@ class ScanConditions:
         bias: standard deviation of an error that a ring's points share, m.
         intensity_dropout: in [0, 1], how much is lost that grazes or is far.
         divergence: of a beam, rad; 0: a line.
+        one_sided: range errors uniform in [0, one_sided) besides, as in the released code, m.
         keep: share of patches that the laser-level mask keeps; 1: no mask.
         phase: a pattern's first frame.
     """
@@ -39,6 +40,7 @@ class ScanConditions:
     bias: float = 0.0
     intensity_dropout: float = 0.0
     divergence: float = 0.0
+    one_sided: float = 0.0
     keep: float = 1.0
     phase: int = 0
 
@@ -108,6 +110,7 @@ def draw_conditions(config: SceneConfig, sensor: Sensor | RayPattern, rng: np.ra
         bias=_between(noise.ring_bias, bias),
         intensity_dropout=noise.intensity_dropout * dropout,
         divergence=_between(_DIVERGENCE, divergence) if wide < noise.beam_divergence else 0.0,
+        one_sided=_DAPT_NOISE if noise.dapt_compat else 0.0,
         keep=_between(noise.mask_keep, keep) if mask < noise.mask * config.hard else 1.0,
         phase=int(1e6 * phase),
     )
@@ -124,22 +127,11 @@ def simulate_scan(scene: Scene, meshes: list[Mesh], rng: np.random.Generator, *,
         meshes: all triangles in the level frame; the window of beams is about the first one, the body.
         frame: how many frames after a pattern's first one.
     """
-    sensor, conditions, dapt_compat = scene.sensor, scene.conditions, scene.config.noise.dapt_compat
+    sensor = scene.sensor
     hits, mesh = _cast(scene, meshes, frame)
-    points, kept = add_sensor_noise(
-        hits,
-        mesh,
-        keep=_laser_level_mask(hits, sensor, conditions.keep, rng),
-        sigma=conditions.sigma,
-        bias=conditions.bias,
-        dropout=sensor.dropout,
-        intensity_dropout=conditions.intensity_dropout,
-        range_max=sensor.range_max,
-        one_sided=_DAPT_NOISE if dapt_compat else 0.0,
-        rng=rng,
-    )
+    points, kept = add_sensor_noise(hits, mesh, sensor, scene.conditions, rng)
     ring, part = hits.ring[kept], mesh.part[hits.face[kept]]
-    if dapt_compat and isinstance(sensor, Sensor):
+    if scene.config.noise.dapt_compat and isinstance(sensor, Sensor):
         seam = np.flatnonzero((hits.column[kept] + hits.column0) % sensor.columns == 0)
         points, ring, part = (np.concatenate([a, a[seam]]) for a in (points, ring, part))
     return Scan(points=scene.place.to_level(points), ring=ring, part=part)
@@ -174,53 +166,29 @@ def _cast(scene: Scene, meshes: list[Mesh], frame: int) -> tuple[Hits, Mesh]:
     return hits, mesh
 
 
-def _laser_level_mask(
-    hits: Hits, sensor: Sensor | RayPattern, keep: float, rng: np.random.Generator
-) -> np.ndarray | None:
-    """(n,) bool: which hits the laser-level mask leaves, None for all."""
+def _laser_level_mask(hits: Hits, sensor: Sensor | RayPattern, keep: float, rng: np.random.Generator) -> np.ndarray:
+    """(n,) bool: which hits the laser-level mask leaves."""
     if keep >= 1:
-        return None
+        return np.ones(len(hits.points), np.bool_)
     if isinstance(sensor, RayPattern):
         return direction_mask(hits.points, keep=keep, rng=rng)
     return laser_mask(hits.columns, hits.rows, keep=keep, rng=rng)[hits.column, hits.ring - hits.row0]
 
 
 def add_sensor_noise(
-    hits: Hits,
-    mesh: Mesh,
-    *,
-    keep: np.ndarray | None = None,
-    sigma: float,
-    bias: float,
-    dropout: float,
-    intensity_dropout: float,
-    range_max: float,
-    one_sided: float = 0.0,
-    rng: np.random.Generator,
+    hits: Hits, mesh: Mesh, sensor: Sensor | RayPattern, conditions: ScanConditions, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The returns that come back, with the errors of their ranges.
-
-    Args:
-        hits: of a cast of `mesh`, in the sensor's frame.
-        keep: (n,) bool, what is left of them so far; None: all.
-        sigma: standard deviation of a range, symmetric, m.
-        bias: of an error that a ring's points share, m.
-        dropout, intensity_dropout: see `sample_kernels.lose_returns`.
-        range_max: of the sensor, m.
-        one_sided: range errors uniform in [0, one_sided) m besides, as in the released code.
-
-    Returns:
-        Points (k, 3) float32 m and their indices (k,).
-    """
+    """The returns of a cast of `mesh`, in the sensor's frame, that come back, with the errors of their ranges: points
+    (k, 3) float32 m and their indices (k,) among the hits."""
     count = len(hits.points)
+    keep = _laser_level_mask(hits, sensor, conditions.keep, rng)
     # the last of the normals are the rings'
     normals = rng.standard_normal(count + int(hits.ring.max(initial=-1)) + 1, np.float32)
     chance = rng.random(count, np.float32)
-    error = range_errors(hits.ring, normals, sigma, bias)
-    if one_sided:
-        error += one_sided * rng.random(count, np.float32)
-    keep = np.ones(count, np.bool_) if keep is None else keep
+    error = range_errors(hits.ring, normals, conditions.sigma, conditions.bias)
+    if conditions.one_sided:
+        error += conditions.one_sided * rng.random(count, np.float32)
     return lose_returns(
         *(hits.points, hits.face, mesh.vertices, mesh.faces, keep, error, chance),
-        *(dropout, intensity_dropout, REACH * range_max),
+        *(sensor.dropout, conditions.intensity_dropout, REACH * sensor.range_max),
     )

@@ -10,19 +10,8 @@ import numpy as np
 
 from lidarpose.lidar.ray_pattern import RayPattern
 from lidarpose.lidar.sensor import Sensor
-from lidarpose.synth.environment.mesh import (
-    QUAD_FACES,
-    Mesh,
-    box,
-    foliage,
-    lattice_fence,
-    prism,
-    rail_fence,
-    shape,
-    sign,
-    union,
-    wall,
-)
+from lidarpose.synth.environment import mesh as shapes
+from lidarpose.synth.environment.mesh import Mesh, shape
 
 # furniture stands so far behind the kerb, m
 RAIL = 0.45
@@ -95,8 +84,8 @@ def _ground(plan: StreetPlan) -> Mesh:
         (-plan.front - 12, plan.kerb, -plan.road, plan.kerb),
     ):
         corners = [[-_LENGTH, y0, z0], [_LENGTH, y0, z0], [_LENGTH, y1, z1], [-_LENGTH, y1, z1]]
-        strips.append(Mesh(np.array(corners, np.float32), QUAD_FACES))
-    return union(strips)
+        strips.append(Mesh(np.array(corners, np.float32), shapes.QUAD_FACES))
+    return shapes.union(strips)
 
 
 def _front(plan: StreetPlan, side: int, rng: np.random.Generator) -> list[Mesh]:
@@ -113,16 +102,16 @@ def _front(plan: StreetPlan, side: int, rng: np.random.Generator) -> list[Mesh]:
             for bay in range(bays):
                 sill, top = (0.0, 2.1) if (bay + int(10 * d)) % 3 == 0 else (0.9, 2.2)
                 opening = (-0.25 * wide, 0.25 * wide, sill, top)
-                front = wall(wide, 3.5 + 3 * d, thick=0.3, opening=opening)
+                front = shapes.wall(wide, 3.5 + 3 * d, thick=0.3, opening=opening)
                 meshes.append(front.moved((x + (bay + 0.5) * wide, y, plan.kerb), pi / 2))
             # rooms end somewhere
-            meshes.append(box((long, 0.1, 3.5)).moved((middle[0], y + side * (1.5 + 3 * d), plan.kerb)))
+            meshes.append(shapes.box((long, 0.1, 3.5)).moved((middle[0], y + side * (1.5 + 3 * d), plan.kerb)))
         elif c < 0.75:
             for k in range(int(long)):
-                bush = foliage((1.3, 0.9, 0.9 + d), 120, 0.11, rng)
+                bush = shapes.foliage((1.3, 0.9, 0.9 + d), 120, 0.11, rng)
                 meshes.append(bush.moved((x + k + 0.5, y, plan.kerb)))
         elif c < 0.9:
-            fence = rail_fence(long, 1.0, 3) if d < 0.4 else lattice_fence(long, 0.8 + d, 0.14, 0.04)
+            fence = shapes.rail_fence(long, 1.0, 3) if d < 0.4 else shapes.lattice_fence(long, 0.8 + d, 0.14, 0.04)
             meshes.append(fence.moved(middle, pi / 2))
         x += long + (0 if c < 0.6 else 0.5 + d)
     return meshes
@@ -145,19 +134,19 @@ def _row(plan: StreetPlan, side: int, rng: np.random.Generator) -> list[Mesh]:
         a, b, c, d = rng.random(4).tolist()
         place, inwards = (x, side * (plan.road + RAIL), plan.kerb), -side * pi / 2
         if a < 0.25:
-            meshes.append(prism(0.05 + 0.06 * b, 5.0).moved(place))
+            meshes.append(shapes.prism(0.05 + 0.06 * b, 5.0).moved(place))
         elif a < 0.5:
             # a tree: trunk and crown
-            crown = foliage((2.2 + b, 2.2 + b, 2.0), 120, 0.28, rng)
-            meshes += [prism(0.10 + 0.10 * c, 2.6).moved(place), crown.moved((x, place[1], plan.kerb + 2.2))]
+            crown = shapes.foliage((2.2 + b, 2.2 + b, 2.0), 120, 0.28, rng)
+            meshes += [shapes.prism(0.10 + 0.10 * c, 2.6).moved(place), crown.moved((x, place[1], plan.kerb + 2.2))]
         elif a < 0.62:
-            meshes.append(sign(2.0 + 0.6 * b, 0.5).moved(place, inwards))
+            meshes.append(shapes.sign(2.0 + 0.6 * b, 0.5).moved(place, inwards))
         elif a < 0.75:
             meshes.append(shape("wheeled bin", 0.5 + 0.2 * b, 0.5 + 0.2 * b, 1.0 + 0.1 * c).moved(place, 2 * pi * d))
         elif a < 0.82:
             meshes.append(shape("bench", 1.0, 1.6).moved(place, inwards))
         elif a < 0.9:
-            meshes.append(foliage((0.8, 0.8, 0.7 + b), 100, 0.1, rng).moved(place))
+            meshes.append(shapes.foliage((0.8, 0.8, 0.7 + b), 100, 0.1, rng).moved(place))
         else:
             meshes.append(shape("traffic cone", 0.6, 0.6, 0.6).moved((x, side * (plan.road - 0.3), 0.0)))
         x += 3.0 + 7.0 * d

@@ -10,21 +10,8 @@ from math import atan2, cos, hypot, log, pi, sin, sqrt, tan
 
 import numpy as np
 
-from lidarpose.synth.environment.mesh import (
-    Mesh,
-    box,
-    foliage,
-    grass,
-    lattice_fence,
-    prism,
-    quad,
-    rail_fence,
-    repeated,
-    shape,
-    sign,
-    union,
-    wall,
-)
+from lidarpose.synth.environment import mesh as shapes
+from lidarpose.synth.environment.mesh import Mesh, shape
 from lidarpose.synth.scene import SceneConfig
 
 # Paper: a square of ground of half width 1 m; elsewhere it reaches beyond any crop
@@ -65,7 +52,7 @@ def _place_thing(feet: np.ndarray, radius: float, draw: list[float], rng: np.ran
         angle = atan2(feet[1], feet[0]) + _BESIDE * angle
     if kind < 0.16:
         # hand luggage, parcels and what lies about: touches the body
-        mesh = box((0.12 + 0.38 * a, 0.12 + 0.18 * b, 0.12 + 0.38 * c))
+        mesh = shapes.box((0.12 + 0.38 * a, 0.12 + 0.18 * b, 0.12 + 0.38 * c))
         near = (0.6 + 0.4 * apart) * radius
         place = (feet[0] + near * cos(angle), feet[1] + near * sin(angle), feet[2] + 0.9 * shift)
         return mesh.moved(place, 2 * pi * yaw)
@@ -86,12 +73,12 @@ def _draw_thing(
     """A mesh, half its depth and its length, m, and how far it may be turned aside, rad."""
     if kind < 0.32:
         radius = 0.02 + 0.16 * a * a
-        return prism(radius, 0.8 + 2.7 * b), radius, 0.0, 0.0
+        return shapes.prism(radius, 0.8 + 2.7 * b), radius, 0.0, 0.0
     if kind < 0.40:
         size = 0.45 + 0.35 * a
         return shape("wheeled bin", size, size, 0.8 + 0.4 * b), size / 2, size, 0.2
     if kind < _WALLS[0]:
-        return box((0.2 + 0.4 * a, 0.2 + 0.7 * b, 0.2 + 0.9 * c)), 0.1 + 0.2 * a, 0.3, 0.3
+        return shapes.box((0.2 + 0.4 * a, 0.2 + 0.7 * b, 0.2 + 0.9 * c)), 0.1 + 0.2 * a, 0.3, 0.3
     if kind < 0.60:
         return _draw_wall(a, b, c)
     if kind < _WALLS[1]:
@@ -99,11 +86,11 @@ def _draw_thing(
     if kind < 0.76:
         long = 1.2 + 2 * a
         if b < 0.5:
-            return rail_fence(long, 0.8 + 0.4 * c, 2 + int(2 * b)), 0.03, long, 0.05
-        return lattice_fence(long, 0.8 + 1.0 * c, 0.10 + 0.10 * b, 0.02 + 0.04 * c), 0.03, long, 0.05
+            return shapes.rail_fence(long, 0.8 + 0.4 * c, 2 + int(2 * b)), 0.03, long, 0.05
+        return shapes.lattice_fence(long, 0.8 + 1.0 * c, 0.10 + 0.10 * b, 0.02 + 0.04 * c), 0.03, long, 0.05
     if kind < 0.88:
         size = (0.4 + 0.6 * a, 0.5 + 1.5 * b, 0.4 + 1.4 * c)
-        return foliage(size, 50 + int(70 * b), 0.07 + 0.08 * d, rng), size[0] / 2, size[1], 0.2
+        return shapes.foliage(size, 50 + int(70 * b), 0.07 + 0.08 * d, rng), size[0] / 2, size[1], 0.2
     if kind < 0.92:
         long = 1.2 + 0.8 * a
         return shape("bench" if b < 0.6 else "bench without back", 1.0, long), 0.22, long, 0.3
@@ -111,7 +98,7 @@ def _draw_thing(
         long, deep = 0.8 + 0.9 * a, 0.3 + 0.15 * b
         return shape("table", 2 * deep, long, 0.7 + 0.35 * c * c), deep, long, 0.2
     if kind < 0.98:
-        return sign(1.6 + 1.0 * a, 0.4 + 0.4 * b), 0.05, 0.3, 1.0
+        return shapes.sign(1.6 + 1.0 * a, 0.4 + 0.4 * b), 0.05, 0.3, 1.0
     high = 0.45 + 0.35 * a
     return shape("traffic cone", high, high, high), 0.12, 0.0, 1.0
 
@@ -121,7 +108,7 @@ def _draw_wall(a: float, b: float, c: float) -> tuple[Mesh, float, float, float]
     opening = None
     if high > 1.8 and c < 0.4:
         opening = (-0.25 * long, (0.5 * c) * long, 0.0 if c < 0.1 else 0.9, 0.85 * high)
-    return wall(long, high, thick=0.15, opening=opening), 0.08, long, 0.15
+    return shapes.wall(long, high, thick=0.15, opening=opening), 0.08, long, 0.15
 
 
 def _draw_car(a: float, b: float, c: float) -> tuple[Mesh, float, float, float]:
@@ -174,13 +161,13 @@ def _low(top: float, share: float, a: float, b: float, c: float, rng: np.random.
     if a < 0.35:
         return shape("bonnet", min(0.5 + 0.5 * b, share), 1.7, top)
     if a < 0.55:
-        return box((0.3, (1.0 + 2.0 * b) * share, top))
+        return shapes.box((0.3, (1.0 + 2.0 * b) * share, top))
     if a < 0.75:
-        return foliage((0.4, (1.2 + 1.5 * b) * share, 1.1 * top), 90 + int(30 * c), 0.06 + 0.08 * c, rng)
+        return shapes.foliage((0.4, (1.2 + 1.5 * b) * share, 1.1 * top), 90 + int(30 * c), 0.06 + 0.08 * c, rng)
     if a < 0.88:
-        return rail_fence(3.0 * share, top, 2 + int(2 * c))
+        return shapes.rail_fence(3.0 * share, top, 2 + int(2 * c))
     # what is seen through may be taller
-    return lattice_fence(2.4 * share, top * (1 + b), 0.10 + 0.08 * b, 0.02 + 0.03 * c)
+    return shapes.lattice_fence(2.4 * share, top * (1 + b), 0.10 + 0.08 * b, 0.02 + 0.03 * c)
 
 
 def _tall(
@@ -197,23 +184,23 @@ def _tall(
         return shape("van", 1.6, 1.6 + c, 2.2).moved((0, 0, 0), pi / 2), 0.8
     if a < 0.5:
         wide = 0.8 + 0.6 * b
-        return foliage((0.5, wide, tall + 0.3 + c), 120, 0.10 + 0.10 * b, rng), 0.45 * wide
-    return box((0.2, 1.5, tall + 2)), 0.75
+        return shapes.foliage((0.5, wide, tall + 0.3 + c), 120, 0.10 + 0.10 * b, rng), 0.45 * wide
+    return shapes.box((0.2, 1.5, tall + 2)), 0.75
 
 
 def _strip(share: float, tall: float, a: float, b: float, c: float, rng: np.random.Generator) -> Mesh:
     """A pole, a trunk, a signpost, a branch that hangs down or a pillar."""
     radius = (0.03 + 0.17 * b * b) * share
     if a < 0.6:
-        return prism(radius, tall + 2)
+        return shapes.prism(radius, tall + 2)
     if a < 0.7:
-        return sign(1.3 + 0.8 * c, 0.35 * share + 0.2 * b)
+        return shapes.sign(1.3 + 0.8 * c, 0.35 * share + 0.2 * b)
     if a < 0.85:
         # down to a height between the hips and the head
-        mesh = foliage((0.4, 0.6 * share + 0.4 * b, 1.0), 60 + int(60 * c), 0.08 + 0.06 * b, rng)
-        stem = prism(0.02, 0.6)
-        return union([stem, mesh.moved((0, 0, 0.55 + 0.5 * c))])
-    return box((0.3, (0.15 + 0.25 * b) * share, tall + 2))
+        mesh = shapes.foliage((0.4, 0.6 * share + 0.4 * b, 1.0), 60 + int(60 * c), 0.08 + 0.06 * b, rng)
+        stem = shapes.prism(0.02, 0.6)
+        return shapes.union([stem, mesh.moved((0, 0, 0.55 + 0.5 * c))])
+    return shapes.box((0.3, (0.15 + 0.25 * b) * share, tall + 2))
 
 
 def ground(config: SceneConfig, feet: np.ndarray, rng: np.random.Generator) -> Mesh:
@@ -227,7 +214,7 @@ def ground(config: SceneConfig, feet: np.ndarray, rng: np.random.Generator) -> M
     tilt = tan(config.slope * normal)
     slope = (tilt * cos(heading), tilt * sin(heading))
     if config.name in _BARE:
-        return quad(_PAPER_HALF, slope).moved(feet)
+        return shapes.quad(_PAPER_HALF, slope).moved(feet)
     uneven = config.clutter * config.hard
     if kind < _KERB * uneven:
         return _kerb(slope, a, b, c).moved(feet)
@@ -236,10 +223,10 @@ def ground(config: SceneConfig, feet: np.ndarray, rng: np.random.Generator) -> M
         return _rough(slope, a, rng).moved(feet)
     kind -= _ROUGH * uneven
     if kind < _GRASS * uneven:
-        lawn = grass(0.5 + 0.3 * a, 0.05 + 0.15 * b, 40 + int(40 * c), rng)
+        lawn = shapes.grass(0.5 + 0.3 * a, 0.05 + 0.15 * b, 40 + int(40 * c), rng)
         lawn.vertices[:, 2] += lawn.vertices[:, :2] @ np.array(slope, np.float32)
-        return union([quad(_WILD_HALF, slope), lawn]).moved(feet)
-    return quad(_WILD_HALF, slope).moved(feet)
+        return shapes.union([shapes.quad(_WILD_HALF, slope), lawn]).moved(feet)
+    return shapes.quad(_WILD_HALF, slope).moved(feet)
 
 
 def _normal_and_uniforms(rng: np.random.Generator) -> list[float]:
@@ -256,7 +243,7 @@ def _kerb(slope: tuple[float, float], a: float, b: float, c: float) -> Mesh:
     strip = [[-far, -far, 0], [edge, -far, 0], [edge, far, 0], [-far, far, 0]]
     riser = [[edge, -far, 0], [edge, -far, step], [edge, far, step], [edge, far, 0]]
     beyond = [[edge, -far, step], [far, -far, step], [far, far, step], [edge, far, step]]
-    kerb = Mesh(np.array(strip + riser + beyond, np.float32), repeated(3, 4, "quad")).moved((0, 0, 0), turn)
+    kerb = Mesh(np.array(strip + riser + beyond, np.float32), shapes.repeated(3, 4, "quad")).moved((0, 0, 0), turn)
     kerb.vertices[:, 2] += kerb.vertices[:, :2] @ np.array(slope, np.float32)
     return kerb
 

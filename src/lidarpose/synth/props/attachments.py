@@ -6,6 +6,7 @@ stand on z = 0; frames are the body's own: rows say where the prop's x, y and z 
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from math import cos, hypot, sin
 
 import numpy as np
@@ -297,15 +298,7 @@ def _free_hands(points: Points) -> dict[str, list[int]]:
 # --- what people push and sit on
 
 
-def _pram(points: Points, u: list[float]) -> Prop | None:
-    return _pushed("pram", points)
-
-
-def _trolley(points: Points, u: list[float]) -> Prop | None:
-    return _pushed("trolley", points)
-
-
-def _pushed(name: str, points: Points) -> Prop | None:
+def _pushed(name: str, points: Points, u: list[float]) -> Prop | None:
     """Its handle is at the hands that are ahead, at their height."""
     hands = [hand for hand in HANDS if _ahead_of_pelvis(points, points[hand]) > 0.15]
     if not hands:
@@ -421,7 +414,7 @@ def _rod(start: tuple, end: tuple) -> Mesh:
 # by activity: (cumulative share, what they use)
 _RIDES = {
     "cycle": ((1.0, _bicycle),),
-    "push": ((0.5, _pram), (0.95, _trolley)),
+    "push": ((0.5, partial(_pushed, "pram")), (0.95, partial(_pushed, "trolley"))),
     "sit": ((0.12, _wheelchair), (0.85, _seat)),
 }
 # how often somebody of an activity carries something
