@@ -1,6 +1,7 @@
 """Boxes from JSON: what is accepted, and one line for each mistake."""
 
 import copy
+import io
 import json
 import math
 
@@ -10,7 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
+from lidarpose.geometry import axis_angle_to_matrix
 from lidarpose.io.boxes import read_boxes
+from lidarpose.sample import Box
 
 PERSON = {"center": [10.0, -2.0, 0.5], "size": [0.6, 0.7, 1.8], "yaw": 0.3, "id": "a"}
 
@@ -32,8 +35,17 @@ people = st.lists(
 )
 
 
+def _id_of(person):
+    return next((person[key] for key in ("id", "track") if person.get(key) is not None), None)
+
+
+def _have_own_ids(people):
+    ids = [_id_of(person) for person in people if _id_of(person) is not None]
+    return len(set(ids)) == len(ids)
+
+
 @settings(max_examples=80, deadline=None)
-@given(people=people, bare=st.booleans(), bom=st.booleans())
+@given(people=people.filter(_have_own_ids), bare=st.booleans(), bom=st.booleans())
 def test_file_and_structure_agree(tmp_path_factory, people, bare, bom):
     path = tmp_path_factory.mktemp("boxes", numbered=True) / "boxes.json"
     content = people if bare else {"people": people, "frame": "lidar"}
@@ -45,8 +57,7 @@ def test_file_and_structure_agree(tmp_path_factory, people, bare, bom):
             np.testing.assert_array_equal(box.center, person["center"])
             np.testing.assert_array_equal(box.size, person["size"])
             assert box.yaw == (person.get("yaw") or 0.0)
-            ids = [person[key] for key in ("id", "track") if person.get(key) is not None]
-            assert box.id == (ids[0] if ids else None)
+            assert box.id == _id_of(person)
     assert content == before
 
 
@@ -59,6 +70,92 @@ def test_arrays_and_numpy_numbers_are_numbers():
 
 def test_nobody_is_legal():
     assert read_boxes([]) == read_boxes({"people": []}) == []
+
+
+KITTI = b"Pedestrian 0 0 -0.2 712 143 810 307 1.89 0.48 1.2 1.84 1.47 8.41 0.01\n"
+ROW = [10.0, -2.0, 0.5, 0.6, 0.7, 1.8, 0.3]
+
+
+def npy(array):
+    file = io.BytesIO()
+    np.save(file, array)
+    return file.getvalue()
+
+
+def fields(box):
+    return [*box.center.tolist(), *box.size.tolist(), box.yaw]
+
+
+def test_rows_of_seven_numbers(tmp_path):
+    rows = np.array([ROW, [1, 2, 3, 0.5, 0.6, 1.7, -1]])
+    (tmp_path / "boxes.npy").write_bytes(npy(rows))
+    (tmp_path / "boxes.json").write_text(json.dumps(rows.tolist()))
+    (tmp_path / "people.json").write_text(json.dumps({"people": rows.tolist()}))
+    files = [tmp_path / name for name in ("boxes.npy", "boxes.json", "people.json")]
+    for source in (rows, rows.astype("f4"), rows.tolist(), {"people": rows}, tuple(rows), *files):
+        boxes = read_boxes(source)
+        np.testing.assert_allclose([fields(box) for box in boxes], rows, rtol=1e-6)
+        assert [box.id for box in boxes] == [None, None]
+    assert read_boxes(np.empty((0, 7))) == []
+
+
+def test_boxes_rows_and_objects_may_be_mixed():
+    box = Box(center=[1, 2, 3], size=[1, 1, 2], id="b")
+    (alone,) = read_boxes(box)
+    mixed = read_boxes([PERSON, box, ROW, np.array(ROW)])
+    assert alone is box and mixed[1] is box
+    assert fields(mixed[0]) == fields(mixed[2]) == fields(mixed[3]) == ROW
+
+
+def rotation(axis, angle):
+    return axis_angle_to_matrix(angle * np.eye(3)["xyz".index(axis)])
+
+
+@pytest.mark.parametrize("tracking", [False, True])
+def test_kitti_labels_come_in_the_frame_of_the_lidar(tmp_path, tracking):
+    """A label written from boxes that are known in the LiDAR's frame, by the forward transform."""
+    # the camera looks ahead: its x is the LiDAR's -y, its y is -z, its z is x; then a little askew
+    R_cam_velo = rotation("x", 0.02) @ np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0.0]])
+    t_cam_velo = np.array([0.03, -0.08, -0.27])
+    rectify = rotation("y", 0.01) @ rotation("z", -0.008)
+    rows = np.array(
+        [[12.0, 3.0, -0.8, 0.6, 0.7, 1.8, 0.4], [7, -2, -0.7, 1.8, 0.6, 1.7, -2.5], [5, 0, -1, 0.8, 0.8, 1.2, 3]]
+    )
+    lines = ["Car 0 0 0 1 2 3 4 1.5 1.6 4 1 2 3 0", "DontCare -1 -1 -10 1 2 3 4 -1 -1 -1 -1000 -1000 -1000 -10"]
+    for kind, (x, y, z, length, width, height, yaw) in zip(
+        ("Pedestrian", "Cyclist", "Person_sitting"), rows, strict=True
+    ):
+        foot = rectify @ (R_cam_velo @ [x, y, z] + t_cam_velo) + [0, height / 2, 0]
+        ahead = rectify @ R_cam_velo @ [np.cos(yaw), np.sin(yaw), 0]
+        values = [height, width, length, *foot, np.arctan2(-ahead[2], ahead[0])]
+        lines.append(
+            f"{kind} 0 0 0 1 2 3 4 " + " ".join(f"{value:.6f}" for value in values) + " 0.9" * (kind == "Cyclist")
+        )
+    for folder in ("label_2", "calib"):
+        (tmp_path / folder).mkdir()
+    label, calib = tmp_path / "label_2" / "000001.txt", tmp_path / "calib" / "000001.txt"
+    label.write_text("\n".join(lines) + "\n")
+    names = ("R_rect", "Tr_velo_cam") if tracking else ("R0_rect:", "Tr_velo_to_cam:")
+    matrices = (rectify, np.column_stack([R_cam_velo, t_cam_velo]))
+    texts = [f"{n} {' '.join(f'{v:.9e}' for v in m.ravel())}" for n, m in zip(names, matrices, strict=True)]
+    calib.write_text("P0: 1 0 0\n" + "\n".join(texts) + "\n")
+    boxes = read_boxes(label)
+    # a camera's vertical is not quite the LiDAR's: 4 cm and a degree at most
+    np.testing.assert_allclose([fields(box) for box in boxes], rows, atol=0.04)
+    np.testing.assert_allclose([box.size for box in boxes], rows[:, 3:6], atol=1e-6)
+    assert [fields(box) for box in read_boxes(label, calib=calib)] == [fields(box) for box in boxes]
+
+    for text, words in (
+        (texts[0], ["expected Tr_velo_to_cam: and 12 numbers, got R"]),
+        (texts[0].replace("e", "x") + "\n" + texts[1], ["expected R0_rect: and 9 numbers"]),
+        (texts[1] + "\n" + names[0] + " 1 1 0 0 1 0 0 0 1", ["expected a rotation as R0_rect"]),
+    ):
+        calib.write_text(text)
+        with pytest.raises(InputError) as caught:
+            read_boxes(label)
+        one_line(caught.value, f"{calib}: ", *words)
+    label.write_text("\n".join(lines[:2]))
+    assert read_boxes(label, calib=tmp_path / "none.txt") == []
 
 
 def changed(**changes):
@@ -96,6 +193,12 @@ BAD = {
     "boolean yaw": (changed(yaw=False), ["people[1].yaw", "false"]),
     "nan yaw": (changed(yaw=math.nan), ["people[1].yaw", "NaN"]),
     "degrees": (changed(yaw=90), ["people[1].yaw", "got 90", "pi / 180"]),
+    "id twice": (changed(), ["people[1].id", 'got "a", which people[0] has too']),
+    "seven with text": ([ROW, [1, 2, 3, 4, 5, "6", 7]], ["people[1].size"]),
+    "six numbers": ([ROW[:6]], ["people[0]", "[x, y, z, l, w, h, yaw]"]),
+    "row alone": (ROW, ["people[0]", "got 10.0"]),
+    "array of one row": (np.array(ROW), ["people[0]", "got 10.0"]),
+    "array of nothing": (np.array(3.0), ["list of people", "got 3.0"]),
     "list as id": (changed(id=[1]), ["people[1].id", "[1]"]),
     "boolean id": (changed(id=True), ["people[1].id", "true"]),
     "fraction as track": (changed(id=None, track=1.5), ["people[1].track", "1.5"]),
@@ -128,7 +231,13 @@ def test_bad_structure(case):
             b"center,size\n1,2\n",
             ['expected JSON {"people": [{"center": [x, y, z], "size"', "got text: write the boxes"],
         ),
-        (b"Pedestrian 0 0 -0.2 712 143 810 307 1.89 0.48 1.2 1.84 1.47 8.41 0.01\n", ["got text"]),
+        (b"Pedestrian 0 0 -0.2 712 143 810 307 1.89 0.48 1.2 1.84 1.47 8.41\n", ["got text"]),
+        (KITTI, ["is a KITTI label: expected its calibration at", "calib/boxes.json", "put it there or name it"]),
+        (KITTI.replace(b" 8.41", b" nan"), ["got text"]),
+        (KITTI + KITTI.replace(b" 8.41", b" far"), ["15 values on line 2, got 'Pedestrian 0 0 -0.2"]),
+        (npy(np.zeros((2, 8))), ["people[0]", "[x, y, z, l, w, h, yaw]"]),
+        (npy(np.zeros((2, 7))), ["people[0].size", "positive"]),
+        (npy(np.zeros((2, 7)))[:-1], ["cut off"]),
         (b'{"people": "\xe4"}', ["UTF-8"]),
         (b"[" * 100_000, ["JSON"]),
         (b"[" + b"9" * 5000 + b"]", ["JSON"]),

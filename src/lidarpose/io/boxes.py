@@ -1,70 +1,182 @@
-"""A detector's boxes from JSON: `{"people": [{"center": [x, y, z], "size": [l, w, h], "yaw": r, "id": ...}]}`."""
+"""People's boxes: a detector's JSON, arrays of seven numbers, and KITTI's labels with their calibration.
+
+JSON is `{"people": [{"center": [x, y, z], "size": [l, w, h], "yaw": r, "id": ...}]}` or the bare list; an entry may be
+the row [x, y, z, l, w, h, yaw] too.
+"""
 
 import difflib
 import json
 import math
 import os
+from pathlib import Path
 
 import numpy as np
 
 from lidarpose.errors import InputError
-from lidarpose.io.files import file_error, read_bytes
+from lidarpose.io.files import FormatError, file_error, read_bytes, shorten
+from lidarpose.io.point_cloud import load_array
 from lidarpose.sample import FARTHEST, Box, box_id
 
 # nobody writes more than two full turns in radians; 30, 90 or 180 are degrees
 _MAX_YAW = 4 * math.pi
 
-_MAX_SHOWN = 60
-
 _FORM = '{"people": [{"center": [x, y, z], "size": [l, w, h]}]}'
 
+# KITTI's classes of people; a cyclist's box holds the bicycle too
+_KITTI_PEOPLE = ("Pedestrian", "Person_sitting", "Cyclist")
+# how far a calibration's rotations may be from orthogonal: files keep seven digits
+_ROTATION_TOLERANCE = 1e-3
 
-def read_boxes(source: str | os.PathLike | dict | list) -> list[Box]:
-    """The people's boxes of a JSON file, or of the same structure already loaded.
 
-    `source` holds `{"people": [...]}` or the bare list. Each entry needs `center` [x, y, z] m and `size` [length,
-    width, height] m; `yaw` rad about z is 0 where it is absent; the id is `id`, else `track`, else None. Other keys
-    are ignored. The frame is that of the points. No people is legal.
+def read_boxes(
+    source: str | os.PathLike | dict | list | tuple | np.ndarray | Box, *, calib: str | os.PathLike | None = None
+) -> list[Box]:
+    """The boxes of people, in the frame of the points, metres and radians.
 
-    Raises InputError, one line that names the file, the entry (counted from 0, as in JSON paths) and the key.
+    Args:
+        source: a file, its content, or boxes. A file is JSON, a .npy array (n, 7), or a KITTI label (`label_2/N.txt`,
+            of which pedestrians, sitting people and cyclists are read, moved to the LiDAR's frame). Content is
+            `{"people": [...]}` or the bare list, of which each entry is a `Box`, a row [x, y, z, l, w, h, yaw] or a
+            dict: `center` [x, y, z], `size` [length, width, height], `yaw` about z (0 where it is absent), and as id
+            `id`, else `track`, else None; other keys are ignored. An array (n, 7) has such rows.
+        calib: KITTI's calibration file; None for `../calib/N.txt` beside a label.
+
+    Returns:
+        A `Box` for each entry, in order. No people is legal.
+
+    Raises:
+        InputError: one line that names the file, the entry (counted from 0, as in JSON paths) and the key. Two entries
+            of one id are an error, since results are told apart by it.
     """
-    if isinstance(source, dict | list):
-        name, content = "boxes", source
-    else:
-        name, content = source, _load_json(source)
+    name, content = "boxes", source
+    if isinstance(source, Box):
+        content = [source]
+    elif not isinstance(source, dict | list | tuple | np.ndarray):
+        name, content = source, _load_file(source, calib)
     if isinstance(content, dict):
         if "people" not in content and {"center", "size"} <= content.keys():
             raise file_error(name, f"expected {_FORM}, got one box alone: put it in a list, [{{...}}]")
         if "people" not in content:
             raise file_error(name, f'expected a list under the key "people", {_keys(content, "people")}')
         content = content["people"]
-    if not isinstance(content, list):
+    if isinstance(content, np.ndarray):
+        content = content.tolist()
+    if not isinstance(content, list | tuple):
         raise file_error(name, f'expected {{"people": [...]}} or a list of people, got {_show(content)}')
-    return [_box(entry, name, f"people[{i}]") for i, entry in enumerate(content)]
+    boxes = [_box(entry, name, f"people[{i}]") for i, entry in enumerate(content)]
+    first: dict[str | int, int] = {}
+    for i, box in enumerate(boxes):
+        if box.id is not None and first.setdefault(box.id, i) != i:
+            came = f"{_show(box.id)}, which people[{first[box.id]}] has too"
+            raise file_error(name, f"people[{i}].id: expected an id of its own, got {came}: rename one or leave it out")
+    return boxes
 
 
-def _load_json(path: str | os.PathLike) -> object:
+def _load_file(path: str | os.PathLike, calib: str | os.PathLike | None) -> object:
     data = read_bytes(path, expected="a JSON file of boxes")
     try:
-        return json.loads(data.decode("utf-8-sig"))
+        if data.startswith(b"\x93NUMPY"):
+            return load_array(data)
+        text = data.decode("utf-8-sig")
+        return _read_kitti(path, text, calib) if _is_kitti(text) else json.loads(text)
+    except InputError:
+        # of the calibration
+        raise
+    except FormatError as error:
+        raise file_error(path, error) from None
     except json.JSONDecodeError as error:
         start = error.doc.lstrip()[:1]
         if start and start not in "{[":
-            # a table of another tool, as KITTI's labels or CSV
-            raise file_error(path, f"expected JSON {_FORM}, got text: write the boxes so") from None
+            # a table of another tool, as CSV
+            raise file_error(path, f"expected JSON {_FORM} or a KITTI label, got text: write the boxes so") from None
         where = f"line {error.lineno}, column {error.colno}"
         raise file_error(path, f"is not JSON: {error.msg} at {where}; correct it there") from None
     except UnicodeDecodeError as error:
-        raise file_error(
-            path, f"expected JSON in UTF-8, got byte {error.start} that is not; save it as UTF-8"
-        ) from None
+        came = f"byte {error.start} that is not"
+        raise file_error(path, f"expected JSON in UTF-8, got {came}; save it as UTF-8") from None
     except (ValueError, RecursionError) as error:
         raise file_error(path, f"cannot be read as JSON ({error}); expected a list of boxes") from None
 
 
+# ---- KITTI: https://www.cvlibs.net/datasets/kitti/eval_object.php, readme.txt of the development kit
+
+
+def _is_kitti(text: str) -> bool:
+    """Whether the first line has a label's values: class, truncation, occlusion, angle, 4 of the picture, 7 of the box,
+    and a score where it is a result."""
+    words = text.lstrip().partition("\n")[0].split()
+    return len(words) in (15, 16) and all(_number_of(word) is not None for word in words[1:])
+
+
+def _read_kitti(path: str | os.PathLike, text: str, calib: str | os.PathLike | None) -> list[list[float]]:
+    """Rows [x, y, z, l, w, h, yaw] in the LiDAR's frame of the people in a label."""
+    people = []
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.split()
+        if not words or words[0] not in _KITTI_PEOPLE:
+            continue
+        values = [_number_of(word) for word in words[8:15]]
+        if len(values) != 7 or None in values:
+            raise FormatError(
+                f"expected a KITTI label of 15 values on line {number}, got {shorten(line)!r}: correct it"
+            )
+        people.append(values)
+    if not people:
+        return []
+    if calib is None:
+        calib = Path(os.path.abspath(os.fsdecode(path))).parents[1] / "calib" / Path(os.fsdecode(path)).name
+        if not calib.is_file():
+            raise FormatError(
+                f"is a KITTI label: expected its calibration at {calib}, got none: put it there or name it (calib)"
+            )
+    R_rect_velo, t_rect_velo = _read_calibration(calib)
+    rows = []
+    for height, width, length, x, y, z, rotation_y in people:
+        # the camera's y points down and a label's place is the middle of the box's bottom
+        center = R_rect_velo.T @ (np.array([x, y - height / 2, z]) - t_rect_velo)
+        ahead = R_rect_velo.T @ [math.cos(rotation_y), 0, -math.sin(rotation_y)]
+        rows.append([*center.tolist(), length, width, height, math.atan2(ahead[1], ahead[0])])
+    return rows
+
+
+def _read_calibration(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
+    """R (3, 3) and t (3,) m from the LiDAR's frame to that of the rectified camera 0, in which labels are."""
+    text = read_bytes(path, expected="KITTI's calibration").decode("utf-8", "replace")
+    lines = {words[0].rstrip(":"): words[1:] for words in map(str.split, text.splitlines()) if words}
+    matrices = []
+    for keys, shape in ((("R0_rect", "R_rect"), (3, 3)), (("Tr_velo_to_cam", "Tr_velo_cam"), (3, 4))):
+        values = [_number_of(word) for key in keys for word in lines.get(key, ())]
+        if len(values) != math.prod(shape) or None in values:
+            came = shorten(", ".join(lines)) or "nothing"
+            raise file_error(path, f"expected {keys[0]}: and {math.prod(shape)} numbers, got {came}: copy it again")
+        matrix = np.array(values).reshape(shape)
+        if np.abs(matrix[:, :3] @ matrix[:, :3].T - np.eye(3)).max() > _ROTATION_TOLERANCE:
+            raise file_error(path, f"expected a rotation as {keys[0]}, got a matrix that is none: copy it again")
+        matrices.append(matrix)
+    rectify, T_cam_velo = matrices
+    return rectify @ T_cam_velo[:, :3], rectify @ T_cam_velo[:, 3]
+
+
+def _number_of(word: str) -> float | None:
+    """A word's number, else None."""
+    try:
+        return _number(float(word))
+    except ValueError:
+        return None
+
+
+# ---- one entry
+
+
 def _box(entry: object, name: object, where: str) -> Box:
+    if isinstance(entry, Box):
+        return entry
+    entry = entry.tolist() if isinstance(entry, np.ndarray) else entry
+    if isinstance(entry, list | tuple) and len(entry) == 7:
+        entry = {"center": entry[:3], "size": entry[3:6], "yaw": entry[6]}
     if not isinstance(entry, dict):
-        raise file_error(name, f'{where}: expected {{"center": [x, y, z], "size": [l, w, h]}}, got {_show(entry)}')
+        expected = '{"center": [x, y, z], "size": [l, w, h]} or [x, y, z, l, w, h, yaw]'
+        raise file_error(name, f"{where}: expected {expected}, got {_show(entry)}")
     center = _triple(entry, "center", name, where, meaning="[x, y, z]")
     size = _triple(entry, "size", name, where, meaning="[length, width, height]")
     if min(size) <= 0:
@@ -83,9 +195,9 @@ def _triple(entry: dict, key: str, name: object, where: str, *, meaning: str) ->
         raise file_error(name, f'{where}: expected the key "{key}" {meaning} in metres, {_keys(entry, key)}')
     value = entry[key]
     try:
-        numbers = [_number(v) for v in value] if not isinstance(value, str | bytes | dict) else [None]
+        numbers = [_number(v) for v in value] if not isinstance(value, str | bytes | dict) else []
     except TypeError:
-        numbers = [None]
+        numbers = []
     if len(numbers) != 3 or None in numbers:
         raise file_error(name, f"{where}.{key}: expected three finite numbers {meaning} in metres, got {_show(value)}")
     return numbers
@@ -121,15 +233,11 @@ def _keys(entry: dict, wanted: str) -> str:
     names = [str(key) for key in entry]
     near = difflib.get_close_matches(wanted, names, n=1, cutoff=0.6)
     hint = f"; rename {near[0]!r}" if near else ""
-    return f"got the keys {_cut(', '.join(names))}{hint}"
+    return f"got the keys {shorten(', '.join(names), 60)}{hint}"
 
 
 def _show(value: object) -> str:
     try:
-        return _cut(json.dumps(value))
+        return shorten(json.dumps(value), 60)
     except (TypeError, ValueError):
-        return _cut(repr(value))
-
-
-def _cut(text: str) -> str:
-    return text if len(text) <= _MAX_SHOWN else text[: _MAX_SHOWN - 3] + "..."
+        return shorten(repr(value), 60)

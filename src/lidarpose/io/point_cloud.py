@@ -212,7 +212,7 @@ def _width(rows: np.ndarray) -> float:
 
 
 def _parse_npy(data: bytes):
-    return _points_of(_load_array(data), "the array")
+    return _points_of(load_array(data), "the array")
 
 
 def _parse_npz(data: bytes):
@@ -226,7 +226,7 @@ def _parse_npz(data: bytes):
         raise FormatError(
             f"expected a NumPy .npz archive, got a damaged or cut off one ({reason}): save it again"
         ) from None
-    return _points_of(_load_array(content), f"the array {shorten(key)!r}")
+    return _points_of(load_array(content), f"the array {shorten(key)!r}")
 
 
 def _choose_array(archive: zipfile.ZipFile) -> tuple[str, bytes]:
@@ -262,7 +262,7 @@ def _array_header(file) -> tuple[tuple[int, ...], np.dtype]:
         ) from None
 
 
-def _load_array(data: bytes) -> np.ndarray:
+def load_array(data: bytes) -> np.ndarray:
     """The array in a .npy file's bytes; nothing is unpickled, and the size is checked before the values are read."""
     file = io.BytesIO(data)
     shape, dtype = _array_header(file)
