@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 from shard_files import write_shard
 
 from lidarpose.data import writer
-from lidarpose.data.labeled import labeled_row, sample_of
 from lidarpose.data.prepare import READERS, PartWriter, prepare
 from lidarpose.data.readers.humanm3 import HumanM3
+from lidarpose.data.schema import labeled_row, sample_of
 from lidarpose.data.shards import open_dataset, read_rows
 from lidarpose.data.splits import SplitRule, _published, split_rule
 from lidarpose.data.summary import lines_of

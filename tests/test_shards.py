@@ -1,18 +1,21 @@
 """Parquet shards: what goes in comes out, for us and for pandas, and damage is told."""
 
 import json
+import sys
 from dataclasses import fields, replace
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
 from pyarrow import parquet
 from shard_files import write_shard
 
+from lidarpose.cli import main
 from lidarpose.data import shards
-from lidarpose.data.labeled import person_row, sample_of
+from lidarpose.data.schema import person_row, sample_of
 from lidarpose.data.shards import DatasetCard, open_dataset, read_card, read_rows, write_card
-from lidarpose.errors import InputError
+from lidarpose.errors import InputError, MissingExtra
 from lidarpose.sample import Box, PersonInfo, Pose, Sample
 from lidarpose.skeleton import BODY26
 
@@ -96,6 +99,15 @@ def test_whole_turns_come_back(tmp_path):
     np.testing.assert_array_equal(found[1]["joints"].reshape(-1, 26, 3), row["joints"])
     with pytest.raises(InputError, match="no shard of people: the columns center"):
         list(read_rows(tmp_path / "f.parquet", "people"))
+    for name, value, problem in (
+        ("person", None, "column person has nulls"),
+        ("ring", [1], "columns points, ring, .* different numbers"),
+        ("points", [1.0], "columns points, ring, .* different numbers"),
+        ("box", [1.0] * 8, "columns track, box, joints .* different numbers"),
+    ):
+        write_shard(tmp_path / "g.parquet", "frames", [row | {name: value}])
+        with pytest.raises(InputError, match=f"g.parquet: {problem}"):
+            list(read_rows(tmp_path / "g.parquet", "frames"))
 
 
 def test_damaged_and_missing_shards_are_named(folder):
@@ -207,13 +219,75 @@ def test_every_fact_is_a_column_and_older_shards_may_lack_one(tmp_path, people):
     assert row["kind"] is None and row["sensor"] == "os1-64"
 
 
-@pytest.mark.parametrize("column", ["points", "part"])
-def test_a_column_of_another_type_is_one_line(tmp_path, people, column):
-    path = tmp_path / "a.parquet"
-    write_shard(path, "people", [person_row(people[0], index=0)])
+def with_column(path, column, values):
     table = parquet.read_table(path)
     place = table.schema.get_field_index(column)
-    parquet.write_table(table.set_column(place, column, [["a text"]]), path)
-    with pytest.raises(InputError, match="a.parquet: cannot be read as Parquet") as caught:
-        list(read_rows(path, "people"))
+    parquet.write_table(table.set_column(place, column, [values]), path)
+
+
+@pytest.mark.parametrize(
+    ("column", "values", "message"),
+    [
+        ("points", [["a text"]] * 3, "column points is list<.*string>, expected float32\\[\\]"),
+        ("part", [["a text"]] * 3, "column part is list<.*string>, expected uint8"),
+        ("points", ["a text"] * 3, "column points is string, expected float32\\[\\]"),
+        ("box_yaw", ["a text"] * 3, "column box_yaw is string, expected float64"),
+        ("part", [[None] * 30, [], [None]], "column part has nulls in its lists, expected uint8"),
+    ],
+)
+def test_a_column_of_another_type_is_one_line(folder, column, values, message):
+    with_column(folder / "people-00000.parquet", column, values)
+    with pytest.raises(InputError, match=f"people-00000.parquet: {message}") as caught:
+        list(open_dataset(folder))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "message"),
+    [
+        ("points", None, "column points is null, expected float32"),
+        ("index", None, "column index is null, expected int64"),
+        ("source", None, "column source is null, expected string"),
+        ("points", [1.0], "column points has 1 values, expected three for each point"),
+        ("joints", [1.0, 2.0, 3.0], "column joints has 3 values, expected 78"),
+        ("center", [1.0], "column center has 1 values, expected 3"),
+        ("part", [1], "column part has 1 values, expected 30"),
+        ("box_size", [1.0, 2.0], "column box_size has 2 values, expected 3"),
+        ("box_yaw", None, "columns box_center, box_size, box_yaw: some are null"),
+    ],
+)
+def test_a_null_or_a_short_list_is_one_line(folder, column, value, message):
+    path = folder / "people-00000.parquet"
+    table = parquet.read_table(path)
+    rest = table[column].to_pylist()[1:]
+    with_column(path, column, pa.array([value, *rest], table[column].type))
+    place = folder if column == "index" else path
+    with pytest.raises(
+        InputError, match=f"{place}: row of index .* is no sample: {message}.*; write it again"
+    ) as caught:
+        list(open_dataset(folder))
+    assert "\n" not in str(caught.value)
+
+
+def test_damaged_columns_are_one_line_wherever_shards_are_read(folder, capsys, monkeypatch):
+    monkeypatch.chdir(folder)
+    with_column(folder / "people-00000.parquet", "points", [None] * 3)
+    for words in (["view", "."], ["view", ".", "--html"], ["pretrain", "--shards", "."]):
+        assert main(words) == 2
+        captured = capsys.readouterr()
+        assert "people-00000.parquet: row of index 0 is no sample: column points is null" in captured.err
+        assert captured.err.count("\n") == 1
+
+
+def test_a_count_of_a_billion_is_no_reason_to_look_for_them(folder):
+    card = read_card(folder)
+    write_card(folder, replace(card, count=10**9, per_shard=1))
+    (folder / "people-99999999999999999999.parquet").write_bytes(b"")
+    # would never end
+    assert open_dataset(folder).written() == [0, 1]
+
+
+def test_without_pyarrow_the_extra_is_named(folder, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(MissingExtra, match="^reading and writing Parquet needs an optional dependency: .*synth"):
+        open_dataset(folder)

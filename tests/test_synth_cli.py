@@ -98,6 +98,19 @@ def test_workers_give_the_same_bytes(dataset, tmp_path, capsys):
     assert "0 people made, 60 were there" in capsys.readouterr().err
 
 
+def test_a_second_command_leaves_the_first_one_s_files_alone(tmp_path, capsys):
+    out = tmp_path / "out"
+    first = command(out)
+    until = time.monotonic() + 60
+    while not list(out.glob(".*-people-*")) and first.poll() is None and time.monotonic() < until:
+        time.sleep(0.002)
+    assert synth(out, *WORDS) == 2
+    assert "another process writes this dataset: wait for its end" in one_line(capsys)
+    assert "Traceback" not in first.communicate()[1] and first.returncode == 0
+    # nor is anything left of the lock
+    assert synth(out, *WORDS) == 0 and sorted(content(out))[0] == "dataset.json"
+
+
 def test_a_shard_of_too_few_people_is_made_again(dataset, tmp_path):
     out = tmp_path / "short"
     shutil.copytree(dataset, out)

@@ -15,12 +15,12 @@ from itertools import repeat
 from pathlib import Path
 from typing import Any
 
-from lidarpose.data.labeled import labeled_row
 from lidarpose.data.readers.base import Reader, Skipped
+from lidarpose.data.schema import labeled_row
 from lidarpose.data.shards import CARD, SENSOR_FRAME, DatasetCard, open_dataset, shard_path, shard_writer, write_card
 from lidarpose.data.splits import SplitRule, split_rule
 from lidarpose.data.summary import summarize
-from lidarpose.data.writer import clean_folder, make_shards, open_folder
+from lidarpose.data.writer import locked, make_shards, open_folder
 from lidarpose.errors import InputError, check_name
 from lidarpose.io.files import file_error, one_line
 from lidarpose.sample import LabeledSample
@@ -103,10 +103,6 @@ def prepare(
     about = getattr(source, "about", {})
     card = _card(name, source, parts, rule, split, about)
     missing = open_folder(out, card)
-    clean_folder(out)
-    # the summary of a run that is not over would be wrong
-    if missing or not (out / CARD).is_file():
-        write_card(out, card)
     make = PartWriter(
         name=name,
         smpl=None if smpl is None else str(smpl),
@@ -117,17 +113,20 @@ def prepare(
         rule=rule,
         only=split,
     )
-    with ExitStack() as stack:
-        bar = _bar(stack, len(parts), len(missing)) if progress else None
-        people = 0
-        for shards, more in make_shards(make, missing, workers=workers):
-            people += more
-            if bar is not None:
-                bar.set_postfix_str(f"{people:,} people", refresh=False)
-                bar.update(shards)
-    clean_folder(out)
-    summary = summarize(open_dataset(out), parts=parts, absent=absent, rule=rule)
-    write_card(out, replace(card, summary=summary))
+    with locked(out):
+        # the summary of a run that is not over would be wrong
+        if missing or not (out / CARD).is_file():
+            write_card(out, card)
+        with ExitStack() as stack:
+            bar = _bar(stack, len(parts), len(missing)) if progress else None
+            people = 0
+            for shards, more in make_shards(make, missing, workers=workers):
+                people += more
+                if bar is not None:
+                    bar.set_postfix_str(f"{people:,} people", refresh=False)
+                    bar.update(shards)
+        summary = summarize(open_dataset(out), parts=parts, absent=absent, rule=rule)
+        write_card(out, replace(card, summary=summary))
     return summary
 
 

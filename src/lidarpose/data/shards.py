@@ -1,44 +1,15 @@
-"""Datasets of people as Parquet shards: a folder with dataset.json and numbered .parquet files.
-
-Any reader of Parquet opens them (pandas, DuckDB, Hugging Face datasets, Ray, ...). A row of people-*.parquet is one
-person in one frame; columns (`PEOPLE`):
-
-    index, frame, track     number of the person, clip or street in the dataset; frame of it; person in a street
-    points                  x, y, z of all points one after the other, m: reshape to (n, 3); the level frame at the
-                            sensor, x forward, y left, z up
-    part, ring              one a point: 0 = not body, 1 + j = the bone of SMPL-24's joint j; the beam
-    joints                  x, y, z of the joints named in dataset.json, m
-    center                  origin of the person's own frame, found from the points
-    box_center, box_size, box_yaw    a detector's box: m, m, rad
-    source, frame_id        as in `Sample`
-    sensor, kind, ...       what is known besides, see `lidarpose.sample.PersonInfo`; null where it was not measured
-
-Datasets of real people, which `lidarpose prepare` wrote, have a part of the raw files (a sequence, a file) in each
-shard: labelled-*.parquet (columns as above where they mean the same, see `schema.TABLES`; index numbers the part) with
-
-    sequence, time, split   of the raw dataset; s since the sequence's beginning; train, val, test or null
-    track                   text; the person in the sequence
-    joints                  NaN where a joint is not labelled
-    joint_labels            one a joint: 0 not labelled, 1 hidden or uncertain, 2 seen
-    center_trans, ...       other origins that published protocols use, m; null where there is none
-    distance                of the center from the sensor, m; null where nobody knows the sensor's place
-
-and skipped-*.parquet: what was left out, `reason` and `where`.
-
-Streets have frames-*.parquet beside them (`FRAMES`): whole turns of the sensor, with the person of every point, and
-of everybody in the street, seen or not, track (P,), box (P, 7: center, size, yaw) and joints (P, J, 3), flattened.
-"""
+"""Datasets of people as Parquet shards: a folder with dataset.json and numbered .parquet files, see `data.schema`."""
 
 import json
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from lidarpose._version import __version__
-from lidarpose.data.labeled import sample_of
-from lidarpose.data.schema import FACTS, TABLES, arrays_of, pyarrow, rows_of, schema_of
+from lidarpose.data.schema import INFO, TABLES, arrays_of, pyarrow, rows_of, sample_of, schema_of
 from lidarpose.errors import InputError
 from lidarpose.io.files import atomic_path, file_error, read_bytes, write_atomic
 from lidarpose.sample import LabeledSample
@@ -201,21 +172,21 @@ def rows_of_shard(path: str | Path) -> int | None:
 def read_rows(path: str | Path, table: str, columns: tuple[str, ...] | None = None) -> Iterator[dict[str, Any]]:
     """The rows of a shard, list columns as numpy arrays; of `columns` alone where they are named, the others None.
 
-    Raises InputError for a damaged file or other columns.
+    Raises InputError for a damaged file, and for a column that is missing or of another type.
     """
     pa, parquet = pyarrow()
     try:
         with parquet.ParquetFile(path, page_checksum_verification=True) as file:
             there = [name for name in TABLES[table] if name in file.schema_arrow.names]
-            optional = FACTS if table == "people" else ()
+            optional = INFO if table == "people" else ()
             missing = [name for name in TABLES[table] if name not in there and name not in optional]
             if missing:
-                raise file_error(path, f"is no shard of {table}: the columns {', '.join(missing)} are missing")
+                raise InputError(f"is no shard of {table}: the columns {', '.join(missing)} are missing")
             wanted = there if columns is None else [name for name in there if name in columns]
             for batch in file.iter_batches(batch_size=_ROW_GROUP[table], columns=wanted):
-                yield from rows_of(batch, table)
-    except InputError:
-        raise
+                yield from rows_of(pa, batch, table)
+    except InputError as error:
+        raise file_error(path, error) from None
     except (pa.ArrowException, OSError, ValueError, TypeError, AttributeError, MemoryError) as error:
         raise file_error(path, f"cannot be read as Parquet ({error}); delete it and make it again") from None
 
@@ -227,20 +198,29 @@ class DatasetReader:
     folder: Path
     card: DatasetCard
 
-    def rows(self, table: str | None = None, shards: range | None = None) -> Iterator[dict[str, Any]]:
+    def path(self, shard: int, table: str | None = None) -> Path:
+        """A shard of a table, by default that of people."""
+        return shard_path(self.folder, table or self.card.people, shard)
+
+    def written(self, table: str | None = None) -> list[int]:
+        """Numbers of the shards of a table, by default that of people, that are there: no count in dataset.json makes
+        this long."""
+        name = re.compile(rf"{table or self.card.people}-(\d{{5,9}})\.parquet")
+        numbers = (name.fullmatch(path.name) for path in self.folder.iterdir())
+        return sorted(k for k in (int(number[1]) for number in numbers if number) if k < self.card.shards)
+
+    def rows(self, table: str | None = None, shards: Iterable[int] | None = None) -> Iterator[dict[str, Any]]:
         """The rows of a table, of some shards or of all; see `TABLES`. By default those of people."""
-        table = table or self.card.people
         for shard in range(self.card.shards) if shards is None else shards:
-            path = shard_path(self.folder, table, shard)
+            path = self.path(shard, table)
             if not path.is_file():
-                raise file_error(
-                    path, f"is missing: the dataset is not finished; run the same {self.card.writer} again"
-                )
-            yield from read_rows(path, table)
+                again = f"run the same {self.card.writer} again"
+                raise file_error(path, f"is missing: the dataset is not finished; {again}")
+            yield from read_rows(path, table or self.card.people)
 
     def rows_of(self, table: str, shard: int) -> int:
         """How many rows a shard has. Raises InputError where it is missing or damaged."""
-        path = shard_path(self.folder, table, shard)
+        path = self.path(shard, table)
         rows = rows_of_shard(path)
         if rows is None:
             problem = "is damaged" if path.exists() else "is missing: the dataset is not finished"
@@ -269,11 +249,14 @@ class DatasetReader:
     items = samples
 
     def sample(self, row: dict[str, Any]) -> LabeledSample:
-        """The sample of a row of people. Raises InputError for a row that is none."""
+        """The sample of a row of people. Raises InputError that names its shard and column for a row that is none."""
         try:
             return sample_of(row, self.card.skeleton, self.card.settings.get("what", "people"))
         except (ValueError, TypeError, AttributeError, KeyError) as error:
-            raise file_error(self.folder, f"row {row['index']} is no sample ({error}); write it again") from None
+            number = row.get("index")
+            shard = number is not None and self.path(number // self.card.per_shard)
+            problem = f"row of index {number} is no sample: {error}; write it again"
+            raise file_error(shard or self.folder, problem) from None
 
 
 def open_dataset(folder: str | Path) -> DatasetReader:

@@ -10,27 +10,31 @@ import os
 import re
 import signal
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 from lidarpose.data.schema import TABLES
 from lidarpose.data.shards import CARD, DatasetCard, check_settings, read_card, rows_of_shard, shard_path
-from lidarpose.errors import InputError
-from lidarpose.io.files import file_error
+from lidarpose.errors import InputError, MissingExtra
+from lidarpose.io.files import check_writable, file_error
+
+try:
+    from filelock import FileLock, Timeout
+except ImportError:
+    raise MissingExtra("writing a dataset", "synth") from None
 
 # makes and writes a shard, by its number; yields how many people, clips or streets are done since it last did
 Make = Callable[[int], Iterator[int]]
 
 # how often progress is told, s
 _TICK = 0.5
-# a temporary file nobody wrote to for so long is of a run that is no more, s
-_STALE = 600.0
+# in a dataset's folder while a process writes there
+LOCK = ".lock"
 # the temporary names of `files.atomic_path`
-_LEFT = re.compile(rf"\.(\d+)-\d+-(?:(?:{'|'.join(TABLES)})-\d{{5}}\.parquet|{re.escape(CARD)})")
+_LEFT = re.compile(rf"\.\d+-\d+-(?:(?:{'|'.join(TABLES)})-\d{{5}}\.parquet|{re.escape(CARD)})")
 
 
 def open_folder(folder: Path, card: DatasetCard, rows: Mapping[str, int] | None = None) -> list[int]:
@@ -43,7 +47,7 @@ def open_folder(folder: Path, card: DatasetCard, rows: Mapping[str, int] | None 
         raise file_error(folder, "is a file; give a folder for the dataset")
     if (folder / CARD).is_file():
         check_settings(folder, read_card(folder), card)
-    elif folder.is_dir() and any(not _LEFT.fullmatch(path.name) for path in folder.iterdir()):
+    elif folder.is_dir() and any(not _LEFT.fullmatch(path.name) and path.name != LOCK for path in folder.iterdir()):
         raise file_error(folder, f"holds other files and no {CARD}; give a new or empty folder for the dataset")
     return [shard for shard in range(card.shards) if not _is_whole(folder, card, shard, rows or {})]
 
@@ -56,29 +60,43 @@ def _is_whole(folder: Path, card: DatasetCard, shard: int, rows: Mapping[str, in
     return True
 
 
-def clean_folder(folder: Path) -> None:
-    """Removes temporary files whose process is gone, or that nobody wrote to for long."""
-    for path in folder.iterdir() if folder.is_dir() else ():
-        left = _LEFT.fullmatch(path.name)
-        with suppress(OSError):
-            # a number of a process may have been given to another one
-            if left and (not _is_alive(int(left[1])) or time.time() - path.stat().st_mtime > _STALE):
-                path.unlink()
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keeps other processes from writing into a dataset's folder, and removes what killed ones left of files.
 
-
-def _is_alive(process: int) -> bool:
-    if process == os.getpid():
-        return False
-    if os.name != "posix":
-        # asking would end it there
-        return True
+    The folder is made, and removed again where nothing came into it. Raises InputError where another process writes
+    there; one that was killed does not.
+    """
+    check_writable(folder / CARD)
+    is_new = not folder.exists()
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / LOCK)
     try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True
-    return True
+        # a file system may know no locks
+        with suppress(NotImplementedError):
+            lock.acquire(timeout=0)
+    except Timeout:
+        raise file_error(
+            folder, "another process writes this dataset: wait for its end, or give another folder"
+        ) from None
+    try:
+        _clean(folder)
+        yield
+        _clean(folder)
+    finally:
+        # Windows does not let go of a file that is open
+        with suppress(OSError):
+            (folder / LOCK).unlink()
+        lock.release()
+        if is_new:
+            with suppress(OSError):
+                folder.rmdir()
+
+
+def _clean(folder: Path) -> None:
+    for path in folder.glob(".*"):
+        if _LEFT.fullmatch(path.name):
+            path.unlink(missing_ok=True)
 
 
 def make_shards(make: Make, shards: list[int], *, workers: int = 1) -> Iterator[tuple[int, int]]:

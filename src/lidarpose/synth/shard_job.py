@@ -1,7 +1,7 @@
 """The job behind `lidarpose synth`: people, clips or streets into Parquet shards; see `data.writer` for how."""
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from lidarpose.body.mocap import digest as motion_digest
-from lidarpose.data.labeled import person_row
+from lidarpose.data.schema import person_row
 from lidarpose.data.shards import CARD, DatasetCard, shard_path, shard_writer, write_card
-from lidarpose.data.writer import clean_folder, make_shards, open_folder
+from lidarpose.data.writer import locked, make_shards, open_folder
 from lidarpose.errors import InputError
 from lidarpose.io.files import content_digest, file_error
 from lidarpose.lidar.presets import SENSORS, sensor
@@ -120,33 +120,23 @@ def write_dataset(
     if missing:
         # before anything is written, so that motion that cannot be read leaves no folder
         make.get_ready()
-    clean_folder(folder)
-    is_new, has_card = not folder.exists(), (folder / CARD).is_file()
-    if not has_card:
-        write_card(folder, card)
-    if progress is not None:
-        progress(done, card.count)
-    try:
-        for _, count in make_shards(make, missing, workers=workers):
-            done += count
-            if progress is not None:
-                progress(done, card.count)
-    except InputError:
+    with locked(folder):
+        has_card = (folder / CARD).is_file()
         if not has_card:
-            _give_up(folder, is_new)
-        raise
-    clean_folder(folder)
+            write_card(folder, card)
+        if progress is not None:
+            progress(done, card.count)
+        try:
+            for _, count in make_shards(make, missing, workers=workers):
+                done += count
+                if progress is not None:
+                    progress(done, card.count)
+        except InputError:
+            # the card of settings that made nothing would keep others from following
+            if not has_card and not any(folder.glob("*.parquet")):
+                (folder / CARD).unlink()
+            raise
     return left
-
-
-def _give_up(folder: Path, is_new: bool) -> None:
-    """Takes the card of settings that made nothing away again, so that others can follow."""
-    clean_folder(folder)
-    with suppress(OSError):
-        if {path.name for path in folder.iterdir()} == {CARD}:
-            (folder / CARD).unlink()
-            if is_new:
-                folder.rmdir()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,13 +1,14 @@
 """People of a dataset on a contact sheet, or on a page to turn them in 3D."""
 
+from math import isnan
 from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.shards import CARD, DatasetReader, counted, open_dataset, shard_path
+from lidarpose.data.shards import CARD, DatasetReader, counted, open_dataset, read_rows
 from lidarpose.errors import InputError
 from lidarpose.io.files import check_apart, file_error
-from lidarpose.sample import Box, Pose
+from lidarpose.sample import Box, LabeledSample, PersonInfo, Pose
 from lidarpose.skeleton import skeleton
 from lidarpose.viz.bird_eye import MAX_SCANS, ScanPanel, draw_scans
 from lidarpose.viz.draw import MAX_PEOPLE, Panel, draw_people
@@ -29,34 +30,39 @@ def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out
     path = Path(out) if out is not None else Path(f"{name}.{'html' if html else 'png'}")
     check_apart(path, dataset.folder / CARD, *dataset.folder.glob("*.parquet"))
     is_streets = "frames" in dataset.card.tables and not html
+    # each with the number that it has in the dataset
     rows = [] if is_streets else _spread(dataset, count)
+    people = [(row["index"], dataset.sample(row)) for row in rows]
     settings = dataset.card.settings
     title = f"{name}: {counted(dataset.card.count, settings.get('what', 'people'))}"
     if "scene" in settings:
         title += f", scene {settings['scene']}"
-    if (written := len(_written(dataset))) < dataset.card.shards:
+    if (written := len(dataset.written())) < dataset.card.shards:
         title += f", {written:,} of {dataset.card.shards:,} shards written so far"
     if is_streets:
         draw_scans(_street_panels(dataset, min(count, MAX_SCANS)), path, title=title)
     elif html:
-        lines = [_line(row, dataset) for row in rows]
-        write_report(path, [_card(row, dataset) for row in rows], title=title, summary=lines)
+        lines = [_line(sample, _label(index, sample, dataset)) for index, sample in people]
+        cards = [_card(sample, _label(index, sample, dataset)) for index, sample in people]
+        write_report(path, cards, title=title, summary=lines)
     else:
-        draw_people([_panel(row, dataset) for row in rows], path, title=title)
+        panels = [_panel(sample, _label(index, sample, dataset)) for index, sample in people]
+        draw_people(panels, path, title=title)
     return path
 
 
 def _street_panels(dataset: DatasetReader, count: int) -> list[ScanPanel]:
     """`count` streets, evenly spread over the shards that are there, in their first frame."""
     there = _written(dataset, "frames")
-    streets = [(shard, k) for shard in there for k in range(dataset.card.size(shard))]
+    index = {shard: read_rows(dataset.path(shard, "frames"), "frames", ("index",)) for shard in there}
+    streets = [(shard, k) for shard in there for k in sorted({row["index"] for row in index[shard]})]
     chosen = [streets[k] for k in np.linspace(0, len(streets) - 1, min(count, len(streets))).round().astype(int)]
     panels = []
     for shard in sorted({shard for shard, _ in chosen}):
         frames: dict[int, list[dict]] = {}
-        for row in dataset.rows("frames", range(shard, shard + 1)):
-            frames.setdefault(row["index"] - shard * dataset.card.per_shard, []).append(row)
-        panels += [_street_panel(frames[k], dataset) for number, k in chosen if number == shard and k in frames]
+        for row in dataset.rows("frames", [shard]):
+            frames.setdefault(row["index"], []).append(row)
+        panels += [_street_panel(frames[k], dataset) for number, k in chosen if number == shard]
     return panels
 
 
@@ -77,12 +83,10 @@ def _street_panel(rows: list[dict], dataset: DatasetReader) -> ScanPanel:
 
 def _written(dataset: DatasetReader, table: str | None = None) -> list[int]:
     """Numbers of the shards of a table, by default of people, that are there. Raises InputError where none is."""
-    table = table or dataset.card.people
-    there = [k for k in range(dataset.card.shards) if shard_path(dataset.folder, table, k).is_file()]
+    there = dataset.written(table)
     if not there:
-        raise file_error(
-            dataset.folder, f"holds no shard yet; wait for the first one, or run {dataset.card.writer} again"
-        )
+        again = f"wait for the first one, or run {dataset.card.writer} again"
+        raise file_error(dataset.folder, f"holds no shard yet; {again}")
     return there
 
 
@@ -98,52 +102,44 @@ def _spread(dataset: DatasetReader, count: int) -> list[dict]:
     for shard, size in zip(there, sizes, strict=True):
         here = {w - first for w in wanted if first <= w < first + size}
         if here:
-            found = dataset.rows(dataset.card.people, range(shard, shard + 1))
+            found = dataset.rows(shards=[shard])
             rows += [row for k, row in enumerate(found) if k in here]
         first += size
     return rows
 
 
-def _label(row: dict, dataset: DatasetReader) -> str:
+def _label(index: int, sample: LabeledSample, dataset: DatasetReader) -> str:
     """As "#12 os1-128"; of clips and streets with the frame and the track."""
-    words = [f"#{row['index']}"]
+    words = [f"#{index}"]
     if dataset.card.settings.get("what") in ("clips", "streets"):
-        words.append(f"frame {row['frame']}")
+        words.append(f"frame {sample.frame}")
     if "frames" in dataset.card.tables:
-        words.append(f"track {row['track']}")
-    return " ".join([*words, row.get("sensor") or row["source"].rpartition("/")[2]])
+        words.append(f"track {sample.track}")
+    sensor = sample.info.sensor if sample.info else ""
+    return " ".join([*words, sensor or sample.source.rpartition("/")[2]])
 
 
-def _panel(row: dict, dataset: DatasetReader) -> Panel:
-    sample = dataset.sample(row)
-    return Panel(
-        points=sample.points,
-        truth=sample.pose,
-        part=sample.part,
-        label=_label(row, dataset),
-        distance=row.get("distance"),
-    )
+def _panel(sample: LabeledSample, label: str) -> Panel:
+    distance = None if isnan(sample.distance) else sample.distance
+    return Panel(points=sample.points, truth=sample.pose, part=sample.part, label=label, distance=distance)
 
 
-def _card(row: dict, dataset: DatasetReader) -> ReportPerson:
-    sample = dataset.sample(row)
+def _card(sample: LabeledSample, label: str) -> ReportPerson:
     caption = f"{len(sample.points):,} points"
-    if row.get("distance") is not None:
+    if not isnan(sample.distance):
         # as in the table above
-        caption += f" · {row['distance']:.1f} m"
-    return ReportPerson(
-        label=_label(row, dataset), points=sample.points, truth=sample.pose, part=sample.part, caption=caption
-    )
+        caption += f" · {sample.distance:.1f} m"
+    return ReportPerson(label=label, points=sample.points, truth=sample.pose, part=sample.part, caption=caption)
 
 
-def _line(row: dict, dataset: DatasetReader) -> dict:
-    line = {"person": _label(row, dataset), "points": len(row["points"]) // 3}
-    # synthetic people have facts beside their distance
-    if row.get("kind") is not None:
-        line["does"] = row["kind"]
-    if row.get("distance") is not None:
-        line["distance m"] = round(row["distance"], 1)
+def _line(sample: LabeledSample, label: str) -> dict:
+    line = {"person": label, "points": len(sample.points)}
+    info = sample.info or PersonInfo()
+    if info.kind:
+        line["does"] = info.kind
+    if not isnan(sample.distance):
+        line["distance m"] = round(sample.distance, 1)
     for name in ("visible", "clutter"):
-        if row.get(name) is not None:
-            line[f"{name} %"] = round(100 * row[name])
+        if not isnan(share := getattr(info, name)):
+            line[f"{name} %"] = round(100 * share)
     return line
