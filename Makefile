@@ -2,7 +2,7 @@
 PYTHON ?= python3
 PIP = .venv/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint docs clean
 
 demo: .venv/synth
 	.venv/bin/lidarpose demo
@@ -13,6 +13,10 @@ test: .venv/test
 lint: .venv/test
 	$(PIP) ruff
 	.venv/bin/ruff check . && .venv/bin/ruff format --check .
+
+# the site, in site/; open site/index.html
+docs: .venv/docs
+	NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build --strict
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
@@ -26,5 +30,9 @@ lint: .venv/test
 	$(PIP) --editable '.[all,test]'
 	touch $@
 
+.venv/docs: pyproject.toml constraints.txt | .venv/bin/python
+	$(PIP) --editable '.[docs]'
+	touch $@
+
 clean:
-	rm -rf .venv build dist lidarpose-demo
+	rm -rf .venv build dist site lidarpose-demo

@@ -1,4 +1,4 @@
-"""The tables of docs/results.md, evaluate.md, method.md and the model cards in docs/cards, from docs/scores.
+"""The tables of the README, docs/results.md, evaluate.md, method.md and the model cards, from docs/scores.
 
     python benchmarks/results.py --collect runs/ablations     # runs' scores.json into docs/scores/ablations.json
     python benchmarks/results.py                              # docs/scores -> the tables of the pages
@@ -26,7 +26,7 @@ from ablation_tables import figures, own_lines
 from ablations import VARIANTS
 from against_paper import WAYS
 
-from lidarpose.eval.scores import MetricRow, Scores, read_scores
+from lidarpose.eval.scores import BASELINE, MetricRow, Scores, published, read_scores
 from lidarpose.io.files import content_digest, write_atomic
 from lidarpose.models import BUNDLED, DEFAULT, bundled_path
 from lidarpose.models.checkpoint import read_header, runs_of
@@ -35,6 +35,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 SCORES = DOCS / "scores"
 PAGES = (
+    ROOT / "README.md",
     *(DOCS / f"{page}.md" for page in ("results", "evaluate", "method")),
     *(DOCS / "cards" / f"{name}.md" for name in BUNDLED),
 )
@@ -110,6 +111,45 @@ def headline(*models: str) -> str:
             cells.append(f"{line.value:.1f} {_interval(line)}".rstrip())
         rows.append((name, *cells))
     return table(("lidarpose-bench", *(f"`{model}`" for model in models)), rows)
+
+
+_MEAN_POSE = f"{BASELINE}mean pose, true facing"
+_CONDITIONS = ("clean", "cluttered", "company", "crop", "occluded")
+
+
+def _mpjpe(file: str, method: str) -> dict[tuple[str, str], MetricRow]:
+    """Lines of MPJPE on lidarpose-bench, by group and by what of it."""
+    lines = _scored(file).results[0].lines
+    wanted = (x for x in lines if (x.method, x.figure, x.arithmetic) == (method, "mpjpe", "lidarpose"))
+    return {(line.group, line.of): line for line in wanted}
+
+
+def readme() -> str:
+    """The headline: the default network, the mean pose beside it, and what the paper prints for its own data."""
+    own, mean_pose = _mpjpe(DEFAULT, DEFAULT)["all", "all"], _mpjpe(DEFAULT, _MEAN_POSE)["all", "all"]
+    dapt = next(method for method in published()["methods"] if method["method"] == "DAPT")["figures"]["waymo"]
+    rows = [
+        (f"**`{DEFAULT}`, the default, on `lidarpose-bench`**", f"**{own.value:.1f}** {_interval(own)}"),
+        ("the mean pose with the true facing, on the same people", f"{mean_pose.value:.1f}"),
+        ("for context: the paper's network on Waymo, as printed, not run here", f"{dapt['mpjpe']:.1f}"),
+    ]
+    return table(("mean joint error, no alignment", "MPJPE, mm"), rows)
+
+
+def conditions() -> str:
+    """The default network by condition, the sensor's position known or not, beside the mean pose."""
+    wanted = [("all", "all"), *(("condition", name) for name in _CONDITIONS)]
+    wanted.append(("plain", f"{_PLAIN}, 100 points"))
+    sources = {
+        "sensor's position known": (DEFAULT, DEFAULT),
+        "unknown": (f"{DEFAULT}-unknown", DEFAULT),
+        "the mean pose with the true facing": (DEFAULT, _MEAN_POSE),
+    }
+    rows = []
+    for name, source in sources.items():
+        lines = _mpjpe(*source)
+        rows.append((name, *(f"{lines[group].value:.1f}" for group in wanted)))
+    return table(("MPJPE, mm", *(changed.WORDS.get(of, of) for _, of in wanted)), rows)
 
 
 def card(model: str) -> str:
@@ -256,6 +296,7 @@ def tables() -> dict[str, Callable[[], str]]:
     made |= {"calibration": calibration, "spread": spread, "real moved": moved}
     made |= {"visibility": visibility, "real": real}
     made["headline"] = partial(headline, *BUNDLED)
+    made |= {"readme": readme, "conditions": conditions}
     made["stability"] = lambda: table(("", "undisturbed", *5 * ("",)), disturbed.curves(DEFAULT))
     made["stability sensors"] = lambda: table(("sensor", "points", "MPJPE mm"), disturbed.sensors(DEFAULT))
     made["stability ends"] = lambda: table(("", "mean, mm", "deviation"), disturbed.ends(DEFAULT))

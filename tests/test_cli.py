@@ -4,6 +4,7 @@ import gzip
 import io
 import json
 import os
+import re
 import runpy
 import subprocess
 import sys
@@ -590,6 +591,18 @@ def test_examples_run(example, tmp_path, monkeypatch, capsys):
     runpy.run_path(str(example), run_name="__main__")
     assert any(path.suffix == ".png" for path in tmp_path.iterdir())
     assert "wrote" in capsys.readouterr().out
+
+
+def test_the_notebook_runs_and_holds_no_output(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    notebook = json.loads((EXAMPLES[0].parent / "03_notebook.ipynb").read_text("utf-8"))
+    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in cells)
+    names = {}
+    for cell in cells:
+        exec("".join(cell["source"]), names)
+    assert Path("person.png").stat().st_size > 10_000
+    assert re.search(r"MPJPE \d+ mm, expected \d+ mm", capsys.readouterr().out)
 
 
 @pytest.mark.parametrize("command", ["pretrain", "finetune"])

@@ -1,5 +1,6 @@
-"""What the docs name is there."""
+"""What the docs name is there, and the README is what a package index can show."""
 
+import importlib.util
 import re
 from pathlib import Path
 
@@ -7,9 +8,31 @@ import pytest
 
 import lidarpose
 
+ROOT = Path(__file__).parents[1]
 SOURCE = Path(lidarpose.__file__).parent
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = ROOT / "docs"
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "SECURITY.md",
+    *DOCS.glob("*.md"),
+    *DOCS.glob("cards/*.md"),
+]
 NAMED = sorted(set(re.findall(r"`([\w/]+\.py): ([\w.]+)", (DOCS / "method.md").read_text())))
+LINK = re.compile(r"\[[^]]*\]\((?!https?:)([^)#]*)(#[^)]*)?\)")
+
+
+def imported(path):
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def anchors(page):
+    """The ids of a page's headings, as Markdown readers make them."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text("utf-8"), re.MULTILINE)
+    return {re.sub(r"[ ]", "-", re.sub(r"[^\w\- ]", "", heading.lower())) for heading in headings}
 
 
 def test_the_table_of_the_paper_s_method_is_read():
@@ -23,3 +46,68 @@ def test_what_stands_beside_the_paper_is_there(path, name):
     text = file.read_text()
     for part in name.split("."):
         assert re.search(rf"(class|def) {part}\b|self\.{part} = |^ *{part}: ", text, re.MULTILINE), part
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_links_lead_somewhere(page):
+    for target, anchor in LINK.findall(page.read_text("utf-8")):
+        path = (page.parent / target) if target else page
+        assert path.exists(), target
+        if anchor:
+            assert anchor[1:] in anchors(path), f"{target}{anchor}"
+
+
+@pytest.mark.parametrize(
+    "page", [p for p in PAGES if p.stem != "log"], ids=lambda page: page.relative_to(ROOT).as_posix()
+)
+def test_files_and_modules_that_pages_name_are_there(page):
+    text = page.read_text("utf-8")
+    for path in re.findall(r"\b((?:src|tools|benchmarks|tests|examples)/[\w./]+\.\w+)", text):
+        assert (ROOT / path).is_file(), path
+    for path in re.findall(r"`((?:\w+/)+\w+\.py)[`:]", text):
+        assert any((root / path).is_file() for root in (ROOT, SOURCE, SOURCE / "models")), path
+    for name in set(re.findall(r"`lidarpose((?:\.\w+)+)`", text)):
+        module, _, attribute = ("lidarpose" + name).rpartition(".")
+        there = importlib.util.find_spec(module) and (
+            hasattr(importlib.import_module(module), attribute) or importlib.util.find_spec(f"{module}.{attribute}")
+        )
+        assert there, name
+
+
+def test_there_are_seven_pages_and_each_is_in_the_site():
+    site = (ROOT / "mkdocs.yml").read_text("utf-8")
+    pages = {path.stem for path in DOCS.glob("*.md")}
+    assert pages - {"index", "reference", "log"} == {
+        "use", "data", "synthesis", "train", "evaluate", "method", "results",
+    }  # fmt: skip
+    for path in [*DOCS.glob("*.md"), *DOCS.glob("cards/*.md")]:
+        assert f"{path.relative_to(DOCS)}" in site, path.name
+
+
+def test_the_readme_is_short_and_begins_with_the_picture():
+    readme = (ROOT / "README.md").read_text("utf-8")
+    assert len(readme.splitlines()) <= 120
+    order = [readme.index(text) for text in ("images/real.png", "pip install", "lidarpose predict", "```python", "| `")]
+    assert order == sorted(order)
+    assert (DOCS / "images" / "real.png").stat().st_size <= 250_000
+
+
+def test_the_readme_on_a_package_index_has_no_relative_links():
+    index_readme = imported(ROOT / "setup.py").index_readme
+    readme = (ROOT / "README.md").read_text("utf-8")
+    alone = index_readme(readme, None)
+    assert not LINK.search(alone) and "![" not in alone and "lidarpose predict sweep.pcd" in alone
+    linked = index_readme(readme, "https://example.org/lidarpose")
+    assert not LINK.search(linked)
+    assert "](https://example.org/lidarpose/raw/main/docs/images/real.png)" in linked
+    assert "[Use](https://example.org/lidarpose/blob/main/docs/use.md)" in linked
+
+
+def test_the_site_begins_with_the_readme_and_lists_every_public_name():
+    hooks = imported(ROOT / "tools" / "mkdocs_hooks.py")
+    start = hooks.on_page_markdown((DOCS / "index.md").read_text("utf-8"))
+    for target, _ in LINK.findall(start):
+        assert (DOCS / target).is_file(), target
+    reference = hooks.on_page_markdown((DOCS / "reference.md").read_text("utf-8"))
+    for name in lidarpose.__all__:
+        assert name == "__version__" or f"heading: lidarpose.{name}\n" in reference

@@ -2,7 +2,7 @@
 what it says of the cloud in tests/golden_poses.json.
 
 python benchmarks/heldout.py --motion cmu_motion.npz --weights RUN/model.safetensors --json scores.json
-python tools/ship_weights.py RUN/model.safetensors scores.json src/lidarpose/model/weights/tiny.safetensors
+python tools/ship_weights.py RUN/model.safetensors scores.json src/lidarpose/models/weights/tiny.safetensors
 """
 
 import argparse

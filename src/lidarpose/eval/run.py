@@ -226,7 +226,10 @@ def run(
         dapt_compat: also the released code's arithmetic; `legacy` is its old name.
         sensor_unknown: do not tell where the sensor stood.
         seed: of displaced boxes and intervals.
-        device, backend, decode, tta: as of `load`, for weights by name or path.
+        device: as of `load`, for weights by name or path.
+        backend: the same.
+        decode: the same.
+        tta: the same.
         command: what scores.json says was run.
         progress: progress(dataset, done, total) is called as people are predicted.
 
