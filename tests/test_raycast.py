@@ -10,6 +10,7 @@ from raycast_meshes import assert_same, body, ground, join, soup, sphere
 from reference.raycast_reference import (
     cast_ray_list_reference,
     cast_rays_reference,
+    window_of,
     window_ranges,
     window_rays,
     window_reference,
@@ -30,10 +31,6 @@ ALL_ELEVATIONS = np.linspace(-1.5, 1.5, 24)
 
 
 SPINNING = [name for name, s in SENSORS.items() if isinstance(s, Sensor)]
-
-
-def window_of(hits):
-    return hits.column0, hits.columns, hits.row0, hits.rows
 
 
 @pytest.mark.parametrize("scene", range(6))

@@ -6,7 +6,7 @@ import pytest
 
 from lidarpose.errors import InputError
 from lidarpose.lidar.presets import SENSORS, sensor
-from lidarpose.lidar.sensor import Sensor
+from lidarpose.lidar.sensor import Sensor, Window
 from lidarpose.lidar.sensor_file import load_sensor
 
 ROWS = {
@@ -82,6 +82,26 @@ def test_shift_groups_hold_each_ring_once():
     for shift, rings in s.shift_groups:
         turned = (s.azimuth_offsets[rings] - shift) / s.azimuth_step
         assert turned == pytest.approx(np.round(turned), abs=1e-3)
+
+
+def test_window_holds_the_beams_between_the_bounds_and_no_others():
+    s = sensor("vlp-32c")
+    azimuths = s.azimuth_start + np.arange(s.columns) * s.azimuth_step
+    inside = (azimuths >= 0.1) & (azimuths <= 0.2)
+    rings = (s.elevations >= -0.1) & (s.elevations <= 0.05)
+    w = s.window(0.1, 0.2, -0.1, 0.05)
+    assert np.flatnonzero(inside).tolist() == list(range(w.column0, w.column0 + w.columns))
+    assert np.flatnonzero(rings).tolist() == list(range(w.row0, w.row0 + w.rows))
+    assert s.azimuths(w)[:, 0] == pytest.approx(azimuths[inside])
+
+
+def test_window_over_the_seam_and_all_round():
+    s = sensor("dapt64")
+    w = s.window(np.pi - 0.01, np.pi + 0.01, -1, 1)
+    # -pi and +pi are one column
+    assert w.columns == 9 and w.column0 + 4 == s.columns and (w.row0, w.rows) == (0, 64)
+    assert s.window(-4, 4, -1, 1) == Window(column0=0, columns=2649, row0=0, rows=64)
+    assert s.window(0, 1e-6, 0, 1e-6).columns in (0, 1) and s.window(0, 1, 0.5, 0.6).rows == 0
 
 
 def test_user_tables_that_go_wrong_are_told_in_one_line(tmp_path):

@@ -2,6 +2,9 @@
 
 import numpy as np
 
+from lidarpose.lidar.raycast import Hits
+from lidarpose.lidar.sensor import Sensor, Window
+
 _RAYS_AT_ONCE = 256
 
 
@@ -74,10 +77,10 @@ def merge_echoes_reference(
     return merged, merged_face
 
 
-def window_reference(vertices: np.ndarray, sensor, *, margin: float = 0.0) -> tuple[int, int, int, int]:
-    """column0, columns, row0, rows of the smallest window of beams that holds vertices (V, 3) m. Paper: Eq. 3."""
+def window_reference(vertices: np.ndarray, sensor: Sensor, *, margin: float = 0.0) -> Window:
+    """The smallest window of beams that holds vertices (V, 3) m, `margin` rad wider on each side. Paper: Eq. 3."""
     if not len(vertices):
-        return 0, 0, 0, 0
+        return Window(column0=0, columns=0, row0=0, rows=0)
     x, y, z = np.asarray(vertices, float).T
     middle = np.arctan2(y.sum(), x.sum())
     azimuth = (np.arctan2(y, x) - middle + np.pi) % (2 * np.pi) - np.pi
@@ -85,28 +88,22 @@ def window_reference(vertices: np.ndarray, sensor, *, margin: float = 0.0) -> tu
     left, right, low, high = azimuth.min(), azimuth.max(), elevation.min(), elevation.max()
     if right - left >= np.pi:
         left, right, low, high = -np.pi, np.pi, -np.pi / 2, np.pi / 2
-    # where beams point, over two turns more than there are
-    columns = np.arange(-sensor.columns, 2 * sensor.columns)
-    pointing = -np.pi + columns * sensor.azimuth_step
-    first = columns[pointing + sensor.azimuth_shifts.max() >= middle + left - margin][0]
-    last = columns[pointing + sensor.azimuth_shifts.min() <= middle + right + margin][-1]
-    count = max(0, last - first + 1)
-    if count >= sensor.columns:
-        first, count = 0, sensor.columns
-    rows = np.flatnonzero((sensor.elevations >= low - margin) & (sensor.elevations <= high + margin))
-    row0 = rows[0] if len(rows) else np.searchsorted(sensor.elevations, low - margin)
-    return int(first % sensor.columns), int(count), int(row0), len(rows)
+    return sensor.window(middle + left - margin, middle + right + margin, low - margin, high + margin)
 
 
-def window_rays(hits, sensor) -> np.ndarray:
+def window_of(hits: Hits) -> Window:
+    """Where `Hits` were looked for."""
+    return Window(column0=hits.column0, columns=hits.columns, row0=hits.row0, rows=hits.rows)
+
+
+def window_rays(hits: Hits, sensor: Sensor) -> np.ndarray:
     """Unit directions (columns, rows, 3) of the beams of the window of `Hits`."""
-    shifts = sensor.azimuth_shifts[hits.row0 : hits.row0 + hits.rows]
-    a = -np.pi + (hits.column0 + np.arange(hits.columns))[:, None] * sensor.azimuth_step + shifts
+    a = sensor.azimuths(window_of(hits))
     e = np.broadcast_to(sensor.elevations[hits.row0 : hits.row0 + hits.rows], a.shape)
     return np.stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)], -1)
 
 
-def window_ranges(hits) -> tuple[np.ndarray, np.ndarray]:
+def window_ranges(hits: Hits) -> tuple[np.ndarray, np.ndarray]:
     """The window of `Hits` as an image: range (columns, rows) float32 m, inf for no hit, and face int32, -1."""
     distance = np.full((hits.columns, hits.rows), np.inf, np.float32)
     face = np.full(distance.shape, -1, np.int32)

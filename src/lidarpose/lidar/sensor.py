@@ -1,4 +1,4 @@
-"""Spinning LiDAR sensors: their beams.
+"""Spinning LiDAR sensors: their beams, and a window of them.
 
 A sensor's columns lie `azimuth_step` apart and start at azimuth -pi; its rings are numbered from the lowest. Sensor
 frame: x forward, y left, z up, the origin is where the beams meet.
@@ -12,6 +12,16 @@ import numpy as np
 from lidarpose.errors import InputError, check_finite
 
 _ANGLES = "angles in radians"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Window:
+    """A block of beams: columns [column0, column0 + columns), modulo the turn, and rows [row0, row0 + rows)."""
+
+    column0: int
+    columns: int
+    row0: int
+    rows: int
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -114,6 +124,26 @@ class Sensor:
             single = replace(self, elevations=self.elevations[rings], azimuth_offsets=offsets, origin_heights=None)
             origins.append((float(height), single, rings))
         return tuple(origins)
+
+    @property
+    def heads(self) -> tuple[tuple[float, "Sensor", np.ndarray], ...]:
+        """Old name of `origins`."""
+        return self.origins
+
+    def window(self, left: float, right: float, low: float, high: float) -> Window:
+        """The beams with azimuth in [left, right] and elevation in [low, high], rad; left <= right, unwrapped."""
+        first = int(np.ceil((left - self.azimuth_start - self.azimuth_shifts.max()) / self.azimuth_step))
+        last = int(np.floor((right - self.azimuth_start - self.azimuth_shifts.min()) / self.azimuth_step))
+        count = max(0, last - first + 1)
+        if count >= self.columns:
+            first, count = 0, self.columns
+        row0, end = np.searchsorted(self.elevations, low), np.searchsorted(self.elevations, high, side="right")
+        return Window(column0=first % self.columns, columns=count, row0=int(row0), rows=max(0, int(end) - int(row0)))
+
+    def azimuths(self, window: Window) -> np.ndarray:
+        """(C, R) rad: azimuth of each beam of a window, not wrapped at the seam."""
+        columns = self.azimuth_start + (window.column0 + np.arange(window.columns)) * self.azimuth_step
+        return columns[:, None] + self.azimuth_shifts[window.row0 : window.row0 + window.rows]
 
 
 def check_limits(sensor: object) -> None:
