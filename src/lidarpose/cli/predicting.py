@@ -22,7 +22,9 @@ def add(commands) -> None:
     predict.set_defaults(run=_predict)
     predict.add_argument("file", help=".pcd .ply .bin .npy .npz .csv .xyz .txt")
     predict.add_argument(
-        "--boxes", metavar="JSON", help='people to find: {"people": [{"center": [x,y,z], "size": [l,w,h], "yaw": rad}]}'
+        "--boxes",
+        metavar="FILE",
+        help='people to find: {"people": [{"center": [x,y,z], "size": [l,w,h], "yaw": rad}]}, .npy rows, KITTI labels',
     )
     predict.add_argument(
         "--crop", action="store_true", help="the file holds one person (assumed when it is under 4 m across)"

@@ -168,4 +168,4 @@ def _place(point: np.ndarray) -> str:
 
 
 def _option(axis: str) -> str:
-    return "--up y, or --up -y where y points down (cameras)" if axis == "y" else f"--up {axis}"
+    return "up y, or up -y where y points down (cameras)" if axis == "y" else f"up {axis}"

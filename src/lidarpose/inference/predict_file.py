@@ -12,7 +12,8 @@ from lidarpose.geometry import rotation_from_up
 from lidarpose.inference.inputs import as_origin, only_returns, unit_warning
 from lidarpose.inference.predictor import Predictor, load
 from lidarpose.inference.results import Poses
-from lidarpose.inference.scan import Scan, as_boxes, pose_scan
+from lidarpose.inference.scan import Scan, pose_scan
+from lidarpose.io.boxes import read_boxes
 from lidarpose.io.files import file_error
 from lidarpose.io.point_cloud import Cloud, read_points
 from lidarpose.models import DEFAULT
@@ -25,7 +26,7 @@ CROP_SIZE = 4.0
 def predict(
     path: str | os.PathLike,
     *,
-    boxes: str | os.PathLike | dict | Box | Sequence[Box | dict] | None = None,
+    boxes: str | os.PathLike | dict | Box | Sequence | np.ndarray | None = None,
     crop: bool = False,
     sensor_origin: tuple[float, float, float] | str | None = None,
     skeleton: str | None = None,
@@ -36,8 +37,9 @@ def predict(
 ) -> Poses:
     """Poses of the people in a point file, in the file's own frame.
 
-    boxes: a JSON file, its content (see `io.boxes`), a `Box` or several, their length and width level, their height and
-    yaw along and about the up axis (the file's z where `up` is a direction); crop: the file is one person already. With
+    boxes: whatever `read_boxes` takes (a JSON file, a KITTI label, rows, a `Box` or several), their length and width
+    level, their height and yaw along and about the up axis (the file's z where `up` is a direction); crop: the file is
+    one person already. With
     neither, a file of less than 4 m across is taken as a crop and anything else asks for boxes. sensor_origin:
     (x, y, z) m in the file's frame, or "unknown"; None means 0, 0, 0 with boxes and unknown for a crop. skeleton: a
     name, or None for smpl24, or for the network's own where it has other joints. up: the file's up axis, "z", "y" or
@@ -57,7 +59,7 @@ def predict(
     rotation_from_up(up)
     scan = Scan(
         points=np.zeros((0, 3)),
-        boxes=None if boxes is None else as_boxes(boxes),
+        boxes=None if boxes is None else read_boxes(boxes),
         origin=np.zeros(3) if sensor_origin is None and boxes is not None else as_origin(sensor_origin),
         up=up if isinstance(up, str) else ",".join(repr(float(value)) for value in up),
         source=os.fsdecode(path),
@@ -92,6 +94,5 @@ def _check_crop_size(path: object, points: np.ndarray) -> None:
     unit = unit_warning(size, what="it")
     raise InputError(
         f"{os.fsdecode(path)}: expected one person, less than {CROP_SIZE:.0f} m across, got {size.max():,.1f} m: "
-        "give the people's boxes (--boxes BOXES.json), or say that it is a crop all the same (--crop)"
-        + (f"; {unit}" if unit else "")
+        "give the people's boxes, or say that it is a crop all the same" + (f"; {unit}" if unit else "")
     )

@@ -171,11 +171,12 @@ class Predictor:
         """
         wanted = self.in_skeleton(skeleton)
         if boxes is not None:
-            from lidarpose.inference.scan import Scan, as_boxes, pose_scan
+            from lidarpose.inference.scan import Scan, pose_scan
+            from lidarpose.io.boxes import read_boxes
 
             cloud, notes = only_returns(as_points(points))
             origin = np.zeros(3) if sensor_origin is None else as_origin(sensor_origin)
-            scan = Scan(points=cloud, boxes=as_boxes(boxes), origin=origin, warnings=tuple(notes))
+            scan = Scan(points=cloud, boxes=read_boxes(boxes), origin=origin, warnings=tuple(notes))
             return pose_scan(scan, self, skeleton=skeleton, progress=progress)
         origin = as_origin(sensor_origin)
         if not _is_many(points):

@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import count
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +14,6 @@ import numpy as np
 from lidarpose.geometry import UP_AXES, rotation_from_up
 from lidarpose.inference.checks import check_scan, origin_warning, rows_inside
 from lidarpose.inference.results import PersonPose, Poses
-from lidarpose.io.boxes import read_boxes
 from lidarpose.sample import Box
 
 if TYPE_CHECKING:
@@ -68,17 +68,6 @@ class Scan:
         return [level] if self.boxes is None else [level[rows] for rows in self.rows]
 
 
-def as_boxes(boxes: object) -> list[Box]:
-    """Boxes in any form: a file, its content, a `Box` or several (see `io.boxes`)."""
-    if isinstance(boxes, Box):
-        return [boxes]
-    if isinstance(boxes, tuple):
-        boxes = list(boxes)
-    if isinstance(boxes, list) and any(isinstance(box, Box) for box in boxes):
-        return [box if isinstance(box, Box) else read_boxes([box])[0] for box in boxes]
-    return read_boxes(boxes)  # type: ignore[arg-type]
-
-
 def pose_scan(scan: Scan, predictor: Predictor, *, skeleton: str | None = None, progress: bool = False) -> Poses:
     """Poses of the scan's people in the input's frame, with warnings; `timing_ms` has "crop" and "predict"."""
     started = time.perf_counter()
@@ -119,13 +108,13 @@ def pose_scan(scan: Scan, predictor: Predictor, *, skeleton: str | None = None, 
 
 
 def _named(people: Sequence[PersonPose], boxes: list[Box] | None) -> tuple[PersonPose, ...]:
-    """People with the ids of their boxes, or their numbers."""
+    """People with the ids of their boxes, or their positions, counted on where that is another's id."""
     if boxes is None:
         return (replace(people[0], id=0),)
-    return tuple(
-        replace(person, id=i if box.id is None else box.id, box=box)
-        for i, (person, box) in enumerate(zip(people, boxes, strict=True))
-    )
+    taken = {box.id for box in boxes}
+    free = (number for number in count(len(boxes)) if number not in taken)
+    ids = [(next(free) if i in taken else i) if box.id is None else box.id for i, box in enumerate(boxes)]
+    return tuple(replace(person, id=id, box=box) for person, id, box in zip(people, ids, boxes, strict=True))
 
 
 def _in_input(person: PersonPose, scan: Scan) -> PersonPose:
