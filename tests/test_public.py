@@ -17,7 +17,7 @@ MODULES = sorted(SOURCE.rglob("*.py"))
 
 # the house from the ground up: a room imports its own floor and those below
 FLOORS = (
-    {"skeleton", "geometry", "sample", "errors", "_version", "_renamed"},
+    {"skeleton", "geometry", "sample", "errors", "_version", "_renamed", "progress"},
     {"io"},
     {"body", "lidar"},
     {"data"},

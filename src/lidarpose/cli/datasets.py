@@ -1,10 +1,9 @@
 """`lidarpose synth`, `prepare`, `view` and `sensors`."""
 
 import argparse
-from collections.abc import Callable
-from contextlib import ExitStack
 
-from lidarpose.cli.terminal import is_watched, names, tell
+from lidarpose.cli.terminal import names, tell
+from lidarpose.progress import Progress
 
 
 def add(commands) -> None:
@@ -107,27 +106,10 @@ def _synth(options: argparse.Namespace) -> None:
         captured=options.captured,
         per_shard=options.per_shard,
     )
-    with ExitStack() as stack:
-        progress = _bar(stack, unit=f" {job.what}") if is_watched() else None
-        made = write_dataset(job, options.out, workers=options.workers, progress=progress)
+    with Progress(job.count, unit=job.what) as shown:
+        made = write_dataset(job, options.out, workers=options.workers, progress=lambda done, _: shown.update(done))
     kept = "" if made == job.count else f", {job.count - made:,} were there"
     tell(f"{counted(made, job.what)} made{kept} -> {options.out}")
-
-
-def _bar(stack: ExitStack, *, unit: str) -> Callable[[int, int], None]:
-    """progress(done, total) that draws a bar with rate and time left; `stack` closes it."""
-    from tqdm import tqdm
-
-    bar = None
-
-    def progress(done: int, total: int) -> None:
-        nonlocal bar
-        if bar is None:
-            # what stood there before is not this run's speed
-            bar = stack.enter_context(tqdm(total=total, initial=done, unit=unit, smoothing=0.1))
-        bar.update(done - bar.n)
-
-    return progress
 
 
 def _prepare(options: argparse.Namespace) -> None:

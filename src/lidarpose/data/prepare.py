@@ -5,7 +5,6 @@ read again: to have a repaired file read, delete its two shards and run the same
 """
 
 import hashlib
-import sys
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -23,6 +22,7 @@ from lidarpose.data.summary import summarize
 from lidarpose.data.writer import locked, make_shards, open_folder
 from lidarpose.errors import InputError, check_name
 from lidarpose.io.files import file_error, one_line
+from lidarpose.progress import Progress
 from lidarpose.sample import LabeledSample
 
 # dataset -> module and class of its reader, and whether that takes the user's SMPL
@@ -113,18 +113,16 @@ def prepare(
         rule=rule,
         only=split,
     )
+    there = len(parts) - len(missing)
     with locked(out):
         # the summary of a run that is not over would be wrong
         if missing or not (out / CARD).is_file():
             write_card(out, card)
-        with ExitStack() as stack:
-            bar = _bar(stack, len(parts), len(missing)) if progress else None
+        with Progress(len(parts), unit="parts", done=there, shown=progress) as shown:
             people = 0
             for shards, more in make_shards(make, missing, workers=workers):
-                people += more
-                if bar is not None:
-                    bar.set_postfix_str(f"{people:,} people", refresh=False)
-                    bar.update(shards)
+                people, there = people + more, there + shards
+                shown.update(there, f"{people:,} people")
         summary = summarize(open_dataset(out), parts=parts, absent=absent, rule=rule)
         write_card(out, replace(card, summary=summary))
     return summary
@@ -226,12 +224,3 @@ class PartWriter:
             # what no reader foresaw must not cost the other parts; its kind tells a mistake in a reader from a bad file
             kind = type(error).__name__
             yield Skipped(reason=f"{_REST} ({kind})", where=one_line(f"{part}: {kind}: {error}"))
-
-
-def _bar(stack: ExitStack, total: int, missing: int):
-    if sys.stderr is None or not sys.stderr.isatty():
-        return None
-    from tqdm import tqdm
-
-    # what stood there before is not this run's speed
-    return stack.enter_context(tqdm(total=total, initial=total - missing, unit=" parts", smoothing=0.1))

@@ -18,6 +18,7 @@ from lidarpose.models import BUNDLED, DEFAULT, weights_path
 from lidarpose.models.checkpoint import read_header
 from lidarpose.models.decode import decoder
 from lidarpose.models.voxelize import WINDOW
+from lidarpose.progress import Progress
 from lidarpose.sample import MIN_POINTS, PER_JOINT, Pose, center_of
 from lidarpose.skeleton import SMPL24, Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
@@ -206,10 +207,12 @@ class Predictor:
         batch = self.backend.batch
         # people of like size together: a batch costs as much as if all were its largest
         order = sorted(range(len(clouds)), key=lambda k: len(clouds[k]))
-        for start in _shown(range(0, len(clouds), batch), progress):
-            part = order[start : start + batch]
-            for k, pose in zip(part, self._poses([clouds[k] for k in part], origin), strict=True):
-                answers[k] = pose
+        with Progress(len(clouds), unit="clouds", shown=progress) as shown:
+            for start in range(0, len(clouds), batch):
+                part = order[start : start + batch]
+                for k, pose in zip(part, self._poses([clouds[k] for k in part], origin), strict=True):
+                    answers[k] = pose
+                shown.update(start + len(part))
         best: dict[int, Pose] = {}
         # a person's first candidate is the whole cloud
         for i, pose in zip(owner, answers, strict=True):
@@ -257,15 +260,6 @@ class Predictor:
         about, view = shown(look, clouds, centers, origin)
         found = estimates(self.backend.run(about, view), self._decoder)
         return brought_back(found, look, self.skeleton)
-
-
-def _shown(starts: range, progress: bool):
-    """The same with a progress bar, if it takes longer than a second."""
-    if not progress:
-        return starts
-    from tqdm import tqdm
-
-    return tqdm(starts, unit=" batches", delay=1, leave=False)
 
 
 def _surer(pose: Pose, best: Pose) -> bool:

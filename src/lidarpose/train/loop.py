@@ -19,10 +19,10 @@ import numpy as np
 import torch
 from accelerate import Accelerator
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from lidarpose.errors import InputError, check_name
 from lidarpose.models.checkpoint import save_checkpoint
+from lidarpose.progress import Progress
 from lidarpose.train.data_loader import BATCHES, Chunks, chunks_of, lanes_of, loader
 from lidarpose.train.interruption import Interrupted, StopRequest
 from lidarpose.train.objective import total
@@ -215,7 +215,8 @@ class _Run:
         before = self.seconds
         with ExitStack() as stack:
             log = stack.enter_context(open(self.folder / LOG, "a")) if main else None
-            bar = stack.enter_context(self._bar())
+            done = min(self.seen, self.setup.people)
+            bar = stack.enter_context(Progress(self.setup.people, unit="people", done=done, shown=main))
             for batches in self._chunks(people):
                 before_it = self.seen
                 line, stopping = self._chunk(batches, stop)
@@ -228,11 +229,11 @@ class _Run:
                     log.write(json.dumps(entry) + "\n")
                     log.flush()
                 self.accelerator.log({k: v for k, v in entry.items() if k != "people"}, step=entry["people"])
-                bar.update(min(self.seen, bar.total) - bar.n)
-                shown = {"loss": f"{sum(v for k, v in line.items() if k not in ('mpjpe', 'gradient')):.3f}"}
-                shown |= {"mpjpe": f"{line['mpjpe'] * 1e3:.0f} mm"}
-                shown |= {"validation": f"{self.validation.last:.0f} mm"} if self.validation.last is not None else {}
-                bar.set_postfix(shown)
+                note = f"loss {sum(v for k, v in line.items() if k not in ('mpjpe', 'gradient')):.3f}"
+                note += f", mpjpe {line['mpjpe'] * 1e3:.0f} mm"
+                if self.validation.last is not None:
+                    note += f", validation {self.validation.last:.0f} mm"
+                bar.update(min(self.seen, self.setup.people), note)
                 if main and (last or stopping or time.monotonic() - saved > SAVE_EVERY):
                     # the state must not be on the disk before the log
                     os.fsync(log.fileno())
@@ -259,11 +260,6 @@ class _Run:
                 "a process that makes people was killed, perhaps for want of memory: go on with --resume and fewer "
                 "--workers"
             ) from None
-
-    def _bar(self) -> tqdm:
-        shown = self.accelerator.is_main_process and sys.stderr is not None and sys.stderr.isatty()
-        done = min(self.seen, self.setup.people)
-        return tqdm(total=self.setup.people, initial=done, unit=" people", smoothing=0.1, disable=not shown)
 
     def _chunk(self, batches: list, stop: StopRequest) -> tuple[dict[str, float], bool]:
         """Takes the steps of a chunk; returns the mean of each term and of the gradient's norm over them, and whether

@@ -1,0 +1,96 @@
+"""Progress of long work on stderr: a bar on a terminal, elsewhere a line every ten seconds."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from types import TracebackType
+
+# seconds between two movements of the bar, and between two lines where stderr is no terminal
+BAR_EVERY, LINE_EVERY = 1.0, 10.0
+_quiet = False
+
+
+def set_quiet(quiet: bool) -> None:
+    """Whether progress is shown nowhere, for the whole process."""
+    global _quiet
+    _quiet = quiet
+
+
+def is_quiet() -> bool:
+    return _quiet
+
+
+class Progress:
+    """Shows how far work is, from `with` to its end; a thread moves it while nothing is updated.
+
+    Args:
+        total: how much there is to do, None if unknown.
+        unit: what is counted, in the plural.
+        done: what was there before, which is not this run's speed; None: the first update says it.
+        label: a name before the bar.
+        shown: False shows nothing, as in all but one of several processes.
+    """
+
+    def __init__(self, total: int | None, *, unit: str, done: int | None = None, label: str = "", shown: bool = True):
+        self.total, self.unit, self.label = total, unit, label
+        self.done, self._first = done or 0, done
+        self._note = ""
+        self._shown = shown and not _quiet and sys.stderr is not None
+        self._ended = threading.Event()
+        self._started = time.monotonic()
+        self._bar = None
+
+    def __enter__(self) -> Progress:
+        self._started = time.monotonic()
+        if self._shown:
+            if sys.stderr.isatty():
+                from tqdm import tqdm
+
+                self._bar = tqdm(
+                    total=self.total, initial=self.done, unit=f" {self.unit}", desc=self.label or None, smoothing=0.1
+                )
+            self._thread = threading.Thread(target=self._watch, daemon=True)
+            self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ended.set()
+        if self._shown:
+            self._thread.join()
+        if self._bar is not None:
+            self._bar.close()
+
+    def update(self, done: int, note: str = "") -> None:
+        """done: in all so far; note: a few words behind it, as a loss."""
+        self.done, self._note = done, note or self._note
+        if self._first is None:
+            self._first = done
+            if self._bar is not None:
+                self._bar.initial = self._bar.n = self._bar.last_print_n = done
+        if self._bar is not None:
+            self._bar.set_postfix_str(self._note, refresh=False)
+            self._bar.update(done - self._bar.n)
+
+    def line(self) -> str:
+        """The progress in words."""
+        of = "" if self.total is None else f" of {self.total:,}"
+        seconds = time.monotonic() - self._started
+        rate = (self.done - (self._first or 0)) / max(seconds, 1e-9)
+        speed = f", {rate:,.1f}/s" if rate > 0 else ""
+        left = ""
+        if self.total is not None and rate > 0:
+            minutes, rest = divmod(round(max(self.total - self.done, 0) / rate), 60)
+            left = f", {minutes // 60}:{minutes % 60:02d}:{rest:02d} left"
+        name = f"{self.label}: " if self.label else ""
+        return f"{name}{self.done:,}{of} {self.unit}{speed}{left}{f', {self._note}' if self._note else ''}"
+
+    def _watch(self) -> None:
+        while not self._ended.wait(BAR_EVERY if self._bar is not None else LINE_EVERY):
+            if self._bar is not None:
+                self._bar.refresh()
+            else:
+                print(f"lidarpose: {self.line()}", file=sys.stderr, flush=True)

@@ -1,0 +1,54 @@
+"""Progress of long work: a bar on a terminal, lines elsewhere, nothing when it is to be quiet."""
+
+import re
+import sys
+import time
+
+import pytest
+
+from lidarpose import progress
+from lidarpose.progress import Progress
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    monkeypatch.setattr(progress, "LINE_EVERY", 0.02)
+    monkeypatch.setattr(progress, "BAR_EVERY", 0.02)
+
+
+def test_without_a_terminal_there_is_a_line_now_and_then(quick, capsys):
+    with Progress(1200, unit="people", label="bench") as shown:
+        # what was there before is not this run's speed
+        shown.update(1000)
+        shown.update(1100, "loss 1.5")
+        time.sleep(0.2)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) >= 2
+    pattern = r"lidarpose: bench: 1,100 of 1,200 people, [\d,.]+/s, 0:00:\d\d left, loss 1\.5"
+    assert re.fullmatch(pattern, lines[-1])
+
+
+def test_a_bar_moves_while_nothing_is_updated(quick, capsys, monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    with Progress(10, unit="parts") as shown:
+        shown.update(3)
+        time.sleep(0.2)
+        drawn = capsys.readouterr().err.count("\r")
+    assert drawn >= 4
+
+
+@pytest.mark.parametrize("quiet, shown", [(True, True), (False, False)])
+def test_nothing_is_shown_where_it_is_not_wanted(quick, capsys, monkeypatch, quiet, shown):
+    monkeypatch.setattr(progress, "_quiet", quiet)
+    with Progress(10, unit="parts", shown=shown) as bar:
+        bar.update(3)
+        time.sleep(0.1)
+    assert capsys.readouterr().err == ""
+    assert bar.line().startswith("3 of 10 parts")
+
+
+def test_an_error_ends_the_thread(quick):
+    with pytest.raises(ValueError), Progress(None, unit="parts") as bar:
+        raise ValueError
+    bar._thread.join(1)
+    assert not bar._thread.is_alive()
