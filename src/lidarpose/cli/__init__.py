@@ -9,6 +9,7 @@ from lidarpose._version import __version__
 from lidarpose.cli import datasets, evaluating, predicting, training, weights
 from lidarpose.cli.terminal import tell
 from lidarpose.errors import InputError, LidarPoseError, missing_extra
+from lidarpose.progress import set_quiet
 
 # options whose value may start with a minus sign, which argparse would take for another option
 _SIGNED = ("--sensor-origin", "--up")
@@ -16,7 +17,12 @@ _SIGNED = ("--sensor-origin", "--up")
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs one command. Returns 0, or 2 after one line on stderr where the input is at fault."""
-    options = _parser().parse_args(_joined(sys.argv[1:] if arguments is None else arguments))
+    parser = _parser()
+    options = parser.parse_args(_joined(sys.argv[1:] if arguments is None else arguments))
+    if options.command is None:
+        parser.print_help()
+        return 0
+    set_quiet(options.quiet)
     with suppress(AttributeError, ValueError):
         # names of files need not be text, nor has every terminal all letters; stderr does so by itself
         sys.stdout.reconfigure(errors="backslashreplace")
@@ -47,7 +53,7 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt as stopped:
         # training says how to go on
         if os.environ.get("RANK", "0") == "0":
-            tell(f"lidarpose: {stopped}" if str(stopped) else "lidarpose: stopped")
+            tell(f"lidarpose: {stopped}" if str(stopped) else "lidarpose: stopped", error=True)
         return getattr(stopped, "status", 130)
     return 0
 
@@ -61,7 +67,7 @@ def _drop_output() -> None:
 def _failed(error: Exception) -> int:
     # of several processes of a training one is enough to say it
     if os.environ.get("RANK", "0") == "0":
-        tell(f"lidarpose: error: {error}")
+        tell(f"lidarpose: error: {error}", error=True)
     return 2
 
 
@@ -85,7 +91,7 @@ def _joined(arguments: list[str]) -> list[str]:
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="lidarpose", description="3D human pose from LiDAR.")
     parser.add_argument("--version", action="version", version=f"lidarpose {__version__}")
-    commands = parser.add_subparsers(title="commands", dest="command", required=True, metavar="COMMAND")
+    commands = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND")
     for module in (predicting, datasets, training, evaluating, weights):
         module.add(commands)
     return parser

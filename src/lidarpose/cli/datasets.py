@@ -1,46 +1,81 @@
-"""`lidarpose synth`, `prepare`, `view` and `sensors`."""
+"""`lidarpose demo`, `synth`, `prepare`, `sensors` and `view`."""
 
 import argparse
 
-from lidarpose.cli.terminal import names, tell
+from lidarpose.cli.terminal import add_command, names, tell
+from lidarpose.models import DEFAULT, NAMES
 from lidarpose.progress import Progress
+
+_WORKERS = "number of processes, at most one a shard (default 1)"
 
 
 def add(commands) -> None:
     """Adds the commands to the parser's."""
-    synth = commands.add_parser(
+    _add_demo(commands)
+    _add_synth(commands)
+    _add_prepare(commands)
+    sensors = add_command(commands, "sensors", "list the simulated sensors", "lidarpose sensors")
+    sensors.set_defaults(run=_sensors)
+    _add_view(commands)
+
+
+def _add_demo(commands) -> None:
+    demo = add_command(
+        commands,
+        "demo",
+        "show people seen by three LiDARs, true and predicted",
+        "lidarpose demo --out demo",
+        description="Synthesizes people, predicts their poses and writes an interactive 3D report.",
+    )
+    demo.set_defaults(run=_demo)
+    demo.add_argument("--out", default="lidarpose-demo", metavar="DIR", help="folder (default lidarpose-demo)")
+    demo.add_argument("--seed", type=int, default=7, metavar="N", help="random seed (default 7)")
+    demo.add_argument("--weights", default=DEFAULT, metavar="NAME|FILE", help=f"{NAMES}, or a checkpoint")
+
+
+def _add_synth(commands) -> None:
+    synth = add_command(
+        commands,
         "synth",
-        help="write synthesized people as Parquet shards",
+        "write synthesized people as Parquet shards",
+        "lidarpose synth --out people -n 20000 --workers 4",
+        "lidarpose synth --out streets -n 20 --scenes --sensor os1-128",
         description="Writes DIR/dataset.json and Parquet shards of people with their true poses. After an interruption "
         "the same command continues; the same settings give the same bytes.",
     )
     synth.set_defaults(run=_synth)
     synth.add_argument("--out", required=True, metavar="DIR", help="a new folder, or the one of an interrupted run")
     synth.add_argument("-n", "--count", type=int, required=True, metavar="N", help="number of people, clips or streets")
-    synth.add_argument("--scene", default="wild", metavar="NAME", help="wild (default), paper or reference")
-    synth.add_argument(
+    scene = synth.add_argument_group("scene")
+    scene.add_argument("--scene", default="wild", metavar="NAME", help="wild (default), paper or reference")
+    scene.add_argument(
         "--sensor", metavar="A,B", help="names of sensors or sensor files (default: the scene's); see lidarpose sensors"
     )
-    synth.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
-    synth.add_argument("--hard", type=float, default=1.0, metavar="H", help="difficulty from 0 (easy) to 1 (default)")
-    synth.add_argument(
-        "--workers", type=int, default=1, metavar="N", help="number of processes, at most one a shard (default 1)"
-    )
-    synth.add_argument("--motion", metavar="FILE", help="take poses from captured motion: a file or a folder")
-    synth.add_argument("--subjects", metavar="A,B", help="subjects to use: the first part of a clip's name")
-    synth.add_argument(
-        "--captured", type=float, metavar="SHARE", help="share of poses taken from the clips (default 0.5)"
-    )
-    synth.add_argument("--per-shard", type=int, metavar="N", help="people (2000), clips (125) or streets (2) per file")
-    several = synth.add_mutually_exclusive_group()
+    scene.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
+    scene.add_argument("--hard", type=float, default=1.0, metavar="H", help="difficulty from 0 (easy) to 1 (default)")
+    several = scene.add_mutually_exclusive_group()
     several.add_argument(
         "--clips", action="store_true", help="write clips of 16 frames at 10 Hz instead of single people"
     )
     several.add_argument("--scenes", action="store_true", help="write whole streets with several walking people")
+    poses = synth.add_argument_group("captured motion")
+    poses.add_argument("--motion", metavar="FILE", help="take poses from captured motion: a file or a folder")
+    poses.add_argument("--subjects", metavar="A,B", help="subjects to use: the first part of a clip's name")
+    poses.add_argument(
+        "--captured", type=float, metavar="SHARE", help="share of poses taken from the clips (default 0.5)"
+    )
+    work = synth.add_argument_group("work")
+    work.add_argument("--workers", type=int, default=1, metavar="N", help=_WORKERS)
+    work.add_argument("--per-shard", type=int, metavar="N", help="people (2000), clips (125) or streets (2) per file")
 
-    prepare = commands.add_parser(
+
+def _add_prepare(commands) -> None:
+    prepare = add_command(
+        commands,
         "prepare",
-        help="write a real dataset's people as Parquet shards",
+        "write a real dataset's people as Parquet shards",
+        "lidarpose prepare waymo RAW waymo",
+        "lidarpose prepare sloper4d RAW sloper4d --smpl SMPL_NEUTRAL.pkl",
         description="Reads the raw files of a public dataset and writes OUT/dataset.json and Parquet shards. After an "
         "interruption the same command continues.",
     )
@@ -62,19 +97,18 @@ def add(commands) -> None:
     prepare.add_argument(
         "--no-level", action="store_true", help="lidarhuman26m: keep the release's frame, as the LiDAR was mounted"
     )
-    prepare.add_argument(
-        "--workers", type=int, default=1, metavar="N", help="number of processes, at most one a shard (default 1)"
-    )
+    prepare.add_argument("--workers", type=int, default=1, metavar="N", help=_WORKERS)
 
-    sensors = commands.add_parser(
-        "sensors", help="list the simulated sensors", description="Lists the simulated sensors by name."
-    )
-    sensors.set_defaults(run=_sensors)
 
-    view = commands.add_parser(
+def _add_view(commands) -> None:
+    view = add_command(
+        commands,
         "view",
-        help="draw people of a dataset",
-        description="Draws a contact sheet of a dataset that synth or prepare wrote.",
+        "draw people of a dataset",
+        "lidarpose view people",
+        "lidarpose view people --html --out people.html",
+        description="Draws a contact sheet of a dataset that synth or prepare wrote; streets from above. A file of the "
+        "same name is replaced.",
     )
     view.set_defaults(run=_view)
     view.add_argument("folder", metavar="DIR", help="a dataset's folder")
@@ -88,6 +122,12 @@ def add(commands) -> None:
     )
     view.add_argument("--html", action="store_true", help="write an interactive 3D page instead of a picture")
     view.add_argument("--out", metavar="FILE", help="default DIR.png or DIR.html, in the current folder")
+
+
+def _demo(options: argparse.Namespace) -> None:
+    from lidarpose.cli.demo import run
+
+    run(options.out, seed=options.seed, weights=options.weights)
 
 
 def _synth(options: argparse.Namespace) -> None:

@@ -1,9 +1,29 @@
 """How options are written, and how the command line speaks."""
 
+import argparse
 import sys
 
 from lidarpose.io.files import one_line
 from lidarpose.progress import is_quiet
+
+
+class _Help(argparse.HelpFormatter):
+    """Wraps descriptions and keeps the lines of examples."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return text if text.startswith("example") else super()._fill_text(text, width, indent)
+
+
+def add_command(
+    commands, name: str, help: str, *examples: str, description: str | None = None
+) -> argparse.ArgumentParser:
+    """A command's parser. help: in the list of commands; examples: command lines, shown under its options."""
+    lines = "\n".join(f"  {line}" for line in examples)
+    epilog = f"example{'s' * (len(examples) > 1)}:\n{lines}"
+    description = description or f"{help[0].upper()}{help[1:]}."
+    parser = commands.add_parser(name, help=help, description=description, epilog=epilog, formatter_class=_Help)
+    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only, no notes and no progress")
+    return parser
 
 
 def names(text: str) -> tuple[str, ...]:

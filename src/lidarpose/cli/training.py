@@ -6,7 +6,7 @@ import shlex
 from dataclasses import fields
 from pathlib import Path
 
-from lidarpose.cli.terminal import names
+from lidarpose.cli.terminal import add_command, names
 from lidarpose.errors import InputError
 from lidarpose.train.recipes import Finetune, Pretrain, Recipe
 
@@ -15,18 +15,26 @@ _WHAT = (
     "state.safetensors to resume from. After an interruption, --resume continues with the same losses. Several "
     "processes: `torchrun --nproc_per_node N -m lidarpose {name} ...`, with the run's folder named."
 )
+# what stands for a value of a setting that names none
+_METAVARS = {int: "N", float: "X", bool: "true|false", str: "NAME", str | None: "FILE", tuple[str, ...]: "A,B"}
 
 
 def add(commands) -> None:
     """Adds the commands to the parser's."""
-    pretrain = commands.add_parser(
+    pretrain = add_command(
+        commands,
         "pretrain",
-        help="train a network on synthesized people",
+        "train a network on synthesized people",
+        "lidarpose pretrain --people 300000",
+        "lidarpose pretrain runs/pretrain-001 --resume",
         description=_WHAT.format(name="pretrain", what="Trains on people synthesized during training, or on shards."),
     )
-    finetune = commands.add_parser(
+    finetune = add_command(
+        commands,
         "finetune",
-        help="fine-tune a network on datasets that prepare wrote",
+        "fine-tune a network on datasets that prepare wrote",
+        "lidarpose finetune humanm3 --epochs 20",
+        "lidarpose finetune --out runs/finetune-001 --resume",
         description=_WHAT.format(
             name="finetune", what="Trains on labelled people; each dataset supervises the joints that it labels."
         ),
@@ -50,11 +58,19 @@ def _add(parser, kind: type[Recipe]) -> None:
     parser.add_argument("--recipe", metavar="NAME", help="default or paper; other options override its settings")
     parser.add_argument("--device", metavar="NAME", help="cpu (default: a GPU if there is one)")
     parser.add_argument("--tracker", metavar="NAME", help="also log to tensorboard or wandb, if installed")
+    # first the settings of this kind of training, then those that both have
+    own = parser.add_argument_group(f"settings of {name}")
+    common = parser.add_argument_group("settings of optimizer and run")
+    shared = {field.name for field in fields(Recipe)}
     for field in fields(kind):
         if field.name != "data":
             default = "" if field.default in (None, (), "") else f" ({_said(field.default)})"
-            option = f"--{field.name.replace('_', '-')}"
-            parser.add_argument(option, dest=f"set_{field.name}", metavar="V", help=field.metadata["help"] + default)
+            (common if field.name in shared else own).add_argument(
+                f"--{field.name.replace('_', '-')}",
+                dest=f"set_{field.name}",
+                metavar=field.metadata.get("metavar") or _METAVARS[field.type],
+                help=field.metadata["help"] + default,
+            )
 
 
 def _train(options: argparse.Namespace) -> None:

@@ -3,28 +3,33 @@
 import argparse
 from pathlib import Path
 
-from lidarpose.cli.terminal import tell
+from lidarpose.cli.terminal import add_command, tell
 from lidarpose.models import DEFAULT
 
 
 def add(commands) -> None:
     """Adds the commands to the parser's."""
-    info = commands.add_parser("info", help="show versions, device, bundled weights and their scores")
+    info = add_command(commands, "info", "show versions, device, bundled weights and their scores", "lidarpose info")
     info.set_defaults(run=_info)
 
-    export = commands.add_parser(
+    export = add_command(
+        commands,
         "export",
-        help="write weights as ONNX or as a torch.export program",
-        description="Converts a checkpoint to one file of another format, for any number of people and points.",
+        "write weights as ONNX or as a torch.export program",
+        "lidarpose export mine.safetensors",
+        description="Converts a checkpoint to one file of another format, for any number of people and points. A file "
+        "of the same name is replaced.",
     )
     export.set_defaults(run=_export)
     export.add_argument("weights", nargs="?", default=DEFAULT, metavar="NAME|FILE", help=f"default {DEFAULT}")
     export.add_argument("--format", default="onnx", metavar="NAME", help="onnx (default) or torch (a .pt2 program)")
     export.add_argument("--out", metavar="FILE", help="default STEM.onnx or STEM.pt2, in the current folder")
 
-    take = commands.add_parser(
+    take = add_command(
+        commands,
         "import",
-        help="convert released DAPT weights to a checkpoint",
+        "convert released DAPT weights to a checkpoint",
+        "lidarpose import dapt_waymo.safetensors waymo.safetensors --config waymo",
         description="Converts weights that DAPT's authors released, saved as safetensors, to a checkpoint for predict.",
     )
     take.set_defaults(run=_import)

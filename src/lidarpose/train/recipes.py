@@ -21,8 +21,9 @@ PAPER, SMALL_PAPER = "paper", "paper-small"
 FREE = ("workers", "validate", "pictures", "precision")
 
 
-def _setting(default: Any, words: str) -> Any:
-    return field(default=default, metadata={"help": words})
+def _setting(default: Any, words: str, metavar: str = "") -> Any:
+    """A field with its help and what stands for its value there; by default that of its type."""
+    return field(default=default, metadata={"help": words, "metavar": metavar})
 
 
 def _declared(f: Field, value: Any) -> Any:
@@ -53,13 +54,13 @@ class Recipe:
     """What pre-training and fine-tuning have in common. Raises InputError for a value that cannot be."""
 
     batch: int = _setting(64, "people a step, in all processes together")
-    rate: float = _setting(2e-3, "peak learning rate of AdamW")
-    muon_rate: float = _setting(0.02, "peak learning rate of Muon for hidden matrices; 0: AdamW for all")
+    rate: float = _setting(2e-3, "peak learning rate of AdamW", "RATE")
+    muon_rate: float = _setting(0.02, "peak learning rate of Muon for hidden matrices; 0: AdamW for all", "RATE")
     decay: float = _setting(0.01, "weight decay")
     schedule: str = _setting("plateau", "plateau (rise, stay, fall) or cosine")
-    warmup: float = _setting(0.02, "share of the run in which the rate rises")
-    cool: float = _setting(0.3, "share of the run in which a plateau's rate falls to nothing")
-    ema: float = _setting(0.999, "how much the running mean of the weights keeps each step; 0: no mean")
+    warmup: float = _setting(0.02, "share of the run in which the rate rises", "SHARE")
+    cool: float = _setting(0.3, "share of the run in which a plateau's rate falls to nothing", "SHARE")
+    ema: float = _setting(0.999, "how much the running mean of the weights keeps each step; 0: no mean", "SHARE")
     clip: float = _setting(1.0, "largest norm of a step's gradient; 0: any")
     bone: float = _setting(0.0, "weight of the error of bones' lengths")
     symmetry: float = _setting(0.0, "weight of the difference of left and right bones")
@@ -102,19 +103,21 @@ class Pretrain(Recipe):
     """Pre-training on synthesized people, made while the network learns, or read from shards."""
 
     size: str = _setting("tiny", "of the network: tiny, small, base; paper or paper-small for the paper's design")
-    init: str = _setting("", "weights to begin with, of this size or smaller: bundled, or a checkpoint")
+    init: str = _setting("", "weights to begin with, of this size or smaller: bundled, or a checkpoint", "NAME|FILE")
     scene: str = _setting("wild", "wild, paper or reference")
     people: int = _setting(300_000, "seen in all")
     easy: float = _setting(
-        0.05, "share of the run in which the largest difficulty rises to full; that of shards is what it is"
+        0.05, "share of the run in which the largest difficulty rises to full; that of shards is what it is", "SHARE"
     )
-    captured: float = _setting(0.5, "share of poses from captured motion, where clips are given")
+    captured: float = _setting(0.5, "share of poses from captured motion, where clips are given", "SHARE")
     motion: str | None = _setting(None, "captured motion to take poses from: a file or a folder")
     subjects: tuple[str, ...] = _setting((), "those of its clips to learn from, by the first part of names")
-    strays: float = _setting(0.2, "how often stray points are about a person")
-    noise: float = _setting(0.15, "how often all points are blurred, by 0.5 to 8 cm")
+    strays: float = _setting(0.2, "how often stray points are about a person", "SHARE")
+    noise: float = _setting(0.15, "how often all points are blurred, by 0.5 to 8 cm", "SHARE")
     shards: tuple[str, ...] = _setting(
-        (), "folders that `lidarpose synth` wrote, to learn from; scene and motion then choose validation people"
+        (),
+        "folders that `lidarpose synth` wrote, to learn from; scene and motion then choose validation people",
+        "DIR,DIR",
     )
 
     def __post_init__(self):
@@ -132,17 +135,19 @@ class Pretrain(Recipe):
 class Finetune(Recipe):
     """Fine-tuning on datasets that `lidarpose prepare` wrote."""
 
-    rate: float = _setting(5e-4, "peak learning rate of AdamW")
-    muon_rate: float = _setting(5e-3, "peak learning rate of Muon for hidden matrices; 0: AdamW for all")
+    rate: float = _setting(5e-4, "peak learning rate of AdamW", "RATE")
+    muon_rate: float = _setting(5e-3, "peak learning rate of Muon for hidden matrices; 0: AdamW for all", "RATE")
     data: tuple[str, ...] = _setting((), "their folders")
-    init: str = _setting(DEFAULT, "weights to begin with: bundled, or a checkpoint")
+    init: str = _setting(DEFAULT, "weights to begin with: bundled, or a checkpoint", "NAME|FILE")
     epochs: float = _setting(20.0, "how often everybody is seen")
     split: str = _setting("train", "whom to learn from; all: everybody")
     interval: int = _setting(1, "only every so many frames, as published recipes thin out")
     augment: str = _setting("default", "what happens to people: default, paper or none")
-    mix: float = _setting(0.25, "share of synthesized people, below 1")
+    mix: float = _setting(0.25, "share of synthesized people, below 1", "SHARE")
     scene: str = _setting("wild", "of the synthesized people: wild, paper or reference")
-    hold_out: float = _setting(0.1, "share of sequences kept for validation where the dataset has no split val")
+    hold_out: float = _setting(
+        0.1, "share of sequences kept for validation where the dataset has no split val", "SHARE"
+    )
     keep_anchors: bool = _setting(True, "of the paper's network: go on with pre-trained anchors and heads")
 
     def __post_init__(self):
