@@ -12,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pandas
 import pytest
 from safetensors.numpy import save_file
 
@@ -438,9 +439,8 @@ def test_json_that_is_nothing_but_brackets_is_one_line(tmp_path, capsys):
 # ---- what is wrong with the command: (words of it, words of the error)
 
 BAD_COMMANDS = {
-    "no command": ("", "COMMAND"),
     "unknown command": ("predikt CROP", "predikt"),
-    "no file": ("predict", "file"),
+    "no file": ("predict", "FILE"),
     "missing file": ("predict DIR/crob.npy", "did you mean crop.npy"),
     "a folder": ("predict DIR", "got a folder"),
     "boxes missing": ("predict CROP --boxes DIR/no.json", "no.json: no such file"),
@@ -468,7 +468,7 @@ BAD_COMMANDS = {
     "export what": ("export tyni", "did you mean tiny"),
     "export how": ("export --format tflite --out DIR/x", "known are onnx, torch"),
     "export nothing": ("export no/such.safetensors --out DIR/x.onnx", "does not exist"),
-    "import nothing": ("import no/such.safetensors DIR/x.safetensors", "there is no such file"),
+    "import nothing": ("import no/such.safetensors DIR/x.safetensors", "does not exist"),
     "import a pickle": ("import weights.pth DIR/x.safetensors", "got a pickle"),
     "import as": ("import DAPT DIR/x.safetensors --config kitti", "waymo"),
     "import into another kind": ("import DAPT DIR/x.onnx", "give a name that ends in .safetensors"),
@@ -477,7 +477,8 @@ BAD_COMMANDS = {
     "demo seed": ("demo --seed -1 --out DIR/d", "seed"),
     "demo weights": ("demo --weights tyni --out DIR/d", "did you mean tiny"),
     "demo into a file": ("demo --out CROP", "cannot write"),
-    "out is a file": ("predict CROP --out CROP", "cannot write"),
+    "out of another kind": ("predict CROP --out DIR/x.parquet", "expected a folder or a file .json or .csv"),
+    "out is a file": ("predict CROP --out CROP", "got .npy"),
     "out below a file": ("predict CROP --out CROP/deep", "cannot write"),
     "out of a long name": (f"predict CROP --out {'x' * 300}.json", "choose a shorter name"),
     "out in a place of no files": ("predict CROP --out /proc/nothing", "cannot write"),
@@ -616,3 +617,48 @@ def test_help_shows_no_empty_default(command, capsys):
 def test_looks_are_as_many_as_asked_for(crop, words, looks, capsys):
     assert main(["predict", str(crop), "--out", "-", *words]) == 0
     assert json.loads(capsys.readouterr().out)["model"].get("tta") == looks
+
+
+# ---- help, quiet and CSV
+
+
+def test_no_command_prints_help(capsys):
+    assert main([]) == 0
+    assert "predict   estimate the poses" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["predict", "demo", "synth", "prepare", "sensors", "view", "pretrain", "finetune"])
+def test_help_has_groups_metavars_and_examples(command, capsys):
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    text = capsys.readouterr().out
+    assert f"\n  lidarpose {command}" in text[text.index("\nexample") :]
+    assert " V\n" not in text and "--quiet" in text
+
+
+def test_quiet_prints_errors_only(crop, tmp_path, capsys):
+    assert main(["predict", "-q", str(crop), "--crop", "--out", str(tmp_path / "a.json"), "--tta", "1"]) == 0
+    told = capsys.readouterr()
+    assert told.err == told.out == "" and (tmp_path / "a.json").is_file()
+    assert main(["predict", "--quiet", str(tmp_path / "no.npy")]) == 2
+    assert "no.npy" in capsys.readouterr().err
+    # and does not outlast its command
+    assert main(["predict", str(crop), "--crop", "--out", str(tmp_path / "a.json"), "--tta", "1"]) == 0
+    assert "1 of 1 people" in capsys.readouterr().err
+
+
+def test_a_csv_has_a_row_a_joint(crop, tmp_path, capsys):
+    assert main(["predict", str(crop), "--crop", "--out", str(tmp_path / "a.CSV"), "--tta", "1", "--picture"]) == 0
+    table = pandas.read_csv(tmp_path / "a.CSV")
+    assert len(table) == 24 and {"id", "joint", "x", "y", "z", "confidence"} <= set(table.columns)
+    assert (tmp_path / "a.png").is_file()
+    # a folder may have a point in its name
+    (tmp_path / "x.csv").mkdir()
+    assert main(["predict", str(crop), "--crop", "--out", str(tmp_path / "x.csv"), "--tta", "1"]) == 0
+    assert (tmp_path / "x.csv" / f"{crop.stem}.poses.json").is_file()
+
+
+def test_a_closed_standard_output_loses_nothing_without_a_word(crop, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "stdout", None)
+    assert main(["predict", str(crop), "--crop", "--out", "-"]) == 2
+    assert "standard output, which is closed" in capsys.readouterr().err

@@ -91,7 +91,7 @@ def _predict(options: argparse.Namespace) -> None:
         raise InputError("--out - prints to the standard output, which is closed: name a file")
     picture = None
     if options.picture:
-        picture = (result or Path(f"{file.stem}.poses")).with_suffix(".png")
+        picture = (result or Path(f"{file.stem}.poses.json")).with_suffix(".png")
     for path in filter(None, (result, picture)):
         check_apart(path, options.file, options.boxes, options.weights)
         # before the work
@@ -139,9 +139,7 @@ def _result_path(out: str, file: Path) -> Path | None:
         if suffix in (".json", ".csv"):
             return Path(out)
         if suffix in _NO_FOLDERS:
-            raise InputError(
-                f"--out {out}: expected a folder, or a file .json or .csv, got {suffix}: name one of these"
-            )
+            raise InputError(f"--out {out}: expected a folder or a file .json or .csv, got {suffix}: name one")
     return Path(out) / f"{file.stem}.poses.json"
 
 
