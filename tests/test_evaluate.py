@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import dataset_files as files
 import numpy as np
+import pandas as pd
 import pytest
 import waymo_files
 from hypothesis import given
@@ -41,8 +42,8 @@ from lidarpose.synth.shard_job import Job, write_dataset
 class Fake:
     """A model of known answers, which remembers what it was shown. answer(cloud) -> (J, 3) m or None."""
 
-    def __init__(self, answer, skeleton=BODY26, confidence=None):
-        self.answer, self.skeleton, self.confidence = answer, skeleton, confidence
+    def __init__(self, answer, skeleton=BODY26):
+        self.answer, self.skeleton = answer, skeleton
         self.model = {"name": "fake", "version": "0", "backend": "none", "decode": "none"}
         self.backend = SimpleNamespace(batch=3)
         self.clouds, self.origins, self.centers = [], [], []
@@ -54,9 +55,7 @@ class Fake:
             self.clouds.append(np.array(cloud, float))
             self.origins.append(sensor_origin)
             joints = self.answer(np.array(cloud, float))
-            pose = (
-                None if joints is None else Pose(joints=joints, skeleton=self.skeleton, confidence=self._told(joints))
-            )
+            pose = None if joints is None else Pose(joints=joints, skeleton=self.skeleton)
             people.append(PersonPose(pose=pose, skeleton=self.skeleton, points=np.array(cloud)))
         return Poses(people=tuple(people), skeleton=self.skeleton)
 
@@ -66,28 +65,24 @@ class Fake:
         self.centers += list(centers)
         self.origins += [origin] * len(clouds)
         joints = np.stack([self.answer(cloud) - center for cloud, center in zip(clouds, centers, strict=True)])
-        nothing = dict.fromkeys(("spread", "visible", "in_range"))
-        return Estimates(joints=joints, confidence=None, **nothing)
-
-    def _told(self, joints):
-        return None if self.confidence is None else np.full(len(joints), self.confidence)
+        return Estimates(joints=joints, **dict.fromkeys(("confidence", "spread", "visible", "in_range")))
 
 
 def standing(cloud):
     """A pose that depends on the points alone."""
-    rng = np.random.default_rng(0)
-    return center_of(cloud) + rng.normal(0, 0.3, (26, 3))
+    return center_of(cloud) + np.random.default_rng(0).normal(0, 0.3, (26, 3))
 
 
-def knowing(people, shift=(0.0, 0.0, 0.0)):
-    """A model that finds a cloud's owner by its middle and answers with the truth, moved."""
+def shifted_truth(people, shift=(0.0, 0.0, 0.0)):
+    """A model that finds a cloud's owner by its middle and answers with the true joints of human15, moved."""
     middles = np.stack([np.median(one.points, axis=0) for one in people])
+    pick = [HUMAN15.index(name) if name in HUMAN15.joints else 0 for name in BODY26.joints]
 
     def answer(cloud):
         one = people[int(np.argmin(np.linalg.norm(middles - np.median(cloud, axis=0), axis=1)))]
-        return np.nan_to_num(one.sample.joints) + shift
+        return (np.nan_to_num(one.sample.joints) + shift)[pick]
 
-    return answer
+    return Fake(answer)
 
 
 @pytest.fixture(scope="module")
@@ -108,8 +103,7 @@ def sets(tmp_path_factory):
     return root
 
 
-def judged(sets, name, model, **options):
-    split, limit = options.pop("split", None), options.pop("limit", None)
+def evaluated(sets, name, model, *, split=None, limit=None, **options):
     return evaluate_dataset(eval_setup(model, open_eval_dataset(sets / name, split=split, limit=limit), **options))
 
 
@@ -118,44 +112,38 @@ def judged(sets, name, model, **options):
 
 def test_clean_shows_what_lies_in_a_displaced_box(sets):
     model = Fake(standing)
-    found = judged(sets, "humanm3", model, seed=3)
+    setting = evaluated(sets, "humanm3", model, seed=3).result.setting
     people = list(open_eval_dataset(sets / "humanm3"))
     assert len(model.clouds) == len(people) == 16
     for cloud, one in zip(model.clouds, people, strict=True):
         box = jittered(one.sample.box, np.random.default_rng([3, one.shard, one.row]))
         np.testing.assert_array_equal(cloud, one.points[box.contains(one.points)])
-    # some points are lost, some come in, and nobody's place is told
-    assert any(
-        len(cloud) != one.sample.box.contains(one.points).sum() for cloud, one in zip(model.clouds, people, strict=True)
-    )
-    assert model.origins == [None] * 16 and found.result.setting.sensor == "unknown"
-    told = found.result.setting
-    assert (told.protocol, told.centring, told.split) == ("clean", "points alone", "test")
-    assert "detector" in told.crop
+    # some points are lost, some come in, and nobody's position is told
+    undisplaced = [one.sample.box.contains(one.points).sum() for one in people]
+    assert [len(cloud) for cloud in model.clouds] != undisplaced
+    assert model.origins == [None] * 16 and setting.sensor == "unknown" and "detector" in setting.crop
+    assert (setting.protocol, setting.centring, setting.split) == ("clean", "points alone", "test")
 
 
 def test_clean_uses_no_label_of_who_was_segmented(sets):
     model = Fake(standing)
-    found = judged(sets, "lidarhuman26m", model)
+    setting = evaluated(sets, "lidarhuman26m", model).result.setting
     people = list(open_eval_dataset(sets / "lidarhuman26m"))
     for cloud, origin, one in zip(model.clouds, model.origins, people, strict=True):
         np.testing.assert_array_equal(cloud, one.points)
         assert (origin == 0).all()
-    assert "none could be displaced" in found.result.setting.crop
-    judged(sets, "lidarhuman26m", model, sensor_unknown=True)
+    assert "none could be displaced" in setting.crop
+    evaluated(sets, "lidarhuman26m", model, sensor_unknown=True)
     assert model.origins[len(people) :] == [None] * len(people)
 
 
 def test_a_person_s_box_does_not_depend_on_the_others(sets):
-    everybody, some = Fake(standing), Fake(standing)
-    judged(sets, "humanm3", everybody, split="all")
-    judged(sets, "humanm3", some, split="all", limit=5)
-    chosen = spread(len(everybody.clouds), 5)
-    assert len(some.clouds) == 5
-    for cloud, k in zip(some.clouds, chosen, strict=True):
+    everybody, some, other = Fake(standing), Fake(standing), Fake(standing)
+    evaluated(sets, "humanm3", everybody, split="all")
+    evaluated(sets, "humanm3", some, split="all", limit=5)
+    for cloud, k in zip(some.clouds, spread(len(everybody.clouds), 5), strict=True):
         np.testing.assert_array_equal(cloud, everybody.clouds[k])
-    other = Fake(standing)
-    judged(sets, "humanm3", other, split="all", seed=1)
+    evaluated(sets, "humanm3", other, split="all", seed=1)
     assert any(len(a) != len(b) for a, b in zip(other.clouds, everybody.clouds, strict=True))
 
 
@@ -173,41 +161,42 @@ def test_a_detector_s_errors_are_as_told():
 
 def test_dapt_crops_and_centers_as_released(sets):
     model = Fake(standing)
-    found = judged(sets, "humanm3", model, protocol="dapt")
-    people = list(open_eval_dataset(sets / "humanm3"))
-    for cloud, center, one in zip(model.clouds, model.centers, people, strict=True):
+    setting = evaluated(sets, "humanm3", model, protocol="dapt").result.setting
+    for cloud, center, one in zip(model.clouds, model.centers, open_eval_dataset(sets / "humanm3"), strict=True):
         low, high = one.sample.joints.min(0).astype(float), one.sample.joints.max(0).astype(float)
-        half = 1.25 * (high - low) / 2
-        inside = (np.abs(one.points - (low + high) / 2) <= half).all(1)
+        inside = (np.abs(one.points - (low + high) / 2) <= 1.25 * (high - low) / 2).all(1)
         np.testing.assert_allclose(cloud, one.points[inside])
         np.testing.assert_allclose(center, (low + high) / 2, atol=1e-6)
     # its mean leaves the pelvis out
-    assert found.result.setting.joints == HUMAN15.joints[1:] and "pelvis" in found.result.setting.not_judged
+    assert setting.joints == HUMAN15.joints[1:] and "pelvis" in setting.not_judged
 
     model = Fake(standing)
-    judged(sets, "waymo", model, protocol="dapt")
+    evaluated(sets, "waymo", model, protocol="dapt")
     people = list(open_eval_dataset(sets / "waymo"))
     for cloud, center, one in zip(model.clouds, model.centers, people, strict=True):
         np.testing.assert_array_equal(cloud, one.points[one.sample.box.contains(one.points)])
         np.testing.assert_array_equal(center, one.sample.box.center)
-    box = people[0].sample.box
-    small = replace(people[0], sample=replace(people[0].sample, box=replace(box, size=box.size * 0.6)))
-    kept = cropped("dapt", "waymo", small, 0).points
-    assert 0 < len(kept) < len(small.points) and small.sample.box.contains(kept).all()
+    box = replace(people[0].sample.box, size=people[0].sample.box.size * 0.6)
+    shown = cropped("dapt", "waymo", replace(people[0], sample=replace(people[0].sample, box=box)), 0).points
+    assert 0 < len(shown) < len(people[0].points) and box.contains(shown).all()
 
     model = Fake(standing)
-    found = judged(sets, "leaking", model, protocol="dapt")
+    result = evaluated(sets, "leaking", model, protocol="dapt").result
     for center, one in zip(model.centers, open_eval_dataset(sets / "leaking"), strict=True):
         np.testing.assert_array_equal(center, one.sample.centers["trans"])
-    assert "neighbouring frames" in found.result.setting.leaks
-    assert all(
-        line.split == "test" and line.protocol == "dapt" and "SMPL" in line.centring for line in found.result.lines
-    )
+    assert "neighbouring frames" in result.setting.leaks
+    assert all(row.split == "test" and row.protocol == "dapt" and "SMPL" in row.centring for row in result.lines)
+
+
+def test_poses_of_dapt_are_in_the_dataset_s_frame(sets):
+    model = shifted_truth(list(open_eval_dataset(sets / "humanm3")), (0.06, 0, 0.08))
+    result = evaluated(sets, "humanm3", model, protocol="dapt").result
+    assert result.line("mpjpe").value == pytest.approx(100, abs=1e-2)
 
 
 def test_a_frame_that_was_turned_is_told_where_it_is_compared_with_the_released_code(sets):
     for name, protocol, told in (("lidarhuman26m", "dapt", 1), ("lidarhuman26m", "clean", 0), ("askew", "dapt", 0)):
-        notes = judged(sets, name, Fake(standing), protocol=protocol).result.notes
+        notes = evaluated(sets, name, Fake(standing), protocol=protocol).result.notes
         assert sum("prepare with --no-level" in note for note in notes) == told, (name, protocol)
 
 
@@ -220,33 +209,41 @@ def test_a_frame_that_was_turned_is_told_where_it_is_compared_with_the_released_
         ("humanm3", {"skeleton": "smpl24"}, "has no spine1"),
         ("humanm3", {"protocol": "clear"}, "did you mean clean"),
         ("humanm3", {"limit": 0}, "at least 1 person"),
+        ("humanm3", {"limit": "4"}, "limit must be a whole number of at least 1 person, got '4'"),
+        ("humanm3", {"limit": 4.0}, "limit must be a whole number"),
         ("humanm3", {"seed": -1}, "seed must be a whole number of at least 0, got -1"),
+        ("humanm3", {"tta": 4}, "of weights by name or path: give them to load instead"),
+        ("lidarhuman26m", {}, "two datasets are called lidarhuman26m"),
         ("nowhere", {}, "is no dataset"),
         ("a", {}, "is no dataset"),
     ],
 )
-def test_what_does_not_fit_is_told_before_anybody_is_judged(sets, name, options, words):
+def test_what_does_not_fit_is_an_error_before_anybody_is_predicted(sets, name, options, words):
     model = Fake(standing)
     with pytest.raises(InputError, match=words) as raised:
         evaluation.run(model, [sets / "lidarhuman26m", sets / name], **options)
     assert not model.clouds and "\n" not in str(raised.value)
 
 
-def test_synthetic_sets_have_neither_splits_nor_oracles(sets):
-    for options, words in (({"protocol": "dapt"}, "is synthetic"), ({"split": "test"}, "without splits")):
-        with pytest.raises(InputError, match=words):
-            evaluation.run(Fake(standing), ["bench"], **options)
+@pytest.mark.parametrize(
+    "model, dataset, options, words",
+    [
+        (Fake(standing), "bench", {"protocol": "dapt"}, "is synthetic"),
+        (Fake(standing), "bench", {"split": "test"}, "without splits"),
+        (3, "bench", {}, "expected a network to evaluate"),
+        ("tiny", None, {}, "expected a dataset to evaluate on"),
+    ],
+)
+def test_synthetic_sets_have_neither_splits_nor_oracles_and_arguments_are_checked(model, dataset, options, words):
+    with pytest.raises(InputError, match=words):
+        evaluation.evaluate(model, dataset, **options)
 
 
-def test_splits_that_are_judged_by_default(sets):
-    assert open_eval_dataset(sets / "waymo").split == "val"
-    assert open_eval_dataset(sets / "humanm3").split == "test"
+def test_splits_that_are_scored_by_default(sets, tmp_path):
+    assert [open_eval_dataset(sets / name).split for name in ("waymo", "humanm3")] == ["val", "test"]
     everybody = open_eval_dataset(sets / "humanm3", split="all")
     assert everybody.split == "all" and everybody.count == 24
     assert open_eval_dataset("bench").split == "none"
-
-
-def test_train_alone_asks_for_a_split(sets, tmp_path):
     prepare("humanm3", sets / "a", tmp_path / "x", split="train")
     with pytest.raises(InputError, match="only in train: say --split"):
         open_eval_dataset(tmp_path / "x")
@@ -267,14 +264,11 @@ def test_a_limit_is_spread_evenly(total, limit):
 
 def test_the_truth_has_no_error_and_a_step_its_length(sets):
     people = list(open_eval_dataset(sets / "humanm3"))
-    pick = [HUMAN15.index(name) if name in HUMAN15.joints else 0 for name in BODY26.joints]
     for shift, error in (((0, 0, 0), 0), ((0.06, 0, 0.08), 100)):
-        known = knowing(people, shift)
-        result = judged(sets, "humanm3", Fake(lambda cloud, known=known: known(cloud)[pick])).result
-        assert result.line("mpjpe").value == pytest.approx(error, abs=1e-2)
-        assert result.line("pa_mpjpe").value == pytest.approx(0, abs=1e-2)
-        assert result.line("pck3").value == 100
-        assert result.line("mpjpe", "joints", "wrists").value == pytest.approx(error, abs=1e-2)
+        result = evaluated(sets, "humanm3", shifted_truth(people, shift)).result
+        values = {(row.figure, row.of): row.value for row in result.lines if row.of in ("all", "wrists")}
+        assert values["mpjpe", "all"] == pytest.approx(error, abs=1e-2) == values["mpjpe", "wrists"]
+        assert values["pa_mpjpe", "all"] == pytest.approx(0, abs=1e-2) and values["pck3", "all"] == 100
         assert result.line("turned_round", "points", "100 and more").value == 0
         # who moves with the truth has its acceleration
         assert result.line("acceleration", "all", "frames in a row").value == pytest.approx(0, abs=1e-2)
@@ -282,140 +276,121 @@ def test_the_truth_has_no_error_and_a_step_its_length(sets):
 
 
 def test_hidden_labels_count_and_missing_ones_do_not(sets):
-    found = judged(sets, "waymo", Fake(standing))
-    people = list(open_eval_dataset(sets / "waymo"))
-    labels = np.stack([one.sample.joint_labels for one in people])
+    found = evaluated(sets, "waymo", Fake(standing))
+    people = [one.sample for one in open_eval_dataset(sets / "waymo")]
+    labels, size = np.stack([one.joint_labels for one in people]), np.stack([one.box.size for one in people])
     assert (labels == 0).any() and (labels == 1).any()
-    assert found.result.line("mpjpe").joints == (labels > 0).sum()
-    pred = found.predictions.pred
-    for name, of in (("mpjpe", metrics.mpjpe), ("pa_mpjpe", metrics.pa_mpjpe), ("pck3", metrics.pck)):
-        assert found.result.line(name).value == pytest.approx(of(pred, found.predictions.true, labels > 0))
-    size = np.stack([one.sample.box.size for one in people])
-    box = metrics.pck_box(pred, found.predictions.true, size, labels > 0, threshold=0.2)
-    assert found.result.line("pck_box@0.2").value == pytest.approx(box)
-    hit = metrics.oks_ap(pred, found.predictions.true, size, labels > 0)
-    assert found.result.line("oks_ap").value == pytest.approx(hit)
-    frames = [
-        [k for k, one in enumerate(people) if one.sample.frame == f]
-        for f in sorted({one.sample.frame for one in people})
-    ]
-    boxes = np.stack([[*one.sample.box.center, *one.sample.box.size, one.sample.box.yaw] for one in people])
-    wanted = metrics.pem(
-        *([value[rows] for rows in frames] for value in (pred, found.predictions.true, boxes, labels == 2))
-    )
-    assert found.result.line("pem").value == pytest.approx(wanted.pem)
+    pred, true, line = found.predictions.pred, found.predictions.true, found.result.line
+    assert line("mpjpe").joints == (labels > 0).sum()
+    for name, metric in (("mpjpe", metrics.mpjpe), ("pa_mpjpe", metrics.pa_mpjpe), ("pck3", metrics.pck)):
+        assert line(name).value == pytest.approx(metric(pred, true, labels > 0))
+    assert line("pck_box@0.2").value == pytest.approx(metrics.pck_box(pred, true, size, labels > 0, threshold=0.2))
+    assert line("oks_ap").value == pytest.approx(metrics.oks_ap(pred, true, size, labels > 0))
+    frames = [[k for k, one in enumerate(people) if one.frame == f] for f in sorted({one.frame for one in people})]
+    boxes = np.stack([[*one.box.center, *one.box.size, one.box.yaw] for one in people])
+    wanted = metrics.pem(*([values[rows] for rows in frames] for values in (pred, true, boxes, labels == 2)))
+    assert line("pem").value == pytest.approx(wanted.pem)
 
 
 def test_people_without_a_pose_count_in_pem_alone(sets):
     turns = itertools.cycle([True, False])
-    shy = judged(sets, "waymo", Fake(lambda cloud: standing(cloud) if next(turns) else None)).result
-    told = "without a pose, and in no figure but PEM"
-    assert shy.counts["without a pose"] and any(told in line for line in evaluating._lines(shy))
-    # each labelled keypoint is missed, be it everybody's
-    nobody = judged(sets, "waymo", Fake(lambda cloud: None)).result
+    some = evaluated(sets, "waymo", Fake(lambda cloud: standing(cloud) if next(turns) else None)).result
+    words = "without a pose, and in no metric but PEM"
+    assert some.counts["without a pose"] and any(words in line for line in evaluating._lines(some))
+    # each labeled keypoint is missed
+    nobody = evaluated(sets, "waymo", Fake(lambda cloud: None)).result
     assert nobody.line("pem").value == 250 and nobody.line("mpjpe").value is None
 
 
 @pytest.mark.parametrize(
-    "learned, told",
-    [("train", "validated on this split"), ("val", "learned from split val"), ("all", "learned from split all")],
+    "trained, words",
+    [("train", "validated on this split"), ("val", "trained on split val"), ("all", "trained on split all")],
 )
-def test_a_network_that_knows_the_people_is_told(sets, learned, told):
+def test_a_network_that_was_trained_on_the_people_is_noted(sets, trained, words):
     """Waymo's people are of the split val."""
-    model = Fake(standing)
-    model.header = SimpleNamespace(card={"data": ["waymo"], "recipe": {"split": learned}, "validation_mm": 60.0})
-    notes = judged(sets, "waymo", model).result.notes
-    assert any(told in note for note in notes)
-    # an earlier run's people are known as well
-    model.header.card = {"data": ["another"], "recipe": {"split": learned}, "init_card": model.header.card}
-    assert sum(told in note for note in judged(sets, "waymo", model).result.notes) == 1
-    del model.header.card["init_card"]
-    assert not any(told in note for note in judged(sets, "waymo", model).result.notes)
-    # pre-training on shards takes everybody
-    model.header.card = {"recipe": {"shards": ["waymo"], "seed": 0, "scene": "wild"}}
-    assert any("learned from split all" in note for note in judged(sets, "waymo", model).result.notes)
+
+    def noted(card, words):
+        model = Fake(standing)
+        model.header = SimpleNamespace(card=card)
+        return sum(words in note for note in evaluated(sets, "waymo", model).result.notes)
+
+    card = {"data": ["waymo"], "recipe": {"split": trained}, "validation_mm": 60.0}
+    other = {"data": ["another"], "recipe": {"split": trained}}
+    assert noted(card, words) == 1 and noted(other, words) == 0
+    # an earlier run's people count as well; pre-training on shards takes everybody
+    assert noted(other | {"init_card": card}, words) == 1
+    assert noted({"recipe": {"shards": ["waymo"], "seed": 0, "scene": "wild"}}, "trained on split all") == 1
 
 
-def test_who_gets_no_pose_is_counted_and_in_no_figure(sets):
-    def shy(cloud):
-        return None if len(cloud) % 2 else standing(cloud)
-
-    found = judged(sets, "humanm3", Fake(shy))
+def test_who_gets_no_pose_is_counted_and_in_no_metric(sets):
+    found = evaluated(sets, "humanm3", Fake(lambda cloud: None if len(cloud) % 2 else standing(cloud)))
     missing = found.result.counts["without a pose"]
-    line = found.result.line("mpjpe")
-    assert 0 < missing < 16 and line.people == 16 - missing and line.no_pose == missing and line.skipped == 0
+    row = found.result.line("mpjpe")
+    assert 0 < missing < 16 and row.people == 16 - missing and row.no_pose == missing and row.skipped == 0
     assert found.result.line("mpjpe", "joints", "knees").no_pose == missing
-    assert line.value == pytest.approx(np.nanmean(found.predictions.errors()))
-    nobody = judged(sets, "humanm3", Fake(lambda cloud: None)).result
+    assert row.value == pytest.approx(np.nanmean(found.predictions.errors()))
+    nobody = evaluated(sets, "humanm3", Fake(lambda cloud: None)).result
     assert nobody.line("mpjpe").value is None and nobody.line("mpjpe").low is None
 
 
-def test_joints_that_both_have_are_judged_and_named(sets):
-    result = judged(sets, "humanm3", Fake(lambda cloud: standing(cloud)[:14], WAYMO14)).result
+def test_joints_that_both_have_are_scored_and_named(sets):
+    result = evaluated(sets, "humanm3", Fake(lambda cloud: standing(cloud)[:14], WAYMO14)).result
     both = tuple(name for name in HUMAN15.joints if name in WAYMO14.joints)
     assert result.setting.joints == both and len(both) == 12
     assert "the network has no pelvis, neck, head" in result.setting.not_judged
     assert any("the network has no" in note for note in result.notes)
     with pytest.raises(InputError, match="none in common"):
-        stranger = Skeleton(name="nose", joints=("nose",), parents=(-1,))
-        judged(sets, "humanm3", Fake(lambda cloud: standing(cloud)[:1], stranger))
+        nose = Skeleton(name="nose", joints=("nose",), parents=(-1,))
+        evaluated(sets, "humanm3", Fake(lambda cloud: standing(cloud)[:1], nose))
     # asked for fewer: those alone
-    asked = judged(sets, "lidarhuman26m", Fake(standing), skeleton="human15").result.setting
+    asked = evaluated(sets, "lidarhuman26m", Fake(standing), skeleton="human15").result.setting
     assert set(asked.joints) == set(HUMAN15.joints)
 
 
-def test_few_sequences_have_no_interval(sets):
-    for name, told in (("lidarhuman26m", "one sequence alone"), ("humanm3", "2 sequences alone")):
-        found = judged(sets, name, Fake(standing)).result
-        assert found.line("mpjpe").low is None and any(note.startswith(told) for note in found.notes)
-
-
-def test_sequences_are_drawn_whole(sets, monkeypatch):
+def test_few_sequences_have_no_interval_and_are_drawn_whole(sets, monkeypatch):
+    for name, words in (("lidarhuman26m", "one sequence alone"), ("humanm3", "2 sequences alone")):
+        result = evaluated(sets, name, Fake(standing)).result
+        assert result.line("mpjpe").low is None and any(note.startswith(words) for note in result.notes)
     monkeypatch.setattr(bootstrap, "LEAST_UNITS", 2)
-    found = judged(sets, "humanm3", Fake(standing))
-    line, table = found.result.line("mpjpe"), found.predictions.errors()
+    found = evaluated(sets, "humanm3", Fake(standing))
+    row, table = found.result.line("mpjpe"), found.predictions.errors()
     means = [np.nanmean(table[found.predictions.sequence == name]) for name in ("test/b", "test/c")]
     # of two sequences the extreme draws are one of them twice
-    assert (line.low, line.high) == pytest.approx((min(means), max(means)))
-
-
-def _moving(sets, frames):
-    """People of one track at frames, every 0.1 s."""
-    base = judged(sets, "lidarhuman26m", Fake(standing)).predictions
-    rows = np.zeros(len(frames), int)
-    frames = np.array(frames)
-    return replace(base.select(rows), frame=frames, time=frames * 0.1)
+    assert (row.low, row.high) == pytest.approx((min(means), max(means)))
 
 
 def test_triples_follow_each_other_evenly(sets):
-    found = triples(_moving(sets, [3, 1, 2, 5, 6, 7, 9, 11, 13]))
-    frames = np.array([3, 1, 2, 5, 6, 7, 9, 11, 13])[found]
+    base = evaluated(sets, "lidarhuman26m", Fake(standing)).predictions
+
+    def triples_of(frames, **more):
+        """Of one person's frames, every 0.1 s."""
+        frames = np.array(frames)
+        predictions = replace(base.select(np.zeros(len(frames), int)), frame=frames, time=frames * 0.1)
+        return frames[triples(replace(predictions, **more))].tolist()
+
     # every second frame is not the sequence's own step
-    assert sorted(map(tuple, frames.tolist())) == [(1, 2, 3), (5, 6, 7)]
-    assert not len(triples(_moving(sets, [1, 2])))
+    assert sorted(triples_of([3, 1, 2, 5, 6, 7, 9, 11, 13])) == [[1, 2, 3], [5, 6, 7]]
+    assert not triples_of([1, 2]) and not triples_of([1, 2, 3], time=np.full(3, np.nan))
     # another track's frames nearby take nothing away
-    several = _moving(sets, [0, 2, 4, 6, 8, 9, 10])
-    several = replace(several, track=np.array(["a"] * 5 + ["b"] * 2))
-    assert len(triples(several)) == 3
-    unknown = replace(_moving(sets, [1, 2, 3]), time=np.full(3, np.nan))
-    assert not len(triples(unknown))
+    assert len(triples_of([0, 2, 4, 6, 8, 9, 10], track=np.array(["a"] * 5 + ["b"] * 2))) == 3
 
 
-def test_turned_round_is_over_a_right_angle(sets):
-    base = judged(sets, "lidarhuman26m", Fake(standing)).predictions
-    true = base.true - base.true.mean(1, keepdims=True)
-    # upright bodies, so that a turn about z turns their facing
-    true = np.tile(SMPL_STANDING.astype(np.float32), (len(true), 1, 1))
+def test_facing_is_flipped_over_a_right_angle(sets):
+    base = evaluated(sets, "lidarhuman26m", Fake(standing)).predictions
+    # an upright body, so that a rotation about z is one of its facing
+    true = np.zeros_like(base.true)
+    for joint, y in (("hip", 0.1), ("shoulder", 0.2)):
+        true[:, SMPL24.index(f"left_{joint}"), 1], true[:, SMPL24.index(f"right_{joint}"), 1] = y, -y
     for angle, wanted in ((0.0, 0), (1.4, 0), (-1.5, 0), (1.7, 100), (np.pi, 100)):
         pred = (true @ rotation_about("z", angle).T).astype(np.float32)
         assert (facing_flipped(replace(base, pred=pred, true=true)) == wanted).all()
     assert np.isnan(facing_flipped(replace(base, pred=np.full_like(true, np.nan)))).all()
 
 
-SMPL_STANDING = np.zeros((24, 3))
-for _name, _y in (("hip", 0.1), ("shoulder", 0.2)):
-    SMPL_STANDING[SMPL24.index(f"left_{_name}"), 1] = _y
-    SMPL_STANDING[SMPL24.index(f"right_{_name}"), 1] = -_y
+def test_the_worst_are_the_worst(sets):
+    found = evaluated(sets, "humanm3", Fake(standing), split="all")
+    error = found.predictions.errors().mean(1)
+    assert len(error) == 24 and [k for _, k in found.worst] == np.argsort(-error, kind="stable").tolist()
 
 
 # ---- damage
@@ -432,16 +407,19 @@ def test_a_damaged_shard_is_skipped_counted_and_named(copy):
     first, second = (path for path, name in zip(shards, split, strict=True) if name == "test")
     first.write_bytes(first.read_bytes()[:-20])
     model = Fake(standing)
-    result = judged(copy.parent, "humanm3", model).result
+    result = evaluated(copy.parent, "humanm3", model).result
     assert result.counts["people"] == len(model.clouds) == 8
     assert result.skipped["damaged shards"]["count"] == 1 and first.name in result.skipped["damaged shards"]["first"]
     second.write_bytes(b"PAR1")
     with pytest.raises(InputError, match="nobody in test or val"):
-        judged(copy.parent, "humanm3", model)
+        evaluated(copy.parent, "humanm3", model)
     for path in shards:
         path.write_bytes(b"PAR1")
     with pytest.raises(InputError, match="none of the 3 shards"):
-        judged(copy.parent, "humanm3", model)
+        evaluated(copy.parent, "humanm3", model)
+    shards[0].unlink()
+    with pytest.raises(InputError, match="not finished"):
+        open_eval_dataset(copy)
 
 
 def test_a_shard_that_breaks_half_way_is_left_out_whole(copy):
@@ -451,48 +429,37 @@ def test_a_shard_that_breaks_half_way_is_left_out_whole(copy):
     at = len(data) // 3
     data[at : at + 64] = bytes(64)
     path.write_bytes(bytes(data))
-    result = judged(copy.parent, "humanm3", Fake(standing), split="all").result
-    assert result.counts["people"] == 16
-    assert result.skipped["people of damaged shards"]["count"] == 8
+    setup = eval_setup(Fake(standing), open_eval_dataset(copy, split="all"))
+    result = evaluate_dataset(setup).result
+    assert result.counts["people"] == 16 and result.skipped["people of damaged shards"]["count"] == 8
     assert path.name in result.skipped["damaged shards"]["first"]
     # a second reading counts no more
-    task = eval_setup(Fake(standing), open_eval_dataset(copy, split="all"))
-    assert (
-        evaluate_dataset(task).result == evaluate_dataset(task).result
-        and evaluate_dataset(task).result.skipped == result.skipped
-    )
-
-
-def test_a_missing_shard_is_an_unfinished_dataset(copy):
-    shard_path(copy, "labelled", 0).unlink()
-    with pytest.raises(InputError, match="not finished"):
-        open_eval_dataset(copy)
+    assert evaluate_dataset(setup).result == result
 
 
 def test_who_the_released_code_leaves_out_is_counted(sets, tmp_path):
-    copied = shutil.copytree(sets / "leaking", tmp_path / "leaking")
-    path = shard_path(copied, "labelled", 0)
+    path = shard_path(shutil.copytree(sets / "leaking", tmp_path / "leaking"), "labelled", 0)
     rows = list(read_rows(path, "labelled"))
     tests = [k for k, row in enumerate(rows) if row["split"] == "test"]
     rows[tests[0]]["points"] = rows[tests[0]]["points"][:15]
     rows[tests[1]]["center_trans"] = None
     write_shard(path, "labelled", rows)
-    before = judged(sets, "leaking", Fake(standing), protocol="dapt").result
-    after = judged(tmp_path, "leaking", Fake(standing), protocol="dapt").result
+    before = evaluated(sets, "leaking", Fake(standing), protocol="dapt").result
+    after = evaluated(tmp_path, "leaking", Fake(standing), protocol="dapt").result
     assert after.counts["people"] == before.counts["people"] - 2
     assert after.skipped["people of under 10 points, as the released code skips them"]["count"] == 1
     assert after.skipped["people without the center 'trans'"]["count"] == 1
-    # nor are they disturbed
-    task = eval_setup(Fake(standing), open_eval_dataset(tmp_path / "leaking"), protocol="dapt")
-    assert len(robustness.people_to_perturb(task)) == after.counts["people"]
+    # nor are they perturbed
+    setup = eval_setup(Fake(standing), open_eval_dataset(tmp_path / "leaking"), protocol="dapt")
+    assert len(robustness.people_to_perturb(setup)) == after.counts["people"]
 
 
-def test_the_released_protocol_is_one_look(sets):
+def test_dapt_predicts_each_person_once(sets):
     model = Fake(standing)
     model.model["tta"] = 4
-    assert judged(sets, "humanm3", model)
-    with pytest.raises(InputError, match="dapt is one look at each person"):
-        judged(sets, "humanm3", model, protocol="dapt")
+    assert evaluated(sets, "humanm3", model)
+    with pytest.raises(InputError, match="dapt predicts each person once"):
+        evaluated(sets, "humanm3", model, protocol="dapt")
 
 
 # ---- files
@@ -506,7 +473,7 @@ def written(sets, tmp_path_factory):
     return run, folder, evaluation.write(run, folder)
 
 
-def test_what_cannot_be_written_or_disturbed_is_known_before_anybody_is_judged(tmp_path, monkeypatch, capsys):
+def test_what_cannot_be_written_or_perturbed_is_an_error_before_anybody_is_predicted(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(run_module, "evaluate_dataset", None)
     (tmp_path / "file").write_text("")
     for out in ("file", "file/deep"):
@@ -514,71 +481,53 @@ def test_what_cannot_be_written_or_disturbed_is_known_before_anybody_is_judged(t
         assert "file" in capsys.readouterr().err
     # of a single person of the bench nobody is clean
     assert main(["evaluate", "tiny", "bench", "--limit", "1", "--stability", "--out", str(tmp_path / "new")]) == 2
-    assert "judge more people, or no --stability" in capsys.readouterr().err
+    assert "score more people, or leave --stability out" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-@pytest.mark.parametrize(
-    "model, dataset, options, words",
-    [
-        (3, "bench", {}, "expected a network to judge"),
-        ("tiny", None, {}, "expected a dataset to judge"),
-        ("tiny", "bench", {"limit": "4"}, "limit must be a whole number of at least 1 person, got '4'"),
-        ("tiny", "bench", {"limit": 4.0}, "limit must be a whole number"),
-        (Fake(None), "bench", {"tta": 4}, "of weights by name or path: give them to load instead"),
-    ],
-)
-def test_arguments_of_the_wrong_kind_are_told(model, dataset, options, words):
-    with pytest.raises(InputError, match=words):
-        evaluation.evaluate(model, dataset, **options)
-
-
-def test_numpy_s_numbers_and_one_dataset_alone_are_judged_and_written(tmp_path):
-    run = evaluation.run("tiny", "bench", limit=np.int64(3), seed=np.int32(2))
+def test_numpy_s_numbers_one_dataset_alone_and_options_of_load(tmp_path):
+    run = evaluation.run("tiny", "bench", limit=np.int64(3), seed=np.int32(2), tta=2, sensor_unknown=True)
     evaluation.write(run, tmp_path / "new")
     assert evaluation.read_scores(tmp_path / "new").results == run.scores.results
     assert evaluation.table(tmp_path / "new") == evaluation.table([tmp_path / "new"])
+    assert run.scores.weights["tta"] == 2 and run.scores.results[0].setting.sensor == "unknown"
 
 
-def test_every_figure_can_be_computed_from_the_poses(written):
-    run, folder, _ = written
+def test_every_metric_can_be_computed_from_the_poses(written):
+    _, folder, _ = written
     scores, people = evaluation.read_scores(folder), evaluation.read_poses(folder / "poses.parquet")
     assert list(people) == ["waymo", "humanm3", "lidarpose-bench-1"]
+    # by anybody else, too, from the table alone
+    table = pd.read_parquet(folder / "poses.parquet")
     for result in scores.results:
         again = metric_rows(people[result.setting.dataset], result.setting, dapt_compat=True)
-        own = tuple(line for line in result.lines if line.method == result.setting.method)
+        own = tuple(row for row in result.lines if row.method == result.setting.method)
         assert again == own and len(own) > 30
-    # and by anybody else, from the table alone
-    import pandas
-
-    table = pandas.read_parquet(folder / "poses.parquet")
-    for name, rows in table.groupby("dataset"):
-        each = rows["error_mm"].map(np.nanmean)
-        wanted = next(r for r in scores.results if r.setting.dataset == name).line("mpjpe")
-        assert each.mean() == pytest.approx(wanted.value, abs=1e-3)
+        each = table[table["dataset"] == result.setting.dataset]["error_mm"].map(np.nanmean)
+        assert each.mean() == pytest.approx(result.line("mpjpe").value, abs=1e-3)
 
 
 def test_scores_come_back_as_they_were(written):
     run, folder, paths = written
     assert evaluation.read_scores(folder) == evaluation.read_scores(folder / "scores.json") == run.scores
-    found = json.loads((folder / "scores.json").read_text())
-    assert found["schema"] == "lidarpose.scores/1" and found["command"] == "as typed"
-    assert len(found["weights"]["digest"]) == 64 and found["weights"]["file"] == "tiny.safetensors"
-    for result in found["results"]:
-        for line in result["lines"]:
-            assert {line[key] for key in ("protocol", "centring")} == {"clean", "points alone"}
-            assert line["split"] == result["setting"]["split"]
+    content = json.loads((folder / "scores.json").read_text())
+    assert content["schema"] == "lidarpose.scores/1" and content["command"] == "as typed"
+    assert len(content["weights"]["digest"]) == 64 and content["weights"]["file"] == "tiny.safetensors"
+    for result in content["results"]:
+        for row in result["lines"]:
+            assert (row["protocol"], row["centring"]) == ("clean", "points alone")
+            assert row["split"] == result["setting"]["split"]
     assert {path.name for path in paths} == {path.name for path in folder.iterdir()}
-    assert all(path.read_bytes()[:4] == b"\x89PNG" for path in paths if path.suffix == ".png")
-    assert sum(path.suffix == ".png" for path in paths) == 9
+    assert [path.read_bytes()[:4] for path in paths if path.suffix == ".png"] == [b"\x89PNG"] * 9
 
 
-def test_limits_and_floors_are_told_in_the_lines(written):
+def test_limits_and_baselines_are_in_the_rows(written):
     result = written[0].scores.results[2]
     assert result.setting.limit == 16 and result.setting.total == 2000
-    assert all(line.limit == 16 for line in result.lines)
-    floor = result.line("mpjpe", method="floor: mean pose, true facing")
-    assert result.line("mpjpe").value < floor.value < result.line("mpjpe", method="floor: mean pose").value
+    assert all(row.limit == 16 for row in result.lines)
+    baseline = result.line("mpjpe", method="floor: mean pose, true facing")
+    assert result.line("mpjpe").value < baseline.value < result.line("mpjpe", method="floor: mean pose").value
+    assert any("MPJPE" in line and "baseline mean pose:" in line for line in evaluating._lines(result))
     # four waymo people are all there are
     assert written[0].scores.results[0].setting.limit is None
 
@@ -586,8 +535,8 @@ def test_limits_and_floors_are_told_in_the_lines(written):
 def test_released_arithmetic_stands_beside(written):
     result = written[0].scores.results[0]
     people = evaluation.read_poses(written[1] / "poses.parquet")["waymo"]
-    known = people.labels > 0
-    wanted = metrics.by_group(metrics.joint_errors(people.pred, people.true, known), "waymo14", empty=0.0)["head"]
+    table = metrics.joint_errors(people.pred, people.true, people.labels > 0)
+    wanted = metrics.by_group(table, "waymo14", empty=0.0)["head"]
     assert result.line("mpjpe", "joints", "head", arithmetic="released").value == pytest.approx(wanted)
     # labels are missing there, so the released alignment has nothing to align
     with pytest.raises(InputError, match="no line"):
@@ -598,12 +547,11 @@ def test_released_arithmetic_stands_beside(written):
 def test_all_files_or_none(written, tmp_path, monkeypatch):
     run, folder, _ = written
     run = replace(run, evaluations=run.evaluations[:1])
-    with pytest.raises(InputError, match="holds other files"):
-        evaluation.write(run, folder)
-    with pytest.raises(InputError, match="is a file; give a new or empty folder"):
-        evaluation.write(run, folder / "scores.json")
+    for path, words in ((folder, "holds other files"), (folder / "scores.json", "is a file; give a new or empty")):
+        with pytest.raises(InputError, match=words):
+            evaluation.write(run, path)
 
-    def broken(path, judged):
+    def broken(path, predictions):
         path.write_bytes(b"half")
         raise InputError("no more")
 
@@ -613,31 +561,26 @@ def test_all_files_or_none(written, tmp_path, monkeypatch):
     assert not (tmp_path / "deep").exists()
 
 
-def test_other_files_are_no_scores(tmp_path):
-    for content, words in (
-        ("{}", "'schema' is missing"),
-        ("[1]", "no scores.json"),
-        ('{"schema": "x/9"}', "x/9"),
-        ("a", "no s"),
-    ):
+def test_other_files_are_no_scores(written, tmp_path):
+    good = json.loads((written[1] / "scores.json").read_text())
+    nameless = json.loads(json.dumps(good))
+    nameless["results"][0]["setting"]["dataset"] = []
+    cases = [
+        ({}, "'schema' is missing"),
+        ([1], "no scores.json"),
+        ({"schema": "x/9"}, "x/9"),
+        (good | {"weights": good["weights"] | {"digest": -1}}, "no scores.json .*digest"),
+        (good | {"weights": good["weights"] | {"digest": float("nan")}}, "no scores.json .*digest"),
+        (nameless, "no scores.json .*dataset is no text"),
+    ]
+    for content, words in [*((json.dumps(content), words) for content, words in cases), ("a", "no s")]:
         (tmp_path / "scores.json").write_text(content)
-        with pytest.raises(InputError, match=words):
-            evaluation.read_scores(tmp_path)
+        for read in (evaluation.read_scores, evaluation.table):
+            with pytest.raises(InputError, match=words):
+                read(tmp_path)
     (tmp_path / "poses.parquet").write_bytes(b"PAR1 and no more")
     with pytest.raises(InputError, match="is no poses.parquet"):
         evaluation.read_poses(tmp_path / "poses.parquet")
-
-
-def test_scores_whose_words_are_none_are_no_scores(written, tmp_path):
-    good = json.loads((written[1] / "scores.json").read_text())
-    for change in ({"digest": -1}, {"digest": float("nan")}):
-        (tmp_path / "a.json").write_text(json.dumps(good | {"weights": good["weights"] | change}))
-        with pytest.raises(InputError, match="no scores.json .*digest"):
-            evaluation.table([tmp_path / "a.json"])
-    good["results"][0]["setting"]["dataset"] = []
-    (tmp_path / "a.json").write_text(json.dumps(good))
-    with pytest.raises(InputError, match="no scores.json .*dataset is no text"):
-        evaluation.table([tmp_path / "a.json"])
 
 
 def test_a_table_never_replaces_its_scores(written, capsys):
@@ -657,13 +600,12 @@ def test_folders_are_numbered(tmp_path):
     assert evaluation.new_folder("x/best.safetensors", tmp_path) == tmp_path / "best"
 
 
-def test_two_of_one_name_are_refused(sets):
-    with pytest.raises(InputError, match="two datasets are called"):
-        evaluation.run("tiny", ["bench", "bench"])
-
-
-def test_the_public_name_is_there():
+def test_names_until_0_2_are_there(written):
     assert lidarpose.evaluation.evaluate is evaluation.evaluate and "evaluation" in dir(lidarpose)
+    first = written[0].evaluations[0]
+    assert evaluation.Judged is type(first.judged) and evaluation.Line is type(first.result.lines[0])
+    assert (first.judged.labelled == first.predictions.labeled).all() and len(first.judged.of([0])) == 1
+    assert first.result.setting.told == first.result.setting.summary
 
 
 @pytest.mark.slow
@@ -682,28 +624,6 @@ def test_the_figures_of_the_docs_are_those_of_the_bundled_weights_on_the_bench()
     assert len(load_bench().people) == 2000
 
 
-def test_evaluate_looks_as_often_as_asked_for():
-    assert evaluation.run("tiny", "bench", limit=2, tta=2).scores.weights["tta"] == 2
-
-
-def test_evaluate_hides_the_sensor():
-    assert evaluation.evaluate("tiny", "bench", limit=2, sensor_unknown=True).setting.sensor == "unknown"
-
-
-def test_dapt_s_poses_are_in_the_dataset_s_frame(sets):
-    people = list(open_eval_dataset(sets / "humanm3"))
-    pick = [HUMAN15.index(name) if name in HUMAN15.joints else 0 for name in BODY26.joints]
-    known = knowing(people, (0.06, 0, 0.08))
-    task = eval_setup(Fake(lambda cloud: known(cloud)[pick]), open_eval_dataset(sets / "humanm3"), protocol="dapt")
-    assert evaluate_dataset(task).result.line("mpjpe").value == pytest.approx(100, abs=1e-2)
-
-
-def test_the_worst_are_the_worst(sets):
-    found = evaluate_dataset(eval_setup(Fake(standing), open_eval_dataset(sets / "humanm3", split="all")))
-    error = found.predictions.errors().mean(1)
-    assert len(error) == 24 and [k for _, k in found.worst] == np.argsort(-error, kind="stable").tolist()
-
-
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """Synthesized people of seed 0."""
@@ -713,7 +633,7 @@ def made(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    "recipe, knows",
+    "recipe, noted",
     [
         ({"seed": 0, "scene": "wild", "shards": []}, True),
         ({"seed": 0, "scene": "wild", "split": "train", "mix": 0.25}, True),
@@ -723,17 +643,16 @@ def made(tmp_path_factory):
         ({"seed": 0, "scene": "paper", "shards": []}, False),
     ],
 )
-def test_people_of_the_seed_that_a_network_learned_from_are_no_strangers(made, recipe, knows):
+def test_people_of_the_seed_that_a_network_was_trained_on_are_noted(made, recipe, noted):
     """Person i of a seed has the same body, pose and place at any difficulty."""
     model = Fake(standing)
     model.header = SimpleNamespace(card={"recipe": {"seed": 5, "scene": "wild"}, "init_card": {"recipe": recipe}})
-    notes = evaluate_dataset(eval_setup(model, open_eval_dataset(made))).result.notes
-    assert any("of seed 0, as these are" in note for note in notes) == knows
+    notes = evaluated(made.parent, made.name, model).result.notes
+    assert any("of seed 0, as these are" in note for note in notes) == noted
 
 
 def test_what_is_hidden_is_not_visible(made):
-    for one, row in zip(open_eval_dataset(made), open_dataset(made).rows(), strict=True):
-        assert 1 - one.info.visible == pytest.approx(1 - row["visible"], abs=1e-6)
-    visible = load_bench().columns["visible"]
-    for one in open_eval_dataset("bench", limit=9):
-        assert 1 - one.info.visible == pytest.approx(1 - visible[one.row], abs=1e-6)
+    hidden = evaluated(made.parent, made.name, Fake(standing)).predictions.hidden
+    np.testing.assert_allclose(hidden, [1 - row["visible"] for row in open_dataset(made).rows()], atol=1e-6)
+    found = evaluate_dataset(eval_setup(Fake(standing), open_eval_dataset("bench", limit=9))).predictions
+    np.testing.assert_allclose(found.hidden, 1 - load_bench().columns["visible"][found.row], atol=1e-6)

@@ -99,7 +99,7 @@ def test_protocols_stand_in_blocks_of_their_own(tmp_path):
 def test_a_limit_is_in_the_note_and_other_sets_stand_apart(tmp_path):
     text = evaluation.table([scores(tmp_path / "a", kind="bench", dataset="lidarpose-bench-1", limit=9)])
     assert "9 people, evenly picked from 200" in text
-    assert "**Evaluated here on sets that the paper does not have.**" in text and "| floor: nobody | 300.00" in text
+    assert "**Evaluated here on sets that the paper does not have.**" in text and "| baseline: nobody | 300.00" in text
 
 
 def test_two_weights_of_one_name_are_two_rows(tmp_path):

@@ -8,11 +8,14 @@ from contextlib import ExitStack
 from lidarpose.cli.terminal import is_watched, tell
 from lidarpose.models import BUNDLED
 
-# groups of lines that the terminal shows; the others are in scores.json
+# groups of rows that the terminal shows; the others are in scores.json
 _SHOWN = ("condition", "plain", "joints", "distance, m", "points", "hidden share")
-# figures of these groups that it shows, besides those of everybody
-_TOLD = ("mpjpe", "turned_round")
-_FIGURES = {"mpjpe": "MPJPE", "pa_mpjpe": "PA-MPJPE", "pck3": "PCK-3", "pck5": "PCK-5"}
+# metrics of these groups that it shows, besides those of everybody
+_GROUP_METRICS = ("mpjpe", "turned_round")
+_TITLES = {
+    **{"mpjpe": "MPJPE", "pa_mpjpe": "PA-MPJPE", "pck3": "PCK-3", "pck5": "PCK-5"},
+    **{"turned_round": "facing flipped (> 90 deg)", "pem": "PEM", "oks_ap": "OKS-AP", "auroc": "AUROC"},
+}
 
 
 def add(commands) -> None:
@@ -20,7 +23,7 @@ def add(commands) -> None:
     evaluate = commands.add_parser(
         "evaluate",
         help="score a checkpoint on datasets",
-        description="Prints figures and writes scores.json, poses.parquet and pictures into a folder.",
+        description="Prints metrics and writes scores.json, poses.parquet and pictures into a folder.",
     )
     evaluate.set_defaults(run=_evaluate)
     evaluate.add_argument(
@@ -40,7 +43,7 @@ def add(commands) -> None:
         "--skeleton", metavar="NAME", help="score the joints of this skeleton (default: the dataset's)"
     )
     evaluate.add_argument("--limit", type=int, metavar="N", help="score only N people, evenly spread")
-    evaluate.add_argument("--stability", action="store_true", help="also disturb the points and draw the curves")
+    evaluate.add_argument("--stability", action="store_true", help="also perturb the points and draw the curves")
     evaluate.add_argument("--legacy", action="store_true", help="also score with the released code's arithmetic")
     evaluate.add_argument("--sensor-unknown", action="store_true", help="hide the sensor's position from the network")
     evaluate.add_argument(
@@ -150,12 +153,12 @@ def _lines(result) -> Iterator[str]:
     yield f"{setting.dataset}: {counts['people']:,} people, {len(setting.joints)} joints, {setting.method}"
     yield f"  protocol {setting.protocol}; center: {setting.centring}; crop: {setting.crop}"
     split = setting.split + (f" ({setting.split_source})" if setting.split_source else "")
-    yield f"  split {split}; the sensor's place is {setting.sensor}"
+    yield f"  split {split}; sensor position {setting.sensor}"
     for note in result.notes:
         yield f"  note: {note}"
     if counts["without a pose"]:
         but = " but PEM" if any(line.figure == "pem" for line in result.lines) else ""
-        yield f"  without a pose, and in no figure{but}: {counts['without a pose']:,} people"
+        yield f"  without a pose, and in no metric{but}: {counts['without a pose']:,} people"
     for reason, entry in result.skipped.items():
         yield f"  skipped {entry['count']:,}: {reason} (first: {entry['first']})"
     shown = [line for line in result.lines if _is_shown(line)]
@@ -167,11 +170,13 @@ def _lines(result) -> Iterator[str]:
 
 
 def _is_shown(line) -> bool:
-    return line.group == "all" or line.group in _SHOWN and line.figure in _TOLD and line.arithmetic == "lidarpose"
+    return (
+        line.group == "all" or line.group in _SHOWN and line.figure in _GROUP_METRICS and line.arithmetic == "lidarpose"
+    )
 
 
 def _named(line, setting) -> str:
-    words = _FIGURES.get(line.figure, line.figure.replace("_", " "))
+    words = _TITLES.get(line.figure, line.figure.replace("_", " "))
     if line.group == "plain":
         words += f", {line.of}"
     elif line.group != "all":
@@ -179,7 +184,7 @@ def _named(line, setting) -> str:
     if line.arithmetic != "lidarpose":
         words += ", released arithmetic"
     if line.method != setting.method:
-        words = f"{line.method.removeprefix('floor: ')}: {words}"
+        words = f"baseline {line.method.removeprefix('floor: ')}: {words}"
     return f"{words}, {line.unit}"
 
 
@@ -192,7 +197,7 @@ def _ends(line) -> str:
 
 
 def _study(study) -> Iterator[str]:
-    yield f"{study.setting.method} disturbed: MPJPE in mm of {study.who} · {study.setting.summary}"
+    yield f"{study.setting.method} perturbed: MPJPE in mm of {study.who} · {study.setting.summary}"
     for curve in study.curves:
         points = (f"{p.label}: {'-' if p.mpjpe is None else f'{p.mpjpe:.1f}'}" for p in curve.points)
         yield f"  {curve.title:<38} {'  '.join(points)}"

@@ -105,7 +105,7 @@ def open_eval_dataset(dataset: str | Path, *, split: str | None = None, limit: i
     if limit is not None:
         limit = whole("limit", limit, least=1, hint=" person")
     if not isinstance(dataset, str | PathLike):
-        raise InputError(f"expected a dataset to judge, {BENCH} or the path of a folder, got {dataset!r}")
+        raise InputError(f"expected a dataset to evaluate on, {BENCH} or the path of a folder, got {dataset!r}")
     if str(dataset) == BENCH:
         return _open_bench(split, limit)
     return _open_folder(Path(dataset), split, limit)

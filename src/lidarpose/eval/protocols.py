@@ -250,7 +250,7 @@ def eval_setup(
     seed = whole("seed", seed, least=0)
     check_protocol(protocol, dataset)
     if protocol == "dapt" and model.model.get("tta", 1) > 1:
-        raise InputError("the protocol dapt is one look at each person, as the released code's: leave --tta away")
+        raise InputError("the protocol dapt predicts each person once, as the released code does: leave --tta out")
     wanted = dataset.scored
     if skeleton is not None:
         wanted = skeleton_of(skeleton)
@@ -269,7 +269,7 @@ def eval_setup(
         "the network has no": [name for name in wanted.joints if name not in own],
         "the released means leave out": [name for name in wanted.joints if name in own and name in without],
     }
-    told = ("split", "split_source", "leaks", "total", "limit", "clusters", "kind")
+    fields = ("split", "split_source", "leaks", "total", "limit", "clusters", "kind")
     setting = Setting(
         dataset=dataset.name,
         method=str(model.model["name"]),
@@ -279,7 +279,7 @@ def eval_setup(
         sensor="unknown" if sensor_unknown else "known",
         seed=seed,
         **described(protocol, dataset.kind),
-        **{name: getattr(dataset, name) for name in told},
+        **{name: getattr(dataset, name) for name in fields},
     )
     joints = subset(wanted, shared)
     return EvalSetup(model=model, dataset=dataset, setting=setting, joints=joints, sensor_unknown=sensor_unknown)

@@ -245,7 +245,9 @@ def people_to_perturb(setup: EvalSetup) -> list[CroppedPerson]:
         if seen is not None and len(seen.points)
     ]
     if not people:
-        raise InputError(f"none of the {_who(setup)} has a point to disturb: judge more people, or no --stability")
+        raise InputError(
+            f"none of the {_who(setup)} has a point to perturb: score more people, or leave --stability out"
+        )
     return people
 
 

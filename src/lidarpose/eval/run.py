@@ -76,7 +76,7 @@ def evaluate_dataset(
             progress(len(chunk))
     if not rows:
         left = "; ".join(f"{reason}: {entry['first']}" for reason, entry in dataset.skipped.items())
-        raise InputError(f"nobody of {dataset.name} could be judged ({left})")
+        raise InputError(f"nobody of {dataset.name} could be scored ({left})")
     predictions = stack(setup.joints, rows)
     if setting.sensor == "known" and unknown:
         setting = replace(setting, sensor="unknown" if unknown == len(rows) else "of some people")
@@ -133,7 +133,7 @@ def _notes(setup: EvalSetup, setting: Setting, predictions: Predictions) -> Iter
     """What the reader must know; setting: the setup's, as it turned out."""
     yield from _training_notes(setup)
     if setting.not_judged:
-        yield f"judged are {', '.join(setting.joints)}; {setting.not_judged}"
+        yield f"scored joints: {', '.join(setting.joints)}; {setting.not_judged}"
     if setting.leaks:
         yield f"the split leaks: {setting.leaks}"
     if setting.protocol == "dapt":
@@ -146,7 +146,7 @@ def _notes(setup: EvalSetup, setting: Setting, predictions: Predictions) -> Iter
         few = "one sequence alone" if sequences == 1 else f"{sequences} sequences alone"
         yield f"{few}: no intervals, which take {LEAST_UNITS}, since frames of a sequence are not independent"
     if setting.kind == BENCH:
-        yield "the floors know no points: the mean skeleton about the points' center, turned to the true facing or not"
+        yield "the baselines use no points: the mean skeleton about the points' center, with the true facing or one for all"
 
 
 def _training_notes(setup: EvalSetup) -> Iterator[str]:
@@ -163,15 +163,15 @@ def _notes_of_run(run: dict, dataset: EvalDataset) -> Iterator[str]:
     data, split = run.get("data") or recipe.get("shards"), recipe.get("split", "all")
     if isinstance(data, list) and dataset.name in data:
         if split == dataset.split or "all" in (split, dataset.split):
-            yield f"the network learned from split {split} of {dataset.name}: it is judged on people whom it knows"
+            yield f"the network was trained on split {split} of {dataset.name}: it is scored on people it was trained on"
         elif dataset.split == "val" and "validation_mm" in run:
-            yield "the network's run was validated on this split: its best.safetensors was chosen by these people"
+            yield "the network's run was validated on this split: its best.safetensors was selected on these people"
     made = dataset.settings if dataset.kind == "synth" else {}
     synthesized = recipe["mix"] if "mix" in recipe else not recipe.get("shards")
     alike = made.get("what") == "people" and all(made.get(name) == recipe.get(name) for name in ("seed", "scene"))
     if synthesized and alike:
         yield (
-            f"the network learned from synthesized people of seed {made['seed']}, as these are: they may be the "
+            f"the network was trained on synthesized people of seed {made['seed']}, as these are: they may be the "
             "very same; make others by lidarpose synth --seed"
         )
 
@@ -238,7 +238,7 @@ def run(
     """
     datasets = listed(datasets)
     if not datasets:
-        raise InputError("expected a dataset to judge: a folder that lidarpose prepare or synth wrote, or bench")
+        raise InputError("expected a dataset to evaluate on: a folder that lidarpose prepare or synth wrote, or bench")
     pyarrow()
     opened = [open_eval_dataset(dataset, split=split, limit=limit) for dataset in datasets]
     names = [one.name for one in opened]
@@ -253,7 +253,7 @@ def run(
         done = _counter(setup.setting.dataset, setup.dataset.count, progress)
         evaluations.append(evaluate_dataset(setup, dapt_compat=dapt_compat or legacy, progress=done))
         if people is not None:
-            done = _counter(f"{setup.setting.dataset}, disturbed", 0, progress)
+            done = _counter(f"{setup.setting.dataset}, perturbed", 0, progress)
             studies.append(study(setup, evaluations[-1].predictions, people=people, progress=done))
     results = tuple(one.result for one in evaluations)
     scores = Scores(weights=weights, command=command, seed=setups[0].setting.seed, results=results)
@@ -270,7 +270,7 @@ def _loaded(model: Model | str | os.PathLike, **options: Any) -> tuple[Model, di
             weights = {"file": path.name, "digest": content_digest(path, expected="a checkpoint")}
         model = load(model, **options)
     elif not hasattr(model, "predict"):
-        raise InputError(f"expected a network to judge, weights by name or path or a predictor, got {model!r}")
+        raise InputError(f"expected a network to evaluate, weights by name or path or a predictor, got {model!r}")
     elif options != {"device": "cpu", "backend": None, "decode": "window", "tta": 1}:
         raise InputError("device, backend, decode and tta are of weights by name or path: give them to load instead")
     # whether a dataset's own sequences were trained on shows only in the checkpoint

@@ -258,7 +258,7 @@ def _entries(path: str, scores: Scores) -> Iterator[TableEntry]:
             words = [
                 *_setting_words(result),
                 "arithmetic of the released code, faults included" if arithmetic == RELEASED else "",
-                weights if own else "knows no points",
+                weights if own else "uses no points",
                 path,
             ]
             yield TableEntry(
@@ -286,7 +286,7 @@ def _setting_words(result: Result) -> Iterator[str]:
     yield f"split: {split}{', which leaks: ' + setting.leaks if setting.leaks else ''}"
     yield f"{result.counts['people']:,} people{limited}"
     yield f"{len(setting.joints)} joints{' (' + setting.not_judged + ')' if setting.not_judged else ''}"
-    yield "" if setting.sensor == "known" else f"the sensor's place is {setting.sensor}"
+    yield "" if setting.sensor == "known" else f"sensor position {setting.sensor}"
     yield f"{no_pose:,} without a pose, not counted" if no_pose else ""
     yield f"{left_out:,} left out" if left_out else ""
 
@@ -323,7 +323,8 @@ def _rows(entries: list[TableEntry], by: str, mark: Callable[[str], str]) -> lis
     is of, "kind" or "dataset"."""
     rows: list[tuple[tuple[str, str | None], dict]] = []
     for entry in entries:
-        key, column = (entry.row, entry.weights), getattr(entry, by)
+        name = entry.row.replace(BASELINE, "baseline: ")
+        key, column = (name, entry.weights), getattr(entry, by)
         cells = next((cells for own, cells in rows if own == key and (column, "mpjpe") not in cells), None)
         if cells is None:
             rows.append((key, cells := {}))
