@@ -21,7 +21,7 @@ from lidarpose.inference.predictor import load
 from lidarpose.io.files import write_atomic
 from lidarpose.metrics import auroc, calibration_error
 from lidarpose.models import DEFAULT
-from lidarpose.sample import HIT
+from lidarpose.sample import CONFIDENCE_RADIUS
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import PoseBank
 from lidarpose.train.example import seen
@@ -57,7 +57,7 @@ def main() -> None:
     confidence = np.stack([p.confidence for p in predicted])
     spread = np.stack([p.spread for p in predicted])
     told = np.stack([p.pose.visible for p in predicted])
-    hit = error < HIT
+    hit = error < CONFIDENCE_RADIUS
     curves = {
         "confidence: the joint is within 10 cm": (confidence.ravel(), hit.ravel()),
         "visible: a point of the body lies within 18 cm of the joint": (told.ravel(), visible.ravel()),

@@ -17,7 +17,7 @@ from lidarpose.geometry import rotation_about
 from lidarpose.inference.predictor import load
 from lidarpose.metrics import auroc, calibration_error, mpjpe, pa_mpjpe
 from lidarpose.models import DEFAULT
-from lidarpose.sample import HIT
+from lidarpose.sample import CONFIDENCE_RADIUS
 from lidarpose.skeleton import HUMAN15, SMPL24, WAYMO14
 from lidarpose.synth.bodies import PoseBank
 from lidarpose.synth.generator import Generator, SyntheticPerson
@@ -92,8 +92,8 @@ def score(predicted, found: list[SyntheticPerson]) -> dict:
         },
         "mpjpe_smpl24": round(_whole(predicted, found, SMPL24), 1),
         "mpjpe_waymo14": round(_whole(predicted, found, WAYMO14), 1),
-        "calibration_error": round(calibration_error(confidence.ravel(), error.ravel() < HIT), 3),
-        "auroc": round(auroc(confidence.ravel(), error.ravel() < HIT), 3),
+        "calibration_error": round(calibration_error(confidence.ravel(), error.ravel() < CONFIDENCE_RADIUS), 3),
+        "auroc": round(auroc(confidence.ravel(), error.ravel() < CONFIDENCE_RADIUS), 3),
         "spread_over_error": round(float(spread.mean() / error.mean()), 3),
     }
 

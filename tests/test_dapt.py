@@ -539,11 +539,11 @@ def test_attention_equals_its_formula():
     attention = PatchAttention(32, 2).eval()
     tables = build_tables([person(70), person(9, 1)], replace(TINY, patch=32))
     level = DaptBatch.from_tables(tables).levels[0]
-    rows = torch.randn(int(sum(level.patch_lengths)), 32)
+    rows = torch.randn(int(level.patch_lengths.sum()), 32)
     for order in range(4):
         sequence = torch.from_numpy(tables.levels[0].sequence[order])
         want = torch.empty_like(rows)
-        for patch in sequence.split(level.patch_lengths):
+        for patch in sequence.split(level.patch_lengths.tolist()):
             query, key, value = attention.qkv(rows[patch]).view(-1, 3, 2, 16).unbind(1)
             weight = torch.einsum("ihd,jhd->hij", query, key).div(4).softmax(-1)
             want[patch] = torch.einsum("hij,jhd->ihd", weight, value).flatten(1)

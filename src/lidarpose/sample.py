@@ -15,7 +15,7 @@ from lidarpose.skeleton import Skeleton
 # no coordinate on Earth is larger, m; arithmetic on what is would overflow
 FARTHEST = 1e9
 # a joint nearer to the truth than this is a hit, m: what confidence is the probability of
-HIT = 0.1
+CONFIDENCE_RADIUS = 0.1
 # fewer points than this say nothing about a pose
 MIN_POINTS = 5
 # what a pose may say of each joint

@@ -12,7 +12,7 @@ from lidarpose.eval.dataset import EvalSample
 from lidarpose.eval.predictions import Predictions
 from lidarpose.eval.robustness import Curve, End, Stability
 from lidarpose.eval.scores import BASELINE, OURS, MetricRow, Result, Setting
-from lidarpose.sample import HIT, Pose
+from lidarpose.sample import CONFIDENCE_RADIUS, Pose
 from lidarpose.viz.draw import Panel, draw_people
 
 # blue and orange of Okabe and Ito's color-blind-safe palette (2008), the orange darker to stand out on white
@@ -68,7 +68,7 @@ def draw_reliability(predictions: Predictions, result: Result) -> bytes | None:
     setting = result.setting
     title = f"{setting.dataset}: confidence and spread that {setting.method} predicts"
     left, right = (figure := _figure(9.0, 4.3, title, setting.summary)).subplots(1, 2)
-    _confidence(left, confidence, error < 1e3 * HIT, result)
+    _confidence(left, confidence, error < 1e3 * CONFIDENCE_RADIUS, result)
     _spread(right, spread * 1e3, error)
     return _png(figure)
 

@@ -24,7 +24,7 @@ from lidarpose.eval.metrics.joint_errors import acceleration_errors, aligned_err
 from lidarpose.eval.metrics.keypoints import PCK_THRESHOLDS, box_hits, oks, oks_hits, oks_sigmas, pem
 from lidarpose.eval.predictions import Predictions
 from lidarpose.eval.scores import OURS, RELEASED, MetricRow, Setting, number
-from lidarpose.sample import HIDDEN, HIT, SEEN, UNLABELED
+from lidarpose.sample import CONFIDENCE_RADIUS, HIDDEN, SEEN, UNLABELED
 
 # people of fewer points do not tell where they face
 PLENTY = 100
@@ -112,7 +112,7 @@ def _of_confidence(p: Predictions, setting: Setting, metric: Callable) -> Score 
     """Confidence against hits, over all labeled joints at once; None where it cannot be ranked or is not stated."""
     error = p.errors()
     known = ~np.isnan(error) & ~np.isnan(p.confidence)
-    hit = error[known] < 1e3 * HIT
+    hit = error[known] < 1e3 * CONFIDENCE_RADIUS
     if not known.any() or (metric is auroc and hit.all() == hit.any()):
         return None
     people = known.any(1)

@@ -19,7 +19,7 @@ from lidarpose.models.checkpoint import Header, read_header
 from lidarpose.models.config import BIN
 from lidarpose.models.decode import Decoder, out_of_range
 from lidarpose.models.onnx import OUTPUTS, input_name, network_inputs, open_onnx, voxelize_people
-from lidarpose.sample import HIT
+from lidarpose.sample import CONFIDENCE_RADIUS
 
 # people a call; more fill the memory without being faster
 _BATCH = 64
@@ -33,8 +33,8 @@ class Raw:
 
     vote (B, J, 3) m: where the heatmaps' origin lies; heatmaps: logits (B, J, W) of x, y and z, None for a network
     without; low, step (3,) m: where bin 0 of each axis lies about the vote and how far apart bins are. Of networks that
-    say so: confidence (B, J) logit of an error under `HIT`, log_spread (B, J) log of the expected error in m, visible
-    (B, J) logit of being seen.
+    say so: confidence (B, J) logit of an error under `CONFIDENCE_RADIUS`, log_spread (B, J) log of the expected error
+    in m, visible (B, J) logit of being seen.
     """
 
     vote: np.ndarray
@@ -159,15 +159,15 @@ def _decoded(raw: Raw, decoder: Decoder) -> np.ndarray:
 def _from_heatmaps(raw: Raw, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Confidence and spread (B, J) of a network that tells neither, from its heatmaps about `offset` (B, J, 3) m.
 
-    Confidence is the share of the heatmaps within `HIT` of the joint, axes taken as independent; spread the root of
-    their mean square distance. Neither is calibrated.
+    Confidence is the share of the heatmaps within `CONFIDENCE_RADIUS` of the joint, axes taken as independent; spread
+    the root of their mean square distance. Neither is calibrated.
     """
     share, square = 1.0, 0.0
     for axis, heatmap in enumerate(raw.heatmaps):
         weight = np.exp(heatmap.astype(float) - heatmap.max(-1, keepdims=True))
         weight /= weight.sum(-1, keepdims=True)
         distance = raw.low[axis] + np.arange(heatmap.shape[-1]) * raw.step[axis] - offset[..., axis, None]
-        share = share * np.clip((weight * (np.abs(distance) < HIT)).sum(-1), 0, 1)
+        share = share * np.clip((weight * (np.abs(distance) < CONFIDENCE_RADIUS)).sum(-1), 0, 1)
         square = square + (weight * distance**2).sum(-1)
     return share, np.sqrt(square)
 

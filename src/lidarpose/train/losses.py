@@ -10,7 +10,7 @@ from torch.nn import functional as F
 from lidarpose.models.config import BIN
 from lidarpose.models.layers import encode
 from lidarpose.models.posenet import Outputs, Targets
-from lidarpose.sample import HIT
+from lidarpose.sample import CONFIDENCE_RADIUS
 from lidarpose.skeleton import BODY26
 from lidarpose.train.objective import Share, alone
 
@@ -50,7 +50,7 @@ def losses(
 
     error = (outputs.joints().float() - true).norm(dim=-1)
     missed = error.detach()
-    hit = (missed < HIT).to(true.dtype)
+    hit = (missed < CONFIDENCE_RADIUS).to(true.dtype)
     log_spread = outputs.log_spread.float()
     terms = {
         "joints": JOINTS * mean(error),

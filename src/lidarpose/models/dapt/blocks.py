@@ -3,43 +3,18 @@
 Legend: B people, M voxels of all people at a level, T taps, P pairs of neighbors, H heads, D channels a head, C
 channels, J joints, N voxels a person at most.
 
-Modules bear the names of the released weights, so that these load by name.
+Modules bear the names of the released weights, so that these load by name. They read `Level` and `Neighbors` of
+tensors.
 """
-
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from lidarpose.models.dapt.voxel_tables import Level, Neighbors
+
 # of the released code's batch norms
 _EPS, _MOMENTUM = 1e-3, 0.01
-
-
-@dataclass(frozen=True, kw_only=True)
-class NeighborTensors:
-    """`tables.Neighbors` as tensors; counts are plain numbers."""
-
-    source: Tensor | None
-    target: Tensor | None
-    counts: tuple[int, ...]
-    table: Tensor | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class LevelTensors:
-    """`tables.Level` as tensors; sequence is None where rows already stand patch after patch."""
-
-    near: NeighborTensors
-    parent: Tensor | None
-    children: Tensor | None
-    slots: Tensor
-    valid: Tensor
-    sequence: Tensor | None
-    patch_lengths: tuple[int, ...]
-    patch_slots: Tensor | None
-    patch_mask: Tensor | None
-    patch_place: Tensor | None
 
 
 class RowNorm(nn.BatchNorm1d):
@@ -81,7 +56,7 @@ class SubmanifoldConvolution(nn.Module):
         bound = (kernel**3 * channels) ** -0.5
         nn.init.uniform_(self.weight, -bound, bound)
 
-    def forward(self, rows: Tensor, near: NeighborTensors) -> Tensor:
+    def forward(self, rows: Tensor, near: Neighbors) -> Tensor:
         """rows (M, C) -> (M, C')."""
         # unbound once: slicing tap after tap would give each slice's gradient the size of the whole weight
         weights = self.weight.flatten(1, 3).unbind(1)
@@ -90,9 +65,8 @@ class SubmanifoldConvolution(nn.Module):
             # the row after the last is zero: an empty cell; the table has none for the middle tap, done above
             read = F.pad(rows, (0, 0, 0, 1))[near.table.flatten()].view(rows.shape[0], -1)
             return out + F.linear(read, self.weight.flatten(1))
-        for weight, source, target in zip(
-            weights, near.source.split(near.counts), near.target.split(near.counts), strict=True
-        ):
+        counts = near.counts.tolist()
+        for weight, source, target in zip(weights, near.source.split(counts), near.target.split(counts), strict=True):
             if source.shape[0]:
                 out = out.index_add_(0, target, F.linear(rows.index_select(0, source), weight))
         return out
@@ -107,31 +81,30 @@ class PatchAttention(nn.Module):
         self.qkv = nn.Linear(channels, 3 * channels)
         self.proj = nn.Linear(channels, channels)
 
-    def forward(self, rows: Tensor, level: LevelTensors, order: int) -> Tensor:
+    def forward(self, rows: Tensor, level: Level, order: int) -> Tensor:
         """rows (M, C) -> (M, C), patches along the `order`-th curve."""
         qkv = self.qkv(rows)
         if level.patch_slots is not None:
             order = order % level.patch_slots.shape[0]
             blocks = qkv[level.patch_slots[order]].unflatten(-1, (3, self.heads, -1))
-            mixed = self._attend(blocks, level.patch_mask).flatten(0, 1)[level.patch_place[order]]
+            mixed = self._attend(blocks, level.patch_valid).flatten(0, 1)[level.patch_place[order]]
             return self.proj(mixed)
-        if level.sequence is not None:
-            sequence = level.sequence[order % level.sequence.shape[0]]
-            qkv = qkv[sequence]
-        qkv = qkv.unflatten(-1, (3, self.heads, -1))
-        lengths = level.patch_lengths
+        sequence = level.sequence[order % level.sequence.shape[0]]
+        # one curve alone: rows already stand patch after patch
+        is_sorted = level.sequence.shape[0] == 1
+        qkv = (qkv if is_sorted else qkv[sequence]).unflatten(-1, (3, self.heads, -1))
+        lengths = level.patch_lengths.tolist()
         if len(set(lengths)) == 1:
             mixed = self._attend(qkv.unflatten(0, (len(lengths), -1)), None).flatten(0, 1)
         else:
             mixed = torch.cat([self._attend(patch[None], None)[0] for patch in qkv.split(lengths)])
-        if level.sequence is not None:
-            mixed = torch.empty_like(mixed).index_copy(0, sequence, mixed)
-        return self.proj(mixed)
+        return self.proj(mixed if is_sorted else torch.empty_like(mixed).index_copy(0, sequence, mixed))
 
     @staticmethod
     def _attend(qkv: Tensor, mask: Tensor | None) -> Tensor:
-        """qkv (Q, K, 3, H, D), mask (Q, 1, 1, K) True = to be read -> (Q, K, H * D)."""
+        """qkv (Q, K, 3, H, D), mask (Q, K) True = to be read, None for all -> (Q, K, H * D)."""
         query, key, value = qkv.permute(2, 0, 3, 1, 4)
+        mask = None if mask is None else mask[:, None, None]
         mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=mask)
         return mixed.transpose(1, 2).flatten(2)
 
@@ -169,7 +142,7 @@ class Block(nn.Module):
         self.mlp = nn.Sequential(Perceptron(channels, mlp_ratio * channels, channels))
         self.drop_path = DropPath(drop_path)
 
-    def forward(self, rows: Tensor, stale: Tensor, level: LevelTensors) -> tuple[Tensor, Tensor]:
+    def forward(self, rows: Tensor, stale: Tensor, level: Level) -> tuple[Tensor, Tensor]:
         """rows (M, C) and what the convolution reads (M, C): the rows, or the stale branch -> rows, last branch."""
         convolution, mix, norm = self.cpe
         rows = rows + norm(mix(convolution(stale, level.near)))
@@ -191,7 +164,7 @@ class Stage(nn.Module):
             self.add_module(f"block{k}", block)
         self.depth = len(blocks)
 
-    def blocks(self, rows: Tensor, stale: Tensor, level: LevelTensors, *, legacy: bool) -> Tensor:
+    def blocks(self, rows: Tensor, stale: Tensor, level: Level, *, legacy: bool) -> Tensor:
         """rows (M, C) -> (M, C); `stale` is what the first convolution reads in the legacy flow."""
         for k in range(self.depth):
             block = getattr(self, f"block{k}")
@@ -241,7 +214,7 @@ class Exchange(nn.Module):
         )
         self.fc_out = _aligned(voxel_channels, out_channels)
 
-    def forward(self, anchors: Tensor, rows: Tensor, level: LevelTensors) -> Tensor:
+    def forward(self, anchors: Tensor, rows: Tensor, level: Level) -> Tensor:
         anchors = self.fc_in(anchors)
         anchors = self.transformer(anchors, rows[level.slots], memory_key_padding_mask=~level.valid)
         return self.fc_out(anchors)

@@ -7,7 +7,9 @@ the convolution of every later block reads the block's last branch instead of th
 stage reads the skip alone. Weights trained with that flow need it (`config.legacy`); new ones are trained without.
 """
 
-from dataclasses import dataclass
+from collections import OrderedDict
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,8 +20,6 @@ from lidarpose.errors import InputError
 from lidarpose.models.dapt.blocks import (
     Block,
     Exchange,
-    LevelTensors,
-    NeighborTensors,
     Perceptron,
     Pooling,
     RowNorm,
@@ -34,11 +34,11 @@ from lidarpose.models.layers import mean_bin
 
 @dataclass(frozen=True, kw_only=True)
 class DaptBatch:
-    """What the network reads, as tensors; see `tables.Tables`."""
+    """What the network reads of `Tables`, as tensors."""
 
     features: Tensor
-    stem: NeighborTensors
-    levels: tuple[LevelTensors, ...]
+    stem: Neighbors
+    levels: tuple[Level, ...]
 
     @classmethod
     def from_tables(
@@ -46,8 +46,8 @@ class DaptBatch:
     ) -> "DaptBatch":
         return cls(
             features=torch.as_tensor(tables.features).to(device, dtype),
-            stem=_neighbors(tables.stem, device),
-            levels=tuple(_level(level, device) for level in tables.levels),
+            stem=_to_tensors(tables.stem, device),
+            levels=_to_tensors(tables.levels, device),
         )
 
 
@@ -92,11 +92,11 @@ class DaptNet(nn.Module):
             heads["query"] = HeatmapHead(width, config)
         if config.coordinates:
             # the released files hold one of the two heads of an anchor, under one name
-            heads["coordinate" if config.bins else "query"] = CoordinateHead(width, 3)
+            heads["coordinate" if config.bins else "query"] = _coordinate_head(width, 3)
         if config.auxiliary:
-            heads["inter_feat"] = CoordinateHead(config.encoder_channels[-1], 3 * len(config.joints))
+            heads["inter_feat"] = _coordinate_head(config.encoder_channels[-1], 3 * len(config.joints))
         if config.parts:
-            heads["feat"] = PartHead(config.decoder_channels[0], config.parts)
+            heads["feat"] = _part_head(config.decoder_channels[0], config.parts)
         self.heads = nn.ModuleDict(heads)
 
     def forward(self, batch: DaptBatch) -> DaptOutputs:
@@ -236,31 +236,16 @@ class HeatmapHead(nn.Module):
         return tuple(fc(anchors) for fc in self.fcs)
 
 
-class CoordinateHead(nn.Module):
+def _coordinate_head(channels: int, out_channels: int) -> nn.Sequential:
     """Paper: the decoder D_reg of anchors; also the released code's auxiliary head of the bottleneck."""
-
-    def __init__(self, channels: int, out_channels: int):
-        super().__init__()
-        self.fc = Perceptron(channels, channels, out_channels)
-
-    def forward(self, rows: Tensor) -> Tensor:
-        return self.fc(rows)
+    return nn.Sequential(OrderedDict(fc=Perceptron(channels, channels, out_channels)))
 
 
-class PartHead(nn.Module):
+def _part_head(channels: int, parts: int) -> nn.Sequential:
     """Paper: the decoder D_seg of points. The released code's batch norm here is torch's own, eps 1e-5."""
-
-    def __init__(self, channels: int, parts: int):
-        super().__init__()
-        self.fc = nn.Sequential(
-            nn.Linear(channels, channels),
-            RowNorm(channels, eps=1e-5, momentum=0.1),
-            nn.GELU(),
-            nn.Linear(channels, parts),
-        )
-
-    def forward(self, rows: Tensor) -> Tensor:
-        return self.fc(rows)
+    norm = RowNorm(channels, eps=1e-5, momentum=0.1)
+    layers = nn.Sequential(nn.Linear(channels, channels), norm, nn.GELU(), nn.Linear(channels, parts))
+    return nn.Sequential(OrderedDict(fc=layers))
 
 
 def _blocks(channels: int, heads: int, drops: list[float], config: DaptConfig) -> list[Block]:
@@ -280,30 +265,14 @@ def _array(values: Tensor) -> np.ndarray:
     return values.float().cpu().numpy()
 
 
-def _neighbors(near: Neighbors, device: torch.device | str) -> NeighborTensors:
-    return NeighborTensors(
-        source=_tensor(near.source, device),
-        target=_tensor(near.target, device),
-        counts=() if near.counts is None else tuple(near.counts.tolist()),
-        table=_tensor(near.table, device),
-    )
-
-
-def _level(level: Level, device: torch.device | str) -> LevelTensors:
-    mask = level.patch_valid
-    return LevelTensors(
-        near=_neighbors(level.near, device),
-        parent=_tensor(level.parent, device),
-        children=_tensor(level.children, device),
-        slots=_tensor(level.slots, device),
-        valid=_tensor(level.valid, device),
-        sequence=_tensor(level.sequence, device) if len(level.sequence) > 1 else None,
-        patch_lengths=tuple(level.patch_lengths.tolist()),
-        patch_slots=_tensor(level.patch_slots, device),
-        patch_mask=None if mask is None or mask.all() else _tensor(mask[:, None, None], device),
-        patch_place=_tensor(level.patch_place, device),
-    )
-
-
-def _tensor(array: np.ndarray | None, device: torch.device | str) -> Tensor | None:
-    return None if array is None else torch.as_tensor(array).to(device)
+def _to_tensors(value: Any, device: torch.device | str) -> Any:
+    """A record of arrays as the same record of tensors."""
+    if isinstance(value, np.ndarray):
+        return torch.as_tensor(value).to(device)
+    if isinstance(value, tuple):
+        return tuple(_to_tensors(part, device) for part in value)
+    if is_dataclass(value):
+        return replace(
+            value, **{field.name: _to_tensors(getattr(value, field.name), device) for field in fields(value)}
+        )
+    return value

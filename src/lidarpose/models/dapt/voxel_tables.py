@@ -46,8 +46,8 @@ class Level:
     last; slots (B, N): rows of each person, the first repeated; valid (B, N) bool.
 
     Patches: sequence (O, M) rows in the order of each curve, O = 1 where nobody exceeds the patch; patch_lengths (Q,):
-    how many each patch holds, one after the other; in the padded layout patch_slots (O, Q, K) rows, patch_valid (Q, K)
-    and patch_place (O, M), the place of each row among the Q * K.
+    how many each patch holds, one after the other; in the padded layout patch_slots (O, Q, K) rows, patch_valid (Q, K),
+    None where all are, and patch_place (O, M), the place of each row among the Q * K.
     """
 
     lengths: np.ndarray
@@ -58,9 +58,9 @@ class Level:
     valid: np.ndarray
     sequence: np.ndarray
     patch_lengths: np.ndarray
-    patch_slots: np.ndarray | None
-    patch_valid: np.ndarray | None
-    patch_place: np.ndarray | None
+    patch_slots: np.ndarray | None = None
+    patch_valid: np.ndarray | None = None
+    patch_place: np.ndarray | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,8 +179,7 @@ def _one_a_voxel(
 
 def _grouped(key: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Sorted keys (n,) -> the distinct ones (m,), where each begins (m,), and which one each is (n,)."""
-    begins = np.ones(len(key), bool)
-    begins[1:] = key[1:] != key[:-1]
+    begins = np.diff(key, prepend=-1) > 0
     first = np.flatnonzero(begins)
     return key[first], first, np.cumsum(begins) - 1
 
@@ -245,13 +244,17 @@ def _people(
         patch_lengths = np.concatenate([_cut(int(length), config.patch) for length in lengths])
     out |= {"sequence": sequence, "patch_lengths": patch_lengths}
     if layout == "ragged":
-        return out | dict.fromkeys(("patch_slots", "patch_valid", "patch_place"))
+        return out
     begins = np.cumsum(patch_lengths) - patch_lengths
     places = _spread(begins, len(owner))
     valid = np.arange(places.shape[1]) < patch_lengths[:, None]
     place = np.empty_like(sequence)
     np.put_along_axis(place, sequence, np.flatnonzero(valid)[None], 1)
-    return out | {"patch_slots": sequence[:, places], "patch_valid": valid, "patch_place": place}
+    return out | {
+        "patch_slots": sequence[:, places],
+        "patch_valid": None if valid.all() else valid,
+        "patch_place": place,
+    }
 
 
 def _cut(length: int, patch: int) -> list[int]:
