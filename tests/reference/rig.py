@@ -2,9 +2,12 @@
 
 import numpy as np
 
-from lidarpose.body.rig import HEAD, HEAD_POINTS, forward_kinematics
+from lidarpose.body.rig import forward_kinematics
 from lidarpose.body.shape import FOLD_GAIN
-from lidarpose.skeleton import SMPL24
+from lidarpose.skeleton import BODY26, SMPL24
+
+HEAD = SMPL24.index("head")
+HEAD_POINTS = tuple(range(len(SMPL24), len(BODY26)))  # joints behind SMPL's 24, which the head carries
 
 
 def pose_bodies_reference(rig, rest, rotations, translation):

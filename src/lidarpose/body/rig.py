@@ -18,11 +18,7 @@ from importlib import resources
 
 import numpy as np
 
-from lidarpose.skeleton import BODY26, SMPL24
-
-# the points behind SMPL's 24 joints that the head carries
-HEAD_POINTS = tuple(range(len(SMPL24), len(BODY26)))
-HEAD = SMPL24.index("head")
+from lidarpose.skeleton import SMPL24
 
 
 @dataclass(frozen=True, kw_only=True)

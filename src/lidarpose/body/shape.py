@@ -145,9 +145,7 @@ def _outfit(rng: np.random.Generator, n: int) -> np.ndarray:
     leg_kind = rng.choice(4, size=n, p=[0.22, 0.52, 0.13, 0.13])
     tight, shorts, skirt = leg_kind == 0, leg_kind == 2, leg_kind == 3
     thigh = np.select(
-        [tight, skirt],
-        [rng.uniform(0.001, 0.006, n), rng.uniform(0.015, 0.035, n)],
-        rng.uniform(0.008, 0.02, n),
+        [tight, skirt], [rng.uniform(0.001, 0.006, n), rng.uniform(0.015, 0.035, n)], rng.uniform(0.008, 0.02, n)
     )
     shank = np.select([tight, shorts, skirt], [thigh, 0.0, 0.0], thigh * rng.uniform(0.8, 1.4, n))
     shank = np.where(skirt & (rng.random(n) < 0.3), thigh, shank)

@@ -41,7 +41,7 @@ Extent = tuple[list[float], list[float]]
 @dataclass(frozen=True, kw_only=True)
 class PoseBank:
     """Captured poses in the rest frame of `body.rig`: local rotations (n, 24, 3, 3) float32, facing +x; moved
-    (n, 24, 3, 3) and step (n, 3) m, `FRAME_TIME` s later (see `body.mocap.motion.Moves`); clips: their
+    (n, 24, 3, 3) and step (n, 3) m, `FRAME_TIME` s later (see `Motion.pairs`); clips: their
     motion."""
 
     rotations: np.ndarray
@@ -52,10 +52,10 @@ class PoseBank:
     @classmethod
     def of_motion(cls, motion: Motion) -> "PoseBank":
         """All poses of a motion that go on for `FRAME_TIME` s. Raises InputError where none does."""
-        moves = motion.pairs(FRAME_TIME)
-        if not len(moves.rotations):
+        rotations, moved, step = motion.pairs(FRAME_TIME)
+        if not len(rotations):
             raise InputError(f"{motion.source}: no clip goes on for {FRAME_TIME:g} s")
-        return cls(rotations=moves.rotations, moved=moves.moved, step=moves.step, clips=motion.resampled(CLIP_HZ))
+        return cls(rotations=rotations, moved=moved, step=step, clips=motion.resampled(CLIP_HZ))
 
     @classmethod
     def from_clips(cls, path: str | Path, subjects: tuple[str, ...] | None = None) -> "PoseBank":

@@ -53,16 +53,22 @@ def load_motion(
     fps: float | None = None,
     hz: float | None = None,
 ) -> Motion:
-    """The motion of a file, or of all files in a folder and its folders, as rotations of the shipped body.
+    """Reads the motion of a file, or of all files in a folder and its folders, as rotations of the shipped body.
 
-    format: a name of `FORMATS`, by default told by the file; up: the axis of the recording that is up, "x", "y" or "z",
-    with a minus where it points down, by default what its format says (BVH: the one people stand along); fps: the
-    recording's frames a second, by default what the file says; hz: resample each file to so many. A folder's clips are
-    named by their paths in it, and get the lowest rate among its files unless `hz` says one. Frames that are not finite
-    are left out and counted.
+    Rotation formats (AMASS, LiDARHuman26M, SLOPER4D) keep every turn; the others are retargeted by positions. Frames
+    that are not finite are left out and counted.
 
-    Rotation formats (AMASS, LiDARHuman26M, SLOPER4D) keep every turn; the others are retargeted by positions.
-    Raises InputError, naming the file, for everything that cannot be read.
+    Args:
+        path: A folder's clips are named by their paths in it, and get the lowest rate among its files unless `hz` is
+            given.
+        format: A name of `FORMATS`, by default after the file's suffix.
+        up: The axis of the recording that is up, "x", "y" or "z", with a minus where it points down, by default the
+            format's (BVH: the one people stand along).
+        fps: The recording's frames a second, by default the file's.
+        hz: Resample each file to so many frames a second.
+
+    Raises:
+        InputError: Naming the file, for everything that cannot be read.
     """
     if format is not None:
         check_name("format of motion", format, FORMATS)
@@ -73,33 +79,28 @@ def load_motion(
             raise file_error(path, f"{name} must be frames a second, above 0, got {rate}")
     try:
         path = Path(path)
-        folder = path.is_dir()
+        whole_folder = path.is_dir() and not (format == "lidarhuman26m" and pose_files(path))
     except (TypeError, ValueError) as error:
         raise file_error(repr(path), f"expected the path of a file or folder of motion ({error})") from None
-    if not folder and format is None and path.suffix.lower() not in _BY_SUFFIX:
-        # says whether there is such a file at all
-        read_bytes(path, expected=f"a file of motion ({' '.join(_BY_SUFFIX)}) or a folder of them")
-    if not folder or (format == "lidarhuman26m" and pose_files(path)):
-        return _load(path, format, up=up, fps=fps, hz=hz)
-    motions = []
-    for source in _sources(path, format):
-        motion = _load(source, format, up=up, fps=fps, hz=hz)
-        motions.append(replace(motion, names=tuple(_placed(name, source, path) for name in motion.names)))
-    if not motions:
+    sources = _sources(path, format) if whole_folder else [path]
+    if not sources:
         raise file_error(path, f"holds no file of motion; read are {', '.join(_BY_SUFFIX)} in it or its folders")
-    return join(motions, source=f"{len(motions)} files: {path}")
+    motions = []
+    for source in sources:
+        motion = FORMATS[format or _format_of(source)](source, up=up, fps=fps)
+        motion = motion if hz is None else motion.resampled(hz)
+        motions.append(replace(motion, names=tuple(_name_in_folder(name, source, path) for name in motion.names)))
+    return join(motions, source=f"{len(motions)} files: {path}") if whole_folder else motions[0]
 
 
-def _load(path: Path, format: str | None, *, up: str | None, fps: float | None, hz: float | None) -> Motion:
-    format = format or ("lidarhuman26m" if path.is_dir() else _BY_SUFFIX.get(path.suffix.lower()))
+def _format_of(path: Path) -> str:
+    format = "lidarhuman26m" if path.is_dir() else _BY_SUFFIX.get(path.suffix.lower())
     if format is None:
-        raise file_error(
-            path,
-            f"expected a file of motion, one of {', '.join(_BY_SUFFIX)}, or a folder: convert it, or in Python give "
-            "format=",
-        )
-    motion = FORMATS[format](path, up=up, fps=fps)
-    return motion if hz is None else motion.resampled(hz)
+        expected = f"a file of motion, one of {', '.join(_BY_SUFFIX)}, or a folder of them"
+        # says whether there is such a file at all
+        read_bytes(path, expected=expected)
+        raise file_error(path, f"expected {expected}: convert it, or in Python give format=")
+    return format
 
 
 def _sources(folder: Path, format: str | None) -> list[Path]:
@@ -125,15 +126,12 @@ def digest(path: str | os.PathLike) -> str:
         return content_digest(path, expected="motion")[:16]
     wanted = {*_BY_SUFFIX, ".asf"}
     files = sorted(Path(here, name) for here, _, names in os.walk(path) for name in names)
-    told = [
-        f"{file.relative_to(path).as_posix()} {content_digest(file, expected='motion')}"
-        for file in files
-        if file.suffix.lower() in wanted
-    ]
-    return hashlib.sha256("\n".join(told).encode("utf-8", "surrogateescape")).hexdigest()[:16]
+    files = [file for file in files if file.suffix.lower() in wanted]
+    lines = [f"{file.relative_to(path).as_posix()} {content_digest(file, expected='motion')}" for file in files]
+    return hashlib.sha256("\n".join(lines).encode("utf-8", "surrogateescape")).hexdigest()[:16]
 
 
-def _placed(name: str, source: Path, folder: Path) -> str:
+def _name_in_folder(name: str, source: Path, folder: Path) -> str:
     """A clip's name with the place of its file in the folder that is read: 02_01 of 02/02_01.bvh -> 02/02_01."""
     if source == folder:
         return name

@@ -8,8 +8,9 @@ Source: the format's description and CMU's database (mocap.cs.cmu.edu), its page
 
 import os
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -90,8 +91,7 @@ def _lines(path: Path, expected: str) -> list[list[str]]:
     return [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Bone:
+class _Bone(NamedTuple):
     """offset (3,) in the parent's axes, bone (3,) in its own, axis (3, 3), and its channels."""
 
     offset: np.ndarray

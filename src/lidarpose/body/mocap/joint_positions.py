@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lidarpose.body.mocap.motion import Motion, load_clips, usable_clips
+from lidarpose.body.mocap.motion import Motion, check_rate, load_clips, standing_axis, usable_clips
 from lidarpose.body.mocap.retarget import SHORTEST_BONE, mean_adult_joints, retarget_positions, shortest_bone
 from lidarpose.body.rig import forward_kinematics
 from lidarpose.geometry import rotation_from_up, unit
@@ -23,7 +23,6 @@ _TYPICAL = 0.85  # between children and tall adults: inches and centimeters must
 _UNEVEN = 2.0  # legs whose lengths are further apart than this were not measured in one unit
 _FASTEST = 50.0  # m/s
 _FARTHEST = 1e5  # m
-_UPRIGHT = 0.7  # mean share of the trunk along the axis that is taken for up
 
 
 def load_clip_positions(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
@@ -60,8 +59,7 @@ def motion_from_joints(
     Raises:
         InputError: For people of no one's size or speed, upside down, or with too many frames to leave out.
     """
-    if not 0 < fps < np.inf:
-        raise file_error(path, f"the frame rate must be above 0, got {fps}; give load_motion fps=")
+    check_rate(path, fps)
     good = np.isfinite(joints).all((1, 2))
     if not good.any():
         raise file_error(path, "expected joints at finite positions, got no frame with any")
@@ -116,13 +114,11 @@ def _median_length(joints: np.ndarray, part: str) -> float:
 
 
 def _up_axis(path: object, joints: np.ndarray) -> str:
-    trunk = unit(joints[:, _J["neck"]] - joints[:, _HIPS].mean(1)).mean(0)
-    axis = int(np.abs(trunk).argmax())
-    if trunk[axis] < -_UPRIGHT:
-        name = "xyz"[axis]
-        remedy = f"give load_motion up='-{name}', or up={name!r} if they are upside down"
-        raise file_error(path, f"people stand along -{name}; {remedy}")
-    return "xyz"[axis] if trunk[axis] > _UPRIGHT else "y"
+    axis = standing_axis(unit(joints[:, _J["neck"]] - joints[:, _HIPS].mean(1))) or "y"
+    if axis.startswith("-"):
+        remedy = f"give load_motion up={axis!r}, or up={axis[1:]!r} if they are upside down"
+        raise file_error(path, f"people stand along {axis}; {remedy}")
+    return axis
 
 
 def _check_speed(path: object, joints: np.ndarray, start: np.ndarray, fps: float) -> None:

@@ -23,6 +23,8 @@ _KEYS = ("joints", "clip", "clip_start", "clip_length", "fps")
 _BLOCK = 4096
 # a larger share of frames that cannot be used: the file is broken, not the odd frame
 _MOST_DROPPED = 0.2
+# mean share of the trunk along an axis from which people are said to stand along it
+_UPRIGHT = 0.7
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,8 +138,13 @@ class Motion(_ClipTable):
         first = [s + np.arange(0, n - frames + 1) for s, n in zip(self.start, self.length, strict=True)]
         return np.concatenate([*first, np.zeros(0, int)]).astype(int)[:, None] + np.arange(frames)
 
-    def pairs(self, dt: float) -> "Moves":
-        """All poses that have one `dt` seconds later in their clip, with that one. dt >= 0."""
+    def pairs(self, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """All poses that have one `dt` >= 0 seconds later in their clip, with that one.
+
+        Returns:
+            The poses (n, 24, 3, 3), facing +x; those `dt` later (n, 24, 3, 3) and the way of the pelvis until then
+            (n, 3) m, both in the axes of the first; float32.
+        """
         spans = [np.arange(s, s + n) for s, n in zip(self.start, self.length, strict=True)]
         frame = np.concatenate([*spans, np.zeros(0, int)]).astype(int)
         ends = np.repeat(self.start + self.length - 1, self.length)
@@ -148,7 +155,7 @@ class Motion(_ClipTable):
         unyaw = rotation_about("z", -heading(first))
         step = (unyaw @ (translation - self.translation[frame])[..., None])[..., 0]
         later[:, 0] = unyaw @ later[:, 0]
-        return Moves(rotations=without_yaw(first), moved=later, step=step.astype(np.float32))
+        return without_yaw(first), later, step.astype(np.float32)
 
     def _between(self, when: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rotations (n, 24, 3, 3) and translation (n, 3) at frames `when` (n,), not whole, up to their clip's last."""
@@ -164,16 +171,6 @@ class Motion(_ClipTable):
             rotations[block] = a @ axis_angle_to_matrix(share[block, None] * turn)
             translation[block] += share[block] * (self.translation[after[block]] - translation[block])
         return rotations, translation
-
-
-@dataclass(frozen=True, kw_only=True)
-class Moves:
-    """Poses and where they are a moment later. rotations (n, 24, 3, 3) float32, local, facing +x; moved
-    (n, 24, 3, 3) float32 and step (n, 3) float32 m, the way of the pelvis, both in the axes of `rotations`."""
-
-    rotations: np.ndarray
-    moved: np.ndarray
-    step: np.ndarray
 
 
 def join(motions: Iterable[Motion], *, source: str) -> Motion:
@@ -228,6 +225,20 @@ def load_clips(path: str | PathLike) -> Clips:
         )
     except InputError as error:
         raise file_error(path, error) from None
+
+
+def check_rate(path: object, fps: float) -> None:
+    """Raises InputError unless `fps` is a rate."""
+    if not 0 < fps < np.inf:
+        raise file_error(path, f"the frame rate must be above 0, got {fps}; give load_motion fps=")
+
+
+def standing_axis(trunk: np.ndarray) -> str | None:
+    """The axis, "-y" say, that people stand along whose trunks have these directions (F, 3) of length 1; None where
+    they do not stand."""
+    mean = trunk.mean(0)
+    axis = int(np.abs(mean).argmax())
+    return None if abs(mean[axis]) <= _UPRIGHT else ("-" if mean[axis] < 0 else "") + "xyz"[axis]
 
 
 def usable_clips(

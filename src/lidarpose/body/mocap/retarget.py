@@ -25,21 +25,13 @@ _ADULT = 18  # years
 # bones under this have no direction, m
 SHORTEST_BONE = 1e-4
 
-_LIMB = ("collar", "shoulder", "elbow", "wrist", "hand", "hip", "knee", "ankle", "foot")
+_ARM, _LEG = ("shoulder", "elbow", "wrist", "hand"), ("hip", "knee", "ankle", "foot")
 _J = {name: i for i, name in enumerate(SMPL24.joints)}
 # the lines whose directions the frames are made of
-_CHAINS = ("collar shoulder elbow wrist hand", "hip knee ankle foot")
-_LINES = (
-    ("spine3", "neck"),
-    ("right_hip", "left_hip"),
-    ("right_shoulder", "left_shoulder"),
-    *(
-        (f"{side}_{a}", f"{side}_{b}")
-        for side in ("left", "right")
-        for chain in map(str.split, _CHAINS)
-        for a, b in zip(chain, chain[1:], strict=False)
-    ),
-)
+_LINES = [("spine3", "neck"), ("right_hip", "left_hip"), ("right_shoulder", "left_shoulder")]
+for _side in ("left", "right"):
+    for _chain in (("collar", *_ARM), _LEG):
+        _LINES += [(f"{_side}_{a}", f"{_side}_{b}") for a, b in zip(_chain, _chain[1:], strict=False)]
 
 
 def retarget_positions(joints: np.ndarray, rest: np.ndarray | None = None) -> np.ndarray:
@@ -53,7 +45,7 @@ def retarget_positions(joints: np.ndarray, rest: np.ndarray | None = None) -> np
     """
     joints = np.asarray(joints, float)
     if joints.ndim != 3 or joints.shape[1:] != (24, 3):
-        raise InputError(f"joints must be (n, 24, 3), SMPL's joints in metres, got {joints.shape}")
+        raise InputError(f"joints must be (n, 24, 3), SMPL's joints in meters, got {joints.shape}")
     if not np.isfinite(joints).all():
         raise InputError("joints must be finite numbers; drop or fill the missing ones before retargeting")
     length, which = shortest_bone(joints)
@@ -73,11 +65,12 @@ def retarget_positions(joints: np.ndarray, rest: np.ndarray | None = None) -> np
     shoulders = np.zeros((len(joints), 3))  # ours, their middle seen from spine3
     for side, sign in (("left", 1.0), ("right", -1.0)):
         collar = _swing(torso, f"{side}_collar", f"{side}_shoulder", joints, rest)
-        arm, forearm, hand = _arm(side, sign, collar, joints, rest)
-        thigh, shank, foot = _leg(side, pelvis, joints, rest)
-        limbs = (collar, arm, forearm, hand, hand, thigh, shank, foot, foot)
-        for name, value in zip(_LIMB, limbs, strict=True):
-            turn[:, _J[f"{side}_{name}"]] = value
+        # elbows bend about -z (left) or +z (right) at rest, knees about +y
+        arm, leg = ([f"{side}_{name}" for name in chain] for chain in (_ARM, _LEG))
+        arm_turns = _limb(collar, arm, np.array([0.0, 0.0, -sign]), _ELBOW_OVERSTRETCH, joints, rest)
+        leg_turns = _limb(pelvis, leg, np.array([0.0, 1.0, 0.0]), _KNEE_OVERSTRETCH, joints, rest)
+        for name, value in zip((f"{side}_collar", *arm, *leg), (collar, *arm_turns, *leg_turns), strict=True):
+            turn[:, _J[name]] = value
         shoulders += _carried(torso, _bone(rest, "spine3", f"{side}_collar")) / 2
         shoulders += _carried(collar, _bone(rest, f"{side}_collar", f"{side}_shoulder")) / 2
     turn[:, _J["neck"]] = turn[:, _J["head"]] = _head(torso, shoulders, joints, rest)
@@ -212,29 +205,20 @@ def _hinge(first: np.ndarray, second: np.ndarray, straight: np.ndarray, overstre
     return (axis_angle_to_matrix(weight * angle * about) @ straight[..., None])[..., 0]
 
 
-def _leg(side: str, pelvis: np.ndarray, joints: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Global rotations of thigh, shank and foot. The knee bends about +y at rest."""
-    names = [f"{side}_{name}" for name in ("hip", "knee", "ankle", "foot")]
-    bones = [_bone(joints, a, b) for a, b in zip(names[:-1], names[1:], strict=True)]
-    rests = [_bone(rest, a, b) for a, b in zip(names[:-1], names[1:], strict=True)]
-    left = np.array([[0.0, 1.0, 0.0]])
-    from_pelvis = _swing(pelvis, names[0], names[1], joints, rest) @ left[0]
-    from_foot = np.cross(unit(bones[2]), unit(bones[1]))  # short where the foot is stretched along the shank
-    axis = _hinge(bones[0], bones[1], from_pelvis + 2 * from_foot, _KNEE_OVERSTRETCH)
-    thigh, shank = (_turn(bones[k], axis, rests[k], left) for k in (0, 1))
-    return thigh, shank, _swing(shank, names[2], names[3], joints, rest)
-
-
-def _arm(side: str, sign: float, collar: np.ndarray, joints: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Global rotations of upper arm, forearm and hand. The elbow bends about -z (left) or +z (right) at rest."""
-    names = [f"{side}_{name}" for name in ("shoulder", "elbow", "wrist", "hand")]
-    bones = [_bone(joints, a, b) for a, b in zip(names[:-1], names[1:], strict=True)]
-    rests = [_bone(rest, a, b) for a, b in zip(names[:-1], names[1:], strict=True)]
-    down = np.array([[0.0, 0.0, -sign]])
-    from_collar = _swing(collar, names[0], names[1], joints, rest) @ down[0]
-    axis = _hinge(bones[0], bones[1], from_collar, _ELBOW_OVERSTRETCH)
-    arm, forearm = (_turn(bones[k], axis, rests[k], down) for k in (0, 1))
-    return arm, forearm, _swing(forearm, names[2], names[3], joints, rest)
+def _limb(
+    parent: np.ndarray, names: list[str], hinge: np.ndarray, overstretch: float, joints: np.ndarray, rest: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """Global rotations of a limb's four joints, named; the last goes with the one before. parent (n, 3, 3): of what it
+    hangs on; hinge (3,): the axis that its second joint bends about at rest; overstretch: see `_hinge`."""
+    bones, rests = ([_bone(j, a, b) for a, b in zip(names[:-1], names[1:], strict=True)] for j in (joints, rest))
+    straight = _swing(parent, names[0], names[1], joints, rest) @ hinge
+    if names[0].endswith("hip"):
+        # where the leg is straight its foot says about what; short where the foot is stretched along the shank
+        straight = straight + 2 * np.cross(unit(bones[2]), unit(bones[1]))
+    axis = _hinge(bones[0], bones[1], straight, overstretch)
+    upper, lower = (_turn(bones[k], axis, rests[k], hinge[None]) for k in (0, 1))
+    end = _swing(lower, names[2], names[3], joints, rest)
+    return upper, lower, end, end
 
 
 def rotation_vector(matrix: np.ndarray) -> np.ndarray:

@@ -27,7 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.body.mocap.motion import Motion, join, usable_clips
+from lidarpose.body.mocap.motion import Motion, check_rate, join, standing_axis, usable_clips
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_from_up
 from lidarpose.io.files import file_error, read_bytes, read_npz
 from lidarpose.io.pickles import load_pickle
@@ -37,8 +37,6 @@ _R_LEVEL_SMPL = UP_AXES["y"]
 _MOST_TURN = 4 * np.pi
 # nobody is as far from the origin of a recording, m
 _FARTHEST = 1e5
-# mean share of the trunk along an axis from which people are said to stand along it
-_UPRIGHT = 0.7
 
 _RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
 _BODY = 66  # the root and SMPL's 21 joints of the body, 3 numbers each; SMPL has two hands more, the others fingers
@@ -78,8 +76,7 @@ def motion_from_smpl(
         raise file_error(path, "pose and trans must be numbers in rows of equal length") from None
     if pose.ndim != 2 or pose.shape[1] != _SMPL or trans.shape != (len(pose), 3):
         raise file_error(path, f"{kind} needs pose (frames, 72) and trans (frames, 3), got {pose.shape}, {trans.shape}")
-    if not 0 < fps < np.inf:
-        raise file_error(path, f"the frame rate must be above 0, got {fps}; give load_motion fps=")
+    check_rate(path, fps)
     good = np.isfinite(pose).all(1) & np.isfinite(trans).all(1)
     clips = usable_clips(path, [name], [len(good)], good, number)
     pose, trans = pose[good].reshape(-1, 24, 3), trans[good]
@@ -94,8 +91,9 @@ def motion_from_smpl(
     rotations[:, 1:] = _R_LEVEL_SMPL @ axis_angle_to_matrix(pose[:, 1:]) @ _R_LEVEL_SMPL.T
     root = axis_angle_to_matrix(pose[:, 0])
     rotations[:, 0] = world @ root @ _R_LEVEL_SMPL.T
-    if up is None:
-        _check_upright(path, root[..., 1].mean(0))
+    axis = standing_axis(root[..., 1])
+    if up is None and axis not in ("z", None):
+        raise file_error(path, f"people stand along {axis}, not z; give load_motion up={axis!r}")
     return Motion(
         rotations=rotations,
         translation=(trans @ world.T).astype(np.float32),
@@ -104,15 +102,6 @@ def motion_from_smpl(
         dropped=int((~good).sum()),
         **clips,
     )
-
-
-def _check_upright(path: object, trunk: np.ndarray) -> None:
-    """Raises InputError where the mean direction of the trunk lies along another axis than z."""
-    axis = int(np.abs(trunk).argmax())
-    name = "xyz"[axis]
-    if name != "z" and abs(trunk[axis]) > _UPRIGHT:
-        name = f"-{name}" if trunk[axis] < 0 else name
-        raise file_error(path, f"people stand along {name}, not z; give load_motion up={name!r}")
 
 
 def load_amass(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:

@@ -8,47 +8,10 @@ from functools import cache
 import numpy as np
 
 from lidarpose.body.mocap.retarget import mean_adult_joints
+from lidarpose.body.pose_prior.activities import TABLES
 from lidarpose.skeleton import SMPL24
 
-# capsule: joint that carries it, its two ends seen from the joint at rest (T-pose), radius; m, measured on the shipped
-# mesh's mean adult. Trunk and head lie across, of the left limbs the right ones are the mirror image. Upper arms and
-# thighs leave out the half that touches the trunk in every pose.
-_TRUNK = {
-    "pelvis": ("pelvis", (0.0, -0.08, -0.05), (0.0, 0.08, -0.05), 0.100),
-    "belly": ("spine1", (0.05, -0.05, 0.03), (0.05, 0.05, 0.03), 0.098),
-    "ribs": ("spine3", (0.055, -0.06, 0.02), (0.055, 0.06, 0.02), 0.102),
-    "head": ("head", (0.022, 0.0, 0.03), (0.022, 0.0, 0.11), 0.082),
-}
-_LIMBS = {
-    "upper_arm": ("shoulder", (0.0, 0.12, 0.0), (0.0, 0.25, 0.0), 0.042),
-    "forearm": ("elbow", (0.0, 0.02, 0.0), (0.0, 0.231, 0.0), 0.032),
-    "hand": ("wrist", (0.01, 0.03, -0.015), (0.01, 0.10, -0.02), 0.032),
-    "thigh": ("hip", (0.015, 0.02, -0.14), (0.01, 0.02, -0.38), 0.062),
-    "shank": ("knee", (-0.03, 0.0, -0.06), (-0.035, 0.005, -0.36), 0.048),
-    "foot": ("ankle", (-0.02, 0.0, -0.045), (0.16, 0.0, -0.05), 0.036),
-}
-# what could touch what on a moving body: (a, b), limbs of one side with the same side's, and with the other side's
-_SAME_SIDE = (
-    ("forearm", "pelvis"), ("forearm", "belly"), ("forearm", "ribs"), ("forearm", "head"), ("hand", "pelvis"),
-    ("hand", "belly"), ("hand", "ribs"), ("hand", "head"), ("hand", "upper_arm"), ("forearm", "thigh"),
-    ("hand", "thigh"), ("hand", "shank"), ("upper_arm", "head"), ("upper_arm", "belly"),
-)  # fmt: skip
-_ACROSS = (
-    ("forearm", "forearm"), ("hand", "hand"), ("thigh", "thigh"), ("shank", "shank"), ("foot", "foot"),
-    ("hand", "forearm"), ("hand", "upper_arm"), ("hand", "thigh"), ("forearm", "thigh"), ("hand", "shank"),
-    ("thigh", "shank"), ("shank", "foot"), ("thigh", "foot"),
-)  # fmt: skip
-# shares of the body's mass and where on a segment its center is: de Leva 1996, means of women and men; the trunk's
-# three parts on our joints
-_MASS = (
-    (0.068, "head", "head", 0.0), (0.13, "pelvis", "spine1", 0.0), (0.155, "spine1", "spine2", 0.8),
-    (0.157, "spine3", "neck", 0.4), *((share, f"{side}_{a}", f"{side}_{b}", at) for side in ("left", "right")
-    for share, a, b, at in (
-        (0.0263, "shoulder", "elbow", 0.576), (0.0150, "elbow", "wrist", 0.457), (0.0059, "wrist", "hand", 0.7),
-        (0.1447, "hip", "knee", 0.385), (0.0457, "knee", "ankle", 0.443), (0.0133, "ankle", "foot", 0.5))),
-)  # fmt: skip
 _J = {name: i for i, name in enumerate(SMPL24.joints)}
-
 
 # the sole seen from the ankle joint, m: heel, inner and outer ball, toes; the left foot's, measured on the shipped mesh
 _SOLE = np.array([[-0.05, 0.0, -0.077], [0.10, -0.045, -0.077], [0.10, 0.045, -0.077], [0.19, -0.01, -0.074]])
@@ -59,44 +22,46 @@ _BEARING = 0.008
 
 def _capsules() -> tuple[np.ndarray, ...]:
     """Joint (C,), ends (C, 2, 3) and radius (C,) m of the capsules; pairs (Q, 2) that could collide."""
-    table = {name: (_J[joint], a, b, radius) for name, (joint, a, b, radius) in _TRUNK.items()}
-    for side, sign in (("left", 1), ("right", -1)):
-        for name, (joint, a, b, radius) in _LIMBS.items():
-            mirrored = [(x, sign * y, z) for x, y, z in (a, b)]
-            table[f"{side}_{name}"] = (_J[f"{side}_{joint}"], *mirrored, radius)
-    names = {name: i for i, name in enumerate(table)}
+    trunk, collisions = TABLES["capsules"]["trunk"], TABLES["collisions"]
+    rows = {name: (_J[c["joint"]], c["start"], c["end"], c["radius"]) for name, c in trunk.items()}
+    for side, mirror in (("left", [1, 1, 1]), ("right", [1, -1, 1])):
+        for name, c in TABLES["capsules"]["left_limbs"].items():
+            start, end = np.multiply([c["start"], c["end"]], mirror)
+            rows[f"{side}_{name}"] = (_J[f"{side}_{c['joint']}"], start, end, c["radius"])
+    index = {name: i for i, name in enumerate(rows)}
     pairs = []
     for side, other in (("left", "right"), ("right", "left")):
-        pairs += [(names[f"{side}_{a}"], names[b if b in _TRUNK else f"{side}_{b}"]) for a, b in _SAME_SIDE]
-        pairs += [(names[f"{side}_{a}"], names[f"{other}_{b}"]) for a, b in _ACROSS if side == "left" or a != b]
-    joint, *ends, radius = (np.array(column) for column in zip(*table.values(), strict=True))
-    return joint, np.stack(ends, 1).astype(np.float32), radius.astype(np.float32), np.array(pairs)
-
-
-_JOINT, _ENDS, _RADIUS, _PAIRS = _capsules()
+        for a, b in collisions["same_side"]:
+            pairs.append((index[f"{side}_{a}"], index[b if b in trunk else f"{side}_{b}"]))
+        for a, b in collisions["across"]:
+            if side == "left" or a != b:
+                pairs.append((index[f"{side}_{a}"], index[f"{other}_{b}"]))
+    joint, start, end, radius = (np.array(column) for column in zip(*rows.values(), strict=True))
+    return joint, np.stack([start, end], 1).astype(np.float32), radius.astype(np.float32), np.array(pairs)
 
 
 def _mass_of_joints() -> np.ndarray:
-    share = np.zeros(24, np.float32)
-    for mass, a, b, at in _MASS:
-        share[_J[a]] += mass * (1 - at)
-        share[_J[b]] += mass * at
-    return share / share.sum()
+    """(24,): shares of the mass, each segment's at its ends so that its center is right."""
+    mass = np.zeros(24, np.float32)
+    segments = [("", segment) for segment in TABLES["mass"]["trunk"]]
+    segments += [(side, segment) for side in ("left_", "right_") for segment in TABLES["mass"]["limbs"]]
+    for side, segment in segments:
+        mass[_J[side + segment["start"]]] += segment["share"] * (1 - segment["center"])
+        mass[_J[side + segment["end"]]] += segment["share"] * segment["center"]
+    return mass / mass.sum()
 
 
-_MASS_OF_JOINTS = _mass_of_joints()
-
-
-def _levels() -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+def _levels() -> list[tuple[np.ndarray, np.ndarray]]:
     """The joints of each depth of the tree below the root, and their parents."""
-    parents = np.array(SMPL24.parents)
-    depth = np.zeros(24, int)
-    for joint, parent in enumerate(SMPL24.parents[1:], 1):
-        depth[joint] = depth[parent] + 1
-    rows = [np.flatnonzero(depth == d) for d in range(1, depth.max() + 1)]
-    return tuple((row, parents[row]) for row in rows)
+    parents, depth = np.array(SMPL24.parents), [0]
+    for parent in SMPL24.parents[1:]:
+        depth.append(depth[parent] + 1)
+    levels = [np.flatnonzero(np.equal(depth, d)) for d in range(1, max(depth) + 1)]
+    return [(joints, parents[joints]) for joints in levels]
 
 
+_JOINT, _ENDS, _RADIUS, _PAIRS = _capsules()
+_MASS_OF_JOINTS = _mass_of_joints()
 _LEVELS = _levels()
 
 
@@ -144,8 +109,7 @@ def self_collision(ends: np.ndarray) -> np.ndarray:
 
 
 def mass_center(joints: np.ndarray) -> np.ndarray:
-    """joints (n, 24, 3) -> (n, 3) m. Segments after de Leva 1996, Adjustments to Zatsiorsky-Seluyanov's segment
-    inertia parameters."""
+    """joints (n, 24, 3) -> (n, 3) m, by the segments of de Leva 1996."""
     return np.einsum("j,njk->nk", _MASS_OF_JOINTS, joints)
 
 

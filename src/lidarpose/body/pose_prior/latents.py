@@ -8,16 +8,8 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from lidarpose.body.pose_prior.activities import (
-    ANGLES,
-    ARM_ODDS,
-    ARM_PACE,
-    CAPTURED_ARMS,
-    KIND_PACE,
-    KINDS,
-    LIMITS,
-    TABLES,
-)
+from lidarpose.body.pose_prior import activities
+from lidarpose.body.pose_prior.activities import ANGLES, KIND_PACE, KINDS, LIMITS
 from lidarpose.body.pose_prior.mixture import captured_angles
 
 _CAPTURED, _FALL, _CYCLE = (KINDS.index(name) for name in ("captured", "fall", "cycle"))
@@ -34,9 +26,9 @@ _FALL_TIME = 1.1
 
 
 # strides a second, least and how much more with the longest stride; a bicycle's cranks turn with its activity's pace
-_CADENCES = np.array([TABLES["gaits"].get(name, {}).get("cadence", (0.0, 0.0)) for name in KINDS])
+_CADENCES = np.array([activities.TABLES["gaits"].get(name, {}).get("cadence", (0.0, 0.0)) for name in KINDS])
 _CADENCES[_CYCLE] = KIND_PACE[_CYCLE] / (2 * np.pi), 0.0
-_CUMULATIVE_ODDS = np.cumsum(ARM_ODDS, 1)
+_CUMULATIVE_ODDS = np.cumsum(activities.ARM_ODDS, 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +63,7 @@ class Latents:
         """The same people t (n,) seconds after these latents, which must be as drawn."""
         t = np.broadcast_to(np.asarray(t, float), self.kind.shape)
         eager = np.where(self.kind == _CYCLE, 1.0, 0.7 + 0.6 * self.tempo[:, 0])
-        pace = np.concatenate([KIND_PACE[self.kind][:, None], ARM_PACE[self.arm]], 1) * eager[:, None]
+        pace = np.concatenate([KIND_PACE[self.kind][:, None], activities.ARM_PACE[self.arm]], 1) * eager[:, None]
         # to and fro between the ends from where they are, half of the people back first
         start = np.arccos(np.clip(1 - 2 * self.where, -1, 1)) * np.where(self.tempo[:, 1:2] < 0.5, 1, -1)
         where = (1 - np.cos(start + pace * t[:, None])) / 2
@@ -129,7 +121,7 @@ def draw_latents(rng: np.random.Generator, kind: np.ndarray) -> Latents:
     # the sum of two uniform numbers: most near the middle, none far out
     noise = rng.random((2, n, len(ANGLES))).sum(0) - 1
     phase, style, mirror, tempo = rng.random(n), rng.random((n, 8)), rng.random(n) < 0.5, rng.random((n, 4))
-    captured, uses = np.zeros((n, 2, len(ANGLES))), (kind == _CAPTURED) | (arm == CAPTURED_ARMS).any(1)
+    captured, uses = np.zeros((n, 2, len(ANGLES))), (kind == _CAPTURED) | (arm == activities.CAPTURED_ARMS).any(1)
     captured[uses] = np.clip(captured_angles(rng, int(uses.sum())), *LIMITS)
     return Latents(
         kind=kind, arm=arm, where=where, noise=noise, phase=phase, style=style, mirror=mirror, tempo=tempo,

@@ -16,30 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarpose.body.mocap.retarget import heading, mean_adult_joints, without_yaw
-from lidarpose.body.pose_prior.activities import (
-    ANGLE_INDEX,
-    ANGLES,
-    ARM_RANGES,
-    CAPTURED_ARMS,
-    FLAT_FOOT,
-    KIND_RANGES,
-    KINDS,
-    LIMITS,
-    OWN_ARMS,
-    SELF_COLLISION,
-    SHARES,
-    UPRIGHT,
-)
+from lidarpose.body.pose_prior import activities, contact
+from lidarpose.body.pose_prior.activities import ANGLE_INDEX, ANGLES, KINDS, LIMITS
 from lidarpose.body.pose_prior.balance import balanced
-from lidarpose.body.pose_prior.contact import (
-    body_frames,
-    capsule_ends,
-    planted_way,
-    self_collision,
-    sole_points,
-    undersides,
-    walked_way,
-)
 from lidarpose.body.pose_prior.gait import GAITS, Stride, add_stride
 from lidarpose.body.pose_prior.joint_angles import mirror_angles, rotations_from_angles
 from lidarpose.body.pose_prior.latents import Latents, draw_latents
@@ -170,7 +149,7 @@ def sample_poses(n: int, seed: int) -> np.ndarray:
 
 def _kind_shares(mix: dict[str, float] | None) -> np.ndarray:
     if mix is None:
-        return SHARES
+        return activities.SHARES
     for name, weight in mix.items():
         check_name("kind of pose", name, KINDS)
         check_finite(f"the mix's weight of {name}", weight)
@@ -190,7 +169,7 @@ def _draw_people(rng: np.random.Generator, n: int, shares: np.ndarray, times: np
     too few of them, the last stay as they are.
     """
     is_clip = len(times) > 1
-    refused_share = 1 - (1 - SELF_COLLISION) ** (_CLIP_POSES if is_clip else 1)
+    refused_share = 1 - (1 - activities.SELF_COLLISION) ** (_CLIP_POSES if is_clip else 1)
     spare_shares = shares * refused_share / (1 - refused_share)
     spares = int(np.ceil(n * (_CLIP_SPARES if is_clip else _SPARES))) + _LEAST_SPARES if n else 0
     drawn = (n, shares), (spares, spare_shares / spare_shares.sum())
@@ -207,8 +186,8 @@ def _draw_people(rng: np.random.Generator, n: int, shares: np.ndarray, times: np
 
 def _depth(rotations: np.ndarray) -> np.ndarray:
     """rotations (n, T, 24, 3, 3) -> (n,) m: how deep each body's parts are in each other at the worst moment."""
-    ends = capsule_ends(*body_frames(rotations.reshape(-1, 24, 3, 3)))
-    return self_collision(ends).max(1).reshape(rotations.shape[:2]).max(1, initial=-np.inf)
+    ends = contact.capsule_ends(*contact.body_frames(rotations.reshape(-1, 24, 3, 3)))
+    return contact.self_collision(ends).max(1).reshape(rotations.shape[:2]).max(1, initial=-np.inf)
 
 
 def _poses(latents: Latents, times: np.ndarray) -> tuple[np.ndarray, Stride]:
@@ -228,15 +207,15 @@ def _motion(latents: Latents, times: np.ndarray) -> DrawnClips:
     unyaw = rotation_about("z", -heading(rotations[:, 0])).astype(np.float32)
     rotations[:, :, 0] = unyaw[:, None] @ rotations[:, :, 0]
     flat = rotations.reshape(-1, 24, 3, 3)
-    capsules = undersides(capsule_ends(*body_frames(flat)))
-    points = np.concatenate([sole_points(flat).reshape(len(flat), 8, 3), capsules], 1)
+    capsules = contact.undersides(contact.capsule_ends(*contact.body_frames(flat)))
+    points = np.concatenate([contact.sole_points(flat).reshape(len(flat), 8, 3), capsules], 1)
     points = points.reshape(n, moments, points.shape[1], 3)
-    way = planted_way(points)
+    way = contact.planted_way(points)
     travels = np.isin(latents.kind, _TRAVELS)
     if travels.any():
         course = latents.course(times)[travels]
         pace = stride.pace.reshape(n, moments)[travels]
-        ahead = walked_way(pace, latents.strides(np.broadcast_to(times, (n, moments)))[travels], course)
+        ahead = contact.walked_way(pace, latents.strides(np.broadcast_to(times, (n, moments)))[travels], course)
         way[travels, :, :2] = ahead @ np.swapaxes(unyaw[travels, :2, :2], -1, -2)
         rotations[travels, :, 0] = rotation_about("z", course).astype(np.float32) @ rotations[travels, :, 0]
     low = points[..., 2].min(2)
@@ -254,7 +233,7 @@ def _motion(latents: Latents, times: np.ndarray) -> DrawnClips:
 def _angles(latents: Latents) -> Stride:
     """The poses' angles (n, 27), degrees, inside the joints' ranges; arms may be in the trunk."""
     kind, captured = latents.kind, latents.captured[:, 0]
-    start, end, spread = KIND_RANGES[:, kind]
+    start, end, spread = activities.KIND_RANGES[:, kind]
     # the cranks of a bicycle move the legs alone
     place = np.where((kind == _CYCLE)[:, None] & _NO_LEG, latents.style[:, 1:2], latents.where[:, :1])
     angles = start + place * (end - start) + spread * latents.noise
@@ -270,16 +249,16 @@ def _angles(latents: Latents) -> Stride:
     # the table gives thighs from the vertical and feet from the floor: turn both into angles of the joints
     for side in ("left", "right"):
         hip, knee, ankle = (ANGLE_INDEX[f"{side}_{name}"] for name in ("hip", "knee", "ankle"))
-        angles[:, ankle] += FLAT_FOOT[kind] * (angles[:, knee] - angles[:, hip])
-        angles[:, hip] += UPRIGHT[kind] * angles[:, ANGLE_INDEX["tilt"]]
+        angles[:, ankle] += activities.FLAT_FOOT[kind] * (angles[:, knee] - angles[:, hip])
+        angles[:, hip] += activities.UPRIGHT[kind] * angles[:, ANGLE_INDEX["tilt"]]
 
     for column, part in enumerate(_ARM.values()):
         arm = latents.arm[:, column]
-        rows = np.flatnonzero(arm != OWN_ARMS)
-        start, end, spread = ARM_RANGES[:, arm[rows]]
+        rows = np.flatnonzero(arm != activities.OWN_ARMS)
+        start, end, spread = activities.ARM_RANGES[:, arm[rows]]
         where = latents.where[rows, 1 + column, None]
         angles[rows, part] = start + where * (end - start) + spread * latents.noise[rows, part]
-        rows = np.flatnonzero(arm == CAPTURED_ARMS)
+        rows = np.flatnonzero(arm == activities.CAPTURED_ARMS)
         angles[rows, part] = captured[rows, part]
     angles = np.clip(angles, LIMITS[0], LIMITS[1])
     angles = np.where(latents.mirror[:, None], mirror_angles(angles), angles)
