@@ -35,7 +35,7 @@ SKIN, THING, CLOTH = (0.70, 0.75, 0.90), (0.93, 0.50, 0.30), (0.45, 0.62, 0.45)
 def print_joints() -> None:
     rig = load_rig()
     mean = rig.rest(rig.coefficients[rig.age >= 18].mean(0, keepdims=True))
-    vertices, joints, floor = mean.vertices[0], mean.joints[0], mean.lowest[0]
+    vertices, joints, floor = mean.vertices[0], mean.joints[0], mean.vertices[0, :, 2].min()
     print(f"mean adult, {100 * np.ptp(vertices[:, 2]):.1f} cm\njoint             height   left  ahead   skin")
     for name, at in zip(BODY26.joints, joints, strict=True):
         skin = np.linalg.norm(vertices - at, axis=1).min()

@@ -8,11 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpose.body.mocap import retarget
-from lidarpose.body.pose_prior import contact, gait, latents, sampling
+from lidarpose.body.pose_prior import activities, contact, gait, latents, sampling
 from lidarpose.body.pose_prior.contact import sole_points
 from lidarpose.errors import InputError
+from lidarpose.skeleton import SMPL24
 
-J = {name: i for i, name in enumerate(sampling.SMPL24.joints)}
+J = {name: i for i, name in enumerate(SMPL24.joints)}
 HZ = 40.0
 
 
@@ -46,7 +47,7 @@ def test_shapes_and_rotations(seed, n, frames):
     assert (drawn.clearance >= 0).all()
 
 
-@pytest.mark.parametrize("kind", sampling.KINDS)
+@pytest.mark.parametrize("kind", activities.KINDS)
 def test_people_move_as_fast_as_people(kind):
     joints, _ = placed(clips(kind))
     speed = np.linalg.norm(np.diff(joints, axis=1), axis=-1) * HZ
@@ -117,7 +118,7 @@ def test_faster_clips_show_the_same_motion():
     )
     np.testing.assert_array_equal(slow.kind, fast.kind)
     np.testing.assert_allclose(fast.rotations[:, ::2], slow.rotations, atol=1e-5)
-    goes = np.isin(slow.kind, [sampling.KINDS.index(k) for k in ("walk", "run", "push", "cycle")])
+    goes = np.isin(slow.kind, [activities.KINDS.index(k) for k in ("walk", "run", "push", "cycle")])
     np.testing.assert_allclose(fast.translation[goes, ::2, :2], slow.translation[goes, :, :2], atol=1e-2)
 
 
@@ -155,7 +156,7 @@ def test_a_stride_takes_and_comes_round():
 
 def test_latents_are_taken_together():
     rng = np.random.default_rng(0)
-    drawn = latents.draw_latents(rng, rng.choice(len(sampling.KINDS), 300, p=sampling.SHARES))
+    drawn = latents.draw_latents(rng, rng.choice(len(activities.KINDS), 300, p=activities.SHARES))
     rows = rng.permutation(300)[:80]
     np.testing.assert_array_equal(sampling._angles(drawn.take(rows)).angles, sampling._angles(drawn).angles[rows])
 
@@ -164,8 +165,8 @@ def test_few_clips_pass_through_themselves_and_the_mix_is_kept():
     drawn = sampling.sample_clips(np.random.default_rng(1), 800, frames=6)
     ends = contact.capsule_ends(*contact.body_frames(drawn.rotations.reshape(-1, 24, 3, 3)))
     assert (contact.self_collision(ends).max(1) > 0.02).mean() < 0.02
-    shares = np.bincount(drawn.kind, minlength=len(sampling.KINDS)) / 800
-    np.testing.assert_allclose(shares, sampling.SHARES, atol=0.045)
+    shares = np.bincount(drawn.kind, minlength=len(activities.KINDS)) / 800
+    np.testing.assert_allclose(shares, activities.SHARES, atol=0.045)
 
 
 def test_wrong_clips_are_refused():

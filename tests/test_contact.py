@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from lidarpose.body import rig
 from lidarpose.body.mocap import retarget
-from lidarpose.body.pose_prior import balance, contact, latents, sampling
+from lidarpose.body.pose_prior import activities, balance, contact, joint_angles, latents, sampling
 from lidarpose.geometry import axis_angle_to_matrix
 from lidarpose.skeleton import SMPL24
 
@@ -55,7 +55,7 @@ def test_both_feet_are_on_the_ground(kind, usual, most):
 def test_what_balance_changes():
     """Without it bending people topple; others keep their angles."""
     rng = np.random.default_rng(1)
-    kind = np.repeat([sampling.KINDS.index("bend"), sampling.KINDS.index("sport")], 200)
+    kind = np.repeat([activities.KINDS.index("bend"), activities.KINDS.index("sport")], 200)
     angles = sampling._angles(latents.draw_latents(rng, kind)).angles
     before = angles.copy()
     after = balance.balanced(angles, kind)
@@ -63,7 +63,7 @@ def test_what_balance_changes():
     np.testing.assert_array_equal(after[200:], before[200:])
 
     def off(angles):
-        rotations = sampling.rotations_from_angles(angles[:200])
+        rotations = joint_angles.rotations_from_angles(angles[:200])
         joints = contact.body_frames(rotations)[1]
         points = balance._ground_points(rotations, joints)
         return np.linalg.norm(balance.overhang(contact.mass_center(joints), points, 0.0), axis=1)
@@ -124,8 +124,10 @@ def test_few_bodies_pass_through_themselves():
     depth = contact.self_collision(contact.capsule_ends(*contact.body_frames(rotations))).max(1)
     assert (depth > 0.02).mean() < 0.01
     rng = np.random.default_rng(3)
-    raw = sampling._angles(latents.draw_latents(rng, rng.choice(len(sampling.KINDS), 5000, p=sampling.SHARES))).angles
-    ends = contact.capsule_ends(*contact.body_frames(sampling.rotations_from_angles(raw)))
+    raw = sampling._angles(
+        latents.draw_latents(rng, rng.choice(len(activities.KINDS), 5000, p=activities.SHARES))
+    ).angles
+    ends = contact.capsule_ends(*contact.body_frames(joint_angles.rotations_from_angles(raw)))
     assert (contact.self_collision(ends).max(1) > 0.02).mean() > 0.05  # so there is something to do
 
 

@@ -18,6 +18,9 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.skeleton import SMPL24
 
+_SPEC = importlib.util.spec_from_file_location("fit_motion", Path(__file__).parents[1] / "tools/fit_motion.py")
+fit = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(fit)
 J = {name: i for i, name in enumerate(SMPL24.joints)}
 MAIN = [J[n] for n in SMPL24.joints if not n.endswith(("foot", "hand"))]
 
@@ -29,7 +32,7 @@ def drawn(n=1500, seed=0, **mix):
 def latents_of(n, seed, **mix):
     """The mix's latents, as they are drawn before anything is drawn anew."""
     rng = np.random.default_rng(seed)
-    return latents.draw_latents(rng, rng.choice(len(sampling.KINDS), n, p=sampling._kind_shares(mix or None)))
+    return latents.draw_latents(rng, rng.choice(len(activities.KINDS), n, p=sampling._kind_shares(mix or None)))
 
 
 def angle_at(joints, a, b, c):
@@ -65,8 +68,8 @@ def test_euler_angles_against_the_product_of_three_rotations():
 
 def test_angles_come_back_from_rotations():
     drawn_angles = sampling._angles(latents_of(1000, 3)).angles
-    rotations = sampling.rotations_from_angles(drawn_angles)
-    again = sampling.rotations_from_angles(joint_angles.angles_from_rotations(rotations))
+    rotations = joint_angles.rotations_from_angles(drawn_angles)
+    again = joint_angles.rotations_from_angles(fit.angles_from_rotations(rotations))
     # where an arm points straight out, raise and inward turn are not told apart, but the pose is the same
     np.testing.assert_allclose(again, rotations, atol=0.02)
 
@@ -89,11 +92,11 @@ def test_hinges_bend_one_way_and_not_too_far():
 def test_knees_point_forward_and_hands_reach_in_front():
     """Signs, seen in space: a bent knee leads its ankle, a bent elbow lifts the hand forward."""
     bent = np.zeros((1, 27))
-    name = {n: i for i, n in enumerate(sampling.ANGLES)}
+    name = {n: i for i, n in enumerate(activities.ANGLES)}
     for side in ("left", "right"):
         bent[:, name[f"{side}_knee"]] = bent[:, name[f"{side}_elbow"]] = 80
         bent[:, name[f"{side}_abd"]] = bent[:, name[f"{side}_out"]] = 15
-    p = joints_of(sampling.rotations_from_angles(bent))[0]
+    p = joints_of(joint_angles.rotations_from_angles(bent))[0]
     for side, left in (("left", 1), ("right", -1)):
         assert p[J[f"{side}_ankle"], 0] < p[J[f"{side}_knee"], 0] - 0.2
         assert p[J[f"{side}_wrist"], 0] > p[J[f"{side}_elbow"], 0] + 0.15
@@ -108,7 +111,10 @@ def test_knees_point_forward_and_hands_reach_in_front():
     ):
         forward = bent.copy()
         forward[:, name[positive]] = 40
-        q, r = joints_of(sampling.rotations_from_angles(forward))[0], joints_of(sampling.rotations_from_angles(bent))[0]
+        q, r = (
+            joints_of(joint_angles.rotations_from_angles(forward))[0],
+            joints_of(joint_angles.rotations_from_angles(bent))[0],
+        )
         assert q[J[joint], 0] > r[J[joint], 0] + 0.1, positive
 
 
@@ -151,11 +157,11 @@ def test_arms_swing_against_the_legs():
 
 def test_a_mirrored_pose_is_the_mirror_image():
     one = sampling._angles(latents_of(200, 6)).angles
-    mirrored = sampling.mirror_angles(one)
+    mirrored = joint_angles.mirror_angles(one)
     assert (mirrored >= activities.LIMITS[0]).all() and (mirrored <= activities.LIMITS[1]).all()
-    p, q = (joints_of(sampling.rotations_from_angles(a)) for a in (one, mirrored))
+    p, q = (joints_of(joint_angles.rotations_from_angles(a)) for a in (one, mirrored))
     np.testing.assert_allclose(q, p[:, SMPL24.flip] * [1, -1, 1], atol=0.02)
-    np.testing.assert_allclose(sampling.mirror_angles(mirrored), one)
+    np.testing.assert_allclose(joint_angles.mirror_angles(mirrored), one)
 
 
 def test_both_sides_are_alike_on_average():
@@ -180,8 +186,8 @@ def test_hands_stay_out_of_the_trunk():
 
 
 def test_the_mix_is_obeyed_and_checked():
-    assert set(drawn(300, 0, sit=1, walk=3).kind) == {sampling.KINDS.index("sit"), sampling.KINDS.index("walk")}
-    counts = np.bincount(drawn(20000, 0).kind, minlength=len(sampling.KINDS)) / 20000
+    assert set(drawn(300, 0, sit=1, walk=3).kind) == {activities.KINDS.index("sit"), activities.KINDS.index("walk")}
+    counts = np.bincount(drawn(20000, 0).kind, minlength=len(activities.KINDS)) / 20000
     np.testing.assert_allclose(counts, activities.SHARES, atol=0.015)
     with pytest.raises(InputError, match="did you mean walk"):
         drawn(3, 0, wakl=1)
@@ -217,8 +223,8 @@ def test_kneeling_people_have_a_knee_on_the_ground():
 
 
 def test_features_come_back_as_the_same_pose():
-    rotations = sampling.rotations_from_angles(sampling._angles(latents_of(500, 2)).angles)
-    again = sampling.rotations_from_angles(mixture.from_features(mixture.to_features(rotations)))
+    rotations = joint_angles.rotations_from_angles(sampling._angles(latents_of(500, 2)).angles)
+    again = joint_angles.rotations_from_angles(mixture.from_features(fit.to_features(rotations)))
     np.testing.assert_allclose(again, rotations, atol=0.02)
 
 
@@ -235,9 +241,6 @@ def test_captured_poses_are_people_upright():
 
 
 def test_the_fit_finds_a_known_mixture(tmp_path):
-    spec = importlib.util.spec_from_file_location("fit", Path(__file__).parents[1] / "tools/fit_motion.py")
-    fit = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(fit)
     rng = np.random.default_rng(0)
     far = rng.normal(size=(2, 27)) * 40
     which = rng.random(1500) < 0.3
@@ -247,7 +250,7 @@ def test_the_fit_finds_a_known_mixture(tmp_path):
     np.testing.assert_allclose(weights[order], [0.7, 0.3], atol=0.05)
     np.testing.assert_allclose(means[order], far, atol=1.5)
     assert np.linalg.eigvalsh(covariances).min() > fit._RIDGE * 0.9
-    mixture.save_mixture(tmp_path / "mixture.npz", weights, means, covariances)
+    fit.save_mixture(tmp_path / "mixture.npz", weights, means, covariances)
     stored = np.load(tmp_path / "mixture.npz")
     assert stored["roots"].shape == (2, 27 * 28 // 2)
 
@@ -328,11 +331,11 @@ def test_clips_are_read_and_selected(tmp_path):
     path, joints = stored(tmp_path)
     loaded = motion.load_clips(path)
     assert len(loaded) == 3 and loaded.fps == 10 and loaded.names == ("002_01", "005_01", "002_02")
-    np.testing.assert_array_equal(loaded[1], joints[4:6])
+    np.testing.assert_array_equal(loaded.joints[loaded.frames(1)], joints[4:6])
     chosen = loaded.of(["002"])
     assert chosen.names == ("002_01", "002_02")
     np.testing.assert_array_equal(chosen.joints, joints[[0, 1, 2, 3, 6, 7, 8, 9]])
-    np.testing.assert_array_equal(chosen[1], joints[6:10])
+    np.testing.assert_array_equal(chosen.joints[chosen.frames(1)], joints[6:10])
     assert loaded.of("005").names == ("005_01",)
     with pytest.raises(InputError, match="'009': there are 002, 005"):
         loaded.of("009")
@@ -384,7 +387,7 @@ def test_cuts_of_any_whole_numbers(tmp_path, kind):
         clip_length=np.array(length, kind),
     )  # fmt: skip
     loaded = motion.load_clips(path)
-    assert [len(loaded[k]) for k in range(2)] == [120, 120]
+    assert [len(loaded.joints[loaded.frames(k)]) for k in range(2)] == [120, 120]
     path, _ = stored(
         tmp_path, joints=joints[:100], clip=np.array(["a"]), clip_start=np.array([100], kind),
         clip_length=np.array([120], kind),

@@ -6,16 +6,66 @@ CLIPS.npz is laid out as `lidarpose.body.mocap.motion` says. Only the mixture's 
 """
 
 import argparse
+from pathlib import Path
 
 import numpy as np
 
 from lidarpose.body.mocap.motion import load_clips
-from lidarpose.body.mocap.retarget import retarget_positions, without_yaw
-from lidarpose.body.pose_prior.mixture import save_mixture, to_features
+from lidarpose.body.mocap.retarget import retarget_positions, rotation_vector, without_yaw
+from lidarpose.body.pose_prior.activities import ANGLE_INDEX
+from lidarpose.body.pose_prior.joint_angles import EULER_FROM_ANGLES, collar_lift, shoulder_angles, shoulder_matrix
+from lidarpose.body.pose_prior.mixture import LOWER, SHOULDERS, hanging_arm
+from lidarpose.geometry import rotation_about
+from lidarpose.skeleton import SMPL24
 
+_LIFT_STEPS = 6  # fixed-point steps that take the collar's share out of the upper arm
 _ITERATIONS = 60
 _RIDGE = 3.0**2  # degrees squared added to every variance: a pose is known no better, and none is stored exactly
 _SHRINK = 0.1  # share of the pooled covariance in each component's
+
+
+def angles_from_rotations(rotations: np.ndarray) -> np.ndarray:
+    """The inverse of `joint_angles.rotations_from_angles`: the angles (n, 27), degrees, nearest to local rotations
+    (n, 24, 3, 3).
+
+    What the angles cannot express is dropped: turns of wrists and hands, unlike shares of the spine's joints, and of
+    the collars all but where they take the upper arms.
+    """
+    rotations = np.asarray(rotations, float)
+    # joints that share an angle turn by the same small rotation: their Euler angles are added
+    angles = _to_euler(rotations).reshape(len(rotations), 72) @ np.sign(EULER_FROM_ANGLES).T
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        collar, shoulder = (rotations[:, SMPL24.index(f"{side}_{name}")] for name in ("collar", "shoulder"))
+        arm = shoulder_angles(collar @ shoulder, sign)
+        for _ in range(_LIFT_STEPS):
+            unlift = rotation_about("x", -sign * np.radians(collar_lift(arm[:, :2])))
+            arm = shoulder_angles(unlift @ collar @ shoulder, sign)
+        angles[:, [ANGLE_INDEX[f"{side}_{name}"] for name in ("raise", "out", "in")]] = arm
+    return angles
+
+
+def to_features(rotations: np.ndarray) -> np.ndarray:
+    """Local rotations (n, 24, 3, 3) -> the mixture's features (n, 27): the inverse of `mixture.from_features`."""
+    features = angles_from_rotations(rotations)
+    for part, sign in SHOULDERS:
+        features[:, part] = np.degrees(rotation_vector(shoulder_matrix(features[:, part], sign) @ hanging_arm(sign).T))
+    return features
+
+
+def _to_euler(matrix: np.ndarray) -> np.ndarray:
+    """R_y R_x R_z (..., 3, 3) -> (..., 3) degrees about y, x, z; x in +-90."""
+    y = np.arctan2(matrix[..., 0, 2], matrix[..., 2, 2])
+    x = -np.arcsin(np.clip(matrix[..., 1, 2], -1, 1))
+    z = np.arctan2(matrix[..., 1, 0], matrix[..., 1, 1])
+    return np.degrees(np.stack([y, x, z], -1))
+
+
+def save_mixture(path: str | Path, weights: np.ndarray, means: np.ndarray, covariances: np.ndarray) -> None:
+    """Writes weights (K,), means (K, 27) and covariances (K, 27, 27), the last as their Cholesky factors."""
+    roots = np.linalg.cholesky(covariances)[:, *LOWER]
+    np.savez_compressed(
+        path, weights=weights.astype(np.float32), means=means.astype(np.float16), roots=roots.astype(np.float16)
+    )
 
 
 def fit_mixture(features: np.ndarray, components: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:

@@ -77,11 +77,6 @@ class RestBody:
     vertices: np.ndarray
     joints: np.ndarray
 
-    @property
-    def lowest(self) -> np.ndarray:
-        """(n,) z of the soles: standing upright, the pelvis is -lowest above the ground."""
-        return self.vertices[..., 2].min(-1)
-
 
 @cache
 def load_rig() -> Rig:

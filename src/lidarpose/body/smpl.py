@@ -127,7 +127,9 @@ class SmplBody:
         nose, ears = self._head_vertices
         points = np.stack([vertices[:, nose], vertices[:, ears].mean(1)], 1) - joints[:, None, _HEAD]
         posed, positions, global_rotations = self._posed(vertices, joints, local, root)
-        hands = [positions[:, bases].mean(1) for bases in self._hand_joints]
+        fingers = [self._fingers(wrist) for wrist in _HANDS]
+        # the thumb is the last finger of SMPL+H and SMPL-X
+        hands = [positions[:, bases[:-1] if len(bases) > 1 else bases].mean(1) for bases in fingers]
         head = positions[:, None, _HEAD] + points @ np.swapaxes(global_rotations[:, _HEAD], -1, -2)
         body26 = np.concatenate([positions[:, :_SHARED], np.stack(hands, 1), head], 1)
         return tuple((x @ _R_LEVEL_SMPL.T).astype(np.float32) for x in (posed, body26))
@@ -182,12 +184,6 @@ class SmplBody:
 
     def _fingers(self, wrist: int) -> np.ndarray:
         return np.flatnonzero(self.parents == wrist)
-
-    @cached_property
-    def _hand_joints(self) -> tuple[np.ndarray, ...]:
-        """Whose mean is left_hand and right_hand. The thumb is the last finger of SMPL+H and SMPL-X."""
-        fingers = [self._fingers(wrist) for wrist in _HANDS]
-        return tuple(f[:-1] if len(f) > 1 else f for f in fingers)
 
     @cached_property
     def _head_vertices(self) -> tuple[int, np.ndarray]:
@@ -267,19 +263,13 @@ def _body(path: object, raw: Mapping) -> SmplBody:
 
 
 def _numbers(path: object, key: str, value: object) -> np.ndarray:
+    """A float64 copy of an array of numbers, C-contiguous: nobody else's array is made read-only."""
     if isinstance(value, Unread):
         raise file_error(path, f"{key} is a {value.name} that holds no numbers: ask for npz")
-    try:
-        if not isinstance(value, np.ndarray):
-            # lists that hold one list many times over would grow without end
-            raise TypeError
-        array = np.array(value)
-        if array.dtype.kind not in "fiub":
-            raise TypeError
-        # a copy in any case, C-contiguous: nobody else's array is made read-only
-        array = array.astype(float, order="C")
-    except (TypeError, ValueError, OverflowError):
-        raise file_error(path, f"{key} must be an array of numbers, got {type(value).__name__}: ask for npz") from None
+    # lists that hold one list many times over would grow without end
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
+        raise file_error(path, f"{key} must be an array of numbers, got {type(value).__name__}: ask for npz")
+    array = value.astype(float, order="C")
     if not np.isfinite(array).all():
         raise file_error(path, f"{key} has values that are not finite; was the file copied completely?")
     return array

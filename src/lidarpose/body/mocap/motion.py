@@ -95,10 +95,6 @@ class Clips(_ClipTable):
 
     ROWS = {"joints": (24, 3)}
 
-    def __getitem__(self, clip: int) -> np.ndarray:
-        """The joints (length, 24, 3) of one clip."""
-        return self.joints[self.frames(clip)]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Motion(_ClipTable):
@@ -173,11 +169,8 @@ class Motion(_ClipTable):
         return rotations, translation
 
 
-def join(motions: Iterable[Motion], *, source: str) -> Motion:
-    """All clips of several motions at one rate, the lowest of theirs. Raises InputError where there is none."""
-    motions = list(motions)
-    if not motions:
-        raise InputError(f"{source}: no motion to join")
+def join(motions: Sequence[Motion], *, source: str) -> Motion:
+    """All clips of one or more motions, at the lowest of their rates."""
     motions = [motion.resampled(min(m.fps for m in motions)) for motion in motions]
     before = np.cumsum([0] + [len(m.rotations) for m in motions[:-1]])
     return Motion(

@@ -37,11 +37,18 @@ for _side in ("left", "right"):
 def retarget_positions(joints: np.ndarray, rest: np.ndarray | None = None) -> np.ndarray:
     """Local rotations that give the body the pose of captured joints.
 
-    joints (n, 24, 3) m, SMPL's joints in SMPL's order, z up, any facing and any bone lengths; rest (24, 3) m, the
-    joints of the T-pose to be turned, by default the mean adult's. Returns (n, 24, 3, 3) float32. The heading of the
-    source stays in the root (`without_yaw` removes it). The twist of the head about the neck and of a straight limb
-    cannot be seen in positions: they follow the parent (a straight leg follows its foot).
-    Raises InputError for another shape, for values that are not finite and for limbs without length.
+    The heading of the source stays in the root (`without_yaw` removes it). The twist of the head about the neck and of
+    a straight limb cannot be seen in positions: they follow the parent (a straight leg follows its foot).
+
+    Args:
+        joints: (n, 24, 3) m, SMPL's joints in SMPL's order, z up, any facing and any bone lengths.
+        rest: (24, 3) m, the joints of the T-pose to be turned, by default the mean adult's.
+
+    Returns:
+        (n, 24, 3, 3) float32, in the rest frame of `body.rig`.
+
+    Raises:
+        InputError: For another shape, values that are not finite and limbs without length.
     """
     joints = np.asarray(joints, float)
     if joints.ndim != 3 or joints.shape[1:] != (24, 3):
@@ -52,9 +59,7 @@ def retarget_positions(joints: np.ndarray, rest: np.ndarray | None = None) -> np
     if (length <= SHORTEST_BONE).any():
         first = int(np.argmax(length <= SHORTEST_BONE))
         raise InputError(f"{which[first]} has no length in frame {first}: a bone without length has no direction")
-    if rest is None:
-        rest = mean_adult_joints()
-    rest = np.asarray(rest, float)[None]
+    rest = np.asarray(mean_adult_joints() if rest is None else rest, float)[None]
 
     turn = np.empty((len(joints), 24, 3, 3))  # global rotations G
     trunk = _trunk(joints, rest)
@@ -124,10 +129,6 @@ def _frame(along: np.ndarray, hint: np.ndarray) -> np.ndarray:
     return np.stack([first, second, np.cross(first, second)], -1)
 
 
-def _align(frame, joints: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    return frame(joints) @ np.swapaxes(frame(rest), -1, -2)
-
-
 def _turn(along: np.ndarray, hint: np.ndarray, rest_along: np.ndarray, rest_hint: np.ndarray) -> np.ndarray:
     return _frame(along, hint) @ np.swapaxes(_frame(rest_along, rest_hint), -1, -2)
 
@@ -143,7 +144,7 @@ def _carried(turn: np.ndarray, offset: np.ndarray) -> np.ndarray:
 
 def _trunk(joints: np.ndarray, rest: np.ndarray) -> list[np.ndarray]:
     """Global rotations of pelvis and spine1-3: the bend is shared evenly, the line hips -> neck is the source's."""
-    pelvis, torso = (_align(frame, joints, rest) for frame in (_pelvis_frame, _torso_frame))
+    pelvis, torso = (frame(joints) @ np.swapaxes(frame(rest), -1, -2) for frame in (_pelvis_frame, _torso_frame))
     across = rotation_vector(np.swapaxes(pelvis, -1, -2) @ torso)
     turns = [pelvis, *(pelvis @ axis_angle_to_matrix(share * across) for share in (1 / 3, 2 / 3)), torso]
     # spines are curved and cut differently in every skeleton, the line from the hips to the neck is not

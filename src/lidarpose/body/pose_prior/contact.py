@@ -149,19 +149,15 @@ def sole_points(rotations: np.ndarray) -> np.ndarray:
     return ankle[:, :, None] + sole @ np.swapaxes(foot, -1, -2)
 
 
-def bearing(points: np.ndarray) -> np.ndarray:
-    """points (..., P, 3) of a body -> (..., P): shares of the weight by height, the lowest most; they sum to 1."""
-    height = points[..., 2]
-    share = np.exp((height.min(-1, keepdims=True) - height) / np.float32(_BEARING))
-    return share / share.sum(-1, keepdims=True)
-
-
 def planted_way(points: np.ndarray) -> np.ndarray:
     """The way (n, T, 3) m of the body if the points that bear it do not slide; z is 0.
 
     points (n, T, P, 3) m seen from the pelvis in axes that do not turn, T close moments; the way starts at 0.
     """
-    share = bearing(points)
+    height = points[..., 2]
+    # each point's share of the weight
+    share = np.exp((height.min(-1, keepdims=True) - height) / np.float32(_BEARING))
+    share = share / share.sum(-1, keepdims=True)
     share = (share[:, 1:] + share[:, :-1]) / 2
     way = np.zeros((*points.shape[:2], 3), points.dtype)
     np.cumsum(-np.einsum("ntp,ntpk->ntk", share, np.diff(points[..., :2], axis=1)), 1, out=way[:, 1:, :2])

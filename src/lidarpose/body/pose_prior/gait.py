@@ -58,12 +58,6 @@ _LEG_COLUMNS, _ABD, _ROT, _RAISE, _ELBOW = (
 )
 
 
-def stride_curves(phase: ndarray, gait: ndarray) -> ndarray:
-    """phase (n, P) in strides, any number, gait (n,) into `GAITS` -> (n, P, 3) degrees: hip and knee flexion, ankle
-    dorsiflexion."""
-    return _basis(phase) @ _COEFFICIENTS[gait]
-
-
 @dataclass(frozen=True, kw_only=True)
 class Stride:
     """angles (n, 27) degrees; pace (n,) m a stride along the way the body goes, 0 for who stays; height (n,) m of the
@@ -148,7 +142,7 @@ def _legs(
     stance_phase, contact = stance
     length, lift, crouch = (value[:, None, None] for value in (length, lift, crouch))
     grid = np.broadcast_to(_GRID_CURVES[gait, None], (len(phase), 2, 7, 3))
-    curves = np.concatenate([stride_curves(phase, gait)[:, :, None], grid], 2)
+    curves = np.concatenate([(_basis(phase) @ _COEFFICIENTS[gait])[:, :, None], grid], 2)
     own_hip, own_knee, own_ankle = np.moveaxis(base[:, _LEG_COLUMNS], 1, 0)[..., None]
     hip = length * (curves[..., 0] - 4) + 4 + 0.45 * crouch + own_hip
     # slow steps bend the knee less

@@ -16,14 +16,13 @@ _COLLAR_LIFTS = 3 * np.array([_J["left_collar"], _J["right_collar"]]) + 1
 _LIFT_SIGNS = np.array([1, -1], np.float32)
 _RAISED_OUT = np.array([[ANGLE_INDEX[f"{side}_raise"], ANGLE_INDEX[f"{side}_out"]] for side, _ in _SIDES])
 _INWARD = np.array([ANGLE_INDEX[f"{side}_in"] for side, _ in _SIDES])
-_LIFT_STEPS = 6  # fixed-point steps that take the collar's share out of the upper arm
 
 
 def rotations_from_angles(angles: np.ndarray) -> np.ndarray:
     """angles (n, 27) degrees in the order of `ANGLES` -> local rotations (n, 24, 3, 3) float32."""
     angles = np.asarray(angles, np.float32)
-    euler = angles @ _TO_EULER + _AT_ZERO
-    euler[:, _COLLAR_LIFTS] += _LIFT_SIGNS * _lift(angles[:, _RAISED_OUT])
+    euler = angles @ EULER_FROM_ANGLES + _AT_ZERO
+    euler[:, _COLLAR_LIFTS] += _LIFT_SIGNS * collar_lift(angles[:, _RAISED_OUT])
     rotations = _from_euler(np.radians(euler.reshape(len(angles), 24, 3)))
     inward = np.radians(angles[:, _INWARD])
     turn = np.zeros((len(angles), 2, 3, 3), np.float32)
@@ -33,24 +32,6 @@ def rotations_from_angles(angles: np.ndarray) -> np.ndarray:
     turn[..., 1, 1] = 1
     rotations[:, _SHOULDERS] = rotations[:, _SHOULDERS] @ turn
     return rotations
-
-
-def angles_from_rotations(rotations: np.ndarray) -> np.ndarray:
-    """The angles (n, 27), degrees, nearest to local rotations (n, 24, 3, 3): the inverse of `rotations_from_angles`.
-
-    What the angles cannot say is dropped: turns of wrists and hands, unlike shares of the spine's joints, and of the
-    collars all but where they take the upper arms.
-    """
-    rotations = np.asarray(rotations, float)
-    # joints that share an angle turn by the same small rotation: their Euler angles are added
-    angles = _to_euler(rotations).reshape(len(rotations), 72) @ np.sign(_TO_EULER).T
-    for side, sign in _SIDES:
-        upper_arm = rotations[:, _J[f"{side}_collar"]] @ rotations[:, _J[f"{side}_shoulder"]]
-        arm = shoulder_angles(upper_arm, sign)
-        for _ in range(_LIFT_STEPS):
-            arm = shoulder_angles(rotation_about("x", -sign * np.radians(_lift(arm[:, :2]))) @ upper_arm, sign)
-        angles[:, [ANGLE_INDEX[f"{side}_{name}"] for name in ("raise", "out", "in")]] = arm
-    return angles
 
 
 def shoulder_angles(matrix: np.ndarray, sign: float) -> np.ndarray:
@@ -68,18 +49,10 @@ def shoulder_matrix(arm: np.ndarray, sign: float) -> np.ndarray:
     return rotation_about("y", -raised) @ rotation_about("x", sign * (out - np.pi / 2)) @ rotation_about("y", inward)
 
 
-def _lift(arm: np.ndarray) -> np.ndarray:
+def collar_lift(arm: np.ndarray) -> np.ndarray:
     """The collar's turn (...) degrees upwards, for an arm's raise and out (..., 2) degrees."""
     elevation = np.degrees(np.arccos(np.clip(np.cos(np.radians(arm)).prod(-1), -1, 1)))
     return _COLLAR_SHARE * np.clip(elevation - _COLLAR_FROM, 0, None)
-
-
-def _to_euler(matrix: np.ndarray) -> np.ndarray:
-    """R_y R_x R_z (..., 3, 3) -> (..., 3) degrees about y, x, z; x in +-90."""
-    y = np.arctan2(matrix[..., 0, 2], matrix[..., 2, 2])
-    x = -np.arcsin(np.clip(matrix[..., 1, 2], -1, 1))
-    z = np.arctan2(matrix[..., 1, 0], matrix[..., 1, 1])
-    return np.degrees(np.stack([y, x, z], -1))
 
 
 def _from_euler(euler: np.ndarray) -> np.ndarray:
@@ -123,7 +96,7 @@ def _euler_map() -> tuple[np.ndarray, np.ndarray]:
     return matrix.reshape(len(ANGLES), 72), zero.reshape(72)
 
 
-_TO_EULER, _AT_ZERO = _euler_map()
+EULER_FROM_ANGLES, _AT_ZERO = _euler_map()
 
 
 def _mirror() -> tuple[np.ndarray, np.ndarray]:

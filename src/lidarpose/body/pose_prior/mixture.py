@@ -7,31 +7,28 @@ Lab Motion Capture Database (mocap.cs.cmu.edu, NSF EIA-0196217); no pose of it i
 
 from functools import cache
 from importlib import resources
-from pathlib import Path
 
 import numpy as np
 
-from lidarpose.body.mocap.retarget import rotation_vector
 from lidarpose.body.pose_prior.activities import ANGLES, ARM_ANGLES
-from lidarpose.body.pose_prior.joint_angles import angles_from_rotations, shoulder_angles, shoulder_matrix
+from lidarpose.body.pose_prior.joint_angles import shoulder_angles, shoulder_matrix
 from lidarpose.geometry import axis_angle_to_matrix
 
 _FIRST_ARM_ANGLE = {side: ANGLES.index(f"{side}_raise") for side in ("left", "right")}
 # columns of each shoulder's three angles, and the side's sign
-_SHOULDERS = tuple((slice(i, i + 3), sign) for i, sign in zip(_FIRST_ARM_ANGLE.values(), (1.0, -1.0), strict=True))
+SHOULDERS = tuple((slice(i, i + 3), sign) for i, sign in zip(_FIRST_ARM_ANGLE.values(), (1.0, -1.0), strict=True))
 # deviations are drawn this much smaller than fitted: the fit's ridge and few components make it wider than the motion
 _SPREAD = 0.75
 # an arm is another pose's this often: one subject's poses then cover another's better
 _OTHER_ARM = 0.4
 _ARMS = tuple(list(range(i, i + len(ARM_ANGLES))) for i in _FIRST_ARM_ANGLE.values())
-_LOWER = np.tril_indices(len(ANGLES))
+# where a Cholesky factor's numbers are
+LOWER = np.tril_indices(len(ANGLES))
 
 
 def captured_angles(rng: np.random.Generator, n: int) -> np.ndarray:
     """n pairs of poses of one component of the mixture: angles (n, 2, 27), degrees, in the order of `ANGLES`; limits
     are not applied. The first of a pair is distributed as the mixture; to move is to go towards the second."""
-    if not n:
-        return np.zeros((0, 2, len(ANGLES)))
     cumulative, means, roots = _mixture()
     component = np.searchsorted(cumulative, rng.random(n))
     normal = rng.standard_normal((n, 2, len(ANGLES)))
@@ -42,32 +39,16 @@ def captured_angles(rng: np.random.Generator, n: int) -> np.ndarray:
     return from_features(features.reshape(-1, len(ANGLES))).reshape(n, 2, len(ANGLES))
 
 
-def to_features(rotations: np.ndarray) -> np.ndarray:
-    """Local rotations (n, 24, 3, 3) -> the mixture's features (n, 27)."""
-    features = angles_from_rotations(rotations)
-    for part, sign in _SHOULDERS:
-        turn = shoulder_matrix(features[:, part], sign) @ _hanging(sign).T
-        features[:, part] = np.degrees(rotation_vector(turn))
-    return features
-
-
 def from_features(features: np.ndarray) -> np.ndarray:
     """The mixture's features (n, 27) -> angles (n, 27), degrees."""
     angles = np.array(features, float)
-    for part, sign in _SHOULDERS:
-        angles[:, part] = shoulder_angles(axis_angle_to_matrix(np.radians(angles[:, part])) @ _hanging(sign), sign)
+    for part, sign in SHOULDERS:
+        angles[:, part] = shoulder_angles(axis_angle_to_matrix(np.radians(angles[:, part])) @ hanging_arm(sign), sign)
     return angles
 
 
-def save_mixture(path: str | Path, weights: np.ndarray, means: np.ndarray, covariances: np.ndarray) -> None:
-    """Writes weights (K,), means (K, 27) and covariances (K, 27, 27), the last as their Cholesky factors."""
-    roots = np.linalg.cholesky(covariances)[:, *_LOWER]
-    np.savez_compressed(
-        path, weights=weights.astype(np.float32), means=means.astype(np.float16), roots=roots.astype(np.float16)
-    )
-
-
-def _hanging(sign: float) -> np.ndarray:
+def hanging_arm(sign: float) -> np.ndarray:
+    """(3, 3): the shoulder's rotation from the T-pose to a hanging arm, sign 1 for the left and -1 for the right."""
     return shoulder_matrix(np.zeros((1, 3)), sign)[0]
 
 
@@ -78,7 +59,7 @@ def _mixture() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         stored = dict(np.load(file, allow_pickle=False))
     weights = stored["weights"].astype(float)
     roots = np.zeros((len(weights), len(ANGLES), len(ANGLES)))
-    roots[:, *_LOWER] = stored["roots"]
+    roots[:, *LOWER] = stored["roots"]
     cumulative = np.cumsum(weights / weights.sum())
     cumulative[-1] = 1.0
     return cumulative, stored["means"].astype(float), roots
