@@ -502,7 +502,7 @@ def test_a_file_of_several_people_asks_for_boxes(tmp_path, out, points, capsys):
     np.save(tmp_path / "a.npy", np.concatenate([points, points + 9]))
     assert run("predict", tmp_path / "a.npy", "--out", out) == 2
     line = one_line(capsys)
-    assert "--boxes" in line and "--crop" in line
+    assert "boxes" in line and "crop" in line
 
 
 def test_a_picture_that_cannot_be_written_leaves_no_json(crop, out, capsys):

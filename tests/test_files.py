@@ -2,6 +2,8 @@
 
 import errno
 import os
+import random
+import re
 import stat
 
 import numpy as np
@@ -67,6 +69,21 @@ def test_names_that_the_disk_refuses(tmp_path):
     with pytest.raises(InputError, match="^'': is a folder"):
         write_atomic("", "x")
     assert tree(tmp_path) == []
+
+
+def test_temporary_names_are_nobody_elses(tmp_path, monkeypatch):
+    """A container that was killed left a file of this very process id, and numbers may be drawn from one seed."""
+    monkeypatch.setattr(os, "getpid", lambda: 1)
+    for number in range(9):
+        (tmp_path / f".1-{number}-a.txt").write_text("left")
+    names = set()
+    for _ in range(2):
+        random.seed(0)
+        with atomic_path(tmp_path / "a.txt") as temporary:
+            names.add(temporary.name)
+            temporary.write_text("new")
+    assert len(names) == 2 and (tmp_path / "a.txt").read_text() == "new"
+    assert all(re.fullmatch(files.TEMPORARY + "a.txt", name) for name in (*names, ".1-8-a.txt"))
 
 
 def test_nested_and_simultaneous_paths_differ(tmp_path):

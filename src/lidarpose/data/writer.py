@@ -19,7 +19,7 @@ from pathlib import Path
 from lidarpose.data.schema import TABLES
 from lidarpose.data.shards import CARD, DatasetCard, check_settings, read_card, rows_of_shard, shard_path
 from lidarpose.errors import InputError, MissingExtra
-from lidarpose.io.files import check_writable, file_error
+from lidarpose.io.files import TEMPORARY, check_writable, file_error
 
 try:
     from filelock import FileLock, Timeout
@@ -33,8 +33,8 @@ Make = Callable[[int], Iterator[int]]
 _TICK = 0.5
 # in a dataset's folder while a process writes there
 LOCK = ".lock"
-# the temporary names of `files.atomic_path`
-_LEFT = re.compile(rf"\.\d+-\d+-(?:(?:{'|'.join(TABLES)})-\d{{5}}\.parquet|{re.escape(CARD)})")
+# what `files.atomic_path` leaves of a process that was killed
+_LEFT = re.compile(rf"{TEMPORARY}(?:(?:{'|'.join(TABLES)})-\d{{5}}\.parquet|{re.escape(CARD)})")
 
 
 def open_folder(folder: Path, card: DatasetCard, rows: Mapping[str, int] | None = None) -> list[int]:

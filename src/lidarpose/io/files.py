@@ -9,10 +9,10 @@ import hashlib
 import io
 import os
 import reprlib
+import secrets
 import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,11 +21,11 @@ from lidarpose.errors import InputError
 if TYPE_CHECKING:
     import numpy as np
 
-# part of a temporary file's name beside the process id, so that threads of one process never share a name
-_serial = count()
-
 # bytes: a name may have 255 on the usual file systems, of which the temporary name needs some itself
 _MAX_KEPT_NAME = 100
+
+# how the names of temporary files begin; with process ids in version 0.2
+TEMPORARY = r"\.(?:[0-9a-f]{16}|\d+-\d+)-"
 
 _REMEDIES = {
     errno.ENOSPC: "free some space or write to another disk",
@@ -228,7 +228,8 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     made: list[Path] = []
     # a character that is cut in two is left out
     kept = target.name.encode("utf-8", "ignore")[-_MAX_KEPT_NAME:].decode("utf-8", "ignore")
-    temporary = target.parent / f".{os.getpid()}-{next(_serial)}-{kept}"
+    # random: containers on one disk have the same process ids
+    temporary = target.parent / f".{secrets.token_hex(8)}-{kept}"
     try:
         for folder in (*reversed(target.parent.parents), target.parent):
             if not folder.is_dir():

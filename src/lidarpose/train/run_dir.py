@@ -15,7 +15,7 @@ from filelock import FileLock, Timeout
 
 from lidarpose._version import __version__
 from lidarpose.errors import InputError
-from lidarpose.io.files import file_error, read_bytes, write_atomic
+from lidarpose.io.files import TEMPORARY, file_error, read_bytes, write_atomic
 from lidarpose.train.recipes import FREE, Recipe
 
 # where numbered runs go
@@ -29,8 +29,8 @@ LOCK_WAIT = 10.0
 SCHEMA = "lidarpose.run/2"
 # settings that are files or folders, which may have been moved
 PATHS = ("data", "shards", "motion", "init")
-# the temporary names of `files.atomic_path`
-_LEFT = re.compile(r"\.\d+-\d+-.+")
+# what `files.atomic_path` leaves of a process that was killed
+_LEFT = re.compile(rf"{TEMPORARY}.+")
 # how a run's length is called: a run may become longer, its schedule follows
 LENGTHS = ("people", "epochs")
 
