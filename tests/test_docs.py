@@ -2,6 +2,7 @@
 
 import importlib.util
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -111,3 +112,14 @@ def test_the_site_begins_with_the_readme_and_lists_every_public_name():
     reference = hooks.on_page_markdown((DOCS / "reference.md").read_text("utf-8"))
     for name in lidarpose.__all__:
         assert name == "__version__" or f"heading: lidarpose.{name}\n" in reference
+
+
+def test_the_hashed_requirements_are_the_constraints_with_hashes_of_all_that_predicting_and_synthesis_need():
+    lines = (ROOT / "requirements-hashed.txt").read_text("utf-8").replace("\\\n", " ").splitlines()
+    entries = [line for line in lines if line and not line.startswith("#")]
+    pins = {entry.split()[0] for entry in entries}
+    assert all("--hash=sha256:" in entry for entry in entries)
+    assert pins <= set((ROOT / "constraints.txt").read_text("utf-8").splitlines())
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    for requirement in project["dependencies"] + project["optional-dependencies"]["synth"]:
+        assert any(pin.startswith(requirement.split(">=")[0] + "==") for pin in pins), requirement
