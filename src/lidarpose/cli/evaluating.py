@@ -5,7 +5,7 @@ import shlex
 from collections.abc import Iterator
 from contextlib import ExitStack
 
-from lidarpose.cli.terminal import is_watched, tell
+from lidarpose.cli.terminal import add_command, is_watched, tell
 from lidarpose.models import BUNDLED
 
 # groups of rows that the terminal shows; the others are in scores.json
@@ -20,9 +20,12 @@ _TITLES = {
 
 def add(commands) -> None:
     """Adds the commands to the parser's."""
-    evaluate = commands.add_parser(
+    evaluate = add_command(
+        commands,
         "evaluate",
-        help="score a checkpoint on datasets",
+        "score a checkpoint on datasets",
+        "lidarpose evaluate small bench",
+        "lidarpose evaluate small prepared/waymo --out scores/waymo",
         description="Prints metrics and writes scores.json, poses.parquet and pictures into a folder.",
     )
     evaluate.set_defaults(run=_evaluate)
@@ -63,9 +66,11 @@ def add(commands) -> None:
         help="test-time augmentation: average N looks at each person, 1 (default) to 8; protocol clean only",
     )
 
-    table = commands.add_parser(
+    table = add_command(
+        commands,
         "table",
-        help="show scores beside the paper's Table 1",
+        "show scores beside the paper's Table 1",
+        "lidarpose table evaluation/small",
         description="Sets scores.json files beside the figures printed in the paper, by protocol.",
     )
     table.set_defaults(run=_table)
