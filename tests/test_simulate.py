@@ -226,7 +226,7 @@ def test_pose_box_and_body_of_a_frame_are_in_one_place(props):
 def test_a_rosette_goes_on_with_its_pattern_from_frame_to_frame():
     actor, where = goer(still=True), scene("livox-avia", 0.16, config=CLEAN)
     first, again, second = (
-        generator._draw_sample(where, actor, frame, np.random.default_rng(0)).points for frame in (0, 0, 1)
+        generator._draw_sample(where, actor, frame, frame, np.random.default_rng(0)).points for frame in (0, 0, 1)
     )
     np.testing.assert_array_equal(first, again)
     assert len(second) > 50 and (first.shape != second.shape or np.abs(first - second).max() > 0.01)
@@ -238,11 +238,11 @@ def test_a_rosette_goes_on_with_its_pattern_from_frame_to_frame():
 def test_every_try_is_nearer_and_easier_and_the_best_counts(monkeypatch):
     seen, counts = [], iter([3, 9, 5, 0, 2, 8, 1, 4])
 
-    def draw_scene(config, body, bodies, row, nearer, rng):
+    def draw_scene(config, bodies, first, block, row, nearer, rng):
         seen.append((config.hard, nearer))
         return len(seen) - 1
 
-    def draw_sample(attempt, body, frame, rng):
+    def draw_sample(attempt, bodies, row, frame, rng):
         count = next(counts)
         points = np.full((count, 3), attempt, np.float32)
         return Sample(points=points, center=np.zeros(3), part=np.ones(count, np.uint8))

@@ -15,8 +15,8 @@ from lidarpose.synth.street import Street, StreetFrame, _Walker, samples
 
 def test_who_passes_by_does_what_people_do_in_streets(monkeypatch):
     kinds = iter(["sit", "cycle", "lie", "run", "walk"])
-    monkeypatch.setattr(street, "draw_moving_body", lambda *given: replace(goer(), kind=next(kinds)))
-    assert street._draw_pedestrian(4, np.random.default_rng(0)).kind == "run"
+    monkeypatch.setattr(street, "draw_moving_body", lambda *given: replace(goer(), kinds=(next(kinds),) * 3))
+    assert street._draw_pedestrian(4, np.random.default_rng(0)).kinds[0] == "run"
 
 
 def test_a_rosette_goes_on_with_its_pattern_in_a_street():

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpose.lidar.raycast import cast_rays
-from lidarpose.synth.environment.mesh import prism, union
+from lidarpose.synth.environment.mesh import shape, union
 from lidarpose.synth.environment.surroundings import ground, occluder, surroundings
 from lidarpose.synth.scene import SCENES
 
@@ -95,7 +95,7 @@ def test_occluders_hide_something_and_seldom_all():
     rng, hidden = RNG(7), []
     for _ in range(200):
         feet = feet_at((rng.uniform(3, 20), rng.uniform(-3, 3), rng.uniform(0.5, 2)))
-        person = prism(0.22, 1.7).moved(feet)
+        person = shape("pole", 0.22, 0.22, 1.7).moved(feet)
         heading, wide = np.arctan2(feet[1], feet[0]), np.arctan(0.25 / np.hypot(*feet[:2]))
         azimuth = heading + np.linspace(-wide, wide, 24)
         elevation = np.linspace(*np.arctan((feet[2] + np.array([0, 1.7])) / np.hypot(*feet[:2])), 30)

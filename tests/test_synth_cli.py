@@ -175,7 +175,7 @@ def test_clips_have_frames(tmp_path):
 
 
 BAD = {
-    "none": (["-n", "0"], "at least 1 of people, got 0"),
+    "none": (["-n", "0"], "the number of people must be a whole number of at least 1, got 0"),
     "negative": (["-n", "-3"], "got -3"),
     "sensor": (["-n", "5", "--sensor", "os1-129"], "did you mean os1-128"),
     "no sensor": (["-n", "5", "--sensor", ","], "expected the names of sensors"),
@@ -189,7 +189,7 @@ BAD = {
     "subjects": (["-n", "5", "--subjects", "a"], "--motion"),
     "no subject": (["-n", "5", "--motion", "none.npz", "--subjects", ","], "leave --subjects away"),
     "both": (["-n", "5", "--clips", "--scenes"], "not allowed with"),
-    "shard": (["-n", "5", "--per-shard", "0"], "a shard, got 0"),
+    "shard": (["-n", "5", "--per-shard", "0"], "--per-shard must be a whole number of at least 1, got 0"),
     "captured": (["-n", "5", "--captured", "0.3"], "--motion"),
     "share": (["-n", "5", "--motion", "none.npz", "--captured", "1.5"], "between 0 and 1, got 1.5"),
     "far too many": (["-n", "1000000000000"], "give a larger --per-shard"),
@@ -347,7 +347,7 @@ def test_streets_take_turns_with_the_sensors(monkeypatch, tmp_path):
 
     monkeypatch.setattr(street, "street", made)
     job = Job(what="streets", count=5, sensors=("os1-64", "vlp-16"))
-    maker = Maker(job=job, card=job.card(), folder=tmp_path)
+    maker = Maker(job=job, card=job.card(), folder=tmp_path, generator=job.generator())
     for index in range(5):
         maker._street_rows(index)
     assert asked == [(k, ("os1-64", "vlp-16")[k % 2]) for k in range(5)]
@@ -358,6 +358,6 @@ def test_a_job_s_scene_and_share_are_the_generator_s(tmp_path):
     path = write_amass(tmp_path / "walk_01.npz", rotations, way, fps=10.0)
     for settings, share in ((dict(), 0.0), (dict(motion=str(path)), 0.5), (dict(motion=str(path), captured=0.2), 0.2)):
         job = Job(what="people", count=1, scene="paper", **settings)
-        maker = Maker(job=job, card=job.card(), folder=tmp_path)
-        assert maker._generator.scene == scene_config("paper") and maker._generator.captured == share
-        assert (maker._generator.bank is None) == (not settings)
+        generator = job.generator()
+        assert generator.scene == scene_config("paper") and generator.captured == share
+        assert (generator.bank is None) == (not settings)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from lidarpose.geometry import rotation_about
-from lidarpose.synth.bodies import Body
+from lidarpose.synth.bodies import Bodies
 from lidarpose.synth.environment.mesh import box
 
 HEADINGS, STEP = (0.0, 1.2, -2.0), 1.5
@@ -20,9 +20,9 @@ def goer(still=False):
         joints.append((np.linspace([0, -0.4, 0.1], [0, 0.4, 1.6], 26) @ turn + way).astype(np.float32))
         local = vertices[-1] @ rotation_about("z", heading)
         extent.append((local.min(0).tolist(), local.max(0).tolist()))
-    return Body(
+    return Bodies(
         vertices=np.array(vertices), joints=np.array(joints), heading=headings, extent=tuple(extent),
-        at_frame_end=lambda frame: (vertices[frame], joints[frame]), kind="walk", faces=mesh.faces,
+        moved=lambda frame: (vertices[frame], joints[frame]), kinds=("walk",) * 3, faces=mesh.faces,
         face_part=np.full(12, 3, np.uint8),
     )  # fmt: skip
 

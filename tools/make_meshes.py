@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.synth.environment.mesh import Mesh, box, boxes, prism, union
+from lidarpose.synth.environment.mesh import Mesh, box, boxes, union
 from lidarpose.synth.props.attachments import CRANK, FRONT_AXLE, NECK, REAR_AXLE, rod_rows
 
 OUT = Path(__file__).parents[1] / "src/lidarpose/synth/assets/meshes.npz"
@@ -75,6 +75,20 @@ def loft(*stations: tuple[float, float, float, float, float]) -> Mesh:
     last = 4 * (len(stations) - 1)
     faces += [[last, last + 1, last + 2], [last, last + 2, last + 3]]
     return Mesh(vertices.reshape(-1, 3).astype(np.float32), np.array(faces, np.int32))
+
+
+def prism(sides: int, *, top: float = 1.0) -> Mesh:
+    """An upright prism of radius and height 1 standing on the origin; open at the bottom, `top` times as wide at the
+    top."""
+    angle = np.arange(sides) * (2 * np.pi / sides)
+    ring = np.column_stack([np.cos(angle), np.sin(angle)])
+    levels = [np.column_stack([ring * wide, np.full(sides, z)]) for z, wide in ((0.0, 1.0), (1.0, top))]
+    vertices = np.concatenate(levels + [[[0, 0, 1.0]]])
+    k = np.arange(sides)
+    n = (k + 1) % sides
+    rows = ((k, n, n + sides), (k, n + sides, k + sides), (k + sides, n + sides, 0 * k + 2 * sides))
+    faces = np.concatenate([np.stack(row, 1) for row in rows])
+    return Mesh(vertices.astype(np.float32), faces.astype(np.int32))
 
 
 # --- rods, wheels
@@ -164,7 +178,9 @@ def street_furniture() -> dict[str, Mesh]:
         "bench without back": blocks(*seat),
         "table": blocks(*table),
         # on its square foot, half as wide as it is high
-        "traffic cone": union([prism(0.2, 1.0, 8, top=0.15), box((0.5, 0.5, 0.05))]),
+        "traffic cone": union([prism(8, top=0.15).scaled((0.2, 0.2, 1.0)), box((0.5, 0.5, 0.05))]),
+        "pole": prism(7),
+        "sign post": prism(5),
         "car": union([car_body, cabin, car_wheels(0.42)]),
         "van": union([van_body, car_wheels(0.3)]),
         "bonnet": bonnet,

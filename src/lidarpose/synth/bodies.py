@@ -34,9 +34,6 @@ _MIRROR = np.diag([1.0, -1.0, 1.0])
 # how high a captured foot may be above its clip's lowest and still stand on the ground, m
 _JUMP = 0.06
 
-# least and greatest x, y, z, m
-Extent = tuple[list[float], list[float]]
-
 
 @dataclass(frozen=True, kw_only=True)
 class PoseBank:
@@ -79,79 +76,30 @@ class PoseBank:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Body:
-    """One person's frames in their own frame: the first on the origin, facing +x, the ground at z = 0.
-
-    Args:
-        vertices: (F, V, 3) m.
-        joints: (F, 26, 3) m, BODY26.
-        heading: (F,) rad.
-        extent: of each frame, least and greatest x, y, z along its heading, m.
-        at_frame_end: frame -> vertices (V, 3) and joints (26, 3) `FRAME_TIME` s after the frame begins.
-        kind: the activity, a name of `body.pose_prior.activities.KINDS`.
-        faces: (Q, 3).
-        face_part: (Q,) as in `body.rig`.
-    """
-
-    vertices: np.ndarray
-    joints: np.ndarray
-    heading: tuple[float, ...]
-    extent: tuple[Extent, ...]
-    at_frame_end: Callable[[int], tuple[np.ndarray, np.ndarray]]
-    kind: str
-    faces: np.ndarray
-    face_part: np.ndarray
-
-
-@dataclass(frozen=True, kw_only=True)
 class Bodies:
-    """A block of posed, clothed bodies that face +x with their lowest point at z = 0.
+    """Posed, clothed bodies: a block of n people in one frame, or the n frames of one person.
+
+    In their own frame: people face +x with their lowest point at z = 0; a person's first frame is on the origin and
+    faces +x, the ground at z = 0.
 
     Args:
-        vertices: (n, V, 3) m.
-        joints: (n, 26, 3) m, BODY26.
-        kinds: (n,) names of activities, "captured" for poses of a bank.
-        extent: of each body, least and greatest x, y, z, m.
+        vertices: (n, V, 3) float32 m.
+        joints: (n, 26, 3) float32 m, BODY26.
+        kinds: (n,) activities, names of `body.pose_prior.activities.KINDS`.
+        heading: (n,) rad.
+        extent: (n,), least and greatest x, y, z along the heading, m.
         faces, face_part: (Q, 3) and (Q,) as in `body.rig`.
-        rest: T-posed bodies.
-        clothes: (n, V) m, how far cloth stands off the skin.
-        next_rotations: (n, 24, 3, 3), the poses `FRAME_TIME` s later.
-        step: (n, 3) m, how far the pelvis goes meanwhile.
-        lift: (n,) m, how far the vertices were lowered onto the ground.
+        moved: row -> vertices (V, 3) and joints (26, 3) of a body `FRAME_TIME` s later.
     """
 
     vertices: np.ndarray
     joints: np.ndarray
     kinds: tuple[str, ...]
-    extent: tuple[Extent, ...]
+    heading: tuple[float, ...]
+    extent: tuple[tuple[list[float], list[float]], ...]
     faces: np.ndarray
     face_part: np.ndarray
-    rest: RestBody
-    clothes: np.ndarray
-    next_rotations: np.ndarray
-    step: np.ndarray
-    lift: np.ndarray
-
-    def body(self, row: int) -> Body:
-        """Body `row`, in one frame."""
-        return Body(
-            vertices=self.vertices[row : row + 1],
-            joints=self.joints[row : row + 1],
-            heading=(0.0,),
-            extent=(self.extent[row],),
-            at_frame_end=lambda frame: self.moved(row),
-            kind=self.kinds[row],
-            faces=self.faces,
-            face_part=self.face_part,
-        )
-
-    def moved(self, row: int) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices (V, 3) and joints (26, 3) of body `row`, `FRAME_TIME` s later."""
-        rows = slice(row, row + 1)
-        rest = RestBody(vertices=self.rest.vertices[rows], joints=self.rest.joints[rows])
-        vertices, joints, _, _ = _dressed(rest, self.clothes[rows], self.next_rotations[rows], self.step[rows])
-        down = np.array([0, 0, self.lift[row]], np.float32)
-        return vertices[0] - down, joints[0] - down
+    moved: Callable[[int], tuple[np.ndarray, np.ndarray]]
 
 
 def draw_bodies(
@@ -164,7 +112,7 @@ def draw_bodies(
     moving: bool = True,
     clothes: float = 1.0,
 ) -> Bodies:
-    """The bodies of a block; a function of (seed, block) and of where poses come from.
+    """The people of a block; a function of (seed, block) and of where poses come from.
 
     Args:
         bank: captured poses, or None.
@@ -191,27 +139,36 @@ def draw_bodies(
     for heights in (vertices[..., 2], joints[..., 2]):
         heights -= lift[:, None]
     low[:, 2], high[:, 2] = 0, high[:, 2] - lift
+    step = step * _stride_ratio(rest, kinds)
+
+    def moved(row: int) -> tuple[np.ndarray, np.ndarray]:
+        rows = slice(row, row + 1)
+        person = RestBody(vertices=rest.vertices[rows], joints=rest.joints[rows])
+        vertices, joints, _, _ = _dressed(person, worn[rows], poses[rows, 1], step[rows])
+        down = np.array([0, 0, lift[row]], np.float32)
+        return vertices[0] - down, joints[0] - down
+
     return Bodies(
         vertices=vertices,
         joints=joints,
         kinds=tuple(kinds.tolist()),
+        heading=(0.0,) * count,
         extent=_extents(low, high),
         faces=rig.faces,
         face_part=rig.face_part,
-        rest=rest,
-        clothes=worn,
-        next_rotations=poses[:, 1],
-        step=step * _stride_ratio(rest, kinds),
-        lift=lift,
+        moved=moved,
     )
 
 
 def draw_moving_body(
     bank: PoseBank | None, captured: float, frames: int, rng: np.random.Generator, *, clothes: float = 1.0
-) -> Body:
-    """A person who moves, at `CLIP_HZ`: from the prior, or with a chance of `captured` from the clips of a bank.
+) -> Bodies:
+    """The frames of a person who moves, at `CLIP_HZ`.
 
-    clothes: see `SceneConfig`.
+    Args:
+        bank: captured poses, or None.
+        captured: chance of a clip of the bank instead of the prior's.
+        clothes: see `SceneConfig`.
     """
     rig = load_rig()
     clip = bank.clip(frames + 1, rng) if bank is not None and rng.random() < captured else None
@@ -235,15 +192,15 @@ def draw_moving_body(
     # where the pelvis's x axis points
     heading = np.arctan2(rotations[:frames, 0, 1, 0], rotations[:frames, 0, 0, 0])
     turned = vertices[:frames] @ rotation_about("z", heading).astype(np.float32)
-    return Body(
+    return Bodies(
         vertices=vertices[:frames],
         joints=joints[:frames],
+        kinds=(kind,) * frames,
         heading=tuple(heading.tolist()),
         extent=_extents(turned.min(1), turned.max(1)),
-        at_frame_end=lambda frame: (vertices[frame + 1], joints[frame + 1]),
-        kind=kind,
         faces=rig.faces,
         face_part=rig.face_part,
+        moved=lambda frame: (vertices[frame + 1], joints[frame + 1]),
     )
 
 
@@ -273,7 +230,7 @@ def _dressed(
     return vertices, joints, low, high
 
 
-def _extents(low: np.ndarray, high: np.ndarray) -> tuple[Extent, ...]:
+def _extents(low: np.ndarray, high: np.ndarray) -> tuple[tuple[list[float], list[float]], ...]:
     return tuple(zip(low.tolist(), high.tolist(), strict=True))
 
 

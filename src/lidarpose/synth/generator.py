@@ -4,7 +4,7 @@ Person i of a seed is the same whatever was asked for before and whoever asks: p
 `BLOCK` people (vectorized, from the block's own generator), everything else from the person's own generator.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 
@@ -17,7 +17,7 @@ from lidarpose.lidar.ray_pattern import RayPattern
 from lidarpose.sample import PersonInfo, Pose, Sample
 from lidarpose.skeleton import BODY26
 from lidarpose.synth import noise
-from lidarpose.synth.bodies import Bodies, Body, PoseBank, draw_bodies, draw_moving_body
+from lidarpose.synth.bodies import Bodies, PoseBank, draw_bodies, draw_moving_body
 from lidarpose.synth.environment.mesh import Mesh
 from lidarpose.synth.environment.surroundings import ground, occluder, surroundings
 from lidarpose.synth.placement import Place, draw_place
@@ -88,8 +88,8 @@ class Generator:
         """Person `index` of `seed`, at the scene's difficulty or at `hard` in [0, 1]."""
         seed, index = whole("seed", seed, least=0), whole("index", index, least=0)
         rng = np.random.default_rng([seed, 1, index])
-        bodies, row = self._bodies(seed, index // BLOCK), index % BLOCK
-        return self._observe(bodies.body(row), bodies, row, rng, hard)[0]
+        block, row = self._bodies(seed, index // BLOCK), index % BLOCK
+        return self._observe(block, [row], block, row, rng, hard)[0]
 
     def clip(
         self, seed: int, index: int, *, frames: int = CLIP_FRAMES, hard: float | None = None
@@ -99,20 +99,22 @@ class Generator:
         frames = whole("a clip's frames", frames, least=1)
         seed, index = whole("seed", seed, least=0), whole("index", index, least=0)
         rng = np.random.default_rng([seed, 3, index])
-        body = draw_moving_body(self.bank, self.captured, frames, rng, clothes=self.scene.clothes)
-        return self._observe(body, self._bodies(seed, index // BLOCK), index % BLOCK, rng, hard)
+        bodies = draw_moving_body(self.bank, self.captured, frames, rng, clothes=self.scene.clothes)
+        block, row = self._bodies(seed, index // BLOCK), index % BLOCK
+        return self._observe(bodies, range(frames), block, row, rng, hard)
 
     def _observe(
-        self, body: Body, bodies: Bodies, row: int, rng: np.random.Generator, hard: float | None
+        self, bodies: Bodies, rows: Sequence[int], block: Bodies, row: int, rng: np.random.Generator, hard: float | None
     ) -> list[SyntheticPerson]:
-        """The body's frames. While hardly anything of it is seen, the scene is drawn again, easier each time; after
-        the last try the best one counts, if it has any points at all. A second person is another of `bodies`."""
+        """A person's frames, `rows` of `bodies`. While hardly anything of them is seen, the scene is drawn again,
+        easier each time; after the last try the best one counts, if it has any points at all. A second person is
+        anybody of `block` but `row`."""
         config = self.scene if hard is None else self.scene.eased(hard)
         best, most_points = None, 0.0
         for attempt in range(_TRIES if self.redraw else 1):
             eased = config.eased(config.hard * (1 - attempt / (_TRIES - 1))) if attempt else config
-            scene = _draw_scene(eased, body, bodies, row, 0.8**attempt, rng)
-            samples = [_draw_sample(scene, body, frame, rng) for frame in range(len(body.vertices))]
+            scene = _draw_scene(eased, bodies, rows[0], block, row, 0.8**attempt, rng)
+            samples = [_draw_sample(scene, bodies, k, frame, rng) for frame, k in enumerate(rows)]
             # of the middle frame: half of a clip's frames have more
             points = float(np.median([np.count_nonzero(sample.part) for sample in samples]))
             if points > most_points or not self.redraw:
@@ -127,27 +129,27 @@ class Generator:
             )
         scene, samples = best
         return [
-            SyntheticPerson(sample=sample, facts=_measure(sample, scene, body, frame) if self.measure else None)
-            for frame, sample in enumerate(samples)
+            SyntheticPerson(sample=sample, facts=_measure(sample, scene, bodies, k, frame) if self.measure else None)
+            for frame, (k, sample) in enumerate(zip(rows, samples, strict=True))
         ]
 
 
 def _draw_scene(
-    config: SceneConfig, body: Body, bodies: Bodies, row: int, nearer: float, rng: np.random.Generator
+    config: SceneConfig, bodies: Bodies, first: int, block: Bodies, row: int, nearer: float, rng: np.random.Generator
 ) -> Scene:
     """Paper: section "Scene sampling". A person too far to be seen comes nearer with every attempt."""
     device = sensor(config.sensors[rng.integers(len(config.sensors))])
-    low, high = body.extent[0]
+    low, high = bodies.extent[first]
     height, reach = high[2], max(-low[0], -low[1], high[0], high[1])
     place = draw_place(config, device, height, reach, nearer, rng)
     background = [ground(config, place.feet, rng), *surroundings(config, place.feet, reach, rng)]
     if (front := occluder(config, place.feet, height, rng)) is not None:
         background.append(front)
     if rng.random() < config.company * config.hard:
-        background.append(_second_person(bodies, row, place, rng))
+        background.append(_second_person(block, row, place, rng))
     props = []
     if rng.random() < config.carry * config.hard:
-        props = draw_props(rng, kind=body.kind, joints=body.joints[0])
+        props = draw_props(rng, kind=bodies.kinds[first], joints=bodies.joints[first])
     conditions = draw_conditions(config, device, rng)
     return Scene(config=config, sensor=device, place=place, conditions=conditions, background=background, props=props)
 
@@ -157,9 +159,9 @@ _BEFORE = 0.3
 _BESIDE, _NEARER = (0.4, 1.0), (0.4, 2.5)
 
 
-def _second_person(bodies: Bodies, row: int, place: Place, rng: np.random.Generator) -> Mesh:
+def _second_person(block: Bodies, row: int, place: Place, rng: np.random.Generator) -> Mesh:
     """Another body of the block, an arm's length away or between the sensor and the person."""
-    other = (row + rng.integers(1, len(bodies.vertices))) % len(bodies.vertices)
+    other = (row + rng.integers(1, len(block.vertices))) % len(block.vertices)
     before, gap, angle, aside, yaw = rng.random(5)
     ahead = place.feet[:2] / max(np.hypot(*place.feet[:2]), 1e-6)
     if before < _BEFORE:
@@ -170,18 +172,17 @@ def _second_person(bodies: Bodies, row: int, place: Place, rng: np.random.Genera
         reach = _BESIDE[0] + gap * (_BESIDE[1] - _BESIDE[0])
         shift = reach * np.array([np.cos(2 * np.pi * angle), np.sin(2 * np.pi * angle)])
     there = Place(feet=place.feet + [*shift, 0], yaw=2 * np.pi * yaw, distance=place.distance)
-    return Mesh(there.of_body(bodies.vertices[other]), bodies.faces)
+    return Mesh(there.of_body(block.vertices[other]), block.faces)
 
 
-def _draw_sample(scene: Scene, body: Body, frame: int, rng: np.random.Generator) -> Sample:
-    scan = simulate_scan(scene, scene.meshes(body, frame), rng, frame=frame)
-    return _crop(scene, body, frame, scan, rng)
+def _draw_sample(scene: Scene, bodies: Bodies, row: int, frame: int, rng: np.random.Generator) -> Sample:
+    return _crop(scene, bodies, row, simulate_scan(scene, scene.meshes(bodies, row), rng, frame=frame), rng)
 
 
-def _crop(scene: Scene, body: Body, frame: int, scan: Scan, rng: np.random.Generator) -> Sample:
+def _crop(scene: Scene, bodies: Bodies, row: int, scan: Scan, rng: np.random.Generator) -> Sample:
     """The points in a box as a detector draws it."""
     config, place = scene.config, scene.body_place
-    box = noise.draw_box(config.crop, config.hard, body.extent[frame], place, rng, heading=body.heading[frame])
+    box = noise.draw_box(config.crop, config.hard, bodies.extent[row], place, rng, heading=bodies.heading[row])
     points, ring, part = scan.points, scan.ring, scan.part
     clutter, missing_part = rng.random(2)
     if clutter < config.noise.clutter * config.hard:
@@ -202,20 +203,20 @@ def _crop(scene: Scene, body: Body, frame: int, scan: Scan, rng: np.random.Gener
         center=center_of_cells(points) if len(points) else box.center,
         part=part,
         ring=ring,
-        pose=Pose(joints=place.of_body(body.joints[frame]), skeleton=BODY26, frame="sensor"),
+        pose=Pose(joints=place.of_body(bodies.joints[row]), skeleton=BODY26, frame="sensor"),
         box=box,
         source=f"synth/{config.name}/{scene.sensor.name}",
     )
 
 
-def _measure(sample: Sample, scene: Scene, body: Body, frame: int) -> PersonInfo:
-    low, high = body.extent[frame]
+def _measure(sample: Sample, scene: Scene, bodies: Bodies, row: int, frame: int) -> PersonInfo:
+    low, high = bodies.extent[row]
     return person_info(
         sample,
         sensor=scene.sensor.name,
-        kind=body.kind,
+        kind=bodies.kinds[row],
         distance=float(np.hypot(*sample.pose.joints[0, :2])),
-        alone=count_alone(scene, scene.meshes(body, frame)[0], frame),
+        alone=count_alone(scene, scene.meshes(bodies, row)[0], frame),
         soles=float(scene.place.feet[2]),
         tall=high[2] - low[2],
     )

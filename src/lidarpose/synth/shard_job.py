@@ -3,9 +3,8 @@
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,10 +12,13 @@ from lidarpose.body.mocap import digest as motion_digest
 from lidarpose.data.schema import person_row
 from lidarpose.data.shards import CARD, DatasetCard, shard_path, shard_writer, write_card
 from lidarpose.data.writer import locked, make_shards, open_folder
-from lidarpose.errors import InputError
+from lidarpose.errors import InputError, check_name, whole
 from lidarpose.io.files import content_digest, file_error
 from lidarpose.lidar.presets import SENSORS, sensor
 from lidarpose.synth.scene import scene_config
+
+if TYPE_CHECKING:
+    from lidarpose.synth.generator import Generator
 
 # persons, clips or streets a shard
 PER_SHARD = {"people": 2000, "clips": 125, "streets": 2}
@@ -49,12 +51,10 @@ class Job:
     per_shard: int | None = None
 
     def __post_init__(self):
-        if self.what not in PER_SHARD:
-            raise InputError(f"what to make must be one of {', '.join(PER_SHARD)}, got {self.what!r}")
-        if self.count < 1:
-            raise InputError(f"expected at least 1 of {self.what}, got {self.count}")
-        if self.per_shard is not None and self.per_shard < 1:
-            raise InputError(f"expected at least 1 of {self.what} a shard, got {self.per_shard}")
+        check_name("kind of dataset", self.what, PER_SHARD)
+        whole(f"the number of {self.what}", self.count, least=1)
+        whole("--per-shard", PER_SHARD[self.what] if self.per_shard is None else self.per_shard, least=1)
+        whole("the seed", self.seed, least=0)
         if self.what == "streets" and (self.scene != "wild" or self.hard != 1 or self.motion is not None):
             raise InputError("streets have scene, difficulty and walkers of their own: leave these options out")
         if -(-self.count // (self.per_shard or PER_SHARD[self.what])) > _MOST_SHARDS:
@@ -67,8 +67,6 @@ class Job:
             raise InputError("expected the subjects of clips, got none: leave --subjects away for all of them")
         if self.captured is not None and not 0 <= self.captured <= 1:
             raise InputError(f"expected a share of captured poses between 0 and 1, got {self.captured}")
-        if self.seed < 0:
-            raise InputError(f"expected a seed of at least 0, got {self.seed}")
         scene_config(self.scene).eased(self.hard)
         for name in self.sensors or ():
             sensor(name)
@@ -79,6 +77,21 @@ class Job:
     def share(self) -> float:
         """Of the poses, how many are captured."""
         return 0.0 if self.motion is None else _CAPTURED if self.captured is None else self.captured
+
+    def generator(self) -> "Generator":
+        """What makes the people. Raises InputError where motion cannot be read, MissingExtra without numba."""
+        from lidarpose.synth.bodies import CLIP_HZ, PoseBank
+        from lidarpose.synth.generator import Generator
+
+        scene = scene_config(self.scene).eased(self.hard)
+        if self.sensors is not None:
+            scene = replace(scene, sensors=self.sensors)
+        bank = PoseBank.from_clips(self.motion, self.subjects) if self.motion is not None else None
+        if self.what == "clips" and self.share and not len(bank.clips.windows(CLIP_FRAMES + 1)):
+            raise file_error(
+                self.motion, f"no clip lasts {CLIP_FRAMES / CLIP_HZ:g} s: give longer motion, or leave --clips away"
+            )
+        return Generator(scene=scene, bank=bank, captured=self.share)
 
     def card(self) -> DatasetCard:
         """The dataset's card: all that decides its content."""
@@ -110,16 +123,13 @@ def write_dataset(
     workers: processes; progress(done, total) is called at the start and as they are done. Raises InputError where the
     folder holds another dataset or something else, or cannot be written, MissingExtra without numba or pyarrow.
     """
-    if workers < 1:
-        raise InputError(f"expected at least 1 worker, got {workers}")
+    whole("--workers", workers, least=1)
     folder, card = Path(folder), job.card()
     missing = open_folder(folder, card, _ROWS.get(job.what))
     left = sum(card.size(shard) for shard in missing)
     done = card.count - left
-    make = Maker(job=job, card=card, folder=folder)
-    if missing:
-        # before anything is written, so that motion that cannot be read leaves no folder
-        make.get_ready()
+    # before anything is written, so that motion that cannot be read leaves no folder
+    make = Maker(job=job, card=card, folder=folder, generator=job.generator()) if missing else None
     with locked(folder):
         has_card = (folder / CARD).is_file()
         if not has_card:
@@ -147,36 +157,9 @@ class Maker:
     job: Job
     card: DatasetCard
     folder: Path
-
-    def __getstate__(self) -> dict[str, Any]:
-        # each process reads the poses itself
-        return {name: value for name, value in vars(self).items() if name != "_generator"}
-
-    def get_ready(self) -> None:
-        """Reads what all shards need, once. Raises InputError where it cannot be read, MissingExtra without numba."""
-        self._generator  # noqa: B018
+    generator: "Generator"
 
     def __call__(self, shard: int) -> Iterator[int]:
-        self.get_ready()
-        return self._shard(shard)
-
-    @cached_property
-    def _generator(self):
-        from lidarpose.synth.bodies import CLIP_HZ, PoseBank
-        from lidarpose.synth.generator import Generator
-
-        job = self.job
-        scene = scene_config(job.scene).eased(job.hard)
-        if job.sensors is not None:
-            scene = replace(scene, sensors=job.sensors)
-        bank = PoseBank.from_clips(job.motion, job.subjects) if job.motion is not None else None
-        if job.what == "clips" and job.share and not len(bank.clips.windows(CLIP_FRAMES + 1)):
-            raise file_error(
-                job.motion, f"no clip lasts {CLIP_FRAMES / CLIP_HZ:g} s: give longer motion, or leave --clips away"
-            )
-        return Generator(scene=scene, bank=bank, captured=job.share)
-
-    def _shard(self, shard: int) -> Iterator[int]:
         rows_of = self._street_rows if self.job.what == "streets" else self._people_rows
         first, size = shard * self.card.per_shard, self.card.size(shard)
         with ExitStack() as stack:
@@ -193,7 +176,7 @@ class Maker:
         yield 1
 
     def _people_rows(self, index: int) -> dict[str, list]:
-        generator, seed = self._generator, self.job.seed
+        generator, seed = self.generator, self.job.seed
         if self.job.what == "people":
             people = [generator.person(seed, index)]
         else:
@@ -203,7 +186,7 @@ class Maker:
     def _street_rows(self, index: int) -> dict[str, list]:
         from lidarpose.synth.street import samples, street
 
-        seed, sensors = self.job.seed, self._generator.scene.sensors
+        seed, sensors = self.job.seed, self.generator.scene.sensors
         scene = street(seed, index, sensor=sensors[index % len(sensors)], frames=STREET_FRAMES)
         people = [
             person_row(sample, index=index, frame=frame, track=int(sample.box.id))

@@ -8,7 +8,7 @@ from lidarpose.lidar.beam_divergence import scan_divergent
 from lidarpose.lidar.ray_pattern import RayPattern
 from lidarpose.lidar.raycast import Hits, scan_pattern
 from lidarpose.lidar.sensor import Sensor
-from lidarpose.synth.bodies import Body
+from lidarpose.synth.bodies import Bodies
 from lidarpose.synth.environment.mesh import Mesh, union
 from lidarpose.synth.noise import direction_mask, laser_mask
 from lidarpose.synth.placement import Place
@@ -76,19 +76,18 @@ class Scene:
         """Whether the sensor takes so long for a frame that people move meanwhile."""
         return isinstance(self.sensor, RayPattern) and self.sensor.duration > 0
 
-    def meshes(self, body: Body, frame: int) -> list[Mesh]:
-        """All triangles of a frame, level frame: the body first, then its props, then the background."""
-        place, joints, faces = self.body_place, body.joints[frame], body.faces
+    def meshes(self, bodies: Bodies, row: int) -> list[Mesh]:
+        """All triangles, level frame: body `row` first, then its props, then the background."""
+        place, joints = self.body_place, bodies.joints[row]
         later = later_joints = None
         if self.is_smeared:
-            later, later_joints = body.at_frame_end(frame)
+            later, later_joints = bodies.moved(row)
             later = place.of_body(later)
-        meshes = [Mesh(place.of_body(body.vertices[frame]), faces, part=body.face_part, later=later)]
+        meshes = [Mesh(place.of_body(bodies.vertices[row]), bodies.faces, bodies.face_part, later)]
         for prop in self.props:
             later = place.of_body(prop.place(later_joints).vertices) if self.is_smeared else None
-            prop_mesh = prop.place(joints)
-            vertices = place.of_body(prop_mesh.vertices)
-            meshes.append(Mesh(vertices, prop_mesh.faces, part=prop.face_part, later=later))
+            mesh = prop.place(joints)
+            meshes.append(Mesh(place.of_body(mesh.vertices), mesh.faces, prop.face_part, later))
         return meshes + self.background
 
 
@@ -176,14 +175,29 @@ def _laser_level_mask(hits: Hits, sensor: Sensor | RayPattern, keep: float, rng:
 
 
 def add_sensor_noise(
-    hits: Hits, mesh: Mesh, sensor: Sensor | RayPattern, conditions: ScanConditions, rng: np.random.Generator
+    hits: Hits,
+    mesh: Mesh,
+    sensor: Sensor | RayPattern,
+    conditions: ScanConditions,
+    rng: np.random.Generator,
+    *,
+    ring_normals: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The returns of a cast of `mesh`, in the sensor's frame, that come back, with the errors of their ranges: points
-    (k, 3) float32 m and their indices (k,) among the hits."""
+    """The returns of a cast that come back, with the errors of their ranges.
+
+    Args:
+        hits: of a cast of `mesh`, in the sensor's frame.
+        ring_normals: standard normals, one a ring, where they are the same for several scans; None: drawn here.
+
+    Returns:
+        Points (k, 3) float32 m and their indices (k,) among the hits.
+    """
     count = len(hits.points)
     keep = _laser_level_mask(hits, sensor, conditions.keep, rng)
-    # the last of the normals are the rings'
-    normals = rng.standard_normal(count + int(hits.ring.max(initial=-1)) + 1, np.float32)
+    normals = rng.standard_normal(count, np.float32)
+    if ring_normals is None:
+        ring_normals = rng.standard_normal(int(hits.ring.max(initial=-1)) + 1, np.float32)
+    normals = np.concatenate([normals, ring_normals])
     chance = rng.random(count, np.float32)
     error = range_errors(hits.ring, normals, conditions.sigma, conditions.bias)
     if conditions.one_sided:

@@ -20,10 +20,10 @@ from lidarpose.lidar.raycast import scan, scan_pattern
 from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import Box, Pose, Sample, center_of
 from lidarpose.skeleton import BODY26
-from lidarpose.synth.bodies import Body, draw_moving_body
+from lidarpose.synth.bodies import Bodies, draw_moving_body
 from lidarpose.synth.environment.mesh import Mesh, union
 from lidarpose.synth.environment.streetscape import RAIL, StreetPlan, draw_plan, scenery
-from lidarpose.synth.sample_kernels import REACH, lose_returns, range_errors
+from lidarpose.synth.simulate import ScanConditions, add_sensor_noise
 
 # people start within these distances of the sensor, m, and keep apart from it and from each other by so much
 _NEAREST, _FARTHEST, _APART = 2.5, 28.0, 0.75
@@ -80,8 +80,8 @@ def street(
     plan = draw_plan(device, rng)
     still = union(scenery(plan, rng)).moved((0, 0, 0), plan.turn)
     walkers = _draw_walkers(plan, int(rng.integers(least, most + 1)), frames, rng)
-    ring_error = rng.standard_normal(max(_RINGS, device.rows if isinstance(device, Sensor) else 0), np.float32)
-    turns = tuple(_scan_turn(device, still, walkers, frame, ring_error, rng) for frame in range(frames))
+    ring_normals = rng.standard_normal(max(_RINGS, device.rows if isinstance(device, Sensor) else 0), np.float32)
+    turns = tuple(_scan_turn(device, still, walkers, frame, ring_normals, rng) for frame in range(frames))
     return Street(frames=turns, sensor=device.name, height=plan.height)
 
 
@@ -92,7 +92,7 @@ def street(
 class _Walker:
     """A body, where it starts (3,) m in the level frame at the sensor, and its yaw there, rad."""
 
-    body: Body
+    body: Bodies
     start: np.ndarray
     yaw: float
 
@@ -108,7 +108,7 @@ class _Walker:
         """The body of a frame; if `is_smeared`, also as it is at the frame's end."""
         body, later = self.body, None
         if is_smeared:
-            later = self.placed(body.at_frame_end(frame)[0].astype(np.float32))
+            later = self.placed(body.moved(frame)[0].astype(np.float32))
         return Mesh(self.placed(body.vertices[frame]), body.faces, body.face_part, later)
 
     def box(self, vertices: np.ndarray, frame: int, track: int) -> Box:
@@ -143,16 +143,16 @@ def _draw_walkers(plan: StreetPlan, count: int, frames: int, rng: np.random.Gene
     return walkers
 
 
-def _draw_pedestrian(frames: int, rng: np.random.Generator) -> Body:
+def _draw_pedestrian(frames: int, rng: np.random.Generator) -> Bodies:
     """Somebody who does what people do in streets: nobody sits without a seat."""
     for _ in range(_KIND_TRIES):
         body = draw_moving_body(None, 0.0, frames, rng)
-        if body.kind in _STREET_KINDS:
+        if body.kinds[0] in _STREET_KINDS:
             break
     return body
 
 
-def _place_walker(plan: StreetPlan, body: Body, rng: np.random.Generator) -> tuple[_Walker, bool]:
+def _place_walker(plan: StreetPlan, body: Bodies, rng: np.random.Generator) -> tuple[_Walker, bool]:
     """The body somewhere, and whether it stays on one surface and out of the rows at the kerbs."""
     where, far, across, way, lean = rng.random(5)
     turn = rotation_about("z", plan.turn)
@@ -184,32 +184,25 @@ def _scan_turn(
     still: Mesh,
     walkers: list[_Walker],
     frame: int,
-    ring_error: np.ndarray,
+    ring_normals: np.ndarray,
     rng: np.random.Generator,
 ) -> StreetFrame:
     is_pattern = isinstance(device, RayPattern)
     people = [walker.mesh(frame, is_smeared=is_pattern) for walker in walkers]
     scene = union([*people, still])
     R_sensor_level = rotation_about("y", -device.tilt).astype(np.float32)
-    vertices = scene.vertices @ R_sensor_level.T
+    mesh = Mesh(scene.vertices @ R_sensor_level.T, scene.faces)
     if is_pattern:
         moved = (scene.vertices if scene.later is None else scene.later) @ R_sensor_level.T
-        hits = scan_pattern(vertices, scene.faces, device, frame % device.frames, moved=moved)
+        hits = scan_pattern(mesh.vertices, mesh.faces, device, frame % device.frames, moved=moved)
     else:
-        hits = scan(vertices, scene.faces, device)
-    count = len(hits.face)
-    normals = np.concatenate([rng.standard_normal(count, np.float32), ring_error])
-    error = range_errors(hits.ring, normals, device.range_sigma, _RING_BIAS)
-    points, kept = lose_returns(
-        *(hits.points, hits.face, vertices, scene.faces, np.ones(count, np.bool_), error),
-        *(rng.random(count, np.float32), device.dropout, _INTENSITY_DROPOUT, REACH * device.range_max),
-    )
+        hits = scan(mesh.vertices, mesh.faces, device)
+    conditions = ScanConditions(sigma=device.range_sigma, bias=_RING_BIAS, intensity_dropout=_INTENSITY_DROPOUT)
+    points, kept = add_sensor_noise(hits, mesh, device, conditions, rng, ring_normals=ring_normals)
     face = hits.face[kept]
     # the people's faces come first, one person after the other
-    owner = np.full(len(scene.faces), -1, np.int16)
-    owner[: sum(len(mesh.faces) for mesh in people)] = np.repeat(
-        np.arange(len(people), dtype=np.int16), [len(mesh.faces) for mesh in people]
-    )
+    owner = np.repeat(np.arange(len(people) + 1), [len(m.faces) for m in (*people, still)]).astype(np.int16)
+    owner[owner == len(people)] = -1
     return StreetFrame(
         points=points @ R_sensor_level,
         ring=hits.ring[kept],

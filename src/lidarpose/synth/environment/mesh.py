@@ -100,31 +100,13 @@ def repeated(count: int, corners: int, piece: str) -> np.ndarray:
     return faces
 
 
-def prism(radius: float, height: float, sides: int = 7, *, top: float = 1.0) -> Mesh:
-    """An upright prism of `sides` faces standing on the origin: a pole, a trunk, a bin. Open at the bottom; `top` times
-    as wide at the top."""
-    return _unit_prism(sides, top).scaled((radius, radius, height))
-
-
-@lru_cache
-def _unit_prism(sides: int, top: float) -> Mesh:
-    angle = np.arange(sides) * (2 * np.pi / sides)
-    ring = np.column_stack([np.cos(angle), np.sin(angle)])
-    levels = [np.column_stack([ring * wide, np.full(sides, z)]) for z, wide in ((0.0, 1.0), (1.0, top))]
-    vertices = np.concatenate(levels + [[[0, 0, 1.0]]])
-    k = np.arange(sides)
-    n = (k + 1) % sides
-    rows = ((k, n, n + sides), (k, n + sides, k + sides), (k + sides, n + sides, 0 * k + 2 * sides))
-    faces = np.concatenate([np.stack(row, 1) for row in rows])
-    return Mesh(vertices.astype(np.float32), faces.astype(np.int32))
-
-
 # --- shipped meshes
 
 
 def shape(name: str, x: float = 1.0, y: float = 1.0, z: float = 1.0) -> Mesh:
     """A fixed mesh of `tools/make_meshes.py`, stretched. Of unit size are "car" and "van" (heading along +x), "table",
-    "wheeled bin", "traffic cone" (high as 1) and "bonnet"; "bench" and "bench without back" are 1 along y."""
+    "wheeled bin", "traffic cone" (high as 1) and "bonnet"; "pole" has a radius and a height of 1; "bench" and "bench
+    without back" are 1 along y."""
     return shipped_meshes()[name].scaled((x, y, z))
 
 
@@ -164,7 +146,7 @@ def wall(length: float, height: float, *, thick: float = 0.2, opening: tuple | N
 def sign(height: float, wide: float) -> Mesh:
     """A traffic sign: a plate `wide` m across, facing +x, on a post of `height` m."""
     plate = np.array([0.02, wide, wide])
-    return union([prism(0.03, height, 5), box(plate).moved(np.array([0.04, 0, height - wide]))])
+    return union([shape("sign post", 0.03, 0.03, height), box(plate).moved(np.array([0.04, 0, height - wide]))])
 
 
 def rail_fence(length: float, height: float, rails: int) -> Mesh:
@@ -204,12 +186,12 @@ def foliage(size: np.ndarray, leaves: int, leaf: float, rng: np.random.Generator
     """A bush or a hedge: `leaves` (at most 120) triangles of about `leaf` m in an ellipsoid of size (3,) m that
     stands on the origin; some beams pass."""
     pick, turn, flip = rng.random(3).tolist()
-    center, shape = _leaf_balls()[int(pick * _LEAF_BALLS)]
+    center, leaf_shape = _leaf_balls()[int(pick * _LEAF_BALLS)]
     c, s = np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn)
     turned = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1 if flip < 0.5 else -1]], np.float32)
     half = np.asarray(size, np.float32) / 2
     # a leaf may not stick out of the ellipsoid by more than itself, nor into the ground
-    vertices = ((center[:leaves] @ turned) * half)[:, None] + shape[:leaves] * np.float32(leaf)
+    vertices = ((center[:leaves] @ turned) * half)[:, None] + leaf_shape[:leaves] * np.float32(leaf)
     vertices[..., 2] = np.maximum(vertices[..., 2] + half[2], 0)
     return Mesh(vertices.reshape(-1, 3), repeated(min(leaves, _LEAVES), 3, "triangle"))
 

@@ -44,15 +44,8 @@ def draw_plan(device: Sensor | RayPattern, rng: np.random.Generator) -> StreetPl
     sensor_y = (2 * e - 1) * (road - 2.0) if on_road else (road + front) / 2 * (1 if e < 0.5 else -1)
     height = device.height + 0.15 * (2 * g - 1) + (0 if on_road else kerb)
     ahead = isinstance(device, RayPattern) and device.azimuths[1] - device.azimuths[0] < 2 * pi - 1e-3
-    return StreetPlan(
-        road=road,
-        front=front,
-        kerb=kerb,
-        sensor_y=sensor_y,
-        height=height,
-        turn=(2 * f - 1) * (0.3 if ahead else pi),
-        ahead=ahead,
-    )
+    turn = (2 * f - 1) * (0.3 if ahead else pi)
+    return StreetPlan(road=road, front=front, kerb=kerb, sensor_y=sensor_y, height=height, turn=turn, ahead=ahead)
 
 
 def scenery(plan: StreetPlan, rng: np.random.Generator) -> list[Mesh]:
@@ -134,11 +127,14 @@ def _row(plan: StreetPlan, side: int, rng: np.random.Generator) -> list[Mesh]:
         a, b, c, d = rng.random(4).tolist()
         place, inwards = (x, side * (plan.road + RAIL), plan.kerb), -side * pi / 2
         if a < 0.25:
-            meshes.append(shapes.prism(0.05 + 0.06 * b, 5.0).moved(place))
+            meshes.append(shape("pole", 0.05 + 0.06 * b, 0.05 + 0.06 * b, 5.0).moved(place))
         elif a < 0.5:
             # a tree: trunk and crown
             crown = shapes.foliage((2.2 + b, 2.2 + b, 2.0), 120, 0.28, rng)
-            meshes += [shapes.prism(0.10 + 0.10 * c, 2.6).moved(place), crown.moved((x, place[1], plan.kerb + 2.2))]
+            meshes += [
+                shape("pole", 0.10 + 0.10 * c, 0.10 + 0.10 * c, 2.6).moved(place),
+                crown.moved((x, place[1], plan.kerb + 2.2)),
+            ]
         elif a < 0.62:
             meshes.append(shapes.sign(2.0 + 0.6 * b, 0.5).moved(place, inwards))
         elif a < 0.75:

@@ -73,7 +73,7 @@ def _draw_thing(
     """A mesh, half its depth and its length, m, and how far it may be turned aside, rad."""
     if kind < 0.32:
         radius = 0.02 + 0.16 * a * a
-        return shapes.prism(radius, 0.8 + 2.7 * b), radius, 0.0, 0.0
+        return shape("pole", radius, radius, 0.8 + 2.7 * b), radius, 0.0, 0.0
     if kind < 0.40:
         size = 0.45 + 0.35 * a
         return shape("wheeled bin", size, size, 0.8 + 0.4 * b), size / 2, size, 0.2
@@ -192,13 +192,13 @@ def _strip(share: float, tall: float, a: float, b: float, c: float, rng: np.rand
     """A pole, a trunk, a signpost, a branch that hangs down or a pillar."""
     radius = (0.03 + 0.17 * b * b) * share
     if a < 0.6:
-        return shapes.prism(radius, tall + 2)
+        return shape("pole", radius, radius, tall + 2)
     if a < 0.7:
         return shapes.sign(1.3 + 0.8 * c, 0.35 * share + 0.2 * b)
     if a < 0.85:
         # down to a height between the hips and the head
         mesh = shapes.foliage((0.4, 0.6 * share + 0.4 * b, 1.0), 60 + int(60 * c), 0.08 + 0.06 * b, rng)
-        stem = shapes.prism(0.02, 0.6)
+        stem = shape("pole", 0.02, 0.02, 0.6)
         return shapes.union([stem, mesh.moved((0, 0, 0.55 + 0.5 * c))])
     return shapes.box((0.3, (0.15 + 0.25 * b) * share, tall + 2))
 
@@ -209,8 +209,9 @@ def ground(config: SceneConfig, feet: np.ndarray, rng: np.random.Generator) -> M
     Else a square of half width 3 m, and by `hard` now and then a kerb (the person on either side of it), a rough
     surface, which is lowest at the feet's level, or grass about the ankles.
     """
-    normal, kind, around, a, b, c = _normal_and_uniforms(rng)
-    heading = (2 * around - 1) * pi
+    u, v, kind, around, a, b, c = rng.random(7).tolist()
+    # a standard normal of two uniforms: Box and Muller 1958
+    normal, heading = sqrt(-2 * log(1 - u)) * cos(2 * pi * v), (2 * around - 1) * pi
     tilt = tan(config.slope * normal)
     slope = (tilt * cos(heading), tilt * sin(heading))
     if config.name in _BARE:
@@ -227,12 +228,6 @@ def ground(config: SceneConfig, feet: np.ndarray, rng: np.random.Generator) -> M
         lawn.vertices[:, 2] += lawn.vertices[:, :2] @ np.array(slope, np.float32)
         return shapes.union([shapes.quad(_WILD_HALF, slope), lawn]).moved(feet)
     return shapes.quad(_WILD_HALF, slope).moved(feet)
-
-
-def _normal_and_uniforms(rng: np.random.Generator) -> list[float]:
-    """A standard normal and five uniforms, of one call. Box and Muller 1958."""
-    u = rng.random(7).tolist()
-    return [sqrt(-2 * log(1 - u[0])) * cos(2 * pi * u[1])] + u[2:]
 
 
 def _kerb(slope: tuple[float, float], a: float, b: float, c: float) -> Mesh:
