@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from lidarpose.data.prepare import prepare, reader
 from lidarpose.data.readers import waymo_v1
 from lidarpose.data.readers.base import Skipped
-from lidarpose.data.readers.waymo import COMPONENTS, Waymo, WaymoV2, images
+from lidarpose.data.readers.waymo import COMPONENTS, Waymo, images
 from lidarpose.data.readers.waymo_frames import MARGIN, Calibration, Frame, person, points_of_image, transform
 from lidarpose.data.shards import open_dataset
 from lidarpose.errors import InputError
@@ -167,13 +167,13 @@ def test_rows_and_joins_are_of_one_segment(v2, tmp_path):
 
 
 def test_the_margin_is_around_the_box(v2):
-    tight, _ = everything(v2, WaymoV2(margin=-0.1))
+    tight, _ = everything(v2, Waymo(margin=-0.1))
     wide, _ = everything(v2, Waymo(margin=0.2))
     for a, b in zip(tight, wide, strict=True):
         inside = b.box.contains(b.points, -0.1)
         np.testing.assert_array_equal(a.points, b.points[inside])
         assert 0 < inside.sum() < len(inside)
-    assert MARGIN == 0.2 and waymo_v1.WaymoV1(margin=0.3).about["settings"] == {"box_margin_m": 0.3}
+    assert MARGIN == 0.2 and Waymo(margin=0.3).about["settings"] == {"box_margin_m": 0.3}
 
 
 def test_prepare_writes_waymo_and_counts_a_corrupted_segment(v2, tmp_path):
@@ -334,7 +334,7 @@ def test_a_frame_that_lacks_something_is_skipped(given, laser, poses, reason):
     frame = one_frame(**given)
     if laser is not None:
         frame.add(laser, 1, np.full((3, 4), 2.0), poses)
-    (found,) = frame.found()
+    (found,) = frame.samples()
     assert found.reason == reason and found.where.startswith("s/7/a")
 
 
@@ -345,7 +345,7 @@ def test_images_added_in_any_order_are_the_same_and_twice_is_once():
         for laser, which in (*order, order[0]):
             image = np.full((3, 4), 2.0 + 0.1 * which)
             frame.add(laser, which, image, np.zeros((3, 4, 6)) if laser == 1 else None)
-        (item,) = frame.found()
+        (item,) = frame.samples()
         results.append(item)
     assert len(results[0].points) and set(results[0].ring.tolist()) == {-1, 0, 1, 2}
     for sample in results[1:]:

@@ -219,8 +219,8 @@ class PartWriter:
         try:
             yield from self._reader.read(self.root, part)
         except InputError as error:
-            yield Skipped(reason=_REST, where=f"{part}: {error}")
+            yield Skipped(_REST, f"{part}: {error}")
         except (OSError, ArithmeticError, LookupError, TypeError, ValueError, AttributeError) as error:
             # what no reader foresaw must not cost the other parts; its kind tells a mistake in a reader from a bad file
             kind = type(error).__name__
-            yield Skipped(reason=f"{_REST} ({kind})", where=one_line(f"{part}: {kind}: {error}"))
+            yield Skipped(f"{_REST} ({kind})", one_line(f"{part}: {kind}: {error}"))

@@ -1,18 +1,20 @@
-"""What every reader of a dataset yields and offers, and what readers of raw files share: lines about wrong roots,
-numbered files, JSON, clouds of people.
+"""What every reader of a dataset yields and offers, and what readers of raw files share.
 
 A dataset's raw files fall into parts, each read on its own (a sequence, a segment, a file): that is what processes
-share out, and what is written as one shard.
+share out, and what is written as one shard. What is known of each dataset is in data/datasets.json.
 """
 
 import json
 import os
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
-from typing import Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -24,7 +26,7 @@ from lidarpose.sample import LabeledSample, within_reach
 _NUMBER = re.compile("[0-9]{1,12}")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Skipped:
     """What was left out: reason, the same words for the same reason, and where."""
 
@@ -32,24 +34,44 @@ class Skipped:
     where: str
 
 
-class Reader(Protocol):
-    """A dataset's raw files. Raises InputError, one line, where the root is not what it should be."""
+class Reader(ABC):
+    """Reads a dataset's raw files. about: what is recorded with a prepared dataset: the frame of its points, its
+    licence, its quirks, and the `settings` that decide its content."""
 
-    name: str
-    skeleton: str
+    name: ClassVar[str]
+    skeleton: ClassVar[str]
 
+    def __init__(self, **settings: Any):
+        known = _datasets()[self.name]
+        self.about = {key: known[key] for key in ("frame", "sensor_known", "licence", "get", "notes") if key in known}
+        self.about["settings"] = settings
+
+    @abstractmethod
     def parts(self, root: Path) -> list[str]:
-        """Names of what can be read on its own, sorted; also checks that the root is complete."""
-        ...
+        """Names of what can be read on its own, sorted. Raises InputError, one line, where the root is incomplete."""
 
+    @abstractmethod
     def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         """Everybody in one part, in an order that never changes."""
-        ...
+
+    def wrong_root(self, root: Path, got: str = "") -> InputError:
+        """The error for a folder that is not the dataset's root. got: by default what is in the folder."""
+        known = _datasets()[self.name]
+        there = got or f"got {entries(root)}"
+        problem = (
+            f"is not the root of {known['title']}: expected {known['expected']}, {there}; get it at {known['get']}"
+        )
+        return file_error(root, problem)
 
 
-def wrong_root(root: Path, dataset: str, expected: str, got: str, get: str) -> InputError:
-    """The line for a folder that is not a dataset's root. get: where a user gets the dataset."""
-    return file_error(root, f"is not the root of {dataset}: expected {expected}, {got}; get it at {get}")
+@cache
+def _datasets() -> dict[str, dict[str, Any]]:
+    return json.loads((files("lidarpose.data") / "datasets.json").read_text("utf-8"))
+
+
+def entries(folder: Path) -> str:
+    """The first names in a folder, for messages."""
+    return ", ".join(sorted(path.name for path in folder.iterdir())[:6]) or "nothing"
 
 
 def numbered(folder: Path, suffix: str) -> dict[int, list[Path]]:

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.base import Skipped, numbered, numbers, read_cloud, read_json, wrong_root
-from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_item
+from lidarpose.data.readers.base import Reader, Skipped, numbered, numbers, read_cloud, read_json
+from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_sample
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_between, unit
 from lidarpose.io.files import file_error
@@ -24,8 +24,6 @@ from lidarpose.skeleton import SMPL24
 # frames a second of the LiDAR
 _FPS = 10.0
 _POSE, _SEGMENT = "labels/3d/pose", "labels/3d/segment"
-_EXPECTED = f"{_POSE}/5/000001.json and {_SEGMENT}/5/000001.ply"
-_GET = "www.lidarhumanmotion.net/lidarcap"
 # fewer frames say too little
 LEAST_FRAMES = 100
 # what the estimate may err by, rad: where people turn round, and where they all face about one way, so that leaning
@@ -41,7 +39,7 @@ _ROUNDS = 4
 _LEAN, _TRUST = 0.1, 0.1
 
 
-class LidarHuman26M:
+class LidarHuman26M(Reader):
     """Reads LiDARHuman26M. A part is a sequence. smpl: the user's SMPL model, see `SmplJoints`; level: turn each
     sequence so that z is up, see `leveling`."""
 
@@ -51,36 +49,19 @@ class LidarHuman26M:
     def __init__(self, *, smpl: str | Path | None = None, level: bool = True):
         self._smpl = SmplJoints(smpl, self.name)
         self._level = level
-        self.about = {
-            "frame": "level frame at the LiDAR: the release's own, turned by one rotation a sequence"
-            if level
-            else "the LiDAR's own, as in the release: it stands still, z up as far as it was mounted level",
-            "settings": {"smpl": self._smpl.digests[self._smpl.kind("neutral")], "level": level},
-            "licence": "asked for on the dataset's page; treat it as non-commercial research, no redistribution",
-            "get": _GET,
-            "notes": [
-                "Joints are SMPL's with the labelled betas, neutral body for everybody. LiDARCap's own figures are of "
-                "betas = 0 and joints relative to the pelvis: not the same joints.",
-                "center_trans is SMPL's trans: the released DAPT evaluation centers on it. The pelvis is about 0.24 m "
-                "from it, at a place that betas decide.",
-                "The labelled people of a sequence tell what is up, since they stand upright on average; a frame "
-                "hardly out of level (3 degrees, 10 where everybody faces one way) or of fewer than 100 people stays "
-                "as it is; source tells the turn. Networks trained on the release's frame need --no-level.",
-                "All joints count as seen; the labels come from suits, not from what the LiDAR saw.",
-                "There are no boxes. time is the frame's number at 10 Hz.",
-                "train.txt and test.txt are not in the release; the published ids are used where they are missing, and "
-                "the blank line at their end is no sequence.",
-            ],
-        }
+        super().__init__(smpl=self._smpl.digests[self._smpl.kind("neutral")], level=level)
+        if not level:
+            mounted = "it stands still, z up as far as it was mounted level"
+            self.about["frame"] = f"the LiDAR's own, as in the release: {mounted}"
 
     def parts(self, root: Path) -> list[str]:
         """The sequences, by number. Raises InputError where poses or clouds are missing altogether."""
         for name in (_POSE, _SEGMENT):
             if not (root / name).is_dir():
-                raise wrong_root(root, "LiDARHuman26M", _EXPECTED, f"got no {name}", _GET)
+                raise self.wrong_root(root, f"got no {name}")
         names = {path.name for folder in (_POSE, _SEGMENT) for path in (root / folder).iterdir() if path.is_dir()}
         if not names:
-            raise wrong_root(root, "LiDARHuman26M", _EXPECTED, f"got no sequence in {_POSE}", _GET)
+            raise self.wrong_root(root, f"got no sequence in {_POSE}")
         return sorted(names, key=lambda name: (int(name) if name.isdecimal() else -1, name))
 
     def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
@@ -103,17 +84,17 @@ class LidarHuman26M:
         for frame in sorted(poses.keys() | clouds.keys()):
             where = f"{part}/{frame:06d}"
             if frame in wrong:
-                yield Skipped(reason="labels cannot be read", where=wrong[frame])
+                yield Skipped("labels cannot be read", wrong[frame])
             elif frame not in poses:
-                yield Skipped(reason="cloud without labels", where=where)
+                yield Skipped("cloud without labels", where)
             elif frame not in clouds:
-                yield Skipped(reason="labels without a cloud", where=where)
+                yield Skipped("labels without a cloud", where)
             elif len(poses[frame]) + len(clouds[frame]) > 2:
                 names = ", ".join(path.name for path in [*poses[frame], *clouds[frame]])
-                yield Skipped(reason="several files of one frame", where=f"{where}: {names}")
+                yield Skipped("several files of one frame", f"{where}: {names}")
             else:
                 time = (frame - first) / _FPS
-                yield _item(clouds[frame][0], joints[frame], labels[frame][2], part, frame, time, turn)
+                yield _sample(clouds[frame][0], joints[frame], labels[frame][2], part, frame, time, turn)
 
 
 def _labels(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -128,21 +109,21 @@ def _labels(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return beta, pose, trans
 
 
-def _item(
+def _sample(
     path: Path, joints: np.ndarray, trans: np.ndarray, part: str, frame: int, time: float, turn: np.ndarray | None
 ) -> LabeledSample | Skipped:
     """turn: R_level_sensor, None to stay in the sensor's frame."""
     try:
         points = read_cloud(path)
     except InputError as error:
-        return Skipped(reason="cloud cannot be read", where=str(error))
+        return Skipped("cloud cannot be read", str(error))
     if not len(points):
-        return Skipped(reason="empty cloud", where=f"{part}/{path.stem}")
+        return Skipped("empty cloud", f"{part}/{path.stem}")
     source = "lidarhuman26m"
     if turn is not None:
         points, joints, trans = (x @ turn.T for x in (points, joints, trans))
         source += f", turned level by {np.degrees(np.arccos(np.clip(turn[2, 2], -1, 1))):.0f} deg"
-    return smpl_item(
+    return smpl_sample(
         points,
         joints,
         sequence=part,

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.base import Skipped, as_cloud, numbers, wrong_root
-from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_item
+from lidarpose.data.readers.base import Reader, Skipped, as_cloud, numbers
+from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_sample
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.io.files import file_error
@@ -27,13 +27,11 @@ from lidarpose.sample import LabeledSample
 from lidarpose.skeleton import SMPL24
 
 _SUFFIX = "_labels.pkl"
-_EXPECTED = "SEQUENCE/SEQUENCE_labels.pkl"
-_GET = "www.lidarhumanmotion.net/data-sloper4d (a form)"
 # a quaternion is no rotation where its length is further from 1
 _UNIT = 0.01
 
 
-class Sloper4D:
+class Sloper4D(Reader):
     """Reads SLOPER4D. A part is a sequence. smpl: the user's SMPL model or models, see `SmplJoints`."""
 
     name = "sloper4d"
@@ -41,35 +39,16 @@ class Sloper4D:
 
     def __init__(self, *, smpl: str | Path | None = None):
         self._smpl = SmplJoints(smpl, self.name)
-        self.about = {
-            "frame": "level frame at the sensor: its heading is x, z is the world's up; m",
-            "settings": {"smpl": self._smpl.digests},
-            "licence": "CC BY-NC-SA 4.0; the dataset by a form on its page",
-            "get": _GET,
-            "notes": [
-                "Clouds and poses are in the world's frame on disk. Here they are moved to the sensor by lidar_traj of "
-                "the frame and turned by its heading only, so that they stay level; roll and pitch of the head "
-                "are left out.",
-                "opt_pose and opt_trans are read, and pose and trans where they are missing; source tells which, and "
-                "whose SMPL body. The released DAPT code reads pose and trans, with the neutral body for everybody.",
-                "center_trans is SMPL's trans, which the released DAPT evaluation centers on.",
-                "Clouds are of a subset of the frames. Those under 10 points, which LiDAR-HMR and DAPT leave out, are "
-                "kept; empty ones are skipped.",
-                "Frames beyond total_frames are skipped, as the authors' loader does.",
-                "All joints count as seen; the labels come from a suit. There are no boxes.",
-            ],
-        }
+        super().__init__(smpl=self._smpl.digests)
 
     def parts(self, root: Path) -> list[str]:
         """The sequences. Raises InputError where there are no labels, or two of one name."""
-        names = [path.name.removesuffix(_SUFFIX) for path in _files(root)]
+        names = sorted(path.name.removesuffix(_SUFFIX) for path in _files(root))
         if not names:
-            there = ", ".join(sorted(path.name for path in root.iterdir())[:6]) or "nothing"
-            raise wrong_root(root, "SLOPER4D", _EXPECTED, f"got {there}", _GET)
-        twice = next((name for name in names if names.count(name) > 1), None)
-        if twice is not None:
-            raise file_error(root, f"has {twice}{_SUFFIX} twice: move one of them away")
-        return sorted(names)
+            raise self.wrong_root(root)
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise file_error(root, f"has {twice[0]}{_SUFFIX} twice: move one of them away")
+        return names
 
     def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         """The person of a sequence, frame by frame."""
@@ -79,26 +58,27 @@ class Sloper4D:
         joints = self._smpl(labels.betas, labels.pose, labels.trans, labels.gender)
         body = labels.gender if kind == "any" else f"{labels.gender} by the {kind} body"
         for index, frame in enumerate(labels.frames):
-            where = f"{part}/{frame}"
-            cloud = labels.clouds.get(frame)
-            if index >= labels.total:
-                yield Skipped(reason="frame beyond total_frames", where=where)
-            elif cloud is None:
-                yield Skipped(reason="labels without a cloud", where=where)
-            elif not isinstance(cloud, np.ndarray):
-                yield Skipped(reason="cloud cannot be read", where=f"{where}: {cloud}")
-            elif not len(cloud):
-                yield Skipped(reason="empty cloud", where=where)
-            elif index >= len(labels.pose) or not labels.good[index]:
-                yield Skipped(reason="cloud without a pose", where=where)
-            elif index >= len(labels.position):
-                yield Skipped(reason="cloud without the LiDAR's place", where=where)
-            elif not np.isfinite(labels.position[index]).all() or not np.isfinite(labels.heading[index]):
-                yield Skipped(reason="cloud without the LiDAR's place", where=where)
-            else:
-                yield _item(labels, index, cloud, joints[index], f"sloper4d/{labels.which}, {body}", part)
+            where, cloud = f"{part}/{frame}", labels.clouds.get(frame)
+            if reason := labels.problem(index, cloud):
+                yield Skipped(reason, f"{where}: {cloud}" if reason == "cloud cannot be read" else where)
+                continue
+            R_sensor_world = rotation_about("z", -labels.heading[index])
+            points, own, trans = (
+                (x - labels.position[index]) @ R_sensor_world.T for x in (cloud, joints[index], labels.trans[index])
+            )
+            yield smpl_sample(
+                points,
+                own,
+                sequence=part,
+                frame=frame,
+                frame_id=where,
+                track="second_person",
+                time=float(labels.time[index]),
+                source=f"sloper4d/{labels.which}, {body}",
+                centers={"trans": trans},
+            )
         for frame in sorted(labels.clouds.keys() - set(labels.frames)):
-            yield Skipped(reason="cloud of a frame without labels", where=f"{part}/{frame}")
+            yield Skipped("cloud of a frame without labels", f"{part}/{frame}")
 
 
 def _files(root: Path) -> list[Path]:
@@ -125,13 +105,30 @@ class _Labels:
     heading: np.ndarray
     time: np.ndarray
 
+    def problem(self, index: int, cloud: np.ndarray | str | None) -> str:
+        """Why the frame of this index is left out, "" if it is not."""
+        if index >= self.total:
+            return "frame beyond total_frames"
+        if cloud is None:
+            return "labels without a cloud"
+        if isinstance(cloud, str):
+            return "cloud cannot be read"
+        if not len(cloud):
+            return "empty cloud"
+        if index >= len(self.pose) or not self.good[index]:
+            return "cloud without a pose"
+        if index >= len(self.position) or not np.isfinite([*self.position[index], self.heading[index]]).all():
+            return "cloud without the LiDAR's place"
+        return ""
+
 
 def _labels(path: Path) -> _Labels:
     content = load_pickle(path)
     if not isinstance(content, dict) or not isinstance(content.get("second_person"), dict):
         old = isinstance(content, dict) and "SMPL_info" in content
         got = "those of a release before 1.0 (SMPL_info)" if old else "others"
-        raise file_error(path, f"expected labels of SLOPER4D 1.0, with second_person, got {got}: get them at {_GET}")
+        get = "get them at www.lidarhumanmotion.net/data-sloper4d (a form)"
+        raise file_error(path, f"expected labels of SLOPER4D 1.0, with second_person, got {got}: {get}")
     person, walker = content["second_person"], content.get("first_person")
     pose, trans, which = _poses(path, person)
     frames = [int(n) for n in numbers(path, content.get("frame_num"), (-1,), "frame_num")]
@@ -195,24 +192,3 @@ def _heading(quaternion: np.ndarray) -> np.ndarray:
     x, y, z, w = quaternion.T
     unit = np.abs(np.linalg.norm(quaternion, axis=1) - 1) < _UNIT
     return np.where(unit, np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)), np.nan)
-
-
-def _item(
-    labels: _Labels, index: int, cloud: np.ndarray, joints: np.ndarray, source: str, part: str
-) -> LabeledSample | Skipped:
-    R_sensor_world = rotation_about("z", -labels.heading[index])
-    points, joints, trans = (
-        (x - labels.position[index]) @ R_sensor_world.T for x in (cloud, joints, labels.trans[index])
-    )
-    frame = labels.frames[index]
-    return smpl_item(
-        points,
-        joints,
-        sequence=part,
-        frame=frame,
-        frame_id=f"{part}/{frame}",
-        track="second_person",
-        time=float(labels.time[index]),
-        source=source,
-        centers={"trans": trans},
-    )

@@ -4,12 +4,13 @@ people that they make."""
 import re
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from lidarpose.body.rig import forward_kinematics
 from lidarpose.body.smpl import SmplBody, load_body
-from lidarpose.data.readers.base import Skipped
+from lidarpose.data.readers.base import Skipped, entries
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix
 from lidarpose.io.files import content_digest, file_error
@@ -43,8 +44,7 @@ class SmplJoints:
         if Path(path).is_dir():
             self.files = _in_folder(Path(path))
             if "neutral" not in self.files:
-                there = ", ".join(sorted(p.name for p in Path(path).iterdir())[:6]) or "nothing"
-                raise file_error(path, f"expected SMPL_NEUTRAL.pkl or .npz, got {there}: {_GET}")
+                raise file_error(path, f"expected SMPL_NEUTRAL.pkl or .npz, got {entries(Path(path))}: {_GET}")
         elif not Path(path).is_file():
             raise file_error(path, f"no such file; expected SMPL's own: {_GET}")
         usual = self.kind("neutral")
@@ -68,37 +68,19 @@ class SmplJoints:
         return {kind: content_digest(path, expected="SMPL")[:12] for kind, path in self.files.items()}
 
 
-def smpl_item(
-    points: np.ndarray,
-    joints: np.ndarray,
-    *,
-    sequence: str,
-    frame: int,
-    frame_id: str,
-    track: str,
-    time: float,
-    source: str,
-    centers: dict[str, np.ndarray],
-    sensor_known: bool = True,
-) -> LabeledSample | Skipped:
-    """A person of whom points (n, 3) m and SMPL's joints (24, 3) m are known, which all count as seen; the rest as in
+def smpl_sample(points: np.ndarray, joints: np.ndarray, **labels: Any) -> LabeledSample | Skipped:
+    """The sample of points (n, 3) m and SMPL's joints (24, 3) m, which all count as seen; labels: the other fields of
     `LabeledSample`. Skipped where the parameters put joints out of reach."""
     if not within_reach(joints).all():
-        return Skipped(reason="joints out of reach", where=f"{frame_id}/{track}: beyond {FARTHEST:g} m")
+        where = f"{labels['frame_id']}/{labels['track']}: beyond {FARTHEST:g} m"
+        return Skipped("joints out of reach", where)
     points = points.astype(np.float32)
     return LabeledSample(
         points=points,
         center=center_of(points),
         pose=Pose(joints=joints.astype(np.float32), skeleton=SMPL24, frame="sensor"),
-        source=source,
-        frame_id=frame_id,
         joint_labels=np.full(len(SMPL24), SEEN, np.uint8),
-        sequence=sequence,
-        frame=frame,
-        track=track,
-        time=time,
-        centers=centers,
-        sensor_known=sensor_known,
+        **labels,
     )
 
 

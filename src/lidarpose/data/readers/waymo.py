@@ -16,22 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.data.readers.base import Reader, Skipped, numbers, wrong_root
-from lidarpose.data.readers.waymo_frames import (
-    BAD_FRAME,
-    BAD_IMAGE,
-    BAD_LABEL,
-    LASERS,
-    MARGIN,
-    Calibration,
-    Frame,
-    LabelledPerson,
-    about,
-    is_image,
-    person,
-    transform,
-)
-from lidarpose.data.readers.waymo_v1 import SPLITS, WaymoV1
+from lidarpose.data.readers import waymo_frames as frames
+from lidarpose.data.readers import waymo_v1
+from lidarpose.data.readers.base import Reader, Skipped, entries, numbers
+from lidarpose.data.readers.waymo_v1 import SPLITS
 from lidarpose.data.schema import pyarrow
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
@@ -40,7 +28,6 @@ from lidarpose.skeleton import WAYMO14
 
 COMPONENTS = ("lidar_hkp", "lidar_box", "lidar_calibration", "vehicle_pose", "lidar", "lidar_pose")
 _BUCKET = "gs://waymo_open_dataset_v_2_0_1"
-_EXPECTED = "{training,validation}/COMPONENT/SEGMENT.parquet or {training,validation}/SEGMENT.tfrecord"
 
 SEGMENT, TIME, LASER, OBJECT = (
     f"key.{name}" for name in ("segment_context_name", "frame_timestamp_micros", "laser_name", "laser_object_id")
@@ -68,89 +55,79 @@ _RETURNS = ("[LiDARComponent].range_image_return1", "[LiDARComponent].range_imag
 _PIXEL_POSES = "[LiDARPoseComponent].range_image_return1"
 
 
-class Waymo:
+class Waymo(Reader):
     """Reads whichever version is there. margin: how far around the labelled box points are taken, m on each side."""
 
     name = "waymo"
     skeleton = WAYMO14.name
 
-    def __init__(self, *, margin: float = MARGIN):
-        self.about = about(margin)
-        self._v1, self._v2 = WaymoV1(margin=margin), WaymoV2(margin=margin)
-
-    def parts(self, root: Path) -> list[str]:
-        """Segments of version 2 ("training/SEGMENT") or files of version 1 ("training/FILE.tfrecord"). Raises
-        InputError where there are both, neither, or a component is missing."""
-        return self._version(root).parts(root)
-
-    def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
-        """Everybody with keypoints in a part, frame by frame."""
-        return (self._v1 if part.endswith(".tfrecord") else self._v2).read(root, part)
-
-    def _version(self, root: Path) -> Reader:
-        old = next((path for split in SPLITS for path in sorted((root / split).glob("*.tfrecord"))), None)
-        new = next((root / split / name for split in _splits(root) for name in _components(root / split)), None)
-        if old is not None and new is not None:
-            mixed = f"{old.relative_to(root)} is of version 1, {new.relative_to(root)} of version 2"
-            raise file_error(root, f"mixes versions of Waymo: {mixed}; keep each in a folder of its own")
-        if old is not None:
-            return self._v1
-        if new is not None:
-            return self._v2
-        there = ", ".join(sorted(path.name for path in root.glob("*"))[:6]) or "nothing"
-        if root.name in SPLITS or _components(root):
-            there += f"; the root is likely {root.absolute().parent}"
-        if any((root / "individual_files" / split).is_dir() for split in SPLITS):
-            there += f"; the root is likely {root / 'individual_files'}"
-        raise wrong_root(root, "Waymo", _EXPECTED, f"got {there}", self.about["get"])
-
-
-class WaymoV2:
-    """Reads version 2. A part is a segment that has keypoints, in one of the splits."""
-
-    name = "waymo"
-    skeleton = WAYMO14.name
-
-    def __init__(self, *, margin: float = MARGIN):
+    def __init__(self, *, margin: float = frames.MARGIN):
+        super().__init__(box_margin_m=margin)
+        self.about["notes"] = [note.format(margin=margin) for note in self.about["notes"]]
         self.margin = margin
-        self.about = about(margin)
 
     def parts(self, root: Path) -> list[str]:
-        """As of `Waymo`. A segment without keypoints needs no other files."""
-        found = []
-        for split in _splits(root):
-            missing = [name for name in COMPONENTS if not any((root / split / name).glob("*.parquet"))]
-            if missing:
-                fetch = f"gcloud storage cp -r {_urls(split, missing)} {shlex.quote(f'{root / split}/')}"
-                raise file_error(root / split, f"lacks {', '.join(missing)}; fetch with: {fetch}")
-            # a damaged file is a part too: reading it tells
-            labels = sorted((root / split / "lidar_hkp").glob("*.parquet"))
-            segments = [path.stem for path in labels if count_rows(path) != 0]
-            for name in COMPONENTS:
-                _check_complete(root / split / name, split, segments)
-            found += [f"{split}/{segment}" for segment in segments]
-        if not found:
-            raise file_error(root, "has no segment with laser keypoints: only some have any; fetch all of lidar_hkp")
-        return sorted(found)
+        """Segments with keypoints of version 2 ("training/SEGMENT") or files of version 1 ("training/FILE.tfrecord").
+        Raises InputError where there are both, neither, or a component is missing."""
+        old = waymo_v1.parts(root)
+        new = next((root / split / name for split in _splits(root) for name in _components(root / split)), None)
+        if old and new is not None:
+            mixed = f"{old[0]} is of version 1, {new.relative_to(root)} of version 2"
+            raise file_error(root, f"mixes versions of Waymo: {mixed}; keep each in a folder of its own")
+        if old or new is not None:
+            return old or _segments(root)
+        got = f"got {entries(root)}"
+        if root.name in SPLITS or _components(root):
+            got += f"; the root is likely {root.absolute().parent}"
+        if any((root / "individual_files" / split).is_dir() for split in SPLITS):
+            got += f"; the root is likely {root / 'individual_files'}"
+        raise self.wrong_root(root, got)
 
     def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
-        """Everybody with keypoints in a segment, in the order of time, then of track. Raises InputError where the
-        labels cannot be read; where the range images cannot, everybody is skipped."""
-        split, _, segment = part.partition("/")
-        files = {name: root / split / name / f"{segment}.parquet" for name in COMPONENTS}
-        labels = table(files["lidar_hkp"], (SEGMENT, TIME, OBJECT, *_KEYPOINT_COLUMNS))
-        for number, row in enumerate(labels):
-            if None in _object_key(row):
-                lacks = "lacks its segment, its time or whose it is"
-                yield Skipped(reason=BAD_LABEL, where=f"{part}: row {number} of lidar_hkp {lacks}")
-        frames = _frames(files, [row for row in labels if None not in _object_key(row)], self.margin)
-        try:
-            _add_images(files, frames)
-        except InputError as error:
-            for frame in frames.values():
-                frame.fail(BAD_IMAGE, str(error))
-        for key in sorted(frames):
-            yield from frames[key].found()
+        """Everybody with keypoints in a part, in the order of time, then of track. Raises InputError where the labels
+        cannot be read; where the range images cannot, everybody is skipped."""
+        if part.endswith(".tfrecord"):
+            return waymo_v1.read(root, part, self.margin)
+        return _read_segment(root, part, self.margin)
+
+
+def _segments(root: Path) -> list[str]:
+    """The segments that have keypoints; others need no other files."""
+    found = []
+    for split in _splits(root):
+        missing = [name for name in COMPONENTS if not any((root / split / name).glob("*.parquet"))]
+        if missing:
+            fetch = f"gcloud storage cp -r {_urls(split, missing)} {shlex.quote(f'{root / split}/')}"
+            raise file_error(root / split, f"lacks {', '.join(missing)}; fetch with: {fetch}")
+        # a damaged file is a part too: reading it tells
+        labels = sorted((root / split / "lidar_hkp").glob("*.parquet"))
+        segments = [path.stem for path in labels if count_rows(path) != 0]
+        for name in COMPONENTS:
+            _check_complete(root / split / name, split, segments)
+        found += [f"{split}/{segment}" for segment in segments]
+    if not found:
+        raise file_error(root, "has no segment with laser keypoints: only some have any; fetch all of lidar_hkp")
+    return sorted(found)
+
+
+def _read_segment(root: Path, part: str, margin: float) -> Iterator[LabeledSample | Skipped]:
+    split, _, segment = part.partition("/")
+    files = {name: root / split / name / f"{segment}.parquet" for name in COMPONENTS}
+    labels = []
+    for number, row in enumerate(table(files["lidar_hkp"], (SEGMENT, TIME, OBJECT, *_KEYPOINT_COLUMNS))):
+        if None in _object_key(row):
+            where = f"{part}: row {number} of lidar_hkp lacks its segment, its time or whose it is"
+            yield Skipped(frames.BAD_LABEL, where)
+        else:
+            labels.append(row)
+    joined = _frames(files, labels, margin)
+    try:
+        _add_images(files, joined)
+    except InputError as error:
+        for frame in joined.values():
+            frame.fail(frames.BAD_IMAGE, str(error))
+    for key in sorted(joined):
+        yield from joined[key].samples()
 
 
 def _components(folder: Path) -> list[str]:
@@ -178,53 +155,44 @@ def _urls(split: str, components: list[str]) -> str:
     return f"{_BUCKET}/{split}/{names}"
 
 
-def _frames(files: dict[str, Path], labels: list[dict[str, Any]], margin: float) -> dict[FrameKey, Frame]:
+def _frames(files: dict[str, Path], labels: list[dict[str, Any]], margin: float) -> dict[FrameKey, frames.Frame]:
     """The frames that have keypoints, with boxes, calibrations and poses joined to them."""
-    keys = {_object_key(row) for row in labels}
-    boxes = {
-        key: row
-        for row in table(files["lidar_box"], (SEGMENT, TIME, OBJECT, *_BOX_COLUMNS, _BOX_TYPE), (_BOX_COUNT,))
-        if (key := _object_key(row)) in keys
-    }
+    boxes = table(files["lidar_box"], (SEGMENT, TIME, OBJECT, *_BOX_COLUMNS, _BOX_TYPE), (_BOX_COUNT,))
+    box_of = {_object_key(row): row for row in boxes}
     poses, starts = {}, {}
     for row in table(files["vehicle_pose"], (SEGMENT, TIME, _VEHICLE_POSE)):
-        segment, time = row[SEGMENT], row[TIME]
-        if time is None:
-            continue
-        poses[segment, time] = row[_VEHICLE_POSE]
-        starts[segment] = min(time, starts.get(segment, time))
+        if row[TIME] is not None:
+            poses[row[SEGMENT], row[TIME]] = row[_VEHICLE_POSE]
+            starts[row[SEGMENT]] = min(row[TIME], starts.get(row[SEGMENT], row[TIME]))
     calibrations = _calibrations(files["lidar_calibration"])
-    people: dict[FrameKey, list[LabelledPerson]] = {}
+    people: dict[FrameKey, list[frames.LabeledPerson]] = {}
     for row in labels:
-        people.setdefault((row[SEGMENT], row[TIME]), []).append(_person(row, boxes.get(_object_key(row))))
-    frames = {}
+        people.setdefault((row[SEGMENT], row[TIME]), []).append(_person(row, box_of.get(_object_key(row))))
+    joined = {}
     for (segment, time), found in people.items():
-        values, T_world_vehicle, wrong = poses.get((segment, time)), None, ""
-        try:
-            T_world_vehicle = None if values is None else transform(values, "the vehicle's pose")
-        except InputError as error:
-            wrong = str(error)
-        frame = frames[segment, time] = Frame(
+        frame = joined[segment, time] = frames.Frame(
             sequence=segment,
             timestamp=time,
             start=starts.get(segment, time),
             people=found,
             calibrations=calibrations.get(segment, {}),
-            T_world_vehicle=T_world_vehicle,
             margin=margin,
         )
-        if wrong:
-            frame.fail(BAD_FRAME, wrong)
-    return frames
+        if (pose := poses.get((segment, time))) is not None:
+            try:
+                frame.T_world_vehicle = frames.transform(pose, "the vehicle's pose")
+            except InputError as error:
+                frame.fail(frames.BAD_FRAME, str(error))
+    return joined
 
 
 def _object_key(row: dict[str, Any]) -> tuple[str, int, str]:
     return row[SEGMENT], row[TIME], row[OBJECT]
 
 
-def _calibrations(path: Path) -> dict[str, dict[int, Calibration]]:
+def _calibrations(path: Path) -> dict[str, dict[int, frames.Calibration]]:
     """Segment -> laser -> its calibration."""
-    found: dict[str, dict[int, Calibration]] = {}
+    found: dict[str, dict[int, frames.Calibration]] = {}
     columns = (SEGMENT, LASER, _EXTRINSIC)
     optional = (f"{_BEAMS}.values", f"{_BEAMS}.min", f"{_BEAMS}.max")
     for row in table(path, columns, optional):
@@ -232,10 +200,10 @@ def _calibrations(path: Path) -> dict[str, dict[int, Calibration]]:
         if not values and (low is None or high is None):
             raise file_error(path, f"has no beam inclinations of laser {row[LASER]}")
         try:
-            extrinsic = transform(row[_EXTRINSIC], f"the extrinsic of laser {row[LASER]}")
+            extrinsic = frames.transform(row[_EXTRINSIC], f"the extrinsic of laser {row[LASER]}")
         except InputError as error:
             raise file_error(path, error) from None
-        found.setdefault(row[SEGMENT], {})[row[LASER]] = Calibration(
+        found.setdefault(row[SEGMENT], {})[row[LASER]] = frames.Calibration(
             laser=row[LASER],
             T_vehicle_laser=extrinsic,
             inclinations=numbers(path, values, (-1,), "beam inclinations", finite=False) if values else None,
@@ -245,24 +213,24 @@ def _calibrations(path: Path) -> dict[str, dict[int, Calibration]]:
     return found
 
 
-def _person(label: dict[str, Any], box: dict[str, Any] | None) -> LabelledPerson:
+def _person(label: dict[str, Any], box: dict[str, Any] | None) -> frames.LabeledPerson:
     kinds, *places, hidden = (label[name] or [] for name in _KEYPOINT_COLUMNS)
     if len({len(kinds), len(hidden), *map(len, places)}) > 1:
-        return LabelledPerson(track=label[OBJECT], problem=(BAD_LABEL, "its lists have different lengths"))
+        return frames.LabeledPerson(track=label[OBJECT], problem=(frames.BAD_LABEL, "its lists have different lengths"))
     try:
         places = numbers("lidar_hkp", places, (3, -1), "keypoints", finite=False)
         keypoints = zip(kinds, places.T, hidden, strict=True)
         if box is None:
-            return person(label[OBJECT], keypoints, None)
+            return frames.person(label[OBJECT], keypoints, None)
         values = numbers("lidar_box", [box[name] for name in _BOX_COLUMNS], (7,), "a box", finite=False)
-        return person(label[OBJECT], keypoints, values, box[_BOX_TYPE], box[_BOX_COUNT])
+        return frames.person(label[OBJECT], keypoints, values, box[_BOX_TYPE], box[_BOX_COUNT])
     except InputError as error:
-        return LabelledPerson(track=label[OBJECT], problem=(BAD_LABEL, str(error)))
+        return frames.LabeledPerson(track=label[OBJECT], problem=(frames.BAD_LABEL, str(error)))
 
 
-def _add_images(files: dict[str, Path], frames: dict[FrameKey, Frame]) -> None:
+def _add_images(files: dict[str, Path], joined: dict[FrameKey, frames.Frame]) -> None:
     """Adds the range images to their frames, one row at a time."""
-    wanted = {key for key, frame in frames.items() if frame.wanted}
+    wanted = {key for key, frame in joined.items() if frame.wanted}
     if not wanted:
         return
     posed = laser_keys(files["lidar_pose"], wanted)
@@ -273,10 +241,10 @@ def _add_images(files: dict[str, Path], frames: dict[FrameKey, Frame]) -> None:
         while key in posed and key not in waiting:
             found, (image,) = next(poses, (key, [None]))
             waiting[found] = image
-        pixel_poses, frame = waiting.pop(key, None), frames[key[:2]]
+        pixel_poses, frame = waiting.pop(key, None), joined[key[:2]]
         for which, image in enumerate(returns, 1):
             if image is not None and not image.size:
-                frame.fail(BAD_IMAGE, f"the values of laser {key[2]} do not fit their shape")
+                frame.fail(frames.BAD_IMAGE, f"the values of laser {key[2]} do not fit their shape")
             elif image is not None:
                 frame.add(key[2], which, image[..., 0], pixel_poses)
 
@@ -345,7 +313,7 @@ def _image(values, shape) -> np.ndarray | None:
         return None
     flat = values.values.to_numpy(zero_copy_only=False).astype(np.float32, copy=False)
     size = shape.as_py()
-    if not is_image(size, len(flat)):
+    if not frames.is_image(size, len(flat)):
         return np.zeros((0, 0, 0), np.float32)
     return flat.reshape(size)
 
@@ -360,9 +328,9 @@ def _keys(path: Path, file, group: int) -> list[LaserKey]:
 def _laser(path: Path, name: int | str) -> int:
     """A laser's number, from its number or its name."""
     if isinstance(name, str) and not name.isdecimal():
-        if name not in LASERS:
-            raise file_error(path, f"names the laser {name!r}; known are {', '.join(LASERS)}")
-        return LASERS[name]
+        if name not in frames.LASERS:
+            raise file_error(path, f"names the laser {name!r}; known are {', '.join(frames.LASERS)}")
+        return frames.LASERS[name]
     return int(name)
 
 

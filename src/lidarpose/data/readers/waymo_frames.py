@@ -8,7 +8,6 @@ and W columns of a range image, n points, J = 14 joints.
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -31,38 +30,11 @@ _JOINTS = {
 } | {1: WAYMO14.index("nose"), 20: WAYMO14.index("head_center")}
 _KINDS = {1: "vehicle", 2: "pedestrian", 3: "sign", 4: "cyclist"}
 
-# why somebody is left out: the same words for both versions of the dataset
-NO_BOX = "keypoints without a box"
-NO_JOINTS = "no joint is labelled"
-NO_POINTS = "no points in the box"
-NO_IMAGE = "no range image of the frame"
-NO_PIXEL_POSES = "no pixel poses of the top laser"
-NO_VEHICLE_POSE = "no vehicle pose of the frame"
+# why somebody is left out, of both versions of the dataset; BAD_REST is `lidarpose prepare`'s too
 BAD_LABEL = "label of another form"
 BAD_IMAGE = "range image cannot be read"
 BAD_FRAME = "frame cannot be read"
-# the words of `lidarpose prepare`
 BAD_REST = "the rest of a part cannot be read"
-
-
-def about(margin: float) -> dict[str, Any]:
-    """What is recorded with a prepared dataset: the frame of its points, its licence, its quirks."""
-    return {
-        "frame": "the vehicle's axes (x forward, y left, z up) about the top laser, m",
-        "settings": {"box_margin_m": margin},
-        "licence": "Waymo Dataset License Agreement for Non-Commercial Use (waymo.com/open/terms): no redistribution",
-        "get": "waymo.com/open/download (a Google account), then gcloud storage cp",
-        "notes": [
-            f"Points are those in the labelled box and {margin:g} m around it, of all five lasers and both returns; "
-            "the released DAPT code takes the box alone. center_box, the box's center, is what it centers on.",
-            "The top laser's points of both returns are moved by the pose of their pixel to the frame's; the released "
-            "DAPT code moves those of return 1 alone. The other lasers have no pixel poses.",
-            "Beams are listed from the lowest, rows of range images from the highest: reversed here. ring is the row "
-            "of the top laser counted from the lowest, -1 for the other four.",
-            "frame is the frame's timestamp in us, time is since the first of its segment.",
-            "joint_labels: 2 clearly visible, 1 occluded or uncertain, 0 not labelled.",
-        ],
-    }
 
 
 def is_image(sizes: Sequence[int | None], count: int) -> bool:
@@ -152,7 +124,7 @@ def _turned(a: np.ndarray, b: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LabelledPerson:
+class LabeledPerson:
     """Somebody with keypoints in one frame, in the vehicle's frame. joints (14, 3) m, NaN where not labelled, and their
     labels (14,); kind: Waymo's type of the box; counted: points in the box by the label; problem: why they are left
     out, and what else to say of it."""
@@ -172,7 +144,7 @@ def person(
     box: tuple[float, ...] | None,
     kind: int = 0,
     counted: int | None = None,
-) -> LabelledPerson:
+) -> LabeledPerson:
     """Somebody by their labels. keypoints: (type, x y z, whether occluded) each, in any order, types that the skeleton
     lacks ignored; box: center, size (length, width, height) and heading, 7 numbers."""
     joints, labels = np.full((len(WAYMO14), 3), np.nan), np.full(len(WAYMO14), UNLABELED, np.uint8)
@@ -181,14 +153,14 @@ def person(
             joints[_JOINTS[found]] = place
             labels[_JOINTS[found]] = HIDDEN if hidden else SEEN
     if box is None:
-        return LabelledPerson(track=track, problem=(NO_BOX, ""))
+        return LabeledPerson(track=track, problem=("keypoints without a box", ""))
     if (labels == UNLABELED).all():
-        return LabelledPerson(track=track, problem=(NO_JOINTS, ""))
+        return LabeledPerson(track=track, problem=("no joint is labelled", ""))
     try:
         of = Box(center=box[:3], size=box[3:6], yaw=box[6], id=track)
     except InputError as error:
-        return LabelledPerson(track=track, problem=(BAD_LABEL, str(error)))
-    return LabelledPerson(track=track, joints=joints, labels=labels, box=of, kind=kind, counted=counted)
+        return LabeledPerson(track=track, problem=(BAD_LABEL, str(error)))
+    return LabeledPerson(track=track, joints=joints, labels=labels, box=of, kind=kind, counted=counted)
 
 
 @dataclass(kw_only=True, eq=False)
@@ -202,9 +174,9 @@ class Frame:
     sequence: str
     timestamp: int
     start: int
-    people: list[LabelledPerson]
+    people: list[LabeledPerson]
     calibrations: dict[int, Calibration]
-    T_world_vehicle: np.ndarray | None
+    T_world_vehicle: np.ndarray | None = None
     margin: float = MARGIN
     _problem: tuple[str, str] | None = None
     _seen: set[tuple[int, int]] = field(default_factory=set)
@@ -226,9 +198,9 @@ class Frame:
         self._seen.add((laser, which))
         try:
             if self.T_world_vehicle is None:
-                return self.fail(NO_VEHICLE_POSE)
+                return self.fail("no vehicle pose of the frame")
             if laser == TOP and pixel_poses is None:
-                return self.fail(NO_PIXEL_POSES)
+                return self.fail("no pixel poses of the top laser")
             if laser not in self.calibrations:
                 return self.fail(BAD_IMAGE, f"laser {laser} has no calibration")
             points, row = points_of_image(image, self.calibrations[laser], pixel_poses, self.T_world_vehicle)
@@ -241,10 +213,10 @@ class Frame:
                 inside = one.box.contains(points, self.margin)
                 self._crops.setdefault(k, []).append(((laser, which), points[inside], ring[inside]))
 
-    def found(self) -> Iterator[LabeledSample | Skipped]:
+    def samples(self) -> Iterator[LabeledSample | Skipped]:
         """Everybody, in the order of their tracks, once all images are there."""
         if self.wanted and not any(laser == TOP for laser, _ in self._seen):
-            self.fail(NO_IMAGE)
+            self.fail("no range image of the frame")
         for k, one in sorted(enumerate(self.people), key=lambda pair: pair[1].track):
             where = f"{self.sequence}/{self.timestamp}/{one.track}"
             problem = one.problem or self._problem
@@ -252,13 +224,13 @@ class Frame:
                 crops = sorted(self._crops[k], key=lambda crop: crop[0])
                 points, ring = (np.concatenate([crop[k] for crop in crops]) for k in (1, 2))
                 if len(points):
-                    yield self._item(one, points, ring)
+                    yield self._sample(one, points, ring)
                     continue
-                problem = (NO_POINTS, "" if one.counted is None else f"the label counts {one.counted}")
+                problem = ("no points in the box", "" if one.counted is None else f"the label counts {one.counted}")
             reason, why = problem
-            yield Skipped(reason=reason, where=f"{where}: {why}" if why else where)
+            yield Skipped(reason, f"{where}: {why}" if why else where)
 
-    def _item(self, one: LabelledPerson, points: np.ndarray, ring: np.ndarray) -> LabeledSample:
+    def _sample(self, one: LabeledPerson, points: np.ndarray, ring: np.ndarray) -> LabeledSample:
         # the sensor is at the origin
         origin = self.calibrations[TOP].T_vehicle_laser[:3, 3]
         points = (points - origin).astype(np.float32)

@@ -17,24 +17,11 @@ from typing import Any
 
 import numpy as np
 
+from lidarpose.data.readers import waymo_frames as frames
 from lidarpose.data.readers.base import Skipped
-from lidarpose.data.readers.waymo_frames import (
-    BAD_FRAME,
-    BAD_IMAGE,
-    BAD_REST,
-    MARGIN,
-    Calibration,
-    Frame,
-    LabelledPerson,
-    about,
-    is_image,
-    person,
-    transform,
-)
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.io.files import file_error
 from lidarpose.sample import LabeledSample
-from lidarpose.skeleton import WAYMO14
 
 try:
     import google_crc32c
@@ -51,45 +38,26 @@ _LARGEST_FRAME = 1 << 25
 _LARGEST_IMAGE = 4 << 24
 _LARGEST_SHAPE = 1 << 16
 
-# message -> (field, number, type) that are read of it; "*" marks a repeated field
+# message -> the fields that are read of it, as name:number:type; "*" marks a repeated one. The data of a matrix is
+# packed, as dataset.proto says: its bytes are the array
 _MESSAGES = {
-    "Frame": [
-        ("context", 1, "Context"),
-        ("timestamp_micros", 2, "int64"),
-        ("pose", 3, "Transform"),
-        ("lasers", 5, "*Laser"),
-        ("laser_labels", 6, "*Label"),
-    ],
-    "Context": [("name", 1, "bytes"), ("laser_calibrations", 3, "*LaserCalibration")],
-    "Transform": [("transform", 1, "*double")],
-    "LaserCalibration": [
-        ("name", 1, "int64"),
-        ("beam_inclinations", 2, "*double"),
-        ("beam_inclination_min", 3, "double"),
-        ("beam_inclination_max", 4, "double"),
-        ("extrinsic", 5, "Transform"),
-    ],
-    "Laser": [("name", 1, "int64"), ("ri_return1", 2, "RangeImage"), ("ri_return2", 3, "RangeImage")],
-    "RangeImage": [("range_image_compressed", 2, "bytes"), ("range_image_pose_compressed", 4, "bytes")],
-    # data is packed, as dataset.proto says: its bytes are the array
-    "MatrixFloat": [("data", 1, "bytes"), ("shape", 2, "bytes")],
-    "Shape": [("dims", 1, "*int64")],
-    "Label": [
-        ("box", 1, "Box"),
-        ("type", 3, "int64"),
-        ("id", 4, "bytes"),
-        ("num_lidar_points_in_box", 7, "int64"),
-        ("laser_keypoints", 8, "LaserKeypoints"),
-    ],
-    "Box": [
-        (name, number, "double")
-        for number, name in enumerate("center_x center_y center_z width length height heading".split(), 1)
-    ],
-    "LaserKeypoints": [("keypoint", 1, "*LaserKeypoint")],
-    "LaserKeypoint": [("type", 1, "int64"), ("keypoint_3d", 2, "Keypoint3d")],
-    "Keypoint3d": [("location_m", 1, "Vec3d"), ("visibility", 2, "Visibility")],
-    "Vec3d": [("x", 1, "double"), ("y", 2, "double"), ("z", 3, "double")],
-    "Visibility": [("is_occluded", 1, "bool")],
+    "Frame": "context:1:Context timestamp_micros:2:int64 pose:3:Transform lasers:5:*Laser laser_labels:6:*Label",
+    "Context": "name:1:bytes laser_calibrations:3:*LaserCalibration",
+    "Transform": "transform:1:*double",
+    "LaserCalibration": "name:1:int64 beam_inclinations:2:*double beam_inclination_min:3:double "
+    "beam_inclination_max:4:double extrinsic:5:Transform",
+    "Laser": "name:1:int64 ri_return1:2:RangeImage ri_return2:3:RangeImage",
+    "RangeImage": "range_image_compressed:2:bytes range_image_pose_compressed:4:bytes",
+    "MatrixFloat": "data:1:bytes shape:2:bytes",
+    "Shape": "dims:1:*int64",
+    "Label": "box:1:Box type:3:int64 id:4:bytes num_lidar_points_in_box:7:int64 laser_keypoints:8:LaserKeypoints",
+    "Box": "center_x:1:double center_y:2:double center_z:3:double width:4:double length:5:double height:6:double "
+    "heading:7:double",
+    "LaserKeypoints": "keypoint:1:*LaserKeypoint",
+    "LaserKeypoint": "type:1:int64 keypoint_3d:2:Keypoint3d",
+    "Keypoint3d": "location_m:1:Vec3d visibility:2:Visibility",
+    "Vec3d": "x:1:double y:2:double z:3:double",
+    "Visibility": "is_occluded:1:bool",
 }
 
 
@@ -99,14 +67,14 @@ def _message_classes() -> dict[str, Any]:
     of = descriptor_pb2.FieldDescriptorProto
     for message, fields in _MESSAGES.items():
         declared = file.message_type.add(name=message)
-        for name, number, kind in fields:
+        for name, number, kind in (field.split(":") for field in fields.split()):
             label = of.LABEL_REPEATED if kind.startswith("*") else of.LABEL_OPTIONAL
             kind = kind.removeprefix("*")
             if kind in _MESSAGES:
                 typed = {"type": of.TYPE_MESSAGE, "type_name": f".waymo.{kind}"}
             else:
                 typed = {"type": getattr(of, f"TYPE_{kind.upper()}")}
-            declared.field.add(name=name, number=number, label=label, **typed)
+            declared.field.add(name=name, number=int(number), label=label, **typed)
     pool = descriptor_pool.DescriptorPool()
     pool.AddSerializedFile(file.SerializeToString())
     return {name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"waymo.{name}")) for name in _MESSAGES}
@@ -125,37 +93,26 @@ def parse(message: str, data: bytes, largest: int) -> Any:
         raise InputError(f"message {message} is cut off or damaged") from None
 
 
-class WaymoV1:
-    """Reads version 1.4. A part is a file. margin: how far around the labelled box points are taken, m."""
+def parts(root: Path) -> list[str]:
+    """The files, as paths below the root, none where there are none."""
+    found = (path.relative_to(root).as_posix() for split in SPLITS for path in (root / split).glob("*.tfrecord"))
+    return sorted(found)
 
-    name = "waymo"
-    skeleton = WAYMO14.name
 
-    def __init__(self, *, margin: float = MARGIN):
-        self.margin = margin
-        self.about = about(margin)
-
-    def parts(self, root: Path) -> list[str]:
-        """The files, as paths below the root. Raises InputError where there are none."""
-        found = [path.relative_to(root).as_posix() for split in SPLITS for path in (root / split).glob("*.tfrecord")]
-        if not found:
-            raise file_error(root, "has no training/*.tfrecord or validation/*.tfrecord")
-        return sorted(found)
-
-    def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
-        """Everybody with keypoints in a file, frame by frame. After a damaged record the rest is given up."""
-        start = None
-        try:
-            for number, data in enumerate(records(root / part)):
-                try:
-                    frame = _frame(parse("Frame", data, _LARGEST_FRAME), start, self.margin)
-                except InputError as error:
-                    yield Skipped(reason=BAD_FRAME, where=f"{part}: record {number}: {error}")
-                    continue
-                start = frame.start
-                yield from frame.found()
-        except InputError as error:
-            yield Skipped(reason=BAD_REST, where=f"{part}: {error}")
+def read(root: Path, part: str, margin: float) -> Iterator[LabeledSample | Skipped]:
+    """Everybody with keypoints in a file, frame by frame. After a damaged record the rest is given up."""
+    start = None
+    try:
+        for number, data in enumerate(records(root / part)):
+            try:
+                frame = _frame(parse("Frame", data, _LARGEST_FRAME), start, margin)
+            except InputError as error:
+                yield Skipped(frames.BAD_FRAME, f"{part}: record {number}: {error}")
+                continue
+            start = frame.start
+            yield from frame.samples()
+    except InputError as error:
+        yield Skipped(frames.BAD_REST, f"{part}: {error}")
 
 
 def records(path: Path) -> Iterator[bytes]:
@@ -188,7 +145,7 @@ def _masked_checksum(data: bytes) -> int:
     return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
 
 
-def _frame(message: Any, start: int | None, margin: float) -> Frame:
+def _frame(message: Any, start: int | None, margin: float) -> frames.Frame:
     """A frame with its range images. start: timestamp of the segment's first frame, None where it is this one.
 
     Raises InputError where its labels cannot be read.
@@ -197,7 +154,7 @@ def _frame(message: Any, start: int | None, margin: float) -> Frame:
     if not name or not message.HasField("timestamp_micros"):
         raise InputError("is no frame of Waymo's perception dataset: it has no segment or no time")
     people = [_person(label) for label in message.laser_labels if label.HasField("laser_keypoints")]
-    frame = Frame(
+    frame = frames.Frame(
         sequence=name,
         timestamp=message.timestamp_micros,
         start=message.timestamp_micros if start is None else start,
@@ -210,11 +167,11 @@ def _frame(message: Any, start: int | None, margin: float) -> Frame:
         try:
             _add_images(frame, laser)
         except InputError as error:
-            frame.fail(BAD_IMAGE, str(error))
+            frame.fail(frames.BAD_IMAGE, str(error))
     return frame
 
 
-def _person(label: Any) -> LabelledPerson:
+def _person(label: Any) -> frames.LabeledPerson:
     keypoints, box = [], None
     for keypoint in label.laser_keypoints.keypoint:
         if keypoint.keypoint_3d.HasField("location_m"):
@@ -224,14 +181,14 @@ def _person(label: Any) -> LabelledPerson:
         b = label.box
         box = (b.center_x, b.center_y, b.center_z, b.length, b.width, b.height, b.heading)
     counted = label.num_lidar_points_in_box if label.HasField("num_lidar_points_in_box") else None
-    return person(label.id.decode("utf-8", "replace"), keypoints, box, label.type, counted)
+    return frames.person(label.id.decode("utf-8", "replace"), keypoints, box, label.type, counted)
 
 
 def _transform(message: Any, field: str, what: str) -> np.ndarray | None:
-    return transform(getattr(message, field).transform, what) if message.HasField(field) else None
+    return frames.transform(getattr(message, field).transform, what) if message.HasField(field) else None
 
 
-def _calibrations(messages: Any) -> dict[int, Calibration]:
+def _calibrations(messages: Any) -> dict[int, frames.Calibration]:
     found = {}
     for one in messages:
         beams = np.array(one.beam_inclinations)
@@ -240,13 +197,13 @@ def _calibrations(messages: Any) -> dict[int, Calibration]:
         has_range = one.HasField("beam_inclination_min") and one.HasField("beam_inclination_max")
         if extrinsic is None or not len(beams) and not has_range:
             raise InputError(f"the calibration of laser {one.name} lacks its extrinsic or its beam inclinations")
-        found[one.name] = Calibration(
+        found[one.name] = frames.Calibration(
             laser=one.name, T_vehicle_laser=extrinsic, inclinations=beams if len(beams) else None, low=low, high=high
         )
     return found
 
 
-def _add_images(frame: Frame, laser: Any) -> None:
+def _add_images(frame: frames.Frame, laser: Any) -> None:
     """Adds both returns of a laser; the pixels' poses are beside the first."""
     poses = _matrix(laser.ri_return1.range_image_pose_compressed)
     for which, image in enumerate((laser.ri_return1, laser.ri_return2), 1):
@@ -269,6 +226,6 @@ def _matrix(compressed: bytes) -> np.ndarray | None:
     matrix = parse("MatrixFloat", content, _LARGEST_IMAGE)
     sizes = list(parse("Shape", matrix.shape, _LARGEST_SHAPE).dims)
     count, rest = divmod(len(matrix.data), 4)
-    if rest or not is_image(sizes, count):
+    if rest or not frames.is_image(sizes, count):
         raise InputError(f"a range image of {count} values says it is {reprlib.repr(sizes)}")
     return np.frombuffer(matrix.data, "<f4").reshape(sizes)
