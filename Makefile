@@ -2,13 +2,17 @@
 PYTHON ?= python3
 PIP = .venv/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test lint docs clean
+.PHONY: demo test fuzz lint docs clean
 
 demo: .venv/synth
 	.venv/bin/lidarpose demo
 
 test: .venv/test
 	OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 --dist loadfile
+
+# damaged and hostile files for the readers, about ten minutes, other ones each time
+fuzz: .venv/test
+	OMP_NUM_THREADS=1 FUZZ_EXAMPLES=7500 .venv/bin/python -m pytest tests/test_fuzz.py
 
 lint: .venv/test
 	$(PIP) ruff

@@ -1,12 +1,12 @@
 """Boxes from JSON: what is accepted, and one line for each mistake."""
 
 import copy
-import io
 import json
 import math
 
 import numpy as np
 import pytest
+from hostile_files import KITTI, npy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -72,14 +72,7 @@ def test_nobody_is_legal():
     assert read_boxes([]) == read_boxes({"people": []}) == []
 
 
-KITTI = b"Pedestrian 0 0 -0.2 712 143 810 307 1.89 0.48 1.2 1.84 1.47 8.41 0.01\n"
 ROW = [10.0, -2.0, 0.5, 0.6, 0.7, 1.8, 0.3]
-
-
-def npy(array):
-    file = io.BytesIO()
-    np.save(file, array)
-    return file.getvalue()
 
 
 def fields(box):

@@ -1,0 +1,122 @@
+"""Any file is read or refused in one line: damaged ones, and hostile ones put together from the parts of good ones.
+
+`make fuzz` runs this for about ten minutes, on other examples each time.
+"""
+
+import os
+import struct
+
+import numpy as np
+import pytest
+import safetensors.numpy
+from hostile_files import BOX_FILES, CALIBRATION, PICKLE_PIECES, PICKLES, POINT_FILES, damaged
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from lidarpose.errors import InputError
+from lidarpose.io.boxes import read_boxes
+from lidarpose.io.pickles import load_pickle
+from lidarpose.io.point_cloud import read_points
+from lidarpose.models import bundled_path
+from lidarpose.models.checkpoint import ENTRY, SafetensorsFile, read_header
+
+fuzz = settings(
+    max_examples=int(os.environ.get("FUZZ_EXAMPLES", 100)),
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("fuzz")
+
+
+def read_or_refuse(read, path, content):
+    """What `read` gives, or None for an error of one line that names the file."""
+    path.write_bytes(content)
+    try:
+        return read(path)
+    except InputError as error:
+        assert str(error).isprintable() and len(str(error)) < 1000 and str(path) in str(error)
+        return None
+
+
+@pytest.mark.parametrize("read, files", [(read_points, POINT_FILES), (load_pickle, PICKLES)])
+def test_undamaged_files_are_read(folder, read, files):
+    for name, content in files.items():
+        assert read_or_refuse(read, folder / name, content) is not None
+
+
+@fuzz
+@given(file=damaged(POINT_FILES))
+def test_points(folder, file):
+    cloud = read_or_refuse(read_points, folder / file[0], file[1])
+    if cloud is not None:
+        assert cloud.points.ndim == 2 and cloud.points.shape[1] == 3 and np.isfinite(cloud.points).all()
+
+
+@fuzz
+@given(file=damaged(BOX_FILES), calibration=damaged({"calib.txt": CALIBRATION}), is_damaged=st.booleans())
+def test_boxes(folder, file, calibration, is_damaged):
+    calib = folder / "calib.txt"
+    calib.write_bytes(calibration[1] if is_damaged else CALIBRATION)
+    for path in (folder / file[0], calib):
+        path.touch()
+    try:
+        boxes = read_or_refuse(lambda path: read_boxes(path, calib=calib), folder / file[0], file[1])
+    except AssertionError:
+        # the error names the calibration
+        with pytest.raises(InputError, match="calib.txt: "):
+            read_boxes(folder / file[0], calib=calib)
+        boxes = None
+    for box in boxes or ():
+        assert np.isfinite([*box.center, *box.size, box.yaw]).all() and (box.size > 0).all()
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=9),
+    lambda part: (
+        st.lists(part, max_size=8)
+        | st.dictionaries(
+            st.sampled_from(["people", "center", "size", "yaw", "id", "track"]) | st.text(max_size=3), part
+        )
+    ),
+    max_leaves=30,
+)
+
+
+@fuzz
+@given(content=JSON)
+def test_structures_of_boxes(content):
+    if isinstance(content, list | dict):
+        try:
+            read_boxes(content)
+        except InputError as error:
+            assert str(error).isprintable()
+
+
+@fuzz
+@given(
+    content=damaged(PICKLES).map(lambda file: file[1])
+    | st.binary(max_size=80).map(lambda data: b"\x80\x02" + data + b".")
+    | st.lists(st.sampled_from(PICKLE_PIECES), max_size=40).map(lambda pieces: b"".join(pieces) + b".")
+)
+def test_pickles(folder, content):
+    """Also instructions in any order, with small arguments: they reach what random bytes hardly ever do."""
+    read_or_refuse(load_pickle, folder / "f.pkl", content)
+
+
+_HEADER = SafetensorsFile.open(bundled_path(), tensors=False).metadata[ENTRY]
+WEIGHTS = {"w.safetensors": safetensors.numpy.save({"a": np.zeros(3, np.float32)}, metadata={ENTRY: _HEADER})}
+
+
+@fuzz
+@given(file=damaged(WEIGHTS), is_fitted=st.booleans())
+def test_headers_of_weights(folder, file, is_fitted):
+    name, content = file
+    if is_fitted:
+        # with the length that the damaged header has, so that its content is looked at
+        content = struct.pack("<Q", max(len(content) - 8 - 12, 0)) + content[8:]
+    read_or_refuse(read_header, folder / name, content)
+    read_or_refuse(lambda path: SafetensorsFile.open(path).check_digest(), folder / name, content)
