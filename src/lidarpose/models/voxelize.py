@@ -75,67 +75,43 @@ def voxelize(
     seeds: np.ndarray | None = None,
     neighbors: bool = False,
 ) -> VoxelPyramid:
-    """Voxels of people whose points (M, 3) m stand one after the other, `lengths` (B,) points each, person's frame.
+    """Voxels of people, at three sizes.
 
-    grid: edge of a fine voxel in meters; the mid and coarse ones are 2 and 4 times as wide. A person of more than
-    `max_voxels` fine voxels keeps that many: evenly spread ones, or with seeds (B,) whole numbers random ones, drawn
-    from the person's own seed. Every person of at least one point inside the window has at least one voxel at every
-    level; one of none has only padding. neighbors: also make the tables of the mid and coarse level that convolutions
-    read.
-    Twin: `voxelize_reference` of the tests. Raises InputError for a grid too fine for the voxel index.
+    A person of more than `max_voxels` fine voxels keeps that many. Every person of at least one point inside the window
+    has at least one voxel at every level; one of none has only padding. Twin: `voxelize_reference` of the tests.
+
+    Args:
+        points: (M, 3) m, each in its person's frame; people one after the other.
+        lengths: (B,) points of each person.
+        grid: edge of a fine voxel in meters; the mid and coarse ones are 2 and 4 times as wide.
+        max_voxels: fine voxels a person at the most.
+        view: (B, 5), see `view_features`.
+        seeds: (B,) whole numbers: the voxels that are kept are random ones, by the person's own seed; None: evenly
+            spread ones.
+        neighbors: also make the tables of the mid and coarse level that convolutions read.
+
+    Raises InputError for a grid too fine for the voxel index.
     """
     if WINDOW / grid > 1 << (_BITS - 1):
         raise InputError(f"grid must be at least {WINDOW / (1 << (_BITS - 1)):.4f} m, got {grid}")
     people = len(lengths)
-    inside = (np.abs(points) < WINDOW).all(1)
-    kept = np.flatnonzero(inside)
-    person = np.repeat(np.arange(people), lengths)[kept]
-    cell = np.floor(points[kept] / grid).astype(np.int64) + (1 << (_BITS - 1))
-    key = ((person << _BITS | cell[:, 0]) << _BITS | cell[:, 1]) << _BITS | cell[:, 2]
-    voxel_key, voxel_of_point, count = np.unique(key, return_inverse=True, return_counts=True)
-
-    chosen = _thin(voxel_key >> (3 * _BITS), people, max_voxels, seeds)
-    if chosen is not None:
-        new = np.full(len(voxel_key), -1)
-        new[chosen] = np.arange(len(chosen))
-        voxel_key, count = voxel_key[chosen], count[chosen]
-        voxel_of_point = new[voxel_of_point]
-        left = voxel_of_point >= 0
-        kept, voxel_of_point = kept[left], voxel_of_point[left]
-
+    kept, key, voxel_of_point, count = _fine_voxels(points, lengths, grid, max_voxels, seeds)
     xyz = points[kept].astype(np.float64)
-    mean = _segment_sum(voxel_of_point, xyz, len(voxel_key)) / count[:, None]
-    square = _segment_sum(voxel_of_point, xyz**2, len(voxel_key)) / count[:, None]
+    mean = _segment_sum(voxel_of_point, xyz, len(key)) / count[:, None]
+    square = _segment_sum(voxel_of_point, xyz**2, len(key)) / count[:, None]
     deviation = np.sqrt(np.maximum(square - mean**2, 0))
     # from the voxel's own cell: a mean on its border may round into the next one
-    offset = mean / grid - _cells(voxel_key) - 0.5
+    offset = mean / grid - _cells(key) - 0.5
 
-    mid_key, mid_of_fine = np.unique(_parent(voxel_key), return_inverse=True)
-    coarse_key, coarse_of_mid = np.unique(_parent(mid_key), return_inverse=True)
-    mid_sum, mid_count = _pool(mid_of_fine, mean * count[:, None], count, len(mid_key))
-    coarse_sum, coarse_count = _pool(coarse_of_mid, mid_sum, mid_count, len(coarse_key))
-
-    fine_slots, mid_slots, coarse_slots = (_Slots(k >> (3 * _BITS), people) for k in (voxel_key, mid_key, coarse_key))
+    levels, slots = _levels(key, mean, count, people, neighbors)
     point_voxel = np.full(len(points), -1)
-    point_voxel[kept] = fine_slots.row[voxel_of_point]
+    point_voxel[kept] = slots.row[voxel_of_point]
     return VoxelPyramid(
-        fine=_level(fine_slots, mean, count, mid_slots.slot[mid_of_fine]),
-        mid=_level(
-            mid_slots,
-            mid_sum / mid_count[:, None],
-            mid_count,
-            coarse_slots.slot[coarse_of_mid],
-            _neighbors(mid_key, mid_slots) if neighbors else None,
-        ),
-        coarse=_level(
-            coarse_slots,
-            coarse_sum / coarse_count[:, None],
-            coarse_count,
-            np.zeros(len(coarse_key), np.int64),
-            _neighbors(coarse_key, coarse_slots) if neighbors else None,
-        ),
-        deviation=fine_slots.pad(deviation.astype(np.float32)),
-        offset=fine_slots.pad(offset.astype(np.float32)),
+        fine=levels[0],
+        mid=levels[1],
+        coarse=levels[2],
+        deviation=slots.pad(deviation.astype(np.float32)),
+        offset=slots.pad(offset.astype(np.float32)),
         view=np.zeros((people, 5), np.float32) if view is None else view.astype(np.float32),
         point_voxel=point_voxel,
     )
@@ -166,16 +142,55 @@ class _Slots:
         return out.reshape(self.shape + values.shape[1:])
 
 
-def _level(
-    slots: _Slots, mean: np.ndarray, count: np.ndarray, parent: np.ndarray, neighbors: np.ndarray | None = None
-) -> VoxelLevel:
-    return VoxelLevel(
-        position=slots.pad(mean.astype(np.float32)),
-        log_count=slots.pad(np.log(count).astype(np.float32)),
-        valid=slots.pad(np.ones(len(count), bool)),
-        parent=slots.pad(parent),
-        neighbors=None if neighbors is None else slots.pad(neighbors, slots.shape[1]),
-    )
+def _fine_voxels(
+    points: np.ndarray, lengths: np.ndarray, grid: float, most: int, seeds: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Indices (K,) of the points that count, sorted keys (V,) of their voxels, the voxel (K,) of each point, and how
+    many points (V,) each voxel has."""
+    people = len(lengths)
+    kept = np.flatnonzero((np.abs(points) < WINDOW).all(1))
+    person = np.repeat(np.arange(people), lengths)[kept]
+    cell = np.floor(points[kept] / grid).astype(np.int64) + (1 << (_BITS - 1))
+    key = ((person << _BITS | cell[:, 0]) << _BITS | cell[:, 1]) << _BITS | cell[:, 2]
+    voxel_key, voxel_of_point, count = np.unique(key, return_inverse=True, return_counts=True)
+    chosen = _thin(voxel_key >> (3 * _BITS), people, most, seeds)
+    if chosen is None:
+        return kept, voxel_key, voxel_of_point, count
+    number = np.full(len(voxel_key), -1)
+    number[chosen] = np.arange(len(chosen))
+    voxel_of_point = number[voxel_of_point]
+    left = voxel_of_point >= 0
+    return kept[left], voxel_key[chosen], voxel_of_point[left], count[chosen]
+
+
+def _levels(
+    key: np.ndarray, mean: np.ndarray, count: np.ndarray, people: int, neighbors: bool
+) -> tuple[list[VoxelLevel], _Slots]:
+    """The three levels over fine voxels of sorted keys (V,), and where the fine ones lie."""
+    keys, means, counts, parents = [key], [mean], [count], []
+    total = mean * count[:, None]
+    for _ in range(2):
+        key, parent = np.unique(_parent(keys[-1]), return_inverse=True)
+        total = _segment_sum(parent, total, len(key))
+        keys.append(key)
+        counts.append(np.bincount(parent, counts[-1], len(key)))
+        means.append(total / counts[-1][:, None])
+        parents.append(parent)
+    slots = [_Slots(key >> (3 * _BITS), people) for key in keys]
+    levels = []
+    for k, own in enumerate(slots):
+        parent = slots[k + 1].slot[parents[k]] if k < 2 else np.zeros(len(keys[k]), np.int64)
+        near = own.pad(_neighbors(keys[k], own), own.shape[1]) if neighbors and k > 0 else None
+        levels.append(
+            VoxelLevel(
+                position=own.pad(means[k].astype(np.float32)),
+                log_count=own.pad(np.log(counts[k]).astype(np.float32)),
+                valid=own.pad(np.ones(len(keys[k]), bool)),
+                parent=own.pad(parent),
+                neighbors=near,
+            )
+        )
+    return levels, slots[0]
 
 
 def _cells(key: np.ndarray) -> np.ndarray:
@@ -197,10 +212,6 @@ def _parent(key: np.ndarray) -> np.ndarray:
     axis = (1 << _BITS) - 1
     x, y, z = key >> (2 * _BITS) & axis, key >> _BITS & axis, key & axis
     return ((key >> (3 * _BITS) << _BITS | x >> 1) << _BITS | y >> 1) << _BITS | z >> 1
-
-
-def _pool(parent: np.ndarray, total: np.ndarray, count: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    return _segment_sum(parent, total, size), np.bincount(parent, count, size)
 
 
 def _segment_sum(segment: np.ndarray, values: np.ndarray, size: int) -> np.ndarray:
