@@ -8,7 +8,6 @@ import hashlib
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
 from importlib import import_module
 from itertools import repeat
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Any
 
 from lidarpose.data.readers.base import Reader, Skipped
 from lidarpose.data.schema import labeled_row
-from lidarpose.data.shards import CARD, SENSOR_FRAME, DatasetCard, open_dataset, shard_path, shard_writer, write_card
+from lidarpose.data.shards import CARD, DatasetCard, open_dataset, shard_path, shard_writer, write_card
 from lidarpose.data.splits import SplitRule, split_rule
 from lidarpose.data.summary import summarize
 from lidarpose.data.writer import locked, make_shards, open_folder
@@ -54,16 +53,13 @@ def reader(name: str, smpl: str | Path | None = None, *, level: bool = True) -> 
     """
     check_name("dataset", name, READERS)
     module, kind, takes_smpl = READERS[name]
-    make = getattr(import_module(f"lidarpose.data.readers.{module}"), kind)
-    if name in _LEVELED:
-        make = partial(make, level=level)
-    elif not level:
+    if not level and name not in _LEVELED:
         raise InputError(f"{name} is not turned level, only {', '.join(_LEVELED)} is: leave --no-level away")
-    if not takes_smpl:
-        if smpl is not None:
-            raise InputError(f"{name} has joints of its own: leave the SMPL model out")
-        return make()
-    return make(smpl=smpl)
+    if smpl is not None and not takes_smpl:
+        raise InputError(f"{name} has joints of its own: leave the SMPL model out")
+    options: dict[str, Any] = {"smpl": smpl} if takes_smpl else {}
+    options |= {"level": level} if name in _LEVELED else {}
+    return getattr(import_module(f"lidarpose.data.readers.{module}"), kind)(**options)
 
 
 def prepare(
@@ -100,19 +96,9 @@ def prepare(
     rule = split_rule(name, root, split_by, parts)
     absent = rule.absent(parts) if rule is not None else {}
     parts = _of_split(name, parts, rule, split)
-    about = getattr(source, "about", {})
-    card = _card(name, source, parts, rule, split, about)
+    card = _card(source, parts, rule, split)
     missing = open_folder(out, card)
-    make = PartWriter(
-        name=name,
-        smpl=None if smpl is None else str(smpl),
-        level=level,
-        root=root,
-        out=out,
-        parts=tuple(parts),
-        rule=rule,
-        only=split,
-    )
+    make = PartWriter(reader=source, root=root, out=out, parts=tuple(parts), rule=rule, only=split)
     there = len(parts) - len(missing)
     with locked(out):
         # the summary of a run that is not over would be wrong
@@ -141,26 +127,24 @@ def _of_split(name: str, parts: list[str], rule: SplitRule | None, split: str | 
     return kept
 
 
-def _card(
-    name: str, source: Reader, parts: list[str], rule: SplitRule | None, split: str | None, about: dict[str, Any]
-) -> DatasetCard:
+def _card(source: Reader, parts: list[str], rule: SplitRule | None, split: str | None) -> DatasetCard:
     # the names themselves would fill the line that says what differs
     digest = hashlib.sha256("\n".join(parts).encode("utf-8", "backslashreplace")).hexdigest()[:12]
-    settings: dict[str, Any] = {"what": "parts", "dataset": name, "parts": digest}
+    settings: dict[str, Any] = {"what": "parts", "dataset": source.name, "parts": digest}
     settings |= {"split": split, "split_by": None if rule is None else rule.name}
-    if rule is not None and rule.name == "own":
-        settings["lists"] = hashlib.sha256(repr(sorted(rule.sets.items())).encode()).hexdigest()[:12]
-    told = {key: value for key, value in about.items() if key not in ("frame", "settings")}
+    about = {key: value for key, value in source.about.items() if key not in ("frame", "settings")}
     if rule is not None:
-        told["split"] = f"{rule.name}: {rule.source}" + (f"; LEAKS: {rule.leaks}" if rule.leaks else "")
+        about["split"] = f"{rule.name}: {rule.source}" + (f"; LEAKS: {rule.leaks}" if rule.leaks else "")
+        if rule.name == "own":
+            settings["lists"] = hashlib.sha256(repr(sorted(rule.sets.items())).encode()).hexdigest()[:12]
     return DatasetCard(
-        settings=settings | about.get("settings", {}),
+        settings=settings | source.about["settings"],
         count=len(parts),
         per_shard=1,
         tables=_TABLES,
         skeleton=source.skeleton,
-        frame=about.get("frame", SENSOR_FRAME),
-        about=told | {"parts": parts},
+        frame=source.about["frame"],
+        about=about | {"parts": parts},
     )
 
 
@@ -169,21 +153,15 @@ class PartWriter:
     """Reads parts of a dataset and writes their shards: called with a part's number, yields counts of people as they
     are done. only: the split to keep, None for all; the rest as in `prepare`. May be pickled."""
 
-    name: str
-    smpl: str | None
-    level: bool
+    reader: Reader
     root: Path
     out: Path
     parts: tuple[str, ...]
     rule: SplitRule | None
     only: str | None
 
-    @cached_property
-    def _reader(self) -> Reader:
-        return reader(self.name, self.smpl, level=self.level)
-
     def __call__(self, number: int) -> Iterator[int]:
-        people, waiting = 0, 0
+        people = 0
         with ExitStack() as stack:
             add = {
                 table: stack.enter_context(shard_writer(shard_path(self.out, table, number), table))
@@ -194,21 +172,16 @@ class PartWriter:
                     add["skipped"]({"index": number, "reason": found.reason, "where": found.where})
                 elif self.only in (None, found.split):
                     add["labelled"](labeled_row(found, index=number))
-                    people, waiting = people + 1, waiting + 1
-                if waiting == _TOLD:
-                    yield waiting
-                    waiting = 0
-        yield waiting
+                    people += 1
+                    if people % _TOLD == 0:
+                        yield _TOLD
+        yield people % _TOLD
 
     def _found(self, part: str) -> Iterator[LabeledSample | Skipped]:
         """Everybody in a part, with the split."""
-        if self.rule is None:
-            yield from self._read(part)
-            return
         found: Iterable[LabeledSample | Skipped] = self._read(part)
-        if self.rule.by_part:
-            splits = repeat(self.rule.of_part(part))
-        else:
+        splits: Iterator[str | None] = repeat(None if self.rule is None else self.rule.of_part(part))
+        if self.rule is not None and not self.rule.by_part:
             found = list(found)
             splits = iter(self.rule.of_chunks(part, sum(isinstance(one, LabeledSample) for one in found)))
         for one in found:
@@ -217,7 +190,7 @@ class PartWriter:
     def _read(self, part: str) -> Iterator[LabeledSample | Skipped]:
         """As the reader, but a part that turns out to be unreadable ends there, which is counted."""
         try:
-            yield from self._reader.read(self.root, part)
+            yield from self.reader.read(self.root, part)
         except InputError as error:
             yield Skipped(_REST, f"{part}: {error}")
         except (OSError, ArithmeticError, LookupError, TypeError, ValueError, AttributeError) as error:

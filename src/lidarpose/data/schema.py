@@ -39,59 +39,43 @@ from lidarpose.errors import InputError, MissingExtra
 from lidarpose.sample import SEEN, Box, LabeledSample, PersonInfo, Pose, Sample
 from lidarpose.skeleton import BODY26, skeleton
 
+
+def _columns(text: str) -> dict[str, str]:
+    return dict(column.split(":") for column in text.split())
+
+
 # a field more is a column more, which older shards have not
 INFO = {info.name: {str: "string?", float: "float32?", bool: "bool?"}[info.type] for info in fields(PersonInfo)}
 # origins that published protocols use, by name: a column center_NAME each
 CENTERS = ("trans", "box", "joints_box")
-_BOX = {"box_center": "float64[]?", "box_size": "float64[]?", "box_yaw": "float64?"}
-_SOURCE = {"source": "string", "frame_id": "string"}
+_SAMPLE = _columns("points:float32[] part:uint8[]? ring:int32[]? joints:float32[]")
+_BOX = _columns("box_center:float64[]? box_size:float64[]? box_yaw:float64?")
+_SOURCE = _columns("source:string frame_id:string")
 
 # table -> column -> its type; "[]" marks a list, flattened arrays are lists, and "?" what may be null
 TABLES: dict[str, dict[str, str]] = {
     "people": {
-        "index": "int64",
-        "frame": "int32",
-        "track": "int32",
-        "points": "float32[]",
-        "part": "uint8[]?",
-        "ring": "int32[]?",
-        "joints": "float32[]",
+        **_columns("index:int64 frame:int32 track:int32"),
+        **_SAMPLE,
         "center": "float64[]",
         **_BOX,
         **_SOURCE,
         **INFO,
     },
     "frames": {
-        "index": "int64",
-        "frame": "int32",
-        "sensor": "string",
-        "points": "float32[]",
-        "ring": "int32[]",
-        "person": "int16[]",
-        "part": "uint8[]",
-        "track": "int16[]",
-        "box": "float64[]",
-        "joints": "float32[]",
+        **_columns("index:int64 frame:int32 sensor:string points:float32[] ring:int32[] person:int16[] part:uint8[]"),
+        **_columns("track:int16[] box:float64[] joints:float32[]"),
     },
     "labelled": {
-        "index": "int64",
-        "sequence": "string",
-        "frame": "int64",
-        "track": "string",
-        "time": "float64",
-        "split": "string?",
-        "points": "float32[]",
-        "part": "uint8[]?",
-        "ring": "int32[]?",
-        "joints": "float32[]",
-        "joint_labels": "uint8[]",
-        "center": "float64[]",
+        **_columns("index:int64 sequence:string frame:int64 track:string time:float64 split:string?"),
+        **_SAMPLE,
+        **_columns("joint_labels:uint8[] center:float64[]"),
         **{f"center_{name}": "float64[]?" for name in CENTERS},
         **_BOX,
         "distance": "float32?",
         **_SOURCE,
     },
-    "skipped": {"index": "int64", "reason": "string", "where": "string"},
+    "skipped": _columns("index:int64 reason:string where:string"),
 }
 # whose rows are samples
 _PEOPLE = ("people", "labelled")
@@ -237,12 +221,9 @@ def rows_of(pa, batch, table: str) -> Iterator[dict[str, Any]]:
         if "[]" not in kind:
             columns[name] = column.to_pylist()
             continue
-        values = column.flatten()
-        if values.null_count:
+        if column.flatten().null_count:
             raise InputError(f"column {name} has nulls in its lists, expected {kind}")
-        ends = np.asarray(column.offsets) - column.offsets[0].as_py()
-        flat, there = values.to_numpy(), column.is_valid().to_pylist()
-        columns[name] = [flat[a:b] if ok else None for a, b, ok in zip(ends[:-1], ends[1:], there, strict=True)]
+        columns[name] = [cell.values.to_numpy() if cell.is_valid else None for cell in column]
     for k in range(batch.num_rows):
         row = {name: values[k] for name, values in columns.items()}
         if table == "frames":
@@ -262,16 +243,9 @@ def _column(pa, values: list, kind: str):
     if kind == "string":
         # names from a disk or from JSON may hold what is no character
         values = [value if value is None else value.encode("utf-8", "backslashreplace").decode() for value in values]
-    if not kind.endswith("[]"):
-        return pa.array(values, _type(pa, kind))
-    dtype = kind.removesuffix("[]")
-    null = [value is None for value in values]
-    flat = [np.zeros(0, dtype) if v is None else np.asarray(v, dtype).ravel() for v in values]
-    offsets = np.zeros(len(flat) + 1, np.int32)
-    np.cumsum([len(v) for v in flat], out=offsets[1:])
-    joined = np.concatenate(flat) if flat else np.zeros(0, dtype)
-    mask = pa.array(null) if any(null) else None
-    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(joined), mask=mask)
+    if kind.endswith("[]"):
+        values = [v if v is None else np.asarray(v, kind.removesuffix("[]")).ravel() for v in values]
+    return pa.array(values, _type(pa, kind))
 
 
 def _type(pa, kind: str):

@@ -277,8 +277,7 @@ def table(path: Path, columns: tuple[str, ...], optional: tuple[str, ...] = ()) 
 def laser_keys(path: Path, wanted: Collection[FrameKey]) -> set[LaserKey]:
     """The keys of a file of range images that are of wanted frames. Raises InputError."""
     with _opened(path) as file:
-        groups = range(file.num_row_groups)
-        return {key for group in groups for key in _keys(path, file, group) if key[:2] in wanted}
+        return {key for key in _keys(path, file) if key[:2] in wanted}
 
 
 def images(
@@ -292,20 +291,17 @@ def images(
     names = tuple(f"{column}.{part}" for column in columns for part in ("values", "shape"))
     with _opened(path) as file:
         _check(path, names, file.schema_arrow.names)
+        keys, first = _keys(path, file), 0
         for group in range(file.num_row_groups):
-            keys = _keys(path, file, group)
-            rows = [k for k, key in enumerate(keys) if key[:2] in wanted]
-            if not rows:
-                continue
-            first = 0
-            for batch in file.iter_batches(batch_size=1, row_groups=[group], columns=names, use_threads=False):
-                for k in range(batch.num_rows):
-                    if keys[first + k][:2] in wanted:
-                        cells = [batch.column(name)[k] for name in names]
-                        yield keys[first + k], [_image(*pair) for pair in zip(cells[::2], cells[1::2], strict=True)]
-                first += batch.num_rows
-                if first > rows[-1]:
-                    break
+            own = keys[first : first + file.metadata.row_group(group).num_rows]
+            first += len(own)
+            last = max((k for k, key in enumerate(own) if key[:2] in wanted), default=-1)
+            # nothing is read of a group before the first batch is asked for
+            batches = file.iter_batches(batch_size=1, row_groups=[group], columns=names, use_threads=False)
+            for key, batch in zip(own[: last + 1], batches, strict=False):
+                if key[:2] in wanted:
+                    cells = [batch.column(name)[0] for name in names]
+                    yield key, [_image(*pair) for pair in zip(cells[::2], cells[1::2], strict=True)]
 
 
 def _image(values, shape) -> np.ndarray | None:
@@ -318,9 +314,9 @@ def _image(values, shape) -> np.ndarray | None:
     return flat.reshape(size)
 
 
-def _keys(path: Path, file, group: int) -> list[LaserKey]:
+def _keys(path: Path, file) -> list[LaserKey]:
     _check(path, (SEGMENT, TIME, LASER), file.schema_arrow.names)
-    found = file.read_row_group(group, columns=[SEGMENT, TIME, LASER], use_threads=False).to_pydict()
+    found = file.read(columns=[SEGMENT, TIME, LASER], use_threads=False).to_pydict()
     lasers = [_laser(path, name) for name in found[LASER]]
     return list(zip(found[SEGMENT], found[TIME], lasers, strict=True))
 
