@@ -46,7 +46,7 @@ def test_the_wheel_installs_into_an_empty_environment_and_predicts(tmp_path):
         scripts / "lidarpose", "predict", "person.npy", "--crop", "--picture", "--tta", "1", "--sensor-origin", "0,0,0"
     )
     (result,) = json.loads((tmp_path / "person.poses.json").read_text("utf-8"))["people"]
-    here = lidarpose.load().predict(person.points, sensor_origin=(0, 0, 0))
+    here = lidarpose.load(tta=1).predict(person.points, sensor_origin=(0, 0, 0))
     np.testing.assert_allclose(result["joints"], here.joints, atol=1e-3)
     assert (tmp_path / "person.poses.png").stat().st_size > 10_000
     where = call(scripts / "python", "-c", "import lidarpose; print(lidarpose.__file__)")

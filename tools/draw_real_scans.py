@@ -144,10 +144,10 @@ def draw(scans: dict[str, np.ndarray], poses: dict) -> Figure:
 def draw_scene(ax, points: np.ndarray, poses, boxes: list[dict], camera: Camera, ground: float) -> None:
     person = np.any([near_box(points, box, 0.0) & (points[:, 2] > ground + 0.12) for box in boxes], axis=0)
     draw_points(ax, points, camera, ground=ground, size=60, largest=3, person=person)
-    for box, pose in zip(boxes, poses, strict=True):
+    for pose in poses:
         draw_skeleton(ax, pose, camera, width=2.0)
         head, _ = camera.project(pose.joints[15] + (0, 0, 0.38))
-        ax.text(*head, box["id"], color=INK, fontsize=10, ha="center", weight="bold", zorder=6)
+        ax.text(*head, pose.id, color=INK, fontsize=10, ha="center", weight="bold", zorder=6)
 
 
 def draw_card(ax, points: np.ndarray, pose, box: dict, ground: float) -> None:
@@ -163,7 +163,7 @@ def draw_card(ax, points: np.ndarray, pose, box: dict, ground: float) -> None:
     person = near_box(local, box, 0.0) & (local[:, 2] > ground + 0.12)
     draw_points(ax, local, camera, ground=ground, size=60, largest=7, person=person)
     draw_skeleton(ax, pose, camera, width=2.6)
-    ax.text(0, low + 0.27, box["id"], color=INK, fontsize=9, ha="center", weight="bold")
+    ax.text(0, low + 0.27, pose.id, color=INK, fontsize=9, ha="center", weight="bold")
     text = f"{pose.num_points} points, {distance:.1f} m\nconfidence {pose.confidence.mean():.2f}"
     ax.text(0, low + 0.05, text, color=FAINT, fontsize=7.5, ha="center", linespacing=1.3)
 
@@ -178,8 +178,7 @@ def main() -> None:
     scans, poses = {}, {}
     for name, boxes in BOXES.items():
         scans[name] = read_points(getattr(args, name))
-        crops = [scans[name][near_box(scans[name], box, 0.0)] for box in boxes]
-        poses[name] = model.predict(crops, sensor_origin=(0, 0, 0))
+        poses[name] = model.predict(scans[name], boxes=boxes)
     figure = draw(scans, poses)
     FigureCanvasAgg(figure).print_png(args.out, metadata={"Software": None})
     with Image.open(args.out) as image:
