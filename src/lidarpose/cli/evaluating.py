@@ -2,11 +2,12 @@
 
 import argparse
 import shlex
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 
-from lidarpose.cli.terminal import add_command, is_watched, tell
+from lidarpose.cli.terminal import add_command, tell
 from lidarpose.models import BUNDLED
+from lidarpose.progress import Progress
 
 # groups of rows that the terminal shows; the others are in scores.json
 _SHOWN = ("condition", "plain", "joints", "distance, m", "points", "hidden share")
@@ -100,7 +101,7 @@ def _evaluate(options: argparse.Namespace) -> None:
             decode=options.decode,
             tta=options.tta,
             command=_command(options),
-            progress=_bar(stack) if is_watched() else None,
+            progress=_progress(stack),
         )
     written = evaluation.write(found, folder)
     for result in found.scores.results:
@@ -138,16 +139,16 @@ def _command(options: argparse.Namespace) -> str:
     return shlex.join(words)
 
 
-def _bar(stack: ExitStack):
-    """progress(dataset, done, total) that draws a bar for each dataset; `stack` closes the last."""
-    from tqdm import tqdm
-
-    bars: dict[str, tqdm] = {}
+def _progress(stack: ExitStack) -> Callable[[str, int, int], None]:
+    """progress(dataset, done, total), which shows one dataset after the other; `stack` ends the last."""
+    label, shown = "", None
 
     def progress(dataset: str, done: int, total: int) -> None:
-        if dataset not in bars:
-            bars[dataset] = stack.enter_context(tqdm(total=total or None, desc=dataset, unit=" people", leave=False))
-        bars[dataset].update(done - bars[dataset].n)
+        nonlocal label, shown
+        if dataset != label:
+            stack.close()
+            label, shown = dataset, stack.enter_context(Progress(total or None, unit="people", label=dataset))
+        shown.update(done)
 
     return progress
 

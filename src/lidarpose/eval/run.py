@@ -146,7 +146,7 @@ def _notes(setup: EvalSetup, setting: Setting, predictions: Predictions) -> Iter
         few = "one sequence alone" if sequences == 1 else f"{sequences} sequences alone"
         yield f"{few}: no intervals, which take {LEAST_UNITS}, since frames of a sequence are not independent"
     if setting.kind == BENCH:
-        yield "the baselines use no points: the mean skeleton about the points' center, with the true facing or one for all"
+        yield "baselines use no points: the mean skeleton about the points' center, with the true facing or one for all"
 
 
 def _training_notes(setup: EvalSetup) -> Iterator[str]:
@@ -163,7 +163,7 @@ def _notes_of_run(run: dict, dataset: EvalDataset) -> Iterator[str]:
     data, split = run.get("data") or recipe.get("shards"), recipe.get("split", "all")
     if isinstance(data, list) and dataset.name in data:
         if split == dataset.split or "all" in (split, dataset.split):
-            yield f"the network was trained on split {split} of {dataset.name}: it is scored on people it was trained on"
+            yield f"the network was trained on split {split} of {dataset.name}: it knows who it is scored on"
         elif dataset.split == "val" and "validation_mm" in run:
             yield "the network's run was validated on this split: its best.safetensors was selected on these people"
     made = dataset.settings if dataset.kind == "synth" else {}
@@ -279,6 +279,8 @@ def _loaded(model: Model | str | os.PathLike, **options: Any) -> tuple[Model, di
 
 
 def _counter(name: str, total: int, progress: Callable[[str, int, int], None] | None) -> Callable[[int], None] | None:
+    if progress is None:
+        return None
     done = 0
 
     def add(more: int) -> None:
@@ -286,7 +288,8 @@ def _counter(name: str, total: int, progress: Callable[[str, int, int], None] | 
         done += more
         progress(name, done, total)
 
-    return add if progress is not None else None
+    add(0)
+    return add
 
 
 # ---- the folder of results
