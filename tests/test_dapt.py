@@ -359,9 +359,8 @@ def test_tables_against_dictionaries(legacy):
         assert level.lengths.tolist() == [sum(cell[0] == b for cell in row_of) for b in range(3)]
         for b in range(3):
             rows = level.slots[b]
-            assert {cell_of[row][0] for row in rows} == {b} and len(set(rows)) == level.lengths[b] == level.valid[
-                b
-            ].sum()
+            assert {cell_of[row][0] for row in rows} == {b}
+            assert len(set(rows)) == level.lengths[b] == level.valid[b].sum()
         assert_neighbors(level.near, row_of, 1)
         if depth == 0:
             assert_neighbors(tables.stem, row_of, 2)
@@ -487,10 +486,8 @@ def test_a_large_cloud_is_cut_into_patches(legacy):
     tables = build_tables([cloud, person(40, 1)], config)
     level = tables.levels[0]
     assert level.lengths[0] > 3000 and level.sequence.shape[0] == 4
-    assert level.patch_lengths.tolist() == [512] * (level.lengths[0] // 512) + [
-        level.lengths[0] % 512,
-        level.lengths[1],
-    ]
+    whole = [512] * (level.lengths[0] // 512)
+    assert level.patch_lengths.tolist() == [*whole, level.lengths[0] % 512, level.lengths[1]]
     ends = np.cumsum(level.patch_lengths)[:-1]
     for sequence in level.sequence:
         assert sorted(sequence) == list(range(len(sequence)))

@@ -13,6 +13,7 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.models.config import BIN, NetworkConfig, preset
 from lidarpose.models.decode import HALF_WIDTH
+from lidarpose.models.decode import window as window_mean
 from lidarpose.models.layers import (
     REACH,
     Convolution,
@@ -44,13 +45,7 @@ BINS = round(2 * WINDOW / BIN)
 
 @cache
 def network():
-    """Random weights everywhere: fresh layers of zeros would hide what they read."""
-    torch.manual_seed(0)
-    made = PoseNet(TINY).eval()
-    with torch.no_grad():
-        for value in made.parameters():
-            value += 0.05 * torch.randn_like(value)
-    return made
+    return random_network(TINY).eval()
 
 
 def person(n, seed=0):
@@ -58,14 +53,26 @@ def person(n, seed=0):
     return (rng.normal(0, [0.2, 0.2, 0.5], (n, 3))).astype(np.float32)
 
 
-def batch_of(clouds, max_voxels=TINY.max_voxels, known=True):
+def batch_of(clouds, max_voxels=TINY.max_voxels, known=True, neighbors=True):
     origin = np.array([-8.0, 1, 1]) if known else None
     view = np.stack([view_features(np.full(3, k), origin) for k in range(len(clouds))])
-    lengths = np.array([len(c) for c in clouds])
-    points = np.concatenate(clouds)
-    return Batch.from_pyramid(
-        voxelize(points, lengths, grid=TINY.grid, max_voxels=max_voxels, view=view, neighbors=True)
-    )
+    options = {"grid": TINY.grid, "max_voxels": max_voxels, "view": view, "neighbors": neighbors}
+    return Batch.from_pyramid(voxelize(np.concatenate(clouds), np.array([len(c) for c in clouds]), **options))
+
+
+def random_network(config):
+    """Random weights everywhere: fresh layers of zeros would hide what they read."""
+    torch.manual_seed(0)
+    made = PoseNet(config)
+    with torch.no_grad():
+        for value in made.parameters():
+            value += 0.05 * torch.randn_like(value)
+    return made
+
+
+def random_targets(people, part):
+    known = torch.ones(people, 26, dtype=torch.bool)
+    return Targets(joints=torch.randn(people, 26, 3) * 0.3, known=known, visible=known, part=part)
 
 
 @torch.inference_mode()
@@ -119,10 +126,8 @@ def test_people_without_points_give_finite_numbers(clouds):
 def test_gradients_are_finite(n):
     model = PoseNet(TINY)
     batch = batch_of([person(n)])
-    known = torch.ones(1, 26, dtype=torch.bool)
     part = torch.where(batch.fine.valid, torch.tensor(3), torch.tensor(-1))
-    targets = Targets(joints=torch.randn(1, 26, 3) * 0.3, known=known, visible=known, part=part)
-    value = total(losses(model(batch), targets))
+    value = total(losses(model(batch), random_targets(1, part)))
     value.backward()
     assert torch.isfinite(value)
     for name, parameter in model.named_parameters():
@@ -187,47 +192,24 @@ def test_configurations():
 def test_sizes(size, parameters):
     made = PoseNet(preset(size))
     assert sum(p.numel() for p in made.parameters()) == parameters
-    tables = voxelize(person(50), np.array([50]), grid=TINY.grid, max_voxels=TINY.max_voxels, neighbors=True)
-    out = made(Batch.from_pyramid(tables))
+    out = made(batch_of([person(50)]))
     assert out.joints().shape == (1, 26, 3) and torch.isfinite(out.joints()).all()
 
 
 @pytest.mark.parametrize("change", [{"heatmap": "full"}, {"heatmap": "none"}, {"convolution": 0}])
 def test_variants(change):
     """The paper's full-range heatmaps, votes alone, no convolutions: each learns, whoever is in the batch."""
-    torch.manual_seed(0)
     config = replace(TINY, **change)
-    made = PoseNet(config)
-    with torch.no_grad():
-        for value in made.parameters():
-            value += 0.05 * torch.randn_like(value)
-    clouds = [person(80, 1), person(700, 2)]
-
-    def run_on(chosen):
-        lengths = np.array([len(c) for c in chosen])
-        tables = voxelize(
-            np.concatenate(chosen),
-            lengths,
-            grid=config.grid,
-            max_voxels=384,
-            view=np.full((len(chosen), 5), 0.5),
-            neighbors=config.convolution,
-        )
-        return made(Batch.from_pyramid(tables))
-
-    out = run_on(clouds)
-    assert_close(of_person(run_on(clouds[:1]), 0), of_person(out, 0))
+    made, clouds = random_network(config), [person(80, 1), person(700, 2)]
+    out, alone = (made(batch_of(chosen, neighbors=config.convolution > 0)) for chosen in (clouds, clouds[:1]))
+    assert_close(of_person(alone, 0), of_person(out, 0))
     bins = {"full": 80, "none": 0}.get(config.heatmap, BINS)
     assert out.heatmap.shape[-1] == bins and out.has_votes == (config.heatmap != "full")
     if config.heatmap == "full":
         assert not out.vote.any() and out.joints().abs().max() < REACH["full"]
     if config.heatmap == "none":
         assert (out.joints() == out.vote).all()
-    known = torch.ones(2, 26, dtype=torch.bool)
-    targets = Targets(
-        joints=torch.randn(2, 26, 3) * 0.3, known=known, visible=known, part=torch.zeros(out.part.shape[:2], dtype=int)
-    )
-    terms = losses(out, targets)
+    terms = losses(out, random_targets(2, torch.zeros(out.part.shape[:2], dtype=int)))
     assert ("vote" in terms) == (config.heatmap != "full") and ("heatmap" in terms) == (config.heatmap != "none")
     total(terms).backward()
     for name, parameter in made.named_parameters():
@@ -286,14 +268,8 @@ def test_an_anchor_reads_the_mean_of_the_voxels_values():
     anchors, believed = torch.randn(1, 3, 14), torch.randn(1, 3, 3)
     voxels, position, count = torch.randn(1, 4, 5), torch.randn(1, 4, 3), torch.tensor([[1.0, 5.0, 2.0, 9.0]])
     valid = torch.tensor([[True, True, True, False]])
-    found = layer(
-        anchors,
-        RotaryEmbedding(believed),
-        voxels,
-        RotaryEmbedding(position),
-        count.log(),
-        key_bias(valid, torch.float32),
-    )
+    places, bias = RotaryEmbedding(position), key_bias(valid, torch.float32)
+    found = layer(anchors, RotaryEmbedding(believed), voxels, places, count.log(), bias)
     for j in range(3):
         mixed = []
         for h in range(2):
@@ -360,26 +336,12 @@ def test_heatmaps_mirror(offset):
     torch.testing.assert_close(bin_centers(BINS), -bin_centers(BINS).flip(-1), atol=1e-6, rtol=0)
 
 
-def decode_slowly(logits):
-    """One heatmap at a time, in plain numbers: mean of the bins about the mode."""
-    mode = max(range(BINS), key=lambda w: logits[w])
-    # as far to either side as the nearer edge allows
-    near = [w for w in range(BINS) if abs(w - mode) <= min(HALF_WIDTH, mode, BINS - 1 - mode)]
-    weight = {w: np.exp(logits[w] - logits[mode]) for w in near}
-    return sum(weight[w] * (-WINDOW + (w + 0.5) * BIN) for w in near) / sum(weight.values())
-
-
 @settings(max_examples=60, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.floats(0.1, 8))
-def test_decoding_against_its_slow_twin(seed, sharp):
-    logits = np.random.default_rng(seed).normal(0, sharp, (2, 3, BINS))
-    slow = [[decode_slowly(row.tolist()) for row in block] for block in logits]
-    torch.testing.assert_close(decode(torch.tensor(logits)), torch.tensor(slow), atol=1e-5, rtol=0, check_dtype=False)
-
-
-def test_two_peaks_decode_to_the_higher_one_not_between():
-    both = torch.log(0.6 * encode(torch.tensor(0.2), SIGMA, BINS) + 0.4 * encode(torch.tensor(-0.2), SIGMA, BINS))
-    assert decode(both).item() == pytest.approx(0.2, abs=0.1 * BIN)
+@given(st.integers(0, 2**32 - 1), st.floats(0.1, 8), st.integers(1, BINS))
+def test_decoding_against_its_twin_in_numpy(seed, sharp, bins):
+    logits = np.random.default_rng(seed).normal(0, sharp, (2, 3, bins))
+    twin = window_mean(logits, low=(0.5 - bins / 2) * BIN, step=BIN)
+    torch.testing.assert_close(decode(torch.tensor(logits)), torch.tensor(twin), atol=1e-5, rtol=0, check_dtype=False)
 
 
 # --- from a sample to a batch

@@ -280,8 +280,8 @@ def _parse_safetensors(path: str | os.PathLike, content: bytes, size: int) -> di
     except (ValueError, AttributeError, KeyError, IndexError, TypeError, RecursionError) as error:
         raise file_error(path, f"its header is damaged ({error}): get the file again") from None
     if size != 8 + length + max(ends):
-        due = 8 + length + max(ends)
-        raise file_error(path, f"the file ends at byte {size:,} where its header says {due:,}: {again}")
+        expected = 8 + length + max(ends)
+        raise file_error(path, f"the file ends at byte {size:,} where its header says {expected:,}: {again}")
     return header
 
 

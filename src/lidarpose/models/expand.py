@@ -98,8 +98,8 @@ def _padded(name: str, old: Tensor, new: Tensor, small: PoseNet, larger: PoseNet
 
 def _places(small: PoseNet, larger: PoseNet) -> Tensor:
     """Where the joint head's old inputs lie among the new ones: the anchors', the voters', and the vote."""
-    (felt, width), (more_felt, wider) = (
+    (voter_channels, width), (more_voter_channels, wider) = (
         (net.config.channels[0] if net.vote is not None else 0, net.config.channels[1]) for net in (small, larger)
     )
-    after = wider + more_felt
-    return torch.cat([torch.arange(width), wider + torch.arange(felt), after + torch.arange(3)])
+    after = wider + more_voter_channels
+    return torch.cat([torch.arange(width), wider + torch.arange(voter_channels), after + torch.arange(3)])

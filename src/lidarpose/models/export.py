@@ -142,9 +142,9 @@ def check(network: PoseNet, run: Callable[[dict[str, np.ndarray]], list[np.ndarr
         arrays = _people(network, sizes)
         with torch.inference_mode():
             expected = ArrayModule(network.eval(), tuple(arrays))(*_tensors(arrays))
-        for name, due, got in zip(OUTPUTS, expected, run(arrays), strict=True):
-            due = due.numpy()
-            off = float(np.abs(got - due).max(initial=0)) if got.shape == due.shape else np.inf
+        for name, expected_values, got in zip(OUTPUTS, expected, run(arrays), strict=True):
+            expected_values = expected_values.numpy()
+            off = float(np.abs(got - expected_values).max(initial=0)) if got.shape == expected_values.shape else np.inf
             if not off <= _TOLERANCE:
                 raise LidarPoseError(
                     f"the exported network's {name} is off by {off:g}, so nothing was written: report this with the "

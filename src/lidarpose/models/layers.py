@@ -273,15 +273,17 @@ class VoteHead(nn.Module):
         nn.init.zeros_(self.residual.bias)
 
     def forward(self, anchors: Tensor, voxels: Tensor, position: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns vote (B, J, 3) m and what the voters felt, (B, J, C)."""
+        """Returns vote (B, J, 3) m and the voters' mean features, (B, J, C)."""
         query = self.query(anchors) * voxels.shape[-1] ** -0.5
         weight = torch.softmax(query @ self.key(voxels).transpose(1, 2) + bias[:, 0], -1)
-        felt = weight @ voxels
-        return weight @ position + (felt[:, :, None] @ self.offset).squeeze(2) + self.residual(anchors), felt
+        voter_features = weight @ voxels
+        return weight @ position + (voter_features[:, :, None] @ self.offset).squeeze(2) + self.residual(
+            anchors
+        ), voter_features
 
 
 class JointHead(nn.Module):
-    """Heatmaps, confidence, spread and visibility of each joint from its anchor, what its voters felt, and its vote."""
+    """Heatmaps, confidence, spread and visibility of each joint: from its anchor, its voters' features, its vote."""
 
     def __init__(self, channels: int, voxel_channels: int, bins: int):
         super().__init__()
@@ -292,9 +294,9 @@ class JointHead(nn.Module):
         self.heatmap = nn.Linear(2 * channels, 3 * bins) if bins else None
         self.certainty = nn.Linear(2 * channels, 3)
 
-    def forward(self, anchors: Tensor, felt: Tensor, vote: Tensor) -> tuple[Tensor, ...]:
+    def forward(self, anchors: Tensor, voter_features: Tensor, vote: Tensor) -> tuple[Tensor, ...]:
         """Returns heatmap (B, J, 3, W), of no bins (B, J, 1, 0); confidence, log_spread, visible (B, J)."""
-        hidden = self.hidden(torch.cat([self.norm(torch.cat([anchors, felt], -1)), vote.detach()], -1))
+        hidden = self.hidden(torch.cat([self.norm(torch.cat([anchors, voter_features], -1)), vote.detach()], -1))
         certainty = self.certainty(hidden).unbind(-1)
         if self.heatmap is None:
             return hidden[..., None, :0], *certainty

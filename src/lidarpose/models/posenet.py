@@ -166,10 +166,10 @@ class PoseNet(nn.Module):
         believed = RotaryEmbedding(level_joints[1].detach())
         anchors = self.exchanges[2](anchors, believed, fine_rows, fine_places, fine.log_count, fine_bias)
 
-        vote, felt = torch.zeros_like(level_joints[0]), anchors[..., :0]
+        vote, voter_features = torch.zeros_like(level_joints[0]), anchors[..., :0]
         if self.vote is not None:
-            vote, felt = self.vote(anchors, fine_rows, fine.position, fine_bias)
-        heatmap, confidence, log_spread, visible = self.joint(anchors, felt, vote)
+            vote, voter_features = self.vote(anchors, fine_rows, fine.position, fine_bias)
+        heatmap, confidence, log_spread, visible = self.joint(anchors, voter_features, vote)
         return Outputs(
             vote=vote,
             heatmap=heatmap,

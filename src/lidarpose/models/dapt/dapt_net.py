@@ -92,11 +92,11 @@ class DaptNet(nn.Module):
             heads["query"] = HeatmapHead(width, config)
         if config.coordinates:
             # the released files hold one of the two heads of an anchor, under one name
-            heads["coordinate" if config.bins else "query"] = _coordinate_head(width, 3)
+            heads["coordinate" if config.bins else "query"] = coordinate_head(width, 3)
         if config.auxiliary:
-            heads["inter_feat"] = _coordinate_head(config.encoder_channels[-1], 3 * len(config.joints))
+            heads["inter_feat"] = coordinate_head(config.encoder_channels[-1], 3 * len(config.joints))
         if config.parts:
-            heads["feat"] = _part_head(config.decoder_channels[0], config.parts)
+            heads["feat"] = part_head(config.decoder_channels[0], config.parts)
         self.heads = nn.ModuleDict(heads)
 
     def forward(self, batch: DaptBatch) -> DaptOutputs:
@@ -149,11 +149,11 @@ class DaptNet(nn.Module):
         finally:
             self.train(was_training)
         names = ("anchors", "logits_x", "logits_y", "logits_z", "inter", "coordinates")
-        found = {name: _array(getattr(out, name))[: len(clouds)] for name in names if getattr(out, name) is not None}
-        found["point_feat_last"] = _array(out.points)[tables.point_voxel]
+        outputs = {name: _array(getattr(out, name))[: len(clouds)] for name in names if getattr(out, name) is not None}
+        outputs["point_feat_last"] = _array(out.points)[tables.point_voxel]
         if out.parts is not None:
-            found["parts"] = _array(out.parts)[tables.point_voxel]
-        return found
+            outputs["parts"] = _array(out.parts)[tables.point_voxel]
+        return outputs
 
     def _layout(self) -> str:
         return "ragged" if self.backbone.keypoint_embedding.device.type == "cpu" else "padded"
@@ -236,12 +236,12 @@ class HeatmapHead(nn.Module):
         return tuple(fc(anchors) for fc in self.fcs)
 
 
-def _coordinate_head(channels: int, out_channels: int) -> nn.Sequential:
+def coordinate_head(channels: int, out_channels: int) -> nn.Sequential:
     """Paper: the decoder D_reg of anchors; also the released code's auxiliary head of the bottleneck."""
     return nn.Sequential(OrderedDict(fc=Perceptron(channels, channels, out_channels)))
 
 
-def _part_head(channels: int, parts: int) -> nn.Sequential:
+def part_head(channels: int, parts: int) -> nn.Sequential:
     """Paper: the decoder D_seg of points. The released code's batch norm here is torch's own, eps 1e-5."""
     norm = RowNorm(channels, eps=1e-5, momentum=0.1)
     layers = nn.Sequential(nn.Linear(channels, channels), norm, nn.GELU(), nn.Linear(channels, parts))

@@ -100,10 +100,10 @@ def _check_ranges(path: Path, config: DaptConfig, loaded: dict[str, torch.Tensor
     """The released heatmap head carries its ranges: they must be those that its logits will be read with."""
     stored = loaded.get("heads.query.coord_range")
     if stored is not None and not torch.allclose(stored, torch.tensor(config.ranges), atol=1e-4):
-        said = stored.double().round(decimals=4).tolist()
-        due = [list(reach) for reach in config.ranges]
+        stored_ranges = stored.double().round(decimals=4).tolist()
+        expected = [list(reach) for reach in config.ranges]
         raise file_error(
             path,
-            f"tensor heads.query.coord_range says {said} m, the configuration {config.name} {due}: "
+            f"tensor heads.query.coord_range says {stored_ranges} m, the configuration {config.name} {expected}: "
             "name the configuration that it was trained with",
         )

@@ -204,11 +204,11 @@ def _neighbors(key: np.ndarray, cells: np.ndarray, reach: int, bits: int, layout
     half = np.arange(taps // 2)
     codes = x[half // side**2] | y[half // side % side] | z[half % side]
     codes |= key >> (3 * wide) << (3 * wide)
-    found = np.searchsorted(key, codes.ravel())
-    found[found == rows] = 0
-    hit = np.flatnonzero(key[found] == codes.ravel())
+    nearest = np.searchsorted(key, codes.ravel())
+    nearest[nearest == rows] = 0
+    occupied = np.flatnonzero(key[nearest] == codes.ravel())
     # the second half of the taps is the first one mirrored, seen from the neighbor
-    tap, target, source = hit // rows, hit % rows, found[hit]
+    tap, target, source = occupied // rows, occupied % rows, nearest[occupied]
     if layout == "padded":
         table = np.full((rows, taps), rows)
         table[target, tap] = source
