@@ -485,16 +485,3 @@ def test_nobody_at_all_is_told(tmp_path, smpl):
     assert summary["people"] == 0 and summary["skipped"] == {"labels without a cloud": 4}
     assert any("nobody in it" in line for line in summary["warnings"])
     assert list(open_dataset(tmp_path / "out")) == []
-
-
-def test_synthetic_datasets_have_no_splits(tmp_path, people_dataset):
-    with pytest.raises(InputError, match="holds synthetic people"):
-        list(open_dataset(people_dataset).samples("test"))
-
-
-@pytest.fixture
-def people_dataset(tmp_path):
-    from lidarpose.data.shards import DatasetCard, write_card
-
-    write_card(tmp_path, DatasetCard(settings={"what": "people"}, count=1, per_shard=1, tables=("people",)))
-    return tmp_path

@@ -97,6 +97,12 @@ def test_humanm3_boxes_are_of_the_joints_and_crop_the_points(tmp_path, smpl):
         np.testing.assert_allclose(box.size, np.ptp(joints, 0) + 0.4, atol=1e-5)
         np.testing.assert_array_equal(item.centers["joints_box"], box.center)
         assert box.contains(item.points, 0.3001).all() and len(item.points) >= 150
+    # the box is 20 cm larger than the joints, and points are taken within 30 cm of it
+    top = items[0].box.center + [0, 0, items[0].box.size[2] / 2]
+    path = tmp_path / items[0].sequence / f"pointcloud/{items[0].frame:06d}.pcd"
+    files.write_pcd(path, [top + [0, 0, more] for more in (0.0, 0.28, 0.32)])
+    (item,) = (one for one in everything("humanm3", tmp_path, smpl)[0] if one.frame_id == items[0].frame_id)
+    assert len(item.points) == 2
 
 
 def test_humanm3_s_database_has_everybody_once(tmp_path, smpl):
@@ -125,11 +131,12 @@ def test_humanm3_says_which_folder_is_incomplete_or_above_the_root(tmp_path, smp
     with pytest.raises(InputError, match="is a folder above HumanM3's root, which is likely .*HumanM3: name that"):
         made("humanm3", smpl).parts(tmp_path)
     assert made("humanm3", smpl).parts(tmp_path / "HumanM3") == ["test/c", "train/a", "train/plaza/p1"]
-    for path in (tmp_path / "HumanM3/train/a/pose_calib").iterdir():
-        path.unlink()
-    (tmp_path / "HumanM3/train/a/pose_calib").rmdir()
-    with pytest.raises(InputError, match="has .*train/a without pose_calib: get that folder too"):
-        made("humanm3", smpl).parts(tmp_path / "HumanM3")
+    shutil.rmtree(tmp_path / "HumanM3/train/a/pose_calib")
+    # its body is no database of people; nor is the database read where a sequence is complete
+    for name in ("SMPL_NEUTRAL.pkl", "train.pkl"):
+        (tmp_path / "HumanM3" / name).write_bytes(pickle.dumps({}))
+        with pytest.raises(InputError, match="has .*train/a without pose_calib: get that folder too"):
+            made("humanm3", smpl).parts(tmp_path / "HumanM3")
 
 
 def test_humanm3_s_database_alone_is_a_root(tmp_path, smpl):
@@ -171,7 +178,7 @@ def test_humanm3_s_clouds_may_lie_beside_its_database(tmp_path, smpl):
 
 
 def test_humanm3_skips_are_counted_and_named(tmp_path, smpl):
-    files.write_humanm3(tmp_path, smpl, sequences=("train/a",), frames=8, first=0)
+    truth = files.write_humanm3(tmp_path, smpl, sequences=("train/a",), frames=9, first=0)
     here = tmp_path / "train/a"
     (here / "pointcloud/000000.pcd").write_bytes((here / "pointcloud/000000.pcd").read_bytes()[:300])
     (here / "pointcloud/000001.pcd").unlink()
@@ -183,36 +190,18 @@ def test_humanm3_skips_are_counted_and_named(tmp_path, smpl):
     content["10"] = (np.array(content["10"]) + 500).tolist()
     (here / "pose_calib/0005.json").write_text(json.dumps(content))
     (here / "pose_calib/0006.json").write_text("{}")
+    content = json.loads((here / "pose_calib/0008.json").read_text())
+    content["2"][0][0] = 1e10
+    (here / "pose_calib/0008.json").write_text(json.dumps(content))
     items, skipped = everything("humanm3", tmp_path, smpl)
-    assert {item.frame for item in items} == {7}
+    check(items, {key: joints for key, joints in truth.items() if key[1:] in ((7, "2"), (7, "10"), (8, "10"))})
     assert reasons(skipped) == {
         "cloud cannot be read": 2, "labels without a cloud": 2, "cloud without labels": 1, "labels cannot be read": 1,
         "several files of one frame": 1, "not 15 joints": 1, "no points in the box": 1, "frame without people": 1,
+        "joints out of reach": 1,
     }  # fmt: skip
     assert any("000000.pcd" in one.where and "cut off" in one.where for one in skipped)
     assert all("\n" not in one.where for one in skipped)
-
-
-def test_humanm3_takes_nothing_but_its_own_database(tmp_path, smpl):
-    files.write_humanm3(tmp_path, smpl, frames=1)
-    (tmp_path / "SMPL_NEUTRAL.pkl").write_bytes(pickle.dumps({}))
-    shutil.rmtree(tmp_path / "test/plaza/seg0/pose_calib")
-    for _ in range(2):
-        with pytest.raises(InputError, match="has .*plaza/seg0 without pose_calib: get that folder too"):
-            made("humanm3", smpl).parts(tmp_path)
-        # nor its own where a sequence is complete
-        (tmp_path / "train.pkl").write_bytes(b"")
-
-
-def test_humanm3_joints_out_of_reach_cost_nobody_else(tmp_path, smpl):
-    truth = files.write_humanm3(tmp_path, smpl, sequences=("train/a",))
-    path = tmp_path / "train/a/pose_calib/0007.json"
-    content = json.loads(path.read_text())
-    content["2"][0][0] = 1e10
-    path.write_text(json.dumps(content))
-    items, skipped = everything("humanm3", tmp_path, smpl)
-    check(items, {key: joints for key, joints in truth.items() if key[1:] != (7, "2")})
-    assert reasons(skipped) == {"joints out of reach": 1} and "train/a/7/2" in skipped[0].where
 
 
 # --- LiDARHuman26M
@@ -319,9 +308,13 @@ def test_sloper4d_reads_refined_poses_and_else_the_others(tmp_path, smpl):
 
 
 def test_sloper4d_is_level_and_about_the_sensor(tmp_path, smpl):
-    files.write_sloper4d(tmp_path, smpl)
-    items, _ = everything("sloper4d", tmp_path, smpl)
-    for item in items:
+    content, _ = files.sloper4d_labels(smpl, "seq001", without=())
+    write_labels(tmp_path, content)
+    for k, item in enumerate(everything("sloper4d", tmp_path, smpl)[0]):
+        # SMPL's trans moves with the joints
+        place, heading = content["first_person"]["lidar_traj"][k, 1:4], 0.4 + 0.1 * k
+        trans = rotation_about("z", -heading) @ (content["second_person"]["opt_trans"][k] - place)
+        np.testing.assert_allclose(item.centers["trans"], trans, atol=1e-6)
         # the head is above the feet, whatever the sensor's tilt, and the person some metres away
         joints = item.joints
         assert joints[15, 2] > joints[[10, 11], 2].max() + 0.8
@@ -470,14 +463,12 @@ def test_a_wrong_root_is_one_line_that_says_what_is_expected_and_where_to_get_it
     with pytest.raises(InputError, match="is not the root of .*expected .* got .* get it at ") as caught:
         made(name, smpl).parts(tmp_path)
     assert "\n" not in str(caught.value)
-
-
-def test_a_missing_component_is_named(tmp_path, smpl):
-    (tmp_path / "labels/3d/pose/5").mkdir(parents=True)
-    with pytest.raises(InputError, match="got no labels/3d/segment"):
-        made("lidarhuman26m", smpl).parts(tmp_path)
-    (tmp_path / "labels/3d/segment").mkdir(parents=True)
-    assert made("lidarhuman26m", smpl).parts(tmp_path) == ["5"]
+    if name == "lidarhuman26m":
+        (tmp_path / "labels/3d/pose/5").mkdir(parents=True)
+        with pytest.raises(InputError, match="got no labels/3d/segment"):
+            made(name, smpl).parts(tmp_path)
+        (tmp_path / "labels/3d/segment").mkdir()
+        assert made(name, smpl).parts(tmp_path) == ["5"]
 
 
 def test_smpl_where_it_is_needed(tmp_path, smpl):
@@ -538,29 +529,6 @@ def test_numbered_files_by_number(tmp_path):
     found = {n: [p.name for p in paths] for n, paths in numbered(tmp_path, ".json").items()}
     assert found == {9: ["0009.json", "9.json"], 10: ["10.json"]} and list(found) == [9, 10]
     assert numbered(tmp_path / "none", ".json") == {}
-
-
-def test_sloper4d_s_trans_moves_with_the_joints(tmp_path):
-    smpl = files.write_smpl(tmp_path / "SMPL_NEUTRAL.npz")
-    content, _ = files.sloper4d_labels(smpl, "seq001", without=())
-    (tmp_path / "raw").mkdir()
-    (tmp_path / "raw/seq001_labels.pkl").write_bytes(pickle.dumps(content))
-    for k, item in enumerate(reader("sloper4d", smpl).read(tmp_path / "raw", "seq001")):
-        place, heading = content["first_person"]["lidar_traj"][k, 1:4], 0.4 + 0.1 * k
-        trans = rotation_about("z", -heading) @ (content["second_person"]["opt_trans"][k] - place)
-        np.testing.assert_allclose(item.centers["trans"], trans, atol=1e-6)
-
-
-def test_humanm3_s_points_reach_beyond_the_box(tmp_path):
-    smpl = files.write_smpl(tmp_path / "SMPL_NEUTRAL.npz")
-    truth = files.write_humanm3(tmp_path, smpl, sequences=("train/a",), frames=1)
-    path = tmp_path / "train/a/pointcloud/000007.pcd"
-    joints = truth["train/a", 7, "2"]
-    low, high = joints.min(0), joints.max(0)
-    # the box is 20 cm larger than the joints, and points are taken within 30 cm of it
-    files.write_pcd(path, [(low + high) / 2 + [0, 0, (high - low)[2] / 2 + 0.2 + more] for more in (0.0, 0.28, 0.32)])
-    (item,) = (one for one in reader("humanm3").read(tmp_path, "train/a") if hasattr(one, "sample"))
-    assert len(item.points) == 2
 
 
 def test_the_longest_end_of_a_path_is_the_cloud(tmp_path):

@@ -13,8 +13,9 @@ from shard_files import write_shard
 
 from lidarpose.cli import main
 from lidarpose.data import shards
-from lidarpose.data.schema import person_row, sample_of
+from lidarpose.data.schema import person_row
 from lidarpose.data.shards import DatasetCard, open_dataset, read_card, read_rows, write_card
+from lidarpose.data.synthetic_info import person_info
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.sample import Box, PersonInfo, Pose, Sample
 from lidarpose.skeleton import BODY26
@@ -65,6 +66,9 @@ def test_samples_come_back_as_they_were(folder, people):
     rows = list(dataset.rows())
     assert [row["index"] for row in rows] == [0, 1, 2, 3] and rows[0]["distance"] is None
     assert (rows[2]["kind"], rows[2]["distance"], rows[2]["upright"]) == ("walk", 7.5, True)
+    assert (found[2].info.kind, found[2].distance, found[2].info.upright) == ("walk", 7.5, True)
+    with pytest.raises(InputError, match="holds synthetic people, which have no split 'test'"):
+        list(dataset.samples("test"))
 
 
 def test_pandas_reads_them(folder, people):
@@ -161,22 +165,12 @@ def test_a_flipped_bit_among_the_points_is_told(folder, people):
         list(open_dataset(folder))
 
 
-def test_facts_are_all_kept():
-    kept = [name for name in shards.TABLES["people"] if name in PersonInfo.__dataclass_fields__]
-    assert kept == list(PersonInfo.__dataclass_fields__)
-
-
 def test_settings_that_differ_are_named(folder):
     found = read_card(folder)
     shards.check_settings(folder, found, found)
     with pytest.raises(InputError, match="count 4 there, 9 asked for; seed null there, 3 asked for") as caught:
         shards.check_settings(folder, found, replace(found, count=9, settings=found.settings | {"seed": 3}))
     assert "\n" not in str(caught.value)
-
-
-def test_a_row_is_enough_for_a_sample(people):
-    row = person_row(people[0], index=0)
-    np.testing.assert_array_equal(sample_of(row).points, people[0].points)
 
 
 def test_rows_that_come_one_by_one_are_written_in_groups(tmp_path, people, monkeypatch):
@@ -212,8 +206,10 @@ def test_every_fact_is_a_column_and_older_shards_may_lack_one(tmp_path, people):
     path = tmp_path / "a.parquet"
     write_shard(path, "people", [person_row(people[0], index=0, facts=FACTS)])
     row = next(read_rows(path, "people"))
-    for fact in fields(PersonInfo):
-        assert row[fact.name] == pytest.approx(getattr(FACTS, fact.name))
+    names = [fact.name for fact in fields(PersonInfo)]
+    assert [name for name in shards.TABLES["people"] if name in names] == names
+    for name in names:
+        assert row[name] == pytest.approx(getattr(FACTS, name))
     parquet.write_table(parquet.read_table(path).drop_columns(["kind"]), path)
     row = next(read_rows(path, "people"))
     assert row["kind"] is None and row["sensor"] == "os1-64"
@@ -291,3 +287,13 @@ def test_without_pyarrow_the_extra_is_named(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(MissingExtra, match="^reading and writing Parquet needs an optional dependency: .*synth"):
         open_dataset(folder)
+
+
+def test_clutter_is_what_stands_above_the_ground_and_is_not_the_body():
+    z = np.array([-1.6, -1.55, -1.0, -0.5, -1.0, -0.2, -0.7, -1.58], np.float32)
+    part = np.array([0, 0, 0, 0, 1, 2, 3, 4], np.uint8)
+    points = np.stack([0 * z + 5, 0 * z, z], 1)
+    pose = Pose(joints=np.zeros((26, 3)), skeleton=BODY26)
+    sample = Sample(points=points, center=np.zeros(3), part=part, pose=pose)
+    facts = person_info(sample, sensor="a", kind="walk", distance=5.0, alone=8, soles=-1.6, tall=1.84)
+    assert facts.clutter == 2 / 8 and facts.visible == 4 / 8 and facts.height_seen == pytest.approx(0.75)

@@ -549,13 +549,8 @@ def test_range_images_are_never_all_in_memory(tmp_path):
     held = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert seen == frames and most + held < values.nbytes / 4
-
-
-def test_only_wanted_rows_are_given(v2):
-    times = [frame.time for frame in files.scene()]
-    path = component(v2, "lidar")
-    found = list(images(path, ("[LiDARComponent].range_image_return1",), {(SEGMENT, times[1])}))
-    assert [key for key, _ in found] == [(SEGMENT, times[1], laser) for laser in range(1, 6)]
+    # only wanted rows are given
+    assert [key for key, _ in images(path, (column,), {("s", 7), ("s", 3)})] == [("s", 3, 1), ("s", 7, 1)]
 
 
 # --- version 1
@@ -643,8 +638,8 @@ def test_a_range_image_of_another_size_than_it_says_is_told(tmp_path, monkeypatc
 
 
 def test_records_come_one_by_one_and_their_checksums_are_castagnoli(tmp_path):
-    # the usual check value of CRC-32C; `files` has an implementation of its own
-    assert files.slow_crc(b"123456789") == 0xE3069283
+    # the usual check value of CRC-32C, masked by hand
+    assert files.masked(b"123456789") == (0xE3069283 >> 15 | (0xE3069283 & 0x7FFF) << 17) + 0xA282EAD8 & 0xFFFFFFFF
     written = [b"", b"a", np.random.default_rng(0).bytes(5000), b"last"]
     (tmp_path / "a").write_bytes(b"".join(map(files.record, written)))
     assert list(waymo_v1.records(tmp_path / "a")) == written

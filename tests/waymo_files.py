@@ -9,6 +9,7 @@ import zlib
 from dataclasses import dataclass, field
 from functools import cache
 
+import google_crc32c
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -314,25 +315,8 @@ def record(data):
 
 
 def masked(data):
-    crc = slow_crc(data)
+    crc = google_crc32c.value(data)
     return ((crc >> 15 | crc << 17 & 0xFFFFFFFF) + 0xA282EAD8) & 0xFFFFFFFF
-
-
-@cache
-def crc_table():
-    table = []
-    for byte in range(256):
-        for _ in range(8):
-            byte = byte >> 1 ^ (0x82F63B78 if byte & 1 else 0)
-        table.append(byte)
-    return table
-
-
-def slow_crc(data):
-    crc, table = 0xFFFFFFFF, crc_table()
-    for byte in data:
-        crc = crc >> 8 ^ table[crc & 255 ^ byte]
-    return crc ^ 0xFFFFFFFF
 
 
 def varint(value):
