@@ -56,40 +56,31 @@ def write_pose_json(folder, rotations, translation, *, up="z", first=1):
     return folder
 
 
-# what other skeletons call SMPL's joints
-CMU_NAMES = dict(pelvis="Hips", spine1="LowerBack", spine2="Spine", spine3="Spine1", neck="Neck", head="Head") | {
-    f"{side}_{joint}": side.title() + name
-    for side in ("left", "right")
-    for joint, name in dict(
-        hip="UpLeg", knee="Leg", ankle="Foot", foot="ToeBase", collar="Shoulder", shoulder="Arm", elbow="ForeArm",
-        wrist="Hand", hand="HandIndex1",
-    ).items()
-}  # fmt: skip
-MIXAMO_NAMES = {
-    k: f"mixamorig:{v.replace('Spine', 'Back').replace('LowerBack', 'Spine')}" for k, v in CMU_NAMES.items()
-}
-ROKOKO_NAMES = CMU_NAMES | {
-    f"{side}_{joint}": side.title() + name
-    for side in ("left", "right")
-    for joint, name in dict(hip="Thigh", knee="Shin", foot="Toe", hand="Finger2").items()
-}
-BLENDER_NAMES = CMU_NAMES | {
-    f"{side}_{joint}": f"{name}.{side[0].upper()}"
-    for side in ("left", "right")
-    for joint, name in dict(
-        hip="thigh", knee="shin", ankle="foot", foot="toe", collar="shoulder", shoulder="upper_arm", elbow="forearm",
-        wrist="hand", hand="f_middle.01",
-    ).items()
-}  # fmt: skip
+# what other skeletons call SMPL's joints: those of the limbs in this order, in a pattern of the side
+_LIMBS = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist", "hand")
+_CENTRAL = dict(pelvis="Hips", spine1="LowerBack", spine2="Spine", spine3="Spine1", neck="Neck", head="Head")
+
+
+def _names(pattern, names):
+    return _CENTRAL | {
+        f"{side}_{joint}": pattern.format(name, Side=side.title(), s=side[0], S=side[0].upper())
+        for side in ("left", "right")
+        for joint, name in zip(_LIMBS, names.split(), strict=True)
+    }
+
+
 SMPL_NAMES = {name: name for name in SMPL24.joints}
-UNREAL_NAMES = CMU_NAMES | {
-    f"{side}_{joint}": f"{name}_{side[0]}"
-    for side in ("left", "right")
-    for joint, name in dict(
-        hip="thigh", knee="calf", ankle="foot", foot="ball", collar="clavicle", shoulder="upperarm", elbow="lowerarm",
-        wrist="hand", hand="middle_01",
-    ).items()
-}  # fmt: skip
+CMU_NAMES = _names("{Side}{}", "UpLeg Leg Foot ToeBase Shoulder Arm ForeArm Hand HandIndex1")
+NAMES = {
+    "smpl": SMPL_NAMES,
+    "cmu": CMU_NAMES,
+    "mixamo": {
+        k: f"mixamorig:{v.replace('Spine', 'Back').replace('LowerBack', 'Spine')}" for k, v in CMU_NAMES.items()
+    },
+    "rokoko": _names("{Side}{}", "Thigh Shin Foot Toe Shoulder Arm ForeArm Hand Finger2"),
+    "blender": _names("{}.{S}", "thigh shin foot toe shoulder upper_arm forearm hand f_middle.01"),
+    "unreal": _names("{}_{s}", "thigh calf foot ball clavicle upperarm lowerarm hand middle_01"),
+}
 
 
 def bvh_text(rotations, translation, *, names=SMPL_NAMES, order="ZXY", unit=0.01, up="y", fps=30.0, drop=()):
@@ -139,22 +130,22 @@ def to_euler(matrix, order):
     return np.stack([first, second, third], -1)
 
 
-# CMU's bones: parent, the joint at the start (whose rotation it has), the joint at the end; `dof` where it turns
+# CMU's bones: parent, the joint at the start (whose rotation it has), the joint at the end
 _ASF = [("lowerback", "root", "pelvis", "spine1"), ("upperback", "lowerback", "spine1", "spine2"),
         ("midback", "upperback", "spine2", "spine3"), ("thorax", "midback", "spine3", "neck"),
         ("lowerneck", "thorax", "neck", "head"), ("upperneck", "lowerneck", "head", None)]  # fmt: skip
-for _s, _l in (("left", "l"), ("right", "r")):
-    _ASF += [
-        (f"{_l}hipjoint", "root", "pelvis", f"{_s}_hip"),
-        (f"{_l}femur", f"{_l}hipjoint", f"{_s}_hip", f"{_s}_knee"),
-        (f"{_l}tibia", f"{_l}femur", f"{_s}_knee", f"{_s}_ankle"),
-        (f"{_l}foot", f"{_l}tibia", f"{_s}_ankle", f"{_s}_foot"),
-        (f"{_l}inner", "midback", "spine3", f"{_s}_collar"),
-        (f"{_l}clavicle", f"{_l}inner", f"{_s}_collar", f"{_s}_shoulder"),
-        (f"{_l}humerus", f"{_l}clavicle", f"{_s}_shoulder", f"{_s}_elbow"),
-        (f"{_l}radius", f"{_l}humerus", f"{_s}_elbow", f"{_s}_wrist"),
-        (f"{_l}hand", f"{_l}radius", f"{_s}_wrist", f"{_s}_hand"),
-    ]  # fmt: skip
+_ASF += [
+    (side[0] + bone, parent if parent in ("root", "midback") else side[0] + parent,
+     start if start in ("pelvis", "spine3") else f"{side}_{start}", f"{side}_{end}")
+    for side in ("left", "right")
+    for bone, parent, start, end in (
+        ("hipjoint", "root", "pelvis", "hip"), ("femur", "hipjoint", "hip", "knee"),
+        ("tibia", "femur", "knee", "ankle"), ("foot", "tibia", "ankle", "foot"),
+        ("inner", "midback", "spine3", "collar"), ("clavicle", "inner", "collar", "shoulder"),
+        ("humerus", "clavicle", "shoulder", "elbow"), ("radius", "humerus", "elbow", "wrist"),
+        ("hand", "radius", "wrist", "hand"),
+    )
+]  # fmt: skip
 ASF_ENDS = {bone: end for bone, _, _, end in _ASF if end}
 
 
@@ -176,12 +167,7 @@ def asf_text(*, length=0.45, seed=0, angle="deg"):
         lines += ["     direction " + " ".join(f"{v:.8f}" for v in way / size), f"     length {size:.8f}"]
         lines += ["     axis " + " ".join(f"{v:.8f}" for v in shown) + "  XYZ"]
         if _turns(bone, start):
-            lines += [
-                "    dof rx ry rz",
-                "    limits (-160.0 20.0)",
-                "           (-70.0 70.0)",
-                "           (-60.0 70.0)",
-            ]
+            lines += ["    dof rx ry rz", "    limits (-160 20)", "           (-70 70)", "           (-60 70)"]
         lines += ["  end"]
     lines += [":hierarchy", "  begin"]
     for parent in dict.fromkeys(p for _, p, _, _ in _ASF):

@@ -1,13 +1,14 @@
-"""Motion: cutting, resampling, windows and pairs; the steadiness of retargeting."""
+"""Captured motion: clips files, cutting, resampling, windows and pairs; retargeting of joint positions."""
 
 import re
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from motion_files import joints_of
 
+from lidarpose.body import rig
 from lidarpose.body.mocap import motion, retarget
 from lidarpose.body.pose_prior import sampling
 from lidarpose.errors import InputError
@@ -15,43 +16,125 @@ from lidarpose.geometry import axis_angle_to_matrix, rotation_about
 from lidarpose.skeleton import SMPL24
 
 J = {name: i for i, name in enumerate(SMPL24.joints)}
+MAIN = [J[n] for n in SMPL24.joints if not n.endswith(("foot", "hand"))]
 
 
 def a_motion(lengths=(8, 1, 13), fps=20.0, seed=0):
     """Clips in which every bone turns evenly about an axis of its own and the pelvis goes straight."""
     rng = np.random.default_rng(seed)
-    rotations, translation = [], []
+    rotations, translation = [np.zeros((0, 24, 3, 3))], [np.zeros((0, 3))]
     for n in lengths:
         time = np.arange(n)[:, None, None] / fps
         turn = axis_angle_to_matrix(rng.normal(0, 1, (1, 24, 3)) * time)
         rotations.append(axis_angle_to_matrix(rng.normal(0, 0.5, (24, 3))) @ turn)
         translation.append(rng.normal(size=3) + time[:, 0] * rng.normal(size=3))
+    lengths = np.array(lengths, int)
     return motion.Motion(
         rotations=np.concatenate(rotations).astype(np.float32),
         translation=np.concatenate(translation).astype(np.float32),
         names=tuple(f"{k:03d}_01" for k in range(len(lengths))),
-        start=np.cumsum(lengths) - lengths,
-        length=np.array(lengths),
-        fps=fps,
-        source="test",
-    )
+        start=np.cumsum(lengths) - lengths, length=lengths, fps=fps, source="test",
+    )  # fmt: skip
+
+
+def stored(tmp_path, **changes):
+    joints = np.random.default_rng(0).normal(size=(10, 24, 3)).astype(np.float32)
+    content = dict(
+        joints=joints, clip=np.array(["002_01", "005_01", "002_02"]), clip_start=np.array([0, 4, 6]),
+        clip_length=np.array([4, 2, 4]), fps=np.float64(10), joint_names=np.array(SMPL24.joints),
+    ) | changes  # fmt: skip
+    path = tmp_path / "clips.npz"
+    np.savez_compressed(path, **{k: v for k, v in content.items() if v is not None})
+    return path, joints
+
+
+# clips files
+
+
+def test_clips_are_read_and_selected(tmp_path):
+    path, joints = stored(tmp_path)
+    clips = motion.load_clips(path)
+    assert len(clips) == 3 and clips.fps == 10 and clips.names == ("002_01", "005_01", "002_02")
+    np.testing.assert_array_equal(clips.joints[clips.frames(1)], joints[4:6])
+    chosen = clips.of(["002"])
+    assert chosen.names == ("002_01", "002_02")
+    np.testing.assert_array_equal(chosen.joints, joints[[0, 1, 2, 3, 6, 7, 8, 9]])
+    np.testing.assert_array_equal(chosen.joints[chosen.frames(1)], joints[6:10])
+    assert clips.of("005").names == ("005_01",)
+    with pytest.raises(InputError, match="'009': there are 002, 005"):
+        clips.of("009")
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"fps": None}, "fps is missing"),
+        ({"joints": np.zeros((10, 23, 3))}, re.escape("(frames, 24, 3)")),
+        ({"joints": np.full((10, 24, 3), np.nan)}, "finite"),
+        ({"clip_length": np.array([4, 2])}, "clip_length"),
+        ({"clip_length": np.array([4, 2, 5])}, "10 frames"),
+        ({"clip_start": np.array([0.0, 4, 6])}, "whole number"),
+        ({"fps": np.array(0.0)}, "above 0"),
+        ({"fps": np.array([1.0, 2.0])}, "one number"),
+        ({"joint_names": np.array(SMPL24.joints[::-1])}, "SMPL's order"),
+        ({"clip": np.array(["a", None, {}], dtype=object)}, "plain arrays"),
+    ],
+)
+def test_a_wrong_clips_file_is_named(tmp_path, changes, message):
+    path, _ = stored(tmp_path, **changes)
+    with pytest.raises(InputError, match=message) as caught:
+        motion.load_clips(path)
+    assert "clips.npz: " in str(caught.value)
+
+
+def test_not_a_clips_file(tmp_path):
+    (tmp_path / "text.npz").write_text("hello")
+    np.save(tmp_path / "one.npy", np.zeros(3))
+    for name, message in (("none.npz", "no such file"), ("text.npz", "not an npz"), ("one.npy", "not an npz")):
+        with pytest.raises(InputError, match=message):
+            motion.load_clips(tmp_path / name)
+
+
+@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(at=st.integers(0, 2**20), bit=st.integers(0, 7), keep=st.integers(0, 2**20))
+def test_a_damaged_clips_file_is_read_or_refused(tmp_path, at, bit, keep):
+    path, _ = stored(tmp_path)
+    data = bytearray(path.read_bytes())
+    data[at % len(data)] ^= 1 << bit
+    path.write_bytes(data if keep % 2 else data[: keep % len(data)])
+    try:
+        motion.load_clips(path)
+    except InputError as error:
+        assert "clips.npz" in str(error)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.int8, np.uint64, np.int32])
+def test_cuts_of_any_whole_numbers(tmp_path, kind):
+    """200 + 200 is 144 in a byte."""
+    clips = dict(clip=np.array(["a", "b"]), clip_start=np.array([0, 120], kind), clip_length=np.array([120] * 2, kind))
+    loaded = motion.load_clips(stored(tmp_path, joints=np.zeros((240, 24, 3), np.float32), **clips)[0])
+    assert [loaded.frames(k) for k in range(2)] == [slice(0, 120), slice(120, 240)]
+    with pytest.raises(InputError, match="inside the 200 frames, got up to frame 240"):
+        motion.load_clips(stored(tmp_path, joints=np.zeros((200, 24, 3), np.float32), **clips)[0])
+
+
+# motion
 
 
 def test_even_turns_stay_even_at_another_rate():
     """The clips of `a_motion` at 20, 50 and 10 frames a second are the same curves."""
-    one = a_motion((9, 21))
+    given = a_motion((9, 21))
     for hz, lengths in ((50.0, (21, 51)), (10.0, (5, 11)), (20.0, (9, 21))):
-        found = one.resampled(hz)
-        assert found.fps == hz and tuple(found.length) == lengths and found.names == one.names
-        back = a_motion((9, 21))
+        other = given.resampled(hz)
+        assert other.fps == hz and tuple(other.length) == lengths and other.names == given.names
         for c in range(2):
-            a, b = found.frames(c), back.frames(c)
-            np.testing.assert_allclose(found.rotations[a][0], back.rotations[b][0], atol=1e-6)
-            np.testing.assert_allclose(found.rotations[a][-1], back.rotations[b][-1], atol=1e-5)
-            np.testing.assert_allclose(found.translation[a][-1], back.translation[b][-1], atol=1e-5)
-            steps = np.swapaxes(found.rotations[a][:-1], -1, -2) @ found.rotations[a][1:]
+            a, b = other.frames(c), given.frames(c)
+            np.testing.assert_allclose(other.rotations[a][0], given.rotations[b][0], atol=1e-6)
+            np.testing.assert_allclose(other.rotations[a][-1], given.rotations[b][-1], atol=1e-5)
+            np.testing.assert_allclose(other.translation[a][-1], given.translation[b][-1], atol=1e-5)
+            steps = np.swapaxes(other.rotations[a][:-1], -1, -2) @ other.rotations[a][1:]
             np.testing.assert_allclose(steps, np.broadcast_to(steps[0], steps.shape), atol=1e-4)
-            np.testing.assert_allclose(np.diff(found.translation[a], 2, axis=0), 0, atol=1e-5)
+            np.testing.assert_allclose(np.diff(other.translation[a], 2, axis=0), 0, atol=1e-5)
 
 
 @settings(max_examples=40, deadline=None)
@@ -63,24 +146,19 @@ def test_even_turns_stay_even_at_another_rate():
     dt=st.integers(0, 50).map(lambda n: n / 100),
 )
 def test_cuts_stay_inside_their_clips(lengths, fps, hz, frames, dt):
-    lengths = np.array(lengths, int)
-    empty = motion.Motion(
-        rotations=np.zeros((0, 24, 3, 3), np.float32), translation=np.zeros((0, 3), np.float32),
-        names=(), start=np.zeros(0, int), length=np.zeros(0, int), fps=fps, source="",
-    )  # fmt: skip
-    one = a_motion(lengths, fps) if len(lengths) else empty
-    found = one.resampled(hz)
-    assert len(found.rotations) == found.length.sum() and (found.length >= (lengths > 0)).all()
-    assert ((found.length - 1) / hz <= (lengths - 1) / fps + 1e-5)[lengths > 0].all()
-    product = found.rotations @ np.swapaxes(found.rotations, -1, -2)
+    given = a_motion(lengths, fps)
+    lengths, other = given.length, given.resampled(hz)
+    assert len(other.rotations) == other.length.sum() and (other.length >= (lengths > 0)).all()
+    assert ((other.length - 1) / hz <= (lengths - 1) / fps + 1e-5)[lengths > 0].all()
+    product = other.rotations @ np.swapaxes(other.rotations, -1, -2)
     np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-5)
-    windows = one.windows(frames)
-    assert windows.shape == (sum(len(range(n - frames + 1)) for n in lengths if n >= frames), frames)
+    windows = given.windows(frames)
+    assert windows.shape == (sum(max(0, n - frames + 1) for n in lengths), frames)
     clip_of = np.repeat(np.arange(len(lengths)), lengths)
     assert (clip_of[windows] == clip_of[windows][:, :1]).all() and (np.diff(windows, axis=1) == 1).all()
-    pairs = one.pairs(dt)
-    assert len(pairs[0]) == sum(max(0, n - int(np.ceil(dt * fps - 1e-5))) for n in lengths)
-    np.testing.assert_allclose(retarget.heading(pairs[0]), 0, atol=1e-5)
+    poses = given.pairs(dt)[0]
+    assert len(poses) == sum(max(0, n - int(np.ceil(dt * fps - 1e-5))) for n in lengths)
+    np.testing.assert_allclose(retarget.heading(poses), 0, atol=1e-5)
 
 
 def test_pairs_are_what_happens_next():
@@ -89,18 +167,18 @@ def test_pairs_are_what_happens_next():
     rotations = np.broadcast_to(np.eye(3), (31, 24, 3, 3)).copy()
     rotations[:, 0] = rotation_about("z", angle)
     way = np.cumsum(np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1) * 0.05, 0)
-    one = motion.Motion(
+    walk = motion.Motion(
         rotations=rotations.astype(np.float32), translation=way.astype(np.float32),
         names=("a",), start=np.array([0]), length=np.array([31]), fps=30.0, source="",
     )  # fmt: skip
-    poses, moved, step = one.pairs(0.1)
+    poses, moved, step = walk.pairs(0.1)
     assert len(poses) == 28 and moved.dtype == step.dtype == np.float32
     np.testing.assert_allclose(retarget.heading(moved), 0.15, atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(step, axis=-1), 0.15, atol=1e-3)
     assert (step[:, 0] > 0.14).all() and (step[:, 1] > 0).all()
-    np.testing.assert_allclose(one.pairs(0)[1], retarget.without_yaw(one.rotations), atol=1e-6)
-    windows = one.windows(16)
-    turned, moved = motion.facing_x(one.rotations[windows], one.translation[windows])
+    np.testing.assert_allclose(walk.pairs(0)[1], retarget.without_yaw(walk.rotations), atol=1e-6)
+    windows = walk.windows(16)
+    turned, moved = motion.facing_x(walk.rotations[windows], walk.translation[windows])
     np.testing.assert_allclose(retarget.heading(turned[:, 0]), 0, atol=1e-5)
     np.testing.assert_allclose(moved[:, 0], 0, atol=1e-6)
     np.testing.assert_allclose(retarget.heading(turned[:, -1]), 0.75, atol=1e-5)
@@ -108,27 +186,25 @@ def test_pairs_are_what_happens_next():
 
 
 def test_a_subject_whose_number_goes_on_is_another_one():
-    """CMU's subjects go from 01 to 144: who trains on 10 must not meet 102, who is kept for judging."""
+    """CMU's subjects go from 01 to 144: who trains on 10 must not meet 102, who is kept for evaluation."""
     names = ("1_01", "10_01", "102_03", "walk01", "02/02_01")
     at, each = np.arange(len(names)), np.ones(len(names), int)
-    some = motion.Clips(joints=np.zeros((5, 24, 3), np.float32), names=names, start=at, length=each, fps=30.0)
-    assert some.of("10").names == ("10_01",) and some.of("1").names == ("1_01",)
-    assert some.of(("walk", "02")).names == ("walk01", "02/02_01")
+    clips = motion.Clips(joints=np.zeros((5, 24, 3), np.float32), names=names, start=at, length=each, fps=30.0)
+    assert clips.of("10").names == ("10_01",) and clips.of("1").names == ("1_01",)
+    assert clips.of(("walk", "02")).names == ("walk01", "02/02_01")
     with pytest.raises(InputError, match="no clip starts with '0'"):
-        some.of("0")
+        clips.of("0")
 
 
 def test_clips_are_chosen_and_joined():
-    one, two = a_motion((4, 2, 6), 20.0), a_motion((7,), 10.0, seed=1)
-    chosen = one.of(("002", "000"))
+    a, b = a_motion((4, 2, 6), 20.0), a_motion((7,), 10.0, seed=1)
+    chosen = a.of(("002", "000"))
     assert chosen.names == ("000_01", "002_01") and tuple(chosen.start) == (0, 4)
-    np.testing.assert_array_equal(chosen.rotations, np.concatenate([one.rotations[:4], one.rotations[6:]]))
-    with pytest.raises(InputError, match="no clip starts with '9': there are 000, 001, 002"):
-        one.of("9")
-    both = motion.join([one, two], source="both")
+    np.testing.assert_array_equal(chosen.rotations, np.concatenate([a.rotations[:4], a.rotations[6:]]))
+    both = motion.join([a, b], source="both")
     assert both.fps == 10 and tuple(both.length) == (2, 1, 3, 7) and both.source == "both"
-    np.testing.assert_array_equal(both.rotations[both.frames(3)], two.rotations)
-    np.testing.assert_allclose(both.rotations[both.frames(2)], one.rotations[[6, 8, 10]], atol=1e-6)
+    np.testing.assert_array_equal(both.rotations[both.frames(3)], b.rotations)
+    np.testing.assert_allclose(both.rotations[both.frames(2)], a.rotations[[6, 8, 10]], atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -149,6 +225,56 @@ def test_what_is_wrong_with_a_motion_is_said(call, message):
 # retargeting
 
 
+@pytest.mark.parametrize("yaw", [0.0, 2.5])
+def test_retargeting_own_poses_gives_them_back(yaw):
+    rotations = sampling.sample_rotations(np.random.default_rng(11), 1500).rotations
+    rotations[:, 0] = rotation_about("z", yaw) @ rotations[:, 0]
+    p = joints_of(rotations)
+    back = retarget.retarget_positions(p + [3.0, -2, 1])
+    error = np.linalg.norm(joints_of(back) - p, axis=-1)[:, MAIN]
+    assert error.mean() < 0.01 and error.mean(0).max() < 0.02 and np.percentile(error, 99.5) < 0.05
+    turn = retarget.heading(back) - retarget.heading(rotations)
+    assert np.median(np.abs((turn + np.pi) % (2 * np.pi) - np.pi)) < 0.02
+    np.testing.assert_allclose(retarget.heading(retarget.without_yaw(back)), 0, atol=1e-5)
+
+
+def test_retargeting_another_body_keeps_the_directions_of_its_limbs():
+    rotations = sampling.sample_rotations(np.random.default_rng(12), 300).rotations
+    rest = retarget.mean_adult_joints() * [1.0, 1.2, 0.8] * 0.9
+    p = rig.forward_kinematics(SMPL24.parents, rest[None], rotations, np.zeros((300, 3)))[1]
+    q = joints_of(retarget.retarget_positions(p))
+    for start, end in (("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist")):
+        for side in ("left", "right"):
+            a, b = (x[:, J[f"{side}_{end}"]] - x[:, J[f"{side}_{start}"]] for x in (p, q))
+            cosine = (a * b).sum(-1) / np.linalg.norm(a, axis=-1) / np.linalg.norm(b, axis=-1)
+            np.testing.assert_allclose(cosine, 1, atol=1e-4)
+
+
+def test_straight_limbs_and_the_rest_pose():
+    rest = retarget.mean_adult_joints()
+    rotations = retarget.retarget_positions(rest[None])
+    np.testing.assert_allclose(rotations[0], np.broadcast_to(np.eye(3), (24, 3, 3)), atol=0.04)
+    straight = rest.copy()  # every limb exactly straight, feet along the shanks
+    for side, sign in (("left", 1), ("right", -1)):
+        limbs = ("hip knee ankle foot", (0, 0, -0.3)), ("shoulder elbow wrist hand", (0, 0.25 * sign, 0))
+        for chain, step in limbs:
+            first, *others = (J[f"{side}_{name}"] for name in chain.split())
+            straight[others] = straight[first] + np.arange(1, 4)[:, None] * np.array(step)
+    rotations = retarget.retarget_positions(straight[None])
+    assert np.isfinite(rotations).all()
+    for name in ("left_hip", "right_hip", "left_knee", "right_shoulder", "left_elbow"):
+        assert np.trace(rotations[0, J[name]]) > 2.8, name
+
+
+def test_an_overstretched_knee_is_not_a_thigh_turned_over():
+    """A knee that is 15 degrees past straight bends by -15 degrees; the thigh keeps its direction."""
+    rotations = np.broadcast_to(np.eye(3), (1, 24, 3, 3)).copy()
+    rotations[:, [J["left_knee"], J["right_knee"]]] = rotation_about("y", np.radians(-15))
+    back = retarget.retarget_positions(joints_of(rotations))
+    assert all(np.trace(back[0, J[name]]) > 2.8 for name in ("left_hip", "right_hip"))
+    np.testing.assert_allclose(joints_of(back), joints_of(rotations), atol=0.01)
+
+
 def arm(bend, twist):
     """The rest pose with the left upper arm turned about itself by `twist` (n,) and the elbow bent by `bend` (n,)."""
     rotations = np.broadcast_to(np.eye(3), (len(bend), 24, 3, 3)).copy()
@@ -157,62 +283,62 @@ def arm(bend, twist):
     return joints_of(rotations)
 
 
+def steps_of(rotations):
+    """Degrees between one frame's rotation and the next one's."""
+    rotations = rotations.astype(float)
+    turn = retarget.rotation_vector(np.swapaxes(rotations[:-1], -1, -2) @ rotations[1:])
+    return np.degrees(np.linalg.norm(turn, axis=-1))
+
+
 @pytest.mark.parametrize("twist", [0.0, 1.5, 2.6, 2.9])
 def test_an_elbow_that_bends_more_and_more_does_not_flip(twist):
     """The upper arm turns over while the bend grows, in steps, however far it was turned."""
-    bend = np.linspace(0.0, 2.9, 300)
-    found = retarget.retarget_positions(arm(bend, np.full(300, twist)))[:, J["left_shoulder"]].astype(float)
-    steps = np.linalg.norm(retarget.rotation_vector(np.swapaxes(found[:-1], -1, -2) @ found[1:]), axis=-1)
-    assert np.degrees(steps.max()) < 20
+    joints = arm(np.linspace(0.0, 2.9, 300), np.full(300, twist))
+    upper = retarget.retarget_positions(joints)[:, J["left_shoulder"]]
+    assert steps_of(upper).max() < 20
     # and once the bend is plain, the twist is the arm's
-    plain = retarget.rotation_vector(found[120:])
+    plain = retarget.rotation_vector(upper[120:])
     np.testing.assert_allclose(plain, np.broadcast_to([0, twist, 0], plain.shape), atol=0.05)
 
 
 def test_a_folded_joint_keeps_its_axis():
     """The sine of a bend near 180 degrees is small, but the joint is not straight."""
-    found = retarget.retarget_positions(arm(np.radians([60.0, 172.0]), np.array([1.2, 1.2])))
-    np.testing.assert_allclose(found[0, J["left_shoulder"]], found[1, J["left_shoulder"]], atol=0.02)
+    back = retarget.retarget_positions(arm(np.radians([60.0, 172.0]), np.array([1.2, 1.2])))
+    np.testing.assert_allclose(back[0, J["left_shoulder"]], back[1, J["left_shoulder"]], atol=0.02)
 
 
 def test_a_hand_across_the_elbows_axis_does_not_flip():
     """A wrist bent sideways points along the axis of the elbow, where that axis says nothing about the hand."""
-    side = np.linspace(1.2, 1.9, 60)
     rotations = np.broadcast_to(np.eye(3), (60, 24, 3, 3)).copy()
     rotations[:, J["left_elbow"]] = rotation_about("z", np.full(60, -1.0))
     # a hair off, so that the hand passes beside the axis and not through it
-    rotations[:, J["left_wrist"]] = rotation_about("z", 0.02) @ rotation_about("x", side)
-    found = retarget.retarget_positions(joints_of(rotations))[:, J["left_wrist"]].astype(float)
-    steps = np.linalg.norm(retarget.rotation_vector(np.swapaxes(found[:-1], -1, -2) @ found[1:]), axis=-1)
-    assert np.degrees(steps.max()) < 5
-
-
-def test_an_overstretched_knee_is_not_a_thigh_turned_round():
-    """A knee that is 15 degrees past straight bends by -15 degrees; the thigh keeps its direction."""
-    rotations = np.broadcast_to(np.eye(3), (1, 24, 3, 3)).copy()
-    for side in ("left", "right"):
-        rotations[:, J[f"{side}_knee"]] = rotation_about("y", np.radians(-15))
-    found = retarget.retarget_positions(joints_of(rotations))
-    for name in ("left_hip", "right_hip"):
-        assert np.trace(found[0, J[name]]) > 2.8
-    np.testing.assert_allclose(joints_of(found), joints_of(rotations), atol=0.01)
+    rotations[:, J["left_wrist"]] = rotation_about("z", 0.02) @ rotation_about("x", np.linspace(1.2, 1.9, 60))
+    back = retarget.retarget_positions(joints_of(rotations))
+    assert steps_of(back[:, J["left_wrist"]]).max() < 5
 
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_retargeting_anything_gives_rotations(seed):
     rng = np.random.default_rng(seed)
-    joints = rng.normal(0, 10 ** rng.uniform(-2, 2), (4, 24, 3))
-    found = retarget.retarget_positions(joints)
-    product = found @ np.swapaxes(found, -1, -2)
+    back = retarget.retarget_positions(rng.normal(0, 10 ** rng.uniform(-2, 2), (4, 24, 3)))
+    product = back @ np.swapaxes(back, -1, -2)
     np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-4)
-    np.testing.assert_allclose(np.linalg.det(found), 1, atol=1e-4)
+    np.testing.assert_allclose(np.linalg.det(back), 1, atol=1e-4)
 
 
-def test_a_bone_without_length_is_named():
+def test_retargeting_says_what_is_wrong():
     joints = joints_of(sampling.sample_rotations(np.random.default_rng(0), 3).rotations)
-    joints[1, J["left_knee"]] = joints[1, J["left_hip"]]
-    with pytest.raises(InputError, match="left_hip -> left_knee has no length in frame 1"):
-        retarget.retarget_positions(joints)
-    length, which = retarget.shortest_bone(joints)
+    short, broken = joints.copy(), joints.copy()
+    short[1, J["left_knee"]] = short[1, J["left_hip"]]
+    broken[1, 4, 0] = np.nan
+    for wrong, message in (
+        (joints[0], re.escape("(n, 24, 3)")),
+        (broken, "finite"),
+        (short, "left_hip -> left_knee has no length in frame 1"),
+    ):
+        with pytest.raises(InputError, match=message):
+            retarget.retarget_positions(wrong)
+    length, which = retarget.shortest_bone(short)
     assert which[1] == "left_hip -> left_knee" and length[1] == 0 and (length[[0, 2]] > 0.05).all()
+    assert retarget.retarget_positions(joints[:0]).shape == (0, 24, 3, 3)

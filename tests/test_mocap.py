@@ -1,0 +1,535 @@
+"""Files of captured motion in every format: what was written comes back on our body, and what is wrong is named."""
+
+import json
+import pickle
+import re
+
+import motion_files as files
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from lidarpose.body.mocap import asf_amc, bvh, digest, joint_positions, joint_tree, load_motion
+from lidarpose.errors import InputError
+from lidarpose.geometry import UP_AXES
+from lidarpose.synth.shard_job import Job
+
+J = files.J
+MAIN = [J[n] for n in J if not n.endswith(("foot", "hand"))]
+ROTATIONS, WAY = files.a_clip(20)
+JOINTS = files.joints_of(ROTATIONS, WAY)
+BVH = files.bvh_text(ROTATIONS, WAY, names=files.CMU_NAMES)
+ASF, AXES = files.asf_text()
+AMC = files.amc_text(ROTATIONS, WAY, AXES)
+
+
+def errors(motion, joints=JOINTS):
+    """Distances (F, 24) m of the joints from where they went in."""
+    return np.linalg.norm(files.joints_of(motion.rotations, motion.translation) - joints, axis=-1)
+
+
+def check_same(motion, rotations, way):
+    """The joints come out where they went in, within 1 mm."""
+    assert motion.rotations.dtype == motion.translation.dtype == np.float32
+    assert errors(motion, files.joints_of(rotations, way)).max() < 1e-3
+
+
+def written(folder, text, name="a.bvh"):
+    (folder / name).write_text(text)
+    return folder / name
+
+
+def refused(path, message, named=None, **options):
+    """`load_motion` raises an InputError of one line that names the file."""
+    with pytest.raises(InputError, match=message) as caught:
+        load_motion(path, **options)
+    assert re.search(rf"{named or re.escape(path.name)}: ", str(caught.value)) and "\n" not in str(caught.value)
+
+
+# BVH, ASF and AMC: positions to less than 0.1 mm, on our body within what retargeting by positions costs
+
+
+@pytest.mark.parametrize("skeleton", files.NAMES)
+def test_a_bvh_of_any_names_comes_back(tmp_path, skeleton):
+    motion = load_motion(written(tmp_path, files.bvh_text(ROTATIONS, WAY, names=files.NAMES[skeleton])))
+    assert motion.names == ("a",) and motion.fps == pytest.approx(30) and motion.dropped == 0
+    assert errors(motion)[:, MAIN].mean() < 0.010 and errors(motion).max() < 0.05
+
+
+@pytest.mark.parametrize("order", ["ZXY", "XYZ", "YXZ", "ZYX", "YZX", "XZY"])
+def test_a_bvh_has_its_joints_where_they_were(tmp_path, order):
+    """The tree's own positions, in centimeters and y up, without retargeting."""
+    tree, values, rate = bvh.read_bvh(written(tmp_path, files.bvh_text(ROTATIONS, WAY, order=order)))
+    assert rate == pytest.approx(30)
+    index = [tree.names.index(name) for name in J]
+    np.testing.assert_allclose(tree.positions(values)[:, index] / 100 @ UP_AXES["y"].T, JOINTS, atol=1e-4)
+
+
+@pytest.mark.parametrize("unit, up", [(1.0, "y"), (0.01, "z"), (0.0254, "y"), (0.001, "x"), (0.0254 / 0.45, "y")])
+def test_units_and_up_are_found(tmp_path, unit, up):
+    path = written(tmp_path, files.bvh_text(ROTATIONS, WAY, names=files.CMU_NAMES, unit=unit, up=up))
+    for motion in (load_motion(path), load_motion(path, up=up)):
+        assert errors(motion)[:, MAIN].mean() < 0.010
+
+
+def test_children_and_tall_people_keep_their_unit():
+    for size in (0.62, 0.8, 1.0, 1.2):
+        for name, meters in joint_positions.UNITS.items():
+            assert joint_positions.meters_per_unit("x", JOINTS[:1] * size / meters) == meters, (size, name)
+
+
+def test_skeletons_with_less(tmp_path):
+    """Without hands, feet, collars' own place and spine joints; what is estimated is plausible."""
+    feet = ("left_foot", "right_foot")
+    text = files.bvh_text(ROTATIONS, WAY, names=files.CMU_NAMES, drop=("left_hand", "right_hand", *feet))
+    error = errors(load_motion(written(tmp_path, text)))
+    no_ankle = [j for j in MAIN if "ankle" not in list(J)[j]]
+    assert error[:, no_ankle].mean() < 0.012 and error[:, [J[foot] for foot in feet]].mean() < 0.12
+    matched = {n: i for n, i in J.items() if n.endswith(("hip", "knee", "ankle", "shoulder", "elbow", "wrist"))}
+    matched["head"] = J["head"]
+    less = joint_tree.JointTree(names=list(J), parents=[-1, *[0] * 23], offsets=np.zeros((24, 3)), channels=[])
+    motion = joint_tree.tree_motion("x", less, JOINTS, fps=10, up="z", kind="test", matched=matched)
+    limbs = [J[f"{side}_{name}"] for side in ("left", "right") for name in ("hip", "knee", "elbow")]
+    assert errors(motion)[:, limbs].mean() < 0.09
+
+
+@pytest.mark.parametrize("length", [0.45, 1.0])
+def test_an_amc_comes_back(tmp_path, length):
+    skeleton, axes = files.asf_text(length=length)
+    written(tmp_path, skeleton, "02.asf")
+    path = written(tmp_path, files.amc_text(ROTATIONS, WAY, axes, length=length), "02_05.amc")
+    tree, values, unit_m = asf_amc.read_amc(path)
+    positions = tree.positions(values) * unit_m @ UP_AXES["y"].T
+    for i, bone in enumerate(tree.names):
+        if bone in files.ASF_ENDS:
+            np.testing.assert_allclose(positions[:, i], JOINTS[:, J[files.ASF_ENDS[bone]]], atol=1e-4)
+    motion = load_motion(path)
+    assert motion.names == ("02_05",) and motion.fps == 120
+    # both collars are one point in this format
+    error = errors(motion)
+    assert error[:, MAIN].mean() < 0.05 and error[:, [J["left_ankle"], J["right_ankle"]]].mean() < 0.02
+
+
+def test_where_the_skeleton_of_an_amc_is_found(tmp_path):
+    path = written(tmp_path, AMC, "02_05.amc")
+    refused(path, "put 02.asf or 02_05.asf beside it")
+    written(tmp_path, ASF, "any.ASF")
+    expected = load_motion(path).rotations
+    written(tmp_path, "nonsense", "02.asf")
+    refused(path, "02.asf: an ASF file has :root", named="02.asf")
+    written(tmp_path, ASF, "02_05.asf")
+    np.testing.assert_array_equal(load_motion(path).rotations, expected)
+    for name in ("02.asf", "02_05.asf"):
+        (tmp_path / name).unlink()
+    written(tmp_path, ASF, "other.asf")
+    refused(path, "there are any.asf, other.asf")
+
+
+def changed(text, old, new, count=1):
+    assert old in text
+    return text.replace(old, new, count)
+
+
+ROW = BVH.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("", "is empty"),
+        ("hello", "starts with HIERARCHY, got 'hello'"),
+        (BVH[: BVH.index("MOTION")], "no MOTION part"),
+        (BVH[:-400], "expected 20 frames of 75 numbers, got .* copied completely"),
+        (BVH[: BVH.index("Frame Time")], "must begin with Frames: and Frame Time:"),
+        (BVH[: BVH.index("Frames")], "must begin with Frames"),
+        (changed(BVH, "Frames: 20", "Frames: x"), "whole number"),
+        (re.sub(r"CHANNELS.*", "CHANNELS 0", BVH), "no joint has CHANNELS"),
+        (changed(BVH, "Frames: 20", "Frames: -1")[: BVH.index(ROW)], "whole number of 0 or more, got ' -1'"),
+        (changed(BVH, "Frames: 20", "Frames: 0")[: BVH.index(ROW)], "frames of 75|no frame"),
+        (re.sub("Frame Time: .*", "Frame Time: 0", BVH), "no frame time above 0"),
+        (re.sub("Frame Time: .*", "Frame Time: x", BVH), "no frame time above 0"),
+        (re.sub("Frame Time: .*", "Frame Time: 1e-300", BVH), "no frame time above 0"),
+        (BVH.replace(ROW, ROW.replace(ROW.split()[7], "abc")), "MOTION must be numbers"),
+        (re.sub(r"OFFSET.*", "OFFSET 0 0 0", BVH), "have no length"),
+        (changed(BVH, "OFFSET", "OFFSET nan"), "3 finite numbers"),
+        (changed(BVH, "CHANNELS 3 Zrotation", "CHANNELS 3 Wrotation"), "the channel 'Wrotation'"),
+        (changed(BVH, "CHANNELS 3", "CHANNELS 4"), "a count and as many names"),
+        (changed(BVH, "OFFSET", "OFFSETS"), "stands where it cannot; expected one ROOT"),
+        (changed(BVH, "{", ""), "stands where it cannot"),
+        (changed(BVH, "}", ""), "not complete"),
+        (changed(BVH, "\nMOTION", "\n}\nMOTION"), "stands where it cannot"),
+        (changed(BVH, "JOINT", "ROOT"), "stands where it cannot"),
+        (changed(BVH, "HIERARCHY", "HIERARCHY\n{"), "stands where it cannot"),
+        (BVH.replace("LeftUpLeg", "Banana").replace("RightForeArm", "Apple"), "joint for left_hip, right_elbow among"),
+        (BVH.replace("Head", "Skulptur"), "no joint for head among Hips, .*; needed are"),
+        (files.bvh_text(ROTATIONS, WAY, unit=0.5), "times as tall as an adult; known units are m, cm"),
+        (files.bvh_text(ROTATIONS, WAY * [100, 100, 1]), "m/s: are positions and bones in one unit"),
+        (files.bvh_text(ROTATIONS, WAY * 1e9), "100 km|m/s"),
+    ],
+)  # fmt: skip
+def test_a_wrong_bvh_is_named(tmp_path, text, message):
+    refused(written(tmp_path, text), message)
+
+
+def test_mixed_units_upside_down_and_no_rate(tmp_path):
+    lines = BVH.splitlines()
+    at = next(i for i, line in enumerate(lines) if "LeftLeg" in line)
+    lines[at + 2] = re.sub(r"(-?[\d.]+)", lambda m: str(float(m[0]) * 100), lines[at + 2])
+    refused(written(tmp_path, "\n".join(lines)), "left leg is .* long, the right .* one unit throughout")
+    over = ROTATIONS.copy()
+    over[:, 0] = np.diag([1.0, -1, -1]) @ over[:, 0]
+    path = written(tmp_path, files.bvh_text(over, WAY, names=files.CMU_NAMES))
+    refused(path, "people stand along -y; give load_motion up='-y'")
+    assert errors(load_motion(path, up="y"), files.joints_of(over, WAY))[:, MAIN].mean() < 0.01
+    assert load_motion(written(tmp_path, re.sub("Frame Time: .*", "Frame Time: 0", BVH)), fps=25).fps == 25
+
+
+def test_bad_frames_of_a_bvh_are_left_out(tmp_path):
+    lines = BVH.splitlines()
+    lines[-6] = "nan " + lines[-6].partition(" ")[2]
+    lines[-3] = lines[-3].rpartition(" ")[0] + " 1e999"
+    motion = load_motion(written(tmp_path, "\n".join(lines)))
+    assert motion.dropped == 2 and tuple(motion.length) == (14, 2, 2)
+    lines[-20:-6] = ["nan " * 75] * 14
+    refused(written(tmp_path, "\n".join(lines)), "16 of 20 frames")
+
+
+@pytest.mark.parametrize(
+    "asf, amc, message",
+    [
+        (ASF, "", "is empty"),
+        (ASF, "hello world\n", "numbered frames of bones, got 'hello world'"),
+        (ASF, ":FULLY-SPECIFIED\n", "no frame"),
+        (ASF, "1\n2\n3\n", "moves no bone"),
+        (ASF, AMC[:-300], "copied completely"),
+        (ASF, AMC.replace("lfemur", "banana"), "moves banana, which s.asf does not have"),
+        (ASF, re.sub("lfemur .*", "lfemur 1 2", AMC), "lfemur has 2 numbers a frame, its skeleton 3"),
+        (ASF, re.sub("lfemur .*", "lfemur 1 2 x", AMC), "numbers of lfemur must be"),
+        ("", AMC, "is empty"),
+        (changed(ASF, ":bonedata", ":bones"), AMC, ":bonedata is missing"),
+        (changed(ASF, "length 0.45", "length 0"), AMC, "length of :units must be above 0"),
+        (changed(ASF, "length 0.45", "length x"), AMC, "length of :units"),
+        (changed(ASF, "angle deg", "angle grad"), AMC, "deg or rad, got 'grad'"),
+        (changed(ASF, "order TX", "order TW"), AMC, "order of :root"),
+        (changed(ASF, "name lfemur", "name"), AMC, "has no name"),
+        (changed(ASF, "name lfemur", "name rfemur"), AMC, "rfemur twice"),
+        (changed(ASF, "     direction", "     direktion"), AMC, "lowerback has no direction"),
+        (changed(ASF, "  XYZ\n", "  XYY\n"), AMC, "order such as XYZ"),
+        (changed(ASF, "dof rx", "dof l"), AMC, "the freedom 'l'"),
+        (changed(ASF, "  end\n:hierarchy", ":hierarchy"), AMC, "stops inside a bone"),
+        (re.sub("root lower", "root nobody lower", ASF), AMC, "names 'nobody'"),
+        (re.sub("root lowerback", "root", ASF), AMC, "lowerback.* hangs from nothing"),
+        (ASF + "  root ltibia\n", AMC, "ltibia twice"),
+        (ASF.replace("ltibia", "lshin"), AMC.replace("ltibia", "lshin"), "s.asf: has no bone ltibia among"),
+        (re.sub(r"     length \S+", "     length 0", ASF), AMC, "have no length"),
+        (re.sub(r"     length (\S+)", "     length 1e300", ASF), AMC, "expected joints at finite positions"),
+    ],
+)  # fmt: skip
+def test_a_wrong_amc_or_asf_is_named(tmp_path, asf, amc, message):
+    written(tmp_path, asf, "s.asf")
+    refused(written(tmp_path, amc, "s_1.amc"), message, named=r"s(_1\.amc|\.asf)")
+
+
+# whatever stands in a file, an InputError is all that comes
+
+SHORT = files.bvh_text(ROTATIONS[:2], WAY[:2], names=files.CMU_NAMES)
+SHORT_AMC = files.amc_text(ROTATIONS[:2], WAY[:2], AXES)
+ODD = st.sampled_from(
+    ["", "{", "}", "nan", "1e308", "-1e308", "inf", "0", "9" * 30, "\x00", "JOINT x", "End Site", "MOTION", "OFFSET",
+     "XYZ", ":root", "begin", "end", "root", "lfemur", "name", "dof rx", "ROOT", "Frames: 3", "\n", "é", "Hips"]
+)  # fmt: skip
+
+
+def damaged(text, places, odd, cut):
+    words = re.split(r"(\s+)", text)
+    for place, word in zip(places, odd, strict=False):
+        words[int(place * (len(words) - 1))] = word
+    return "".join(words)[: int(cut * len(text)) + 1]
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    which=st.sampled_from(["a.bvh", "s.asf", "s_1.amc"]),
+    places=st.lists(st.floats(0, 1), max_size=4),
+    odd=st.lists(ODD, max_size=4),
+    cut=st.one_of(st.just(1.1), st.floats(0, 1)),
+)
+def test_a_damaged_text_file_never_crashes(tmp_path, which, places, odd, cut):
+    texts = {"a.bvh": SHORT, "s.asf": ASF, "s_1.amc": SHORT_AMC}
+    for name, text in texts.items():
+        text = damaged(text, places, odd, cut) if name == which else text
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    try:
+        motion = load_motion(tmp_path / ("a.bvh" if which == "a.bvh" else "s_1.amc"))
+    except InputError as error:
+        assert "\n" not in str(error)
+    else:
+        assert np.isfinite(motion.rotations).all()
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.binary(max_size=200), suffix=st.sampled_from([".bvh", ".amc", ".json", ".npz"]))
+def test_any_bytes_are_an_input_error(tmp_path, data, suffix):
+    for name in ("a.asf", f"a{suffix}"):
+        (tmp_path / name).write_bytes(data)
+    with pytest.raises(InputError):
+        load_motion(tmp_path / f"a{suffix}")
+
+
+# formats of SMPL's rotations, which keep every turn
+
+
+@pytest.mark.parametrize("width, rate", [(156, "mocap_framerate"), (165, "mocap_frame_rate"), (72, "fps"), (66, "fps")])
+def test_amass_comes_back(tmp_path, width, rate):
+    rotations, way = files.a_clip()
+    if width != 72:
+        rotations[:, [J["left_hand"], J["right_hand"]]] = np.eye(3)
+    motion = load_motion(files.write_amass(tmp_path / "02_01_poses.npz", rotations, way, width=width, rate=rate))
+    check_same(motion, rotations, way)
+    assert motion.names == ("02_01_poses",) and motion.fps == 60 and motion.dropped == 0
+    assert motion.source.startswith("AMASS: ")
+
+
+def test_amass_in_parts_and_of_another_up(tmp_path):
+    rotations, way = files.a_clip(5)
+    pose, path = files.to_smpl(rotations, "y"), tmp_path / "a_stageii.npz"
+    rate = np.array(120.0)
+    np.savez(path, root_orient=pose[:, :3], pose_body=pose[:, 3:66], trans=way @ files.C, mocap_frame_rate=rate)
+    refused(path, "stand along y, not z; give load_motion up='y'")
+    check_same(load_motion(path, up="y"), rotations, way)
+    assert load_motion(path, up="y", fps=30).fps == 30
+    assert load_motion(path, up="y", hz=60).rotations.shape[0] == 3
+
+
+def test_people_may_lie_where_up_is_given(tmp_path):
+    rotations, way = files.a_clip(5)
+    rotations[:, 0] = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], float) @ rotations[:, 0]
+    path = files.write_amass(tmp_path / "lies_poses.npz", rotations, way)
+    refused(path, "people stand along")
+    check_same(load_motion(path, up="z"), rotations, way)
+
+
+def test_frames_that_are_not_finite_end_a_clip(tmp_path):
+    path = files.write_amass(tmp_path / "a.npz", ROTATIONS, WAY)
+    content = dict(np.load(path))
+    content["poses"][7, 3] = np.nan
+    content["trans"][12] = np.inf
+    np.savez(path, **content)
+    motion = load_motion(path)
+    assert motion.dropped == 2 and motion.names == ("a", "a#2", "a#3") and tuple(motion.length) == (7, 4, 7)
+    check_same(motion, *(np.delete(x, [7, 12], 0) for x in (ROTATIONS, WAY)))
+    content["poses"][:5] = np.nan
+    np.savez(path, **content)
+    refused(path, "7 of 20 frames have values that are not finite")
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"drop": ("trans",)}, "holds betas, dmpls, gender, mocap_framerate, poses; an npz of motion needs"),
+        ({"drop": ("poses",)}, "root_orient"),
+        ({"drop": ("mocap_framerate",)}, "does not give its frame rate .* give load_motion fps="),
+        ({"fps": 0}, "above 0"),
+        ({"fps": np.nan}, "above 0"),
+        ({"mocap_framerate": np.array(["x"])}, "as one number"),
+        ({"mocap_framerate": np.array([1.0, 2])}, "as one number"),
+        ({"poses": np.zeros((4, 60))}, r"\(4, 60\)"),
+        ({"poses": np.zeros((4, 2, 156))}, r"\(4, 2, 156\)"),
+        ({"poses": np.array([["a"] * 156])}, "must be numbers"),
+        ({"poses": np.full((4, 156), 90.0)}, "radians, not degrees"),
+        ({"trans": np.zeros((5, 3))}, r"\(4, 72\).*\(5, 3\)"),
+        ({"trans": np.array(["a"])}, "trans must be numbers"),
+        ({"trans": np.full((4, 3), 1e30)}, "expected meters"),
+        ({"poses": np.array([{}] * 4)}, "plain arrays"),
+        ({"drop": ("poses",), "root_orient": np.zeros((4, 3)), "pose_body": np.zeros((4, 60))}, r"\(4, 60\)"),
+        ({"drop": ("poses",), "root_orient": np.zeros((4, 3)), "pose_body": np.zeros(())}, "pose_body"),
+    ],
+)
+def test_a_wrong_amass_file_is_named(tmp_path, changes, message):
+    refused(files.write_amass(tmp_path / "wrong.npz", *files.a_clip(4), **changes), message)
+
+
+@pytest.mark.parametrize("up", ["z", "y"])
+def test_lidarhuman26m_comes_back(tmp_path, up):
+    rotations, way = files.a_clip(12)
+    folder = files.write_pose_json(tmp_path / "labels/3d/pose/24", rotations, way, up=up, first=5)
+    (folder / "notes.json").write_text("[]")
+    motion = load_motion(folder, up=up)
+    check_same(motion, rotations, way)
+    assert motion.fps == 10 and motion.names == ("24",)
+    assert load_motion(folder / "000007.json", up=up).names == ("000007",)
+    (folder / "000009.json").unlink()
+    motion = load_motion(tmp_path, up=up)
+    assert motion.names == ("labels/3d/pose/24", "labels/3d/pose/24#2") and tuple(motion.length) == (4, 7)
+
+
+@pytest.mark.parametrize(
+    "content, message",
+    [
+        ("{", "is not JSON"),
+        ("[" * 100000, "is not JSON"),
+        ("3", r"expected pose \(72 numbers\) and trans \(3 numbers\), got 3"),
+        ("{}", "expected pose .* got {}"),
+        ('{"pose": [1, 2], "trans": [1, 2, 3]}', "expected pose"),
+        ('{"pose": "x", "trans": [1, 2, 3]}', "expected pose"),
+        (json.dumps({"pose": [0] * 72, "trans": [1, {}, 3]}), "expected pose"),
+        (json.dumps({"pose": [10**400] * 72, "trans": [0] * 3}), "expected pose"),
+    ],
+)
+def test_a_wrong_pose_file_is_named(tmp_path, content, message):
+    folder = files.write_pose_json(tmp_path / "7", *files.a_clip(3))
+    (folder / "000002.json").write_text(content)
+    for path in (folder, folder / "000002.json"):
+        refused(path, message, named="000002.json")
+    (folder / "000002.json").write_text(json.dumps({"pose": [0] * 72, "trans": [None] * 3}))
+    refused(folder / "000002.json", "expected pose|not finite")
+
+
+def labels(rotations, way, **changes):
+    person = {"pose": files.to_smpl(rotations), "trans": way, "beta": np.zeros(10), "gender": "male"}
+    return {"framerate": 20, "first_person": {"lidar_traj": np.zeros((3, 9))}, "second_person": person} | changes
+
+
+@pytest.fixture
+def sloper4d(tmp_path):
+    """Writes a label file."""
+
+    def write(content):
+        path = tmp_path / "seq007_garden_001_labels.pkl"
+        path.write_bytes(pickle.dumps(content))
+        return path
+
+    return write
+
+
+def test_sloper4d_comes_back(sloper4d):
+    rotations, way = files.a_clip()
+    motion = load_motion(sloper4d(labels(rotations, way)))
+    check_same(motion, rotations, way)
+    assert motion.fps == 20 and motion.names == ("seq007_garden_001_labels_second",)
+    other, path = files.a_clip(4, seed=1)
+    first = {"pose": files.to_smpl(other), "trans": path}
+    refined = {"opt_pose": files.to_smpl(rotations) * 0.5, "opt_trans": way + [1, 0, 0]}
+    second = labels(rotations, way)["second_person"] | refined
+    motion = load_motion(sloper4d(labels(rotations, way, first_person=first, second_person=second)))
+    assert motion.names == ("seq007_garden_001_labels_first", "seq007_garden_001_labels_second")
+    np.testing.assert_allclose(motion.translation[motion.frames(1)], way + [1, 0, 0], atol=1e-5)
+    check_same(motion.of("seq007_garden_001_labels_first"), other, path)
+
+
+class Counter(dict):
+    """A class that no label file needs."""
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (lambda c: 3, "a dict, got int"),
+        (lambda c: {}, "expected second_person .* got nothing"),
+        (lambda c: {k: v for k, v in c.items() if k != "framerate"}, "frame rate"),
+        (lambda c: c | {"framerate": "fast"}, "frame rate"),
+        (lambda c: c | {"framerate": -20}, "above 0"),
+        (lambda c: c | {"second_person": {"pose": np.zeros((3, 71)), "trans": np.zeros((3, 3))}}, r"\(3, 71\)"),
+        (lambda c: c | {"second_person": {"pose": [[1, 2], [3]], "trans": np.zeros((3, 3))}}, "rows of equal length"),
+        (lambda c: c | {"second_person": {"pose": np.zeros((0, 72)), "trans": np.zeros((0, 3))}}, "no frame"),
+        (lambda c: c | {"extra": Counter()}, "Counter"),
+    ],
+)
+def test_wrong_labels_are_named(sloper4d, change, message):
+    refused(sloper4d(change(labels(*files.a_clip(3)))), message)
+
+
+# clips of positions, folders, and what is no motion
+
+
+def test_own_clips_are_retargeted(tmp_path):
+    rotations, way = files.a_clip(40)
+    joints, path = files.joints_of(rotations, way), tmp_path / "clips.npz"
+    content = dict(
+        joints=joints, clip=np.array(["002_01", "005_01"]), clip_start=np.array([0, 15]),
+        clip_length=np.array([15, 25]), fps=np.array(10.0),
+    )  # fmt: skip
+    np.savez(path, **content)
+    motion = load_motion(path)
+    assert motion.names == ("002_01", "005_01") and motion.fps == 10 and tuple(motion.length) == (15, 25)
+    assert errors(motion, joints).mean() < 0.010 and errors(motion, joints).max() < 0.06
+    np.testing.assert_array_equal(motion.rotations, load_motion(path, format="clips").rotations)
+    for change, message in (
+        ({"joints": 1e3 * joints}, "998 times as tall"),
+        ({"fps": np.array(1e5)}, "people move at"),
+    ):
+        np.savez(path, **content | change)
+        refused(path, message)
+
+    joints[3, 4] = joints[3, 1]  # a thigh without length
+    np.savez(path, **content)
+    motion = load_motion(path)
+    assert motion.dropped == 1 and tuple(motion.length) == (3, 11, 25)
+    assert motion.names == ("002_01", "002_01#2", "005_01") and motion.of("002").names == ("002_01", "002_01#2")
+    joints[15:25, 4] = joints[15:25, 1]
+    np.savez(path, **content)
+    refused(path, "10 of 25 frames")
+
+
+def test_a_folder_of_everything(tmp_path, sloper4d):
+    rotations, way = files.a_clip(13)
+    files.write_amass(tmp_path / "b_poses.npz", rotations, way, fps=60)
+    (tmp_path / "02").mkdir()
+    written(tmp_path, files.bvh_text(rotations, way, fps=120), "02/02_01.bvh")
+    written(tmp_path, ASF, "02/02.asf")
+    written(tmp_path, files.amc_text(rotations, way, AXES), "02/02_02.amc")
+    files.write_pose_json(tmp_path / "pose/7", rotations, way)
+    sloper4d(labels(rotations, way))
+    written(tmp_path, "nothing to read here", "shape.npz")
+    written(tmp_path, "hello", "README.txt")
+    motion = load_motion(tmp_path)
+    assert motion.names == ("02/02_01", "02/02_02", "b_poses", "pose/7", "seq007_garden_001_labels_second")
+    assert motion.fps == 10 and tuple(motion.length) == (2, 2, 3, 13, 7)
+    assert motion.of("02").names == ("02/02_01", "02/02_02")
+    assert tuple(load_motion(tmp_path, hz=20).length) == (3, 3, 5, 25, 13)
+    assert load_motion(tmp_path, format="bvh").names == ("02/02_01",)
+    assert load_motion(tmp_path, format="lidarhuman26m").names == ("pose/7",)
+
+
+def test_a_recording_is_told_from_another_by_what_it_holds(tmp_path):
+    one, two = tmp_path / "one", tmp_path / "two"
+    for folder in (one, two):
+        (folder / "02").mkdir(parents=True)
+        files.write_amass(folder / "02" / "a_poses.npz", *files.a_clip(3))
+    (two / "notes.txt").write_text("no motion")
+    was = digest(one)
+    assert digest(two) == was and digest(one / "02" / "a_poses.npz") not in (was, digest(one / "02"))
+    card = Job(what="people", count=3, motion=str(one)).card()
+    assert card == Job(what="people", count=3, motion=str(two)).card()
+    files.write_amass(one / "02" / "b_poses.npz", *files.a_clip(4))
+    assert digest(one) != was and card != Job(what="people", count=3, motion=str(one)).card()
+    with pytest.raises(InputError, match="none.npz: no such file"):
+        digest(tmp_path / "none.npz")
+
+
+def test_what_is_no_motion_at_all(tmp_path):
+    for name, content, message in (
+        ("a.npz", b"", "is empty"),
+        ("b.npz", b"hello", "plain arrays"),
+        ("c.fbx", b"hello", "expected a file of motion, one of .npz, .bvh"),
+        ("d", b"hello", "format="),
+    ):
+        (tmp_path / name).write_bytes(content)
+        refused(tmp_path / name, message)
+    np.save(tmp_path / "one.npy", np.zeros(3))
+    refused((tmp_path / "one.npy").rename(tmp_path / "one.npz"), "not an npz")
+    path = files.write_amass(tmp_path / "e.npz", *files.a_clip(4))
+    whole = path.read_bytes()
+    for share in (0.1, 0.5, 0.9, 0.999):
+        path.write_bytes(whole[: int(share * len(whole))])
+        refused(path, "copied completely")
+    (tmp_path / "empty").mkdir()
+    refused(tmp_path / "empty", "holds no file of motion; read are .npz, .bvh")
+    for name in ("none.bvh", "none.json", "none"):
+        refused(tmp_path / name, "no such file")
+    for name, value in (("fps", 0), ("hz", -1), ("fps", float("nan")), ("format", "bhv"), ("up", "w")):
+        with pytest.raises(InputError, match=f"{name} must be .* above 0|did you mean bvh|unknown up axis"):
+            load_motion(path, **{name: value})
+    with pytest.raises(InputError, match="expected the path"):
+        load_motion(3)

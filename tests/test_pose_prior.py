@@ -1,0 +1,484 @@
+"""The pose prior: single poses, clips of people who go on, balance, contact with the ground and with themselves."""
+
+import importlib.util
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from motion_files import joints_of
+
+from lidarpose.body import rig
+from lidarpose.body.mocap import retarget
+from lidarpose.body.pose_prior import activities, balance, contact, gait, joint_angles, latents, mixture, sampling
+from lidarpose.body.pose_prior.contact import body_frames, capsule_ends, self_collision, sole_points
+from lidarpose.body.pose_prior.joint_angles import mirror_angles, rotations_from_angles
+from lidarpose.errors import InputError
+from lidarpose.geometry import axis_angle_to_matrix, rotation_about
+from lidarpose.skeleton import SMPL24
+
+_SPEC = importlib.util.spec_from_file_location("fit_motion", Path(__file__).parents[1] / "tools/fit_motion.py")
+fit = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(fit)
+J = {name: i for i, name in enumerate(SMPL24.joints)}
+A, KINDS = activities.ANGLE_INDEX, activities.KINDS
+SIDES = (("left", 1), ("right", -1))
+HZ = 40.0
+
+
+def drawn(n=1500, seed=0, **mix):
+    return sampling.sample_rotations(np.random.default_rng(seed), n, mix=mix or None)
+
+
+def latents_of(n, seed, **mix):
+    """The mix's latents, as they are drawn before anybody is replaced."""
+    rng = np.random.default_rng(seed)
+    return latents.draw_latents(rng, rng.choice(len(KINDS), n, p=sampling._kind_shares(mix or None)))
+
+
+def raw_angles(n, seed, **mix):
+    return sampling._angles(latents_of(n, seed, **mix)).angles
+
+
+@cache
+def clips(kind, n=12, frames=80, hz=HZ, seed=0):
+    return sampling.sample_clips(np.random.default_rng(seed), n, frames=frames, hz=hz, mix={kind: 1})
+
+
+def placed(drawn):
+    """Joints (n, F, 24, 3) and soles (n, F, 8, 3) of the mean adult where the clip puts them, the ground at 0."""
+    n, frames = drawn.rotations.shape[:2]
+    flat = drawn.rotations.reshape(-1, 24, 3, 3)
+    soles = sole_points(flat).reshape(n, frames, 8, 3)
+    joints = body_frames(flat)[1].reshape(n, frames, 24, 3)
+    way = drawn.translation[:, :, None]
+    ground = drawn.clearance[:, 0] - soles[:, 0, :, 2].min(1)
+    up = [0, 0, 1] * ground[:, None, None, None]
+    return joints + way + up, soles + way + up
+
+
+def check_rotations(rotations):
+    assert rotations.dtype == np.float32
+    product = rotations @ np.swapaxes(rotations, -1, -2)
+    np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-5)
+    np.testing.assert_allclose(np.linalg.det(rotations), 1, atol=1e-5)
+
+
+# draws
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), n=st.integers(0, 60), frames=st.integers(0, 7))
+def test_shapes_and_rotations(seed, n, frames):
+    prior = drawn(n, seed)
+    assert prior.rotations.shape == (n, 24, 3, 3) and prior.kind.shape == (n,)
+    check_rotations(prior.rotations)
+    np.testing.assert_allclose(retarget.heading(prior.rotations), 0, atol=1e-5)
+    n = n // 8
+    clip = sampling.sample_clips(np.random.default_rng(seed), n, frames=frames)
+    assert clip.rotations.shape == (n, frames, 24, 3, 3) and (clip.clearance >= 0).all()
+    assert clip.translation.shape == (n, frames, 3) and clip.clearance.shape == (n, frames)
+    check_rotations(clip.rotations)
+    if frames:
+        np.testing.assert_allclose(retarget.heading(clip.rotations[:, 0]), 0, atol=1e-5)
+        np.testing.assert_array_equal(clip.translation[:, 0], 0)
+
+
+def test_the_same_generator_gives_the_same_poses():
+    a, b, c = drawn(50, 7), drawn(50, 7), drawn(50, 8)
+    np.testing.assert_array_equal(a.rotations, b.rotations)
+    assert np.abs(a.rotations - c.rotations).max() > 0.1
+    a, b = sampling.sample_poses(40, 3), sampling.sample_poses(40, 3)
+    assert a.shape == (40, 24, 3) and a.dtype == np.float32
+    np.testing.assert_array_equal(a, b)
+    np.testing.assert_allclose(a[:, 0], 0, atol=1e-6)
+    assert (np.linalg.norm(a, axis=-1) < 1.6).all()
+
+
+def test_the_mix_is_obeyed():
+    assert set(drawn(300, 0, sit=1, walk=3).kind) == {KINDS.index("sit"), KINDS.index("walk")}
+    counts = np.bincount(drawn(20000, 0).kind, minlength=len(KINDS)) / 20000
+    np.testing.assert_allclose(counts, activities.SHARES, atol=0.015)
+    np.testing.assert_array_equal(drawn(40, walk=1e308, run=1e308).rotations, drawn(40, walk=1, run=1).rotations)
+
+
+@pytest.mark.parametrize(
+    "call, message",
+    [
+        (lambda rng: drawn(3, 0, wakl=1), "did you mean walk"),
+        (lambda rng: drawn(3, 0, walk=0), "above 0"),
+        (lambda rng: drawn(-1), "n must be a whole number of at least 0"),
+        (lambda rng: drawn(2, walk=np.inf), "the mix's weight of walk must be a finite number"),
+        (lambda rng: drawn(2, walk=np.nan), "the mix's weight of walk must be a finite number"),
+        (lambda rng: drawn(2, walk="a"), "the mix's weight of walk must be a finite number"),
+        (lambda rng: sampling.sample_rotations(rng, 1, dt=-0.1), "0 or more"),
+        (lambda rng: sampling.sample_poses(3, -1), "seed must be a whole number"),
+        (lambda rng: sampling.sample_poses(2.5, 0), "n must be a whole number"),
+        (lambda rng: sampling.sample_clips(rng, -1, frames=3), "n must"),
+        (lambda rng: sampling.sample_clips(rng, 1, frames=-3), "frames must"),
+        (lambda rng: sampling.sample_clips(rng, 1, frames=3, hz=0.0), "hz > 0"),
+        (lambda rng: sampling.sample_clips(rng, 1, frames=2, mix={"wakl": 1}), "did you mean walk"),
+    ],
+)
+def test_wrong_arguments_are_named(call, message):
+    with pytest.raises(InputError, match=message):
+        call(np.random.default_rng(0))
+
+
+def test_latents_are_taken_together():
+    people, rows = latents_of(300, 0), np.random.default_rng(0).permutation(300)[:80]
+    np.testing.assert_array_equal(sampling._angles(people.take(rows)).angles, sampling._angles(people).angles[rows])
+
+
+# angles and rotations
+
+
+def test_euler_angles_against_the_product_of_three_rotations():
+    euler = np.random.default_rng(0).uniform(-3, 3, (40, 3))
+    reference = rotation_about("y", euler[:, 0]) @ rotation_about("x", euler[:, 1]) @ rotation_about("z", euler[:, 2])
+    np.testing.assert_allclose(joint_angles._from_euler(euler), reference, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "back", [fit.angles_from_rotations, lambda rotations: mixture.from_features(fit.to_features(rotations))]
+)
+def test_angles_come_back_from_rotations(back):
+    rotations = rotations_from_angles(raw_angles(1000, 3))
+    # where an arm points straight out, raise and inward turn are not told apart, but the pose is the same
+    np.testing.assert_allclose(rotations_from_angles(back(rotations)), rotations, atol=0.02)
+
+
+def test_a_mirrored_pose_is_the_mirror_image():
+    angles = raw_angles(200, 6)
+    mirrored = mirror_angles(angles)
+    assert (mirrored >= activities.LIMITS[0]).all() and (mirrored <= activities.LIMITS[1]).all()
+    p, q = (joints_of(rotations_from_angles(a)) for a in (angles, mirrored))
+    np.testing.assert_allclose(q, p[:, SMPL24.flip] * [1, -1, 1], atol=0.02)
+    np.testing.assert_allclose(mirror_angles(mirrored), angles)
+    mean = joints_of(drawn(6000, 9).rotations).mean(0)
+    np.testing.assert_allclose(mean, mean[list(SMPL24.flip)] * [1, -1, 1], atol=0.03)
+
+
+def test_hinges_bend_one_way_and_not_too_far():
+    prior = drawn(4000, 1)
+    for side, sign in SIDES:
+        knee = prior.rotations[:, J[f"{side}_knee"]]
+        bend = np.degrees(np.arctan2(knee[:, 0, 2], knee[:, 0, 0]))
+        assert bend.min() > -0.1 and bend.max() < 151
+        np.testing.assert_allclose(knee[:, 1], np.broadcast_to([0, 1, 0], knee[:, 1].shape), atol=1e-5)
+        elbow = prior.rotations[:, J[f"{side}_elbow"]]
+        bend = np.degrees(np.arctan2(-sign * elbow[:, 1, 0], elbow[:, 0, 0]))
+        assert bend.min() > -0.1 and bend.max() < 151
+        thigh = prior.rotations[:, J[f"{side}_hip"]] @ [0, 0, -1.0]
+        flexion = np.degrees(np.arctan2(thigh[:, 0], -thigh[:, 2]))[thigh[:, 2] < -0.3]
+        assert flexion.min() > -31
+
+
+def test_knees_point_forward_and_hands_reach_in_front():
+    """Signs, seen in space: a bent knee leads its ankle, a bent elbow lifts the hand forward."""
+    bent = np.zeros((1, 27))
+    for side, _ in SIDES:
+        bent[:, [A[f"{side}_knee"], A[f"{side}_elbow"]]] = 80
+        bent[:, [A[f"{side}_abd"], A[f"{side}_out"]]] = 15
+    p = joints_of(rotations_from_angles(bent))[0]
+    for side, left in SIDES:
+        assert p[J[f"{side}_ankle"], 0] < p[J[f"{side}_knee"], 0] - 0.2
+        assert p[J[f"{side}_wrist"], 0] > p[J[f"{side}_elbow"], 0] + 0.15
+        assert left * p[J[f"{side}_knee"], 1] > left * p[J[f"{side}_hip"], 1] + 0.05
+        assert left * p[J[f"{side}_elbow"], 1] > left * p[J[f"{side}_shoulder"], 1] + 0.03
+    for angle, joint in (("bend", "neck"), ("tilt", "neck"), ("left_hip", "left_knee"), ("right_raise", "right_wrist")):
+        angles = np.zeros((2, 27))
+        angles[1, A[angle]] = 40
+        still, moved = joints_of(rotations_from_angles(angles))[:, J[joint], 0]
+        assert moved > still + 0.1, angle
+
+
+# what people do
+
+
+@pytest.mark.parametrize("kind", ["idle", "walk"])
+def test_standing_people_stand(kind):
+    p = joints_of(drawn(800, 2, **{kind: 1}).rotations)
+    pelvis, feet = p[:, J["pelvis"], 2], p[:, [J["left_ankle"], J["right_ankle"]], 2]
+    assert (p[:, J["head"], 2] > pelvis + 0.4).all()
+    assert (feet.min(1) < pelvis - 0.6).all() and (feet < pelvis[:, None] - 0.3).all()
+    width = p[:, J["left_ankle"], 1] - p[:, J["right_ankle"], 1]
+    assert 0.10 < np.median(width) < 0.35 and (width > -0.15).mean() > 0.99
+    for side, _ in SIDES:  # toes point ahead, legs are straight
+        assert (p[:, J[f"{side}_foot"], 0] > p[:, J[f"{side}_ankle"], 0] - 0.06).mean() > 0.98
+        hip, knee, ankle = (p[:, J[f"{side}_{name}"]] for name in ("hip", "knee", "ankle"))
+        thigh, shank = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (knee - hip, ankle - knee))
+        assert np.median((thigh * shank).sum(-1)) > np.cos(np.radians(40))
+
+
+def test_arms_swing_against_the_legs():
+    walkers = latents_of(24, 4, walk=1)
+    walkers = replace(walkers, arm=np.full((24, 2), activities.OWN_ARMS), captured=np.zeros((24, 2, 27)))
+    for walk in sampling._motion(walkers, np.arange(60) / 40).rotations:
+        p = joints_of(walk)
+        for side, across in (("left", "right"), ("right", "left")):
+            arm = (p[:, J[f"{side}_elbow"]] - p[:, J[f"{side}_shoulder"]])[:, 0]
+            for leg, sign in ((side, -1), (across, 1)):
+                ankle = (p[:, J[f"{leg}_ankle"]] - p[:, J["pelvis"]])[:, 0]
+                assert sign * np.corrcoef(arm, ankle)[0, 1] > 0.6
+    p = joints_of(drawn(2000, 5, walk=1).rotations)
+    arms, legs = ((p[:, J[f"left_{name}"]] - p[:, J[f"right_{name}"]])[:, 0] for name in ("elbow", "ankle"))
+    assert np.corrcoef(arms, legs)[0, 1] < -0.3
+
+
+def test_a_stride_comes_round():
+    """Hips and knees of a stride are periodic, and the knee bends most in the swing."""
+    phase = np.linspace(0, 1, 40, endpoint=False)
+    base, style, walk = np.zeros((40, 27)), np.full((40, 8), 0.5), np.full(40, gait.GAITS.index("walk"))
+    stride, later = (gait.add_stride(walk, phase + k, style, base) for k in (0, 3))
+    np.testing.assert_allclose(stride.angles, later.angles, atol=1e-9)
+    knee = stride.angles[:, A["left_knee"]]
+    assert 0.6 < phase[knee.argmax()] < 0.85 and knee.max() > 45 and knee[(phase > 0.2) & (phase < 0.4)].max() < 30
+    assert np.ptp(stride.pace) < 1e-9 and 0.7 < stride.pace[0] < 1.8
+
+
+def test_kneeling_people_have_a_knee_on_the_ground():
+    p = joints_of(drawn(300, 14, kneel=1).rotations)
+    knee, ankle = (p[:, [J[f"left_{name}"], J[f"right_{name}"]], 2].min(1) for name in ("knee", "ankle"))
+    # a knee joint is 5 cm above the floor, an ankle joint 8 cm
+    assert np.median(np.abs(knee - ankle)) < 0.08
+
+
+def test_captured_poses_are_people_upright():
+    rng = np.random.default_rng(0)
+    assert [mixture.captured_angles(rng, n).shape for n in (500, 0)] == [(500, 2, 27), (0, 2, 27)]
+    p = joints_of(drawn(500, 15, captured=1).rotations)
+    assert (p[:, J["neck"], 2] > p[:, J["pelvis"], 2]).mean() > 0.95
+    assert Path(rig.__file__).with_name("assets").joinpath("motion_prior.npz").stat().st_size < 60_000
+
+
+def test_the_fit_finds_a_known_mixture(tmp_path):
+    rng = np.random.default_rng(0)
+    far = rng.normal(size=(2, 27)) * 40
+    which = rng.random(1500) < 0.3
+    features = far[which.astype(int)] + rng.normal(size=(1500, 27)) * 6
+    weights, means, covariances = fit.fit_mixture(features, 2, rng)
+    order = np.argsort(-weights)
+    np.testing.assert_allclose(weights[order], [0.7, 0.3], atol=0.05)
+    np.testing.assert_allclose(means[order], far, atol=1.5)
+    assert np.linalg.eigvalsh(covariances).min() > fit._RIDGE * 0.9
+    fit.save_mixture(tmp_path / "mixture.npz", weights, means, covariances)
+    assert np.load(tmp_path / "mixture.npz")["roots"].shape == (2, 27 * 28 // 2)
+
+
+# clips
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_people_move_as_fast_as_people(kind):
+    joints, _ = placed(clips(kind))
+    speed = np.linalg.norm(np.diff(joints, axis=1), axis=-1) * HZ
+    assert 0.01 < speed.max() < 10  # nobody is a statue
+    acceleration = np.linalg.norm(np.diff(joints[:, ::2], n=2, axis=1), axis=-1) * (HZ / 2) ** 2
+    # a runner's foot is stopped in a few hundredths of a second; heads and hips are carried softly
+    assert np.percentile(acceleration, 99) < 130
+    assert np.percentile(acceleration[:, :, [J["pelvis"], J["head"]]], 99) < (40 if kind != "fall" else 80)
+
+
+@pytest.mark.parametrize(
+    "kind, most",
+    [("idle", 0.01), ("crouch", 0.02), ("bend", 0.02), ("step", 0.03), ("kneel", 0.02), ("sport", 0.05)]
+    + [("captured", 0.04), ("walk", 0.03), ("push", 0.03), ("run", 0.04)],
+)
+def test_feet_that_stand_do_not_slide(kind, most):
+    """The lowest sole point of a frame that is low in the next one, too, went hardly anywhere."""
+    _, soles = placed(clips(kind, n=20, hz=10.0, frames=24))
+    low = soles[..., 2].argmin(2)[:, :-1, None, None]
+    here, there = (np.take_along_axis(part, low, 2)[:, :, 0] for part in (soles[:, :-1], soles[:, 1:]))
+    stays = (here[..., 2] < 0.005) & (there[..., 2] < 0.005)
+    slid = np.linalg.norm((there - here)[..., :2], axis=-1)[stays]
+    assert len(slid) > 20 and np.percentile(slid, 95) < most
+
+
+def test_no_foot_goes_through_the_ground_and_somebody_is_always_on_it():
+    low = {kind: placed(clips(kind))[1][..., 2].min(2) for kind in ("walk", "idle", "bend", "step", "run")}
+    run = low.pop("run")
+    assert all(np.abs(heights).max() < 0.02 for heights in low.values())
+    assert run.min() > -0.02 and 0.02 < run.max() < 0.15
+    assert 0.05 < (run > 0.01).mean() < 0.5  # in flight
+
+
+def test_hips_do_not_bob():
+    """Walkers' hips rise and fall by a few centimeters, cyclists' not at all, standing people's by millimeters."""
+    for kind, most in (("walk", 0.09), ("idle", 0.03), ("cycle", 0.005)):
+        assert np.ptp(clips(kind).translation[..., 2], axis=1).max() < most, kind
+
+
+def test_walkers_go_ahead_at_the_speed_of_their_strides():
+    walk, run = (clips(kind, n=40).translation[..., :2] for kind in ("walk", "run"))
+    speed, run_speed = (np.linalg.norm(np.diff(way, axis=1), axis=-1) * HZ for way in (walk, run))
+    assert 0.8 < np.median(speed) < 1.5 and speed.min() > 0.1 and speed.max() < 2.5
+    assert 2.0 < np.median(run_speed) < 4.0 and (walk[:, -1, 0] > 0.3).all()
+    # the way and the hips turn together
+    x, y = np.moveaxis(np.diff(walk, axis=1), -1, 0)
+    course = np.unwrap(np.arctan2(y, x), axis=1)
+    assert np.abs(course[:, -1] - course[:, 0]).max() > 0.15
+    facing = np.unwrap([retarget.heading(r) for r in clips("walk", n=40).rotations], axis=1)[:, 1:]
+    assert np.abs((facing - course) - (facing - course).mean(1, keepdims=True)).max() < 0.3
+
+
+def test_a_fall_ends_on_the_ground():
+    head = placed(clips("fall", n=20, frames=80))[0][:, :, J["head"], 2]
+    assert (head[:, 0] > 1.0).all() and np.median(head[:, -1]) < 0.6
+
+
+def test_faster_clips_show_the_same_motion():
+    slow, fast = (
+        sampling.sample_clips(np.random.default_rng(3), 20, frames=f, hz=h) for f, h in ((6, 5.0), (11, 10.0))
+    )
+    np.testing.assert_array_equal(slow.kind, fast.kind)
+    np.testing.assert_allclose(fast.rotations[:, ::2], slow.rotations, atol=1e-5)
+    travels = np.isin(slow.kind, [KINDS.index(k) for k in ("walk", "run", "push", "cycle")])
+    np.testing.assert_allclose(fast.translation[travels, ::2, :2], slow.translation[travels, :, :2], atol=1e-2)
+
+
+def test_moved_poses_are_those_of_the_pose_itself_later():
+    still, moved = (sampling.sample_rotations(np.random.default_rng(5), 200, dt=dt) for dt in (0.0, 0.1))
+    np.testing.assert_allclose(moved.rotations, still.rotations, atol=1e-6)
+    np.testing.assert_array_equal(moved.kind, still.kind)
+    np.testing.assert_array_equal(still.moved, still.rotations)
+    assert not still.step.any()
+    before, after = (body_frames(r)[1] for r in (moved.rotations, moved.moved))
+    far = np.linalg.norm(after - before, axis=-1).max(1)
+    assert 0.001 < np.median(far) < 0.2 and far.max() < 1.0
+    walk = sampling.sample_rotations(np.random.default_rng(5), 200, mix={"walk": 1}, dt=0.1)
+    assert 0.07 < np.median(walk.step[:, 0]) < 0.15
+    # a foot on the ground stays there while the body goes on
+    here, there = sole_points(walk.rotations).reshape(200, 8, 3), sole_points(walk.moved).reshape(200, 8, 3)
+    low, i = here[..., 2].argmin(1), np.arange(200)
+    at, later = here[i, low], there[i, low] + walk.step
+    stays = np.abs(later[:, 2] - at[:, 2]) < 0.005
+    assert stays.mean() > 0.3 and np.percentile(np.linalg.norm((later - at)[stays, :2], axis=1), 90) < 0.03
+
+
+# balance and the ground
+
+
+def test_frames_are_forward_kinematics():
+    rotations, rest = drawn(200).rotations, retarget.mean_adult_joints()[None]
+    slow = rig.forward_kinematics(SMPL24.parents, rest, rotations, np.zeros((200, 3)))
+    for a, b in zip(body_frames(rotations), slow, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5)
+
+
+def test_soles_are_the_meshs():
+    """The lowest of a foot's points is where the shipped body's lowest vertex is."""
+    body, rotations = rig.load_rig(), drawn(60, walk=1).rotations
+    rest = body.rest(np.repeat(body.coefficients[body.age >= 18].mean(0, keepdims=True), 60, 0))
+    vertices = rig.pose_bodies(body, rest, rotations, np.zeros((60, 3)))[0]
+    lowest = sole_points(rotations).reshape(60, 8, 3)[..., 2].min(1)
+    np.testing.assert_allclose(lowest, vertices[..., 2].min(1), atol=0.012)
+
+
+def out_of_balance(rotations):
+    """How far (n,) m the center of mass is outside of what the body stands on."""
+    joints = body_frames(rotations)[1]
+    points = balance._ground_points(rotations, joints)
+    return np.linalg.norm(balance.overhang(contact.mass_center(joints), points, 0.0), axis=1)
+
+
+@pytest.mark.parametrize("kind", balance.STATIC)
+def test_standing_and_kneeling_people_are_in_balance(kind):
+    assert (out_of_balance(drawn(600, **{kind: 1}).rotations) > 0.005).mean() < 0.01
+
+
+@pytest.mark.parametrize("kind, usual, most", [("idle", 0.003, 0.01), ("crouch", 0.015, 0.06), ("bend", 0.01, 0.03)])
+def test_both_feet_are_on_the_ground(kind, usual, most):
+    low = sole_points(drawn(600, **{kind: 1}).rotations)[..., 2].min(2)
+    apart = np.abs(low[:, 0] - low[:, 1])
+    assert np.percentile(apart, 95) < usual and np.percentile(apart, 99) < most
+
+
+def test_what_balance_changes():
+    """Without it bending people topple; others keep their angles."""
+    kind = np.repeat([KINDS.index("bend"), KINDS.index("sport")], 200)
+    angles = sampling._angles(latents.draw_latents(np.random.default_rng(1), kind)).angles
+    before = angles.copy()
+    after = balance.balanced(angles, kind)
+    np.testing.assert_array_equal(angles, before)
+    np.testing.assert_array_equal(after[200:], before[200:])
+    off = [(out_of_balance(rotations_from_angles(a[:200])) > 0.01).mean() for a in (before, after)]
+    assert off[0] > 0.4 and off[1] < 0.02
+
+
+def test_overhang_of_a_square():
+    square = np.array([[[x, y, 0.0] for x in (-0.1, 0.1) for y in (-0.1, 0.1)]])
+    for at, margin, want in (((0.05, 0.0), 0.0, 0.0), ((0.15, 0.0), 0.0, -0.05), ((0.15, 0.0), 0.02, -0.07)):
+        center = np.array([[*at, 1.0]])
+        np.testing.assert_allclose(balance.overhang(center, square, margin), [[want, 0]], atol=1e-6)
+        # what hangs in the air above bears nothing
+        both = np.concatenate([square, square + [1.0, 0, 1]], 1)
+        np.testing.assert_allclose(balance.overhang(center, both, margin)[0], [want, 0], atol=2e-3)
+
+
+def test_the_center_of_mass_of_the_rest_pose():
+    """Of a standing adult 55 to 58 % of the height, arms up a little more; the shares sum to one."""
+    joints = retarget.mean_adult_joints()[None]
+    assert 0.55 < (contact.mass_center(joints)[0, 2] + 0.97) / 1.70 < 0.61
+    np.testing.assert_allclose(contact.mass_center(joints + [1.0, 2, 3]) - contact.mass_center(joints), [[1, 2, 3]])
+
+
+def test_what_does_not_slide_carries_the_body():
+    """A point that stays on the ground while the pelvis goes over it says how far it went."""
+    t = np.linspace(0, 1, 11)
+    planted = np.stack([0.3 - t, 0.1 + 0 * t, -1 + 0 * t], -1)
+    swinging = np.stack([t, -0.1 + 0 * t, -0.9 + 0 * t], -1)
+    way = contact.planted_way(np.stack([planted, swinging], 1)[None])
+    np.testing.assert_allclose(way[0], np.stack([t, 0 * t, 0 * t], -1), atol=1e-4)
+    # the ground is under the lowest vertex
+    np.testing.assert_allclose(contact.ground_offset(np.array([-0.9, -0.8]), np.array([0.0, 0.03])), [0.9, 0.83])
+    assert contact.ground_offset(-0.97) == 0.97
+
+
+# self-collision
+
+
+def segment_distance_reference(a, b, steps=400):
+    """Least distance of two segments, on a grid of points of them."""
+    t = np.linspace(0, 1, steps)[:, None]
+    p, q = (s[0] + t * (s[1] - s[0]) for s in (a, b))
+    return np.linalg.norm(p[:, None] - q, axis=-1).min()
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_distances_of_segments(seed):
+    a, b = np.random.default_rng(seed).normal(size=(2, 2, 3))
+    fast = contact._segment_distance(a[None].astype(np.float32), b[None].astype(np.float32))[0]
+    assert abs(fast - segment_distance_reference(a, b)) < 0.02
+
+
+def depth(rotations):
+    return self_collision(capsule_ends(*body_frames(rotations))).max(1)
+
+
+def test_a_hand_in_the_belly_is_deep_and_the_rest_pose_is_free():
+    pose = np.repeat(np.eye(3, dtype=np.float32)[None, None], 24, 1)
+    assert depth(pose) < 0
+    pose[0, J["left_shoulder"]] = axis_angle_to_matrix(np.array([-1.4, 0, 0]))
+    pose[0, J["left_elbow"]] = rotation_about("x", -1.5) @ rotation_about("z", -0.3)
+    assert depth(pose) > 0.05
+
+
+def test_few_bodies_pass_through_themselves():
+    assert (depth(drawn(5000, 3).rotations) > 0.02).mean() < 0.01
+    assert (depth(rotations_from_angles(raw_angles(5000, 3))) > 0.02).mean() > 0.05  # so there is something to do
+    clip = sampling.sample_clips(np.random.default_rng(1), 800, frames=6)
+    assert (depth(clip.rotations.reshape(-1, 24, 3, 3)) > 0.02).mean() < 0.02
+    np.testing.assert_allclose(np.bincount(clip.kind, minlength=len(KINDS)) / 800, activities.SHARES, atol=0.045)
+
+
+def test_hands_stay_out_of_the_trunk():
+    rotations, p = body_frames(drawn(3000, 10).rotations)
+    shoulders = p[:, [J["left_shoulder"], J["right_shoulder"]]].mean(1)
+    # the chest's frame is that of spine3
+    hands = [np.einsum("nji,nj->in", rotations[:, J["spine3"]], p[:, J[f"{s}_wrist"]] - shoulders) for s, _ in SIDES]
+    assert np.mean([(np.abs(x) < 0.06) & (np.abs(y) < 0.10) & (z < -0.05) for x, y, z in hands]) < 0.01
