@@ -3,7 +3,7 @@
     python benchmarks/test_time.py tiny --limit 1000 --out docs/scores/test_time.json
 
 Passes: each but the first is about the pelvis that the one before found. Looks: the last pass is repeated with the
-person mirrored, turned by quarters, or shifted in the grid of voxels, and joints are averaged (`inference/tta.py`), or
+person mirrored, turned by quarters, or shifted in the grid of voxels, and joints are average (`inference/tta.py`), or
 heatmaps are (as logarithms, brought to the mean vote). Rejection: the error of the most confident people and joints.
 """
 
@@ -19,7 +19,7 @@ from ablation_tables import figures
 from lidarpose import evaluation
 from lidarpose.inference.backend import Estimates, Raw, estimates
 from lidarpose.inference.predictor import PASSES, Predictor, load
-from lidarpose.inference.tta import LOOKS, Look, averaged, shown
+from lidarpose.inference.tta import TRANSFORMS, TTATransform, apply, average
 from lidarpose.io.files import write_atomic
 from lidarpose.skeleton import BODY26
 
@@ -32,23 +32,23 @@ _FLIP = np.array(BODY26.flip)
 class Way:
     what: str
     passes: int = PASSES
-    looks: tuple[Look, ...] = (Look(),)
+    looks: tuple[TTATransform, ...] = (TTATransform(),)
     heatmaps: bool = False
 
 
-_SYMMETRIES = tuple(Look(turns, mirrored) for turns in range(4) for mirrored in (False, True))
+_SYMMETRIES = tuple(TTATransform(turns, mirrored) for turns in range(4) for mirrored in (False, True))
 USUAL = Way("as shipped: two passes, one look")
 WAYS = (
     Way("one pass", passes=1),
     USUAL,
     Way("three passes", passes=3),
-    Way("and mirrored, joints averaged", looks=_SYMMETRIES[:2]),
-    Way("and mirrored, heatmaps averaged", looks=_SYMMETRIES[:2], heatmaps=True),
-    Way("four quarter turns, joints averaged", looks=_SYMMETRIES[::2]),
-    Way("four turns, each mirrored too, joints averaged", looks=_SYMMETRIES),
-    Way("`--tta 2`: turned, mirrored and shifted", looks=LOOKS[:2]),
-    Way("`--tta 4`", looks=LOOKS[:4]),
-    Way("`--tta 8`", looks=LOOKS),
+    Way("and mirrored, joints average", looks=_SYMMETRIES[:2]),
+    Way("and mirrored, heatmaps average", looks=_SYMMETRIES[:2], heatmaps=True),
+    Way("four quarter turns, joints average", looks=_SYMMETRIES[::2]),
+    Way("four turns, each mirrored too, joints average", looks=_SYMMETRIES),
+    Way("`--tta 2`: turned, mirrored and shifted", looks=TRANSFORMS[:2]),
+    Way("`--tta 4`", looks=TRANSFORMS[:4]),
+    Way("`--tta 8`", looks=TRANSFORMS),
 )
 
 
@@ -62,14 +62,14 @@ class Averaging(Predictor):
     def _looks(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Estimates:
         if not self.heatmaps:
             # the first look may be any here
-            return averaged([self._look(look, clouds, centers, origin) for look in self._tta])
+            return average([self._look(look, clouds, centers, origin) for look in self._tta])
         raws = [self._raw(look, clouds, centers, origin) for look in self._tta]
         return estimates(_fused(raws), self._decoder)
 
-    def _raw(self, look: Look, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Raw:
+    def _raw(self, look: TTATransform, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Raw:
         """What the network says of people shown so, brought back before it is decoded: heatmaps turn exactly."""
-        R, heatmaps = look.R_shown_person, []
-        raw = self.backend.run(*shown(look, clouds, centers, origin))
+        R, heatmaps = look.R_view_person, []
+        raw = self.backend.run(*apply(look, clouds, centers, origin))
         for axis in range(3):
             source = int(np.abs(R[:, axis]).argmax())
             heatmaps.append(raw.heatmaps[source][..., :: int(R[source, axis])])

@@ -651,7 +651,7 @@ def test_load_takes_names_and_paths(model, points, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / DEFAULT).mkdir()
     for given in (copy, str(copy), "mine.safetensors", Path("odd.name"), "odd.name", DEFAULT):
-        found = lidarpose.load(given).predict(points)
+        found = lidarpose.load(given, tta=1).predict(points)
         np.testing.assert_allclose(found.joints, model.predict(points).joints, atol=1e-4)
 
 
@@ -849,3 +849,25 @@ def test_one_box_in_centimetres_among_boxes_in_metres_is_noticed(model, points):
     warnings = model.predict(points, boxes=[metres, wrong, metres]).warnings
     assert any(line.startswith("box c is unlike the others: it is 180 m tall: are the units") for line in warnings)
     assert not any("unlike" in line for line in model.predict(points, boxes=[metres, metres]).warnings)
+
+
+# ---- inputs that are no person in metres with z up
+
+
+@pytest.mark.parametrize("scale", [1 / 0.3048, 2.0, 10.0])
+def test_a_person_of_another_size_is_noticed(model, points, scale):
+    warnings = model.predict(points * scale).warnings
+    assert any("taller than a person: expected meters" in line for line in warnings)
+    assert not any("taller" in line for line in model.predict(points).warnings)
+
+
+def test_upside_down_is_noticed(model, points):
+    turned = model.predict(points * [1, -1, -1])
+    assert any("try --up -z" in line for line in turned.warnings)
+    assert not any("upside" in line for line in model.predict(points).warnings)
+
+
+def test_a_sweep_given_as_a_crop_is_noticed(model, points):
+    street = np.random.default_rng(0).uniform([-200, -200, -2], [200, 200, -1.9], (3000, 3))
+    warnings = model.predict(np.concatenate([points, street])).warnings
+    assert any("expected a crop of one person" in line for line in warnings)

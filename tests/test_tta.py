@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 import lidarpose
 from lidarpose.errors import InputError
 from lidarpose.inference.backend import Estimates
-from lidarpose.inference.tta import LOOKS, Look, averaged, brought_back, looks_of, shown
+from lidarpose.inference.tta import TRANSFORMS, TTATransform, apply, average, invert, tta_transforms
 from lidarpose.skeleton import HUMAN15
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
@@ -44,9 +44,9 @@ def test_a_look_comes_back(turns, mirrored, shift, seed):
 
     def looked_at(look):
         # from a sensor so far away that a shift turns nothing
-        return brought_back(answer(*shown(look, clouds, centers, np.array([1e7, 3e6, 0]))), look, HUMAN15)
+        return invert(answer(*apply(look, clouds, centers, np.array([1e7, 3e6, 0]))), look, HUMAN15)
 
-    plain, other = looked_at(Look()), looked_at(Look(turns, mirrored, shift))
+    plain, other = looked_at(TTATransform()), looked_at(TTATransform(turns, mirrored, shift))
     np.testing.assert_allclose(other.joints, plain.joints, atol=1e-5)
     # a mirrored left hand is the right one's
     flip = np.array(HUMAN15.flip) if mirrored else np.arange(len(HUMAN15))
@@ -63,27 +63,27 @@ def estimate(value, confidence, people=2, joints=3):
 
 
 def test_the_surer_look_counts_more():
-    one = averaged([estimate(0.0, 0.9), estimate(1.0, 0.45)])
+    one = average([estimate(0.0, 0.9), estimate(1.0, 0.45)])
     assert 0 < one.joints.max() < 0.01
-    assert (averaged([estimate(0.0, 0.5), estimate(1.0, 0.5)]).joints == 0.5).all()
+    assert (average([estimate(0.0, 0.5), estimate(1.0, 0.5)]).joints == 0.5).all()
     # a network that does not tell its confidence has all looks alike
-    assert (averaged([estimate(0.0, None), estimate(1.0, None)]).joints == 0.5).all()
+    assert (average([estimate(0.0, None), estimate(1.0, None)]).joints == 0.5).all()
     # whom no look is sure of at all has them alike too, and is no harm to others
     sure, unsure = estimate(0.0, 0.5), estimate(1.0, 0.5)
     unsure.confidence[1] = sure.confidence[1] = 0.0
-    assert (averaged([sure, unsure]).joints == 0.5).all()
+    assert (average([sure, unsure]).joints == 0.5).all()
     single = estimate(0.3, 0.2)
-    assert averaged([single]) is single
+    assert average([single]) is single
 
 
 def test_looks_are_different_and_the_first_is_none():
-    assert looks_of(1) == (Look(),) and len(set(LOOKS)) == len(LOOKS) == len(looks_of(8))
+    assert tta_transforms(1) == (TTATransform(),) and len(set(TRANSFORMS)) == len(TRANSFORMS) == len(tta_transforms(8))
     # no two put the fine grid in the same place
-    assert len({tuple(np.round(np.mod(look.shift, 0.06), 6)) for look in LOOKS}) == len(LOOKS)
+    assert len({tuple(np.round(np.mod(look.shift, 0.06), 6)) for look in TRANSFORMS}) == len(TRANSFORMS)
 
 
 def test_numpy_s_numbers_are_numbers_of_looks():
-    assert looks_of(np.int64(3)) == looks_of(3)
+    assert tta_transforms(np.int64(3)) == tta_transforms(3)
 
 
 @pytest.mark.parametrize("tta", [0, 9, -1, 1.5, True, "four"])

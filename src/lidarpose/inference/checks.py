@@ -14,7 +14,7 @@ import numpy as np
 
 from lidarpose.inference.inputs import flat_axis, lies, unit_warning
 from lidarpose.inference.results import Poses
-from lidarpose.sample import MIN_POINTS
+from lidarpose.sample import MIN_POINTS, Pose
 
 if TYPE_CHECKING:
     from lidarpose.inference.scan import Scan
@@ -27,8 +27,59 @@ _TALL_TO_WIDE = 0.8
 # center; at most this share of the points is elsewhere, and so few tell nothing
 _GROUND, _CHEST, _TOP = -0.1, 0.75, 1.1
 _ELSEWHERE, _FEWEST = 0.05, 20
+# a network that is shown something of another size or upside down predicts a person of human size all the same, but
+# expects larger errors, m: benchmarks/plausibility.py measures how often these bounds warn
+_UNSURE, _UNSURE_OF_SIZE, _UNSURE_OF_GIANT = 0.08, 0.1, 0.05
+# of fewer points it is unsure anyway
+_FEWEST_UPSIDE_DOWN = 20
+# nobody's points reach over so much height, m, percents of the highest and lowest points left out
+_TALLEST, _GIANT, _TRIMMED = 2.2, 3.0, (3, 97)
+# the spread of a pose upside down, as a share of that as given, from which on the input is upside down
+_CLEARLY_SURER = 0.6
+# a crop that is so far across is no crop of one person, m
+_WIDEST_CROP = 20.0
+# a half turn about x
+UPSIDE_DOWN = np.array([1.0, -1.0, -1.0])
 # boxes named by a warning
 _MOST_NAMED = 3
+
+
+def oversize_warning(points: np.ndarray, pose: Pose) -> str | None:
+    """A person's points are in other units than meters, or hold far more than a person.
+
+    Args:
+        points: (n, 3) m, z up, of the whole crop.
+        pose: the person's.
+    """
+    across = float(np.ptp(points[:, :2], axis=0).max())
+    if across > _WIDEST_CROP:
+        return (
+            f"the points reach over {across:,.0f} m, and one person was looked for near their middle: expected a crop "
+            "of one person: give the people's boxes, or crop closer"
+        )
+    low, high = np.percentile(points[:, 2], _TRIMMED)
+    # what is wider than tall holds walls and trees too
+    bound = _UNSURE_OF_SIZE if high - low < _GIANT else _UNSURE_OF_GIANT
+    if high - low < max(_TALLEST, across) or pose.spread is None or pose.spread.mean() < bound:
+        return None
+    return (
+        f"the points are {high - low:.1f} m tall, taller than a person: expected meters, perhaps they are in feet or "
+        "another unit, or the crop holds more than a person"
+    )
+
+
+def looks_unsure(pose: Pose, points: np.ndarray) -> bool:
+    """Whether it is worth looking at the person, of points (n, 3), upside down too."""
+    return len(points) >= _FEWEST_UPSIDE_DOWN and pose.spread is not None and bool(pose.spread.mean() > _UNSURE)
+
+
+def upside_down_warning(pose: Pose, turned: Pose | None) -> str | None:
+    """The pose is far less certain than the pose of the points turned upside down."""
+    if turned is None or pose.spread is None or turned.spread is None:
+        return None
+    if turned.spread.mean() > _CLEARLY_SURER * pose.spread.mean():
+        return None
+    return "upside down the person is found with more certainty: does the up axis point down? try --up -z"
 
 
 def origin_warning(scan: Scan) -> str | None:

@@ -10,9 +10,10 @@ import numpy as np
 
 from lidarpose.errors import InputError, check_name, missing_extra, whole
 from lidarpose.inference.backend import Backend, Estimates, OnnxBackend, estimates, exported_beside
+from lidarpose.inference.checks import UPSIDE_DOWN, looks_unsure, oversize_warning, upside_down_warning
 from lidarpose.inference.inputs import as_origin, as_points, candidates, clean, is_few, only_returns, unit_warning
 from lidarpose.inference.results import PersonPose, Poses
-from lidarpose.inference.tta import Look, averaged, brought_back, looks_of, shown
+from lidarpose.inference.tta import TTATransform, apply, average, invert, tta_transforms
 from lidarpose.io.files import file_error
 from lidarpose.models import BUNDLED, DEFAULT, weights_path
 from lidarpose.models.checkpoint import read_header
@@ -61,7 +62,7 @@ def load(
     device that is not there; MissingExtra where torch is needed and not installed.
     """
     decoder(decode)
-    looks_of(tta)
+    tta_transforms(tta)
     if threads is not None:
         threads = whole("threads", threads, least=1)
     if backend is not None:
@@ -108,7 +109,7 @@ class Predictor:
         self.model = {"name": name, "version": self.header.version, "backend": backend.name, "decode": decode}
         if tta > 1:
             self.model["tta"] = tta
-        self._decoder, self._tta, self._passes = decoder(decode), looks_of(tta), PASSES
+        self._decoder, self._tta, self._passes = decoder(decode), tta_transforms(tta), PASSES
         # the middle of a person: the pelvis, or half way between the hips where the skeleton has none
         root = ("pelvis",) if "pelvis" in self.skeleton.joints else ("left_hip", "right_hip")
         self._root = [self.skeleton.index(joint) for joint in root]
@@ -192,41 +193,52 @@ class Predictor:
             PersonPose(pose=None, skeleton=wanted, points=points, warnings=tuple(notes), model=self.model)
             for points, notes in cleaned
         ]
-        clouds, owner = [], []
+        parts, owner = [], []
         for i, (points, _) in enumerate(cleaned):
             if is_few(points):
                 points_of = "points" if len(points) < MIN_POINTS else "different points"
                 results[i] = _warned(results[i], f"no pose: under {MIN_POINTS} {points_of}")
                 continue
-            if warning := unit_warning(np.ptp(points, axis=0), what="the person"):
-                results[i] = _warned(results[i], warning)
-            found = candidates(points)
-            clouds += found
-            owner += [i] * len(found)
-        answers: list[Pose | None] = [None] * len(clouds)
-        batch = self.backend.batch
-        # people of like size together: a batch costs as much as if all were its largest
-        order = sorted(range(len(clouds)), key=lambda k: len(clouds[k]))
-        with Progress(len(clouds), unit="clouds", shown=progress) as shown:
-            for start in range(0, len(clouds), batch):
-                part = order[start : start + batch]
-                for k, pose in zip(part, self._poses([clouds[k] for k in part], origin), strict=True):
-                    answers[k] = pose
-                shown.update(start + len(part))
-        best: dict[int, Pose] = {}
+            searched = candidates(points)
+            parts += searched
+            owner += [i] * len(searched)
         # a person's first candidate is the whole cloud
-        for i, pose in zip(owner, answers, strict=True):
-            if pose is not None and (i not in best or _surer(pose, best[i])):
-                best[i] = pose
+        best: dict[int, tuple[Pose, np.ndarray]] = {}
+        for i, part, pose in zip(owner, parts, self._all_poses(parts, origin, progress), strict=True):
+            if pose is not None and (i not in best or _surer(pose, best[i][0])):
+                best[i] = pose, part
         for i in sorted(set(owner)):
-            if i in best:
-                results[i] = replace(results[i], pose=best[i].to(wanted))
-                if names := results[i].out_of_range:
-                    results[i] = _warned(results[i], _range_warning(names))
-            else:
+            if warning := unit_warning(np.ptp(results[i].points, axis=0), what="the person"):
+                results[i] = _warned(results[i], warning)
+            if i not in best:
                 note = f"no pose: under {MIN_POINTS} points within {WINDOW:.0f} m of the person's middle"
                 results[i] = _warned(results[i], note)
+                continue
+            pose, part = best[i]
+            results[i] = replace(results[i], pose=pose.to(wanted))
+            if names := results[i].out_of_range:
+                results[i] = _warned(results[i], _range_warning(names))
+            if not warning and (warning := oversize_warning(results[i].points, pose)):
+                results[i] = _warned(results[i], warning)
+            elif not warning and looks_unsure(pose, part):
+                # the second opinion of a half turn about x costs a pass for the few who look unsure
+                turned = self._poses([part * UPSIDE_DOWN], None if origin is None else origin * UPSIDE_DOWN)[0]
+                if warning := upside_down_warning(pose, turned):
+                    results[i] = _warned(results[i], warning)
         return results
+
+    def _all_poses(self, clouds: list[np.ndarray], origin: np.ndarray | None, progress: bool) -> list[Pose | None]:
+        """The pose of each cloud (n, 3) m in batches. People of like size go together: a batch costs as much as if all
+        were its largest."""
+        poses: list[Pose | None] = [None] * len(clouds)
+        order = sorted(range(len(clouds)), key=lambda k: len(clouds[k]))
+        with Progress(len(clouds), unit="clouds", shown=progress) as shown:
+            for start in range(0, len(clouds), self.backend.batch):
+                batch = order[start : start + self.backend.batch]
+                for k, pose in zip(batch, self._poses([clouds[k] for k in batch], origin), strict=True):
+                    poses[k] = pose
+                shown.update(start + len(batch))
+        return poses
 
     def _poses(self, clouds: list[np.ndarray], origin: np.ndarray | None) -> list[Pose | None]:
         """The pose of each cloud (n, 3) m, None where too little of it is near its middle."""
@@ -236,7 +248,7 @@ class Predictor:
             # an answer that is no number stays one
             centers = centers + np.round(np.clip(root, -WINDOW / 2, WINDOW / 2) / _CENTER_STEP) * _CENTER_STEP
         found = self._looks(clouds, centers, origin)
-        poses = []
+        poses: list[Pose | None] = []
         for k, points in enumerate(clouds):
             near = (np.abs(points - centers[k]) < WINDOW).all(1).sum()
             if near < MIN_POINTS or not np.isfinite(found.joints[k]).all():
@@ -249,17 +261,19 @@ class Predictor:
 
     def outputs(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Estimates:
         """What the network says of clouds (n, 3) m seen about centers (B, 3), from a sensor at origin (3,) or None."""
-        return self._look(Look(), clouds, centers, origin)
+        return self._look(TTATransform(), clouds, centers, origin)
 
     def _looks(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Estimates:
         """The mean of all looks, of which the first is the plain one."""
-        others = [self._look(look, clouds, centers, origin) for look in self._tta[1:]]
-        return averaged([self.outputs(clouds, centers, origin), *others])
+        others = [self._look(transform, clouds, centers, origin) for transform in self._tta[1:]]
+        return average([self.outputs(clouds, centers, origin), *others])
 
-    def _look(self, look: Look, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Estimates:
-        about, view = shown(look, clouds, centers, origin)
+    def _look(
+        self, transform: TTATransform, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None
+    ) -> Estimates:
+        about, view = apply(transform, clouds, centers, origin)
         found = estimates(self.backend.run(about, view), self._decoder)
-        return brought_back(found, look, self.skeleton)
+        return invert(found, transform, self.skeleton)
 
 
 def _surer(pose: Pose, best: Pose) -> bool:
