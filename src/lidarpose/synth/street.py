@@ -23,6 +23,7 @@ from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import Bodies, draw_moving_body
 from lidarpose.synth.environment.mesh import Mesh, union
 from lidarpose.synth.environment.streetscape import RAIL, StreetPlan, draw_plan, scenery
+from lidarpose.synth.placement import Place
 from lidarpose.synth.simulate import ScanConditions, add_sensor_noise
 
 # people start within these distances of the sensor, m, and keep apart from it and from each other by so much
@@ -85,59 +86,35 @@ def street(
     return Street(frames=turns, sensor=device.name, height=plan.height)
 
 
-# --- the people
+# --- the people: the frames of each, and where they start
+
+Walker = tuple[Bodies, Place]
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Walker:
-    """A body, where it starts (3,) m in the level frame at the sensor, and its yaw there, rad."""
-
-    body: Bodies
-    start: np.ndarray
-    yaw: float
-
-    def placed(self, points: np.ndarray) -> np.ndarray:
-        """Points (n, 3) of the body's own frame in the level frame at the sensor."""
-        return points @ rotation_about("z", self.yaw).T.astype(np.float32) + self.start.astype(np.float32)
-
-    def path(self) -> np.ndarray:
-        """(F, 2) m: where the pelvis is."""
-        return np.stack([self.placed(joints[:1])[0, :2] for joints in self.body.joints])
-
-    def mesh(self, frame: int, *, is_smeared: bool) -> Mesh:
-        """The body of a frame; if `is_smeared`, also as it is at the frame's end."""
-        body, later = self.body, None
-        if is_smeared:
-            later = self.placed(body.moved(frame)[0].astype(np.float32))
-        return Mesh(self.placed(body.vertices[frame]), body.faces, body.face_part, later)
-
-    def box(self, vertices: np.ndarray, frame: int, track: int) -> Box:
-        """Around the placed body (V, 3), along its heading."""
-        yaw = self.yaw + self.body.heading[frame]
-        local = vertices.astype(float) @ rotation_about("z", yaw)
-        low, high = local.min(0), local.max(0)
-        center = rotation_about("z", yaw) @ ((low + high) / 2)
-        return Box(center=center, size=high - low + _BOX_ROOM, yaw=float((yaw + pi) % (2 * pi) - pi), id=track)
+def _path(walker: Walker) -> np.ndarray:
+    """(F, 2) m: where the pelvis is."""
+    bodies, place = walker
+    return place.of_body(bodies.joints[:, 0])[:, :2]
 
 
-def _draw_walkers(plan: StreetPlan, count: int, frames: int, rng: np.random.Generator) -> list[_Walker]:
+def _draw_walkers(plan: StreetPlan, count: int, frames: int, rng: np.random.Generator) -> list[Walker]:
     """People on the pavements and on the road, apart from each other at all times; fewer where there is no room.
 
     Who walks too far to stay on one surface in any of the first half of the tries may leave it in the others.
     """
-    walkers: list[_Walker] = []
+    walkers: list[Walker] = []
     paths: list[np.ndarray] = []
     for _ in range(count):
-        body = _draw_pedestrian(frames, rng)
+        bodies = _draw_pedestrian(frames, rng)
         for attempt in range(_PLACE_TRIES):
-            walker, stays = _place_walker(plan, body, rng)
-            path = walker.path()
+            place, stays = _draw_start(plan, bodies, rng)
+            path = _path((bodies, place))
             if np.linalg.norm(path, axis=1).min() < _NEAREST - 1:
                 continue
             if (stays or 2 * attempt > _PLACE_TRIES) and all(
                 np.linalg.norm(path - other, axis=1).min() > _APART for other in paths
             ):
-                walkers.append(walker)
+                walkers.append((bodies, place))
                 paths.append(path)
                 break
     return walkers
@@ -146,14 +123,14 @@ def _draw_walkers(plan: StreetPlan, count: int, frames: int, rng: np.random.Gene
 def _draw_pedestrian(frames: int, rng: np.random.Generator) -> Bodies:
     """Somebody who does what people do in streets: nobody sits without a seat."""
     for _ in range(_KIND_TRIES):
-        body = draw_moving_body(None, 0.0, frames, rng)
-        if body.kinds[0] in _STREET_KINDS:
+        bodies = draw_moving_body(None, 0.0, frames, rng)
+        if bodies.kinds[0] in _STREET_KINDS:
             break
-    return body
+    return bodies
 
 
-def _place_walker(plan: StreetPlan, body: Bodies, rng: np.random.Generator) -> tuple[_Walker, bool]:
-    """The body somewhere, and whether it stays on one surface and out of the rows at the kerbs."""
+def _draw_start(plan: StreetPlan, bodies: Bodies, rng: np.random.Generator) -> tuple[Place, bool]:
+    """Where somebody starts, and whether they stay on one surface and out of the rows at the kerbs."""
     where, far, across, way, lean = rng.random(5)
     turn = rotation_about("z", plan.turn)
     x = (1 if far < 0.5 or plan.ahead else -1) * (_NEAREST - 1 + (_FARTHEST - _NEAREST) * abs(2 * far - 1) ** 1.5)
@@ -170,10 +147,19 @@ def _place_walker(plan: StreetPlan, body: Bodies, rng: np.random.Generator) -> t
         y = bounds[0] + across * (bounds[1] - bounds[0])
         yaw = (pi / 2 if way < 0.5 else -pi / 2) + 1.2 * (lean - 0.5)
     start = turn @ np.array([x, y - plan.sensor_y, z - plan.height])
-    walker = _Walker(body=body, start=start, yaw=float(yaw + plan.turn))
-    path = walker.path() @ turn[:2, :2]
-    inside = (path[:, 1] + plan.sensor_y > bounds[0] - 0.1) & (path[:, 1] + plan.sensor_y < bounds[1] + 0.1)
-    return walker, bool(inside.all())
+    place = Place(feet=start, yaw=float(yaw + plan.turn), distance=float(np.hypot(*start[:2])))
+    across_street = (_path((bodies, place)) @ turn[:2, :2])[:, 1] + plan.sensor_y
+    return place, bool(((across_street > bounds[0] - 0.1) & (across_street < bounds[1] + 0.1)).all())
+
+
+def _label(walker: Walker, frame: int, track: int) -> Box:
+    """The box around somebody, along their heading."""
+    bodies, place = walker
+    yaw = place.yaw + bodies.heading[frame]
+    local = place.of_body(bodies.vertices[frame]).astype(float) @ rotation_about("z", yaw)
+    low, high = local.min(0), local.max(0)
+    center = rotation_about("z", yaw) @ ((low + high) / 2)
+    return Box(center=center, size=high - low + _BOX_ROOM, yaw=float((yaw + pi) % (2 * pi) - pi), id=track)
 
 
 # --- a turn of the sensor
@@ -182,13 +168,16 @@ def _place_walker(plan: StreetPlan, body: Bodies, rng: np.random.Generator) -> t
 def _scan_turn(
     device: Sensor | RayPattern,
     still: Mesh,
-    walkers: list[_Walker],
+    walkers: list[Walker],
     frame: int,
     ring_normals: np.ndarray,
     rng: np.random.Generator,
 ) -> StreetFrame:
     is_pattern = isinstance(device, RayPattern)
-    people = [walker.mesh(frame, is_smeared=is_pattern) for walker in walkers]
+    people = []
+    for bodies, place in walkers:
+        later = place.of_body(bodies.moved(frame)[0].astype(np.float32)) if is_pattern else None
+        people.append(Mesh(place.of_body(bodies.vertices[frame]), bodies.faces, bodies.face_part, later))
     scene = union([*people, still])
     R_sensor_level = rotation_about("y", -device.tilt).astype(np.float32)
     mesh = Mesh(scene.vertices @ R_sensor_level.T, scene.faces)
@@ -208,8 +197,10 @@ def _scan_turn(
         ring=hits.ring[kept],
         person=owner[face],
         part=np.zeros(len(face), np.uint8) if scene.part is None else scene.part[face],
-        boxes=tuple(w.box(m.vertices, frame, track) for track, (w, m) in enumerate(zip(walkers, people, strict=True))),
-        joints=np.array([w.placed(w.body.joints[frame]) for w in walkers], np.float32).reshape(-1, len(BODY26), 3),
+        boxes=tuple(_label(walker, frame, track) for track, walker in enumerate(walkers)),
+        joints=np.array([place.of_body(bodies.joints[frame]) for bodies, place in walkers], np.float32).reshape(
+            -1, len(BODY26), 3
+        ),
     )
 
 
