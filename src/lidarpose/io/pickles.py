@@ -11,6 +11,7 @@ import os
 import pickle
 import re
 import struct
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -127,8 +128,6 @@ class _DataUnpickler(pickle._Unpickler):
             self.dispatch[code[0]](self)
         raise FormatError("is a pickle of too many small parts for its size: ask for npz, or split it")
 
-    # --- what only its maker has
-
     def find_class(self, module: str, name: str) -> Unread:
         name = _canonical(f"{module}.{name}")
         if name not in _KNOWN and not name.startswith("chumpy.") and not _SPARSE.fullmatch(name):
@@ -138,18 +137,8 @@ class _DataUnpickler(pickle._Unpickler):
             )
         return Unread(name)
 
-    def persistent_load(self, pid: object) -> None:
-        raise FormatError("its pickle wants an object by a persistent id, which only its maker has: ask for npz")
-
-    def get_extension(self, code: int) -> None:
-        raise FormatError("its pickle wants a class by a registered number, which only its maker has: ask for npz")
-
-    def load_buffer(self) -> None:
-        raise FormatError("its pickle wants a buffer outside of the file, which only its maker has: ask for npz")
-
-    # --- calls
-
     def _instantiate(self, klass: object, args: list) -> None:
+        """Of the instructions INST and OBJ."""
         self.append(self.call(klass, args))
 
     def load_call(self) -> None:
@@ -167,6 +156,15 @@ class _DataUnpickler(pickle._Unpickler):
             raise TypeError(f"a state of a {type(stub).__name__}")
         stub.value = self.stack[-1] = self.build(stub.name, stub.args, state)
 
+    def load_dict(self) -> None:
+        items = self.pop_mark()
+        self.append({})
+        self.update(items)
+
+    def load_frozenset(self) -> None:
+        items = self.pop_mark()
+        self.append(frozenset(self.keys(items)))
+
     def call(self, what: object, args: object) -> object:
         """What `what(*args)` would return, or a stub where that lacks its state."""
         if type(what) is not Unread or not isinstance(args, tuple | list):
@@ -177,15 +175,12 @@ class _DataUnpickler(pickle._Unpickler):
         if name in _DICTS:
             pairs = args[name == "collections.defaultdict" :] or [()]
             pairs = pairs[0].items() if isinstance(pairs[0], dict) else pairs[0]
-            made = self.updated({}, [part for key, value in pairs for part in (key, value)])
+            made = dict(zip(self.keys([key for key, _ in pairs]), [value for _, value in pairs], strict=True))
         elif name in _ITEMS:
-            items = args[0] if args else ()
-            if len(args) > 1 or not isinstance(items, list | tuple | set | frozenset):
-                raise TypeError(f"a {name} of something else than items")
-            made = _ITEMS[name](self.keys(items) if "set" in name else items)
+            made = _ITEMS[name](*(map(self.keys, args) if "set" in name else args))
         elif name in _CALLS:
             made = _CALLS[name](*args)
-        elif name in ("numpy.ndarray", "builtins.object") or name in _NEW:
+        elif name in _CLASSES:
             raise TypeError(f"a call of {name}")
         else:
             return _Stub(name, args)
@@ -208,47 +203,25 @@ class _DataUnpickler(pickle._Unpickler):
 
     def charged(self, made: object) -> object:
         """The value, once it is sure that all values together do not outgrow the file."""
-        self.copies_left -= (
-            made.nbytes if isinstance(made, np.ndarray) else len(made) if hasattr(made, "__len__") else 0
-        )
+        self.copies_left -= getattr(made, "nbytes", None) or (len(made) if hasattr(made, "__len__") else 0)
         if self.copies_left < 0:
             raise FormatError(f"has arrays of more than {_COPIES} times its size: ask for npz")
         return made
 
-    # --- containers
-
-    def extended(self, items: list) -> None:
+    def extend(self, items: list) -> None:
         if type(self.stack[-1]) is not list:
             raise TypeError(f"items of a {type(self.stack[-1]).__name__}")
         self.stack[-1].extend(items)
 
-    def updated(self, target: object, items: list) -> dict:
-        if type(target) is not dict:
-            raise TypeError(f"values by key of a {type(target).__name__}")
-        target.update(zip(self.keys(items[::2]), items[1::2], strict=True))
-        return target
-
-    def load_dict(self) -> None:
-        items = self.pop_mark()
-        self.append(self.updated({}, items))
-
-    def load_frozenset(self) -> None:
-        items = self.pop_mark()
-        self.append(frozenset(self.keys(items)))
-
-    def load_setitem(self) -> None:
-        value, key = self.stack.pop(), self.stack.pop()
-        self.updated(self.stack[-1], [key, value])
-
-    def load_setitems(self) -> None:
-        items = self.pop_mark()
-        self.updated(self.stack[-1], items)
-
-    def load_additems(self) -> None:
-        items = self.pop_mark()
+    def add(self, items: list) -> None:
         if type(self.stack[-1]) is not set:
             raise TypeError(f"items of a {type(self.stack[-1]).__name__}")
         self.stack[-1].update(self.keys(items))
+
+    def update(self, items: list) -> None:
+        if type(self.stack[-1]) is not dict:
+            raise TypeError(f"values by key of a {type(self.stack[-1]).__name__}")
+        self.stack[-1].update(zip(self.keys(items[::2]), items[1::2], strict=True))
 
     def keys(self, items: object) -> object:
         """The items, once each can be a key: a nested one could overflow the interpreter's stack, and numbers can be
@@ -272,27 +245,33 @@ class _DataUnpickler(pickle._Unpickler):
         return items
 
 
-_DataUnpickler.dispatch |= {
-    code[0]: handler
-    for handler, codes in {
-        # frames only say how much to read ahead
-        lambda self: self.read(8): [pickle.FRAME],
-        _DataUnpickler.load_buffer: [pickle.NEXT_BUFFER, pickle.READONLY_BUFFER],
-        _DataUnpickler.load_call: [pickle.REDUCE, pickle.NEWOBJ],
-        _DataUnpickler.load_call_with_names: [pickle.NEWOBJ_EX],
-        _DataUnpickler.load_state: [pickle.BUILD],
-        _DataUnpickler.load_dict: [pickle.DICT],
-        _DataUnpickler.load_setitem: [pickle.SETITEM],
-        _DataUnpickler.load_setitems: [pickle.SETITEMS],
-        _DataUnpickler.load_additems: [pickle.ADDITEMS],
-        lambda self: self.extended([self.stack.pop()]): [pickle.APPEND],
-        lambda self: self.extended(self.pop_mark()): [pickle.APPENDS],
-        _DataUnpickler.load_frozenset: [pickle.FROZENSET],
-        # Python's own takes the announced memory before it reads
-        pickle._Unpickler.load_binbytes8: [pickle.BYTEARRAY8],
-    }.items()
-    for code in codes
+def _refuse(what: str) -> Callable[[_DataUnpickler], None]:
+    def handler(self: _DataUnpickler) -> None:
+        raise FormatError(f"its pickle wants {what}, which only its maker has: ask for npz")
+
+    return handler
+
+
+_HANDLERS = {
+    # frames only say how much to read ahead
+    pickle.FRAME: lambda self: self.read(8),
+    **dict.fromkeys((pickle.PERSID, pickle.BINPERSID), _refuse("an object by a persistent id")),
+    **dict.fromkeys((pickle.EXT1, pickle.EXT2, pickle.EXT4), _refuse("a class by a registered number")),
+    **dict.fromkeys((pickle.NEXT_BUFFER, pickle.READONLY_BUFFER), _refuse("a buffer outside of the file")),
+    **dict.fromkeys((pickle.REDUCE, pickle.NEWOBJ), _DataUnpickler.load_call),
+    pickle.NEWOBJ_EX: _DataUnpickler.load_call_with_names,
+    pickle.BUILD: _DataUnpickler.load_state,
+    pickle.DICT: _DataUnpickler.load_dict,
+    pickle.FROZENSET: _DataUnpickler.load_frozenset,
+    pickle.APPEND: lambda self: self.extend([self.stack.pop()]),
+    pickle.APPENDS: lambda self: self.extend(self.pop_mark()),
+    pickle.ADDITEMS: lambda self: self.add(self.pop_mark()),
+    pickle.SETITEM: lambda self: self.update([self.stack.pop(-2), self.stack.pop()]),
+    pickle.SETITEMS: lambda self: self.update(self.pop_mark()),
+    # Python's own takes the announced memory before it reads
+    pickle.BYTEARRAY8: pickle._Unpickler.load_binbytes8,
 }
+_DataUnpickler.dispatch |= {code[0]: handler for code, handler in _HANDLERS.items()}
 
 
 def _check_levels(value: object, levels: dict[int, int | None], depth: int) -> int:
@@ -400,12 +379,6 @@ def _encode(text: object = b"", encoding: object = "latin1") -> bytes:
     return text.encode("latin1")
 
 
-def _complex(real: object, imaginary: object) -> complex:
-    if type(real) not in (int, float) or type(imaginary) not in (int, float):
-        raise FormatError(f"makes a complex number of something else than numbers: {_REMEDY}")
-    return complex(real, imaginary)
-
-
 # what can be made at once, without a state
 _CALLS = {
     "numpy.core.multiarray.scalar": _scalar,
@@ -413,9 +386,11 @@ _CALLS = {
     "_codecs.encode": _encode,
     "builtins.bytes": _encode,
     "builtins.bytearray": _encode,
-    "builtins.complex": _complex,
+    "builtins.complex": complex,
 }
-_KNOWN = {"numpy.dtype", "numpy.ndarray", "builtins.object", _RECONSTRUCT, *_NEW, *_DICTS, *_ITEMS, *_CALLS}
+# what may be named, not called
+_CLASSES = ("numpy.ndarray", "builtins.object", *_NEW)
+_KNOWN = {"numpy.dtype", _RECONSTRUCT, *_CLASSES, *_DICTS, *_ITEMS, *_CALLS}
 
 
 # --- chumpy and scipy
@@ -437,30 +412,21 @@ def _dense(name: str, state: object, most: int) -> np.ndarray:
     """A compressed sparse matrix, of at most so many numbers: indptr (lines + 1,), indices and data (entries,)."""
     state = state if isinstance(state, dict) else {}
     shape = state.get("_shape", state.get("shape"))
-    pieces = [state.get(part) for part in ("indptr", "indices", "data")]
-    if (
-        not isinstance(shape, tuple)
-        or len(shape) != 2
-        or not all(isinstance(p, np.ndarray) and p.ndim == 1 for p in pieces)
-    ):
+    parts = [state.get(part) for part in ("indptr", "indices", "data")]
+    good = isinstance(shape, tuple) and len(shape) == 2 and all(isinstance(n, int | np.integer) for n in shape)
+    for part, kinds in zip(parts, ("iu", "iu", "fiub"), strict=True):
+        good = good and isinstance(part, np.ndarray) and part.ndim == 1 and part.dtype.kind in kinds
+    if not good:
         raise FormatError(f"has a {name} without its parts: {_REMEDY}")
     rows, columns = (int(n) for n in shape)
-    by_column = "csc" in name
-    lines, across = (columns, rows) if by_column else (rows, columns)
     if min(shape) < 0 or rows * columns > most:
         raise FormatError(f"has a {name} of {rows} x {columns}; up to {MAX_DENSE} numbers are read in all: ask for npz")
-    start, index, data = pieces
-    wrong = (
-        len(start) != lines + 1
-        or len(index) != len(data)
-        or start.dtype.kind not in "iu"
-        or data.dtype.kind not in "fiub"
-    )
-    wrong = (
-        wrong or index.dtype.kind not in "iu" or start[0] != 0 or start[-1] != len(data) or (np.diff(start) < 0).any()
-    )
-    if wrong or (len(index) and not 0 <= index.min() <= index.max() < across):
+    lines, across = (columns, rows) if "csc" in name else (rows, columns)
+    start, index, data = parts[0].astype(np.int64), parts[1].astype(np.int64), parts[2]
+    counts = np.diff(start)
+    fits = len(start) == lines + 1 and start[0] == 0 and start[-1] == len(data) == len(index) and (counts >= 0).all()
+    if not fits or ((index < 0) | (index >= across)).any():
         raise FormatError(f"has a {name} whose parts do not fit together: {_REMEDY}")
     dense = np.zeros((lines, across), data.dtype)
-    np.add.at(dense, (np.repeat(np.arange(lines), np.diff(start)), index), data)
-    return dense.T.copy() if by_column else dense
+    np.add.at(dense, (np.repeat(np.arange(lines), counts), index), data)
+    return dense.T.copy() if "csc" in name else dense
