@@ -235,7 +235,7 @@ def real() -> str:
         )
         for one in _read("real")["people"]
     ]
-    header = ("sweep", "person", "points", "distance m", "facing relative to the box", "the same, one look")
+    header = ("sweep", "person", "points", "distance m", "facing relative to the box", "the same, `--tta 1`")
     return table((*header, "points within 15 cm of a bone", "trunk lean", "confidence"), rows)
 
 

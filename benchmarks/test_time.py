@@ -37,16 +37,16 @@ class Way:
 
 
 _SYMMETRIES = tuple(TTATransform(turns, mirrored) for turns in range(4) for mirrored in (False, True))
-USUAL = Way("as shipped: two passes, one look")
+USUAL = Way("two passes, one prediction (`--tta 1`)")
 WAYS = (
     Way("one pass", passes=1),
     USUAL,
     Way("three passes", passes=3),
-    Way("and mirrored, joints average", looks=_SYMMETRIES[:2]),
-    Way("and mirrored, heatmaps average", looks=_SYMMETRIES[:2], heatmaps=True),
-    Way("four quarter turns, joints average", looks=_SYMMETRIES[::2]),
-    Way("four turns, each mirrored too, joints average", looks=_SYMMETRIES),
-    Way("`--tta 2`: turned, mirrored and shifted", looks=TRANSFORMS[:2]),
+    Way("and mirrored, joints averaged", looks=_SYMMETRIES[:2]),
+    Way("and mirrored, heatmaps averaged", looks=_SYMMETRIES[:2], heatmaps=True),
+    Way("four quarter rotations, joints averaged", looks=_SYMMETRIES[::2]),
+    Way("four rotations, each mirrored too, joints averaged", looks=_SYMMETRIES),
+    Way("`--tta 2`: rotated, mirrored and shifted", looks=TRANSFORMS[:2]),
     Way("`--tta 4`", looks=TRANSFORMS[:4]),
     Way("`--tta 8`", looks=TRANSFORMS),
 )
