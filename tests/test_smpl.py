@@ -219,42 +219,48 @@ def test_wrong_models_are_explained_in_one_line(tmp_path, change, line):
 
 
 def test_weights_must_be_weights(tmp_path):
-    for change in (lambda w: w * 2, lambda w: w - 0.5, lambda w: np.roll(w, 3, 1) * 0):
-        model = synthetic()
-        np.savez(tmp_path / "m.npz", **model | {"weights": change(model["weights"])})
+    weights = synthetic()["weights"]
+    for wrong in (weights * 2, weights - 0.5, weights * 0):
+        np.savez(tmp_path / "m.npz", **synthetic() | {"weights": wrong})
         with pytest.raises(InputError, match="sum to 1"):
             load_body(tmp_path / "m.npz")
 
 
 def test_wrong_files(tmp_path):
-    with pytest.raises(InputError, match="no such file"):
-        load_body(tmp_path / "none.npz")
-    path = tmp_path / "m.npz"
-    path.write_bytes(b"PK\x03\x04 broken")
-    with pytest.raises(InputError, match="not an npz of plain arrays"):
-        load_body(path)
-    np.savez(path, **synthetic() | {"J_regressor": np.array([{}, {}], dtype=object)})
-    with pytest.raises(InputError, match="not an npz of plain arrays"):
-        load_body(path)
-    np.save(tmp_path / "m.npy", np.zeros(3))
-    with pytest.raises(InputError, match="expected a body of the SMPL family"):
-        load_body(tmp_path / "m.npy")
-    (tmp_path / "m.pkl").write_bytes(pickle.dumps([1]))
-    with pytest.raises(InputError, match="a dict of SMPL's arrays, got list"):
-        load_body(tmp_path / "m.pkl")
+    objects = synthetic() | {"J_regressor": np.array([{}, {}], dtype=object)}
+    (tmp_path / "broken.npz").write_bytes(b"PK\x03\x04 broken")
+    np.savez(tmp_path / "objects.npz", **objects)
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    (tmp_path / "list.pkl").write_bytes(pickle.dumps([1]))
+    for name, message in (
+        ("none.npz", "no such file"),
+        ("broken.npz", "not an npz of plain arrays"),
+        ("objects.npz", "not an npz of plain arrays"),
+        ("array.npy", "expected a body of the SMPL family"),
+        ("list.pkl", "a dict of SMPL's arrays, got list"),
+    ):
+        with pytest.raises(InputError, match=message):
+            load_body(tmp_path / name)
 
 
-def test_wrong_calls(body):
-    eye = np.broadcast_to(np.eye(3), (2, 24, 3, 3))
-    with pytest.raises(InputError, match=r"betas must be finite, \(n, up to 10\)"):
-        body.pose(np.zeros((2, 11)), eye)
-    with pytest.raises(InputError, match="betas must be finite"):
-        body.pose(np.full((2, 3), np.nan), eye)
-    with pytest.raises(InputError, match="rotations must be finite"):
-        body.pose(np.zeros((2, 3)), eye[:1])
-    with pytest.raises(InputError, match="rotations must be finite"):
-        body.pose(np.zeros((2, 3)), np.zeros((2, 21, 3)))
-    with pytest.raises(InputError, match="rotations must be finite"):
-        body.pose(np.zeros((2, 3)), np.zeros((2, 24, 4)))
-    with pytest.raises(InputError, match=r"translation must be \(2, 3\)"):
-        body.pose(np.zeros((2, 3)), eye, np.zeros(3))
+EYE = np.broadcast_to(np.eye(3), (2, 24, 3, 3))
+
+
+@pytest.mark.parametrize(
+    "betas, rotations, translation, message",
+    [
+        (np.zeros((2, 11)), EYE, None, r"betas must be finite, \(n, up to 10\)"),
+        (np.full((2, 3), np.nan), EYE, None, "betas must be finite"),
+        (np.zeros((2, 3)), EYE[:1], None, "rotations must be finite"),
+        (np.zeros((2, 3)), np.zeros((2, 21, 3)), None, "rotations must be finite"),
+        (np.zeros((2, 3)), np.zeros((2, 24, 4)), None, "rotations must be finite"),
+        (np.zeros((2, 3)), "a text", None, "rotations must be an array of numbers"),
+        (np.zeros((2, 3)), EYE, np.zeros(3), r"translation must be \(2, 3\)"),
+    ],
+)
+def test_wrong_calls(body, betas, rotations, translation, message):
+    with pytest.raises(InputError, match=message):
+        body.pose(betas, rotations, translation)
+    if isinstance(rotations, np.ndarray) and rotations.ndim == 4:
+        with pytest.raises(InputError, match=message):
+            body.pose_house(betas, rotations, np.zeros((2, 3)) if translation is None else translation)
