@@ -145,7 +145,7 @@ def test_house_frame(bodies):
     for joints in (24, 55):
         body, _ = bodies[joints]
         betas = rng.normal(size=(3, 10))
-        vertices, joints26 = body.pose_house(betas, turns, move)
+        vertices, joints26 = body.pose_level(betas, turns, move)
         assert vertices.dtype == joints26.dtype == np.float32 and joints26.shape == (3, 26, 3)
         np.testing.assert_allclose(joints26[:, 0], move, atol=1e-6)
         there, at = body.pose(betas, R_LEVEL_SMPL.T @ turns @ R_LEVEL_SMPL)
@@ -154,18 +154,18 @@ def test_house_frame(bodies):
             joints26[:, :22], (at[:, :22] - at[:, :1]) @ R_LEVEL_SMPL.T + move[:, None], atol=1e-5
         )
         # nose and middle of the head ride on the head
-        still, rest = body.pose_house(betas, np.broadcast_to(np.eye(3), (3, 24, 3, 3)), np.zeros((3, 3)))
+        still, rest = body.pose_level(betas, np.broadcast_to(np.eye(3), (3, 24, 3, 3)), np.zeros((3, 3)))
         apart = [np.linalg.norm(j[:, J("nose")] - j[:, J("head_center")], axis=-1) for j in (rest, joints26)]
         np.testing.assert_allclose(*apart, atol=1e-5)
         assert (rest[:, J("nose"), 0] > rest[:, J("head_center"), 0] + 0.05).all()
-        _, mean = body.pose_house(np.zeros((1, 0)), np.eye(3) + np.zeros((1, 24, 1, 1)), np.zeros((1, 3)))
+        _, mean = body.pose_level(np.zeros((1, 0)), np.eye(3) + np.zeros((1, 24, 1, 1)), np.zeros((1, 3)))
         assert abs(mean[0, J("head_center"), 1]) < 0.01
         assert (rest[:, J("left_hand"), 1] > 0.4).all() and (rest[:, J("left_foot"), 2] < -0.6).all()
     # facing +x, the left at +y, the head up
     turn = rotation_about("z", np.pi / 2)
     turns = np.broadcast_to(np.eye(3), (1, 24, 3, 3)).copy()
     turns[0, 0] = turn
-    turned, _ = body.pose_house(betas[:1], turns, np.zeros((1, 3)))
+    turned, _ = body.pose_level(betas[:1], turns, np.zeros((1, 3)))
     np.testing.assert_allclose(turned[0], still[0] @ turn.T, atol=1e-5)
 
 

@@ -100,7 +100,7 @@ class SmplBody:
         root = joints[:, 0] + self._checked_translation(translation, len(vertices))
         return self._posed(vertices, joints, rotations, root)[:2]
 
-    def pose_house(
+    def pose_level(
         self, betas: np.ndarray, rotations: np.ndarray, translation: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Poses the model in the level frame (x forward, y left, z up), as `body.rig.pose_bodies` does.
@@ -133,6 +133,9 @@ class SmplBody:
         head = positions[:, None, _HEAD] + points @ np.swapaxes(global_rotations[:, _HEAD], -1, -2)
         body26 = np.concatenate([positions[:, :_SHARED], np.stack(hands, 1), head], 1)
         return tuple((x @ _R_LEVEL_SMPL.T).astype(np.float32) for x in (posed, body26))
+
+    # its name before 0.3
+    pose_house = pose_level
 
     def _posed(
         self, vertices: np.ndarray, joints: np.ndarray, rotations: np.ndarray, root: np.ndarray
@@ -263,7 +266,7 @@ def _body(path: object, raw: Mapping) -> SmplBody:
 
 
 def _numbers(path: object, key: str, value: object) -> np.ndarray:
-    """A float64 copy of an array of numbers, C-contiguous: nobody else's array is made read-only."""
+    """A float64 copy of an array of numbers, C-contiguous: the caller's array is not made read-only."""
     if isinstance(value, Unread):
         raise file_error(path, f"{key} is a {value.name} that holds no numbers: ask for npz")
     # lists that hold one list many times over would grow without end

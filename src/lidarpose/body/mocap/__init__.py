@@ -106,16 +106,13 @@ def _format_of(path: Path) -> str:
 def _sources(folder: Path, format: str | None) -> list[Path]:
     """Files of motion in a folder and its folders, and its folders of pose files, in the order of their names."""
     suffixes = {s for s, name in _BY_SUFFIX.items() if format in (None, name) or (s, format) == (".npz", "clips")}
-    found = []
-    for here, folders, files in os.walk(folder):
-        folders.sort()
-        for name in sorted(files):
-            suffix = Path(name).suffix.lower()
-            if suffix in suffixes - {".json"} and not name.lower().endswith(_NO_MOTION):
-                found.append(Path(here, name))
+    sources = []
+    for here, _, names in os.walk(folder):
+        files = [Path(here, name) for name in names if not name.lower().endswith(_NO_MOTION)]
+        sources += [file for file in files if file.suffix.lower() in suffixes - {".json"}]
         if ".json" in suffixes and pose_files(Path(here)):
-            found.append(Path(here))
-    return sorted(found)
+            sources.append(Path(here))
+    return sorted(sources)
 
 
 def digest(path: str | os.PathLike) -> str:

@@ -37,7 +37,7 @@ def read_bvh(path: str | os.PathLike) -> tuple[JointTree, np.ndarray, float | No
     tree = _hierarchy(path, lines[1:motion])
     width = sum(map(len, tree.channels))
     if not width:
-        raise file_error(path, "no joint has CHANNELS, so nobody moves: was it exported with its motion?")
+        raise file_error(path, "no joint has CHANNELS, so nothing moves: was it exported with its motion?")
     return tree, *_frames(path, lines[motion + 1 :], width)
 
 

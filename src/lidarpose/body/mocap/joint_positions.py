@@ -57,7 +57,7 @@ def motion_from_joints(
         unit_m: Meters of a file's number, by default the unit that gives the person the most usual size.
 
     Raises:
-        InputError: For people of no one's size or speed, upside down, or with too many frames to leave out.
+        InputError: For sizes or speeds that people do not have, upside down, or with too many frames to leave out.
     """
     check_rate(path, fps)
     good = np.isfinite(joints).all((1, 2))
@@ -87,7 +87,7 @@ def motion_from_joints(
 
 def meters_per_unit(path: object, joints: np.ndarray, unit_m: float | None = None) -> float:
     """Meters of a number of SMPL's joints (F, 24, 3): the unit that gives the person the most usual size, or `unit_m`.
-    Raises InputError where that is nobody's size, and for legs of different lengths."""
+    Raises InputError where that is not a person's size, and for legs of different lengths."""
     left, right, trunk = (_median_length(joints, part) for part in ("left_", "right_", "trunk"))
     if not (np.isfinite([left, right, trunk]).all() and min(left, right, trunk) > 0):
         raise file_error(path, "the legs or the trunk have no length; expected the offsets of a person's bones")

@@ -125,7 +125,7 @@ def tree_motion(
         matched: Joints of the tree by SMPL's names, where names are not to be guessed.
 
     Raises:
-        InputError: For a skeleton that is nobody's, and what `motion_from_joints` refuses.
+        InputError: For a skeleton without the joints of a person, and what `motion_from_joints` refuses.
     """
     matched = match_joints(path, tree.names, tree.parents) if matched is None else matched
     name, finite = Path(path).stem, np.isfinite(positions).all((1, 2))
@@ -171,7 +171,7 @@ def match_joints(path: object, names: Sequence[str], parents: Sequence[int]) -> 
         listed = ", ".join(n for n in names if not n.endswith(END))
         raise file_error(
             path,
-            f"found no joint for {', '.join(missing)} among {listed or 'no joints'}; needed are left and right "
+            f"has no joint for {', '.join(missing)} among {listed or 'no joints'}; needed are left and right "
             "hip/UpLeg, knee/Leg, ankle/Foot, shoulder/Arm, elbow/ForeArm, wrist/Hand, and Head",
         )
     return matched

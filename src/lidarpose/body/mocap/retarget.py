@@ -188,7 +188,7 @@ def _hinge(first: np.ndarray, second: np.ndarray, straight: np.ndarray, overstre
     """The axis (n, 3) about which `second` is bent from `first`, `straight` where the joint is straight.
 
     A small bend the other way round than `straight` is a joint stretched too far; a larger one, over `overstretch`
-    (a sine) more, is a limb that is turned that far. In between the axis turns over without a jump.
+    (a sine) more, is a limb that is rotated that far. In between the axis changes without a jump.
     """
     first, second, straight = unit(first), unit(second), unit(straight)
     normal = np.cross(first, second)

@@ -35,7 +35,7 @@ from lidarpose.io.pickles import load_pickle
 _R_LEVEL_SMPL = UP_AXES["y"]
 # rotations beyond this are degrees, rad
 _MOST_TURN = 4 * np.pi
-# nobody is as far from the origin of a recording, m
+# farthest position from the origin of a recording, m
 _FARTHEST = 1e5
 
 _RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
