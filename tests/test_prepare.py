@@ -11,9 +11,11 @@ from dataclasses import replace
 import dataset_files as files
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pyarrow import parquet
 from shard_files import write_shard
 
 from lidarpose.data import writer
@@ -186,6 +188,13 @@ def test_what_is_whole_is_not_read_again(raw, prepared, tmp_path, monkeypatch):
     assert read == [1, 2] and content(out) == content(prepared[0]) and summary == prepared[1]
     prepare("humanm3", raw[0], out)
     assert read == [1, 2]
+    # of the right number of rows, but damaged
+    table = parquet.read_table(out / "labelled-00001.parquet")
+    column = pa.nulls(len(table), table.schema.field("joints").type)
+    place = table.schema.get_field_index("joints")
+    parquet.write_table(table.set_column(place, "joints", column), out / "labelled-00001.parquet")
+    with pytest.raises(InputError, match="labelled-00001.parquet: has a row that is no sample; delete it"):
+        prepare("humanm3", raw[0], out)
 
 
 def _gone():

@@ -67,22 +67,11 @@ class DatasetCard:
         return min(self.per_shard, self.count - shard * self.per_shard)
 
     def to_json(self) -> str:
-        named = {
-            "schema": SCHEMA,
-            "version": self.version,
-            "count": self.count,
-            "per_shard": self.per_shard,
-            "tables": list(self.tables),
-            "unit": "m",
-            "frame": self.frame,
-            "skeleton": self.skeleton,
-            "joints": list(skeleton(self.skeleton).joints),
-            "settings": self.settings,
-        }
-        if self.about:
-            named["about"] = self.about
-        if self.summary is not None:
-            named["summary"] = self.summary
+        named = {"schema": SCHEMA, "version": self.version, "count": self.count, "per_shard": self.per_shard}
+        named |= {"tables": list(self.tables), "unit": "m", "frame": self.frame, "skeleton": self.skeleton}
+        named |= {"joints": list(skeleton(self.skeleton).joints), "settings": self.settings}
+        optional = {"about": self.about or None, "summary": self.summary}
+        named |= {name: value for name, value in optional.items() if value is not None}
         return json.dumps(named, indent=2) + "\n"
 
 
@@ -94,11 +83,9 @@ def read_card(folder: str | Path) -> DatasetCard:
     try:
         found = json.loads(read_bytes(path, expected="a dataset's card"))
         if found["schema"] != SCHEMA:
-            raise file_error(
-                path,
-                f"is of schema {found['schema']!r}, this lidarpose reads {SCHEMA}: "
-                f"install lidarpose {found.get('version', 'of the version that wrote it')}",
-            )
+            version = found.get("version", "of the version that wrote it")
+            problem = f"is of schema {found['schema']!r}, this lidarpose reads {SCHEMA}: install lidarpose {version}"
+            raise file_error(path, problem)
         card = DatasetCard(
             settings=dict(found["settings"]),
             count=int(found["count"]),
@@ -276,6 +263,5 @@ def check_settings(folder: str | Path, found: DatasetCard, wanted: DatasetCard) 
         if old.get(name) != new.get(name)
     ]
     if differ:
-        raise InputError(
-            f"{folder} holds a dataset of other settings: {'; '.join(differ)}; give another folder or the same settings"
-        )
+        problem = f"{folder} holds a dataset of other settings: {'; '.join(differ)}"
+        raise InputError(f"{problem}; give another folder or the same settings")

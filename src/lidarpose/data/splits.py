@@ -81,9 +81,8 @@ def split_rule(dataset: str, root: Path, name: str | None = None, parts: Sequenc
     published = {rule.name: rule for rule in _published(dataset)}
     if name is not None:
         if not published:
-            raise InputError(
-                f"{dataset} has no published splits, got {name!r}: put train.txt and test.txt into its folder"
-            )
+            own = "put train.txt and test.txt into its folder"
+            raise InputError(f"{dataset} has no published splits, got {name!r}: {own}")
         check_name(f"split of {dataset}", name, published)
         return published[name]
     return _own(root, parts) or next((rule for rule in published.values() if rule.usual), None)

@@ -7,6 +7,7 @@ import numpy as np
 
 from lidarpose.data.shards import DatasetReader, read_rows, shard_path
 from lidarpose.data.splits import SplitRule
+from lidarpose.io.files import file_error
 from lidarpose.sample import HIDDEN, SEEN, UNLABELED
 from lidarpose.skeleton import skeleton
 
@@ -29,7 +30,10 @@ def summarize(
     ends = [[names.index(f"{side}_{joint}") for side in ("left", "right")] for joint in ("hip", "shoulder")]
     for shard, part in enumerate(parts):
         people, skipped = 0, 0
-        for row in read_rows(shard_path(dataset.folder, "labelled", shard), "labelled", _COLUMNS):
+        path = shard_path(dataset.folder, "labelled", shard)
+        for row in read_rows(path, "labelled", _COLUMNS):
+            if any(row[name] is None for name in _COLUMNS if name != "split") or len(row["joints"]) != 3 * len(names):
+                raise file_error(path, "has a row that is no sample; delete it and run the same command again")
             people += 1
             frames.add((row["sequence"], row["frame"]))
             splits[row["split"] or "none"] += 1

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.body.rig import forward_kinematics
-from lidarpose.body.smpl import SmplBody, load_body
+from lidarpose.body.smpl import load_body
 from lidarpose.data.readers.base import Skipped, entries
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix
@@ -40,27 +40,43 @@ class SmplJoints:
     def __init__(self, path: str | Path | None, dataset: str):
         if path is None:
             raise InputError(f"{dataset} has SMPL poses and no joints, so it needs SMPL's own file: {_GET}")
-        self.files = {"any": Path(path)}
-        if Path(path).is_dir():
-            self.files = _in_folder(Path(path))
+        path = Path(path)
+        if path.is_dir():
+            self.files = _in_folder(path)
             if "neutral" not in self.files:
-                raise file_error(path, f"expected SMPL_NEUTRAL.pkl or .npz, got {entries(Path(path))}: {_GET}")
-        elif not Path(path).is_file():
+                raise file_error(path, f"expected SMPL_NEUTRAL.pkl or .npz, got {entries(path)}: {_GET}")
+        elif not path.is_file():
             raise file_error(path, f"no such file; expected SMPL's own: {_GET}")
-        usual = self.kind("neutral")
-        self._models = {usual: _Model(self.files[usual])}
+        else:
+            self.files = {"any": path}
+        # what becomes joints at rest: the mean's (24, 3) and the shapes' (24, 3, betas)
+        self._models: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        self._model(self.kind("neutral"))
 
     def kind(self, gender: str) -> str:
         """Which model a gender gets: "any" where one file is for everybody, else its own, else the neutral one."""
         return "any" if "any" in self.files else gender if gender in self.files else "neutral"
 
+    def _model(self, kind: str) -> tuple[np.ndarray, np.ndarray]:
+        if kind not in self._models:
+            body = load_body(self.files[kind])
+            if (count := len(body.parents)) != len(SMPL24):
+                problem = f"expected SMPL, with 24 joints, got {count} (SMPL+H, SMPL-X?): {_GET}"
+                raise file_error(self.files[kind], problem)
+            shapes = np.einsum("jv,vcs->jcs", body.regressor, body.shapes, optimize=True)
+            self._models[kind] = body.regressor @ body.template, shapes
+        return self._models[kind]
+
     def __call__(self, betas: np.ndarray, pose: np.ndarray, trans: np.ndarray, gender: str = "neutral") -> np.ndarray:
         """Joints (n, 24, 3) float64 m. betas (n or 1, <= 300); pose (n, 72) axis-angles rad, the root first; trans
         (n, 3) m, added to everything, so that the pelvis is at its rest position plus trans."""
-        kind = self.kind(gender)
-        if kind not in self._models:
-            self._models[kind] = _Model(self.files[kind])
-        return self._models[kind].joints(betas, pose, trans)
+        mean, shapes = self._model(self.kind(gender))
+        if (count := betas.shape[-1]) > shapes.shape[-1]:
+            path = self.files[self.kind(gender)]
+            raise file_error(path, f"has {shapes.shape[-1]} shapes, the labels {count}: give the full model")
+        rest = mean + np.moveaxis(shapes[..., :count] @ betas.T, -1, 0)
+        rotations = axis_angle_to_matrix(pose.reshape(len(pose), -1, 3))
+        return forward_kinematics(SMPL24.parents, rest, rotations, rest[:, 0] + trans)[1]
 
     @cached_property
     def digests(self) -> dict[str, str]:
@@ -82,26 +98,6 @@ def smpl_sample(points: np.ndarray, joints: np.ndarray, **labels: Any) -> Labele
         joint_labels=np.full(len(SMPL24), SEEN, np.uint8),
         **labels,
     )
-
-
-class _Model:
-    """A body's joints at rest, linear in betas."""
-
-    def __init__(self, path: Path):
-        body: SmplBody = load_body(path)
-        if len(body.parents) != len(SMPL24):
-            raise file_error(path, f"expected SMPL, with 24 joints, got {len(body.parents)} (SMPL+H, SMPL-X?): {_GET}")
-        self.path = path
-        self.rest = body.regressor @ body.template
-        self.shapes = np.einsum("jv,vcs->jcs", body.regressor, body.shapes, optimize=True)
-
-    def joints(self, betas: np.ndarray, pose: np.ndarray, trans: np.ndarray) -> np.ndarray:
-        count = betas.shape[-1]
-        if count > self.shapes.shape[-1]:
-            raise file_error(self.path, f"has {self.shapes.shape[-1]} shapes, the labels {count}: give the full model")
-        rest = self.rest + np.moveaxis(self.shapes[..., :count] @ betas.T, -1, 0)
-        turns = axis_angle_to_matrix(pose.reshape(len(pose), -1, 3))
-        return forward_kinematics(SMPL24.parents, rest, turns, rest[:, 0] + trans)[1]
 
 
 def _in_folder(folder: Path) -> dict[str, Path]:

@@ -143,11 +143,8 @@ def _check_complete(folder: Path, split: str, segments: list[str]) -> None:
     missing = [segment for segment in segments if not (folder / f"{segment}.parquet").is_file()]
     if missing:
         fetch = f"gcloud storage cp {_urls(split, [folder.name])}/{missing[0]}.parquet {shlex.quote(f'{folder}/')}"
-        raise file_error(
-            folder,
-            f"lacks {len(missing)} of the {len(segments)} segments with keypoints; fetch the first with: {fetch} "
-            "(or take what you do not want out of lidar_hkp)",
-        )
+        problem = f"lacks {len(missing)} of the {len(segments)} segments with keypoints; fetch the first with: {fetch}"
+        raise file_error(folder, f"{problem} (or take what you do not want out of lidar_hkp)")
 
 
 def _urls(split: str, components: list[str]) -> str:
@@ -197,19 +194,16 @@ def _calibrations(path: Path) -> dict[str, dict[int, frames.Calibration]]:
     optional = (f"{_BEAMS}.values", f"{_BEAMS}.min", f"{_BEAMS}.max")
     for row in table(path, columns, optional):
         values, low, high = (row[name] for name in optional)
-        if not values and (low is None or high is None):
-            raise file_error(path, f"has no beam inclinations of laser {row[LASER]}")
         try:
-            extrinsic = frames.transform(row[_EXTRINSIC], f"the extrinsic of laser {row[LASER]}")
+            found.setdefault(row[SEGMENT], {})[row[LASER]] = frames.Calibration(
+                laser=row[LASER],
+                T_vehicle_laser=frames.transform(row[_EXTRINSIC], f"the extrinsic of laser {row[LASER]}"),
+                inclinations=numbers(LASER, values, (-1,), "beam inclinations", finite=False) if values else None,
+                low=low,
+                high=high,
+            )
         except InputError as error:
             raise file_error(path, error) from None
-        found.setdefault(row[SEGMENT], {})[row[LASER]] = frames.Calibration(
-            laser=row[LASER],
-            T_vehicle_laser=extrinsic,
-            inclinations=numbers(path, values, (-1,), "beam inclinations", finite=False) if values else None,
-            low=low,
-            high=high,
-        )
     return found
 
 

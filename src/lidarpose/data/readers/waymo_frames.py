@@ -68,8 +68,12 @@ class Calibration:
     laser: int
     T_vehicle_laser: np.ndarray
     inclinations: np.ndarray | None
-    low: float
-    high: float
+    low: float | None
+    high: float | None
+
+    def __post_init__(self):
+        if self.inclinations is None and (self.low is None or self.high is None):
+            raise InputError(f"has no beam inclinations of laser {self.laser}")
 
     def rows(self, height: int) -> np.ndarray:
         """(H,) rad: the inclination of each row of a range image. Row 0 is the last beam of the table: its order is

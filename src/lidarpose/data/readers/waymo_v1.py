@@ -191,14 +191,16 @@ def _transform(message: Any, field: str, what: str) -> np.ndarray | None:
 def _calibrations(messages: Any) -> dict[int, frames.Calibration]:
     found = {}
     for one in messages:
-        beams = np.array(one.beam_inclinations)
         extrinsic = _transform(one, "extrinsic", f"the extrinsic of laser {one.name}")
-        low, high = one.beam_inclination_min, one.beam_inclination_max
-        has_range = one.HasField("beam_inclination_min") and one.HasField("beam_inclination_max")
-        if extrinsic is None or not len(beams) and not has_range:
-            raise InputError(f"the calibration of laser {one.name} lacks its extrinsic or its beam inclinations")
+        if extrinsic is None:
+            raise InputError(f"the calibration of laser {one.name} lacks its extrinsic")
+        beams = np.array(one.beam_inclinations)
         found[one.name] = frames.Calibration(
-            laser=one.name, T_vehicle_laser=extrinsic, inclinations=beams if len(beams) else None, low=low, high=high
+            laser=one.name,
+            T_vehicle_laser=extrinsic,
+            inclinations=beams if len(beams) else None,
+            low=one.beam_inclination_min if one.HasField("beam_inclination_min") else None,
+            high=one.beam_inclination_max if one.HasField("beam_inclination_max") else None,
         )
     return found
 
