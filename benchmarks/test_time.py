@@ -3,7 +3,7 @@
     python benchmarks/test_time.py tiny --limit 1000 --out docs/scores/test_time.json
 
 Passes: each but the first is about the pelvis that the one before found. Looks: the last pass is repeated with the
-person mirrored, turned by quarters, or shifted in the grid of voxels, and joints are average (`inference/tta.py`), or
+person mirrored, turned by quarters, or shifted in the grid of voxels, and joints are averaged (`inference/tta.py`), or
 heatmaps are (as logarithms, brought to the mean vote). Rejection: the error of the most confident people and joints.
 """
 

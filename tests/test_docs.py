@@ -1,6 +1,8 @@
 """What the docs name is there, and the README is what a package index can show."""
 
+import contextlib
 import importlib.util
+import io
 import re
 import tomllib
 from pathlib import Path
@@ -8,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import lidarpose
+from lidarpose.cli import main
 
 ROOT = Path(__file__).parents[1]
 SOURCE = Path(lidarpose.__file__).parent
@@ -20,7 +23,16 @@ PAGES = [
     *DOCS.glob("cards/*.md"),
 ]
 NAMED = sorted(set(re.findall(r"`([\w/]+\.py): ([\w.]+)", (DOCS / "method.md").read_text())))
+FLAG = re.compile(r"(?<![\w-])--[a-z][a-z0-9_-]*")
+COMMANDS = (
+    "predict", "demo", "synth", "prepare", "sensors", "view", "pretrain", "finetune", "evaluate", "table", "info",
+    "export", "import",
+)  # fmt: skip
 LINK = re.compile(r"\[[^]]*\]\((?!https?:)([^)#]*)(#[^)]*)?\)")
+
+
+def named(page):
+    return page.relative_to(ROOT).as_posix()
 
 
 def imported(path):
@@ -49,7 +61,7 @@ def test_what_stands_beside_the_paper_is_there(path, name):
         assert re.search(rf"(class|def) {part}\b|self\.{part} = |^ *{part}: ", text, re.MULTILINE), part
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+@pytest.mark.parametrize("page", PAGES, ids=named)
 def test_links_lead_somewhere(page):
     for target, anchor in LINK.findall(page.read_text("utf-8")):
         path = (page.parent / target) if target else page
@@ -58,9 +70,7 @@ def test_links_lead_somewhere(page):
             assert anchor[1:] in anchors(path), f"{target}{anchor}"
 
 
-@pytest.mark.parametrize(
-    "page", [p for p in PAGES if p.stem != "log"], ids=lambda page: page.relative_to(ROOT).as_posix()
-)
+@pytest.mark.parametrize("page", [p for p in PAGES if p.stem != "log"], ids=named)
 def test_files_and_modules_that_pages_name_are_there(page):
     text = page.read_text("utf-8")
     for path in re.findall(r"\b((?:src|tools|benchmarks|tests|examples)/[\w./]+\.\w+)", text):
@@ -123,3 +133,25 @@ def test_the_hashed_requirements_are_the_constraints_with_hashes_of_all_that_pre
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     for requirement in project["dependencies"] + project["optional-dependencies"]["synth"]:
         assert any(pin.startswith(requirement.split(">=")[0] + "==") for pin in pins), requirement
+
+
+# of pip, gcloud, torchrun and accelerate
+OTHERS = {"--require-hashes", "--no-deps", "--nproc_per_node", "--num_processes", "--standalone", "--constraint"}
+
+
+@pytest.fixture(scope="module")
+def flags():
+    """Every flag of every command, and of the scripts beside the package."""
+    help_of_all = io.StringIO()
+    with contextlib.redirect_stdout(help_of_all):
+        for command in COMMANDS:
+            with pytest.raises(SystemExit):
+                main([command, "--help"])
+    scripts = [*(ROOT / "tools").glob("*.py"), *(ROOT / "benchmarks").glob("*.py")]
+    text = help_of_all.getvalue() + "".join(path.read_text("utf-8") for path in scripts)
+    return set(FLAG.findall(text)) | OTHERS
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if p.stem != "log"], ids=named)
+def test_flags_that_pages_name_are_there(page, flags):
+    assert set(FLAG.findall(page.read_text("utf-8"))) <= flags
