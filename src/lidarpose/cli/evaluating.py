@@ -141,14 +141,13 @@ def _command(options: argparse.Namespace) -> str:
 
 def _progress(stack: ExitStack) -> Callable[[str, int, int], None]:
     """progress(dataset, done, total), which shows one dataset after the other; `stack` ends the last."""
-    label, shown = "", None
+    shown: dict[str, Progress] = {}
 
     def progress(dataset: str, done: int, total: int) -> None:
-        nonlocal label, shown
-        if dataset != label:
+        if dataset not in shown:
             stack.close()
-            label, shown = dataset, stack.enter_context(Progress(total or None, unit="people", label=dataset))
-        shown.update(done)
+            shown[dataset] = stack.enter_context(Progress(total or None, unit="people", label=dataset))
+        shown[dataset].update(done)
 
     return progress
 

@@ -18,6 +18,7 @@ import json
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -98,7 +99,7 @@ def load_bench() -> Bench:
         raise file_error(path, f"is not {NAME} as it was frozen: install lidarpose again")
     table = parquet.read_table(pa.BufferReader(data), schema=schema())
     card = json.loads(parquet.read_schema(pa.BufferReader(data)).metadata[METADATA.encode()])
-    columns = {}
+    columns: dict[str, Any] = {}
     for name, kind in COLUMNS.items():
         # lists of all people lie in one array, one after the other
         column = table[name].combine_chunks()

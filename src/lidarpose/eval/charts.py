@@ -5,6 +5,7 @@ Drawn with matplotlib's Agg canvas through its object interface; every function 
 
 import io
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -38,8 +39,8 @@ def draw_errors(result: Result) -> bytes:
     figure = _figure(9.6, 6.6, f"{setting.dataset}: MPJPE of {setting.method}, mm", setting.summary)
     rows = [row for row in result.lines if row.figure == "mpjpe" and row.arithmetic == OURS and row.value is not None]
     own = [row for row in rows if row.method == setting.method]
-    levels = [(row, f"all {row.value:.1f}", _INK) for row in own if row.group == "all"]
-    baselines = [row for row in rows if row.method != setting.method and row.group == "all"]
+    overall = [(row.method, row.value) for row in rows if row.group == "all" and row.value is not None]
+    baselines = [(name.removeprefix(BASELINE), value) for name, value in overall if name != setting.method]
     for axes, (group, (title, missing)) in zip(figure.subplots(2, 2).ravel(), panels.items(), strict=True):
         axes.set_title(title, fontsize=10, loc="left", color=_INK)
         shown = [row for row in own if row.group == group]
@@ -47,12 +48,12 @@ def draw_errors(result: Result) -> bytes:
             _empty(axes, missing)
             continue
         _bars(axes, shown)
-        for row, words, color in levels:
-            _level(axes, row.value, words, color)
-        for row in baselines:
-            if row.value < axes.get_ylim()[1] * 1.6:
-                axes.set_ylim(0, max(axes.get_ylim()[1], row.value * 1.12))
-                _level(axes, row.value, row.method.removeprefix(BASELINE), _ORANGE)
+        for value in (value for name, value in overall if name == setting.method):
+            _level(axes, value, f"all {value:.1f}", _INK)
+        for name, value in baselines:
+            if value < axes.get_ylim()[1] * 1.6:
+                axes.set_ylim(0, max(axes.get_ylim()[1], value * 1.12))
+                _level(axes, value, name, _ORANGE)
     return _png(figure)
 
 
@@ -150,8 +151,8 @@ def _confidence(axes, stated: np.ndarray, hit: np.ndarray, result: Result) -> No
     axes.set(xlim=(0, 1), ylim=(0, 1))
     values = {row.figure: row.value for row in result.lines if row.group == "all"}
     title = f"expected calibration error {values['calibration_error']:.1f} %"
-    if values.get("auroc") is not None:
-        title += f", AUROC {values['auroc'] / 100:.3f}"
+    if (auroc := values.get("auroc")) is not None:
+        title += f", AUROC {auroc / 100:.3f}"
     _styled(axes, title, xlabel="predicted confidence", legend=True)
 
 
@@ -257,7 +258,7 @@ def _styled(
         axes.legend(fontsize=8, loc="upper left", frameon=False)
 
 
-def _text(axes, words: str, at: tuple[float, float], offset: tuple[float, float], *, ha: str = "center", **more):
+def _text(axes, words: str, at: tuple[Any, Any], offset: tuple[float, float], *, ha: str = "center", **more):
     return axes.annotate(words, at, offset, textcoords="offset points", ha=ha, fontsize=8, color=_INK, **more)
 
 

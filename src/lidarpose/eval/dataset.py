@@ -94,7 +94,7 @@ class EvalDataset:
         return self.read(self.skipped)
 
 
-def open_eval_dataset(dataset: str | Path, *, split: str | None = None, limit: int | None = None) -> EvalDataset:
+def open_eval_dataset(dataset: str | PathLike, *, split: str | None = None, limit: int | None = None) -> EvalDataset:
     """A dataset's people: those of `split`, "all" for everybody; None: test, else val, else everybody where there is no
     split. limit: only so many, evenly spread.
 
@@ -127,7 +127,7 @@ def spread(total: int, limit: int | None) -> np.ndarray:
 
 def _open_folder(folder: Path, split: str | None, limit: int | None) -> EvalDataset:
     dataset = open_dataset(folder)
-    card, damaged = dataset.card, {}
+    card, damaged = dataset.card, Skipped()
     synthetic = card.people != "labelled"
     if synthetic and split not in (None, EVERYBODY):
         raise file_error(folder, f"holds synthetic people, which have no splits, got {split!r}: leave --split out")

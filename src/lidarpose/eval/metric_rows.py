@@ -12,6 +12,7 @@ import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -44,7 +45,7 @@ def facing_flipped(predictions: Predictions) -> np.ndarray:
     pairs = np.array([(of.index(a), of.index(b)) for a, b in names if a in of.joints and b in of.joints], int)
     if not len(pairs):
         return np.full(len(predictions), np.nan)
-    labeled = predictions.labeled[:, pairs.ravel()].all(1)
+    labeled = np.all(predictions.labeled[:, pairs.ravel()], axis=1)
     # (N, 2): from right to left as seen from above, summed over hips and shoulders
     predicted, true = (
         np.where(labeled[:, None, None], joints[:, pairs[:, 0]] - joints[:, pairs[:, 1]], 0).sum(1)[:, :2]
@@ -99,7 +100,7 @@ def _pem(p: Predictions, setting: Setting) -> Score | None:
     if not _has_waymo_boxes(p, setting):
         return None
     frames: dict[tuple, list[int]] = {}
-    for k in np.flatnonzero(p.boxed):
+    for k in np.flatnonzero(p.boxed).tolist():
         frames.setdefault((p.sequence[k], p.frame[k]), []).append(k)
     rows = [np.array(own) for own in frames.values()]
     columns = (p.true, p.box, p.labels == SEEN)
@@ -213,7 +214,7 @@ def _mean_rows(
                     table = tables[name][rows] if joints is None else tables[name][rows][:, joints]
                     clusters = p.sequence[rows] if setting.clusters else None
                     no_pose = int((~p.posed[rows]).sum())
-                    options = {"unit": metric.unit, "average": metric.average, "no_pose": no_pose}
+                    options: dict[str, Any] = {"unit": metric.unit, "average": metric.average, "no_pose": no_pose}
                     yield _mean_row(table, setting, name, group, of, clusters=clusters, **options)
 
 
@@ -283,7 +284,7 @@ def _dapt_compat_rows(p: Predictions, setting: Setting) -> Iterator[MetricRow]:
                 score = mean(table[:, joints], empty=np.nan if is_pck else 0.0)
                 score.skipped = 0
                 group = "all" if name == "all" else "joints"
-                options = {"unit": unit, "no_pose": len(p) - len(posed), "arithmetic": RELEASED}
+                options: dict[str, Any] = {"unit": unit, "no_pose": len(p) - len(posed), "arithmetic": RELEASED}
                 yield _row(score, setting, metric, group, name, **options)
 
 
@@ -312,7 +313,7 @@ def triples(p: Predictions) -> np.ndarray:
 def _acceleration(p: Predictions, setting: Setting) -> Iterator[MetricRow]:
     """Acceleration error over all triples of frames that follow each other, in mm a frame squared."""
     # people evenly picked out of sequences do not follow each other
-    rows = triples(p) if setting.limit is None else ()
+    rows = triples(p) if setting.limit is None else np.empty((0, 3), int)
     if len(rows):
         table = acceleration_errors(p.filled[rows], p.true[rows], 1.0, p.labeled[rows])
         clusters = p.sequence[rows[:, 0]]

@@ -139,7 +139,7 @@ def subset(of: Skeleton, joints: Sequence[str]) -> Skeleton:
     on the first."""
     if tuple(joints) == of.joints:
         return of
-    parents = []
+    parents: list[int] = []
     for name in joints:
         parent = of.parents[of.index(name)]
         while parent >= 0 and of.joints[parent] not in joints:

@@ -89,7 +89,7 @@ def check_protocol(protocol: str, dataset: EvalDataset) -> None:
         )
 
 
-def described(protocol: str, kind: str) -> dict[str, str]:
+def described(protocol: str, kind: str) -> dict[str, Any]:
     """What the center is found from (centring) and how the person was cut out (crop), in words."""
     if protocol == "dapt":
         return {"centring": DAPT[kind].centring, "crop": DAPT[kind].crop}
@@ -162,9 +162,6 @@ class Model(Protocol):
     def predict(self, points, *, sensor_origin=None, skeleton: str | None = None, progress: bool = False): ...
 
     def outputs(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None): ...
-
-
-# ---- a network before a dataset
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,8 +275,7 @@ def eval_setup(
         not_judged="; ".join(f"{reason} {', '.join(names)}" for reason, names in reasons.items() if names),
         sensor="unknown" if sensor_unknown else "known",
         seed=seed,
-        **described(protocol, dataset.kind),
-        **{name: getattr(dataset, name) for name in fields},
+        **described(protocol, dataset.kind) | {name: getattr(dataset, name) for name in fields},
     )
     joints = subset(wanted, shared)
     return EvalSetup(model=model, dataset=dataset, setting=setting, joints=joints, sensor_unknown=sensor_unknown)

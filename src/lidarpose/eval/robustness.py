@@ -336,7 +336,7 @@ def _perturbed(setup: EvalSetup, person: CroppedPerson, name: str, amount: float
     if PERTURBATIONS[name].rigid:
         sample = replace(
             sample,
-            pose=replace(sample.pose, joints=apply(sample.joints)),
+            pose=Pose(joints=apply(sample.joints), skeleton=sample.skeleton),
             box=sample.box and replace(sample.box, center=apply(sample.box.center)),
             centers={name: apply(center) for name, center in sample.centers.items()},
         )
@@ -386,7 +386,9 @@ def _sensor_curve(setup: EvalSetup, progress: Callable[[int], None]) -> Curve:
         distance=_DISTANCE,
         # uniform: the law of counts would bring people nearer to coarser sensors
         median_points=0,
-        **dict.fromkeys(("clutter", "occluder", "company"), 0.0),
+        clutter=0.0,
+        occluder=0.0,
+        company=0.0,
         noise=replace(scene.noise, mask=0.0, clutter=0.0, missing_part=0.0),
         crop=replace(scene.crop, jitter=0.03, loose=0.0, cut=0.0),
     )

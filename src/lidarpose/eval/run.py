@@ -15,7 +15,7 @@ import numpy as np
 from lidarpose._version import __version__
 from lidarpose.data.schema import pyarrow
 from lidarpose.errors import InputError
-from lidarpose.eval.bench import mean_poses
+from lidarpose.eval.bench import Bench, mean_poses
 from lidarpose.eval.dataset import BENCH, EvalDataset, EvalSample, count_skipped, open_eval_dataset
 from lidarpose.eval.metric_rows import baseline_rows, metric_rows
 from lidarpose.eval.metrics.bootstrap import LEAST_UNITS
@@ -82,7 +82,7 @@ def evaluate_dataset(
         setting = replace(setting, sensor="unknown" if unknown == len(rows) else "of some people")
     lines = metric_rows(predictions, setting, dapt_compat=dapt_compat)
     if dataset.bench is not None:
-        lines += _baselines(dataset, predictions, setting)
+        lines += _baselines(dataset.bench, predictions, setting)
     alone = ~predictions.moving
     counts = {"people": int(alone.sum()), "frames of clips": int((~alone).sum())}
     counts["without a pose"] = int((~predictions.posed & alone).sum())
@@ -117,12 +117,12 @@ def _mean_error(row: dict[str, Any]) -> float | None:
     return float(np.linalg.norm(row["pred"] - row["true"], axis=1)[labeled].mean())
 
 
-def _baselines(dataset: EvalDataset, predictions: Predictions, setting: Setting) -> tuple[MetricRow, ...]:
+def _baselines(bench: Bench, predictions: Predictions, setting: Setting) -> tuple[MetricRow, ...]:
     """What knows no points, scored on the same people."""
     pick = BODY26.map_to(predictions.skeleton)
     unstated = np.full_like(predictions.confidence, np.nan)
     rows: tuple[MetricRow, ...] = ()
-    for name, joints in mean_poses(dataset.bench).items():
+    for name, joints in mean_poses(bench).items():
         pred = joints[predictions.row][:, pick].astype(np.float32)
         baseline = replace(predictions, pred=pred, confidence=unstated, spread=unstated, visible=unstated)
         rows += baseline_rows(baseline, replace(setting, method=f"{BASELINE}{name}"))

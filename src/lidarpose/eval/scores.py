@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
 from importlib import resources
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -144,13 +145,13 @@ def _json_lines(values: dict[str, Any], *, indent: int) -> str:
     return ",\n".join(f"{' ' * indent}{json.dumps(key)}: {json.dumps(value)}" for key, value in values.items())
 
 
-def scores_path(path: str | Path) -> Path:
+def scores_path(path: str | PathLike) -> Path:
     """scores.json itself, of a file or of a folder that holds one."""
     path = Path(path)
     return path / FILE if path.is_dir() else path
 
 
-def read_scores(path: str | Path) -> Scores:
+def read_scores(path: str | PathLike) -> Scores:
     """scores.json, or that of a folder. Raises InputError for a file that is none."""
     path = scores_path(path)
     data = read_bytes(path, expected=f"{FILE} of lidarpose evaluate")
@@ -232,7 +233,7 @@ def published() -> dict[str, Any]:
     return json.loads((resources.files("lidarpose.eval") / "assets" / "published.json").read_text("utf-8"))
 
 
-def table(paths: Sequence[str | Path], *, format: str = "markdown") -> str:
+def table(paths: str | PathLike | Sequence[str | PathLike], *, format: str = "markdown") -> str:
     """The table of scores.json files, or of folders that hold one; ours come from these files alone, and results of
     different protocols stand in different blocks. Raises InputError for an unknown format and for a file that is
     none."""

@@ -5,6 +5,7 @@ person. NaN stands where there is nothing to score: a joint without a label.
 """
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lidarpose.errors import InputError, check_name
 
@@ -29,7 +30,7 @@ class Score(float):
         return score
 
 
-def as_table(table: np.ndarray) -> np.ndarray:
+def as_table(table: ArrayLike) -> np.ndarray:
     """A table as (n, J) float; raises InputError for another shape or for infinite entries."""
     try:
         table = np.asarray(table, float)
@@ -48,7 +49,7 @@ def person_sums(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.where(labeled, table, 0.0).sum(1), labeled.sum(1)
 
 
-def mean(table: np.ndarray, average: str = "person", *, empty: float | None = None) -> Score:
+def mean(table: ArrayLike, average: str = "person", *, empty: float | None = None) -> Score:
     """The mean of a table (n, J) or (n,).
 
     Args:

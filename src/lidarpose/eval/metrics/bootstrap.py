@@ -9,6 +9,7 @@ trials with 20 units, in 90 % with 10, in 49 % with two.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lidarpose.errors import InputError, check_name
 from lidarpose.eval.metrics.aggregate import AVERAGES, as_table, person_sums
@@ -37,11 +38,11 @@ class Interval:
 
 
 def interval(
-    table: np.ndarray,
+    table: ArrayLike,
     rng: np.random.Generator,
     average: str = "person",
     *,
-    clusters: np.ndarray | None = None,
+    clusters: ArrayLike | None = None,
     level: float = 0.95,
     repeats: int = 2000,
 ) -> Interval:
@@ -67,12 +68,12 @@ def interval(
 
 
 def paired_interval(
-    first: np.ndarray,
-    second: np.ndarray,
+    first: ArrayLike,
+    second: ArrayLike,
     rng: np.random.Generator,
     average: str = "person",
     *,
-    clusters: np.ndarray | None = None,
+    clusters: ArrayLike | None = None,
     level: float = 0.95,
     repeats: int = 2000,
 ) -> Interval:
@@ -87,7 +88,7 @@ def paired_interval(
 
 
 def bootstrap_means(
-    table: np.ndarray, rng: np.random.Generator, average: str, *, clusters: np.ndarray | None, repeats: int
+    table: np.ndarray, rng: np.random.Generator, average: str, *, clusters: ArrayLike | None, repeats: int
 ) -> tuple[np.ndarray, int]:
     """The means of `repeats` draws (repeats,), and how many units were drawn from; of nobody NaN and 0."""
     total, count = person_sums(table)

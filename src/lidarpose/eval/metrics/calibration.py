@@ -1,12 +1,13 @@
 """Whether confidence means what it says, and whether it ranks hits before misses."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lidarpose.errors import InputError, whole
 from lidarpose.eval.metrics.joint_errors import as_flags, as_numbers
 
 
-def calibration_error(confidence: np.ndarray, hit: np.ndarray, *, bins: int = 10) -> float:
+def calibration_error(confidence: ArrayLike, hit: ArrayLike, *, bins: int = 10) -> float:
     """Expected calibration error, 0 to 1: mean distance of confidence (n,) and share of hits (n,), over equal bins; NaN
     of nothing.
 
@@ -29,7 +30,7 @@ def calibration_error(confidence: np.ndarray, hit: np.ndarray, *, bins: int = 10
     return float(np.abs(stated - true).sum() / len(confidence))
 
 
-def auroc(score: np.ndarray, hit: np.ndarray) -> float:
+def auroc(score: ArrayLike, hit: ArrayLike) -> float:
     """Area under the ROC curve, 0 to 1, of scores (n,) for hits (n,): how well the score ranks hits before misses.
 
     Args:
@@ -49,7 +50,7 @@ def auroc(score: np.ndarray, hit: np.ndarray) -> float:
     return float((rank[hit].sum() - positives * (positives + 1) / 2) / (positives * negatives))
 
 
-def _without_nan(name: str, values: np.ndarray) -> np.ndarray:
+def _without_nan(name: str, values: ArrayLike) -> np.ndarray:
     values = as_numbers(name, values)
     if values.ndim != 1:
         raise InputError(f"{name} must be (n,), got {values.shape}: pass values.ravel()")

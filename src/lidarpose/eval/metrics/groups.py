@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lidarpose.errors import InputError
 from lidarpose.eval.metrics.aggregate import Score, as_table, mean
@@ -49,7 +50,7 @@ def joint_groups(of: Skeleton | str, groups: Mapping[str, Sequence[str]] = GROUP
 
 
 def by_group(
-    table: np.ndarray,
+    table: ArrayLike,
     of: Skeleton | str,
     average: str = "person",
     *,
@@ -64,7 +65,7 @@ def by_group(
     return {name: mean(table[:, index], average, empty=empty) for name, index in joint_groups(of, groups).items()}
 
 
-def span_rows(values: np.ndarray, edges: Sequence[float]) -> dict[str, np.ndarray]:
+def span_rows(values: np.ndarray, edges: Sequence[float] | np.ndarray) -> dict[str, np.ndarray]:
     """Span -> (n,) bool: whose value (n,) lies in it. A span holds its lower edge, the last one its upper edge too."""
     rows = {}
     for low, high in zip(edges[:-1], edges[1:], strict=True):
@@ -74,13 +75,13 @@ def span_rows(values: np.ndarray, edges: Sequence[float]) -> dict[str, np.ndarra
 
 
 def by_span(
-    table: np.ndarray,
-    values: np.ndarray,
-    edges: Sequence[float],
+    table: ArrayLike,
+    values: ArrayLike,
+    edges: ArrayLike,
     average: str = "person",
     *,
     rng: np.random.Generator | None = None,
-    clusters: np.ndarray | None = None,
+    clusters: ArrayLike | None = None,
 ) -> dict[str, Slice]:
     """The mean of a table (n, J) or (n,) for people whose value lies between two edges: distance, points, occlusion.
 

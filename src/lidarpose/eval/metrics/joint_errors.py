@@ -10,7 +10,10 @@ dapt_compat=True (`legacy` is its old name): the arithmetic of the paper's relea
 docs/evaluate.md says which.
 """
 
+from numbers import Real
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lidarpose.errors import InputError, check_name
 from lidarpose.eval.metrics.aggregate import AVERAGES, Score, mean
@@ -23,9 +26,9 @@ LEAST_ALIGNED = 3
 
 
 def mpjpe(
-    pred: np.ndarray,
-    true: np.ndarray,
-    visible: np.ndarray | None = None,
+    pred: ArrayLike,
+    true: ArrayLike,
+    visible: ArrayLike | None = None,
     dapt_compat: bool = False,
     *,
     average: str = "person",
@@ -39,9 +42,9 @@ def mpjpe(
 
 
 def pa_mpjpe(
-    pred: np.ndarray,
-    true: np.ndarray,
-    visible: np.ndarray | None = None,
+    pred: ArrayLike,
+    true: ArrayLike,
+    visible: ArrayLike | None = None,
     dapt_compat: bool = False,
     *,
     average: str = "person",
@@ -57,9 +60,9 @@ def pa_mpjpe(
 
 
 def pck(
-    pred: np.ndarray,
-    true: np.ndarray,
-    visible: np.ndarray | None = None,
+    pred: ArrayLike,
+    true: ArrayLike,
+    visible: ArrayLike | None = None,
     dapt_compat: bool = False,
     *,
     threshold: float = 0.3,
@@ -76,12 +79,7 @@ def pck(
 
 
 def acceleration_error(
-    pred: np.ndarray,
-    true: np.ndarray,
-    rate: float,
-    visible: np.ndarray | None = None,
-    *,
-    average: str = "person",
+    pred: ArrayLike, true: ArrayLike, rate: float, visible: ArrayLike | None = None, *, average: str = "person"
 ) -> Score:
     """Mean distance of predicted and true acceleration of joints, in mm/s^2; `rate` in frames a second.
 
@@ -95,15 +93,15 @@ def acceleration_error(
 # ---- tables
 
 
-def joint_errors(pred: np.ndarray, true: np.ndarray, visible: np.ndarray | None = None) -> np.ndarray:
+def joint_errors(pred: ArrayLike, true: ArrayLike, visible: ArrayLike | None = None) -> np.ndarray:
     """(n, J) mm: each joint's distance from the truth, NaN where it has no label."""
     return _distances(*checked_poses(pred, true, visible))
 
 
 def aligned_errors(
-    pred: np.ndarray,
-    true: np.ndarray,
-    visible: np.ndarray | None = None,
+    pred: ArrayLike,
+    true: ArrayLike,
+    visible: ArrayLike | None = None,
     dapt_compat: bool = False,
     *,
     legacy: bool = False,
@@ -127,9 +125,7 @@ def aligned_errors(
     return _distances(similarity_align(pred, filled), true, labeled)
 
 
-def acceleration_errors(
-    pred: np.ndarray, true: np.ndarray, rate: float, visible: np.ndarray | None = None
-) -> np.ndarray:
+def acceleration_errors(pred: ArrayLike, true: ArrayLike, rate: float, visible: ArrayLike | None = None) -> np.ndarray:
     """(n, (T - 2) J) mm/s^2: distance of predicted and true acceleration, see `acceleration_error`; NaN where none."""
     pred, true, labeled = checked_poses(pred, true, visible, trailing=("frames", "joints", "3"))
     if pred.shape[1] < 3:
@@ -143,12 +139,7 @@ def acceleration_errors(
 
 
 def joint_hits(
-    pred: np.ndarray,
-    true: np.ndarray,
-    visible: np.ndarray | None = None,
-    *,
-    threshold: float = 0.3,
-    torso: float = TORSO,
+    pred: ArrayLike, true: ArrayLike, visible: ArrayLike | None = None, *, threshold: float = 0.3, torso: float = TORSO
 ) -> np.ndarray:
     """(n, J) percent: 100 where a joint is nearer to the truth than threshold * torso, m, else 0; NaN without label."""
     check_positive("threshold", threshold)
@@ -172,7 +163,7 @@ def _mean(table: np.ndarray, average: str, dapt_compat: bool, *, empty: float) -
 # ---- arguments, checked once where they come in
 
 
-def as_numbers(name: str, value: np.ndarray) -> np.ndarray:
+def as_numbers(name: str, value: ArrayLike) -> np.ndarray:
     """An array of floats; raises InputError where it holds something else, or lists of unequal length."""
     try:
         return np.asarray(value, float)
@@ -180,7 +171,7 @@ def as_numbers(name: str, value: np.ndarray) -> np.ndarray:
         raise InputError(f"{name} must hold numbers, in lists of equal length") from None
 
 
-def as_flags(name: str, value: np.ndarray, shape: tuple[int, ...], *, of: str = "joint") -> np.ndarray:
+def as_flags(name: str, value: ArrayLike, shape: tuple[int, ...], *, of: str = "joint") -> np.ndarray:
     """bool of a shape, one a joint or another thing, from bool or 0 and 1; raises InputError otherwise."""
     flags = as_numbers(name, value)
     if flags.shape != shape:
@@ -192,7 +183,7 @@ def as_flags(name: str, value: np.ndarray, shape: tuple[int, ...], *, of: str = 
 
 def check_positive(name: str, value: float) -> None:
     """Raises InputError unless `value` is a positive, finite number."""
-    if not (np.isscalar(value) and np.isfinite(value) and value > 0):
+    if not (isinstance(value, Real) and np.isfinite(value) and value > 0):
         raise InputError(f"{name} must be a positive number, got {value!r}")
 
 

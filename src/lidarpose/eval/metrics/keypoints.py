@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lidarpose.errors import InputError
 from lidarpose.eval.metrics.aggregate import Score, mean
@@ -45,13 +46,13 @@ def oks_sigmas(of: Skeleton | str = WAYMO14) -> np.ndarray:
 
 
 def box_hits(
-    pred: np.ndarray,
-    true: np.ndarray,
-    size: np.ndarray,
-    visible: np.ndarray | None = None,
+    pred: ArrayLike,
+    true: ArrayLike,
+    size: ArrayLike,
+    visible: ArrayLike | None = None,
     *,
     threshold: float = 0.2,
-    sigmas: Sequence[float] | None = None,
+    sigmas: ArrayLike | None = None,
 ) -> np.ndarray:
     """(n, J) percent: 100 where a joint is within threshold times its box's scale of the truth, else 0; NaN without
     label. size (n, 3) m; sigmas (J,): times these, too, which Waymo's code does and its text does not."""
@@ -64,13 +65,13 @@ def box_hits(
 
 
 def pck_box(
-    pred: np.ndarray,
-    true: np.ndarray,
-    size: np.ndarray,
-    visible: np.ndarray | None = None,
+    pred: ArrayLike,
+    true: ArrayLike,
+    size: ArrayLike,
+    visible: ArrayLike | None = None,
     *,
     threshold: float = 0.2,
-    sigmas: Sequence[float] | None = None,
+    sigmas: ArrayLike | None = None,
     average: str = "joint",
 ) -> Score:
     """Percentage of joints within `threshold` times the cube root of their person's box volume: see `box_hits`."""
@@ -78,12 +79,12 @@ def pck_box(
 
 
 def oks(
-    pred: np.ndarray,
-    true: np.ndarray,
-    size: np.ndarray,
-    visible: np.ndarray | None = None,
+    pred: ArrayLike,
+    true: ArrayLike,
+    size: ArrayLike,
+    visible: ArrayLike | None = None,
     *,
-    sigmas: Sequence[float] | None = None,
+    sigmas: ArrayLike | None = None,
 ) -> np.ndarray:
     """(n,) object keypoint similarity in [0, 1]; NaN for people without a labeled joint.
 
@@ -102,7 +103,7 @@ def oks(
     return np.where(count > 0, similarity.sum(1) / np.maximum(count, 1), np.nan)
 
 
-def oks_hits(similarity: np.ndarray, thresholds: Sequence[float] = OKS_THRESHOLDS) -> np.ndarray:
+def oks_hits(similarity: ArrayLike, thresholds: ArrayLike = OKS_THRESHOLDS) -> np.ndarray:
     """OKS (n,) -> (n,) percent: the share of the thresholds that it is above; NaN stays. One threshold: P at it."""
     similarity, thresholds = as_numbers("similarity", similarity), np.atleast_1d(as_numbers("thresholds", thresholds))
     if similarity.ndim != 1 or not thresholds.size:
@@ -112,20 +113,20 @@ def oks_hits(similarity: np.ndarray, thresholds: Sequence[float] = OKS_THRESHOLD
 
 
 def oks_ap(
-    pred: np.ndarray,
-    true: np.ndarray,
-    size: np.ndarray,
-    visible: np.ndarray | None = None,
+    pred: ArrayLike,
+    true: ArrayLike,
+    size: ArrayLike,
+    visible: ArrayLike | None = None,
     *,
-    sigmas: Sequence[float] | None = None,
-    thresholds: Sequence[float] = OKS_THRESHOLDS,
+    sigmas: ArrayLike | None = None,
+    thresholds: ArrayLike = OKS_THRESHOLDS,
 ) -> Score:
     """Percent: the share of people whose OKS is above a threshold, averaged over the thresholds. Waymo's OKS-AP is this
     precision of matched people; it ranks nothing by confidence."""
     return mean(oks_hits(oks(pred, true, size, visible, sigmas=sigmas), thresholds))
 
 
-def _box_scale(size: np.ndarray, people: int) -> np.ndarray:
+def _box_scale(size: ArrayLike, people: int) -> np.ndarray:
     """size (n, 3) m, length, width and height of each person's box -> (n, 1) m: the cube root of its volume."""
     size = as_numbers("size", size)
     size = size.reshape(1, 3) if size.size == 3 else size
@@ -136,7 +137,7 @@ def _box_scale(size: np.ndarray, people: int) -> np.ndarray:
     return np.cbrt(size.prod(1))[:, None]
 
 
-def _checked_sigmas(sigmas: Sequence[float], joints: int) -> np.ndarray:
+def _checked_sigmas(sigmas: ArrayLike, joints: int) -> np.ndarray:
     sigmas = as_numbers("sigmas", sigmas)
     if sigmas.shape != (joints,) or not (np.isfinite(sigmas) & (sigmas > 0)).all():
         raise InputError(f"sigmas must be ({joints},) positive numbers, one a joint, got {sigmas.shape}")
@@ -167,12 +168,12 @@ class Pem:
 
 
 def pem(
-    pred: Sequence[np.ndarray],
-    true: Sequence[np.ndarray],
-    boxes: Sequence[np.ndarray],
-    visible: Sequence[np.ndarray] | None = None,
+    pred: Sequence[ArrayLike],
+    true: Sequence[ArrayLike],
+    boxes: Sequence[ArrayLike],
+    visible: Sequence[ArrayLike] | None = None,
     *,
-    predicted: Sequence[np.ndarray] | None = None,
+    predicted: Sequence[ArrayLike] | None = None,
     penalty: float = PENALTY,
 ) -> Pem:
     """Waymo's PEM over frames: the mean, over all keypoints of all frames, of the matched ones' distances and of
@@ -236,7 +237,7 @@ def _frame_totals(pred, true, boxes, visible, predicted, penalty: float) -> np.n
     return np.array([cost[both].sum(), both.sum(), missed, extra, *map(len, astuple(matches))])
 
 
-def _people(name: str, value: np.ndarray) -> np.ndarray:
+def _people(name: str, value: ArrayLike) -> np.ndarray:
     value = as_numbers(name, value)
     if value.size and (value.ndim != 3 or value.shape[-1] != 3):
         raise InputError(f"{name} must be (people, joints, 3), got {value.shape}")
@@ -274,7 +275,7 @@ def match_people(
     the sum of the mean keypoint costs is least, among pairs with a predicted keypoint within `penalty` meters of the
     box.
     """
-    has_label = labeled.any(1)
+    has_label = np.any(labeled, axis=1)
     distance = np.where(predicted[None], distance_to_boxes(pred, boxes), np.inf)
     # (G, P, J)
     near = np.linalg.norm(pred[None] - np.where(labeled[..., None], true, np.inf)[:, None], axis=-1) < penalty
@@ -282,7 +283,7 @@ def match_people(
     inside = np.where(~has_label[:, None] & ~near_label, (distance < _WITHIN).sum(-1), 0)
     excused = np.array([p for g, p in assign(-inside.astype(float)) if inside[g, p] > 0], int)
 
-    free = predicted.any(1)
+    free = np.any(predicted, axis=1)
     free[excused] = False
     people, candidates = np.flatnonzero(has_label), np.flatnonzero(free)
     cost = keypoint_costs(
@@ -316,7 +317,7 @@ def distance_to_boxes(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     return np.linalg.norm(np.maximum(np.abs(local) - boxes[:, 3:6].reshape(*tail, 3) / 2, 0), axis=-1)
 
 
-def assign(cost: np.ndarray) -> np.ndarray:
+def assign(cost: ArrayLike) -> np.ndarray:
     """The assignment of least total cost: cost (n, m) finite -> (min(n, m), 2) of (row, column), rows rising.
 
     The Hungarian method (Kuhn 1955) by shortest augmenting paths (Jonker & Volgenant 1987).
