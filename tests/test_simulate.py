@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from walkers import HEADINGS, goer
+from walkers import HEADINGS, bone_distance, goer
 
 from lidarpose.geometry import rotation_about
 from lidarpose.lidar.presets import sensor
@@ -136,20 +136,12 @@ def test_the_window_has_the_scene_s_margin():
 # --- people and what is about them
 
 
-def bone_gap(points, joints):
-    """(n,) m: from points (n, 3) to the nearest bone."""
-    a, b = joints[[p for p, _ in BODY26.bones]], joints[[c for _, c in BODY26.bones]]
-    along = b - a
-    t = ((points[:, None] - a) * along).sum(-1) / np.maximum((along**2).sum(-1), 1e-9)
-    return np.linalg.norm(points[:, None] - a - np.clip(t, 0, 1)[..., None] * along, axis=-1).min(1)
-
-
 def test_another_person_in_the_crop_is_not_this_one():
     maker, strangers = Generator(scene=replace(CLEAN, company=1.0, margin=0.1), measure=False), 0
     for index in range(12):
         sample = maker.person(SEED, index).sample
         own = sample.points[sample.part > 0].astype(float)
-        assert bone_gap(own, sample.pose.joints).max() < 0.32
+        assert bone_distance(own, sample.pose.joints, BODY26.bones).min(1).max() < 0.32
         above = sample.points[sample.part == 0][:, 2] > sample.pose.joints[:, 2].min() + 0.4
         strangers += np.count_nonzero(above) > 10
     assert strangers >= 6

@@ -1,4 +1,4 @@
-"""Shared by tests of scenes: a box that goes and turns, and volumes of meshes."""
+"""Shared by tests of scenes: a box that goes and turns, and volumes, distances to bones."""
 
 import numpy as np
 
@@ -44,3 +44,11 @@ def piece_volumes(mesh):
         a, b, c = np.moveaxis(corners[faces] - corners[piece == number].mean(0), 1, 0)
         found.append((np.cross(a, b) * c).sum() / 6)
     return found
+
+
+def bone_distance(points, joints, bones):
+    """(n, bones) distances of points (n, 3) to segments."""
+    a, b = joints[[p for p, _ in bones]], joints[[c for _, c in bones]]
+    along = b - a
+    t = ((points[:, None] - a) * along).sum(-1) / np.maximum((along**2).sum(-1), 1e-9)
+    return np.linalg.norm(points[:, None] - a - np.clip(t, 0, 1)[..., None] * along, axis=-1)
