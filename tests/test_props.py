@@ -40,6 +40,17 @@ def drawn(bodies):
     return found
 
 
+@pytest.fixture(scope="module")
+def placed(drawn, bodies):
+    """(name, most) -> props with their people's joints, their vertices there, and the people's rows."""
+
+    def of_name(name, most=None):
+        for prop, row in drawn[name][:most]:
+            yield prop, bodies.joints[row], prop.place(bodies.joints[row]).vertices, row
+
+    return of_name
+
+
 def test_every_thing_is_drawn_and_is_within_reach(drawn, bodies):
     assert THINGS | {"skirt", "hat"} == set(drawn)
     for name, props in drawn.items():
@@ -92,42 +103,33 @@ def test_what_is_carried_goes_along(drawn, bodies, yaw, x, pick):
         np.testing.assert_allclose(prop.place(there).vertices, expected, atol=2e-4, err_msg=name)
 
 
-def test_the_next_pose_moves_the_thing(drawn, bodies):
+def test_the_next_pose_moves_the_thing(placed):
     for name in ("bag", "stick", "umbrella", "suitcase", "phone"):
-        prop, row = drawn[name][0]
-        joints = bodies.joints[row].copy()
-        before = prop.place(joints).vertices
+        prop, joints, before, _ = next(placed(name))
+        joints = joints.copy()
         joints[HANDS] += np.float32([0.05, 0.02, 0.03])
         after = prop.place(joints).vertices
-        step = (after - before).max(0)
-        assert step[0] > 0.02 and np.isfinite(after).all(), name
+        assert (after - before).max(0)[0] > 0.02 and np.isfinite(after).all(), name
 
 
-def test_bags_hang_straight_down_whatever_the_forearm_does(drawn, bodies):
-    for prop, row in drawn["bag"][:40]:
-        joints = bodies.joints[row].copy()
-        mesh = prop.place(joints)
-        hand = joints[HANDS][np.linalg.norm(joints[HANDS, :2] - mesh.vertices[:, :2].mean(0), axis=-1).argmin()]
-        np.testing.assert_allclose(mesh.vertices[:, :2].mean(0), hand[:2], atol=0.02)
-        assert 0 <= hand[2] - mesh.vertices[:, 2].max() + 1e-4 < 0.05
+def test_bags_hang_straight_down_whatever_the_forearm_does(placed):
+    for prop, joints, vertices, _ in placed("bag", 40):
+        middle, joints = vertices[:, :2].mean(0), joints.copy()
+        hand = joints[HANDS][np.linalg.norm(joints[HANDS, :2] - middle, axis=-1).argmin()]
+        np.testing.assert_allclose(middle, hand[:2], atol=0.02)
+        assert 0 <= hand[2] - vertices[:, 2].max() + 1e-4 < 0.05
         # another forearm, the same hand
         joints[[J["left_elbow"], J["right_elbow"], J["left_wrist"], J["right_wrist"]]] += np.float32([0.1, 0, 0.2])
-        np.testing.assert_array_equal(prop.place(joints).vertices, mesh.vertices)
+        np.testing.assert_array_equal(prop.place(joints).vertices, vertices)
 
 
-def test_sticks_and_shafts_pass_through_a_hand(drawn, bodies):
-    for name, radius in (("stick", 0.02), ("umbrella", 0.03)):
-        for prop, row in drawn[name][:20]:
-            vertices = prop.place(bodies.joints[row]).vertices
-            low, high = vertices[:5].mean(0), vertices[5:10].mean(0)
-            if name == "umbrella":
-                low, high = vertices[:4].mean(0), vertices[4:8].mean(0)
-            along = (high - low) / np.linalg.norm(high - low)
-            off = bodies.joints[row][HANDS] - low
-            away = np.linalg.norm(off - (off @ along)[:, None] * along, axis=-1).min()
-            assert away < radius, name
-            if name == "stick":
-                assert abs(vertices[:, 2].min()) < 0.02
+@pytest.mark.parametrize(("name", "radius", "sides"), [("stick", 0.02, 5), ("umbrella", 0.03, 4)])
+def test_sticks_and_shafts_pass_through_a_hand(placed, name, radius, sides):
+    for _, joints, vertices, _ in placed(name, 20):
+        low, high = vertices[:sides].mean(0), vertices[sides : 2 * sides].mean(0)
+        along, off = (high - low) / np.linalg.norm(high - low), joints[HANDS] - low
+        assert np.linalg.norm(off - (off @ along)[:, None] * along, axis=-1).min() < radius
+        assert name == "umbrella" or abs(vertices[:, 2].min()) < 0.02
 
 
 def test_rucksacks_touch_the_back(drawn, bodies):
@@ -165,14 +167,11 @@ def test_seats_are_under_the_thighs(drawn, bodies):
             assert abs(seat * fit[2, 2] + fit[3, 2] - lowest) < 0.06, name
 
 
-def test_cyclists_sit_hold_and_pedal(drawn, bodies):
+def test_cyclists_sit_hold_and_pedal(placed):
     held = []
-    for prop, row in drawn["bicycle"]:
-        joints, vertices = bodies.joints[row], prop.place(bodies.joints[row]).vertices
-        assert vertices[:, 2].min() == pytest.approx(-prop.lift, abs=0.03)
-        assert prop.lift == pytest.approx(0.1)
-        for hand in HANDS:
-            held.append(np.linalg.norm(vertices - joints[hand], axis=-1).min())
+    for prop, joints, vertices, _ in placed("bicycle"):
+        assert vertices[:, 2].min() == pytest.approx(-prop.lift, abs=0.03) and prop.lift == pytest.approx(0.1)
+        held += [np.linalg.norm(vertices - joints[hand], axis=-1).min() for hand in HANDS]
         feet = [np.linalg.norm(vertices - joints[J[f]], axis=-1).min() for f in ("left_foot", "right_foot")]
         assert min(feet) < 0.2
     # hands' joints are knuckles; a few cyclists wave
@@ -191,12 +190,10 @@ def test_pedals_go_along_with_the_feet():
     assert len(now) >= 3 and np.median(later) < np.median(now) + 0.02
 
 
-def test_prams_are_held_at_their_handles(drawn, bodies):
-    for name in ("pram", "trolley"):
-        for prop, row in drawn[name]:
-            joints, vertices = bodies.joints[row], prop.place(bodies.joints[row]).vertices
-            assert vertices[:, 2].min() == pytest.approx(0, abs=0.04)
-            assert np.linalg.norm(vertices[:, None] - joints[HANDS], axis=-1).min() < 0.3
+def test_prams_are_held_at_their_handles(placed):
+    for _, joints, vertices, _ in [*placed("pram"), *placed("trolley")]:
+        assert vertices[:, 2].min() == pytest.approx(0, abs=0.04)
+        assert np.linalg.norm(vertices[:, None] - joints[HANDS], axis=-1).min() < 0.3
 
 
 def test_girths_are_those_of_the_skin():
@@ -256,17 +253,13 @@ def test_skirts_bridge_the_legs_and_hold_them(drawn, bodies):
     assert ((prop.face_part == 1 + J["left_hip"]) == on_left)[thighs].mean() > 0.8
 
 
-def test_hats_sit_on_the_head(drawn, bodies):
+def test_hats_sit_on_the_head(placed, bodies):
     head = load_rig().dense_weight[:, J["head"]] > 0.8
-    for prop, row in drawn["hat"][:40]:
+    for prop, joints, hat, row in placed("hat", 40):
         assert set(prop.face_part) == {1 + J["head"]}
-        hat, skin = prop.place(bodies.joints[row]).vertices, bodies.vertices[row][head]
-        crown = np.linalg.norm(skin - hat.mean(0), axis=-1).min()
-        assert crown < 0.16
-        up = bodies.joints[row][J["head_center"]] - bodies.joints[row][J["head"]]
-        up /= np.linalg.norm(up)
-        top = (hat @ up).max() - (skin @ up).max()
-        assert -0.02 < top < 0.08
+        skin, up = bodies.vertices[row][head], joints[J["head_center"]] - joints[J["head"]]
+        assert np.linalg.norm(skin - hat.mean(0), axis=-1).min() < 0.16
+        assert -0.02 < ((hat @ up).max() - (skin @ up).max()) / np.linalg.norm(up) < 0.08
 
 
 def test_a_long_skirt_s_lower_half_is_of_the_shank_on_its_side():

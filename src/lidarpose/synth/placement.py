@@ -11,7 +11,7 @@ from lidarpose.lidar.ray_pattern import RayPattern
 from lidarpose.lidar.sensor import Sensor
 from lidarpose.synth.scene import SceneConfig
 
-# a standing adult fills about this much of a sphere seen from one metre (silhouette, m2)
+# a standing adult fills about this much of a sphere seen from one meter (silhouette, m2)
 _SILHOUETTE = 0.55
 # log-normal spread of point counts about the median: 5 to 95 percent are a factor of about 5
 _COUNT_SPREAD = 0.95
@@ -91,7 +91,7 @@ def _azimuth(device: Sensor | RayPattern, half_width: float, share: float, cut: 
 
 
 def draw_distance(config: SceneConfig, device: Sensor | RayPattern, rng: np.random.Generator) -> float:
-    """Horizontal distance to the person in metres.
+    """Horizontal distance to the person in meters.
 
     Paper: uniform. Else the distance at which this sensor returns a log-normal number of points.
     """
@@ -129,7 +129,7 @@ def draw_height(
     pitch: float = 0.0,
     ahead: float = 0.0,
 ) -> float:
-    """Height of the sensor above the person's ground in metres, jittered for mounts and slopes.
+    """Height of the sensor above the person's ground in meters, jittered for mounts and slopes.
 
     Where the person of `tall` m would reach out of the sensor's fan although there is room for them, the height is
     moved until they fit, but for a share `cut` of people. `pitch` rad tilts the fan down at azimuth 0, `ahead` rad is

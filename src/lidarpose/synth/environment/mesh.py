@@ -1,7 +1,7 @@
 """Triangle meshes for scenes: primitives, their union, and what stands about in streets and rooms.
 
 Things look as a LiDAR sees them: few triangles, right outlines. All stand on the origin, their front along +x, their
-length along y where they have one; sizes in metres. What is called with an rng is random in shape, all else is a
+length along y where they have one; sizes in meters. What is called with an rng is random in shape, all else is a
 function of its sizes. A mesh of a kind is built once with unit size and then scaled: every person draws some.
 """
 
@@ -127,7 +127,7 @@ def shipped_meshes() -> dict[str, Mesh]:
 
 
 def wall(length: float, height: float, *, thick: float = 0.2, opening: tuple | None = None) -> Mesh:
-    """A wall along y. opening: (from, to, sill, top) of a window or a door, the first two in y, all in metres."""
+    """A wall along y. opening: (from, to, sill, top) of a window or a door, the first two in y, all in meters."""
     if opening is None:
         return box(np.array([thick, length, height]))
     left, right, sill, top = opening
