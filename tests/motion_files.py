@@ -74,6 +74,7 @@ CMU_NAMES = _names("{Side}{}", "UpLeg Leg Foot ToeBase Shoulder Arm ForeArm Hand
 NAMES = {
     "smpl": SMPL_NAMES,
     "cmu": CMU_NAMES,
+    "lower case": {joint: name.lower() for joint, name in CMU_NAMES.items()},
     "mixamo": {
         k: f"mixamorig:{v.replace('Spine', 'Back').replace('LowerBack', 'Spine')}" for k, v in CMU_NAMES.items()
     },

@@ -71,6 +71,7 @@ def test_clips_are_read_and_selected(tmp_path):
         ({"fps": None}, "fps is missing"),
         ({"joints": np.zeros((10, 23, 3))}, re.escape("(frames, 24, 3)")),
         ({"joints": np.full((10, 24, 3), np.nan)}, "finite"),
+        ({"joints": np.full((10, 24, 3), "x")}, "joints must be numbers"),
         ({"clip_length": np.array([4, 2])}, "clip_length"),
         ({"clip_length": np.array([4, 2, 5])}, "10 frames"),
         ({"clip_start": np.array([0.0, 4, 6])}, "whole number"),

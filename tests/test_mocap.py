@@ -155,6 +155,7 @@ ROW = BVH.splitlines()[-1]
         (changed(BVH, "OFFSET", "OFFSET nan"), "3 finite numbers"),
         (changed(BVH, "CHANNELS 3 Zrotation", "CHANNELS 3 Wrotation"), "the channel 'Wrotation'"),
         (changed(BVH, "CHANNELS 3", "CHANNELS 4"), "a count and as many names"),
+        (re.sub(r"OFFSET.*", "", BVH, count=1), "joint Hips has no OFFSET|stands where"),
         (changed(BVH, "OFFSET", "OFFSETS"), "stands where it cannot; expected one ROOT"),
         (changed(BVH, "{", ""), "stands where it cannot"),
         (changed(BVH, "}", ""), "not complete"),

@@ -111,8 +111,8 @@ def test_poses_are_those_of_the_published_equations(bodies, joints, seed, coeffi
     betas, turns = rng.normal(size=(2, coefficients)), rng.normal(0, 0.7, (2, joints, 3))
     move = rng.normal(0, 3, (2, 3))
     vertices, found = body.pose(betas, turns, move)
-    same = body.pose(betas, axis_angle_to_matrix(turns), move)
-    np.testing.assert_allclose(same[0], vertices, atol=1e-12)
+    for form in (axis_angle_to_matrix(turns), turns.reshape(2, -1)):
+        np.testing.assert_allclose(body.pose(betas, form, move)[0], vertices, atol=1e-12)
     for i in range(2):
         expected = published(model, betas[i], axis_angle_to_matrix(turns[i]), move[i])
         np.testing.assert_allclose(vertices[i], expected[0], atol=1e-6)
@@ -218,11 +218,15 @@ def test_wrong_models_are_explained_in_one_line(tmp_path, change, line):
         assert "\n" not in str(caught.value) and name in str(caught.value)
 
 
-def test_weights_must_be_weights(tmp_path):
+def test_weights_and_sizes_must_be_a_person_s(tmp_path):
     weights = synthetic()["weights"]
-    for wrong in (weights * 2, weights - 0.5, weights * 0):
-        np.savez(tmp_path / "m.npz", **synthetic() | {"weights": wrong})
-        with pytest.raises(InputError, match="sum to 1"):
+    headless = np.where(np.arange(24) == HEAD, 0, weights)
+    headless[:, HEAD - 1] += weights[:, HEAD]
+    sums = [({"weights": wrong}, "sum to 1") for wrong in (weights * 2, weights - 0.5, weights * 0)]
+    centimeters = {"v_template": 100 * synthetic()["v_template"]}
+    for change, message in (*sums, ({"weights": headless}, "no vertex .* head"), (centimeters, "expected meters")):
+        np.savez(tmp_path / "m.npz", **synthetic() | change)
+        with pytest.raises(InputError, match=message):
             load_body(tmp_path / "m.npz")
 
 

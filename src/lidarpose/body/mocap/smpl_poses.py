@@ -169,8 +169,6 @@ def load_lidarhuman26m(path: str | os.PathLike, *, up: str | None = None, fps: f
     that is missing ends a clip."""
     path = Path(path)
     files = pose_files(path) if path.is_dir() else [path]
-    if not files:
-        raise file_error(path, "holds no numbered JSON file such as 000001.json")
     poses, trans = zip(*(_read_pose_file(file) for file in files), strict=True)
     number = np.array([int(file.stem) for file in files]) if path.is_dir() else None
     fps = fps or LIDARHUMAN26M_FPS
