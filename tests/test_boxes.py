@@ -17,11 +17,11 @@ from lidarpose.sample import Box
 
 PERSON = {"center": [10.0, -2.0, 0.5], "size": [0.6, 0.7, 1.8], "yaw": 0.3, "id": "a"}
 
-metres = st.floats(-1e6, 1e6)
+meters = st.floats(-1e6, 1e6)
 people = st.lists(
     st.fixed_dictionaries(
         {
-            "center": st.lists(metres, min_size=3, max_size=3),
+            "center": st.lists(meters, min_size=3, max_size=3),
             "size": st.lists(st.floats(1e-3, 99), min_size=3, max_size=3),
         },
         optional={

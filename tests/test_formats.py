@@ -287,9 +287,9 @@ def test_ply_variants(folder):
 
 def test_bin_columns(folder):
     rng = np.random.default_rng(0)
-    metres = rng.normal(scale=20, size=(8, 3)).astype(np.float32)
+    meters = rng.normal(scale=20, size=(8, 3)).astype(np.float32)
     ring = np.arange(8, dtype=np.float32)[:, None]
-    nuscenes = np.hstack([metres, metres[:, :1], ring])
+    nuscenes = np.hstack([meters, meters[:, :1], ring])
     fields = ("x", "y", "z", "intensity", "ring")
     # 7 rows of 5 do not divide by 4; 8 rows of 5 are also 10 rows of 4, and only the beams tell
     for rows in (7, 8):
@@ -305,8 +305,8 @@ def test_bin_columns(folder):
         cloud = read(folder, name, nuscenes.tobytes(), **options)
         same(cloud, nuscenes, fields)
         assert cloud.warnings == ()
-    same(read(folder, "a.bin", metres.tobytes(), columns=3), metres, ("x", "y", "z"))
-    same(read(folder, "a.bin", nuscenes[:, [0, 1, 2, 3, 4, 0]].tobytes(), columns=6), metres)
+    same(read(folder, "a.bin", meters.tobytes(), columns=3), meters, ("x", "y", "z"))
+    same(read(folder, "a.bin", nuscenes[:, [0, 1, 2, 3, 4, 0]].tobytes(), columns=6), meters)
 
 
 def _sweep(rng, n):

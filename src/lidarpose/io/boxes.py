@@ -31,7 +31,7 @@ _ROTATION_TOLERANCE = 1e-3
 def read_boxes(
     source: str | os.PathLike | dict | list | tuple | np.ndarray | Box, *, calib: str | os.PathLike | None = None
 ) -> list[Box]:
-    """The boxes of people, in the frame of the points, metres and radians.
+    """The boxes of people, in the frame of the points, meters and radians.
 
     Args:
         source: a file, its content, or boxes. A file is JSON, a .npy array (n, 7), or a KITTI label (`label_2/N.txt`,
@@ -48,54 +48,56 @@ def read_boxes(
         InputError: one line that names the file, the entry (counted from 0, as in JSON paths) and the key. Two entries
             of one id are an error, since results are told apart by it.
     """
-    name, content = "boxes", source
-    if isinstance(source, Box):
-        content = [source]
-    elif not isinstance(source, dict | list | tuple | np.ndarray):
-        name, content = source, _load_file(source, calib)
-    if isinstance(content, dict):
-        if "people" not in content and {"center", "size"} <= content.keys():
-            raise file_error(name, f"expected {_FORM}, got one box alone: put it in a list, [{{...}}]")
-        if "people" not in content:
-            raise file_error(name, f'expected a list under the key "people", {_keys(content, "people")}')
-        content = content["people"]
-    if isinstance(content, np.ndarray):
-        content = content.tolist()
-    if not isinstance(content, list | tuple):
-        raise file_error(name, f'expected {{"people": [...]}} or a list of people, got {_show(content)}')
-    boxes = [_box(entry, name, f"people[{i}]") for i, entry in enumerate(content)]
-    first: dict[str | int, int] = {}
-    for i, box in enumerate(boxes):
-        if box.id is not None and first.setdefault(box.id, i) != i:
-            came = f"{_show(box.id)}, which people[{first[box.id]}] has too"
-            raise file_error(name, f"people[{i}].id: expected an id of its own, got {came}: rename one or leave it out")
+    name = "boxes" if isinstance(source, Box | dict | list | tuple | np.ndarray) else source
+    try:
+        content = source if name == "boxes" else _load_file(source, calib)
+        boxes = [_box(entry, f"people[{i}]") for i, entry in enumerate(_entries(content))]
+        first: dict[str | int, int] = {}
+        for i, box in enumerate(boxes):
+            if box.id is not None and first.setdefault(box.id, i) != i:
+                came = f"{_show(box.id)}, which people[{first[box.id]}] has too"
+                raise FormatError(f"people[{i}].id: expected an id of its own, got {came}: rename one or leave it out")
+    except FormatError as problem:
+        raise file_error(name, problem) from None
     return boxes
 
 
+def _entries(content: object) -> list | tuple:
+    if isinstance(content, Box):
+        return [content]
+    if isinstance(content, dict):
+        if "people" not in content and {"center", "size"} <= content.keys():
+            raise FormatError(_FORM, "one box alone", "put it in a list, [{...}]")
+        if "people" not in content:
+            raise FormatError(f'expected a list under the key "people", {_keys(content, "people")}')
+        content = content["people"]
+    content = content.tolist() if isinstance(content, np.ndarray) else content
+    if not isinstance(content, list | tuple):
+        raise FormatError('{"people": [...]} or a list of people', _show(content), "write the boxes so")
+    return content
+
+
 def _load_file(path: str | os.PathLike, calib: str | os.PathLike | None) -> object:
-    data = read_bytes(path, expected="a JSON file of boxes")
+    data = read_bytes(path, expected="a file of boxes")
+    if data.startswith(b"\x93NUMPY"):
+        return load_array(data)
     try:
-        if data.startswith(b"\x93NUMPY"):
-            return load_array(data)
         text = data.decode("utf-8-sig")
         return _read_kitti(path, text, calib) if _is_kitti(text) else json.loads(text)
     except InputError:
         # of the calibration
         raise
-    except FormatError as error:
-        raise file_error(path, error) from None
     except json.JSONDecodeError as error:
         start = error.doc.lstrip()[:1]
         if start and start not in "{[":
             # a table of another tool, as CSV
-            raise file_error(path, f"expected JSON {_FORM} or a KITTI label, got text: write the boxes so") from None
+            raise FormatError(f"JSON {_FORM} or a KITTI label", "text", "write the boxes so") from None
         where = f"line {error.lineno}, column {error.colno}"
-        raise file_error(path, f"is not JSON: {error.msg} at {where}; correct it there") from None
+        raise FormatError(f"is not JSON: {error.msg} at {where}; correct it there") from None
     except UnicodeDecodeError as error:
-        came = f"byte {error.start} that is not"
-        raise file_error(path, f"expected JSON in UTF-8, got {came}; save it as UTF-8") from None
+        raise FormatError("JSON in UTF-8", f"byte {error.start} that is not", "save it as UTF-8") from None
     except (ValueError, RecursionError) as error:
-        raise file_error(path, f"cannot be read as JSON ({error}); expected a list of boxes") from None
+        raise FormatError(f"cannot be read as JSON ({error}); expected a list of boxes") from None
 
 
 # ---- KITTI: https://www.cvlibs.net/datasets/kitti/eval_object.php, readme.txt of the development kit
@@ -168,7 +170,7 @@ def _number_of(word: str) -> float | None:
 # ---- one entry
 
 
-def _box(entry: object, name: object, where: str) -> Box:
+def _box(entry: object, where: str) -> Box:
     if isinstance(entry, Box):
         return entry
     entry = entry.tolist() if isinstance(entry, np.ndarray) else entry
@@ -176,30 +178,30 @@ def _box(entry: object, name: object, where: str) -> Box:
         entry = {"center": entry[:3], "size": entry[3:6], "yaw": entry[6]}
     if not isinstance(entry, dict):
         expected = '{"center": [x, y, z], "size": [l, w, h]} or [x, y, z, l, w, h, yaw]'
-        raise file_error(name, f"{where}: expected {expected}, got {_show(entry)}")
-    center = _triple(entry, "center", name, where, meaning="[x, y, z]")
-    size = _triple(entry, "size", name, where, meaning="[length, width, height]")
+        raise FormatError(f"{where}: expected {expected}, got {_show(entry)}")
+    center = _triple(entry, "center", where, meaning="[x, y, z]")
+    size = _triple(entry, "size", where, meaning="[length, width, height]")
     if min(size) <= 0:
-        raise file_error(name, f"{where}.size: expected positive metres [length, width, height], got {_show(size)}")
+        raise FormatError(f"{where}.size: expected positive meters [length, width, height], got {_show(size)}")
     yaw = entry.get("yaw")
     yaw = 0.0 if yaw is None else _number(yaw)
     if yaw is None:
-        raise file_error(name, f"{where}.yaw: expected a finite number in radians, got {_show(entry['yaw'])}")
+        raise FormatError(f"{where}.yaw: expected a finite number in radians, got {_show(entry['yaw'])}")
     if abs(yaw) > _MAX_YAW:
-        raise file_error(name, f"{where}.yaw: expected radians, got {yaw:g}; if it is in degrees, multiply by pi / 180")
-    return Box(center=center, size=size, yaw=yaw, id=_id(entry, name, where))
+        raise FormatError(f"{where}.yaw: expected radians, got {yaw:g}; if it is in degrees, multiply by pi / 180")
+    return Box(center=center, size=size, yaw=yaw, id=_id(entry, where))
 
 
-def _triple(entry: dict, key: str, name: object, where: str, *, meaning: str) -> list[float]:
+def _triple(entry: dict, key: str, where: str, *, meaning: str) -> list[float]:
     if key not in entry:
-        raise file_error(name, f'{where}: expected the key "{key}" {meaning} in metres, {_keys(entry, key)}')
+        raise FormatError(f'{where}: expected the key "{key}" {meaning} in meters, {_keys(entry, key)}')
     value = entry[key]
     try:
         numbers = [_number(v) for v in value] if not isinstance(value, str | bytes | dict) else []
     except TypeError:
         numbers = []
     if len(numbers) != 3 or None in numbers:
-        raise file_error(name, f"{where}.{key}: expected three finite numbers {meaning} in metres, got {_show(value)}")
+        raise FormatError(f"{where}.{key}: expected three finite numbers {meaning} in meters, got {_show(value)}")
     return numbers
 
 
@@ -214,13 +216,13 @@ def _number(value: object) -> float | None:
     return number if abs(number) < FARTHEST else None
 
 
-def _id(entry: dict, name: object, where: str) -> str | int | None:
+def _id(entry: dict, where: str) -> str | int | None:
     for key in ("id", "track"):
         value = entry.get(key)
         try:
             found = box_id(value)
         except InputError:
-            raise file_error(name, f"{where}.{key}: expected text or a whole number, got {_show(value)}") from None
+            raise FormatError(f"{where}.{key}: expected text or a whole number, got {_show(value)}") from None
         if found is not None:
             return found
     return None

@@ -44,7 +44,13 @@ _UNPACKED_BYTES, _UNPACKED_RATIO = 64 * 2**20, 32
 
 
 class FormatError(Exception):
-    """What is wrong with a file's content and what to do, without the file's name, which its reader adds."""
+    """What is wrong with a file's content and what to do, without the file's name, which its reader adds.
+
+    A whole sentence, or three parts: what was expected, what came, and the remedy.
+    """
+
+    def __init__(self, problem: str, came: object = None, remedy: str = ""):
+        super().__init__(problem if came is None else f"expected {problem}, got {came}: {remedy}")
 
 
 def shorten(text: str, limit: int = 80) -> str:

@@ -19,20 +19,18 @@ def parse_pcd(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]
     sizes, types, counts = (header.get(key, ["1"] * len(names)) for key in ("SIZE", "TYPE", "COUNT"))
     if not len(sizes) == len(types) == len(counts) == len(names):
         came = f"{len(names)} fields, {len(sizes)} sizes, {len(types)} types and {len(counts)} counts"
-        raise FormatError(
-            f"expected a PCD header with as many SIZE, TYPE, COUNT as FIELDS, got {came}: export it again"
-        )
+        raise FormatError("a PCD header with as many SIZE, TYPE, COUNT as FIELDS", came, "export it again")
     counts = [parse_count(c, "COUNT") for c in counts]
     formats = [t.lower() + s for t, s in zip(types, sizes, strict=True)]
     for text in set(formats) - set(_TYPES):
-        raise FormatError(f"expected PCD TYPE F, I or U with SIZE 1, 2, 4 or 8, got {shorten(text)!r}: export it again")
+        raise FormatError("PCD TYPE F, I or U with SIZE 1, 2, 4 or 8", f"{shorten(text)!r}", "export it again")
     size_keys = ("POINTS",) if "POINTS" in header else ("WIDTH", "HEIGHT")
     num_points = math.prod(parse_count(" ".join(header.get(key, ())), key) for key in size_keys)
     pick = pick_xyz(names)
     if any(counts[i] != 1 for i in pick):
         raise FormatError("expected COUNT 1 for x, y and z in the PCD header: export the points without features")
     if encoding not in ("ascii", "binary", "binary_compressed"):
-        raise FormatError(f"expected PCD DATA ascii, binary or binary_compressed, got {encoding!r}: export it again")
+        raise FormatError("PCD DATA ascii, binary or binary_compressed", f"{encoding!r}", "export it again")
     if not num_points:
         return np.empty((0, 3)), names, ()
     if encoding == "ascii":
@@ -58,10 +56,10 @@ def parse_pcd(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]
 def _read_header(data: bytes) -> tuple[dict[str, list[str]], str, int]:
     """(values by key, encoding, where the body starts)."""
     if not re.match(rb"\s*(#|VERSION|FIELDS|COLUMNS)", data):
-        raise FormatError(f"expected a PCD header, got {shorten(repr(data[:16]))}: is it another format?")
+        raise FormatError("a PCD header", f"{shorten(repr(data[:16]))}", "is it another format?")
     end = re.search(rb"^DATA[ \t]+(\w+)[ \t]*\r?\n", data, re.MULTILINE)
     if end is None:
-        raise FormatError("expected a PCD header with a DATA line, got none: it is cut off or damaged, export it again")
+        raise FormatError("a PCD header with a DATA line", "none", "it is cut off or damaged, export it again")
     header = {}
     for line in data[: end.start()].decode("utf-8", "replace").splitlines():
         if line.strip() and not line.lstrip().startswith("#"):
@@ -79,12 +77,12 @@ def _decompress(data: bytes, start: int, size: int, num_points: int) -> bytes:
     check_bytes(data, start + 8, packed, num_points)
     if unpacked != size:
         came = f"a compressed part of {packed} bytes for {unpacked}"
-        raise FormatError(f"expected {size} bytes for {num_points} points of the header, got {came}: export it again")
+        raise FormatError(f"{size} bytes for {num_points} points of the header", came, "export it again")
     check_unpacked(packed, unpacked)
     try:
         body = decompress(data[start + 8 : start + 8 + packed], unpacked)
     except ValueError:
         body = None
     if body is None or len(body) != size:
-        raise FormatError("expected LZF-compressed points, got damaged ones: copy or export it again")
+        raise FormatError("LZF-compressed points", "damaged ones", "copy or export it again")
     return body

@@ -28,7 +28,7 @@ MAX_DENSE = 20_000_000
 # keys without text have hashes that a file can make equal: so many cost a second at most, whatever they are
 MAX_NUMBER_KEYS, MAX_TUPLE_KEYS = 20_000, 1_000
 # instructions that a file of no size may have, and bytes for each further one; one can take 0.2 kB of memory
-_STEPS, _BYTES_PER_STEP = 2_000_000, 2
+_STEPS, _BYTES_PER_STEP = 1_000_000, 2
 # arrays and lists are copied out of the file, some of them twice or three times: Python 2 kept them as text
 _FREE_COPIES, _COPIES = 4096, 8
 
@@ -289,8 +289,6 @@ def _check_levels(value: object, levels: dict[int, int | None], depth: int) -> i
         if not value.name.startswith("chumpy."):
             raise FormatError(f"has a {value.name} without content: {_REMEDY}")
         return 0
-    if depth > MAX_DEPTH:
-        raise FormatError(f"is nested more than {MAX_DEPTH} levels deep: ask for npz")
     parts = ()
     if isinstance(value, list | tuple | set | frozenset):
         parts = value
@@ -300,7 +298,10 @@ def _check_levels(value: object, levels: dict[int, int | None], depth: int) -> i
     elif isinstance(value, np.ndarray) and value.dtype.kind == "O":
         parts = value.flat
     levels[id(value)] = None
-    count = 1 + max((_check_levels(p, levels, depth + 1) for p in parts if type(p) not in _PLAIN), default=0)
+    inner = (part for part in parts if type(part) not in _PLAIN)
+    count = (
+        max((1 + _check_levels(part, levels, depth + 1) for part in inner), default=1) if depth < MAX_DEPTH else depth
+    )
     if count > MAX_DEPTH:
         raise FormatError(f"is nested more than {MAX_DEPTH} levels deep: ask for npz")
     levels[id(value)] = count

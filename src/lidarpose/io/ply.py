@@ -23,16 +23,14 @@ def parse_ply(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]
         odd = next((kind for _, kind in properties if kind not in _TYPES), None)
         if odd and (name == "vertex" or encoding != "ascii"):
             came = f"{shorten(odd)!r} in {shorten(name)}"
-            raise FormatError(
-                f"expected PLY vertices of plain numbers, before any list, got {came}: export the points alone"
-            )
+            raise FormatError("PLY vertices of plain numbers, before any list", came, "export the points alone")
         widths = [np.dtype(_TYPES[kind]).itemsize if kind in _TYPES else 0 for _, kind in properties]
         if name == "vertex":
             break
         skip_lines += num_points
         start += num_points * sum(widths)
     else:
-        raise FormatError("expected a PLY element 'vertex', got none: export the points")
+        raise FormatError("a PLY element 'vertex'", "none", "export the points")
     names = tuple(name for name, _ in properties)
     pick = pick_xyz(names)
     if not num_points:
@@ -50,11 +48,11 @@ def _read_header(data: bytes) -> tuple[str, list[tuple[str, int, list[tuple[str,
     """(encoding, elements, where the body starts); an element is its name, its number of rows and its properties."""
     start = re.match(rb"ply[ \t]*(\r\n|\n|\r)", data)
     if start is None:
-        raise FormatError(f"expected a PLY header, got {shorten(repr(data[:16]))}: is it another format?")
+        raise FormatError("a PLY header", f"{shorten(repr(data[:16]))}", "is it another format?")
     # with the first line's kind of line end, since binary rows may begin with a byte that looks like one
     end = re.compile(rb"[\r\n]end_header[ \t]*" + start.group(1)).search(data)
     if end is None:
-        raise FormatError("expected a PLY header with an end_header line, got none: it is cut off, export it again")
+        raise FormatError("a PLY header with an end_header line", "none", "it is cut off, export it again")
     encoding, elements = "", []
     for line in data[: end.start()].decode("utf-8", "replace").splitlines()[1:]:
         match line.split():
@@ -67,8 +65,8 @@ def _read_header(data: bytes) -> tuple[str, list[tuple[str, int, list[tuple[str,
             case [] | ["comment" | "obj_info", *_]:
                 pass
             case _:
-                raise FormatError(f"expected a PLY header line, got {shorten(line)!r}: export it again")
+                raise FormatError("a PLY header line", f"{shorten(line)!r}", "export it again")
     if encoding not in _BYTE_ORDERS:
         expected = ", ".join(_BYTE_ORDERS)
-        raise FormatError(f"expected a PLY format of {expected}, got {shorten(encoding)!r}: export it again")
+        raise FormatError(f"a PLY format of {expected}", f"{shorten(encoding)!r}", "export it again")
     return encoding, elements, end.end()

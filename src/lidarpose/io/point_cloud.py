@@ -1,7 +1,7 @@
 """Point clouds from files: PCD, PLY, raw float32, NumPy and text.
 
-The suffix, in any case, says the format. Coordinates stay as they are in the file (metres are assumed, nothing is
-turned or scaled), in float64, since float32 rounds map coordinates such as UTM's to half a metre. Columns other than
+The suffix, in any case, says the format. Coordinates stay as they are in the file (meters are assumed, nothing is
+turned or scaled), in float64, since float32 rounds map coordinates such as UTM's to half a meter. Columns other than
 x, y and z are named in `Cloud.fields` and otherwise ignored.
 
 What a header announces is checked against the file before numpy, pandas or LZF decode it. A parser takes a file's bytes
@@ -28,7 +28,7 @@ from lidarpose.io.text import FEW_ROWS, check_bytes, is_transposed, numbered, pa
 KITTI_FIELDS = ("x", "y", "z", "intensity")
 NUSCENES_FIELDS = ("x", "y", "z", "intensity", "ring")
 
-# metres; no coordinate on Earth is larger (earth-centred ones reach 6.4e6), misread bytes mostly are
+# meters; no coordinate on Earth is larger (earth-centered ones reach 6.4e6), misread bytes mostly are
 _MAX_PLAUSIBLE = 1e7
 # share of the rows beyond that at which raw bytes are taken for something else than float32 rows
 _MAX_IMPLAUSIBLE_SHARE = 0.01
@@ -112,9 +112,7 @@ def read_points(path: str | os.PathLike, *, columns: int | None = None) -> Cloud
         if not len(points):
             raise FormatError("has no points; expected at least one: was it saved completely?")
         if num_dropped == len(points):
-            raise FormatError(
-                f"expected finite x, y, z, got NaN or infinity in all {num_dropped} points: export it again"
-            )
+            raise FormatError("finite x, y, z", f"NaN or infinity in all {num_dropped} points", "export it again")
     except FormatError as problem:
         raise file_error(path, problem) from None
     except MemoryError:
@@ -133,17 +131,13 @@ def _refuse_foreign(data: bytes, suffix: str) -> None:
     for other, pattern in _MAGIC.items():
         if re.match(pattern, data):
             if other != suffix:
-                raise FormatError(
-                    f"expected a {suffix or 'known'} file, got a {other} file's content: rename it to {other}"
-                )
+                raise FormatError(f"a {suffix or 'known'} file", f"a {other} file's content", f"rename it to {other}")
             return
     for pattern, problem in _FOREIGN.items():
         if re.match(pattern, data):
             raise FormatError(problem)
     if suffix not in SUFFIXES:
-        raise FormatError(
-            f"expected one of {' '.join(SUFFIXES)}, got the suffix {suffix!r}: convert or rename the file"
-        )
+        raise FormatError(f"one of {' '.join(SUFFIXES)}", f"the suffix {suffix!r}", "convert or rename the file")
 
 
 # ---- raw float32 rows
@@ -152,7 +146,7 @@ def _refuse_foreign(data: bytes, suffix: str) -> None:
 def _parse_bin(data: bytes, columns: int | None):
     # printable bytes alone may be a few float32: 837282 is " jLI"
     if re.fullmatch(rb"[\t\r\n -~]+", data[:1024]) and re.search(rb"[0-9][\s,;]+[-+.]?[0-9]", data[:1024]):
-        raise FormatError("expected raw float32 rows, got text: rename it to .txt or .csv")
+        raise FormatError("raw float32 rows", "text", "rename it to .txt or .csv")
     notes = ()
     if columns is None:
         columns, notes = _guess_columns(data)
@@ -164,14 +158,12 @@ def _parse_bin(data: bytes, columns: int | None):
             else "it is cut off or not raw float32, copy it again"
         )
         came = f"{len(data)} bytes, which do not divide by {4 * columns}"
-        raise FormatError(f"expected rows of {columns} float32 (x y z first), got {came}: {remedy}")
+        raise FormatError(f"rows of {columns} float32 (x y z first)", came, remedy)
     points = np.frombuffer(data, "<f4").reshape(-1, columns)[:, :3].astype(np.float64)
     share = float((np.isfinite(points) & (np.abs(points) > _MAX_PLAUSIBLE)).any(axis=1).mean())
     if share > _MAX_IMPLAUSIBLE_SHARE:
         came = f"{share:.0%} of rows beyond {_MAX_PLAUSIBLE:g} m"
-        raise FormatError(
-            f"expected rows of {columns} float32 in metres, got {came}: another format, or another number of columns?"
-        )
+        raise FormatError(f"rows of {columns} float32 in meters", came, "another format, or another number of columns?")
     return points, {4: KITTI_FIELDS, 5: NUSCENES_FIELDS}.get(columns) or numbered(columns), notes
 
 
@@ -183,7 +175,7 @@ def _guess_columns(data: bytes) -> tuple[int, tuple[str, ...]]:
     why, other = "the size divides by 5 values and not by 4" if usual == five else "", four
     values = np.frombuffer(data[: len(data) // 4 * 4], "<f4")
     if five in fits:
-        # a fifth value that is always a beam number is no accident, misaligned metres are not whole
+        # a fifth value that is always a beam number is no accident, misaligned meters are not whole
         ring = values.reshape(-1, five)[:, -1]
         if ((ring >= 0) & (ring < _MAX_BEAMS) & (ring == np.floor(ring))).all() and ring.any():
             usual, fits, why = five, [five], "every fifth value is a beam number"
@@ -223,9 +215,7 @@ def _parse_npz(data: bytes):
         raise
     except Exception as error:
         reason = shorten(str(error))
-        raise FormatError(
-            f"expected a NumPy .npz archive, got a damaged or cut off one ({reason}): save it again"
-        ) from None
+        raise FormatError("a NumPy .npz archive", f"a damaged or cut off one ({reason})", "save it again") from None
     return _points_of(load_array(content), f"the array {shorten(key)!r}")
 
 
@@ -236,43 +226,40 @@ def _choose_array(archive: zipfile.ZipFile) -> tuple[str, bytes]:
     if not named:
         for key, name in keys.items():
             with archive.open(name) as member:
-                shape, dtype = _array_header(member)
+                shape, dtype, _ = _array_header(member)
             if (len(shape) == 2 and shape[1] >= 3 and dtype.kind in "fiu") or (dtype.names and len(shape) == 1):
                 named.append(key)
         if len(named) != 1:
             came = shorten(", ".join(keys)) or "no array"
-            raise FormatError(f"expected 'points', 'xyz' or one (n, 3+) array alone, got {came}: save it with points=")
+            raise FormatError("'points', 'xyz' or one (n, 3+) array alone", came, "save it with points=")
     member = archive.getinfo(keys[named[0]])
     check_unpacked(member.compress_size, member.file_size)
     return named[0], archive.read(member)
 
 
-def _array_header(file) -> tuple[tuple[int, ...], np.dtype]:
-    """(shape, dtype) of a .npy stream, which is left at its first value."""
+def _array_header(file) -> tuple[tuple[int, ...], np.dtype, str]:
+    """(shape, dtype, order) of a .npy stream, which is left at its first value."""
     try:
         version = np.lib.format.read_magic(file)
         # version 3 differs from 2 by the characters that field names may have
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, _, dtype = read(file)
-        return shape, dtype
+        shape, is_fortran, dtype = read(file)
+        return shape, dtype, "F" if is_fortran else "C"
     except Exception as error:
         reason = shorten(str(error))
-        raise FormatError(
-            f"expected a NumPy .npy header, got another or a damaged one ({reason}): save it again"
-        ) from None
+        raise FormatError("a NumPy .npy header", f"another or a damaged one ({reason})", "save it again") from None
 
 
 def load_array(data: bytes) -> np.ndarray:
     """The array in a .npy file's bytes; nothing is unpickled, and the size is checked before the values are read."""
     file = io.BytesIO(data)
-    shape, dtype = _array_header(file)
+    shape, dtype, order = _array_header(file)
     if dtype.hasobject:
-        raise FormatError("expected an array of numbers, got dtype object: save a float array with numpy.save")
+        raise FormatError("an array of numbers", "dtype object", "save a float array with numpy.save")
     if any(n < 0 for n in shape):
-        raise FormatError(f"expected an array (n, 3+), got the shape {shape}: save it again")
-    count = math.prod(shape)
-    check_bytes(data, file.tell(), count * dtype.itemsize, shape[0] if shape else 1)
-    return np.load(io.BytesIO(data), allow_pickle=False)
+        raise FormatError("an array (n, 3+)", f"the shape {shape}", "save it again")
+    check_bytes(data, file.tell(), math.prod(shape) * dtype.itemsize, shape[0] if shape else 1)
+    return np.ndarray(shape, dtype, data, file.tell(), order=order)
 
 
 def _points_of(array: np.ndarray, what: str):
@@ -280,19 +267,17 @@ def _points_of(array: np.ndarray, what: str):
         names = array.dtype.names
         parts = [array[names[i]] for i in pick_xyz(names)]
         if any(part.ndim != 1 or part.dtype.kind not in "fiu" for part in parts):
-            raise FormatError(
-                f"expected (n,) records with numbers x, y, z in {what}, got {array.shape}: save (n, 3) floats"
-            )
+            raise FormatError(f"(n,) records with numbers x, y, z in {what}", array.shape, "save (n, 3) floats")
         return np.stack([part.astype(np.float64) for part in parts], axis=-1), names, ()
     if array.dtype.kind not in "fiu":
-        raise FormatError(f"expected numbers in {what}, got dtype {array.dtype}: save a float array")
+        raise FormatError(f"numbers in {what}", f"dtype {array.dtype}", "save a float array")
     if array.ndim != 2 or array.shape[1] < 3 or is_transposed(array.shape):
         remedy = "save x, y and z of each point" if array.ndim == 2 else "save a row for each point"
         if array.ndim == 2 and 3 <= array.shape[0] <= FEW_ROWS:
             remedy = "save its transpose, points.T"
         elif array.ndim > 2 and array.shape[-1] >= 3:
             remedy = f"save points.reshape(-1, {array.shape[-1]})"
-        raise FormatError(f"expected {what} to have the shape (n, 3+), got {array.shape}: {remedy}")
+        raise FormatError(f"{what} to have the shape (n, 3+)", array.shape, remedy)
     return array[:, :3].astype(np.float64), numbered(array.shape[1]), ()
 
 

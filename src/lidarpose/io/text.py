@@ -21,7 +21,7 @@ def pick_xyz(names: Sequence[str]) -> list[int]:
     low = [name.strip().lower() for name in names]
     if not {"x", "y", "z"} <= set(low):
         came = shorten(" ".join(names)) or "none"
-        raise FormatError(f"expected columns x, y and z, got {came}: export or rename x, y, z")
+        raise FormatError("columns x, y and z", came, "export or rename x, y, z")
     return [low.index(axis) for axis in "xyz"]
 
 
@@ -38,7 +38,7 @@ def is_transposed(shape: tuple[int, ...]) -> bool:
 def parse_count(text: str, what: str) -> int:
     """A number of a header, at most 18 digits."""
     if not re.fullmatch(r"[0-9]{1,18}", text):
-        raise FormatError(f"expected a whole number as the header's {what}, got {shorten(text)!r}: export it again")
+        raise FormatError(f"a whole number as the header's {what}", f"{shorten(text)!r}", "export it again")
     return int(text)
 
 
@@ -64,7 +64,7 @@ def parse_rows(text: str, num_rows: int, columns: list[int], num_cells: int, *, 
     for number, row in enumerate(rows, 1):
         if row.count(" ") + 1 != num_cells:
             came = f"{row.count(' ') + 1} in {shorten(row)!r} on line {number} of the points"
-            raise FormatError(f"expected {num_cells} values a row, as the header says, got {came}: export it again")
+            raise FormatError(f"{num_cells} values a row, as the header says", came, "export it again")
     try:
         return np.loadtxt(rows, np.float64, comments=None, usecols=columns, ndmin=2)
     except ValueError as error:
@@ -92,7 +92,7 @@ def parse_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...
     points = _read_csv(body, pick_xyz(names), separator=separator, decimal=decimal, num_skipped=num_skipped)
     if not has_header and is_transposed((len(points), len(names))):
         came = f"{len(points)} of {len(names)}"
-        raise FormatError(f"expected a line of x y z for each point, got {came}: save its transpose")
+        raise FormatError("a line of x y z for each point", came, "save its transpose")
     return points, tuple(names), ()
 
 
@@ -113,12 +113,10 @@ def _find_columns(text: str) -> tuple[Sequence[str], int, bool, str | None, str]
     came = f"on line {skip + 1}, {shorten(first)!r}"
     if not all(_is_number(cell, decimal) for cell in cells):
         if not {"x", "y", "z"} <= {cell.lower() for cell in cells}:
-            raise FormatError(
-                f"expected numbers, or a header with x, y and z, got others {came}: export or rename x, y, z"
-            )
+            raise FormatError("numbers, or a header with x, y and z", f"others {came}", "export or rename x, y, z")
         return cells, skip + 1, True, separator, decimal
     if len(cells) < 3:
-        raise FormatError(f"expected at least 3 columns x y z, got {len(cells)} {came}: export x, y and z")
+        raise FormatError("at least 3 columns x y z", f"{len(cells)} {came}", "export x, y and z")
     # a comment above names them where it has as many words with x, y and z: numpy.savetxt writes its header so
     for words in (_split(comment, mark) for mark in (None, ",", ";")):
         if len(words) == len(cells) and {"x", "y", "z"} <= {word.lower() for word in words}:
@@ -133,8 +131,9 @@ def _check_width(body: str, names: list[str], separator: str | None, num_skipped
             cells = _split(line.strip(), separator)
             if any(cells[len(names) :]):
                 raise FormatError(
-                    f"expected {len(names)} values a row, as its header names, got {len(cells)} on line {number}, "
-                    f"{shorten(line)!r}: name every column, row numbers too, or leave them away"
+                    f"{len(names)} values a row, as its header names",
+                    f"{len(cells)} on line {number}, {shorten(line)!r}",
+                    "name every column, row numbers too, or leave them away",
                 )
             return
 
@@ -142,13 +141,13 @@ def _check_width(body: str, names: list[str], separator: str | None, num_skipped
 def decode(data: bytes) -> str:
     """UTF-8 text whose lines end in \\n; raises FormatError."""
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        raise FormatError("expected text in UTF-8, got UTF-16: save it as UTF-8")
+        raise FormatError("text in UTF-8", "UTF-16", "save it as UTF-8")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise FormatError(f"expected text in UTF-8, got other bytes at {error.start}: save it as UTF-8") from None
+        raise FormatError("text in UTF-8", f"other bytes at {error.start}", "save it as UTF-8") from None
     if "\x00" in text:
-        raise FormatError("expected text, got zero bytes: is it another format?")
+        raise FormatError("text", "zero bytes", "is it another format?")
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
@@ -167,7 +166,7 @@ def _wrong_line(
         cells = _split(line.strip(), separator)
         if line.strip() and not all(i < len(cells) and _is_number(cells[i], decimal) for i in columns):
             came = f"{shorten(line)!r} on line {number}{where}"
-            return FormatError(f"expected numbers for x, y and z, got {came}: correct that line")
+            return FormatError("numbers for x, y and z", came, "correct that line")
     return FormatError(f"expected rows of numbers ({shorten(str(reason))}): export it again")
 
 
