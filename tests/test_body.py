@@ -128,7 +128,7 @@ def test_left_mirrors_right(rig, some):
     mirrored = some.joints[:, BODY26.flip] * [1, -1, 1]
     assert np.abs(mirrored - some.joints).max() < 0.01
     faces = rig.faces
-    for vertices in some.vertices:
+    for vertices in some.vertices[:3]:
         other = vertices * np.float32([1, -1, 1])
         middle = np.concatenate([vertices, vertices[faces].mean(1)])
         gap = np.linalg.norm(other[:, None] - middle, axis=-1).min(1)

@@ -249,7 +249,7 @@ def damaged(text, places, odd, cut):
     return "".join(words)[: int(cut * len(text)) + 1]
 
 
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     which=st.sampled_from(["a.bvh", "s.asf", "s_1.amc"]),
     places=st.lists(st.floats(0, 1), max_size=4),
