@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
 from lidarpose.io import files
-from lidarpose.io.files import atomic_path, check_suffix, file_error, read_bytes, write_atomic
+from lidarpose.io.files import atomic_path, check_suffix, file_error, read_bytes, read_npz, write_atomic
 
 
 def tree(folder):
@@ -188,6 +188,16 @@ def test_links_are_followed(tmp_path):
     (tmp_path / "link.txt").symlink_to(tmp_path / "there" / "a.txt")
     write_atomic(tmp_path / "link.txt", "new")
     assert (tmp_path / "link.txt").is_symlink() and (tmp_path / "there" / "a.txt").read_text() == "new"
+
+
+def test_npz_of_zeros_is_bounded(tmp_path, monkeypatch):
+    np.savez_compressed(tmp_path / "a.npz", zeros=np.zeros(2**24), ones=np.ones(3))
+    arrays, names = read_npz(tmp_path / "a.npz", ["ones", "none"], expected="an npz")
+    assert list(arrays) == ["ones"] and names == ["ones", "zeros"]
+    with pytest.raises(InputError, match=r"a.npz: expected at most 67108864 bytes or 32 .*LIDARPOSE_MAX_UNPACKED=\d+$"):
+        read_npz(tmp_path / "a.npz", ["zeros"], expected="an npz")
+    monkeypatch.setenv("LIDARPOSE_MAX_UNPACKED", str(2**28))
+    assert read_npz(tmp_path / "a.npz", ["zeros"], expected="an npz")[0]["zeros"].shape == (2**24,)
 
 
 def test_messages_are_printable_lines():

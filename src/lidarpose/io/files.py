@@ -151,7 +151,12 @@ def read_npz(
         if not data.startswith(b"PK"):
             raise ValueError("no zip archive")
         with np.load(io.BytesIO(data), allow_pickle=False) as file:
-            return {name: file[name] for name in wanted if name in file.files}, sorted(file.files)
+            names = [name for name in wanted if name in file.files]
+            members = [member for member in file.zip.infolist() if member.filename.removesuffix(".npy") in names]
+            check_unpacked(sum(m.compress_size for m in members), sum(m.file_size for m in members))
+            return {name: file[name] for name in names}, sorted(file.files)
+    except FormatError as problem:
+        raise file_error(path, problem) from None
     except MemoryError:
         raise file_error(path, "does not fit in memory; split it first") from None
     except Exception as error:  # numpy, zipfile and zlib raise many kinds for a damaged archive
