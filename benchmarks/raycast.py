@@ -149,6 +149,8 @@ def plot(path, sensor, by_distance, by_count):
         axis.grid(True, which="both", lw=0.3)
     left.set(xlabel="distance, m", ylabel="ms a person, one thread", title=f"{sensor.name}, 14,160 triangles")
     right.set(xlabel="triangles", xscale="log", title="mean over 4 to 20 m")
+    right.set_xticks(list(by_count), [f"{count:,}" for count in by_count], rotation=30)
+    right.minorticks_off()
     right.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     figure.savefig(path, dpi=80)
 

@@ -93,12 +93,17 @@ def test_no_such_file_and_a_folder(tmp_path):
     assert_one_line(tmp_path, "is a folder")
 
 
-@pytest.mark.parametrize("keep", [0, 4, 8, 100, 5000, -1])
+@pytest.mark.parametrize("keep", [4, 8, 100, 5000, -1])
 def test_a_truncated_file_names_the_byte(stored, tmp_path, keep):
     path = tmp_path / "cut.safetensors"
     path.write_bytes(stored.read_bytes()[:keep])
     size, whole = path.stat().st_size, stored.stat().st_size
     assert_one_line(path, f"ends at byte {size:,}", "get it again", *([f"says {whole:,}"] if size > 20_000 else []))
+
+
+def test_an_empty_file(tmp_path):
+    (tmp_path / "empty.safetensors").write_bytes(b"")
+    assert_one_line(tmp_path / "empty.safetensors", "is empty", "copied completely")
 
 
 def test_a_file_with_more_behind_it(stored, tmp_path):

@@ -85,12 +85,12 @@ def runs_of(card: dict) -> list[dict]:
 
 def read_header(path: str | os.PathLike) -> Header:
     """The header of a checkpoint. Raises InputError where the file is not a checkpoint of this package."""
-    return parse_header(path, SafetensorsFile.open(path, tensors=False).metadata.get(ENTRY))
+    return parse_header(path, SafetensorsFile.open(path).metadata.get(ENTRY))
 
 
 def parameter_count(path: str | os.PathLike) -> int:
     """Numbers that a checkpoint holds. Raises InputError as `read_header` does."""
-    return sum(map(math.prod, SafetensorsFile.open(path, tensors=False).shapes.values()))
+    return sum(map(math.prod, SafetensorsFile.open(path).shapes.values()))
 
 
 def save_checkpoint(path: str | os.PathLike, network: PoseNet | DaptNet, *, card: dict, half: bool = False) -> None:
@@ -171,7 +171,7 @@ class SafetensorsFile:
     """A safetensors file that is neither cut off nor something else.
 
     metadata: texts by name; header: all of it; shapes: of the tensors, by the names that the network gives them;
-    content: the whole file, empty where only the header was wanted; prefix: of the names in the file.
+    content: the whole file; prefix: of the names in the file.
     """
 
     path: str | os.PathLike
@@ -180,18 +180,16 @@ class SafetensorsFile:
     prefix: str = ""
 
     @classmethod
-    def open(cls, path: str | os.PathLike, *, tensors: bool = True, prefix: str = "") -> SafetensorsFile:
+    def open(cls, path: str | os.PathLike, *, prefix: str = "") -> SafetensorsFile:
         """prefix: dropped where all names of tensors begin with it. Raises InputError that names the damaged byte."""
         kind = "is a folder" if os.path.isdir(path) else "" if os.path.isfile(path) else "does not exist"
         if kind:
             raise file_error(path, f"expected {_EXPECTED}, but it {kind}: check the path")
-        size = os.path.getsize(path)
-        # an empty file is one that ends at byte 0
-        content = read_bytes(path, expected=_EXPECTED) if tensors and size else _start_of(path)
-        header = _parse_safetensors(path, content, size)
+        content = read_bytes(path, expected=_EXPECTED)
+        header = _parse_safetensors(path, content)
         names = [name for name in header if name != "__metadata__"]
         is_wrapped = prefix and names and all(name.startswith(prefix) for name in names)
-        return cls(path=path, header=header, content=content if tensors else b"", prefix=prefix if is_wrapped else "")
+        return cls(path=path, header=header, content=content, prefix=prefix if is_wrapped else "")
 
     @property
     def metadata(self) -> dict[str, str]:
@@ -243,18 +241,11 @@ class SafetensorsFile:
         return tensors
 
 
-def _start_of(path: str | os.PathLike) -> bytes:
-    """The length of the header and the header, as far as they are there."""
-    with open(path, "rb") as file:
-        start = file.read(8)
-        length = struct.unpack("<Q", start)[0] if len(start) == 8 else 0
-        return start + file.read(min(length, _MOST_HEADER) + 1)
-
-
-def _parse_safetensors(path: str | os.PathLike, content: bytes, size: int) -> dict:
-    """The header of a file of `size` bytes that begins with `content`: 8 bytes of a length, so much JSON, then the
-    tensors. Raises InputError that says what is wrong, and where."""
+def _parse_safetensors(path: str | os.PathLike, content: bytes) -> dict:
+    """The header of a file: 8 bytes of a length, so much JSON, then the tensors. Raises InputError that says what is
+    wrong, and where."""
     again = "it was not copied completely: get it again"
+    size = len(content)
     if size < 8:
         raise file_error(path, f"expected {_EXPECTED}, but the file ends at byte {size}: {again}")
     length = struct.unpack("<Q", content[:8])[0]
