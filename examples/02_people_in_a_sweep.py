@@ -16,11 +16,12 @@ from lidarpose.synth.environment.mesh import Mesh, quad, union
 # ---- a sweep: three people on flat ground about a sensor 1.7 m above it
 
 device = lidarpose.sensor("os1-128")
+assert isinstance(device, lidarpose.Sensor)  # not a rosette
 bodies = draw_bodies(None, captured=0.0, count=3, seed=1, block=0)
 places = np.array([[6.0, 1.0], [-4.0, 5.0], [2.0, -9.0]])
 feet = np.column_stack([places, np.full(3, -device.height)]).astype(np.float32)
 meshes = [Mesh(vertices, bodies.faces).moved(at) for vertices, at in zip(bodies.vertices, feet, strict=True)]
-scene = union([*meshes, quad(15.0, np.zeros(2)).moved([0, 0, -device.height])])
+scene = union([*meshes, quad(15.0, np.zeros(2)).moved(np.array([0, 0, -device.height]))])
 points = scan(scene.vertices, scene.faces, device).points
 np.save("sweep.npy", points)
 

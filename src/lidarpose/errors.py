@@ -4,6 +4,7 @@ import difflib
 from collections.abc import Iterable
 from math import isfinite
 from numbers import Integral
+from typing import Any
 
 
 class LidarPoseError(Exception):
@@ -50,16 +51,17 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> InputError:
     return InputError(f"unknown {kind} {name!r}: {hint}known are {', '.join(known)}")
 
 
-def whole(name: str, value: object, *, least: int, most: int | None = None, hint: str = "") -> int:
+def whole(name: str, value: Any, *, least: int, most: int | None = None, hint: str = "") -> int:
     """A whole number, numpy's too, as Python's. Raises InputError for anything else, and outside least to most."""
     if isinstance(value, Integral) and not isinstance(value, bool):
-        if value >= least and (most is None or value <= most):
-            return int(value)
+        number = int(value)
+        if number >= least and (most is None or number <= most):
+            return number
     bounds = f"of at least {least}" if most is None else f"from {least} to {most}"
     raise InputError(f"{name} must be a whole number {bounds}{hint}, got {value!r}")
 
 
-def check_finite(name: str, value: object) -> None:
+def check_finite(name: str, value: Any) -> None:
     """Raises InputError unless `value` is a finite number, Python's or numpy's."""
     try:
         good = isfinite(value)

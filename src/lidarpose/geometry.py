@@ -6,6 +6,7 @@ column vectors: `rotated = R @ v`, for rows `points @ R.T`.
 
 import reprlib
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -98,7 +99,7 @@ def rotation_from_up(up: str | Sequence[float]) -> np.ndarray:
     return rotation_between(direction / np.abs(direction).max(), np.array([0.0, 0.0, 1.0]))
 
 
-def vector_of(given: object) -> np.ndarray | None:
+def vector_of(given: Any) -> np.ndarray | None:
     """Three finite numbers or the text "x,y,z" as (3,) float64; None for anything else."""
     try:
         vector = np.array([float(value) for value in (given.split(",") if isinstance(given, str) else given)])

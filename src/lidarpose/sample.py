@@ -6,6 +6,7 @@ Lengths in metres, angles in radians, z up.
 
 from dataclasses import dataclass, field, replace
 from numbers import Integral, Real
+from typing import Any
 
 import numpy as np
 
@@ -65,7 +66,7 @@ class Pose:
         """The same pose with the joints of another skeleton, picked by name."""
         pick = self.skeleton.map_to(skeleton)
         values = {name: getattr(self, name) for name in PER_JOINT}
-        picked = {name: None if value is None else value[..., pick] for name, value in values.items()}
+        picked: dict[str, Any] = {name: None if value is None else value[..., pick] for name, value in values.items()}
         return replace(self, joints=self.joints[..., pick, :], skeleton=skeleton, **picked)
 
 
@@ -183,6 +184,7 @@ class LabeledSample(Sample):
     "val", "test" or None; info: of a synthetic person, None of a real one.
     """
 
+    pose: Pose
     joint_labels: np.ndarray
     sequence: str = ""
     frame: int = 0

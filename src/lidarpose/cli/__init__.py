@@ -25,7 +25,7 @@ def main(arguments: list[str] | None = None) -> int:
     set_quiet(options.quiet)
     with suppress(AttributeError, ValueError):
         # names of files need not be text, nor has every terminal all letters; stderr does so by itself
-        sys.stdout.reconfigure(errors="backslashreplace")
+        sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     try:
         options.run(options)
         if sys.stdout is not None:

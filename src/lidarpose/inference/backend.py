@@ -8,6 +8,7 @@ Runtime, here, and torch (`backend_torch`).
 
 import os
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -93,17 +94,15 @@ class OnnxBackend:
     def __init__(self, path: str | os.PathLike, *, threads: int | None = None):
         if threads is not None:
             threads = whole("threads", threads, least=1)
-        self._opened = {"path": os.path.abspath(path), "threads": threads}
+        self._opened = os.path.abspath(path), threads
         self.session, self.header, self.source = open_onnx(path, threads=threads)
         # parts are of no use here: what is not asked for is not computed
         self._outputs = [name for name in OUTPUTS if name != "part"]
 
-    def __getstate__(self) -> dict:
+    def __reduce__(self) -> tuple:
         # a session cannot go to another process, which opens the file anew
-        return self._opened
-
-    def __setstate__(self, state: dict) -> None:
-        self.__init__(**state)
+        path, threads = self._opened
+        return partial(OnnxBackend, path, threads=threads), ()
 
     def run(self, clouds: list[np.ndarray], view: np.ndarray) -> Raw:
         inputs = network_inputs(voxelize_people(clouds, view, self.header.config))
@@ -137,7 +136,7 @@ def estimates(raw: Raw, decoder: Decoder) -> Estimates:
     """
     joints, in_range = raw.vote.astype(float), None
     if raw.heatmaps is not None:
-        joints = joints + _decoded(raw, decoder)
+        joints = joints + _decoded(raw, raw.heatmaps, decoder)
         # a vote can be too far off on any axis
         in_range = ~np.any([out_of_range(heatmap) for heatmap in raw.heatmaps], axis=0)
     if joints.size and not np.isfinite(joints).any():
@@ -145,25 +144,25 @@ def estimates(raw: Raw, decoder: Decoder) -> Estimates:
     confidence = None if raw.confidence is None else _probability(raw.confidence)
     spread = None if raw.log_spread is None else np.exp(np.minimum(raw.log_spread.astype(float), _LARGEST_LOG_SPREAD))
     if confidence is None and raw.heatmaps is not None:
-        confidence, spread = _from_heatmaps(raw, joints - raw.vote)
+        confidence, spread = _from_heatmaps(raw, raw.heatmaps, joints - raw.vote)
     visible = None if raw.visible is None else _probability(raw.visible)
     return Estimates(joints=joints, confidence=confidence, spread=spread, visible=visible, in_range=in_range)
 
 
-def _decoded(raw: Raw, decoder: Decoder) -> np.ndarray:
+def _decoded(raw: Raw, heatmaps: tuple[np.ndarray, ...], decoder: Decoder) -> np.ndarray:
     """(B, J, 3) m about the vote."""
-    axes = zip(raw.heatmaps, raw.low, raw.step, strict=True)
+    axes = zip(heatmaps, raw.low, raw.step, strict=True)
     return np.stack([decoder(heatmap, low=low, step=step) for heatmap, low, step in axes], -1)
 
 
-def _from_heatmaps(raw: Raw, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _from_heatmaps(raw: Raw, heatmaps: tuple[np.ndarray, ...], offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Confidence and spread (B, J) of a network that tells neither, from its heatmaps about `offset` (B, J, 3) m.
 
     Confidence is the share of the heatmaps within `CONFIDENCE_RADIUS` of the joint, axes taken as independent; spread
     the root of their mean square distance. Neither is calibrated.
     """
-    share, square = 1.0, 0.0
-    for axis, heatmap in enumerate(raw.heatmaps):
+    share, square = np.ones(offset.shape[:2]), np.zeros(offset.shape[:2])
+    for axis, heatmap in enumerate(heatmaps):
         weight = np.exp(heatmap.astype(float) - heatmap.max(-1, keepdims=True))
         weight /= weight.sum(-1, keepdims=True)
         distance = raw.low[axis] + np.arange(heatmap.shape[-1]) * raw.step[axis] - offset[..., axis, None]

@@ -1,6 +1,7 @@
 """From a user's cloud to one person's points: checks, where the person may stand, what looks wrong about the input."""
 
 import os
+from typing import Any
 
 import numpy as np
 
@@ -40,7 +41,7 @@ _LONG, _LONG_TO_TALL = 0.25, 1.5
 _MOST, _STREET, _FLATTER = (10, 90), 10.0, 3.0
 
 
-def as_points(points: object, what: str = "points") -> np.ndarray:
+def as_points(points: Any, what: str = "points") -> np.ndarray:
     """Anything array-like (n, 3+), or a table or records with columns x, y, z, as (n, 3) float64.
 
     Raises InputError for another shape or type; n = 0 is legal.
@@ -50,7 +51,7 @@ def as_points(points: object, what: str = "points") -> np.ndarray:
     points = _by_name(points, what)
     if isinstance(points, np.ma.MaskedArray):
         # masked is no point
-        points = points.astype(np.float64).filled(np.nan)
+        points = np.ma.filled(points.astype(np.float64), np.nan)
     if hasattr(points, "detach"):
         # a torch tensor that may sit on a device, in a graph, or in bfloat16, which numpy lacks
         points = points.detach().cpu().double()
@@ -74,7 +75,7 @@ def as_points(points: object, what: str = "points") -> np.ndarray:
     return array[:, :3].astype(np.float64)
 
 
-def _by_name(points: object, what: str) -> object:
+def _by_name(points: Any, what: str) -> Any:
     """The columns x, y and z of a table (pandas, polars) or of records, wherever they stand; anything else as it is."""
     names = getattr(getattr(points, "dtype", None), "names", None) or getattr(points, "columns", None)
     if names is None or not len(names) or not all(isinstance(name, str) for name in names):

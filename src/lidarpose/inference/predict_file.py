@@ -77,7 +77,7 @@ def predict(
     return replace(poses, timing_ms=timing | poses.timing_ms)
 
 
-def _only_returns(path: object, cloud: Cloud) -> Cloud:
+def _only_returns(path: str | os.PathLike, cloud: Cloud) -> Cloud:
     points, notes = only_returns(cloud.points)
     if not len(points):
         found = f"none within {FARTHEST:g} m" if cloud.points.any() else "only 0,0,0, which are no returns"
@@ -86,7 +86,7 @@ def _only_returns(path: object, cloud: Cloud) -> Cloud:
     return replace(cloud, points=points, num_dropped=cloud.num_dropped + dropped, warnings=(*cloud.warnings, *notes))
 
 
-def _check_crop_size(path: object, points: np.ndarray) -> None:
+def _check_crop_size(path: str | os.PathLike, points: np.ndarray) -> None:
     """Raises InputError for a file, z up, that is too large for one person."""
     size = np.ptp(points, axis=0)
     if size.max() < CROP_SIZE:

@@ -4,7 +4,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -106,7 +106,12 @@ class Predictor:
         self.backend = backend
         self.header = backend.header
         self.skeleton = backend.header.skeleton
-        self.model = {"name": name, "version": self.header.version, "backend": backend.name, "decode": decode}
+        self.model: dict[str, str | int] = {
+            "name": name,
+            "version": self.header.version,
+            "backend": backend.name,
+            "decode": decode,
+        }
         if tta > 1:
             self.model["tta"] = tta
         self._decoder, self._tta, self._passes = decoder(decode), tta_transforms(tta), PASSES
@@ -255,8 +260,8 @@ class Predictor:
                 poses.append(None)
                 continue
             values = {name: getattr(found, name) for name in PER_JOINT}
-            told = {name: None if value is None else value[k] for name, value in values.items()}
-            poses.append(Pose(joints=found.joints[k] + centers[k], skeleton=self.skeleton, **told))
+            of_person: dict[str, Any] = {name: None if value is None else value[k] for name, value in values.items()}
+            poses.append(Pose(joints=found.joints[k] + centers[k], skeleton=self.skeleton, **of_person))
         return poses
 
     def outputs(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Estimates:
@@ -278,7 +283,9 @@ class Predictor:
 
 def _surer(pose: Pose, best: Pose) -> bool:
     """A network that does not tell its confidence has its first answer, that of the whole cloud, taken."""
-    return pose.confidence is not None and pose.confidence.mean() > best.confidence.mean()
+    if pose.confidence is None or best.confidence is None:
+        return False
+    return bool(pose.confidence.mean() > best.confidence.mean())
 
 
 def _range_warning(names: list[str]) -> str:

@@ -1,6 +1,7 @@
 """Networks run by torch: any device, the paper's network too."""
 
 import os
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -50,7 +51,7 @@ class TorchBackend:
         self.header = header
         self.device = device
         self._compile = compile
-        self._module = None
+        self._module: Callable | None = None
 
     def __getstate__(self) -> dict:
         # what torch compiled stays in its process

@@ -7,6 +7,7 @@ Legend: B people, J joints.
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -74,7 +75,8 @@ def invert(estimates: Estimates, transform: TTATransform, skeleton: Skeleton) ->
         return estimates
     flip = np.array(skeleton.flip)
     values = {name: getattr(estimates, name) for name in _NAMES}
-    return replace(estimates, **{name: None if value is None else value[:, flip] for name, value in values.items()})
+    flipped: dict[str, Any] = {name: None if value is None else value[:, flip] for name, value in values.items()}
+    return replace(estimates, **flipped)
 
 
 def average(estimates: list[Estimates]) -> Estimates:
@@ -95,7 +97,7 @@ def average(estimates: list[Estimates]) -> Estimates:
         rows = np.stack(stack).astype(float)
         return np.average(rows, 0, weight.reshape(weight.shape + (1,) * (rows.ndim - 2)) * np.ones_like(rows))
 
-    out = {name: mean(values[name]) for name in _NAMES}
+    out: dict[str, Any] = {name: mean(values[name]) for name in _NAMES}
     # out of range where most answers say so
     out["in_range"] = None if out["in_range"] is None else out["in_range"] > 0.5
     return Estimates(**out)

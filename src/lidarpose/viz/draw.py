@@ -8,6 +8,7 @@ import io
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -153,17 +154,17 @@ def _header(ax, panels: list[Panel], shown: list[Panel], *, title: str, at: tupl
             handles.append(Line2D([], [], color=color, lw=2.6, label=name))
     if any(is_known(p.truth) for p in shown):
         handles.append(Line2D([], [], color=_TRUTH, lw=1.2, ls=(0, (3, 1.6)), label="true"))
-    dot = {"ls": "", "marker": "o", "ms": 4}
+    dot: dict[str, Any] = {"ls": "", "marker": "o", "ms": 4}
     if any(p.part is not None and (p.part > 0).any() for p in shown):
         for name, (_, color) in _PART_SHADES.items():
             handles.append(Line2D([], [], color=color, label=f"{name} part", **dot))
     if any(p.part is not None and (p.part == 0).any() for p in shown):
-        handles.append(Line2D([], [], color=_NOT_BODY, label="not body", **dot))
+        handles.append(Line2D([], [], color=_NOT_BODY, label="background", **dot))
     if any(p.part is None and len(p.points) for p in shown):
         handles.append(Line2D([], [], color=_NEAR, label="near point", **dot))
         handles.append(Line2D([], [], color=_FAR, label="far point", **dot))
     if any(_forward(p) is not None for p in shown):
-        handles.append(Line2D([], [], color=_FAINT, ls="", marker=">", ms=4.5, label="looks to"))
+        handles.append(Line2D([], [], color=_FAINT, ls="", marker=">", ms=4.5, label="facing"))
     if handles:
         legend = ax.legend(
             handles=handles,
@@ -319,11 +320,11 @@ def _view(ax, panel: Panel, *, seen_from, forward, origin, scale, ground, window
         add_lines(segments, zorder=4, capstyle="round", **styles)
         known = np.isfinite(at).all(-1)
         weight = confidences(panel.pose)[known]
-        colors = [SIDE_COLORS[side(name)] for name in panel.pose.skeleton.joints]
+        side_colors = [SIDE_COLORS[side(name)] for name in panel.pose.skeleton.joints]
         dots = ax.scatter(
             *at[known].T,
             s=3 + 5 * weight,
-            c=[c for c, k in zip(colors, known, strict=True) if k],
+            c=[c for c, k in zip(side_colors, known, strict=True) if k],
             edgecolors="white",
             linewidths=0.4,
             alpha=0.25 + 0.75 * weight,

@@ -7,6 +7,7 @@ from html import escape
 from importlib import resources
 from numbers import Integral, Real
 from pathlib import Path
+from typing import TypeGuard
 
 import numpy as np
 
@@ -154,7 +155,7 @@ def _card(i: int, person: ReportPerson, drawn: int) -> str:
     )
 
 
-def _is_number(value: object) -> bool:
+def _is_number(value: object) -> TypeGuard[float]:
     return isinstance(value, Real) and not isinstance(value, bool | np.bool_)
 
 

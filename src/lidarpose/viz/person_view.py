@@ -1,5 +1,7 @@
 """What both the picture and the report need of a person: where the person looks, the views, the sides, the words."""
 
+from typing import TypeGuard
+
 import numpy as np
 
 from lidarpose.errors import InputError
@@ -79,7 +81,7 @@ def confidences(pose: Pose) -> np.ndarray:
     return np.clip(np.nan_to_num(np.asarray(pose.confidence, float)), 0, 1)
 
 
-def is_known(pose: Pose | None) -> bool:
+def is_known(pose: Pose | None) -> TypeGuard[Pose]:
     """Whether there is a pose with at least one finite joint."""
     return pose is not None and bool(np.isfinite(pose.joints).all(-1).any())
 
