@@ -21,7 +21,7 @@ from lidarpose.body.rig import load_rig
 from lidarpose.body.shape import clothing, sample_people
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import Bodies, draw_bodies
-from lidarpose.synth.props.attachments import Prop, draw_props
+from lidarpose.synth.props import Prop, draw_props
 
 BLOCK = 64
 ON_SHEET = (

@@ -44,7 +44,7 @@ def test_lasers_of_one_elevation_share_its_beams():
 @given(st.integers(0, 2**32 - 1), st.floats(2, 40), st.floats(0.4, 2.1), st.floats(-0.3, 0.3), st.floats(-3, 3))
 def test_a_sensor_is_mounted_so_that_the_person_fits(seed, distance, tall, pitch, ahead):
     device = sensor("os1-128")
-    height = draw_height(device, distance, tall, rng=np.random.default_rng(seed), cut=0.0, pitch=pitch, ahead=ahead)
+    height = draw_height(device, distance, tall, 0.3, pitch, ahead, np.random.default_rng(seed), cut=0.0)
     low, high = distance * np.tan(device.elevations[[0, -1]] - pitch * np.cos(ahead))
     if high - low > tall:
         # the head may be cut only where the feet would be

@@ -15,7 +15,6 @@ from lidarpose.cli import main
 from lidarpose.data import shards
 from lidarpose.data.schema import person_row
 from lidarpose.data.shards import DatasetCard, open_dataset, read_card, read_rows, write_card
-from lidarpose.data.synthetic_info import person_info
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.sample import Box, PersonInfo, Pose, Sample
 from lidarpose.skeleton import BODY26
@@ -287,13 +286,3 @@ def test_without_pyarrow_the_extra_is_named(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(MissingExtra, match="^reading and writing Parquet needs an optional dependency: .*synth"):
         open_dataset(folder)
-
-
-def test_clutter_is_what_stands_above_the_ground_and_is_not_the_body():
-    z = np.array([-1.6, -1.55, -1.0, -0.5, -1.0, -0.2, -0.7, -1.58], np.float32)
-    part = np.array([0, 0, 0, 0, 1, 2, 3, 4], np.uint8)
-    points = np.stack([0 * z + 5, 0 * z, z], 1)
-    pose = Pose(joints=np.zeros((26, 3)), skeleton=BODY26)
-    sample = Sample(points=points, center=np.zeros(3), part=part, pose=pose)
-    facts = person_info(sample, sensor="a", kind="walk", distance=5.0, alone=8, soles=-1.6, tall=1.84)
-    assert facts.clutter == 2 / 8 and facts.visible == 4 / 8 and facts.height_seen == pytest.approx(0.75)

@@ -8,7 +8,7 @@ from walkers import HEADINGS, bone_distance, goer
 
 from lidarpose.geometry import rotation_about
 from lidarpose.lidar.presets import sensor
-from lidarpose.sample import Sample
+from lidarpose.sample import Pose, Sample
 from lidarpose.skeleton import BODY26
 from lidarpose.synth import generator, noise
 from lidarpose.synth.environment.mesh import Mesh, box, quad
@@ -222,6 +222,18 @@ def test_a_rosette_goes_on_with_its_pattern_from_frame_to_frame():
     )
     np.testing.assert_array_equal(first, again)
     assert len(second) > 50 and (first.shape != second.shape or np.abs(first - second).max() > 0.01)
+
+
+def test_clutter_is_what_stands_above_the_ground_and_is_not_the_body(monkeypatch):
+    monkeypatch.setattr(generator, "count_alone", lambda scene, body, frame: 8)
+    # the soles are at -0.5 m, the body is 1.7 m tall
+    z = np.array([-0.5, -0.45, 0.1, 0.6, 0.1, 0.9, 0.4, -0.375], np.float32)
+    part = np.array([0, 0, 0, 0, 1, 2, 3, 4], np.uint8)
+    pose = Pose(joints=np.zeros((26, 3)), skeleton=BODY26)
+    sample = Sample(points=np.stack([0 * z + 5, 0 * z, z], 1), center=np.zeros(3), part=part, pose=pose)
+    info = generator._measure(sample, scene(), goer(), 0, 0)
+    assert info.clutter == 2 / 8 and info.visible == 4 / 8 and info.height_seen == pytest.approx(0.75)
+    assert info.sensor == "dapt64" and info.kind == "walk" and not info.upright
 
 
 # --- another try

@@ -30,6 +30,7 @@ RENAMED = {
     "model.network": "models.posenet",
     "model.plan": "models.voxelize",
     "model.presets": "models.config",
+    "synth.garments": "synth.props.garments",
     "synth.generate": "synth.generator",
     "synth.mesh": "synth.environment.mesh",
     "train.job": "train.setup",

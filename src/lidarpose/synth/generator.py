@@ -10,7 +10,6 @@ from functools import cached_property, lru_cache, partial
 
 import numpy as np
 
-from lidarpose.data.synthetic_info import person_info
 from lidarpose.errors import InputError, whole
 from lidarpose.lidar.presets import sensor
 from lidarpose.lidar.ray_pattern import RayPattern
@@ -21,7 +20,7 @@ from lidarpose.synth.bodies import Bodies, PoseBank, draw_bodies, draw_moving_bo
 from lidarpose.synth.environment.mesh import Mesh
 from lidarpose.synth.environment.surroundings import ground, occluder, surroundings
 from lidarpose.synth.placement import Place, draw_place
-from lidarpose.synth.props.attachments import draw_props
+from lidarpose.synth.props import draw_props
 from lidarpose.synth.sample_kernels import center_of_cells, crop_points
 from lidarpose.synth.scene import SceneConfig, scene_config
 from lidarpose.synth.simulate import Scan, Scene, count_alone, draw_conditions, simulate_scan
@@ -209,14 +208,35 @@ def _crop(scene: Scene, bodies: Bodies, row: int, scan: Scan, rng: np.random.Gen
     )
 
 
+# points this close to the soles count as ground, not as clutter, m
+_GROUND = 0.1
+
+
 def _measure(sample: Sample, scene: Scene, bodies: Bodies, row: int, frame: int) -> PersonInfo:
+    """What is known of a sample: see `PersonInfo`."""
     low, high = bodies.extent[row]
-    return person_info(
-        sample,
+    visible_alone = count_alone(scene, scene.meshes(bodies, row)[0], frame)
+    seen = sample.points[sample.part > 0]
+    clutter = (sample.part == 0) & (sample.points[:, 2] > float(scene.place.feet[2]) + _GROUND)
+    return PersonInfo(
         sensor=scene.sensor.name,
         kind=bodies.kinds[row],
         distance=float(np.hypot(*sample.pose.joints[0, :2])),
-        alone=count_alone(scene, scene.meshes(bodies, row)[0], frame),
-        soles=float(scene.place.feet[2]),
-        tall=high[2] - low[2],
+        visible=min(len(seen) / max(visible_alone, 1), 1.0),
+        height_seen=float(np.ptp(seen[:, 2])) / max(high[2] - low[2], 1e-6) if len(seen) else 0.0,
+        clutter=float(clutter.mean()) if len(clutter) else 0.0,
+        upright=_is_upright(sample.pose.joints),
     )
+
+
+def _is_upright(joints: np.ndarray) -> bool:
+    """Stands or walks: trunk within 35 degrees of upright, and a hip above its ankle by over four fifths of the leg."""
+    pelvis, neck = joints[BODY26.index("pelvis")], joints[BODY26.index("neck")]
+    if (neck - pelvis)[2] < np.cos(np.radians(35)) * np.linalg.norm(neck - pelvis):
+        return False
+    for side in ("left", "right"):
+        hip, knee, ankle = (joints[BODY26.index(f"{side}_{name}")] for name in ("hip", "knee", "ankle"))
+        leg = np.linalg.norm(hip - knee) + np.linalg.norm(knee - ankle)
+        if (hip - ankle)[2] > 0.8 * leg:
+            return True
+    return False

@@ -170,29 +170,27 @@ def draw_box(
         extent: the body's least and greatest x, y, z in m along its `heading` rad, in its own frame.
         place: of the body.
     """
-    (x0, y0, z0), (x1, y1, z1) = extent
+    low, high = np.array(extent)
     yaw, cut = place.yaw + heading, 1.0
     if not errors.jitter:
-        x0, y0, z0, x1, y1, z1 = x0 - _ALL, y0 - _ALL, z0 - _ALL, x1 + _ALL, y1 + _ALL, z1 + _ALL
+        low, high = low - _ALL, high + _ALL
     else:
-        a, b, c, loose, how_loose, bottom, deep, cut = rng.random(8).tolist()
-        dx, dy, dz, turn = (errors.jitter * rng.standard_normal(4)).tolist()
+        *room, loose, how_loose, bottom, deep, cut = rng.random(8).tolist()
+        *shift, turn = (errors.jitter * rng.standard_normal(4)).tolist()
         more = _LOOSE[0] + how_loose * (_LOOSE[1] - _LOOSE[0]) if loose < errors.loose else 0.0
         if bottom < _RAISED:
-            z0 += _RAISED_BY[0] + deep * (_RAISED_BY[1] - _RAISED_BY[0])
+            low[2] += _RAISED_BY[0] + deep * (_RAISED_BY[1] - _RAISED_BY[0])
         elif bottom < _RAISED + _SUNK:
-            z0 -= _SUNK_BY[0] + deep * (_SUNK_BY[1] - _SUNK_BY[0])
-        a, b, c = ((_ROOM + _MORE * u + more) / 2 for u in (a, b, c))
+            low[2] -= _SUNK_BY[0] + deep * (_SUNK_BY[1] - _SUNK_BY[0])
+        margin = (_ROOM + _MORE * np.array(room) + more) / 2
         # heights are estimated better than places
-        dz /= 2
-        x0, y0, z0, x1, y1, z1 = x0 - a + dx, y0 - b + dy, z0 - c + dz, x1 + a + dx, y1 + b + dy, z1 + c + dz
-        yaw += turn
+        shift = np.array(shift) / [1, 1, 2]
+        low, high, yaw = low - margin + shift, high + margin + shift, yaw + turn
     # the extent's middle, along the true heading
     c, s = cos(place.yaw + heading), sin(place.yaw + heading)
-    x, y, z = (x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2
+    x, y, z = ((low + high) / 2).tolist()
     center = place.feet + np.array([c * x - s * y, s * x + c * y, z])
-    size = np.array([max(high - low, _LEAST_SIZE) for low, high in ((x0, x1), (y0, y1), (z0, z1))])
-    box = Box(center=center, size=size, yaw=yaw)
+    box = Box(center=center, size=np.maximum(high - low, _LEAST_SIZE), yaw=yaw)
     return cut_box(box, rng=rng) if cut < errors.cut * difficulty else box
 
 

@@ -65,12 +65,10 @@ def draw_place(
     pitch, roll = device.tilt, 0.0
     if config.mount:
         pitch, roll = pitch + _MOUNT_TILT * rng.standard_normal(), _MOUNT_TILT * rng.standard_normal()
-    mount = None
-    if pitch or roll:
-        mount = rotation_about("x", roll) @ rotation_about("y", -pitch)
+    mount = rotation_about("x", roll) @ rotation_about("y", -pitch) if pitch or roll else None
     height = device.height
     if config.mount:
-        height = draw_height(device, distance, tall, rng=rng, cut=_CUT, spread=config.mount, pitch=pitch, ahead=azimuth)
+        height = draw_height(device, distance, tall, config.mount, pitch, azimuth, rng)
     return Place(
         feet=np.array([distance * cos(azimuth), distance * sin(azimuth), -height]),
         yaw=float(2 * np.pi * yaw - np.pi),
@@ -119,25 +117,18 @@ def _beam(device: Sensor | RayPattern) -> float:
 
 
 def draw_height(
-    device: Sensor | RayPattern,
-    distance: float,
-    tall: float,
-    *,
-    rng: np.random.Generator,
-    cut: float = _CUT,
-    spread: float = 0.3,
-    pitch: float = 0.0,
-    ahead: float = 0.0,
-) -> float:
+    device: Sensor | RayPattern, distance: float, tall: float, spread: float, pitch: float, azimuth: float,
+    rng: np.random.Generator, cut: float = _CUT,
+) -> float:  # fmt: skip
     """Height of the sensor above the person's ground in meters, jittered for mounts and slopes.
 
     Where the person of `tall` m would reach out of the sensor's fan although there is room for them, the height is
-    moved until they fit, but for a share `cut` of people. `pitch` rad tilts the fan down at azimuth 0, `ahead` rad is
-    the person's azimuth.
+    moved until they fit, but for a share `cut` of people. `spread` m is the height's standard
+    deviation, `pitch` rad tilts the fan down at azimuth 0, `azimuth` rad is the person's.
     """
     mount, slope = rng.standard_normal(2).tolist()
     height = device.height + spread * mount + 0.02 * slope * distance
-    down = pitch * cos(ahead)
+    down = pitch * cos(azimuth)
     edges = [min(max(device.elevations[end] - down, -_STEEPEST), _STEEPEST) for end in (0, -1)]
     low, high = distance * tan(edges[0]), distance * tan(edges[1])
     if rng.random() < cut:

@@ -12,7 +12,7 @@ from lidarpose.synth.bodies import Bodies
 from lidarpose.synth.environment.mesh import Mesh, union
 from lidarpose.synth.noise import direction_mask, laser_mask
 from lidarpose.synth.placement import Place
-from lidarpose.synth.props.attachments import Prop
+from lidarpose.synth.props import Prop
 from lidarpose.synth.sample_kernels import REACH, lose_returns, range_errors
 from lidarpose.synth.scene import SceneConfig
 

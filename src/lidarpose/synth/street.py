@@ -212,7 +212,7 @@ def samples(scene: Street, rng: np.random.Generator, *, least: int = 15) -> list
 
     The box's id is the track id; frame_id is "frame/track".
     """
-    found = []
+    pairs = []
     for number, frame in enumerate(scene.frames):
         for track, label in enumerate(frame.boxes):
             shift, room, turn = rng.normal(0, _OFF, 3), rng.uniform(*_GROWN, 3), rng.normal(0, _TURNED)
@@ -234,5 +234,5 @@ def samples(scene: Street, rng: np.random.Generator, *, least: int = 15) -> list
                 source=f"synth/street/{scene.sensor}",
                 frame_id=f"{number}/{track}",
             )
-            found.append((number, sample))
-    return found
+            pairs.append((number, sample))
+    return pairs

@@ -125,10 +125,10 @@ def skirt(points: Points, u: list[float]) -> tuple[object, Mesh, np.ndarray]:
         # the hull of two circles: each vertex goes with the leg on its side
         long = np.maximum(np.hypot(halves[:, 0], halves[:, 1]), 1e-6)
         toward = np.clip(2.5 * (halves[:, :2] / long[:, None]) @ around.T, -1, 1)
-        found = centers[:, None] + toward[..., None] * halves[:, None]
-        found[..., :2] += (radii[:, None] * _FOLDS)[..., None] * around
-        found[..., 2] = np.maximum(found[..., 2], 0.02)
-        return found.reshape(-1, 3).astype(np.float32)
+        cloth = centers[:, None] + toward[..., None] * halves[:, None]
+        cloth[..., :2] += (radii[:, None] * _FOLDS)[..., None] * around
+        cloth[..., 2] = np.maximum(cloth[..., 2], 0.02)
+        return cloth.reshape(-1, 3).astype(np.float32)
 
     return vertices, Mesh(vertices(points), _skirt_faces()), parts
 
