@@ -1,4 +1,4 @@
-"""Small files of every kind that the readers take, as bytes, and how to damage them: what `test_fuzz` starts from.
+"""Small files of every kind that the readers take, as bytes, how to damage them, and what an error must be like.
 
 Writers are literal, so that they share nothing with the readers.
 """
@@ -10,10 +10,25 @@ import struct
 import zipfile
 
 import numpy as np
+import pytest
 from hypothesis import strategies as st
+
+from lidarpose.errors import InputError
 
 POINTS = np.array([[1.5, -2.25, 0.125, 7], [10, 20, -1, 8], [3, 4, 5, 9]], np.float32)
 KITTI = b"Pedestrian 0 0 -0.2 712 143 810 307 1.89 0.48 1.2 1.84 1.47 8.41 0.01\n"
+
+
+def refusal(call, *args, words=(), **options) -> str:
+    """The message of the InputError that a call raises: one printable line, with the words."""
+    with pytest.raises(InputError) as caught:
+        call(*args, **options)
+    error, message = caught.value, str(caught.value)
+    assert message.isprintable() and len(message) < 600
+    assert "Traceback" not in message and "Error:" not in message, message
+    assert error.__cause__ is None and (error.__context__ is None or error.__suppress_context__)
+    assert all(word in message for word in words), message
+    return message
 
 
 # ---- points

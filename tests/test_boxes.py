@@ -6,11 +6,10 @@ import math
 
 import numpy as np
 import pytest
-from hostile_files import KITTI, npy
+from hostile_files import KITTI, npy, refusal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix
 from lidarpose.io.boxes import read_boxes
 from lidarpose.sample import Box
@@ -144,9 +143,7 @@ def test_kitti_labels_come_in_the_frame_of_the_lidar(tmp_path, tracking):
         (texts[1] + "\n" + names[0] + " 1 1 0 0 1 0 0 0 1", ["expected a rotation as R0_rect"]),
     ):
         calib.write_text(text)
-        with pytest.raises(InputError) as caught:
-            read_boxes(label)
-        one_line(caught.value, f"{calib}: ", *words)
+        refusal(read_boxes, label, words=[f"{calib}: ", *words])
     label.write_text("\n".join(lines[:2]))
     assert read_boxes(label, calib=tmp_path / "none.txt") == []
 
@@ -198,19 +195,10 @@ BAD = {
 }
 
 
-def one_line(error, *words):
-    message = str(error)
-    assert message.isprintable() and len(message) < 400 and "Error:" not in message
-    for word in words:
-        assert word in message, message
-
-
 @pytest.mark.parametrize("case", BAD)
 def test_bad_structure(case):
     content, words = BAD[case]
-    with pytest.raises(InputError) as caught:
-        read_boxes(content)
-    one_line(caught.value, "boxes: ", *words)
+    refusal(read_boxes, content, words=["boxes: ", *words])
 
 
 @pytest.mark.parametrize(
@@ -243,9 +231,7 @@ def test_bad_structure(case):
 def test_bad_files(tmp_path, content, words):
     path = tmp_path / "boxes.json"
     path.write_bytes(content)
-    with pytest.raises(InputError) as caught:
-        read_boxes(path)
-    one_line(caught.value, f"{path}: ", *words)
+    refusal(read_boxes, path, words=[f"{path}: ", *words])
 
 
 def test_bad_paths(tmp_path):
@@ -255,6 +241,4 @@ def test_bad_paths(tmp_path):
         (3, "expected the path"),
         (None, "path"),
     ):
-        with pytest.raises(InputError) as caught:
-            read_boxes(path)
-        one_line(caught.value, word)
+        refusal(read_boxes, path, words=[word])

@@ -4,7 +4,6 @@ import gzip
 import io
 import json
 import os
-import random
 import struct
 import subprocess
 import sys
@@ -12,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hostile_files import POINTS, lzf_body, npy, npy_header, npz, pcd_header, ply_header, zipped
+from hostile_files import POINTS, lzf_body, npy, npy_header, npz, pcd_header, ply_header, refusal, zipped
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -155,12 +154,6 @@ def test_ply_binary_orders_and_line_ends(folder, points, order, newline):
 
 
 @settings(max_examples=40, deadline=None)
-@given(points=float32_points)
-def test_bin_kitti(folder, points):
-    same(read(folder, "kitti.bin", points.tobytes(), columns=4), points, ("x", "y", "z", "intensity"))
-
-
-@settings(max_examples=40, deadline=None)
 @given(points=float64_points, fortran=st.booleans())
 def test_npy_and_npz_keep_every_bit(folder, points, fortran):
     points = np.asfortranarray(points) if fortran else points
@@ -249,20 +242,6 @@ def test_pcd_variants(folder):
     assert cloud.num_dropped == 1
 
 
-def test_pcd_leaves_the_global_random_state_alone(folder):
-    random.seed(0)
-    state = random.getstate()
-    read(folder, "a.pcd", pcd_header("x y z _") + ROWS)
-    assert random.getstate() == state
-
-
-def test_ascii_has_the_digits_of_the_text_not_of_the_type(folder):
-    text = b"500000.001 5000000.002 100.003\n"
-    expected = [[500000.001, 5000000.002, 100.003]]
-    same(read(folder, "a.pcd", pcd_header("x y z", "4 4 4", "F F F", "1 1 1", 1, "ascii") + text), expected)
-    same(read(folder, "a.ply", ply_header(1, "ascii", names="x y z") + text), expected)
-
-
 def test_ply_variants(folder):
     rows = POINTS.tobytes()
     before = "element camera 2\nproperty double a\nproperty uchar b\n"
@@ -301,6 +280,7 @@ def test_bin_columns(folder):
     cloud = read(folder, "a.bin", kitti.tobytes())
     same(cloud, kitti)
     assert cloud.warnings == ()
+    same(read(folder, "a.bin", kitti.tobytes(), columns=4), kitti, ("x", "y", "z", "intensity"))
     for name, options in (("sweep.pcd.bin", {}), ("a.bin", {"columns": 5})):
         cloud = read(folder, name, nuscenes.tobytes(), **options)
         same(cloud, nuscenes, fields)
@@ -391,12 +371,18 @@ def test_decimal_commas_that_only_later_lines_show(folder):
     same(read(folder, "a.csv", "x;y;z;name\n1e-05;1;2;a,1\n0.5;1;2.25;b\n"), expected)
 
 
-def test_map_coordinates_keep_their_millimetres(folder):
+def test_map_coordinates_keep_their_millimeters(folder):
+    """Float64 is read whole, and text has the digits of the text, not of the type that a header gives it."""
     points = np.array([[500000.001, 5000000.002, 100.003], [500001.0, 5000001.0, 99.999]])
-    text = "\n".join(" ".join(map(str, row)) for row in points.tolist())
+    text = "\n".join(" ".join(map(str, row)) for row in points.tolist()).encode()
+    wide, narrow = (
+        pcd_header("x y z", f"{n} {n} {n}", "F F F", "1 1 1", 2, kind) for n, kind in ((8, "binary"), (4, "ascii"))
+    )
     same(read(folder, "utm.xyz", text), points, rtol=1e-15)
-    same(read(folder, "utm.pcd", pcd_header("x y z", "8 8 8", "F F F", "1 1 1", 2) + points.tobytes()), points)
+    same(read(folder, "utm.pcd", wide + points.tobytes()), points)
+    same(read(folder, "utm.pcd", narrow + text), points)
     same(read(folder, "utm.ply", ply_header(2, kind="double", names="x y z") + points.tobytes()), points)
+    same(read(folder, "utm.ply", ply_header(2, "ascii", names="x y z") + text), points)
 
 
 def test_not_finite_rows_are_dropped_and_counted(folder):
@@ -570,24 +556,11 @@ def test_archives_do_not_unpack_to_far_more_than_they_are(folder, monkeypatch):
         read(folder, "a.npz", file.getvalue())
 
 
-def one_line(error, *names):
-    message = str(error)
-    assert isinstance(error, InputError)
-    assert message.isprintable() and len(message) < 600
-    for name in names:
-        assert name in message, message
-    assert "Traceback" not in message and "Error:" not in message, message
-    assert error.__cause__ is None and (error.__context__ is None or error.__suppress_context__)
-
-
 @pytest.mark.parametrize("case", BAD)
 def test_bad_input_is_one_line(tmp_path, case):
     name, content, words = BAD[case]
-    with pytest.raises(InputError) as caught:
-        read(tmp_path, name, content)
-    if name.isprintable():
-        assert str(caught.value).startswith(f"{tmp_path / name}: ")
-    one_line(caught.value, *words)
+    message = refusal(read, tmp_path, name, content, words=words)
+    assert message.startswith(f"{tmp_path / name}: ") or not name.isprintable()
 
 
 def test_bad_paths(tmp_path):
@@ -608,9 +581,7 @@ def test_bad_paths(tmp_path):
         os.mkfifo(tmp_path / "pipe.pcd")
         cases[tmp_path / "pipe.pcd"] = ["pipe"]
     for path, words in cases.items():
-        with pytest.raises(InputError) as caught:
-            read_points(path)
-        one_line(caught.value, *words)
+        refusal(read_points, path, words=words)
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may read everything")

@@ -11,9 +11,8 @@ import types
 
 import numpy as np
 import pytest
-from hostile_files import DATA, old_array
+from hostile_files import DATA, old_array, refusal
 
-from lidarpose.errors import InputError
 from lidarpose.io import pickles
 from lidarpose.io.pickles import MAX_BYTES, Unread, load_pickle
 
@@ -31,33 +30,25 @@ def load(tmp_path):
 @pytest.fixture
 def refused(load):
     def line(data: bytes) -> str:
-        with pytest.raises(InputError) as caught:
-            load(data)
-        assert "\n" not in str(caught.value) and "body.pkl: " in str(caught.value)
-        return str(caught.value).split("body.pkl: ")[1]
+        return refusal(load, data, words=["body.pkl: "]).split("body.pkl: ")[1]
 
     return line
 
 
+def described(value):
+    """Types and contents, in a form that tells arrays apart."""
+    if isinstance(value, np.ndarray):
+        items = [described(item) for item in value.flat] if value.dtype == object else value.tolist()
+        return value.dtype, value.shape, items
+    if isinstance(value, dict):
+        return dict, [(described(key), described(part)) for key, part in value.items()]
+    if isinstance(value, list | tuple):
+        return type(value), [described(part) for part in value]
+    return type(value), value
+
+
 def same(a, b):
-    assert type(a) is type(b)
-    if isinstance(a, np.ndarray):
-        assert a.dtype == b.dtype and a.shape == b.shape
-        if a.dtype == object:
-            for x, y in zip(a.flat, b.flat, strict=True):
-                same(x, y)
-        else:
-            np.testing.assert_array_equal(a, b)
-    elif isinstance(a, dict):
-        assert list(a) == list(b)
-        for key in a:
-            same(a[key], b[key])
-    elif isinstance(a, list | tuple):
-        assert len(a) == len(b)
-        for x, y in zip(a, b, strict=True):
-            same(x, y)
-    else:
-        assert a == b
+    assert described(a) == described(b)
 
 
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
@@ -246,8 +237,6 @@ def test_hostile_arrays(refused):
         (b"\x89T", b"\x89NT", "with|without"),
     ):
         assert old in good
-        with pytest.raises(AssertionError):
-            assert good.replace(old, new) == good
         line = refused(head + good.replace(old, new, 1) + b".")
         assert any(part in line for part in hint.split("|")), (new, line)
     assert "without content" in refused(head + good[: good.index(b"R(") + 1] + b".")
@@ -287,10 +276,8 @@ def test_memory_and_time_stay_in_proportion_to_the_file(load, refused, monkeypat
 
 
 def test_files(load, refused, tmp_path):
-    with pytest.raises(InputError, match="no such file; expected a pickle"):
-        load_pickle(tmp_path / "none.pkl")
-    with pytest.raises(InputError, match="got a folder"):
-        load_pickle(tmp_path)
+    refusal(load_pickle, tmp_path / "none.pkl", words=["no such file; expected a pickle"])
+    refusal(load_pickle, tmp_path, words=["got a folder"])
     assert "is empty" in refused(b"")
     assert "got a zip archive" in refused(b"PK\x03\x04 a zip archive")
     assert "damaged or no pickle" in refused(b"{'json': 1}")
@@ -299,5 +286,4 @@ def test_files(load, refused, tmp_path):
     huge = tmp_path / "huge.pkl"
     with huge.open("wb") as file:
         file.truncate(MAX_BYTES + 1)
-    with pytest.raises(InputError, match="has 4.0 GiB, 4 GiB are read at most"):
-        load_pickle(huge)
+    refusal(load_pickle, huge, words=["has 4.0 GiB, 4 GiB are read at most"])
