@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_evaluate import Fake, standing
+from test_metric_rows import PERSON
 
 from lidarpose.data.prepare import prepare
 from lidarpose.data.shards import open_dataset
@@ -145,14 +146,12 @@ def test_a_displaced_box_loses_one_side(seed, amount):
 
 def people_of(error):
     """Predictions of human15, of errors (n, 15) m along x; NaN has no label."""
-    known = {"sequence": "s", "frame": 0, "track": "0", "time": 0.0, "sensor": "", "condition": "", "poses": ""}
-    known |= {"plain": False, "moving": False, "points": 100, "distance": 5.0, "hidden": np.nan, "shard": 0}
     people = []
     for k, own in enumerate(error):
         labels = np.where(np.isnan(own), 0, 2)
         true = np.where(labels[:, None], 0, np.full((15, 3), np.nan))
         pred = np.nan_to_num(own)[:, None] * [1, 0, 0]
-        people.append(known | {"row": k, "pred": pred, "true": true, "labels": labels})
+        people.append(PERSON | {"row": k, "pred": pred, "true": true, "labels": labels})
     return stack(HUMAN15, people)
 
 

@@ -24,7 +24,7 @@ from lidarpose.eval.metrics.groups import DISTANCE_EDGES, OCCLUSION_EDGES, POINT
 from lidarpose.eval.metrics.joint_errors import acceleration_errors, aligned_errors, joint_hits
 from lidarpose.eval.metrics.keypoints import PCK_THRESHOLDS, box_hits, oks, oks_hits, oks_sigmas, pem
 from lidarpose.eval.predictions import Predictions
-from lidarpose.eval.scores import OURS, RELEASED, MetricRow, Setting, number
+from lidarpose.eval.scores import RELEASED, MetricRow, Setting, number
 from lidarpose.sample import CONFIDENCE_RADIUS, HIDDEN, SEEN, UNLABELED
 
 # people of fewer points do not tell where they face
@@ -201,12 +201,12 @@ def baseline_rows(predictions: Predictions, setting: Setting) -> tuple[MetricRow
 
 
 def _mean_rows(
-    p: Predictions, setting: Setting, sections: Sequence[str], metrics: Sequence[str] = tuple(METRICS)
+    p: Predictions, setting: Setting, sections: Sequence[str], metrics: Sequence[str] = ()
 ) -> Iterator[MetricRow]:
     tables: dict[str, np.ndarray] = {}
     for section in sections:
         for group, of, rows, joints in _groups(section, p, setting):
-            for name in metrics if rows.any() else ():
+            for name in (metrics or METRICS) if rows.any() else ():
                 metric = METRICS[name]
                 if section in metric.sections:
                     if name not in tables:
@@ -225,47 +225,24 @@ def _mean_row(
     group: str,
     of: str,
     *,
-    unit: str,
     average: str = "person",
-    clusters: np.ndarray | None = None,
-    no_pose: int = 0,
+    clusters=None,
+    **more,
 ) -> MetricRow:
-    """The mean of a table (n, J) or (n,) as a row; see `Interval.stated`."""
+    """The mean of a table (n, J) or (n,) as a row, with its interval: see `Interval.stated`."""
     name = f"{setting.method}/{metric}/{group}/{of}"
     rng = np.random.default_rng([setting.seed, zlib.crc32(name.encode())])
-    ends = interval(table, rng, average, clusters=clusters, repeats=_REPEATS).stated
+    low, high = interval(table, rng, average, clusters=clusters, repeats=_REPEATS).stated
     score = mean(table, average)
-    score.skipped -= no_pose
-    return _row(score, setting, metric, group, of, unit=unit, no_pose=no_pose, ends=ends)
+    score.skipped -= more.get("no_pose", 0)
+    return _row(score, setting, metric, group=group, of=of, low=low, high=high, **more)
 
 
-def _row(
-    score: Score,
-    setting: Setting,
-    metric: str,
-    group: str = "all",
-    of: str = "all",
-    *,
-    unit: str,
-    no_pose: int,
-    ends: tuple[float | None, float | None] = (None, None),
-    arithmetic: str = OURS,
-) -> MetricRow:
-    return MetricRow(
-        figure=metric,
-        group=group,
-        of=of,
-        value=number(score),
-        unit=unit,
-        low=ends[0],
-        high=ends[1],
-        people=int(score.people),
-        joints=int(score.joints),
-        skipped=int(score.skipped),
-        no_pose=no_pose,
-        arithmetic=arithmetic,
-        **{name: getattr(setting, name) for name in ("method", "protocol", "centring", "split", "limit")},
-    )
+def _row(score: Score, setting: Setting, metric: str, *, group: str = "all", of: str = "all", **more: Any) -> MetricRow:
+    """A row of a score; more: the other fields of `MetricRow`."""
+    counts: dict[str, Any] = {name: int(getattr(score, name)) for name in ("people", "joints", "skipped")}
+    shared = {name: getattr(setting, name) for name in ("method", "protocol", "centring", "split", "limit")}
+    return MetricRow(figure=metric, group=group, of=of, value=number(score), **counts | shared | more)
 
 
 def _dapt_compat_rows(p: Predictions, setting: Setting) -> Iterator[MetricRow]:
@@ -285,7 +262,7 @@ def _dapt_compat_rows(p: Predictions, setting: Setting) -> Iterator[MetricRow]:
                 score.skipped = 0
                 group = "all" if name == "all" else "joints"
                 options: dict[str, Any] = {"unit": unit, "no_pose": len(p) - len(posed), "arithmetic": RELEASED}
-                yield _row(score, setting, metric, group, name, **options)
+                yield _row(score, setting, metric, group=group, of=name, **options)
 
 
 # ---- motion

@@ -118,14 +118,6 @@ def detector_box(kind: str, one: EvalSample, seed: int) -> Box | None:
     return jittered(one.sample.box, np.random.default_rng([seed, one.shard, one.row]))
 
 
-def crop_box(protocol: str, kind: str, one: EvalSample, seed: int) -> Box | None:
-    """The box of a person's crop: a detector's in the protocol clean, the released code's in dapt, else the dataset's,
-    if any."""
-    if protocol == "dapt":
-        return released_box(one.sample.joints, one.sample.centers, one.sample.box)
-    return detector_box(kind, one, seed) or one.sample.box
-
-
 def cropped(protocol: str, kind: str, one: EvalSample, seed: int) -> EvalSample:
     """The person with the points that the protocol lets the network see."""
     if protocol == "dapt":
@@ -133,23 +125,6 @@ def cropped(protocol: str, kind: str, one: EvalSample, seed: int) -> EvalSample:
         return replace(one, points=one.points[inside])
     box = detector_box(kind, one, seed)
     return one if box is None else replace(one, points=one.points[box.contains(one.points)])
-
-
-def as_shown(protocol: str, kind: str, one: EvalSample, seed: int) -> tuple[EvalSample | None, str]:
-    """`cropped`; or None, and why the protocol leaves the person out."""
-    if protocol == "dapt":
-        rules = DAPT[kind]
-        if rules.center not in one.sample.centers:
-            return None, f"people without the center {rules.center!r}"
-        if kind == "humanm3" and (one.sample.joint_labels == UNLABELED).all():
-            return None, "people without a labelled joint, whom their box is made of"
-    shown = cropped(protocol, kind, one, seed)
-    if protocol == "dapt" and len(shown.points) < rules.least:
-        return None, f"people of under {rules.least} points, as the released code skips them"
-    return shown, ""
-
-
-# ---- a network before a dataset
 
 
 class Model(Protocol):
@@ -176,11 +151,25 @@ class EvalSetup:
 
     def shown(self, one: EvalSample) -> tuple[EvalSample | None, str]:
         """The person as the protocol shows them; or None, and why it leaves them out."""
-        return as_shown(self.setting.protocol, self.setting.kind, one, self.setting.seed)
+        protocol, kind = self.setting.protocol, self.setting.kind
+        if protocol == "clean":
+            return cropped(protocol, kind, one, self.setting.seed), ""
+        rules = DAPT[kind]
+        if rules.center not in one.sample.centers:
+            return None, f"people without the center {rules.center!r}"
+        if kind == "humanm3" and (one.sample.joint_labels == UNLABELED).all():
+            return None, "people without a labelled joint, whom their box is made of"
+        shown = cropped(protocol, kind, one, self.setting.seed)
+        if len(shown.points) < rules.least:
+            return None, f"people of under {rules.least} points, as the released code skips them"
+        return shown, ""
 
     def crop_box(self, one: EvalSample) -> Box | None:
-        """The box of the person's crop, if any."""
-        return crop_box(self.setting.protocol, self.setting.kind, one, self.setting.seed)
+        """The box of a person's crop: a detector's in the protocol clean, the released code's in dapt, else the
+        dataset's, if any."""
+        if self.setting.protocol == "dapt":
+            return released_box(one.sample.joints, one.sample.centers, one.sample.box)
+        return detector_box(self.setting.kind, one, self.setting.seed) or one.sample.box
 
     def predict(self, samples: Sequence[EvalSample]) -> list[dict[str, Any]]:
         """A row of `predictions.stack` for each person as the protocol shows them: what is known of them and what the

@@ -1,0 +1,84 @@
+"""Every metric of a few people whose errors are known, worked out by hand, and where charts draw it."""
+
+import numpy as np
+import pytest
+
+from lidarpose.eval import charts, metric_rows
+from lidarpose.eval.metric_rows import METRICS, Metric
+from lidarpose.eval.predictions import stack
+from lidarpose.eval.scores import Result, Setting
+from lidarpose.skeleton import HUMAN15
+
+# a row of `stack` but for the poses: somebody of whom little is known
+PERSON = {"sequence": "s", "frame": 0, "track": "0", "time": 0.0, "sensor": "", "condition": "", "poses": ""}
+PERSON |= {"plain": False, "moving": False, "points": 100, "distance": 5.0, "hidden": np.nan, "shard": 0, "row": 0}
+
+
+def four():
+    """Four people of one track, at 5 and 15 m, of 60 and 300 points, half hidden and whole."""
+    true = np.zeros((15, 3))
+    for joint in ("hip", "shoulder"):
+        true[HUMAN15.index(f"left_{joint}"), 1], true[HUMAN15.index(f"right_{joint}"), 1] = 0.2, -0.2
+    stated = {"confidence": np.full(15, 0.75), "spread": np.full(15, 0.06), "labels": np.full(15, 2), "true": true}
+    rows = []
+    for k, (shift, flipped, points, distance, hidden) in enumerate(
+        [(0.05, 0, 60, 5.0, 0.45), (0.05, 0, 300, 5.0, 0.0), (0.25, 0, 300, 15.0, 0.0), (0.05, 1, 300, 15.0, 0.0)]
+    ):
+        pred = (true * [1, -1, 1] if flipped else true) + [shift, 0, 0]
+        own = {"row": k, "frame": k, "time": k / 10, "pred": pred}
+        rows.append(PERSON | stated | own | {"points": points, "distance": distance, "hidden": hidden})
+    setting = Setting(
+        dataset="a", kind="synth", method="m", protocol="clean", centring="", crop="", split="none", split_source="",
+        leaks="", joints=HUMAN15.joints, not_judged="", sensor="known", total=4, limit=None, clusters=False, seed=0,
+    )  # fmt: skip
+    return stack(HUMAN15, rows), setting
+
+
+def test_rows_by_hand():
+    rows = {(x.figure, x.group, x.of): x for x in metric_rows.metric_rows(*four())}
+    # steps of 0, 20 cm and -20 cm: second differences of 20 and, but for who is flipped, 40 cm
+    assert 200 < rows["acceleration", "all", "frames in a row"].value < 450
+    # one of three people of 100 points and more
+    assert rows["turned_round", "points", "100 and more"].value == pytest.approx(100 / 3)
+    # 11 of 15 joints of the flipped one are 5 cm off, as all of two others are: 41 of 60 within 10 cm
+    assert rows["calibration_error", "all", "all"].value == pytest.approx(100 * (0.75 - 41 / 60), abs=1e-3)
+    spans = {group: {of: x.people for (f, g, of), x in rows.items() if (f, g) == ("mpjpe", group)}
+             for group in ("distance, m", "points", "hidden share")}  # fmt: skip
+    assert spans["distance, m"] == {"0 to 10": 2, "10 to 20": 2}
+    assert spans["points"] == {"50 to 100": 1, "200 to 400": 3}
+    assert spans["hidden share"] == {"0 to 0.1": 3, "0.3 to 0.5": 1}
+
+
+def test_a_new_metric_is_a_function_and_an_entry(monkeypatch):
+    def largest_error(predictions):
+        return predictions.errors().max(1)
+
+    before = metric_rows.metric_rows(*four())
+    monkeypatch.setitem(METRICS, "largest_error", Metric(largest_error, "mm", ("all", "spans")))
+    after = metric_rows.metric_rows(*four())
+    added = {(row.group, row.of): row for row in after if row.figure == "largest_error"}
+    assert [row for row in after if row.figure != "largest_error"] == list(before)
+    # hips and shoulders of the flipped one are 40 cm off along y, too
+    wanted = [50, 50, 250, 1e3 * np.hypot(0.4, 0.05)]
+    assert added["all", "all"].value == pytest.approx(np.mean(wanted), abs=1e-3)
+    assert added["distance, m", "0 to 10"].value == pytest.approx(50, abs=1e-3) and len(added) == 7
+
+
+def test_charts_draw_what_the_rows_say(monkeypatch):
+    predictions, setting = four()
+    rows = metric_rows.metric_rows(predictions, setting)
+    result = Result(setting=setting, counts={}, skipped={}, notes=(), lines=rows)
+    figures = []
+    monkeypatch.setattr(charts, "_png", lambda figure: figures.append(figure) or b"")
+    charts.draw_errors(result)
+    charts.draw_reliability(predictions, result)
+    by_group = dict(zip(("distance, m", "points", "hidden share", "joints"), figures[0].axes, strict=True))
+    for group, axes in by_group.items():
+        due = [row for row in rows if (row.figure, row.group) == ("mpjpe", group)]
+        np.testing.assert_allclose([bar.get_height() for bar in axes.patches], [row.value for row in due])
+        named = [label.get_text().split("\n")[0] for label in axes.get_xticklabels()]
+        assert named == [row.of for row in due] and len(due) > 1
+    assert by_group["distance, m"].patches[0].get_height() == pytest.approx(50)
+    confidence, spread = figures[1].axes
+    np.testing.assert_allclose(confidence.lines[1].get_xydata(), [[0.75, 41 / 60]])
+    np.testing.assert_allclose(spread.lines[1].get_xydata(), [[60, np.nanmean(predictions.errors())]])
