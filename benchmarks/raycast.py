@@ -34,6 +34,8 @@ REFERENCE_RAYS = 16
 # of the meshes of the plot: 4 * rings * (rings - 1) triangles
 RINGS = (18, 25, 42, 60, 90)
 REFERENCE = "slow twin"
+# ms, of the plot
+TICKS = (0.05, 0.1, 0.2, 0.3, 0.5, 1, 5, 20, 50)
 
 
 def blob(rng, rings):
@@ -146,7 +148,12 @@ def plot(path, sensor, by_distance, by_count):
             values = [series[x][way] * 1e3 for x in series]
             axis.plot(list(series), values, marker="o", ms=4, label=way)
         axis.set_yscale("log")
-        axis.grid(True, which="both", lw=0.3)
+        axis.grid(True, lw=0.3)
+    # of both axes, which share them
+    limits = left.get_ylim()
+    left.set_yticks(TICKS, [f"{ms:g}" for ms in TICKS])
+    left.set_ylim(limits)
+    left.minorticks_off()
     left.set(xlabel="distance, m", ylabel="ms a person, one thread", title=f"{sensor.name}, 14,160 triangles")
     right.set(xlabel="triangles", xscale="log", title="mean over 4 to 20 m")
     right.set_xticks(list(by_count), [f"{count:,}" for count in by_count], rotation=30)
