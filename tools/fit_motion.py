@@ -69,7 +69,7 @@ def save_mixture(path: str | Path, weights: np.ndarray, means: np.ndarray, covar
 
 
 def fit_mixture(features: np.ndarray, components: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """features (n, D) -> weights (K,), means (K, D), covariances (K, D, D), by expectation and maximisation."""
+    """features (n, D) -> weights (K,), means (K, D), covariances (K, D, D), by expectation and maximization."""
     n, width = features.shape
     means = features[_spread_seeds(features, components, rng)]
     pooled = np.cov(features.T) + _RIDGE * np.eye(width)
