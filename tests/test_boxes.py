@@ -3,6 +3,7 @@
 import copy
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -78,7 +79,7 @@ def fields(box):
     return [*box.center.tolist(), *box.size.tolist(), box.yaw]
 
 
-def test_rows_of_seven_numbers(tmp_path):
+def test_rows_of_seven_numbers(tmp_path, monkeypatch):
     rows = np.array([ROW, [1, 2, 3, 0.5, 0.6, 1.7, -1]])
     (tmp_path / "boxes.npy").write_bytes(npy(rows))
     (tmp_path / "boxes.json").write_text(json.dumps(rows.tolist()))
@@ -89,6 +90,9 @@ def test_rows_of_seven_numbers(tmp_path):
         np.testing.assert_allclose([fields(box) for box in boxes], rows, rtol=1e-6)
         assert [box.id for box in boxes] == [None, None]
     assert read_boxes(np.empty((0, 7))) == []
+    monkeypatch.chdir(tmp_path)
+    Path("boxes").write_text("[]")
+    assert read_boxes("boxes") == []
 
 
 def test_boxes_rows_and_objects_may_be_mixed():

@@ -783,9 +783,7 @@ def test_import_of_files_that_are_none(tmp_path):
     whole = WEIGHTS.read_bytes()
     for content in (whole[: len(whole) // 2], whole[:100], b"", b"not a file of tensors at all"):
         (tmp_path / "cut.safetensors").write_bytes(content)
-        with pytest.raises(
-            InputError, match="cut.safetensors: .*(ends at byte|is something else|is empty)"
-        ):
+        with pytest.raises(InputError, match="cut.safetensors: .*(ends at byte|is something else|is empty)"):
             import_dapt(tmp_path / "cut.safetensors")
     for entry, message in (
         ({}, "its header has no configuration: name one of paper, waymo"),

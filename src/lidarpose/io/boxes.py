@@ -48,9 +48,9 @@ def read_boxes(
         InputError: one line that names the file, the entry (counted from 0, as in JSON paths) and the key. Two entries
             of one id are an error, since results are told apart by it.
     """
-    name = "boxes" if isinstance(source, Box | dict | list | tuple | np.ndarray) else source
+    is_content = isinstance(source, Box | dict | list | tuple | np.ndarray)
     try:
-        content = source if name == "boxes" else _load_file(source, calib)
+        content = source if is_content else _load_file(source, calib)
         boxes = [_box(entry, f"people[{i}]") for i, entry in enumerate(_entries(content))]
         first: dict[str | int, int] = {}
         for i, box in enumerate(boxes):
@@ -58,7 +58,7 @@ def read_boxes(
                 came = f"{_show(box.id)}, which people[{first[box.id]}] has too"
                 raise FormatError(f"people[{i}].id: expected an id of its own, got {came}: rename one or leave it out")
     except FormatError as problem:
-        raise file_error(name, problem) from None
+        raise file_error("boxes" if is_content else source, problem) from None
     return boxes
 
 
