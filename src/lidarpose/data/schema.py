@@ -37,7 +37,7 @@ import numpy as np
 
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.sample import SEEN, Box, LabeledSample, PersonInfo, Pose, Sample
-from lidarpose.skeleton import BODY26, skeleton
+from lidarpose.skeleton import BODY26, SMPL24, skeleton
 
 
 def _columns(text: str) -> dict[str, str]:
@@ -171,6 +171,11 @@ def _check_row(row: dict[str, Any], table: str, joints: int) -> None:
         raise InputError("columns box_center, box_size, box_yaw: some are null, expected all or none")
     if len(row["points"]) % 3:
         raise InputError(f"column points has {len(row['points'])} values, expected three for each point")
+    for name in ("points", "center"):
+        if not np.isfinite(row[name]).all():
+            raise InputError(f"column {name} has values that are no finite numbers")
+    if row["part"] is not None and row["part"].max(initial=0) > len(SMPL24):
+        raise InputError(f"column part has values above {len(SMPL24)}, expected 0 or 1 + a joint of SMPL-24")
     lengths = {name: 3 for name in row if name.partition("_")[0] == "center"}
     lengths |= {"box_center": 3, "box_size": 3, "joints": 3 * joints, "joint_labels": joints}
     lengths |= dict.fromkeys(("part", "ring"), len(row["points"]) // 3)

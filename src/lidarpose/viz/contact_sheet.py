@@ -67,7 +67,9 @@ def _street_panels(dataset: DatasetReader, count: int) -> list[ScanPanel]:
 
 
 def _street_panel(rows: list[dict], dataset: DatasetReader) -> ScanPanel:
-    first, boxes = rows[0], np.stack([row["box"].reshape(-1, 7) for row in rows])
+    first = rows[0]
+    # everybody is in every frame
+    boxes = np.stack([row["box"].reshape(-1, 7) for row in rows if len(row["box"]) == len(first["box"])])
     joints = first["joints"].reshape(len(first["track"]), -1, 3)
     return ScanPanel(
         points=first["points"].reshape(-1, 3),
