@@ -138,7 +138,7 @@ ROW = BVH.splitlines()[-1]
     "text, message",
     [
         ("", "is empty"), ("hello", "starts with HIERARCHY, got 'hello'"),
-        (BVH[ BVH.index("MOTION")], "no MOTION part"),
+        (BVH[: BVH.index("MOTION")], "no MOTION part"),
         (BVH[:-400], "expected 20 frames of 75 numbers, got .* copied completely"),
         (BVH[: BVH.index("Frame Time")], "must begin with Frames: and Frame Time:"),
         (BVH[: BVH.index("Frames")], "must begin with Frames"),
