@@ -9,6 +9,12 @@ from lidarpose.cli.terminal import add_command, tell
 from lidarpose.models import BUNDLED
 from lidarpose.progress import Progress
 
+# options of `evaluation.run` and their defaults, and those that are on or off
+_DEFAULTS = {
+    **{"protocol": "clean", "split": None, "skeleton": None, "limit": None, "seed": 0},
+    **{"device": "cpu", "backend": None, "decode": "window", "tta": 1},
+}
+_SWITCHES = ("stability", "legacy", "sensor_unknown")
 # groups of rows that the terminal shows; the others are in scores.json
 _SHOWN = ("condition", "plain", "joints", "distance, m", "points", "hidden share")
 # metrics of these groups that it shows, besides those of everybody
@@ -84,24 +90,10 @@ def _evaluate(options: argparse.Namespace) -> None:
     from lidarpose import evaluation
 
     folder = evaluation.new_folder(options.weights) if options.out is None else evaluation.check_folder(options.out)
+    asked = {name: getattr(options, name) for name in (*_DEFAULTS, *_SWITCHES)}
     with ExitStack() as stack:
         found = evaluation.run(
-            options.weights,
-            options.datasets,
-            protocol=options.protocol,
-            split=options.split,
-            skeleton=options.skeleton,
-            limit=options.limit,
-            stability=options.stability,
-            legacy=options.legacy,
-            sensor_unknown=options.sensor_unknown,
-            seed=options.seed,
-            device=options.device,
-            backend=options.backend,
-            decode=options.decode,
-            tta=options.tta,
-            command=_command(options),
-            progress=_progress(stack),
+            options.weights, options.datasets, command=_command(options), progress=_progress(stack), **asked
         )
     written = evaluation.write(found, folder)
     for result in found.scores.results:
@@ -128,14 +120,10 @@ def _table(options: argparse.Namespace) -> None:
 def _command(options: argparse.Namespace) -> str:
     """What was asked for, as it would be typed."""
     words = ["lidarpose", "evaluate", options.weights, *options.datasets]
-    defaults = {"protocol": "clean", "seed": 0, "device": "cpu", "decode": "window", "tta": 1}
-    for name in ("protocol", "split", "skeleton", "limit", "seed", "device", "backend", "decode", "tta"):
-        value = getattr(options, name)
-        if value is not None and value != defaults.get(name):
+    for name, default in _DEFAULTS.items():
+        if (value := getattr(options, name)) != default:
             words += [f"--{name}", str(value)]
-    for name in ("stability", "legacy", "sensor_unknown"):
-        if getattr(options, name):
-            words.append(f"--{name.replace('_', '-')}")
+    words += [f"--{name.replace('_', '-')}" for name in _SWITCHES if getattr(options, name)]
     return shlex.join(words)
 
 

@@ -236,14 +236,7 @@ def run(
     Raises:
         InputError: one line, for what does not fit. MissingExtra: without pyarrow.
     """
-    datasets = listed(datasets)
-    if not datasets:
-        raise InputError("expected a dataset to evaluate on: a folder that lidarpose prepare or synth wrote, or bench")
-    pyarrow()
-    opened = [open_eval_dataset(dataset, split=split, limit=limit) for dataset in datasets]
-    names = [one.name for one in opened]
-    if twice := next((name for name in names if names.count(name) > 1), None):
-        raise InputError(f"two datasets are called {twice}: evaluate them one by one, or rename a folder")
+    opened = _opened(datasets, split, limit)
     predictor, weights = _loaded(model, device=device, backend=backend, decode=decode, tta=tta)
     options: dict[str, Any] = {"protocol": protocol, "seed": seed, "skeleton": skeleton}
     setups = [eval_setup(predictor, one, sensor_unknown=sensor_unknown, **options) for one in opened]
@@ -258,6 +251,18 @@ def run(
     results = tuple(one.result for one in evaluations)
     scores = Scores(weights=weights, command=command, seed=setups[0].setting.seed, results=results)
     return Run(scores=scores, evaluations=tuple(evaluations), studies=tuple(studies))
+
+
+def _opened(datasets: str | os.PathLike | Sequence[str | os.PathLike], split, limit) -> list[EvalDataset]:
+    datasets = listed(datasets)
+    if not datasets:
+        raise InputError("expected a dataset to evaluate on: a folder that lidarpose prepare or synth wrote, or bench")
+    pyarrow()
+    opened = [open_eval_dataset(dataset, split=split, limit=limit) for dataset in datasets]
+    names = [one.name for one in opened]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise InputError(f"two datasets are called {twice}: evaluate them one by one, or rename a folder")
+    return opened
 
 
 def _loaded(model: Model | str | os.PathLike, **options: Any) -> tuple[Model, dict[str, Any]]:
