@@ -95,29 +95,33 @@ def test_pck_by_box_is_the_documented_example():
 
 def test_pck_by_box_averages_over_joints_like_waymo():
     true, boxes = people(0, 5)
-    pred = true.copy()
+    pred, visible = true.copy(), np.ones((2, J))
     pred[1] += 1
-    visible = np.ones((2, J))
     visible[1, 1:] = 0
     assert metrics.pck_box(pred, true, boxes[:, 3:6], visible) == pytest.approx(100 * J / (J + 1))
     assert metrics.pck_box(pred, true, boxes[:, 3:6], visible, average="person") == 50
 
 
 @pytest.mark.parametrize("metric", [metrics.pck_box, metrics.oks, metrics.oks_ap])
-def test_boxes_and_sigmas_are_checked(metric):
-    true, boxes = people(0, 5)
-    with pytest.raises(InputError, match=r"size must be \(2, 3\), length, width and height .* got \(2, 7\)"):
-        metric(true, true, boxes)
-    with pytest.raises(InputError, match="size must be positive"):
-        metric(true, true, np.zeros((2, 3)))
-    with pytest.raises(InputError, match=r"sigmas must be \(14,\) positive"):
-        metric(true, true, boxes[:, 3:6], sigmas=[0.1] * 13)
+@pytest.mark.parametrize(
+    "size, sigmas, message",
+    [
+        (np.ones((2, 7)), None, r"size must be \(2, 3\), length, width and height .* got \(2, 7\)"),
+        (np.zeros((2, 3)), None, "size must be positive"),
+        (np.ones((2, 3)), [0.1] * 13, r"sigmas must be \(14,\) positive"),
+    ],
+)
+def test_boxes_and_sigmas_are_checked(metric, size, sigmas, message):
+    true, _ = people(0, 5)
+    with pytest.raises(InputError, match=message):
+        metric(true, true, size, sigmas=sigmas)
 
 
 def test_oks_of_other_skeletons_needs_sigmas():
+    poses, size = np.zeros((2, 15, 3)), np.ones((2, 3))
     with pytest.raises(InputError, match="OKS of 15 joints needs sigmas"):
-        metrics.oks(np.zeros((2, 15, 3)), np.zeros((2, 15, 3)), np.ones((2, 3)))
-    assert (metrics.oks(np.zeros((2, 15, 3)), np.zeros((2, 15, 3)), np.ones((2, 3)), sigmas=[0.1] * 15) == 1).all()
+        metrics.oks(poses, poses, size)
+    assert (metrics.oks(poses, poses, size, sigmas=[0.1] * 15) == 1).all()
 
 
 # ---- matching
@@ -217,38 +221,37 @@ def test_pem_of_a_frame_by_hand():
     assert (found.people, found.people_missed, found.people_extra, found.people_excused) == (1, 1, 1, 1)
 
 
-def test_pem_of_exact_frames_is_nothing():
-    true, boxes = people(0, 1, 2, 7)
-    frames = 3
-    found = metrics.pem([true[::-1]] * frames, [true] * frames, [boxes] * frames)
-    assert found.pem == 0 and found.matched == frames * 4 * J and not found.missed + found.extra
-
-
 def test_pem_pools_keypoints_of_all_frames():
+    true, boxes = people(0, 1, 2, 7)
+    exact = metrics.pem([true[::-1]] * 3, [true] * 3, [boxes] * 3)
+    assert exact.pem == 0 and exact.matched == 3 * 4 * J and not exact.missed + exact.extra
     true, boxes = people(0)
-    pred = true + [0, 0, 0.05]
-    empty = np.empty((0, J, 3))
+    pred, empty = true + [0, 0, 0.05], np.empty((0, J, 3))
     found = metrics.pem([pred, empty, pred], [true, true, empty], [boxes, boxes, np.empty((0, 7))])
     assert found.pem == pytest.approx((50 + 250 + 250) / 3)
     assert (found.matched, found.missed, found.extra) == (J, J, J)
+    # frames of nobody may be empty lists
+    ones = np.ones((1, J))
+    found = metrics.pem([true, []], [[], true], [[], boxes], [[], ones], predicted=[ones, []])
+    assert found.pem == 250 and (found.missed, found.extra) == (J, J)
     nothing = metrics.pem([[]], [[]], [[]])
     assert np.isnan([nothing.pem, nothing.matched_error]).all()
 
 
 def test_pem_joints_of_one_person():
     true, boxes = people(0)
-    pred = true.copy()
+    pred, visible, predicted = true.copy(), np.ones((1, J)), np.ones((1, J))
     pred[0, 0, 0] += 3.0
-    visible, predicted = np.ones((1, J)), np.ones((1, J))
-    visible[0, 1] = predicted[0, 2] = 0
-    visible[0, 3] = predicted[0, 3] = 0
+    visible[0, [1, 3]] = predicted[0, [2, 3]] = 0
     found = metrics.pem([pred], [true], [boxes], [visible], predicted=[predicted])
-    # far off costs no more than missing; neither labelled nor predicted costs nothing
+    # far off costs no more than missing; neither labeled nor predicted costs nothing
     assert found.pem == pytest.approx(3 * 250 / (J - 1)) and found.matched_error == pytest.approx(250 / (J - 3))
     assert (found.matched, found.missed, found.extra) == (J - 3, 1, 1)
-    assert metrics.pem([pred], [true], [boxes], [visible], predicted=[predicted], penalty=0.5).pem == pytest.approx(
-        3 * 500 / (J - 1)
-    )
+    dear = metrics.pem([pred], [true], [boxes], [visible], predicted=[predicted], penalty=0.5)
+    assert dear.pem == pytest.approx(3 * 500 / (J - 1))
+    # somebody without a predicted joint is nobody
+    found = metrics.pem([true], [true], [boxes], predicted=[np.zeros((1, J))])
+    assert (found.missed, found.extra, found.people_extra) == (J, 0, 0)
 
 
 def test_predictions_of_labelled_people_are_not_excused():
@@ -274,38 +277,28 @@ def test_pem_does_not_match_far_from_the_box():
 
 
 def test_joints_that_are_not_claimed_decide_nothing():
-    # the first joint alone is not claimed, and lies beside the label of somebody
     true, boxes = people(0, 10)
     visible, predicted = np.ones((2, J)), np.ones((1, J))
     visible[1] = predicted[0, 0] = 0
+
+    def matched(pred, true=true, boxes=boxes, visible=visible):
+        return metrics.pem([pred], [true], [boxes], [visible], predicted=[predicted])
+
+    # the first joint alone is not claimed, and lies beside the label of somebody
     pred = true[1:].copy()
     pred[0, 0] = true[0, 0]
-    found = metrics.pem([pred], [true], [boxes], [visible], predicted=[predicted])
+    found = matched(pred)
     assert (found.people_excused, found.people_missed, found.extra) == (1, 1, 0)
     # it lies in the box of somebody without labels
     pred = true[1:] + [5, 0, 0]
     pred[0, 0] = true[1, 0]
-    found = metrics.pem([pred], [true], [boxes], [visible], predicted=[predicted])
+    found = matched(pred)
     assert (found.people_excused, found.people_missed, found.extra) == (0, 1, J - 1)
     # it is all that lies near the box
-    pred, boxes = true[:1].copy(), boxes.copy()
-    boxes[0, 0] = 2
-    pred[0, 0, 0] = 2
-    found = metrics.pem([pred], [true[:1]], [boxes[:1]], predicted=[predicted])
+    pred, moved = true[:1].copy(), boxes[:1].copy()
+    moved[0, 0] = pred[0, 0, 0] = 2
+    found = matched(pred, true[:1], moved, visible[:1])
     assert (found.people, found.people_missed, found.people_extra) == (0, 1, 1)
-
-
-def test_frames_of_nobody_may_be_empty_lists():
-    true, boxes = people(0)
-    ones = np.ones((1, J))
-    found = metrics.pem([true, []], [[], true], [[], boxes], [[], ones], predicted=[ones, []])
-    assert found.pem == 250 and (found.missed, found.extra) == (J, J)
-
-
-def test_people_without_a_predicted_joint_are_nobody():
-    true, boxes = people(0)
-    found = metrics.pem([true], [true], [boxes], predicted=[np.zeros((1, J))])
-    assert (found.missed, found.extra, found.people_extra) == (J, 0, 0)
 
 
 @pytest.mark.parametrize(
