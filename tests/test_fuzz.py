@@ -7,18 +7,24 @@ import os
 import struct
 
 import numpy as np
+import pyarrow as pa
 import pytest
 import safetensors.numpy
 from hostile_files import BOX_FILES, CALIBRATION, PICKLE_PIECES, PICKLES, POINT_FILES, damaged
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from pyarrow import parquet
+from shard_files import sample, write_shard
 
+from lidarpose.data.schema import TABLES, person_row
+from lidarpose.data.shards import DatasetCard, write_card
 from lidarpose.errors import InputError
 from lidarpose.io.boxes import read_boxes
 from lidarpose.io.pickles import load_pickle
 from lidarpose.io.point_cloud import read_points
 from lidarpose.models import bundled_path
 from lidarpose.models.checkpoint import ENTRY, SafetensorsFile, read_header
+from lidarpose.train.labeled_dataset import InMemoryDataset
 
 fuzz = settings(
     max_examples=int(os.environ.get("FUZZ_EXAMPLES", 100)),
@@ -107,7 +113,7 @@ def test_pickles(folder, content):
     read_or_refuse(load_pickle, folder / "f.pkl", content)
 
 
-_HEADER = SafetensorsFile.open(bundled_path(), tensors=False).metadata[ENTRY]
+_HEADER = SafetensorsFile.open(bundled_path()).metadata[ENTRY]
 WEIGHTS = {"w.safetensors": safetensors.numpy.save({"a": np.zeros(3, np.float32)}, metadata={ENTRY: _HEADER})}
 
 
@@ -120,3 +126,35 @@ def test_headers_of_weights(folder, file, is_fitted):
         content = struct.pack("<Q", max(len(content) - 8 - 12, 0)) + content[8:]
     read_or_refuse(read_header, folder / name, content)
     read_or_refuse(lambda path: SafetensorsFile.open(path).check_digest(), folder / name, content)
+
+
+SCALARS = st.none() | st.integers(-(2**63), 2**63 - 1) | st.floats() | st.booleans() | st.text(max_size=9)
+
+
+LISTS = st.none() | st.lists(st.none() | st.floats() | st.integers(-9, 300), max_size=12)
+
+
+@fuzz
+@given(
+    column=st.sampled_from(sorted(TABLES["people"])),
+    values=st.tuples(SCALARS, SCALARS) | st.tuples(LISTS, LISTS),
+    is_typed=st.booleans(),
+)
+def test_columns_of_shards(folder, column, values, is_typed):
+    """Each as learned from, and with the type that the column has where its values allow that."""
+    path = folder / "people-00000.parquet"
+    write_card(folder, DatasetCard(settings={"what": "people"}, count=2, per_shard=2, tables=("people",)))
+    rng = np.random.default_rng(0)
+    write_shard(path, "people", [person_row(sample(rng, count), index=k) for k, count in enumerate((3, 4))])
+    table = parquet.read_table(path)
+    place = table.schema.get_field_index(column)
+    try:
+        array = pa.array(values, table.schema.field(column).type if is_typed else None)
+    except (pa.ArrowException, OverflowError, TypeError, ValueError):
+        return
+    parquet.write_table(table.set_column(place, column, array), path)
+    try:
+        data = InMemoryDataset.load([folder])
+        assert all(np.isfinite(data.sample(row).points).all() for row in range(len(data)))
+    except InputError as error:
+        assert str(error).isprintable() and len(str(error)) < 1000 and str(folder) in str(error)

@@ -9,30 +9,17 @@ import pandas as pd
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
-from shard_files import write_shard
+from shard_files import sample, write_shard
 
 from lidarpose.cli import main
 from lidarpose.data import shards
 from lidarpose.data.schema import person_row
 from lidarpose.data.shards import DatasetCard, open_dataset, read_card, read_rows, write_card
 from lidarpose.errors import InputError, MissingExtra
-from lidarpose.sample import Box, PersonInfo, Pose, Sample
+from lidarpose.sample import PersonInfo
 from lidarpose.skeleton import BODY26
 
 FACTS = PersonInfo(sensor="os1-64", kind="walk", distance=7.5, visible=0.5, height_seen=0.9, clutter=0.1, upright=True)
-
-
-def sample(rng, count):
-    return Sample(
-        points=rng.normal(0, 1, (count, 3)).astype(np.float32),
-        center=rng.normal(0, 1, 3),
-        part=rng.integers(0, 25, count).astype(np.uint8),
-        ring=rng.integers(0, 64, count).astype(np.int32),
-        pose=Pose(joints=rng.normal(0, 1, (26, 3)).astype(np.float32), skeleton=BODY26, frame="sensor"),
-        box=Box(center=rng.normal(0, 1, 3), size=rng.uniform(0.4, 2, 3), yaw=float(rng.normal())),
-        source="synth/wild/os1-64",
-        frame_id="3/1",
-    )
 
 
 @pytest.fixture
