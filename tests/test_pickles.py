@@ -232,6 +232,12 @@ def test_hostile_arrays(refused):
         (b"U\x02f8", b"U\x02M8", "of type 'M8'"),
         (b"U\x02f8", b"U\x02V8", "of type 'V8'"),
         (b"U\x02f8", b"U\x02U0", "with 24 bytes"),
+        (
+            b"U\x02f8K\x00K\x01\x87R(K\x03U\x01<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb\x89T\x18\x00\x00\x00"
+            + np.arange(3.0).tobytes(),
+            b"U\x02S0K\x00K\x01\x87R(K\x03U\x01|NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb\x89U\x00",
+            "shape (3,) with 0 bytes",
+        ),
         (b"<NNN", b"<N]N", "derived from"),
         (b"ndarray", b"dtype\n", "unknown class|damaged"),
         (b"\x89T", b"\x89NT", "with|without"),
@@ -269,6 +275,14 @@ def test_memory_and_time_stay_in_proportion_to_the_file(load, refused, monkeypat
     # text is hashed with a secret, alone and within a tuple
     many = {key: None for i in range(30_000) for key in (str(i), ("a", i))}
     assert load(pickle.dumps(many)) == many
+    # what is done anew at each mention of one long part
+    numbers = b"(" + b"K\x01" * 10_000 + b"t"
+    assert "a tuple of 10000 as a key" in refused(list_of(numbers, b"}h\x01Ns", 10))
+    assert "can't multiply" in refused(list_of(text, b"c__builtin__\ncomplex\nh\x01K\x01\x86R", 10))
+    # numbers that share one hash, as names of what is remembered
+    memo = b"".join(b"p%d\n" % (i * (2**61 - 1)) for i in range(1, 21_000))
+    assert "in no order" in refused(b"N" + memo + b".")
+    assert load(b"N" + b"".join(b"p%d\n" % i for i in range(1, 30_000)) + b".") is None
     monkeypatch.setattr(pickles, "_STEPS", 1_000)
     assert load(b"(" + b"K\x01" * 1_900 + b"l.") == [1] * 1_900
     for part in (b"\x8f", b"]", b"(", b"N\x94"):

@@ -27,6 +27,8 @@ MAX_DEPTH = 100
 MAX_DENSE = 20_000_000
 # keys without text have hashes that a file can make equal: so many cost a second at most, whatever they are
 MAX_NUMBER_KEYS, MAX_TUPLE_KEYS = 20_000, 1_000
+# a tuple is hashed whenever it is looked up
+MAX_KEY_PARTS = 16
 # instructions that a file of no size may have, and bytes for each further one; one can take 0.2 kB of memory
 _STEPS, _BYTES_PER_STEP = 1_000_000, 2
 # arrays and lists are copied out of the file, some of them twice or three times: Python 2 kept them as text
@@ -89,7 +91,18 @@ class _Stub(Unread):
 
 
 class _Memo(dict):
-    """The unpickler's memo, in which what has got its state is the value that it became."""
+    """The unpickler's memo, in which what has got its state is the value that it became.
+
+    Picklers number what they remember from 0 or 1 on; numbers of a file's own choice could share one hash.
+    """
+
+    far = 0
+
+    def __setitem__(self, key: int, value: object) -> None:
+        self.far += key > 2 * len(self) + 1000
+        if self.far > MAX_NUMBER_KEYS:
+            raise FormatError("numbers its parts in no order: ask for npz")
+        super().__setitem__(key, value)
 
     def __getitem__(self, key: int) -> object:
         value = super().__getitem__(key)
@@ -177,7 +190,10 @@ class _DataUnpickler(pickle._Unpickler):
             pairs = pairs[0].items() if isinstance(pairs[0], dict) else pairs[0]
             made = dict(zip(self.keys([key for key, _ in pairs]), [value for _, value in pairs], strict=True))
         elif name in _ITEMS:
-            made = _ITEMS[name](*(map(self.keys, args) if "set" in name else args))
+            (items,) = args or [()]
+            if not isinstance(items, list | tuple | set | frozenset):
+                raise TypeError(f"a {name} of something else than items")
+            made = _ITEMS[name](self.keys(items) if "set" in name else items)
         elif name in _CALLS:
             made = _CALLS[name](*args)
         elif name in _CLASSES:
@@ -198,7 +214,8 @@ class _DataUnpickler(pickle._Unpickler):
         if name.startswith("chumpy."):
             return self.charged(_chumpy(name, state))
         dense = _dense(name, state, self.dense_left)
-        self.dense_left -= dense.size
+        # many entries may add up in one number
+        self.dense_left -= dense.size + state["data"].size
         return dense
 
     def charged(self, made: object) -> object:
@@ -230,6 +247,8 @@ class _DataUnpickler(pickle._Unpickler):
             if type(item) is str and item:
                 continue
             parts = item if type(item) is tuple else (item,)
+            if len(parts) > MAX_KEY_PARTS:
+                raise TypeError(f"a tuple of {len(parts)} as a key")
             for part in parts:
                 if type(part) not in _PLAIN and not isinstance(part, np.generic):
                     raise TypeError(f"a {type(item).__name__} as a key")
@@ -349,7 +368,8 @@ def _array(data: object, dtype: object, shape: object, order: str) -> np.ndarray
     if not isinstance(data, list if is_object else bytes):
         raise FormatError(f"has an array of a {type(data).__name__}: {_REMEDY}")
     count = math.prod(shape)
-    if any(n < 0 for n in shape) or len(data) != count * (1 if is_object else dtype.itemsize):
+    size = 1 if is_object else dtype.itemsize
+    if any(n < 0 for n in shape) or len(data) != count * size or count and not size:
         came = f"{shorten(str(shape))} with {len(data)} {'items' if is_object else 'bytes'}"
         raise FormatError(f"has an array of the shape {came}: {_REMEDY}")
     if is_object or not data:
@@ -387,7 +407,8 @@ _CALLS = {
     "_codecs.encode": _encode,
     "builtins.bytes": _encode,
     "builtins.bytearray": _encode,
-    "builtins.complex": complex,
+    # no text: the same long one could be parsed again and again
+    "builtins.complex": lambda real, imaginary: complex(1.0 * real, 1.0 * imaginary),
 }
 # what may be named, not called
 _CLASSES = ("numpy.ndarray", "builtins.object", *_NEW)
