@@ -229,7 +229,7 @@ def test_what_is_hard_for_both_does_not_widen_a_comparison():
     assert found.low < (first - second).mean() < found.high < found.low + 0.3
     alone = metrics.interval(first, np.random.default_rng(0))
     assert alone.high - alone.low > 5
-    with pytest.raises(InputError, match="same joints labelled"):
+    with pytest.raises(InputError, match="same joints labeled"):
         metrics.paired_interval(first, np.where(first > 100, np.nan, second), np.random.default_rng(0))
 
 

@@ -92,13 +92,13 @@ def _evaluate(options: argparse.Namespace) -> None:
     folder = evaluation.new_folder(options.weights) if options.out is None else evaluation.check_folder(options.out)
     asked = {name: getattr(options, name) for name in (*_DEFAULTS, *_SWITCHES)}
     with ExitStack() as stack:
-        found = evaluation.run(
+        run = evaluation.run(
             options.weights, options.datasets, command=_command(options), progress=_progress(stack), **asked
         )
-    written = evaluation.write(found, folder)
-    for result in found.scores.results:
+    written = evaluation.write(run, folder)
+    for result in run.scores.results:
         print("\n".join(_lines(result)))
-    for study in found.studies:
+    for study in run.studies:
         print("\n".join(_study(study)))
     tell(f"{', '.join(path.name for path in written)} -> {folder}")
 

@@ -99,14 +99,14 @@ def draw_worst(p: Predictions, setting: Setting, worst: Sequence[tuple[EvalSampl
     """The people with the largest mean errors and their rows in the predictions: points, pose and truth."""
     errors = p.errors()
     panels = []
-    for one, k in worst:
+    for person, k in worst:
         where = f"{p.sequence[k]} {p.frame[k]} {p.track[k]}"
         if p.sensor[k]:
             where = f"#{p.row[k]} {p.condition[k] or p.sensor[k]}"
         confidence = None if np.isnan(p.confidence[k]).any() else p.confidence[k].astype(float)
         panels.append(
             Panel(
-                points=one.points,
+                points=person.points,
                 label=f"{np.nanmean(errors[k]):.0f} mm · {where}",
                 distance=float(p.distance[k]),
                 pose=Pose(joints=p.pred[k].astype(float), skeleton=p.skeleton, confidence=confidence),

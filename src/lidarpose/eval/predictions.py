@@ -158,18 +158,18 @@ def write_poses(path: str | Path, predictions: dict[str, Predictions]) -> None:
     columns = [("dataset", pa.string())]
     columns += [(name, types[kind] if kind in types else pa.from_numpy_dtype(kind)) for name, kind in _VALUES.items()]
     columns += [(name, pa.list_(pa.from_numpy_dtype(kind))) for name, (kind, _) in _LISTS.items()]
-    skeletons = {name: one.skeleton for name, one in predictions.items()}
+    skeletons = {name: own.skeleton for name, own in predictions.items()}
     about = {k: {"skeleton": of.name, "joints": of.joints, "parents": of.parents} for k, of in skeletons.items()}
     schema = pa.schema(
         [*columns, ("error_mm", pa.list_(pa.float32()))],
         metadata={METADATA: json.dumps({"unit": "m", "datasets": about})},
     )
     with parquet.ParquetWriter(path, schema, compression="zstd", write_page_checksum=True) as writer:
-        for name, one in predictions.items():
-            values: dict[str, Any] = {"dataset": [name] * len(one)} | {key: getattr(one, key) for key in _VALUES}
-            values["error_mm"] = list(one.errors().astype(np.float32))
+        for name, own in predictions.items():
+            values: dict[str, Any] = {"dataset": [name] * len(own)} | {key: getattr(own, key) for key in _VALUES}
+            values["error_mm"] = list(own.errors().astype(np.float32))
             for key in _LISTS:
-                flat = getattr(one, key).reshape(len(one), -1)
+                flat = getattr(own, key).reshape(len(own), -1)
                 null = np.isnan(flat).all(1) & (key in _NULLABLE)
                 values[key] = [None if is_null else row for is_null, row in zip(null, flat, strict=True)]
             writer.write_table(pa.Table.from_pydict(values, schema=schema))

@@ -110,21 +110,21 @@ def jittered(box: Box, rng: np.random.Generator) -> Box:
     )
 
 
-def detector_box(kind: str, one: EvalSample, seed: int) -> Box | None:
+def detector_box(kind: str, person: EvalSample, seed: int) -> Box | None:
     """The displaced box that a person of a real dataset is cut out by in the protocol clean; None where they come as
     they are. It depends on `seed` and the person's place in the dataset alone."""
-    if kind in _OWN_CROP or kind not in _CLEAN_CROPS or one.sample.box is None:
+    if kind in _OWN_CROP or kind not in _CLEAN_CROPS or person.sample.box is None:
         return None
-    return jittered(one.sample.box, np.random.default_rng([seed, one.shard, one.row]))
+    return jittered(person.sample.box, np.random.default_rng([seed, person.shard, person.row]))
 
 
-def cropped(protocol: str, kind: str, one: EvalSample, seed: int) -> EvalSample:
+def cropped(protocol: str, kind: str, person: EvalSample, seed: int) -> EvalSample:
     """The person with the points that the protocol lets the network see."""
     if protocol == "dapt":
-        inside, _ = released_view(one.points, one.sample.joints, one.sample.centers, one.sample.box)
-        return replace(one, points=one.points[inside])
-    box = detector_box(kind, one, seed)
-    return one if box is None else replace(one, points=one.points[box.contains(one.points)])
+        inside, _ = released_view(person.points, person.sample.joints, person.sample.centers, person.sample.box)
+        return replace(person, points=person.points[inside])
+    box = detector_box(kind, person, seed)
+    return person if box is None else replace(person, points=person.points[box.contains(person.points)])
 
 
 class Model(Protocol):
@@ -149,27 +149,27 @@ class EvalSetup:
     joints: Skeleton
     sensor_unknown: bool
 
-    def shown(self, one: EvalSample) -> tuple[EvalSample | None, str]:
+    def shown(self, person: EvalSample) -> tuple[EvalSample | None, str]:
         """The person as the protocol shows them; or None, and why it leaves them out."""
         protocol, kind = self.setting.protocol, self.setting.kind
         if protocol == "clean":
-            return cropped(protocol, kind, one, self.setting.seed), ""
+            return cropped(protocol, kind, person, self.setting.seed), ""
         rules = DAPT[kind]
-        if rules.center not in one.sample.centers:
+        if rules.center not in person.sample.centers:
             return None, f"people without the center {rules.center!r}"
-        if kind == "humanm3" and (one.sample.joint_labels == UNLABELED).all():
+        if kind == "humanm3" and (person.sample.joint_labels == UNLABELED).all():
             return None, "people without a labelled joint, whom their box is made of"
-        shown = cropped(protocol, kind, one, self.setting.seed)
+        shown = cropped(protocol, kind, person, self.setting.seed)
         if len(shown.points) < rules.least:
             return None, f"people of under {rules.least} points, as the released code skips them"
         return shown, ""
 
-    def crop_box(self, one: EvalSample) -> Box | None:
+    def crop_box(self, person: EvalSample) -> Box | None:
         """The box of a person's crop: a detector's in the protocol clean, the released code's in dapt, else the
         dataset's, if any."""
         if self.setting.protocol == "dapt":
-            return released_box(one.sample.joints, one.sample.centers, one.sample.box)
-        return detector_box(self.setting.kind, one, self.setting.seed) or one.sample.box
+            return released_box(person.sample.joints, person.sample.centers, person.sample.box)
+        return detector_box(self.setting.kind, person, self.setting.seed) or person.sample.box
 
     def predict(self, samples: Sequence[EvalSample]) -> list[dict[str, Any]]:
         """A row of `predictions.stack` for each person as the protocol shows them: what is known of them and what the
@@ -181,10 +181,10 @@ class EvalSetup:
             rows = [k for k, s in enumerate(samples) if (s.sample.sensor_known and not self.sensor_unknown) == known]
             for k, values in zip(rows, answer([samples[k] for k in rows], origin) if rows else (), strict=True):
                 answers[k] = values
-        return [self._known(one) | values for one, values in zip(samples, answers, strict=True)]
+        return [self._known(person) | values for person, values in zip(samples, answers, strict=True)]
 
     def _predict_clean(self, samples: list[EvalSample], origin: np.ndarray | None) -> Iterator[dict]:
-        clouds = [one.points for one in samples]
+        clouds = [person.points for person in samples]
         for person in self.model.predict(clouds, sensor_origin=origin, skeleton=self.model.skeleton.name):
             yield {} if person.pose is None else self._picked(person.pose, ())
 
@@ -193,8 +193,8 @@ class EvalSetup:
         batch = self.model.backend.batch
         for start in range(0, len(samples), batch):
             some = samples[start : start + batch]
-            centers = np.stack([one.sample.centers[DAPT[self.setting.kind].center] for one in some])
-            estimates = self.model.outputs([one.points.astype(float) for one in some], centers, origin)
+            centers = np.stack([person.sample.centers[DAPT[self.setting.kind].center] for person in some])
+            estimates = self.model.outputs([person.points.astype(float) for person in some], centers, origin)
             for k, center in enumerate(centers):
                 values = self._picked(estimates, k)
                 values["pred"] = values["pred"] + center
@@ -207,15 +207,15 @@ class EvalSetup:
         stated = {name: value[index][..., pick] for name, value in stated.items() if value is not None}
         return stated | {"pred": estimates.joints[index][..., pick, :]}
 
-    def _known(self, one: EvalSample) -> dict[str, Any]:
-        sample, box = one.sample, one.sample.box
+    def _known(self, person: EvalSample) -> dict[str, Any]:
+        sample, box = person.sample, person.sample.box
         pick = self.dataset.skeleton.map_to(self.joints)
         return {
-            **{name: getattr(one, name) for name in ("shard", "row", "condition", "poses", "plain", "moving")},
+            **{name: getattr(person, name) for name in ("shard", "row", "condition", "poses", "plain", "moving")},
             **{name: getattr(sample, name) for name in ("sequence", "frame", "track", "time", "distance")},
-            "sensor": str(one.info.sensor),
-            "hidden": 1 - one.info.visible,
-            "points": len(one.points),
+            "sensor": str(person.info.sensor),
+            "hidden": 1 - person.info.visible,
+            "points": len(person.points),
             "box": None if box is None else [*box.center, *box.size, box.yaw],
             "true": sample.joints[pick],
             "labels": sample.joint_labels[pick],

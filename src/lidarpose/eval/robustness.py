@@ -233,16 +233,16 @@ def people_to_perturb(setup: EvalSetup) -> list[CroppedPerson]:
     """Of lidarpose-bench its clean people, of other datasets at most `PEOPLE`, evenly spread. Raises InputError where
     nobody has a point."""
     if setup.setting.kind == BENCH:
-        chosen = [one for one in setup.dataset if one.condition == _CLEAN and not one.moving]
+        chosen = [person for person in setup.dataset if person.condition == _CLEAN and not person.moving]
     else:
         rows = set(spread(setup.dataset.count, PEOPLE).tolist())
-        chosen = [one for k, one in enumerate(setup.dataset) if k in rows]
+        chosen = [person for k, person in enumerate(setup.dataset) if k in rows]
     # who is not scored is not perturbed either
-    shown = [(setup.shown(one)[0], one) for one in chosen]
+    shown = [(setup.shown(person)[0], person) for person in chosen]
     people = [
-        CroppedPerson(shown=seen, whole=one, box=setup.crop_box(one))
-        for seen, one in shown
-        if seen is not None and len(seen.points)
+        CroppedPerson(shown=cropped, whole=person, box=setup.crop_box(person))
+        for cropped, person in shown
+        if cropped is not None and len(cropped.points)
     ]
     if not people:
         raise InputError(
@@ -269,7 +269,7 @@ def study(
     people = people_to_perturb(setup) if people is None else people
     progress = progress or (lambda count: None)
     shown = [person.shown for person in people]
-    clusters = np.array([one.sample.sequence for one in shown]) if setup.setting.clusters else None
+    clusters = np.array([person.sample.sequence for person in shown]) if setup.setting.clusters else None
     unperturbed = _predict(setup, shown)
     base = unperturbed.errors()
     first = _point(unperturbed, base, 0.0, "0", setup, clusters)

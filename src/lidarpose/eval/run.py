@@ -65,10 +65,10 @@ def evaluate_dataset(
     worst: list[tuple[float, int, EvalSample]] = []
     unknown = 0
     for chunk in _chunks(setup):
-        for one, row in zip(chunk, setup.predict(chunk), strict=True):
-            unknown += not one.sample.sensor_known
-            if (error := _mean_error(row)) is not None and not one.moving:
-                worst.append((error, len(rows), one))
+        for person, row in zip(chunk, setup.predict(chunk), strict=True):
+            unknown += not person.sample.sensor_known
+            if (error := _mean_error(row)) is not None and not person.moving:
+                worst.append((error, len(rows), person))
             rows.append(row)
         # the points of the worst people alone are kept
         worst = sorted(worst, key=lambda entry: (-entry[0], entry[1]))[:WORST]
@@ -89,16 +89,16 @@ def evaluate_dataset(
     skipped = {reason: dict(entry) for reason, entry in dataset.skipped.items()}
     notes = tuple(_notes(setup, setting, predictions))
     result = Result(setting=setting, counts=counts, skipped=skipped, notes=notes, lines=lines)
-    return Evaluation(result=result, predictions=predictions, worst=tuple((one, k) for _, k, one in worst))
+    return Evaluation(result=result, predictions=predictions, worst=tuple((person, k) for _, k, person in worst))
 
 
 def _chunks(setup: EvalSetup) -> Iterator[list[EvalSample]]:
     """The people as the protocol shows them; who has nothing to show is counted."""
     chunk: list[EvalSample] = []
-    for one in setup.dataset:
-        shown, reason = setup.shown(one)
+    for person in setup.dataset:
+        shown, reason = setup.shown(person)
         if shown is None:
-            where = f"{one.sample.sequence}, frame {one.sample.frame}, track {one.sample.track}"
+            where = f"{person.sample.sequence}, frame {person.sample.frame}, track {person.sample.track}"
             count_skipped(setup.dataset.skipped, reason, where)
             continue
         chunk.append(shown)
@@ -239,7 +239,7 @@ def run(
     opened = _opened(datasets, split, limit)
     predictor, weights = _loaded(model, device=device, backend=backend, decode=decode, tta=tta)
     options: dict[str, Any] = {"protocol": protocol, "seed": seed, "skeleton": skeleton}
-    setups = [eval_setup(predictor, one, sensor_unknown=sensor_unknown, **options) for one in opened]
+    setups = [eval_setup(predictor, dataset, sensor_unknown=sensor_unknown, **options) for dataset in opened]
     perturbed = [people_to_perturb(setup) if stability else None for setup in setups]
     evaluations, studies = [], []
     for setup, people in zip(setups, perturbed, strict=True):
@@ -248,7 +248,7 @@ def run(
         if people is not None:
             done = _counter(f"{setup.setting.dataset}, perturbed", 0, progress)
             studies.append(study(setup, evaluations[-1].predictions, people=people, progress=done))
-    results = tuple(one.result for one in evaluations)
+    results = tuple(evaluation.result for evaluation in evaluations)
     scores = Scores(weights=weights, command=command, seed=setups[0].setting.seed, results=results)
     return Run(scores=scores, evaluations=tuple(evaluations), studies=tuple(studies))
 
@@ -259,7 +259,7 @@ def _opened(datasets: str | os.PathLike | Sequence[str | os.PathLike], split, li
         raise InputError("expected a dataset to evaluate on: a folder that lidarpose prepare or synth wrote, or bench")
     pyarrow()
     opened = [open_eval_dataset(dataset, split=split, limit=limit) for dataset in datasets]
-    names = [one.name for one in opened]
+    names = [dataset.name for dataset in opened]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise InputError(f"two datasets are called {twice}: evaluate them one by one, or rename a folder")
     return opened
@@ -328,11 +328,13 @@ def write(run: Run, folder: str | os.PathLike) -> list[Path]:
 
     folder, scores = check_folder(folder), run.scores
     files: dict[str, Any] = {FILE: scores.to_json().encode()}
-    for one in run.evaluations:
-        name = one.result.setting.dataset
-        files[f"{name}-errors.png"] = charts.draw_errors(one.result)
-        files[f"{name}-reliability.png"] = charts.draw_reliability(one.predictions, one.result)
-        files[f"{name}-worst.png"] = one.worst and charts.draw_worst(one.predictions, one.result.setting, one.worst)
+    for evaluation in run.evaluations:
+        name = evaluation.result.setting.dataset
+        files[f"{name}-errors.png"] = charts.draw_errors(evaluation.result)
+        files[f"{name}-reliability.png"] = charts.draw_reliability(evaluation.predictions, evaluation.result)
+        files[f"{name}-worst.png"] = evaluation.worst and charts.draw_worst(
+            evaluation.predictions, evaluation.result.setting, evaluation.worst
+        )
     for stability in run.studies:
         files[f"{stability.setting.dataset}-stability.png"] = charts.draw_stability(stability)
     if run.studies:
@@ -340,7 +342,7 @@ def write(run: Run, folder: str | os.PathLike) -> list[Path]:
         files["stability.json"] = to_json(run.studies, head=head).encode()
     files = {name: content for name, content in files.items() if content}
     with ExitStack() as stack:
-        poses = {one.result.setting.dataset: one.predictions for one in run.evaluations}
+        poses = {evaluation.result.setting.dataset: evaluation.predictions for evaluation in run.evaluations}
         write_poses(stack.enter_context(atomic_path(folder / "poses.parquet")), poses)
         for name, content in files.items():
             stack.enter_context(atomic_path(folder / name)).write_bytes(content)

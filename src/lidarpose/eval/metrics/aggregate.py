@@ -63,7 +63,7 @@ def mean(table: ArrayLike, average: str = "person", *, empty: float | None = Non
     seen = count > 0
     if average == "joint":
         if empty is not None:
-            raise InputError('empty is for average="person": people without labelled joints add none to the other')
+            raise InputError('empty is for average="person": people without labeled joints add none to the other')
         value = total.sum() / count.sum() if seen.any() else np.nan
     else:
         each = np.where(seen, total / np.maximum(count, 1), np.nan if empty is None else empty)

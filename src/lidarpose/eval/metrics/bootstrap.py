@@ -83,7 +83,7 @@ def paired_interval(
     """
     first, second = as_table(first), as_table(second)
     if first.shape != second.shape or (np.isnan(first) != np.isnan(second)).any():
-        raise InputError("tables to compare must be of the same people, with the same joints labelled")
+        raise InputError("tables to compare must be of the same people, with the same joints labeled")
     return interval(first - second, rng, average, clusters=clusters, level=level, repeats=repeats)
 
 

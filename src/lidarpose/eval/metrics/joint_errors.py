@@ -111,7 +111,7 @@ def aligned_errors(
     pred, true, labeled = checked_poses(pred, true, visible)
     if dapt_compat or legacy:
         if np.isnan(true).any():
-            raise InputError("legacy alignment takes every joint, labelled or not: true must hold no NaN")
+            raise InputError("dapt_compat aligns all joints, labeled or not: true must hold no NaN")
         # the released code asks the number of people whether the array is transposed
         axes = (0, 2, 1) if len(pred) in (2, 3) else (0, 1, 2)
         aligned = similarity_align(pred.transpose(axes), true.transpose(axes)).transpose(axes)
@@ -156,7 +156,7 @@ def _distances(pred: np.ndarray, true: np.ndarray, labeled: np.ndarray) -> np.nd
 def _mean(table: np.ndarray, average: str, dapt_compat: bool, *, empty: float) -> Score:
     check_name("average", average, AVERAGES)
     if dapt_compat and average != "person":
-        raise InputError('legacy=True averages over people, as the released code does: pass average="person"')
+        raise InputError('dapt_compat=True averages over people, as the released code does: pass average="person"')
     return mean(table, average, empty=empty if dapt_compat else None)
 
 
