@@ -37,6 +37,7 @@ _FREE_COPIES, _COPIES = 4096, 8
 _TEXT = (str, bytes)
 # values without parts
 _PLAIN = frozenset({type(None), bool, int, float, complex, str, bytes})
+_CONTAINERS = (list, tuple, set, frozenset, dict)
 _REMEDY = "copy it again, or ask for npz"
 
 
@@ -99,6 +100,8 @@ class _Memo(dict):
     far = 0
 
     def __setitem__(self, key: int, value: object) -> None:
+        if key >= 2**32:
+            raise TypeError("a number of more than 32 bits in the memo")
         self.far += key > 2 * len(self) + 1000
         if self.far > MAX_NUMBER_KEYS:
             raise FormatError("numbers its parts in no order: ask for npz")
@@ -309,15 +312,13 @@ def _check_levels(value: object, levels: dict[int, int | None], depth: int) -> i
             raise FormatError(f"has a {value.name} without content: {_REMEDY}")
         return 0
     parts = ()
-    if isinstance(value, list | tuple | set | frozenset):
-        parts = value
-    elif isinstance(value, dict):
+    if type(value) in _CONTAINERS:
         # keys have no parts that have parts
-        parts = value.values()
+        parts = value.values() if isinstance(value, dict) else value
     elif isinstance(value, np.ndarray) and value.dtype.kind == "O":
         parts = value.flat
     levels[id(value)] = None
-    inner = (part for part in parts if type(part) not in _PLAIN)
+    inner = (part for part in parts if type(part) not in _PLAIN and (type(part) not in _CONTAINERS or part))
     count = (
         max((1 + _check_levels(part, levels, depth + 1) for part in inner), default=1) if depth < MAX_DEPTH else depth
     )
