@@ -93,7 +93,7 @@ def load_rig() -> Rig:
 
 
 def forward_kinematics(
-    parents: Sequence[int], rest_joints: np.ndarray, rotations: np.ndarray, translation: np.ndarray
+    parents: Sequence[int] | np.ndarray, rest_joints: np.ndarray, rotations: np.ndarray, translation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Global rotations and joint positions of a kinematic tree.
 

@@ -14,6 +14,7 @@ import struct
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -48,7 +49,7 @@ class Unread:
     name: str
 
 
-def load_pickle(path: str | os.PathLike) -> object:
+def load_pickle(path: str | os.PathLike) -> Any:
     """The data of a pickle: dicts, lists, tuples, sets, numbers, text, bytes and numpy arrays.
 
     chumpy's arrays and scipy's csc and csr matrices come as (dense) arrays, strings of Python 2 as latin-1 text,

@@ -14,6 +14,8 @@ Letters as in `raycast`; S sub-beams along a side, K = S * S of a beam. A change
 does not renew what is cached of this module: remove its __pycache__ after one.
 """
 
+from typing import Any
+
 import numpy as np
 
 from lidarpose.errors import InputError
@@ -60,7 +62,7 @@ def scan_divergent(
     if divergence == 0:
         return scan(vertices, faces, sensor, window_vertices=window_vertices, margin=margin)
     if sensor.origins:
-        options = {"divergence": divergence, "sub_beams": sub_beams, "pulse": pulse, "margin": margin}
+        options: dict[str, Any] = {"divergence": divergence, "sub_beams": sub_beams, "pulse": pulse, "margin": margin}
         return scan_multi_origin(
             lambda v, single, w: scan_divergent(v, faces, single, window_vertices=w, **options),
             vertices,

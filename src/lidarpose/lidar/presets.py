@@ -2,6 +2,7 @@
 
 import os
 from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -37,7 +38,7 @@ _PANDAR64_OFFSETS = -_degrees("-1.042 " * 10 + "-3.125 -5.208 5.208 3.125 1.042 
 _AV2_ORDER = np.argsort(np.concatenate([_VLP_32C, -_VLP_32C]), kind="stable")
 
 
-def _spinning(name: str, elevations: np.ndarray, columns: int, **fields: object) -> Sensor:
+def _spinning(name: str, elevations: np.ndarray, columns: int, **fields: Any) -> Sensor:
     """A sensor of elevations rad and so many columns a turn."""
     return Sensor(name=name, elevations=elevations, azimuth_step=_turn(columns), **fields)
 

@@ -7,7 +7,7 @@ Legend: N rays of a frame, V vertices, F faces, n hits.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -49,6 +49,7 @@ class RayPattern:
     dropout: float = 0.025
     height: float = 1.7
     tilt: float = 0.0
+    _made: dict[int, Rays] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self):
         if self.frames < 1:
@@ -61,7 +62,6 @@ class RayPattern:
         if self.duration < 0:
             raise InputError(f"RayPattern.duration must be 0 s or more, got {self.duration}")
         check_limits(self)
-        object.__setattr__(self, "_made", {})
 
     def __getstate__(self) -> dict:
         # frames are made again in another process

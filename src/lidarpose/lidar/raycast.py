@@ -174,7 +174,7 @@ def scan_multi_origin(
     for height, single, rings in sensor.origins:
         origin = np.array([0, 0, height])
         hits = scan(vertices - origin, single, window_vertices - origin)
-        parts.append(replace(hits, points=hits.points + np.float32([0, 0, height])))
+        parts.append(replace(hits, points=hits.points + np.array([0, 0, height], np.float32)))
         ring_numbers.append(rings)
     # columns of all origins counted from the first one of any
     turn, base = sensor.columns, parts[0].column0

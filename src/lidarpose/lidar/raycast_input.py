@@ -3,13 +3,15 @@
 Arrays come out in one type each, so that compiled code is compiled once.
 """
 
+from typing import Any
+
 import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.sample import FARTHEST
 
 
-def as_points(name: str, values: np.ndarray) -> np.ndarray:
+def as_points(name: str, values: Any) -> np.ndarray:
     """A copy (n, 3) float64, C-contiguous, finite; writable, as what compiled code makes."""
     values = _as_floats(name, values, "an (n, 3) array of numbers")
     if values.ndim != 2 or values.shape[1] != 3:

@@ -6,6 +6,7 @@ frame: x forward, y left, z up, the origin is where the beams meet.
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -146,7 +147,7 @@ class Sensor:
         return columns[:, None] + self.azimuth_shifts[window.row0 : window.row0 + window.rows]
 
 
-def check_limits(sensor: object) -> None:
+def check_limits(sensor: Any) -> None:
     """Raises InputError for a range, noise, loss or mount that no `Sensor` or `RayPattern` has."""
     kind = type(sensor).__name__
     for field in ("range_min", "range_max", "range_sigma", "dropout", "height", "tilt"):

@@ -162,11 +162,12 @@ def _from_csv(path: Path, text: str) -> dict:
     if any(cell and not _is_number(cell) for cell in header):
         rows = rows[1:]
         names = {re.sub("[ -]", "_", cell.split("(")[0].strip()): k for k, cell in enumerate(header)}
-        elevation = next((names[name] for name in _ELEVATIONS if name in names), None)
+        elevation_name = next((name for name in _ELEVATIONS if name in names), None)
         offset_name = next((name for name in (*_OFFSETS, *_CLOCKWISE) if name in names), None)
-        offset = names.get(offset_name)
-        if elevation is None:
+        offset = names[offset_name] if offset_name else None
+        if elevation_name is None:
             raise file_error(path, f"has no column named elevation, got {', '.join(header)}")
+        elevation = names[elevation_name]
         # beams without their offsets would be another sensor
         if offset is None and (unknown := next((n for n in names if re.search("azimuth|offset|horiz", n)), None)):
             raise file_error(path, f"unknown column {unknown!r}: name it azimuth_offset, or azimuth if clockwise")

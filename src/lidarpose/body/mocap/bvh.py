@@ -6,6 +6,8 @@ Source: the format as published with Biovision's motion data (Meredith and Maddo
 """
 
 import os
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +21,10 @@ _CHANNELS = {f"{axis}{kind}": kind[0].replace("p", "t") + axis for axis in "xyz"
 def load_bvh(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
     """The motion of a BVH file as one clip, named as the file. up: by default the axis people stand along."""
     tree, values, rate = read_bvh(path)
-    if fps is None and rate is None:
+    rate = fps or rate
+    if rate is None:
         raise file_error(path, "has no frame time above 0 (Frame Time: seconds); give load_motion fps=")
-    return tree_motion(path, tree, tree.positions(values), fps=fps or rate, up=up, kind="BVH")
+    return tree_motion(path, tree, tree.positions(values), fps=rate, up=up, kind="BVH")
 
 
 def read_bvh(path: str | os.PathLike) -> tuple[JointTree, np.ndarray, float | None]:
@@ -42,7 +45,11 @@ def read_bvh(path: str | os.PathLike) -> tuple[JointTree, np.ndarray, float | No
 
 
 def _hierarchy(path: object, lines: list[str]) -> JointTree:
-    names, parents, offsets, channels = [], [], [], []
+    names: list[str] = []
+    parents: list[int] = []
+    # None until a joint's OFFSET is read
+    offsets: list[Any] = []
+    channels: list[Sequence[str]] = []
     open_joints: list[int] = []
     awaits_brace = False
     for line in lines:

@@ -39,7 +39,7 @@ def motion_from_joints(
     path: object,
     joints: np.ndarray,
     names: Sequence[str],
-    length: Sequence[int],
+    length: Sequence[int] | np.ndarray,
     *,
     fps: float,
     up: str | None,

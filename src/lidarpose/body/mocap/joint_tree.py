@@ -5,6 +5,7 @@ line hips -> neck at which the shipped body has its spine's joints; and what onl
 estimated where it is missing. The rest is needed.
 """
 
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -79,11 +80,13 @@ class JointTree:
         finite = np.isfinite(values).all(1)
         columns = iter(values[finite].T)
         count = int(finite.sum())
-        rotations, places = [], []
+        rotations: list[np.ndarray] = []
+        places: list[np.ndarray] = []
         for j, parent in enumerate(self.parents):
             rotation = np.broadcast_to(np.eye(3), (count, 3, 3))
             offset = np.repeat(self.offsets[j][None], count, 0)
-            for kind, axis in self.channels[j]:
+            for channel in self.channels[j]:
+                kind, axis = channel[0], channel[1]
                 value = next(columns)
                 if kind == "t":
                     offset[:, "xyz".index(axis)] += value
@@ -106,7 +109,7 @@ class JointTree:
 
 
 def tree_motion(
-    path: object,
+    path: str | os.PathLike,
     tree: JointTree,
     positions: np.ndarray,
     *,
@@ -157,9 +160,9 @@ def match_joints(path: object, names: Sequence[str], parents: Sequence[int]) -> 
     for side, known in (("left_", _SIDED), ("right_", _SIDED), ("", _CENTRAL)):
         for joint, words in known.items():
             candidates = (by_word.get((side, word)) for word in words)
-            i = next((i for i in candidates if i is not None and i not in matched.values()), None)
-            if i is not None:
-                matched[side + joint] = i
+            index = next((i for i in candidates if i is not None and i not in matched.values()), None)
+            if index is not None:
+                matched[side + joint] = index
     ends = {parents[i]: i for i, name in enumerate(names) if name.endswith(END)}
     for tip, base in (("foot", "ankle"), ("hand", "wrist")):
         for side in _SIDES:

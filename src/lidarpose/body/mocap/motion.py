@@ -8,7 +8,7 @@ A file of clips is an npz with `joints` (F, 24, 3) m, z up, all clips one after 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -79,7 +79,7 @@ class _ClipTable:
                 raise InputError(f"no clip starts with {subject!r}: there are {known}")
         chosen = [c for c, name in enumerate(self.names) if any(_is_of(name, subject) for subject in subjects)]
         length = self.length[chosen]
-        arrays = {
+        arrays: dict[str, Any] = {
             name: np.concatenate([getattr(self, name)[:0], *(getattr(self, name)[self.frames(c)] for c in chosen)])
             for name in self.ROWS
         }
@@ -235,7 +235,11 @@ def standing_axis(trunk: np.ndarray) -> str | None:
 
 
 def usable_clips(
-    path: object, names: Sequence[str], length: Sequence[int], good: np.ndarray, number: np.ndarray | None = None
+    path: object,
+    names: Sequence[str],
+    length: Sequence[int] | np.ndarray,
+    good: np.ndarray,
+    number: np.ndarray | None = None,
 ) -> dict:
     """Cuts clips at frames that cannot be used, so that no motion jumps over a gap.
 

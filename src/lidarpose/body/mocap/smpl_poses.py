@@ -24,6 +24,7 @@ import os
 import re
 import reprlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -49,8 +50,8 @@ _FRAME = re.compile("[0-9]{1,12}")
 
 def motion_from_smpl(
     path: object,
-    pose: object,
-    trans: object,
+    pose: Any,
+    trans: Any,
     *,
     name: str,
     fps: float,

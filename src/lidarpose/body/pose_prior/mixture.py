@@ -21,7 +21,7 @@ SHOULDERS = tuple((slice(i, i + 3), sign) for i, sign in zip(_FIRST_ARM_ANGLE.va
 _SPREAD = 0.75
 # an arm is another pose's this often: one subject's poses then cover another's better
 _OTHER_ARM = 0.4
-_ARMS = tuple(list(range(i, i + len(ARM_ANGLES))) for i in _FIRST_ARM_ANGLE.values())
+_ARMS = tuple(np.arange(i, i + len(ARM_ANGLES)) for i in _FIRST_ARM_ANGLE.values())
 # where a Cholesky factor's numbers are
 LOWER = np.tril_indices(len(ANGLES))
 
@@ -33,9 +33,10 @@ def captured_angles(rng: np.random.Generator, n: int) -> np.ndarray:
     component = np.searchsorted(cumulative, rng.random(n))
     normal = rng.standard_normal((n, 2, len(ANGLES)))
     features = means[component, None] + _SPREAD * normal @ np.swapaxes(roots[component], -1, -2)
+    pair = np.arange(2)
     for shift, arm in enumerate(_ARMS, 1):
         rows = np.flatnonzero(rng.random(n) < _OTHER_ARM)
-        features[np.ix_(rows, (0, 1), arm)] = features[np.ix_((rows + shift) % n, (0, 1), arm)]
+        features[np.ix_(rows, pair, arm)] = features[np.ix_((rows + shift) % n, pair, arm)]
     return from_features(features.reshape(-1, len(ANGLES))).reshape(n, 2, len(ANGLES))
 
 
