@@ -51,7 +51,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> InputError:
     return InputError(f"unknown {kind} {name!r}: {hint}known are {', '.join(known)}")
 
 
-def whole(name: str, value: Any, *, least: int, most: int | None = None, hint: str = "") -> int:
+def check_int(name: str, value: Any, *, least: int, most: int | None = None, hint: str = "") -> int:
     """A whole number, numpy's too, as Python's. Raises InputError for anything else, and outside least to most."""
     if isinstance(value, Integral) and not isinstance(value, bool):
         number = int(value)

@@ -71,7 +71,7 @@ def from_spherical(distance: np.ndarray, azimuth: np.ndarray, elevation: np.ndar
     return np.stack([x, y, z], -1)
 
 
-# rows are the house's x, y, z in coordinates of an input whose up axis is the key: right-handed, forward kept
+# rows are the level frame's x, y, z in coordinates of an input whose up axis is the key: right-handed, forward kept
 # where the convention has a usual one (y up: z towards the viewer, as in graphics; x up: z forward; -y up: z forward
 # and x to the right, as in cameras; -z up: x forward, as in aircraft)
 UP_AXES = {
@@ -85,7 +85,7 @@ UP_AXES = {
 
 
 def rotation_from_up(up: str | Sequence[float]) -> np.ndarray:
-    """R_house_input (3, 3): turns coordinates of an input in which `up` is up into the house's (z up).
+    """R_level_input (3, 3): turns coordinates of an input in which `up` is up into the level frame's (z up).
 
     up: an axis, "z", "y" or "x", with a minus where it points down, or a direction of any length > 0 in the input's
     coordinates, three numbers or "x,y,z", which is turned up by the smallest rotation. Raises InputError.

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from lidarpose.data.shards import DatasetReader, open_dataset, read_rows, rows_of_shard, shard_path
-from lidarpose.errors import InputError, whole
+from lidarpose.errors import InputError, check_int
 from lidarpose.eval.bench import NAME, Bench, load_bench
 from lidarpose.io.files import file_error
 from lidarpose.sample import SEEN, Box, LabeledSample, PersonInfo, Pose, is_plain
@@ -103,7 +103,7 @@ def open_eval_dataset(dataset: str | PathLike, *, split: str | None = None, limi
         MissingExtra: without pyarrow.
     """
     if limit is not None:
-        limit = whole("limit", limit, least=1, hint=" person")
+        limit = check_int("limit", limit, least=1, hint=" person")
     if not isinstance(dataset, str | PathLike):
         raise InputError(f"expected a dataset to evaluate on, {BENCH} or the path of a folder, got {dataset!r}")
     if str(dataset) == BENCH:

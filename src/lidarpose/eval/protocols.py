@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from lidarpose.data.dapt_crops import released_box, released_view
-from lidarpose.errors import InputError, check_name, whole
+from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.eval.dataset import EvalDataset, EvalSample
 from lidarpose.eval.predictions import subset
 from lidarpose.eval.scores import Setting
@@ -233,7 +233,7 @@ def eval_setup(
 ) -> EvalSetup:
     """Puts a network before a dataset. Raises InputError, one line, where the protocol does not fit the dataset, the
     dataset lacks joints of the `skeleton` asked for, or it and the network have no joint in common."""
-    seed = whole("seed", seed, least=0)
+    seed = check_int("seed", seed, least=0)
     check_protocol(protocol, dataset)
     if protocol == "dapt" and model.model.get("tta", 1) > 1:
         raise InputError("the protocol dapt predicts each person once, as the released code does: leave --tta out")

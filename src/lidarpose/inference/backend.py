@@ -14,7 +14,7 @@ from typing import Protocol
 
 import numpy as np
 
-from lidarpose.errors import InputError, whole
+from lidarpose.errors import InputError, check_int
 from lidarpose.io.files import content_digest, file_error
 from lidarpose.models.checkpoint import Header, read_header
 from lidarpose.models.config import BIN
@@ -93,7 +93,7 @@ class OnnxBackend:
 
     def __init__(self, path: str | os.PathLike, *, threads: int | None = None):
         if threads is not None:
-            threads = whole("threads", threads, least=1)
+            threads = check_int("threads", threads, least=1)
         self._opened = os.path.abspath(path), threads
         self.session, self.header, self.source = open_onnx(path, threads=threads)
         # parts are of no use here: what is not asked for is not computed

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from lidarpose.errors import InputError, check_name, missing_extra, whole
+from lidarpose.errors import InputError, check_int, check_name, missing_extra
 from lidarpose.inference.backend import Backend, Estimates, OnnxBackend, estimates, exported_beside
 from lidarpose.inference.checks import UPSIDE_DOWN, looks_unsure, oversize_warning, upside_down_warning
 from lidarpose.inference.inputs import as_origin, as_points, candidates, clean, is_few, only_returns, unit_warning
@@ -64,7 +64,7 @@ def load(
     decoder(decode)
     tta_transforms(tta)
     if threads is not None:
-        threads = whole("threads", threads, least=1)
+        threads = check_int("threads", threads, least=1)
     if backend is not None:
         check_name("backend", backend, BACKENDS)
     path = weights_path(weights)

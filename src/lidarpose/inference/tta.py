@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.errors import whole
+from lidarpose.errors import check_int
 from lidarpose.inference.backend import Estimates
 from lidarpose.models.voxelize import view_features
 from lidarpose.sample import PER_JOINT
@@ -54,7 +54,7 @@ TRANSFORMS = (
 
 def tta_transforms(count: int) -> tuple[TTATransform, ...]:
     """The first so many transforms; the very first is the identity. Raises InputError for none or too many."""
-    return TRANSFORMS[: whole("tta", count, least=1, most=len(TRANSFORMS))]
+    return TRANSFORMS[: check_int("tta", count, least=1, most=len(TRANSFORMS))]
 
 
 def apply(

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarpose.errors import whole
+from lidarpose.errors import check_int
 from lidarpose.io.files import FormatError, check_unpacked, file_error, read_bytes, shorten
 from lidarpose.io.pcd import parse_pcd
 from lidarpose.io.ply import parse_ply
@@ -92,7 +92,7 @@ def read_points(path: str | os.PathLike, *, columns: int | None = None) -> Cloud
     Raises InputError of one line that names the file, what was expected, what came and what to do.
     """
     if columns is not None:
-        columns = whole("columns", columns, least=3, hint=" (x y z first)")
+        columns = check_int("columns", columns, least=3, hint=" (x y z first)")
     data = read_bytes(path, expected=f"a point cloud ({' '.join(SUFFIXES)})")
     name = os.path.basename(os.fsdecode(path)).lower()
     suffix = os.path.splitext(name)[1]

@@ -2,7 +2,7 @@
 
 from dataclasses import asdict, dataclass
 
-from lidarpose.errors import InputError, check_name, whole
+from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.skeleton import skeleton
 
 # heatmaps in a window about each joint's vote; over the whole person, as the paper's; or votes alone
@@ -39,7 +39,7 @@ class NetworkConfig:
             value = getattr(self, name)
             # false in files of before it was a number
             value = 0 if name == "convolution" and value is False else value
-            object.__setattr__(self, name, whole(name, value, least=least, most=MOST))
+            object.__setattr__(self, name, check_int(name, value, least=least, most=MOST))
         for name, least in (("channels", 1), ("blocks", 0)):
             value = getattr(self, name)
             counts = tuple(value) if isinstance(value, list | tuple) else ()

@@ -10,7 +10,7 @@ from functools import cached_property, lru_cache, partial
 
 import numpy as np
 
-from lidarpose.errors import InputError, whole
+from lidarpose.errors import InputError, check_int
 from lidarpose.lidar.presets import sensor
 from lidarpose.lidar.ray_pattern import RayPattern
 from lidarpose.sample import PersonInfo, Pose, Sample
@@ -85,7 +85,7 @@ class Generator:
 
     def person(self, seed: int, index: int, *, hard: float | None = None) -> SyntheticPerson:
         """Person `index` of `seed`, at the scene's difficulty or at `hard` in [0, 1]."""
-        seed, index = whole("seed", seed, least=0), whole("index", index, least=0)
+        seed, index = check_int("seed", seed, least=0), check_int("index", index, least=0)
         rng = np.random.default_rng([seed, 1, index])
         block, row = self._bodies(seed, index // BLOCK), index % BLOCK
         return self._observe(block, [row], block, row, rng, hard)[0]
@@ -95,8 +95,8 @@ class Generator:
     ) -> list[SyntheticPerson]:
         """Clip `index` of `seed`: one person who moves, `frames` samples at 10 Hz; things and sensor stay where they
         are. Frames in which nothing of the person is seen have samples without points."""
-        frames = whole("a clip's frames", frames, least=1)
-        seed, index = whole("seed", seed, least=0), whole("index", index, least=0)
+        frames = check_int("a clip's frames", frames, least=1)
+        seed, index = check_int("seed", seed, least=0), check_int("index", index, least=0)
         rng = np.random.default_rng([seed, 3, index])
         bodies = draw_moving_body(self.bank, self.captured, frames, rng, clothes=self.scene.clothes)
         block, row = self._bodies(seed, index // BLOCK), index % BLOCK

@@ -12,7 +12,7 @@ from lidarpose.body.mocap import digest as motion_digest
 from lidarpose.data.schema import person_row
 from lidarpose.data.shards import CARD, DatasetCard, shard_path, shard_writer, write_card
 from lidarpose.data.writer import locked, make_shards, open_folder
-from lidarpose.errors import InputError, check_name, whole
+from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.io.files import content_digest, file_error
 from lidarpose.lidar.presets import SENSORS, sensor
 from lidarpose.synth.scene import scene_config
@@ -52,9 +52,9 @@ class Job:
 
     def __post_init__(self):
         check_name("kind of dataset", self.what, PER_SHARD)
-        whole(f"the number of {self.what}", self.count, least=1)
-        whole("--per-shard", PER_SHARD[self.what] if self.per_shard is None else self.per_shard, least=1)
-        whole("the seed", self.seed, least=0)
+        check_int(f"the number of {self.what}", self.count, least=1)
+        check_int("--per-shard", PER_SHARD[self.what] if self.per_shard is None else self.per_shard, least=1)
+        check_int("the seed", self.seed, least=0)
         if self.what == "streets" and (self.scene != "wild" or self.hard != 1 or self.motion is not None):
             raise InputError("streets have scene, difficulty and walkers of their own: leave these options out")
         if -(-self.count // (self.per_shard or PER_SHARD[self.what])) > _MOST_SHARDS:
@@ -123,7 +123,7 @@ def write_dataset(
     workers: processes; progress(done, total) is called at the start and as they are done. Raises InputError where the
     folder holds another dataset or something else, or cannot be written, MissingExtra without numba or pyarrow.
     """
-    whole("--workers", workers, least=1)
+    check_int("--workers", workers, least=1)
     folder, card = Path(folder), job.card()
     missing = open_folder(folder, card, _ROWS.get(job.what))
     left = sum(card.size(shard) for shard in missing)

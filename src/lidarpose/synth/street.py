@@ -12,7 +12,7 @@ from operator import index as as_index
 
 import numpy as np
 
-from lidarpose.errors import InputError, whole
+from lidarpose.errors import InputError, check_int
 from lidarpose.geometry import rotation_about
 from lidarpose.lidar.presets import sensor as named_sensor
 from lidarpose.lidar.ray_pattern import RayPattern
@@ -69,7 +69,11 @@ def street(
     seed: int, index: int, *, sensor: str = "os1-128", people: tuple[int, int] = (3, 8), frames: int = 1
 ) -> Street:
     """Street `index` of `seed` with `people` (least, most) in it, `frames` turns at 10 Hz. Raises InputError."""
-    seed, index, frames = whole("seed", seed, least=0), whole("index", index, least=0), whole("frames", frames, least=1)
+    seed, index, frames = (
+        check_int("seed", seed, least=0),
+        check_int("index", index, least=0),
+        check_int("frames", frames, least=1),
+    )
     try:
         least, most = map(as_index, people)
     except (TypeError, ValueError):

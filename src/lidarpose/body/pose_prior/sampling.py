@@ -23,7 +23,7 @@ from lidarpose.body.pose_prior.gait import GAITS, Stride, add_stride
 from lidarpose.body.pose_prior.joint_angles import mirror_angles, rotations_from_angles
 from lidarpose.body.pose_prior.latents import Latents, draw_latents
 from lidarpose.body.rig import forward_kinematics
-from lidarpose.errors import InputError, check_finite, check_name, whole
+from lidarpose.errors import InputError, check_finite, check_int, check_name
 from lidarpose.geometry import rotation_about
 from lidarpose.skeleton import SMPL24
 
@@ -95,7 +95,7 @@ def sample_rotations(
     Raises:
         InputError: For a negative n or dt, and a mix with unknown names or without weight.
     """
-    n = whole("n", n, least=0)
+    n = check_int("n", n, least=0)
     if not 0 <= dt < np.inf:
         raise InputError(f"dt must be seconds, 0 or more, got {dt}")
     latents, rotations = _draw_people(rng, n, _kind_shares(mix), np.zeros(1))
@@ -119,7 +119,7 @@ def sample_clips(
     Raises:
         InputError: For a negative n or frames, hz <= 0, or a wrong mix.
     """
-    n, frames = whole("n", n, least=0), whole("frames", frames, least=0)
+    n, frames = check_int("n", n, least=0), check_int("frames", frames, least=0)
     if not 0 < hz < np.inf:
         raise InputError(f"clips need hz > 0, got {hz}")
     last = max(0, frames - 1) / hz
@@ -141,8 +141,8 @@ def sample_poses(n: int, seed: int) -> np.ndarray:
     Raises:
         InputError: Unless n and seed are whole numbers of 0 or more.
     """
-    n = whole("n", n, least=0)
-    rotations = sample_rotations(np.random.default_rng(whole("seed", seed, least=0)), n).rotations
+    n = check_int("n", n, least=0)
+    rotations = sample_rotations(np.random.default_rng(check_int("seed", seed, least=0)), n).rotations
     joints = forward_kinematics(SMPL24.parents, mean_adult_joints()[None], rotations, np.zeros((n, 3)))[1]
     return joints.astype(np.float32)
 

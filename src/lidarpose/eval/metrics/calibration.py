@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lidarpose.errors import InputError, whole
+from lidarpose.errors import InputError, check_int
 from lidarpose.eval.metrics.joint_errors import as_flags, as_numbers
 
 
@@ -17,7 +17,7 @@ def calibration_error(confidence: ArrayLike, hit: ArrayLike, *, bins: int = 10) 
     Raises:
         InputError: for NaN and other values: leave out what is not known.
     """
-    bins = whole("bins", bins, least=1)
+    bins = check_int("bins", bins, least=1)
     confidence = _without_nan("confidence", confidence)
     if not ((confidence >= 0) & (confidence <= 1)).all():
         raise InputError(f"confidence must be within 0 and 1, got {confidence.min():g} to {confidence.max():g}")
