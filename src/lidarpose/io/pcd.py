@@ -46,11 +46,10 @@ def parse_pcd(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]
         # field by field: all x, then all y
         data = _decompress(data, start, num_points * row_size, num_points)
         offsets, strides = [num_points * offset for offset in offsets], [widths[i] for i in pick]
-    columns = [
-        np.ndarray(num_points, f"<{formats[i]}", data, offset, stride).astype(np.float64)
-        for i, offset, stride in zip(pick, offsets, strides, strict=True)
-    ]
-    return np.stack(columns, -1), names, ()
+    points = np.empty((num_points, 3))
+    for axis, (i, offset, stride) in enumerate(zip(pick, offsets, strides, strict=True)):
+        points[:, axis] = np.ndarray(num_points, f"<{formats[i]}", data, offset, stride)
+    return points, names, ()
 
 
 def _read_header(data: bytes) -> tuple[dict[str, list[str]], str, int]:

@@ -39,9 +39,10 @@ def parse_ply(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]
         return parse_rows(decode(data[body_start:]), num_points, pick, len(names), skip=skip_lines), names, ()
     check_bytes(data, start, num_points * sum(widths), num_points)
     types = [_BYTE_ORDERS[encoding] + _TYPES[kind] for _, kind in properties]
-    offsets = [start + sum(widths[:i]) for i in range(len(widths))]
-    columns = [np.ndarray(num_points, types[i], data, offsets[i], sum(widths)).astype(np.float64) for i in pick]
-    return np.stack(columns, -1), names, ()
+    points = np.empty((num_points, 3))
+    for axis, i in enumerate(pick):
+        points[:, axis] = np.ndarray(num_points, types[i], data, start + sum(widths[:i]), sum(widths))
+    return points, names, ()
 
 
 def _read_header(data: bytes) -> tuple[str, list[tuple[str, int, list[tuple[str, str]]]], int]:
