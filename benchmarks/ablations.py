@@ -38,12 +38,12 @@ from lidarpose.models.expand import expand_weights
 from lidarpose.models.posenet import PoseNet
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import SCENES, SceneConfig
-from lidarpose.train.example import Example
+from lidarpose.train.augment import Example
+from lidarpose.train.data_loader import SyntheticSource
 from lidarpose.train.loop import train
-from lidarpose.train.posenet_objective import PoseNetObjective
+from lidarpose.train.objectives.posenet_objective import PoseNetObjective
 from lidarpose.train.recipes import Pretrain, recipe
 from lidarpose.train.setup import TrainSetup, make_setup
-from lidarpose.train.sources import SyntheticSource
 
 _WILD = SCENES["wild"]
 

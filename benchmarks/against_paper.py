@@ -21,8 +21,14 @@ from lidarpose import evaluation
 from lidarpose.inference.predictor import load
 from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.dapt.dapt_config import DaptConfig
-from lidarpose.train.dapt_objective import DaptObjective, finetuning_config, pretraining_config, small, transferred
 from lidarpose.train.loop import train
+from lidarpose.train.objectives.dapt_objective import (
+    DaptObjective,
+    finetuning_config,
+    pretraining_config,
+    small,
+)
+from lidarpose.train.objectives.dapt_transfer import transferred
 from lidarpose.train.recipes import Pretrain, recipe
 from lidarpose.train.setup import make_setup
 

@@ -24,7 +24,7 @@ from lidarpose.models import DEFAULT
 from lidarpose.sample import CONFIDENCE_RADIUS
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import PoseBank
-from lidarpose.train.example import seen
+from lidarpose.train.augment import seen
 
 BINS = 10
 # what `spread` may say, m

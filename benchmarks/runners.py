@@ -26,10 +26,10 @@ from lidarpose.models.voxelize import voxelize
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
-from lidarpose.train.example import Example, example
-from lidarpose.train.objective import total
+from lidarpose.train.augment import Example, example
+from lidarpose.train.objectives.objective import total
+from lidarpose.train.objectives.posenet_objective import PoseNetObjective
 from lidarpose.train.optim import average, optimizers
-from lidarpose.train.posenet_objective import PoseNetObjective
 from lidarpose.train.recipes import Pretrain
 
 SIZES = ("tiny", "small", "base", "paper")

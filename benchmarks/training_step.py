@@ -16,11 +16,10 @@ from lidarpose.models.config import preset
 from lidarpose.models.posenet import Batch, PoseNet, Targets
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
-from lidarpose.train.example import example
-from lidarpose.train.losses import losses
-from lidarpose.train.objective import total
+from lidarpose.train.augment import example
+from lidarpose.train.objectives.objective import total
+from lidarpose.train.objectives.posenet_objective import PoseNetObjective, losses
 from lidarpose.train.optim import optimizers
-from lidarpose.train.posenet_objective import PoseNetObjective
 from lidarpose.train.recipes import Pretrain
 
 ROUNDS = 5

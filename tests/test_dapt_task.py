@@ -18,10 +18,16 @@ from lidarpose.models.dapt.dapt_net import DaptBatch, DaptNet, DaptOutputs
 from lidarpose.models.dapt.voxel_tables import LAYOUTS
 from lidarpose.models.posenet import PoseNet
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14
-from lidarpose.train.dapt_losses import DaptTargets, finetuning, log_gaussian, pretraining
-from lidarpose.train.dapt_objective import DaptObjective, finetuning_config, pretraining_config, small, transferred
-from lidarpose.train.example import Example
-from lidarpose.train.objective import alone, total
+from lidarpose.train.augment import Example
+from lidarpose.train.objectives.dapt_losses import DaptTargets, finetuning, log_gaussian, pretraining
+from lidarpose.train.objectives.dapt_objective import (
+    DaptObjective,
+    finetuning_config,
+    pretraining_config,
+    small,
+)
+from lidarpose.train.objectives.dapt_transfer import transferred
+from lidarpose.train.objectives.objective import alone, total
 
 TINY = {
     "encoder_depths": (1, 1, 1),

@@ -14,10 +14,10 @@ from lidarpose.models.expand import expand_weights
 from lidarpose.models.posenet import Batch, PoseNet
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
-from lidarpose.train.example import example
-from lidarpose.train.objective import total
+from lidarpose.train.augment import example
+from lidarpose.train.objectives.objective import total
+from lidarpose.train.objectives.posenet_objective import PoseNetObjective
 from lidarpose.train.optim import optimizers
-from lidarpose.train.posenet_objective import PoseNetObjective
 from lidarpose.train.recipes import Pretrain
 from lidarpose.train.setup import make_setup
 

@@ -25,12 +25,20 @@ from lidarpose.synth.generator import Generator
 from lidarpose.synth.shard_job import Job, write_dataset
 from lidarpose.train import loop, run_dir
 from lidarpose.train import setup as jobs
-from lidarpose.train.augment import AUGMENTATIONS, Augmentation, augmentation, augmented
-from lidarpose.train.example import BLIND, PELVIS_ERROR, example, seen
-from lidarpose.train.labeled_dataset import InMemoryDataset
+from lidarpose.train.augment import (
+    AUGMENTATIONS,
+    BLIND,
+    PELVIS_ERROR,
+    Augmentation,
+    augmentation,
+    augmented,
+    example,
+    seen,
+)
+from lidarpose.train.data_loader import MixedSource, StoredSource, SyntheticSource
+from lidarpose.train.datasets import InMemoryDataset
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.setup import make_setup
-from lidarpose.train.sources import MixedSource, StoredSource, SyntheticSource
 
 FEW = 16
 NAMES = ("humanm3", "lidarhuman26m", "sloper4d", "waymo")

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lidarpose.train.muon import Muon, orthogonalized
+from lidarpose.train.optim import Muon, orthogonalized
 
 SHAPES = [(6, 6), (6, 6), (12, 6), (6, 12), (6, 12), (3, 6)]
 

@@ -30,11 +30,10 @@ from lidarpose.models.posenet import Batch, PoseNet, Targets
 from lidarpose.models.voxelize import view_features, voxelize
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import SCENES
-from lidarpose.train.example import SEEN, example, seen
-from lidarpose.train.losses import SIGMA, losses
-from lidarpose.train.objective import total
+from lidarpose.train.augment import SEEN, example, seen
+from lidarpose.train.objectives.objective import total
+from lidarpose.train.objectives.posenet_objective import MAX_VOXELS, SIGMA, PoseNetObjective, losses
 from lidarpose.train.optim import optimizers
-from lidarpose.train.posenet_objective import MAX_VOXELS, PoseNetObjective
 from lidarpose.train.recipes import Pretrain
 
 TINY = preset("tiny")

@@ -24,12 +24,11 @@ from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.config import preset
 from lidarpose.models.posenet import PoseNet
 from lidarpose.train import loop, run_dir, setup
-from lidarpose.train.data_loader import BATCHES, lanes_of
-from lidarpose.train.interruption import Interrupted, StopRequest
+from lidarpose.train.data_loader import BATCHES, SyntheticSource, lanes_of
+from lidarpose.train.loop import Interrupted, StopRequest
+from lidarpose.train.objectives.posenet_objective import PoseNetObjective
 from lidarpose.train.optim import optimizers, rate_factor
-from lidarpose.train.posenet_objective import PoseNetObjective
 from lidarpose.train.recipes import Finetune, Pretrain, recipe
-from lidarpose.train.sources import SyntheticSource
 from lidarpose.train.validation import Validation
 
 # three chunks of `BATCHES` batches

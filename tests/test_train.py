@@ -20,15 +20,23 @@ from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import SCENES
 from lidarpose.train.augment import disturbed
-from lidarpose.train.data_loader import BATCHES, Chunks, loader
-from lidarpose.train.losses import CONFIDENCE, HEATMAP, JOINTS, LEVEL, SIGMA, SPREAD, VOTE, losses
-from lidarpose.train.objective import total
+from lidarpose.train.data_loader import BATCHES, Chunks, SyntheticSource, loader
+from lidarpose.train.objectives.objective import total
+from lidarpose.train.objectives.posenet_objective import (
+    CONFIDENCE,
+    HEATMAP,
+    JOINTS,
+    LEVEL,
+    SIGMA,
+    SPREAD,
+    VOTE,
+    PoseNetObjective,
+    losses,
+)
 from lidarpose.train.optim import average, optimizers, rate_factor
-from lidarpose.train.posenet_objective import PoseNetObjective
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.recipes import recipe as recipe_of
 from lidarpose.train.setup import make_setup
-from lidarpose.train.sources import SyntheticSource
 from lidarpose.train.validation import Validation
 
 # three chunks of `BATCHES` batches

@@ -75,9 +75,9 @@ def _add(parser, kind: type[Recipe]) -> None:
 
 def _train(options: argparse.Namespace) -> None:
     from lidarpose.train.loop import train
-    from lidarpose.train.pictures import draw_examples
     from lidarpose.train.recipes import recipe
     from lidarpose.train.run_dir import latest, stored_recipe
+    from lidarpose.train.validation import draw_examples
 
     kind: type[Recipe] = options.kind
     name = kind.__name__.lower()

@@ -1,4 +1,4 @@
-"""Stored people shown anew each time: crop, center, turn, mirror, scale, loss and strays.
+"""How a sample becomes an `Example`: crop, center, turn, mirror, scale, dropout and clutter points.
 
 All happens in the person's own frame but for the crop. Legend: n points.
 """
@@ -13,31 +13,57 @@ from lidarpose.errors import check_name
 from lidarpose.eval.protocols import jittered
 from lidarpose.geometry import rotation_about
 from lidarpose.models.voxelize import view_features
-from lidarpose.sample import LabeledSample, Sample, center_of
+from lidarpose.sample import LabeledSample, Pose, Sample, center_of
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth.noise import half_space_keep, jitter, noise_clusters, random_keep
-from lidarpose.train.example import BLIND, PELVIS_ERROR, REFINED, Example, seen
 
-# a person of fewer points after the crop is shown whole
+# half of the samples are centered as a user's cloud is, half about a guess of the pelvis, as in a second pass
+REFINED, PELVIS_ERROR = 0.5, 0.06
+# how often the sensor's position is kept from the network
+BLIND = 0.3
+# a joint of which the body's surface is seen within this distance is visible, m: hips lie 12 cm deep
+SEEN = 0.18
+# part of a point of which nothing is known
+UNKNOWN_PART = -1
+# a sample of fewer points after the crop stays whole
 LEAST_POINTS = 5
-# largest number of strays in a blob
-_STRAYS = 60
-# of a synthetic person's, and steps on their coordinates, m
-_MOST_STRAYS, _NOISE = 200, (0.005, 0.08)
-_Sample = TypeVar("_Sample", bound=Sample)
+# largest number of clutter points in a cluster
+_CLUTTER = 60
+# of a synthetic sample's, and standard deviations of its noise, m
+_MOST_CLUTTER, _NOISE = 200, (0.005, 0.08)
+_PELVIS = BODY26.index("pelvis")
+_HIPS = [BODY26.index("left_hip"), BODY26.index("right_hip")]
 _FLIP_PART = np.array([-1, 0, *(1 + np.array(SMPL24.flip))], np.int16)
+_Sample = TypeVar("_Sample", bound=Sample)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Example:
+    """One person in their own frame, z up, as a training step shows them.
+
+    points (n, 3) float32 m; part (n,) int: 0 = not body, 1 + j = the bone of SMPL-24's joint j, -1 = not known; joints
+    (26, 3) float32 m of body26, NaN where there is no label; visible (26,) float32: 1 seen, 0 not, NaN not known;
+    view (5,): `voxelize.view_features`; seed: of what is drawn when the example is collated.
+    """
+
+    points: np.ndarray
+    part: np.ndarray
+    joints: np.ndarray
+    visible: np.ndarray
+    view: np.ndarray
+    seed: int
 
 
 @dataclass(frozen=True, kw_only=True)
 class Augmentation:
-    """How often what happens to a person.
+    """How often a sample is changed, and by how much.
 
     released: crop and center as the released code's, else by a box and by the points; box: probability that a box has a
     detector's errors, those of the protocol clean, else it crops nothing; refined: that the center is a guess of the
-    pelvis; cut: probability that part of the cloud is cut off by a plane; turn: of a turn about
-    z by any angle; scale: sizes from 1 - scale to 1 + scale; flip: of a mirror, across x and across y on their own;
-    jitter: standard deviation of each coordinate, m, cut at four times that; drop: probability that a fifth of the
-    points is lost; strays: of blobs of stray points.
+    pelvis; cut: that part of the cloud is cut off by a plane; turn: of a turn about z by any angle; scale: sizes from
+    1 - scale to 1 + scale; flip: of a mirror, across x and across y on their own; jitter: standard deviation of each
+    coordinate, m, cut at four times that; drop: probability that a fifth of the points is lost; strays: of clusters of
+    clutter points.
     """
 
     released: bool = False
@@ -66,103 +92,132 @@ def augmentation(name: str) -> Augmentation:
     return AUGMENTATIONS[name]
 
 
-def augmented(person: LabeledSample, kind: Augmentation, rng: np.random.Generator) -> Example:
-    """A stored person as a step of training shows them. Labels that are missing stay missing."""
-    person, center = _view(person, kind, rng)
-    origin = np.zeros(3) if person.sensor_known and rng.random() >= BLIND else None
+def example(sample: Sample, rng: np.random.Generator, *, refined: float = REFINED) -> Example:
+    """A synthetic sample, pose and parts known, as a training step shows it.
+
+    The center is that of the points or a guess of the pelvis (refined: how often), the sensor, at the origin of the
+    sample's frame, is known or not.
+    """
+    assert sample.pose is not None and sample.part is not None
+    center = sample.center
+    if rng.random() < refined:
+        center = sample.pose.joints[_PELVIS] + rng.normal(0, PELVIS_ERROR, 3)
+    origin = None if rng.random() < BLIND else np.zeros(3)
+    points, joints = sample.points - center, sample.pose.joints - center
+    visible = seen(joints, points[sample.part > 0]).astype(np.float32)
+    return _example(points, sample.part, joints, visible, view_features(center, origin), rng)
+
+
+def augmented(sample: LabeledSample, kind: Augmentation, rng: np.random.Generator) -> Example:
+    """A stored sample, with the joints of body26, as a training step shows it. Missing labels stay missing."""
+    sample, center = _view(sample, kind, rng)
+    origin = np.zeros(3) if sample.sensor_known and rng.random() >= BLIND else None
     view = view_features(center, origin)
-    points, joints, part = person.points - center, person.joints - center, person.part
-    visible = person.pose.visible
-    R = _turn(kind, rng) * (1 + kind.scale * rng.uniform(-1, 1))
+    part, visible = _labels(sample)
+    points, joints = sample.points - center, sample.joints - center
+    yaw = rng.uniform(-np.pi, np.pi)
+    R = rotation_about("z", yaw if rng.random() < kind.turn else 0.0) * (1 + kind.scale * rng.uniform(-1, 1))
     mirrors = rng.random(2) < kind.flip
     R = np.diag([*np.where(mirrors, -1.0, 1.0), 1.0]) @ R
     if mirrors.sum() == 1:
         flip = list(BODY26.flip)
         joints, visible, part = joints[flip], visible[flip], _FLIP_PART[part + 1]
-    points, joints = points @ R.T, joints @ R.T
-    toward = view[:3] @ R.T
-    view = np.concatenate([toward / max(np.linalg.norm(toward), 1e-9), view[3:]]).astype(np.float32)
+    points, joints, toward = points @ R.T, joints @ R.T, view[:3] @ R.T
+    view = np.concatenate([toward / max(float(np.linalg.norm(toward)), 1e-9), view[3:]]).astype(np.float32)
     if rng.random() < kind.drop:
-        kept = random_keep(len(points), share=0.2, rng=rng)
-        points, part = points[kept], part[kept]
+        keep = random_keep(len(points), share=0.2, rng=rng)
+        points, part = points[keep], part[keep]
     if kind.jitter:
         points = jitter(points, sigma=kind.jitter, clip=4 * kind.jitter, rng=rng)
     if rng.random() < kind.strays:
-        stray = noise_clusters(np.zeros(3), most=_STRAYS, rng=rng)
-        points = np.concatenate([points, stray])
-        part = np.concatenate([part, np.zeros(len(stray), part.dtype)])
-    return Example(
-        points=points.astype(np.float32),
-        part=part,
-        joints=joints.astype(np.float32),
-        visible=visible,
-        view=view,
-        seed=int(rng.integers(2**31)),
-    )
+        points, part = _with_clutter(points, part, np.zeros(3), _CLUTTER, rng)
+    return _example(points, part, joints, visible, view, rng)
 
 
-def disturbed(one: _Sample, *, strays: float, noise: float, rng: np.random.Generator) -> _Sample:
-    """A synthetic person whose points are worse than a sensor's: with probability `strays` blobs of stray points, which
-    no box has cut, and with probability `noise` normal steps of 0.5 to 8 cm on every coordinate.
+def _example(
+    points: np.ndarray,
+    part: np.ndarray,
+    joints: np.ndarray,
+    visible: np.ndarray,
+    view: np.ndarray,
+    rng: np.random.Generator,
+) -> Example:
+    seed = int(rng.integers(2**31))
+    points, joints = points.astype(np.float32), joints.astype(np.float32)
+    return Example(points=points, part=part, joints=joints, visible=visible, view=view, seed=seed)
+
+
+def disturbed(sample: _Sample, *, strays: float, noise: float, rng: np.random.Generator) -> _Sample:
+    """A synthetic sample whose points are worse than a sensor's: with probability `strays` clusters of clutter points,
+    which no box has cut, and with probability `noise` normal steps of 0.5 to 8 cm on every coordinate.
 
     Paper: the disturbances of its stability study, of any size. The center is that of what is there now.
     """
-    points, part = one.points, one.part
+    points, part = sample.points, sample.part
+    assert part is not None
     chance = rng.random(2)
     if chance[0] < strays:
-        most = min(_MOST_STRAYS, _STRAYS // 3 + len(points))
-        blobs = noise_clusters(one.center, most=most, rng=rng)
-        points = np.concatenate([points, blobs.astype(np.float32)])
-        part = np.concatenate([part, np.zeros(len(blobs), part.dtype)])
+        most = min(_MOST_CLUTTER, _CLUTTER // 3 + len(points))
+        points, part = _with_clutter(points, part, sample.center, most, rng)
+        points = points.astype(np.float32)
     if chance[1] < noise:
         sigma = np.exp(rng.uniform(*np.log(_NOISE)))
         points = jitter(points, sigma=sigma, clip=2 * sigma, rng=rng).astype(np.float32)
-    if points is one.points:
-        return one
-    # strays come from no ring
-    return replace(one, points=points, part=part, ring=None, center=center_of(points))
+    if points is sample.points:
+        return sample
+    # clutter comes from no ring
+    return replace(sample, points=points, part=part, ring=None, center=center_of(points))
 
 
-def _view(person: LabeledSample, kind: Augmentation, rng: np.random.Generator) -> tuple[LabeledSample, np.ndarray]:
-    """The person's crop and its center (3,) m."""
+def _with_clutter(
+    points: np.ndarray, part: np.ndarray, center: np.ndarray, most: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    clutter = noise_clusters(center, most=most, rng=rng)
+    return np.concatenate([points, clutter]), np.concatenate([part, np.zeros(len(clutter), part.dtype)])
+
+
+def seen(joints: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """joints (J, 3) m, points (n, 3) m on the body -> (J,) bool: some point lies within `SEEN` of the joint."""
+    if not len(points):
+        return np.zeros(len(joints), bool)
+    square = (joints**2).sum(1)[:, None] + (points**2).sum(1) - 2 * joints @ points.T
+    return square.min(1) < SEEN**2
+
+
+def _view(sample: LabeledSample, kind: Augmentation, rng: np.random.Generator) -> tuple[LabeledSample, np.ndarray]:
+    """The sample's crop and its center (3,) m."""
     if kind.released:
-        kept, center = released_view(person.points, person.joints, person.centers, person.box)
-        return _kept(person, kept), person.center if center is None else center
-    keep = np.ones(len(person.points), bool)
-    if person.box is not None and rng.random() < kind.box:
-        keep &= jittered(person.box, rng).contains(person.points)
+        keep, center = released_view(sample.points, sample.joints, sample.centers, sample.box)
+        return _cropped(sample, keep), sample.center if center is None else center
+    keep = np.ones(len(sample.points), bool)
+    if sample.box is not None and rng.random() < kind.box:
+        keep &= jittered(sample.box, rng).contains(sample.points)
     if rng.random() < kind.cut:
-        keep &= half_space_keep(person.points, most=0.4, rng=rng)
-    person = _kept(person, keep)
-    center = center_of(person.points)
-    root = _root(person.joints)
-    if root is not None and rng.random() < kind.refined:
+        keep &= half_space_keep(sample.points, most=0.4, rng=rng)
+    sample = _cropped(sample, keep)
+    center = center_of(sample.points)
+    # where the pelvis is not labelled, half way between the hips: what a second pass centers on
+    pelvis = sample.joints[_PELVIS]
+    root = sample.joints[_HIPS].mean(0) if np.isnan(pelvis).any() else pelvis
+    if not np.isnan(root).any() and rng.random() < kind.refined:
         center = root + rng.normal(0, PELVIS_ERROR, 3)
-    return person, center
+    return sample, center
 
 
-def _kept(person: LabeledSample, keep: np.ndarray) -> LabeledSample:
+def _cropped(sample: LabeledSample, keep: np.ndarray) -> LabeledSample:
     if keep.all() or keep.sum() < LEAST_POINTS:
-        return person
-    # a joint whose points are all gone is not seen any more
-    gone = _near(person, np.ones_like(keep)) & ~_near(person, keep)
-    visible = np.where(gone & (person.pose.visible == 1), np.float32(0), person.pose.visible)
-    pose = replace(person.pose, visible=visible)
-    return replace(person, points=person.points[keep], part=person.part[keep], pose=pose)
+        return sample
+    part, visible = _labels(sample)
+    # a joint whose points are all gone is not seen any more; points whose part is unknown count as body
+    body = part != 0
+    gone = seen(sample.joints, sample.points[body]) & ~seen(sample.joints, sample.points[keep & body])
+    visible = np.where(gone & (visible == 1), np.float32(0), visible)
+    pose = Pose(joints=sample.joints, visible=visible, skeleton=BODY26, frame="sensor")
+    return replace(sample, points=sample.points[keep], part=part[keep], pose=pose)
 
 
-def _near(person: LabeledSample, keep: np.ndarray) -> np.ndarray:
-    """(26,) bool: some point of the body, or of which nothing is known, lies near the joint; keep (n,): which count."""
-    return seen(person.joints, person.points[keep & (person.part != 0)])
-
-
-def _root(joints: np.ndarray) -> np.ndarray | None:
-    """The pelvis, or half way between the hips where it is not labelled; what a second pass centers on."""
-    pelvis = joints[BODY26.index("pelvis")]
-    hips = joints[[BODY26.index("left_hip"), BODY26.index("right_hip")]].mean(0)
-    return next((place for place in (pelvis, hips) if not np.isnan(place).any()), None)
-
-
-def _turn(kind: Augmentation, rng: np.random.Generator) -> np.ndarray:
-    yaw = rng.uniform(-np.pi, np.pi)
-    return rotation_about("z", yaw if rng.random() < kind.turn else 0.0)
+def _labels(sample: LabeledSample) -> tuple[np.ndarray, np.ndarray]:
+    """part (n,) and visible (26,), which samples of an `InMemoryDataset` always have."""
+    part, visible = sample.part, sample.pose.visible
+    assert part is not None and visible is not None
+    return part, visible

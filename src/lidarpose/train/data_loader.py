@@ -1,9 +1,10 @@
-"""A run's people as batches, made by worker processes and shared out among the processes of a run. No network here.
+"""A run's examples: their sources (synthetic, stored, mixed), and the loader of batches.
 
-Chunk c holds people c * CHUNK ... of the run, whatever the number of workers and processes, so a run can be taken up at
-any chunk. A chunk is sorted by voxels before it is cut into batches: padding is what a small network spends its time
-on. It is sorted in lanes, and a process takes whole lanes: nobody makes people for another process, and the batches of
-all of them together are the same however many there are.
+A source is a function of an example's number in the run alone, so any process makes any example, in any order. Chunk c
+holds the examples of steps c * BATCHES ... whatever the number of workers and processes, so a run can resume at any
+chunk. A chunk is sorted by voxels before it is cut into batches: padding is what a small network spends its time on. It
+is sorted in lanes, and a process takes whole lanes: no process makes examples for another, and the batches of all of
+them together are the same however many there are.
 """
 
 import os
@@ -12,27 +13,124 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
-from math import gcd
-from typing import Any
+from functools import cached_property, lru_cache, partial
+from math import floor, gcd
+from typing import Any, Protocol
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from lidarpose.errors import InputError
-from lidarpose.train.example import Example
-from lidarpose.train.objective import Objective
-from lidarpose.train.sources import Source
+from lidarpose.synth.bodies import PoseBank
+from lidarpose.synth.generator import Generator
+from lidarpose.synth.scene import scene_config
+from lidarpose.train.augment import REFINED, Augmentation, Example, augmented, disturbed, example
+from lidarpose.train.datasets import InMemoryDataset
+from lidarpose.train.objectives.objective import Objective
 
 # batches a chunk
 BATCHES = 8
 # lanes at most, and so processes
 LANES = 8
-# how often a worker looks whether its parent lives, s
-_LOOK = 1.0
-# what orders batches of a chunk
-_ORDER = 8
+# how often a worker checks that its parent lives, s
+_POLL = 1.0
+# scenes whose every person is as the paper says, masked always
+_OF_ONE_DIFFICULTY = ("paper", "reference")
+# first words of generators' seeds: 1 is the synthetic person's own, 9 and 10 are the loop's
+_SYNTHETIC, _STORED, _EPOCH_ORDER, _BATCH_ORDER = 2, 5, 6, 8
+
+
+class Source(Protocol):
+    """People by their number in a run. May be pickled."""
+
+    def example(self, index: int) -> Example: ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class SyntheticSource:
+    """People of a scene whose difficulty rises.
+
+    easy: how many people it takes to rise from nothing to full; below the ceiling every difficulty goes on being seen,
+    the harder ones more often, but for the paper's scenes, which know one difficulty; motion, subjects, captured,
+    strays, noise: see `recipes.Pretrain`; refined: see `example`. Raises InputError, at once, for an unknown scene and
+    for clips that cannot be read.
+    """
+
+    scene: str
+    seed: int
+    easy: float = 0.0
+    motion: str | None = None
+    subjects: tuple[str, ...] = ()
+    captured: float = 0.0
+    strays: float = 0.0
+    noise: float = 0.0
+    refined: float = REFINED
+
+    def __post_init__(self):
+        # here, not in a worker, whose errors come wrapped in a traceback
+        self._generator  # noqa: B018
+
+    def __getstate__(self) -> dict:
+        # each process reads the clips itself
+        return {name: value for name, value in vars(self).items() if name != "_generator"}
+
+    @cached_property
+    def _generator(self) -> Generator:
+        bank = PoseBank.from_clips(self.motion, self.subjects) if self.motion else None
+        captured = self.captured if bank is not None else 0.0
+        return Generator(scene=scene_config(self.scene), bank=bank, captured=captured, measure=False)
+
+    def example(self, index: int) -> Example:
+        rng = np.random.default_rng([self.seed, _SYNTHETIC, index])
+        hard = min(index / self.easy, 1.0) if self.easy else 1.0
+        if self.scene not in _OF_ONE_DIFFICULTY:
+            hard *= np.sqrt(rng.random())
+        sample = self._generator.person(self.seed, index, hard=hard).sample
+        return example(disturbed(sample, strays=self.strays, noise=self.noise, rng=rng), rng, refined=self.refined)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredSource:
+    """The people of datasets, all of them once an epoch in an order of the epoch's own, each time augmented anew.
+
+    dataset: see `InMemoryDataset.load`; strays, noise: see `disturbed`.
+    """
+
+    dataset: InMemoryDataset
+    seed: int
+    augmentation: Augmentation
+    strays: float = 0.0
+    noise: float = 0.0
+
+    def example(self, index: int) -> Example:
+        epoch, place = divmod(index, len(self.dataset))
+        row = int(_order(self.seed, epoch, len(self.dataset))[place])
+        rng = np.random.default_rng([self.seed, _STORED, index])
+        person = self.dataset.sample(row)
+        if self.strays or self.noise:
+            person = disturbed(person, strays=self.strays, noise=self.noise, rng=rng)
+        return augmented(person, self.augmentation, rng)
+
+
+@lru_cache(maxsize=2)
+def _order(seed: int, epoch: int, count: int) -> np.ndarray:
+    """(count,) int: whom an epoch shows, one after the other."""
+    return np.random.default_rng([seed, _EPOCH_ORDER, epoch]).permutation(count)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MixedSource:
+    """People of `main` in their order, and evenly spread among them people of `other`, so that these are a `share` in
+    [0, 1) of all."""
+
+    main: Source
+    other: Source
+    share: float
+
+    def example(self, index: int) -> Example:
+        before, after = floor(index * self.share), floor((index + 1) * self.share)
+        return self.other.example(before) if after > before else self.main.example(index - before)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,9 +168,9 @@ class Chunks(IterableDataset):
         mine = []
         for lane in range(self.rank, lanes, self.ranks):
             people = [self.source.example(index) for index in range(first + lane, first + batches * self.batch, lanes)]
-            mine.append(sorted(people, key=_width))
+            mine.append(sorted(people, key=_voxels))
         share = self.batch // lanes
-        order = np.random.default_rng([self.seed, _ORDER, chunk]).permutation(batches)
+        order = np.random.default_rng([self.seed, _BATCH_ORDER, chunk]).permutation(batches)
         return [self.task.collate([e for lane in mine for e in lane[k * share : (k + 1) * share]]) for k in order]
 
 
@@ -91,9 +189,9 @@ def lanes_of(batch: int, ranks: int = 1) -> int:
     return lanes
 
 
-def _width(one: Example) -> int:
-    """Cells of 10 cm stand for voxels: what matters is that like comes to like."""
-    return len(np.unique(np.floor(one.points * 10), axis=0))
+def _voxels(example: Example) -> int:
+    """Cells of 10 cm stand for voxels: what matters is that examples of like size share a batch."""
+    return len(np.unique(np.floor(example.points * 10), axis=0))
 
 
 def loader(chunks: Chunks, *, workers: int) -> DataLoader:
@@ -118,7 +216,7 @@ def _end_with(parent: int, worker: int) -> None:
 
     def watch() -> None:
         while os.getppid() == parent:
-            time.sleep(_LOOK)
+            time.sleep(_POLL)
         os._exit(1)
 
     # Ctrl-C reaches workers too, and the parent still needs them for the batches that it finishes

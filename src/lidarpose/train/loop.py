@@ -1,4 +1,4 @@
-"""The training loop: people in, a run folder out (see `runs`), on one process or many.
+"""The training loop: examples in, a run folder out (see `run_dir`), on one process or many.
 
 A run killed at any moment goes on with `resume`, to the same losses. Processes are those of Accelerate's or torch's
 launcher; each makes its share of every batch, and together they take the same steps as one.
@@ -9,11 +9,14 @@ import os
 import shlex
 import signal
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, nullcontext
 from importlib.util import find_spec
 from pathlib import Path
+from types import FrameType
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,10 +27,9 @@ from lidarpose.errors import InputError, check_name
 from lidarpose.models.checkpoint import save_checkpoint
 from lidarpose.progress import Progress
 from lidarpose.train.data_loader import BATCHES, Chunks, chunks_of, lanes_of, loader
-from lidarpose.train.interruption import Interrupted, StopRequest
-from lidarpose.train.objective import total
+from lidarpose.train.objectives.objective import total
 from lidarpose.train.optim import average, optimizers, set_rates
-from lidarpose.train.recipes import Recipe
+from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.run_dir import (
     BEST,
     LOG,
@@ -42,12 +44,13 @@ from lidarpose.train.run_dir import (
     folder_names,
     held,
     latest,
+    load_state,
     numbered,
+    save_state,
     stored_command,
     stored_recipe,
 )
 from lidarpose.train.setup import TrainSetup, make_setup
-from lidarpose.train.train_state import load_state, save_state
 from lidarpose.train.validation import Draw, Validation
 
 # of Accelerate's, those that are known to work with a run's folder
@@ -56,12 +59,44 @@ TRACKERS = ("tensorboard", "wandb")
 SAVE_EVERY = 120
 # validations in a run whose recipe does not say how many
 _VALIDATIONS = 20
-# first words of generators' seeds; see `sources`
+# first words of generators' seeds; see `data_loader`
 _INIT, _STEP = 9, 10
 
 
+class Interrupted(KeyboardInterrupt):
+    """A run that was asked to stop and has saved its state. `status` is the exit status of a shell."""
+
+    def __init__(self, message: str, number: int):
+        super().__init__(message)
+        self.status = 128 + number
+
+
+class StopRequest:
+    """Notes the first SIGINT or SIGTERM inside its `with` block; a second one stops at once, as without this class.
+
+    Python delivers signals to the main thread alone: in any other thread nothing is noted.
+    """
+
+    number: int = 0
+
+    def __enter__(self) -> "StopRequest":
+        numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+        self._before = {number: signal.signal(number, self._note) for number in numbers}
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        if self.number:
+            raise KeyboardInterrupt
+        self.number = number
+        print("lidarpose: finishing these batches and saving; once more to stop at once", file=sys.stderr)
+
+
 def train(
-    recipe: Recipe,
+    recipe: Pretrain | Finetune,
     folder: str | Path | None = None,
     *,
     setup: TrainSetup | None = None,
@@ -86,8 +121,7 @@ def train(
     if resume:
         folder = latest(kind.__name__.lower()) if folder is None else Path(folder)
         check_same(folder, stored_recipe(folder, kind), recipe)
-        begun = stored_command(folder)
-        command = f"{begun}; then {command}" if begun and command else begun or command
+        command = "; then ".join(text for text in (stored_command(folder), command) if text)
     elif folder is None and int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise InputError("several processes need to know the run's folder: name it")
     elif folder is not None:
@@ -100,12 +134,11 @@ def train(
     folder = numbered(kind.__name__.lower()) if folder is None else Path(folder)
     accelerator.project_configuration.set_directories(str(folder))
     run = _Run(recipe, setup, folder, accelerator, command, draw)
-    if accelerator.is_main_process:
-        for warning in setup.warnings:
-            _warn(warning)
+    for warning in setup.warnings if accelerator.is_main_process else ():
+        _warn(warning)
     with held(folder) if accelerator.is_main_process else nullcontext(), StopRequest() as stop:
         if resume:
-            run.take_up()
+            run.resume()
         elif accelerator.is_main_process:
             begin(folder, recipe, command)
         accelerator.wait_for_everyone()
@@ -113,7 +146,7 @@ def train(
             settings = {name: value for name, value in recipe.to_dict().items() if isinstance(value, int | float | str)}
             accelerator.init_trackers("lidarpose", config=settings)
         try:
-            run.go(stop)
+            run.steps_until(stop)
         finally:
             if tracker is not None:
                 accelerator.end_training()
@@ -124,7 +157,7 @@ def _warn(text: str) -> None:
     print(f"lidarpose: warning: {text}", file=sys.stderr)
 
 
-def _accelerator(recipe: Recipe, device: str | None, tracker: str | None) -> Accelerator:
+def _accelerator(recipe: Pretrain | Finetune, device: str | None, tracker: str | None) -> Accelerator:
     on_cpu = _on_cpu(device)
     half = recipe.precision == "bf16" or recipe.precision == "auto" and not on_cpu and torch.cuda.is_bf16_supported()
     try:
@@ -153,7 +186,13 @@ class _Run:
     """A run that goes on: the network, the mean of its weights, its optimizers, how far it is."""
 
     def __init__(
-        self, recipe: Recipe, setup: TrainSetup, folder: Path, accelerator: Accelerator, command: str, draw: Draw | None
+        self,
+        recipe: Pretrain | Finetune,
+        setup: TrainSetup,
+        folder: Path,
+        accelerator: Accelerator,
+        command: str,
+        draw: Draw | None,
     ):
         self.recipe, self.setup, self.folder, self.command = recipe, setup, folder, command
         self.accelerator = accelerator
@@ -167,8 +206,8 @@ class _Run:
         self.chunk, self.seconds, self.best = 0, 0.0, float("inf")
         self.validation = Validation(setup, recipe, folder, draw)
 
-    def take_up(self) -> None:
-        """The state of the run that was stopped; the beginning, where it was killed before its first was saved."""
+    def resume(self) -> None:
+        """Loads the state of the run that was stopped; stays at the beginning, where none was saved yet."""
         if (self.folder / STATE).is_file():
             progress = load_state(self.folder / STATE, self.network, self.mean, self.optimizers)
             done, self.seconds = progress["steps"], progress["seconds"]
@@ -188,57 +227,42 @@ class _Run:
             cut_log(self.folder, self.seen)
 
     @property
-    def taken(self) -> int:
+    def steps_done(self) -> int:
         """Steps of all chunks that are done."""
         return min(self.chunk * BATCHES, self.steps)
 
     @property
     def seen(self) -> int:
-        """People of all chunks that are done."""
-        return self.taken * self.recipe.batch
+        """Samples of all chunks that are done."""
+        return self.steps_done * self.recipe.batch
 
-    def go(self, stop: StopRequest) -> None:
+    def steps_until(self, stop: StopRequest) -> None:
         """All that is left of the run, or until `stop` is asked for. Raises `Interrupted` in the latter case."""
-        main = self.accelerator.is_main_process
-        people = Chunks(
-            source=self.setup.source,
-            task=self.setup.task,
-            batch=self.recipe.batch,
-            seed=self.recipe.seed,
-            start=self.chunk,
-            steps=self.steps,
-            rank=self.accelerator.process_index,
-            ranks=self.accelerator.num_processes,
-        )
-        due = self.recipe.validate or max(self.setup.people // _VALIDATIONS, 1)
+        main, people = self.accelerator.is_main_process, self.setup.people
+        validate_every = self.recipe.validate or max(people // _VALIDATIONS, 1)
         started = saved = time.monotonic()
-        before = self.seconds
+        seconds_before = self.seconds
         with ExitStack() as stack:
             log = stack.enter_context(open(self.folder / LOG, "a")) if main else None
-            done = min(self.seen, self.setup.people)
-            bar = stack.enter_context(Progress(self.setup.people, unit="people", done=done, shown=main))
-            for batches in self._chunks(people):
-                before_it = self.seen
-                line, stopping = self._chunk(batches, stop)
-                self.seconds = before + time.monotonic() - started
-                entry = {"people": self.seen, "seconds": round(self.seconds, 1)} | line
+            bar = stack.enter_context(Progress(people, unit="people", done=min(self.seen, people), shown=main))
+            for batches in self._chunks():
+                seen_before = self.seen
+                terms, stopping = self._chunk(batches, stop)
+                self.seconds = seconds_before + time.monotonic() - started
+                entry = {"people": self.seen, "seconds": round(self.seconds, 1)} | terms
                 last = self.chunk == self.chunks
-                if last or self.seen // due > before_it // due:
-                    entry |= self._validated(self.seen)
-                if main:
+                if main and (last or self.seen // validate_every > seen_before // validate_every):
+                    entry |= self._validated()
+                self.accelerator.log({k: v for k, v in entry.items() if k != "people"}, step=self.seen)
+                bar.update(min(self.seen, people), self._note(terms))
+                if log is not None:
                     log.write(json.dumps(entry) + "\n")
                     log.flush()
-                self.accelerator.log({k: v for k, v in entry.items() if k != "people"}, step=entry["people"])
-                note = f"loss {sum(v for k, v in line.items() if k not in ('mpjpe', 'gradient')):.3f}"
-                note += f", mpjpe {line['mpjpe'] * 1e3:.0f} mm"
-                if self.validation.last is not None:
-                    note += f", validation {self.validation.last:.0f} mm"
-                bar.update(min(self.seen, self.setup.people), note)
-                if main and (last or stopping or time.monotonic() - saved > SAVE_EVERY):
-                    # the state must not be on the disk before the log
-                    os.fsync(log.fileno())
-                    self._save()
-                    saved = time.monotonic()
+                    if last or stopping or time.monotonic() - saved > SAVE_EVERY:
+                        # the state must not be on the disk before the log
+                        os.fsync(log.fileno())
+                        self._save()
+                        saved = time.monotonic()
                 if stopping and not last:
                     # all processes take this branch: the request was shared with the losses
                     kind, where = type(self.recipe).__name__.lower(), shlex.quote(str(self.folder))
@@ -249,10 +273,26 @@ class _Run:
                     )
         self.accelerator.wait_for_everyone()
 
-    def _chunks(self, people: Chunks) -> Iterator[list]:
-        """As the loader gives them. Raises InputError where one of its processes was killed."""
+    def _note(self, terms: dict[str, float]) -> str:
+        """What the progress bar shows."""
+        loss = sum(value for name, value in terms.items() if name not in ("mpjpe", "gradient"))
+        note = f"loss {loss:.3f}, mpjpe {terms['mpjpe'] * 1e3:.0f} mm"
+        return note if self.validation.last is None else f"{note}, validation {self.validation.last:.0f} mm"
+
+    def _chunks(self) -> Iterator[list]:
+        """The chunks that are left. Raises InputError where a process of the loader was killed."""
+        chunks = Chunks(
+            source=self.setup.source,
+            task=self.setup.task,
+            batch=self.recipe.batch,
+            seed=self.recipe.seed,
+            start=self.chunk,
+            steps=self.steps,
+            rank=self.accelerator.process_index,
+            ranks=self.accelerator.num_processes,
+        )
         try:
-            yield from loader(people, workers=self.recipe.workers)
+            yield from loader(chunks, workers=self.recipe.workers)
         except RuntimeError as error:
             if "DataLoader worker" not in str(error):
                 raise
@@ -271,11 +311,10 @@ class _Run:
         values, asked = self.accelerator.reduce(torch.cat([values, asked], 1), "mean").cpu().split((len(names), 1), 1)
         broken = (~values.isfinite().all(1)).nonzero().flatten().tolist()
         if broken:
-            first = self.seen
-            kept = f"{STATE} is kept" if (self.folder / STATE).is_file() else "nothing was saved before"
+            state = f"{STATE} is kept" if (self.folder / STATE).is_file() else "nothing was saved before"
             raise InputError(
                 f"the loss or its gradient is not finite in batch {broken[0]} of the {len(batches)} from person "
-                f"{first} on: start in another folder with a lower --rate; {kept}"
+                f"{self.seen} on: start in another folder with a lower --rate; {state}"
             )
         self.chunk += 1
         means = {name: round(value, 5) for name, value in zip(names, values.mean(0).tolist(), strict=True)}
@@ -306,41 +345,38 @@ class _Run:
         network.load_state_dict(self.network.state_dict() | self.mean)
         return network.eval()
 
-    def _validated(self, people: int) -> dict[str, float]:
-        """On the first process; the weights of the best validation are kept."""
-        if not self.accelerator.is_main_process:
-            return {}
+    def _validated(self) -> dict[str, float]:
+        """On the main process; the weights of the best validation are kept."""
         network = self._averaged()
-        error = self.validation.run(network, people, self.accelerator.device)
+        error = self.validation.run(network, self.seen, self.accelerator.device)
         if error is None:
             return {}
         if error < self.best:
             self.best = error
-            self._save_weights(BEST, network, validation=error)
+            self._save_weights(BEST, network)
         return {"validation_mm": round(error, 2)}
 
     def _save(self) -> None:
         # the state last: killed between the two, a run goes on from the older one and writes both again
         self._save_weights(MODEL, self._averaged())
         best = self.best if np.isfinite(self.best) else None
-        progress = {"steps": self.taken, "seconds": self.seconds, "best": best, "validation": self.validation.last}
+        progress = {"steps": self.steps_done, "seconds": self.seconds, "best": best, "validation": self.validation.last}
         save_state(self.folder / STATE, self.network, self.mean, self.optimizers, progress)
 
-    def _save_weights(self, name: str, network: nn.Module, **more: float) -> None:
-        stated = self.recipe.to_dict()
-        for entry in PATHS:
-            # names of files, not where they lie
-            value = stated.get(entry)
-            if value:
-                stated[entry] = Path(value).name if isinstance(value, str) else folder_names(value)
+    def _save_weights(self, name: str, network: Any) -> None:
+        recipe = self.recipe.to_dict()
+        for field in PATHS:
+            if value := recipe.get(field):
+                # names of files, not where they lie
+                recipe[field] = Path(value).name if isinstance(value, str) else folder_names(value)
         card = {
             "command": self.command or "lidarpose.train.loop.train",
-            "recipe": stated,
+            "recipe": recipe,
             "people_seen": self.seen,
             "hours": round(self.seconds / 3600, 3),
         }
         if self.validation.last is not None:
-            card["validation_mm"] = round(more.get("validation", self.validation.last), 2)
+            card["validation_mm"] = round(self.validation.last, 2)
         save_checkpoint(self.folder / name, network, card=card | self.setup.card)
 
 

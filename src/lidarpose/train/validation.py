@@ -1,4 +1,4 @@
-"""A run's validation: the same people every time, their mean error, and a picture of some of them."""
+"""A run's validation: the same samples every time, their mean error, and a picture of some of them."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -8,13 +8,14 @@ import torch
 from torch import nn
 
 from lidarpose.io.files import write_atomic
-from lidarpose.skeleton import Skeleton
-from lidarpose.train.example import Example
+from lidarpose.sample import Pose
+from lidarpose.skeleton import BODY26, Skeleton
+from lidarpose.train.augment import Example
 from lidarpose.train.recipes import Recipe
 from lidarpose.train.run_dir import PICTURES
 from lidarpose.train.setup import TrainSetup
 
-# people in their own frames, predicted joints (N, 26, 3) m of body26, the skeleton to draw, a title -> PNG
+# examples in their own frames, predicted joints (N, 26, 3) m of body26, the skeleton to draw, a title -> PNG
 Draw = Callable[[list[Example], np.ndarray, Skeleton, str], bytes]
 
 
@@ -24,34 +25,42 @@ class Validation:
     def __init__(self, setup: TrainSetup, recipe: Recipe, folder: Path, draw: Draw | None = None):
         self.setup, self.recipe, self.folder, self.draw = setup, recipe, folder, draw
         self.last: float | None = None
-        self._people: list[Example] | None = None
+        self._examples: list[Example] | None = None
 
     def run(self, network: nn.Module, people: int, device: torch.device | str) -> float | None:
-        """MPJPE in mm of a network in evaluation mode over the labelled joints that it has; None with nobody to
+        """MPJPE in mm of a network in evaluation mode over the labelled joints that it has; None with no sample to
         validate on. people: seen so far, which names the picture."""
-        if self._people is None:
-            self._people = self.setup.validation()
-        if not self._people:
+        if self._examples is None:
+            self._examples = self.setup.validation()
+        examples, size, task = self._examples, self.recipe.batch, self.setup.task
+        if not examples:
             return None
-        joints = self.predicted(network, self._people, device)
-        true = np.stack([one.joints for one in self._people])
+        batches = [task.collate(examples[k : k + size]) for k in range(0, len(examples), size)]
+        joints = np.concatenate([task.joints(network, batch, device=device) for batch in batches])
+        true = np.stack([example.joints for example in examples])
         # labelled, and of a joint that the network has; what is not finite though it should be, must be seen
-        judged = ~np.isnan(true).any(-1) & ~np.isnan(joints).all((0, 2))
-        self.last = float(np.linalg.norm(joints - true, axis=-1)[judged].mean() * 1e3)
+        counted = ~np.isnan(true).any(-1) & ~np.isnan(joints).all((0, 2))
+        self.last = float(np.linalg.norm(joints - true, axis=-1)[counted].mean() * 1e3)
         if self.recipe.pictures and self.draw is not None:
-            self._drawn(joints, people)
+            rows = np.unique(np.linspace(0, len(joints) - 1, min(self.recipe.pictures, len(joints))).astype(int))
+            shown = [examples[k] for k in rows]
+            picture = self.draw(shown, joints[rows], self.setup.joints, f"after {people:,} people")
+            write_atomic(self.folder / PICTURES / f"people-{people:09d}.png", picture)
         return self.last
 
-    def predicted(self, network: nn.Module, people: list[Example], device: torch.device | str) -> np.ndarray:
-        """(N, 26, 3) m."""
-        size = self.recipe.batch
-        parts = [people[k : k + size] for k in range(0, len(people), size)]
-        return np.concatenate(
-            [self.setup.task.joints(network, self.setup.task.collate(p), device=device) for p in parts]
-        )
 
-    def _drawn(self, joints: np.ndarray, people: int) -> None:
-        chosen = np.unique(np.linspace(0, len(joints) - 1, min(self.recipe.pictures, len(joints))).astype(int))
-        shown = [self._people[k] for k in chosen]
-        picture = self.draw(shown, joints[chosen], self.setup.joints, f"after {people:,} people")
-        write_atomic(self.folder / PICTURES / f"people-{people:09d}.png", picture)
+def draw_examples(examples: list[Example], joints: np.ndarray, skeleton: Skeleton, title: str) -> bytes:
+    """A PNG of people in their own frames with predicted joints (N, 26, 3) m of body26, drawn in `skeleton`."""
+    from lidarpose.viz.draw import Panel, draw_people
+
+    def pose(joints: np.ndarray) -> Pose | None:
+        # none where the skeleton's joints are not all known
+        own = joints[BODY26.map_to(skeleton)]
+        return None if np.isnan(own).any() else Pose(joints=own, skeleton=skeleton)
+
+    panels = []
+    for example, predicted in zip(examples, joints, strict=True):
+        error = np.nanmean(np.linalg.norm(predicted - example.joints, axis=-1)) * 1e3
+        label = f"{len(example.points)} points, {error:.0f} mm"
+        panels.append(Panel(points=example.points, pose=pose(predicted), truth=pose(example.joints), label=label))
+    return draw_people(panels, title=title)

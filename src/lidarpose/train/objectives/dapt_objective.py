@@ -12,17 +12,17 @@ from torch import Tensor
 
 from lidarpose.errors import InputError, check_name
 from lidarpose.models.dapt.dapt_config import PARTS, DaptConfig, named_config
-from lidarpose.models.dapt.dapt_net import DaptBatch, DaptNet, DaptOutputs
+from lidarpose.models.dapt.dapt_net import DaptBatch, DaptNet
 from lidarpose.models.dapt.voxel_tables import LAYOUTS, Tables, build_tables
 from lidarpose.skeleton import BODY26, HUMAN15
-from lidarpose.train.dapt_losses import DaptTargets, finetuning, pretraining
-from lidarpose.train.dapt_transfer import transferred
-from lidarpose.train.example import UNKNOWN_PART, Example
-from lidarpose.train.objective import Share, alone
-
-__all__ = ["DaptArrays", "DaptObjective", "finetuning_config", "pretraining_config", "small", "transferred"]
+from lidarpose.train.augment import UNKNOWN_PART, Example
+from lidarpose.train.objectives.dapt_losses import DaptTargets, finetuning, pretraining
+from lidarpose.train.objectives.objective import Share, alone, majority_part
 
 STAGES = ("pretrain", "finetune")
+# outputs of heads, and those that a stage's terms read besides the auxiliary head
+_HEADS = ("logits_x", "logits_y", "logits_z", "inter", "parts", "coordinates")
+_ASKED = {"pretrain": {"coordinates", "parts"}, "finetune": {"logits_x", "logits_y", "logits_z"}}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,23 +30,29 @@ class DaptArrays:
     """A batch of people.
 
     tables: what the network reads; joints (B, J, 3) float32 m in the network's order, NaN where there is no label;
-    weight (B, J) float32: 1 for a label, else 0; part (M,) int64: the part most of a voxel's points are of, -1 where
-    none is known; None in fine-tuning.
+    part (M,) int64: the part most of a voxel's points are of, -1 where none is known; None in fine-tuning.
     """
 
     tables: Tables
     joints: np.ndarray
-    weight: np.ndarray
     part: np.ndarray | None
+
+    def targets(self, device: torch.device | str) -> DaptTargets:
+        labelled = np.isfinite(self.joints).all(-1)
+        return DaptTargets(
+            joints=torch.as_tensor(np.where(labelled[..., None], self.joints, 0)).to(device),
+            weight=torch.as_tensor(labelled.astype(np.float32)).to(device),
+            part=None if self.part is None else torch.as_tensor(self.part).to(device),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
 class DaptObjective:
-    """A `Objective` of a `DaptNet` with this configuration.
+    """The `Objective` of a `DaptNet` with this configuration.
 
     stage: "pretrain", which needs coordinates and parts, or "finetune", which needs heatmaps; layout: of the tables,
     "ragged" for CPUs and "padded" for accelerators; regression, segmentation, auxiliary: weights, see `dapt_losses`.
-    Heads that a stage does not ask get a gradient of zero. Raises InputError where the configuration lacks a head.
+    Heads that a stage does not use get a gradient of zero. Raises InputError where the configuration lacks a head.
     """
 
     config: DaptConfig
@@ -76,56 +82,49 @@ class DaptObjective:
                 "in its configuration"
             )
 
+    @property
+    def _columns(self) -> list[int]:
+        """Columns of body26 that the network's joints are."""
+        return [BODY26.index(name) for name in self.config.joints]
+
     def network(self) -> DaptNet:
         return DaptNet(self.config)
 
     def collate(self, examples: list[Example]) -> DaptArrays:
         """Of each voxel one random point is kept, as in the released code, drawn from the person's own seed.
 
-        So nobody depends on batch mates, nor on the order of their own points. The curves of people of more than
+        So no cloud depends on its batch mates, nor on the order of its points. The curves of people of more than
         `config.patch` voxels are shuffled by all seeds of the batch; smaller people attend in full, whatever the curve.
         A voxel's part is that of most of its points, where the released code takes the kept point's.
         """
-        thinned = [_thinned(one, self.config.grid) for one in examples]
+        thinned = [_thinned(example, self.config.grid) for example in examples]
         tables = build_tables(
             [points for points, _ in thinned],
             self.config,
             layout=self.layout,
-            rng=np.random.default_rng([one.seed for one in examples]),
+            rng=np.random.default_rng([example.seed for example in examples]),
         )
-        # the last entry: of the stand-in for somebody without points
+        # the last entry: of the stand-in for an empty cloud
         part = np.concatenate([*(part for _, part in thinned), [UNKNOWN_PART]])
-        order = [BODY26.index(name) for name in self.config.joints]
-        joints = np.stack([one.joints for one in examples])[:, order].astype(np.float32)
-        return DaptArrays(
-            tables=tables,
-            joints=joints,
-            weight=np.isfinite(joints).all(-1).astype(np.float32),
-            part=part[tables.kept] if self.stage == "pretrain" else None,
-        )
+        joints = np.stack([example.joints for example in examples])[:, self._columns].astype(np.float32)
+        return DaptArrays(tables=tables, joints=joints, part=part[tables.kept] if self.stage == "pretrain" else None)
 
     def terms(
         self, network: Callable, arrays: DaptArrays, *, device: torch.device | str = "cpu", share: Share = alone
     ) -> dict[str, Tensor]:
         """`dapt_losses.pretraining` or `finetuning`. A joint's weight is 1 where it is labelled, seen or not, as in the
         released code."""
-        outputs, targets = network(DaptBatch.from_tables(arrays.tables, device)), _targets(arrays, device)
+        outputs, targets = network(DaptBatch.from_tables(arrays.tables, device)), arrays.targets(device)
         if self.stage == "pretrain":
-            terms = pretraining(
-                outputs, targets, regression=self.regression, segmentation=self.segmentation, share=share
-            )
-            return terms | {"regression": terms["regression"] + self._idle(outputs)}
-        terms = finetuning(outputs, targets, auxiliary=self.auxiliary, share=share)
-        return terms | {"heatmap": terms["heatmap"] + self._idle(outputs)}
-
-    def _idle(self, outputs: DaptOutputs) -> Tensor | float:
-        """Zero, of the heads that the stage does not ask: processes that average gradients wait for everybody's."""
-        asked = ("coordinates", "parts") if self.stage == "pretrain" else ("logits_x", "logits_y", "logits_z")
-        if self.stage == "finetune" and self.auxiliary:
-            asked += ("inter",)
-        heads = ("logits_x", "logits_y", "logits_z", "inter", "parts", "coordinates")
-        values = [getattr(outputs, name) for name in heads if name not in asked]
-        return sum(value.float().sum() * 0 for value in values if value is not None)
+            weights = {"regression": self.regression, "segmentation": self.segmentation}
+            terms, first = pretraining(outputs, targets, share=share, **weights), "regression"
+        else:
+            terms, first = finetuning(outputs, targets, share=share, auxiliary=self.auxiliary), "heatmap"
+        # zero, of the heads that the stage does not use: processes that average gradients wait for all of them
+        asked = _ASKED[self.stage] | ({"inter"} if self.stage == "finetune" and self.auxiliary else set())
+        idle = [value for name in _HEADS if name not in asked and (value := getattr(outputs, name)) is not None]
+        terms[first] = sum((value.float().sum() * 0 for value in idle), terms[first])
+        return terms
 
     @torch.no_grad()
     def joints(self, network: Callable, arrays: DaptArrays, *, device: torch.device | str = "cpu") -> np.ndarray:
@@ -133,7 +132,7 @@ class DaptObjective:
         outputs = network(DaptBatch.from_tables(arrays.tables, device))
         own = outputs.coordinates if self.stage == "pretrain" else outputs.joints()
         joints = np.full((len(arrays.joints), len(BODY26), 3), np.nan, np.float32)
-        joints[:, [BODY26.index(name) for name in self.config.joints]] = own.float().cpu().numpy()
+        joints[:, self._columns] = own.float().cpu().numpy()
         return joints
 
 
@@ -168,21 +167,13 @@ def small(config: DaptConfig) -> DaptConfig:
     )
 
 
-def _targets(arrays: DaptArrays, device: torch.device | str) -> DaptTargets:
-    return DaptTargets(
-        joints=torch.as_tensor(np.where(arrays.weight[..., None] > 0, arrays.joints, 0)).to(device),
-        weight=torch.as_tensor(arrays.weight).to(device),
-        part=None if arrays.part is None else torch.as_tensor(arrays.part).to(device),
-    )
-
-
-def _thinned(one: Example, grid: float) -> tuple[np.ndarray, np.ndarray]:
+def _thinned(example: Example, grid: float) -> tuple[np.ndarray, np.ndarray]:
     """A random point of each voxel (m, 3), and the part that most of the voxel's points are of (m,).
 
     Cells as in `build_tables`, which then finds one point in each.
     """
-    points = np.asarray(one.points, np.float32).reshape(-1, 3)
-    part = np.asarray(one.part, np.int64)
+    points = np.asarray(example.points, np.float32).reshape(-1, 3)
+    part = np.asarray(example.part, np.int64)
     if len(part) != len(points) or part.size and part.max() >= PARTS:
         most = part.max() if part.size else "none"
         raise InputError(
@@ -195,9 +186,5 @@ def _thinned(one: Example, grid: float) -> tuple[np.ndarray, np.ndarray]:
     begins[1:] = (cells[1:] != cells[:-1]).any(1)
     first = np.flatnonzero(begins)
     counts = np.diff(first, append=len(cells))
-    rng = np.random.default_rng(one.seed)
-    kept = order[first + (rng.random(len(first)) * counts).astype(np.int64)]
-    voxel, part = np.cumsum(begins) - 1, part[order]
-    told = part >= 0
-    votes = np.bincount(voxel[told] * PARTS + part[told], minlength=len(first) * PARTS).reshape(-1, PARTS)
-    return points[kept], np.where(votes.any(1), votes.argmax(1), UNKNOWN_PART)
+    kept = order[first + (np.random.default_rng(example.seed).random(len(first)) * counts).astype(np.int64)]
+    return points[kept], majority_part(np.cumsum(begins) - 1, part[order], voxels=len(first), parts=PARTS)

@@ -28,20 +28,22 @@ def transferred(source: DaptNet | str | os.PathLike, config: DaptConfig, *, keep
     # before anything else draws
     network = DaptNet(config)
     if isinstance(source, DaptNet):
-        trained = source
+        kept, trained = _backbone(source, network), source
     else:
-        trained, _ = load_checkpoint(source)
-        if not isinstance(trained, DaptNet):
-            raise file_error(
-                source, f"expected the paper's network, got {type(trained).__name__}: name one pre-trained as such"
-            )
-    try:
-        kept = _backbone(trained, network)
-    except InputError as error:
-        raise error if trained is source else file_error(source, error) from None
+        stored, _ = load_checkpoint(source)
+        if not isinstance(stored, DaptNet):
+            kind = type(stored).__name__
+            raise file_error(source, f"expected the paper's network, got {kind}: name one pre-trained as such")
+        try:
+            kept, trained = _backbone(stored, network), stored
+        except InputError as error:
+            raise file_error(source, error) from None
     wanted = network.state_dict()
     if keep_anchors:
-        kept |= _anchors(trained, config, wanted) | _heads(trained, network)
+        # the backbones fit, so the widths of their anchors do
+        name = f"backbone.{_ANCHORS}"
+        kept[name] = _by_joint(trained.state_dict()[name], wanted[name], trained.config.joints, config.joints)
+        kept |= _heads(trained, network)
     network.load_state_dict(wanted | kept)
     return network
 
@@ -67,16 +69,10 @@ def _backbone(trained: DaptNet, network: DaptNet) -> dict[str, Tensor]:
     return {f"backbone.{name}": value for name, value in stored.items()}
 
 
-def _anchors(trained: DaptNet, config: DaptConfig, wanted: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Anchors by joint name; those of new joints stay as they were drawn. The backbones fit, so their widths do."""
-    name = f"backbone.{_ANCHORS}"
-    return {name: _by_joint(trained.state_dict()[name], wanted[name], trained.config.joints, config.joints)}
-
-
 def _heads(trained: DaptNet, network: DaptNet) -> dict[str, Tensor]:
     """Tensors of the heads that both networks have, by what they do: the coordinate head has two names."""
     old, new = trained.config, network.config
-    kept = {}
+    kept: dict[str, Tensor] = {}
     if old.coordinates and new.coordinates:
         names = ["heads.coordinate" if config.bins else "heads.query" for config in (old, new)]
         kept |= _alike(trained, network, *names)

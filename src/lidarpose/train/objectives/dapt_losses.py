@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from lidarpose.models.dapt.dapt_net import DaptOutputs
-from lidarpose.train.objective import Share, alone
+from lidarpose.train.objectives.objective import Share, alone, at_least_one
 
 # width of a heatmap's target, bins
 SIGMA = 2.0
@@ -21,7 +21,7 @@ SIGMA = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class DaptTargets:
-    """What training compares with.
+    """What the losses compare with.
 
     joints (B, J, 3) m in the network's order, numbers also where nothing is known; weight (B, J): v_i of the paper, 1
     where a joint is labelled and else 0; part (M,) int64, -1 where it is not known, None where none is asked for.
@@ -42,14 +42,15 @@ def pretraining(
 ) -> dict[str, Tensor]:
     """Paper: Eq. 9, L_pre = lambda_reg L_reg + lambda_seg L_seg, of the coordinate head and the part head.
 
-    Terms "regression" and "segmentation", and "mpjpe" of the coordinates for the log; share: see `task`.
+    Terms "regression" and "segmentation", and "mpjpe" of the coordinates for the log; share: see `objective`.
     """
-    people, labels, voxels = _shared(share, *_counts(targets), (targets.part >= 0).sum())
-    coordinates = outputs.coordinates.float()
+    coordinates, parts, part = outputs.coordinates, outputs.parts, targets.part
+    assert coordinates is not None and parts is not None and part is not None
+    people, labels, voxels = _divisors(targets, share, (part >= 0).sum())
     return {
-        "regression": regression * regression_loss(coordinates, targets, people),
-        "segmentation": segmentation * segmentation_loss(outputs.parts.float(), targets.part, voxels),
-        "mpjpe": _mpjpe(coordinates, targets, labels),
+        "regression": regression * distance_loss(coordinates, targets, people),
+        "segmentation": segmentation * segmentation_loss(parts.float(), part, voxels),
+        "mpjpe": _mpjpe(coordinates.float(), targets, labels),
     }
 
 
@@ -60,24 +61,29 @@ def finetuning(
 
     The released code adds 0.2 times a term of the auxiliary head, of which the paper has no word: `auxiliary`. Terms
     "heatmap", with an `auxiliary` weight above 0 "auxiliary", and "mpjpe" of the decoded heatmaps for the log; share:
-    see `task`.
+    see `objective`.
     """
-    people, labels = _shared(share, *_counts(targets))
+    people, labels = _divisors(targets, share)
     terms = {
         "heatmap": heatmap_loss(outputs, targets, people),
         "mpjpe": _mpjpe(outputs.joints().float(), targets, labels),
     }
     if auxiliary:
-        terms["auxiliary"] = auxiliary * auxiliary_loss(outputs.inter.float(), targets, people)
+        assert outputs.inter is not None
+        terms["auxiliary"] = auxiliary * distance_loss(outputs.inter, targets, people, squared=True)
     return terms
 
 
-def regression_loss(coordinates: Tensor, targets: DaptTargets, people: Tensor) -> Tensor:
+def distance_loss(joints: Tensor, targets: DaptTargets, people: Tensor, *, squared: bool = False) -> Tensor:
     """Paper: Eq. 7, sum_i ||J_i - J^_i||_2 v_i / sum_i v_i, its mean over `people`, those with a label.
 
-    coordinates (B, J, 3) m. The released code squares the distance.
+    joints (B, J, 3) m. squared: the distance squared, as the released code has it, here and in the term of the
+    auxiliary head, which is not in the paper.
     """
-    return _person_mean((coordinates - targets.joints).norm(dim=-1), targets.weight).sum() / people
+    offset = joints.float() - targets.joints
+    distance = offset.square().sum(-1) if squared else offset.norm(dim=-1)
+    weight = targets.weight
+    return ((distance * weight).sum(1) / at_least_one(weight.sum(1))).sum() / people
 
 
 def segmentation_loss(logits: Tensor, part: Tensor, voxels: Tensor) -> Tensor:
@@ -97,9 +103,10 @@ def heatmap_loss(outputs: DaptOutputs, targets: DaptTargets, people: Tensor) -> 
     targets do not sum to 1, and it takes the mean over bins and over joints, so that the finer or longer an axis is,
     the less it weighs.
     """
-    loss = outputs.logits_x.new_zeros((), dtype=torch.float32)
+    loss = torch.zeros((), device=people.device)
     heatmaps = (outputs.logits_x, outputs.logits_y, outputs.logits_z)
     for k, (logits, low, step) in enumerate(zip(heatmaps, outputs.low, outputs.step, strict=True)):
+        assert logits is not None
         log_truth = log_gaussian((targets.joints[..., k] - low) / step, logits.shape[-1])
         divergence = log_truth.exp() * (log_truth - logits.float().log_softmax(-1))
         loss = loss + (divergence.sum(-1) * targets.weight).sum()
@@ -109,7 +116,7 @@ def heatmap_loss(outputs: DaptOutputs, targets: DaptTargets, people: Tensor) -> 
 def log_gaussian(place: Tensor, bins: int) -> Tensor:
     """place (...) in bins -> (..., W): logarithm of a Gaussian of `SIGMA` bins about it that sums to 1.
 
-    A joint beyond the range is told to lie in the outermost bin, where whoever decodes it reports it as out of range
+    A joint beyond the range counts as in the outermost bin, where decoding reports it as out of range
     (`decode.out_of_range`); the released code's target for it fades to nothing.
     """
     index = torch.arange(bins, device=place.device)
@@ -117,32 +124,12 @@ def log_gaussian(place: Tensor, bins: int) -> Tensor:
     return (-0.5 * away.square()).log_softmax(-1)
 
 
-def auxiliary_loss(joints: Tensor, targets: DaptTargets, people: Tensor) -> Tensor:
-    """The released code's term of all joints read off the bottleneck (B, J, 3) m, its distance squared: not in the
-    paper. sum_i ||J_i - J^_i||^2 v_i / sum_i v_i, its mean over `people`, those with a label."""
-    return _person_mean((joints - targets.joints).square().sum(-1), targets.weight).sum() / people
-
-
-def _person_mean(values: Tensor, weight: Tensor) -> Tensor:
-    """values, weight (B, J) -> (B,): the weighted mean of each person, 0 where nothing has a weight."""
-    return (values * weight).sum(1) / _at_least_one(weight.sum(1))
-
-
 def _mpjpe(joints: Tensor, targets: DaptTargets, labels: Tensor) -> Tensor:
     """Mean distance over labelled joints, m."""
     return ((joints.detach() - targets.joints).norm(dim=-1) * targets.weight).sum() / labels
 
 
-def _counts(targets: DaptTargets) -> tuple[Tensor, Tensor]:
-    """How many people have a label, and how many labels there are."""
-    return (targets.weight.sum(1) > 0).sum(), targets.weight.sum()
-
-
-def _shared(share: Share, *counts: Tensor) -> tuple[Tensor, ...]:
-    """Counts as divisors; told to the other processes all at once."""
-    return _at_least_one(share(torch.stack([count.float() for count in counts]))).unbind()
-
-
-def _at_least_one(count: Tensor) -> Tensor:
-    """1 for a sum over nothing; a share of one among several processes is below 1 and stays."""
-    return torch.where(count > 0, count, torch.ones_like(count))
+def _divisors(targets: DaptTargets, share: Share, *more: Tensor) -> tuple[Tensor, ...]:
+    """How many people have a label, how many labels there are, and more counts, shared all at once."""
+    counts = ((targets.weight.sum(1) > 0).sum(), targets.weight.sum(), *more)
+    return at_least_one(share(torch.stack([count.float() for count in counts]))).unbind()

@@ -1,21 +1,31 @@
-"""Datasets in memory, joints by the names of body26.
+"""Datasets to learn from: labeled samples in memory, and samples for a torch DataLoader.
+
+`SyntheticPeople` and `ShardPeople` yield one `Sample` each, the same ones whatever the number of workers. Worker w of W
+makes the runs of `batch` samples whose number is w modulo W, so a DataLoader gives them in order where its batch_size
+is `batch` (1, as by default, also goes with batch_size=None); with other sizes they are the same samples, batched
+differently. A Sample is no tensor: give the DataLoader a collate_fn, `list` if nothing else.
 
 Legend: N samples, M points of all of them.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
+from torch.utils.data import IterableDataset, get_worker_info
 
 from lidarpose.data.schema import CENTERS
 from lidarpose.data.shards import DatasetReader, open_dataset, shard_path
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error, listed
-from lidarpose.sample import HIDDEN, SEEN, UNLABELED, Box, LabeledSample, Pose
+from lidarpose.sample import HIDDEN, SEEN, UNLABELED, Box, LabeledSample, Pose, Sample
 from lidarpose.skeleton import BODY26
-from lidarpose.train.example import UNKNOWN_PART, seen
+from lidarpose.synth.bodies import PoseBank
+from lidarpose.synth.generator import Generator
+from lidarpose.synth.scene import SceneConfig
+from lidarpose.train.augment import UNKNOWN_PART, seen
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +73,7 @@ class InMemoryDataset:
                 raise file_error(folder, f"holds synthetic people, which have no split {split!r}: say --split all")
             own = [_to_body26(sample) for sample in _thinned(_samples(dataset, split, damaged), interval)]
             if not any((sample.pose.visible == 0).any() for sample in own):
-                # a dataset that never says hidden tells nothing of what is seen
+                # a dataset that never says hidden says nothing of what is seen
                 unknown = np.full(len(BODY26), np.nan, np.float32)
                 own = [replace(sample, pose=replace(sample.pose, visible=unknown)) for sample in own]
             samples += (sample for sample in own if sample.joint_labels.any())
@@ -168,7 +178,7 @@ def _to_body26(sample: LabeledSample) -> LabeledSample:
     if sample.info is None:
         visible[columns] = np.select([sample.joint_labels == SEEN, sample.joint_labels == HIDDEN], [1.0, 0.0], np.nan)
     elif sample.part is not None:
-        # parts tell it, as of people made meanwhile
+        # from the parts, as of samples made during training
         visible[columns] = seen(joints[columns], sample.points[part > 0])
     return replace(
         sample,
@@ -189,3 +199,76 @@ def _joint_labels(joints: np.ndarray, visible: np.ndarray) -> np.ndarray:
 def _box_row(box: Box | None) -> np.ndarray:
     """(7,): center, size, yaw; NaN for no box."""
     return np.full(7, np.nan) if box is None else np.array([*box.center, *box.size, box.yaw])
+
+
+@dataclass(frozen=True, kw_only=True)
+class SyntheticPeople(IterableDataset):
+    """Persons `start` ... `stop` - 1 of `seed`, without end where `stop` is None, see `Generator.person`.
+
+    scene, bank and captured are the generator's; hard in [0, 1] replaces the scene's difficulty. With a `batch` of
+    many samples workers draw fewer bodies twice (see `generator.BLOCK`). Raises InputError for settings out of range.
+    """
+
+    scene: SceneConfig
+    seed: int = 0
+    start: int = 0
+    stop: int | None = None
+    hard: float | None = None
+    bank: PoseBank | None = None
+    captured: float = 0.0
+    batch: int = 1
+
+    def __post_init__(self):
+        if self.seed < 0 or self.start < 0 or self.stop is not None and self.stop < self.start:
+            raise InputError(
+                f"SyntheticPeople needs a seed >= 0 and 0 <= start <= stop, got {self.seed}, {self.start}, {self.stop}"
+            )
+        _check_batch(self.batch)
+        # errors come here, not in a worker
+        self._generator()
+        if self.hard is not None:
+            self.scene.eased(self.hard)
+
+    def _generator(self) -> Generator:
+        return Generator(scene=self.scene, bank=self.bank, captured=self.captured, measure=False)
+
+    def __iter__(self) -> Iterator[Sample]:
+        generator = self._generator()
+        worker, workers = _worker()
+        for run in count(worker, workers):
+            first = self.start + run * self.batch
+            if self.stop is not None and first >= self.stop:
+                return
+            last = first + self.batch
+            for index in range(first, last if self.stop is None else min(last, self.stop)):
+                yield generator.person(self.seed, index, hard=self.hard).sample
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShardPeople(IterableDataset):
+    """The people of a dataset that `lidarpose synth` wrote, in its order. Raises InputError where it is none."""
+
+    folder: str | Path
+    batch: int = 1
+    dataset: DatasetReader = field(init=False, repr=False)
+
+    def __post_init__(self):
+        _check_batch(self.batch)
+        object.__setattr__(self, "dataset", open_dataset(self.folder))
+
+    def __iter__(self) -> Iterator[Sample]:
+        worker, workers = _worker()
+        for number, row in enumerate(self.dataset.rows()):
+            if number // self.batch % workers == worker:
+                yield self.dataset.sample(row)
+
+
+def _check_batch(batch: int) -> None:
+    if batch < 1:
+        raise InputError(f"batch must be 1 or more, got {batch}")
+
+
+def _worker() -> tuple[int, int]:
+    """The number of this DataLoader's worker, and of how many."""
+    info = get_worker_info()
+    return (0, 1) if info is None else (info.id, info.num_workers)

@@ -1,4 +1,4 @@
-"""What the loop must know of a kind of network: how people become arrays, and arrays losses.
+"""What the training loop must know of a kind of network: how examples become arrays, and arrays losses.
 
 Legend: B people, J joints of body26.
 """
@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lidarpose.train.example import Example
+from lidarpose.train.augment import UNKNOWN_PART, Example
 
 # a sum over this process's people -> that over all processes', divided by their number. Gradients are averaged over
 # processes, so what is divided by it is the mean over everybody of the step, however they are shared out
@@ -25,7 +25,8 @@ def alone(count: Tensor) -> Tensor:
 class Objective(Protocol):
     """A kind of network to train. Is pickled into the loader's workers, so it holds settings and no tensors."""
 
-    config: Any
+    @property
+    def config(self) -> Any: ...
 
     def network(self) -> nn.Module:
         """A new network, its weights drawn from torch's global generator."""
@@ -33,13 +34,13 @@ class Objective(Protocol):
 
     def collate(self, examples: list[Example]) -> Any:
         """Examples of a batch, one or more, as what `terms` reads: numpy arrays, in a dict or a dataclass. Random
-        draws for a person are from a generator of `Example.seed` alone, so nobody depends on batch mates."""
+        draws for an example are from a generator of `Example.seed` alone, so none depends on its batch mates."""
         ...
 
     def terms(
         self, network: Callable, arrays: Any, *, device: torch.device | str = "cpu", share: Share = alone
     ) -> dict[str, Tensor]:
-        """Each weighted loss term by name; their sum is minimized. "mpjpe" (m, of decoded joints, detached) is told
+        """Each weighted loss term by name; their sum is minimized. "mpjpe" (m, of decoded joints, detached) is logged
         and not part of it. network: called as the network itself, be it wrapped."""
         ...
 
@@ -51,3 +52,16 @@ class Objective(Protocol):
 def total(terms: dict[str, Tensor]) -> Tensor:
     """The sum of the weighted terms."""
     return torch.stack([value for name, value in terms.items() if name != "mpjpe"]).sum()
+
+
+def at_least_one(count: Tensor) -> Tensor:
+    """1 for a sum over nothing; the share of one among several processes may be below 1 and stays."""
+    return torch.where(count > 0, count, torch.ones_like(count))
+
+
+def majority_part(voxel: np.ndarray, part: np.ndarray, *, voxels: int, parts: int) -> np.ndarray:
+    """voxel (n,) of each point, negative for none; part (n,), negative where unknown -> (voxels,) int64: the part that
+    most points of a voxel are of, the first of equals; -1 where none is known."""
+    known = (voxel >= 0) & (part >= 0)
+    votes = np.bincount(voxel[known] * parts + part[known], minlength=voxels * parts).reshape(-1, parts)
+    return np.where(votes.any(1), votes.argmax(1), UNKNOWN_PART)

@@ -1,0 +1,157 @@
+"""`PoseNetObjective`: what the package's own network minimizes.
+
+Legend: B people, J joints, N fine voxels, W heatmap bins, P parts.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from lidarpose.models.config import BIN, NetworkConfig
+from lidarpose.models.layers import encode
+from lidarpose.models.posenet import Batch, Outputs, PoseNet, Targets
+from lidarpose.models.voxelize import voxelize
+from lidarpose.sample import CONFIDENCE_RADIUS
+from lidarpose.skeleton import BODY26
+from lidarpose.train.augment import Example
+from lidarpose.train.objectives.objective import Share, alone, at_least_one, majority_part
+
+# most fine voxels a person in training
+MAX_VOXELS = 224
+# weights; distances are in meters, so a weight of 10 brings 10 cm to order one
+VOTE, JOINTS, LEVEL, HEATMAP, PART, CONFIDENCE, SPREAD, VISIBLE = 10.0, 5.0, 2.0, 0.25, 0.25, 0.1, 0.05, 0.05
+# width of the heatmap's target: 1.2 bins
+SIGMA = 0.036
+# bones as pairs (parent, child), and pairs of bones that mirror each other
+_BONES = torch.tensor(BODY26.bones)
+_PAIRS = torch.tensor(
+    [
+        (k, BODY26.bones.index((BODY26.flip[a], BODY26.flip[b])))
+        for k, (a, b) in enumerate(BODY26.bones)
+        if BODY26.joints[b].startswith("left_") and (BODY26.flip[a], BODY26.flip[b]) in BODY26.bones
+    ]
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseNetObjective:
+    """The `Objective` of a `PoseNet` with this configuration. bone, symmetry: weights, see `losses`."""
+
+    config: NetworkConfig
+    bone: float = 0.0
+    symmetry: float = 0.0
+
+    def network(self) -> PoseNet:
+        return PoseNet(self.config)
+
+    def collate(self, examples: list[Example]) -> dict[str, np.ndarray]:
+        """The arrays of a `VoxelPyramid`, and those of `Targets`."""
+        pyramid = voxelize(
+            np.concatenate([e.points for e in examples]),
+            np.array([len(e.points) for e in examples]),
+            grid=self.config.grid,
+            max_voxels=MAX_VOXELS,
+            view=np.stack([e.view for e in examples]),
+            seeds=np.array([e.seed for e in examples]),
+            neighbors=self.config.convolution > 0,
+        )
+        part = np.concatenate([e.part for e in examples]).astype(np.int64)
+        valid = pyramid.fine.valid
+        part = majority_part(pyramid.point_voxel, part, voxels=valid.size, parts=self.config.parts)
+        joints = np.stack([e.joints for e in examples])
+        arrays = pyramid.arrays()
+        del arrays["point_voxel"]
+        return arrays | {
+            "joints": joints,
+            "known": ~np.isnan(joints).any(-1),
+            "visible": np.stack([e.visible for e in examples]),
+            "part": part.reshape(valid.shape),
+        }
+
+    def terms(
+        self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
+    ) -> dict[str, Tensor]:
+        outputs, targets = network(Batch.from_arrays(arrays, device)), Targets.from_arrays(arrays, device)
+        return losses(outputs, targets, share=share, bone=self.bone, symmetry=self.symmetry)
+
+    @torch.no_grad()
+    def joints(self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu") -> np.ndarray:
+        return network(Batch.from_arrays(arrays, device)).joints().float().cpu().numpy()
+
+
+def losses(
+    outputs: Outputs, targets: Targets, *, share: Share = alone, bone: float = 0.0, symmetry: float = 0.0
+) -> dict[str, Tensor]:
+    """Each term, weighted, by name; their sum is what is minimized. "mpjpe" (meters) is for the log alone.
+
+    All are means over the joints whose truth is known; share: see `objective`; bone, symmetry: weights of terms on the
+    lengths of bones whose ends are known, and on the difference of left and right ones, known or not. Paper: L_reg is
+    here the mean distance of votes, of decoded joints and of the coarser levels' joints (the released code squares it);
+    L_hm a cross entropy against normalized targets, axes alike; L_seg with background as a class.
+    """
+    known = targets.known.float()
+    true = torch.where(targets.known[..., None], targets.joints, 0.0)
+    labels = at_least_one(share(known.sum()))
+    # of joints with a label, those whose visibility is known
+    seen = targets.visible.float()
+    seen_known = known * ~seen.isnan()
+
+    def over(value: Tensor, count: Tensor) -> Tensor:
+        return value / at_least_one(share(count))
+
+    def mean(value: Tensor) -> Tensor:
+        return (value.float() * known).sum() / labels
+
+    error = (outputs.joints().float() - true).norm(dim=-1)
+    missed = error.detach()
+    hit = (missed < CONFIDENCE_RADIUS).to(true.dtype)
+    log_spread = outputs.log_spread.float()
+    part = F.cross_entropy(outputs.part.float().flatten(0, 1), targets.part.flatten(), ignore_index=-1, reduction="sum")
+    visible = _binary(outputs.visible, seen.nan_to_num(0.0))
+    terms = {
+        "joints": JOINTS * mean(error),
+        "level": LEVEL * sum((mean((j.float() - true).norm(dim=-1)) for j in outputs.level_joints), torch.zeros(())),
+        "part": PART * over(part, (targets.part >= 0).sum().float()),
+        "confidence": CONFIDENCE * mean(_binary(outputs.confidence, hit)),
+        # log-likelihood of an exponential law: its mean, exp(log_spread), becomes the expected distance
+        "spread": SPREAD * mean(log_spread + missed * torch.exp(-log_spread)),
+        "visible": VISIBLE * over((visible * seen_known).sum(), seen_known.sum()),
+        "mpjpe": mean(missed),
+    }
+    if outputs.has_votes:
+        terms["vote"] = VOTE * mean((outputs.vote.float() - true).norm(dim=-1))
+    bins = outputs.heatmap.shape[-1]
+    if bins:
+        offset = true - outputs.vote.detach().float()
+        reached = (offset.abs() < bins * BIN / 2).to(true.dtype) * known[..., None]
+        cross = -(encode(offset, SIGMA, bins) * outputs.heatmap.float().log_softmax(-1)).sum(-1)
+        terms["heatmap"] = HEATMAP * (cross * reached).sum() / at_least_one(share(reached.sum()))
+    if bone or symmetry:
+        terms |= _lengths(outputs.joints().float(), true, known, share, bone, symmetry)
+    return terms
+
+
+def _lengths(
+    joints: Tensor, true: Tensor, known: Tensor, share: Share, bone: float, symmetry: float
+) -> dict[str, Tensor]:
+    """Mean errors of bones' lengths, and mean differences between the two sides."""
+    parent, child = _BONES.to(joints.device).unbind(1)
+    length = (joints[:, parent] - joints[:, child]).norm(dim=-1)
+    terms = {}
+    if bone:
+        both = known[:, parent] * known[:, child]
+        missed = (length - (true[:, parent] - true[:, child]).norm(dim=-1)).abs() * both
+        terms["bone"] = bone * missed.sum() / at_least_one(share(both.sum()))
+    if symmetry:
+        left, right = _PAIRS.to(joints.device).unbind(1)
+        uneven = (length[:, left] - length[:, right]).abs()
+        terms["symmetry"] = symmetry * uneven.sum() / at_least_one(share(torch.ones_like(uneven).sum()))
+    return terms
+
+
+def _binary(logit: Tensor, truth: Tensor) -> Tensor:
+    return F.binary_cross_entropy_with_logits(logit.float(), truth, reduction="none")
