@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from training_runs import refused
 
 from lidarpose.errors import InputError
 from lidarpose.models.checkpoint import save_checkpoint
@@ -201,18 +202,14 @@ def test_targets_are_distributions(place, bins):
     assert abs(target.argmax().item() - min(max(place, 0), bins - 1)) <= 0.5 + 1e-3
 
 
-def test_background_is_supervised():
+def test_background_is_supervised_and_joints_without_a_label_teach_nothing():
     outputs, targets = made()
-    logits = outputs.parts.clone().requires_grad_()
-    pretraining(replace(outputs, parts=logits), targets)["segmentation"].backward()
-    assert (logits.grad.abs().amax(1) > 0).tolist() == (targets.part >= 0).tolist()
-
-
-def test_joints_without_a_label_teach_nothing():
-    outputs, targets = made()
-    free = outputs.logits_x.clone().requires_grad_()
-    finetuning(replace(outputs, logits_x=free), targets)["heatmap"].backward()
-    assert ((free.grad.abs().amax(-1) > 0) == targets.weight.bool()).all()
+    parts, logits = (value.clone().requires_grad_() for value in (outputs.parts, outputs.logits_x))
+    outputs = replace(outputs, parts=parts, logits_x=logits)
+    pretraining(outputs, targets)["segmentation"].backward()
+    assert (parts.grad.abs().amax(1) > 0).tolist() == (targets.part >= 0).tolist()
+    finetuning(outputs, targets)["heatmap"].backward()
+    assert ((logits.grad.abs().amax(-1) > 0) == targets.weight.bool()).all()
 
 
 # --- batches
@@ -538,9 +535,8 @@ def test_a_network_to_the_same_configuration_is_the_same_network():
 )
 @pytest.mark.parametrize("keep", [False, True])
 def test_a_backbone_that_does_not_fit(change, message, keep):
-    with pytest.raises(InputError, match=message) as caught:
+    with refused(message):
         transferred(trained(PRETRAIN.config), replace(FINETUNE.config, **change), keep_anchors=keep)
-    assert "\n" not in str(caught.value)
 
 
 def test_transfer_from_files_that_do_not_fit(tmp_path):

@@ -1,6 +1,7 @@
 """Datasets to learn from: what is read, how it is shown, and runs on each of the four, from raw files to scores."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import dataset_files as files
@@ -10,6 +11,7 @@ import torch
 import waymo_files
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from training_runs import few_to_validate_on, refused, train_until_killed  # noqa: F401 - a fixture
 
 from lidarpose import evaluation
 from lidarpose.cli import main
@@ -24,7 +26,6 @@ from lidarpose.skeleton import BODY26, HUMAN15, skeleton
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.shard_job import Job, write_dataset
 from lidarpose.train import loop, run_dir
-from lidarpose.train import setup as jobs
 from lidarpose.train.augment import (
     AUGMENTATIONS,
     BLIND,
@@ -40,16 +41,7 @@ from lidarpose.train.datasets import InMemoryDataset
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.setup import make_setup
 
-FEW = 16
 NAMES = ("humanm3", "lidarhuman26m", "sloper4d", "waymo")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def few_to_validate_on():
-    """So that a run of seconds is not all validation."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jobs, "VALIDATION", FEW)
-        yield
 
 
 def write_waymo(root, smpl):
@@ -90,20 +82,30 @@ def synthetic(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_everybody_who_was_prepared_is_there(datasets, name):
-    dataset = InMemoryDataset.load([datasets[name]])
-    items = list(open_dataset(datasets[name]).items())
+def test_everything_that_was_prepared_is_there(datasets, name):
+    dataset, items = InMemoryDataset.load([datasets[name]]), list(open_dataset(datasets[name]).items())
     of = skeleton(dataset.skeleton)
-    assert len(dataset) == len(items) and dataset.dataset == name and not dataset.damaged
-    for row, item in enumerate(items):
-        person = dataset.sample(row)
-        np.testing.assert_array_equal(person.points, item.points)
-        np.testing.assert_allclose(person.joints[BODY26.map_to(of)], item.joints, atol=1e-6)
-        others = [k for k, joint in enumerate(BODY26.joints) if joint not in of.joints]
-        assert np.isnan(person.joints[others]).all() and np.isnan(person.pose.visible[others]).all()
-        assert person.centers.keys() == item.centers.keys()
-        assert (person.box is None) == (item.box is None)
-        assert dataset.sequences[dataset.sequence[row]] == item.sequence
+    others = [k for k, joint in enumerate(BODY26.joints) if joint not in of.joints]
+    assert dataset.dataset == name and not dataset.damaged
+    left = dataset.without(dataset.sequences[:1])
+    for some, expected in (dataset, items), (left, [item for item in items if item.sequence != dataset.sequences[0]]):
+        assert len(some) == len(expected)
+        for row, item in enumerate(expected):
+            sample = some.sample(row)
+            np.testing.assert_array_equal(sample.points, item.points)
+            np.testing.assert_array_equal(sample.center, item.center)
+            np.testing.assert_allclose(sample.joints[BODY26.map_to(of)], item.joints, atol=1e-6)
+            assert np.isnan(sample.joints[others]).all() and np.isnan(sample.pose.visible[others]).all()
+            assert sample.centers.keys() == item.centers.keys()
+            for key, center in item.centers.items():
+                np.testing.assert_array_equal(sample.centers[key], center)
+            assert sample.sequence == item.sequence and sample.sensor_known == item.sensor_known
+            assert (sample.box is None) == (item.box is None)
+            if item.box is not None:
+                np.testing.assert_array_equal(sample.box.center, item.box.center)
+                np.testing.assert_array_equal([*sample.box.size, sample.box.yaw], [*item.box.size, item.box.yaw])
+    if name in ("humanm3", "waymo"):
+        assert all(item.box is not None and item.sensor_known == (name == "waymo") for item in items)
 
 
 def test_only_a_dataset_that_says_hidden_tells_what_is_seen(datasets):
@@ -168,15 +170,8 @@ def test_what_cannot_be_read_is_one_line(datasets, synthetic, tmp_path):
         assert "\n" not in str(caught.value)
 
 
-def copied(folder, to):
-    to.mkdir()
-    for path in folder.iterdir():
-        (to / path.name).write_bytes(path.read_bytes())
-    return to
-
-
 def test_a_damaged_shard_is_left_out_and_named(datasets, tmp_path):
-    folder = copied(datasets["humanm3"], tmp_path / "copy")
+    folder = shutil.copytree(datasets["humanm3"], tmp_path / "copy")
     broken = shard_path(folder, "labelled", 1)
     broken.write_bytes(broken.read_bytes()[:-200])
     dataset = InMemoryDataset.load([folder])
@@ -248,16 +243,21 @@ def test_a_person_scaled_is_scaled_with_their_joints():
     assert 0.9 <= min(scales) < 0.93 and 1.07 < max(scales) <= 1.1
 
 
-def test_a_mirror_exchanges_what_is_seen():
-    person = someone()
-    visible = np.where(np.isnan(person.pose.visible), np.nan, np.arange(26) % 2).astype(np.float32)
-    person, mirrored = replace(person, pose=body26(person.joints, visible)), 0
-    for seed in range(20):
-        shown = augmented(person, Augmentation(flip=0.5), np.random.default_rng(seed))
-        exchanged = (np.isnan(shown.joints) != np.isnan(person.joints)).any()
+def test_a_mirror_exchanges_what_is_seen_and_left_and_right_parts():
+    sample, mirrored = someone(), 0
+    visible = np.where(np.isnan(sample.pose.visible), np.nan, np.arange(26) % 2).astype(np.float32)
+    sample = replace(sample, pose=body26(sample.joints, visible))
+    left, right = 1 + BODY26.index("left_ankle"), 1 + BODY26.index("right_ankle")
+    for seed in range(40):
+        shown = augmented(sample, RIGID, np.random.default_rng(seed))
+        exchanged = (shown.part != sample.part).any()
         mirrored += exchanged
         np.testing.assert_array_equal(shown.visible, visible[list(BODY26.flip)] if exchanged else visible)
-    assert 4 < mirrored < 16
+        assert (np.isnan(shown.joints) != np.isnan(sample.joints)).any() == exchanged
+        np.testing.assert_array_equal(shown.part == left, sample.part == (right if exchanged else left))
+        for kept in (-1, 0):
+            np.testing.assert_array_equal(shown.part == kept, sample.part == kept)
+    assert 10 < mirrored < 30
 
 
 def test_half_of_people_are_centered_on_a_guess_of_the_pelvis():
@@ -269,12 +269,6 @@ def test_half_of_people_are_centered_on_a_guess_of_the_pelvis():
     np.testing.assert_allclose(np.mean(draw, 0), 0, atol=0.02)
     still = [augmented(person, Augmentation(refined=0.0), np.random.default_rng(k)).joints[pelvis] for k in range(3)]
     np.testing.assert_allclose(still, [person.joints[pelvis] - center_of(person.points)] * 3, atol=1e-5)
-
-
-def test_a_fifth_of_points_is_lost():
-    lost = augmented(someone(count=500), Augmentation(drop=1.0), np.random.default_rng(0))
-    # 400 of 500, drawn one by one
-    assert len(lost.points) == len(lost.part) and 370 < len(lost.points) < 430
 
 
 @pytest.mark.parametrize("how", [Augmentation(cut=1.0), Augmentation(box=1.0)], ids=["cut", "box"])
@@ -290,19 +284,6 @@ def test_what_an_augmentation_hides_is_not_told_visible(how):
         np.testing.assert_array_equal(shown.visible, wanted)
         hidden += np.nansum(visible) - np.nansum(wanted)
     assert hidden > 4
-
-
-def test_a_mirror_exchanges_left_and_right_parts():
-    person, mirrored = someone(), 0
-    left, right = 1 + BODY26.index("left_ankle"), 1 + BODY26.index("right_ankle")
-    for seed in range(40):
-        shown = augmented(person, RIGID, np.random.default_rng(seed))
-        if (shown.part != person.part).any():
-            mirrored += 1
-            np.testing.assert_array_equal(shown.part == left, person.part == right)
-            np.testing.assert_array_equal(shown.part == -1, person.part == -1)
-            np.testing.assert_array_equal(shown.part == 0, person.part == 0)
-    assert 10 < mirrored < 30
 
 
 @pytest.mark.parametrize("name", AUGMENTATIONS)
@@ -475,31 +456,14 @@ def test_the_paper_s_two_stages(datasets, tmp_path, capsys, monkeypatch, keep):
     assert "MPJPE" in capsys.readouterr().out
 
 
-def test_a_run_on_a_dataset_is_taken_up(datasets, tmp_path, monkeypatch):
+def test_a_run_on_a_dataset_is_taken_up(datasets, tmp_path):
     recipe = Finetune(
         data=(str(datasets["lidarhuman26m"]),), epochs=6, batch=2, workers=0, pictures=0, scene="paper", validate=1000
     )
     loop.train(recipe, tmp_path / "whole")
-
-    class Killed(BaseException):
-        pass
-
-    def killed(*_):
-        raise Killed
-
-    with monkeypatch.context() as patch:
-        patch.setattr(loop, "SAVE_EVERY", -1.0)
-        original, calls = loop._Run._chunk, []
-
-        def counted(self, *args):
-            calls.append(1)
-            return original(self, *args) if len(calls) < 3 else killed()
-
-        patch.setattr(loop._Run, "_chunk", counted)
-        with pytest.raises(Killed):
-            loop.train(recipe, tmp_path / "run")
+    train_until_killed(recipe, tmp_path / "run", "_chunk", 2)
     # the dataset may have moved meanwhile
-    moved = copied(datasets["lidarhuman26m"], tmp_path / "lidarhuman26m")
+    moved = shutil.copytree(datasets["lidarhuman26m"], tmp_path / "lidarhuman26m")
     loop.train(replace(recipe, data=(str(moved),)), tmp_path / "run", resume=True)
     with pytest.raises(InputError, match="a run keeps its recipe"):
         loop.train(replace(recipe, data=(str(datasets["sloper4d"]),)), tmp_path / "run", resume=True)
@@ -549,35 +513,15 @@ def test_the_sensor_s_place_is_often_kept_from_the_network_and_never_made_up():
     assert np.mean(known) == pytest.approx(1 - BLIND, abs=0.07)
 
 
-@pytest.mark.parametrize("name, known", [("humanm3", False), ("waymo", True)])
-def test_samples_in_memory_keep_their_boxes_and_centers(datasets, name, known):
-    dataset, items = InMemoryDataset.load([datasets[name]]), list(open_dataset(datasets[name]).items())
-
-    def same(person, item):
-        box = item.box
-        np.testing.assert_array_equal([*person.box.center, *person.box.size], [*box.center, *box.size])
-        assert person.box.yaw == box.yaw and person.sensor_known == known
-        for key, center in item.centers.items():
-            np.testing.assert_array_equal(person.centers[key], center)
-        np.testing.assert_array_equal(person.center, item.center)
-
-    for row, item in enumerate(items):
-        same(dataset.sample(row), item)
-    left = dataset.without(dataset.sequences[:1])
-    kept = [item for item in items if item.sequence != dataset.sequences[0]]
-    assert len(left) == len(kept)
-    for row, item in enumerate(kept):
-        same(left.sample(row), item)
-
-
-def test_points_are_jittered_and_strays_are_added():
-    person = someone(count=400)
-    plain, blurred, strays = (
-        augmented(person, Augmentation(refined=0.0, **more), np.random.default_rng(3))
-        for more in ({}, {"jitter": 0.005}, {"strays": 1.0})
+def test_points_are_jittered_lost_and_added():
+    plain, jittered, clutter, lost = (
+        augmented(someone(count=500), Augmentation(refined=0.0, **more), np.random.default_rng(3))
+        for more in ({}, {"jitter": 0.005}, {"strays": 1.0}, {"drop": 1.0})
     )
-    assert (blurred.points - plain.points).std() == pytest.approx(0.005, rel=0.1)
-    assert len(strays.points) > 400 and len(strays.points) == len(strays.part) and not strays.part[400:].any()
+    assert (jittered.points - plain.points).std() == pytest.approx(0.005, rel=0.1)
+    assert len(clutter.points) > 500 and len(clutter.points) == len(clutter.part) and not clutter.part[500:].any()
+    # 400 of 500, drawn one by one
+    assert len(lost.points) == len(lost.part) and 370 < len(lost.points) < 430
 
 
 def test_everybody_is_seen_as_often_as_epochs_say(datasets):

@@ -359,50 +359,34 @@ def test_workers_change_nothing(workers):
     assert_same_chunks(chunks(RECIPE), chunks(replace(RECIPE, workers=workers)))
 
 
-def test_recipes():
-    for change, message in [
-        ({"people": 0}, "people must be at least 1"),
-        ({"batch": 0}, "batch must be at least 1"),
-        # without a file they would choose nobody
-        ({"subjects": ("a",)}, "subjects are of captured clips: name their file by motion too"),
-    ]:
-        with pytest.raises(InputError, match=message):
-            Pretrain(**change)
-    assert Pretrain(motion="m", subjects=["a"]) == Pretrain(motion="m", subjects=("a",))
-
-
 def test_numbers_of_numpy_paths_and_one_name_alone_are_settings_too():
     plain = Pretrain(people=64, rate=0.5, motion="walks", subjects=("002",), shards=("a",))
     other = Pretrain(people=np.int64(64), rate=np.float32(0.5), motion=Path("walks"), subjects="002", shards=Path("a"))
     assert other == plain and json.loads(json.dumps(other.to_dict())) == json.loads(json.dumps(plain.to_dict()))
+    assert Pretrain(motion="m", subjects=["a"]) == Pretrain(motion="m", subjects=("a",))
     assert Finetune(data="humanm3").data == ("humanm3",)
+    assert Finetune(data="a", keep_anchors=np.bool_(False)).keep_anchors is False
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    "change, message",
     [
+        ({"people": 0}, "people must be at least 1, got 0"),
+        ({"batch": 0}, "batch must be at least 1, got 0"),
+        *(({name: -1}, f"{name} must be at least [01], got -1") for name in ("people", "rate", "captured", "workers")),
+        ({"seed": -1}, "seed must be at least 0, got -1"),
         ({"people": 5.5}, "people must be a whole number, got 5.5"),
         ({"rate": None}, "rate must be a number, got None"),
         ({"scene": 3}, "scene must be text, got 3"),
         ({"shards": [3]}, r"shards must be a list of texts, got \[3\]"),
+        # without a file they would choose nobody
+        ({"subjects": ("a",)}, "subjects are of captured clips: name their file by motion too"),
+        *(({"keep_anchors": value}, "keep_anchors must be True or False, got .*") for value in ("false", 0, None)),
     ],
 )
 def test_a_recipe_refuses_what_is_no_such_setting(change, message):
     with pytest.raises(InputError, match=f"^{message}$"):
-        Pretrain(**change)
-
-
-def test_a_recipe_s_booleans_are_booleans():
-    assert Finetune(data="a", keep_anchors=np.bool_(False)).keep_anchors is False
-    for other in ("false", 0, None):
-        with pytest.raises(InputError, match="^keep_anchors must be True or False, got"):
-            recipe_of(Finetune, data="a", keep_anchors=other)
-
-
-@pytest.mark.parametrize("field", ["people", "rate", "captured", "seed", "workers"])
-def test_a_recipe_refuses_negative_numbers(field):
-    with pytest.raises(InputError, match=f"^{field} must be at least [01], got -1$"):
-        Pretrain(**{field: -1})
+        recipe_of(Finetune, data="a", **change) if "keep_anchors" in change else Pretrain(**change)
 
 
 def test_disturbed_people_have_their_joints_and_more_or_other_points():

@@ -5,6 +5,7 @@ import os
 import shlex
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 from lidarpose.cli.terminal import add_command, names
 from lidarpose.errors import InputError
@@ -16,7 +17,14 @@ _WHAT = (
     "processes: `torchrun --nproc_per_node N -m lidarpose {name} ...`, with the run's folder named."
 )
 # what stands for a value of a setting that names none
-_METAVARS = {int: "N", float: "X", bool: "true|false", str: "NAME", str | None: "FILE", tuple[str, ...]: "A,B"}
+_METAVARS: dict[Any, str] = {
+    int: "N",
+    float: "X",
+    bool: "true|false",
+    str: "NAME",
+    str | None: "FILE",
+    tuple[str, ...]: "A,B",
+}
 
 
 def add(commands) -> None:
@@ -79,9 +87,9 @@ def _train(options: argparse.Namespace) -> None:
     from lidarpose.train.run_dir import latest, stored_recipe
     from lidarpose.train.validation import draw_examples
 
-    kind: type[Recipe] = options.kind
+    kind: type[Pretrain | Finetune] = options.kind
     name = kind.__name__.lower()
-    changes = {
+    changes: dict[str, Any] = {
         field.name: _parsed(field.name, text, field.type)
         for field in fields(kind)
         if (text := getattr(options, f"set_{field.name}", None)) is not None
@@ -102,20 +110,13 @@ def _train(options: argparse.Namespace) -> None:
     words += ["--resume"] * options.resume
     sets = [shlex.quote(Path(data).name) for data in changes.get("data", ())]
     command = " ".join(["lidarpose", name, *sets, *words])
-    path = train(
-        wanted,
-        folder,
-        resume=options.resume,
-        command=command,
-        device=options.device,
-        tracker=options.tracker,
-        draw=draw_examples,
-    )
+    environment = {"device": options.device, "tracker": options.tracker}
+    path = train(wanted, folder, resume=options.resume, command=command, draw=draw_examples, **environment)
     if os.environ.get("RANK", "0") == "0":
         print(path)
 
 
-def _parsed(name: str, text: str, kind: type) -> object:
+def _parsed(name: str, text: str, kind: Any) -> object:
     """An option's value. Raises InputError for a text of another type."""
     option = f"--{name.replace('_', '-')}"
     if kind is bool:
@@ -131,7 +132,7 @@ def _parsed(name: str, text: str, kind: type) -> object:
     return names(text) if kind == tuple[str, ...] else text
 
 
-def _said(value: object) -> str:
+def _said(value: Any) -> str:
     """A value as it is written after an option, of paths the name alone."""
     if isinstance(value, bool):
         return str(value).lower()

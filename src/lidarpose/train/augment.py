@@ -113,7 +113,7 @@ def augmented(sample: LabeledSample, kind: Augmentation, rng: np.random.Generato
     sample, center = _view(sample, kind, rng)
     origin = np.zeros(3) if sample.sensor_known and rng.random() >= BLIND else None
     view = view_features(center, origin)
-    part, visible = _labels(sample)
+    part, visible = part_and_visible(sample)
     points, joints = sample.points - center, sample.joints - center
     yaw = rng.uniform(-np.pi, np.pi)
     R = rotation_about("z", yaw if rng.random() < kind.turn else 0.0) * (1 + kind.scale * rng.uniform(-1, 1))
@@ -207,7 +207,7 @@ def _view(sample: LabeledSample, kind: Augmentation, rng: np.random.Generator) -
 def _cropped(sample: LabeledSample, keep: np.ndarray) -> LabeledSample:
     if keep.all() or keep.sum() < LEAST_POINTS:
         return sample
-    part, visible = _labels(sample)
+    part, visible = part_and_visible(sample)
     # a joint whose points are all gone is not seen any more; points whose part is unknown count as body
     body = part != 0
     gone = seen(sample.joints, sample.points[body]) & ~seen(sample.joints, sample.points[keep & body])
@@ -216,7 +216,7 @@ def _cropped(sample: LabeledSample, keep: np.ndarray) -> LabeledSample:
     return replace(sample, points=sample.points[keep], part=part[keep], pose=pose)
 
 
-def _labels(sample: LabeledSample) -> tuple[np.ndarray, np.ndarray]:
+def part_and_visible(sample: LabeledSample) -> tuple[np.ndarray, np.ndarray]:
     """part (n,) and visible (26,), which samples of an `InMemoryDataset` always have."""
     part, visible = sample.part, sample.pose.visible
     assert part is not None and visible is not None

@@ -35,24 +35,24 @@ BATCHES = 8
 LANES = 8
 # how often a worker checks that its parent lives, s
 _POLL = 1.0
-# scenes whose every person is as the paper says, masked always
+# scenes of which every sample is as the paper says, masked always
 _OF_ONE_DIFFICULTY = ("paper", "reference")
 # first words of generators' seeds: 1 is the synthetic person's own, 9 and 10 are the loop's
 _SYNTHETIC, _STORED, _EPOCH_ORDER, _BATCH_ORDER = 2, 5, 6, 8
 
 
 class Source(Protocol):
-    """People by their number in a run. May be pickled."""
+    """Examples by their number in a run. May be pickled."""
 
     def example(self, index: int) -> Example: ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class SyntheticSource:
-    """People of a scene whose difficulty rises.
+    """Synthetic samples of a scene, of rising difficulty.
 
-    easy: how many people it takes to rise from nothing to full; below the ceiling every difficulty goes on being seen,
-    the harder ones more often, but for the paper's scenes, which know one difficulty; motion, subjects, captured,
+    easy: how many samples it takes to rise from nothing to full; below the ceiling every difficulty is still sampled,
+    harder ones more often, except in the paper's scenes, which have one difficulty; motion, subjects, captured,
     strays, noise: see `recipes.Pretrain`; refined: see `example`. Raises InputError, at once, for an unknown scene and
     for clips that cannot be read.
     """
@@ -92,7 +92,7 @@ class SyntheticSource:
 
 @dataclass(frozen=True, kw_only=True)
 class StoredSource:
-    """The people of datasets, all of them once an epoch in an order of the epoch's own, each time augmented anew.
+    """The samples of datasets, all of them once an epoch in an order of its own, each time augmented anew.
 
     dataset: see `InMemoryDataset.load`; strays, noise: see `disturbed`.
     """
@@ -107,22 +107,21 @@ class StoredSource:
         epoch, place = divmod(index, len(self.dataset))
         row = int(_order(self.seed, epoch, len(self.dataset))[place])
         rng = np.random.default_rng([self.seed, _STORED, index])
-        person = self.dataset.sample(row)
+        sample = self.dataset.sample(row)
         if self.strays or self.noise:
-            person = disturbed(person, strays=self.strays, noise=self.noise, rng=rng)
-        return augmented(person, self.augmentation, rng)
+            sample = disturbed(sample, strays=self.strays, noise=self.noise, rng=rng)
+        return augmented(sample, self.augmentation, rng)
 
 
 @lru_cache(maxsize=2)
 def _order(seed: int, epoch: int, count: int) -> np.ndarray:
-    """(count,) int: whom an epoch shows, one after the other."""
+    """(count,) int: the rows of an epoch in its order."""
     return np.random.default_rng([seed, _EPOCH_ORDER, epoch]).permutation(count)
 
 
 @dataclass(frozen=True, kw_only=True)
 class MixedSource:
-    """People of `main` in their order, and evenly spread among them people of `other`, so that these are a `share` in
-    [0, 1) of all."""
+    """Examples of `main` in their order, and evenly spread among them those of `other`, a `share` in [0, 1) of all."""
 
     main: Source
     other: Source
@@ -138,7 +137,7 @@ class Chunks(IterableDataset):
     """The chunks of a run of so many `steps` from chunk `start` on, each a list of `BATCHES` batches as the task
     collates them, the last one perhaps shorter.
 
-    batch: people of a step in all processes; rank, ranks: which process this is, of how many.
+    batch: samples of a step in all processes; rank, ranks: which process this is, of how many.
     """
 
     source: Source
@@ -167,8 +166,8 @@ class Chunks(IterableDataset):
         lanes = lanes_of(self.batch, self.ranks)
         mine = []
         for lane in range(self.rank, lanes, self.ranks):
-            people = [self.source.example(index) for index in range(first + lane, first + batches * self.batch, lanes)]
-            mine.append(sorted(people, key=_voxels))
+            numbers = range(first + lane, first + batches * self.batch, lanes)
+            mine.append(sorted(map(self.source.example, numbers), key=_voxels))
         share = self.batch // lanes
         order = np.random.default_rng([self.seed, _BATCH_ORDER, chunk]).permutation(batches)
         return [self.task.collate([e for lane in mine for e in lane[k * share : (k + 1) * share]]) for k in order]
@@ -201,18 +200,18 @@ def loader(chunks: Chunks, *, workers: int) -> DataLoader:
         batch_size=None,
         num_workers=workers,
         prefetch_factor=4 if workers else None,
-        collate_fn=_as_it_is,
-        worker_init_fn=partial(_end_with, os.getpid()) if workers else None,
+        collate_fn=_unchanged,
+        worker_init_fn=partial(_end_with_parent, os.getpid()) if workers else None,
     )
 
 
-def _as_it_is(batches: list[Any]) -> list[Any]:
+def _unchanged(batches: list[Any]) -> list[Any]:
     # torch would turn arrays into tensors; the task does so, on its device
     return batches
 
 
-def _end_with(parent: int, worker: int) -> None:
-    """Ends this worker when its parent is no more: killed, that could not tell it, and it would wait for ever."""
+def _end_with_parent(parent: int, worker: int) -> None:
+    """Ends this worker when its parent is gone: a killed parent cannot stop it, and it would wait for ever."""
 
     def watch() -> None:
         while os.getppid() == parent:

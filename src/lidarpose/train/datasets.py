@@ -8,6 +8,7 @@ differently. A Sample is no tensor: give the DataLoader a collate_fn, `list` if 
 Legend: N samples, M points of all of them.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count
@@ -25,7 +26,7 @@ from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import PoseBank
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import SceneConfig
-from lidarpose.train.augment import UNKNOWN_PART, seen
+from lidarpose.train.augment import UNKNOWN_PART, part_and_visible, seen
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,38 +73,38 @@ class InMemoryDataset:
             if split is not None and dataset.card.people != "labelled":
                 raise file_error(folder, f"holds synthetic people, which have no split {split!r}: say --split all")
             own = [_to_body26(sample) for sample in _thinned(_samples(dataset, split, damaged), interval)]
-            if not any((sample.pose.visible == 0).any() for sample in own):
+            if not any((sample.joint_labels == HIDDEN).any() for sample in own):
                 # a dataset that never says hidden says nothing of what is seen
                 unknown = np.full(len(BODY26), np.nan, np.float32)
                 own = [replace(sample, pose=replace(sample.pose, visible=unknown)) for sample in own]
             samples += (sample for sample in own if sample.joint_labels.any())
         if len(skeletons) > 1:
-            raise InputError(
-                f"datasets that are learned together need one skeleton, got {', '.join(sorted(skeletons))}"
-            )
+            names = ", ".join(sorted(skeletons))
+            raise InputError(f"datasets that are learned together need one skeleton, got {names}")
         if not samples:
             where = ", ".join(map(str, folders))
             why = f" ({len(damaged)} shards cannot be read: {damaged[0]})" if damaged else ""
             what = "labelled people" if split is None else f"labelled people in the split {split!r}"
             raise InputError(f"{where}: expected {what}, found none{why}; lidarpose prepare says what is there")
-        names = sorted({sample.sequence for sample in samples})
-        number = {name: k for k, name in enumerate(names)}
+        sequences = sorted({sample.sequence for sample in samples})
+        number = {name: k for k, name in enumerate(sequences)}
         counts = np.array([len(sample.points) for sample in samples])
         ends = counts.cumsum()
         nowhere = np.full(3, np.nan)
+        part, visible = zip(*map(part_and_visible, samples), strict=True)
         return cls(
             points=np.concatenate([sample.points for sample in samples]),
-            part=np.concatenate([sample.part for sample in samples]),
+            part=np.concatenate(part),
             start=ends - counts,
             end=ends,
             joints=np.stack([sample.joints for sample in samples]),
-            visible=np.stack([sample.pose.visible for sample in samples]),
+            visible=np.stack(visible),
             center=np.stack([sample.center for sample in samples]),
             centers={name: np.stack([s.centers.get(name, nowhere) for s in samples]) for name in CENTERS},
             box=np.stack([_box_row(sample.box) for sample in samples]),
             sensor_known=np.array([sample.sensor_known for sample in samples]),
             sequence=np.array([number[sample.sequence] for sample in samples]),
-            sequences=tuple(names),
+            sequences=tuple(sequences),
             skeleton=next(iter(skeletons)),
             dataset=str(open_dataset(folders[0]).card.settings.get("dataset", "")),
             damaged=tuple(damaged),
@@ -160,12 +161,12 @@ def _samples(dataset: DatasetReader, split: str | None, damaged: list[str]) -> I
 
 def _thinned(samples: Iterator[LabeledSample], interval: int) -> Iterator[LabeledSample]:
     """Those with points of every `interval`th frame of a person, however frames are numbered: time stamps too."""
-    frames: dict[tuple[str, str], int] = {}
+    frames: Counter[tuple[str, str]] = Counter()
     for sample in samples:
         person = sample.sequence, sample.track
-        frames[person] = frames.get(person, -1) + 1
         if frames[person] % interval == 0 and len(sample.points):
             yield sample
+        frames[person] += 1
 
 
 def _to_body26(sample: LabeledSample) -> LabeledSample:
@@ -203,7 +204,7 @@ def _box_row(box: Box | None) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True)
 class SyntheticPeople(IterableDataset):
-    """Persons `start` ... `stop` - 1 of `seed`, without end where `stop` is None, see `Generator.person`.
+    """Samples `start` ... `stop` - 1 of `seed`, without end where `stop` is None, see `Generator.person`.
 
     scene, bank and captured are the generator's; hard in [0, 1] replaces the scene's difficulty. With a `batch` of
     many samples workers draw fewer bodies twice (see `generator.BLOCK`). Raises InputError for settings out of range.
@@ -246,7 +247,7 @@ class SyntheticPeople(IterableDataset):
 
 @dataclass(frozen=True, kw_only=True)
 class ShardPeople(IterableDataset):
-    """The people of a dataset that `lidarpose synth` wrote, in its order. Raises InputError where it is none."""
+    """The samples of a dataset that `lidarpose synth` wrote, in its order. Raises InputError where it is none."""
 
     folder: str | Path
     batch: int = 1

@@ -3,10 +3,11 @@
 A field's help is what the command line says of it; this module stays light for that.
 """
 
+from collections.abc import Callable
 from dataclasses import Field, asdict, dataclass, field, fields
 from operator import index
 from os import fspath
-from typing import Any
+from typing import Any, TypeVar
 
 from lidarpose.errors import InputError, check_finite, check_name
 from lidarpose.io.files import listed
@@ -17,7 +18,7 @@ SCHEDULES = ("plateau", "cosine")
 PRECISIONS = ("auto", "float32", "bf16")
 # the paper's network, and one of the same design for CPUs, besides the sizes of the package's own
 PAPER, SMALL_PAPER = "paper", "paper-small"
-# what changes no person: a run that goes on may have others
+# what changes no sample: a resumed run may have others
 FREE = ("workers", "validate", "pictures", "precision")
 
 
@@ -43,10 +44,9 @@ def _declared(f: Field, value: Any) -> Any:
             return bool(value)
         return None if value is None and f.default is None else fspath(value)
     except (TypeError, ValueError, OverflowError):
-        wanted = {int: "a whole number", float: "a number", bool: "True or False"}.get(f.type, "text")
-        raise InputError(
-            f"{f.name} must be {'a list of texts' if isinstance(f.default, tuple) else wanted}, got {value!r}"
-        ) from None
+        wanted: dict[Any, str] = {int: "a whole number", float: "a number", bool: "True or False"}
+        expected = "a list of texts" if isinstance(f.default, tuple) else wanted.get(f.type, "text")
+        raise InputError(f"{f.name} must be {expected}, got {value!r}") from None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,8 +139,8 @@ class Finetune(Recipe):
     muon_rate: float = _setting(5e-3, "peak learning rate of Muon for hidden matrices; 0: AdamW for all", "RATE")
     data: tuple[str, ...] = _setting((), "their folders")
     init: str = _setting(DEFAULT, "weights to begin with: bundled, or a checkpoint", "NAME|FILE")
-    epochs: float = _setting(20.0, "how often everybody is seen")
-    split: str = _setting("train", "whom to learn from; all: everybody")
+    epochs: float = _setting(20.0, "how often each sample is seen")
+    split: str = _setting("train", "samples to learn from; all: of every split")
     interval: int = _setting(1, "only every so many frames, as published recipes thin out")
     augment: str = _setting("default", "what happens to people: default, paper or none")
     mix: float = _setting(0.25, "share of synthesized people, below 1", "SHARE")
@@ -175,15 +175,10 @@ def pretrain_default() -> dict:
 def pretrain_paper() -> dict:
     """Paper: implementation details. 50 epochs; an epoch is here 50,000 people, since the paper's follow frames of
     LiDARHuman26M, and every pose is new."""
-    return (
-        _RELEASED
-        | {"size": PAPER, "scene": "paper", "rate": 3e-4, "people": 2_500_000, "easy": 0.0}
-        | {
-            # its law of noise is the scene's
-            "strays": 0.0,
-            "noise": 0.0,
-        }
-    )
+    # its law of noise is the scene's
+    noise = {"strays": 0.0, "noise": 0.0}
+    own = {"size": PAPER, "scene": "paper", "rate": 3e-4, "people": 2_500_000, "easy": 0.0}
+    return _RELEASED | own | noise
 
 
 def finetune_default() -> dict:
@@ -197,13 +192,14 @@ def finetune_paper() -> dict:
     return _RELEASED | own
 
 
-RECIPES = {
+AnyRecipe = TypeVar("AnyRecipe", bound=Recipe)
+RECIPES: dict[type[Recipe], dict[str, Callable[[], dict]]] = {
     Pretrain: {"default": pretrain_default, "paper": pretrain_paper},
     Finetune: {"default": finetune_default, "paper": finetune_paper},
 }
 
 
-def recipe(kind: type[Recipe], name: str = "default", **changes: Any) -> Recipe:
+def recipe(kind: type[AnyRecipe], name: str = "default", **changes: Any) -> AnyRecipe:
     """A named recipe of `Pretrain` or `Finetune`, some of its fields changed."""
     known = RECIPES[kind]
     check_name("recipe", name, known)

@@ -1,7 +1,7 @@
-"""Run folders: numbered, never overwritten, and what a run is taken up from.
+"""Run folders: numbered, never overwritten, and the state that a run resumes from.
 
 A run folder holds config.json (the recipe and the command), log.jsonl (a line a chunk and a line a validation),
-state.safetensors (to go on from), model.safetensors (the mean weights, to use), best.safetensors (those of the best
+state.safetensors (to resume from), model.safetensors (the mean weights, to use), best.safetensors (those of the best
 validation) and pictures/.
 """
 
@@ -23,7 +23,7 @@ from lidarpose._version import __version__
 from lidarpose.errors import InputError
 from lidarpose.io.files import TEMPORARY, file_error, read_bytes, write_atomic
 from lidarpose.train.optim import Muon
-from lidarpose.train.recipes import FREE, Recipe
+from lidarpose.train.recipes import FREE, AnyRecipe, Recipe
 
 # where numbered runs go
 RUNS = "runs"
@@ -63,12 +63,12 @@ def numbered(kind: str, parent: str | Path = RUNS) -> Path:
 
 
 def latest(kind: str, parent: str | Path = RUNS) -> Path:
-    """The numbered folder that was begun last. Raises InputError where there is none."""
+    """The numbered folder of the run that was started last. Raises InputError where there is none."""
     folders = [Path(parent) / f"{kind}-{number:03d}" for number in sorted(_numbers(Path(parent), kind))]
-    begun = [folder for folder in folders if (folder / CONFIG).is_file()]
-    if not begun:
+    started = [folder for folder in folders if (folder / CONFIG).is_file()]
+    if not started:
         raise InputError(f"{parent} has no run {kind}-... to resume: name its folder")
-    return begun[-1]
+    return started[-1]
 
 
 def _numbers(parent: Path, kind: str) -> list[int]:
@@ -123,7 +123,7 @@ def begin(folder: Path, recipe: Recipe, command: str) -> None:
     write_atomic(folder / CONFIG, json.dumps(config | {"recipe": recipe.to_dict()}, indent=1) + "\n")
 
 
-def stored_recipe(folder: Path, kind: type[Recipe]) -> Recipe:
+def stored_recipe(folder: Path, kind: type[AnyRecipe]) -> AnyRecipe:
     """The recipe of a run. Raises InputError where the folder is no run of this kind."""
     path = folder / CONFIG
     if not path.is_file():
@@ -239,7 +239,7 @@ def load_state(
 def _memory(
     path: Path, tensors: dict[str, Tensor], k: int, optimizer: torch.optim.Optimizer
 ) -> dict[int, dict[str, Tensor]]:
-    """What optimizer k remembers of each parameter. Raises InputError where an entry lacks or has another shape."""
+    """The state of optimizer k by parameter. Raises InputError where an entry lacks or has another shape."""
     memory: dict[int, dict[str, Tensor]] = {}
     try:
         for name, value in _part(tensors, f"optimizer.{k}.").items():

@@ -1,10 +1,11 @@
-"""What a recipe means: the objective, the source of samples, the weights to begin with, and whom to validate on."""
+"""What a recipe means: the objective, the source of samples, the initial weights, and the validation samples."""
 
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from torch import nn
@@ -81,14 +82,13 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
         task = DaptObjective(config=paper if recipe.size == PAPER else small(paper), stage="pretrain", layout=layout)
         network = task.network
 
-    def synthetic(seed: int, **more: float) -> SyntheticSource:
-        names = ("scene", "motion", "subjects", "captured", "strays", "noise")
-        return SyntheticSource(seed=seed, **{name: getattr(recipe, name) for name in names}, **more)
+    names = ("scene", "motion", "subjects", "captured", "strays", "noise")
+    synthetic: dict[str, Any] = {name: getattr(recipe, name) for name in names}
 
     def validation() -> list[Example]:
         # as a user's cloud: centered on its points
-        source = synthetic(_VALIDATION_SEED, refined=0.0)
-        return [source.example(index) for index in range(VALIDATION)]
+        held_out = SyntheticSource(seed=_VALIDATION_SEED, refined=0.0, **synthetic)
+        return [held_out.example(index) for index in range(VALIDATION)]
 
     warnings: tuple[str, ...] = ()
     source: Source
@@ -104,7 +104,7 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
         )
         warnings = _damage(dataset)
     else:
-        source = synthetic(recipe.seed, easy=recipe.easy * recipe.people)
+        source = SyntheticSource(seed=recipe.seed, easy=recipe.easy * recipe.people, **synthetic)
     return TrainSetup(
         task=task,
         source=source,
@@ -226,7 +226,7 @@ def _initial(
         # a network of this dataset already, as released ones are
         return DaptObjective(config=own, stage="finetune", layout=layout), lambda: network
     # the paper fine-tunes by heatmaps alone
-    heads = {"parts": 0, "coordinates": False, "auxiliary": False}
+    heads: dict[str, Any] = {"parts": 0, "coordinates": False, "auxiliary": False}
     config = replace(own, name=like.name, joints=like.joints, bins=like.bins, ranges=like.ranges, **heads)
     return (
         DaptObjective(config=config, stage="finetune", layout=layout),

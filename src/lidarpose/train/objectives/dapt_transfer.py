@@ -19,10 +19,10 @@ _MEANING = ("legacy", "grid", "strides", "encoder_heads", "decoder_heads", "anch
 def transferred(source: DaptNet | str | os.PathLike, config: DaptConfig, *, keep_anchors: bool = False) -> DaptNet:
     """A network of `config` that begins with the backbone of the pre-trained one, in training mode.
 
-    source: the network, which stays as it is, or the path of its checkpoint. Anchors and heads begin anew, drawn from
+    source: the network, which stays as it is, or the path of its checkpoint. Anchors and heads are new, drawn from
     torch's global generator, as in the released code. With `keep_anchors` anchors go on by joint name, as does the
     auxiliary head, and every other head that both have, the last layer of a heatmap's only where its bins and range are
-    the same; joints that are new begin anew. Raises InputError, one line, for a file that holds no such network and for
+    the same; those of new joints are new. Raises InputError, one line, for a file that holds no such network and for
     the first setting or tensor of the backbone that does not fit.
     """
     # before anything else draws

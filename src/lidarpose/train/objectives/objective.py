@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from lidarpose.train.augment import UNKNOWN_PART, Example
 
 # a sum over this process's people -> that over all processes', divided by their number. Gradients are averaged over
-# processes, so what is divided by it is the mean over everybody of the step, however they are shared out
+# processes, so what is divided by it is the mean over all samples of the step, however they are shared out
 Share = Callable[[Tensor], Tensor]
 
 

@@ -1,0 +1,48 @@
+"""What tests of training share: short runs, runs that are killed, and refusals in one line."""
+
+from contextlib import contextmanager
+
+import pytest
+
+from lidarpose.errors import InputError
+from lidarpose.train import loop, setup
+
+FEW = 16
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_to_validate_on():
+    """So that a run of seconds is not all validation."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(setup, "VALIDATION", FEW)
+        yield
+
+
+@contextmanager
+def refused(message):
+    """An InputError that matches, in one line."""
+    with pytest.raises(InputError, match=message) as caught:
+        yield
+    assert "\n" not in str(caught.value)
+
+
+class Killed(BaseException):
+    """As a signal would: nothing catches it."""
+
+
+def train_until_killed(recipe, folder, name, call):
+    """Lets the named function of the loop be called `call` times, then kills the run; saves after every chunk."""
+    where = loop if hasattr(loop, name) else loop._Run
+    original, calls = getattr(where, name), []
+
+    def counted(*args, **kwargs):
+        calls.append(name)
+        if len(calls) > call:
+            raise Killed
+        return original(*args, **kwargs)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(where, name, counted)
+        patch.setattr(loop, "SAVE_EVERY", -1.0)
+        with pytest.raises(Killed):
+            loop.train(recipe, folder)
