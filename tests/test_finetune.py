@@ -37,9 +37,9 @@ from lidarpose.train.augment import (
     seen,
 )
 from lidarpose.train.data_loader import MixedSource, StoredSource, SyntheticSource
-from lidarpose.train.datasets import InMemoryDataset
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.setup import make_setup
+from lidarpose.train.torch_dataset import InMemoryDataset
 
 NAMES = ("humanm3", "lidarhuman26m", "sloper4d", "waymo")
 

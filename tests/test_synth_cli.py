@@ -23,7 +23,7 @@ from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
 from lidarpose.synth.shard_job import Job, Maker, write_dataset
 from lidarpose.synth.street import Street
-from lidarpose.train.datasets import ShardPeople, SyntheticPeople
+from lidarpose.train.torch_dataset import ShardPeople, SyntheticPeople
 
 COUNT, PER_SHARD = 60, 10
 WORDS = ["-n", str(COUNT), "--per-shard", str(PER_SHARD), "--sensor", "os1-64,vlp-16", "--seed", "5"]

@@ -34,7 +34,7 @@ RENAMED = {
     "synth.generate": "synth.generator",
     "synth.mesh": "synth.environment.mesh",
     "train.job": "train.setup",
-    "train.people": "train.datasets",
+    "train.people": "train.torch_dataset",
     "view": "viz",
     "view.picture": "viz.draw",
 }

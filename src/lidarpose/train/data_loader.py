@@ -26,8 +26,8 @@ from lidarpose.synth.bodies import PoseBank
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
 from lidarpose.train.augment import REFINED, Augmentation, Example, augmented, disturbed, example
-from lidarpose.train.datasets import InMemoryDataset
 from lidarpose.train.objectives.objective import Objective
+from lidarpose.train.torch_dataset import InMemoryDataset
 
 # batches a chunk
 BATCHES = 8

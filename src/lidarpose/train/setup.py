@@ -23,13 +23,13 @@ from lidarpose.models.posenet import PoseNet
 from lidarpose.skeleton import HUMAN15, SMPL24, Skeleton, skeleton
 from lidarpose.train.augment import Augmentation, Example, augmentation, augmented
 from lidarpose.train.data_loader import MixedSource, Source, StoredSource, SyntheticSource
-from lidarpose.train.datasets import InMemoryDataset
 from lidarpose.train.objectives.dapt_objective import DaptObjective, pretraining_config, small
 from lidarpose.train.objectives.dapt_transfer import transferred
 from lidarpose.train.objectives.objective import Objective
 from lidarpose.train.objectives.posenet_objective import PoseNetObjective
 from lidarpose.train.recipes import PAPER, SMALL_PAPER, Finetune, Pretrain
 from lidarpose.train.run_dir import folder_names
+from lidarpose.train.torch_dataset import InMemoryDataset
 
 # samples to validate on; synthetic ones are of a seed that no run learns from
 VALIDATION = 256
