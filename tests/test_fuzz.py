@@ -24,7 +24,7 @@ from lidarpose.io.pickles import load_pickle
 from lidarpose.io.point_cloud import read_points
 from lidarpose.models import bundled_path
 from lidarpose.models.checkpoint import ENTRY, SafetensorsFile, read_header
-from lidarpose.train.labeled_dataset import InMemoryDataset
+from lidarpose.train.torch_dataset import InMemoryDataset
 
 fuzz = settings(
     max_examples=int(os.environ.get("FUZZ_EXAMPLES", 100)),

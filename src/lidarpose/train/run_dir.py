@@ -15,7 +15,8 @@ from types import NoneType
 
 import torch
 from filelock import FileLock, Timeout
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
+from safetensors.torch import load
 from safetensors.torch import save as to_bytes
 from torch import Tensor, nn
 
@@ -212,15 +213,17 @@ def load_state(
 ) -> dict:
     """Fills network, mean and optimizers in place and returns the progress. Raises InputError where it does not fit."""
     try:
-        with safe_open(str(path), framework="pt") as file:
-            progress = json.loads((file.metadata() or {})["progress"])
-            # states of 0.1 lack the last validation
-            progress.setdefault("validation", None)
-            for entry, types in _PROGRESS.items():
-                value = progress.get(entry)
-                if entry not in progress or type(value) not in types or value is not None and not 0 <= value < inf:
-                    raise ValueError(f"its {entry} is {value!r}")
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
+        # read, not mapped: a mapped file that is cut off meanwhile would end the process
+        content = path.read_bytes()
+        tensors = load(content)
+        header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
+        progress = json.loads(header["__metadata__"]["progress"])
+        # states of 0.1 lack the last validation
+        progress.setdefault("validation", None)
+        for entry, types in _PROGRESS.items():
+            value = progress.get(entry)
+            if entry not in progress or type(value) not in types or value is not None and not 0 <= value < inf:
+                raise ValueError(f"its {entry} is {value!r}")
     except (SafetensorError, OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(f"{path}: expected the state of a run, but it is damaged ({error}): start a new run") from None
     stored_mean = _part(tensors, "mean.")
