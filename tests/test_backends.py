@@ -8,18 +8,18 @@ import sys
 import textwrap
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 import torch
 
-import lidarpose
-from lidarpose.errors import InputError, MissingExtra
+from lidarpose.errors import InputError, MissingExtra, missing_extra
 from lidarpose.inference.backend import Raw, estimates
 from lidarpose.inference.predictor import Predictor, load
 from lidarpose.io.files import content_digest
 from lidarpose.models import DEFAULT, bundled_path, decode, layers, onnx
-from lidarpose.models.checkpoint import Header, load_checkpoint, read_header, save_checkpoint
+from lidarpose.models.checkpoint import Header, read_header, save_checkpoint
 from lidarpose.models.config import BIN, NetworkConfig
 from lidarpose.models.dapt.dapt_config import DaptConfig
 from lidarpose.models.dapt.dapt_net import DaptNet
@@ -29,10 +29,6 @@ from lidarpose.models.voxelize import view_features
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14
 
 DAPT = Path(__file__).parent / "parity" / "dapt_tiny.safetensors"
-CROP = """
-import numpy as np
-np.save("crop.npy", np.random.default_rng(0).normal(0, (0.15, 0.15, 0.4), (300, 3)))
-"""
 
 
 def blob(count, seed=0):
@@ -42,7 +38,7 @@ def blob(count, seed=0):
 
 @pytest.fixture(scope="module")
 def models():
-    return {name: load(backend=name, threads=1 if name == "onnx" else None) for name in ("onnx", "torch")}
+    return {name: load(backend=name, threads=1 if name == "onnx" else None, tta=1) for name in ("onnx", "torch")}
 
 
 # ---- one answer
@@ -94,18 +90,19 @@ def test_the_bundled_twins_are_of_one_network():
     assert model.header == read_header(bundled_path())
 
 
-def test_a_batch_is_as_one_by_one(models):
+@pytest.mark.parametrize("name", ["onnx", "torch"])
+def test_a_batch_is_as_one_by_one_in_another_process_too(models, name):
     clouds = [blob(40), blob(900, 1), blob(7, 2)]
-    for model in models.values():
-        together = model.predict(clouds)
-        for cloud, person in zip(clouds, together, strict=True):
-            np.testing.assert_allclose(person.joints, model.predict(cloud).joints, atol=1e-4)
+    alone = [models[name].predict(cloud).joints for cloud in clouds]
+    np.testing.assert_allclose(models[name].predict(clouds).to_numpy(), alone, atol=1e-4)
+    other = pickle.loads(pickle.dumps(models[name]))
+    np.testing.assert_array_equal(other.predict(clouds[0]).joints, alone[0])
 
 
 def test_compiling_is_asked_for(models, monkeypatch):
     asked = []
     monkeypatch.setattr(torch, "compile", lambda module, **settings: asked.append(settings) or module)
-    compiled = load(compile=True)
+    compiled = load(compile=True, tta=1)
     assert compiled.backend.name == "torch" and asked == []
     for count in (300, 60):
         np.testing.assert_array_equal(compiled.predict(blob(count)).joints, models["torch"].predict(blob(count)).joints)
@@ -114,20 +111,17 @@ def test_compiling_is_asked_for(models, monkeypatch):
 
 @pytest.mark.slow
 def test_compiled_is_the_same(models):
-    compiled = load(compile=True)
+    compiled = load(compile=True, tta=1)
     for count in (300, 60, 5):
         due = models["torch"].predict(blob(count)).joints
         np.testing.assert_allclose(compiled.predict(blob(count)).joints, due, atol=1e-4)
 
 
 def test_a_failed_compilation_is_one_line(monkeypatch):
-    def compile(module, **settings):
-        def run(*tensors):
-            raise torch._dynamo.exc.TorchDynamoException("no\ncompiler")
+    def fails(*tensors):
+        raise torch._dynamo.exc.TorchDynamoException("no\ncompiler")
 
-        return run
-
-    monkeypatch.setattr(torch, "compile", compile)
+    monkeypatch.setattr(torch, "compile", lambda module, **settings: fails)
     with pytest.raises(InputError, match="torch.compile failed .no compiler.: leave compile away"):
         load(compile=True).predict(blob(30))
 
@@ -142,11 +136,11 @@ def test_numpy_and_torch_decode_alike(kind):
     logits = rng.normal(0, 3, (50, 26, 3, bins)).astype(np.float32)
     logits[..., 0] += 4 * (rng.random((50, 26, 3)) < 0.2)
     raw = raw_of(logits)
-    found = estimates(raw, decode.window)
+    out = estimates(raw, decode.window)
     due = raw.vote + layers.decode(torch.from_numpy(logits)).numpy()
-    np.testing.assert_allclose(found.joints, due, atol=2e-6)
+    np.testing.assert_allclose(out.joints, due, atol=2e-6)
     ends = (logits.argmax(-1) % (bins - 1) == 0).any(-1)
-    np.testing.assert_array_equal(found.in_range, ~ends)
+    np.testing.assert_array_equal(out.in_range, ~ends)
     assert 0.1 < ends.mean() < 0.9
 
 
@@ -164,33 +158,33 @@ def test_decoders_differ_and_each_is_taken(models):
     cloud = blob(400)
     center = cloud.mean(0)
     raw = models["onnx"].backend.run([cloud - center], np.zeros((1, 5), np.float32))
-    found = {}
+    joints = {}
     for name in ("window", "argmax", "dark"):
-        model = load(decode=name, threads=1)
-        found[name] = model.outputs([cloud], center[None], None).joints
-        np.testing.assert_allclose(found[name], estimates(raw, decode.decoder(name)).joints, atol=1e-6)
-        assert model.predict(cloud).model["decode"] == name
+        model = Predictor(models["onnx"].backend, name="x", decode=name)
+        joints[name] = model.outputs([cloud], center[None], None).joints
+        np.testing.assert_allclose(joints[name], estimates(raw, decode.decoder(name)).joints, atol=1e-6)
+        assert load(decode=name).model["decode"] == model.predict(cloud).model["decode"] == name
     # a peak's bin and what is refined about it are less than the window apart
-    assert 0 < np.abs(found["window"] - found["argmax"]).max() < 4 * BIN
-    assert 0 < np.abs(found["dark"] - found["argmax"]).max() <= BIN
-    np.testing.assert_array_equal(found["window"], load(threads=1).outputs([cloud], center[None], None).joints)
+    assert 0 < np.abs(joints["window"] - joints["argmax"]).max() < 4 * BIN
+    assert 0 < np.abs(joints["dark"] - joints["argmax"]).max() <= BIN
+    np.testing.assert_array_equal(joints["window"], models["onnx"].outputs([cloud], center[None], None).joints)
 
 
 def test_extreme_outputs_stay_in_their_ranges():
     huge = np.array([[-1e4, 1e4, 0.0]], np.float32)
     logits = np.zeros((1, 3, 3, 24), np.float32)
     logits[..., 5] = 1e4
-    found = estimates(raw_of(logits, confidence=huge, log_spread=huge, visible=huge), decode.window)
-    np.testing.assert_array_equal(found.confidence, [[0, 1, 0.5]])
-    np.testing.assert_array_equal(found.visible, [[0, 1, 0.5]])
-    assert np.isfinite(found.spread).all() and (found.spread >= 0).all() and np.isfinite(found.joints).all()
+    out = estimates(raw_of(logits, confidence=huge, log_spread=huge, visible=huge), decode.window)
+    np.testing.assert_array_equal(out.confidence, [[0, 1, 0.5]])
+    np.testing.assert_array_equal(out.visible, [[0, 1, 0.5]])
+    assert np.isfinite(out.spread).all() and (out.spread >= 0).all() and np.isfinite(out.joints).all()
 
 
 def test_a_network_without_heatmaps_knows_no_range():
     raw = raw_of(np.zeros((2, 26, 3, 0), np.float32))
-    found = estimates(raw, decode.window)
-    np.testing.assert_array_equal(found.joints, raw.vote)
-    assert found.in_range is None and found.confidence.shape == (2, 26)
+    out = estimates(raw, decode.window)
+    np.testing.assert_array_equal(out.joints, raw.vote)
+    assert out.in_range is None and out.confidence.shape == (2, 26)
 
 
 def test_confidence_read_off_heatmaps():
@@ -201,11 +195,11 @@ def test_confidence_read_off_heatmaps():
     sure = np.full((1, 2, 100), -1e4, np.float32)
     sure[..., 50] = 0
     raw = Raw(vote=np.zeros((1, 2, 3)), heatmaps=(logits, sure, sure), low=np.full(3, -1.0), step=np.full(3, 0.02))
-    found = estimates(raw, decode.window)
-    np.testing.assert_allclose(found.joints, 0, atol=1e-9)
-    np.testing.assert_allclose(found.confidence, [[0.75, 1]], atol=1e-6)
-    np.testing.assert_allclose(found.spread, [[0.15, 0]], atol=1e-6)
-    assert found.visible is None and found.in_range.all()
+    out = estimates(raw, decode.window)
+    np.testing.assert_allclose(out.joints, 0, atol=1e-9)
+    np.testing.assert_allclose(out.confidence, [[0.75, 1]], atol=1e-6)
+    np.testing.assert_allclose(out.spread, [[0.15, 0]], atol=1e-6)
+    assert out.visible is None and out.in_range.all()
 
 
 class Scripted:
@@ -231,13 +225,8 @@ class Scripted:
 
 def test_joints_at_the_end_of_the_range_are_named():
     mode = np.full((26, 3), 10)
-    for joint, axis, end in (
-        ("left_wrist", 0, 0),
-        ("head", 2, 23),
-        ("nose", 1, 0),
-        ("neck", 1, 23),
-        ("left_hand", 0, 0),
-    ):
+    ends = {("left_wrist", 0): 0, ("head", 2): 23, ("nose", 1): 0, ("neck", 1): 23, ("left_hand", 0): 0}
+    for (joint, axis), end in ends.items():
         mode[BODY26.index(joint), axis] = end
     pose = Predictor(Scripted(mode), name="x").predict(blob(30))
     assert set(pose.out_of_range) == {"neck", "head", "left_wrist", "left_hand"}
@@ -247,8 +236,8 @@ def test_joints_at_the_end_of_the_range_are_named():
     entry = json.loads(pose.to_json())["people"][0]
     assert entry["out_of_range"] == pose.out_of_range and len(entry["visible"]) == 24
     assert all(0 <= value <= 1 for value in entry["visible"])
-    # asked for joints that are all in range, nothing is said
-    pose = Predictor(Scripted(np.where(mode == 10, 10, [[10]])), name="x").predict(blob(30))
+    # nothing is said where all are in range
+    pose = Predictor(Scripted(np.full((26, 3), 10)), name="x").predict(blob(30))
     assert pose.warnings == () and pose.out_of_range == [] and pose.in_range.all()
 
 
@@ -260,14 +249,14 @@ def test_a_person_without_joints_has_nothing_to_tell(models):
 
 
 def test_the_second_pass_is_centered_on_the_pelvis_to_a_centimetre():
-    found = np.zeros((26, 3), np.float32)
-    found[0] = 0.1234, -0.0567, 0.301
-    scripted = Scripted(np.full((26, 3), 11), found)
+    joints = np.zeros((26, 3), np.float32)
+    joints[0] = 0.1234, -0.0567, 0.301
+    scripted = Scripted(np.full((26, 3), 11), joints)
     Predictor(scripted, name="x").predict(blob(30))
     first, second = scripted.centers[:2]
     moved = second - first
     # a bin's middle is half a bin from the vote
-    np.testing.assert_allclose(moved, np.round((found[:1] - BIN / 2) / 0.01) * 0.01, atol=1e-6)
+    np.testing.assert_allclose(moved, np.round((joints[:1] - BIN / 2) / 0.01) * 0.01, atol=1e-6)
 
 
 # ---- which backend
@@ -275,8 +264,8 @@ def test_the_second_pass_is_centered_on_the_pelvis_to_a_centimetre():
 
 def test_backends_are_chosen(tmp_path):
     path = tmp_path / "mine.safetensors"
-    path.write_bytes(bundled_path().read_bytes())
-    (tmp_path / "mine.onnx").write_bytes(bundled_path(suffix=".onnx").read_bytes())
+    path.write_bytes(bundled_path("tiny").read_bytes())
+    (tmp_path / "mine.onnx").write_bytes(bundled_path("tiny", ".onnx").read_bytes())
     chosen = {
         "onnx": [{}, {"weights": tmp_path / "mine.onnx"}, {"weights": str(path), "backend": "onnx"}, {"device": "cpu"}],
         "torch": [{"backend": "torch"}, {"weights": path}, {"compile": True}, {"weights": str(path)}],
@@ -301,6 +290,13 @@ BAD = {
     "onnx file by torch": ({"weights": bundled_path(suffix=".onnx"), "backend": "torch"}, "torch runs a .safetensors"),
     "device": ({"device": "hal9000"}, "device 'hal9000' cannot be used"),
     "missing": ({"weights": "no/such.onnx"}, "no such file"),
+    "missing checkpoint": ({"weights": "no/such.safetensors"}, "does not exist"),
+    "missing path": ({"weights": Path("nothing")}, "does not exist"),
+    "no stem": ({"weights": ".safetensors"}, "does not exist"),
+    "no checkpoint": ({"weights": __file__}, "expected a checkpoint (.safetensors), but the file is something else"),
+    "a folder": ({"weights": Path(__file__).parent}, "is a folder"),
+    "None": ({"weights": None}, "expected weights as tiny, small or the path of a file"),
+    "a number": ({"weights": 0.5}, "expected weights as tiny, small or the path of a file"),
 }
 
 
@@ -314,32 +310,20 @@ def test_a_wrong_choice_is_one_line(case):
 
 def test_threads():
     assert 1 <= usable_threads() <= 8
-    assert load(threads=3).backend.session.get_session_options().intra_op_num_threads == 3
-    assert load().backend.session.get_session_options().intra_op_num_threads == usable_threads()
-
-
-@pytest.mark.parametrize("name", ["onnx", "torch"])
-def test_a_predictor_goes_to_another_process(models, name):
-    given = models[name].predict(blob(60)).joints
-    other = pickle.loads(pickle.dumps(models[name]))
-    np.testing.assert_array_equal(other.predict(blob(60)).joints, given)
+    for asked, used in ((3, 3), (None, usable_threads())):
+        assert load(threads=asked).backend.session.get_session_options().intra_op_num_threads == used
 
 
 def test_a_runtime_that_cannot_be_loaded_is_not_the_file_s_fault(monkeypatch):
-    def fails(error):
-        def load_module(name):
-            raise error
-
-        monkeypatch.setattr(onnx, "import_module", load_module)
-
+    import_module = mock.Mock()
+    monkeypatch.setattr(onnx, "import_module", import_module)
     for error in (ImportError("DLL load failed:\nnot found"), OSError("libgomp.so.1: cannot open")):
-        fails(error)
+        import_module.side_effect = error
         with pytest.raises(InputError, match=r"^ONNX Runtime cannot be loaded \(.*\): reinstall it, pip") as raised:
             load()
         assert "\n" not in str(raised.value)
-    stopped = ImportError("initialization failed")
+    stopped = import_module.side_effect = ImportError("initialization failed")
     stopped.__cause__ = KeyboardInterrupt()
-    fails(stopped)
     with pytest.raises(KeyboardInterrupt):
         load()
 
@@ -354,57 +338,54 @@ def released(tmp_path_factory):
     return path
 
 
-def test_a_released_network_predicts_its_own_skeleton(released):
-    model = load(released)
-    assert model.backend.name == "torch" and model.skeleton is WAYMO14
-    people = model.predict([blob(80), blob(3), blob(20, 1)])
+@pytest.fixture(scope="module")
+def dapt(released):
+    return load(released)
+
+
+def test_a_released_network_predicts_its_own_skeleton(dapt):
+    assert dapt.backend.name == "torch" and dapt.skeleton is WAYMO14
+    people = dapt.predict([blob(80), blob(3), blob(20, 1)])
     assert people.skeleton is WAYMO14 and [person.joints is None for person in people] == [False, True, False]
     pose = people[0]
     assert pose.joints.shape == (14, 3) and pose.visible is None
     assert (pose.confidence >= 0).all() and (pose.confidence <= 1).all() and (pose.spread > 0).all()
     assert json.loads(pose.to_json())["people"][0]["visible"] == []
     with pytest.raises(InputError, match="waymo14 has no pelvis, .* which smpl24 needs"):
-        model.predict(blob(80), skeleton="smpl24")
+        dapt.predict(blob(80), skeleton="smpl24")
 
 
-def test_a_released_networks_joints_are_brought_in_order(released):
-    network, header = load_checkpoint(released)
+def test_a_released_networks_joints_are_brought_in_order(dapt):
+    network, config = dapt.backend.network, dapt.header.config
     cloud = blob(60) - blob(60).mean(0)
-    out = network.outputs([cloud])
-    found = load(released).outputs([cloud], np.zeros((1, 3)), None)
+    raw = network.outputs([cloud])
+    joints = dapt.outputs([cloud], np.zeros((1, 3)), None).joints[0]
     for joint in WAYMO14.joints:
-        theirs = network.config.joints.index(joint)
-        for axis, name in enumerate("xyz"):
-            due = decode.window(
-                out[f"logits_{name}"][0, theirs], low=network.config.low[axis], step=network.config.step[axis]
-            )
-            assert found.joints[0, WAYMO14.index(joint), axis] == pytest.approx(due, abs=1e-6)
-    assert header.config.joints != WAYMO14.joints
+        logits = [raw[f"logits_{axis}"][0, config.joints.index(joint)] for axis in "xyz"]
+        expected = [decode.window(row, low=config.low[k], step=config.step[k]) for k, row in enumerate(logits)]
+        np.testing.assert_allclose(joints[WAYMO14.index(joint)], expected, atol=1e-6)
+    assert config.joints != WAYMO14.joints
 
 
-def test_a_released_network_is_centered_on_the_hips(released, monkeypatch):
-    model = load(released)
-    real, seen = model.outputs, []
+def test_a_released_network_is_centered_on_the_hips(dapt, monkeypatch):
+    outputs, calls = dapt.outputs, []
 
-    def outputs(clouds, centers, origin):
-        found = real(clouds, centers, origin)
-        seen.append((centers, found.joints))
-        return found
+    def recorded(clouds, centers, origin):
+        calls.append((centers, outputs(clouds, centers, origin)))
+        return calls[-1][1]
 
-    monkeypatch.setattr(model, "outputs", outputs)
-    model.predict(blob(200))
-    (first, joints), (second, _) = seen[:2]
-    hips = joints[:, [WAYMO14.index("left_hip"), WAYMO14.index("right_hip")]].mean(1)
+    monkeypatch.setattr(dapt, "outputs", recorded)
+    dapt.predict(blob(200))
+    (first, estimated), (second, _) = calls[:2]
+    hips = estimated.joints[:, [WAYMO14.index("left_hip"), WAYMO14.index("right_hip")]].mean(1)
     np.testing.assert_allclose(second - first, hips, atol=0.00501)
 
 
-def test_strays_do_not_reach_a_released_network(released):
-    model = load(released)
+def test_far_points_do_not_reach_a_released_network(dapt):
     cloud = blob(100)
-    strays = np.concatenate([cloud, cloud[:1] + (0, 0, 900.0)])
-    due = model.outputs([cloud], cloud.mean(0)[None], None)
-    found = model.outputs([strays], cloud.mean(0)[None], None)
-    np.testing.assert_allclose(found.joints, due.joints, atol=1e-6)
+    far = np.concatenate([cloud, cloud[:1] + (0, 0, 900.0)])
+    a, b = (dapt.outputs([points], cloud.mean(0)[None], None).joints for points in (cloud, far))
+    np.testing.assert_allclose(a, b, atol=1e-6)
 
 
 def test_a_network_that_only_regresses(tmp_path):
@@ -420,115 +401,92 @@ def test_a_network_that_only_regresses(tmp_path):
     pose.picture(tmp_path / "a.png")
 
 
-def test_what_a_released_network_cannot_do_is_one_line(released, tmp_path):
-    for settings, words in (({"backend": "onnx"}, "does not run as ONNX"), ({"compile": True}, "is not offered")):
-        with pytest.raises(InputError, match=words):
-            load(released, **settings)
-    with pytest.raises(InputError, match="is not offered as onnx"):
-        lidarpose.export(released, tmp_path / "x.onnx")
-    assert list(tmp_path.iterdir()) == []
+@pytest.mark.parametrize(
+    "settings, words", [({"backend": "onnx"}, "does not run as ONNX"), ({"compile": True}, "is not offered")]
+)
+def test_what_a_released_network_cannot_do_is_one_line(released, settings, words):
+    with pytest.raises(InputError, match=words):
+        load(released, **settings)
 
 
 # ---- without torch
 
 
-def without(modules, code, cwd):
-    """Runs a program in which modules cannot be imported."""
-    block = "import sys\n" + "".join(f"sys.modules[{name!r}] = None\n" for name in modules)
-    return subprocess.run(
-        [sys.executable, "-c", block + textwrap.dedent(code)], capture_output=True, text=True, cwd=cwd, timeout=120
-    )
+def program(modules, code, cwd):
+    """Runs a program in which `modules` cannot be imported, beside a file crop.npy."""
+    np.save(cwd / "crop.npy", blob(300))
+    head = f"import sys\nsys.modules.update(dict.fromkeys({modules!r}))\nfrom lidarpose.cli import main\n"
+    command = [sys.executable, "-c", head + textwrap.dedent(code)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, timeout=120)
 
 
 EXTRAS = ("torch", "accelerate", "onnx", "onnxscript", "numba", "threadpoolctl", "pyarrow")
 
 
 def test_the_base_install_predicts_and_informs(tmp_path):
-    done = without(
-        EXTRAS,
-        CROP
-        + """
-from lidarpose.cli import main
-assert main(["predict", "crop.npy", "--crop", "--picture", "--decode", "dark"]) == 0
-assert main(["info"]) == 0
-import lidarpose
-assert lidarpose.load().predict(np.load("crop.npy")).joints.shape == (24, 3)
-""",
-        tmp_path,
-    )
+    code = """
+        import numpy as np
+        assert main(["predict", "crop.npy", "--crop", "--picture", "--decode", "dark"]) == 0
+        assert main(["info"]) == 0
+        import lidarpose
+        assert lidarpose.load().predict(np.load("crop.npy")).joints.shape == (24, 3)
+        """
+    done = program(EXTRAS, code, tmp_path)
     assert done.returncode == 0, done.stderr
     assert "not installed" in done.stdout and "ONNX Runtime" in done.stdout and "tiny" in done.stdout
     assert {path.name for path in tmp_path.iterdir()} == {"crop.npy", "crop.poses.json", "crop.poses.png"}
 
 
+# command -> the extra that it needs, and one that is wrong all the same
 LACKING = {
-    "backend": (["predict", "crop.npy", "--backend", "torch"], "train"),
-    "device": (["predict", "crop.npy", "--device", "cuda"], "train"),
-    "weights": (["predict", "crop.npy", "--weights", str(bundled_path())], "train"),
-    "export": (["export", "--out", "x.onnx"], "export"),
-    "import": (["import", "x.safetensors", "y.safetensors"], "train"),
-    "pretrain": (["pretrain", "run"], "(train|synth)"),
-    "demo": (["demo"], "synth"),
+    "predict crop.npy --backend torch": "train",
+    "predict crop.npy --device cuda": "train",
+    f"predict crop.npy --weights {bundled_path()}": "train",
+    "export --out x.onnx": "export",
+    "import x.safetensors y.safetensors": "train",
+    "pretrain run": "(train|synth)",
+    "demo": "synth",
 }
+DAMAGED = "predict crop.npy --weights bad.safetensors"
 
 
 def test_what_needs_an_extra_names_it_in_one_line(tmp_path):
-    done = without(
-        EXTRAS,
-        CROP
-        + f"""
-from lidarpose.cli import main
-for name, (words, _) in {LACKING!r}.items():
-    print(name, file=sys.stderr)
-    assert main(words) == 2, name
-import lidarpose
-for call in (lambda: lidarpose.export, lambda: lidarpose.import_dapt, lambda: lidarpose.load(backend="torch")):
-    try:
-        call()
-    except lidarpose.LidarPoseError as error:
-        print(error)
-""",
-        tmp_path,
-    )
-    assert done.returncode == 0, done.stderr
-    lines = done.stderr.splitlines()
-    assert lines[::2] == list(LACKING) and [path.name for path in tmp_path.iterdir()] == ["crop.npy"]
-    for line, (_, extra) in zip(lines[1::2], LACKING.values(), strict=True):
-        assert re.fullmatch(rf"lidarpose: error: .*: in the clone, pip install '\.\[{extra}\]'", line), line
-    found = [re.search(r"(.*) needs .*\[(.*)\]", line).groups() for line in done.stdout.splitlines()]
-    assert found[:2] == [("lidarpose.export", "export"), ("lidarpose.import_dapt", "train")]
-    assert found[2] == (f"running {DEFAULT}.safetensors with torch", "train")
-
-
-def test_a_bad_file_is_told_before_torch_is_asked_for(tmp_path):
     (tmp_path / "bad.safetensors").write_bytes(b"no weights at all")
-    done = without(["torch"], "import lidarpose\nlidarpose.load('bad.safetensors')", tmp_path)
-    assert "something else" in done.stderr and "MissingExtra" not in done.stderr
+    code = f"""
+        for words in {[*LACKING, DAMAGED]!r}:
+            assert main(words.split()) == 2, words
+        import lidarpose
+        for call in (lambda: lidarpose.export, lambda: lidarpose.import_dapt, lambda: lidarpose.load(backend="torch")):
+            try:
+                call()
+            except lidarpose.LidarPoseError as error:
+                print(error)
+        """
+    done = program(EXTRAS, code, tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert {path.name for path in tmp_path.iterdir()} == {"crop.npy", "bad.safetensors"}
+    *lines, damaged = done.stderr.splitlines()
+    assert "something else" in damaged
+    for line, extra in zip(lines, LACKING.values(), strict=True):
+        assert re.fullmatch(rf"lidarpose: error: .*: in the clone, pip install '\.\[{extra}\]'", line), line
+    needs = [re.search(r"(.*) needs .*\[(.*)\]", line).groups() for line in done.stdout.splitlines()]
+    assert needs[:2] == [("lidarpose.export", "export"), ("lidarpose.import_dapt", "train")]
+    assert needs[2] == (f"running {DEFAULT}.safetensors with torch", "train")
 
 
-def test_predicting_loads_nothing_that_it_does_not_need(tmp_path):
+def test_predicting_and_the_demo_load_nothing_that_they_do_not_need(tmp_path):
     heavy = ("torch", "numba", "pandas", "matplotlib", "tqdm", "onnx", "scipy", "sympy")
-    done = without(
-        (),
-        CROP
-        + f"""
-from lidarpose.cli import main
-main(["predict", "crop.npy", "--crop"])
-print(*[name for name in {heavy} if name in sys.modules])
-""",
-        tmp_path,
-    )
-    assert done.stdout.strip() == "", done.stderr
-
-
-def test_the_demo_and_the_generator_need_no_torch(tmp_path):
-    code = "import lidarpose.cli.demo, lidarpose.synth.generator, lidarpose.synth.shard_job, lidarpose.viz.html"
-    assert without(["torch"], code, tmp_path).returncode == 0
+    code = f"""
+        main(["predict", "crop.npy", "--crop"])
+        print(*[name for name in {heavy} if name in sys.modules])
+        sys.modules["torch"] = None
+        import lidarpose.cli.demo, lidarpose.synth.generator, lidarpose.synth.shard_job, lidarpose.viz.html
+        """
+    done = program((), code, tmp_path)
+    assert done.stdout.strip() == "" and done.returncode == 0, done.stderr
 
 
 def test_missing_extra_leaves_other_modules_alone():
-    from lidarpose.errors import missing_extra
-
     error = ModuleNotFoundError("No module named 'lidarpose.nothing'", name="lidarpose.nothing")
     assert missing_extra(error, "this") is error
     assert isinstance(missing_extra(ModuleNotFoundError(name="torch.nn"), "this"), MissingExtra)

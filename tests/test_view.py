@@ -54,6 +54,15 @@ def person(kind=Panel, *, count=200, label="somebody", **pose):
     return kind(points=cloud(pose, count=count), pose=pose, truth=t_pose(), label=label)
 
 
+EMPTY = Panel(points=np.zeros((0, 3)))
+
+
+def report(*people):
+    """The page of people, and its data."""
+    text = render_report(list(people), title="t", summary=[])
+    return text, Reader(text).data()
+
+
 def decoded(png):
     """(height, width, 3) uint8."""
     from matplotlib.image import imread
@@ -74,19 +83,15 @@ def test_facing_follows_the_body(skeleton, yaw, expected):
     np.testing.assert_allclose(facing(t_pose(yaw=yaw, skeleton=skeleton)), expected, atol=1e-9)
 
 
-def test_facing_is_unknown_where_nothing_tells_it():
-    pose = t_pose()
-    on_the_side = Pose(joints=pose.joints @ rotation_about("x", np.pi / 2).T, skeleton=BODY26)
-    assert facing(None) is None
-    assert facing(on_the_side) is None
-    assert facing(Pose(joints=np.full((26, 3), np.nan), skeleton=BODY26)) is None
-
-
-def test_facing_needs_only_one_pair_of_joints():
+def test_facing_needs_one_known_pair_of_joints_that_is_not_upright():
     pose = t_pose(yaw=1.0)
+    assert facing(None) is None
+    # on the side
+    assert facing(replace(pose, joints=t_pose().joints @ rotation_about("x", np.pi / 2).T)) is None
+    assert facing(replace(pose, joints=np.full((26, 3), np.nan))) is None
     joints = pose.joints.copy()
     joints[BODY26.index("left_hip")] = np.nan
-    np.testing.assert_allclose(facing(Pose(joints=joints, skeleton=BODY26)), (np.cos(1), np.sin(1), 0), atol=1e-9)
+    np.testing.assert_allclose(facing(replace(pose, joints=joints)), (np.cos(1), np.sin(1), 0), atol=1e-9)
 
 
 @given(yaw=st.floats(-np.pi, np.pi), seed=st.integers(0, 99))
@@ -157,7 +162,7 @@ def test_parts_color_the_points():
 @pytest.mark.parametrize(
     "panel",
     [
-        Panel(points=np.zeros((0, 3))),
+        EMPTY,
         Panel(points=np.zeros((0, 3)), truth=t_pose()),
         Panel(points=np.ones((1, 3)), label="$x^$ \\frac <b>\n" + "long " * 99),
         Panel(points=np.full((9, 3), np.nan), pose=Pose(joints=np.full((26, 3), np.nan), skeleton=BODY26)),
@@ -189,17 +194,17 @@ def test_what_is_said_under_a_person():
         "1,500 points · 10.0 m · confidence 0.50"
     )
     assert describe(Panel(points=np.zeros((1, 3)), distance=12.34)) == "1 point · 12.3 m"
-    assert describe(Panel(points=np.zeros((0, 3)))) == "0 points"
+    assert describe(EMPTY) == "0 points"
 
 
-def test_a_long_name_keeps_its_ends():
+def test_names_and_titles_of_any_length_and_script(recwarn):
     name = "0aa51a7c-6c2d-4c0e-9d5e-7f1b2a3c4d5e"
     assert _shortened(name, 36) == name and _shortened(name, 11) == "0aa51…c4d5e"
-
-
-def test_a_title_of_digits_ends_on_the_sheet():
-    image = decoded(draw_people([Panel(points=np.zeros((0, 3)))], title="0123456789abcdef" * 4 + ".npy"))
+    image = decoded(draw_people([EMPTY], title="0123456789abcdef" * 4 + ".npy"))
     assert (image[:, -8:] == 255).all()
+    # what the font lacks is no warning
+    draw_people([Panel(points=np.zeros((3, 3)), label="人")], title="点云.pcd")
+    assert not recwarn.list
 
 
 def test_only_so_many_people_fit(monkeypatch):
@@ -212,20 +217,16 @@ def test_only_so_many_people_fit(monkeypatch):
 
 
 def test_picture_is_the_same_each_time_and_changes_nothing():
-    panel = person(count=MAX_PEOPLE)
-    before = panel.points.copy(), panel.pose.joints.copy()
-    assert draw_people([panel], title="a") == draw_people([panel], title="a")
-    np.testing.assert_array_equal(before[0], panel.points)
-    np.testing.assert_array_equal(before[1], panel.pose.joints)
-
-
-def test_picture_ignores_the_settings_of_the_user():
     from matplotlib import rc_context
 
-    panel = person()
-    plain = draw_people([panel], title="a")
+    panel = person(count=MAX_PEOPLE)
+    before = panel.points.copy(), panel.pose.joints.copy()
+    png = draw_people([panel], title="a")
+    # whatever the user's settings
     with rc_context({"savefig.bbox": "tight", "savefig.dpi": 50, "font.size": 30, "figure.facecolor": "black"}):
-        assert draw_people([panel], title="a") == plain
+        assert draw_people([panel], title="a") == png
+    np.testing.assert_array_equal(before[0], panel.points)
+    np.testing.assert_array_equal(before[1], panel.pose.joints)
 
 
 def test_importing_is_light_and_drawing_leaves_pyplot_alone():
@@ -300,8 +301,8 @@ def test_report_escapes_what_callers_say():
 def test_report_data_cannot_end_its_element():
     name = "</script><!--<script>"
     pose = Pose(joints=np.zeros((1, 3)), skeleton=Skeleton(name=name, joints=(name,), parents=(-1,)))
-    page = Reader(render_report([ReportPerson(label="", points=np.ones((9, 3)), pose=pose)], title="t", summary=[]))
-    assert page.data()["skeletons"][name]["joints"] == [name]
+    _, data = report(ReportPerson(label="", points=np.ones((9, 3)), pose=pose))
+    assert data["skeletons"][name]["joints"] == [name]
 
 
 def test_report_loads_nothing():
@@ -311,107 +312,85 @@ def test_report_loads_nothing():
 
 
 def test_report_holds_the_data():
-    one = person(ReportPerson, yaw=1.25)
-    joints = one.pose.joints.copy()
+    given = person(ReportPerson, yaw=1.25)
+    joints = given.pose.joints.copy()
     joints[3] = np.nan
-    one = ReportPerson(label="x", points=one.points, pose=Pose(joints=joints, skeleton=BODY26), truth=one.truth)
-    data = Reader(render_report([one], title="t", summary=[])).data()
-    (got,) = data["people"]
-    center = np.median(one.truth.joints, axis=0)
-    np.testing.assert_allclose(np.reshape(got["points"], (-1, 3)) / 1000 + center, one.points, atol=6e-4)
-    assert got["pose"]["joints"][3] is None and "confidence" not in got["pose"]
-    np.testing.assert_allclose(np.array(got["pose"]["joints"][:3]) / 1000 + center, joints[:3], atol=6e-4)
-    assert got["facing"] == pytest.approx(1.25, abs=1e-3)
-    assert got["truth"]["confidence"] == [0.9] * 26
+    _, data = report(replace(given, pose=Pose(joints=joints, skeleton=BODY26)))
+    (entry,) = data["people"]
+    center = np.median(given.truth.joints, axis=0)
+    np.testing.assert_allclose(np.reshape(entry["points"], (-1, 3)) / 1000 + center, given.points, atol=6e-4)
+    assert entry["pose"]["joints"][3] is None and "confidence" not in entry["pose"]
+    np.testing.assert_allclose(np.array(entry["pose"]["joints"][:3]) / 1000 + center, joints[:3], atol=6e-4)
+    assert entry["facing"] == pytest.approx(1.25, abs=1e-3)
+    assert entry["truth"]["confidence"] == [0.9] * 26
     skeleton = data["skeletons"]["body26"]
     assert tuple(skeleton["joints"]) == BODY26.joints
     assert [tuple(b[:2]) for b in skeleton["bones"]] == list(BODY26.bones)
     assert {s for *_, s in skeleton["bones"]} == set(skeleton["sides"]) == set("lrc")
 
 
-def test_report_of_twelve_people_is_small_and_the_same_each_time():
+def test_report_is_small_and_thins_what_is_too_much():
     people = [person(ReportPerson, count=1000, label=str(i), yaw=i) for i in range(12)]
-    text = render_report(people, title="t", summary=[])
-    assert len(text.encode()) < 500_000
-    assert text == render_report(people, title="t", summary=[])
-    assert len(Reader(text).data()["people"][0]["points"]) == 3000
-
-
-def test_report_thins_what_is_too_much():
-    people = [person(ReportPerson, count=MAX_POINTS)] * 2
-    text = render_report(people, title="t", summary=[])
+    text, data = report(*people)
+    assert len(text.encode()) < 500_000 and text == report(*people)[0]
+    assert len(data["people"][0]["points"]) == 3000
+    text, _ = report(*[person(ReportPerson, count=MAX_POINTS)] * 2)
     assert len(text.encode()) < 1_500_000
     assert "30,000 of 60,000 points drawn" in text
     # points that are nowhere are not drawn, and not counted as drawn
     odd = person(ReportPerson, count=100)
     odd.points[:90], odd.points[90] = np.nan, 1e30
-    text = render_report([odd], title="t", summary=[])
-    assert "9 of 100 points drawn" in text and len(Reader(text).data()["people"][0]["points"]) == 27
+    text, data = report(odd)
+    assert "9 of 100 points drawn" in text and len(data["people"][0]["points"]) == 27
 
 
 def test_report_of_odd_people():
     nothing = Pose(joints=np.full((26, 3), np.nan), skeleton=BODY26)
-    people = [
+    text, data = report(
         ReportPerson(label="none", points=np.zeros((0, 3))),
         ReportPerson(label="few", points=np.zeros((4, 3))),
         ReportPerson(label="nan", points=np.full((9, 3), np.nan), pose=nothing, truth=nothing),
-    ]
-    text = render_report(people, title="t", summary=[])
-    data = Reader(text).data()
+    )
     assert [len(p["points"]) for p in data["people"]] == [0, 12, 0]
     assert all(p["pose"] is None and p["facing"] is None for p in data["people"])
     assert text.count("no pose: under 5 points") == 2
-    labelled = ReportPerson(label="few, but labelled", points=np.zeros((4, 3)), truth=t_pose())
-    assert "no pose" not in render_report([labelled], title="t", summary=[])
-    assert "no people" in render_report([], title="t", summary=[])
+    assert "no pose" not in report(ReportPerson(label="few", points=np.zeros((4, 3)), truth=t_pose()))[0]
+    assert "no people" in report()[0]
 
 
 def test_summary_table():
     rows = [
-        {"set": "near", "people": 1873, "MPJPE mm": 63.412, "PCK": np.float32(0.5), "ok": True},
-        {"set": "far", "people": np.int64(2), "MPJPE mm": 103.25, "extra": "x"},
-        {"set": "none", "people": 0, "MPJPE mm": float("nan"), "PCK": None},
+        {"set": "near", "people": 1873, "MPJPE mm": 63.412, "PCK": np.float32(0.5), "ok": True, "a": 8.6, "b": 3.0},
+        {"set": "far", "people": np.int64(2), "MPJPE mm": 103.25, "extra": "x", "a": 20.0, "b": 4.0, "c": 12.5},
+        {"set": "none", "people": 0, "MPJPE mm": float("nan"), "PCK": None, "c": 0.1234},
     ]
     text = render_report([], title="t", summary=rows)
     page = Reader(text)
-    assert page.texts["th"] == ["set", "people", "MPJPE mm", "PCK", "ok", "extra"]
-    cells = np.reshape(page.texts["td"], (3, 6)).tolist()
-    assert cells[0] == ["near", "1873", "63.4", "0.5", "yes", "–"]
-    assert cells[1] == ["far", "2", "103.2", "–", "–", "x"]
-    assert cells[2] == ["none", "0", "–", "–", "–", "–"]
-    assert text.count('<td class="number">') == 9
+    assert page.texts["th"] == ["set", "people", "MPJPE mm", "PCK", "ok", "a", "b", "extra", "c"]
+    assert np.reshape(page.texts["td"], (3, 9)).tolist() == [
+        ["near", "1873", "63.4", "0.5", "yes", "8.6", "3", "–", "–"],
+        ["far", "2", "103.2", "–", "–", "20.0", "4", "x", "12.50"],
+        ["none", "0", "–", "–", "–", "–", "–", "–", "0.12"],
+    ]
+    assert text.count('<td class="number">') == 18
 
 
 @settings(max_examples=20, deadline=None)
 @given(label=st.text(max_size=40))
 def test_any_label_is_readable_again(label):
-    page = Reader(render_report([ReportPerson(label=label, points=np.ones((1, 3)))], title="t", summary=[]))
+    page = Reader(report(ReportPerson(label=label, points=np.ones((1, 3))))[0])
     shown = "".join(page.texts.get("strong", []))
     assert shown == label or any(not c.isprintable() for c in label)
 
 
-def test_a_label_from_a_strange_file_name(tmp_path):
-    label = "a\udc80\x00b"
-    assert draw_people([Panel(points=np.ones((9, 3)), label=label)], title=label)
-    write_report(tmp_path / "a.html", [ReportPerson(label=label, points=np.ones((9, 3)))], title="t", summary=[])
-    assert "a?" in (tmp_path / "a.html").read_text(encoding="utf-8")
-
-
-def test_write_report(tmp_path):
+def test_files_and_labels_from_strange_file_names(tmp_path):
     path = tmp_path / "report.html"
     write_report(path, [person(ReportPerson)], title="t", summary=[{"a": 1}])
     assert path.read_text(encoding="utf-8") == render_report([person(ReportPerson)], title="t", summary=[{"a": 1}])
-
-
-def test_a_name_that_the_font_lacks_is_no_warning(recwarn):
-    draw_people([Panel(points=np.zeros((3, 3)), label="人")], title="点云.pcd")
-    assert not recwarn.list
-
-
-def test_numbers_of_a_table_end_without_needless_zeros():
-    page = render_report([], title="t", summary=[{"a": 8.6, "b": 3.0, "c": 0.1234}, {"a": 20.0, "b": 4.0, "c": 12.5}])
-    cells = re.findall(r'<td class="number">([^<]*)</td>', page)
-    assert cells == ["8.6", "3", "0.12", "20.0", "4", "12.50"]
+    label = "a\udc80\x00b"
+    assert draw_people([Panel(points=np.ones((9, 3)), label=label)], title=label)
+    write_report(path, [ReportPerson(label=label, points=np.ones((9, 3)))], title="t", summary=[])
+    assert "a?" in path.read_text(encoding="utf-8")
 
 
 def test_points_have_the_colors_that_the_legend_says():

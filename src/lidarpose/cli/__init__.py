@@ -35,10 +35,10 @@ def main(arguments: list[str] | None = None) -> int:
         _drop_output()
     except ModuleNotFoundError as error:
         extra = "export" if options.command == "export" else None
-        told = missing_extra(error, f"`lidarpose {options.command}`", extra)
-        if not isinstance(told, LidarPoseError):
+        missing = missing_extra(error, f"`lidarpose {options.command}`", extra)
+        if not isinstance(missing, LidarPoseError):
             raise
-        return _failed(told)
+        return _failed(missing)
     except LidarPoseError as error:
         return _failed(error)
     except OSError as error:

@@ -148,8 +148,8 @@ def _synth(options: argparse.Namespace) -> None:
     )
     with Progress(job.count, unit=job.what) as shown:
         made = write_dataset(job, options.out, workers=options.workers, progress=lambda done, _: shown.update(done))
-    kept = "" if made == job.count else f", {job.count - made:,} were there"
-    tell(f"{counted(made, job.what)} made{kept} -> {options.out}")
+    there = "" if made == job.count else f", {job.count - made:,} were there"
+    tell(f"{counted(made, job.what)} made{there} -> {options.out}")
 
 
 def _prepare(options: argparse.Namespace) -> None:

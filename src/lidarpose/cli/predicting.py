@@ -10,8 +10,8 @@ from lidarpose.cli.terminal import add_command, is_watched, tell
 from lidarpose.errors import InputError
 from lidarpose.models import DEFAULT, NAMES
 
-# people named by a warning that several share, and characters of an id
-_MOST_NAMED, _LONGEST_ID = 3, 40
+# characters of an id in a warning
+_LONGEST_ID = 40
 _BOXES = 'people to pose: {"people": [{"center": [x,y,z], "size": [l,w,h], "yaw": rad}]}, .npy rows, KITTI labels'
 # what a user who names it expects as a file
 _NO_FOLDERS = {".bin", ".html", ".jsonl", ".npy", ".npz", ".parquet", ".pcd", ".pdf", ".pkl", ".ply", ".png", ".txt"}
@@ -133,7 +133,7 @@ def _result_path(out: str, file: Path) -> Path | None:
     """The file to write, None for the standard output. Raises InputError for a file of another type."""
     if out == "-":
         return None
-    # os.path says no where a name is too long, which is told when it is written
+    # os.path says no where a name is too long, which is an error when it is written
     if not out.endswith(("/", os.sep)) and not os.path.isdir(out):
         suffix = Path(out).suffix.lower()
         if suffix in (".json", ".csv"):
@@ -145,6 +145,7 @@ def _result_path(out: str, file: Path) -> Path | None:
 
 def _warnings(poses) -> list[str]:
     """The input's warnings, and each of the people's once with the ids of those it is about."""
+    from lidarpose.inference.results import first_names
     from lidarpose.io.files import shorten
 
     shared: dict[str, list[str]] = {}
@@ -153,7 +154,5 @@ def _warnings(poses) -> list[str]:
             shared.setdefault(warning, []).append(shorten(str(person.id), _LONGEST_ID))
     lines = list(poses.warnings)
     for warning, ids in shared.items():
-        more = f" and {len(ids) - _MOST_NAMED} more" if len(ids) > _MOST_NAMED else ""
-        who = "person" if len(ids) == 1 else "people"
-        lines.append(f"{who} {', '.join(ids[:_MOST_NAMED])}{more}: {warning}")
+        lines.append(f"{'person' if len(ids) == 1 else 'people'} {first_names(ids)}: {warning}")
     return lines

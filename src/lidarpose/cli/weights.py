@@ -2,6 +2,7 @@
 
 import argparse
 from pathlib import Path
+from typing import cast
 
 from lidarpose.cli.terminal import add_command, tell
 from lidarpose.models import DEFAULT
@@ -59,7 +60,8 @@ def _export(options: argparse.Namespace) -> None:
 
 
 def _import(options: argparse.Namespace) -> None:
+    from lidarpose.models.dapt.dapt_config import DaptConfig
     from lidarpose.models.dapt.import_weights import import_released
 
     header = import_released(options.file, options.out, config=options.config)
-    tell(f"{header.config.name}, joints of {header.skeleton.name} -> {options.out}")
+    tell(f"{cast(DaptConfig, header.config).name}, joints of {header.skeleton.name} -> {options.out}")

@@ -10,21 +10,21 @@ import os
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, cast
 
 import numpy as np
 
 from lidarpose.errors import InputError, check_int
 from lidarpose.io.files import content_digest, file_error
 from lidarpose.models.checkpoint import Header, read_header
-from lidarpose.models.config import BIN
+from lidarpose.models.config import BIN, NetworkConfig
 from lidarpose.models.decode import Decoder, out_of_range
 from lidarpose.models.onnx import OUTPUTS, input_name, network_inputs, open_onnx, voxelize_people
 from lidarpose.sample import CONFIDENCE_RADIUS
 
 # people a call; more fill the memory without being faster
 _BATCH = 64
-# log of the largest spread that is told, m: an untrained network may say anything
+# log of the largest reported spread, m: that of an untrained network is unbounded
 _LARGEST_LOG_SPREAD = 5.0
 
 
@@ -96,7 +96,8 @@ class OnnxBackend:
             threads = check_int("threads", threads, least=1)
         self._opened = os.path.abspath(path), threads
         self.session, self.header, self.source = open_onnx(path, threads=threads)
-        # parts are of no use here: what is not asked for is not computed
+        self._config = cast(NetworkConfig, self.header.config)
+        # body parts are not used: outputs that are not requested are not computed
         self._outputs = [name for name in OUTPUTS if name != "part"]
 
     def __reduce__(self) -> tuple:
@@ -105,7 +106,7 @@ class OnnxBackend:
         return partial(OnnxBackend, path, threads=threads), ()
 
     def run(self, clouds: list[np.ndarray], view: np.ndarray) -> Raw:
-        inputs = network_inputs(voxelize_people(clouds, view, self.header.config))
+        inputs = network_inputs(voxelize_people(clouds, view, self._config))
         values = self.session.run(self._outputs, {input_name(name): array for name, array in inputs.items()})
         return Raw.from_pose(dict(zip(self._outputs, values, strict=True)))
 
@@ -132,7 +133,7 @@ def exported_beside(path: str | os.PathLike, *, threads: int | None = None) -> O
 def estimates(raw: Raw, decoder: Decoder) -> Estimates:
     """Joints and what is known of them from raw outputs; `decoder` reads the heatmaps.
 
-    Raises InputError where not one is a number.
+    Raises InputError where none is finite.
     """
     joints, in_range = raw.vote.astype(float), None
     if raw.heatmaps is not None:
@@ -156,7 +157,7 @@ def _decoded(raw: Raw, heatmaps: tuple[np.ndarray, ...], decoder: Decoder) -> np
 
 
 def _from_heatmaps(raw: Raw, heatmaps: tuple[np.ndarray, ...], offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Confidence and spread (B, J) of a network that tells neither, from its heatmaps about `offset` (B, J, 3) m.
+    """Confidence and spread (B, J) of a network without these outputs, from its heatmaps about `offset` (B, J, 3) m.
 
     Confidence is the share of the heatmaps within `CONFIDENCE_RADIUS` of the joint, axes taken as independent; spread
     the root of their mean square distance. Neither is calibrated.

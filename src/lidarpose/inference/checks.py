@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidarpose.inference.inputs import flat_axis, lies, unit_warning
-from lidarpose.inference.results import Poses
+from lidarpose.inference.results import Poses, first_names
 from lidarpose.sample import MIN_POINTS, Pose
 
 if TYPE_CHECKING:
@@ -40,8 +40,6 @@ _CLEARLY_SURER = 0.6
 _WIDEST_CROP = 20.0
 # a half turn about x
 UPSIDE_DOWN = np.array([1.0, -1.0, -1.0])
-# boxes named by a warning
-_MOST_NAMED = 3
 
 
 def oversize_warning(points: np.ndarray, pose: Pose) -> str | None:
@@ -106,9 +104,7 @@ def box_units(scan: Scan, people: Poses) -> str | None:
     wrong = [(name, warning) for name, warning in wrong if warning]
     if not wrong:
         return None
-    names = ", ".join(str(name) for name, _ in wrong[:_MOST_NAMED])
-    more = f" and {len(wrong) - _MOST_NAMED} more" if len(wrong) > _MOST_NAMED else ""
-    return f"box {names}{more} is unlike the others: {wrong[0][1]}"
+    return f"box {first_names([str(name) for name, _ in wrong])} is unlike the others: {wrong[0][1]}"
 
 
 def empty_boxes(scan: Scan, people: Poses) -> str | None:

@@ -40,17 +40,17 @@ def _seen(card: dict) -> str:
     """People and hours of the run, and of those before it."""
     runs = runs_of(card)
     people, hours = ([run.get(name, 0) for run in runs] for name in ("people_seen", "hours"))
-    told = f"{people[0]:,} people, {hours[0]:.2f} hours"
+    line = f"{people[0]:,} people, {hours[0]:.2f} hours"
     if len(runs) == 1:
-        return told
-    return f"{told}; with the runs before it {sum(people):,} people, {sum(hours):.2f} hours"
+        return line
+    return f"{line}; with the runs before it {sum(people):,} people, {sum(hours):.2f} hours"
 
 
 def _torch_line() -> str:
     if find_spec("torch") is None:
         return "torch      not installed, training and --device need it: in the clone, pip install '.[train]'"
     try:
-        # found is not yet usable: libraries of it may be missing
+        # torch may be installed and still fail to load its libraries
         import torch
 
         device = (

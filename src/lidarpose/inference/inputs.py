@@ -155,7 +155,7 @@ def candidates(points: np.ndarray) -> list[np.ndarray]:
     places = np.argwhere(grid.any(2))
     score = score[tuple(places.T)]
     places = corner[:2] + (places + 0.5) * _CELL
-    found = [points]
+    clouds = [points]
     for _ in range(_COLUMNS):
         best = int(np.argmax(score))
         if np.isneginf(score[best]):
@@ -165,9 +165,9 @@ def candidates(points: np.ndarray) -> list[np.ndarray]:
         # without the trees above
         cloud = points[(_distance(points, middle) < _AROUND) & (points[:, 2] < ground + _REACH)]
         if len(cloud) >= MIN_POINTS:
-            found.append(cloud)
+            clouds.append(cloud)
         score[_distance(places, places[best]) < _APART] = -np.inf
-    return found
+    return clouds
 
 
 def _heights(grid: np.ndarray, near: float, far: float) -> np.ndarray:

@@ -26,7 +26,7 @@ CROP_SIZE = 4.0
 def predict(
     path: str | os.PathLike,
     *,
-    boxes: str | os.PathLike | dict | Box | Sequence | np.ndarray | None = None,
+    boxes: str | os.PathLike | dict | Box | list | tuple | np.ndarray | None = None,
     crop: bool = False,
     sensor_origin: tuple[float, float, float] | str | None = None,
     skeleton: str | None = None,
@@ -80,8 +80,8 @@ def predict(
 def _only_returns(path: str | os.PathLike, cloud: Cloud) -> Cloud:
     points, notes = only_returns(cloud.points)
     if not len(points):
-        found = f"none within {FARTHEST:g} m" if cloud.points.any() else "only 0,0,0, which are no returns"
-        raise file_error(path, f"expected points in metres, got {found}: export it again")
+        problem = f"none within {FARTHEST:g} m" if cloud.points.any() else "only 0,0,0, which are no returns"
+        raise file_error(path, f"expected points in metres, got {problem}: export it again")
     dropped = len(cloud.points) - len(points)
     return replace(cloud, points=points, num_dropped=cloud.num_dropped + dropped, warnings=(*cloud.warnings, *notes))
 

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
@@ -12,7 +11,7 @@ from lidarpose.errors import InputError, check_int, check_name, missing_extra
 from lidarpose.inference.backend import Backend, Estimates, OnnxBackend, estimates, exported_beside
 from lidarpose.inference.checks import UPSIDE_DOWN, looks_unsure, oversize_warning, upside_down_warning
 from lidarpose.inference.inputs import as_origin, as_points, candidates, clean, is_few, only_returns, unit_warning
-from lidarpose.inference.results import PersonPose, Poses
+from lidarpose.inference.results import PersonPose, Poses, first_names
 from lidarpose.inference.tta import TTATransform, apply, average, invert, tta_transforms
 from lidarpose.io.files import file_error
 from lidarpose.models import BUNDLED, DEFAULT, weights_path
@@ -30,15 +29,13 @@ if TYPE_CHECKING:
     from lidarpose.sample import Box
 
 BACKENDS = ("onnx", "torch")
-# looks at each person where nobody says how many: nobody waits for milliseconds
+# default number of test-time augmentation passes
 TTA = 4
-# passes: the second is centered on the pelvis that the first one found
+# passes: the second is centered on the pelvis that the first estimated
 PASSES = 2
-# to which a found center is rounded, m: backends differ by less than a micrometre, and a point on the border of a voxel
-# must not fall on another side for that
+# to which the center of the second pass is rounded, m: backends differ by less than a micrometer, which must not move a
+# point to another voxel
 _CENTER_STEP = 0.01
-# joints named by a warning
-_MOST_NAMED = 3
 
 
 def load(
@@ -57,9 +54,9 @@ def load(
     for other paths and devices. decode: how heatmaps are read, "window" (the mean about the mode), "argmax" or "dark"
     (the released DAPT code's); where two peaks are equally high, rounding decides. compile: by `torch.compile`, backend
     torch only. threads: of ONNX Runtime, None for all processors; backend onnx only. tta: test-time augmentation, the
-    number of looks at each person (1 to 8), averaged. A person costs one pass to center the cloud and one pass a look,
-    so 1 look takes two passes, 4 looks five. Raises InputError for an unknown name, a file that is no checkpoint, or a
-    device that is not there; MissingExtra where torch is needed and not installed.
+    number of transforms of each person (1 to 8), averaged. A person costs one pass to center the cloud and one for each
+    transform, so 1 takes two passes, 4 take five. Raises InputError for an unknown name, a file that is no checkpoint,
+    or a device that is not there; MissingExtra where torch is needed and not installed.
     """
     decoder(decode)
     tta_transforms(tta)
@@ -90,7 +87,7 @@ def load(
 
 
 def _torch_backend(path: Path, device: str, compile: bool) -> Backend:
-    # what is wrong with the file is told even where torch is not installed, and at once
+    # a bad file is an error even where torch is not installed
     read_header(path)
     try:
         from lidarpose.inference.torch_backend import torch_backend
@@ -100,7 +97,7 @@ def _torch_backend(path: Path, device: str, compile: bool) -> Backend:
 
 
 class Predictor:
-    """A network ready to use. `predict` is kind; `outputs` is raw, of one look. model: what results tell of it."""
+    """A network ready to use. `predict` checks its input; `outputs` is one plain pass. model: as in results."""
 
     def __init__(self, backend: Backend, *, name: str, decode: str = "window", tta: int = 1):
         self.backend = backend
@@ -161,7 +158,7 @@ class Predictor:
         self,
         points: "ArrayLike",
         *,
-        boxes: "str | os.PathLike | dict | Box | Sequence[Box | dict] | np.ndarray",
+        boxes: "str | os.PathLike | dict | Box | list | tuple | np.ndarray",
         sensor_origin: "np.ndarray | Sequence[float] | str | None" = None,
         skeleton: str | None = None,
         progress: bool = False,
@@ -194,15 +191,11 @@ class Predictor:
 
     def _people(self, clouds, origin, wanted, progress) -> list[PersonPose]:
         cleaned = [clean(cloud) for cloud in clouds]
-        results = [
-            PersonPose(pose=None, skeleton=wanted, points=points, warnings=tuple(notes), model=self.model)
-            for points, notes in cleaned
-        ]
         parts, owner = [], []
-        for i, (points, _) in enumerate(cleaned):
+        for i, (points, notes) in enumerate(cleaned):
             if is_few(points):
                 points_of = "points" if len(points) < MIN_POINTS else "different points"
-                results[i] = _warned(results[i], f"no pose: under {MIN_POINTS} {points_of}")
+                notes.append(f"no pose: under {MIN_POINTS} {points_of}")
                 continue
             searched = candidates(points)
             parts += searched
@@ -212,25 +205,30 @@ class Predictor:
         for i, part, pose in zip(owner, parts, self._all_poses(parts, origin, progress), strict=True):
             if pose is not None and (i not in best or _surer(pose, best[i][0])):
                 best[i] = pose, part
+        poses: list[Pose | None] = [None] * len(clouds)
         for i in sorted(set(owner)):
-            if warning := unit_warning(np.ptp(results[i].points, axis=0), what="the person"):
-                results[i] = _warned(results[i], warning)
+            points, notes = cleaned[i]
+            unit = unit_warning(np.ptp(points, axis=0), what="the person")
             if i not in best:
-                note = f"no pose: under {MIN_POINTS} points within {WINDOW:.0f} m of the person's middle"
-                results[i] = _warned(results[i], note)
+                few = f"no pose: under {MIN_POINTS} points within {WINDOW:.0f} m of the person's middle"
+                notes += filter(None, (unit, few))
                 continue
             pose, part = best[i]
-            results[i] = replace(results[i], pose=pose.to(wanted))
-            if names := results[i].out_of_range:
-                results[i] = _warned(results[i], _range_warning(names))
-            if not warning and (warning := oversize_warning(results[i].points, pose)):
-                results[i] = _warned(results[i], warning)
-            elif not warning and looks_unsure(pose, part):
-                # the second opinion of a half turn about x costs a pass for the few who look unsure
-                turned = self._poses([part * UPSIDE_DOWN], None if origin is None else origin * UPSIDE_DOWN)[0]
-                if warning := upside_down_warning(pose, turned):
-                    results[i] = _warned(results[i], warning)
-        return results
+            poses[i] = wanted_pose = pose.to(wanted)
+            notes += filter(None, (unit, _range_warning(wanted_pose)))
+            if not unit and (warning := oversize_warning(points, pose) or self._upside_down(pose, part, origin)):
+                notes.append(warning)
+        return [
+            PersonPose(pose=pose, skeleton=wanted, points=points, warnings=tuple(notes), model=self.model)
+            for pose, (points, notes) in zip(poses, cleaned, strict=True)
+        ]
+
+    def _upside_down(self, pose: Pose, points: np.ndarray, origin: np.ndarray | None) -> str | None:
+        """A warning where the person is upside down: costs a pass for the few whose pose looks unsure."""
+        if not looks_unsure(pose, points):
+            return None
+        turned = self._poses([points * UPSIDE_DOWN], None if origin is None else origin * UPSIDE_DOWN)[0]
+        return upside_down_warning(pose, turned)
 
     def _all_poses(self, clouds: list[np.ndarray], origin: np.ndarray | None, progress: bool) -> list[Pose | None]:
         """The pose of each cloud (n, 3) m in batches. People of like size go together: a batch costs as much as if all
@@ -252,47 +250,44 @@ class Predictor:
             root = self.outputs(clouds, centers, origin).joints[:, self._root].mean(1)
             # an answer that is no number stays one
             centers = centers + np.round(np.clip(root, -WINDOW / 2, WINDOW / 2) / _CENTER_STEP) * _CENTER_STEP
-        found = self._looks(clouds, centers, origin)
+        estimated = self.outputs(clouds, centers, origin)
+        if len(self._tta) > 1:
+            others = [self._transformed(transform, clouds, centers, origin) for transform in self._tta[1:]]
+            estimated = average([estimated, *others])
         poses: list[Pose | None] = []
         for k, points in enumerate(clouds):
             near = (np.abs(points - centers[k]) < WINDOW).all(1).sum()
-            if near < MIN_POINTS or not np.isfinite(found.joints[k]).all():
+            if near < MIN_POINTS or not np.isfinite(estimated.joints[k]).all():
                 poses.append(None)
                 continue
-            values = {name: getattr(found, name) for name in PER_JOINT}
+            values = {name: getattr(estimated, name) for name in PER_JOINT}
             of_person: dict[str, Any] = {name: None if value is None else value[k] for name, value in values.items()}
-            poses.append(Pose(joints=found.joints[k] + centers[k], skeleton=self.skeleton, **of_person))
+            poses.append(Pose(joints=estimated.joints[k] + centers[k], skeleton=self.skeleton, **of_person))
         return poses
 
     def outputs(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Estimates:
         """What the network says of clouds (n, 3) m seen about centers (B, 3), from a sensor at origin (3,) or None."""
-        return self._look(TTATransform(), clouds, centers, origin)
+        return self._transformed(TTATransform(), clouds, centers, origin)
 
-    def _looks(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Estimates:
-        """The mean of all looks, of which the first is the plain one."""
-        others = [self._look(transform, clouds, centers, origin) for transform in self._tta[1:]]
-        return average([self.outputs(clouds, centers, origin), *others])
-
-    def _look(
+    def _transformed(
         self, transform: TTATransform, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None
     ) -> Estimates:
         about, view = apply(transform, clouds, centers, origin)
-        found = estimates(self.backend.run(about, view), self._decoder)
-        return invert(found, transform, self.skeleton)
+        return invert(estimates(self.backend.run(about, view), self._decoder), transform, self.skeleton)
 
 
 def _surer(pose: Pose, best: Pose) -> bool:
-    """A network that does not tell its confidence has its first answer, that of the whole cloud, taken."""
+    """Of a network without confidence the first pose, that of the whole cloud, is kept."""
     if pose.confidence is None or best.confidence is None:
         return False
     return bool(pose.confidence.mean() > best.confidence.mean())
 
 
-def _range_warning(names: list[str]) -> str:
-    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
-    return (
-        f"at the end of the heatmap's range, so perhaps farther out than given: {', '.join(names[:_MOST_NAMED])}{more}"
-    )
+def _range_warning(pose: Pose) -> str | None:
+    if pose.in_range is None or pose.in_range.all():
+        return None
+    names = [name for name, inside in zip(pose.skeleton.joints, pose.in_range, strict=True) if not inside]
+    return f"at the end of the heatmap's range, so perhaps farther out than given: {first_names(names)}"
 
 
 def _is_many(points) -> bool:
@@ -310,7 +305,3 @@ def _is_row(value) -> bool:
         # records are a cloud
         flat = getattr(value, "ndim", 0) == 1 and not getattr(getattr(value, "dtype", None), "names", None)
     return flat and len(value) > 0
-
-
-def _warned(person: PersonPose, warning: str) -> PersonPose:
-    return replace(person, warnings=(*person.warnings, warning))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, cast, overload
 import numpy as np
 
 from lidarpose.geometry import UP_AXES, rotation_from_up
+from lidarpose.io.files import write_atomic
 from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import Skeleton
 
@@ -93,12 +94,14 @@ class PersonPose:
 
     def to_dict(self) -> dict:
         """The entry of this person under "people"."""
-        box = self.box
+        box = self.box and {
+            "center": self.box.center.tolist(),
+            "size": self.box.size.tolist(),
+            "yaw": float(self.box.yaw),
+        }
         return {
             "id": self.id,
-            "box": None
-            if box is None
-            else {"center": box.center.tolist(), "size": box.size.tolist(), "yaw": float(box.yaw)},
+            "box": box,
             "num_points": self.num_points,
             "joints": None if self.pose is None else _rounded(self.joints, 4),
             "confidence": _rounded(self.confidence, 3),
@@ -223,8 +226,8 @@ class Poses(Sequence):
                 continue
             values = [getattr(person.pose, name) for name in names]
             for j, joint in enumerate(self.skeleton.joints):
-                told = [np.nan if value is None else value[j] for value in values]
-                rows.append((number, person.id, joint, *person.pose.joints[j], *told))
+                known = [np.nan if value is None else value[j] for value in values]
+                rows.append((number, person.id, joint, *person.pose.joints[j], *known))
         return pandas.DataFrame(rows, columns=list(columns))
 
     def to_dict(self) -> dict:
@@ -257,8 +260,6 @@ class Poses(Sequence):
 
     def save(self, path: str | Path) -> None:
         """Writes `to_json` to a file, whole or not at all."""
-        from lidarpose.io.files import write_atomic
-
         write_atomic(path, self.to_json())
 
     def picture(self, path: str | Path | None = None, *, title: str = "") -> Picture:
@@ -282,6 +283,12 @@ def _upright(person: PersonPose, up: str) -> PersonPose:
         pose=pose and replace(pose, joints=pose.joints @ R_level_input.T),
         box=box and replace(box, center=R_level_input @ box.center),
     )
+
+
+def first_names(names: Sequence[str], most: int = 3) -> str:
+    """ "a, b, c and 2 more"."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def _rounded(values: np.ndarray | None, digits: int) -> list:

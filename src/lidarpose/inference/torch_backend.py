@@ -9,8 +9,10 @@ import torch
 from lidarpose.errors import InputError
 from lidarpose.inference.backend import Backend, Raw
 from lidarpose.models.checkpoint import Header, load_checkpoint
+from lidarpose.models.dapt.dapt_net import DaptNet
 from lidarpose.models.export import ArrayModule
 from lidarpose.models.onnx import OUTPUTS, network_inputs, voxelize_people
+from lidarpose.models.posenet import PoseNet
 from lidarpose.models.voxelize import WINDOW
 
 # people a call; the paper's network is a hundred times as large
@@ -24,7 +26,7 @@ def torch_backend(path: str | os.PathLike, *, device: str = "cpu", compile: bool
     """
     network, header = load_checkpoint(path)
     try:
-        network = network.to(device)
+        network.to(device)
         # there are devices, "meta", from which no number comes back
         torch.zeros(1, device=device).cpu()
     except (RuntimeError, AssertionError) as error:
@@ -33,7 +35,7 @@ def torch_backend(path: str | os.PathLike, *, device: str = "cpu", compile: bool
         raise InputError(
             f"device {device!r} cannot be used ({reason}); expected cpu, or cuda where torch has it"
         ) from None
-    if header.network == "pose":
+    if isinstance(network, PoseNet):
         return TorchBackend(network, header, device=device, compile=compile)
     if compile:
         raise InputError("torch.compile is not offered for the paper's network: leave compile away")
@@ -46,7 +48,7 @@ class TorchBackend:
     name = "torch"
     batch = _BATCH
 
-    def __init__(self, network: torch.nn.Module, header: Header, *, device: str = "cpu", compile: bool = False):
+    def __init__(self, network: PoseNet, header: Header, *, device: str = "cpu", compile: bool = False):
         self.network = network.to(device).eval()
         self.header = header
         self.device = device
@@ -59,7 +61,7 @@ class TorchBackend:
 
     @torch.inference_mode()
     def run(self, clouds: list[np.ndarray], view: np.ndarray) -> Raw:
-        arrays = network_inputs(voxelize_people(clouds, view, self.header.config))
+        arrays = network_inputs(voxelize_people(clouds, view, self.network.config))
         tensors = [torch.as_tensor(array).to(self.device) for array in arrays.values()]
         if self._module is None:
             module = ArrayModule(self.network, tuple(arrays))
@@ -79,12 +81,12 @@ class DaptBackend:
     name = "torch"
     batch = _DAPT_BATCH
 
-    def __init__(self, network: torch.nn.Module, header: Header):
+    def __init__(self, network: DaptNet, header: Header):
         self.network = network.eval()
         self.header = header
 
     def run(self, clouds: list[np.ndarray], view: np.ndarray) -> Raw:
-        config = self.header.config
+        config = self.network.config
         near = [cloud[(np.abs(cloud) < WINDOW).all(1)] for cloud in clouds]
         out = self.network.outputs(near)
         order = config.order_in(self.header.skeleton)

@@ -1,4 +1,4 @@
-"""Test-time augmentation: a person is seen under several transforms, and one answer is made of all.
+"""Test-time augmentation: a person is seen under several transforms, whose estimates are averaged.
 
 A transform turns the person by quarters, mirrors them, and shifts the grid of voxels. The answers differ a little,
 where a point falls into another voxel; their mean is better than any of them.
@@ -17,7 +17,7 @@ from lidarpose.models.voxelize import view_features
 from lidarpose.sample import PER_JOINT
 from lidarpose.skeleton import Skeleton
 
-# a transform's answer counts by its mean confidence to this power: one flipped facing in four is outvoted
+# a transform's answer counts by its mean confidence to this power: one flipped facing of four is outvoted
 _POWER = 8
 _NAMES = ("joints", *PER_JOINT)
 _QUARTERS = ((1, 0), (0, 1), (-1, 0), (0, -1))
@@ -83,7 +83,7 @@ def average(estimates: list[Estimates]) -> Estimates:
     """One answer: the mean of all, a person's answers weighted by their confidence where the network has it."""
     if len(estimates) == 1:
         return estimates[0]
-    values = {name: [getattr(one, name) for one in estimates] for name in _NAMES}
+    values = {name: [getattr(each, name) for each in estimates] for name in _NAMES}
     joints = np.stack(values["joints"])
     weight = np.ones(joints.shape[:2])
     if values["confidence"][0] is not None:

@@ -8,6 +8,7 @@ checkpoint that it was made from, and a digest: the SHA-256 of the file with zer
 import hashlib
 import os
 from importlib import import_module
+from typing import Any
 
 import numpy as np
 
@@ -88,7 +89,7 @@ def open_session(content: bytes, *, threads: int | None = None):
     return runtime.InferenceSession(content, settings, providers=["CPUExecutionProvider"])
 
 
-def open_onnx(path: str | os.PathLike, *, threads: int | None = None) -> tuple[object, Header, str]:
+def open_onnx(path: str | os.PathLike, *, threads: int | None = None) -> tuple[Any, Header, str]:
     """The session of an exported network, its header, and the digest of the checkpoint that it was made from.
 
     Warns of a file without a digest. Raises InputError, one line, for a file that is damaged, cut off, something else,
@@ -113,7 +114,7 @@ def open_onnx(path: str | os.PathLike, *, threads: int | None = None) -> tuple[o
         ) from None
     metadata = session.get_modelmeta().custom_metadata_map
     header = parse_header(path, metadata.get(ENTRY))
-    if header.network != "pose":
+    if not isinstance(header.config, NetworkConfig):
         raise file_error(path, f"expected a network of the kind pose, got {header.network}: use its .safetensors")
     for what, found, due in (
         ("input", {value.name for value in session.get_inputs()}, expected_inputs(header.config)),

@@ -3,15 +3,15 @@
 Drawn with matplotlib's object interface, as in `draw`: no global state is touched.
 """
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from lidarpose.io.files import check_suffix
 from lidarpose.sample import Box, Pose
-from lidarpose.viz.draw import SIDE_COLORS
+from lidarpose.viz.draw import SIDE_COLORS, png_of
 from lidarpose.viz.person_view import bone_sides, is_known, thinned
 
 MAX_SCANS = 12
@@ -45,10 +45,7 @@ class ScanPanel:
 
 def draw_scans(panels: Sequence[ScanPanel], path: str | Path | None = None, *, title: str = "") -> bytes:
     """Scans from above side by side, at most the first 12. Returns the PNG's bytes; writes `path` too where given."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
-
-    from lidarpose.io.files import check_suffix, write_atomic
 
     if path is not None:
         check_suffix(path, ".png")
@@ -64,11 +61,7 @@ def draw_scans(panels: Sequence[ScanPanel], path: str | Path | None = None, *, t
         row, column = divmod(number, columns)
         place = ((column * _PANEL + 0.55) / width, (height - _TITLE - (row + 1) * _PANEL + 0.45) / height)
         _draw_panel(figure.add_axes((*place, (_PANEL - 0.7) / width, (_PANEL - 0.75) / height)), panel)
-    buffer = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
-    if path is not None:
-        write_atomic(path, buffer.getvalue())
-    return buffer.getvalue()
+    return png_of(figure, path)
 
 
 def _draw_panel(ax, panel: ScanPanel) -> None:

@@ -104,8 +104,7 @@ def _spread(dataset: DatasetReader, count: int) -> list[dict]:
     for shard, size in zip(there, sizes, strict=True):
         here = {w - first for w in wanted if first <= w < first + size}
         if here:
-            found = dataset.rows(shards=[shard])
-            rows += [row for k, row in enumerate(found) if k in here]
+            rows += [row for k, row in enumerate(dataset.rows(shards=[shard])) if k in here]
         first += size
     return rows
 

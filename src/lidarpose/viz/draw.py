@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from lidarpose.io.files import check_suffix, write_atomic
 from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import SMPL24
 from lidarpose.viz.person_view import (
@@ -19,7 +20,7 @@ from lidarpose.viz.person_view import (
     check_person,
     confidences,
     describe,
-    facing,
+    facing_of,
     is_known,
     middle,
     missing_pose,
@@ -80,12 +81,9 @@ def draw_people(panels: list[Panel], path: str | Path | None = None, *, title: s
     The front is where the predicted pose looks to, else the true one, else +x. Left limbs are blue, right ones
     orange; a bone is the fainter and thinner the less confident its ends are. Writes `path` too where given.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     if path is not None:
-        from lidarpose.io.files import check_suffix
-
         check_suffix(path, ".png")
     panels = list(panels)
     shown = panels[:MAX_PEOPLE]
@@ -98,7 +96,6 @@ def draw_people(panels: list[Panel], path: str | Path | None = None, *, title: s
     height = top + rows * (card_height + _GAP) - _GAP + _MARGIN
 
     figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white")
-    canvas = FigureCanvasAgg(figure)
     ax = figure.add_axes((0, 0, 1, 1))
     ax.set(xlim=(0, width), ylim=(0, height))
     ax.set_axis_off()
@@ -111,17 +108,21 @@ def draw_people(panels: list[Panel], path: str | Path | None = None, *, title: s
     if not shown:
         _text(ax, width / 2, _MARGIN + card_height / 2, "no people", size=11, color=_FAINT, ha="center")
 
+    return png_of(figure, path)
+
+
+def png_of(figure, path: str | Path | None) -> bytes:
+    """A matplotlib figure as the bytes of a PNG, whatever the user's savefig settings; also written to `path`."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     buffer = io.BytesIO()
     with warnings.catch_warnings():
-        # a file name in a script that the font lacks becomes boxes on the sheet; nothing the user need be told
+        # letters that the font lacks become boxes; no warning for the user
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
-        canvas.print_png(buffer, metadata={"Software": None})  # print_figure would follow the user's savefig settings
-    data = buffer.getvalue()
+        FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
     if path is not None:
-        from lidarpose.io.files import write_atomic
-
-        write_atomic(path, data)
-    return data
+        write_atomic(path, buffer.getvalue())
+    return buffer.getvalue()
 
 
 def _text(ax, x: float, y: float, words: str, *, size: float, color: str = _INK, **more) -> None:
@@ -163,7 +164,7 @@ def _header(ax, panels: list[Panel], shown: list[Panel], *, title: str, at: tupl
     if any(p.part is None and len(p.points) for p in shown):
         handles.append(Line2D([], [], color=_NEAR, label="near point", **dot))
         handles.append(Line2D([], [], color=_FAR, label="far point", **dot))
-    if any(_forward(p) is not None for p in shown):
+    if any(facing_of(p) is not None for p in shown):
         handles.append(Line2D([], [], color=_FAINT, ls="", marker=">", ms=4.5, label="facing"))
     if handles:
         legend = ax.legend(
@@ -182,11 +183,6 @@ def _header(ax, panels: list[Panel], shown: list[Panel], *, title: str, at: tupl
             prop={"family": "DejaVu Sans", "size": 8},
         )
         legend.set_clip_on(False)
-
-
-def _forward(panel: Panel) -> np.ndarray | None:
-    forward = facing(panel.pose)
-    return facing(panel.truth) if forward is None else forward
 
 
 def _box_edges(box: Box) -> np.ndarray:
@@ -218,7 +214,7 @@ def _card(ax, panel: Panel, *, at: tuple[float, float], size: tuple[float, float
     if anchor is None:
         _text(ax, center, bottom + _CAPTION + view_height / 2, note, size=8, color=_FAINT, ha="center")
         return
-    forward = _forward(panel)
+    forward = facing_of(panel)
     directions = view_directions(forward)
     names = ("from +x", "from −y") if forward is None else ("front", "side")
     if note:
@@ -241,7 +237,10 @@ def _card(ax, panel: Panel, *, at: tuple[float, float], size: tuple[float, float
         origin = np.array([edge + wide / 2 - center_u / scale, ground - low / scale])
         window = (edge, ground - 0.08, wide, tall + 0.16)
         _text(ax, edge + wide / 2, bottom + height - 0.2, "" if note else name, size=7, color=_FAINT, ha="center")
-        _view(ax, panel, seen_from=direction, forward=forward, origin=origin, scale=scale, ground=ground, window=window)
+        _view(ax, panel, seen_from=direction, origin=origin, scale=scale, ground=ground, window=window)
+        if forward is not None:
+            x = project(anchor, seen_from=direction)[0] / scale + origin[0]
+            _arrow(ax, x, ground, towards_viewer=float(forward @ direction) > 0.5)
         edge += wide + _RULER
         if view == 0:
             _ruler(ax, edge - _RULER / 2, ground, 1 / scale)
@@ -278,7 +277,7 @@ def _ruler(ax, x: float, ground: float, meter: float) -> None:
     _text(ax, x - 0.06, ground + meter / 2, "1 m", size=6.5, color=_FAINT, rotation=90, ha="right", va="center")
 
 
-def _view(ax, panel: Panel, *, seen_from, forward, origin, scale, ground, window) -> None:
+def _view(ax, panel: Panel, *, seen_from, origin, scale, ground, window) -> None:
     """One view; `origin` is where (right, up) = 0 lies, in inches, `window` (left, bottom, width, height) cuts."""
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Rectangle
@@ -295,8 +294,6 @@ def _view(ax, panel: Panel, *, seen_from, forward, origin, scale, ground, window
         lines.set_clip_path(clip)
 
     ax.plot([window[0], window[0] + window[2]], [ground, ground], color=_HAIRLINE, lw=1.2, zorder=1)
-    if forward is not None:
-        _arrow(ax, placed(middle(panel))[0][0], ground, towards_viewer=float(forward @ seen_from) > 0.5)
     if panel.box is not None:
         add_lines(placed(_box_edges(panel.box))[0], zorder=1.5, colors=_HAIRLINE, linewidths=1.0)
 

@@ -12,6 +12,7 @@ from typing import TypeGuard
 import numpy as np
 
 from lidarpose._version import __version__
+from lidarpose.io.files import check_suffix, write_atomic
 from lidarpose.sample import Pose, within_reach
 from lidarpose.skeleton import SMPL24, Skeleton
 from lidarpose.viz.person_view import (
@@ -19,7 +20,7 @@ from lidarpose.viz.person_view import (
     check_person,
     confidences,
     describe,
-    facing,
+    facing_of,
     is_known,
     middle,
     missing_pose,
@@ -56,8 +57,6 @@ def write_report(path: str | Path, people: list[ReportPerson], *, title: str, su
     `summary` holds the rows of the table on top; its columns are the rows' keys in order of appearance, and a column
     of numbers is aligned to the right. More than 60,000 points in all are thinned evenly for the views.
     """
-    from lidarpose.io.files import check_suffix, write_atomic
-
     check_suffix(path, ".html", ".htm")
     write_atomic(path, render_report(people, title=title, summary=summary).encode("utf-8", "replace"))
 
@@ -106,12 +105,10 @@ def _person_data(person: ReportPerson, limit: int) -> dict:
     center = middle(person)
     center = np.zeros(3) if center is None else center
     points = np.asarray(person.points, float)
-    # points that are somewhere
-    kept = np.flatnonzero(within_reach(points))
-    kept = kept[thinned(len(kept), limit)]
-    points = points[kept]
-    forward = facing(person.pose)
-    forward = facing(person.truth) if forward is None else forward
+    rows = np.flatnonzero(within_reach(points))
+    rows = rows[thinned(len(rows), limit)]
+    points = points[rows]
+    forward = facing_of(person)
     data = {
         "points": np.rint((points - center) * 1000).astype(int).ravel().tolist(),
         "facing": None if forward is None else round(math.atan2(forward[1], forward[0]), 4),
@@ -119,7 +116,7 @@ def _person_data(person: ReportPerson, limit: int) -> dict:
         "truth": _pose_data(person.truth, center),
     }
     if person.part is not None:
-        data["sides"] = "".join(_PART_SIDES[np.clip(person.part[kept], 0, len(SMPL24))])
+        data["sides"] = "".join(_PART_SIDES[np.clip(person.part[rows], 0, len(SMPL24))])
     return data
 
 

@@ -46,6 +46,12 @@ def facing(pose: Pose | None) -> np.ndarray | None:
     return np.array([axis[1], -axis[0], 0.0]) / length
 
 
+def facing_of(person) -> np.ndarray | None:
+    """`facing` of the predicted pose, else of the true one."""
+    forward = facing(person.pose)
+    return facing(person.truth) if forward is None else forward
+
+
 def project(points: np.ndarray, *, seen_from: np.ndarray) -> np.ndarray:
     """points (..., 3) m as somebody sees them who looks level at them: (..., 3) m = (right, up, towards the viewer).
 
