@@ -1,7 +1,7 @@
 """lidarpose: 3D human pose from LiDAR.
 
     import lidarpose
-    pose = lidarpose.load().predict(points)                       # one person, (n, 3) metres, z up
+    pose = lidarpose.load().predict(points)                       # one person, (n, 3) meters, z up
     people = lidarpose.predict("sweep.pcd", boxes="boxes.json")   # everybody in a sweep
 
 Names are loaded when first used: importing the package costs no torch and no numba, and predicting needs neither.

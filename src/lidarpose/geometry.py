@@ -1,6 +1,6 @@
 """Rotations, spherical coordinates, up axes and similarity alignment, in numpy.
 
-Frames are right-handed, x forward, y left, z up; lengths in metres, angles in radians. Rotation matrices act on
+Frames are right-handed, x forward, y left, z up; lengths in meters, angles in radians. Rotation matrices act on
 column vectors: `rotated = R @ v`, for rows `points @ R.T`.
 """
 

@@ -1,7 +1,7 @@
-"""What flows between the rooms: a person's points (`Sample`), a skeleton in space (`Pose`), a detector's `Box`.
+"""What packages hand on: a person's points (`Sample`), a skeleton in space (`Pose`), a detector's `Box`.
 
 All are frozen, keyword-only and validated when built, and equal to nothing but themselves, since they hold arrays.
-Lengths in metres, angles in radians, z up.
+Lengths in meters, angles in radians, z up.
 """
 
 from dataclasses import dataclass, field, replace
@@ -240,7 +240,7 @@ def _as_arrays(self: Pose | Sample, *names: str) -> None:
         object.__setattr__(self, name, made)
 
 
-# edge of the cells in which a cloud's density is evened out before its center is taken, metres
+# edge of the cells in which a cloud's density is evened out before its center is taken, meters
 CENTER_CELL = 0.1
 
 
@@ -254,7 +254,7 @@ def center_of(points: np.ndarray) -> np.ndarray:
     low = cells.min(0)
     span = cells.max(0) - low + 1
     if span.astype(float).prod() > 2.0**62:
-        # strays kilometres away: one number a cell would overflow
+        # strays kilometers away: one number a cell would overflow
         return (np.median(np.unique(cells, axis=0), axis=0) + 0.5) * CENTER_CELL
     # one number a cell: far faster to make unique than rows
     number = np.sort(((cells[:, 0] - low[0]) * span[1] + cells[:, 1] - low[1]) * span[2] + cells[:, 2] - low[2])

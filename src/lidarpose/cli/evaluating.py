@@ -70,7 +70,7 @@ def add(commands) -> None:
         type=int,
         default=1,
         metavar="N",
-        help="test-time augmentation: average N looks at each person, 1 (default) to 8; protocol clean only",
+        help="test-time augmentation: average N predictions of each person, 1 (default) to 8; protocol clean only",
     )
 
     table = add_command(

@@ -33,7 +33,9 @@ def add(commands) -> None:
     predict.add_argument("file", metavar="FILE", help=".pcd .ply .bin .npy .npz .csv .xyz .txt")
     scan = predict.add_argument_group("what is in the file")
     scan.add_argument("--boxes", metavar="FILE", help=_BOXES)
-    scan.add_argument("--crop", action="store_true", help="one person (assumed when it is under 4 m across)")
+    scan.add_argument(
+        "--crop", action="store_true", help="the file holds one person (assumed when it is under 4 m across)"
+    )
     scan.add_argument(
         "--sensor-origin",
         metavar="X,Y,Z",
@@ -76,7 +78,7 @@ def add(commands) -> None:
         "--tta",
         type=int,
         metavar="N",
-        help="test-time augmentation: average N looks at each person, 1 to 8 (default 4)",
+        help="test-time augmentation: average N predictions of each person, 1 to 8 (default 4)",
     )
 
 

@@ -7,7 +7,7 @@ made it once). A row is one person in one frame:
     condition           clean, occluded, cluttered, crop (a poor detector's box) or company (a second person)
     poses               prior (procedural) or captured (subjects kept out of all training)
     sensor, kind, distance, visible, clutter, upright      as in `sample.PersonInfo`
-    origin              (3,) m in the level frame at the sensor; points_mm: x, y, z of all points from it, millimetres
+    origin              (3,) m in the level frame at the sensor; points_mm: x, y, z of all points from it, millimeters
     part                one a point: 0 = not body, 1 + j = the bone of SMPL-24's joint j
     joints              x, y, z of body26's joints, m, in the level frame at the sensor, which stands at its origin
     box                 center (3), size (3), yaw of the detector's box: m, rad

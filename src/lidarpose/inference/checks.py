@@ -95,7 +95,7 @@ def origin_warning(scan: Scan) -> str | None:
 
 
 def box_units(scan: Scan, people: Poses) -> str | None:
-    """All boxes, or some of them, have sizes of other units than metres."""
+    """All boxes, or some of them, have sizes of other units than meters."""
     if not scan.boxes:
         return None
     if warning := unit_warning(np.median([box.size for box in scan.boxes], axis=0), what="a person's box"):

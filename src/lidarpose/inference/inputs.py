@@ -30,7 +30,7 @@ _RING_WEIGHT = 0.5
 # columns a crop, m from one to the next, and m around each that a person takes
 _COLUMNS, _APART, _AROUND = 3, 0.6, 0.75
 
-# bounds of what a person measures in other units, taken for metres
+# bounds of what a person measures in other units, taken for meters
 _LARGEST_IN_CENTIMETRES, _SMALLEST_IN_OTHER_UNITS, _LARGEST_IN_KILOMETRES = 500, 20, 0.02
 # a person with the ground around is at most so many times as wide as tall
 _WIDEST = 4
@@ -189,7 +189,7 @@ def _distance(points: np.ndarray, place: np.ndarray) -> np.ndarray:
 
 
 def unit_warning(size: np.ndarray, *, what: str) -> str | None:
-    """What is likely wrong where a person's extent `size` (3,), z up, is no person's in metres."""
+    """What is likely wrong where a person's extent `size` (3,), z up, is no person's in meters."""
     tall, largest = float(size[2]), float(size.max())
     if 0 < largest < _LARGEST_IN_KILOMETRES:
         return f"{what} is {largest:.2g} m in size: are the units kilometres? multiply all coordinates by 1000"

@@ -167,7 +167,7 @@ class Predictor:
     def predict(self, points, *, boxes=None, sensor_origin=None, skeleton=None, progress=False) -> PersonPose | Poses:
         """One cloud (n, 3+) -> `PersonPose`; a list of clouds, or a cloud with boxes -> `Poses`, in their order.
 
-        points: x, y, z in metres, z up, any frame, each cloud one person, ground and clutter allowed; more columns are
+        points: x, y, z in meters, z up, any frame, each cloud one person, ground and clutter allowed; more columns are
         ignored, those of tables and records are taken by name. boxes: the people of a whole scan, as in
         `lidarpose.predict`. sensor_origin (3,) m: where the sensor stood in that frame, or "unknown"; None means
         0, 0, 0 with boxes and unknown without. skeleton: see `in_skeleton`. A cloud of under 5 different points

@@ -7,7 +7,8 @@ middle's at half the divergence, as makers state it. What the rays meet comes ba
     2. Power returned falls with the square of the range (LiDAR equation of an extended diffuse target, Wagner et al.
        2006); how bright a surface is and how it is turned is left aside.
     3. The strongest echo is the beam's return ("strongest return", the usual mode of spinning sensors), if it is as
-       strong as a whole beam's from the sensor's greatest range. It lies on the beam's axis.
+       strong as a whole beam's from the sensor's greatest range. It lies on the beam's axis. There
+       are no second returns.
 So silhouettes grow by up to half the divergence, thin things are seen from farther, edges are smeared.
 
 Letters as in `raycast`; S sub-beams along a side, K = S * S of a beam. A change in `raycast_kernels` or `raycast_scan`

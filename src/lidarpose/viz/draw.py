@@ -228,7 +228,7 @@ def _card(ax, panel: Panel, *, at: tuple[float, float], size: tuple[float, float
     top_space = 0.2  # inches for the names of the views
     ground = bottom + _CAPTION + 0.1
     tall = view_height - top_space - 0.1
-    scale = max(sum(spans) / room, (high - low) / tall, _TALLEST / tall)  # metres an inch
+    scale = max(sum(spans) / room, (high - low) / tall, _TALLEST / tall)  # meters an inch
     spare = (room - sum(spans) / scale) / 2
     edge = left + 0.1
     for view, (direction, name) in enumerate(zip(directions, names, strict=True)):

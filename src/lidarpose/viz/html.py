@@ -101,7 +101,7 @@ def _skeleton_data(skeleton: Skeleton) -> dict:
 
 
 def _person_data(person: ReportPerson, limit: int) -> dict:
-    """Millimetres as integers about the person's middle, so that a point costs some 14 letters."""
+    """Millimeters as integers about the person's middle, so that a point costs some 14 letters."""
     center = middle(person)
     center = np.zeros(3) if center is None else center
     points = np.asarray(person.points, float)

@@ -1,7 +1,7 @@
 """Waymo's frames, whatever files they come from: range images to points, keypoints and boxes to people.
 
 Frames of reference: a laser's own (x along its azimuth 0, z up); the vehicle's (x forward, y left, z up) at the time of
-the frame's pose, in which boxes and keypoints are labelled; the world's. Lengths in metres, angles in radians. H rows
+the frame's pose, in which boxes and keypoints are labeled; the world's. Lengths in meters, angles in radians. H rows
 and W columns of a range image, n points, J = 14 joints.
 """
 
