@@ -9,6 +9,7 @@ import json
 import math
 import os
 from pathlib import Path
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -27,10 +28,10 @@ _KITTI_PEOPLE = ("Pedestrian", "Person_sitting", "Cyclist")
 # how far a calibration's rotations may be from orthogonal: files keep seven digits
 _ROTATION_TOLERANCE = 1e-3
 
+_Content = dict | list | tuple | np.ndarray | Box
 
-def read_boxes(
-    source: str | os.PathLike | dict | list | tuple | np.ndarray | Box, *, calib: str | os.PathLike | None = None
-) -> list[Box]:
+
+def read_boxes(source: str | os.PathLike | _Content, *, calib: str | os.PathLike | None = None) -> list[Box]:
     """The boxes of people, in the frame of the points, meters and radians.
 
     Args:
@@ -48,9 +49,8 @@ def read_boxes(
         InputError: one line that names the file, the entry (counted from 0, as in JSON paths) and the key. Two entries
             of one id are an error, since results are told apart by it.
     """
-    is_content = isinstance(source, Box | dict | list | tuple | np.ndarray)
     try:
-        content = source if is_content else _load_file(source, calib)
+        content = source if isinstance(source, _Content) else _load_file(source, calib)
         boxes = [_box(entry, f"people[{i}]") for i, entry in enumerate(_entries(content))]
         first: dict[str | int, int] = {}
         for i, box in enumerate(boxes):
@@ -58,7 +58,7 @@ def read_boxes(
                 came = f"{_show(box.id)}, which people[{first[box.id]}] has too"
                 raise FormatError(f"people[{i}].id: expected an id of its own, got {came}: rename one or leave it out")
     except FormatError as problem:
-        raise file_error("boxes" if is_content else source, problem) from None
+        raise file_error("boxes" if isinstance(source, _Content) else source, problem) from None
     return boxes
 
 
@@ -118,7 +118,7 @@ def _read_kitti(path: str | os.PathLike, text: str, calib: str | os.PathLike | N
         if not words or words[0] not in _KITTI_PEOPLE:
             continue
         values = [_number_of(word) for word in words[8:15]]
-        if len(values) != 7 or None in values:
+        if not _are_numbers(values, 7):
             raise FormatError(
                 f"expected a KITTI label of 15 values on line {number}, got {shorten(line)!r}: correct it"
             )
@@ -136,7 +136,7 @@ def _read_kitti(path: str | os.PathLike, text: str, calib: str | os.PathLike | N
     for height, width, length, x, y, z, rotation_y in people:
         # the camera's y points down and a label's place is the middle of the box's bottom
         center = R_rect_velo.T @ (np.array([x, y - height / 2, z]) - t_rect_velo)
-        ahead = R_rect_velo.T @ [math.cos(rotation_y), 0, -math.sin(rotation_y)]
+        ahead = R_rect_velo.T @ np.array([math.cos(rotation_y), 0, -math.sin(rotation_y)])
         rows.append([*center.tolist(), length, width, height, math.atan2(ahead[1], ahead[0])])
     return rows
 
@@ -148,7 +148,7 @@ def _read_calibration(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
     matrices = []
     for keys, shape in ((("R0_rect", "R_rect"), (3, 3)), (("Tr_velo_to_cam", "Tr_velo_cam"), (3, 4))):
         values = [_number_of(word) for key in keys for word in lines.get(key, ())]
-        if len(values) != math.prod(shape) or None in values:
+        if not _are_numbers(values, math.prod(shape)):
             came = shorten(", ".join(lines)) or "nothing"
             raise file_error(path, f"expected {keys[0]}: and {math.prod(shape)} numbers, got {came}: copy it again")
         matrix = np.array(values).reshape(shape)
@@ -165,6 +165,11 @@ def _number_of(word: str) -> float | None:
         return _number(float(word))
     except ValueError:
         return None
+
+
+def _are_numbers(values: list[float | None], count: int) -> TypeGuard[list[float]]:
+    """Whether there are `count` values, each a number."""
+    return len(values) == count and None not in values
 
 
 # ---- one entry
@@ -189,7 +194,7 @@ def _box(entry: object, where: str) -> Box:
         raise FormatError(f"{where}.yaw: expected a finite number in radians, got {_show(entry['yaw'])}")
     if abs(yaw) > _MAX_YAW:
         raise FormatError(f"{where}.yaw: expected radians, got {yaw:g}; if it is in degrees, multiply by pi / 180")
-    return Box(center=center, size=size, yaw=yaw, id=_id(entry, where))
+    return Box(center=np.array(center), size=np.array(size), yaw=yaw, id=_id(entry, where))
 
 
 def _triple(entry: dict, key: str, where: str, *, meaning: str) -> list[float]:
@@ -200,12 +205,12 @@ def _triple(entry: dict, key: str, where: str, *, meaning: str) -> list[float]:
         numbers = [_number(v) for v in value] if not isinstance(value, str | bytes | dict) else []
     except TypeError:
         numbers = []
-    if len(numbers) != 3 or None in numbers:
+    if not _are_numbers(numbers, 3):
         raise FormatError(f"{where}.{key}: expected three finite numbers {meaning} in meters, got {_show(value)}")
     return numbers
 
 
-def _number(value: object) -> float | None:
+def _number(value: Any) -> float | None:
     """The value as a float that a place or an angle may have, else None. Truth values and texts are no numbers."""
     if isinstance(value, bool | np.bool_ | str | bytes):
         return None

@@ -281,7 +281,7 @@ def _is_about(error: OSError, temporary: Path) -> bool:
 
 
 def _write_error(path: object, folder: Path, error: OSError) -> InputError:
-    remedy = _REMEDIES.get(error.errno, "choose another folder")
+    remedy = _REMEDIES.get(error.errno or 0, "choose another folder")
     return file_error(path, f"cannot write into the folder {folder} ({error.strerror or error}); {remedy}")
 
 

@@ -16,11 +16,11 @@ def parse_pcd(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]
     header, encoding, start = _read_header(data)
     names = tuple(header.get("FIELDS") or header.get("COLUMNS") or ())
     # the older versions of the format leave out COUNT
-    sizes, types, counts = (header.get(key, ["1"] * len(names)) for key in ("SIZE", "TYPE", "COUNT"))
-    if not len(sizes) == len(types) == len(counts) == len(names):
-        came = f"{len(names)} fields, {len(sizes)} sizes, {len(types)} types and {len(counts)} counts"
+    sizes, types, count_words = (header.get(key, ["1"] * len(names)) for key in ("SIZE", "TYPE", "COUNT"))
+    if not len(sizes) == len(types) == len(count_words) == len(names):
+        came = f"{len(names)} fields, {len(sizes)} sizes, {len(types)} types and {len(count_words)} counts"
         raise FormatError("a PCD header with as many SIZE, TYPE, COUNT as FIELDS", came, "export it again")
-    counts = [parse_count(c, "COUNT") for c in counts]
+    counts = [parse_count(c, "COUNT") for c in count_words]
     formats = [t.lower() + s for t, s in zip(types, sizes, strict=True)]
     for text in set(formats) - set(_TYPES):
         raise FormatError("PCD TYPE F, I or U with SIZE 1, 2, 4 or 8", f"{shorten(text)!r}", "export it again")

@@ -11,10 +11,10 @@ import os
 import pickle
 import re
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -87,9 +87,10 @@ def load_pickle(path: str | os.PathLike) -> Any:
 class _Stub(Unread):
     """What a call made that still lacks its state; `value` is set with the state."""
 
-    def __init__(self, name: str, args: tuple):
+    def __init__(self, name: str, args: tuple | list):
         super().__init__(name)
-        self.args, self.value = args, None
+        self.args = args
+        self.value: Any = None
 
 
 class _Memo(dict):
@@ -119,7 +120,10 @@ class _DataUnpickler(pickle._Unpickler):
     The pure Python class, since it takes no memory for announced sizes and lets instructions be replaced.
     """
 
-    dispatch = dict(pickle._Unpickler.dispatch)
+    dispatch: ClassVar[dict[int, Any]] = dict(pickle._Unpickler.dispatch)
+    # Python's own, which its type stubs leave out
+    pop_mark: Callable[[], list]
+    stack: list[Any]
 
     def __init__(self, data: bytes):
         self.file = io.BytesIO(data)
@@ -134,7 +138,8 @@ class _DataUnpickler(pickle._Unpickler):
         """The data. Raises EOFError where the file ends before it, and FormatError."""
         read = self.read = self.file.read
         self.readline = self.file.readline
-        self.metastack, self.stack = [], []
+        self.metastack: list[list] = []
+        self.stack = []
         self.append = self.stack.append
         for _ in range(self.steps):
             code = read(1)
@@ -182,7 +187,7 @@ class _DataUnpickler(pickle._Unpickler):
         items = self.pop_mark()
         self.append(frozenset(self.keys(items)))
 
-    def call(self, what: object, args: object) -> object:
+    def call(self, what: object, args: Any) -> object:
         """What `what(*args)` would return, or a stub where that lacks its state."""
         if type(what) is not Unread or not isinstance(args, tuple | list):
             raise TypeError("a call of something that is no name")
@@ -190,9 +195,9 @@ class _DataUnpickler(pickle._Unpickler):
         if name in _NEW and args and type(args[0]) is Unread:
             name, args = args[0].name, ()
         if name in _DICTS:
-            pairs = args[name == "collections.defaultdict" :] or [()]
+            pairs: Any = args[name == "collections.defaultdict" :] or [()]
             pairs = pairs[0].items() if isinstance(pairs[0], dict) else pairs[0]
-            made = dict(zip(self.keys([key for key, _ in pairs]), [value for _, value in pairs], strict=True))
+            made: Any = dict(zip(self.keys([key for key, _ in pairs]), [value for _, value in pairs], strict=True))
         elif name in _ITEMS:
             (items,) = args or [()]
             if not isinstance(items, list | tuple | set | frozenset):
@@ -206,7 +211,7 @@ class _DataUnpickler(pickle._Unpickler):
             return _Stub(name, args)
         return self.charged(made)
 
-    def build(self, name: str, args: tuple, state: object) -> object:
+    def build(self, name: str, args: tuple | list, state: Any) -> object:
         """What a stub becomes with its state."""
         if name == "numpy.dtype":
             return _dtype(args, state)
@@ -244,7 +249,7 @@ class _DataUnpickler(pickle._Unpickler):
             raise TypeError(f"values by key of a {type(self.stack[-1]).__name__}")
         self.stack[-1].update(zip(self.keys(items[::2]), items[1::2], strict=True))
 
-    def keys(self, items: object) -> object:
+    def keys(self, items: Iterable[Any]) -> Iterable[Any]:
         """The items, once each can be a key: a nested one could overflow the interpreter's stack, and numbers can be
         made to share one hash, which takes time by the square of their count."""
         for item in items:
@@ -292,12 +297,12 @@ _HANDLERS = {
     pickle.SETITEM: lambda self: self.update([self.stack.pop(-2), self.stack.pop()]),
     pickle.SETITEMS: lambda self: self.update(self.pop_mark()),
     # Python's own takes the announced memory before it reads
-    pickle.BYTEARRAY8: pickle._Unpickler.load_binbytes8,
+    pickle.BYTEARRAY8: pickle._Unpickler.dispatch[pickle.BINBYTES8[0]],
 }
 _DataUnpickler.dispatch |= {code[0]: handler for code, handler in _HANDLERS.items()}
 
 
-def _check_levels(value: object, levels: dict[int, int | None], depth: int) -> int:
+def _check_levels(value: Any, levels: dict[int, int | None], depth: int) -> int:
     """How many levels of containers a value has. levels: by id, of those seen before, None while they are counted.
 
     Raises FormatError for too many, for a container in itself, and for an object that never got its state.
@@ -305,14 +310,15 @@ def _check_levels(value: object, levels: dict[int, int | None], depth: int) -> i
     if type(value) in _PLAIN:
         return 0
     if id(value) in levels:
-        if levels[id(value)] is None:
+        known = levels[id(value)]
+        if known is None:
             raise FormatError("holds a list or dict that contains itself: ask for npz")
-        return levels[id(value)]
+        return known
     if type(value) is _Stub:
         if not value.name.startswith("chumpy."):
             raise FormatError(f"has a {value.name} without content: {_REMEDY}")
         return 0
-    parts = ()
+    parts: Iterable[Any] = ()
     if type(value) in _CONTAINERS:
         # keys have no parts that have parts
         parts = value.values() if isinstance(value, dict) else value
@@ -347,7 +353,7 @@ def _canonical(name: str) -> str:
 # --- numpy and Python's own
 
 
-def _dtype(args: tuple, state: object) -> np.dtype:
+def _dtype(args: tuple | list, state: object) -> np.dtype:
     code = args[0] if args else None
     if not isinstance(code, str) or not re.fullmatch(
         r"[|<>=]?(b1|[iu][1248]|f(2|4|8|16)|c(8|16|32)|[SU]\d{1,9}|O\d*|\?)", code
@@ -361,13 +367,14 @@ def _dtype(args: tuple, state: object) -> np.dtype:
     return np.dtype(order + code.lstrip("|<>="))
 
 
-def _array(data: object, dtype: object, shape: object, order: str) -> np.ndarray:
+def _array(data: Any, dtype: object, shape: object, order: Literal["C", "F"]) -> np.ndarray:
     if not isinstance(dtype, np.dtype) or not isinstance(shape, tuple) or any(type(n) is not int for n in shape):
         raise FormatError(f"has an array without type or shape: {_REMEDY}")
     # Python 2 kept the content as text
     data = data.encode("latin1") if isinstance(data, str) else data
     is_object = dtype.kind == "O"
-    if not isinstance(data, list if is_object else bytes):
+    expected: Any = list if is_object else bytes
+    if not isinstance(data, expected):
         raise FormatError(f"has an array of a {type(data).__name__}: {_REMEDY}")
     count = math.prod(shape)
     size = 1 if is_object else dtype.itemsize
@@ -387,7 +394,7 @@ def _from_buffer(data: object, dtype: object, shape: object, order: object) -> n
     return _array(data, dtype, shape, "F" if order == "F" else "C")
 
 
-def _scalar(dtype: object, data: object) -> np.generic:
+def _scalar(dtype: object, data: object) -> Any:
     if not isinstance(dtype, np.dtype) or dtype.kind == "O":
         raise FormatError("has a number of type object: ask for npz")
     return _array(data, dtype, (), "C")[()]
@@ -403,7 +410,7 @@ def _encode(text: object = b"", encoding: object = "latin1") -> bytes:
 
 
 # what can be made at once, without a state
-_CALLS = {
+_CALLS: dict[str, Callable[..., object]] = {
     "numpy.core.multiarray.scalar": _scalar,
     "numpy.core.numeric._frombuffer": _from_buffer,
     "_codecs.encode": _encode,
@@ -424,7 +431,7 @@ def _chumpy(name: str, state: object) -> np.ndarray | Unread:
     """A Ch holds its numbers as `x`; a Select is a choice from another, by flat indices."""
     if not isinstance(state, dict):
         return Unread(name)
-    parts = [state.get(key) for key in ("a", "idxs")]
+    parts: list[Any] = [state.get(key) for key in ("a", "idxs")]
     if name == "chumpy.reordering.Select" and all(isinstance(part, np.ndarray) for part in parts):
         selected = parts[0].flat[parts[1].astype(np.int64)]
         shape = state.get("preferred_shape")
@@ -435,8 +442,8 @@ def _chumpy(name: str, state: object) -> np.ndarray | Unread:
 def _dense(name: str, state: object, most: int) -> np.ndarray:
     """A compressed sparse matrix, of at most so many numbers: indptr (lines + 1,), indices and data (entries,)."""
     state = state if isinstance(state, dict) else {}
-    shape = state.get("_shape", state.get("shape"))
-    parts = [state.get(part) for part in ("indptr", "indices", "data")]
+    shape: Any = state.get("_shape", state.get("shape"))
+    parts: list[Any] = [state.get(part) for part in ("indptr", "indices", "data")]
     good = isinstance(shape, tuple) and len(shape) == 2 and all(isinstance(n, int | np.integer) for n in shape)
     for part, kinds in zip(parts, ("iu", "iu", "fiub"), strict=True):
         good = good and isinstance(part, np.ndarray) and part.ndim == 1 and part.dtype.kind in kinds

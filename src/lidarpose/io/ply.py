@@ -54,7 +54,8 @@ def _read_header(data: bytes) -> tuple[str, list[tuple[str, int, list[tuple[str,
     end = re.compile(rb"[\r\n]end_header[ \t]*" + start.group(1)).search(data)
     if end is None:
         raise FormatError("a PLY header with an end_header line", "none", "it is cut off, export it again")
-    encoding, elements = "", []
+    encoding = ""
+    elements: list[tuple[str, int, list[tuple[str, str]]]] = []
     for line in data[: end.start()].decode("utf-8", "replace").splitlines()[1:]:
         match line.split():
             case ["format", kind, *_]:

@@ -16,6 +16,7 @@ import re
 import warnings
 import zipfile
 from dataclasses import dataclass
+from typing import IO, Literal
 
 import numpy as np
 
@@ -147,7 +148,7 @@ def _parse_bin(data: bytes, columns: int | None):
     # printable bytes alone may be a few float32: 837282 is " jLI"
     if re.fullmatch(rb"[\t\r\n -~]+", data[:1024]) and re.search(rb"[0-9][\s,;]+[-+.]?[0-9]", data[:1024]):
         raise FormatError("raw float32 rows", "text", "rename it to .txt or .csv")
-    notes = ()
+    notes: tuple[str, ...] = ()
     if columns is None:
         columns, notes = _guess_columns(data)
     if len(data) % (4 * columns):
@@ -181,7 +182,7 @@ def _guess_columns(data: bytes) -> tuple[int, tuple[str, ...]]:
             usual, fits, why = five, [five], "every fifth value is a beam number"
     if usual in fits and len(fits) > 1:
         width = {columns: _width(values.reshape(-1, columns)) for columns in fits}
-        best = min(fits, key=width.get)
+        best = min(fits, key=width.__getitem__)
         if width[best] < width[usual] - _NARROWER:
             usual, why = best, f"rows of {usual} would mix its columns up"
         elif best != usual:
@@ -222,11 +223,11 @@ def _parse_npz(data: bytes):
 def _choose_array(archive: zipfile.ZipFile) -> tuple[str, bytes]:
     """(name, .npy content) of the array of points: `points`, else `xyz`, else the only one of their shape."""
     keys = {name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")}
-    named = [key for key in ("points", "xyz") if key in keys]
+    named: list[str] = [key for key in ("points", "xyz") if key in keys]
     if not named:
         for key, name in keys.items():
-            with archive.open(name) as member:
-                shape, dtype, _ = _array_header(member)
+            with archive.open(name) as file:
+                shape, dtype, _ = _array_header(file)
             if (len(shape) == 2 and shape[1] >= 3 and dtype.kind in "fiu") or (dtype.names and len(shape) == 1):
                 named.append(key)
         if len(named) != 1:
@@ -237,7 +238,7 @@ def _choose_array(archive: zipfile.ZipFile) -> tuple[str, bytes]:
     return named[0], archive.read(member)
 
 
-def _array_header(file) -> tuple[tuple[int, ...], np.dtype, str]:
+def _array_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype, Literal["C", "F"]]:
     """(shape, dtype, order) of a .npy stream, which is left at its first value."""
     try:
         version = np.lib.format.read_magic(file)

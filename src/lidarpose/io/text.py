@@ -5,6 +5,7 @@ import io
 import itertools
 import re
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -124,7 +125,7 @@ def _find_columns(text: str) -> tuple[Sequence[str], int, bool, str | None, str]
     return numbered(len(cells)), skip, False, separator, decimal
 
 
-def _check_width(body: str, names: list[str], separator: str | None, num_skipped: int) -> None:
+def _check_width(body: str, names: Sequence[str], separator: str | None, num_skipped: int) -> None:
     """Raises FormatError where the first row has more cells than the header names: any of them could be x then."""
     for number, line in enumerate(io.StringIO(body), num_skipped + 1):
         if line.strip():
@@ -174,7 +175,7 @@ def _read_csv(text: str, columns: list[int], *, separator: str | None, decimal: 
     """The columns at three positions as (n, 3) float64; missing values are NaN. Separator None is any run of blanks."""
     import pandas as pd
 
-    style = {"separator": separator, "decimal": decimal}
+    style: dict[str, Any] = {"separator": separator, "decimal": decimal}
     try:
         frame = pd.read_csv(
             io.StringIO(text),
