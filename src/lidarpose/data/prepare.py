@@ -18,7 +18,7 @@ from lidarpose.data.schema import labeled_row
 from lidarpose.data.shards import CARD, DatasetCard, open_dataset, shard_path, shard_writer, write_card
 from lidarpose.data.splits import SplitRule, split_rule
 from lidarpose.data.summary import summarize
-from lidarpose.data.writer import locked, make_shards, open_folder
+from lidarpose.data.writer import Counts, locked, make_shards, open_folder
 from lidarpose.errors import InputError, check_name
 from lidarpose.io.files import file_error, one_line
 from lidarpose.progress import Progress
@@ -160,7 +160,7 @@ class PartWriter:
     rule: SplitRule | None
     only: str | None
 
-    def __call__(self, number: int) -> Iterator[int]:
+    def __call__(self, number: int) -> Counts:
         people = 0
         with ExitStack() as stack:
             add = {

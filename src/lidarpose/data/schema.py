@@ -45,7 +45,8 @@ def _columns(text: str) -> dict[str, str]:
 
 
 # a field more is a column more, which older shards have not
-INFO = {info.name: {str: "string?", float: "float32?", bool: "bool?"}[info.type] for info in fields(PersonInfo)}
+_INFO_TYPES: dict[Any, str] = {str: "string?", float: "float32?", bool: "bool?"}
+INFO = {info.name: _INFO_TYPES[info.type] for info in fields(PersonInfo)}
 # origins that published protocols use, by name: a column center_NAME each
 CENTERS = ("trans", "box", "joints_box")
 _SAMPLE = _columns("points:float32[] part:uint8[]? ring:int32[]? joints:float32[]")
@@ -90,8 +91,10 @@ def person_row(
     sample: Sample, *, index: int, frame: int = 0, track: int = 0, facts: PersonInfo | None = None
 ) -> dict[str, Any]:
     """A row of the people table. The sample needs pose (body26), part, ring and box."""
+    if sample.pose is None:
+        raise InputError("a row of the people table needs a sample with a pose")
     info = dict.fromkeys(INFO) if facts is None else asdict(facts)
-    return {"index": index, "frame": frame, "track": track, **_sample_columns(sample), **info}
+    return {"index": index, "frame": frame, "track": track, **_sample_columns(sample, sample.pose), **info}
 
 
 def labeled_row(sample: LabeledSample, *, index: int) -> dict[str, Any]:
@@ -103,19 +106,19 @@ def labeled_row(sample: LabeledSample, *, index: int) -> dict[str, Any]:
     return {
         "index": index,
         **{name: getattr(sample, name) for name in ("sequence", "frame", "track", "time", "split", "joint_labels")},
-        **_sample_columns(sample),
+        **_sample_columns(sample, sample.pose),
         **{f"center_{name}": sample.centers.get(name) for name in CENTERS},
         "distance": sample.distance if sample.sensor_known else None,
     }
 
 
-def _sample_columns(sample: Sample) -> dict[str, Any]:
+def _sample_columns(sample: Sample, pose: Pose) -> dict[str, Any]:
     box = sample.box
     return {
         "points": sample.points.ravel(),
         "part": sample.part,
         "ring": sample.ring,
-        "joints": np.asarray(sample.pose.joints, np.float32).ravel(),
+        "joints": np.asarray(pose.joints, np.float32).ravel(),
         "center": sample.center,
         "box_center": box and box.center,
         "box_size": box and box.size,

@@ -100,7 +100,7 @@ def read_card(folder: str | Path) -> DatasetCard:
     except InputError:
         raise
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
-        problem = f"{error} is missing" if isinstance(error, KeyError) else error
+        problem = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         raise file_error(path, f"is not a dataset's card ({problem})") from None
     if card.count < 1 or card.per_shard < 1 or not set(card.tables) <= set(TABLES):
         raise file_error(path, "is not a dataset's card: count, per_shard or tables make no sense")
@@ -125,7 +125,8 @@ def shard_writer(path: str | Path, table: str) -> Iterator[Callable[[dict[str, A
     written, MissingExtra without pyarrow.
     """
     pa, parquet = pyarrow()
-    schema, waiting = schema_of(pa, table), []
+    schema = schema_of(pa, table)
+    waiting: list[dict[str, Any]] = []
 
     def write() -> None:
         found = pa.Table.from_arrays(arrays_of(pa, table, waiting), schema=schema)

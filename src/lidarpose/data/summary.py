@@ -22,7 +22,10 @@ def summarize(
     dataset: DatasetReader, *, parts: list[str], absent: dict[str, list[str]], rule: SplitRule | None
 ) -> dict[str, Any]:
     """The summary of `prepare`: counts, and warnings of what looks wrong. absent: split -> sequences not there."""
-    labels, splits, sources, reasons = Counter(), Counter(), Counter(), Counter()
+    labels: Counter[int] = Counter()
+    splits: Counter[str] = Counter()
+    sources: Counter[str] = Counter()
+    reasons: Counter[str] = Counter()
     examples: dict[str, str] = {}
     frames: set[tuple[str, int]] = set()
     trunks, apart, table = [], [], []
@@ -79,10 +82,10 @@ def _warnings(found: dict[str, Any], absent: dict[str, list[str]], rule: SplitRu
     empty = [part["part"] for part in found["parts"] if not part["people"]]
     if empty and found["people"]:
         lines.append(f"nobody in {_some(empty)}")
-    for split, names in absent.items():
-        lines.append(f"of {split} by {rule.name} {_some(names)} are not there")
-    if rule is not None and rule.leaks:
-        lines.append(f"the split {rule.name} leaks: {rule.leaks}")
+    if rule is not None:
+        lines += [f"of {split} by {rule.name} {_some(names)} are not there" for split, names in absent.items()]
+        if rule.leaks:
+            lines.append(f"the split {rule.name} leaks: {rule.leaks}")
     return lines
 
 

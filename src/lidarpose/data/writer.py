@@ -10,7 +10,7 @@ import os
 import re
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager, suppress
@@ -26,8 +26,10 @@ try:
 except ImportError:
     raise MissingExtra("writing a dataset", "synth") from None
 
-# makes and writes a shard, by its number; yields how many people, clips or streets are done since it last did
-Make = Callable[[int], Iterator[int]]
+# how many people, clips or streets are done since it last told
+Counts = Generator[int, None, None]
+# makes and writes a shard, by its number
+Make = Callable[[int], Counts]
 
 # how often progress is told, s
 _TICK = 0.5
@@ -154,7 +156,9 @@ def _start(make: Make, done, stop) -> None:
 
 
 def _leave_with_parent() -> None:
-    multiprocessing.parent_process().join()
+    parent = multiprocessing.parent_process()
+    assert parent is not None, "runs in a worker"
+    parent.join()
     os._exit(1)
 
 
@@ -168,7 +172,7 @@ def _shard(shard: int) -> None:
                 return
 
 
-def _counts(make: Make, shard: int) -> Iterator[int]:
+def _counts(make: Make, shard: int) -> Counts:
     """As `make`, on one thread: in products of a few thousand numbers threads of BLAS only get in each other's way.
     What `make` does before it returns, such as reading what all shards need, has them all."""
     from threadpoolctl import threadpool_limits

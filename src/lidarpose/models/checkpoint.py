@@ -58,7 +58,7 @@ class Header:
     @property
     def skeleton(self) -> Skeleton:
         """The joints that the network predicts. Raises InputError for a network whose joints make up no skeleton."""
-        if self.network == "pose":
+        if isinstance(self.config, NetworkConfig):
             return skeleton(self.config.skeleton)
         own = set(self.config.joints)
         inside = [candidate for candidate in SKELETONS.values() if set(candidate.joints) <= own]
@@ -124,7 +124,8 @@ def load_checkpoint(path: str | os.PathLike) -> tuple[PoseNet | DaptNet, Header]
     file = SafetensorsFile.open(path)
     has_digest = file.check_digest()
     header = parse_header(path, file.metadata.get(ENTRY))
-    name = header.config.size if header.network == "pose" else header.config.name
+    config = header.config
+    name = config.size if isinstance(config, NetworkConfig) else config.name
     older = f"use the lidarpose version that wrote it ({header.version})"
     again = "get the file again"
     wanted = empty_state(path, header.config, len(file.shapes), by="its configuration", remedy=again)
@@ -355,9 +356,11 @@ def _other_schema(schema: object, version: object) -> str:
 def _parse_config(path: str | os.PathLike, kind: str, entries: dict) -> NetworkConfig | DaptConfig:
     if not isinstance(entries, dict):
         raise TypeError(f"config is a {type(entries).__name__}")
-    config_class = NetworkConfig
+    config_class: type[NetworkConfig] | type[DaptConfig] = NetworkConfig
     if kind == "dapt":
-        from lidarpose.models.dapt.dapt_config import DaptConfig as config_class
+        from lidarpose.models.dapt.dapt_config import DaptConfig
+
+        config_class = DaptConfig
     extra = sorted(set(entries) - {field.name for field in fields(config_class)})
     if extra:
         raise file_error(

@@ -63,9 +63,9 @@ def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = 
     check_apart(out, weights)
     check_suffix(out, FORMATS[format])
     network, header = load_checkpoint(weights)
-    if header.network != "pose":
+    if not isinstance(network, PoseNet):
         raise InputError(
-            f"{os.fspath(weights)}: the paper's network ({header.config.name}) is not offered as {format}: "
+            f"{os.fspath(weights)}: the paper's network ({network.config.name}) is not offered as {format}: "
             "it runs with torch, and networks that `lidarpose pretrain` trains are exported"
         )
     # tracing takes a minute
@@ -120,6 +120,7 @@ def onnx_bytes(network: PoseNet, metadata: dict[str, str]) -> bytes:
             dynamo=True,
             verbose=False,
         )
+    assert program is not None, "of an export that names no file"
     model = program.model_proto
     # where each node was traced from: a third of the file, and paths of the machine that made it
     for node in [*model.graph.node, *(node for function in model.functions for node in function.node)]:

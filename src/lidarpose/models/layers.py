@@ -70,6 +70,8 @@ def key_bias(valid: Tensor, dtype: torch.dtype) -> Tensor:
 class SelfAttention(nn.Module):
     """Multi-head self-attention of rows (B, N, C), all of a person's to all, with rotary places."""
 
+    frequencies: Tensor
+
     def __init__(self, channels: int, heads: int):
         super().__init__()
         self.heads = heads
@@ -96,6 +98,8 @@ class CrossAttention(nn.Module):
     A head's weight of a voxel is multiplied by (its number of points) ** density, a learned exponent a head: 0 reads
     voxels alike, 1 reads points alike.
     """
+
+    frequencies: Tensor
 
     def __init__(self, channels: int, heads: int, key_channels: int):
         super().__init__()

@@ -3,7 +3,9 @@
 Legend: B people, F / M / N rows of the fine, mid and coarse level (padded), J joints, C channels, W heatmap bins.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import torch
@@ -36,9 +38,9 @@ VIEW_FEATURES = 5
 class Batch:
     """What the network reads: the tables of a `voxelize.VoxelPyramid` as tensors."""
 
-    fine: VoxelLevel
-    mid: VoxelLevel
-    coarse: VoxelLevel
+    fine: VoxelLevel[Tensor]
+    mid: VoxelLevel[Tensor]
+    coarse: VoxelLevel[Tensor]
     deviation: Tensor
     offset: Tensor
     view: Tensor
@@ -48,14 +50,16 @@ class Batch:
         return cls.from_arrays(pyramid.arrays(), device)
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, np.ndarray], device: torch.device | str = "cpu") -> "Batch":
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray | Tensor], device: torch.device | str = "cpu") -> "Batch":
         """From arrays by dotted name, "fine.position"; names that a batch does not have are left out."""
 
-        def tensors(kind: type, prefix: str = "") -> dict[str, Tensor]:
+        def tensors(kind: type, prefix: str = "") -> dict[str, Any]:
             names = [field.name for field in fields(kind) if prefix + field.name in arrays]
             return {name: torch.as_tensor(arrays[prefix + name]).to(device) for name in names}
 
-        levels = {name: VoxelLevel(**tensors(VoxelLevel, f"{name}.")) for name in ("fine", "mid", "coarse")}
+        levels: dict[str, Any] = {
+            name: VoxelLevel(**tensors(VoxelLevel, f"{name}.")) for name in ("fine", "mid", "coarse")
+        }
         return cls(**levels, **tensors(cls))
 
 

@@ -7,10 +7,14 @@ others (the released DAPT code subtracts the minimum). A parent is the child's i
 """
 
 from dataclasses import dataclass, fields
+from typing import Generic, TypeVar
 
 import numpy as np
 
 from lidarpose.errors import InputError
+
+# of a level: numpy's, or torch's tensors
+Array = TypeVar("Array")
 
 # half width of the window around the center that reaches the network, meters: arm span plus a step
 WINDOW = 2.0
@@ -19,7 +23,7 @@ _BITS = 8
 
 
 @dataclass(frozen=True, kw_only=True)
-class VoxelLevel:
+class VoxelLevel(Generic[Array]):
     """Voxels of one size, padded to the most a person has.
 
     position (B, N, 3) float32 m: mean of the points inside, in the person's frame; log_count (B, N) float32: log of the
@@ -27,11 +31,11 @@ class VoxelLevel:
     neighbors (B, N, 27) int64, where asked for: rows of the 3 x 3 x 3 cells around, N where there is no voxel.
     """
 
-    position: np.ndarray
-    log_count: np.ndarray
-    valid: np.ndarray
-    parent: np.ndarray
-    neighbors: np.ndarray | None = None
+    position: Array
+    log_count: Array
+    valid: Array
+    parent: Array
+    neighbors: Array | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,9 +48,9 @@ class VoxelPyramid:
     -1 for a point outside the window or thinned away.
     """
 
-    fine: VoxelLevel
-    mid: VoxelLevel
-    coarse: VoxelLevel
+    fine: VoxelLevel[np.ndarray]
+    mid: VoxelLevel[np.ndarray]
+    coarse: VoxelLevel[np.ndarray]
     deviation: np.ndarray
     offset: np.ndarray
     view: np.ndarray
@@ -54,7 +58,7 @@ class VoxelPyramid:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The arrays by dotted name ("fine.position"), for tensors, ONNX inputs and tests."""
-        out = {}
+        out: dict[str, np.ndarray] = {}
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, VoxelLevel):

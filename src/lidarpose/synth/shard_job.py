@@ -1,6 +1,6 @@
 """The job behind `lidarpose synth`: people, clips or streets into Parquet shards; see `data.writer` for how."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +11,7 @@ import numpy as np
 from lidarpose.body.mocap import digest as motion_digest
 from lidarpose.data.schema import person_row
 from lidarpose.data.shards import CARD, DatasetCard, shard_path, shard_writer, write_card
-from lidarpose.data.writer import locked, make_shards, open_folder
+from lidarpose.data.writer import Counts, locked, make_shards, open_folder
 from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.io.files import content_digest, file_error
 from lidarpose.lidar.presets import SENSORS, sensor
@@ -159,7 +159,7 @@ class Maker:
     folder: Path
     generator: "Generator"
 
-    def __call__(self, shard: int) -> Iterator[int]:
+    def __call__(self, shard: int) -> Counts:
         rows_of = self._street_rows if self.job.what == "streets" else self._people_rows
         first, size = shard * self.card.per_shard, self.card.size(shard)
         with ExitStack() as stack:

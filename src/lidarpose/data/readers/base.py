@@ -43,7 +43,9 @@ class Reader(ABC):
 
     def __init__(self, **settings: Any):
         known = _datasets()[self.name]
-        self.about = {key: known[key] for key in ("frame", "sensor_known", "licence", "get", "notes") if key in known}
+        self.about: dict[str, Any] = {
+            key: known[key] for key in ("frame", "sensor_known", "licence", "get", "notes") if key in known
+        }
         self.about["settings"] = settings
 
     @abstractmethod

@@ -133,7 +133,7 @@ def _without_copies(info: list[dict], where: str) -> dict[str, np.ndarray]:
         seen = np.ones(joints.shape)
         if camera.get("joints_3d_vis") is not None:
             seen = numbers(where, camera["joints_3d_vis"], joints.shape, "joints_3d_vis")
-        for person, there in zip(joints, (seen > 0).all(-1), strict=True):
+        for person, there in zip(joints, np.all(seen > 0, axis=-1), strict=True):
             key = person.tobytes()
             found.setdefault(key, person)
             visible[key] = visible.get(key, False) | there

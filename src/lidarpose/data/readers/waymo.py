@@ -156,7 +156,8 @@ def _frames(files: dict[str, Path], labels: list[dict[str, Any]], margin: float)
     """The frames that have keypoints, with boxes, calibrations and poses joined to them."""
     boxes = table(files["lidar_box"], (SEGMENT, TIME, OBJECT, *_BOX_COLUMNS, _BOX_TYPE), (_BOX_COUNT,))
     box_of = {_object_key(row): row for row in boxes}
-    poses, starts = {}, {}
+    poses: dict[FrameKey, Any] = {}
+    starts: dict[str, int] = {}
     for row in table(files["vehicle_pose"], (SEGMENT, TIME, _VEHICLE_POSE)):
         if row[TIME] is not None:
             poses[row[SEGMENT], row[TIME]] = row[_VEHICLE_POSE]
@@ -212,8 +213,8 @@ def _person(label: dict[str, Any], box: dict[str, Any] | None) -> frames.Labeled
     if len({len(kinds), len(hidden), *map(len, places)}) > 1:
         return frames.LabeledPerson(track=label[OBJECT], problem=(frames.BAD_LABEL, "its lists have different lengths"))
     try:
-        places = numbers("lidar_hkp", places, (3, -1), "keypoints", finite=False)
-        keypoints = zip(kinds, places.T, hidden, strict=True)
+        positions = numbers("lidar_hkp", places, (3, -1), "keypoints", finite=False)
+        keypoints = zip(kinds, positions.T, hidden, strict=True)
         if box is None:
             return frames.person(label[OBJECT], keypoints, None)
         values = numbers("lidar_box", [box[name] for name in _BOX_COLUMNS], (7,), "a box", finite=False)

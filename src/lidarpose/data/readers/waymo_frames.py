@@ -8,6 +8,7 @@ and W columns of a range image, n points, J = 14 joints.
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 
@@ -40,7 +41,8 @@ BAD_REST = "the rest of a part cannot be read"
 def is_image(sizes: Sequence[int | None], count: int) -> bool:
     """Whether a range image of so many values may have these sizes: rows, columns, channels."""
     # of Python's numbers: the product of damaged ones may be 0 in 64 bits
-    return len(sizes) == 3 and None not in sizes and min(sizes) >= 1 and count == math.prod(sizes)
+    known = [size for size in sizes if size is not None]
+    return len(sizes) == len(known) == 3 and min(known) >= 1 and count == math.prod(known)
 
 
 def transform(values: Iterable[float] | None, what: str) -> np.ndarray:
@@ -79,7 +81,9 @@ class Calibration:
         """(H,) rad: the inclination of each row of a range image. Row 0 is the last beam of the table: its order is
         reversed. Raises InputError where the table has another length."""
         if self.inclinations is None:
-            beams = self.low + (np.arange(height) + 0.5) / height * (self.high - self.low)
+            # both are set: checked when built
+            low, high = cast("tuple[float, float]", (self.low, self.high))
+            beams = low + (np.arange(height) + 0.5) / height * (high - low)
         else:
             beams = np.asarray(self.inclinations, float)
         if len(beams) != height or not np.isfinite(beams).all():
@@ -110,6 +114,8 @@ def points_of_image(
     points = points @ T[:3, :3].T + T[:3, 3]
     if pixel_poses is None:
         return points, row
+    if T_world_vehicle is None:
+        raise InputError("pixel poses move points to the frame's own pose: give T_world_vehicle too")
     if pixel_poses.shape != (height, width, 6):
         raise InputError(f"pixel poses are {pixel_poses.shape}, of a range image {height} x {width}")
     roll, pitch, yaw, *shift = pixel_poses[row, column].astype(float).T
@@ -145,7 +151,7 @@ class LabeledPerson:
 def person(
     track: str,
     keypoints: Iterable[tuple[int, tuple[float, float, float], bool]],
-    box: tuple[float, ...] | None,
+    box: tuple[float, ...] | np.ndarray | None,
     kind: int = 0,
     counted: int | None = None,
 ) -> LabeledPerson:
@@ -161,7 +167,7 @@ def person(
     if (labels == UNLABELED).all():
         return LabeledPerson(track=track, problem=("no joint is labelled", ""))
     try:
-        of = Box(center=box[:3], size=box[3:6], yaw=box[6], id=track)
+        of = Box(center=np.asarray(box[:3]), size=np.asarray(box[3:6]), yaw=box[6], id=track)
     except InputError as error:
         return LabeledPerson(track=track, problem=(BAD_LABEL, str(error)))
     return LabeledPerson(track=track, joints=joints, labels=labels, box=of, kind=kind, counted=counted)
@@ -213,7 +219,7 @@ class Frame:
         # the lowest beam is ring 0; only the top laser's rows are told
         ring = len(image) - 1 - row if laser == TOP else np.full(len(row), -1)
         for k, one in enumerate(self.people):
-            if one.problem is None:
+            if one.problem is None and one.box is not None:
                 inside = one.box.contains(points, self.margin)
                 self._crops.setdefault(k, []).append(((laser, which), points[inside], ring[inside]))
 
@@ -235,19 +241,21 @@ class Frame:
             yield Skipped(reason, f"{where}: {why}" if why else where)
 
     def _sample(self, one: LabeledPerson, points: np.ndarray, ring: np.ndarray) -> LabeledSample:
+        # all set of somebody without a problem
+        joints, labels, label = cast("tuple[np.ndarray, np.ndarray, Box]", (one.joints, one.labels, one.box))
         # the sensor is at the origin
         origin = self.calibrations[TOP].T_vehicle_laser[:3, 3]
         points = (points - origin).astype(np.float32)
-        box = Box(center=one.box.center - origin, size=one.box.size, yaw=one.box.yaw, id=one.track)
+        box = Box(center=label.center - origin, size=label.size, yaw=label.yaw, id=one.track)
         return LabeledSample(
             points=points,
             center=center_of(points),
             ring=ring.astype(np.int32),
-            pose=Pose(joints=(one.joints - origin).astype(np.float32), skeleton=WAYMO14, frame="sensor"),
+            pose=Pose(joints=(joints - origin).astype(np.float32), skeleton=WAYMO14, frame="sensor"),
             box=box,
             source=f"waymo/{_KINDS.get(one.kind, 'unknown')}",
             frame_id=f"{self.sequence}/{self.timestamp}",
-            joint_labels=one.labels,
+            joint_labels=labels,
             sequence=self.sequence,
             frame=self.timestamp,
             track=one.track,

@@ -7,6 +7,8 @@ Modules bear the names of the released weights, so that these load by name. They
 tensors.
 """
 
+from typing import cast
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -56,7 +58,7 @@ class SubmanifoldConvolution(nn.Module):
         bound = (kernel**3 * channels) ** -0.5
         nn.init.uniform_(self.weight, -bound, bound)
 
-    def forward(self, rows: Tensor, near: Neighbors) -> Tensor:
+    def forward(self, rows: Tensor, near: Neighbors[Tensor]) -> Tensor:
         """rows (M, C) -> (M, C')."""
         # unbound once: slicing tap after tap would give each slice's gradient the size of the whole weight
         weights = self.weight.flatten(1, 3).unbind(1)
@@ -65,8 +67,10 @@ class SubmanifoldConvolution(nn.Module):
             # the row after the last is zero: an empty cell; the table has none for the middle tap, done above
             read = F.pad(rows, (0, 0, 0, 1))[near.table.flatten()].view(rows.shape[0], -1)
             return out + F.linear(read, self.weight.flatten(1))
-        counts = near.counts.tolist()
-        for weight, source, target in zip(weights, near.source.split(counts), near.target.split(counts), strict=True):
+        # all set where there is no table
+        all_sources, all_targets, pairs = cast("tuple[Tensor, Tensor, Tensor]", (near.source, near.target, near.counts))
+        counts = pairs.tolist()
+        for weight, source, target in zip(weights, all_sources.split(counts), all_targets.split(counts), strict=True):
             if source.shape[0]:
                 out = out.index_add_(0, target, F.linear(rows.index_select(0, source), weight))
         return out
@@ -81,13 +85,15 @@ class PatchAttention(nn.Module):
         self.qkv = nn.Linear(channels, 3 * channels)
         self.proj = nn.Linear(channels, channels)
 
-    def forward(self, rows: Tensor, level: Level, order: int) -> Tensor:
+    def forward(self, rows: Tensor, level: Level[Tensor], order: int) -> Tensor:
         """rows (M, C) -> (M, C), patches along the `order`-th curve."""
         qkv = self.qkv(rows)
         if level.patch_slots is not None:
             order = order % level.patch_slots.shape[0]
             blocks = qkv[level.patch_slots[order]].unflatten(-1, (3, self.heads, -1))
-            mixed = self._attend(blocks, level.patch_valid).flatten(0, 1)[level.patch_place[order]]
+            # set with the slots
+            place = cast("Tensor", level.patch_place)[order]
+            mixed = self._attend(blocks, level.patch_valid).flatten(0, 1)[place]
             return self.proj(mixed)
         sequence = level.sequence[order % level.sequence.shape[0]]
         # one curve alone: rows already stand patch after patch

@@ -9,7 +9,7 @@ stage reads the skip alone. Weights trained with that flow need it (`config.lega
 
 from collections import OrderedDict
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -37,8 +37,8 @@ class DaptBatch:
     """What the network reads of `Tables`, as tensors."""
 
     features: Tensor
-    stem: Neighbors
-    levels: tuple[Level, ...]
+    stem: Neighbors[Tensor]
+    levels: tuple[Level[Tensor], ...]
 
     @classmethod
     def from_tables(
@@ -74,8 +74,9 @@ class DaptOutputs:
     def joints(self) -> Tensor:
         """(B, J, 3) m, differentiable: the heatmaps' windowed mean, as `decode.window`; else the coordinates."""
         if self.logits_x is None:
-            return self.coordinates
-        heatmaps = (self.logits_x, self.logits_y, self.logits_z)
+            # a network has the one head or the other
+            return cast("Tensor", self.coordinates)
+        heatmaps = cast("tuple[Tensor, Tensor, Tensor]", (self.logits_x, self.logits_y, self.logits_z))
         axes = [mean_bin(h) * step + low for h, low, step in zip(heatmaps, self.low, self.step, strict=True)]
         return torch.stack(axes, -1)
 
@@ -87,7 +88,8 @@ class DaptNet(nn.Module):
         super().__init__()
         self.config = config
         self.backbone = _Backbone(config)
-        width, heads = config.anchor_channels[0], {}
+        width = config.anchor_channels[0]
+        heads: dict[str, nn.Module] = {}
         if config.bins:
             heads["query"] = HeatmapHead(width, config)
         if config.coordinates:
@@ -201,7 +203,7 @@ class _Backbone(nn.Module):
 
     def forward(self, batch: DaptBatch) -> tuple[Tensor, Tensor, Tensor]:
         """Anchors (B, J, A), level 0's rows (M, C), and the bottleneck's maximum over each person (B, C')."""
-        stem = self.embedding.stem
+        stem: Any = self.embedding.stem
         rows = F.gelu(stem.norm(stem.conv(batch.features, batch.stem)))
         skips = []
         for s, level in enumerate(batch.levels):
@@ -271,7 +273,7 @@ def _to_tensors(value: Any, device: torch.device | str) -> Any:
         return torch.as_tensor(value).to(device)
     if isinstance(value, tuple):
         return tuple(_to_tensors(part, device) for part in value)
-    if is_dataclass(value):
+    if is_dataclass(value) and not isinstance(value, type):
         return replace(
             value, **{field.name: _to_tensors(getattr(value, field.name), device) for field in fields(value)}
         )

@@ -9,12 +9,14 @@ for everybody, and nobody's batch mates need to know.
 """
 
 from dataclasses import dataclass
+from typing import Any, Generic
 
 import numpy as np
 
 from lidarpose.errors import InputError, check_name
 from lidarpose.models.dapt.dapt_config import CELL_BITS, DaptConfig
 from lidarpose.models.dapt.space_filling_curves import curve, dilated, z_order
+from lidarpose.models.voxelize import Array
 
 # bits an axis of a cell, and of a neighbor's cell: one more, so that a step across the edge meets no cell
 _BITS, _WIDE = CELL_BITS, CELL_BITS + 1
@@ -24,21 +26,21 @@ LAYOUTS = ("ragged", "padded")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Neighbors:
+class Neighbors(Generic[Array]):
     """The occupied cells about each voxel, taps in the order of a kernel's (x, y, z) offsets, the middle tap left out.
 
     ragged: source (P,) rows of the neighbors, tap after tap; counts (T,) pairs of each tap (0 for the middle one);
     target (P,) the rows that they are neighbors of. padded: table (M, T) rows, M for an empty cell; else None.
     """
 
-    source: np.ndarray | None = None
-    target: np.ndarray | None = None
-    counts: np.ndarray | None = None
-    table: np.ndarray | None = None
+    source: Array | None = None
+    target: Array | None = None
+    counts: Array | None = None
+    table: Array | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
-class Level:
+class Level(Generic[Array]):
     """Voxels of one width.
 
     lengths (B,): voxels of each person, at least 1; near: neighbors of 3 x 3 x 3; parent (M,): row of the next level,
@@ -50,17 +52,17 @@ class Level:
     None where all are, and patch_place (O, M), the place of each row among the Q * K.
     """
 
-    lengths: np.ndarray
-    near: Neighbors
-    parent: np.ndarray | None
-    children: np.ndarray | None
-    slots: np.ndarray
-    valid: np.ndarray
-    sequence: np.ndarray
-    patch_lengths: np.ndarray
-    patch_slots: np.ndarray | None = None
-    patch_valid: np.ndarray | None = None
-    patch_place: np.ndarray | None = None
+    lengths: Array
+    near: Neighbors[Array]
+    parent: Array | None
+    children: Array | None
+    slots: Array
+    valid: Array
+    sequence: Array
+    patch_lengths: Array
+    patch_slots: Array | None = None
+    patch_valid: Array | None = None
+    patch_place: Array | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,7 +204,7 @@ def _neighbors(key: np.ndarray, cells: np.ndarray, reach: int, bits: int, layout
         for k in range(3)
     )
     half = np.arange(taps // 2)
-    codes = x[half // side**2] | y[half // side % side] | z[half % side]
+    codes: np.ndarray = x[half // side**2] | y[half // side % side] | z[half % side]
     codes |= key >> (3 * wide) << (3 * wide)
     nearest = np.searchsorted(key, codes.ravel())
     nearest[nearest == rows] = 0
@@ -230,7 +232,7 @@ def _people(
     config: DaptConfig,
     layout: str,
     rng: np.random.Generator | None,
-) -> dict[str, np.ndarray | None]:
+) -> dict[str, Any]:
     """The entries of a `Level` about whose rows are whose, and which attend to each other."""
     lengths = np.bincount(owner, minlength=people)
     first = np.cumsum(lengths) - lengths
