@@ -176,7 +176,7 @@ def draw_moving_body(
         (rotations, translation), kind, clearance = clip, "captured", None
     else:
         drawn = sample_clips(rng, 1, frames=frames + 1, hz=CLIP_HZ)
-        rotations, translation = drawn.rotations[0], drawn.translation[0] * np.float32([1, 1, 0])
+        rotations, translation = drawn.rotations[0], drawn.translation[0] * np.array([1, 1, 0], np.float32)
         kind, clearance = KINDS[drawn.kind[0]], drawn.clearance[0]
     person = rig.rest(sample_people(rng, 1).coefficients)
     translation = translation * [*_stride_ratio(person, [kind]).repeat(2), 1]

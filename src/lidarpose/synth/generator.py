@@ -7,6 +7,7 @@ Person i of a seed is the same whatever was asked for before and whoever asks: p
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
+from typing import cast
 
 import numpy as np
 
@@ -75,12 +76,17 @@ class Generator:
         # the cache of blocks stays in its process
         return {name: value for name, value in vars(self).items() if name != "_bodies"}
 
+    @property
+    def config(self) -> SceneConfig:
+        """The scene's configuration, whichever way it was given."""
+        return cast("SceneConfig", self.scene)
+
     @cached_property
     def _bodies(self) -> Callable[[int, int], Bodies]:
         """(seed, block) -> its bodies."""
-        moving = any(isinstance(sensor(name), RayPattern) for name in self.scene.sensors)
+        moving = any(isinstance(sensor(name), RayPattern) for name in self.config.sensors)
         # neighbors share a block; two suffice for a reader that crosses from one to the next
-        draw_block = partial(draw_bodies, self.bank, self.captured, BLOCK, moving=moving, clothes=self.scene.clothes)
+        draw_block = partial(draw_bodies, self.bank, self.captured, BLOCK, moving=moving, clothes=self.config.clothes)
         return lru_cache(maxsize=2)(draw_block)
 
     def person(self, seed: int, index: int, *, hard: float | None = None) -> SyntheticPerson:
@@ -98,7 +104,7 @@ class Generator:
         frames = check_int("a clip's frames", frames, least=1)
         seed, index = check_int("seed", seed, least=0), check_int("index", index, least=0)
         rng = np.random.default_rng([seed, 3, index])
-        bodies = draw_moving_body(self.bank, self.captured, frames, rng, clothes=self.scene.clothes)
+        bodies = draw_moving_body(self.bank, self.captured, frames, rng, clothes=self.config.clothes)
         block, row = self._bodies(seed, index // BLOCK), index % BLOCK
         return self._observe(bodies, range(frames), block, row, rng, hard)
 
@@ -108,14 +114,14 @@ class Generator:
         """A person's frames, `rows` of `bodies`. While hardly anything of them is seen, the scene is drawn again,
         easier each time; after the last try the best one counts, if it has any points at all. A second person is
         anybody of `block` but `row`."""
-        config = self.scene if hard is None else self.scene.eased(hard)
+        config = self.config if hard is None else self.config.eased(hard)
         best, most_points = None, 0.0
         for attempt in range(_TRIES if self.redraw else 1):
             eased = config.eased(config.hard * (1 - attempt / (_TRIES - 1))) if attempt else config
             scene = _draw_scene(eased, bodies, rows[0], block, row, 0.8**attempt, rng)
             samples = [_draw_sample(scene, bodies, k, frame, rng) for frame, k in enumerate(rows)]
             # of the middle frame: half of a clip's frames have more
-            points = float(np.median([np.count_nonzero(sample.part) for sample in samples]))
+            points = float(np.median([np.count_nonzero(_truth(sample)[0]) for sample in samples]))
             if points > most_points or not self.redraw:
                 best, most_points = (scene, samples), points
             if points >= LEAST_POINTS:
@@ -212,20 +218,26 @@ def _crop(scene: Scene, bodies: Bodies, row: int, scan: Scan, rng: np.random.Gen
 _GROUND = 0.1
 
 
+def _truth(sample: Sample) -> tuple[np.ndarray, Pose]:
+    """Part and pose, which every sample of a scene has."""
+    return cast("tuple[np.ndarray, Pose]", (sample.part, sample.pose))
+
+
 def _measure(sample: Sample, scene: Scene, bodies: Bodies, row: int, frame: int) -> PersonInfo:
     """What is known of a sample: see `PersonInfo`."""
     low, high = bodies.extent[row]
     visible_alone = count_alone(scene, scene.meshes(bodies, row)[0], frame)
-    seen = sample.points[sample.part > 0]
-    clutter = (sample.part == 0) & (sample.points[:, 2] > float(scene.place.feet[2]) + _GROUND)
+    part, pose = _truth(sample)
+    seen = sample.points[part > 0]
+    clutter = (part == 0) & (sample.points[:, 2] > float(scene.place.feet[2]) + _GROUND)
     return PersonInfo(
         sensor=scene.sensor.name,
         kind=bodies.kinds[row],
-        distance=float(np.hypot(*sample.pose.joints[0, :2])),
+        distance=float(np.hypot(*pose.joints[0, :2])),
         visible=min(len(seen) / max(visible_alone, 1), 1.0),
         height_seen=float(np.ptp(seen[:, 2])) / max(high[2] - low[2], 1e-6) if len(seen) else 0.0,
         clutter=float(clutter.mean()) if len(clutter) else 0.0,
-        upright=_is_upright(sample.pose.joints),
+        upright=_is_upright(pose.joints),
     )
 
 

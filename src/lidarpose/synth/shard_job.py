@@ -4,7 +4,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -87,7 +87,7 @@ class Job:
         if self.sensors is not None:
             scene = replace(scene, sensors=self.sensors)
         bank = PoseBank.from_clips(self.motion, self.subjects) if self.motion is not None else None
-        if self.what == "clips" and self.share and not len(bank.clips.windows(CLIP_FRAMES + 1)):
+        if self.what == "clips" and self.share and bank is not None and not len(bank.clips.windows(CLIP_FRAMES + 1)):
             raise file_error(
                 self.motion, f"no clip lasts {CLIP_FRAMES / CLIP_HZ:g} s: give longer motion, or leave --clips away"
             )
@@ -137,7 +137,7 @@ def write_dataset(
         if progress is not None:
             progress(done, card.count)
         try:
-            for _, count in make_shards(make, missing, workers=workers):
+            for _, count in make_shards(make, missing, workers=workers) if make is not None else ():
                 done += count
                 if progress is not None:
                     progress(done, card.count)
@@ -186,10 +186,11 @@ class Maker:
     def _street_rows(self, index: int) -> dict[str, list]:
         from lidarpose.synth.street import samples, street
 
-        seed, sensors = self.job.seed, self.generator.scene.sensors
+        seed, sensors = self.job.seed, self.generator.config.sensors
         scene = street(seed, index, sensor=sensors[index % len(sensors)], frames=STREET_FRAMES)
+        # all of a street have a box, whose id is their track
         people = [
-            person_row(sample, index=index, frame=frame, track=int(sample.box.id))
+            person_row(sample, index=index, frame=frame, track=int(cast("Any", sample.box).id))
             for frame, sample in samples(scene, np.random.default_rng([seed, 5, index]))
         ]
         frames = [

@@ -1,6 +1,7 @@
 """What a sensor returns of a person's scene: its triangles, the cast, and the sensor's noise."""
 
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
@@ -79,13 +80,11 @@ class Scene:
     def meshes(self, bodies: Bodies, row: int) -> list[Mesh]:
         """All triangles, level frame: body `row` first, then its props, then the background."""
         place, joints = self.body_place, bodies.joints[row]
-        later = later_joints = None
-        if self.is_smeared:
-            later, later_joints = bodies.moved(row)
-            later = place.of_body(later)
+        moved = bodies.moved(row) if self.is_smeared else None
+        later = None if moved is None else place.of_body(moved[0])
         meshes = [Mesh(place.of_body(bodies.vertices[row]), bodies.faces, bodies.face_part, later)]
         for prop in self.props:
-            later = place.of_body(prop.place(later_joints).vertices) if self.is_smeared else None
+            later = None if moved is None else place.of_body(prop.place(moved[1]).vertices)
             mesh = prop.place(joints)
             meshes.append(Mesh(place.of_body(mesh.vertices), mesh.faces, prop.face_part, later))
         return meshes + self.background
@@ -129,7 +128,8 @@ def simulate_scan(scene: Scene, meshes: list[Mesh], rng: np.random.Generator, *,
     sensor = scene.sensor
     hits, mesh = _cast(scene, meshes, frame)
     points, kept = add_sensor_noise(hits, mesh, sensor, scene.conditions, rng)
-    ring, part = hits.ring[kept], mesh.part[hits.face[kept]]
+    # a union has parts
+    ring, part = hits.ring[kept], cast("np.ndarray", mesh.part)[hits.face[kept]]
     if scene.config.noise.dapt_compat and isinstance(sensor, Sensor):
         seam = np.flatnonzero((hits.column[kept] + hits.column0) % sensor.columns == 0)
         points, ring, part = (np.concatenate([a, a[seam]]) for a in (points, ring, part))

@@ -185,7 +185,7 @@ def _scan_turn(
     scene = union([*people, still])
     R_sensor_level = rotation_about("y", -device.tilt).astype(np.float32)
     mesh = Mesh(scene.vertices @ R_sensor_level.T, scene.faces)
-    if is_pattern:
+    if isinstance(device, RayPattern):
         moved = (scene.vertices if scene.later is None else scene.later) @ R_sensor_level.T
         hits = scan_pattern(mesh.vertices, mesh.faces, device, frame % device.frames, moved=moved)
     else:

@@ -5,12 +5,15 @@ length along y where they have one; sizes in meters. What is called with an rng 
 function of its sizes. A mesh of a kind is built once with unit size and then scaled: every person draws some.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib import resources
 from math import cos, sin
 
 import numpy as np
+
+Vector = Sequence[float] | np.ndarray
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class Mesh:
     part: np.ndarray | None = None
     later: np.ndarray | None = None
 
-    def moved(self, translation: np.ndarray, yaw: float = 0.0) -> "Mesh":
+    def moved(self, translation: Vector, yaw: float = 0.0) -> "Mesh":
         """Turned by `yaw` rad about z, then moved by `translation` (3,) m."""
         vertices = self.vertices
         if yaw:
@@ -37,11 +40,11 @@ class Mesh:
             vertices = vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], np.float32)
         return Mesh(vertices + np.asarray(translation, np.float32), self.faces, self.part)
 
-    def scaled(self, size: tuple[float, float, float] | np.ndarray) -> "Mesh":
+    def scaled(self, size: Vector) -> "Mesh":
         """Stretched along x, y and z."""
         return Mesh(self.vertices * np.asarray(size, np.float32), self.faces, self.part)
 
-    def placed(self, rows: list, origin: list) -> "Mesh":
+    def placed(self, rows: Sequence, origin: Sequence) -> "Mesh":
         """In another frame: rows (3, 3) say where x, y and z go, then `origin` (3,) m is added."""
         return Mesh(self.vertices @ np.array(rows, np.float32) + np.array(origin, np.float32), self.faces, self.part)
 
@@ -69,14 +72,14 @@ _BOX_FACES = np.array(
 )
 
 
-def quad(half: float, slope: np.ndarray) -> Mesh:
+def quad(half: float, slope: Vector) -> Mesh:
     """A square of half width `half` m about the origin, its height slope (2,) times x and y."""
     x, y = half * float(slope[0]), half * float(slope[1])
     corners = [[-half, -half, -x - y], [half, -half, x - y], [half, half, x + y], [-half, half, y - x]]
     return Mesh(np.array(corners, np.float32), QUAD_FACES)
 
 
-def box(size: np.ndarray) -> Mesh:
+def box(size: Vector) -> Mesh:
     """A box of size (3,) m standing on the origin."""
     return Mesh(_BOX_CORNERS * np.asarray(size, np.float32), _BOX_FACES)
 
@@ -182,7 +185,7 @@ _LEAF_BALLS = 8
 _LEAVES = 120
 
 
-def foliage(size: np.ndarray, leaves: int, leaf: float, rng: np.random.Generator) -> Mesh:
+def foliage(size: Vector, leaves: int, leaf: float, rng: np.random.Generator) -> Mesh:
     """A bush or a hedge: `leaves` (at most 120) triangles of about `leaf` m in an ellipsoid of size (3,) m that
     stands on the origin; some beams pass."""
     pick, turn, flip = rng.random(3).tolist()

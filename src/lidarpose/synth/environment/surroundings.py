@@ -89,8 +89,8 @@ def _draw_thing(
             return shapes.rail_fence(long, 0.8 + 0.4 * c, 2 + int(2 * b)), 0.03, long, 0.05
         return shapes.lattice_fence(long, 0.8 + 1.0 * c, 0.10 + 0.10 * b, 0.02 + 0.04 * c), 0.03, long, 0.05
     if kind < 0.88:
-        size = (0.4 + 0.6 * a, 0.5 + 1.5 * b, 0.4 + 1.4 * c)
-        return shapes.foliage(size, 50 + int(70 * b), 0.07 + 0.08 * d, rng), size[0] / 2, size[1], 0.2
+        bush = (0.4 + 0.6 * a, 0.5 + 1.5 * b, 0.4 + 1.4 * c)
+        return shapes.foliage(bush, 50 + int(70 * b), 0.07 + 0.08 * d, rng), bush[0] / 2, bush[1], 0.2
     if kind < 0.92:
         long = 1.2 + 0.8 * a
         return shape("bench" if b < 0.6 else "bench without back", 1.0, long), 0.22, long, 0.3

@@ -4,10 +4,11 @@ A prop knows where its mesh is for a pose: it is asked again for the next pose, 
 stand on z = 0; frames are the body's own: rows say where the prop's x, y and z go, then its origin.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from math import cos, hypot, sin
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,7 @@ HANDS = (JOINT["left_hand"], JOINT["right_hand"])
 # from a hand's joint to its elbow's
 _ELBOW = JOINT["left_elbow"] - JOINT["left_hand"]
 _HEAD_PART = np.uint8(1 + JOINT["head"])
-Frame = Callable[[Points], tuple[list, list]]
+Frame = Callable[[Points], tuple[Sequence, Sequence]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +46,7 @@ class Prop:
         return Mesh(self.where(joints.tolist()), self.mesh.faces)
 
 
-def rigid_prop(name: str, mesh: Mesh, frame: Frame, **more: object) -> Prop:
+def rigid_prop(name: str, mesh: Mesh, frame: Frame, **more: Any) -> Prop:
     """A prop that keeps its shape."""
     return Prop(name=name, mesh=mesh, where=lambda points: mesh.placed(*frame(points)).vertices, **more)
 
@@ -412,7 +413,7 @@ def _rod(start: tuple, end: tuple) -> Mesh:
 
 
 # by activity: (cumulative share, what they use)
-_RIDES = {
+_RIDES: dict[str, tuple[tuple[float, Callable[[Points, list[float]], Prop | None]], ...]] = {
     "cycle": ((1.0, _bicycle),),
     "push": ((0.5, partial(_pushed, "pram")), (0.95, partial(_pushed, "trolley"))),
     "sit": ((0.12, _wheelchair), (0.85, _seat)),

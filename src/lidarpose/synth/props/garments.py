@@ -4,6 +4,7 @@ An offset along the skin's normals (`body.shape.clothing`) cannot bridge; these 
 count as the part of the body they hang on.
 """
 
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from math import hypot, pi
 
@@ -13,7 +14,7 @@ from lidarpose.skeleton import BODY26
 from lidarpose.synth.environment.mesh import Mesh
 
 JOINT = {name: i for i, name in enumerate(BODY26.joints)}
-Point = list[float]
+Point = Sequence[float]
 Points = list[Point]
 # Girths of the shipped body's skin from lengths between its joints, m: weights of `_LENGTHS`, then a constant. Fitted
 # to 1,500 people of `body.shape.sample_people`; what is left is 3 mm of the back, 4 of the width, 7 and 5 of the rest.
@@ -90,7 +91,7 @@ def _skirt_parts(below_knee: tuple[bool, ...]) -> np.ndarray:
     return np.concatenate(rows).astype(np.uint8)
 
 
-def skirt(points: Points, u: list[float]) -> tuple[object, Mesh, np.ndarray]:
+def skirt(points: Points, u: list[float]) -> tuple[Callable[[Points], np.ndarray], Mesh, np.ndarray]:
     """A skirt, a dress or a long coat: (how its vertices are found for a pose, its mesh, parts of its faces).
 
     u: four uniforms, its length, flare, ease and whether it is a coat.
@@ -114,7 +115,7 @@ def skirt(points: Points, u: list[float]) -> tuple[object, Mesh, np.ndarray]:
         across = (max(side - deep, 0.0) * -y, max(side - deep, 0.0) * x, 0.0)
         shifted = (hips[0] + ahead * x, hips[1] + ahead * y, hips[2])
         waist = (pelvis[0] + 0.8 * ahead * x, pelvis[1] + 0.8 * ahead * y, pelvis[2] + 0.04)
-        rings = [(waist, across, 0.92 * deep), (shifted, across, deep)]
+        rings: list[tuple[Point, Point, float]] = [(waist, across, 0.92 * deep), (shifted, across, deep)]
         for at, share in ((half, 0.5), (hem, 1.0)):
             legs = [_leg(points, name, at) for name in ("left", "right")]
             radius = thigh * (1 + (_KNEE - 1) * min(at, 1.0) if at < 1 else _CALF) + ease + flare * share
