@@ -2,7 +2,7 @@
 PYTHON ?= python3
 PIP = .venv/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test fuzz lint docs clean
+.PHONY: demo test fuzz check lint docs clean
 
 demo: .venv/synth
 	.venv/bin/lidarpose demo
@@ -14,9 +14,12 @@ test: .venv/test
 fuzz: .venv/test
 	OMP_NUM_THREADS=1 FUZZ_EXAMPLES=7500 .venv/bin/python -m pytest tests/test_fuzz.py
 
-lint: .venv/test
-	$(PIP) ruff
-	.venv/bin/ruff check . && .venv/bin/ruff format --check .
+# style, then types; "lint" is its older name
+check: .venv/test
+	$(PIP) ruff mypy
+	.venv/bin/ruff check . && .venv/bin/ruff format --check . && .venv/bin/mypy
+
+lint: check
 
 # the site, in site/; open site/index.html
 docs: .venv/docs

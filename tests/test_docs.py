@@ -3,6 +3,7 @@
 import contextlib
 import importlib.util
 import io
+import os
 import re
 import tomllib
 from pathlib import Path
@@ -155,3 +156,19 @@ def flags():
 @pytest.mark.parametrize("page", [p for p in PAGES if p.stem != "log"], ids=named)
 def test_flags_that_pages_name_are_there(page, flags):
     assert set(FLAG.findall(page.read_text("utf-8"))) <= flags
+
+
+@pytest.mark.slow
+def test_python_blocks_of_pages_pass_type_checking(tmp_path, monkeypatch):
+    api = pytest.importorskip("mypy.api")
+    files = []
+    for page in PAGES:
+        blocks = re.findall(r"^```python\n(.*?)^```", page.read_text("utf-8"), re.MULTILINE | re.DOTALL)
+        for number, block in enumerate(blocks):
+            files.append(tmp_path / f"{page.stem.lower()}_{number}.py")
+            files[-1].write_text(block, "utf-8")
+    assert {"readme_0.py", "use_0.py"} <= {file.name for file in files}
+    monkeypatch.setenv("MYPYPATH", str(SOURCE.parent))
+    config = ["--config-file", str(ROOT / "pyproject.toml"), "--follow-imports", "silent", "--cache-dir", os.devnull]
+    out, errors, code = api.run([*config, *map(str, files)])
+    assert code == 0, out + errors
