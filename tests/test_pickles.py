@@ -268,13 +268,18 @@ def test_memory_and_time_stay_in_proportion_to_the_file(load, refused, monkeypat
     # -1 and -2 have one hash, and so have all tuples of them
     tuples = [tuple(-1 - (i >> k & 1) for k in range(11)) for i in range(1_500)]
     assert len({hash(key) for key in tuples}) == 1
-    for keys in (tuples, range(30_000), [float(i) for i in range(30_000)]):
+    with_text = [("a", *numbers) for numbers in tuples]
+    assert len({hash(key) for key in with_text}) == 1
+    for keys in (tuples, with_text, range(30_000), [float(i) for i in range(30_000)]):
         for data in (dict.fromkeys(keys), set(keys), frozenset(keys)):
             for protocol in (0, 2, 4):
                 assert "as keys" in refused(pickle.dumps(data, protocol))
     # text is hashed with a secret, alone and within a tuple
     many = {key: None for i in range(30_000) for key in (str(i), ("a", i))}
     assert load(pickle.dumps(many)) == many
+    # one key in many dicts is no clash
+    again = [{("a", k): None} for k in (1, 2) for _ in range(1_500)]
+    assert load(pickle.dumps(again)) == again
     # what is done anew at each mention of one long part
     numbers = b"(" + b"K\x01" * 10_000 + b"t"
     assert "a tuple of 10000 as a key" in refused(list_of(numbers, b"}h\x01Ns", 10))

@@ -133,6 +133,8 @@ class _DataUnpickler(pickle._Unpickler):
         self.copies_left = _FREE_COPIES + _COPIES * len(data)
         self.dense_left = MAX_DENSE
         self.key_share = 0.0
+        # tuples as keys, one of each hash
+        self.tuples: dict[int, tuple] = {}
 
     def load(self) -> object:
         """The data. Raises EOFError where the file ends before it, and FormatError."""
@@ -263,8 +265,13 @@ class _DataUnpickler(pickle._Unpickler):
                     raise TypeError(f"a {type(item).__name__} as a key")
                 if type(part) is int and abs(part) >= 2**63:
                     raise TypeError("a number of more than 64 bits as a key")
-            # text is hashed with a secret
-            if not any(isinstance(part, _TEXT) and part for part in parts):
+            # text is hashed with a secret, and so are tuples with text, but those that differ in numbers alone can
+            # share one hash
+            if any(isinstance(part, _TEXT) and part for part in parts):
+                charged = type(item) is tuple and self.tuples.setdefault(hash(item), item) != item
+            else:
+                charged = True
+            if charged:
                 self.key_share += 1 / (MAX_TUPLE_KEYS if type(item) is tuple else MAX_NUMBER_KEYS)
                 if self.key_share > 1:
                     raise FormatError(
