@@ -236,6 +236,8 @@ def test_a_column_of_another_type_is_one_line(folder, column, values, message):
         ("part", [1], "column part has 1 values, expected 30"),
         ("part", [25] * 30, "column part has values above 24"),
         ("points", [float("nan")] * 90, "column points has values that are no finite numbers"),
+        ("points", [1e30] * 90, r"column points has values beyond 1e\+09 m"),
+        ("joints", [1e30] * 78, r"column joints has values beyond 1e\+09 m"),
         ("box_size", [1.0, 2.0], "column box_size has 2 values, expected 3"),
         ("box_yaw", None, "columns box_center, box_size, box_yaw: some are null"),
     ],

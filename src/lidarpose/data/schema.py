@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.errors import InputError, MissingExtra
-from lidarpose.sample import SEEN, Box, LabeledSample, PersonInfo, Pose, Sample
+from lidarpose.sample import FARTHEST, SEEN, Box, LabeledSample, PersonInfo, Pose, Sample
 from lidarpose.skeleton import BODY26, SMPL24, skeleton
 
 
@@ -177,6 +177,10 @@ def _check_row(row: dict[str, Any], table: str, joints: int) -> None:
     for name in ("points", "center"):
         if not np.isfinite(row[name]).all():
             raise InputError(f"column {name} has values that are no finite numbers")
+    # a joint may be NaN
+    for name in ("points", "center", "joints"):
+        if (np.abs(row[name]) > FARTHEST).any():
+            raise InputError(f"column {name} has values beyond {FARTHEST:g} m")
     if row["part"] is not None and row["part"].max(initial=0) > len(SMPL24):
         raise InputError(f"column part has values above {len(SMPL24)}, expected 0 or 1 + a joint of SMPL-24")
     lengths = {name: 3 for name in row if name.partition("_")[0] == "center"}
