@@ -217,11 +217,14 @@ def test_what_a_kill_leaves_is_no_obstacle(tmp_path, unbroken):
     assert not (folder / ".123-1-model.safetensors").exists()
 
 
-def test_a_dead_worker_is_one_line(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("where", "name"), [(loop, "loader"), (PoseNetObjective, "terms")])
+def test_a_dead_worker_is_one_line(tmp_path, monkeypatch, where, name):
+    """It is noticed while batches are waited for, or in the middle of a step."""
+
     def lost(*_, **__):
         raise RuntimeError("DataLoader worker (pid 12) is killed by signal: Killed.")
 
-    monkeypatch.setattr(loop, "loader", lost)
+    monkeypatch.setattr(where, name, lost)
     with refused("a process that makes people was killed"):
         loop.train(RECIPE, tmp_path / "run")
 
@@ -311,6 +314,16 @@ def test_a_state_whose_optimizer_lacks_an_entry_is_refused(tmp_path, unbroken, e
     del tensors[next(name for name in tensors if name.endswith(f".{entry}"))]
     save_file(tensors, folder / run_dir.STATE, metadata=metadata)
     with pytest.raises(InputError, match=f"optimizer's memory is damaged .*{entry}"):
+        loop.train(RECIPE, folder, resume=True)
+
+
+@pytest.mark.parametrize(("entry", "value"), [("batch", None), ("rate", "fast"), ("seed", -1)])
+def test_a_damaged_recipe_names_its_file(tmp_path, unbroken, entry, value):
+    folder = shutil.copytree(unbroken, tmp_path / "run")
+    config = json.loads((folder / run_dir.CONFIG).read_text())
+    config["recipe"][entry] = value
+    (folder / run_dir.CONFIG).write_text(json.dumps(config))
+    with refused(f"{re.escape(str(folder / run_dir.CONFIG))}: {entry} must be"):
         loop.train(RECIPE, folder, resume=True)
 
 

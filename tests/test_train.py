@@ -1,7 +1,10 @@
 """Losses, schedule, and runs that can be killed and taken up again."""
 
 import json
+import multiprocessing
+import os
 import pickle
+import signal
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -284,6 +287,20 @@ def test_chunks_are_the_same_from_any_start():
     assert_same_chunks(whole[2:], chunks(RECIPE, start=2))
     joints = np.concatenate([b["joints"] for batches in whole for b in batches])
     assert len(np.unique(joints[:, 5], axis=0)) == len(joints) == RECIPE.people
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_workers_go_on_when_their_whole_group_is_told_to_stop(number):
+    """The run needs them for the batches that it finishes before it saves."""
+    people = Chunks(
+        source=make_setup(RECIPE).source, task=TASK, batch=RECIPE.batch, seed=RECIPE.seed, start=0, steps=3 * BATCHES
+    )
+    made = []
+    for batches in loader(people, workers=1):
+        for worker in multiprocessing.active_children():
+            os.kill(worker.pid, number)
+        made.append(batches)
+    assert_same_chunks(made, chunks(RECIPE))
 
 
 def test_the_last_chunk_may_be_short():

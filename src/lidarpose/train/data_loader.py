@@ -218,6 +218,8 @@ def _end_with_parent(parent: int, worker: int) -> None:
             time.sleep(_POLL)
         os._exit(1)
 
-    # Ctrl-C reaches workers too, and the parent still needs them for the batches that it finishes
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Ctrl-C, and the SIGTERM of a batch system, reach workers too, and the parent still needs them for the batches that
+    # it finishes
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=watch, daemon=True).start()

@@ -11,8 +11,8 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, nullcontext
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager, nullcontext
 from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
@@ -242,7 +242,7 @@ class _Run:
         validate_every = self.recipe.validate or max(people // _VALIDATIONS, 1)
         started = saved = time.monotonic()
         seconds_before = self.seconds
-        with ExitStack() as stack:
+        with _dead_worker_named(), ExitStack() as stack:
             log = stack.enter_context(open(self.folder / LOG, "a")) if main else None
             bar = stack.enter_context(Progress(people, unit="people", done=min(self.seen, people), shown=main))
             for batches in self._chunks():
@@ -279,8 +279,8 @@ class _Run:
         note = f"loss {loss:.3f}, mpjpe {terms['mpjpe'] * 1e3:.0f} mm"
         return note if self.validation.last is None else f"{note}, validation {self.validation.last:.0f} mm"
 
-    def _chunks(self) -> Iterator[list]:
-        """The chunks that are left. Raises InputError where a process of the loader was killed."""
+    def _chunks(self) -> Iterable[list]:
+        """The chunks that are left."""
         chunks = Chunks(
             source=self.setup.source,
             task=self.setup.task,
@@ -291,15 +291,7 @@ class _Run:
             rank=self.accelerator.process_index,
             ranks=self.accelerator.num_processes,
         )
-        try:
-            yield from loader(chunks, workers=self.recipe.workers)
-        except RuntimeError as error:
-            if "DataLoader worker" not in str(error):
-                raise
-            raise InputError(
-                "a process that makes people was killed, perhaps for want of memory: go on with --resume and fewer "
-                "--workers"
-            ) from None
+        return loader(chunks, workers=self.recipe.workers)
 
     def _chunk(self, batches: list, stop: StopRequest) -> tuple[dict[str, float], bool]:
         """Takes the steps of a chunk; returns the mean of each term and of the gradient's norm over them, and whether
@@ -383,3 +375,17 @@ class _Run:
 def _number(*words: int) -> int:
     """A seed of torch's from words."""
     return int(np.random.SeedSequence(words).generate_state(1)[0])
+
+
+@contextmanager
+def _dead_worker_named() -> Iterator[None]:
+    """Raises InputError where a process that makes people was killed, which PyTorch notices at any moment of a step."""
+    try:
+        yield
+    except RuntimeError as error:
+        if "DataLoader worker" not in str(error):
+            raise
+        raise InputError(
+            "a process that makes people was killed, perhaps for want of memory: go on with --resume and fewer "
+            "--workers"
+        ) from None

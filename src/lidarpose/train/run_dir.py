@@ -138,7 +138,10 @@ def stored_recipe(folder: Path, kind: type[AnyRecipe]) -> AnyRecipe:
             )
         if config["kind"] != kind.__name__.lower():
             raise file_error(path, f"is of a run of `lidarpose {config['kind']}`: resume it by that command")
-        return kind(**config["recipe"])
+        try:
+            return kind(**config["recipe"])
+        except InputError as error:
+            raise file_error(path, error) from None
     except InputError:
         raise
     except (ValueError, KeyError, TypeError, RecursionError) as error:
