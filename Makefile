@@ -2,13 +2,17 @@
 PYTHON ?= python3
 PIP = .venv/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test fuzz check lint docs clean
+.PHONY: demo test test-slow fuzz check lint docs clean
 
 demo: .venv/synth
 	.venv/bin/lidarpose demo
 
 test: .venv/test
 	OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 --dist loadfile
+
+# the tests that take more than ten seconds each: README's figures, exports, the wheel, the types of the pages' snippets
+test-slow: .venv/test
+	OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 --dist loadfile -m slow
 
 # damaged and hostile files for the readers, about ten minutes, other ones each time
 fuzz: .venv/test

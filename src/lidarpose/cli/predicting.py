@@ -33,9 +33,7 @@ def add(commands) -> None:
     predict.add_argument("file", metavar="FILE", help=".pcd .ply .bin .npy .npz .csv .xyz .txt")
     scan = predict.add_argument_group("what is in the file")
     scan.add_argument("--boxes", metavar="FILE", help=_BOXES)
-    scan.add_argument(
-        "--crop", action="store_true", help="the file holds one person (assumed when it is under 4 m across)"
-    )
+    scan.add_argument("--crop", action="store_true", help="the file holds one person (assumed under 4 m across)")
     scan.add_argument(
         "--sensor-origin",
         metavar="X,Y,Z",
