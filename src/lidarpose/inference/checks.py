@@ -158,9 +158,6 @@ def flat_along_another_axis(scan: Scan, people: Poses) -> str | None:
 
 def everybody_lies(scan: Scan, people: Poses) -> str | None:
     """Everybody lies down, as where another axis is up. people: in the level frame."""
-    # people who are cut short by their boxes only seem to lie
-    if wide_boxes(scan, people) or boxes_at_feet(scan, people):
-        return None
     posed = [person for person in people if person.pose is not None]
     if not posed or not all(lies(person.pose, person.points) for person in posed):
         return None
@@ -169,21 +166,22 @@ def everybody_lies(scan: Scan, people: Poses) -> str | None:
     return f"{who} down: if that is wrong, {scan.up} is not the input's up axis: try {others}"
 
 
-# the last ones give way to those before them: one wrong axis is one warning
 SCAN_CHECKS: tuple[Callable[[Scan, Poses], str | None], ...] = (
     box_units,
     empty_boxes,
     wide_boxes,
     boxes_at_feet,
 )
-AXIS_CHECKS: tuple[Callable[[Scan, Poses], str | None], ...] = (flat_along_another_axis, everybody_lies)
 
 
 def check_scan(scan: Scan, people: Poses) -> list[str]:
     """The warnings of all checks. people: in the level frame, in the order of the scan's clouds."""
-    warnings = [check(scan, people) for check in SCAN_CHECKS]
-    warnings.append(next(filter(None, (check(scan, people) for check in AXIS_CHECKS)), None))
-    return [warning for warning in warnings if warning]
+    warnings = {check: check(scan, people) for check in SCAN_CHECKS}
+    # one wrong axis is one warning, and people who are cut short by their boxes only seem to lie
+    axis = flat_along_another_axis(scan, people)
+    if not (axis or warnings[wide_boxes] or warnings[boxes_at_feet]):
+        axis = everybody_lies(scan, people)
+    return [warning for warning in (*warnings.values(), axis) if warning]
 
 
 def rows_inside(boxes: list, points: np.ndarray) -> list[np.ndarray]:
