@@ -11,9 +11,9 @@ from reference.raycast_reference import (
 )
 
 from lidarpose.errors import InputError
-from lidarpose.lidar.beam_divergence import footprint, scan_divergent, strongest_echo
 from lidarpose.lidar.presets import sensor
-from lidarpose.lidar.raycast import Hits, scan
+from lidarpose.lidar.raycast import Hits, footprint, scan, scan_divergent
+from lidarpose.lidar.scan_kernels import strongest_echo
 
 
 def wall(x: float, y: tuple[float, float], z: tuple[float, float] = (-3, 3)):

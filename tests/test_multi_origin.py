@@ -7,9 +7,8 @@ import pytest
 from reference.raycast_reference import cast_ray_list_reference
 
 from lidarpose.errors import InputError
-from lidarpose.lidar.beam_divergence import scan_divergent
 from lidarpose.lidar.presets import sensor
-from lidarpose.lidar.raycast import scan
+from lidarpose.lidar.raycast import scan, scan_divergent
 from lidarpose.synth.environment.mesh import box
 
 AV2 = sensor("av2")

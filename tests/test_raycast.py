@@ -18,9 +18,8 @@ from reference.raycast_reference import (
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
-from lidarpose.lidar.beam_divergence import scan_divergent
 from lidarpose.lidar.presets import SENSORS, sensor
-from lidarpose.lidar.raycast import cast_ray_list, cast_rays, scan
+from lidarpose.lidar.raycast import cast_ray_list, cast_rays, scan, scan_divergent
 from lidarpose.lidar.raycast_kernels import raster
 from lidarpose.lidar.sensor import Sensor
 

@@ -63,7 +63,7 @@ def cast_ray_list_reference(
 def merge_echoes_reference(
     distance: np.ndarray, face: np.ndarray, weights: np.ndarray, *, pulse: float, range_max: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """As `beam_divergence` merges the sub-beams (N, K) of beams: range (N,) float32 m and face (N,) int32."""
+    """As `scan_kernels` merges the sub-beams (N, K) of beams: range (N,) float32 m and face (N,) int32."""
     merged, merged_face = np.full(len(distance), np.inf, np.float32), np.full(len(distance), -1, np.int32)
     for i, ranges in enumerate(distance):
         met = np.flatnonzero(np.isfinite(ranges))

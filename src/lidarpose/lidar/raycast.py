@@ -15,32 +15,40 @@ How a sector of columns (at most a quarter turn) is cast:
        closed mesh has no holes and no beam is counted twice. The largest I wins.
 Vertices beside or behind the sensor have no Y and Z: edges that end there are crossed in x, y, z instead.
 
+A LiDAR's beam lights a spot, not a point. A beam of a width becomes S x S rays over its footprint, whose power is
+Gaussian across, 1/e^2 of the middle's at half the divergence, as makers state it. What the rays meet comes back as
+echoes:
+    1. Surfaces nearer together in range than the pulse resolves, c tau / 2 for a pulse of tau seconds, are one echo,
+       whose range is the mean of theirs weighted by the power they return: at an edge, a point in mid-air.
+    2. Power returned falls with the square of the range (LiDAR equation of an extended diffuse target, Wagner et al.
+       2006); how bright a surface is and how it is turned is left aside.
+    3. The strongest echo is the beam's return ("strongest return", the usual mode of spinning sensors), if it is as
+       strong as a whole beam's from the sensor's greatest range. It lies on the beam's axis. There
+       are no second returns.
+So silhouettes grow by up to half the divergence, thin things are seen from farther, edges are smeared.
+
 Letters: V vertices, F faces, C columns, R rows of a window, A azimuths, E elevations, N rays, n hits.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from lidarpose.errors import InputError
+from lidarpose.lidar.ray_list_kernels import ray_list
 from lidarpose.lidar.ray_pattern import RayPattern, Rays
-from lidarpose.lidar.raycast_input import (
-    as_angles,
-    as_directions,
-    as_faces,
-    as_mesh,
-    as_points,
-    as_times,
-    as_vertices,
-    check_margin,
-    read_only,
-)
-from lidarpose.lidar.raycast_kernels import raster, ray_list
-from lidarpose.lidar.raycast_scan import BAD_FACES, BAD_VERTICES, SECTOR, Beams, bounds, scan_checked
+from lidarpose.lidar.raycast_kernels import raster
+from lidarpose.lidar.scan_kernels import SECTOR, Beams, bounds, scan_window, sub_tangents
 from lidarpose.lidar.sensor import Sensor
+from lidarpose.sample import FARTHEST
 
+# m: c tau / 2 of a pulse of 5 ns, as spinning sensors send it
+PULSE = 0.75
+_MOST_SUB_BEAMS = 15
+# rad: a lamp, not a LiDAR
+_WIDEST = 0.1
 _BEAMS: WeakKeyDictionary[Sensor, Beams] = WeakKeyDictionary()
 
 
@@ -62,15 +70,6 @@ class Hits:
     column0: int
     row0: int
 
-    @classmethod
-    def from_arrays(cls, packed: tuple[np.ndarray, ...], window: tuple[int, int, int, int]) -> "Hits":
-        """From what compiled scans return: points, face, column, ring; column0, columns, row0, rows."""
-        points, face, column, ring = packed
-        column0, columns, row0, rows = window
-        return cls(
-            points=points, face=face, column=column, ring=ring, columns=columns, rows=rows, column0=column0, row0=row0
-        )
-
 
 def cast_rays(
     vertices: np.ndarray, faces: np.ndarray, azimuth: np.ndarray, elevation: np.ndarray
@@ -81,8 +80,8 @@ def cast_rays(
     order, |elevation| <= pi/2. Returns range (A, E) float32 m, inf where nothing is hit, and face (A, E) int32, -1
     where nothing is hit. Meshes may be open, degenerate, or surround the sensor. Raises InputError.
     """
-    vertices, faces = as_mesh(vertices, faces)
-    azimuth, elevation = as_angles("azimuth", azimuth), as_angles("elevation", elevation)
+    vertices, faces = _as_mesh(vertices, faces)
+    azimuth, elevation = _as_angles("azimuth", azimuth), _as_angles("elevation", elevation)
     if (np.abs(elevation) > np.pi / 2).any():
         raise InputError(
             f"elevation must be within +-pi/2 rad, got up to {np.abs(elevation).max():.4g}: are they degrees?"
@@ -112,6 +111,22 @@ def cast_rays(
     return distance.astype(np.float32), face
 
 
+def _sectors(turned: np.ndarray) -> list[np.ndarray]:
+    """Index lists that split sorted azimuths in [0, 2 pi) into sectors, starting after the widest gap."""
+    gaps = np.diff(turned, append=turned[0] + 2 * np.pi)
+    order = np.roll(np.arange(len(turned)), -(int(np.argmax(gaps)) + 1))
+    ahead = np.mod(turned[order] - turned[order[0]], 2 * np.pi)
+    sectors, start = [], 0
+    while start < len(order):
+        stop = int(np.searchsorted(ahead, ahead[start] + SECTOR, side="right"))
+        sectors.append(order[start:stop])
+        start = stop
+    return sectors
+
+
+# --- spinning sensors
+
+
 def scan(
     vertices: np.ndarray,
     faces: np.ndarray,
@@ -138,64 +153,130 @@ def scan(
 
     Raises InputError.
     """
-    if sensor.origins:
-        return scan_multi_origin(
-            lambda v, single, w: scan(v, faces, single, window_vertices=w, margin=margin),
-            vertices,
-            sensor,
-            window_vertices,
-        )
-    given = vertices, faces, window_vertices
-    vertices, faces = as_vertices("vertices", vertices), as_faces(faces, len(vertices))
-    window_vertices = vertices if window_vertices is None else as_vertices("window_vertices", window_vertices)
-    check_margin(margin)
-    packed, window, fault = scan_checked(vertices, faces, window_vertices, compiled_beams(sensor), float(margin))
-    if fault == BAD_VERTICES:
-        as_points("vertices", given[0])
-        as_points("window_vertices", given[2])
-    elif fault == BAD_FACES:
-        as_mesh(*given[:2])
-    return Hits.from_arrays(packed, window)
+    return scan_divergent(vertices, faces, sensor, divergence=0.0, window_vertices=window_vertices, margin=margin)
 
 
-def scan_multi_origin(
-    scan: Callable[[np.ndarray, Sensor, np.ndarray], Hits],
+def scan_divergent(
     vertices: np.ndarray,
+    faces: np.ndarray,
     sensor: Sensor,
-    window_vertices: np.ndarray | None,
+    *,
+    divergence: float,
+    sub_beams: int = 3,
+    pulse: float = PULSE,
+    window_vertices: np.ndarray | None = None,
+    margin: float = 0.0,
 ) -> Hits:
-    """The hits of a sensor whose beams leave from several origins, ordered by column, then ring, in one window.
+    """`scan` with beams of a width. Takes about sub_beams times as long.
 
-    scan(vertices, sensor, window_vertices) casts the beams of one origin (`Sensor.origins`).
+    A hit's face is that of the nearest surface in the returned echo. The window reaches half the divergence farther
+    than without. In azimuth the footprint is that at the horizon.
+
+    Args:
+        divergence: full, rad; 0.0015 to 0.003 for most sensors; 0 is `scan` itself.
+        sub_beams: along a side of the footprint.
+        pulse: m, how far apart in range two echoes must be to be told apart.
+        vertices, faces, sensor, window_vertices, margin: as in `scan`.
+
+    Raises InputError.
     """
-    vertices = as_points("vertices", vertices)
-    window_vertices = vertices if window_vertices is None else as_points("window_vertices", window_vertices)
-    parts, ring_numbers = [], []
-    for height, single, rings in sensor.origins:
-        origin = np.array([0, 0, height])
-        hits = scan(vertices - origin, single, window_vertices - origin)
-        parts.append(replace(hits, points=hits.points + np.array([0, 0, height], np.float32)))
-        ring_numbers.append(rings)
+    if not 0 <= divergence <= _WIDEST:
+        raise InputError(f"divergence must be between 0 and {_WIDEST} rad, got {divergence}: is it in mrad?")
+    if sub_beams != int(sub_beams) or not 1 <= sub_beams <= _MOST_SUB_BEAMS:
+        raise InputError(f"sub_beams must be a whole number from 1 to {_MOST_SUB_BEAMS}, got {sub_beams}")
+    if not 0 <= pulse < np.inf:
+        raise InputError(f"pulse must be a length >= 0 m, got {pulse}")
+    if not np.isfinite(margin):
+        raise InputError(f"margin must be a finite angle in radians, got {margin}")
+    vertices, faces = _as_mesh(vertices, faces)
+    body = vertices if window_vertices is None else _as_points("window_vertices", window_vertices)
+    if sensor.origins:
+        options: dict[str, Any] = {"divergence": divergence, "sub_beams": sub_beams, "pulse": pulse, "margin": margin}
+        parts = []
+        for height, single, _ in sensor.origins:
+            origin = np.array([0, 0, height])
+            parts.append(scan_divergent(vertices - origin, faces, single, window_vertices=body - origin, **options))
+        return _join_origins(sensor, parts)
+    window = (0, 0, 0, 0)
+    if len(body):
+        center, left, right, low, high = bounds(body)
+        margin += divergence / 2
+        near = sensor.window(center + left - margin, center + right + margin, low - margin, high + margin)
+        window = near.column0, near.columns, near.row0, near.rows
+    offsets, weights, tangents = np.zeros(1), np.ones((1, 1)), sensor.tangents[:, None]
+    if divergence:
+        offsets, weights = footprint(divergence, sub_beams)
+        tangents = sub_tangents(sensor.elevations, offsets)
+    points, face, column, ring = scan_window(
+        vertices, faces, _compiled_beams(sensor), window, offsets, tangents, weights, float(pulse)
+    )
+    column0, columns, row0, rows = window
+    return Hits(
+        points=points, face=face, column=column, ring=ring, columns=columns, rows=rows, column0=column0, row0=row0
+    )
+
+
+def footprint(divergence: float, sub_beams: int) -> tuple[np.ndarray, np.ndarray]:
+    """Offsets (S,) rad of the sub-beams in azimuth and in elevation, and the power (S, S) in each, in all 1."""
+    offsets = ((np.arange(sub_beams) + 0.5) / sub_beams - 0.5) * divergence
+    across = np.exp(-2 * (offsets / (divergence / 2)) ** 2)
+    weights = across[:, None] * across
+    return offsets, weights / weights.sum()
+
+
+def _join_origins(sensor: Sensor, parts: list[Hits]) -> Hits:
+    """The hits of each of the `Sensor.origins`, ordered by column, then ring, in one window."""
     # columns of all origins counted from the first one of any
     turn, base = sensor.columns, parts[0].column0
     starts = [(part.column0 - base + turn // 2) % turn - turn // 2 for part in parts]
     first = min(starts)
-    column = np.concatenate([p.column + np.int32(start - first) for p, start in zip(parts, starts, strict=True)])
-    ring = np.concatenate([rings[p.ring].astype(np.int32) for p, rings in zip(parts, ring_numbers, strict=True)])
-    order = np.lexsort([ring, column])
-    ends = [start - first + part.columns for part, start in zip(parts, starts, strict=True)]
-    inside = [rings[p.row0 : p.row0 + p.rows] for p, rings in zip(parts, ring_numbers, strict=True) if p.rows]
-    low, high = (min(r[0] for r in inside), max(r[-1] for r in inside)) if inside else (0, -1)
+    points, column, ring, inside = [], [], [], []
+    for part, start, (height, _, rings) in zip(parts, starts, sensor.origins, strict=True):
+        points.append(part.points + np.array([0, 0, height], np.float32))
+        column.append(part.column + np.int32(start - first))
+        ring.append(rings[part.ring].astype(np.int32))
+        inside.append(rings[part.row0 : part.row0 + part.rows])
+    rows = np.concatenate(inside)
+    row0, end = (int(rows.min()), int(rows.max()) + 1) if len(rows) else (0, 0)
+    all_columns, all_rings = np.concatenate(column), np.concatenate(ring)
+    order = np.lexsort([all_rings, all_columns])
     return Hits(
-        points=np.concatenate([p.points for p in parts])[order],
-        face=np.concatenate([p.face for p in parts])[order],
-        column=column[order],
-        ring=ring[order],
-        columns=min(max(ends), turn),
-        rows=int(high - low + 1),
+        points=np.concatenate(points)[order],
+        face=np.concatenate([part.face for part in parts])[order],
+        column=all_columns[order],
+        ring=all_rings[order],
+        columns=min(max(start - first + part.columns for part, start in zip(parts, starts, strict=True)), turn),
+        rows=end - row0,
         column0=(base + first) % turn,
-        row0=int(low),
+        row0=row0,
     )
+
+
+def _compiled_beams(sensor: Sensor) -> Beams:
+    """A sensor for the compiled code of `scan_kernels`; made once."""
+    if sensor not in _BEAMS:
+        shifts, rings = zip(*sensor.shift_groups, strict=True)
+        sector = min(max(1, int(SECTOR / sensor.azimuth_step)), sensor.columns)
+        half_steps = np.arange(sector) / 2 * sensor.azimuth_step
+        _BEAMS[sensor] = Beams(
+            tangents=sensor.tangents,
+            shifts=sensor.azimuth_shifts,
+            group_shift=np.array(shifts),
+            group_ring=np.concatenate(rings),
+            group_start=np.cumsum([0, *map(len, rings)]),
+            half_tan=np.tan(half_steps),
+            half_cos=np.cos(half_steps),
+            sector=sector,
+            start=float(sensor.azimuth_start),
+            step=float(sensor.azimuth_step),
+            columns=sensor.columns,
+            nearest=float(sensor.range_min),
+            farthest=float(sensor.range_max),
+        )
+    return _BEAMS[sensor]
+
+
+# --- rays of any direction
 
 
 def scan_pattern(
@@ -271,57 +352,72 @@ def cast_ray_list(
     at its own time (N,) in [0, 1]. Returns range (N,) float32 m, inf for no hit, and face (N,) int32, -1 for no hit.
     Faces count from both sides. Raises InputError.
     """
-    vertices, faces = as_mesh(vertices, faces)
-    directions = as_directions(directions)
+    vertices, faces = _as_mesh(vertices, faces)
+    directions = _as_points("directions", directions)
+    length = np.linalg.norm(directions, axis=1)
+    if (length == 0).any():
+        raise InputError(f"directions must be longer than 0, but number {int(np.argmin(length))} is zero")
+    directions = directions / length[:, None]
     if time is not None:
-        time = as_times(time, len(directions))
+        time = _as_times(time, len(directions))
     if moved is None:
         return ray_list(vertices, faces, directions, None, None)
     if time is None:
         raise InputError("moved vertices need the rays' times: pass time (N,) in [0, 1]")
-    moved = as_points("moved", moved)
+    moved = _as_points("moved", moved)
     if moved.shape != vertices.shape:
         raise InputError(f"moved must hold the vertices once more, {vertices.shape}, got {moved.shape}")
     return ray_list(vertices, faces, directions, moved - vertices, time)
 
 
-def compiled_beams(sensor: Sensor) -> Beams:
-    """A sensor for the compiled code of `raycast_scan`; made once."""
-    beams = _BEAMS.get(sensor)
-    if beams is None:
-        groups = sensor.shift_groups
-        sector = min(max(1, int(SECTOR / sensor.azimuth_step)), sensor.columns)
-        half_steps = np.arange(sector) / 2 * sensor.azimuth_step
-        arrays = {
-            "elevations": sensor.elevations,
-            "tangents": sensor.tangents,
-            "shifts": sensor.azimuth_shifts,
-            "group_shift": np.array([shift for shift, _ in groups]),
-            "group_ring": np.concatenate([rings for _, rings in groups]),
-            "group_start": np.cumsum([0] + [len(rings) for _, rings in groups]),
-            "half_tan": np.tan(half_steps),
-            "half_cos": np.cos(half_steps),
-        }
-        beams = _BEAMS[sensor] = Beams(
-            **{name: read_only(values) for name, values in arrays.items()},
-            sector=sector,
-            start=float(sensor.azimuth_start),
-            step=float(sensor.azimuth_step),
-            columns=sensor.columns,
-            nearest=float(sensor.range_min),
-            farthest=float(sensor.range_max),
+# --- checks of arguments: arrays come out in one type each, so that compiled code is compiled once
+
+
+def _as_points(name: str, values: Any) -> np.ndarray:
+    """A copy (n, 3) float64, C-contiguous, finite; writable, as what compiled code makes."""
+    values = _as_floats(name, values, "an (n, 3) array of numbers")
+    if values.ndim != 2 or values.shape[1] != 3:
+        raise InputError(f"{name} must be (n, 3), got {values.shape}")
+    if values.size and not (values.max() < FARTHEST and values.min() > -FARTHEST):
+        bad = int((~(np.abs(values) < FARTHEST).all(1)).sum())
+        raise InputError(f"{name} must be finite and below {FARTHEST:.0e} m, but {bad} of {len(values)} are not")
+    return values
+
+
+def _as_mesh(vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Copies of vertices (V, 3) float64 and faces (F, 3) int32 that index them."""
+    vertices, faces = _as_points("vertices", vertices), np.asarray(faces)
+    if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
+        raise InputError(f"faces must be (F, 3) integers, got {faces.shape} {faces.dtype}")
+    if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
+        raise InputError(f"faces must index the {len(vertices)} vertices from 0, got {faces.min()} to {faces.max()}")
+    return vertices, np.array(faces, np.int32, order="C")
+
+
+def _as_times(time: np.ndarray, count: int) -> np.ndarray:
+    """A copy (count,) float64 in [0, 1]."""
+    time = _as_floats("time", time, f"({count},) numbers, one a ray")
+    if time.shape != (count,):
+        raise InputError(f"time must be ({count},), one a ray, got {time.shape}")
+    outside = np.flatnonzero(~((time >= 0) & (time <= 1)))
+    if len(outside):
+        raise InputError(
+            f"time must be within 0 and 1, the ends of the motion, got {time[outside[0]]} for ray {outside[0]}"
         )
-    return beams
+    return time
 
 
-def _sectors(turned: np.ndarray) -> list[np.ndarray]:
-    """Index lists that split sorted azimuths in [0, 2 pi) into sectors, starting after the widest gap."""
-    gaps = np.diff(turned, append=turned[0] + 2 * np.pi)
-    order = np.roll(np.arange(len(turned)), -(int(np.argmax(gaps)) + 1))
-    ahead = np.mod(turned[order] - turned[order[0]], 2 * np.pi)
-    sectors, start = [], 0
-    while start < len(order):
-        stop = int(np.searchsorted(ahead, ahead[start] + SECTOR, side="right"))
-        sectors.append(order[start:stop])
-        start = stop
-    return sectors
+def _as_angles(name: str, values: np.ndarray) -> np.ndarray:
+    """A copy (n,) float64, finite."""
+    expected = "a list of finite angles in radians"
+    values = _as_floats(name, values, expected)
+    if values.ndim != 1 or not np.isfinite(values).all():
+        raise InputError(f"{name} must be {expected}, got shape {values.shape}")
+    return values
+
+
+def _as_floats(name: str, values: np.ndarray, expected: str) -> np.ndarray:
+    try:
+        return np.array(values, np.float64, order="C")
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must be {expected}, got {type(values).__name__}") from None

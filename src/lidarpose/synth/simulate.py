@@ -5,9 +5,8 @@ from typing import cast
 
 import numpy as np
 
-from lidarpose.lidar.beam_divergence import scan_divergent
 from lidarpose.lidar.ray_pattern import RayPattern
-from lidarpose.lidar.raycast import Hits, scan_pattern
+from lidarpose.lidar.raycast import Hits, scan_divergent, scan_pattern
 from lidarpose.lidar.sensor import Sensor
 from lidarpose.synth.bodies import Bodies
 from lidarpose.synth.environment.mesh import Mesh, union

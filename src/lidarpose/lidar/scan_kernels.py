@@ -1,0 +1,262 @@
+"""The compiled way from a mesh to the packed hits of a spinning sensor: window, sectors, cast, echoes, points. See
+`raycast`, which explains the letters; S sub-beams along a side of a beam's footprint.
+
+All runs outside the interpreter's lock. A change in `raycast_kernels` does not renew what is cached of this module:
+remove its __pycache__ after one.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lidarpose.lidar.raycast_kernels import AXIS, STEEP, compiled, njit, raster
+
+# a sector spans at most this much azimuth, so that tan(a) stays near 1
+SECTOR = np.radians(92.0)
+
+_MOST = np.int64(2**63 - 1)
+# no sub-beam beyond the zenith
+_ZENITH = np.pi / 2 - 1e-6
+
+
+class Beams(NamedTuple):
+    """A spinning sensor as compiled code reads it; angles in rad. Built by `raycast._compiled_beams`.
+
+    tangents, shifts (E,): of the rings; group_shift (G,): the different shifts; group_ring (E,): the
+    rings, group by group, ascending; group_start (G + 1,): where each group starts in it; half_tan, half_cos: of
+    0, 1, 2, ... half steps of azimuth, as far as a sector of `sector` columns reaches from its middle; start, step:
+    azimuth of column 0 and between columns; columns in a turn; nearest, farthest m.
+    """
+
+    tangents: np.ndarray
+    shifts: np.ndarray
+    group_shift: np.ndarray
+    group_ring: np.ndarray
+    group_start: np.ndarray
+    half_tan: np.ndarray
+    half_cos: np.ndarray
+    sector: int
+    start: float
+    step: float
+    columns: int
+    nearest: float
+    farthest: float
+
+
+@compiled
+def _ordered(value):
+    """A whole number that orders as the value does: the least of whole numbers is found many at a time."""
+    bits = np.float64(value).view(np.int64)
+    return bits ^ ((bits >> 63) & _MOST)
+
+
+@compiled
+def _number(ordered):
+    """The value of `_ordered`."""
+    return np.int64(ordered ^ ((ordered >> 63) & _MOST)).view(np.float64)
+
+
+# sums may be taken in any order
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"nsz", "reassoc"})
+def bounds(vertices):
+    """Mean azimuth, and the vertices' least and greatest azimuth relative to it and elevation, rad."""
+    flat, east, north = vertices.reshape(-1), 0.0, 0.0
+    for i in range(len(vertices)):
+        east += flat[np.uintp(3 * i)]
+        north += flat[np.uintp(3 * i + 1)]
+    center = np.arctan2(north, east)
+    c, s = np.cos(center), np.sin(center)
+    left, right, low, high, ahead = _MOST, -_MOST, _MOST, -_MOST, _MOST
+    for i in range(len(vertices)):
+        vx, vy, vz = flat[np.uintp(3 * i)], flat[np.uintp(3 * i + 1)], flat[np.uintp(3 * i + 2)]
+        x, y = c * vx + s * vy, c * vy - s * vx
+        ahead = min(ahead, _ordered(min(x * STEEP - abs(y), x - AXIS)))
+        azimuth = _ordered(y * (1 / (x if x > AXIS else 1.0)))
+        # squared, with its sign
+        slope = _ordered(vz * abs(vz) / (x * x + y * y if x > AXIS else 1.0))
+        left, right = min(left, azimuth), max(right, azimuth)
+        low, high = min(low, slope), max(high, slope)
+    if ahead > 0:
+        left, right, low, high = _number(left), _number(right), _number(low), _number(high)
+        low, high = np.sign(low) * np.sqrt(abs(low)), np.sign(high) * np.sqrt(abs(high))
+        return center, np.arctan(left), np.arctan(right), np.arctan(low), np.arctan(high)
+    left, right, low, high = np.inf, -np.inf, np.inf, -np.inf
+    for i in range(len(vertices)):
+        x = c * vertices[i, 0] + s * vertices[i, 1]
+        y = c * vertices[i, 1] - s * vertices[i, 0]
+        azimuth = np.arctan2(y, x)
+        elevation = np.arctan2(vertices[i, 2], np.sqrt(x * x + y * y))
+        left, right = min(left, azimuth), max(right, azimuth)
+        low, high = min(low, elevation), max(high, elevation)
+    if right - left >= np.pi:
+        # around the sensor: between vertices, faces may reach over the zenith and behind
+        return center, -np.pi, np.pi, -np.pi / 2, np.pi / 2
+    return center, left, right, low, high
+
+
+@compiled
+def sub_tangents(elevations, offsets):
+    """(E, S) tan(elevation) of the sub-beams at offsets (S,) rad from elevations (E,) rad."""
+    tangents = np.empty((len(elevations), len(offsets)))
+    for ring in range(len(elevations)):
+        for b in range(len(offsets)):
+            tangents[ring, b] = np.tan(min(max(elevations[ring] + offsets[b], -_ZENITH), _ZENITH))
+    return tangents
+
+
+@compiled
+def _cast_grid(vertices, faces, beams, window, offsets, tangents):
+    """1/x in the sectors' frames and face, both (S, C, R * S), and 1/cos(azimuth - the sector's middle) (C,).
+
+    Sub-columns, at offsets (S,) rad of azimuth, lie apart; sub-rows, of tangents (E, S), together with the rows.
+    """
+    column0, columns, row0, rows = window
+    subs = len(offsets)
+    inverse_x = np.zeros((subs, columns, rows * subs))
+    face = np.full((subs, columns, rows * subs), -1, np.int32)
+    scale = np.ones(columns)
+    most = min(columns, beams.sector)
+    tan, cos, index = np.empty(most), np.empty(most), np.empty(most, np.int64)
+    row_tan, row_index = np.empty(rows * subs), np.empty(rows * subs, np.int64)
+    for g in range(len(beams.group_shift)):
+        n = 0
+        for ring in beams.group_ring[beams.group_start[g] : beams.group_start[g + 1]]:
+            if row0 <= ring < row0 + rows:
+                for b in range(subs):
+                    # the sub-rows of rows that are near one another mix: almost in order as they are
+                    i = n
+                    while i > 0 and row_tan[i - 1] > tangents[ring, b]:
+                        row_tan[i], row_index[i] = row_tan[i - 1], row_index[i - 1]
+                        i -= 1
+                    row_tan[i], row_index[i] = tangents[ring, b], (ring - row0) * subs + b
+                    n += 1
+        if not n:
+            continue
+        for start in range(0, columns, beams.sector):
+            count = min(beams.sector, columns - start)
+            for k in range(count):
+                half = 2 * k - (count - 1)
+                tan[k] = beams.half_tan[half] if half >= 0 else -beams.half_tan[-half]
+                cos[k] = beams.half_cos[abs(half)]
+                scale[start + k] = 1 / cos[k]
+                index[k] = start + k
+            center = beams.start + (column0 + start + (count - 1) / 2) * beams.step + beams.group_shift[g]
+            for a in range(subs):
+                raster(
+                    vertices, faces, center + offsets[a], tan[:count], cos[:count], row_tan[:n], index[:count],
+                    row_index, inverse_x[a], face[a],
+                )  # fmt: skip
+    return inverse_x, face, scale
+
+
+@compiled
+def _collect(inverse_x, face, scale, beams, column0, row0):
+    """The hits of a window within the sensor's range, packed: points (n, 3), face, column and ring (n,)."""
+    columns, rows = inverse_x.shape
+    n = 0
+    for k in range(columns):
+        for r in range(rows):
+            n += inverse_x[k, r] > 0
+    points = np.empty((n, 3), np.float32)
+    hit, column, ring = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int32)
+    if not n:
+        return points, hit, column, ring
+    per_ring = len(beams.group_shift) > 1
+    first = beams.start + column0 * beams.step
+    n = 0
+    for k in range(columns):
+        azimuth = first + k * beams.step + (0.0 if per_ring else beams.shifts[row0])
+        c, s = np.cos(azimuth), np.sin(azimuth)
+        for r in range(rows):
+            if inverse_x[k, r] <= 0:
+                continue
+            if per_ring:
+                c, s = np.cos(azimuth + beams.shifts[row0 + r]), np.sin(azimuth + beams.shifts[row0 + r])
+            tangent = beams.tangents[row0 + r]
+            horizontal = scale[k] / inverse_x[k, r]
+            distance = horizontal * np.sqrt(1 + tangent * tangent)
+            if distance < beams.nearest or distance > beams.farthest:
+                continue
+            points[n, 0] = horizontal * c
+            points[n, 1] = horizontal * s
+            points[n, 2] = horizontal * tangent
+            hit[n] = face[k, r]
+            column[n] = k
+            ring[n] = row0 + r
+            n += 1
+    return points[:n], hit[:n], column[:n], ring[:n]
+
+
+@compiled
+def strongest_echo(distance, weights, order, pulse, farthest):
+    """Range and number of the nearest sub-beam of the strongest echo of sub-beams (K,), inf and -1 for none.
+
+    distance (K,) m, inf where nothing is met; weights (K,) in all 1; order (K,) is overwritten.
+    """
+    n = 0
+    for k in range(len(distance)):
+        if distance[k] == np.inf:
+            continue
+        # by range: few and often in order
+        i = n
+        while i > 0 and distance[order[i - 1]] > distance[k]:
+            order[i] = order[i - 1]
+            i -= 1
+        order[i] = k
+        n += 1
+    best, best_range, best_face = 0.0, np.inf, -1
+    start = 0
+    while start < n:
+        power, sum_range, end = 0.0, 0.0, start
+        while end < n and (end == start or distance[order[end]] - distance[order[end - 1]] <= pulse):
+            r = distance[order[end]]
+            received = weights[order[end]] / (r * r)
+            power += received
+            sum_range += received * r
+            end += 1
+        if power > best:
+            best, best_range, best_face = power, sum_range / power, order[start]
+        start = end
+    if best * farthest * farthest < 1:
+        return np.inf, -1
+    return best_range, best_face
+
+
+@compiled
+def _merge_echoes(inverse_x, face, scale, beams, row0, tangents, weights, pulse):
+    """1/x and face (C, R) of the beams' returns, as if their axes had met them; inputs as `_cast_grid` gives them."""
+    subs, columns, rows = len(weights), len(scale), inverse_x.shape[2] // len(weights)
+    merged, merged_face = np.zeros((columns, rows)), np.full((columns, rows), -1, np.int32)
+    distance, flat = np.empty(subs * subs), weights.copy().reshape(-1)
+    order = np.empty(subs * subs, np.int64)
+    for k in range(columns):
+        for r in range(rows):
+            met = False
+            for a in range(subs):
+                for b in range(subs):
+                    near, tangent = inverse_x[a, k, r * subs + b], tangents[row0 + r, b]
+                    met |= near > 0
+                    distance[a * subs + b] = scale[k] * np.sqrt(1 + tangent * tangent) / near if near > 0 else np.inf
+            if not met:
+                continue
+            range_, sub = strongest_echo(distance, flat, order, pulse, beams.farthest)
+            if sub >= 0:
+                tangent = beams.tangents[row0 + r]
+                merged[k, r] = scale[k] * np.sqrt(1 + tangent * tangent) / range_
+                merged_face[k, r] = face[sub // subs, k, r * subs + sub % subs]
+    return merged, merged_face
+
+
+@compiled
+def scan_window(vertices, faces, beams, window, offsets, tangents, weights, pulse):
+    """Points (n, 3), face, column and ring (n,) that the beams of a window (column0, columns, row0, rows) return.
+
+    vertices (V, 3) float64, faces (F, 3) int32; sub-beams at offsets (S,) rad of azimuth and of tangents (E, S), of
+    weights (S, S); pulse m as in `raycast.scan_divergent`. A single sub-beam is the beam's axis.
+    """
+    column0, _, row0, _ = window
+    cast_inverse_x, cast_face, scale = _cast_grid(vertices, faces, beams, window, offsets, tangents)
+    inverse_x, face = cast_inverse_x[0], cast_face[0]
+    if len(offsets) > 1:
+        inverse_x, face = _merge_echoes(cast_inverse_x, cast_face, scale, beams, row0, tangents, weights, pulse)
+    return _collect(inverse_x, face, scale, beams, column0, row0)
