@@ -17,8 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.body.rig import load_rig
-from lidarpose.body.shape import clothing, sample_people
+from lidarpose.body.rig import clothing, load_rig, sample_people
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import Bodies, draw_bodies
 from lidarpose.synth.props import Prop, draw_props

@@ -11,9 +11,8 @@ import motion_files
 import numpy as np
 from test_smpl import synthetic
 
-from lidarpose.body.mocap.retarget import rotation_vector
 from lidarpose.body.smpl import load_body
-from lidarpose.geometry import axis_angle_to_matrix
+from lidarpose.geometry import axis_angle_to_matrix, rotation_vector
 from lidarpose.skeleton import HUMAN15, SMPL24
 
 TO_HUMAN15 = SMPL24.map_to(HUMAN15)

@@ -5,9 +5,8 @@ import json
 import numpy as np
 
 from lidarpose.body import rig
-from lidarpose.body.mocap import retarget
 from lidarpose.body.pose_prior import sampling
-from lidarpose.geometry import UP_AXES, rotation_about
+from lidarpose.geometry import UP_AXES, rotation_about, rotation_vector
 from lidarpose.skeleton import SMPL24
 
 J = {name: i for i, name in enumerate(SMPL24.joints)}
@@ -25,7 +24,7 @@ def a_clip(frames=6, seed=0):
 
 def joints_of(rotations, translation=None):
     """(F, 24, 3) m of the mean adult, the pelvis at `translation` (F, 3) or at the origin."""
-    rest = retarget.mean_adult_joints()[None]
+    rest = rig.mean_adult_joints()[None]
     way = np.zeros((len(rotations), 3)) if translation is None else np.asarray(translation, float)
     return rig.forward_kinematics(SMPL24.parents, rest, np.asarray(rotations, float), way)[1]
 
@@ -34,7 +33,7 @@ def to_smpl(rotations, up="z"):
     """Our rotations as SMPL's axis-angles (F, 72) in a world whose axis `up` is upwards."""
     local = C.T @ rotations @ C
     local[:, 0] = UP_AXES[up].T @ rotations[:, 0] @ C
-    return retarget.rotation_vector(local.reshape(-1, 3, 3)).reshape(-1, 72)
+    return rotation_vector(local.reshape(-1, 3, 3)).reshape(-1, 72)
 
 
 def write_amass(path, rotations, translation, *, width=156, rate="mocap_framerate", fps=60.0, drop=(), **changes):
@@ -88,7 +87,7 @@ def bvh_text(rotations, translation, *, names=SMPL_NAMES, order="ZXY", unit=0.01
     """A BVH of the mean adult: `unit` metres a number, rotations in channels of this order; joints in `drop` (with all
     below them) are left out."""
     world = UP_AXES[up]
-    rest = retarget.mean_adult_joints() @ C / unit
+    rest = rig.mean_adult_joints() @ C / unit
     local = C.T @ rotations @ C
     local[:, 0] = world.T @ rotations[:, 0] @ C
     euler = [np.degrees(to_euler(local[:, j], order)) for j in range(24)]
@@ -154,7 +153,7 @@ def asf_text(*, length=0.45, seed=0, angle="deg"):
     """The mean adult as CMU's skeleton: y up, every bone's axes turned at random."""
     rng = np.random.default_rng(seed)
     scale = length / 0.0254
-    rest = retarget.mean_adult_joints() @ C
+    rest = rig.mean_adult_joints() @ C
     axes = {}
     lines = ["# test", ":version 1.10", ":name test", ":units", "  mass 1.0", f"  length {length}", f"  angle {angle}"]
     lines += [":documentation", "  none", ":root", "   order TX TY TZ RX RY RZ", "   axis XYZ", "   position 0 0 0"]

@@ -7,7 +7,7 @@ import pytest
 from motion_files import joints_of
 
 from lidarpose.body.mocap.motion import Motion
-from lidarpose.body.shape import clothing
+from lidarpose.body.rig import clothing
 from lidarpose.geometry import rotation_about
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth import bodies
@@ -32,7 +32,7 @@ def motion(frames=40, fps=10.0, jump=0.0, turn=0.0, names=("001_01",)):
     way[:, 2] = 0.95 + jump * (np.round(time * 10) % 8 == 4)
     length = np.full(len(names), frames // len(names))
     return Motion(
-        rotations=rotations, translation=way, names=names, start=np.cumsum(length) - length, length=length, fps=fps,
+        rotations=rotations, translation=way, names=names, length=length, fps=fps,
         source="test",
     )  # fmt: skip
 

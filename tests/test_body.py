@@ -8,10 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.rig import add_folds_reference, pose_bodies_reference, vertex_normals_reference
 
-from lidarpose.body import shape
-from lidarpose.body.rig import forward_kinematics, load_rig, pose_bodies
+from lidarpose.body import rig as body_rig
+from lidarpose.body.rig import MAX_CLOTHING, clothing, forward_kinematics, load_rig, pose_bodies, sample_people
 from lidarpose.body.rig_kernels import dress_people, fold_clothing, vertex_normals
-from lidarpose.body.shape import MAX_CLOTHING, clothing, sample_people
 from lidarpose.geometry import axis_angle_to_matrix, rotation_about
 from lidarpose.skeleton import BODY26, SMPL24
 
@@ -172,7 +171,7 @@ def test_kernels_equal_their_references(seed, spread):
     np.testing.assert_array_equal([low, high], [clothed.min(1), clothed.max(1)])
     direction, phase = rng.normal(0, 3, (3, 4, 3)).astype(np.float32), rng.random((3, 4)).astype(np.float32)
     folded = add_folds_reference(rig.template, direction, phase, offset)
-    fold_clothing(rig.template, direction, phase, shape.FOLD_GAIN, offset)
+    fold_clothing(rig.template, direction, phase, body_rig.FOLD_GAIN, offset)
     np.testing.assert_allclose(offset, folded, atol=1e-6)
 
 
@@ -229,7 +228,7 @@ def test_people_are_those_of_a_street(rig):
     assert 0.9 < people.height.min() and people.height.max() < 2.1
     assert len(np.unique(people.coefficients, axis=0)) == 4000
     np.testing.assert_array_equal(people.coefficients, sample_people(np.random.default_rng(3), 4000).coefficients)
-    probability, neighbors = shape._sampling_table()
+    probability, neighbors = body_rig._sampling_table()
     assert (rig.sex[neighbors] == rig.sex[:, None]).all() and probability.sum() == pytest.approx(1)
     rest = rig.rest(people.coefficients[:200])
     np.testing.assert_allclose(np.ptp(rest.vertices[..., 2], axis=1), people.height[:200], atol=0.02)

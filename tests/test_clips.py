@@ -12,7 +12,7 @@ from lidarpose.body import rig
 from lidarpose.body.mocap import motion, retarget
 from lidarpose.body.pose_prior import sampling
 from lidarpose.errors import InputError
-from lidarpose.geometry import axis_angle_to_matrix, rotation_about
+from lidarpose.geometry import axis_angle_to_matrix, rotation_about, rotation_vector
 from lidarpose.skeleton import SMPL24
 
 J = {name: i for i, name in enumerate(SMPL24.joints)}
@@ -33,7 +33,7 @@ def a_motion(lengths=(8, 1, 13), fps=20.0, seed=0):
         rotations=np.concatenate(rotations).astype(np.float32),
         translation=np.concatenate(translation).astype(np.float32),
         names=tuple(f"{k:03d}_01" for k in range(len(lengths))),
-        start=np.cumsum(lengths) - lengths, length=lengths, fps=fps, source="test",
+        length=lengths, fps=fps, source="test",
     )  # fmt: skip
 
 
@@ -151,7 +151,7 @@ def test_cuts_stay_inside_their_clips(lengths, fps, hz, frames, dt):
     assert (clip_of[windows] == clip_of[windows][:, :1]).all() and (np.diff(windows, axis=1) == 1).all()
     poses = given.pairs(dt)[0]
     assert len(poses) == sum(max(0, n - int(np.ceil(dt * fps - 1e-5))) for n in lengths)
-    np.testing.assert_allclose(retarget.heading(poses), 0, atol=1e-5)
+    np.testing.assert_allclose(rig.heading(poses), 0, atol=1e-5)
 
 
 def test_pairs_are_what_happens_next():
@@ -162,27 +162,27 @@ def test_pairs_are_what_happens_next():
     way = np.cumsum(np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1) * 0.05, 0)
     walk = motion.Motion(
         rotations=rotations.astype(np.float32), translation=way.astype(np.float32),
-        names=("a",), start=np.array([0]), length=np.array([31]), fps=30.0, source="",
+        names=("a",), length=np.array([31]), fps=30.0, source="",
     )  # fmt: skip
     poses, moved, step = walk.pairs(0.1)
     assert len(poses) == 28 and moved.dtype == step.dtype == np.float32
-    np.testing.assert_allclose(retarget.heading(moved), 0.15, atol=1e-5)
+    np.testing.assert_allclose(rig.heading(moved), 0.15, atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(step, axis=-1), 0.15, atol=1e-3)
     assert (step[:, 0] > 0.14).all() and (step[:, 1] > 0).all()
-    np.testing.assert_allclose(walk.pairs(0)[1], retarget.without_yaw(walk.rotations), atol=1e-6)
+    np.testing.assert_allclose(walk.pairs(0)[1], rig.without_yaw(walk.rotations), atol=1e-6)
     windows = walk.windows(16)
     turned, moved = motion.facing_x(walk.rotations[windows], walk.translation[windows])
-    np.testing.assert_allclose(retarget.heading(turned[:, 0]), 0, atol=1e-5)
+    np.testing.assert_allclose(rig.heading(turned[:, 0]), 0, atol=1e-5)
     np.testing.assert_allclose(moved[:, 0], 0, atol=1e-6)
-    np.testing.assert_allclose(retarget.heading(turned[:, -1]), 0.75, atol=1e-5)
+    np.testing.assert_allclose(rig.heading(turned[:, -1]), 0.75, atol=1e-5)
     assert (moved[:, -1, 0] > 0.5).all()
 
 
 def test_a_subject_whose_number_goes_on_is_another_one():
     """CMU's subjects go from 01 to 144: who trains on 10 must not meet 102, who is kept for evaluation."""
     names = ("1_01", "10_01", "102_03", "walk01", "02/02_01")
-    at, each = np.arange(len(names)), np.ones(len(names), int)
-    clips = motion.Clips(joints=np.zeros((5, 24, 3), np.float32), names=names, start=at, length=each, fps=30.0)
+    each = np.ones(len(names), int)
+    clips = motion.Clips(joints=np.zeros((5, 24, 3), np.float32), names=names, length=each, fps=30.0)
     assert clips.of("10").names == ("10_01",) and clips.of("1").names == ("1_01",)
     assert clips.of(("walk", "02")).names == ("walk01", "02/02_01")
     with pytest.raises(InputError, match="no clip starts with '0'"):
@@ -226,14 +226,14 @@ def test_retargeting_own_poses_gives_them_back(yaw):
     back = retarget.retarget_positions(p + [3.0, -2, 1])
     error = np.linalg.norm(joints_of(back) - p, axis=-1)[:, MAIN]
     assert error.mean() < 0.01 and error.mean(0).max() < 0.02 and np.percentile(error, 99.5) < 0.05
-    turn = retarget.heading(back) - retarget.heading(rotations)
+    turn = rig.heading(back) - rig.heading(rotations)
     assert np.median(np.abs((turn + np.pi) % (2 * np.pi) - np.pi)) < 0.02
-    np.testing.assert_allclose(retarget.heading(retarget.without_yaw(back)), 0, atol=1e-5)
+    np.testing.assert_allclose(rig.heading(rig.without_yaw(back)), 0, atol=1e-5)
 
 
 def test_retargeting_another_body_keeps_the_directions_of_its_limbs():
     rotations = sampling.sample_rotations(np.random.default_rng(12), 300).rotations
-    rest = retarget.mean_adult_joints() * [1.0, 1.2, 0.8] * 0.9
+    rest = rig.mean_adult_joints() * [1.0, 1.2, 0.8] * 0.9
     p = rig.forward_kinematics(SMPL24.parents, rest[None], rotations, np.zeros((300, 3)))[1]
     q = joints_of(retarget.retarget_positions(p))
     for start, end in (("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist")):
@@ -244,7 +244,7 @@ def test_retargeting_another_body_keeps_the_directions_of_its_limbs():
 
 
 def test_straight_limbs_and_the_rest_pose():
-    rest = retarget.mean_adult_joints()
+    rest = rig.mean_adult_joints()
     rotations = retarget.retarget_positions(rest[None])
     np.testing.assert_allclose(rotations[0], np.broadcast_to(np.eye(3), (24, 3, 3)), atol=0.04)
     straight = rest.copy()  # every limb exactly straight, feet along the shanks
@@ -279,7 +279,7 @@ def arm(bend, twist):
 def steps_of(rotations):
     """Degrees between one frame's rotation and the next one's."""
     rotations = rotations.astype(float)
-    turn = retarget.rotation_vector(np.swapaxes(rotations[:-1], -1, -2) @ rotations[1:])
+    turn = rotation_vector(np.swapaxes(rotations[:-1], -1, -2) @ rotations[1:])
     return np.degrees(np.linalg.norm(turn, axis=-1))
 
 
@@ -290,7 +290,7 @@ def test_an_elbow_that_bends_more_and_more_does_not_flip(twist):
     upper = retarget.retarget_positions(joints)[:, J["left_shoulder"]]
     assert steps_of(upper).max() < 20
     # and once the bend is plain, the twist is the arm's
-    plain = retarget.rotation_vector(upper[120:])
+    plain = rotation_vector(upper[120:])
     np.testing.assert_allclose(plain, np.broadcast_to([0, twist, 0], plain.shape), atol=0.05)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from walkers import bone_distance
 
-from lidarpose.body.shape import sample_people
+from lidarpose.body.rig import sample_people
 from lidarpose.errors import InputError
 from lidarpose.lidar.presets import sensor
 from lidarpose.lidar.sensor import Sensor

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from lidarpose.body.mocap import asf_amc, bvh, digest, joint_positions, joint_tree, load_motion
+from lidarpose.body.mocap import digest, joint_tree, load_motion, retarget, skeleton_files
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES
 from lidarpose.synth.shard_job import Job
@@ -60,7 +60,7 @@ def test_a_bvh_of_any_names_comes_back(tmp_path, skeleton):
 @pytest.mark.parametrize("order", ["ZXY", "XYZ", "YXZ", "ZYX", "YZX", "XZY"])
 def test_a_bvh_has_its_joints_where_they_were(tmp_path, order):
     """The tree's own positions, in centimeters and y up, without retargeting."""
-    tree, values, rate = bvh.read_bvh(written(tmp_path, files.bvh_text(ROTATIONS, WAY, order=order)))
+    tree, values, rate = skeleton_files.read_bvh(written(tmp_path, files.bvh_text(ROTATIONS, WAY, order=order)))
     assert rate == pytest.approx(30)
     index = [tree.names.index(name) for name in J]
     np.testing.assert_allclose(tree.positions(values)[:, index] / 100 @ UP_AXES["y"].T, JOINTS, atol=1e-4)
@@ -75,8 +75,8 @@ def test_units_and_up_are_found(tmp_path, unit, up):
 
 def test_children_and_tall_people_keep_their_unit():
     for size in (0.62, 0.8, 1.0, 1.2):
-        for name, meters in joint_positions.UNITS.items():
-            assert joint_positions.meters_per_unit("x", JOINTS[:1] * size / meters) == meters, (size, name)
+        for name, meters in retarget.UNITS.items():
+            assert retarget.meters_per_unit("x", JOINTS[:1] * size / meters) == meters, (size, name)
 
 
 def test_skeletons_with_less(tmp_path):
@@ -88,7 +88,7 @@ def test_skeletons_with_less(tmp_path):
     assert error[:, no_ankle].mean() < 0.012 and error[:, [J[foot] for foot in feet]].mean() < 0.12
     matched = {n: i for n, i in J.items() if n.endswith(("hip", "knee", "ankle", "shoulder", "elbow", "wrist"))}
     matched["head"] = J["head"]
-    less = joint_tree.JointTree(names=list(J), parents=[-1, *[0] * 23], offsets=np.zeros((24, 3)), channels=[])
+    less = joint_tree.JointTree(joints=[joint_tree.Joint(name=name, parent=0 if i else -1) for name, i in J.items()])
     motion = joint_tree.tree_motion("x", less, JOINTS, fps=10, up="z", kind="test", matched=matched)
     limbs = [J[f"{side}_{name}"] for side in ("left", "right") for name in ("hip", "knee", "elbow")]
     assert errors(motion)[:, limbs].mean() < 0.09
@@ -99,7 +99,7 @@ def test_an_amc_comes_back(tmp_path, length):
     skeleton, axes = files.asf_text(length=length)
     written(tmp_path, skeleton, "02.asf")
     path = written(tmp_path, files.amc_text(ROTATIONS, WAY, axes, length=length), "02_05.amc")
-    tree, values, unit_m = asf_amc.read_amc(path)
+    tree, values, unit_m = skeleton_files.read_amc(path)
     positions = tree.positions(values) * unit_m @ UP_AXES["y"].T
     for i, bone in enumerate(tree.names):
         if bone in files.ASF_ENDS:

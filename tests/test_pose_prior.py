@@ -12,10 +12,9 @@ from hypothesis import strategies as st
 from motion_files import joints_of
 
 from lidarpose.body import rig
-from lidarpose.body.mocap import retarget
-from lidarpose.body.pose_prior import activities, balance, contact, gait, joint_angles, latents, mixture, sampling
-from lidarpose.body.pose_prior.contact import body_frames, capsule_ends, self_collision, sole_points
-from lidarpose.body.pose_prior.joint_angles import mirror_angles, rotations_from_angles
+from lidarpose.body.pose_prior import activities, constraints, gait, latents, sampling
+from lidarpose.body.pose_prior.activities import mirror_angles, rotations_from_angles
+from lidarpose.body.pose_prior.constraints import body_frames, capsule_ends, self_collision, sole_points
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix, rotation_about
 from lidarpose.skeleton import SMPL24
@@ -76,14 +75,14 @@ def test_shapes_and_rotations(seed, n, frames):
     prior = drawn(n, seed)
     assert prior.rotations.shape == (n, 24, 3, 3) and prior.kind.shape == (n,)
     check_rotations(prior.rotations)
-    np.testing.assert_allclose(retarget.heading(prior.rotations), 0, atol=1e-5)
+    np.testing.assert_allclose(rig.heading(prior.rotations), 0, atol=1e-5)
     n = n // 8
     clip = sampling.sample_clips(np.random.default_rng(seed), n, frames=frames)
     assert clip.rotations.shape == (n, frames, 24, 3, 3) and (clip.clearance >= 0).all()
     assert clip.translation.shape == (n, frames, 3) and clip.clearance.shape == (n, frames)
     check_rotations(clip.rotations)
     if frames:
-        np.testing.assert_allclose(retarget.heading(clip.rotations[:, 0]), 0, atol=1e-5)
+        np.testing.assert_allclose(rig.heading(clip.rotations[:, 0]), 0, atol=1e-5)
         np.testing.assert_array_equal(clip.translation[:, 0], 0)
 
 
@@ -139,11 +138,11 @@ def test_latents_are_taken_together():
 def test_euler_angles_against_the_product_of_three_rotations():
     euler = np.random.default_rng(0).uniform(-3, 3, (40, 3))
     reference = rotation_about("y", euler[:, 0]) @ rotation_about("x", euler[:, 1]) @ rotation_about("z", euler[:, 2])
-    np.testing.assert_allclose(joint_angles._from_euler(euler), reference, atol=1e-12)
+    np.testing.assert_allclose(activities._from_euler(euler), reference, atol=1e-12)
 
 
 @pytest.mark.parametrize(
-    "back", [fit.angles_from_rotations, lambda rotations: mixture.from_features(fit.to_features(rotations))]
+    "back", [fit.angles_from_rotations, lambda rotations: latents.from_features(fit.to_features(rotations))]
 )
 def test_angles_come_back_from_rotations(back):
     rotations = rotations_from_angles(raw_angles(1000, 3))
@@ -249,7 +248,7 @@ def test_kneeling_people_have_a_knee_on_the_ground():
 
 def test_captured_poses_are_people_upright():
     rng = np.random.default_rng(0)
-    assert [mixture.captured_angles(rng, n).shape for n in (500, 0)] == [(500, 2, 27), (0, 2, 27)]
+    assert [latents.captured_angles(rng, n).shape for n in (500, 0)] == [(500, 2, 27), (0, 2, 27)]
     p = joints_of(drawn(500, 15, captured=1).rotations)
     assert (p[:, J["neck"], 2] > p[:, J["pelvis"], 2]).mean() > 0.95
     assert Path(rig.__file__).with_name("assets").joinpath("motion_prior.npz").stat().st_size < 60_000
@@ -321,7 +320,7 @@ def test_walkers_go_ahead_at_the_speed_of_their_strides():
     x, y = np.moveaxis(np.diff(walk, axis=1), -1, 0)
     course = np.unwrap(np.arctan2(y, x), axis=1)
     assert np.abs(course[:, -1] - course[:, 0]).max() > 0.15
-    facing = np.unwrap([retarget.heading(r) for r in clips("walk", n=40).rotations], axis=1)[:, 1:]
+    facing = np.unwrap([rig.heading(r) for r in clips("walk", n=40).rotations], axis=1)[:, 1:]
     assert np.abs((facing - course) - (facing - course).mean(1, keepdims=True)).max() < 0.3
 
 
@@ -363,7 +362,7 @@ def test_moved_poses_are_those_of_the_pose_itself_later():
 
 
 def test_frames_are_forward_kinematics():
-    rotations, rest = drawn(200).rotations, retarget.mean_adult_joints()[None]
+    rotations, rest = drawn(200).rotations, rig.mean_adult_joints()[None]
     slow = rig.forward_kinematics(SMPL24.parents, rest, rotations, np.zeros((200, 3)))
     for a, b in zip(body_frames(rotations), slow, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5)
@@ -381,11 +380,11 @@ def test_soles_are_the_meshs():
 def out_of_balance(rotations):
     """How far (n,) m the center of mass is outside of what the body stands on."""
     joints = body_frames(rotations)[1]
-    points = balance._ground_points(rotations, joints)
-    return np.linalg.norm(balance.overhang(contact.mass_center(joints), points, 0.0), axis=1)
+    points = constraints._ground_points(rotations, joints)
+    return np.linalg.norm(constraints.overhang(constraints.mass_center(joints), points, 0.0), axis=1)
 
 
-@pytest.mark.parametrize("kind", balance.STATIC)
+@pytest.mark.parametrize("kind", constraints.STATIC)
 def test_standing_and_kneeling_people_are_in_balance(kind):
     assert (out_of_balance(drawn(600, **{kind: 1}).rotations) > 0.005).mean() < 0.01
 
@@ -402,7 +401,7 @@ def test_what_balance_changes():
     kind = np.repeat([KINDS.index("bend"), KINDS.index("sport")], 200)
     angles = sampling._angles(latents.draw_latents(np.random.default_rng(1), kind)).angles
     before = angles.copy()
-    after = balance.balanced(angles, kind)
+    after = constraints.balanced(angles, kind)
     np.testing.assert_array_equal(angles, before)
     np.testing.assert_array_equal(after[200:], before[200:])
     off = [(out_of_balance(rotations_from_angles(a[:200])) > 0.01).mean() for a in (before, after)]
@@ -413,17 +412,19 @@ def test_overhang_of_a_square():
     square = np.array([[[x, y, 0.0] for x in (-0.1, 0.1) for y in (-0.1, 0.1)]])
     for at, margin, want in (((0.05, 0.0), 0.0, 0.0), ((0.15, 0.0), 0.0, -0.05), ((0.15, 0.0), 0.02, -0.07)):
         center = np.array([[*at, 1.0]])
-        np.testing.assert_allclose(balance.overhang(center, square, margin), [[want, 0]], atol=1e-6)
+        np.testing.assert_allclose(constraints.overhang(center, square, margin), [[want, 0]], atol=1e-6)
         # what hangs in the air above bears nothing
         both = np.concatenate([square, square + [1.0, 0, 1]], 1)
-        np.testing.assert_allclose(balance.overhang(center, both, margin)[0], [want, 0], atol=2e-3)
+        np.testing.assert_allclose(constraints.overhang(center, both, margin)[0], [want, 0], atol=2e-3)
 
 
 def test_the_center_of_mass_of_the_rest_pose():
     """Of a standing adult 55 to 58 % of the height, arms up a little more; the shares sum to one."""
-    joints = retarget.mean_adult_joints()[None]
-    assert 0.55 < (contact.mass_center(joints)[0, 2] + 0.97) / 1.70 < 0.61
-    np.testing.assert_allclose(contact.mass_center(joints + [1.0, 2, 3]) - contact.mass_center(joints), [[1, 2, 3]])
+    joints = rig.mean_adult_joints()[None]
+    assert 0.55 < (constraints.mass_center(joints)[0, 2] + 0.97) / 1.70 < 0.61
+    np.testing.assert_allclose(
+        constraints.mass_center(joints + [1.0, 2, 3]) - constraints.mass_center(joints), [[1, 2, 3]]
+    )
 
 
 def test_what_does_not_slide_carries_the_body():
@@ -431,11 +432,11 @@ def test_what_does_not_slide_carries_the_body():
     t = np.linspace(0, 1, 11)
     planted = np.stack([0.3 - t, 0.1 + 0 * t, -1 + 0 * t], -1)
     swinging = np.stack([t, -0.1 + 0 * t, -0.9 + 0 * t], -1)
-    way = contact.planted_way(np.stack([planted, swinging], 1)[None])
+    way = constraints.planted_way(np.stack([planted, swinging], 1)[None])
     np.testing.assert_allclose(way[0], np.stack([t, 0 * t, 0 * t], -1), atol=1e-4)
     # the ground is under the lowest vertex
-    np.testing.assert_allclose(contact.ground_offset(np.array([-0.9, -0.8]), np.array([0.0, 0.03])), [0.9, 0.83])
-    assert contact.ground_offset(-0.97) == 0.97
+    np.testing.assert_allclose(constraints.ground_offset(np.array([-0.9, -0.8]), np.array([0.0, 0.03])), [0.9, 0.83])
+    assert constraints.ground_offset(-0.97) == 0.97
 
 
 # self-collision
@@ -452,7 +453,7 @@ def segment_distance_reference(a, b, steps=400):
 @given(seed=st.integers(0, 2**32 - 1))
 def test_distances_of_segments(seed):
     a, b = np.random.default_rng(seed).normal(size=(2, 2, 3))
-    fast = contact._segment_distance(a[None].astype(np.float32), b[None].astype(np.float32))[0]
+    fast = constraints._segment_distance(a[None].astype(np.float32), b[None].astype(np.float32))[0]
     assert abs(fast - segment_distance_reference(a, b)) < 0.02
 
 

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from walkers import piece_volumes
 
 from lidarpose.body.pose_prior.activities import KINDS
-from lidarpose.body.rig import load_rig
-from lidarpose.body.shape import sample_people
+from lidarpose.body.rig import load_rig, sample_people
 from lidarpose.geometry import rotation_about
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import draw_bodies

@@ -15,8 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lidarpose.body.pose_prior.sampling import sample_rotations
-from lidarpose.body.rig import load_rig, pose_bodies
-from lidarpose.body.shape import sample_people
+from lidarpose.body.rig import load_rig, pose_bodies, sample_people
 from lidarpose.geometry import rotation_about
 from lidarpose.lidar.raycast import cast_ray_list
 from lidarpose.skeleton import BODY26, WAYMO14

@@ -11,11 +11,17 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose.body.mocap.motion import load_clips
-from lidarpose.body.mocap.retarget import retarget_positions, rotation_vector, without_yaw
-from lidarpose.body.pose_prior.activities import ANGLE_INDEX
-from lidarpose.body.pose_prior.joint_angles import EULER_FROM_ANGLES, collar_lift, shoulder_angles, shoulder_matrix
-from lidarpose.body.pose_prior.mixture import LOWER, SHOULDERS, hanging_arm
-from lidarpose.geometry import rotation_about
+from lidarpose.body.mocap.retarget import retarget_positions
+from lidarpose.body.pose_prior.activities import (
+    ANGLE_INDEX,
+    EULER_FROM_ANGLES,
+    collar_lift,
+    shoulder_angles,
+    shoulder_matrix,
+)  # fmt: skip
+from lidarpose.body.pose_prior.latents import LOWER, SHOULDERS, hanging_arm
+from lidarpose.body.rig import without_yaw
+from lidarpose.geometry import rotation_about, rotation_vector
 from lidarpose.skeleton import SMPL24
 
 _LIFT_STEPS = 6  # fixed-point steps that take the collar's share out of the upper arm
@@ -25,7 +31,7 @@ _SHRINK = 0.1  # share of the pooled covariance in each component's
 
 
 def angles_from_rotations(rotations: np.ndarray) -> np.ndarray:
-    """The inverse of `joint_angles.rotations_from_angles`: the angles (n, 27), degrees, nearest to local rotations
+    """The inverse of `activities.rotations_from_angles`: the angles (n, 27), degrees, nearest to local rotations
     (n, 24, 3, 3).
 
     What the angles cannot express is dropped: turns of wrists and hands, unlike shares of the spine's joints, and of
@@ -45,7 +51,7 @@ def angles_from_rotations(rotations: np.ndarray) -> np.ndarray:
 
 
 def to_features(rotations: np.ndarray) -> np.ndarray:
-    """Local rotations (n, 24, 3, 3) -> the mixture's features (n, 27): the inverse of `mixture.from_features`."""
+    """Local rotations (n, 24, 3, 3) -> the mixture's features (n, 27): the inverse of `latents.from_features`."""
     features = angles_from_rotations(rotations)
     for part, sign in SHOULDERS:
         features[:, part] = np.degrees(rotation_vector(shoulder_matrix(features[:, part], sign) @ hanging_arm(sign).T))

@@ -25,8 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose.body.mocap import load_motion
-from lidarpose.body.mocap.retarget import mean_adult_joints
-from lidarpose.body.rig import forward_kinematics
+from lidarpose.body.rig import forward_kinematics, mean_adult_joints
 from lidarpose.errors import InputError
 from lidarpose.io.files import write_atomic
 from lidarpose.skeleton import SMPL24

@@ -12,6 +12,7 @@ RENAMED = {
     "body.clips": "body.mocap.motion",
     "body.motion": "body.pose_prior.sampling",
     "body.retarget": "body.mocap.retarget",
+    "body.shape": "body.rig",
     "body.sources": "body.mocap",
     "evaluate": "eval",
     "evaluate.metrics": "metrics",

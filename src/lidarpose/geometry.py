@@ -23,6 +23,15 @@ def axis_angle_to_matrix(vector: np.ndarray) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
 
 
+def rotation_vector(matrix: np.ndarray) -> np.ndarray:
+    """The inverse of `axis_angle_to_matrix` for angles under pi. (..., 3, 3) -> (..., 3) rad."""
+    m = np.asarray(matrix)
+    skew = np.stack([m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], -1)
+    sine = np.linalg.norm(skew, axis=-1, keepdims=True) / 2
+    angle = np.arctan2(sine, (np.trace(m, axis1=-2, axis2=-1)[..., None] - 1) / 2)
+    return unit(skew) * angle
+
+
 def rotation_about(axis: str, angle: np.ndarray | float) -> np.ndarray:
     """Rotation by `angle` (...) radians about the axis "x", "y" or "z", right-handed. Returns (..., 3, 3)."""
     angle = np.asarray(angle, float)

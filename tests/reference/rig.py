@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from lidarpose.body.rig import forward_kinematics
-from lidarpose.body.shape import FOLD_GAIN
+from lidarpose.body.rig import FOLD_GAIN, forward_kinematics
 from lidarpose.skeleton import BODY26, SMPL24
 
 HEAD = SMPL24.index("head")

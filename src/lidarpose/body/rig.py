@@ -1,4 +1,4 @@
-"""The shipped body: a mesh with SMPL's joint tree, its shapes, and how a pose moves it.
+"""The shipped body: a mesh with SMPL's joint tree, how a pose moves it, the shapes of a street's people, their clothes.
 
 The rest pose is a T-pose that faces +x: arms along +-y with the palms down, legs down, feet along +x, and the pelvis
 at the origin. All bone frames are the level frame (x forward, y left, z up) at rest, so a pose is 24 local rotations
@@ -7,6 +7,10 @@ R_j and the position of the pelvis:
     G_j = G_parent @ R_j        p_j = p_parent + G_parent @ (rest_j - rest_parent)
 
 Flexing a hip (thigh forwards) is a negative rotation about y, flexing a knee a positive one.
+
+Shapes of people come from the rig's table of sampled people. The table's source has too many thin adults, so rows are
+drawn with weights that bring heights and BMI near those of real adults, then mixed with a similar row so that no two
+people are the same.
 
 n people, V vertices, F faces, S shape coefficients. Lengths in meters.
 """
@@ -18,7 +22,26 @@ from importlib import resources
 
 import numpy as np
 
-from lidarpose.skeleton import SMPL24
+from lidarpose.geometry import rotation_about
+from lidarpose.skeleton import BODY26, SMPL24
+
+CHILD_SHARE = 0.12
+ADULT_AGE = 18.0
+
+# adult stature (mean, deviation) in m: chosen a little below US means, for streets of several continents
+HEIGHT = {"male": (1.74, 0.075), "female": (1.615, 0.070)}
+# adult BMI, log-normal (median in kg/m2, deviation of the logarithm): chosen, 5th to 95th percentile about 18 to 33
+BMI = {"male": (25.0, 0.16), "female": (24.5, 0.19)}
+# streets see fewer of the old (chosen): full share until 60 years, 40 % at 80
+OLD_FROM, OLD_TO, OLD_SHARE = 60.0, 80.0, 0.4
+# no row of the table is drawn more often than this many times its equal share
+WEIGHT_CAP = 6.0
+# a person is a row of the table mixed with one of its nearest rows, the first counting at least half
+NEIGHBORS = 8
+
+MAX_CLOTHING = 0.04
+# how much a wave of folds thickens cloth
+FOLD_GAIN = np.float32(0.18)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,6 +142,29 @@ def forward_kinematics(
     return global_rotations, positions
 
 
+def heading(rotations: np.ndarray) -> np.ndarray:
+    """Yaw (n,) rad of poses (n, 24, 3, 3): the part of the root's rotation that is about z (swing-twist)."""
+    root = rotations[:, 0]
+    return np.arctan2(root[:, 1, 0] - root[:, 0, 1], root[:, 0, 0] + root[:, 1, 1])
+
+
+def without_yaw(rotations: np.ndarray) -> np.ndarray:
+    """The same poses (n, 24, 3, 3) with the root turned about z so that they face +x: `heading` is 0."""
+    rotations = np.array(rotations)
+    rotations[:, 0] = rotation_about("z", -heading(rotations)) @ rotations[:, 0]
+    return rotations
+
+
+@cache
+def mean_adult_joints() -> np.ndarray:
+    """(24, 3) m: the joints of the shipped body's mean adult in the T-pose, SMPL's order; read-only."""
+    rig = load_rig()
+    mean = rig.coefficients[rig.age >= ADULT_AGE].mean(0, keepdims=True)
+    joints = rig.rest(mean).joints[0, : len(SMPL24)].astype(float)
+    joints.flags.writeable = False
+    return joints
+
+
 def pose_bodies(
     rig: Rig, rest: RestBody, rotations: np.ndarray, translation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -142,3 +188,138 @@ def pose_bodies(
         rest.vertices, rest.joints, rotations, translation, rig.parents, rig.weight_index, rig.weight, vertices, joints
     )
     return vertices, joints
+
+
+@dataclass(frozen=True, kw_only=True)
+class People:
+    """n people: coefficients (n, S) float32 for `Rig.rest`, sex (n,) "female" or "male", age (n,) years, height (n,) m,
+    bmi (n,) kg/m2."""
+
+    coefficients: np.ndarray
+    sex: np.ndarray
+    age: np.ndarray
+    height: np.ndarray
+    bmi: np.ndarray
+
+
+def sample_people(rng: np.random.Generator, n: int) -> People:
+    """Draws n people: 88 % adults of 18 to 80 years, 12 % children of 4 to 18, half of them female."""
+    rig = load_rig()
+    probability, neighbors = _sampling_table()
+    first = rng.choice(len(probability), size=n, p=probability)
+    second = neighbors[first, rng.integers(0, neighbors.shape[1], n)]
+    share = rng.uniform(0.0, 0.5, n).astype(np.float32)
+
+    def mix(table: np.ndarray) -> np.ndarray:
+        s = share.reshape(-1, *[1] * (table.ndim - 1))
+        return (1 - s) * table[first] + s * table[second]
+
+    return People(
+        coefficients=mix(rig.coefficients),
+        sex=rig.sex[first],
+        age=mix(rig.age),
+        height=mix(rig.height),
+        bmi=mix(rig.bmi),
+    )
+
+
+@cache
+def _sampling_table() -> tuple[np.ndarray, np.ndarray]:
+    """Probability (N,) of each row of the rig's table, and its nearest rows (N, NEIGHBORS) of the same sex."""
+    rig = load_rig()
+    adult, log_bmi = rig.age >= ADULT_AGE, np.log(rig.bmi)
+    weight = np.where(adult, np.interp(rig.age, [OLD_FROM, OLD_TO], [1.0, OLD_SHARE]), 1.0)
+    neighbors = np.empty((len(weight), NEIGHBORS), int)
+    for sex in ("male", "female"):
+        for is_adult, share, years in ((True, 1 - CHILD_SHARE, 15), (False, CHILD_SHARE, 3)):
+            rows = np.flatnonzero((rig.sex == sex) & (adult == is_adult))
+            if is_adult:
+                median, spread = BMI[sex]
+                weight[rows] *= _density_ratio(rig.height[rows], *HEIGHT[sex])
+                weight[rows] *= _density_ratio(log_bmi[rows], np.log(median), spread)
+            weight[rows] = np.minimum(weight[rows], WEIGHT_CAP * weight[rows].mean())
+            weight[rows] *= share / 2 / weight[rows].sum()
+            # one unit each: 5 cm, 10 % of BMI, 15 years (3 for children, who change faster)
+            features = np.stack([rig.height[rows] / 0.05, log_bmi[rows] / 0.1, rig.age[rows] / years], -1)
+            distance = ((features[:, None] - features) ** 2).sum(-1)
+            np.fill_diagonal(distance, np.inf)
+            neighbors[rows] = rows[np.argsort(distance, 1)[:, :NEIGHBORS]]
+    return weight / weight.sum(), neighbors
+
+
+def _density_ratio(value: np.ndarray, mean: float, spread: float) -> np.ndarray:
+    """Density of a normal distribution over that of the normal distribution fitted to `value`."""
+    target = (value - mean) / spread
+    fitted = (value - value.mean()) / value.std()
+    return np.exp((fitted**2 - target**2) / 2)
+
+
+def clothing(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Draws clothes: how far clothes, hair and shoes stand off the skin along its normals, smooth over the body.
+
+    A torso's mean is about 1.5 cm; a tenth of the people wear next to nothing, a tenth bulky coats; hands and faces
+    stay bare but for a few gloves.
+
+    Returns:
+        (n, V) float32 m in [0, `MAX_CLOTHING`].
+
+    Raises:
+        ModuleNotFoundError: without numba.
+    """
+    from lidarpose.body.rig_kernels import fold_clothing
+
+    dense, scalp, template = _regions()
+    offset = _outfit(rng, n) @ dense.T
+    hair = rng.uniform(0.0, 0.03, (n, 1)) + rng.choice([0.0, 0.012], (n, 1), p=[0.8, 0.2])
+    offset += hair.astype(np.float32) * scalp
+    # folds: a few waves of 15 to 60 cm length that thicken and thin the cloth by about a quarter
+    waves = 4
+    direction = rng.normal(size=(n, waves, 3))
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True) * rng.uniform(0.15, 0.6, (n, waves, 1))
+    phase = rng.random((n, waves))
+    fold_clothing(template, direction.astype(np.float32), phase.astype(np.float32), FOLD_GAIN, offset)
+    return np.clip(offset, 0, MAX_CLOTHING)
+
+
+@cache
+def _regions() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Dense weights (V, 24), hair's share of each vertex (V,), and the mean body's vertices (V, 3)."""
+    rig = load_rig()
+    dense = rig.dense_weight
+    from_center = rig.template - rig.joint_template[BODY26.index("head_center")]
+    # hair: above and behind a plane that rises forwards from below the ears to the brow, 4 cm of transition
+    behind = from_center @ np.array([-0.6, 0.0, 0.8], np.float32)
+    scalp = np.clip(behind / 0.04 + 0.5, 0, 1) * dense[:, SMPL24.index("head")]
+    return dense, scalp.astype(np.float32), rig.template
+
+
+def _outfit(rng: np.random.Generator, n: int) -> np.ndarray:
+    """(n, 24) float32 m: what a person wears on each joint's part of the body."""
+    top = _pick(rng, n, [0.12, 0.40, 0.36, 0.12], [(0.0, 0.005), (0.006, 0.018), (0.014, 0.028), (0.026, 0.038)])
+    thick = top > 0.014
+    sleeve = top * np.where(thick | (rng.random(n) < 0.4), rng.uniform(0.5, 0.9, n), 0.0)
+    leg_kind = rng.choice(4, size=n, p=[0.22, 0.52, 0.13, 0.13])
+    tight, shorts, skirt = leg_kind == 0, leg_kind == 2, leg_kind == 3
+    thigh = np.select(
+        [tight, skirt], [rng.uniform(0.001, 0.006, n), rng.uniform(0.015, 0.035, n)], rng.uniform(0.008, 0.02, n)
+    )
+    shank = np.select([tight, shorts, skirt], [thigh, 0.0, 0.0], thigh * rng.uniform(0.8, 1.4, n))
+    shank = np.where(skirt & (rng.random(n) < 0.3), thigh, shank)
+    # long coats reach over the thighs
+    thigh = np.where((top > 0.024) & (rng.random(n) < 0.6), np.maximum(thigh, 0.9 * top), thigh)
+    neck = np.where(rng.random(n) < 0.15, rng.uniform(0.01, 0.03, n), 0.3 * top)
+    glove = np.where(thick & (rng.random(n) < 0.2), rng.uniform(0.002, 0.006, n), 0.0)
+    shoe = rng.uniform(0.004, 0.014, n)
+    worn = {
+        "pelvis": np.maximum(0.9 * top, 0.8 * thigh), "hip": thigh, "knee": shank, "ankle": shoe, "foot": shoe,
+        "spine1": 1.05 * top, "spine2": top, "spine3": 0.9 * top, "neck": neck, "collar": 0.8 * top,
+        "shoulder": np.maximum(0.75 * top, sleeve), "elbow": sleeve, "wrist": glove, "hand": glove,
+    }  # fmt: skip
+    bare = np.zeros(n)
+    return np.stack([worn.get(name.split("_")[-1], bare) for name in SMPL24.joints], -1).astype(np.float32)
+
+
+def _pick(rng: np.random.Generator, n: int, shares: list[float], ranges: list[tuple[float, float]]) -> np.ndarray:
+    """(n,) values, uniform within one of the ranges, which are chosen by their shares."""
+    low, high = np.array(ranges)[rng.choice(len(shares), size=n, p=shares)].T
+    return rng.uniform(low, high)

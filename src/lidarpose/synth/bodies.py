@@ -8,12 +8,10 @@ import numpy as np
 
 from lidarpose.body.mocap import load_motion
 from lidarpose.body.mocap.motion import Motion, facing_x
-from lidarpose.body.mocap.retarget import mean_adult_joints
 from lidarpose.body.pose_prior.activities import KINDS
-from lidarpose.body.pose_prior.contact import ground_offset
+from lidarpose.body.pose_prior.constraints import ground_offset
 from lidarpose.body.pose_prior.sampling import sample_clips, sample_rotations
-from lidarpose.body.rig import RestBody, load_rig, pose_bodies
-from lidarpose.body.shape import clothing, sample_people
+from lidarpose.body.rig import RestBody, clothing, load_rig, mean_adult_joints, pose_bodies, sample_people
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.geometry import axis_angle_to_matrix, rotation_about
 from lidarpose.skeleton import SMPL24

@@ -16,10 +16,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from lidarpose.body.mocap.asf_amc import load_amc
-from lidarpose.body.mocap.bvh import load_bvh
-from lidarpose.body.mocap.joint_positions import load_clip_positions
 from lidarpose.body.mocap.motion import Motion, join
+from lidarpose.body.mocap.retarget import load_clip_positions
+from lidarpose.body.mocap.skeleton_files import load_amc, load_bvh
 from lidarpose.body.mocap.smpl_poses import load_amass, load_lidarhuman26m, load_sloper4d, pose_files
 from lidarpose.errors import check_name
 from lidarpose.geometry import UP_AXES

@@ -10,12 +10,13 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from lidarpose.body.mocap.joint_positions import motion_from_joints
 from lidarpose.body.mocap.motion import Motion, usable_clips
-from lidarpose.body.mocap.retarget import mean_adult_joints
+from lidarpose.body.mocap.retarget import motion_from_joints
+from lidarpose.body.rig import mean_adult_joints
 from lidarpose.geometry import rotation_about, unit
 from lidarpose.io.files import file_error
 from lidarpose.skeleton import SMPL24
@@ -54,25 +55,40 @@ _SIDES = ("left_", "right_")
 END = " (end)"
 
 
-@dataclass(frozen=True, kw_only=True)
-class JointTree:
-    """N joints of a file, parents before children, in its own unit and axes.
+@dataclass(kw_only=True)
+class Joint:
+    """A joint of a file, in the file's unit and axes.
 
-    names (N,); parents (N,), -1 for the root; offsets (N, 3): from the parent's place, in the parent's axes; bones
-    (N, 3): added to that, in the joint's own axes; axes (N, 3, 3): the axes that the joint's channels turn about;
-    channels (N,): what a frame's numbers are in order, "tx", "ty", "tz" for translations, "rx", "ry", "rz" for
-    rotations; fixed_axes: later rotations of a joint turn about axes that stay (ASF), not about turned ones (BVH);
-    degrees: unit of the rotations.
+    parent: its place in the tree's list, -1 for the root; offset (3,): from the parent's place, in the parent's axes;
+    channels: what a frame's numbers are in order, "tx", "ty", "tz" for translations, "rx", "ry", "rz" for rotations;
+    bone (3,): added to the offset, in the joint's own axes; axes (3, 3): those that the channels turn about. With
+    axes, later rotations turn about axes that stay (ASF), without about turned ones (BVH).
     """
 
-    names: Sequence[str]
-    parents: Sequence[int]
-    offsets: np.ndarray
-    channels: Sequence[Sequence[str]]
-    bones: np.ndarray | None = None
+    name: str
+    parent: int = -1
+    offset: Any = None
+    channels: Sequence[str] = ()
+    bone: np.ndarray | None = None
     axes: np.ndarray | None = None
-    fixed_axes: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointTree:
+    """N joints, parents before children; degrees: unit of their rotations."""
+
+    joints: Sequence[Joint]
     degrees: bool = True
+
+    @property
+    def names(self) -> list[str]:
+        """(N,), of the joints."""
+        return [joint.name for joint in self.joints]
+
+    @property
+    def parents(self) -> list[int]:
+        """(N,), -1 for the root."""
+        return [joint.parent for joint in self.joints]
 
     def positions(self, values: np.ndarray) -> np.ndarray:
         """Joints (F, N, 3) of frames of channels (F, C), C those of all joints in order; NaN in frames with values
@@ -82,28 +98,26 @@ class JointTree:
         count = int(finite.sum())
         rotations: list[np.ndarray] = []
         places: list[np.ndarray] = []
-        for j, parent in enumerate(self.parents):
+        for joint in self.joints:
             rotation = np.broadcast_to(np.eye(3), (count, 3, 3))
-            offset = np.repeat(self.offsets[j][None], count, 0)
-            for channel in self.channels[j]:
-                kind, axis = channel[0], channel[1]
-                value = next(columns)
+            offset = np.repeat(joint.offset[None], count, 0)
+            for (kind, axis), value in zip(joint.channels, columns, strict=False):
                 if kind == "t":
                     offset[:, "xyz".index(axis)] += value
                     continue
                 turn = rotation_about(axis, np.radians(value) if self.degrees else value)
-                rotation = turn @ rotation if self.fixed_axes else rotation @ turn
-            if self.axes is not None:
-                rotation = self.axes[j] @ rotation @ self.axes[j].T
+                rotation = rotation @ turn if joint.axes is None else turn @ rotation
+            if joint.axes is not None:
+                rotation = joint.axes @ rotation @ joint.axes.T
             with np.errstate(over="ignore", invalid="ignore"):
-                if parent >= 0:
-                    offset = (rotations[parent] @ offset[..., None])[..., 0]
-                    rotation = rotations[parent] @ rotation
-                if self.bones is not None:
-                    offset = rotation @ self.bones[j] + offset
-                places.append(places[parent] + offset if parent >= 0 else offset)
+                if joint.parent >= 0:
+                    offset = (rotations[joint.parent] @ offset[..., None])[..., 0]
+                    rotation = rotations[joint.parent] @ rotation
+                if joint.bone is not None:
+                    offset = rotation @ joint.bone + offset
+                places.append(places[joint.parent] + offset if joint.parent >= 0 else offset)
             rotations.append(rotation)
-        positions = np.full((len(values), len(self.parents), 3), np.nan)
+        positions = np.full((len(values), len(self.joints), 3), np.nan)
         positions[finite] = np.stack(places, 1)
         return positions
 
@@ -137,18 +151,6 @@ def tree_motion(
     with np.errstate(over="ignore", invalid="ignore"):
         joints[finite] = smpl_joints(tree.parents, matched, positions[finite])
     return motion_from_joints(path, joints, [name], [len(finite)], fps=fps, up=up, kind=kind, unit_m=unit_m)
-
-
-def parse_numbers(path: object, what: str, words: Sequence[str], count: int | None = None) -> np.ndarray:
-    """Words of a text file as floats, finite ones where a count is given. Raises InputError naming `what`."""
-    try:
-        numbers = np.array(words, float)
-    except ValueError:
-        numbers = np.zeros(0)
-    if not len(numbers) or (count is not None and (len(numbers) != count or not np.isfinite(numbers).all())):
-        expected = f"{count} finite numbers" if count else "numbers"
-        raise file_error(path, f"{what} must be {expected}, got {' '.join(words)[:60]!r}")
-    return numbers
 
 
 def match_joints(path: object, names: Sequence[str], parents: Sequence[int]) -> dict[str, int]:

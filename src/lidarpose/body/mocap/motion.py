@@ -12,9 +12,9 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from lidarpose.body.mocap.retarget import heading, rotation_vector, without_yaw
+from lidarpose.body.rig import heading, without_yaw
 from lidarpose.errors import InputError
-from lidarpose.geometry import axis_angle_to_matrix, rotation_about
+from lidarpose.geometry import axis_angle_to_matrix, rotation_about, rotation_vector
 from lidarpose.io.files import file_error, read_npz
 from lidarpose.skeleton import SMPL24
 
@@ -29,11 +29,10 @@ _UPRIGHT = 0.7
 
 @dataclass(frozen=True, kw_only=True)
 class _ClipTable:
-    """F frames of several clips: clip c, named names[c], is the frames start[c] to start[c] + length[c], one every
+    """F frames of several clips, one clip after the other: clip c is named names[c] and has length[c] frames, one every
     1 / fps s."""
 
     names: tuple[str, ...]
-    start: np.ndarray
     length: np.ndarray
     fps: float
 
@@ -41,29 +40,24 @@ class _ClipTable:
     ROWS: ClassVar[dict[str, tuple[int, ...]]]
 
     def __post_init__(self):
-        arrays = {name: getattr(self, name) for name in self.ROWS}
-        frames = len(next(iter(arrays.values())))
-        for name, array in arrays.items():
-            if array.shape != (frames, *self.ROWS[name]):
-                wanted = ", ".join(map(str, self.ROWS[name]))
+        frames = int(self.length.sum())
+        for name, shape in self.ROWS.items():
+            array = getattr(self, name)
+            if array.shape != (frames, *shape):
+                wanted = ", ".join(map(str, shape))
                 raise InputError(f"{name} must be (frames, {wanted}), {frames} frames, got {array.shape}")
             if not np.isfinite(array).all():
                 raise InputError(f"{name} must be finite; drop the frames that are not")
-        for name in ("start", "length"):
-            value = getattr(self, name)
-            if value.shape != (len(self),) or value.dtype.kind not in "iu":
-                expected = f"one whole number a clip, ({len(self)})"
-                raise InputError(f"clip_{name} needs {expected}, got {value.dtype} {value.shape}")
-            # in narrow or unsigned numbers an end could overflow
-            object.__setattr__(self, name, value.astype(np.int64))
-        ends = self.start + self.length
-        if len(ends) and (min(self.start.min(), self.length.min()) < 0 or ends.max() > frames):
-            raise InputError(f"clips must lie inside the {frames} frames, got up to frame {ends.max()}")
         if not 0 < self.fps < np.inf:
             raise InputError(f"fps must be frames a second, above 0, got {self.fps}")
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def start(self) -> np.ndarray:
+        """(C,): the clips' first frames."""
+        return np.cumsum(self.length) - self.length
 
     def frames(self, clip: int) -> slice:
         """The frames of one clip, to cut the arrays with."""
@@ -77,14 +71,11 @@ class _ClipTable:
             if not any(_is_of(name, subject) for name in self.names):
                 known = ", ".join(sorted({name.partition("_")[0] for name in self.names}))
                 raise InputError(f"no clip starts with {subject!r}: there are {known}")
-        chosen = [c for c, name in enumerate(self.names) if any(_is_of(name, subject) for subject in subjects)]
-        length = self.length[chosen]
-        arrays: dict[str, Any] = {
-            name: np.concatenate([getattr(self, name)[:0], *(getattr(self, name)[self.frames(c)] for c in chosen)])
-            for name in self.ROWS
-        }
-        names = tuple(self.names[c] for c in chosen)
-        return replace(self, **arrays, names=names, start=np.cumsum(length) - length, length=length)
+        chosen = np.array([any(_is_of(name, subject) for subject in subjects) for name in self.names], bool)
+        rows = np.repeat(chosen, self.length)
+        arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in self.ROWS}
+        names = tuple(name for name, is_chosen in zip(self.names, chosen, strict=True) if is_chosen)
+        return replace(self, **arrays, names=names, length=self.length[chosen])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,19 +111,18 @@ class Motion(_ClipTable):
             return self
         # the small number keeps the last frame where rounding would lose it, as from 30 to 10 frames a second
         length = np.array([int((n - 1) / self.fps * hz + 1e-6) + 1 if n else 0 for n in self.length.tolist()], int)
-        when = [c + np.arange(n) * (self.fps / hz) for c, n in zip(self.start, length, strict=True)]
-        last = np.repeat(self.start + np.maximum(self.length, 1) - 1, length)
+        when = [s + np.arange(n) * (self.fps / hz) for s, n in zip(self.start, length, strict=True)]
+        last = np.repeat(self.start + self.length - 1, length)
         rotations, translation = self._between(np.concatenate([*when, np.zeros(0)]), last)
-        start = np.cumsum(length) - length
-        return replace(self, rotations=rotations, translation=translation, start=start, length=length, fps=float(hz))
+        return replace(self, rotations=rotations, translation=translation, length=length, fps=float(hz))
 
     def windows(self, frames: int) -> np.ndarray:
         """Which frames make clips of `frames`: (n, frames) int, none across the end of a clip.
 
         `motion.rotations[motion.resampled(10).windows(16)]` would mix rates: cut the motion that was resampled.
         """
-        first = [s + np.arange(0, n - frames + 1) for s, n in zip(self.start, self.length, strict=True)]
-        return np.concatenate([*first, np.zeros(0, int)]).astype(int)[:, None] + np.arange(frames)
+        frame, last = self._last_frames()
+        return frame[frame + frames - 1 <= last, None] + np.arange(frames)
 
     def pairs(self, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """All poses that have one `dt` >= 0 seconds later in their clip, with that one.
@@ -141,17 +131,19 @@ class Motion(_ClipTable):
             The poses (n, 24, 3, 3), facing +x; those `dt` later (n, 24, 3, 3) and the way of the pelvis until then
             (n, 3) m, both in the axes of the first; float32.
         """
-        spans = [np.arange(s, s + n) for s, n in zip(self.start, self.length, strict=True)]
-        frame = np.concatenate([*spans, np.zeros(0, int)]).astype(int)
-        ends = np.repeat(self.start + self.length - 1, self.length)
-        has_later = frame + dt * self.fps <= ends + 1e-6
-        frame, ends = frame[has_later], ends[has_later]
-        later, translation = self._between(frame + dt * self.fps, ends)
+        frame, last = self._last_frames()
+        has_later = frame + dt * self.fps <= last + 1e-6
+        frame, last = frame[has_later], last[has_later]
+        later, translation = self._between(frame + dt * self.fps, last)
         first = self.rotations[frame]
         unyaw = rotation_about("z", -heading(first))
         step = (unyaw @ (translation - self.translation[frame])[..., None])[..., 0]
         later[:, 0] = unyaw @ later[:, 0]
         return without_yaw(first), later, step.astype(np.float32)
+
+    def _last_frames(self) -> tuple[np.ndarray, np.ndarray]:
+        """All frames (F,), and the last one (F,) of the clip that each is in."""
+        return np.arange(len(self.rotations)), np.repeat(self.start + self.length - 1, self.length)
 
     def _between(self, when: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rotations (n, 24, 3, 3) and translation (n, 3) at frames `when` (n,), not whole, up to their clip's last."""
@@ -163,7 +155,7 @@ class Motion(_ClipTable):
         mixed = np.flatnonzero(share[:, 0])
         for block in np.array_split(mixed, len(mixed) // _BLOCK + 1):
             a, b = self.rotations[frame[block]].astype(float), self.rotations[after[block]].astype(float)
-            turn = rotation_vector((np.swapaxes(a, -1, -2) @ b).reshape(-1, 3, 3)).reshape(-1, 24, 3)
+            turn = rotation_vector(np.swapaxes(a, -1, -2) @ b)
             rotations[block] = a @ axis_angle_to_matrix(share[block, None] * turn)
             translation[block] += share[block] * (self.translation[after[block]] - translation[block])
         return rotations, translation
@@ -172,12 +164,10 @@ class Motion(_ClipTable):
 def join(motions: Sequence[Motion], *, source: str) -> Motion:
     """All clips of one or more motions, at the lowest of their rates."""
     motions = [motion.resampled(min(m.fps for m in motions)) for motion in motions]
-    before = np.cumsum([0] + [len(m.rotations) for m in motions[:-1]])
     return Motion(
         rotations=np.concatenate([m.rotations for m in motions]),
         translation=np.concatenate([m.translation for m in motions]),
         names=tuple(name for m in motions for name in m.names),
-        start=np.concatenate([m.start + b for m, b in zip(motions, before, strict=True)]),
         length=np.concatenate([m.length for m in motions]),
         fps=motions[0].fps,
         source=source,
@@ -197,24 +187,36 @@ def facing_x(rotations: np.ndarray, translation: np.ndarray) -> tuple[np.ndarray
 
 def load_clips(path: str | PathLike) -> Clips:
     """Reads a clips file (its layout is at the top of this module). Raises InputError where it is another."""
-    stored, names = read_npz(path, (*_KEYS, "joint_names"), expected="an npz file of clips")
+    stored, _ = read_npz(path, (*_KEYS, "joint_names"), expected="an npz file of clips")
     missing = [key for key in _KEYS if key not in stored]
     if missing:
         raise file_error(path, f"clips need {', '.join(_KEYS)}; {', '.join(missing)} is missing")
+    joints, clip, start, length, fps = (stored[key] for key in _KEYS)
     order = stored.get("joint_names")
     if order is not None and tuple(map(str, np.ravel(order))) != SMPL24.joints:
         raise file_error(path, f"joint_names must be SMPL's 24 in SMPL's order, got {', '.join(map(str, order))}")
-    if stored["fps"].size != 1 or stored["fps"].dtype.kind not in "iuf":
-        raise file_error(path, f"fps must be one number, got {stored['fps'].tolist()}")
-    if stored["joints"].dtype.kind not in "iuf":
-        raise file_error(path, f"joints must be numbers, got {stored['joints'].dtype}")
+    if fps.size != 1 or fps.dtype.kind not in "iuf":
+        raise file_error(path, f"fps must be one number, got {fps.tolist()}")
+    if joints.dtype.kind not in "iuf" or joints.shape[1:] != (24, 3):
+        raise file_error(path, f"joints must be numbers (frames, 24, 3), got {joints.dtype} {joints.shape}")
+    for key, value in (("clip_start", start), ("clip_length", length)):
+        if value.shape != (clip.size,) or value.dtype.kind not in "iu":
+            raise file_error(
+                path, f"{key} needs one whole number a clip, ({clip.size}), got {value.dtype} {value.shape}"
+            )
+    # in narrow or unsigned numbers an end could overflow
+    start, length = start.astype(np.int64), length.astype(np.int64)
+    if ((start < 0) | (length < 0) | (start > len(joints) - length)).any():
+        inside = f"inside the {len(joints)} frames, got up to frame {(start + length).max()}"
+        raise file_error(path, f"clips must lie {inside}")
+    spans = [np.arange(s, s + n) for s, n in zip(start, length, strict=True)]
+    frames = np.concatenate([*spans, np.zeros(0, int)]).astype(int)
     try:
         return Clips(
-            joints=stored["joints"].astype(np.float32),
-            names=tuple(map(str, np.ravel(stored["clip"]))),
-            start=stored["clip_start"],
-            length=stored["clip_length"],
-            fps=float(stored["fps"].item()),
+            joints=joints.astype(np.float32)[frames],
+            names=tuple(map(str, np.ravel(clip))),
+            length=length,
+            fps=float(fps.item()),
         )
     except InputError as error:
         raise file_error(path, error) from None
@@ -249,7 +251,7 @@ def usable_clips(
         number: (F,) the frames' numbers in the recording, by default without gaps.
 
     Returns:
-        names, start and length of the clips among the good frames; a piece after the first is called NAME#2 and so on.
+        names and length of the clips among the good frames; a piece after the first is called NAME#2 and so on.
 
     Raises:
         InputError: Without frames, or where too large a share of a clip cannot be used.
@@ -270,8 +272,8 @@ def usable_clips(
             pieces.append((name if k == 0 else f"{name}#{k + 1}", int(piece)))
     if not pieces:
         raise file_error(path, "holds no frame of motion")
-    counts = np.array([count for _, count in pieces])
-    return {"names": tuple(name for name, _ in pieces), "start": np.cumsum(counts) - counts, "length": counts}
+    piece_names, counts = zip(*pieces, strict=True)
+    return {"names": piece_names, "length": np.array(counts)}
 
 
 def _is_of(name: str, subject: str) -> bool:

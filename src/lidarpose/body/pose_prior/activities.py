@@ -1,4 +1,5 @@
-"""The pose prior's tables as arrays: angles, activities and arms, from assets/pose_prior.toml, which documents them.
+"""The pose prior's tables as arrays, from assets/pose_prior.toml, which documents them; and the 27 angles of a pose
+(`ANGLES`) as rotations of the body's 24 bones.
 
 K kinds of activity, A kinds of arm. All angles are degrees.
 """
@@ -7,6 +8,9 @@ import tomllib
 from importlib import resources
 
 import numpy as np
+
+from lidarpose.geometry import rotation_about
+from lidarpose.skeleton import SMPL24
 
 TABLES = tomllib.loads(resources.files("lidarpose.body").joinpath("assets/pose_prior.toml").read_text("utf-8"))
 _ACTIVITIES, _ARMS = TABLES["activities"].values(), TABLES["arms"].values()
@@ -56,3 +60,111 @@ ARM_RANGES = np.array([[arm[name] for arm in _ARMS] for name in ("start", "end",
 # how fast people go to and fro between the ends of their range, rad/s, (K,) and (A,)
 KIND_PACE = np.array([activity.get("pace", 0.0) for activity in _ACTIVITIES])
 ARM_PACE = np.array([arm.get("pace", 0.0) for arm in _ARMS])
+
+_J = {name: i for i, name in enumerate(SMPL24.joints)}
+_SIDES = (("left", 1.0), ("right", -1.0))
+
+# scapulohumeral rhythm: over 45 degrees of elevation the collar takes part of the arm's angle
+_COLLAR_FROM, _COLLAR_SHARE = 45.0, 0.15
+_SHOULDERS = np.array([_J["left_shoulder"], _J["right_shoulder"]])
+_COLLAR_LIFTS = 3 * np.array([_J["left_collar"], _J["right_collar"]]) + 1
+_LIFT_SIGNS = np.array([1, -1], np.float32)
+_RAISED_OUT = np.array([[ANGLE_INDEX[f"{side}_raise"], ANGLE_INDEX[f"{side}_out"]] for side, _ in _SIDES])
+_INWARD = np.array([ANGLE_INDEX[f"{side}_in"] for side, _ in _SIDES])
+
+
+def rotations_from_angles(angles: np.ndarray) -> np.ndarray:
+    """angles (n, 27) degrees in the order of `ANGLES` -> local rotations (n, 24, 3, 3) float32."""
+    angles = np.asarray(angles, np.float32)
+    euler = angles @ EULER_FROM_ANGLES + _AT_ZERO
+    euler[:, _COLLAR_LIFTS] += _LIFT_SIGNS * collar_lift(angles[:, _RAISED_OUT])
+    rotations = _from_euler(np.radians(euler.reshape(len(angles), 24, 3)))
+    inward = np.radians(angles[:, _INWARD])
+    turn = np.zeros((len(angles), 2, 3, 3), np.float32)
+    turn[..., 0, 0] = turn[..., 2, 2] = np.cos(inward)
+    turn[..., 0, 2] = np.sin(inward)
+    turn[..., 2, 0] = -turn[..., 0, 2]
+    turn[..., 1, 1] = 1
+    rotations[:, _SHOULDERS] = rotations[:, _SHOULDERS] @ turn
+    return rotations
+
+
+def shoulder_angles(matrix: np.ndarray, sign: float) -> np.ndarray:
+    """Shoulder rotations (n, 3, 3), sign 1 for the left and -1 for the right -> (n, 3) degrees: raise, out, in."""
+    # R_y(-raise) R_x(sign (out - 90)) R_y(in): the middle row and column hold the angles
+    out = np.arcsin(np.clip(matrix[:, 1, 1], -1, 1))
+    raised = np.arctan2(sign * matrix[:, 0, 1], -sign * matrix[:, 2, 1])
+    inward = np.arctan2(-sign * matrix[:, 1, 0], sign * matrix[:, 1, 2])
+    return np.degrees(np.stack([raised, out, inward], -1))
+
+
+def shoulder_matrix(arm: np.ndarray, sign: float) -> np.ndarray:
+    """The inverse of `shoulder_angles`: arm (n, 3) degrees -> rotations (n, 3, 3)."""
+    raised, out, inward = np.radians(arm).T
+    return rotation_about("y", -raised) @ rotation_about("x", sign * (out - np.pi / 2)) @ rotation_about("y", inward)
+
+
+def collar_lift(arm: np.ndarray) -> np.ndarray:
+    """The collar's turn (...) degrees upwards, for an arm's raise and out (..., 2) degrees."""
+    elevation = np.degrees(np.arccos(np.clip(np.cos(np.radians(arm)).prod(-1), -1, 1)))
+    return _COLLAR_SHARE * np.clip(elevation - _COLLAR_FROM, 0, None)
+
+
+def _from_euler(euler: np.ndarray) -> np.ndarray:
+    """(..., 3) rad about y, x, z -> R_y R_x R_z (..., 3, 3): twist first, then sideways, then forward."""
+    (ca, cb, cc), (sa, sb, sc) = (np.moveaxis(f(euler), -1, 0) for f in (np.cos, np.sin))
+    matrix = np.empty(euler.shape + (3,), euler.dtype)
+    sbsc, sbcc = sb * sc, sb * cc
+    matrix[..., 0, 0] = ca * cc + sa * sbsc
+    matrix[..., 0, 1] = sa * sbcc - ca * sc
+    matrix[..., 0, 2] = sa * cb
+    matrix[..., 1, 0] = cb * sc
+    matrix[..., 1, 1] = cb * cc
+    matrix[..., 1, 2] = -sb
+    matrix[..., 2, 0] = ca * sbsc - sa * cc
+    matrix[..., 2, 1] = sa * sc + ca * sbcc
+    matrix[..., 2, 2] = ca * cb
+    return matrix
+
+
+def _euler_map() -> tuple[np.ndarray, np.ndarray]:
+    """The linear map from `ANGLES` to 24 x (y, x, z) Euler angles, (27, 72), and its value at zero (72,), degrees."""
+    matrix, zero = np.zeros((len(ANGLES), 24, 3), np.float32), np.zeros((24, 3), np.float32)
+    y, x, z = 0, 1, 2
+    # the joints that share angles about y, x and z, evenly
+    shared = {
+        ("tilt", "roll", "yaw"): ("pelvis",),
+        ("bend", "side", "twist"): ("spine1", "spine2", "spine3"),
+        ("nod", "neck_side", "neck_twist"): ("neck", "head"),
+    }
+    for names, joints in shared.items():
+        for axis, name in enumerate(names):
+            matrix[ANGLE_INDEX[name], [_J[joint] for joint in joints], axis] = 1 / len(joints)
+    for side, sign in _SIDES:
+        for name, joint, axis, gain in (
+            ("hip", "hip", y, -1), ("abd", "hip", x, sign), ("rot", "hip", z, sign), ("knee", "knee", y, 1),
+            ("ankle", "ankle", y, -1), ("raise", "shoulder", y, -1), ("out", "shoulder", x, sign),
+            ("elbow", "elbow", z, -sign),
+        ):  # fmt: skip
+            matrix[ANGLE_INDEX[f"{side}_{name}"], _J[f"{side}_{joint}"], axis] = gain
+        zero[_J[f"{side}_shoulder"], x] = -90 * sign  # from the T-pose to a hanging arm
+    return matrix.reshape(len(ANGLES), 72), zero.reshape(72)
+
+
+EULER_FROM_ANGLES, _AT_ZERO = _euler_map()
+
+
+def _mirror() -> tuple[np.ndarray, np.ndarray]:
+    other = {"left": "right_", "right": "left_"}
+    parts = [name.partition("_") for name in ANGLES]
+    index = [ANGLE_INDEX[other[a] + c if a in other else a + b + c] for a, b, c in parts]
+    odd = ("roll", "yaw", "side", "twist", "neck_side", "neck_twist")
+    return np.array(index), np.array([-1.0 if name in odd else 1.0 for name in ANGLES])
+
+
+_MIRROR_INDEX, _MIRROR_SIGN = _mirror()
+
+
+def mirror_angles(angles: np.ndarray) -> np.ndarray:
+    """Left and right exchanged. angles (n, 27) -> (n, 27)."""
+    return angles[:, _MIRROR_INDEX] * _MIRROR_SIGN

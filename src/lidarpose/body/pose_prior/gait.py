@@ -25,7 +25,7 @@ _TRAIL = 0.08  # of a stride: so long a foot that leaves stays where it was
 _FIRST = 1.7  # it is over its place before it comes down, and goes on only once it is lifted: by this factor
 
 # the mean adult's leg in its plane: lengths of thigh and shank m, and how far their bones stand out of the vertical at
-# rest, rad (`retarget.mean_adult_joints`); half the distance of the hips; heel and toes from the ankle (x, z)
+# rest, rad (`rig.mean_adult_joints`); half the distance of the hips; heel and toes from the ankle (x, z)
 _THIGH, _SHANK, _HALF_HIPS = 0.390, 0.410, 0.075
 _THIGH_REST, _SHANK_REST = 0.023, -0.076
 _HEEL, _TOES = (-0.05, -0.077), (0.19, -0.075)

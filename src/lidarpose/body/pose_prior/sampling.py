@@ -4,8 +4,8 @@ A pose is 27 angles (`ANGLES`, degrees, the same sign on both sides of the body)
 activity, a kind of arm for each side, where between the two ends of its range the activity stands, noise, and for
 gaits a phase; `latents` says how they go on in time. The angles are kept inside the joints' ranges, left and right are
 exchanged in half of the poses, arms are pushed out of the trunk, standing people are set on both feet and balanced
-(`balance`), one matrix product turns the angles into Euler angles of the 24 bones, and bodies that pass through
-themselves (`contact.self_collision`) are replaced by spare ones.
+(`constraints.balanced`), one matrix product turns the angles into Euler angles of the 24 bones, and bodies that pass
+through themselves (`constraints.self_collision`) are replaced by spare ones.
 
 Frame of the result: x forward, y left, z up, facing +x, in the rest pose of `rig` (T-pose, every bone's axes along
 the body's).
@@ -15,14 +15,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarpose.body.mocap.retarget import heading, mean_adult_joints, without_yaw
-from lidarpose.body.pose_prior import activities, contact
-from lidarpose.body.pose_prior.activities import ANGLE_INDEX, ANGLES, KINDS, LIMITS
-from lidarpose.body.pose_prior.balance import balanced
+from lidarpose.body.pose_prior import activities, constraints
+from lidarpose.body.pose_prior.activities import (
+    ANGLE_INDEX,
+    ANGLES,
+    KINDS,
+    LIMITS,
+    mirror_angles,
+    rotations_from_angles,
+)
 from lidarpose.body.pose_prior.gait import GAITS, Stride, add_stride
-from lidarpose.body.pose_prior.joint_angles import mirror_angles, rotations_from_angles
 from lidarpose.body.pose_prior.latents import Latents, draw_latents
-from lidarpose.body.rig import forward_kinematics
+from lidarpose.body.rig import forward_kinematics, heading, mean_adult_joints, without_yaw
 from lidarpose.errors import InputError, check_finite, check_int, check_name
 from lidarpose.geometry import rotation_about
 from lidarpose.skeleton import SMPL24
@@ -71,8 +75,8 @@ class PosePrior:
 class DrawnClips:
     """People in motion. rotations (n, F, 24, 3, 3) float32, local, the first frame facing +x; translation (n, F, 3)
     float32 m, the way of the pelvis since the first frame on flat ground (z: on the mean adult); clearance (n, F)
-    float32 m, how far the lowest point is above the ground (`contact.ground_offset`); kind (n,) indices into `KINDS`.
-    """
+    float32 m, how far the lowest point is above the ground (`constraints.ground_offset`); kind (n,) indices into
+    `KINDS`."""
 
     rotations: np.ndarray
     translation: np.ndarray
@@ -90,7 +94,7 @@ def sample_rotations(
             or at work sees them.
 
     Returns:
-        Poses whose root leans and tilts but has no yaw (`retarget.heading` is 0).
+        Poses whose root leans and tilts but has no yaw (`rig.heading` is 0).
 
     Raises:
         InputError: For a negative n or dt, and a mix with unknown names or without weight.
@@ -186,8 +190,8 @@ def _draw_people(rng: np.random.Generator, n: int, shares: np.ndarray, times: np
 
 def _depth(rotations: np.ndarray) -> np.ndarray:
     """rotations (n, T, 24, 3, 3) -> (n,) m: how deep each body's parts are in each other at the worst moment."""
-    ends = contact.capsule_ends(*contact.body_frames(rotations.reshape(-1, 24, 3, 3)))
-    return contact.self_collision(ends).max(1).reshape(rotations.shape[:2]).max(1, initial=-np.inf)
+    ends = constraints.capsule_ends(*constraints.body_frames(rotations.reshape(-1, 24, 3, 3)))
+    return constraints.self_collision(ends).max(1).reshape(rotations.shape[:2]).max(1, initial=-np.inf)
 
 
 def _poses(latents: Latents, times: np.ndarray) -> tuple[np.ndarray, Stride]:
@@ -196,7 +200,7 @@ def _poses(latents: Latents, times: np.ndarray) -> tuple[np.ndarray, Stride]:
     if moments > 1 or times[0] != 0:
         latents = latents.take(np.repeat(np.arange(n), moments)).at(np.tile(times, n))
     stride = _angles(latents)
-    angles = balanced(_free_arms(stride.angles, moments), latents.kind)
+    angles = constraints.balanced(_free_arms(stride.angles, moments), latents.kind)
     return rotations_from_angles(angles).reshape(n, moments, 24, 3, 3), stride
 
 
@@ -207,15 +211,15 @@ def _motion(latents: Latents, times: np.ndarray) -> DrawnClips:
     unyaw = rotation_about("z", -heading(rotations[:, 0])).astype(np.float32)
     rotations[:, :, 0] = unyaw[:, None] @ rotations[:, :, 0]
     flat = rotations.reshape(-1, 24, 3, 3)
-    capsules = contact.undersides(contact.capsule_ends(*contact.body_frames(flat)))
-    points = np.concatenate([contact.sole_points(flat).reshape(len(flat), 8, 3), capsules], 1)
+    capsules = constraints.undersides(constraints.capsule_ends(*constraints.body_frames(flat)))
+    points = np.concatenate([constraints.sole_points(flat).reshape(len(flat), 8, 3), capsules], 1)
     points = points.reshape(n, moments, points.shape[1], 3)
-    way = contact.planted_way(points)
+    way = constraints.planted_way(points)
     travels = np.isin(latents.kind, _TRAVELS)
     if travels.any():
         course = latents.course(times)[travels]
         pace = stride.pace.reshape(n, moments)[travels]
-        ahead = contact.walked_way(pace, latents.strides(np.broadcast_to(times, (n, moments)))[travels], course)
+        ahead = constraints.walked_way(pace, latents.strides(np.broadcast_to(times, (n, moments)))[travels], course)
         way[travels, :, :2] = ahead @ np.swapaxes(unyaw[travels, :2, :2], -1, -2)
         rotations[travels, :, 0] = rotation_about("z", course).astype(np.float32) @ rotations[travels, :, 0]
     low = points[..., 2].min(2)

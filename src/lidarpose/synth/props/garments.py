@@ -1,6 +1,6 @@
 """Clothes that stand away from the body: skirts, dresses and long coats that bridge the legs, hats and helmets.
 
-An offset along the skin's normals (`body.shape.clothing`) cannot bridge; these are meshes of their own, whose faces
+An offset along the skin's normals (`body.rig.clothing`) cannot bridge; these are meshes of their own, whose faces
 count as the part of the body they hang on.
 """
 
@@ -17,7 +17,7 @@ JOINT = {name: i for i, name in enumerate(BODY26.joints)}
 Point = Sequence[float]
 Points = list[Point]
 # Girths of the shipped body's skin from lengths between its joints, m: weights of `_LENGTHS`, then a constant. Fitted
-# to 1,500 people of `body.shape.sample_people`; what is left is 3 mm of the back, 4 of the width, 7 and 5 of the rest.
+# to 1,500 people of `body.rig.sample_people`; what is left is 3 mm of the back, 4 of the width, 7 and 5 of the rest.
 _LENGTHS = (
     ("left_hip", "right_hip"), ("spine3", "left_collar"), ("head", "nose"), ("left_knee", "left_ankle"),
     ("left_shoulder", "left_elbow"), ("pelvis", "left_hip"),

@@ -1,0 +1,344 @@
+"""Text files of captured skeletons: BVH, and Acclaim's ASF (the skeleton) with AMC (its motion), as CMU's database has.
+
+BVH is a tree of joints with offsets and channels, then a line of numbers a frame. A joint's rotation is the product of
+its rotation channels in the order they are listed, in degrees; channels of position stand in for its offset. Units, the
+up axis and the rest pose are not in the file: see `joint_tree`.
+Source: the format as published with Biovision's motion data (Meredith and Maddock 2001).
+
+A bone of ASF turns about its own axes: with A the rotation of its `axis` and M that of its numbers, both R_z R_y R_x
+where the order is XYZ, its local rotation is A M A^-1; it goes from its parent's end, along its `direction` as turned
+by its global rotation, for its `length`. Lengths are inches / 0.45 where `length` is 0.45, y is up.
+Source: the format's description and CMU's database (mocap.cs.cmu.edu), its page on units.
+"""
+
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from lidarpose.body.mocap.joint_tree import END, Joint, JointTree, tree_motion
+from lidarpose.body.mocap.motion import Motion
+from lidarpose.geometry import rotation_about
+from lidarpose.io.files import file_error, read_bytes
+
+_BVH_CHANNELS = {
+    f"{axis}{kind}": kind[0].replace("p", "t") + axis for axis in "xyz" for kind in ("position", "rotation")
+}
+_ASF_CHANNELS = ("tx", "ty", "tz", "rx", "ry", "rz")
+# frames a second of CMU's database; an AMC file does not say its own
+CMU_FPS = 120.0
+_INCH = 0.0254
+# SMPL's joints are at the ends of these bones; sides are filled in
+_BONES = {"pelvis": "root", "neck": "thorax", "head": "upperneck"} | {
+    f"{side}_{joint}": side[0] + bone
+    for side in ("left", "right")
+    for joint, bone in (
+        ("hip", "hipjoint"), ("knee", "femur"), ("ankle", "tibia"), ("foot", "foot"),
+        ("shoulder", "clavicle"), ("elbow", "humerus"), ("wrist", "radius"), ("hand", "hand"),
+    )
+}  # fmt: skip
+_OPTIONAL = ("left_foot", "right_foot", "left_hand", "right_hand", "neck")
+_FRAME = re.compile("[0-9]{1,12}")
+
+
+def load_bvh(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
+    """The motion of a BVH file as one clip, named as the file. up: by default the axis people stand along."""
+    tree, values, rate = read_bvh(path)
+    rate = fps or rate
+    if rate is None:
+        raise file_error(path, "has no frame time above 0 (Frame Time: seconds); give load_motion fps=")
+    return tree_motion(path, tree, tree.positions(values), fps=rate, up=up, kind="BVH")
+
+
+def load_amc(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
+    """The motion of an AMC file as one clip, named as the file.
+
+    Its skeleton is the ASF file of the same name, of the name up to the last `_` (02.asf for 02_01.amc), or the only
+    one in the folder. fps: by default CMU's 120; up: by default y.
+    """
+    tree, values, unit_m = read_amc(path)
+    matched = {joint: tree.names.index(bone) for joint, bone in _BONES.items() if bone in tree.names}
+    positions = tree.positions(values)
+    return tree_motion(
+        path, tree, positions, fps=fps or CMU_FPS, up=up or "y", kind="AMC", unit_m=unit_m, matched=matched
+    )
+
+
+def _numbers(path: object, what: str, words: Sequence[str], count: int | None = None) -> np.ndarray:
+    """Words of a text file as floats, finite ones where a count is given. Raises InputError naming `what`."""
+    try:
+        numbers = np.array(words, float)
+    except ValueError:
+        numbers = np.zeros(0)
+    if not len(numbers) or (count is not None and (len(numbers) != count or not np.isfinite(numbers).all())):
+        expected = f"{count} finite numbers" if count else "numbers"
+        raise file_error(path, f"{what} must be {expected}, got {' '.join(words)[:60]!r}")
+    return numbers
+
+
+def _read_text(path: str | os.PathLike, expected: str) -> str:
+    return read_bytes(path, expected=expected).decode("utf-8-sig", "replace")
+
+
+# BVH
+
+
+def read_bvh(path: str | os.PathLike) -> tuple[JointTree, np.ndarray, float | None]:
+    """The joints of a BVH file, its frames of channels (F, C), and frames a second where it says. Raises InputError."""
+    text = _read_text(path, "a BVH file").replace("{", "\n{\n").replace("}", "\n}\n")
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    if not lines or lines[0].upper() != "HIERARCHY":
+        raise file_error(path, f"a BVH file starts with HIERARCHY, got {lines[0][:40] if lines else 'nothing'!r}")
+    motion = next((i for i, line in enumerate(lines) if line.upper() == "MOTION"), None)
+    if motion is None:
+        raise file_error(path, "has no MOTION part; was it copied completely?")
+    tree = JointTree(joints=_bvh_joints(path, lines[1:motion]))
+    width = sum(len(joint.channels) for joint in tree.joints)
+    if not width:
+        raise file_error(path, "no joint has CHANNELS, so nothing moves: was it exported with its motion?")
+    return tree, *_bvh_frames(path, lines[motion + 1 :], width)
+
+
+def _bvh_joints(path: object, lines: list[str]) -> list[Joint]:
+    joints: list[Joint] = []
+    open_joints: list[int] = []
+    awaits_brace = False
+    for line in lines:
+        key, *words = line.split()
+        key = key.upper()
+        inside = open_joints and not awaits_brace
+        here = joints[open_joints[-1]] if inside else None
+        if key in ("JOINT", "END") and here or (key == "ROOT" and not joints):
+            name = here.name + END if here and key == "END" else line[len(key) :].strip()
+            joints.append(Joint(name=name, parent=open_joints[-1] if here else -1))
+            awaits_brace = True
+        elif key == "{" and awaits_brace:
+            open_joints.append(len(joints) - 1)
+            awaits_brace = False
+        elif here and key == "}":
+            if here.offset is None:
+                raise file_error(path, f"joint {here.name} has no OFFSET")
+            here.offset = np.where([f"t{axis}" in here.channels for axis in "xyz"], 0, here.offset)
+            open_joints.pop()
+        elif here and key == "OFFSET":
+            here.offset = _numbers(path, f"OFFSET of {here.name}", words, 3)
+        elif here and key == "CHANNELS":
+            here.channels = _bvh_channels(path, here.name, words)
+        else:
+            expected = "one ROOT, and in its braces OFFSET, CHANNELS, JOINT and End Site"
+            raise file_error(path, f"{line[:60]!r} stands where it cannot; expected {expected}")
+    if open_joints or awaits_brace or not joints:
+        raise file_error(path, "the HIERARCHY is not complete; was the file copied completely?")
+    return joints
+
+
+def _bvh_channels(path: object, name: str, words: list[str]) -> list[str]:
+    if not words or words[0] != str(len(words) - 1):
+        raise file_error(path, f"CHANNELS of {name} must be a count and as many names, got {' '.join(words)[:60]!r}")
+    unknown = [word for word in words[1:] if word.lower() not in _BVH_CHANNELS]
+    if unknown:
+        raise file_error(path, f"{name} has the channel {unknown[0]!r}; known are Xposition, Zrotation and the like")
+    return [_BVH_CHANNELS[word.lower()] for word in words[1:]]
+
+
+def _bvh_frames(path: object, lines: list[str], width: int) -> tuple[np.ndarray, float | None]:
+    """The values (F, width), and frames a second or None."""
+    header = {key.strip().lower(): value for key, _, value in (line.partition(":") for line in lines[:2])}
+    if list(header) != ["frames", "frame time"]:
+        raise file_error(path, "MOTION must begin with Frames: and Frame Time:; was it copied completely?")
+    if not header["frames"].strip().isdecimal():
+        raise file_error(path, f"Frames: must be a whole number of 0 or more, got {header['frames'][:40]!r}")
+    try:
+        seconds = float(header["frame time"])
+    except ValueError:
+        seconds = 0.0
+    values = _numbers(path, "the frames of MOTION", " ".join(lines[2:]).split())
+    if len(values) != int(header["frames"]) * width:
+        expected = f"{header['frames'].strip()[:20]} frames of {width} numbers"
+        raise file_error(path, f"expected {expected}, got {len(values)} numbers; was it copied completely?")
+    # a frame time of almost nothing would be an infinite rate
+    return values.reshape(-1, width), 1 / seconds if 1e-6 < seconds < np.inf else None
+
+
+# ASF and AMC
+
+
+def read_amc(path: str | os.PathLike) -> tuple[JointTree, np.ndarray, float]:
+    """The bones' ends as joints, of an AMC file and its ASF file, the frames of channels (F, C) of those that move,
+    and meters of a number. Raises InputError."""
+    path = Path(path)
+    values = _amc_frames(path)
+    skeleton = _skeleton_of(path)
+    tree, unit_m = read_asf(skeleton)
+    unknown = sorted(values.keys() - set(tree.names))
+    if unknown:
+        raise file_error(path, f"moves {', '.join(unknown)[:80]}, which {skeleton.name} does not have; is it this one?")
+    missing = [bone for joint, bone in _BONES.items() if bone not in tree.names and joint not in _OPTIONAL]
+    if missing:
+        raise file_error(skeleton, f"has no bone {', '.join(missing)} among {', '.join(sorted(tree.names))}")
+    for joint in tree.joints:
+        if joint.name not in values:
+            joint.channels = ()
+        elif values[joint.name].shape[1] != len(joint.channels):
+            numbers, freedoms = values[joint.name].shape[1], len(joint.channels)
+            raise file_error(path, f"{joint.name} has {numbers} numbers a frame, its skeleton {freedoms} freedoms")
+    return tree, np.concatenate([values[name] for name in tree.names if name in values], 1), unit_m
+
+
+def _skeleton_of(path: Path) -> Path:
+    skeletons = {file.name.lower(): file for file in path.parent.iterdir() if file.suffix.lower() == ".asf"}
+    subject = path.stem.partition("_")[0]
+    for stem in (path.stem, path.stem.rpartition("_")[0], subject):
+        if f"{stem}.asf".lower() in skeletons:
+            return skeletons[f"{stem}.asf".lower()]
+    if len(skeletons) == 1:
+        return next(iter(skeletons.values()))
+    others = f" (there are {', '.join(sorted(skeletons))})" if skeletons else ""
+    raise file_error(path, f"an AMC file needs its skeleton: put {subject}.asf or {path.stem}.asf beside it{others}")
+
+
+def _words_of_lines(path: Path, expected: str) -> list[list[str]]:
+    lines = _read_text(path, expected).splitlines()
+    return [line.split() for line in lines if line.strip() and not line.lstrip().startswith("#")]
+
+
+def read_asf(path: Path) -> tuple[JointTree, float]:
+    """The bones of an ASF file, the root first, as joints at their ends, and meters of a number. Raises InputError."""
+    sections: dict[str, list[list[str]]] = {}
+    section: list[list[str]] = []
+    for words in _words_of_lines(path, "an ASF file"):
+        if words[0].startswith(":"):
+            section = sections.setdefault(words[0].lower(), [])
+            words = words[1:]
+        if words:
+            section.append(words)
+    needed = (":root", ":bonedata", ":hierarchy")
+    missing = [name for name in needed if name not in sections]
+    if missing:
+        raise file_error(path, f"an ASF file has {', '.join(needed)}; {', '.join(missing)} is missing")
+    units = {words[0].lower(): words[1] for words in sections.get(":units", []) if len(words) > 1}
+    length = _numbers(path, "length of :units", [units.get("length", "0.45")], 1)[0]
+    if not 1e-6 < length < 1e6:
+        raise file_error(path, f"length of :units must be above 0, got {length}")
+    angle = units.get("angle", "deg").lower()
+    if angle not in ("deg", "rad", "degrees", "radians"):
+        raise file_error(path, f"angle of :units must be deg or rad, got {angle[:40]!r}")
+    degrees = angle.startswith("deg")
+    bones = {"root": _root(path, {words[0].lower(): words[1:] for words in sections[":root"]}, degrees)}
+    for name, stored in _bone_data(path, sections[":bonedata"]):
+        if name in bones:
+            raise file_error(path, f"has the bone {name} twice")
+        bones[name] = _bone(path, name, stored, degrees)
+    return JointTree(joints=_in_tree_order(path, sections[":hierarchy"], bones), degrees=degrees), _INCH / length
+
+
+def _root(path: Path, stored: dict[str, list[str]], degrees: bool) -> Joint:
+    channels = tuple(word.lower() for word in stored.get("order", _ASF_CHANNELS))
+    if sorted(channels) != sorted(_ASF_CHANNELS):
+        raise file_error(path, f"order of :root must be TX TY TZ RX RY RZ in any order, got {' '.join(channels)[:60]}")
+    offset = _numbers(path, "position of :root", list(stored.get("position", "000")), 3)
+    axes = _rotation(path, "root", [*stored.get("orientation", "000"), *stored.get("axis", [])[:1]], degrees)
+    return Joint(name="root", parent=-1, offset=offset, channels=channels, bone=np.zeros(3), axes=axes)
+
+
+def _bone_data(path: Path, lines: list[list[str]]) -> list[tuple[str, dict[str, list[str]]]]:
+    """The bones' names and what is stored of each, the first of every keyword."""
+    bones: list[tuple[str, dict[str, list[str]]]] = []
+    stored: dict[str, list[str]] | None = None
+    for key, *words in lines:
+        key = key.lower()
+        if key == "begin":
+            stored = {}
+        elif key == "end":
+            if not stored or not stored.get("name"):
+                raise file_error(path, "a bone of :bonedata has no name, or an end without begin")
+            bones.append((stored["name"][0], stored))
+            stored = None
+        elif stored is not None:
+            stored.setdefault(key, words)
+    if stored is not None:
+        raise file_error(path, ":bonedata stops inside a bone; was it copied completely?")
+    return bones
+
+
+def _bone(path: Path, name: str, stored: dict[str, list[str]], degrees: bool) -> Joint:
+    missing = [key for key in ("direction", "length") if key not in stored]
+    if missing:
+        raise file_error(path, f"bone {name} has no {', '.join(missing)}")
+    direction = _numbers(path, f"direction of {name}", stored["direction"], 3)
+    length = _numbers(path, f"length of {name}", stored["length"], 1)[0]
+    channels = tuple(word.lower() for word in stored.get("dof", []))
+    unknown = [word for word in channels if word not in _ASF_CHANNELS]
+    if unknown:
+        raise file_error(path, f"bone {name} has the freedom {unknown[0][:40]!r}; known are {', '.join(_ASF_CHANNELS)}")
+    with np.errstate(over="ignore"):
+        size = np.linalg.norm(direction)
+        bone = direction / size * length if 0 < size < np.inf else np.zeros(3)
+    axes = _rotation(path, name, stored.get("axis", list("000")), degrees)
+    return Joint(name=name, offset=np.zeros(3), channels=channels, bone=bone, axes=axes)
+
+
+def _rotation(path: Path, name: str, words: list[str], degrees: bool) -> np.ndarray:
+    """(3, 3) of three angles and their order, by default XYZ: about x first."""
+    order = words[3].lower() if len(words) > 3 else "xyz"
+    if sorted(order) != ["x", "y", "z"]:
+        raise file_error(path, f"axis of {name} must have an order such as XYZ, got {order[:40]!r}")
+    angles = _numbers(path, f"axis of {name}", words[:3], 3)
+    rotation = np.eye(3)
+    for axis, angle in zip(order, np.radians(angles) if degrees else angles, strict=True):
+        rotation = rotation_about(axis, angle) @ rotation
+    return rotation
+
+
+def _in_tree_order(path: Path, lines: list[list[str]], bones: dict[str, Joint]) -> list[Joint]:
+    """The bones with their parents, which come before their children."""
+    parent_of: dict[str, str] = {}
+    for parent, *children in lines:
+        if parent.lower() in ("begin", "end") and not children:
+            continue
+        unknown = [word for word in (parent, *children) if word not in bones]
+        if unknown:
+            raise file_error(path, f":hierarchy names {unknown[0][:40]!r}, which :bonedata does not have")
+        for child in children:
+            if child in parent_of or child == "root":
+                raise file_error(path, f":hierarchy has {child} twice")
+            parent_of[child] = parent
+    order = ["root"]
+    for k, name in enumerate(order):
+        children = [child for child, parent in parent_of.items() if parent == name]
+        for child in children:
+            bones[child].parent = k
+        order += children
+    loose = [name for name in bones if name not in order]
+    if loose:
+        raise file_error(path, f"{', '.join(loose)[:80]} hangs from nothing in :hierarchy")
+    return [bones[name] for name in order]
+
+
+def _amc_frames(path: Path) -> dict[str, np.ndarray]:
+    """Of each bone that moves: its numbers (F, n)."""
+    frames: list[dict[str, list[str]]] = []
+    for words in _words_of_lines(path, "an AMC file"):
+        if words[0].startswith(":"):
+            continue
+        if len(words) == 1 and _FRAME.fullmatch(words[0]):
+            frames.append({})
+        elif not frames:
+            raise file_error(path, f"an AMC file has numbered frames of bones, got {' '.join(words)[:60]!r}")
+        else:
+            frames[-1][words[0]] = words[1:]
+    if not frames or not frames[0]:
+        raise file_error(path, "holds no frame of motion, or one that moves no bone")
+    lengths = {name: len(words) for name, words in frames[0].items()}
+    for k, frame in enumerate(frames, 1):
+        if {name: len(words) for name, words in frame.items()} != lengths:
+            raise file_error(
+                path, f"frame {k} of {len(frames)} lacks numbers that the first one has; was it copied completely?"
+            )
+    values = {}
+    for name in lengths:
+        words = [word for frame in frames for word in frame[name]]
+        values[name] = _numbers(path, f"numbers of {name}", words).reshape(len(frames), -1)
+    return values
