@@ -98,19 +98,23 @@ def content_digest(path: str | os.PathLike, *, expected: str) -> str:
     return hashlib.sha256(read_bytes(path, expected=expected)).hexdigest()
 
 
-def read_bytes(path: str | os.PathLike, *, expected: str) -> bytes:
-    """The content of a regular, non-empty file; `expected` says what it should be ("a JSON file", ...).
+def read_bytes(path: str | os.PathLike, *, expected: str, most: int | None = None) -> bytes:
+    """The content of a regular, non-empty file of at most `most` bytes; `expected` says what it should be ("a JSON
+    file", ...).
 
-    Raises InputError for a missing, empty or unreadable file, a folder, a device or a pipe.
+    Raises InputError for a missing, empty, too large or unreadable file, a folder, a device or a pipe.
     """
     try:
         # a bare number would be taken for an open file's handle
         path = os.fspath(path)
-        mode = os.stat(path).st_mode
+        mode, size = os.stat(path).st_mode, os.stat(path).st_size
         if stat.S_ISDIR(mode):
             raise file_error(path, f"expected {expected}, got a folder; name one file in it")
         if not stat.S_ISREG(mode):
             raise file_error(path, f"expected {expected}, got a device or pipe; save it as a file first")
+        if most is not None and size > most:
+            limit = f"{most / 2**30:g} GiB are read at most: split it first"
+            raise file_error(path, f"has {size / 2**30:.1f} GiB, {limit}")
         with open(path, "rb") as file:
             data = file.read()
     except InputError:
