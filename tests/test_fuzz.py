@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 from pyarrow import parquet
 from shard_files import sample, write_shard
 
-from lidarpose.data.schema import TABLES, person_row
-from lidarpose.data.shards import DatasetCard, write_card
+from lidarpose.data.shards import TABLES, DatasetCard, person_row, write_card
 from lidarpose.errors import InputError
 from lidarpose.io.boxes import read_boxes
 from lidarpose.io.pickles import load_pickle

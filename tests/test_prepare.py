@@ -19,12 +19,10 @@ from pyarrow import parquet
 from shard_files import write_shard
 
 from lidarpose.data import writer
-from lidarpose.data.prepare import READERS, PartWriter, prepare
+from lidarpose.data.prepare import READERS, PartWriter, prepare, summary_lines
 from lidarpose.data.readers.humanm3 import HumanM3
-from lidarpose.data.schema import labeled_row, sample_of
-from lidarpose.data.shards import open_dataset, read_rows
+from lidarpose.data.shards import labeled_row, open_dataset, read_rows, sample_of
 from lidarpose.data.splits import SplitRule, _published, split_rule
-from lidarpose.data.summary import lines_of
 from lidarpose.errors import InputError
 from lidarpose.sample import SEEN, UNLABELED, Box, LabeledSample, Pose, center_of
 from lidarpose.skeleton import HUMAN15, WAYMO14
@@ -61,6 +59,7 @@ def test_items_come_back_from_the_shards(raw, prepared):
     dataset = open_dataset(out)
     items = list(dataset.items())
     assert summary["people"] == len(items) == len(raw[1])
+    assert [(part["people"], part["skipped"]) for part in summary["parts"]] == [(6, 0)] * 3
     for item in items:
         joints = raw[1][item.sequence, item.frame, item.track]
         assert np.abs(item.joints - joints).max() < 1e-3
@@ -104,7 +103,7 @@ def test_datasets_of_smpl_have_its_trans_and_distances(tmp_path, smpl):
     assert summary["trunk"][2] > 0.7 and summary["joints"] == {"seen": 144, "hidden": 0, "unlabelled": 0}
     # the list names sequences that are not in this release
     assert any("of train by lidar-hmr seq003_street_002" in line for line in summary["warnings"])
-    lines = lines_of(summary)
+    lines = summary_lines(summary)
     assert lines[0] == "6 people in 6 frames (test 3, train 3)" and lines[1].startswith("skipped 2: labels without")
     shutil.copy(smpl, tmp_path / "SMPL_MALE.npz")
     shutil.copy(smpl, tmp_path / "SMPL_NEUTRAL.npz")
@@ -436,7 +435,7 @@ def test_a_corrupted_part_is_counted_and_the_rest_goes_on(tmp_path, smpl):
     assert summary["people"] == 3 and summary["skipped"]["the rest of a part cannot be read"] == 1
     assert "seq002_football_001_labels.pkl" in summary["skipped_first"]["the rest of a part cannot be read"]
     assert any(line == "nobody in seq002_football_001" for line in summary["warnings"])
-    assert any("skipped 1: the rest of a part" in line for line in lines_of(summary))
+    assert any("skipped 1: the rest of a part" in line for line in summary_lines(summary))
     # repaired: without its shards it is read again
     path.write_bytes(whole)
     for shard in (tmp_path / "out").glob("*-00000.parquet"):

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 
 from lidarpose.body.smpl import load_body
 from lidarpose.data.prepare import READERS, reader
-from lidarpose.data.readers.base import Skipped, find_below, numbered, numbers, read_cloud
+from lidarpose.data.readers.base import Skipped, SmplJoints, find_below, numbered, numbers, read_cloud
 from lidarpose.data.readers.sloper4d import _heading
-from lidarpose.data.readers.smpl_joints import SmplJoints
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix, rotation_about
 from lidarpose.sample import SEEN, UNLABELED, LabeledSample, center_of

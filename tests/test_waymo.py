@@ -301,7 +301,7 @@ def test_keypoints_by_type_in_any_order():
     index = [files.WAYMO14.index(name) for name in names]
     np.testing.assert_array_equal(found.joints[index], [[1, 2, 3], [4, 5, 6]])
     assert found.labels[index].tolist() == [HIDDEN, SEEN] and (found.labels > 0).sum() == 2
-    assert person("a", [(5, (np.nan, 0, 0), False)], (0, 0, 0, 1, 1, 2, 0.5)).problem == ("no joint is labelled", "")
+    assert person("a", [(5, (np.nan, 0, 0), False)], (0, 0, 0, 1, 1, 2, 0.5)).reason == "no joint is labelled"
 
 
 def test_keypoints_out_of_reach_are_not_labelled():
@@ -311,7 +311,7 @@ def test_keypoints_out_of_reach_are_not_labelled():
 
 def test_a_box_that_is_none_is_told():
     found = person("a", [(5, (0, 0, 0), False)], (0, 0, 0, 1, 1, 0, 0.5))
-    assert found.problem[0] == "label of another form" and "size" in found.problem[1]
+    assert found.reason == "label of another form" and "size" in found.why
 
 
 def one_frame(**given):

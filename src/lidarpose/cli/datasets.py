@@ -153,8 +153,7 @@ def _synth(options: argparse.Namespace) -> None:
 
 
 def _prepare(options: argparse.Namespace) -> None:
-    from lidarpose.data.prepare import prepare
-    from lidarpose.data.summary import lines_of
+    from lidarpose.data.prepare import prepare, summary_lines
 
     summary = prepare(
         options.dataset,
@@ -166,7 +165,7 @@ def _prepare(options: argparse.Namespace) -> None:
         level=not options.no_level,
         workers=options.workers,
     )
-    for line in lines_of(summary):
+    for line in summary_lines(summary):
         tell(line)
 
 

@@ -5,24 +5,35 @@ read again: to have a repaired file read, delete its two shards and run the same
 """
 
 import hashlib
+from collections import Counter
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from importlib import import_module
 from itertools import repeat
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lidarpose.data.readers.base import Reader, Skipped
-from lidarpose.data.schema import labeled_row
-from lidarpose.data.shards import CARD, DatasetCard, open_dataset, shard_path, shard_writer, write_card
+from lidarpose.data.shards import (
+    CARD,
+    DatasetCard,
+    DatasetReader,
+    labeled_row,
+    open_dataset,
+    read_rows,
+    shard_path,
+    shard_writer,
+    write_card,
+)
 from lidarpose.data.splits import SplitRule, split_rule
-from lidarpose.data.summary import summarize
 from lidarpose.data.writer import Counts, locked, make_shards, open_folder
 from lidarpose.errors import InputError, check_name
 from lidarpose.io.files import file_error, one_line
 from lidarpose.progress import Progress
-from lidarpose.sample import LabeledSample
+from lidarpose.sample import HIDDEN, SEEN, UNLABELED, LabeledSample
+from lidarpose.skeleton import skeleton
 
 # dataset -> module and class of its reader, and whether that takes the user's SMPL
 READERS: dict[str, tuple[str, str, bool]] = {
@@ -40,8 +51,14 @@ _LEVELED = ("lidarhuman26m",)
 _TABLES = ("skipped", "labelled")
 # why the people of a part, or those after a fault in it, are left out
 _REST = "the rest of a part cannot be read"
-# how many people between two tellings of progress
-_TOLD = 200
+# how many people are counted at once for the progress bar
+_PROGRESS_STEP = 200
+# what the summary reads of the shards
+_SUMMARIZED = ("sequence", "frame", "split", "source", "joints", "joint_labels", "center")
+# people whose trunks lean more than this on average are in a frame whose z is not up
+_LEAST_UP = 0.7
+# the middle of a person's points is hardly ever so far from the middle of the joints, m
+_FAR = 1.0
 
 
 def reader(name: str, smpl: str | Path | None = None, *, level: bool = True) -> Reader:
@@ -95,48 +112,53 @@ def prepare(
     parts = list(source.parts(root))
     rule = split_rule(name, root, split_by, parts)
     absent = rule.absent(parts) if rule is not None else {}
-    parts = _of_split(name, parts, rule, split)
+    parts = _parts_of(name, parts, rule, split)
     card = _card(source, parts, rule, split)
     missing = open_folder(out, card)
     make = PartWriter(reader=source, root=root, out=out, parts=tuple(parts), rule=rule, only=split)
-    there = len(parts) - len(missing)
+    finished = len(parts) - len(missing)
     with locked(out):
         # the summary of a run that is not over would be wrong
         if missing or not (out / CARD).is_file():
             write_card(out, card)
-        with Progress(len(parts), unit="parts", done=there, shown=progress) as shown:
+        with Progress(len(parts), unit="parts", done=finished, shown=progress) as bar:
             people = 0
             for shards, more in make_shards(make, missing, workers=workers):
-                people, there = people + more, there + shards
-                shown.update(there, f"{people:,} people")
-        summary = summarize(open_dataset(out), parts=parts, absent=absent, rule=rule)
+                people, finished = people + more, finished + shards
+                bar.update(finished, f"{people:,} people")
+        summary = _summarize(open_dataset(out), parts=parts, absent=absent, rule=rule)
         write_card(out, replace(card, summary=summary))
     return summary
 
 
-def _of_split(name: str, parts: list[str], rule: SplitRule | None, split: str | None) -> list[str]:
+def _parts_of(name: str, parts: list[str], rule: SplitRule | None, split: str | None) -> list[str]:
     """The parts in which people of the split may be. Raises InputError where there are none."""
     if split is None:
         return parts
     if rule is None:
         raise InputError(f"{name} has no split to choose {split!r} from: put train.txt and test.txt into its folder")
     check_name(f"split of {name} by {rule.name}", split, rule.sets)
-    kept = [part for part in parts if not rule.by_part or rule.of_part(part) == split]
-    if not kept:
+    chosen = [part for part in parts if not rule.by_part or rule.of_part(part) == split]
+    if not chosen:
         raise InputError(f"none of the {len(parts)} parts of {name} is in {split!r} by {rule.name}: {rule.source}")
-    return kept
+    return chosen
 
 
 def _card(source: Reader, parts: list[str], rule: SplitRule | None, split: str | None) -> DatasetCard:
     # the names themselves would fill the line that says what differs
-    digest = hashlib.sha256("\n".join(parts).encode("utf-8", "backslashreplace")).hexdigest()[:12]
-    settings: dict[str, Any] = {"what": "parts", "dataset": source.name, "parts": digest}
-    settings |= {"split": split, "split_by": None if rule is None else rule.name}
+    digest = _digest("\n".join(parts))
+    settings = {
+        "what": "parts",
+        "dataset": source.name,
+        "parts": digest,
+        "split": split,
+        "split_by": rule and rule.name,
+    }
     about = {key: value for key, value in source.about.items() if key not in ("frame", "settings")}
     if rule is not None:
         about["split"] = f"{rule.name}: {rule.source}" + (f"; LEAKS: {rule.leaks}" if rule.leaks else "")
         if rule.name == "own":
-            settings["lists"] = hashlib.sha256(repr(sorted(rule.sets.items())).encode()).hexdigest()[:12]
+            settings["lists"] = _digest(repr(sorted(rule.sets.items())))
     return DatasetCard(
         settings=settings | source.about["settings"],
         count=len(parts),
@@ -146,6 +168,10 @@ def _card(source: Reader, parts: list[str], rule: SplitRule | None, split: str |
         frame=source.about["frame"],
         about=about | {"parts": parts},
     )
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode("utf-8", "backslashreplace")).hexdigest()[:12]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,30 +188,27 @@ class PartWriter:
 
     def __call__(self, number: int) -> Counts:
         people = 0
-        with ExitStack() as stack:
-            add = {
-                table: stack.enter_context(shard_writer(shard_path(self.out, table, number), table))
-                for table in reversed(_TABLES)
-            }
-            for found in self._found(self.parts[number]):
-                if isinstance(found, Skipped):
-                    add["skipped"]({"index": number, "reason": found.reason, "where": found.where})
-                elif self.only in (None, found.split):
-                    add["labelled"](labeled_row(found, index=number))
+        skipped, labeled = (shard_writer(shard_path(self.out, table, number), table) for table in _TABLES)
+        with labeled as add_person, skipped as add_skipped:
+            for record in self._with_split(self.parts[number]):
+                if isinstance(record, Skipped):
+                    add_skipped({"index": number, "reason": record.reason, "where": record.where})
+                elif self.only in (None, record.split):
+                    add_person(labeled_row(record, index=number))
                     people += 1
-                    if people % _TOLD == 0:
-                        yield _TOLD
-        yield people % _TOLD
+                    if people % _PROGRESS_STEP == 0:
+                        yield _PROGRESS_STEP
+        yield people % _PROGRESS_STEP
 
-    def _found(self, part: str) -> Iterator[LabeledSample | Skipped]:
+    def _with_split(self, part: str) -> Iterator[LabeledSample | Skipped]:
         """Everybody in a part, with the split."""
-        found: Iterable[LabeledSample | Skipped] = self._read(part)
-        splits: Iterator[str | None] = repeat(None if self.rule is None else self.rule.of_part(part))
+        records: Iterable[LabeledSample | Skipped] = self._read(part)
+        splits: Iterator[str | None] = repeat(self.rule.of_part(part) if self.rule else None)
         if self.rule is not None and not self.rule.by_part:
-            found = list(found)
-            splits = iter(self.rule.of_chunks(part, sum(isinstance(one, LabeledSample) for one in found)))
-        for one in found:
-            yield replace(one, split=next(splits)) if isinstance(one, LabeledSample) else one
+            records = list(records)
+            splits = iter(self.rule.of_chunks(part, sum(isinstance(record, LabeledSample) for record in records)))
+        for record in records:
+            yield replace(record, split=next(splits)) if isinstance(record, LabeledSample) else record
 
     def _read(self, part: str) -> Iterator[LabeledSample | Skipped]:
         """As the reader, but a part that turns out to be unreadable ends there, which is counted."""
@@ -197,3 +220,87 @@ class PartWriter:
             # what no reader foresaw must not cost the other parts; its kind tells a mistake in a reader from a bad file
             kind = type(error).__name__
             yield Skipped(f"{_REST} ({kind})", one_line(f"{part}: {kind}: {error}"))
+
+
+# ---- the summary: from the shards alone, so that it is the same however often a run was stopped
+
+
+def _summarize(
+    dataset: DatasetReader, *, parts: list[str], absent: dict[str, list[str]], rule: SplitRule | None
+) -> dict[str, Any]:
+    """The summary of `prepare`: counts, and warnings of what looks wrong. absent: split -> sequences not there."""
+    labels, splits, sources, reasons = Counter[int](), Counter[str](), Counter[str](), Counter[str]()
+    examples: dict[str, str] = {}
+    frames: set[tuple[str, int]] = set()
+    trunks, offsets, table = [], [], []
+    names = skeleton(dataset.card.skeleton).joints
+    ends = [[names.index(f"{side}_{joint}") for side in ("left", "right")] for joint in ("hip", "shoulder")]
+    for shard, part in enumerate(parts):
+        people, skipped = 0, list(read_rows(dataset.path(shard, "skipped"), "skipped"))
+        for row in read_rows(dataset.path(shard), "labelled", _SUMMARIZED):
+            missing = any(row[name] is None for name in _SUMMARIZED if name != "split")
+            if missing or len(row["joints"]) != 3 * len(names):
+                problem = "has a row that is no sample; delete it and run the same command again"
+                raise file_error(dataset.path(shard), problem)
+            people += 1
+            frames.add((row["sequence"], row["frame"]))
+            splits[row["split"] or "none"] += 1
+            sources[row["source"]] += 1
+            labels.update(row["joint_labels"].tolist())
+            joints = row["joints"].reshape(-1, 3)
+            is_labeled = ~np.isnan(joints[:, 0])
+            if is_labeled.any():
+                offsets.append(float(np.linalg.norm(joints[is_labeled].mean(0) - row["center"])))
+            hips, shoulders = (joints[pair].mean(0) for pair in ends)
+            if not np.isnan(shoulders - hips).any():
+                trunks.append((shoulders - hips) / max(float(np.linalg.norm(shoulders - hips)), 1e-6))
+        for row in skipped:
+            reasons[row["reason"]] += 1
+            examples.setdefault(row["reason"], row["where"])
+        table.append({"part": part, "people": people, "skipped": len(skipped)})
+    summary = {
+        "people": sum(splits.values()),
+        "frames": len(frames),
+        "splits": dict(sorted(splits.items())),
+        "sources": dict(sorted(sources.items())),
+        "joints": {"seen": labels[SEEN], "hidden": labels[HIDDEN], "unlabelled": labels[UNLABELED]},
+        "skipped": dict(reasons.most_common()),
+        "skipped_first": examples,
+        "trunk": [round(float(v), 3) for v in np.mean(trunks, 0)] if trunks else None,
+        "joints_from_center_m": round(float(np.median(offsets)), 3) if offsets else None,
+        "parts": table,
+    }
+    return summary | {"warnings": _warnings(summary, absent, rule)}
+
+
+def _warnings(summary: dict[str, Any], absent: dict[str, list[str]], rule: SplitRule | None) -> list[str]:
+    lines, trunk, offset = [], summary["trunk"], summary["joints_from_center_m"]
+    if not summary["people"]:
+        lines.append("there is nobody in it; see what was skipped")
+    if trunk is not None and trunk[2] < _LEAST_UP:
+        lines.append(f"people stand along {trunk} on average, expected z up: turn the dataset first")
+    if offset is not None and offset > _FAR:
+        problem = f"joints are {offset:.2f} m from the points in the median"
+        lines.append(f"{problem}: labels and clouds of different releases?")
+    empty = [part["part"] for part in summary["parts"] if not part["people"]]
+    if empty and summary["people"]:
+        lines.append(f"nobody in {_first_five(empty)}")
+    if rule is not None:
+        lines += [f"of {split} by {rule.name} {_first_five(names)} are not there" for split, names in absent.items()]
+        if rule.leaks:
+            lines.append(f"the split {rule.name} leaks: {rule.leaks}")
+    return lines
+
+
+def summary_lines(summary: dict[str, Any]) -> list[str]:
+    """The summary for a terminal, a line each: people, what was skipped with an example, warnings."""
+    splits = ", ".join(f"{split} {count:,}" for split, count in summary["splits"].items())
+    lines = [f"{summary['people']:,} people in {summary['frames']:,} frames ({splits or 'none'})"]
+    for reason, count in summary["skipped"].items():
+        lines.append(f"skipped {count:,}: {reason} (first: {summary['skipped_first'][reason]})")
+    return lines + [f"warning: {line}" for line in summary["warnings"]]
+
+
+def _first_five(names: list[str]) -> str:
+    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+    return f"{', '.join(names[:5])}{more}"

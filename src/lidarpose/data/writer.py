@@ -16,8 +16,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
-from lidarpose.data.schema import TABLES
-from lidarpose.data.shards import CARD, DatasetCard, check_settings, read_card, rows_of_shard, shard_path
+from lidarpose.data.shards import CARD, TABLES, DatasetCard, check_settings, read_card, rows_of_shard, shard_path
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.io.files import TEMPORARY, check_writable, file_error
 

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.data.schema import pyarrow
+from lidarpose.data.shards import pyarrow
 from lidarpose.geometry import rotation_about
 from lidarpose.io.files import file_error, read_bytes
 from lidarpose.sample import center_of

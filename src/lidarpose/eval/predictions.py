@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.data.schema import pyarrow
+from lidarpose.data.shards import pyarrow
 from lidarpose.eval.metrics.joint_errors import joint_errors
 from lidarpose.io.files import file_error, read_bytes
 from lidarpose.sample import UNLABELED

@@ -12,7 +12,6 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from lidarpose.data.dapt_crops import released_box, released_view
 from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.eval.dataset import EvalDataset, EvalSample
 from lidarpose.eval.predictions import subset
@@ -63,6 +62,12 @@ _CLEAN_CROPS = {
 }
 # sets whose crops are a detector's already
 _OWN_CROP = ("bench", "synth")
+
+
+# how much larger than the labeled joints the released box of HumanM3 is
+_ROOM = 1.25
+# of a box, m
+_LEAST_EDGE = 1e-6
 
 
 def check_protocol(protocol: str, dataset: EvalDataset) -> None:
@@ -116,6 +121,33 @@ def detector_box(kind: str, person: EvalSample, seed: int) -> Box | None:
     if kind in _OWN_CROP or kind not in _CLEAN_CROPS or person.sample.box is None:
         return None
     return jittered(person.sample.box, np.random.default_rng([seed, person.shard, person.row]))
+
+
+def released_view(
+    points: np.ndarray, joints: np.ndarray, centers: dict[str, np.ndarray], box: Box | None
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """points (n, 3) m, joints (J, 3) m, NaN without a label -> (n,) bool of what is kept, and the center (3,) m.
+
+    "trans" (LiDARHuman26M, SLOPER4D): all points, about SMPL's translation; "joints_box" (HumanM3): an upright box of
+    1.25 times the joints' extent; "box" (Waymo): the labelled box. All true and None for a dataset with none of these.
+    """
+    everything = np.ones(len(points), bool)
+    if "trans" in centers:
+        return everything, centers["trans"]
+    crop = released_box(joints, centers, box)
+    for name in ("joints_box", "box"):
+        if name in centers:
+            return everything if crop is None else crop.contains(points), centers[name]
+    return everything, None
+
+
+def released_box(joints: np.ndarray, centers: dict[str, np.ndarray], box: Box | None) -> Box | None:
+    """The box that `released_view` crops by; where it crops nothing, the dataset's own, if any."""
+    if "trans" in centers or "joints_box" not in centers:
+        return box
+    low, high = np.nanmin(joints, 0), np.nanmax(joints, 0)
+    # of a single labelled joint too
+    return Box(center=(low + high) / 2, size=np.maximum(_ROOM * (high - low), _LEAST_EDGE))
 
 
 def cropped(protocol: str, kind: str, person: EvalSample, seed: int) -> EvalSample:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose._version import __version__
-from lidarpose.data.schema import pyarrow
+from lidarpose.data.shards import pyarrow
 from lidarpose.errors import InputError
 from lidarpose.eval.bench import Bench, mean_poses
 from lidarpose.eval.dataset import BENCH, EvalDataset, EvalSample, count_skipped, open_eval_dataset

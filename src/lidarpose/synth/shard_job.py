@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from lidarpose.body.mocap import digest as motion_digest
-from lidarpose.data.schema import person_row
-from lidarpose.data.shards import CARD, DatasetCard, shard_path, shard_writer, write_card
+from lidarpose.data.shards import CARD, DatasetCard, person_row, shard_path, shard_writer, write_card
 from lidarpose.data.writer import Counts, locked, make_shards, open_folder
 from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.io.files import content_digest, file_error

@@ -8,9 +8,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from lidarpose.data.dapt_crops import released_view
 from lidarpose.errors import check_name
-from lidarpose.eval.protocols import jittered
+from lidarpose.eval.protocols import jittered, released_view
 from lidarpose.geometry import rotation_about
 from lidarpose.models.voxelize import view_features
 from lidarpose.sample import LabeledSample, Pose, Sample, center_of

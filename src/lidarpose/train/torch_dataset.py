@@ -17,8 +17,7 @@ from pathlib import Path
 import numpy as np
 from torch.utils.data import IterableDataset, get_worker_info
 
-from lidarpose.data.schema import CENTERS
-from lidarpose.data.shards import DatasetReader, open_dataset, shard_path
+from lidarpose.data.shards import CENTERS, DatasetReader, open_dataset, shard_path
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error, listed
 from lidarpose.sample import HIDDEN, SEEN, UNLABELED, Box, LabeledSample, Pose, Sample

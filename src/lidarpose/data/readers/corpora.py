@@ -17,8 +17,16 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.base import Reader, Skipped, as_cloud, find_below, numbers, read_cloud
-from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_sample
+from lidarpose.data.readers.base import (
+    Reader,
+    Skipped,
+    SmplJoints,
+    as_cloud,
+    find_below,
+    numbers,
+    read_cloud,
+    smpl_sample,
+)
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
 from lidarpose.io.pickles import load_pickle

@@ -13,8 +13,16 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.base import Reader, Skipped, numbered, numbers, read_cloud, read_json
-from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_sample
+from lidarpose.data.readers.base import (
+    Reader,
+    Skipped,
+    SmplJoints,
+    numbered,
+    numbers,
+    read_cloud,
+    read_json,
+    smpl_sample,
+)
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_between, unit
 from lidarpose.io.files import file_error

@@ -17,8 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.base import Reader, Skipped, as_cloud, numbers
-from lidarpose.data.readers.smpl_joints import SmplJoints, smpl_sample
+from lidarpose.data.readers.base import Reader, Skipped, SmplJoints, as_cloud, numbers, smpl_sample
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.io.files import file_error

@@ -20,7 +20,7 @@ from lidarpose.data.readers import waymo_frames as frames
 from lidarpose.data.readers import waymo_v1
 from lidarpose.data.readers.base import Reader, Skipped, entries, numbers
 from lidarpose.data.readers.waymo_v1 import SPLITS
-from lidarpose.data.schema import pyarrow
+from lidarpose.data.shards import pyarrow
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
 from lidarpose.sample import LabeledSample
@@ -35,6 +35,8 @@ SEGMENT, TIME, LASER, OBJECT = (
 # segment and timestamp; and the laser
 FrameKey = tuple[str, int]
 LaserKey = tuple[str, int, int]
+# the values of the key columns, and the others by name
+Row = tuple[tuple, dict[str, Any]]
 # what is read of a file at once: its column chunks are larger than a machine's memory should have to hold
 _BUFFER = 1 << 20
 
@@ -49,14 +51,14 @@ _BOX_COLUMNS = tuple(
 )
 _BOX_TYPE, _BOX_COUNT = "[LiDARBoxComponent].type", "[LiDARBoxComponent].num_lidar_points_in_box"
 _EXTRINSIC = "[LiDARCalibrationComponent].extrinsic.transform"
-_BEAMS = "[LiDARCalibrationComponent].beam_inclination"
+_BEAMS = tuple(f"[LiDARCalibrationComponent].beam_inclination.{name}" for name in ("values", "min", "max"))
 _VEHICLE_POSE = "[VehiclePoseComponent].world_from_vehicle.transform"
 _RETURNS = ("[LiDARComponent].range_image_return1", "[LiDARComponent].range_image_return2")
 _PIXEL_POSES = "[LiDARPoseComponent].range_image_return1"
 
 
 class Waymo(Reader):
-    """Reads whichever version is there. margin: how far around the labelled box points are taken, m on each side."""
+    """Reads whichever version is there. margin: how far around the labeled box points are taken, m on each side."""
 
     name = "waymo"
     skeleton = WAYMO14.name
@@ -69,13 +71,13 @@ class Waymo(Reader):
     def parts(self, root: Path) -> list[str]:
         """Segments with keypoints of version 2 ("training/SEGMENT") or files of version 1 ("training/FILE.tfrecord").
         Raises InputError where there are both, neither, or a component is missing."""
-        old = waymo_v1.parts(root)
-        new = next((root / split / name for split in _splits(root) for name in _components(root / split)), None)
-        if old and new is not None:
-            mixed = f"{old[0]} is of version 1, {new.relative_to(root)} of version 2"
+        files = waymo_v1.parts(root)
+        folders = [f"{split}/{name}" for split in SPLITS for name in _components(root / split)]
+        if files and folders:
+            mixed = f"{files[0]} is of version 1, {folders[0]} of version 2"
             raise file_error(root, f"mixes versions of Waymo: {mixed}; keep each in a folder of its own")
-        if old or new is not None:
-            return old or _segments(root)
+        if files or folders:
+            return files or _segments(root)
         got = f"got {entries(root)}"
         if root.name in SPLITS or _components(root):
             got += f"; the root is likely {root.absolute().parent}"
@@ -91,136 +93,114 @@ class Waymo(Reader):
         return _read_segment(root, part, self.margin)
 
 
+def _components(folder: Path) -> list[str]:
+    return [name for name in COMPONENTS if (folder / name).is_dir()]
+
+
 def _segments(root: Path) -> list[str]:
     """The segments that have keypoints; others need no other files."""
-    found = []
-    for split in _splits(root):
-        missing = [name for name in COMPONENTS if not any((root / split / name).glob("*.parquet"))]
+    parts = []
+    for split in SPLITS:
+        folder, url = root / split, f"{_BUCKET}/{split}"
+        if not _components(folder):
+            continue
+        missing = [name for name in COMPONENTS if not any((folder / name).glob("*.parquet"))]
         if missing:
-            fetch = f"gcloud storage cp -r {_urls(split, missing)} {shlex.quote(f'{root / split}/')}"
-            raise file_error(root / split, f"lacks {', '.join(missing)}; fetch with: {fetch}")
-        # a damaged file is a part too: reading it tells
-        labels = sorted((root / split / "lidar_hkp").glob("*.parquet"))
+            names = missing[0] if len(missing) == 1 else f"{{{','.join(missing)}}}"
+            fetch = f"gcloud storage cp -r {url}/{names} {shlex.quote(f'{folder}/')}"
+            raise file_error(folder, f"lacks {', '.join(missing)}; fetch with: {fetch}")
+        # a damaged file is a part too: reading it reports it
+        labels = sorted((folder / "lidar_hkp").glob("*.parquet"))
         segments = [path.stem for path in labels if count_rows(path) != 0]
         for name in COMPONENTS:
-            _check_complete(root / split / name, split, segments)
-        found += [f"{split}/{segment}" for segment in segments]
-    if not found:
+            missing = [segment for segment in segments if not (folder / name / f"{segment}.parquet").is_file()]
+            if missing:
+                fetch = f"gcloud storage cp {url}/{name}/{missing[0]}.parquet {shlex.quote(f'{folder / name}/')}"
+                problem = f"lacks {len(missing)} of the {len(segments)} segments with keypoints"
+                remedy = f"fetch the first with: {fetch} (or take what you do not want out of lidar_hkp)"
+                raise file_error(folder / name, f"{problem}; {remedy}")
+        parts += [f"{split}/{segment}" for segment in segments]
+    if not parts:
         raise file_error(root, "has no segment with laser keypoints: only some have any; fetch all of lidar_hkp")
-    return sorted(found)
+    return sorted(parts)
 
 
 def _read_segment(root: Path, part: str, margin: float) -> Iterator[LabeledSample | Skipped]:
     split, _, segment = part.partition("/")
     files = {name: root / split / name / f"{segment}.parquet" for name in COMPONENTS}
     labels = []
-    for number, row in enumerate(table(files["lidar_hkp"], (SEGMENT, TIME, OBJECT, *_KEYPOINT_COLUMNS))):
-        if None in _object_key(row):
+    for number, (key, row) in enumerate(table(files["lidar_hkp"], (SEGMENT, TIME, OBJECT), _KEYPOINT_COLUMNS)):
+        if None in key:
             where = f"{part}: row {number} of lidar_hkp lacks its segment, its time or whose it is"
             yield Skipped(frames.BAD_LABEL, where)
         else:
-            labels.append(row)
+            labels.append((key, row))
     joined = _frames(files, labels, margin)
     try:
         _add_images(files, joined)
     except InputError as error:
         for frame in joined.values():
             frame.fail(frames.BAD_IMAGE, str(error))
-    for key in sorted(joined):
-        yield from joined[key].samples()
+    for frame_key in sorted(joined):
+        yield from joined[frame_key].samples()
 
 
-def _components(folder: Path) -> list[str]:
-    return [name for name in COMPONENTS if (folder / name).is_dir()]
-
-
-def _splits(root: Path) -> list[str]:
-    """The splits of which any component is there."""
-    return [split for split in SPLITS if _components(root / split)]
-
-
-def _check_complete(folder: Path, split: str, segments: list[str]) -> None:
-    missing = [segment for segment in segments if not (folder / f"{segment}.parquet").is_file()]
-    if missing:
-        fetch = f"gcloud storage cp {_urls(split, [folder.name])}/{missing[0]}.parquet {shlex.quote(f'{folder}/')}"
-        problem = f"lacks {len(missing)} of the {len(segments)} segments with keypoints; fetch the first with: {fetch}"
-        raise file_error(folder, f"{problem} (or take what you do not want out of lidar_hkp)")
-
-
-def _urls(split: str, components: list[str]) -> str:
-    names = components[0] if len(components) == 1 else f"{{{','.join(components)}}}"
-    return f"{_BUCKET}/{split}/{names}"
-
-
-def _frames(files: dict[str, Path], labels: list[dict[str, Any]], margin: float) -> dict[FrameKey, frames.Frame]:
+def _frames(files: dict[str, Path], labels: list[Row], margin: float) -> dict[FrameKey, frames.Frame]:
     """The frames that have keypoints, with boxes, calibrations and poses joined to them."""
-    boxes = table(files["lidar_box"], (SEGMENT, TIME, OBJECT, *_BOX_COLUMNS, _BOX_TYPE), (_BOX_COUNT,))
-    box_of = {_object_key(row): row for row in boxes}
-    poses: dict[FrameKey, Any] = {}
-    starts: dict[str, int] = {}
-    for row in table(files["vehicle_pose"], (SEGMENT, TIME, _VEHICLE_POSE)):
-        if row[TIME] is not None:
-            poses[row[SEGMENT], row[TIME]] = row[_VEHICLE_POSE]
-            starts[row[SEGMENT]] = min(row[TIME], starts.get(row[SEGMENT], row[TIME]))
-    calibrations = _calibrations(files["lidar_calibration"])
-    people: dict[FrameKey, list[frames.LabeledPerson]] = {}
-    for row in labels:
-        people.setdefault((row[SEGMENT], row[TIME]), []).append(_person(row, box_of.get(_object_key(row))))
-    joined = {}
-    for (segment, time), found in people.items():
-        frame = joined[segment, time] = frames.Frame(
-            sequence=segment,
-            timestamp=time,
-            start=starts.get(segment, time),
-            people=found,
-            calibrations=calibrations.get(segment, {}),
-            margin=margin,
-        )
-        if (pose := poses.get((segment, time))) is not None:
-            try:
-                frame.T_world_vehicle = frames.transform(pose, "the vehicle's pose")
-            except InputError as error:
-                frame.fail(frames.BAD_FRAME, str(error))
+    boxes = dict(table(files["lidar_box"], (SEGMENT, TIME, OBJECT), (*_BOX_COLUMNS, _BOX_TYPE), (_BOX_COUNT,)))
+    poses = dict(table(files["vehicle_pose"], (SEGMENT, TIME), (_VEHICLE_POSE,)))
+    calibrations: dict[str, dict[int, frames.Calibration]] = {}
+    for (segment, laser), row in table(files["lidar_calibration"], (SEGMENT, LASER), (_EXTRINSIC,), _BEAMS):
+        try:
+            calibrations.setdefault(segment, {})[laser] = _calibration(laser, row)
+        except InputError as error:
+            raise file_error(files["lidar_calibration"], error) from None
+    joined: dict[FrameKey, frames.Frame] = {}
+    for key, row in labels:
+        segment, time, _ = key
+        if (segment, time) not in joined:
+            joined[segment, time] = frames.Frame(
+                sequence=segment,
+                timestamp=time,
+                start=min((t for s, t in poses if s == segment and t is not None), default=time),
+                people=[],
+                calibrations=calibrations.get(segment, {}),
+                margin=margin,
+            )
+        joined[segment, time].people.append(_person(key[2], row, boxes.get(key)))
+    for frame_key, frame in joined.items():
+        pose = poses.get(frame_key, {}).get(_VEHICLE_POSE)
+        try:
+            frame.T_world_vehicle = None if pose is None else frames.transform(pose, "the vehicle's pose")
+        except InputError as error:
+            frame.fail(frames.BAD_FRAME, str(error))
     return joined
 
 
-def _object_key(row: dict[str, Any]) -> tuple[str, int, str]:
-    return row[SEGMENT], row[TIME], row[OBJECT]
+def _calibration(laser: int, row: dict[str, Any]) -> frames.Calibration:
+    values, low, high = (row[name] for name in _BEAMS)
+    return frames.Calibration(
+        laser=laser,
+        T_vehicle_laser=frames.transform(row[_EXTRINSIC], f"the extrinsic of laser {laser}"),
+        inclinations=numbers(LASER, values, (-1,), "beam inclinations", finite=False) if values else None,
+        low=low,
+        high=high,
+    )
 
 
-def _calibrations(path: Path) -> dict[str, dict[int, frames.Calibration]]:
-    """Segment -> laser -> its calibration."""
-    found: dict[str, dict[int, frames.Calibration]] = {}
-    columns = (SEGMENT, LASER, _EXTRINSIC)
-    optional = (f"{_BEAMS}.values", f"{_BEAMS}.min", f"{_BEAMS}.max")
-    for row in table(path, columns, optional):
-        values, low, high = (row[name] for name in optional)
-        try:
-            found.setdefault(row[SEGMENT], {})[row[LASER]] = frames.Calibration(
-                laser=row[LASER],
-                T_vehicle_laser=frames.transform(row[_EXTRINSIC], f"the extrinsic of laser {row[LASER]}"),
-                inclinations=numbers(LASER, values, (-1,), "beam inclinations", finite=False) if values else None,
-                low=low,
-                high=high,
-            )
-        except InputError as error:
-            raise file_error(path, error) from None
-    return found
-
-
-def _person(label: dict[str, Any], box: dict[str, Any] | None) -> frames.LabeledPerson:
+def _person(track: str, label: dict[str, Any], box: dict[str, Any] | None) -> frames.LabeledPerson | frames.Problem:
     kinds, *places, hidden = (label[name] or [] for name in _KEYPOINT_COLUMNS)
     if len({len(kinds), len(hidden), *map(len, places)}) > 1:
-        return frames.LabeledPerson(track=label[OBJECT], problem=(frames.BAD_LABEL, "its lists have different lengths"))
+        return frames.Problem(frames.BAD_LABEL, "its lists have different lengths", track)
     try:
         positions = numbers("lidar_hkp", places, (3, -1), "keypoints", finite=False)
         keypoints = zip(kinds, positions.T, hidden, strict=True)
         if box is None:
-            return frames.person(label[OBJECT], keypoints, None)
+            return frames.person(track, keypoints, None)
         values = numbers("lidar_box", [box[name] for name in _BOX_COLUMNS], (7,), "a box", finite=False)
-        return frames.person(label[OBJECT], keypoints, values, box[_BOX_TYPE], box[_BOX_COUNT])
+        return frames.person(track, keypoints, values, box[_BOX_TYPE], box[_BOX_COUNT])
     except InputError as error:
-        return frames.LabeledPerson(track=label[OBJECT], problem=(frames.BAD_LABEL, str(error)))
+        return frames.Problem(frames.BAD_LABEL, str(error), track)
 
 
 def _add_images(files: dict[str, Path], joined: dict[FrameKey, frames.Frame]) -> None:
@@ -234,8 +214,8 @@ def _add_images(files: dict[str, Path], joined: dict[FrameKey, frames.Frame]) ->
     waiting: dict[LaserKey, np.ndarray | None] = {}
     for key, returns in images(files["lidar"], _RETURNS, wanted):
         while key in posed and key not in waiting:
-            found, (image,) = next(poses, (key, [None]))
-            waiting[found] = image
+            pose_key, (image,) = next(poses, (key, [None]))
+            waiting[pose_key] = image
         pixel_poses, frame = waiting.pop(key, None), joined[key[:2]]
         for which, image in enumerate(returns, 1):
             if image is not None and not image.size:
@@ -257,16 +237,16 @@ def count_rows(path: Path) -> int | None:
         return None
 
 
-def table(path: Path, columns: tuple[str, ...], optional: tuple[str, ...] = ()) -> list[dict[str, Any]]:
-    """All rows of a small file; None where an optional column is missing or a value null. Raises InputError."""
+def table(path: Path, keys: tuple[str, ...], columns: tuple[str, ...], optional: tuple[str, ...] = ()) -> list[Row]:
+    """All rows of a small file: the values of its key columns, and the others by name, None where an optional column is
+    missing or a value null. Raises InputError."""
     with _opened(path) as file:
-        there = [name for name in (*columns, *optional) if name in file.schema_arrow.names]
-        _check(path, columns, there)
-        found = file.read(columns=there, use_threads=False).to_pydict()
-        if LASER in found:
-            found[LASER] = [_laser(path, name) for name in found[LASER]]
+        _check(path, (*keys, *columns), file.schema_arrow.names)
+        names = [name for name in (*columns, *optional) if name in file.schema_arrow.names]
+        values = file.read(columns=names, use_threads=False).to_pydict()
         empty = dict.fromkeys(optional)
-        return [empty | dict(zip(found, row, strict=True)) for row in zip(*found.values(), strict=True)]
+        rows = [empty | dict(zip(names, row, strict=True)) for row in zip(*map(values.get, names), strict=True)]
+        return list(zip(_keys(path, file, keys), rows, strict=True))
 
 
 def laser_keys(path: Path, wanted: Collection[FrameKey]) -> set[LaserKey]:
@@ -309,11 +289,13 @@ def _image(values, shape) -> np.ndarray | None:
     return flat.reshape(size)
 
 
-def _keys(path: Path, file) -> list[LaserKey]:
-    _check(path, (SEGMENT, TIME, LASER), file.schema_arrow.names)
-    found = file.read(columns=[SEGMENT, TIME, LASER], use_threads=False).to_pydict()
-    lasers = [_laser(path, name) for name in found[LASER]]
-    return list(zip(found[SEGMENT], found[TIME], lasers, strict=True))
+def _keys(path: Path, file, names: tuple[str, ...] = (SEGMENT, TIME, LASER)) -> list[tuple]:
+    """The key columns of all rows."""
+    _check(path, names, file.schema_arrow.names)
+    values = file.read(columns=list(names), use_threads=False).to_pydict()
+    if LASER in values:
+        values[LASER] = [_laser(path, laser) for laser in values[LASER]]
+    return list(zip(*(values[name] for name in names), strict=True))
 
 
 def _laser(path: Path, name: int | str) -> int:

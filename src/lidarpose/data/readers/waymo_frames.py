@@ -7,8 +7,8 @@ and W columns of a range image, n points, J = 14 joints.
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import cast
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from lidarpose.skeleton import WAYMO14
 
 LASERS = {"TOP": 1, "FRONT": 2, "SIDE_LEFT": 3, "SIDE_RIGHT": 4, "REAR": 5}
 TOP = LASERS["TOP"]
-# how far outside the labelled box points are still taken, m on each side
+# how far outside the labeled box points are still taken, m on each side
 MARGIN = 0.2
 
 # KeypointType -> the joint of WAYMO14; 19, the forehead, is of cameras
@@ -74,18 +74,16 @@ class Calibration:
     high: float | None
 
     def __post_init__(self):
-        if self.inclinations is None and (self.low is None or self.high is None):
+        if self.inclinations is None and None in (self.low, self.high):
             raise InputError(f"has no beam inclinations of laser {self.laser}")
 
     def rows(self, height: int) -> np.ndarray:
         """(H,) rad: the inclination of each row of a range image. Row 0 is the last beam of the table: its order is
         reversed. Raises InputError where the table has another length."""
-        if self.inclinations is None:
-            # both are set: checked when built
-            low, high = cast("tuple[float, float]", (self.low, self.high))
+        beams = self.inclinations
+        if beams is None:
+            low, high = float(self.low or 0), float(self.high or 0)
             beams = low + (np.arange(height) + 0.5) / height * (high - low)
-        else:
-            beams = np.asarray(self.inclinations, float)
         if len(beams) != height or not np.isfinite(beams).all():
             raise InputError(f"laser {self.laser} has {len(beams)} inclinations, its range image {height} rows")
         return beams[::-1]
@@ -108,8 +106,7 @@ def points_of_image(
     row, column = np.nonzero((image > 0) & (image < np.inf))
     T = calibration.T_vehicle_laser
     # columns divide the turn of the vehicle's axes, not of the laser's own
-    turned = np.arctan2(T[1, 0], T[0, 0])
-    azimuth = ((width - column - 0.5) / width * 2 - 1) * np.pi - turned
+    azimuth = ((width - column - 0.5) / width * 2 - 1) * np.pi - np.arctan2(T[1, 0], T[0, 0])
     points = from_spherical(image[row, column].astype(float), azimuth, calibration.rows(height)[row])
     points = points @ T[:3, :3].T + T[:3, 3]
     if pixel_poses is None:
@@ -135,17 +132,23 @@ def _turned(a: np.ndarray, b: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LabeledPerson:
-    """Somebody with keypoints in one frame, in the vehicle's frame. joints (14, 3) m, NaN where not labelled, and their
-    labels (14,); kind: Waymo's type of the box; counted: points in the box by the label; problem: why they are left
-    out, and what else to say of it."""
+    """Somebody with keypoints in one frame, in the vehicle's frame. joints (14, 3) m, NaN where not labeled, and their
+    labels (14,); kind: Waymo's type of the box; counted: points in the box by the label."""
 
     track: str
-    joints: np.ndarray | None = None
-    labels: np.ndarray | None = None
-    box: Box | None = None
-    kind: int = 0
-    counted: int | None = None
-    problem: tuple[str, str] | None = None
+    joints: np.ndarray
+    labels: np.ndarray
+    box: Box
+    kind: int
+    counted: int | None
+
+
+class Problem(NamedTuple):
+    """Why somebody, or everybody in a frame, is left out, and what else to say of it."""
+
+    reason: str
+    why: str = ""
+    track: str = ""
 
 
 def person(
@@ -154,28 +157,28 @@ def person(
     box: tuple[float, ...] | np.ndarray | None,
     kind: int = 0,
     counted: int | None = None,
-) -> LabeledPerson:
+) -> LabeledPerson | Problem:
     """Somebody by their labels. keypoints: (type, x y z, whether occluded) each, in any order, types that the skeleton
     lacks ignored; box: center, size (length, width, height) and heading, 7 numbers."""
     joints, labels = np.full((len(WAYMO14), 3), np.nan), np.full(len(WAYMO14), UNLABELED, np.uint8)
-    for found, place, hidden in keypoints:
-        if found in _JOINTS and within_reach(np.asarray(place)):
-            joints[_JOINTS[found]] = place
-            labels[_JOINTS[found]] = HIDDEN if hidden else SEEN
+    for keypoint, place, hidden in keypoints:
+        if keypoint in _JOINTS and within_reach(np.asarray(place)):
+            joints[_JOINTS[keypoint]] = place
+            labels[_JOINTS[keypoint]] = HIDDEN if hidden else SEEN
     if box is None:
-        return LabeledPerson(track=track, problem=("keypoints without a box", ""))
+        return Problem("keypoints without a box", track=track)
     if (labels == UNLABELED).all():
-        return LabeledPerson(track=track, problem=("no joint is labelled", ""))
+        return Problem("no joint is labelled", track=track)
     try:
-        of = Box(center=np.asarray(box[:3]), size=np.asarray(box[3:6]), yaw=box[6], id=track)
+        checked = Box(center=np.asarray(box[:3]), size=np.asarray(box[3:6]), yaw=box[6], id=track)
     except InputError as error:
-        return LabeledPerson(track=track, problem=(BAD_LABEL, str(error)))
-    return LabeledPerson(track=track, joints=joints, labels=labels, box=of, kind=kind, counted=counted)
+        return Problem(BAD_LABEL, str(error), track)
+    return LabeledPerson(track=track, joints=joints, labels=labels, box=checked, kind=kind, counted=counted)
 
 
 @dataclass(kw_only=True, eq=False)
 class Frame:
-    """A frame and the people labelled in it, to which range images are added one by one, in any order.
+    """A frame and the people labeled in it, to which range images are added one by one, in any order.
 
     sequence, timestamp (us) and start, that of the sequence's first frame; calibrations by laser; T_world_vehicle
     (4, 4) or None where it is missing; margin m around the boxes.
@@ -184,28 +187,27 @@ class Frame:
     sequence: str
     timestamp: int
     start: int
-    people: list[LabeledPerson]
+    people: list[LabeledPerson | Problem]
     calibrations: dict[int, Calibration]
     T_world_vehicle: np.ndarray | None = None
     margin: float = MARGIN
-    _problem: tuple[str, str] | None = None
-    _seen: set[tuple[int, int]] = field(default_factory=set)
-    _crops: dict[int, list] = field(default_factory=dict)
+    _problem: Problem | None = None
+    # (laser, return) -> points and rings in the box of each person
+    _crops: dict[tuple[int, int], list[tuple[np.ndarray, np.ndarray]]] = field(default_factory=dict)
 
     @property
     def wanted(self) -> bool:
-        """Whether anybody's points are looked for."""
-        return self._problem is None and any(one.problem is None for one in self.people)
+        """Whether range images are still needed."""
+        return self._problem is None and any(isinstance(person, LabeledPerson) for person in self.people)
 
     def fail(self, reason: str, why: str = "") -> None:
         """Leaves out everybody in the frame."""
-        self._problem = self._problem or (reason, why)
+        self._problem = self._problem or Problem(reason, why)
 
     def add(self, laser: int, which: int, image: np.ndarray, pixel_poses: np.ndarray | None) -> None:
         """A laser's return number `which`: range image (H, W) m and its pixels' poses (H, W, 6), None for none."""
-        if not self.wanted or (laser, which) in self._seen:
+        if not self.wanted or (laser, which) in self._crops:
             return
-        self._seen.add((laser, which))
         try:
             if self.T_world_vehicle is None:
                 return self.fail("no vehicle pose of the frame")
@@ -216,49 +218,50 @@ class Frame:
             points, row = points_of_image(image, self.calibrations[laser], pixel_poses, self.T_world_vehicle)
         except InputError as error:
             return self.fail(BAD_IMAGE, str(error))
-        # the lowest beam is ring 0; only the top laser's rows are told
+        # the lowest beam is ring 0; only the top laser's rows are kept
         ring = len(image) - 1 - row if laser == TOP else np.full(len(row), -1)
-        for k, one in enumerate(self.people):
-            if one.problem is None and one.box is not None:
-                inside = one.box.contains(points, self.margin)
-                self._crops.setdefault(k, []).append(((laser, which), points[inside], ring[inside]))
+        crops = self._crops[laser, which] = []
+        for person in self.people:
+            inside = person.box.contains(points, self.margin) if isinstance(person, LabeledPerson) else slice(0)
+            crops.append((points[inside], ring[inside]))
 
     def samples(self) -> Iterator[LabeledSample | Skipped]:
         """Everybody, in the order of their tracks, once all images are there."""
-        if self.wanted and not any(laser == TOP for laser, _ in self._seen):
+        if self.wanted and not any(laser == TOP for laser, _ in self._crops):
             self.fail("no range image of the frame")
-        for k, one in sorted(enumerate(self.people), key=lambda pair: pair[1].track):
-            where = f"{self.sequence}/{self.timestamp}/{one.track}"
-            problem = one.problem or self._problem
-            if problem is None:
-                crops = sorted(self._crops[k], key=lambda crop: crop[0])
-                points, ring = (np.concatenate([crop[k] for crop in crops]) for k in (1, 2))
+        for k, person in sorted(enumerate(self.people), key=lambda pair: pair[1].track):
+            where = f"{self.sequence}/{self.timestamp}/{person.track}"
+            problem = self._problem
+            if isinstance(person, Problem):
+                problem = person
+            elif problem is None:
+                points, ring = map(
+                    np.concatenate, zip(*(self._crops[key][k] for key in sorted(self._crops)), strict=True)
+                )
                 if len(points):
-                    yield self._sample(one, points, ring)
+                    yield self._sample(person, points, ring)
                     continue
-                problem = ("no points in the box", "" if one.counted is None else f"the label counts {one.counted}")
-            reason, why = problem
-            yield Skipped(reason, f"{where}: {why}" if why else where)
+                counted = "" if person.counted is None else f"the label counts {person.counted}"
+                problem = Problem("no points in the box", counted)
+            yield Skipped(problem.reason, f"{where}: {problem.why}" if problem.why else where)
 
-    def _sample(self, one: LabeledPerson, points: np.ndarray, ring: np.ndarray) -> LabeledSample:
-        # all set of somebody without a problem
-        joints, labels, label = cast("tuple[np.ndarray, np.ndarray, Box]", (one.joints, one.labels, one.box))
+    def _sample(self, person: LabeledPerson, points: np.ndarray, ring: np.ndarray) -> LabeledSample:
         # the sensor is at the origin
         origin = self.calibrations[TOP].T_vehicle_laser[:3, 3]
         points = (points - origin).astype(np.float32)
-        box = Box(center=label.center - origin, size=label.size, yaw=label.yaw, id=one.track)
+        box = replace(person.box, center=person.box.center - origin)
         return LabeledSample(
             points=points,
             center=center_of(points),
             ring=ring.astype(np.int32),
-            pose=Pose(joints=(joints - origin).astype(np.float32), skeleton=WAYMO14, frame="sensor"),
+            pose=Pose(joints=(person.joints - origin).astype(np.float32), skeleton=WAYMO14, frame="sensor"),
             box=box,
-            source=f"waymo/{_KINDS.get(one.kind, 'unknown')}",
+            source=f"waymo/{_KINDS.get(person.kind, 'unknown')}",
             frame_id=f"{self.sequence}/{self.timestamp}",
-            joint_labels=labels,
+            joint_labels=person.labels,
             sequence=self.sequence,
             frame=self.timestamp,
-            track=one.track,
+            track=person.track,
             time=(self.timestamp - self.start) / 1e6,
             centers={"box": box.center},
         )

@@ -95,8 +95,8 @@ def parse(message: str, data: bytes, largest: int) -> Any:
 
 def parts(root: Path) -> list[str]:
     """The files, as paths below the root, none where there are none."""
-    found = (path.relative_to(root).as_posix() for split in SPLITS for path in (root / split).glob("*.tfrecord"))
-    return sorted(found)
+    paths = (path for split in SPLITS for path in (root / split).glob("*.tfrecord"))
+    return sorted(path.relative_to(root).as_posix() for path in paths)
 
 
 def read(root: Path, part: str, margin: float) -> Iterator[LabeledSample | Skipped]:
@@ -153,26 +153,32 @@ def _frame(message: Any, start: int | None, margin: float) -> frames.Frame:
     name = message.context.name.decode("utf-8", "replace")
     if not name or not message.HasField("timestamp_micros"):
         raise InputError("is no frame of Waymo's perception dataset: it has no segment or no time")
-    people = [_person(label) for label in message.laser_labels if label.HasField("laser_keypoints")]
     frame = frames.Frame(
         sequence=name,
         timestamp=message.timestamp_micros,
         start=message.timestamp_micros if start is None else start,
-        people=people,
-        calibrations=_calibrations(message.context.laser_calibrations) if people else {},
-        T_world_vehicle=_transform(message, "pose", "the vehicle's pose") if people else None,
+        people=[_person(label) for label in message.laser_labels if label.HasField("laser_keypoints")],
+        calibrations={},
         margin=margin,
     )
+    if frame.people:
+        frame.calibrations = {laser.name: _calibration(laser) for laser in message.context.laser_calibrations}
+        if message.HasField("pose"):
+            frame.T_world_vehicle = frames.transform(message.pose.transform, "the vehicle's pose")
     for laser in message.lasers if frame.wanted else ():
         try:
-            _add_images(frame, laser)
+            # the pixels' poses are beside the first return and are those of both
+            poses = _matrix(laser.ri_return1.range_image_pose_compressed)
+            for which, image in enumerate((laser.ri_return1, laser.ri_return2), 1):
+                if (values := _matrix(image.range_image_compressed)) is not None:
+                    frame.add(laser.name, which, values[..., 0], poses)
         except InputError as error:
             frame.fail(frames.BAD_IMAGE, str(error))
     return frame
 
 
-def _person(label: Any) -> frames.LabeledPerson:
-    keypoints, box = [], None
+def _person(label: Any) -> frames.LabeledPerson | frames.Problem:
+    keypoints, box, counted = [], None, None
     for keypoint in label.laser_keypoints.keypoint:
         if keypoint.keypoint_3d.HasField("location_m"):
             at = keypoint.keypoint_3d.location_m
@@ -180,38 +186,20 @@ def _person(label: Any) -> frames.LabeledPerson:
     if label.HasField("box"):
         b = label.box
         box = (b.center_x, b.center_y, b.center_z, b.length, b.width, b.height, b.heading)
-    counted = label.num_lidar_points_in_box if label.HasField("num_lidar_points_in_box") else None
+    if label.HasField("num_lidar_points_in_box"):
+        counted = label.num_lidar_points_in_box
     return frames.person(label.id.decode("utf-8", "replace"), keypoints, box, label.type, counted)
 
 
-def _transform(message: Any, field: str, what: str) -> np.ndarray | None:
-    return frames.transform(getattr(message, field).transform, what) if message.HasField(field) else None
-
-
-def _calibrations(messages: Any) -> dict[int, frames.Calibration]:
-    found = {}
-    for one in messages:
-        extrinsic = _transform(one, "extrinsic", f"the extrinsic of laser {one.name}")
-        if extrinsic is None:
-            raise InputError(f"the calibration of laser {one.name} lacks its extrinsic")
-        beams = np.array(one.beam_inclinations)
-        found[one.name] = frames.Calibration(
-            laser=one.name,
-            T_vehicle_laser=extrinsic,
-            inclinations=beams if len(beams) else None,
-            low=one.beam_inclination_min if one.HasField("beam_inclination_min") else None,
-            high=one.beam_inclination_max if one.HasField("beam_inclination_max") else None,
-        )
-    return found
-
-
-def _add_images(frame: frames.Frame, laser: Any) -> None:
-    """Adds both returns of a laser; the pixels' poses are beside the first."""
-    poses = _matrix(laser.ri_return1.range_image_pose_compressed)
-    for which, image in enumerate((laser.ri_return1, laser.ri_return2), 1):
-        values = _matrix(image.range_image_compressed)
-        if values is not None:
-            frame.add(laser.name, which, values[..., 0], poses)
+def _calibration(laser: Any) -> frames.Calibration:
+    beams = np.array(laser.beam_inclinations)
+    return frames.Calibration(
+        laser=laser.name,
+        T_vehicle_laser=frames.transform(laser.extrinsic.transform, f"the extrinsic of laser {laser.name}"),
+        inclinations=beams if len(beams) else None,
+        low=laser.beam_inclination_min if laser.HasField("beam_inclination_min") else None,
+        high=laser.beam_inclination_max if laser.HasField("beam_inclination_max") else None,
+    )
 
 
 def _matrix(compressed: bytes) -> np.ndarray | None:
