@@ -1,4 +1,4 @@
-"""`lidarpose view`: people of a dataset on a sheet and on a page."""
+"""`lidarpose view`: people of a dataset on a sheet and on a page, streets from above; scans from above in general."""
 
 import re
 import shutil
@@ -50,9 +50,9 @@ def test_a_sheet_and_a_page_in_the_current_folder(dataset, capsys):
 
 def test_people_are_spread_over_the_dataset(dataset):
     people = open_dataset("streetlife")
-    index = [row["index"] for row in _spread(people, 6)]
+    index = [row["index"] for (row,) in _spread(people, "people", 6)]
     assert len(index) == 6 == len(set(index)) and {k // 8 for k in index} == {0, 1, 2}
-    assert len(_spread(people, 1)) == 1
+    assert len(_spread(people, "people", 1)) == 1
 
 
 @pytest.mark.parametrize(

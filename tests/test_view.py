@@ -17,14 +17,14 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14, Skeleton
-from lidarpose.viz import draw, html
-from lidarpose.viz.draw import MAX_PEOPLE, Panel, _shortened, draw_people
-from lidarpose.viz.html import MAX_POINTS, ReportPerson, render_report, write_report
-from lidarpose.viz.person_view import bone_sides, describe, facing, project, side, thinned, view_directions
+from lidarpose.viz import draw
+from lidarpose.viz.draw import _shortened, draw_people
+from lidarpose.viz.html import MAX_POINTS, render_report, write_report
+from lidarpose.viz.person_view import Panel, bone_sides, describe, facing, project, side, thinned, view_directions
 
 BLUE, ORANGE = (0x00, 0x72, 0xB2), (0xE0, 0x70, 0x00)
 
-# a T-pose that faces +x, metres: left is +y
+# a T-pose that faces +x, meters: left is +y
 _T_POSE = {
     "pelvis": (0, 0, 0.95), "spine1": (0, 0, 1.06), "spine2": (0, 0, 1.18), "spine3": (0, 0, 1.28),
     "neck": (0, 0, 1.45), "head": (0.02, 0, 1.54), "nose": (0.14, 0, 1.6), "head_center": (0.04, 0, 1.62),
@@ -49,12 +49,13 @@ def cloud(pose, *, count=200, seed=0):
     return (joints[bones[:, 0]] * t + joints[bones[:, 1]] * (1 - t) + rng.normal(0, 0.03, (count, 3))).astype("f4")
 
 
-def person(kind=Panel, *, count=200, label="somebody", **pose):
+def person(*, count=200, label="somebody", **pose):
     pose = t_pose(**pose)
-    return kind(points=cloud(pose, count=count), pose=pose, truth=t_pose(), label=label)
+    return Panel(points=cloud(pose, count=count), pose=pose, truth=t_pose(), label=label)
 
 
-EMPTY = Panel(points=np.zeros((0, 3)))
+NOTHING = np.zeros((0, 3))
+EMPTY = Panel(points=NOTHING)
 
 
 def report(*people):
@@ -75,14 +76,6 @@ def pixels(image, color):
     return np.argwhere(np.abs(image - color).max(-1) <= 12)
 
 
-@pytest.mark.parametrize("skeleton", [SMPL24, HUMAN15, WAYMO14, BODY26], ids=lambda s: s.name)
-@pytest.mark.parametrize(
-    ("yaw", "expected"), [(0, (1, 0, 0)), (np.pi / 2, (0, 1, 0)), (np.pi, (-1, 0, 0)), (-np.pi / 2, (0, -1, 0))]
-)
-def test_facing_follows_the_body(skeleton, yaw, expected):
-    np.testing.assert_allclose(facing(t_pose(yaw=yaw, skeleton=skeleton)), expected, atol=1e-9)
-
-
 def test_facing_needs_one_known_pair_of_joints_that_is_not_upright():
     pose = t_pose(yaw=1.0)
     assert facing(None) is None
@@ -97,6 +90,9 @@ def test_facing_needs_one_known_pair_of_joints_that_is_not_upright():
 @given(yaw=st.floats(-np.pi, np.pi), seed=st.integers(0, 99))
 def test_front_view_is_face_to_face_and_the_side_view_looks_right(yaw, seed):
     pose = t_pose(yaw=yaw)
+    for skeleton in (SMPL24, HUMAN15, WAYMO14, BODY26):
+        forward = facing(t_pose(yaw=yaw, skeleton=skeleton))
+        np.testing.assert_allclose(forward, (np.cos(yaw), np.sin(yaw), 0), atol=1e-9)
     front, from_right = view_directions(facing(pose))
     joint = {name: pose.joints[i] for i, name in enumerate(BODY26.joints)}
     seen = {name: project(at, seen_from=front) for name, at in joint.items()}
@@ -129,7 +125,7 @@ def test_thinned_keeps_distinct_points_in_order(count, limit):
 
 def test_picture_has_left_in_blue_on_the_right_of_the_front_view(tmp_path):
     # the person looks at the frame's +y; points are left out so that only the skeleton has colors
-    panel = Panel(points=np.zeros((0, 3)), pose=t_pose(yaw=np.pi / 2, confidence=1.0), label="a")
+    panel = Panel(points=NOTHING, pose=t_pose(yaw=np.pi / 2, confidence=1.0), label="a")
     png = draw_people([panel], tmp_path / "sheet.png")
     assert (tmp_path / "sheet.png").read_bytes() == png
     image = decoded(png)[70:]  # below the legend
@@ -144,26 +140,38 @@ def test_picture_has_left_in_blue_on_the_right_of_the_front_view(tmp_path):
 
 def test_an_unsure_pose_is_fainter():
     def ink(confidence):
-        panel = Panel(points=np.zeros((0, 3)), pose=t_pose(confidence=confidence))
+        panel = Panel(points=NOTHING, pose=t_pose(confidence=confidence))
         return (255 - decoded(draw_people([panel]))[70:]).sum()
 
     assert ink(0.05) < 0.7 * ink(1.0)
 
 
-def test_parts_color_the_points():
-    pose = t_pose()
-    points = cloud(pose)
-    part = np.full(len(points), 1 + SMPL24.index("left_knee"), np.uint8)
-    plain, colored = (decoded(draw_people([Panel(points=points, part=p)])) for p in (None, part))
-    saturated = [(np.ptp(image[70:], axis=-1) > 60).sum() for image in (plain, colored)]
-    assert saturated[0] == 0 and saturated[1] > 300
+def test_points_have_the_colors_of_their_parts_else_of_their_depth():
+    def shown(points, **settings):
+        return decoded(draw_people([Panel(points=points, **settings)]))[70:]
+
+    points = cloud(t_pose())
+    part = np.full(len(points), 1, np.uint8)
+    for side_of_body, channel in (("left", 2), ("right", 0)):
+        image = shown(points, part=part + SMPL24.index(f"{side_of_body}_knee"))
+        vivid = image[np.ptp(image, axis=-1) > 60]
+        assert len(vivid) > 300 and (vivid.argmax(-1) == channel).mean() > 0.95
+    # two planes, the nearer one on the right of the view from +x
+    planes = np.mgrid[-1:1:2j, 0.3:0.9:20j, 0:1:20j].reshape(3, -1).T
+    image = shown(planes * np.where(planes[:, :1] < 0, [1, -1, 1], 1))
+    assert (np.ptp(image, axis=-1) <= 60).all()
+    dark = pixels(image, np.round(255 * np.array(draw._NEAR)))[:, 1]
+    dark = dark[dark < 290]
+    assert len(dark) > 200 and dark.min() > 165
+    light = pixels(image, np.round(255 * np.array(draw._FAR)))[:, 1]
+    assert ((light > 40) & (light < 160)).sum() > 200
 
 
 @pytest.mark.parametrize(
     "panel",
     [
         EMPTY,
-        Panel(points=np.zeros((0, 3)), truth=t_pose()),
+        Panel(points=NOTHING, truth=t_pose()),
         Panel(points=np.ones((1, 3)), label="$x^$ \\frac <b>\n" + "long " * 99),
         Panel(points=np.full((9, 3), np.nan), pose=Pose(joints=np.full((26, 3), np.nan), skeleton=BODY26)),
         Panel(points=cloud(t_pose()) * [1, 1, 0.001], box=Box(center=(8, 3, 0), size=(1, 1, 2), yaw=0.3)),
@@ -219,7 +227,7 @@ def test_only_so_many_people_fit(monkeypatch):
 def test_picture_is_the_same_each_time_and_changes_nothing():
     from matplotlib import rc_context
 
-    panel = person(count=MAX_PEOPLE)
+    panel = person(count=60)
     before = panel.points.copy(), panel.pose.joints.copy()
     png = draw_people([panel], title="a")
     # whatever the user's settings
@@ -238,15 +246,18 @@ def test_importing_is_light_and_drawing_leaves_pyplot_alone():
     subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
 
 
-@pytest.mark.parametrize("kind", [Panel, ReportPerson])
-def test_wrong_shapes_are_refused(kind):
-    many = Pose(joints=np.zeros((2, 26, 3)), skeleton=BODY26)
-    with pytest.raises(InputError, match=r"points must be \(n, 3\) metres, got \(5, 2\)"):
-        kind(label="a", points=np.zeros((5, 2)))
-    with pytest.raises(InputError, match=r"pose must hold one person, joints \(26, 3\), got \(2, 26, 3\)"):
-        kind(label="a", points=np.zeros((5, 3)), pose=many)
-    with pytest.raises(InputError, match="part must be"):
-        Panel(points=np.zeros((5, 3)), part=np.zeros(4, int))
+@pytest.mark.parametrize(
+    "settings, message",
+    [
+        ({"points": np.zeros((5, 2))}, r"points must be \(n, 3\) meters, got \(5, 2\)"),
+        ({"pose": Pose(joints=np.zeros((2, 26, 3)), skeleton=BODY26)}, r"pose must hold one person, joints \(26, 3\)"),
+        ({"truth": Pose(joints=np.zeros((2, 26, 3)), skeleton=BODY26)}, r"got \(2, 26, 3\): draw people one by one"),
+        ({"part": np.zeros(4, int)}, r"part must be \(5,\)"),
+    ],
+)
+def test_wrong_shapes_are_refused(settings, message):
+    with pytest.raises(InputError, match=message):
+        Panel(**{"points": np.zeros((5, 3))} | settings)
 
 
 VOID = {"meta", "input", "br", "link", "img"}
@@ -284,7 +295,7 @@ EVIL = "</script><script>alert('\"%%DATA%%&amp;"
 
 
 def evil_report():
-    people = [person(ReportPerson, label=EVIL), ReportPerson(label="b", points=np.zeros((0, 3)), caption=EVIL)]
+    people = [person(label=EVIL), Panel(label="b", points=NOTHING, caption=EVIL)]
     return render_report(people, title=EVIL, summary=[{EVIL: EVIL}])
 
 
@@ -301,7 +312,7 @@ def test_report_escapes_what_callers_say():
 def test_report_data_cannot_end_its_element():
     name = "</script><!--<script>"
     pose = Pose(joints=np.zeros((1, 3)), skeleton=Skeleton(name=name, joints=(name,), parents=(-1,)))
-    _, data = report(ReportPerson(label="", points=np.ones((9, 3)), pose=pose))
+    _, data = report(Panel(label="", points=np.ones((9, 3)), pose=pose))
     assert data["skeletons"][name]["joints"] == [name]
 
 
@@ -312,7 +323,7 @@ def test_report_loads_nothing():
 
 
 def test_report_holds_the_data():
-    given = person(ReportPerson, yaw=1.25)
+    given = person(yaw=1.25)
     joints = given.pose.joints.copy()
     joints[3] = np.nan
     _, data = report(replace(given, pose=Pose(joints=joints, skeleton=BODY26)))
@@ -330,15 +341,15 @@ def test_report_holds_the_data():
 
 
 def test_report_is_small_and_thins_what_is_too_much():
-    people = [person(ReportPerson, count=1000, label=str(i), yaw=i) for i in range(12)]
+    people = [person(count=1000, label=str(i), yaw=i) for i in range(12)]
     text, data = report(*people)
     assert len(text.encode()) < 500_000 and text == report(*people)[0]
     assert len(data["people"][0]["points"]) == 3000
-    text, _ = report(*[person(ReportPerson, count=MAX_POINTS)] * 2)
+    text, _ = report(*[person(count=MAX_POINTS)] * 2)
     assert len(text.encode()) < 1_500_000
     assert "30,000 of 60,000 points drawn" in text
     # points that are nowhere are not drawn, and not counted as drawn
-    odd = person(ReportPerson, count=100)
+    odd = person(count=100)
     odd.points[:90], odd.points[90] = np.nan, 1e30
     text, data = report(odd)
     assert "9 of 100 points drawn" in text and len(data["people"][0]["points"]) == 27
@@ -347,14 +358,14 @@ def test_report_is_small_and_thins_what_is_too_much():
 def test_report_of_odd_people():
     nothing = Pose(joints=np.full((26, 3), np.nan), skeleton=BODY26)
     text, data = report(
-        ReportPerson(label="none", points=np.zeros((0, 3))),
-        ReportPerson(label="few", points=np.zeros((4, 3))),
-        ReportPerson(label="nan", points=np.full((9, 3), np.nan), pose=nothing, truth=nothing),
+        Panel(label="none", points=NOTHING),
+        Panel(label="few", points=np.zeros((4, 3))),
+        Panel(label="nan", points=np.full((9, 3), np.nan), pose=nothing, truth=nothing),
     )
     assert [len(p["points"]) for p in data["people"]] == [0, 12, 0]
     assert all(p["pose"] is None and p["facing"] is None for p in data["people"])
     assert text.count("no pose: under 5 points") == 2
-    assert "no pose" not in report(ReportPerson(label="few", points=np.zeros((4, 3)), truth=t_pose()))[0]
+    assert "no pose" not in report(Panel(label="few", points=np.zeros((4, 3)), truth=t_pose()))[0]
     assert "no people" in report()[0]
 
 
@@ -378,36 +389,28 @@ def test_summary_table():
 @settings(max_examples=20, deadline=None)
 @given(label=st.text(max_size=40))
 def test_any_label_is_readable_again(label):
-    page = Reader(report(ReportPerson(label=label, points=np.ones((1, 3))))[0])
+    page = Reader(report(Panel(label=label, points=np.ones((1, 3))))[0])
     shown = "".join(page.texts.get("strong", []))
     assert shown == label or any(not c.isprintable() for c in label)
 
 
 def test_files_and_labels_from_strange_file_names(tmp_path):
     path = tmp_path / "report.html"
-    write_report(path, [person(ReportPerson)], title="t", summary=[{"a": 1}])
-    assert path.read_text(encoding="utf-8") == render_report([person(ReportPerson)], title="t", summary=[{"a": 1}])
+    write_report(path, [person()], title="t", summary=[{"a": 1}])
+    assert path.read_text(encoding="utf-8") == render_report([person()], title="t", summary=[{"a": 1}])
     label = "a\udc80\x00b"
     assert draw_people([Panel(points=np.ones((9, 3)), label=label)], title=label)
-    write_report(path, [ReportPerson(label=label, points=np.ones((9, 3)))], title="t", summary=[])
+    write_report(path, [Panel(points=np.ones((9, 3)), label=label)], title="t", summary=[])
     assert "a?" in path.read_text(encoding="utf-8")
-
-
-def test_points_have_the_colors_that_the_legend_says():
-    left, right = draw._part_colors(np.array([1 + BODY26.index("left_knee"), 1 + BODY26.index("right_knee")]))
-    assert left[2] > left[0] + 0.2 and right[0] > right[2] + 0.2
-    near, far = draw._depth_colors(np.array([1.0, -1.0]))
-    np.testing.assert_allclose([near, far], [draw._NEAR, draw._FAR])
 
 
 def test_a_report_says_the_side_of_every_joint_and_point():
     part = np.array([0, 1, 1 + BODY26.index("left_knee"), 1 + BODY26.index("right_hand"), 24], np.uint8)
     points = np.arange(15.0).reshape(5, 3)
     points[1] = np.nan
-    pose = Pose(joints=np.zeros((26, 3)), skeleton=BODY26)
-    sides = html._skeleton_data(BODY26)["sides"]
+    _, data = report(Panel(points=points, pose=Pose(joints=np.zeros((26, 3)), skeleton=BODY26), part=part))
+    assert data["people"][0]["sides"] == "nlrr"
+    sides = data["skeletons"]["body26"]["sides"]
     for name, letter in (("left_hand", "l"), ("right_hip", "r"), ("neck", "c")):
         assert sides[BODY26.index(name)] == letter
     assert [sides.count(letter) for letter in "lrc"] == [9, 9, 8]
-    person = ReportPerson(label="a", points=points, pose=pose, part=part)
-    assert html._person_data(person, 100)["sides"] == "nlrr"

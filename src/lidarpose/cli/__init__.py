@@ -52,9 +52,7 @@ def main(arguments: list[str] | None = None) -> int:
         return _failed(InputError(f"the memory is full{reason}: give less at once, as fewer points or people"))
     except KeyboardInterrupt as stopped:
         # training says how to go on
-        if os.environ.get("RANK", "0") == "0":
-            tell(f"lidarpose: {stopped}" if str(stopped) else "lidarpose: stopped", error=True)
-        return getattr(stopped, "status", 130)
+        return _ended(str(stopped) or "stopped", getattr(stopped, "status", 130))
     return 0
 
 
@@ -64,11 +62,15 @@ def _drop_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _failed(error: Exception) -> int:
-    # of several processes of a training one is enough to say it
+def _ended(text: object, status: int) -> int:
+    """Says why the command ends; of several processes of a training one is enough to say it. Returns the status."""
     if os.environ.get("RANK", "0") == "0":
-        tell(f"lidarpose: error: {error}", error=True)
-    return 2
+        tell(f"lidarpose: {text}", error=True)
+    return status
+
+
+def _failed(error: Exception) -> int:
+    return _ended(f"error: {error}", 2)
 
 
 class _Parser(argparse.ArgumentParser):

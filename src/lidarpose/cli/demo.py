@@ -54,7 +54,7 @@ def run(folder: str | Path, *, seed: int, weights: str = DEFAULT) -> None:
 def _report(model: Predictor, people: list) -> tuple[list[dict], dict[str, bytes]]:
     """Predicts synthetic people. Returns the table's rows, and the report and the pictures by their files' names."""
     from lidarpose.viz.draw import Panel, draw_people
-    from lidarpose.viz.html import ReportPerson, render_report
+    from lidarpose.viz.html import render_report
 
     clouds = [person.sample.points for person in people]
     # the sensor of a sample is the origin of its frame; the first call warms the network up
@@ -63,33 +63,31 @@ def _report(model: Predictor, people: list) -> tuple[list[dict], dict[str, bytes
     poses = model.predict(clouds, sensor_origin=(0, 0, 0))
     milliseconds = (time.perf_counter() - started) * 1e3 / len(people)
 
-    rows, panels, cards = [], [], []
+    rows, panels = [], []
     for person, pose in zip(people, poses, strict=True):
-        truth = person.sample.pose.to(pose.skeleton)
+        facts, points, truth = person.facts, person.sample.points, person.sample.pose.to(pose.skeleton)
         error = float(np.linalg.norm(pose.joints - truth.joints, axis=-1).mean() * 1e3)
-        facts = person.facts
-        label = f"{facts.sensor}, {facts.distance:.1f} m"
         rows.append(
             {
                 "LiDAR": facts.sensor,
-                "points": len(person.sample.points),
+                "points": len(points),
                 "distance m": round(facts.distance, 1),
                 "visible %": round(facts.visible * 100),
                 "MPJPE mm": round(error),
                 "ms a person": round(milliseconds, 1),
             }
         )
-        panels.append(Panel(points=person.sample.points, pose=pose.pose, truth=truth, label=label))
-        caption = f"{len(person.sample.points)} points, {facts.visible:.0%} visible, MPJPE {error:.0f} mm"
-        cards.append(
-            ReportPerson(label=label, points=person.sample.points, pose=pose.pose, truth=truth, caption=caption)
+        label = f"{facts.sensor}, {facts.distance:.1f} m"
+        caption = f"{len(points)} points, {facts.visible:.0%} visible, MPJPE {error:.0f} mm"
+        panels.append(Panel(points=points, pose=pose.pose, truth=truth, label=label, caption=caption))
+    contents = {
+        f"{name}.png": draw_people(
+            panels[k * PEOPLE_EACH : (k + 1) * PEOPLE_EACH], title=f"{name}: predicted, and the truth dashed"
         )
-    contents = {}
-    for k, name in enumerate(SENSORS):
-        shown = panels[k * PEOPLE_EACH : (k + 1) * PEOPLE_EACH]
-        contents[f"{name}.png"] = draw_people(shown, title=f"{name}: predicted, and the truth dashed")
+        for k, name in enumerate(SENSORS)
+    }
     title = "lidarpose demo: synthesized people, predicted and true"
-    contents["index.html"] = render_report(cards, title=title, summary=rows).encode()
+    contents["index.html"] = render_report(panels, title=title, summary=rows).encode()
     return rows, contents
 
 

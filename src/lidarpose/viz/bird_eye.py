@@ -12,7 +12,7 @@ import numpy as np
 from lidarpose.io.files import check_suffix
 from lidarpose.sample import Box, Pose
 from lidarpose.viz.draw import SIDE_COLORS, png_of
-from lidarpose.viz.person_view import bone_sides, is_known, thinned
+from lidarpose.viz.person_view import bone_pairs, bone_sides, box_edges, finite, is_known, thinned
 
 MAX_SCANS = 12
 _MAX_POINTS = 120_000  # a scan; more only cover each other at this size
@@ -51,7 +51,7 @@ def draw_scans(panels: Sequence[ScanPanel], path: str | Path | None = None, *, t
         check_suffix(path, ".png")
     panels = list(panels)[:MAX_SCANS]
     columns = min(2, max(len(panels), 1))
-    rows = -(-max(len(panels), 1) // columns)
+    rows = max(-(-len(panels) // columns), 1)
     width, height = columns * _PANEL, rows * _PANEL + _TITLE
     figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white")
     figure.text(0.15 / width, 1 - 0.15 / height, title, fontsize=13, weight="bold", va="top", parse_math=False)
@@ -65,7 +65,9 @@ def draw_scans(panels: Sequence[ScanPanel], path: str | Path | None = None, *, t
 
 
 def _draw_panel(ax, panel: ScanPanel) -> None:
-    points = panel.points[np.isfinite(panel.points).all(-1)]
+    from matplotlib.collections import LineCollection
+
+    points = finite(panel.points)
     (left, bottom), span = _window(panel, points)
     ax.set(xlim=(left, left + span), ylim=(bottom, bottom + span), aspect="equal")
     ax.set_xlabel("x, m", fontsize=7, color=_FAINT, labelpad=1)
@@ -84,10 +86,10 @@ def _draw_panel(ax, panel: ScanPanel) -> None:
     for box in panel.boxes:
         _draw_box(ax, box)
     if is_known(panel.poses):
-        sides = bone_sides(panel.poses.skeleton)
-        for joints in panel.poses.joints.reshape(-1, len(panel.poses.skeleton), 3):
-            for (a, b), side in zip(panel.poses.skeleton.bones, sides, strict=True):
-                ax.plot(*joints[[a, b], :2].T, color=SIDE_COLORS[side], lw=1.6, zorder=6, solid_capstyle="round")
+        skeleton = panel.poses.skeleton
+        bones = panel.poses.joints.reshape(-1, len(skeleton), 3)[:, bone_pairs(skeleton), :2]
+        colors = [SIDE_COLORS[side] for side in bone_sides(skeleton)] * len(bones)
+        ax.add_collection(LineCollection(bones.reshape(-1, 2, 2), colors=colors, lw=1.6, zorder=6, capstyle="round"))
 
 
 def _window(panel: ScanPanel, points: np.ndarray) -> tuple[np.ndarray, float]:
@@ -105,17 +107,17 @@ def _window(panel: ScanPanel, points: np.ndarray) -> tuple[np.ndarray, float]:
 
 def _draw_points(ax, points: np.ndarray) -> None:
     """The ground light gray, what stands on it by height, what is higher than people fainter still."""
+    from matplotlib import colormaps
+
     height = points[:, 2] - (np.percentile(points[:, 2], 2) if len(points) else 0)
-    low, high = height < _BELOW, height > _ABOVE
-    size = float(np.clip(20_000 / max(len(points), 1), 0.3, 4))
-    for chosen, color, order in ((low, _GROUND, 1), (high, _HIGH, 2)):
-        ax.scatter(*points[chosen, :2].T, s=size, color=color, linewidths=0, zorder=order)
-    middle = ~low & ~high
-    dots = ax.scatter(
-        *points[middle, :2].T, s=1.5 * size, c=height[middle], cmap="viridis_r", vmin=0, vmax=_ABOVE, linewidths=0,
-        zorder=3,
-    )  # fmt: skip
-    bar = ax.figure.colorbar(dots, cax=ax.inset_axes((0.02, 0.05, 0.012, 0.2)))
+    by_height = (height >= _BELOW) & (height <= _ABOVE)
+    # what stands on the ground last, so that nothing covers it
+    order = np.argsort(by_height, kind="stable")
+    size = np.clip(20_000 / max(len(points), 1), 0.3, 4) * np.where(by_height, 1.5, 1)
+    cmap = colormaps["viridis_r"].with_extremes(under=_GROUND, over=_HIGH)
+    limits = {"cmap": cmap, "vmin": _BELOW, "vmax": _ABOVE}
+    dots = ax.scatter(*points[order, :2].T, s=size[order], c=height[order], linewidths=0, zorder=2, **limits)
+    bar = ax.figure.colorbar(dots, cax=ax.inset_axes((0.02, 0.05, 0.012, 0.2)), extend="neither")
     bar.set_label("height, m", fontsize=7)
     bar.ax.tick_params(labelsize=6)
     bar.outline.set_visible(False)
@@ -123,11 +125,10 @@ def _draw_points(ax, points: np.ndarray) -> None:
 
 def _draw_box(ax, box: Box) -> None:
     """Its outline, the way it faces, and its id."""
-    c, s = np.cos(box.yaw), np.sin(box.yaw)
-    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]]) * box.size[:2] / 2
-    outline = corners @ np.array([[c, s], [-s, c]]) + box.center[:2]
-    ax.plot(*outline.T, color=_BOX, lw=1.1, zorder=5)
-    nose = box.center[:2] + np.array([c, s]) * (box.size[0] / 2 + 0.6)
+    from matplotlib.collections import LineCollection
+
+    ax.add_collection(LineCollection(box_edges(box)[..., :2], colors=_BOX, lw=1.1, zorder=5))
+    nose = box.center[:2] + np.array([np.cos(box.yaw), np.sin(box.yaw)]) * (box.size[0] / 2 + 0.6)
     ax.annotate("", nose, box.center[:2], arrowprops={"arrowstyle": "->", "color": _BOX, "lw": 1.1}, zorder=5)
     if box.id is not None:
         ax.annotate(

@@ -5,14 +5,14 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.shards import CARD, DatasetReader, counted, open_dataset, read_rows
+from lidarpose.data.shards import CARD, DatasetReader, counted, open_dataset
 from lidarpose.errors import InputError
 from lidarpose.io.files import check_apart, file_error
 from lidarpose.sample import Box, LabeledSample, PersonInfo, Pose
 from lidarpose.skeleton import skeleton
 from lidarpose.viz.bird_eye import MAX_SCANS, ScanPanel, draw_scans
 from lidarpose.viz.draw import MAX_PEOPLE, Panel, draw_people
-from lidarpose.viz.html import ReportPerson, write_report
+from lidarpose.viz.html import write_report
 
 
 def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out: str | Path | None = None) -> Path:
@@ -29,41 +29,51 @@ def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out
     name = Path(folder).resolve().name
     path = Path(out) if out is not None else Path(f"{name}.{'html' if html else 'png'}")
     check_apart(path, dataset.folder / CARD, *dataset.folder.glob("*.parquet"))
-    is_streets = "frames" in dataset.card.tables and not html
-    # each with the number that it has in the dataset
-    rows = [] if is_streets else _spread(dataset, count)
-    people = [(row["index"], dataset.sample(row)) for row in rows]
     settings = dataset.card.settings
     title = f"{name}: {counted(dataset.card.count, settings.get('what', 'people'))}"
     if "scene" in settings:
         title += f", scene {settings['scene']}"
     if (written := len(dataset.written())) < dataset.card.shards:
         title += f", {written:,} of {dataset.card.shards:,} shards written so far"
-    if is_streets:
-        draw_scans(_street_panels(dataset, min(count, MAX_SCANS)), path, title=title)
-    elif html:
-        lines = [_line(sample, _label(index, sample, dataset)) for index, sample in people]
-        cards = [_card(sample, _label(index, sample, dataset)) for index, sample in people]
-        write_report(path, cards, title=title, summary=lines)
+    if "frames" in dataset.card.tables and not html:
+        streets = _spread(dataset, "frames", min(count, MAX_SCANS))
+        draw_scans([_street_panel(rows, dataset) for rows in streets], path, title=title)
+        return path
+    samples = [(row["index"], dataset.sample(row)) for (row,) in _spread(dataset, dataset.card.people, count)]
+    panels = [_panel(index, sample, dataset) for index, sample in samples]
+    if html:
+        summary = [_summary_row(panel.label, sample) for panel, (_, sample) in zip(panels, samples, strict=True)]
+        write_report(path, panels, title=title, summary=summary)
     else:
-        panels = [_panel(sample, _label(index, sample, dataset)) for index, sample in people]
         draw_people(panels, path, title=title)
     return path
 
 
-def _street_panels(dataset: DatasetReader, count: int) -> list[ScanPanel]:
-    """`count` streets, evenly spread over the shards that are there, in their first frame."""
-    there = _written(dataset, "frames")
-    index = {shard: read_rows(dataset.path(shard, "frames"), "frames", ("index",)) for shard in there}
-    streets = [(shard, k) for shard in there for k in sorted({row["index"] for row in index[shard]})]
-    chosen = [streets[k] for k in np.linspace(0, len(streets) - 1, min(count, len(streets))).round().astype(int)]
-    panels = []
-    for shard in sorted({shard for shard, _ in chosen}):
-        frames: dict[int, list[dict]] = {}
-        for row in dataset.rows("frames", [shard]):
-            frames.setdefault(row["index"], []).append(row)
-        panels += [_street_panel(frames[k], dataset) for number, k in chosen if number == shard]
-    return panels
+def _spread(dataset: DatasetReader, table: str, count: int) -> list[list[dict]]:
+    """Rows of `count` people, one each, or of streets, one a frame, evenly spread over the shards that are there; of a
+    smaller dataset all. Raises InputError where no shard is there."""
+    there = dataset.written(table)
+    if not there:
+        again = f"wait for the first one, or run {dataset.card.writer} again"
+        raise file_error(dataset.folder, f"holds no shard yet; {again}")
+    by_index, most = table == "frames", dataset.card.per_shard
+    if by_index:
+        keys = {shard: range(shard * most, min((shard + 1) * most, dataset.card.count)) for shard in there}
+    else:
+        keys = {shard: range(dataset.rows_of(table, shard)) for shard in there}
+    total = sum(map(len, keys.values()))
+    count = min(count, total)
+    # each in the middle of an equal share
+    wanted = ((2 * np.arange(count) + 1) * total // (2 * count)).tolist()
+    groups: list[list[dict]] = []
+    first = 0
+    for shard, numbers in keys.items():
+        chosen: dict[int, list[dict]] = {numbers[w - first]: [] for w in wanted if 0 <= w - first < len(numbers)}
+        for number, row in enumerate(dataset.rows(table, [shard]) if chosen else ()):
+            chosen.get(row["index"] if by_index else number, []).append(row)
+        groups += [rows for rows in chosen.values() if rows]
+        first += len(numbers)
+    return groups
 
 
 def _street_panel(rows: list[dict], dataset: DatasetReader) -> ScanPanel:
@@ -83,64 +93,26 @@ def _street_panel(rows: list[dict], dataset: DatasetReader) -> ScanPanel:
     )
 
 
-def _written(dataset: DatasetReader, table: str | None = None) -> list[int]:
-    """Numbers of the shards of a table, by default of people, that are there. Raises InputError where none is."""
-    there = dataset.written(table)
-    if not there:
-        again = f"wait for the first one, or run {dataset.card.writer} again"
-        raise file_error(dataset.folder, f"holds no shard yet; {again}")
-    return there
-
-
-def _spread(dataset: DatasetReader, count: int) -> list[dict]:
-    """`count` rows, evenly spread over the shards that are there; of a smaller dataset all rows."""
-    there = _written(dataset)
-    sizes = [dataset.rows_of(dataset.card.people, shard) for shard in there]
-    total = sum(sizes)
-    count = min(count, total)
-    # each in the middle of an equal share of the rows
-    wanted = ((2 * np.arange(count) + 1) * total // (2 * count)).tolist()
-    rows, first = [], 0
-    for shard, size in zip(there, sizes, strict=True):
-        here = {w - first for w in wanted if first <= w < first + size}
-        if here:
-            rows += [row for k, row in enumerate(dataset.rows(shards=[shard])) if k in here]
-        first += size
-    return rows
-
-
-def _label(index: int, sample: LabeledSample, dataset: DatasetReader) -> str:
-    """As "#12 os1-128"; of clips and streets with the frame and the track."""
+def _panel(index: int, sample: LabeledSample, dataset: DatasetReader) -> Panel:
+    """Labeled as "#12 os1-128"; of clips and streets with the frame and the track."""
     words = [f"#{index}"]
     if dataset.card.settings.get("what") in ("clips", "streets"):
         words.append(f"frame {sample.frame}")
     if "frames" in dataset.card.tables:
         words.append(f"track {sample.track}")
-    sensor = sample.info.sensor if sample.info else ""
-    return " ".join([*words, sensor or sample.source.rpartition("/")[2]])
+    words.append((sample.info and sample.info.sensor) or sample.source.rpartition("/")[2])
+    label = " ".join(words)
+    return Panel(points=sample.points, truth=sample.pose, part=sample.part, label=label, distance=sample.distance)
 
 
-def _panel(sample: LabeledSample, label: str) -> Panel:
-    distance = None if isnan(sample.distance) else sample.distance
-    return Panel(points=sample.points, truth=sample.pose, part=sample.part, label=label, distance=distance)
-
-
-def _card(sample: LabeledSample, label: str) -> ReportPerson:
-    caption = f"{len(sample.points):,} points"
-    if not isnan(sample.distance):
-        # as in the table above
-        caption += f" · {sample.distance:.1f} m"
-    return ReportPerson(label=label, points=sample.points, truth=sample.pose, part=sample.part, caption=caption)
-
-
-def _line(sample: LabeledSample, label: str) -> dict:
-    line = {"person": label, "points": len(sample.points)}
+def _summary_row(label: str, sample: LabeledSample) -> dict:
+    row: dict = {"person": label, "points": len(sample.points)}
     info = sample.info or PersonInfo()
     if info.kind:
-        line["does"] = info.kind
+        row["does"] = info.kind
     if not isnan(sample.distance):
-        line["distance m"] = round(sample.distance, 1)
+        row["distance m"] = round(sample.distance, 1)
     for name in ("visible", "clutter"):
         if not isnan(share := getattr(info, name)):
-            line[f"{name} %"] = round(100 * share)
-    return line
+            row[f"{name} %"] = round(100 * share)
+    return row

@@ -2,7 +2,6 @@
 
 import json
 import math
-from dataclasses import dataclass
 from html import escape
 from importlib import resources
 from numbers import Integral, Real
@@ -16,8 +15,8 @@ from lidarpose.io.files import check_suffix, write_atomic
 from lidarpose.sample import Pose, within_reach
 from lidarpose.skeleton import SMPL24, Skeleton
 from lidarpose.viz.person_view import (
+    Panel,
     bone_sides,
-    check_person,
     confidences,
     describe,
     facing_of,
@@ -33,25 +32,7 @@ _FEWEST_POINTS = 150  # a person keeps these, however many people there are
 _SCHEMA = 1
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ReportPerson:
-    """One person of a report: points (n, 3) m, z up, n = 0 is legal; pose and truth of one person, joints (J, 3) m in
-    the points' frame; caption is a line of the caller's (sensor, distance, error), by default the number of points,
-    the distance from the frame's origin and the mean confidence; part (n,) int, 0 = not body, 1 + j = the bone of
-    SMPL-24's joint j, colors the points by side. Raises InputError on a wrong shape."""
-
-    label: str
-    points: np.ndarray
-    pose: Pose | None = None
-    truth: Pose | None = None
-    caption: str = ""
-    part: np.ndarray | None = None
-
-    def __post_init__(self):
-        check_person(self, "ReportPerson")
-
-
-def write_report(path: str | Path, people: list[ReportPerson], *, title: str, summary: list[dict]) -> None:
+def write_report(path: str | Path, people: list[Panel], *, title: str, summary: list[dict]) -> None:
     """Writes the report to `path`, whole or not at all.
 
     `summary` holds the rows of the table on top; its columns are the rows' keys in order of appearance, and a column
@@ -61,7 +42,7 @@ def write_report(path: str | Path, people: list[ReportPerson], *, title: str, su
     write_atomic(path, render_report(people, title=title, summary=summary).encode("utf-8", "replace"))
 
 
-def render_report(people: list[ReportPerson], *, title: str, summary: list[dict]) -> str:
+def render_report(people: list[Panel], *, title: str, summary: list[dict]) -> str:
     """The text of `write_report`'s file; the same input gives the same text."""
     people = list(people)
     skeletons = {pose.skeleton.name: pose.skeleton for p in people for pose in (p.pose, p.truth) if pose is not None}
@@ -100,17 +81,15 @@ def _skeleton_data(skeleton: Skeleton) -> dict:
     return {"joints": skeleton.joints, "sides": "".join(side(j)[0] for j in skeleton.joints), "bones": bones}
 
 
-def _person_data(person: ReportPerson, limit: int) -> dict:
+def _person_data(person: Panel, limit: int) -> dict:
     """Millimeters as integers about the person's middle, so that a point costs some 14 letters."""
     center = middle(person)
     center = np.zeros(3) if center is None else center
-    points = np.asarray(person.points, float)
-    rows = np.flatnonzero(within_reach(points))
+    rows = np.flatnonzero(within_reach(person.points))
     rows = rows[thinned(len(rows), limit)]
-    points = points[rows]
     forward = facing_of(person)
     data = {
-        "points": np.rint((points - center) * 1000).astype(int).ravel().tolist(),
+        "points": _millimeters(person.points[rows], center),
         "facing": None if forward is None else round(math.atan2(forward[1], forward[0]), 4),
         "pose": _pose_data(person.pose, center),
         "truth": _pose_data(person.truth, center),
@@ -127,18 +106,18 @@ _PART_SIDES = np.array(["n"] + [side(joint)[0] for joint in SMPL24.joints])
 def _pose_data(pose: Pose | None, center: np.ndarray) -> dict | None:
     if not is_known(pose):
         return None
-    joints = np.asarray(pose.joints, float)
-    known = np.isfinite(joints).all(-1)
-    placed = [
-        np.rint((j - center) * 1000).astype(int).tolist() if k else None for j, k in zip(joints, known, strict=True)
-    ]
-    data = {"skeleton": pose.skeleton.name, "joints": placed}
+    joints = [_millimeters(joint, center) if np.isfinite(joint).all() else None for joint in pose.joints]
+    data = {"skeleton": pose.skeleton.name, "joints": joints}
     if pose.confidence is not None:
         data["confidence"] = confidences(pose).round(3).tolist()
     return data
 
 
-def _card(i: int, person: ReportPerson, drawn: int) -> str:
+def _millimeters(points: np.ndarray, center: np.ndarray) -> list[int]:
+    return np.rint((np.asarray(points, float) - center) * 1000).astype(int).ravel().tolist()
+
+
+def _card(i: int, person: Panel, drawn: int) -> str:
     """drawn: how many of the person's points are."""
     notes = [missing_pose(person)]
     if drawn < len(person.points):
@@ -148,7 +127,7 @@ def _card(i: int, person: ReportPerson, drawn: int) -> str:
     return (
         f'<figure class="card"><canvas data-person="{i}" tabindex="0" role="img" aria-label="3D view of {label}">'
         f"</canvas>{note}<figcaption><strong>{label}</strong>"
-        f"<span>{escape(person.caption or describe(person))}</span></figcaption></figure>"
+        f"<span>{escape(describe(person))}</span></figcaption></figure>"
     )
 
 

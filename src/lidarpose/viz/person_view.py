@@ -1,28 +1,51 @@
-"""What both the picture and the report need of a person: where the person looks, the views, the sides, the words."""
+"""A person to draw, and what the picture and the report need of it: facing, views, sides, words."""
 
+from dataclasses import dataclass
 from typing import TypeGuard
 
 import numpy as np
 
 from lidarpose.errors import InputError
-from lidarpose.sample import MIN_POINTS, Pose
+from lidarpose.geometry import rotation_about
+from lidarpose.sample import MIN_POINTS, Box, Pose
 from lidarpose.skeleton import Skeleton
 
 
-def check_person(person, kind: str) -> None:
-    """Raises InputError unless `person` has points (n, 3), part (n,) or None, and poses of one person: joints (J, 3) or
-    None."""
-    if person.points.ndim != 2 or person.points.shape[1] != 3:
-        raise InputError(f"{kind}.points must be (n, 3) metres, got {person.points.shape}")
-    if person.part is not None and person.part.shape != (len(person.points),):
-        raise InputError(f"{kind}.part must be ({len(person.points)},), one a point, got {person.part.shape}")
-    for name in ("pose", "truth"):
-        pose = getattr(person, name)
-        if pose is not None and pose.joints.ndim != 2:
-            raise InputError(
-                f"{kind}.{name} must hold one person, joints ({len(pose.skeleton)}, 3), got {pose.joints.shape}: "
-                "draw people one by one"
-            )
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Panel:
+    """One person to draw. Raises InputError on a wrong shape.
+
+    Args:
+        points: (n, 3) m, z up, n = 0 is legal.
+        pose, truth: predicted and true pose of one person in the points' frame, joints (J, 3) m; a joint that is not
+            finite is left out.
+        label: the name above the caption.
+        part: (n,) int, 0 = not body, 1 + j = the bone of SMPL-24's joint j: colors the points by side.
+        box: drawn in pictures.
+        distance: m, printed; by default that of the person from the frame's origin, none for NaN.
+        caption: the line under the person, by default the number of points, the distance and the mean confidence.
+    """
+
+    points: np.ndarray
+    pose: Pose | None = None
+    truth: Pose | None = None
+    label: str = ""
+    part: np.ndarray | None = None
+    box: Box | None = None
+    distance: float | None = None
+    caption: str = ""
+
+    def __post_init__(self):
+        if self.points.ndim != 2 or self.points.shape[1] != 3:
+            raise InputError(f"Panel.points must be (n, 3) meters, got {self.points.shape}")
+        if self.part is not None and self.part.shape != (len(self.points),):
+            raise InputError(f"Panel.part must be ({len(self.points)},), one a point, got {self.part.shape}")
+        for name, pose in (("pose", self.pose), ("truth", self.truth)):
+            if pose is not None and pose.joints.ndim != 2:
+                raise InputError(
+                    f"Panel.{name} must hold one person, joints ({len(pose.skeleton)}, 3), got {pose.joints.shape}: "
+                    "draw people one by one"
+                )
 
 
 def facing(pose: Pose | None) -> np.ndarray | None:
@@ -46,7 +69,7 @@ def facing(pose: Pose | None) -> np.ndarray | None:
     return np.array([axis[1], -axis[0], 0.0]) / length
 
 
-def facing_of(person) -> np.ndarray | None:
+def facing_of(person: Panel) -> np.ndarray | None:
     """`facing` of the predicted pose, else of the true one."""
     forward = facing(person.pose)
     return facing(person.truth) if forward is None else forward
@@ -80,6 +103,18 @@ def bone_sides(skeleton: Skeleton) -> list[str]:
     return ["center" if {sides[a], sides[b]} == {"left", "right"} else sides[b] for a, b in skeleton.bones]
 
 
+def bone_pairs(skeleton: Skeleton) -> np.ndarray:
+    """`skeleton.bones` as (B, 2) indices."""
+    return np.array(skeleton.bones, int).reshape(-1, 2)
+
+
+def box_edges(box: Box) -> np.ndarray:
+    """(12, 2, 3) m: the edges of a box."""
+    corner = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * box.size / 2
+    corner = corner @ rotation_about("z", box.yaw).T + box.center
+    return np.array([corner[[i, i | bit]] for i in range(8) for bit in (1, 2, 4) if not i & bit])
+
+
 def confidences(pose: Pose) -> np.ndarray:
     """(J,) in [0, 1]; 1 where the pose knows none."""
     if pose.confidence is None:
@@ -92,11 +127,13 @@ def is_known(pose: Pose | None) -> TypeGuard[Pose]:
     return pose is not None and bool(np.isfinite(pose.joints).all(-1).any())
 
 
-def describe(person) -> str:
-    """The line under a person: number of points, distance from the origin, mean confidence."""
+def describe(person: Panel) -> str:
+    """The line under a person: the caption, by default number of points, distance from the origin, mean confidence."""
+    if person.caption:
+        return person.caption
     count = len(person.points)
     words = [f"{count:,} point{'' if count == 1 else 's'}"]
-    distance = getattr(person, "distance", None)
+    distance = person.distance
     if distance is None:
         at = middle(person)
         distance = None if at is None else float(np.linalg.norm(at))
@@ -107,9 +144,9 @@ def describe(person) -> str:
     return " · ".join(words)
 
 
-def missing_pose(person) -> str:
+def missing_pose(person: Panel) -> str:
     """What to say where there is nothing predicted: empty if there is a pose, or nobody could expect one."""
-    # a labelled person of a dataset was never predicted
+    # a labeled person of a dataset was never predicted
     if is_known(person.pose) or (person.pose is None and is_known(person.truth)):
         return ""
     if len(person.points) < MIN_POINTS:
@@ -117,18 +154,21 @@ def missing_pose(person) -> str:
     return "" if person.pose is None else "no pose"
 
 
+def finite(points: np.ndarray) -> np.ndarray:
+    """Those of points (n, 3) that are finite."""
+    return points[np.isfinite(points).all(-1)]
+
+
 def thinned(count: int, limit: int) -> np.ndarray:
     """Indices of at most `limit` of `count` points, evenly spread and the same each time."""
     return np.arange(count) if count <= limit else np.linspace(0, count - 1, limit).round().astype(int)
 
 
-def middle(person) -> np.ndarray | None:
+def middle(person: Panel) -> np.ndarray | None:
     """A point (3,) in the person: of a skeleton, else of the points, most of which may be of a wall; None where there
     is nothing."""
     clouds = [pose.joints for pose in (person.truth, person.pose) if pose is not None] + [person.points]
     for cloud in clouds:
-        cloud = np.asarray(cloud, float)
-        cloud = cloud[np.isfinite(cloud).all(-1)]
-        if len(cloud):
+        if len(cloud := finite(np.asarray(cloud, float))):
             return np.median(cloud, axis=0)
     return None
