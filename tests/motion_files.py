@@ -10,7 +10,17 @@ from lidarpose.geometry import UP_AXES, rotation_about, rotation_vector
 from lidarpose.skeleton import SMPL24
 
 J = {name: i for i, name in enumerate(SMPL24.joints)}
+# the joints that retargeting places well: hands and feet have directions alone
+MAIN = [J[name] for name in J if not name.endswith(("foot", "hand"))]
 C = UP_AXES["y"]
+
+
+def check_rotations(rotations, atol=1e-5):
+    """Rotations (..., 3, 3) float32 are orthonormal and not reflected."""
+    assert rotations.dtype == np.float32
+    product = rotations @ np.swapaxes(rotations, -1, -2)
+    np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=atol)
+    np.testing.assert_allclose(np.linalg.det(rotations), 1, atol=atol)
 
 
 def a_clip(frames=6, seed=0):

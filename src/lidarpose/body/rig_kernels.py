@@ -17,73 +17,57 @@ _jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"
 
 
 @_jit
-def pose_person(rest_vertices, rest_joints, rotations, translation, parents, weight_index, weight, vertices, joints):
-    """One person: rest_vertices (V, 3), rest_joints (26, 3), rotations (24, 3, 3), translation (3,) -> fills
-    vertices (V, 3) and joints (26, 3)."""
+def pose_people(rest_vertices, rest_joints, rotations, translation, parents, weight_index, weight, vertices, joints):
+    """n people, one after the other: rest_vertices (n, V, 3), rest_joints (n, 26, 3), rotations (n, 24, 3, 3) and
+    translation (n, 3) -> fills vertices (n, V, 3) and joints (n, 26, 3)."""
     # rows of [G | p - G rest]: what a bone does to a point of the rest pose
     motion = np.empty((_JOINTS, 12), np.float32)
-    for j in range(_JOINTS):
-        p = parents[j]
-        for a in range(3):
-            if p < 0:
-                joints[j, a] = translation[a]
-                for b in range(3):
-                    motion[j, 4 * a + b] = rotations[j, a, b]
-            else:
-                joints[j, a] = motion[p, 4 * a + 3]
-                for c in range(3):
-                    joints[j, a] += motion[p, 4 * a + c] * rest_joints[j, c]
-                for b in range(3):
-                    motion[j, 4 * a + b] = (
-                        motion[p, 4 * a] * rotations[j, 0, b]
-                        + motion[p, 4 * a + 1] * rotations[j, 1, b]
-                        + motion[p, 4 * a + 2] * rotations[j, 2, b]
-                    )
-        for a in range(3):
-            motion[j, 4 * a + 3] = joints[j, a] - (
-                motion[j, 4 * a] * rest_joints[j, 0]
-                + motion[j, 4 * a + 1] * rest_joints[j, 1]
-                + motion[j, 4 * a + 2] * rest_joints[j, 2]
-            )
-    for k in range(_JOINTS, rest_joints.shape[0]):
-        for a in range(3):
-            joints[k, a] = (
-                motion[_HEAD, 4 * a] * rest_joints[k, 0]
-                + motion[_HEAD, 4 * a + 1] * rest_joints[k, 1]
-                + motion[_HEAD, 4 * a + 2] * rest_joints[k, 2]
-                + motion[_HEAD, 4 * a + 3]
-            )
-    for v in range(rest_vertices.shape[0]):
-        x, y, z = rest_vertices[v, 0], rest_vertices[v, 1], rest_vertices[v, 2]
-        px, py, pz = np.float32(0), np.float32(0), np.float32(0)
-        for k in range(weight_index.shape[1]):
-            w = weight[v, k]
-            if w == 0:
-                break
-            m = motion[weight_index[v, k]]
-            px += w * (m[0] * x + m[1] * y + m[2] * z + m[3])
-            py += w * (m[4] * x + m[5] * y + m[6] * z + m[7])
-            pz += w * (m[8] * x + m[9] * y + m[10] * z + m[11])
-        vertices[v, 0] = px
-        vertices[v, 1] = py
-        vertices[v, 2] = pz
-
-
-@_jit
-def pose_people(rest_vertices, rest_joints, rotations, translation, parents, weight_index, weight, vertices, joints):
-    """`pose_person` for n people one after the other; each array with n in front."""
     for i in range(rotations.shape[0]):
-        pose_person(
-            rest_vertices[i],
-            rest_joints[i],
-            rotations[i],
-            translation[i],
-            parents,
-            weight_index,
-            weight,
-            vertices[i],
-            joints[i],
-        )
+        for j in range(_JOINTS):
+            p = parents[j]
+            for a in range(3):
+                if p < 0:
+                    joints[i, j, a] = translation[i, a]
+                    for b in range(3):
+                        motion[j, 4 * a + b] = rotations[i, j, a, b]
+                else:
+                    joints[i, j, a] = motion[p, 4 * a + 3]
+                    for c in range(3):
+                        joints[i, j, a] += motion[p, 4 * a + c] * rest_joints[i, j, c]
+                    for b in range(3):
+                        motion[j, 4 * a + b] = (
+                            motion[p, 4 * a] * rotations[i, j, 0, b]
+                            + motion[p, 4 * a + 1] * rotations[i, j, 1, b]
+                            + motion[p, 4 * a + 2] * rotations[i, j, 2, b]
+                        )
+            for a in range(3):
+                motion[j, 4 * a + 3] = joints[i, j, a] - (
+                    motion[j, 4 * a] * rest_joints[i, j, 0]
+                    + motion[j, 4 * a + 1] * rest_joints[i, j, 1]
+                    + motion[j, 4 * a + 2] * rest_joints[i, j, 2]
+                )
+        for k in range(_JOINTS, rest_joints.shape[1]):
+            for a in range(3):
+                joints[i, k, a] = (
+                    motion[_HEAD, 4 * a] * rest_joints[i, k, 0]
+                    + motion[_HEAD, 4 * a + 1] * rest_joints[i, k, 1]
+                    + motion[_HEAD, 4 * a + 2] * rest_joints[i, k, 2]
+                    + motion[_HEAD, 4 * a + 3]
+                )
+        for v in range(rest_vertices.shape[1]):
+            x, y, z = rest_vertices[i, v, 0], rest_vertices[i, v, 1], rest_vertices[i, v, 2]
+            px, py, pz = np.float32(0), np.float32(0), np.float32(0)
+            for k in range(weight_index.shape[1]):
+                w = weight[v, k]
+                if w == 0:
+                    break
+                m = motion[weight_index[v, k]]
+                px += w * (m[0] * x + m[1] * y + m[2] * z + m[3])
+                py += w * (m[4] * x + m[5] * y + m[6] * z + m[7])
+                pz += w * (m[8] * x + m[9] * y + m[10] * z + m[11])
+            vertices[i, v, 0] = px
+            vertices[i, v, 1] = py
+            vertices[i, v, 2] = pz
 
 
 @_jit

@@ -101,11 +101,11 @@ class JointTree:
         for joint in self.joints:
             rotation = np.broadcast_to(np.eye(3), (count, 3, 3))
             offset = np.repeat(joint.offset[None], count, 0)
-            for (kind, axis), value in zip(joint.channels, columns, strict=False):
-                if kind == "t":
-                    offset[:, "xyz".index(axis)] += value
+            for channel, value in zip(joint.channels, columns, strict=False):
+                if channel[0] == "t":
+                    offset[:, "xyz".index(channel[1])] += value
                     continue
-                turn = rotation_about(axis, np.radians(value) if self.degrees else value)
+                turn = rotation_about(channel[1], np.radians(value) if self.degrees else value)
                 rotation = rotation @ turn if joint.axes is None else turn @ rotation
             if joint.axes is not None:
                 rotation = joint.axes @ rotation @ joint.axes.T
