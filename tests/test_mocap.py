@@ -15,8 +15,7 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES
 from lidarpose.synth.shard_job import Job
 
-J = files.J
-MAIN = [J[n] for n in J if not n.endswith(("foot", "hand"))]
+J, MAIN = files.J, files.MAIN
 ROTATIONS, WAY = files.a_clip(20)
 JOINTS = files.joints_of(ROTATIONS, WAY)
 BVH = files.bvh_text(ROTATIONS, WAY, names=files.CMU_NAMES)
@@ -140,12 +139,10 @@ ROW = BVH.splitlines()[-1]
         ("", "is empty"), ("hello", "starts with HIERARCHY, got 'hello'"),
         (BVH[: BVH.index("MOTION")], "no MOTION part"),
         (BVH[:-400], "expected 20 frames of 75 numbers, got .* copied completely"),
-        (BVH[: BVH.index("Frame Time")], "must begin with Frames: and Frame Time:"),
-        (BVH[: BVH.index("Frames")], "must begin with Frames"),
-        (changed(BVH, "Frames: 20", "Frames: x"), "whole number"),
-        (re.sub(r"CHANNELS.*", "CHANNELS 0", BVH), "no joint has CHANNELS"),
-        (changed(BVH, "Frames: 20", "Frames: -1")[: BVH.index(ROW)], "whole number of 0 or more, got ' -1'"),
+        *((BVH[: BVH.index(cut)], "must begin with Frames: and Frame Time:") for cut in ("Frame Time", "Frames")),
+        *((changed(BVH, "Frames: 20", f"Frames: {n}"), f"whole number of 0 or more, got ' {n}'") for n in ("x", "-1")),
         (changed(BVH, "Frames: 20", "Frames: 0")[: BVH.index(ROW)], "frames of 75|no frame"),
+        (re.sub(r"CHANNELS.*", "CHANNELS 0", BVH), "no joint has CHANNELS"),
         *((re.sub("Time: .*", f"Time: {seconds}", BVH), "no frame time above 0") for seconds in ("0", "x", "1e-300")),
         (BVH.replace(ROW, ROW.replace(ROW.split()[7], "abc")), "MOTION must be numbers"),
         (re.sub(r"OFFSET.*", "OFFSET 0 0 0", BVH), "have no length"),
@@ -319,8 +316,8 @@ def test_frames_that_are_not_finite_end_a_clip(tmp_path):
         ({"drop": ("trans",)}, "holds betas, dmpls, gender, mocap_framerate, poses; an npz of motion needs"),
         ({"drop": ("poses",)}, "root_orient"),
         ({"drop": ("mocap_framerate",)}, "does not give its frame rate .* give load_motion fps="),
-        ({"fps": 0}, "above 0"), ({"fps": np.nan}, "above 0"),
-        ({"mocap_framerate": np.array(["x"])}, "as one number"), ({"mocap_framerate": np.ones(2)}, "as one number"),
+        *(({"fps": rate}, "above 0") for rate in (0, np.nan)),
+        *(({"mocap_framerate": np.array(rate)}, "as one number") for rate in (["x"], [1.0, 1.0])),
         ({"poses": np.zeros((4, 60))}, r"\(4, 60\)"), ({"poses": np.zeros((4, 2, 156))}, r"\(4, 2, 156\)"),
         ({"poses": np.full((4, 156), "a")}, "must be numbers"), ({"poses": np.array([{}] * 4)}, "plain arrays"),
         ({"poses": np.full((4, 156), 90.0)}, "radians, not degrees"), ({"trans": np.full(3, "a")}, "must be numbers"),
