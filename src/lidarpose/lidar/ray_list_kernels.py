@@ -31,7 +31,7 @@ def ray_list(vertices, faces, directions, shift, time):
     u, v, cell = np.empty(count), np.empty(count), np.empty(count, np.int64)
     w, p, q = np.empty(3), np.empty(3), np.empty(3)
     dw, dp, dq = np.zeros(3), np.zeros(3), np.zeros(3)
-    cells, touching = np.empty(4 * len(vertices), np.int32), np.empty(len(faces) + 1, np.int32)
+    cells = np.empty(4 * len(vertices), np.int32)
     for side in range(6):
         axis, sign = side // 2, 1.0 - 2.0 * (side % 2)
         across, along = (axis + 1) % 3, (axis + 2) % 3
@@ -61,10 +61,19 @@ def ray_list(vertices, faces, directions, shift, time):
                 order[filled[cell[i]]] = i
                 filled[cell[i]] += 1
         _cells(vertices, shift, axis, sign, u0, v0, scale_u, scale_v, grid, cells)
-        for m in range(_touching(faces, cells, start, grid, touching)):
-            f = touching[m]
+        for f in range(len(faces)):
             i0, i1, i2 = 4 * np.int64(faces[f, 0]), 4 * np.int64(faces[f, 1]), 4 * np.int64(faces[f, 2])
-            a0, b0, a1, b1 = _block(cells, i0, i1, i2, grid)
+            # the cells that the triangle may cover: from a0, b0 to a1, b1
+            a0 = max(min(cells[np.uintp(i0)], cells[np.uintp(i1)], cells[np.uintp(i2)]), 0)
+            b0 = max(min(cells[np.uintp(i0 + 1)], cells[np.uintp(i1 + 1)], cells[np.uintp(i2 + 1)]), 0)
+            a1 = min(max(cells[np.uintp(i0 + 2)], cells[np.uintp(i1 + 2)], cells[np.uintp(i2 + 2)]), grid - 1)
+            b1 = min(max(cells[np.uintp(i0 + 3)], cells[np.uintp(i1 + 3)], cells[np.uintp(i2 + 3)]), grid - 1)
+            rays = 0
+            if b0 <= b1:
+                for a in range(a0, a1 + 1):
+                    rays += start[a * grid + b1 + 1] - start[a * grid + b0]
+            if not rays:
+                continue
             front = -np.inf
             for j in range(3):
                 i = faces[f, j]
@@ -130,40 +139,3 @@ def _cells(vertices, shift, axis, sign, u0, v0, scale_u, scale_v, grid, cells):
         cells[4 * i + 1] = np.int32(min(max((low_v - v0) * scale_v, -1.0), float(grid))) if ahead else -1
         cells[4 * i + 2] = np.int32(min(max((high_u - u0) * scale_u, -1.0), float(grid))) if ahead else grid
         cells[4 * i + 3] = np.int32(min(max((high_v - v0) * scale_v, -1.0), float(grid))) if ahead else grid
-
-
-@compiled
-def _block(cells, i0, i1, i2, grid):
-    """First cells along u and v, and the last ones, of a triangle whose corners' cells are at i0, i1, i2."""
-    a0 = max(min(cells[np.uintp(i0)], cells[np.uintp(i1)], cells[np.uintp(i2)]), 0)
-    b0 = max(min(cells[np.uintp(i0 + 1)], cells[np.uintp(i1 + 1)], cells[np.uintp(i2 + 1)]), 0)
-    a1 = min(max(cells[np.uintp(i0 + 2)], cells[np.uintp(i1 + 2)], cells[np.uintp(i2 + 2)]), grid - 1)
-    b1 = min(max(cells[np.uintp(i0 + 3)], cells[np.uintp(i1 + 3)], cells[np.uintp(i2 + 3)]), grid - 1)
-    return a0, b0, a1, b1
-
-
-@compiled
-def _touching(faces, cells, start, grid, touching):
-    """Fills `touching` with the faces that have rays in their cells, ascending; returns how many.
-
-    start (grid * grid + 1,): how many rays are in earlier cells.
-    """
-    # how many rays are in cells before both a and b
-    wide = grid + 1
-    before = np.zeros(wide * wide, np.int32)
-    for a in range(grid):
-        for b in range(grid):
-            inside = start[a * grid + b + 1] - start[a * grid]
-            before[(a + 1) * wide + b + 1] = before[a * wide + b + 1] + inside
-    n = np.uintp(0)
-    for f in range(len(faces)):
-        i0, i1, i2 = 4 * np.int64(faces[f, 0]), 4 * np.int64(faces[f, 1]), 4 * np.int64(faces[f, 2])
-        a0, b0, a1, b1 = _block(cells, i0, i1, i2, grid)
-        # a block that ends before it starts is all beyond the rays
-        low, high, left, right = a0 * wide, max(a1 + 1, a0) * wide, b0, max(b1 + 1, b0)
-        low, high = min(low, wide * grid), min(high, wide * grid)
-        left, right = min(left, grid), min(right, grid)
-        rays = before[high + right] - before[low + right] - before[high + left] + before[low + left]
-        touching[n] = f
-        n += np.uintp(rays > 0)
-    return n

@@ -9,7 +9,7 @@ How a sector of columns (at most a quarter turn) is cast:
        lines and I is affine over a triangle, so interpolating I gives the exact hit.
     2. Columns are lines Y = tan(a); on a column, rows are T = tan(e) with T = Z cos(a). Finding the first column
        right of a vertex or the first row above a crossing is one table look-up.
-    3. Triangles that cross no column or reach no row are dropped.
+    3. Triangles that cross no column are dropped.
     4. Two edges of a triangle cross a column. A crossing is computed from the edge alone, from its right to its left
        end, so both triangles of an edge get the same number, rows are half-open intervals between crossings: a
        closed mesh has no holes and no beam is counted twice. The largest I wins.

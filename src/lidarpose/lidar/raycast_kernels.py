@@ -4,9 +4,9 @@ run outside the interpreter's lock and may be called from many threads.
 Loops over vertices, faces and pairs read flat arrays by unsigned numbers: only then does the compiler know the step
 between elements, and that no index is negative, and use the processor's vectors. That halves the time.
 
-Compiling is what a first call waits for. So every kernel knows one type of each array (see `raycast_input`), and what
-numpy does in one expression, assignment between slices, `max()`, `searchsorted()`, is a loop here: numba takes longer
-to compile one such expression, with its messages, than most of these functions.
+Compiling is what a first call waits for. So every kernel knows one type of each array (see the checks in `raycast`),
+and what numpy does in one expression, assignment between slices, `max()`, `searchsorted()`, is a loop here: numba takes
+longer to compile one such expression, with its messages, than most of these functions.
 """
 
 from typing import NamedTuple
@@ -22,19 +22,12 @@ except ImportError as error:  # pragma: no cover - numba is an optional extra
 
 # vertices with |y/x| or |z/x| above this are not projected: beyond it float64 loses more than 14 - 2 digits
 STEEP = 100.0
-# triangles wider than this in Y are not dropped by row; narrower ones by a bound that follows from it, see `raster`
-_NARROW = 0.04
-_SAG = 1 / np.cos(_NARROW / 2) - 1
-# slack of the row bounds against rounding; crossings are good to 1e-13
+# slack against rounding; crossings are good to 1e-13
 ROUNDING = 1e-9
 _TABLE_BINS = 8192
 # what is less than this ahead of the sensor's axis, m, counts as behind it, and what is nearer is not hit
 AXIS = 1e-9
 _LOW = 0xFFFFFFFF
-# of a vertex's column and rows in its key
-_BITS = 21
-_OPEN_BIT = 2 * _BITS
-_MASK, _COLUMNS, _OPEN = (1 << _BITS) - 1, (1 << _BITS) - 1 << _BITS, 1 << _OPEN_BIT
 # pairs of triangle and column that are worked on at a time, to stay near the processor
 _BLOCK = 1024
 
@@ -88,114 +81,57 @@ def _table(values):
 @compiled
 def _find(t, table):
     """The number of values below t, which may be inf."""
-    i = _find_single(t, table.values, table.lut, table.low, table.scale, table.bins)
-    if not table.single:
-        while table.values[i] < t:
-            i += np.uintp(1)
+    i = np.uintp(table.lut[np.uintp(np.int32(min(max((t - table.low) * table.scale, 0.0), table.bins)))])
+    while table.values[i] < t:
+        i += np.uintp(1)
     return i
 
 
 @compiled
-def _find_single(t, values, lut, low, scale, bins):
-    """`_find` if no bin holds two values, else at most that: without branches, for the processor's vectors."""
-    i = np.uintp(lut[np.uintp(np.int32(min(max((t - low) * scale, 0.0), bins)))])
-    return i + np.uintp(values[i] < t)
+def _find_all(t, table):
+    """(n,) int32: `_find` of each of t (n,), without branches where one comparison finishes the search."""
+    count = np.empty(len(t), np.int32)
+    values, lut, low, scale, bins = table.values, table.lut, table.low, table.scale, table.bins
+    for m in range(len(t)):
+        i = np.uintp(lut[np.uintp(np.int32(min(max((t[m] - low) * scale, 0.0), bins)))])
+        count[m] = i + np.uintp(values[i] < t[m])
+    if not table.single:
+        for m in range(len(t)):
+            count[m] = _find(t[m], table)
+    return count
 
 
 @compiled
-def _projected(vertices, c, s, columns, rows, P, bins):
-    """Fills P (V * 4) with Y, Z, I, T of vertices turned by an angle of cosine c and sine s, and bins (V * 2): where
-    to look for the first column right of each, and the first row above the least that its triangles may reach.
+def _projected(vertices, c, s, P, Y):
+    """Fills P (V * 3) with Y, Z, I of vertices turned by an angle of cosine c and sine s, and Y (V,) once more.
 
     Returns how many are not ahead; theirs mean nothing.
     """
-    given, beside = vertices.reshape(-1), 0
-    low_c, scale_c, bins_c, low_r, scale_r, bins_r = (
-        columns.low, columns.scale, columns.bins, rows.low, rows.scale, rows.bins,
-    )  # fmt: skip
+    flat, beside = vertices.reshape(-1), 0
     for i in range(len(vertices)):
-        east, north, z = given[np.uintp(3 * i)], given[np.uintp(3 * i + 1)], given[np.uintp(3 * i + 2)]
+        east, north, z = flat[np.uintp(3 * i)], flat[np.uintp(3 * i + 1)], flat[np.uintp(3 * i + 2)]
         x = c * east + s * north
         y = c * north - s * east
         ahead = (x > AXIS) & (x * STEEP > abs(y)) & (x * STEEP > abs(z))
         beside += not ahead
         inverse = 1 / (x if ahead else 1.0)
-        right, up = y * inverse, z * inverse
-        t = up / np.sqrt(1 + right * right)
-        P[np.uintp(4 * i)] = right
-        P[np.uintp(4 * i + 1)] = up
-        P[np.uintp(4 * i + 2)] = inverse
-        P[np.uintp(4 * i + 3)] = t
-        bins[np.uintp(2 * i)] = np.int32(min(max((right - low_c) * scale_c, 0.0), bins_c))
-        bins[np.uintp(2 * i + 1)] = np.int32(min(max((_least(t) - low_r) * scale_r, 0.0), bins_r))
+        Y[np.uintp(i)] = y * inverse
+        P[np.uintp(3 * i)] = y * inverse
+        P[np.uintp(3 * i + 1)] = z * inverse
+        P[np.uintp(3 * i + 2)] = inverse
     return beside
 
 
 @compiled
-def _least(t):
-    """The least T that an edge from a vertex at t may reach: an arc of a great circle of azimuth width D rises at most
-    by 1 / cos(D / 2) over its higher end."""
-    return t + min(t, 0.0) * _SAG - ROUNDING
-
-
-@compiled
-def _most(t):
-    return t + max(t, 0.0) * _SAG + ROUNDING
-
-
-@compiled
-def _keys(P, bins, columns, rows):
-    """(V,) of vertices P (V * 4): _OPEN if there is a row between what a vertex's edges may reach at least and at most,
-    | first column right of it << _BITS | first row above the least.
-
-    So a triangle whose keys have equal rows and are not open reaches no row, but if it is wide.
-    """
-    count = len(bins) // 2
-    keys = np.empty(count, np.int64)
-    line, row, lut_c, lut_r, end = columns.values, rows.values, columns.lut, rows.lut, np.uintp(len(columns.values) - 1)
-    for i in range(count):
-        y, t = P[np.uintp(4 * i)], P[np.uintp(4 * i + 3)]
-        column = np.uintp(lut_c[np.uintp(bins[np.uintp(2 * i)])])
-        lower = np.uintp(lut_r[np.uintp(bins[np.uintp(2 * i + 1)])])
-        column, lower = column + np.uintp(line[column] < y), lower + np.uintp(row[lower] < _least(t))
-        # whoever reaches beyond the columns may be wide
-        reaches = (row[lower] < _most(t)) | (column == 0) | (column == end)
-        keys[i] = np.int64(reaches) << _OPEN_BIT | np.int64(column) << _BITS | np.int64(lower)
-    if columns.single and rows.single:
-        return keys
-    for i in range(count):
-        y, t = P[4 * i], P[4 * i + 3]
-        column, lower = _find(y, columns), _find(_least(t), rows)
-        reaches = row[lower] < _most(t) or column == 0 or column == end
-        keys[i] = np.int64(reaches) << _OPEN_BIT | np.int64(column) << _BITS | np.int64(lower)
-    return keys
-
-
-@compiled
-def _column(key):
-    return (key & _COLUMNS) >> _BITS
-
-
-@compiled
-def _reaching(faces, keys, columns):
-    """The faces that cross a column and may reach a row, ascending; none is left out that does."""
-    widest = 0.0
-    for k in range(len(columns.values) - 2):
-        widest = max(widest, columns.values[k + 1] - columns.values[k])
-    # what is in one block of so many bits of columns is not too wide to be dropped by row
-    block = _BITS
-    while widest * 2.0 ** (block - _BITS + 1) <= _NARROW and block < _OPEN_BIT:
-        block += 1
-    kept_if = _MASK | -1 << block
-    corners, kept, n = faces.reshape(-1), np.empty(len(faces) + 1, np.int32), np.uintp(0)
+def _crossing(faces, column):
+    """The faces whose corners do not all lie between the same two columns, ascending."""
+    corners, crosses = faces.reshape(-1), np.empty(len(faces), np.bool_)
     for f in range(len(faces)):
-        a = keys[np.uintp(corners[np.uintp(3 * f)])]
-        b = keys[np.uintp(corners[np.uintp(3 * f + 1)])]
-        d = keys[np.uintp(corners[np.uintp(3 * f + 2)])]
-        differ = a ^ b | b ^ d
-        kept[n] = f
-        n += np.uintp((differ & _COLUMNS != 0) & ((differ & kept_if) | (a & _OPEN) != 0))
-    return kept[:n]
+        a = column[np.uintp(corners[np.uintp(3 * f)])]
+        b = column[np.uintp(corners[np.uintp(3 * f + 1)])]
+        d = column[np.uintp(corners[np.uintp(3 * f + 2)])]
+        crosses[f] = (a != b) | (b != d)
+    return _picked(crosses)
 
 
 @compiled
@@ -218,23 +154,21 @@ def raster(vertices, faces, center, column_tan, column_cos, row_tan, column_inde
     """
     c, s = np.cos(center), np.sin(center)
     # what is read together is kept together
-    P, bins = np.empty(4 * len(vertices)), np.empty(2 * len(vertices), np.int32)
-    columns, rows = _table(column_tan), _table(row_tan)
-    beside = _projected(vertices, c, s, columns, rows, P, bins)
-    keys = _keys(P, bins, columns, rows)
+    P, Y = np.empty(3 * len(vertices)), np.empty(len(vertices))
+    beside = _projected(vertices, c, s, P, Y)
+    column, rows = _find_all(Y, _table(column_tan)), _table(row_tan)
     ahead = _ahead(vertices, c, s) if beside else np.empty(0, np.bool_)
-    kept = _reaching(faces, keys, columns)
     lines = np.empty(2 * len(column_tan))
     for k in range(len(column_tan)):
         lines[2 * k], lines[2 * k + 1] = column_tan[k], column_cos[k]
     pairs = np.empty(8 * (_BLOCK + len(column_tan)), np.int32)
     n = 0
-    for f in kept:
+    for f in _crossing(faces, column):
         a, b, d = np.int64(faces[f, 0]), np.int64(faces[f, 1]), np.int64(faces[f, 2])
         if beside and not (ahead[a] and ahead[b] and ahead[d]):
             continue
         # sorted from right to left, by column and vertex
-        a, b, d = a | _column(keys[a]) << 32, b | _column(keys[b]) << 32, d | _column(keys[d]) << 32
+        a, b, d = a | np.int64(column[a]) << 32, b | np.int64(column[b]) << 32, d | np.int64(column[d]) << 32
         first, last = min(a, b, d), max(a, b, d)
         middle = a ^ b ^ d ^ first ^ last
         turn = middle >> 32
@@ -250,7 +184,7 @@ def raster(vertices, faces, center, column_tan, column_cos, row_tan, column_inde
     _fill(pairs[:n], P, lines, rows, column_index, row_index, inverse_x, face)
     if beside:
         _raster_beside(
-            vertices, faces, c, s, ahead, P, keys, column_tan, column_cos, rows, column_index, row_index,
+            vertices, faces, c, s, ahead, P, column, column_tan, column_cos, rows, column_index, row_index,
             inverse_x, face,
         )  # fmt: skip
 
@@ -260,13 +194,13 @@ def _fill(pairs, P, lines, rows, column_index, row_index, inverse_x, face):
     """Casts the beams between the crossings of triangles with columns.
 
     pairs (n * 8): of each, the ends of either edge that crosses the column, a, d and p, q, the column and the face;
-    P (V * 4); lines (C * 2): tan and cos of the columns.
+    P (V * 3); lines (C * 2): tan and cos of the columns.
     """
     count = len(pairs) // 8
-    ends, start = np.empty(4 * count), np.empty(count, np.int32)
+    ends, lower = np.empty(4 * count), np.empty(count)
     for m in range(count):
-        a, d = 4 * np.int64(pairs[np.uintp(8 * m)]), 4 * np.int64(pairs[np.uintp(8 * m + 1)])
-        p, q = 4 * np.int64(pairs[np.uintp(8 * m + 2)]), 4 * np.int64(pairs[np.uintp(8 * m + 3)])
+        a, d = 3 * np.int64(pairs[np.uintp(8 * m)]), 3 * np.int64(pairs[np.uintp(8 * m + 1)])
+        p, q = 3 * np.int64(pairs[np.uintp(8 * m + 2)]), 3 * np.int64(pairs[np.uintp(8 * m + 3)])
         k = 2 * np.int64(pairs[np.uintp(8 * m + 4)])
         line, cosine = lines[np.uintp(k)], lines[np.uintp(k + 1)]
         ay, az, ai = P[np.uintp(a)], P[np.uintp(a + 1)], P[np.uintp(a + 2)]
@@ -277,13 +211,8 @@ def _fill(pairs, P, lines, rows, column_index, row_index, inverse_x, face):
         u = (line - py) / (P[np.uintp(q)] - py)
         ends[np.uintp(4 * m + 2)] = (pz + u * (P[np.uintp(q + 1)] - pz)) * cosine
         ends[np.uintp(4 * m + 3)] = pi + u * (P[np.uintp(q + 2)] - pi)
-    values, lut, low, scale, bins = rows.values, rows.lut, rows.low, rows.scale, rows.bins
-    for m in range(count):
-        lower = min(ends[np.uintp(4 * m)], ends[np.uintp(4 * m + 2)])
-        start[m] = np.int32(_find_single(lower, values, lut, low, scale, bins))
-    if not rows.single:
-        for m in range(count):
-            start[m] = np.int32(_find(min(ends[4 * m], ends[4 * m + 2]), rows))
+        lower[m] = min(ends[np.uintp(4 * m)], ends[np.uintp(4 * m + 2)])
+    start, values = _find_all(lower, rows), rows.values
     met = np.empty(count, np.bool_)
     for m in range(count):
         met[m] = values[np.uintp(start[m])] < max(ends[np.uintp(4 * m)], ends[np.uintp(4 * m + 2)])
@@ -313,7 +242,7 @@ def _ahead(vertices, c, s):
 
 @compiled
 def _raster_beside(
-    vertices, faces, c, s, ahead, P, keys, column_tan, column_cos, table, column_index, row_index, inverse_x, face
+    vertices, faces, c, s, ahead, P, column, column_tan, column_cos, table, column_index, row_index, inverse_x, face
 ):  # fmt: skip
     """The part of `raster` for triangles with a vertex that is not `ahead`: slower, right for any triangle.
 
@@ -333,8 +262,8 @@ def _raster_beside(
             x[j] = c * vertices[i, 0] + s * vertices[i, 1]
             y[j] = c * vertices[i, 1] - s * vertices[i, 0]
             z[j] = vertices[i, 2]
-            first += (_column(keys[i]) > 0) if ahead[i] else (y[j] - column_tan[0] * x[j] > 0)
-            last += (_column(keys[i]) > columns - 1) if ahead[i] else (y[j] - column_tan[columns - 1] * x[j] > 0)
+            first += (column[i] > 0) if ahead[i] else (y[j] - column_tan[0] * x[j] > 0)
+            last += (column[i] > columns - 1) if ahead[i] else (y[j] - column_tan[columns - 1] * x[j] > 0)
         # a vertex's side changes at most once over the columns
         if first == last and (first == 0 or first == 3) or max(x[0], x[1], x[2]) <= 0:
             continue
@@ -342,7 +271,7 @@ def _raster_beside(
             total = 0
             for j in range(3):
                 i = faces[f, j]
-                left[j] = (k < _column(keys[i])) if ahead[i] else (y[j] - column_tan[k] * x[j] > 0)
+                left[j] = (k < column[i]) if ahead[i] else (y[j] - column_tan[k] * x[j] > 0)
                 total += left[j]
             if total == 0 or total == 3:
                 continue
@@ -357,15 +286,15 @@ def _raster_beside(
                     p, q = q, p
                 a, b = faces[f, p], faces[f, q]
                 if ahead[a] and ahead[b]:
-                    u = (column_tan[k] - P[4 * a]) / (P[4 * b] - P[4 * a])
-                    end_i[e] = P[4 * a + 2] + u * (P[4 * b + 2] - P[4 * a + 2])
-                    end_t[e] = (P[4 * a + 1] + u * (P[4 * b + 1] - P[4 * a + 1])) * column_cos[k]
+                    u = (column_tan[k] - P[3 * a]) / (P[3 * b] - P[3 * a])
+                    end_i[e] = P[3 * a + 2] + u * (P[3 * b + 2] - P[3 * a + 2])
+                    end_t[e] = (P[3 * a + 1] + u * (P[3 * b + 1] - P[3 * a + 1])) * column_cos[k]
                     end_x[e] = 1 / end_i[e]
-                    end_z[e] = (P[4 * a + 1] + u * (P[4 * b + 1] - P[4 * a + 1])) * end_x[e]
+                    end_z[e] = (P[3 * a + 1] + u * (P[3 * b + 1] - P[3 * a + 1])) * end_x[e]
                 else:
                     # of the sign that the side was found by, or an edge in the column's plane might cross nowhere
-                    before = (P[4 * a] - column_tan[k]) * x[p] if ahead[a] else y[p] - column_tan[k] * x[p]
-                    after = (P[4 * b] - column_tan[k]) * x[q] if ahead[b] else y[q] - column_tan[k] * x[q]
+                    before = (P[3 * a] - column_tan[k]) * x[p] if ahead[a] else y[p] - column_tan[k] * x[p]
+                    after = (P[3 * b] - column_tan[k]) * x[q] if ahead[b] else y[q] - column_tan[k] * x[q]
                     u = before / (before - after)
                     end_x[e] = x[p] + u * (x[q] - x[p])
                     end_z[e] = z[p] + u * (z[q] - z[p])
