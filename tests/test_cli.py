@@ -104,44 +104,61 @@ FORMATS = {
 
 
 def test_every_format_gives_the_same_pose(tmp_path, out, crop, points):
-    assert run("predict", crop, "--out", out) == 0
-    joints = json.loads((out / "crop.poses.json").read_text())["people"][0]["joints"]
-    for name, (content, options) in FORMATS.items():
-        file = write(tmp_path / name, content(points))
-        assert run("predict", file, "--out", out, *options) == 0
-        document = json.loads((out / f"{file.stem}.poses.json").read_text())
-        np.testing.assert_allclose(document["people"][0]["joints"], joints, atol=1e-3)
-        assert document["source"] == str(file)
+    results = []
+    for name, (content, options) in {"crop.npy": (None, []), **FORMATS}.items():
+        file = write(tmp_path / name, content(points)) if content else crop
+        assert run("predict", file, "--out", out, "--tta", 1, *options) == 0
+        results.append(json.loads((out / f"{file.stem}.poses.json").read_text()))
+        assert results[-1]["source"] == str(file)
+        np.testing.assert_allclose(results[-1]["people"][0]["joints"], results[0]["people"][0]["joints"], atol=1e-3)
 
 
-def test_boxes_picture_and_skeleton(crop, boxes, out, capsys):
-    out.mkdir()
-    write(out / "crop.poses.json", "an older result")
-    words = ["--picture", "--skeleton", "waymo14", "--sensor-origin", "-1.5,0,2"]
+@pytest.mark.parametrize(
+    "words, written, is_printed",
+    [
+        ("", ["crop.poses.json"], False),
+        ("--out -", [], True),
+        ("--out - --picture", ["crop.poses.png"], True),
+        ("--out a/one.JSON --picture", ["a/one.JSON", "a/one.png"], False),
+        ("--out a.CSV --picture", ["a.CSV", "a.png"], False),
+        # a folder is a folder whatever its name
+        ("--out b.json", ["b.json/crop.poses.json"], False),
+        ("--out c.csv/", ["c.csv/crop.poses.json"], False),
+    ],
+)
+def test_results_go_where_they_are_to_go(crop, tmp_path, monkeypatch, capsys, words, written, is_printed):
+    here = tmp_path / "here"
+    (here / "b.json").mkdir(parents=True)
+    write(here / "crop.poses.json", "an older result")
+    monkeypatch.chdir(here)
+    assert run("predict", crop, "--tta", 1, *words.split()) == 0
+    text = capsys.readouterr().out
+    assert json.loads(text)["schema"] == "lidarpose.poses/1" if is_printed else text == ""
+    files = {path.relative_to(here).as_posix(): path.read_bytes() for path in here.rglob("*") if path.is_file()}
+    if "crop.poses.json" not in written:
+        assert files.pop("crop.poses.json") == b"an older result"
+    assert sorted(files) == written
+    for name, content in files.items():
+        if name.endswith("png"):
+            assert content.startswith(b"\x89PNG")
+        elif name.endswith("CSV"):
+            table = pandas.read_csv(io.BytesIO(content))
+            assert len(table) == 24 and {"id", "joint", "x", "y", "z", "confidence"} <= set(table.columns)
+        else:
+            assert json.loads(content)["people"]
+
+
+def test_boxes_and_skeleton(crop, boxes, out, capsys):
+    words = ["--skeleton", "waymo14", "--sensor-origin", "-1.5,0,2"]
     assert run("predict", crop, "--boxes", boxes, "--out", out, *words) == 0
-    assert sorted(path.name for path in out.iterdir()) == ["crop.poses.json", "crop.poses.png"]
-    document = json.loads((out / "crop.poses.json").read_text())
-    assert document["people"][0]["id"] == "a" and len(document["people"][0]["joints"]) == 14
-    assert (out / "crop.poses.png").read_bytes().startswith(b"\x89PNG")
+    (person,) = json.loads((out / "crop.poses.json").read_text())["people"]
+    assert person["id"] == "a" and len(person["joints"]) == 14
     assert "1 of 1 people" in capsys.readouterr().err
 
 
-def test_results_are_printed_or_go_to_the_current_folder(crop, tmp_path, monkeypatch, capsys):
-    here = tmp_path / "here"
-    here.mkdir()
-    monkeypatch.chdir(here)
-    for words, printed, written in (
-        (["--out", "-"], True, []),
-        (["--out", "-", "--picture"], True, ["crop.poses.png"]),
-        ([], False, ["crop.poses.json", "crop.poses.png"]),
-    ):
-        assert run("predict", crop, *words) == 0
-        text = capsys.readouterr().out
-        assert json.loads(text)["schema"] == "lidarpose.poses/1" if printed else text == ""
-        assert sorted(path.name for path in here.iterdir()) == written
-
-
-def test_people_without_a_pose_share_a_warning_line(crop, tmp_path, out, capsys):
+def test_people_without_a_pose_are_no_error_and_share_a_warning_line(crop, tmp_path, out, capsys):
+    assert run("predict", write(tmp_path / "a.xyz", "0 0 0\n0 0 1\n"), "--out", out) == 0
+    assert "person 0: no pose: under 5 points" in capsys.readouterr().err
     empty = [{"center": [90 + i, 0, 0], "size": [1, 1, 1], "id": f"p{i}"} for i in range(5)]
     assert run("predict", crop, "--boxes", write(tmp_path / "b.json", json.dumps(empty)), "--out", out) == 0
     err = capsys.readouterr().err
@@ -149,11 +166,6 @@ def test_people_without_a_pose_share_a_warning_line(crop, tmp_path, out, capsys)
     assert "warning: no box holds 5 points" in err and "0 of 5 people" in err
     people = json.loads((out / "crop.poses.json").read_text())["people"]
     assert [person["joints"] for person in people] == [None] * 5 and people[0]["warnings"]
-
-
-def test_a_crop_of_few_points_is_no_error(tmp_path, out, capsys):
-    assert run("predict", write(tmp_path / "a.xyz", "0 0 0\n0 0 1\n"), "--out", out) == 0
-    assert "person 0: no pose: under 5 points" in capsys.readouterr().err
 
 
 def test_info(capsys):
@@ -183,18 +195,19 @@ def test_info_counts_the_people_of_all_runs(monkeypatch):
     assert "           1,000 people, 1.25 hours" in info.lines()
 
 
-def test_backends_and_decoders(crop, out):
-    joints = {}
-    for words in (["--backend", "onnx"], ["--backend", "torch"], ["--decode", "argmax"], ["--decode", "dark"], []):
-        assert run("predict", crop, "--out", out, *words) == 0
-        document = json.loads((out / "crop.poses.json").read_text())
-        joints[tuple(words)] = np.array(document["people"][0]["joints"])
+def test_backends_decoders_and_tta(crop, capsys):
+    results = {}
+    for words in ("", "--backend onnx", "--backend torch", "--decode argmax", "--decode dark", "--tta 1", "--tta 2"):
+        assert run("predict", crop, "--out", "-", *words.split()) == 0
+        document = json.loads(capsys.readouterr().out)
         model = document["model"]
+        results[words] = np.array(document["people"][0]["joints"])
         assert model["backend"] == ("torch" if "torch" in words else "onnx")
-        assert model["decode"] == (words[1] if "--decode" in words else "window")
-    np.testing.assert_allclose(joints["--backend", "torch"], joints[()], atol=1.1e-4)
-    np.testing.assert_array_equal(joints["--backend", "onnx"], joints[()])
-    assert not np.array_equal(joints["--decode", "argmax"], joints[()])
+        assert model["decode"] == (words.split()[1] if "--decode" in words else "window")
+        assert model.get("tta") == {"--tta 1": None, "--tta 2": 2}.get(words, 4)
+    np.testing.assert_allclose(results["--backend torch"], results[""], atol=1.1e-4)
+    np.testing.assert_array_equal(results["--backend onnx"], results[""])
+    assert not np.array_equal(results["--decode argmax"], results[""])
 
 
 @pytest.mark.parametrize(
@@ -237,40 +250,7 @@ def test_released_weights_are_imported_and_predict(crop, tmp_path, monkeypatch, 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["crop.npy", "crop.poses.json", "mine.safetensors"]
 
 
-def test_results_go_to_a_file_that_is_named(crop, tmp_path):
-    assert run("predict", crop, "--out", tmp_path / "a" / "one.JSON", "--picture") == 0
-    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["one.JSON", "one.png"]
-    assert json.loads((tmp_path / "a" / "one.JSON").read_text())["people"]
-    # a folder is a folder whatever its name
-    (tmp_path / "b.json").mkdir()
-    assert run("predict", crop, "--out", tmp_path / "b.json") == 0
-    assert run("predict", crop, "--out", f"{tmp_path / 'c.csv'}/") == 0
-    for name in ("b.json", "c.csv"):
-        assert [path.name for path in (tmp_path / name).iterdir()] == ["crop.poses.json"]
-
-
-# ---- what is wrong with a file of points or boxes: (name, content, words of the error)
-
-BAD_FILES = {
-    "unknown suffix": ("a.obj", b"o x\nv 0 0 0\n", ".pcd .ply"),
-    "truncated": ("a.ply", _ply(np.zeros((99, 3)))[:-40], "cut off"),
-    "all NaN": ("a.xyz", "nan nan nan\n" * 9, "finite"),
-    "a word": ("a.txt", "1 2 3\n4 five 6\n", "five"),
-    "boxes: no JSON": ("bad.json", "{people: []}", "line 1"),
-    "boxes: a number": ("bad.json", "5", "people"),
-    "boxes: no center": ("bad.json", '{"people": [{"size": [1, 1, 1]}]}', 'people[0]: expected the key "center"'),
-    "boxes: far off": ("bad.json", '[{"center": [1e300, 1, 1], "size": [1, 1, 1]}]', "people[0].center"),
-}
-
-
-@pytest.mark.parametrize("case", BAD_FILES)
-def test_a_bad_file_is_one_line(crop, tmp_path, out, capsys, case):
-    name, content, words = BAD_FILES[case]
-    file = write(tmp_path / name, content)
-    assert run("predict", *((crop, "--boxes", file) if name == "bad.json" else (file, "--crop")), "--out", out) == 2
-    line = one_line(capsys)
-    assert words in line and str(file) in line
-    assert not out.exists()
+# ---- what is wrong
 
 
 def test_what_is_read_is_never_written_over(crop, boxes, tmp_path, capsys):
@@ -358,9 +338,28 @@ def test_json_that_is_nothing_but_brackets_is_one_line(tmp_path, capsys):
     assert "its header cannot be read" in one_line(capsys)
 
 
-# ---- what is wrong with the command: (words of it, words of the error)
+# ---- what is wrong with a command or a file: (command, words of the error)
+
+BAD_FILES = {
+    "a.obj": b"o x\nv 0 0 0\n",
+    "cut.ply": _ply(np.zeros((99, 3)))[:-40],
+    "nan.xyz": "nan nan nan\n" * 9,
+    "word.txt": "1 2 3\n4 five 6\n",
+    "keys.json": "{people: []}",
+    "five.json": "5",
+    "size.json": '{"people": [{"size": [1, 1, 1]}]}',
+    "far.json": '[{"center": [1e300, 1, 1], "size": [1, 1, 1]}]',
+}
 
 BAD_COMMANDS = {
+    "unknown suffix": ("predict DIR/a.obj --crop", ".pcd .ply"),
+    "truncated": ("predict DIR/cut.ply --crop", "cut off"),
+    "all NaN": ("predict DIR/nan.xyz --crop", "finite"),
+    "a word": ("predict DIR/word.txt --crop", "five"),
+    "boxes: no JSON": ("predict CROP --boxes DIR/keys.json", "line 1"),
+    "boxes: a number": ("predict CROP --boxes DIR/five.json", "people"),
+    "boxes: no center": ("predict CROP --boxes DIR/size.json", 'people[0]: expected the key "center"'),
+    "boxes: far off": ("predict CROP --boxes DIR/far.json", "people[0].center"),
     "unknown command": ("predikt CROP", "predikt"),
     "no file": ("predict", "FILE"),
     "missing file": ("predict DIR/crob.npy", "did you mean crop.npy"),
@@ -405,12 +404,13 @@ BAD_COMMANDS = {
 def test_a_bad_command_is_one_line(crop, boxes, tmp_path, capsys, monkeypatch, case):
     words, expected = BAD_COMMANDS[case]
     monkeypatch.chdir(tmp_path)
+    files = [write(tmp_path / name, content) for name, content in BAD_FILES.items() if f"DIR/{name}" in words]
     before = sorted(tmp_path.iterdir())
-    names = {"DIR": tmp_path, "CROP": crop, "BOXES": boxes, "DAPT": DAPT}
-    for name, path in names.items():
+    for name, path in {"DIR": tmp_path, "CROP": crop, "BOXES": boxes, "DAPT": DAPT}.items():
         words = words.replace(name, str(path))
     assert run(*words.split()) == 2
-    assert expected in one_line(capsys)
+    line = one_line(capsys)
+    assert expected in line and all(str(file) in line for file in files)
     assert sorted(tmp_path.iterdir()) == before
 
 
@@ -421,17 +421,14 @@ def test_a_file_of_several_people_asks_for_boxes(tmp_path, out, points, capsys):
     assert "boxes" in line and "crop" in line
 
 
-def test_a_picture_that_cannot_be_written_leaves_no_json(crop, out, capsys):
-    (out / "crop.poses.png").mkdir(parents=True)
-    assert run("predict", crop, "--out", out, "--picture") == 2
-    assert "crop.poses.png" in one_line(capsys)
-    assert [path.name for path in out.iterdir()] == ["crop.poses.png"]
-
-
-def test_an_output_that_cannot_be_written_is_told_before_the_work(crop, monkeypatch, capsys):
+def test_an_output_that_cannot_be_written_is_told_before_the_work(crop, out, monkeypatch, capsys):
     monkeypatch.setattr(predictor.Predictor, "predict", lambda *_, **__: pytest.fail("predicted first"))
-    assert run("predict", crop, "--out", crop / "deep", "--picture") == 2
-    assert "cannot write" in one_line(capsys)
+    (out / "crop.poses.png").mkdir(parents=True)
+    for folder, words in ((crop / "deep", "cannot write"), (out, "crop.poses.png")):
+        assert run("predict", crop, "--out", folder, "--picture") == 2
+        assert words in one_line(capsys)
+    # no JSON without its picture
+    assert [path.name for path in out.iterdir()] == ["crop.poses.png"]
 
 
 def test_a_demo_that_is_killed_leaves_nothing(out, monkeypatch, capsys):
@@ -518,13 +515,7 @@ def test_the_notebook_runs_and_holds_no_output(tmp_path, monkeypatch, capsys):
     assert re.search(r"MPJPE \d+ mm, expected \d+ mm", capsys.readouterr().out)
 
 
-def test_tta_is_as_asked_for(crop, capsys):
-    for words, expected in ([], 4), (["--tta", "1"], None), (["--tta", "2"], 2):
-        assert run("predict", crop, "--out", "-", *words) == 0
-        assert json.loads(capsys.readouterr().out)["model"].get("tta") == expected
-
-
-# ---- help, quiet and CSV
+# ---- help and quiet
 
 
 def test_help_and_version(capsys):
@@ -550,10 +541,3 @@ def test_quiet_prints_errors_only(crop, tmp_path, capsys):
     # and does not outlast its command
     assert run(*words) == 0
     assert "1 of 1 people" in capsys.readouterr().err
-
-
-def test_a_csv_has_a_row_a_joint(crop, tmp_path):
-    assert run("predict", crop, "--crop", "--out", tmp_path / "a.CSV", "--tta", 1, "--picture") == 0
-    table = pandas.read_csv(tmp_path / "a.CSV")
-    assert len(table) == 24 and {"id", "joint", "x", "y", "z", "confidence"} <= set(table.columns)
-    assert (tmp_path / "a.png").is_file()

@@ -89,7 +89,9 @@ def _draw_panel(ax, panel: ScanPanel) -> None:
         skeleton = panel.poses.skeleton
         bones = panel.poses.joints.reshape(-1, len(skeleton), 3)[:, bone_pairs(skeleton), :2]
         colors = [SIDE_COLORS[side] for side in bone_sides(skeleton)] * len(bones)
-        ax.add_collection(LineCollection(bones.reshape(-1, 2, 2), colors=colors, lw=1.6, zorder=6, capstyle="round"))
+        ax.add_collection(
+            LineCollection(list(bones.reshape(-1, 2, 2)), colors=colors, lw=1.6, zorder=6, capstyle="round")
+        )
 
 
 def _window(panel: ScanPanel, points: np.ndarray) -> tuple[np.ndarray, float]:
@@ -127,7 +129,7 @@ def _draw_box(ax, box: Box) -> None:
     """Its outline, the way it faces, and its id."""
     from matplotlib.collections import LineCollection
 
-    ax.add_collection(LineCollection(box_edges(box)[..., :2], colors=_BOX, lw=1.1, zorder=5))
+    ax.add_collection(LineCollection(list(box_edges(box)[..., :2]), colors=_BOX, lw=1.1, zorder=5))
     nose = box.center[:2] + np.array([np.cos(box.yaw), np.sin(box.yaw)]) * (box.size[0] / 2 + 0.6)
     ax.annotate("", nose, box.center[:2], arrowprops={"arrowstyle": "->", "color": _BOX, "lw": 1.1}, zorder=5)
     if box.id is not None:

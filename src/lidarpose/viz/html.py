@@ -88,7 +88,7 @@ def _person_data(person: Panel, limit: int) -> dict:
     rows = np.flatnonzero(within_reach(person.points))
     rows = rows[thinned(len(rows), limit)]
     forward = facing_of(person)
-    data = {
+    data: dict[str, object] = {
         "points": _millimeters(person.points[rows], center),
         "facing": None if forward is None else round(math.atan2(forward[1], forward[0]), 4),
         "pose": _pose_data(person.pose, center),
