@@ -57,24 +57,22 @@ def person(smpl, frames=4, seed=0, at=(8.0, 2.0, 0.0), betas=None):
 # --- clouds
 
 
-def write_ply(path, points, *, text=False):
+def write_cloud(path, points, header, text):
     path.parent.mkdir(parents=True, exist_ok=True)
-    kind = "ascii" if text else "binary_little_endian"
-    header = f"ply\nformat {kind} 1.0\nelement vertex {len(points)}\n"
-    header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
     rows = "".join("{:.6f} {:.6f} {:.6f}\n".format(*p) for p in points).encode()
     path.write_bytes(header.encode() + (rows if text else np.asarray(points, "<f4").tobytes()))
+
+
+def write_ply(path, points, *, text=False):
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    kind = "ascii" if text else "binary_little_endian"
+    write_cloud(path, points, f"ply\nformat {kind} 1.0\nelement vertex {len(points)}\n{axes}end_header\n", text)
 
 
 def write_pcd(path, points, *, text=False):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    header = (
-        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
-    )
+    header = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
     header += f"WIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}\n"
-    header += f"DATA {'ascii' if text else 'binary'}\n"
-    rows = "".join("{:.6f} {:.6f} {:.6f}\n".format(*p) for p in points).encode()
-    path.write_bytes(header.encode() + (rows if text else np.asarray(points, "<f4").tobytes()))
+    write_cloud(path, points, f"{header}DATA {'ascii' if text else 'binary'}\n", text)
 
 
 # --- HumanM3
@@ -154,11 +152,8 @@ def sloper4d_labels(smpl, sequence, *, frames=4, without=(1,), total=None, refin
     for f, number in enumerate(numbers):
         place = np.array([100.0 + 0.1 * f, -50.0, 3.7])
         heading, pitch, roll = 0.4 + 0.1 * f, 0.25, -0.1
-        R_world_sensor = (
-            axis_angle_to_matrix([0, 0, heading])
-            @ axis_angle_to_matrix([0, pitch, 0])
-            @ axis_angle_to_matrix([roll, 0, 0])
-        )
+        turns = [axis_angle_to_matrix(vector) for vector in ([0, 0, heading], [0, pitch, 0], [roll, 0, 0])]
+        R_world_sensor = turns[0] @ turns[1] @ turns[2]
         way.append([f, *place, *quaternion(R_world_sensor), 1641234567.5 + 0.05 * f])
         if f in without:
             continue

@@ -53,11 +53,11 @@ def test_rotation_about_adds_up_and_agrees_with_rodrigues(axis, a, b):
     np.testing.assert_allclose(matrix, axis_angle_to_matrix(along * a), atol=1e-9)
 
 
-def test_rotation_about_is_right_handed():
-    np.testing.assert_allclose(rotation_about("z", np.pi / 2) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
-    np.testing.assert_allclose(rotation_about("x", np.pi / 2) @ [0, 1, 0], [0, 0, 1], atol=1e-12)
-    np.testing.assert_allclose(rotation_about("y", np.pi / 2) @ [0, 0, 1], [1, 0, 0], atol=1e-12)
-    assert rotation_about("z", np.zeros((2, 4))).shape == (2, 4, 3, 3)
+@pytest.mark.parametrize(("axis", "a", "b"), ["zxy", "xyz", "yzx"])
+def test_rotation_about_is_right_handed(axis, a, b):
+    a, b = (np.eye(3)["xyz".index(name)] for name in (a, b))
+    np.testing.assert_allclose(rotation_about(axis, np.pi / 2) @ a, b, atol=1e-12)
+    assert rotation_about(axis, np.zeros((2, 4))).shape == (2, 4, 3, 3)
 
 
 directions = vectors.filter(lambda v: (np.linalg.norm(v, axis=-1) > 1e-3).all())
@@ -85,17 +85,9 @@ def test_rotation_between_of_opposite_and_of_equal_directions(a):
 
 @quick
 @given(vectors)
-def test_unit_has_length_one_or_stays_zero(vector):
-    length = np.linalg.norm(unit(vector), axis=-1)
-    big = np.linalg.norm(vector, axis=-1) > 1e-9
-    np.testing.assert_allclose(length[big], 1, atol=1e-12)
-    np.testing.assert_array_equal(unit(np.zeros(3)), np.zeros(3))
-
-
-@quick
-@given(vectors)
-def test_spherical_coordinates_and_back(points):
+def test_unit_vectors_and_spherical_coordinates_and_back(points):
     distance, azimuth, elevation = to_spherical(points)
+    np.testing.assert_allclose(np.linalg.norm(unit(points), axis=-1)[distance > 1e-9], 1, atol=1e-12)
     assert (distance >= 0).all() and (np.abs(azimuth) <= np.pi).all() and (np.abs(elevation) <= np.pi / 2).all()
     np.testing.assert_allclose(from_spherical(distance, azimuth, elevation), points, atol=1e-9)
 
@@ -105,8 +97,8 @@ def test_spherical_conventions():
     np.testing.assert_allclose(distance, [2, 3, np.sqrt(2), 1])
     np.testing.assert_allclose(azimuth, [np.pi / 2, 0, 0, np.pi])
     np.testing.assert_allclose(elevation, [0, np.pi / 2, -np.pi / 4, 0])
-    grid = from_spherical(2.0, np.zeros((4, 1)), np.zeros((1, 3)))
-    assert grid.shape == (4, 3, 3)
+    assert from_spherical(2.0, np.zeros((4, 1)), np.zeros((1, 3))).shape == (4, 3, 3)
+    np.testing.assert_array_equal(unit(np.zeros(3)), np.zeros(3))
 
 
 @pytest.mark.parametrize("up", UP_AXES)
@@ -139,38 +131,24 @@ def test_a_direction_is_put_up_by_the_smallest_rotation(direction):
     np.testing.assert_array_equal(rotation_from_up(",".join(map(repr, direction))), rotation)
 
 
-def random_similarities(seed, batch):
-    rng = np.random.default_rng(seed)
-    rotation = axis_angle_to_matrix(rng.normal(0, 2, (batch, 3)))
-    scale = np.exp(rng.normal(0, 0.7, batch))
-    return rng, rotation, scale, rng.normal(0, 5, (batch, 1, 3))
-
-
-def moved(source, rotation, scale, shift):
-    return scale[:, None, None] * source @ np.swapaxes(rotation, -1, -2) + shift
-
-
 # a batch of 3 is the trap: an axis of 3 can be taken for x, y, z
 @pytest.mark.parametrize("batch", [1, 2, 3, 4, 5])
-@pytest.mark.parametrize("joints", [3, 4, 14])
-@settings(max_examples=10, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1))
-def test_alignment_recovers_a_similarity(batch, joints, seed):
-    rng, *similarity = random_similarities(seed, batch)
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), joints=st.sampled_from([3, 4, 14]))
+def test_alignment_recovers_a_similarity_and_is_least_squares_without_reflections(batch, joints, seed):
+    rng = np.random.default_rng(seed)
+    rotation = axis_angle_to_matrix(rng.normal(0, 2, (batch, 3)))
+    scale, shift = np.exp(rng.normal(0, 0.7, batch)), rng.normal(0, 5, (batch, 1, 3))
     source = rng.normal(size=(batch, joints, 3))
-    target = moved(source, *similarity)
-    np.testing.assert_allclose(similarity_align(source, target), target, atol=1e-6)
-    np.testing.assert_allclose(similarity_align(source[0], target[0]), target[0], atol=1e-6)
 
+    def moved(points):
+        return scale[:, None, None] * points @ np.swapaxes(rotation, -1, -2) + shift
 
-@pytest.mark.parametrize("batch", [1, 2, 3, 4, 5])
-@settings(max_examples=10, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1))
-def test_alignment_of_noisy_sets_never_reflects_and_is_least_squares(batch, seed):
-    rng, rotation, scale, shift = random_similarities(seed, batch)
-    source = rng.normal(size=(batch, 9, 3))
+    np.testing.assert_allclose(similarity_align(source, moved(source)), moved(source), atol=1e-6)
+    np.testing.assert_allclose(similarity_align(source[0], moved(source)[0]), moved(source)[0], atol=1e-6)
     # a mirror image invites a reflection
-    target = moved(source * [1, -1, 1], rotation, scale, shift) + rng.normal(0, 0.1, source.shape)
+    source = rng.normal(size=(batch, 9, 3))
+    target = moved(source * [1, -1, 1]) + rng.normal(0, 0.1, source.shape)
     aligned = similarity_align(source, target)
     s, a = source - source.mean(1, keepdims=True), aligned - aligned.mean(1, keepdims=True)
     for k in range(batch):

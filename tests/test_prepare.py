@@ -47,6 +47,12 @@ def prepared(raw, tmp_path_factory):
     return out, prepare("humanm3", raw[0], out)
 
 
+def refused(message, *arguments, **options):
+    with pytest.raises(InputError, match=message) as caught:
+        prepare(*arguments, **options)
+    assert "\n" not in str(caught.value)
+
+
 def content(folder):
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
@@ -107,8 +113,7 @@ def test_datasets_of_smpl_have_its_trans_and_distances(tmp_path, smpl):
     assert lines[0] == "6 people in 6 frames (test 3, train 3)" and lines[1].startswith("skipped 2: labels without")
     shutil.copy(smpl, tmp_path / "SMPL_MALE.npz")
     shutil.copy(smpl, tmp_path / "SMPL_NEUTRAL.npz")
-    with pytest.raises(InputError, match="other settings: smpl "):
-        prepare("sloper4d", root, tmp_path / "out", smpl=tmp_path)
+    refused("other settings: smpl ", "sloper4d", root, tmp_path / "out", smpl=tmp_path)
 
 
 @settings(max_examples=40, deadline=None)
@@ -155,15 +160,9 @@ def test_any_item_comes_back_as_it_was(tmp_path_factory, seed, count, boxed, rin
 
 
 def test_only_columns_that_have_a_place_are_written(raw):
-    item = next(one for one in _reader().read(raw[0], "train/a"))
+    item = next(HumanM3().read(raw[0], "train/a"))
     with pytest.raises(InputError, match="names trans, box, joints_box, got mean"):
         labeled_row(replace(item, centers={"mean": np.zeros(3)}), index=0)
-
-
-def _reader():
-    from lidarpose.data.prepare import reader
-
-    return reader("humanm3")
 
 
 # --- stopped, killed, in several processes
@@ -192,8 +191,7 @@ def test_what_is_whole_is_not_read_again(raw, prepared, tmp_path, monkeypatch):
     column = pa.nulls(len(table), table.schema.field("joints").type)
     place = table.schema.get_field_index("joints")
     parquet.write_table(table.set_column(place, "joints", column), out / "labelled-00001.parquet")
-    with pytest.raises(InputError, match="labelled-00001.parquet: has a row that is no sample; delete it"):
-        prepare("humanm3", raw[0], out)
+    refused("labelled-00001.parquet: has a row that is no sample; delete it", "humanm3", raw[0], out)
 
 
 def _gone():
@@ -204,34 +202,28 @@ def _gone():
 
 
 def test_a_stopped_run_goes_on_and_has_no_summary_before(raw, prepared, tmp_path, monkeypatch):
-    out = tmp_path / "out"
+    out, whole = tmp_path / "out", PartWriter.__call__
 
     def stop(self, number):
         if number == 1:
             raise KeyboardInterrupt
         return whole(self, number)
 
-    whole = PartWriter.__call__
-    with monkeypatch.context() as patch:
-        patch.setattr(PartWriter, "__call__", stop)
-        with pytest.raises(KeyboardInterrupt):
+    def stopped():
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(PartWriter, "__call__", stop)
             prepare("humanm3", raw[0], out)
-    assert sorted(path.name for path in out.iterdir()) == [
-        "dataset.json", "labelled-00000.parquet", "skipped-00000.parquet"
-    ]  # fmt: skip
-    dataset = open_dataset(out)
-    assert dataset.card.summary is None
+        assert open_dataset(out).card.summary is None
+
+    stopped()
+    assert list(content(out)) == ["dataset.json", "labelled-00000.parquet", "skipped-00000.parquet"]
     with pytest.raises(InputError, match="not finished; run the same lidarpose prepare again"):
-        list(dataset)
+        list(open_dataset(out))
     prepare("humanm3", raw[0], out)
     assert content(out) == content(prepared[0])
     # nor does one that was whole and is not any more
     (out / "labelled-00001.parquet").unlink()
-    with monkeypatch.context() as patch:
-        patch.setattr(PartWriter, "__call__", stop)
-        with pytest.raises(KeyboardInterrupt):
-            prepare("humanm3", raw[0], out)
-    assert open_dataset(out).card.summary is None
+    stopped()
 
 
 class Slow:
@@ -262,76 +254,65 @@ def test_workers_end_when_the_run_is_stopped(tmp_path):
 
 
 def test_a_user_s_own_lists_win_and_blank_lines_are_no_sequence(tmp_path, smpl):
-    root = tmp_path / "raw"
+    root, out = tmp_path / "raw", tmp_path / "own"
     files.write_lidarhuman26m(root, smpl, sequences=("5", "7", "9"), frames=1)
     assert split_rule("lidarhuman26m", root).of_part("7") == "test"
     (root / "train.txt").write_text("7\n9\n\n")
-    with pytest.raises(InputError, match="has train.txt and no test.txt"):
-        prepare("lidarhuman26m", root, tmp_path / "out", smpl=smpl)
+    refused("has train.txt and no test.txt", "lidarhuman26m", root, out, smpl=smpl)
     (root / "test.txt").write_text("5\n")
-    summary = prepare("lidarhuman26m", root, tmp_path / "own", smpl=smpl)
-    assert summary["splits"] == {"test": 1, "train": 2}
-    assert {item.sequence for item in open_dataset(tmp_path / "own").items("test")} == {"5"}
+    assert prepare("lidarhuman26m", root, out, smpl=smpl)["splits"] == {"test": 1, "train": 2}
+    assert {item.sequence for item in open_dataset(out).items("test")} == {"5"}
     # unless the published one is asked for by name
     summary = prepare("lidarhuman26m", root, tmp_path / "named", smpl=smpl, split_by="official")
     assert summary["splits"] == {"none": 1, "test": 1, "train": 1}
     (root / "train.txt").write_text("7\n")
-    with pytest.raises(InputError, match="other settings: lists "):
-        prepare("lidarhuman26m", root, tmp_path / "own", smpl=smpl)
-    (root / "test.txt").write_text("7\n")
-    with pytest.raises(InputError, match="test.txt: names 7, which is in train.txt too"):
-        prepare("lidarhuman26m", root, tmp_path / "out", smpl=smpl)
-    (root / "test.txt").write_text("\n")
-    with pytest.raises(InputError, match="test.txt: names no sequence"):
-        prepare("lidarhuman26m", root, tmp_path / "out", smpl=smpl)
+    refused("other settings: lists ", "lidarhuman26m", root, out, smpl=smpl)
+
+
+@pytest.fixture
+def copied(raw, tmp_path):
+    """A copy of HumanM3, and what writes a user's lists into it."""
+    root = tmp_path / "raw"
+    shutil.copytree(raw[0], root)
+
+    def write(train, test):
+        for name, content in (("train", train), ("test", test)):
+            (root / f"{name}.txt").write_bytes(content if isinstance(content, bytes) else content.encode())
+        return root
+
+    return write
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-8"])
-def test_own_lists_may_leave_out_the_first_folder(raw, tmp_path, encoding):
-    root = tmp_path / "raw"
-    shutil.copytree(raw[0], root)
-    (root / "train.txt").write_text("c\r\nb/seg0\r\n", encoding)
-    (root / "test.txt").write_text("train/a\nelsewhere\n", encoding)
+def test_own_lists_may_leave_out_the_first_folder(copied, encoding):
+    root = copied("c\r\nb/seg0\r\n".encode(encoding), "train/a\nelsewhere\n".encode(encoding))
     rule = split_rule("humanm3", root, parts=["test/c", "train/a", "train/b/seg0"])
     assert rule.sets == {"train": ("test/c", "train/b/seg0"), "test": ("train/a", "elsewhere")}
     # of two that end alike neither is meant
     rule = split_rule("humanm3", root, parts=["test/c", "train/c", "train/a"])
     assert rule.of_part("test/c") is None and rule.of_part("train/a") == "test"
-    (root / "test.txt").write_text("test/c\n", encoding)
-    with pytest.raises(InputError, match="test.txt: names test/c, which is in train.txt too"):
-        prepare("humanm3", root, tmp_path / "out")
 
 
 @pytest.mark.parametrize(
-    ("train", "message"),
+    ("train", "test", "message"),
     [
-        (b"basketball1\n", "expected names such as 'test/c', got 'basketball1'"),
-        ("train/a\n".encode("utf-16"), "train.txt: expected text in UTF-8, got UTF-16"),
-        ("train/a\n".encode("utf-16-le"), "train.txt: expected text, got zero bytes"),
-        ("stra\xdfe\n".encode("latin-1"), "train.txt: expected text in UTF-8, got other bytes at 4"),
+        ("basketball1\n", "plaza\n", "expected names such as 'test/c', got 'basketball1'"),
+        ("train/a\n".encode("utf-16"), "plaza\n", "train.txt: expected text in UTF-8, got UTF-16"),
+        ("train/a\n".encode("utf-16-le"), "plaza\n", "train.txt: expected text, got zero bytes"),
+        ("stra\xdfe\n".encode("latin-1"), "plaza\n", "train.txt: expected text in UTF-8, got other bytes at 4"),
+        ("c\nb/seg0\n", "test/c\n", "test.txt: names test/c, which is in train.txt too"),
+        ("train/a\n", "\n", "test.txt: names no sequence"),
     ],
 )
-def test_own_lists_that_name_nothing_are_refused(raw, tmp_path, train, message):
-    root = tmp_path / "raw"
-    shutil.copytree(raw[0], root)
-    (root / "train.txt").write_bytes(train)
-    (root / "test.txt").write_text("plaza\n")
-    with pytest.raises(InputError, match=message) as caught:
-        prepare("humanm3", root, tmp_path / "out")
-    one_line(caught)
+def test_own_lists_that_are_wrong_are_refused(copied, tmp_path, train, test, message):
+    refused(message, "humanm3", copied(train, test), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 def test_one_split_alone(raw, tmp_path):
     summary = prepare("humanm3", raw[0], tmp_path / "out", split="test")
     assert summary["splits"] == {"test": 6} and [part["part"] for part in summary["parts"]] == ["test/c"]
-    with pytest.raises(InputError, match="other settings: count 1 there, 2 asked for"):
-        prepare("humanm3", raw[0], tmp_path / "out", split="train")
-    with pytest.raises(InputError, match="unknown split of humanm3 by official 'tset': did you mean test"):
-        prepare("humanm3", raw[0], tmp_path / "no", split="tset")
-    with pytest.raises(InputError, match="unknown split of humanm3 'dapt'"):
-        prepare("humanm3", raw[0], tmp_path / "no", split_by="dapt")
-    assert not (tmp_path / "no").exists()
+    refused("other settings: count 1 there, 2 asked for", "humanm3", raw[0], tmp_path / "out", split="train")
 
 
 def test_the_split_in_chunks_leaks_and_says_so(tmp_path, smpl):
@@ -358,34 +339,26 @@ def test_chunks_are_drawn_by_the_part_s_name_alone(people, part):
     assert sum(chunk[0] == "train" for chunk in chunks) == int(0.7 * len(chunks))
 
 
-@pytest.mark.parametrize("dataset", READERS)
-def test_one_published_split_of_a_dataset_is_the_usual_one(dataset):
-    rules = list(_published(dataset))
-    assert sum(rule.usual for rule in rules) == bool(rules)
-
-
 def test_published_splits_are_apart_and_name_their_source(tmp_path):
-    seen = 0
     for name in READERS:
+        rules = list(_published(name))
+        assert (
+            sum(rule.usual for rule in rules)
+            == bool(rules)
+            == (name in ("humanm3", "lidarhuman26m", "sloper4d", "waymo"))
+        )
         rule = split_rule(name, tmp_path)
-        if rule is None:
-            continue
-        seen += 1
-        # Waymo keeps the labels of its test folder to itself
-        held_out = rule.sets["val" if name == "waymo" else "test"]
-        assert rule.source and rule.sets["train"] and held_out
-        assert not set(rule.sets["train"]) & set(held_out)
-    assert seen >= 4 and split_rule("sloper4d", tmp_path).name == "lidar-hmr"
-    assert split_rule("sloper4d", tmp_path, "dapt").leaks
+        assert (rule is None) == (not rules)
+        if rule is not None:
+            # Waymo keeps the labels of its test folder to itself
+            held_out = rule.sets["val" if name == "waymo" else "test"]
+            assert rule.source and rule.sets["train"] and held_out
+            assert not set(rule.sets["train"]) & set(held_out)
+    assert split_rule("sloper4d", tmp_path).name == "lidar-hmr" and split_rule("sloper4d", tmp_path, "dapt").leaks
     assert len(split_rule("lidarhuman26m", tmp_path).sets["train"]) == 19
 
 
 # --- wrong input
-
-
-def one_line(caught):
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["sloper4d", "lidarhuman26m"])
@@ -394,34 +367,26 @@ def test_a_body_that_is_not_smpl_is_refused_before_anything_is_written(tmp_path,
     wrong = tmp_path / "SMPL_NEUTRAL.npz"
     wrong.write_bytes(b"PK no model")
     for asked in (wrong, tmp_path):
-        with pytest.raises(InputError, match="SMPL_NEUTRAL.npz"):
-            prepare(name, tmp_path / "raw", tmp_path / "out", smpl=asked)
+        refused("SMPL_NEUTRAL.npz", name, tmp_path / "raw", tmp_path / "out", smpl=asked)
     assert not (tmp_path / "out").exists()
 
 
 def test_wrong_calls_are_one_line_and_write_nothing(raw, tmp_path, smpl):
-    out = tmp_path / "out"
-    wrong = (
+    out, mine = tmp_path / "out", tmp_path / "mine.txt"
+    mine.write_text("x")
+    for arguments, options, message in (
         (("humanm3", tmp_path / "none", out), {}, "none: is no folder; expected the raw files of humanm3"),
         (("humanm3", raw[0], out), {"workers": 0}, "at least 1 worker"),
         (("human3m", raw[0], out), {}, "unknown dataset 'human3m': did you mean humanm3"),
         (("lidarhuman26m", raw[0], out), {"smpl": smpl}, "is not the root of LiDARHuman26M"),
         (("lidarhuman26m", raw[0], out), {}, "register at smpl.is.tue.mpg.de"),
-        (("lipd", raw[0], out), {"split": "test"}, "lipd is not|is not the root of lipd"),
-    )
-    for arguments, options, message in wrong:
-        with pytest.raises(InputError, match=message) as caught:
-            prepare(*arguments, **options)
-        one_line(caught)
-    assert not out.exists()
-
-
-def test_a_folder_of_something_else_is_left_alone(raw, tmp_path):
-    (tmp_path / "mine.txt").write_text("x")
-    with pytest.raises(InputError, match="holds other files and no dataset.json"):
-        prepare("humanm3", raw[0], tmp_path)
-    with pytest.raises(InputError, match="is a file"):
-        prepare("humanm3", raw[0], tmp_path / "mine.txt")
+        (("lipd", raw[0], out), {"split": "test"}, "is not the root of lipd"),
+        (("humanm3", raw[0], out), {"split": "tset"}, "unknown split of humanm3 by official 'tset': did you mean test"),
+        (("humanm3", raw[0], out), {"split_by": "dapt"}, "unknown split of humanm3 'dapt'"),
+        (("humanm3", raw[0], tmp_path), {}, "holds other files and no dataset.json"),
+        (("humanm3", raw[0], mine), {}, "is a file"),
+    ):
+        refused(message, *arguments, **options)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 

@@ -108,10 +108,8 @@ def test_humanm3_s_database_has_everybody_once(tmp_path, smpl):
     truth = files.write_humanm3(tmp_path, smpl)
     files.write_humanm3_database(tmp_path, truth)
     folders, _ = everything("humanm3", tmp_path, smpl)
-    for labels in tmp_path.glob("**/pose_calib/*"):
-        labels.unlink()
     for folder in tmp_path.glob("**/pose_calib"):
-        folder.rmdir()
+        shutil.rmtree(folder)
     source = made("humanm3", smpl)
     assert source.parts(tmp_path) == ["train.pkl"]
     items = list(source.read(tmp_path, "train.pkl"))
@@ -120,60 +118,34 @@ def test_humanm3_s_database_has_everybody_once(tmp_path, smpl):
         np.testing.assert_array_equal(a.points, b.points)
         np.testing.assert_array_equal(a.joints, b.joints)
         assert (a.sequence, a.frame) == (b.sequence, b.frame)
+    # clouds may lie beside the database
+    flat = tmp_path / "flat"
+    flat.mkdir()
+    shutil.copy(tmp_path / "train.pkl", flat)
+    shutil.copy(next(tmp_path.rglob("000007.pcd")), flat)
+    found = [one for one in source.read(flat, "train.pkl") if isinstance(one, LabeledSample)]
+    assert found and {(item.sequence, item.frame) for item in found} == {(".", 7)}
     (tmp_path / "train.pkl").unlink()
     with pytest.raises(InputError, match="got .*plaza/seg0 without pose_calib"):
         source.parts(tmp_path)
 
 
-def test_humanm3_says_which_folder_is_incomplete_or_above_the_root(tmp_path, smpl):
-    files.write_humanm3(tmp_path / "HumanM3", smpl, sequences=("train/a", "train/plaza/p1", "test/c"), frames=1)
-    with pytest.raises(InputError, match="is a folder above HumanM3's root, which is likely .*HumanM3: name that"):
-        made("humanm3", smpl).parts(tmp_path)
-    assert made("humanm3", smpl).parts(tmp_path / "HumanM3") == ["test/c", "train/a", "train/plaza/p1"]
-    shutil.rmtree(tmp_path / "HumanM3/train/a/pose_calib")
-    # its body is no database of people; nor is the database read where a sequence is complete
-    for name in ("SMPL_NEUTRAL.pkl", "train.pkl"):
-        (tmp_path / "HumanM3" / name).write_bytes(pickle.dumps({}))
-        with pytest.raises(InputError, match="has .*train/a without pose_calib: get that folder too"):
-            made("humanm3", smpl).parts(tmp_path / "HumanM3")
-
-
-def test_humanm3_s_database_alone_is_a_root(tmp_path, smpl):
-    truth = files.write_humanm3(tmp_path / "x", smpl, frames=1)
-    files.write_humanm3_database(tmp_path, truth)
-    view = pickle.loads((tmp_path / "train.pkl").read_bytes())["db"]
-    for k, camera in enumerate(view[0]["info"]):
+def test_humanm3_s_database_tells_who_is_visible(tmp_path, smpl):
+    files.write_humanm3_database(tmp_path, files.write_humanm3(tmp_path, smpl, frames=1))
+    frames = pickle.loads((tmp_path / "train.pkl").read_bytes())["db"]
+    for k, camera in enumerate(frames[0]["info"]):
         camera["joints_3d_vis"] = camera["joints_3d_vis"].copy()
         camera["joints_3d_vis"][0, 5] = 0
         camera["joints_3d_vis"][1, 6] = k == 2
-    view.append({"pcd": None, "info": [{"joints_3d": [[1, 2]]}]})
-    view.append({"pcd": "nowhere/000001.pcd", "info": view[0]["info"]})
-    (tmp_path / "only").mkdir()
-    (tmp_path / "only/test.pkl").write_bytes(pickle.dumps({"db": view}))
-    for sequence in {key[0] for key in truth}:
-        target = tmp_path / "only" / sequence / "pointcloud"
-        target.mkdir(parents=True)
-        for path in (tmp_path / "x" / sequence / "pointcloud").iterdir():
-            path.rename(target / path.name)
-    found = list(made("humanm3", smpl).read(tmp_path / "only", "test.pkl"))
+    frames.append({"pcd": None, "info": [{"joints_3d": [[1, 2]]}]})
+    frames.append({"pcd": "nowhere/000001.pcd", "info": frames[0]["info"]})
+    (tmp_path / "test.pkl").write_bytes(pickle.dumps({"db": frames}))
+    found = list(made("humanm3", smpl).read(tmp_path, "test.pkl"))
     items = [one for one in found if isinstance(one, LabeledSample)]
     # one camera that sees a joint is enough
     assert [int((item.joint_labels == UNLABELED).sum()) for item in items] == [1, 0, 0, 0]
     assert np.isnan(items[0].joints[5]).all()
-    assert [one.reason for one in found if isinstance(one, Skipped)] == [
-        "entry of another form", "labels without a cloud"
-    ]  # fmt: skip
-
-
-def test_humanm3_s_clouds_may_lie_beside_its_database(tmp_path, smpl):
-    truth = files.write_humanm3(tmp_path / "x", smpl, frames=1, sequences=("train/a",))
-    files.write_humanm3_database(tmp_path, truth)
-    root = tmp_path / "flat"
-    root.mkdir()
-    (tmp_path / "train.pkl").rename(root / "train.pkl")
-    next((tmp_path / "x").rglob("*.pcd")).rename(root / "000007.pcd")
-    items = [one for one in made("humanm3", smpl).read(root, "train.pkl") if isinstance(one, LabeledSample)]
-    assert len(items) == 2 and {item.sequence for item in items} == {"."}
+    assert reasons(found[len(items) :]) == {"entry of another form": 1, "labels without a cloud": 1}
 
 
 def test_humanm3_skips_are_counted_and_named(tmp_path, smpl):
@@ -207,20 +179,33 @@ def test_humanm3_skips_are_counted_and_named(tmp_path, smpl):
 
 
 def test_lidarhuman26m_one_bad_file_costs_one_frame(tmp_path, smpl):
-    truth = files.write_lidarhuman26m(tmp_path, smpl, sequences=("5",), frames=5)
-    segment = tmp_path / "labels/3d/segment/5"
-    for frame in (1, 2):
+    truth = files.write_lidarhuman26m(tmp_path, smpl, sequences=("7",), frames=11)
+    pose, segment = tmp_path / "labels/3d/pose/7", tmp_path / "labels/3d/segment/7"
+
+    def changed(frame, change):
+        path = pose / f"{frame:06d}.json"
+        path.write_text(json.dumps(change(json.loads(path.read_text()))))
+
+    for frame in (1, 2, 5):
         (segment / f"{frame:06d}.ply").unlink()
     (segment / "000001.ply").symlink_to(tmp_path / "nowhere.ply")
     (segment / "000002.ply").mkdir()
-    path = tmp_path / "labels/3d/pose/5/000003.json"
-    content = json.loads(path.read_text())
-    content["trans"][0] = 1e60
-    path.write_text(json.dumps(content))
+    changed(3, lambda content: content | {"trans": [1e60, 0, 0]})
+    (pose / "000004.json").unlink()
+    (segment / "000006.ply").write_bytes((segment / "000006.ply").read_bytes()[:200])
+    files.write_ply(segment / "000007.ply", np.zeros((0, 3)))
+    changed(8, lambda content: {k: v for k, v in content.items() if k != "beta"})
+    shutil.copy(segment / "000009.ply", segment / "9.ply")
+    (segment / "notes.txt").write_text("mine")
     items, skipped = everything("lidarhuman26m", tmp_path, smpl)
-    check(items, {key: joints for key, joints in truth.items() if key[1] > 3})
-    assert reasons(skipped) == {"cloud cannot be read": 2, "joints out of reach": 1}
-    assert "it is a link to what is not there" in skipped[0].where and "got a folder" in skipped[1].where
+    check(items, {key: joints for key, joints in truth.items() if key[1] > 9})
+    assert reasons(skipped) == {
+        "cloud cannot be read": 3, "joints out of reach": 1, "cloud without labels": 1, "labels without a cloud": 1,
+        "empty cloud": 1, "labels cannot be read": 1, "several files of one frame": 1,
+    }  # fmt: skip
+    told = " | ".join(one.where for one in skipped)
+    for words in ("it is a link to what is not there", "got a folder", "000008.json: expected beta, pose and trans, "):
+        assert words in told
 
 
 @pytest.mark.parametrize("bad", [1e30, np.finfo(np.float32).max, -1e10])
@@ -243,25 +228,6 @@ def test_points_out_of_reach_are_left_out(tmp_path, smpl, bad):
         (item,), skipped = everything(name, tmp_path / name, smpl)
         assert len(item.points) == count and not skipped
         assert np.abs(item.center - item.joints.mean(0)).max() < 1
-
-
-def test_lidarhuman26m_labels_and_clouds_are_paired_by_number(tmp_path, smpl):
-    truth = files.write_lidarhuman26m(tmp_path, smpl, sequences=("7",), frames=6)
-    pose, segment = tmp_path / "labels/3d/pose/7", tmp_path / "labels/3d/segment/7"
-    (pose / "000002.json").unlink()
-    (segment / "000003.ply").unlink()
-    (segment / "000004.ply").write_bytes((segment / "000004.ply").read_bytes()[:200])
-    files.write_ply(segment / "000005.ply", np.zeros((0, 3)))
-    content = json.loads((pose / "000006.json").read_text())
-    (pose / "000006.json").write_text(json.dumps({k: v for k, v in content.items() if k != "beta"}))
-    (segment / "notes.txt").write_text("mine")
-    items, skipped = everything("lidarhuman26m", tmp_path, smpl)
-    check(items, {key: value for key, value in truth.items() if key[1] == 1})
-    assert reasons(skipped) == {
-        "cloud without labels": 1, "labels without a cloud": 1, "cloud cannot be read": 1, "empty cloud": 1,
-        "labels cannot be read": 1,
-    }  # fmt: skip
-    assert any("no beta" in one.where and "000006.json" in one.where for one in skipped)
 
 
 def test_lidarhuman26m_s_trans_is_a_center(tmp_path, smpl):
@@ -379,31 +345,32 @@ def test_sloper4d_skips_are_counted(tmp_path, smpl):
     [
         (lambda c: [], "expected labels of SLOPER4D 1.0, with second_person, got others"),
         (lambda c: {"SMPL_info": {}, "RGB_frames": {}}, "a release before 1.0"),
-        (lambda c: c | {"frame_num": None}, "frame_num is missing"),
-        (lambda c: c | {"first_person": {}}, "lidar_traj is missing"),
-        (lambda c: c | {"first_person": {"lidar_traj": np.zeros((3, 8))}}, r"lidar_traj must be \(-1, 9\)"),
-        (lambda c: c | {"second_person": {"beta": 1}}, "no pose and trans"),
-        (lambda c: c | {"second_person": c["second_person"] | {"opt_trans": np.zeros((2, 3))}}, "4 frames and opt_tra"),
-        (lambda c: c | {"second_person": c["second_person"] | {"point_frame": [1]}}, "3 point_clouds of 1 frames"),
-        (lambda c: c | {"second_person": c["second_person"] | {"point_clouds": None}}, "another release"),
-        (lambda c: c | {"second_person": c["second_person"] | {"beta": "tall"}}, "beta must be numbers"),
-        (lambda c: c | {"second_person": c["second_person"] | {"beta": [[1], [1, 2]]}}, "beta must be numbers"),
         (lambda c: c | {"extra": Counter}, "Counter"),
-        *[(lambda c, v=v: c | {"total_frames": v}, "total_frames") for v in ([1, 2], "x", float("nan"))],
-        *[
-            (lambda c, v=v: c | {"second_person": c["second_person"] | {"point_frame": v}}, told)
-            for v, told in (
-                (5, "3 point_clouds of 1 frames"),
-                (["a", "b", "c"], "point_frame must be numbers"),
-                ([1, 2, float("nan")], "point_frame has values that are no numbers"),
-            )
-        ],
-        (lambda c: c | {"second_person": c["second_person"] | {"point_clouds": 5}}, "point_clouds should be a list"),
-        (lambda c: c | {"second_person": c["second_person"] | {"point_clouds": np.array(5.0)}}, "should be a list"),
+        ({"frame_num": None}, "frame_num is missing"),
+        ({"first_person": {}}, "lidar_traj is missing"),
+        ({"first_person": {"lidar_traj": np.zeros((3, 8))}}, r"lidar_traj must be \(-1, 9\)"),
+        *[({"total_frames": value}, "total_frames") for value in ([1, 2], "x", float("nan"))],
+        (lambda c: c | {"second_person": {"beta": 1}}, "no pose and trans"),
+        ({"opt_trans": np.zeros((2, 3))}, "4 frames and opt_tra"),
+        ({"beta": "tall"}, "beta must be numbers"),
+        ({"beta": [[1], [1, 2]]}, "beta must be numbers"),
+        ({"point_frame": [1]}, "3 point_clouds of 1 frames"),
+        ({"point_frame": 5}, "3 point_clouds of 1 frames"),
+        ({"point_frame": ["a", "b", "c"]}, "point_frame must be numbers"),
+        ({"point_frame": [1, 2, float("nan")]}, "point_frame has values that are no numbers"),
+        ({"point_clouds": None}, "another release"),
+        ({"point_clouds": 5}, "point_clouds should be a list"),
+        ({"point_clouds": np.array(5.0)}, "should be a list"),
     ],
 )
 def test_sloper4d_labels_that_are_wrong_are_one_line(tmp_path, smpl, change, message):
-    write_labels(tmp_path, change(files.sloper4d_labels(smpl, "seq001")[0]))
+    content = files.sloper4d_labels(smpl, "seq001")[0]
+    if callable(change):
+        content = change(content)
+    else:
+        of_all = change.keys() <= {"frame_num", "first_person", "total_frames"}
+        (content if of_all else content["second_person"]).update(change)
+    write_labels(tmp_path, content)
     with pytest.raises(InputError, match=message) as caught:
         everything("sloper4d", tmp_path, smpl)
     assert "seq001_labels.pkl: " in str(caught.value) and "\n" not in str(caught.value)
@@ -421,29 +388,26 @@ def test_lipd_places_joints_by_the_points_and_says_how(tmp_path, smpl):
     assert reasons(skipped) == {"joints are not where the points are": 1}
 
 
-def test_entries_without_a_field_are_skipped_with_it(tmp_path, smpl):
+def test_entries_of_another_form_cost_one_entry(tmp_path, smpl):
     files.write_freemotion(tmp_path, smpl, frames=5)
-    entries = pickle.loads((tmp_path / "fm_test2.pkl").read_bytes())
+    path = tmp_path / "fm_test2.pkl"
+    entries = pickle.loads(path.read_bytes())
     del entries[0]["shape"], entries[1]["T_2"], entries[2]["pc_3"]
     entries[3] = 5
     entries[4]["gt"] = np.zeros(71)
-    (tmp_path / "fm_test2.pkl").write_bytes(pickle.dumps(entries))
+    path.write_bytes(pickle.dumps(entries))
     items, skipped = everything("freemotion", tmp_path, smpl)
     assert reasons(skipped) == {"no shape": 1, "no T_2": 1, "entry of another form": 2} and len(items) == 4
-    entries = [{"seq_path": "a", "gt_joint": np.zeros((24, 3)), "pc": "x/y.bin"}, {"gt_joint": np.zeros((24, 3))}]
-    (tmp_path / "fm_test2.pkl").write_bytes(pickle.dumps(entries))
-    items, skipped = everything("lipd", tmp_path, smpl)
-    assert not items and "y.bin is not in" in skipped[0].where and skipped[1].reason == "no pc"
-
-
-@pytest.mark.parametrize("cloud", ["/a/" + "x" * 300 + ".bin", "/a/x\0.bin", [[1, 2, 3], [1, 2]], np.ones((3, 40))])
-def test_lipd_s_bad_clouds_cost_one_entry(tmp_path, smpl, cloud):
+    path.unlink()
     files.write_lipd(tmp_path, smpl)
-    entries = pickle.loads((tmp_path / "LIPD_train.pkl").read_bytes())[:3]
-    entries[0]["pc"] = cloud
-    (tmp_path / "LIPD_train.pkl").write_bytes(pickle.dumps(entries))
+    path = tmp_path / "LIPD_train.pkl"
+    entries = pickle.loads(path.read_bytes())[:3]
+    clouds = ["x/y.bin", "/a/" + "x" * 300 + ".bin", "/a/x\0.bin", [[1, 2, 3], [1, 2]], np.ones((3, 40))]
+    broken = [entries[0] | {"pc": cloud} for cloud in clouds]
+    path.write_bytes(pickle.dumps([*broken, {"gt_joint": np.zeros((24, 3))}, *entries]))
     items, skipped = everything("lipd", tmp_path, smpl)
-    assert len(items) == 2 and reasons(skipped) == {"entry of another form": 1}
+    assert len(items) == 3 and reasons(skipped) == {"entry of another form": 5, "no pc": 1}
+    assert "y.bin is not in" in skipped[0].where
 
 
 def test_noisemotion_without_poses_says_how_they_are_made(tmp_path, smpl):

@@ -90,16 +90,6 @@ def check(items):
         assert item.sequence == SEGMENT and item.time == pytest.approx((item.frame - 1_550_083_467_346_370) / 1e6)
 
 
-def same(a, b):
-    assert len(a) == len(b)
-    for x, y in zip(a, b, strict=True):
-        assert (x.sequence, x.frame, x.track, x.time) == (y.sequence, y.frame, y.track, y.time)
-        np.testing.assert_allclose(x.points, y.points, atol=1e-6)
-        np.testing.assert_array_equal(x.ring, y.ring)
-        np.testing.assert_array_equal(x.joints, y.joints)
-        np.testing.assert_array_equal(x.joint_labels, y.joint_labels)
-
-
 # --- end to end
 
 
@@ -125,26 +115,24 @@ def test_version_2_comes_out_where_it_went_in(v2):
         {"shuffled": True, "group": 1000},
         {"shuffled": True, "wide": True, "group": 1},
         {"group": 1000},
+        None,
     ],
     ids=str,
 )
-def test_version_2_of_any_width_and_order_is_the_same(v2, tmp_path, kinds):
-    files.write_v2(tmp_path, **kinds)
-    items, skipped = everything(tmp_path)
+def test_version_2_of_any_width_and_order_and_version_1_are_the_same(v1, v2, tmp_path, kinds):
+    if kinds is None:
+        assert Waymo().parts(v1) == [TFRECORD]
+    else:
+        files.write_v2(tmp_path, **kinds)
+    items, skipped = everything(v1 if kinds is None else tmp_path)
     check(items)
     want, also = everything(v2)
-    same(items, want)
-    assert skipped == also
-
-
-def test_version_1_is_the_same_as_version_2(v1, v2):
-    source = Waymo()
-    assert source.parts(v1) == [TFRECORD]
-    items, skipped = everything(v1, source)
-    check(items)
-    want, also = everything(v2)
-    same(items, want)
-    assert skipped == also
+    assert skipped == also and len(items) == len(want)
+    for x, y in zip(items, want, strict=True):
+        assert (x.sequence, x.frame, x.track, x.time) == (y.sequence, y.frame, y.track, y.time)
+        np.testing.assert_allclose(x.points, y.points, atol=1e-6)
+        for name in ("ring", "joints", "joint_labels"):
+            np.testing.assert_array_equal(getattr(x, name), getattr(y, name))
 
 
 def test_rows_and_joins_are_of_one_segment(v2, tmp_path):
@@ -197,23 +185,14 @@ def top(T=None, **given):
     return Calibration(T_vehicle_laser=np.eye(4) if T is None else T, **given)
 
 
-def test_rows_begin_with_the_last_beam_and_columns_behind_the_car():
-    image = np.full((3, 4), 2.0)
-    points, row = points_of_image(image, top())
-    elevation = np.arcsin(points[:, 2] / 2)
-    np.testing.assert_allclose(elevation, np.repeat([0.2, -0.1, -0.3], 4))
+@pytest.mark.parametrize("yaw", [0.0, 1.5, -2.6])
+def test_rows_begin_with_the_last_beam_and_columns_behind_the_car_however_the_laser_is_turned(yaw):
+    T = files.rigid(1.0, 2.0, 3.0, yaw)
+    points, row = points_of_image(np.full((3, 4), 2.0), top(T))
+    points -= [1.0, 2.0, 3.0]
+    np.testing.assert_allclose(np.arcsin(points[:, 2] / 2), np.repeat([0.2, -0.1, -0.3], 4))
     np.testing.assert_allclose(np.degrees(np.arctan2(points[:, 1], points[:, 0])), [135, 45, -45, -135] * 3)
     np.testing.assert_array_equal(row, np.repeat([0, 1, 2], 4))
-
-
-@pytest.mark.parametrize("yaw", [0.0, 1.5, -2.6])
-def test_columns_divide_the_turn_of_the_car_however_the_laser_is_turned(yaw):
-    T = np.eye(4)
-    T[:3, :3] = rotation_about("z", yaw)
-    T[:3, 3] = 1.0, 2.0, 3.0
-    points, _ = points_of_image(np.full((3, 4), 2.0), top(T))
-    points -= [1.0, 2.0, 3.0]
-    np.testing.assert_allclose(np.degrees(np.arctan2(points[:, 1], points[:, 0])), [135, 45, -45, -135] * 3)
 
 
 def test_even_beams_divide_their_range_in_its_middles():
@@ -295,23 +274,20 @@ def test_matrices_that_are_no_transforms_are_refused(values):
 # --- labels and frames
 
 
+BOX = (0, 0, 0, 1, 1, 2, 0.5)
+
+
 def test_keypoints_by_type_in_any_order():
-    found = person("a", [(20, (1, 2, 3), True), (5, (4, 5, 6), False), (19, (7, 8, 9), False)], (0, 0, 0, 1, 1, 2, 0.5))
-    names = ["head_center", "left_shoulder"]
-    index = [files.WAYMO14.index(name) for name in names]
+    found = person("a", [(20, (1, 2, 3), True), (5, (4, 5, 6), False), (19, (7, 8, 9), False)], BOX)
+    index = [files.WAYMO14.index(name) for name in ("head_center", "left_shoulder")]
     np.testing.assert_array_equal(found.joints[index], [[1, 2, 3], [4, 5, 6]])
     assert found.labels[index].tolist() == [HIDDEN, SEEN] and (found.labels > 0).sum() == 2
-    assert person("a", [(5, (np.nan, 0, 0), False)], (0, 0, 0, 1, 1, 2, 0.5)).reason == "no joint is labelled"
-
-
-def test_keypoints_out_of_reach_are_not_labelled():
-    found = person("a", [(5, (1e300, 0, 0), False), (6, (0, 0, 0), False)], (0, 0, 0, 1, 1, 1, 0.5))
+    # out of reach is not labeled
+    found = person("a", [(5, (1e300, 0, 0), False), (6, (0, 0, 0), False)], BOX)
     assert found.labels.sum() == SEEN and np.isfinite(found.joints).any(1).sum() == 1
-
-
-def test_a_box_that_is_none_is_told():
-    found = person("a", [(5, (0, 0, 0), False)], (0, 0, 0, 1, 1, 0, 0.5))
-    assert found.reason == "label of another form" and "size" in found.why
+    assert person("a", [(5, (np.nan, 0, 0), False)], BOX).reason == "no joint is labelled"
+    problem = person("a", [(5, (0, 0, 0), False)], (0, 0, 0, 1, 1, 0, 0.5))
+    assert problem.reason == "label of another form" and "size" in problem.why
 
 
 def one_frame(**given):
@@ -362,53 +338,53 @@ def rewritten(path, change):
     pq.write_table(pa.Table.from_pylist(change(table.to_pylist()), schema=table.schema), path)
 
 
-def test_a_missing_component_is_told_with_the_command_that_fetches_it(copy):
-    shutil.rmtree(copy / "training/lidar_pose")
-    shutil.rmtree(copy / "training/vehicle_pose")
-    with pytest.raises(InputError) as caught:
-        Waymo().parts(copy)
-    line = str(caught.value)
-    url = r"gs://waymo_open_dataset_v_2_0_1/training/{vehicle_pose,lidar_pose}"
-    assert f"lacks vehicle_pose, lidar_pose; fetch with: gcloud storage cp -r {url} {copy}/training/" in line
-    assert "\n" not in line
+def without(*names):
+    return lambda root: [shutil.rmtree(root / "training" / name) for name in names]
 
 
-def test_a_missing_file_of_a_segment_is_told(copy):
-    component(copy, "lidar").rename(copy / "training/lidar/other.parquet")
-    command = f"cp gs://waymo_open_dataset_v_2_0_1/training/lidar/{SEGMENT}.parquet"
-    with pytest.raises(InputError, match=f"lacks 1 of the 1 segments with keypoints; .*{re.escape(command)}"):
-        Waymo().parts(copy)
+def without_people(root):
+    path = component(root, "lidar_hkp")
+    pq.write_table(pq.read_table(path).slice(0, 0), path)
+
+
+@pytest.mark.parametrize(
+    ("change", "below", "message"),
+    [
+        (
+            without("lidar_pose", "vehicle_pose"),
+            "",
+            "lacks vehicle_pose, lidar_pose; fetch with: gcloud storage cp -r "
+            "gs://waymo_open_dataset_v_2_0_1/training/{vehicle_pose,lidar_pose} ROOT/training/",
+        ),
+        (
+            lambda root: component(root, "lidar").rename(root / "training/lidar/other.parquet"),
+            "",
+            "lacks 1 of the 1 segments with keypoints; fetch the first with: gcloud storage cp "
+            f"gs://waymo_open_dataset_v_2_0_1/training/lidar/{SEGMENT}.parquet ROOT/training/lidar/ ",
+        ),
+        (without_people, "", "has no segment with laser keypoints"),
+        (
+            lambda root: files.write_v1(root, split="validation", frames=files.scene()[:1]),
+            "",
+            f"mixes versions of Waymo: {TFRECORD.replace('training', 'validation')} is of version 1, training/",
+        ),
+        (lambda root: (root / "empty").mkdir(), "empty", "is not the root of Waymo: expected "),
+        (lambda root: (root / "empty").mkdir(), "empty", "got nothing; get it at waymo.com"),
+        (lambda root: None, "training", "the root is likely ROOT"),
+        (lambda root: None, "training/lidar", "is not the root of Waymo"),
+        (lambda root: (root / "v1/individual_files/training").mkdir(parents=True), "v1", "ROOT/v1/individual_files"),
+    ],
+)
+def test_wrong_roots_are_told_with_what_helps(copy, change, below, message):
+    change(copy)
+    with pytest.raises(InputError, match=re.escape(message.replace("ROOT", str(copy)))) as caught:
+        Waymo().parts(copy / below)
+    assert "\n" not in str(caught.value)
 
 
 def test_segments_without_keypoints_need_no_other_files(copy):
-    table = pq.read_table(component(copy, "lidar_hkp"))
-    pq.write_table(table.slice(0, 0), copy / "training/lidar_hkp/nobody.parquet")
+    pq.write_table(pq.read_table(component(copy, "lidar_hkp")).slice(0, 0), copy / "training/lidar_hkp/nobody.parquet")
     assert Waymo().parts(copy) == [f"training/{SEGMENT}"]
-    component(copy, "lidar_hkp").unlink()
-    with pytest.raises(InputError, match="has no segment with laser keypoints"):
-        Waymo().parts(copy)
-
-
-def test_mixed_versions_are_told(copy):
-    files.write_v1(copy, split="validation", frames=files.scene()[:1])
-    with pytest.raises(
-        InputError, match=r"mixes versions of Waymo: validation/.*\.tfrecord is of version 1, training/"
-    ):
-        Waymo().parts(copy)
-
-
-def test_wrong_roots_are_told(copy, tmp_path):
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="is not the root of Waymo: expected .* got nothing; get it at waymo.com"):
-        Waymo().parts(tmp_path / "empty")
-    for wrong in (copy / "training", copy / "training/lidar"):
-        with pytest.raises(InputError, match="is not the root of Waymo"):
-            Waymo().parts(wrong)
-    with pytest.raises(InputError, match=f"the root is likely {copy}"):
-        Waymo().parts(copy / "training")
-    (tmp_path / "v1/individual_files/training").mkdir(parents=True)
-    with pytest.raises(InputError, match="the root is likely .*individual_files"):
-        Waymo().parts(tmp_path / "v1")
 
 
 @pytest.mark.parametrize("name", ["lidar", "lidar_pose"])
@@ -451,41 +427,39 @@ def test_an_unknown_laser_is_told(tmp_path):
         everything(tmp_path)
 
 
-def reasons_after(copy, name, change):
-    rewritten(component(copy, name), change)
-    items, skipped = everything(copy)
-    return len(items), Counter(one.reason for one in skipped)
-
-
-def test_frames_that_lack_rows_are_skipped_and_others_read(copy):
-    first = files.scene()[0].time
-    here = lambda row: row["key.frame_timestamp_micros"] == first  # noqa: E731
-    count, found = reasons_after(copy, "lidar_pose", lambda rows: [row for row in rows if not here(row)])
-    assert count == 2 and found["no pixel poses of the top laser"] == 2
-    count, found = reasons_after(copy, "vehicle_pose", lambda rows: [row for row in rows if not here(row)])
-    assert count == 2 and found["no vehicle pose of the frame"] == 2
-    count, found = reasons_after(copy, "lidar", lambda rows: [row for row in rows if not here(row)])
-    assert count == 2 and found["no range image of the frame"] == 2
-
-
+FIRST = files.scene()[0].time
 _KEYPOINT = "[LiDARHumanKeypointsComponent].lidar_keypoints[*]"
 _POSE = "[VehiclePoseComponent].world_from_vehicle.transform"
+_SHAPE = "[LiDARComponent].range_image_return1.shape"
 
 
 @pytest.mark.parametrize(
     "name, changed, reason, lost",
     [
+        # None: all rows of the first frame are missing, else what the first row holds
+        ("lidar_pose", None, "no pixel poses of the top laser", 2),
+        ("vehicle_pose", None, "no vehicle pose of the frame", 2),
+        ("lidar", None, "no range image of the frame", 2),
         ("vehicle_pose", {_POSE: [0.0] * 16}, "frame cannot be read", 2),
         ("vehicle_pose", {_POSE: [1.0] * 15 + [None]}, "frame cannot be read", 2),
         ("vehicle_pose", {"key.frame_timestamp_micros": None}, "no vehicle pose of the frame", 2),
+        ("lidar", {_SHAPE: [1, 2, 3]}, "range image cannot be read", 2),
+        ("lidar", {_SHAPE: [1, None, 3]}, "range image cannot be read", 2),
         ("lidar_hkp", {"key.frame_timestamp_micros": None}, "label of another form", 1),
         ("lidar_hkp", {"key.laser_object_id": None}, "label of another form", 1),
+        ("lidar_hkp", {f"{_KEYPOINT}.keypoint_3d.location_m.y": [1.0]}, "label of another form", 1),
         ("lidar_box", {"[LiDARBoxComponent].box.center.x": 1e10}, "label of another form", 1),
     ],
 )
 def test_one_bad_value_costs_one_frame_or_person(copy, name, changed, reason, lost):
-    count, found = reasons_after(copy, name, lambda rows: [rows[0] | changed, *rows[1:]])
-    assert count == 4 - lost and found[reason] == lost
+    def change(rows):
+        if changed is None:
+            return [row for row in rows if row["key.frame_timestamp_micros"] != FIRST]
+        return [rows[0] | changed, *rows[1:]]
+
+    rewritten(component(copy, name), change)
+    items, skipped = everything(copy)
+    assert len(items) == 4 - lost and Counter(one.reason for one in skipped)[reason] == lost
 
 
 @pytest.mark.parametrize(
@@ -494,17 +468,11 @@ def test_one_bad_value_costs_one_frame_or_person(copy, name, changed, reason, lo
 )
 def test_text_for_numbers_is_skipped(copy, name, column):
     path = component(copy, name)
-    found = pq.read_table(path)
-    values = ["a" if not isinstance(v, list) else ["a"] * len(v) for v in found[column].to_pylist()]
-    pq.write_table(found.set_column(found.schema.get_field_index(column), column, pa.array(values)), path)
+    table = pq.read_table(path)
+    values = ["a" if not isinstance(v, list) else ["a"] * len(v) for v in table[column].to_pylist()]
+    pq.write_table(table.set_column(table.schema.get_field_index(column), column, pa.array(values)), path)
     items, skipped = everything(copy)
     assert not items and Counter(one.reason for one in skipped)["label of another form"] >= 4
-
-
-def test_lists_of_different_lengths_are_skipped(copy):
-    name = "[LiDARHumanKeypointsComponent].lidar_keypoints[*].keypoint_3d.location_m.y"
-    count, found = reasons_after(copy, "lidar_hkp", lambda rows: [rows[0] | {name: [1.0]}, *rows[1:]])
-    assert count == 3 and found["label of another form"] == 1
 
 
 def test_a_missing_second_return_is_none(copy):
@@ -515,13 +483,6 @@ def test_a_missing_second_return_is_none(copy):
         points = truth()[item.frame, item.track].points
         want = np.concatenate([points[key][0] for key in sorted(points) if key[1] == 1]) - TOP
         np.testing.assert_allclose(item.points, want, atol=1e-3)
-
-
-@pytest.mark.parametrize("size", [[1, 2, 3], [1, None, 3]])
-def test_values_that_do_not_fit_their_shape_are_told(copy, size):
-    shape = "[LiDARComponent].range_image_return1.shape"
-    count, found = reasons_after(copy, "lidar", lambda rows: [rows[0] | {shape: size}, *rows[1:]])
-    assert count == 2 and found["range image cannot be read"] == 2
 
 
 def test_range_images_are_never_all_in_memory(tmp_path):
@@ -559,25 +520,20 @@ def test_range_images_are_never_all_in_memory(tmp_path):
 def test_a_corrupted_record_ends_a_file_by_name(v1, tmp_path):
     data = (v1 / TFRECORD).read_bytes()
     first = 16 + int.from_bytes(data[:8], "little")
+    flipped = lambda k: data[:k] + bytes([data[k] ^ 1]) + data[k + 1 :]  # noqa: E731
     (tmp_path / "training").mkdir()
-    for damaged, what in (
-        (data[: first + 500] + bytes([data[first + 500] ^ 1]) + data[first + 501 :], "is damaged in record 1"),
-        (data[: first + 3] + bytes([data[first + 3] ^ 1]) + data[first + 4 :], "is damaged at record 1"),
-        (data[: first + 500], "is cut off in record 1"),
-        (data[: first + 5], "is cut off in record 1"),
+    for damaged, people, what in (
+        (flipped(first + 500), 2, "is damaged in record 1"),
+        (flipped(first + 3), 2, "is damaged at record 1"),
+        (data[: first + 500], 2, "is cut off in record 1"),
+        (data[: first + 5], 2, "is cut off in record 1"),
+        (b"\x1f\x8b gzip, or anything else", 0, "is no TFRecord file"),
     ):
         (tmp_path / TFRECORD).write_bytes(damaged)
         items, skipped = everything(tmp_path)
-        assert [item.frame for item in items] == [files.scene()[0].time] * 2
+        assert [item.frame for item in items] == [FIRST] * people
         assert [one.reason for one in skipped] == ["the rest of a part cannot be read"]
         assert what in skipped[0].where and TFRECORD in skipped[0].where and "\n" not in skipped[0].where
-
-
-def test_what_is_no_tfrecord_is_told(tmp_path):
-    (tmp_path / "training").mkdir()
-    (tmp_path / "training/a.tfrecord").write_bytes(b"\x1f\x8b gzip, or anything else")
-    _, skipped = everything(tmp_path)
-    assert len(skipped) == 1 and "is no TFRecord file" in skipped[0].where
 
 
 def test_records_that_are_no_frames_are_told_and_the_next_read(v1, tmp_path):
@@ -607,31 +563,27 @@ def test_a_range_image_that_cannot_be_inflated_skips_its_frame(tmp_path, damage,
     assert [one.reason for one in skipped[:2]] == ["range image cannot be read"] * 2
 
 
-def test_top_without_pixel_poses_is_skipped_in_version_1_too(tmp_path, monkeypatch):
-    pack = files.matrix_float
-    monkeypatch.setattr(files, "matrix_float", lambda image: b"" if image.shape[2] == 6 else pack(image))
-    files.write_v1(tmp_path, frames=files.scene()[:1])
-    items, skipped = everything(tmp_path)
-    assert not items and [one.reason for one in skipped] == ["no pixel poses of the top laser"] * 2
-
-
 @pytest.mark.parametrize(
-    "values, sizes, told",
+    "values, shape, told",
     [
-        (10, [3], "a range image of 10 values says it is [3]"),
+        (10, files.number(1, 3), "a range image of 10 values says it is [3]"),
         # whose product is 0 in 64 bits
-        (0, [1 << 32, 1 << 32, 1], "a range image of 0 values says it is [4294967296, 4294967296, 1]"),
+        (0, files.number(1, 1 << 32) * 2 + files.number(1, 1), "0 values says it is [4294967296, 4294967296, 1]"),
         # however many there are
-        (1, [1] * 1000, "a range image of 1 values says it is [1, 1, 1, 1, 1, 1, ...]"),
+        (1, files.number(1, 1) * 1000, "a range image of 1 values says it is [1, 1, 1, 1, 1, 1, ...]"),
+        (1, files.block(1, b"\1" * 65536), "message Shape has 65,540 bytes, more than 65,536: damaged"),
+        (None, b"", "no pixel poses of the top laser"),
     ],
 )
-def test_a_range_image_of_another_size_than_it_says_is_told(tmp_path, monkeypatch, values, sizes, told):
-    shape = b"".join(files.number(1, size) for size in sizes)
-    wrong = zlib.compress(files.block(1, bytes(4 * values)) + files.block(2, shape))
-    monkeypatch.setattr(files, "matrix_float", lambda image: wrong)
+def test_a_range_image_of_another_size_than_it_says_is_told(tmp_path, monkeypatch, values, shape, told):
+    pack = files.matrix_float
+    wrong = b"" if values is None else zlib.compress(files.block(1, bytes(4 * values)) + files.block(2, shape))
+    # without values: the poses of the pixels alone are missing
+    monkeypatch.setattr(files, "matrix_float", lambda image: wrong if wrong or image.shape[2] == 6 else pack(image))
     files.write_v1(tmp_path, frames=files.scene()[:1])
     items, skipped = everything(tmp_path)
-    assert not items and told in skipped[0].where
+    assert not items and len(skipped) == 2
+    assert all(told in f"{one.reason} {one.where}" for one in skipped)
 
 
 # --- TFRecord and protobuf
@@ -649,15 +601,9 @@ def test_records_come_one_by_one_and_their_checksums_are_castagnoli(tmp_path):
         list(waymo_v1.records(tmp_path / "none"))
 
 
-def test_messages_larger_than_any_of_waymo_s_are_not_parsed(tmp_path, monkeypatch):
-    monkeypatch.setattr(waymo_v1, "_LARGEST_SHAPE", 1000)
-    wrong = zlib.compress(files.block(1, bytes(4)) + files.block(2, files.block(1, b"\1" * 1000)))
-    monkeypatch.setattr(files, "matrix_float", lambda image: wrong)
-    files.write_v1(tmp_path, frames=files.scene()[:1])
-    items, skipped = everything(tmp_path)
-    assert not items and "message Shape has 1,003 bytes, more than 1,000: damaged" in skipped[0].where
+def test_frames_larger_than_any_of_waymo_s_are_not_parsed(v1, monkeypatch):
     monkeypatch.setattr(waymo_v1, "_LARGEST_FRAME", 1000)
-    items, skipped = everything(tmp_path)
+    items, skipped = everything(v1)
     assert not items and skipped[0].reason == "frame cannot be read" and "message Frame has" in skipped[0].where
 
 
@@ -686,19 +632,16 @@ def test_repeated_numbers_are_packed_or_not():
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.sampled_from(["Frame", "Label", "MatrixFloat"]), st.binary(max_size=60))
-def test_any_bytes_are_a_message_or_an_input_error(name, data):
-    try:
-        waymo_v1.parse(name, data, 100)
-    except InputError as error:
-        assert "\n" not in str(error)
-
-
-def test_every_cut_of_a_frame_is_an_input_error_or_a_shorter_message():
-    whole, cut_off = files.v1_frame(files.scene()[2], "s")[:400], 0
-    for end in range(0, 400, 7):
+@given(st.sampled_from(["Frame", "Label", "MatrixFloat"]), st.binary(max_size=60), st.integers(0, 400))
+def test_any_bytes_and_every_cut_of_a_frame_are_a_message_or_an_input_error(name, data, end):
+    for kind, content in ((name, data), ("Frame", files.v1_frame(files.scene()[2], "s")[:end])):
         try:
-            waymo_v1.parse("Frame", whole[:end], 400)
+            waymo_v1.parse(kind, content, 400)
         except InputError as error:
-            cut_off += "is cut off or damaged" in str(error)
-    assert cut_off > 40
+            assert "\n" not in str(error) and "is cut off or damaged" in str(error)
+
+
+def test_cuts_of_a_frame_are_noticed():
+    whole = files.v1_frame(files.scene()[2], "s")[:400]
+    with pytest.raises(InputError, match="is cut off or damaged"):
+        waymo_v1.parse("Frame", whole[:333], 400)

@@ -85,10 +85,10 @@ class Box:
             try:
                 value = np.array(given, float)
             except (TypeError, ValueError):
-                raise InputError(f"Box.{name} must be three finite numbers in metres, got {given!r}") from None
+                raise InputError(f"Box.{name} must be three finite numbers in meters, got {given!r}") from None
             if value.shape != (3,) or not (np.abs(value) < FARTHEST).all():
                 raise InputError(
-                    f"Box.{name} must be three finite numbers in metres, below {FARTHEST:g}, got {value.tolist()}"
+                    f"Box.{name} must be three finite numbers in meters, below {FARTHEST:g}, got {value.tolist()}"
                 )
             object.__setattr__(self, name, value)
         if (self.size <= 0).any():

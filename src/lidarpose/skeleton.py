@@ -1,10 +1,10 @@
 """Named joints: the one place that knows which number a joint has.
 
 Every skeleton is a tree of named joints. Two skeletons that share a name share the joint's definition, so maps
-between them are made by name. `BODY26` is the superset that the network speaks: SMPL's 24 joints, nose and head centre.
+between them are made by name. `BODY26` is the superset that the network speaks: SMPL's 24 joints, nose and head center.
 
 Definitions (all points are carried rigidly by the bone whose name stands in brackets):
-    SMPL names      the joint centres of SMPL's kinematic tree: the pelvis lies about 9.5 cm above the middle of the
+    SMPL names      the joint centers of SMPL's kinematic tree: the pelvis lies about 9.5 cm above the middle of the
                     hips, the hips about 15 cm and the shoulders about 37 cm apart on a mean adult
     head            the joint at the base of the skull, as in SMPL [head]
     nose            the tip of the nose [head]

@@ -134,20 +134,15 @@ def _synth(options: argparse.Namespace) -> None:
     from lidarpose.data.shards import counted
     from lidarpose.synth.shard_job import Job, write_dataset
 
+    fields = ("count", "scene", "seed", "hard", "motion", "captured", "per_shard")
     job = Job(
         what="clips" if options.clips else "streets" if options.scenes else "people",
-        count=options.count,
-        scene=options.scene,
         sensors=None if options.sensor is None else names(options.sensor),
-        seed=options.seed,
-        hard=options.hard,
-        motion=options.motion,
         subjects=None if options.subjects is None else names(options.subjects),
-        captured=options.captured,
-        per_shard=options.per_shard,
+        **{name: getattr(options, name) for name in fields},
     )
-    with Progress(job.count, unit=job.what) as shown:
-        made = write_dataset(job, options.out, workers=options.workers, progress=lambda done, _: shown.update(done))
+    with Progress(job.count, unit=job.what) as bar:
+        made = write_dataset(job, options.out, workers=options.workers, progress=lambda done, _: bar.update(done))
     there = "" if made == job.count else f", {job.count - made:,} were there"
     tell(f"{counted(made, job.what)} made{there} -> {options.out}")
 
@@ -155,16 +150,9 @@ def _synth(options: argparse.Namespace) -> None:
 def _prepare(options: argparse.Namespace) -> None:
     from lidarpose.data.prepare import prepare, summary_lines
 
-    summary = prepare(
-        options.dataset,
-        options.root,
-        options.out,
-        split=options.split,
-        split_by=options.split_by,
-        smpl=options.smpl,
-        level=not options.no_level,
-        workers=options.workers,
-    )
+    where = options.dataset, options.root, options.out
+    choices = {name: getattr(options, name) for name in ("split", "split_by", "smpl", "workers")}
+    summary = prepare(*where, level=not options.no_level, **choices)
     for line in summary_lines(summary):
         tell(line)
 

@@ -50,10 +50,12 @@ class SplitRule:
 
     def of_part(self, part: str) -> str | None:
         """The split of a part, where it is told by its name."""
-        if not self.by_part:
-            return None
-        name = part.split("/")[0].removesuffix(".pkl") if self.rule == "folders" else part
-        return next((split for split, names in self.sets.items() if name in names), None)
+        name = self._name(part)
+        return next((split for split, names in self.sets.items() if self.by_part and name in names), None)
+
+    def _name(self, part: str) -> str:
+        """What lists call a part: its first folder, or all of its name."""
+        return part.split("/")[0].removesuffix(".pkl") if self.rule == "folders" else part
 
     def of_chunks(self, part: str, people: int) -> list[str]:
         """The split of each of a part's people, in their order."""
@@ -65,8 +67,8 @@ class SplitRule:
 
     def absent(self, parts: list[str]) -> dict[str, list[str]]:
         """Split -> names in the list that no part has."""
-        there = {part.split("/")[0].removesuffix(".pkl") if self.rule == "folders" else part for part in parts}
-        missing = {split: [name for name in names if name not in there] for split, names in self.sets.items()}
+        present = set(map(self._name, parts))
+        missing = {split: [name for name in names if name not in present] for split, names in self.sets.items()}
         return {split: names for split, names in missing.items() if names}
 
 
@@ -89,33 +91,34 @@ def split_rule(dataset: str, root: Path, name: str | None = None, parts: Sequenc
 
 
 def _own(root: Path, parts: Sequence[str]) -> SplitRule | None:
-    there = [split for split, file in _LISTS.items() if (root / file).is_file()]
-    if not there:
+    paths = {split: root / file for split, file in _LISTS.items() if (root / file).is_file()}
+    if not paths:
         return None
-    missing = [_LISTS[split] for split in _NEEDED if split not in there]
+    missing = [_LISTS[split] for split in _NEEDED if split not in paths]
     if missing:
-        raise file_error(root, f"has {_LISTS[there[0]]} and no {missing[0]}: add it, or take the other away")
+        present = next(iter(paths.values())).name
+        raise file_error(root, f"has {present} and no {missing[0]}: add it, or take the other away")
+    # a name without its first folder, where only one part has it
     short = Counter(part.partition("/")[2] for part in parts)
-    full = {part.partition("/")[2]: part for part in parts if short[part.partition("/")[2]] == 1}
-    full |= {part: part for part in parts}
+    full = {name: part for part in parts if short[name := part.partition("/")[2]] == 1} | {part: part for part in parts}
     sets: dict[str, tuple[str, ...]] = {}
-    for split in there:
-        path = root / _LISTS[split]
+    split_of: dict[str, str] = {}
+    for split, path in paths.items():
         try:
             lines = decode(read_bytes(path, expected="names of sequences, one a line")).splitlines()
         except FormatError as problem:
             raise file_error(path, problem) from None
         # a line end at the end of the file is no sequence
         names = [line.strip() for line in lines if line.strip()]
-        sets[split] = tuple(full.get(name, name) for name in names)
-        if not sets[split]:
+        if not names:
             raise file_error(path, "names no sequence; expected one a line")
-        for other in there[: there.index(split)]:
-            if both := sorted(set(sets[split]) & set(sets[other])):
-                raise file_error(path, f"names {both[0]}, which is in {_LISTS[other]} too: leave it out of one")
-    source = ", ".join(_LISTS[split] for split in there)
-    if parts and not any(name in full for names in sets.values() for name in names):
-        got = sets[there[0]][0]
+        sets[split] = tuple(full.get(name, name) for name in names)
+        for name in sorted(sets[split]):
+            if split_of.setdefault(name, split) != split:
+                raise file_error(path, f"names {name}, which is in {_LISTS[split_of[name]]} too: leave it out of one")
+    source = ", ".join(path.name for path in paths.values())
+    if parts and not full.keys() & split_of.keys():
+        got = sets[next(iter(sets))][0]
         raise file_error(root, f"has nothing that {source} name: expected names such as {parts[0]!r}, got {got!r}")
     return SplitRule(name="own", source=f"{source} beside the data", rule="sequences", sets=sets)
 
@@ -125,7 +128,7 @@ def _published(dataset: str) -> Iterator[SplitRule]:
     for file in sorted(folder.iterdir(), key=lambda file: file.name):
         if not file.name.endswith(".json"):
             continue
-        found = json.loads(file.read_text("utf-8"))
-        if found.pop("dataset") == dataset:
-            sets = {split: tuple(names) for split, names in found.pop("sets").items()}
-            yield SplitRule(sets=sets, **found)
+        rule = json.loads(file.read_text("utf-8"))
+        if rule.pop("dataset") == dataset:
+            sets = {split: tuple(names) for split, names in rule.pop("sets").items()}
+            yield SplitRule(sets=sets, **rule)

@@ -24,8 +24,8 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix
 from lidarpose.io.files import content_digest, file_error, read_bytes
 from lidarpose.io.point_cloud import read_points
-from lidarpose.sample import FARTHEST, SEEN, LabeledSample, Pose, center_of, within_reach
-from lidarpose.skeleton import SMPL24
+from lidarpose.sample import FARTHEST, SEEN, UNLABELED, LabeledSample, Pose, center_of, within_reach
+from lidarpose.skeleton import SMPL24, Skeleton
 
 _NUMBER = re.compile("[0-9]{1,12}")
 # what the published files are called: SMPL_MALE.pkl, basicmodel_m_lbs_10_207_0_v1.1.0.pkl, basicModel_f_lbs_...
@@ -56,10 +56,8 @@ class Reader(ABC):
     skeleton: ClassVar[str]
 
     def __init__(self, **settings: Any):
-        known = _datasets()[self.name]
-        self.about: dict[str, Any] = {
-            key: known[key] for key in ("frame", "sensor_known", "licence", "get", "notes") if key in known
-        }
+        about = _datasets()[self.name]
+        self.about = {key: value for key, value in about.items() if key not in ("title", "expected")}
         self.about["settings"] = settings
 
     @abstractmethod
@@ -72,12 +70,9 @@ class Reader(ABC):
 
     def wrong_root(self, root: Path, got: str = "") -> InputError:
         """The error for a folder that is not the dataset's root. got: by default what is in the folder."""
-        known = _datasets()[self.name]
-        there = got or f"got {entries(root)}"
-        problem = (
-            f"is not the root of {known['title']}: expected {known['expected']}, {there}; get it at {known['get']}"
-        )
-        return file_error(root, problem)
+        about, got = _datasets()[self.name], got or f"got {entries(root)}"
+        problem = f"is not the root of {about['title']}: expected {about['expected']}, {got}"
+        return file_error(root, f"{problem}; get it at {about['get']}")
 
 
 @cache
@@ -92,11 +87,27 @@ def entries(folder: Path) -> str:
 
 def numbered(folder: Path, suffix: str) -> dict[int, list[Path]]:
     """The files of a folder that are numbered, whatever the number of digits: number -> its files, in order."""
-    found: dict[int, list[Path]] = {}
+    files: dict[int, list[Path]] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         if path.suffix.lower() == suffix and _NUMBER.fullmatch(path.stem):
-            found.setdefault(int(path.stem), []).append(path)
-    return dict(sorted(found.items()))
+            files.setdefault(int(path.stem), []).append(path)
+    return dict(sorted(files.items()))
+
+
+def paired(
+    labels: dict[int, list[Path]], clouds: dict[int, list[Path]], where: str
+) -> Iterator[tuple[int, Path, Path | None] | Skipped]:
+    """The frames of numbered label files and clouds: number, labels, cloud or None. Skipped are clouds without labels
+    and frames of which a file is there twice. where: a format of the frame's number."""
+    for frame in sorted(labels.keys() | clouds.keys()):
+        paths = labels.get(frame, []), clouds.get(frame, [])
+        if not paths[0]:
+            yield Skipped("cloud without labels", where.format(frame))
+        elif max(map(len, paths)) > 1:
+            names = ", ".join(path.name for path in (*paths[0], *paths[1]))
+            yield Skipped("several files of one frame", f"{where.format(frame)}: {names}")
+        else:
+            yield frame, paths[0][0], paths[1][0] if paths[1] else None
 
 
 def read_json(path: Path, expected: str) -> dict:
@@ -179,7 +190,7 @@ class SmplJoints:
 
     path: the user's SMPL, one file for everybody, or a folder with a file for each gender, by their published names.
     Raises InputError where it is None, missing, a folder without a neutral body, or where that is no SMPL; the
-    dataset's name is told.
+    dataset's name is in the message.
     """
 
     def __init__(self, path: str | Path | None, dataset: str):
@@ -229,26 +240,25 @@ class SmplJoints:
         return {kind: content_digest(path, expected="SMPL")[:12] for kind, path in self.files.items()}
 
 
-def smpl_sample(points: np.ndarray, joints: np.ndarray, **labels: Any) -> LabeledSample | Skipped:
-    """The sample of points (n, 3) m and SMPL's joints (24, 3) m, which all count as seen; labels: the other fields of
-    `LabeledSample`. Skipped where the parameters put joints out of reach."""
-    if not within_reach(joints).all():
+def labeled_sample(
+    points: np.ndarray, joints: np.ndarray, tree: Skeleton = SMPL24, **labels: Any
+) -> LabeledSample | Skipped:
+    """The sample of points (n, 3) m and joints (J, 3) m of a skeleton, NaN where not labeled; labels: the other fields
+    of `LabeledSample`, by default all joints that are there count as seen. Skipped where a joint is out of reach."""
+    is_labeled = ~np.isnan(joints).any(-1)
+    if not within_reach(joints[is_labeled]).all():
         where = f"{labels['frame_id']}/{labels['track']}: beyond {FARTHEST:g} m"
         return Skipped("joints out of reach", where)
     points = points.astype(np.float32)
-    return LabeledSample(
-        points=points,
-        center=center_of(points),
-        pose=Pose(joints=joints.astype(np.float32), skeleton=SMPL24, frame="sensor"),
-        joint_labels=np.full(len(SMPL24), SEEN, np.uint8),
-        **labels,
-    )
+    labels.setdefault("joint_labels", np.where(is_labeled, SEEN, UNLABELED).astype(np.uint8))
+    pose = Pose(joints=joints.astype(np.float32), skeleton=tree, frame="sensor")
+    return LabeledSample(points=points, center=center_of(points), pose=pose, **labels)
 
 
 def _in_folder(folder: Path) -> dict[str, Path]:
-    found: dict[str, Path] = {}
+    models: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
         for gender, names in _NAMES.items():
             if path.suffix.lower() in (".pkl", ".npz") and re.fullmatch(names, path.stem.lower()):
-                found.setdefault(gender, path)
-    return found
+                models.setdefault(gender, path)
+    return models

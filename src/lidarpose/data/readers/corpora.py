@@ -23,9 +23,9 @@ from lidarpose.data.readers.base import (
     SmplJoints,
     as_cloud,
     find_below,
+    labeled_sample,
     numbers,
     read_cloud,
-    smpl_sample,
 )
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
@@ -73,7 +73,7 @@ class _Entry:
             return Skipped("empty cloud", self.where)
         if _apart(points, joints) > _NEAR:
             return Skipped("joints are not where the points are", self.where)
-        return smpl_sample(
+        return labeled_sample(
             points,
             joints,
             sequence=self.sequence,

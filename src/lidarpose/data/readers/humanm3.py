@@ -17,11 +17,22 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.base import Reader, Skipped, entries, find_below, numbered, numbers, read_cloud, read_json
+from lidarpose.data.readers.base import (
+    Reader,
+    Skipped,
+    entries,
+    find_below,
+    labeled_sample,
+    numbered,
+    numbers,
+    paired,
+    read_cloud,
+    read_json,
+)
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
 from lidarpose.io.pickles import load_pickle
-from lidarpose.sample import SEEN, UNLABELED, Box, LabeledSample, Pose, center_of
+from lidarpose.sample import Box, LabeledSample
 from lidarpose.skeleton import HUMAN15
 
 # frames a second of the fused clouds
@@ -49,18 +60,18 @@ class HumanM3(Reader):
         below = [path.parent for name in _SPLITS for path in sorted(root.glob(f"*/{name}")) if path.is_dir()]
         if below and not databases and not any((root / name).is_dir() for name in _SPLITS):
             raise file_error(root, f"is a folder above HumanM3's root, which is likely {below[0]}: name that")
-        found, incomplete = [], ""
+        sequences, incomplete = [], ""
         for folder in sorted(_folders(root, _DEEPEST)):
             missing = [name for name in ("pointcloud", "pose_calib") if not (folder / name).is_dir()]
             if not missing:
-                found.append(folder.relative_to(root).as_posix())
+                sequences.append(folder.relative_to(root).as_posix())
             elif len(missing) == 1:
                 incomplete = incomplete or f"{folder} without {missing[0]}"
-        if found and incomplete:
+        if sequences and incomplete:
             raise file_error(root, f"has {incomplete}: get that folder too, or move its sequence away")
-        if not found and not databases:
+        if not sequences and not databases:
             raise self.wrong_root(root, f"got {incomplete or entries(root)}")
-        return found or databases
+        return sequences or databases
 
     def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         """Everybody in a sequence by frame, or in a database in its order."""
@@ -76,32 +87,28 @@ def _folders(folder: Path, depth: int) -> Iterator[Path]:
 
 
 def _read_sequence(root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
-    clouds = numbered(root / part / "pointcloud", ".pcd")
     labels = numbered(root / part / "pose_calib", ".json")
     first = min(labels, default=0)
-    for frame in sorted(labels.keys() | clouds.keys()):
-        where, paths = f"{part}/{frame}", [*labels.get(frame, ()), *clouds.get(frame, ())]
-        if frame not in labels:
-            yield Skipped("cloud without labels", where)
+    for pair in paired(labels, numbered(root / part / "pointcloud", ".pcd"), f"{part}/{{}}"):
+        if isinstance(pair, Skipped):
+            yield pair
             continue
-        if len(labels[frame]) > 1 or len(clouds.get(frame, ())) > 1:
-            yield Skipped("several files of one frame", f"{where}: {', '.join(path.name for path in paths)}")
-            continue
+        frame, path, cloud = pair
         try:
-            bodies = read_json(labels[frame][0], "people's joints")
+            bodies = read_json(path, "people's joints")
         except InputError as error:
             yield Skipped("labels cannot be read", str(error))
             continue
-        if frame not in clouds:
-            yield from (Skipped("labels without a cloud", f"{where}/{track}") for track in bodies)
+        if cloud is None:
+            yield from (Skipped("labels without a cloud", f"{part}/{frame}/{track}") for track in bodies)
             continue
         people = {}
         for track in sorted(bodies, key=lambda track: (int(track) if track.isdecimal() else -1, track)):
             try:
-                people[track] = numbers(labels[frame][0], bodies[track], (15, 3), f"joints of {track}")
+                people[track] = numbers(path, bodies[track], (15, 3), f"joints of {track}")
             except InputError as error:
                 yield Skipped("not 15 joints", str(error))
-        yield from _people(clouds[frame][0], people, part, frame, (frame - first) / _FPS)
+        yield from _people(cloud, people, part, frame, (frame - first) / _FPS)
 
 
 def _read_database(root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
@@ -126,18 +133,16 @@ def _read_database(root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
 
 def _without_copies(info: list[dict], where: str) -> dict[str, np.ndarray]:
     """Joints (15, 3) of everybody in a frame, NaN where no camera says visible: each has copies of the same people."""
-    found: dict[bytes, np.ndarray] = {}
-    visible: dict[bytes, np.ndarray] = {}
+    people: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
     for camera in info:
         joints = numbers(where, camera["joints_3d"], (-1, 15, 3), "joints_3d")
         seen = np.ones(joints.shape)
         if camera.get("joints_3d_vis") is not None:
             seen = numbers(where, camera["joints_3d_vis"], joints.shape, "joints_3d_vis")
-        for person, there in zip(joints, np.all(seen > 0, axis=-1), strict=True):
-            key = person.tobytes()
-            found.setdefault(key, person)
-            visible[key] = visible.get(key, False) | there
-    return {str(k): np.where(visible[key][:, None], joints, np.nan) for k, (key, joints) in enumerate(found.items())}
+        for person, visible in zip(joints, np.all(seen > 0, axis=-1), strict=True):
+            _, before = people.get(person.tobytes(), (None, False))
+            people[person.tobytes()] = person, visible | before
+    return {str(k): np.where(visible[:, None], person, np.nan) for k, (person, visible) in enumerate(people.values())}
 
 
 def _people(
@@ -154,28 +159,27 @@ def _people(
         yield from (Skipped("cloud cannot be read", f"{error} ({track})") for track in people)
         return
     for track, joints in people.items():
-        where, labeled = f"{frame_id}/{track}", ~np.isnan(joints).any(-1)
-        if not labeled.any():
+        where, labeled = f"{frame_id}/{track}", joints[~np.isnan(joints).any(-1)]
+        if not len(labeled):
             yield Skipped("no joint is labelled", where)
             continue
-        low, high = joints[labeled].min(0), joints[labeled].max(0)
+        low, high = labeled.min(0), labeled.max(0)
         try:
             box = Box(center=(low + high) / 2, size=high - low + 2 * _BOX_MARGIN, id=track)
         except InputError as error:
             yield Skipped("joints out of reach", f"{where}: {error}")
             continue
-        points = cloud[box.contains(cloud, _POINT_MARGIN)].astype(np.float32)
+        points = cloud[box.contains(cloud, _POINT_MARGIN)]
         if not len(points):
             yield Skipped("no points in the box", where)
             continue
-        yield LabeledSample(
-            points=points,
-            center=center_of(points),
-            pose=Pose(joints=joints.astype(np.float32), skeleton=HUMAN15, frame="sensor"),
+        yield labeled_sample(
+            points,
+            joints,
+            HUMAN15,
             box=box,
             source="humanm3",
             frame_id=frame_id,
-            joint_labels=np.where(labeled, SEEN, UNLABELED).astype(np.uint8),
             sequence=sequence,
             frame=frame,
             track=track,

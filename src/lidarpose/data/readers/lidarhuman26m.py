@@ -17,11 +17,12 @@ from lidarpose.data.readers.base import (
     Reader,
     Skipped,
     SmplJoints,
+    labeled_sample,
     numbered,
     numbers,
+    paired,
     read_cloud,
     read_json,
-    smpl_sample,
 )
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_between, unit
@@ -74,35 +75,31 @@ class LidarHuman26M(Reader):
 
     def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         """The person of a sequence, frame by frame."""
-        poses, clouds = numbered(root / _POSE / part, ".json"), numbered(root / _SEGMENT / part, ".ply")
-        first = min(poses, default=0)
-        labels, wrong = {}, {}
+        poses = numbered(root / _POSE / part, ".json")
+        labels, damaged = {}, {}
         for frame, paths in poses.items():
             try:
                 labels[frame] = _labels(paths[0])
             except InputError as error:
-                wrong[frame] = str(error)
+                damaged[frame] = str(error)
         joints, turn = {}, None
         if labels:
             betas, pose, trans = (np.stack(rows) for rows in zip(*labels.values(), strict=True))
-            found = self._smpl(betas, pose, trans)
-            joints = dict(zip(labels, found, strict=True))
-            # one that cannot be will be skipped, and says nothing about the others
-            turn = leveling(found[within_reach(found).all(-1)]) if self._level else None
-        for frame in sorted(poses.keys() | clouds.keys()):
-            where = f"{part}/{frame:06d}"
-            if frame in wrong:
-                yield Skipped("labels cannot be read", wrong[frame])
-            elif frame not in poses:
-                yield Skipped("cloud without labels", where)
-            elif frame not in clouds:
-                yield Skipped("labels without a cloud", where)
-            elif len(poses[frame]) + len(clouds[frame]) > 2:
-                names = ", ".join(path.name for path in [*poses[frame], *clouds[frame]])
-                yield Skipped("several files of one frame", f"{where}: {names}")
+            people = self._smpl(betas, pose, trans)
+            joints = dict(zip(labels, people, strict=True))
+            # one out of reach will be skipped, and says nothing about the others
+            turn = leveling(people[within_reach(people).all(-1)]) if self._level else None
+        for pair in paired(poses, numbered(root / _SEGMENT / part, ".ply"), f"{part}/{{:06d}}"):
+            if isinstance(pair, Skipped):
+                yield pair
+            elif pair[0] in damaged:
+                yield Skipped("labels cannot be read", damaged[pair[0]])
+            elif pair[2] is None:
+                yield Skipped("labels without a cloud", f"{part}/{pair[0]:06d}")
             else:
-                time = (frame - first) / _FPS
-                yield _sample(clouds[frame][0], joints[frame], labels[frame][2], part, frame, time, turn)
+                frame, _, path = pair
+                time = (frame - min(poses)) / _FPS
+                yield _sample(path, joints[frame], labels[frame][2], part, frame, time, turn)
 
 
 def _labels(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -111,9 +108,8 @@ def _labels(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     missing = [key for key in ("beta", "pose", "trans") if key not in content]
     if missing:
         raise file_error(path, f"expected beta, pose and trans, got no {', '.join(missing)}")
-    beta, pose, trans = (
-        numbers(path, content[key], (size,), key) for key, size in (("beta", 10), ("pose", 72), ("trans", 3))
-    )
+    sizes = {"beta": 10, "pose": 72, "trans": 3}
+    beta, pose, trans = (numbers(path, content[key], (size,), key) for key, size in sizes.items())
     return beta, pose, trans
 
 
@@ -131,7 +127,7 @@ def _sample(
     if turn is not None:
         points, joints, trans = (x @ turn.T for x in (points, joints, trans))
         source += f", turned level by {np.degrees(np.arccos(np.clip(turn[2, 2], -1, 1))):.0f} deg"
-    return smpl_sample(
+    return labeled_sample(
         points,
         joints,
         sequence=part,
@@ -172,10 +168,7 @@ def up_of_people(joints: np.ndarray) -> tuple[np.ndarray, float] | None:
 def leveling(joints: np.ndarray) -> np.ndarray | None:
     """R_level_sensor (3, 3), the smallest rotation that makes z up, from people's joints as `up_of_people` takes them;
     None where the frame is as level as can be told, or too few people say what is up."""
-    found = up_of_people(joints)
-    if found is None:
+    estimate = up_of_people(joints)
+    if estimate is None or estimate[0][2] > np.cos(estimate[1]):
         return None
-    up, doubt = found
-    if up[2] > np.cos(doubt):
-        return None
-    return rotation_between(up, np.array([0.0, 0.0, 1.0]))
+    return rotation_between(estimate[0], np.array([0.0, 0.0, 1.0]))

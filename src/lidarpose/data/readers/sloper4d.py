@@ -12,12 +12,11 @@ Source: climbingdaily/SLOPER4D src/data_loader.py, guidodumont/SMPLify-3D datase
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.base import Reader, Skipped, SmplJoints, as_cloud, numbers, smpl_sample
+from lidarpose.data.readers.base import Reader, Skipped, SmplJoints, as_cloud, labeled_sample, numbers
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.io.files import file_error
@@ -52,32 +51,56 @@ class Sloper4D(Reader):
     def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         """The person of a sequence, frame by frame."""
         path = next(path for path in _files(root) if path.name == part + _SUFFIX)
-        labels = _labels(path)
-        kind = self._smpl.kind(labels.gender)
-        joints = self._smpl(labels.betas, labels.pose, labels.trans, labels.gender)
-        body = labels.gender if kind == "any" else f"{labels.gender} by the {kind} body"
-        for index, frame in enumerate(labels.frames):
-            where, cloud = f"{part}/{frame}", labels.clouds.get(frame)
-            if reason := labels.problem(index, cloud):
-                yield Skipped(reason, f"{where}: {cloud}" if reason == "cloud cannot be read" else where)
-                continue
-            R_sensor_world = rotation_about("z", -labels.heading[index])
-            points, own, trans = (
-                (x - labels.position[index]) @ R_sensor_world.T for x in (cloud, joints[index], labels.trans[index])
-            )
-            yield smpl_sample(
-                points,
-                own,
-                sequence=part,
-                frame=frame,
-                frame_id=where,
-                track="second_person",
-                time=float(labels.time[index]),
-                source=f"sloper4d/{labels.which}, {body}",
-                centers={"trans": trans},
-            )
-        for frame in sorted(labels.clouds.keys() - set(labels.frames)):
-            yield Skipped("cloud of a frame without labels", f"{part}/{frame}")
+        content, person, walker = _content(path)
+        pose, trans, which = _poses(path, person)
+        clouds = _clouds(path, person)
+        frames = numbers(path, content.get("frame_num"), (-1,), "frame_num").astype(int).tolist()
+        total = content.get("total_frames")
+        total = len(frames) if total is None else int(numbers(path, total, (), "total_frames"))
+        way = numbers(path, walker.get("lidar_traj"), (-1, 9), "first_person's lidar_traj", finite=False)
+        position, heading = way[:, 1:4], _heading(way[:, 4:8])
+        betas = numbers(path, numbers(path, person.get("beta"), (-1,), "beta")[:10], (10,), "beta")[None]
+        gender = str(person.get("gender", "neutral")).lower()
+        kind = self._smpl.kind(gender)
+        body = gender if kind == "any" else f"{gender} by the {kind} body"
+        has_pose = np.isfinite(pose).all(1) & np.isfinite(trans).all(1)
+        pose, trans = (np.where(has_pose[:, None], x, 0.0) for x in (pose, trans))
+        has_place = np.isfinite(position).all(1) & np.isfinite(heading)
+        joints = self._smpl(betas, pose, trans, gender)
+        for index, frame in enumerate(frames):
+            where, cloud = f"{part}/{frame}", clouds.get(frame)
+            if index >= total:
+                yield Skipped("frame beyond total_frames", where)
+            elif cloud is None:
+                yield Skipped("labels without a cloud", where)
+            elif isinstance(cloud, str):
+                yield Skipped("cloud cannot be read", f"{where}: {cloud}")
+            elif not len(cloud):
+                yield Skipped("empty cloud", where)
+            elif index >= len(pose) or not has_pose[index]:
+                yield Skipped("cloud without a pose", where)
+            elif index >= len(way) or not has_place[index]:
+                yield Skipped("cloud without the LiDAR's place", where)
+            else:
+                R_sensor_world = rotation_about("z", -heading[index])
+                points, own, center = (
+                    (x - position[index]) @ R_sensor_world.T for x in (cloud, joints[index], trans[index])
+                )
+                yield labeled_sample(
+                    points,
+                    own,
+                    sequence=part,
+                    frame=frame,
+                    frame_id=where,
+                    track="second_person",
+                    time=float(way[index, 8] - way[0, 8]),
+                    source=f"sloper4d/{which}, {body}",
+                    centers={"trans": center},
+                )
+        yield from (
+            Skipped("cloud of a frame without labels", f"{part}/{frame}")
+            for frame in sorted(clouds.keys() - set(frames))
+        )
 
 
 def _files(root: Path) -> list[Path]:
@@ -85,71 +108,16 @@ def _files(root: Path) -> list[Path]:
     return sorted(path for depth in ("", "*/", "*/*/") for path in root.glob(f"{depth}*{_SUFFIX}"))
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Labels:
-    """A sequence. frames (n,); total: those to use; pose (n, 72) and trans (n, 3) with good (n,), whether they are
-    numbers; which of the poses; betas (1, 10); clouds by frame, (k, 3) or what is wrong; position (n, 3) m and heading
-    (n,) rad of the LiDAR; time (n,) s."""
-
-    frames: list[int]
-    total: int
-    pose: np.ndarray
-    trans: np.ndarray
-    good: np.ndarray
-    which: str
-    betas: np.ndarray
-    gender: str
-    clouds: dict[int, np.ndarray | str]
-    position: np.ndarray
-    heading: np.ndarray
-    time: np.ndarray
-
-    def problem(self, index: int, cloud: np.ndarray | str | None) -> str:
-        """Why the frame of this index is left out, "" if it is not."""
-        if index >= self.total:
-            return "frame beyond total_frames"
-        if cloud is None:
-            return "labels without a cloud"
-        if isinstance(cloud, str):
-            return "cloud cannot be read"
-        if not len(cloud):
-            return "empty cloud"
-        if index >= len(self.pose) or not self.good[index]:
-            return "cloud without a pose"
-        if index >= len(self.position) or not np.isfinite([*self.position[index], self.heading[index]]).all():
-            return "cloud without the LiDAR's place"
-        return ""
-
-
-def _labels(path: Path) -> _Labels:
+def _content(path: Path) -> tuple[dict, dict, dict]:
+    """The labels, and of them those of the person who is seen and of the one with the LiDAR."""
     content = load_pickle(path)
     if not isinstance(content, dict) or not isinstance(content.get("second_person"), dict):
         old = isinstance(content, dict) and "SMPL_info" in content
         got = "those of a release before 1.0 (SMPL_info)" if old else "others"
         get = "get them at www.lidarhumanmotion.net/data-sloper4d (a form)"
         raise file_error(path, f"expected labels of SLOPER4D 1.0, with second_person, got {got}: {get}")
-    person, walker = content["second_person"], content.get("first_person")
-    pose, trans, which = _poses(path, person)
-    frames = [int(n) for n in numbers(path, content.get("frame_num"), (-1,), "frame_num")]
-    walker = walker if isinstance(walker, dict) else {}
-    way = numbers(path, walker.get("lidar_traj"), (-1, 9), "first_person's lidar_traj", finite=False)
-    good = np.isfinite(pose).all(1) & np.isfinite(trans).all(1)
-    total = content.get("total_frames")
-    total = len(frames) if total is None else int(numbers(path, total, (), "total_frames"))
-    return _Labels(
-        frames=frames,
-        total=total,
-        pose=np.where(good[:, None], pose, 0.0),
-        trans=np.where(good[:, None], trans, 0.0),
-        good=good,
-        which=which,
-        betas=numbers(path, numbers(path, person.get("beta"), (-1,), "beta")[:10], (10,), "beta")[None],
-        gender=str(person.get("gender", "neutral")).lower(),
-        clouds=_clouds(path, person),
-        position=way[:, 1:4],
-        heading=_heading(way[:, 4:8]),
-        time=way[:, 8] - way[0, 8] if len(way) else np.zeros(0),
-    )
+    walker = content.get("first_person")
+    return content, content["second_person"], walker if isinstance(walker, dict) else {}
 
 
 def _poses(path: Path, person: dict) -> tuple[np.ndarray, np.ndarray, str]:
@@ -168,6 +136,7 @@ def _poses(path: Path, person: dict) -> tuple[np.ndarray, np.ndarray, str]:
 
 
 def _clouds(path: Path, person: dict) -> dict[int, np.ndarray | str]:
+    """Frame -> its cloud (k, 3) m, or what is wrong with it."""
     clouds, frames = person.get("point_clouds"), person.get("point_frame")
     if clouds is None or frames is None:
         raise file_error(path, "second_person has no point_clouds and point_frame: labels of another release?")
@@ -176,14 +145,14 @@ def _clouds(path: Path, person: dict) -> dict[int, np.ndarray | str]:
     frames = numbers(path, frames, (-1,), "point_frame").astype(int).tolist()
     if len(clouds) != len(frames):
         raise file_error(path, f"has {len(clouds)} point_clouds of {len(frames)} frames (point_frame)")
-    found: dict[int, np.ndarray | str] = {}
+    by_frame: dict[int, np.ndarray | str] = {}
     for frame, cloud in zip(frames, clouds, strict=True):
         try:
             # rows that are no numbers are left out, as the authors' loaders do
-            found[frame] = as_cloud(path, cloud)
+            by_frame[frame] = as_cloud(path, cloud)
         except InputError as error:
-            found[frame] = str(error)
-    return found
+            by_frame[frame] = str(error)
+    return by_frame
 
 
 def _heading(quaternion: np.ndarray) -> np.ndarray:

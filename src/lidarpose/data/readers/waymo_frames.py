@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarpose.data.readers.base import Skipped
+from lidarpose.data.readers.base import Skipped, labeled_sample
 from lidarpose.errors import InputError
 from lidarpose.geometry import from_spherical
-from lidarpose.sample import HIDDEN, SEEN, UNLABELED, Box, LabeledSample, Pose, center_of, within_reach
+from lidarpose.sample import HIDDEN, SEEN, UNLABELED, Box, LabeledSample, within_reach
 from lidarpose.skeleton import WAYMO14
 
 LASERS = {"TOP": 1, "FRONT": 2, "SIDE_LEFT": 3, "SIDE_RIGHT": 4, "REAR": 5}
@@ -245,16 +245,15 @@ class Frame:
                 problem = Problem("no points in the box", counted)
             yield Skipped(problem.reason, f"{where}: {problem.why}" if problem.why else where)
 
-    def _sample(self, person: LabeledPerson, points: np.ndarray, ring: np.ndarray) -> LabeledSample:
+    def _sample(self, person: LabeledPerson, points: np.ndarray, ring: np.ndarray) -> LabeledSample | Skipped:
         # the sensor is at the origin
         origin = self.calibrations[TOP].T_vehicle_laser[:3, 3]
-        points = (points - origin).astype(np.float32)
         box = replace(person.box, center=person.box.center - origin)
-        return LabeledSample(
-            points=points,
-            center=center_of(points),
+        return labeled_sample(
+            points - origin,
+            person.joints - origin,
+            WAYMO14,
             ring=ring.astype(np.int32),
-            pose=Pose(joints=(person.joints - origin).astype(np.float32), skeleton=WAYMO14, frame="sensor"),
             box=box,
             source=f"waymo/{_KINDS.get(person.kind, 'unknown')}",
             frame_id=f"{self.sequence}/{self.timestamp}",
