@@ -11,14 +11,14 @@ from reference.sensor_noise import intensity_loss, lose_returns_reference
 from lidarpose.geometry import rotation_about, unit
 from lidarpose.lidar.presets import sensor
 from lidarpose.lidar.raycast import Hits
-from lidarpose.sample import Box, center_of
+from lidarpose.sample import Box
 from lidarpose.synth import noise
 from lidarpose.synth.environment.mesh import Mesh
 from lidarpose.synth.noise import draw_box, laser_mask
+from lidarpose.synth.noise_kernels import lose_returns
 from lidarpose.synth.placement import Place
-from lidarpose.synth.sample_kernels import REACH, center_of_cells, crop_points, lose_returns, range_errors
 from lidarpose.synth.scene import SCENES
-from lidarpose.synth.simulate import ScanConditions, add_sensor_noise
+from lidarpose.synth.simulate import REACH, ScanConditions, add_sensor_noise
 
 RNG = np.random.default_rng
 seeds = st.integers(0, 2**32 - 1)
@@ -212,13 +212,6 @@ def test_a_surface_without_area_returns_nothing_where_weak_returns_are_lost():
     assert len(moved) == 0
 
 
-def test_a_ring_s_error_is_drawn_once():
-    ring = np.array([3, 0, 3, 1])
-    normals = np.arange(8, dtype=np.float32)
-    np.testing.assert_allclose(range_errors(ring, normals, 0.0, 2.0), 2.0 * (4 + ring))
-    np.testing.assert_allclose(range_errors(ring, normals, 1.0, 0.0), normals[:4])
-
-
 # --- clutter points, cuts, masks without a grid
 
 
@@ -380,20 +373,3 @@ def test_cuts_come_with_difficulty():
 def test_the_paper_cuts_nothing():
     (box,) = boxes(SCENES["paper"].crop, RNG(3), 1)
     assert box.contains(PLACE.of_body(BODY.astype(float))).all() and (box.size > 4).all()
-
-
-# --- the compiled crop
-
-
-@settings(max_examples=150, deadline=None)
-@given(seeds, st.sampled_from([0.1, 1.0, 50.0, 3e5]), st.integers(1, 300), st.floats(-4, 4))
-def test_compiled_crops_and_centers_are_their_twins_to_the_last_bit(seed, spread, n, yaw):
-    rng = RNG(seed)
-    # strays a few hundred kilometers away leave no room for one number a cell
-    points = (rng.normal(0, spread, (n, 3)) + rng.normal(0, 20, 3)).astype(np.float32)
-    np.testing.assert_array_equal(center_of_cells(points), center_of(points))
-    box = Box(center=points.mean(0), size=rng.uniform(0.1, 5, 3), yaw=yaw)
-    ring, part = np.arange(n), rng.integers(0, 25, n).astype(np.uint8)
-    inside = box.contains(points)
-    for cropped, whole in zip(crop_points(points, ring, part, box), (points, ring, part), strict=True):
-        np.testing.assert_array_equal(cropped, whole[inside])

@@ -1,8 +1,8 @@
-"""Slow twin of `synth.sample_kernels.lose_returns`."""
+"""Slow twin of `synth.noise_kernels.lose_returns`."""
 
 import numpy as np
 
-from lidarpose.synth.sample_kernels import REACH
+from lidarpose.synth.simulate import REACH
 
 # what is nearer to the sensor is not moved by more than its share, m
 _NEAREST = 1e-3

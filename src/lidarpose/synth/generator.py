@@ -14,7 +14,7 @@ import numpy as np
 from lidarpose.errors import InputError, check_int
 from lidarpose.lidar.presets import sensor
 from lidarpose.lidar.ray_pattern import RayPattern
-from lidarpose.sample import PersonInfo, Pose, Sample
+from lidarpose.sample import PersonInfo, Pose, Sample, center_of
 from lidarpose.skeleton import BODY26
 from lidarpose.synth import noise
 from lidarpose.synth.bodies import Bodies, PoseBank, draw_bodies, draw_moving_body
@@ -22,7 +22,6 @@ from lidarpose.synth.environment.mesh import Mesh
 from lidarpose.synth.environment.surroundings import ground, occluder, surroundings
 from lidarpose.synth.placement import Place, draw_place
 from lidarpose.synth.props import draw_props
-from lidarpose.synth.sample_kernels import center_of_cells, crop_points
 from lidarpose.synth.scene import SceneConfig, scene_config
 from lidarpose.synth.simulate import Scan, Scene, count_alone, draw_conditions, simulate_scan
 
@@ -199,13 +198,14 @@ def _crop(scene: Scene, bodies: Bodies, row: int, scan: Scan, rng: np.random.Gen
         points = np.concatenate([points, clusters.astype(np.float32)])
         ring = np.concatenate([ring, np.zeros(len(clusters), ring.dtype)])
         part = np.concatenate([part, np.zeros(len(clusters), np.uint8)])
-    points, ring, part = crop_points(points, ring, part, box)
+    kept = box.contains(points)
+    points, ring, part = points[kept], ring[kept], part[kept]
     if missing_part < config.noise.missing_part * config.hard:
         kept = noise.part_removal(part, rng=rng)
         points, ring, part = points[kept], ring[kept], part[kept]
     return Sample(
         points=points,
-        center=center_of_cells(points) if len(points) else box.center,
+        center=center_of(points) if len(points) else box.center,
         part=part,
         ring=ring,
         pose=Pose(joints=place.of_body(bodies.joints[row]), skeleton=BODY26, frame="sensor"),

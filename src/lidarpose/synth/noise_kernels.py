@@ -1,0 +1,59 @@
+"""Which returns of a scan a sensor loses, compiled: the generator asks for every person.
+
+Slow twin: `lose_returns_reference` in tests/reference.
+"""
+
+import numpy as np
+
+from lidarpose.errors import MissingExtra
+
+try:
+    from numba import njit
+except ImportError as error:  # pragma: no cover - numba is an optional extra
+    raise MissingExtra("synthesis", "synth") from error
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def lose_returns(points, face, vertices, faces, keep, error, chance, dropout, intensity_dropout, reach):
+    """The returns (k, 3) float32 m that come back, and their indices (k,).
+
+    A return of points (n, 3) m, which lies on face (n,) of faces (F, 3), counts where keep (n,) and where its chance
+    (n,), uniform, is above the probability that it is lost at random (`dropout`) or because it is weak
+    (`intensity_dropout` times the probability below); it moves along its beam by error (n,) m.
+
+    The power that comes back from a matt surface larger than the beam goes with cos(incidence) / range^2 (the LiDAR
+    range equation for extended Lambertian targets). At `reach` m, half of what faces the sensor comes back; clothes
+    differ in reflectivity, which makes the step soft: 1 / (1 + power^2) is lost, power 1 there. What a face without
+    area returns is weak.
+    """
+    kept = np.empty(len(points), np.int64)
+    moved = np.empty((len(points), 3), np.float32)
+    n = 0
+    for i in range(len(points)):
+        if not keep[i]:
+            continue
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        squared = x * x + y * y + z * z
+        lost = dropout
+        if intensity_dropout > 0:
+            a, b, c = faces[face[i], 0], faces[face[i], 1], faces[face[i], 2]
+            ux = np.float64(vertices[b, 0]) - vertices[a, 0]
+            uy = np.float64(vertices[b, 1]) - vertices[a, 1]
+            uz = np.float64(vertices[b, 2]) - vertices[a, 2]
+            vx = np.float64(vertices[c, 0]) - vertices[a, 0]
+            vy = np.float64(vertices[c, 1]) - vertices[a, 1]
+            vz = np.float64(vertices[c, 2]) - vertices[a, 2]
+            nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+            # 1 / (1 + power^2) with power = |n . p| reach^2 / (|n| |p|^3), without its roots
+            dark = max(nx * nx + ny * ny + nz * nz, 1e-30) * max(squared, 1e-6) ** 3
+            lit = (nx * x + ny * y + nz * z) ** 2 * reach**4
+            lost = 1 - (1 - dropout) * (1 - intensity_dropout * dark / (dark + lit))
+        if chance[i] < lost:
+            continue
+        scale = 1 + error[i] / max(np.sqrt(squared), 1e-3)
+        moved[n, 0] = x * scale
+        moved[n, 1] = y * scale
+        moved[n, 2] = z * scale
+        kept[n] = i
+        n += 1
+    return moved[:n], kept[:n]
