@@ -94,7 +94,7 @@ NAMES = {
 
 
 def bvh_text(rotations, translation, *, names=SMPL_NAMES, order="ZXY", unit=0.01, up="y", fps=30.0, drop=()):
-    """A BVH of the mean adult: `unit` metres a number, rotations in channels of this order; joints in `drop` (with all
+    """A BVH of the mean adult: `unit` meters a number, rotations in channels of this order; joints in `drop` (with all
     below them) are left out."""
     world = UP_AXES[up]
     rest = rig.mean_adult_joints() @ C / unit
@@ -111,12 +111,8 @@ def bvh_text(rotations, translation, *, names=SMPL_NAMES, order="ZXY", unit=0.01
         offset = rest[j] - rest[SMPL24.parents[j]] if depth else np.zeros(3)
         lines.append(f"{pad}\tOFFSET " + " ".join(f"{v:.6f}" for v in offset))
         turns = " ".join(f"{axis}rotation" for axis in order)
-        if depth:
-            lines.append(f"{pad}\tCHANNELS 3 {turns}")
-        else:
-            lines.append(f"{pad}\tCHANNELS 6 Xposition Yposition Zposition {turns}")
-            columns.append(at)
-        columns.append(euler[j])
+        lines.append(f"{pad}\tCHANNELS " + (f"3 {turns}" if depth else f"6 Xposition Yposition Zposition {turns}"))
+        columns.extend([euler[j]] if depth else [at, euler[j]])
         children = [k for k in range(24) if SMPL24.parents[k] == j and SMPL24.joints[k] not in drop]
         for child in children:
             joint(child, depth + 1)
@@ -140,22 +136,24 @@ def to_euler(matrix, order):
     return np.stack([first, second, third], -1)
 
 
-# CMU's bones: parent, the joint at the start (whose rotation it has), the joint at the end
-_ASF = [("lowerback", "root", "pelvis", "spine1"), ("upperback", "lowerback", "spine1", "spine2"),
-        ("midback", "upperback", "spine2", "spine3"), ("thorax", "midback", "spine3", "neck"),
-        ("lowerneck", "thorax", "neck", "head"), ("upperneck", "lowerneck", "head", None)]  # fmt: skip
-_ASF += [
-    (side[0] + bone, parent if parent in ("root", "midback") else side[0] + parent,
-     start if start in ("pelvis", "spine3") else f"{side}_{start}", f"{side}_{end}")
-    for side in ("left", "right")
-    for bone, parent, start, end in (
-        ("hipjoint", "root", "pelvis", "hip"), ("femur", "hipjoint", "hip", "knee"),
-        ("tibia", "femur", "knee", "ankle"), ("foot", "tibia", "ankle", "foot"),
-        ("inner", "midback", "spine3", "collar"), ("clavicle", "inner", "collar", "shoulder"),
-        ("humerus", "clavicle", "shoulder", "elbow"), ("radius", "humerus", "elbow", "wrist"),
-        ("hand", "radius", "wrist", "hand"),
-    )
-]  # fmt: skip
+# CMU's bones by the joint of SMPL's at their end; a bone turns as the joint at its start, which is that joint's parent
+_BONES = dict(
+    pelvis="root", spine1="lowerback", spine2="upperback", spine3="midback", neck="thorax", head="lowerneck",
+    hip="hipjoint", knee="femur", ankle="tibia", foot="foot", collar="inner", shoulder="clavicle", elbow="humerus",
+    wrist="radius", hand="hand",
+)  # fmt: skip
+
+
+def _bone(joint):
+    side, _, name = joint.rpartition("_")
+    return side[:1] + _BONES[name]
+
+
+# bone, its parent, the joints at its start and its end; the trunk's before those with a side
+_PARENTS = {end: SMPL24.joints[p] for end, p in zip(J, SMPL24.parents, strict=True) if p >= 0}
+_ENDS = sorted(_PARENTS, key=lambda end: "_" in end)
+_ASF = [(_bone(end), _bone(_PARENTS[end]), _PARENTS[end], end) for end in _ENDS]
+_ASF.append(("upperneck", "lowerneck", "head", None))
 ASF_ENDS = {bone: end for bone, _, _, end in _ASF if end}
 
 
@@ -176,7 +174,7 @@ def asf_text(*, length=0.45, seed=0, angle="deg"):
         lines += ["  begin", f"     id {k}", f"     name {bone}"]
         lines += ["     direction " + " ".join(f"{v:.8f}" for v in way / size), f"     length {size:.8f}"]
         lines += ["     axis " + " ".join(f"{v:.8f}" for v in shown) + "  XYZ"]
-        if _turns(bone, start):
+        if start != "pelvis":  # what starts there goes with the root
             lines += ["    dof rx ry rz", "    limits (-160 20)", "           (-70 70)", "           (-60 70)"]
         lines += ["  end"]
     lines += [":hierarchy", "  begin"]
@@ -190,20 +188,14 @@ def amc_text(rotations, translation, axes, *, length=0.45):
     at = translation @ C * length / 0.0254
     columns = {"root": np.concatenate([at, np.degrees(_xyz(local[:, 0]))], 1)}
     for bone, _, start, _ in _ASF:
-        if _turns(bone, start):
+        if start != "pelvis":
             a = _from_xyz(np.radians(axes[bone]))
-            turn = local[:, J[start]] if bone not in ("linner", "rinner") else local[:, J["spine3"]]
-            columns[bone] = np.degrees(_xyz(a.T @ turn @ a))
+            columns[bone] = np.degrees(_xyz(a.T @ local[:, J[start]] @ a))
     lines = ["#!OML:ASF test", ":FULLY-SPECIFIED", ":DEGREES"]
     for f in range(len(rotations)):
         lines.append(str(f + 1))
         lines += [f"{bone} " + " ".join(f"{v:.7f}" for v in value[f]) for bone, value in columns.items()]
     return "\n".join(lines) + "\n"
-
-
-def _turns(bone, start):
-    """Bones that start at the pelvis go with the root."""
-    return start != "pelvis"
 
 
 def _xyz(matrix):

@@ -38,12 +38,12 @@ def piece_volumes(mesh):
             break
         piece = least
     corners = mesh.vertices.astype(float)
-    found = []
+    volumes = []
     for number in np.unique(piece):
         faces = mesh.faces[piece[mesh.faces[:, 0]] == number]
         a, b, c = np.moveaxis(corners[faces] - corners[piece == number].mean(0), 1, 0)
-        found.append((np.cross(a, b) * c).sum() / 6)
-    return found
+        volumes.append((np.cross(a, b) * c).sum() / 6)
+    return volumes
 
 
 def bone_distance(points, joints, bones):

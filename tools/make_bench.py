@@ -90,13 +90,13 @@ def people(bank: PoseBank) -> Iterator[dict]:
     each = PEOPLE // (len(conditions()) * len(SOURCES) * len(SENSORS))
     for cell, (condition, scene, source, device) in enumerate(_cells()):
         generator = _generator(scene, source, device, bank)
-        found, index = 0, 0
-        while found < each:
+        drawn, index = 0, 0
+        while drawn < each:
             person = generator.person(SEED + cell, index)
             index += 1
             if _enough(person):
                 yield _row(person, condition=condition, source=source, clip=-1, frame=0)
-                found += 1
+                drawn += 1
 
 
 def clips(bank: PoseBank) -> Iterator[dict]:

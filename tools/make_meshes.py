@@ -2,7 +2,7 @@
 
     python tools/make_meshes.py [--out src/lidarpose/synth/assets/meshes.npz]
 
-All are closed, of few triangles, each in a frame of its own: x ahead, y left, z up; metres, or 1 where their user
+All are closed, of few triangles, each in a frame of its own: x ahead, y left, z up; meters, or 1 where their user
 scales them (see `lidarpose.synth.environment.mesh.shape`). The file is the same on any machine with the same numpy.
 """
 
@@ -173,7 +173,7 @@ def street_furniture() -> dict[str, Mesh]:
     )
     return {
         "wheeled bin": union([tub, box((1.0, 1.0, 0.07)).moved((0, 0, 0.93))]),
-        # metres across, 1 along y
+        # meters across, 1 along y
         "bench": blocks(*seat, ((-0.22, 0, 0.52), (0.05, 1.0, 0.34))),
         "bench without back": blocks(*seat),
         "table": blocks(*table),

@@ -28,18 +28,18 @@ def main() -> None:
     network, header = load_checkpoint(options.model)
     with open(options.scores) as file:
         scores = json.load(file)
-    told = {}
+    measured = {}
     for condition in ("sensor known", "sensor unknown"):
         for group in ("all", "upright, whole, uncluttered"):
             figures = scores[condition]["groups"][group]
-            told[f"{condition}, {group}"] = f"MPJPE {figures['mpjpe']} mm of {figures['people']} people"
-    told["measured on"] = f"benchmarks/heldout.py, subjects {scores['subjects']}, seed {scores['seed']}, human15"
+            measured[f"{condition}, {group}"] = f"MPJPE {figures['mpjpe']} mm of {figures['people']} people"
+    measured["measured on"] = f"benchmarks/heldout.py, subjects {scores['subjects']}, seed {scores['seed']}, human15"
     note = {"note": options.note} if options.note else {}
     out = Path(options.out)
     # both or none: twins of different weights would not load
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / out.name
-        save_checkpoint(made, network, card=header.card | note | {"scores": told}, half=True)
+        save_checkpoint(made, network, card=header.card | note | {"scores": measured}, half=True)
         export(made, made.with_suffix(".onnx"))
         for path in (out, out.with_suffix(".onnx")):
             write_atomic(path, (made.parent / path.name).read_bytes())

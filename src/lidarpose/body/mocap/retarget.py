@@ -153,15 +153,14 @@ def _check_speed(path: object, joints: np.ndarray, length: np.ndarray, fps: floa
         )
 
 
-def retarget_positions(joints: np.ndarray, rest: np.ndarray | None = None) -> np.ndarray:
-    """Local rotations that give the body the pose of captured joints.
+def retarget_positions(joints: np.ndarray) -> np.ndarray:
+    """Local rotations that give the mean adult the pose of captured joints.
 
     The heading of the source stays in the root (`without_yaw` removes it). The twist of the head about the neck and of
     a straight limb cannot be seen in positions: they follow the parent (a straight leg follows its foot).
 
     Args:
         joints: (n, 24, 3) m, SMPL's joints in SMPL's order, z up, any facing and any bone lengths.
-        rest: (24, 3) m, the joints of the T-pose to be turned, by default the mean adult's.
 
     Returns:
         (n, 24, 3, 3) float32, in the rest frame of `body.rig`.
@@ -178,7 +177,7 @@ def retarget_positions(joints: np.ndarray, rest: np.ndarray | None = None) -> np
     if (length <= SHORTEST_BONE).any():
         first = int(np.argmax(length <= SHORTEST_BONE))
         raise InputError(f"{which[first]} has no length in frame {first}: a bone without length has no direction")
-    rest = np.asarray(mean_adult_joints() if rest is None else rest, float)[None]
+    rest = mean_adult_joints()[None]
 
     turn = np.empty((len(joints), 24, 3, 3))  # global rotations G
     trunk = _trunk(joints, rest)
