@@ -87,8 +87,12 @@ def test_skeletons_with_less(tmp_path):
     assert error[:, no_ankle].mean() < 0.012 and error[:, [J[foot] for foot in feet]].mean() < 0.12
     matched = {n: i for n, i in J.items() if n.endswith(("hip", "knee", "ankle", "shoulder", "elbow", "wrist"))}
     matched["head"] = J["head"]
-    less = joint_tree.JointTree(joints=[joint_tree.Joint(name=name, parent=0 if i else -1) for name, i in J.items()])
-    motion = joint_tree.tree_motion("x", less, JOINTS, fps=10, up="z", kind="test", matched=matched)
+    way = dict(offset=np.zeros(3), channels=("tx", "ty", "tz"))
+    less = [joint_tree.Joint(name=name, parent=0 if i else -1, **way) for name, i in J.items()]
+    values = np.concatenate([JOINTS[:, :1], JOINTS[:, 1:] - JOINTS[:, :1]], 1).reshape(-1, 72)
+    motion = joint_tree.tree_motion(
+        "x", joint_tree.JointTree(joints=less), values, fps=10, up="z", kind="test", matched=matched
+    )
     limbs = [J[f"{side}_{name}"] for side in ("left", "right") for name in ("hip", "knee", "elbow")]
     assert errors(motion)[:, limbs].mean() < 0.09
 

@@ -31,15 +31,16 @@ def load_npz(path: str | os.PathLike, *, up: str | None = None, fps: float | Non
     return (load_clip_positions if "joints" in names else load_amass)(path, up=up, fps=fps)
 
 
-FORMATS: dict[str, Callable[..., Motion]] = {
-    "clips": load_npz,
-    "amass": load_npz,
-    "bvh": load_bvh,
-    "amc": load_amc,
-    "sloper4d": load_sloper4d,
-    "lidarhuman26m": load_lidarhuman26m,
+# how a format is read, and the suffix of its files
+FORMATS: dict[str, tuple[Callable[..., Motion], str]] = {
+    "clips": (load_npz, ".npz"),
+    "amass": (load_npz, ".npz"),
+    "bvh": (load_bvh, ".bvh"),
+    "amc": (load_amc, ".amc"),
+    "sloper4d": (load_sloper4d, ".pkl"),
+    "lidarhuman26m": (load_lidarhuman26m, ".json"),
 }
-_BY_SUFFIX = {".npz": "amass", ".bvh": "bvh", ".amc": "amc", ".pkl": "sloper4d", ".json": "lidarhuman26m"}
+_SUFFIXES = tuple(dict.fromkeys(suffix for _, suffix in FORMATS.values()))
 # what lies beside the motion in AMASS's folders and holds none
 _NO_MOTION = ("shape.npz", "stagei.npz")
 
@@ -83,28 +84,29 @@ def load_motion(
         raise file_error(repr(path), f"expected the path of a file or folder of motion ({error})") from None
     sources = _sources(path, format) if whole_folder else [path]
     if not sources:
-        raise file_error(path, f"holds no file of motion; read are {', '.join(_BY_SUFFIX)} in it or its folders")
+        raise file_error(path, f"holds no file of motion; read are {', '.join(_SUFFIXES)} in it or its folders")
     motions = []
     for source in sources:
-        motion = FORMATS[format or _format_of(source)](source, up=up, fps=fps)
+        motion = FORMATS[format or _format_of(source)][0](source, up=up, fps=fps)
         motion = motion if hz is None else motion.resampled(hz)
         motions.append(replace(motion, names=tuple(_name_in_folder(name, source, path) for name in motion.names)))
     return join(motions, source=f"{len(motions)} files: {path}") if whole_folder else motions[0]
 
 
 def _format_of(path: Path) -> str:
-    format = "lidarhuman26m" if path.is_dir() else _BY_SUFFIX.get(path.suffix.lower())
-    if format is None:
-        expected = f"a file of motion, one of {', '.join(_BY_SUFFIX)}, or a folder of them"
-        # says whether there is such a file at all
-        read_bytes(path, expected=expected)
-        raise file_error(path, f"expected {expected}: convert it, or in Python give format=")
-    return format
+    suffix = ".json" if path.is_dir() else path.suffix.lower()
+    for format, (_, its_suffix) in FORMATS.items():
+        if suffix == its_suffix:
+            return format
+    expected = f"a file of motion, one of {', '.join(_SUFFIXES)}, or a folder of them"
+    # says whether there is such a file at all
+    read_bytes(path, expected=expected)
+    raise file_error(path, f"expected {expected}: convert it, or in Python give format=")
 
 
 def _sources(folder: Path, format: str | None) -> list[Path]:
     """Files of motion in a folder and its folders, and its folders of pose files, in the order of their names."""
-    suffixes = {s for s, name in _BY_SUFFIX.items() if format in (None, name) or (s, format) == (".npz", "clips")}
+    suffixes = {suffix for name, (_, suffix) in FORMATS.items() if format in (None, name)}
     sources = []
     for here, _, names in os.walk(folder):
         files = [Path(here, name) for name in names if not name.lower().endswith(_NO_MOTION)]
@@ -120,9 +122,8 @@ def digest(path: str | os.PathLike) -> str:
     path = Path(path)
     if not path.is_dir():
         return content_digest(path, expected="motion")[:16]
-    wanted = {*_BY_SUFFIX, ".asf"}
     files = sorted(Path(here, name) for here, _, names in os.walk(path) for name in names)
-    files = [file for file in files if file.suffix.lower() in wanted]
+    files = [file for file in files if file.suffix.lower() in (*_SUFFIXES, ".asf")]
     lines = [f"{file.relative_to(path).as_posix()} {content_digest(file, expected='motion')}" for file in files]
     return hashlib.sha256("\n".join(lines).encode("utf-8", "surrogateescape")).hexdigest()[:16]
 

@@ -125,7 +125,7 @@ class JointTree:
 def tree_motion(
     path: str | os.PathLike,
     tree: JointTree,
-    positions: np.ndarray,
+    values: np.ndarray,
     *,
     fps: float,
     up: str | None,
@@ -136,7 +136,7 @@ def tree_motion(
     """The motion of one clip of any skeleton, named as the file.
 
     Args:
-        positions: (F, N, 3) in the file's unit and axes, NaN in frames without.
+        values: Frames of channels (F, C), in the file's unit and axes; those that are not finite are left out.
         up: The axis that is up, by default the one along which people stand (y where they do not stand).
         unit_m: Meters of a file's number, by default the unit that gives the person the most usual size.
         matched: Joints of the tree by SMPL's names, where names are not to be guessed.
@@ -145,6 +145,7 @@ def tree_motion(
         InputError: For a skeleton without the joints of a person, and what `motion_from_joints` refuses.
     """
     matched = match_joints(path, tree.names, tree.parents) if matched is None else matched
+    positions = tree.positions(values)
     name, finite = Path(path).stem, np.isfinite(positions).all((1, 2))
     usable_clips(path, [name], [len(finite)], finite)
     joints = np.full((len(finite), 24, 3), np.nan)

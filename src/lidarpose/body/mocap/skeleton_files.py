@@ -49,7 +49,7 @@ def load_bvh(path: str | os.PathLike, *, up: str | None = None, fps: float | Non
     rate = fps or rate
     if rate is None:
         raise file_error(path, "has no frame time above 0 (Frame Time: seconds); give load_motion fps=")
-    return tree_motion(path, tree, tree.positions(values), fps=rate, up=up, kind="BVH")
+    return tree_motion(path, tree, values, fps=rate, up=up, kind="BVH")
 
 
 def load_amc(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
@@ -60,10 +60,7 @@ def load_amc(path: str | os.PathLike, *, up: str | None = None, fps: float | Non
     """
     tree, values, unit_m = read_amc(path)
     matched = {joint: tree.names.index(bone) for joint, bone in _BONES.items() if bone in tree.names}
-    positions = tree.positions(values)
-    return tree_motion(
-        path, tree, positions, fps=fps or CMU_FPS, up=up or "y", kind="AMC", unit_m=unit_m, matched=matched
-    )
+    return tree_motion(path, tree, values, fps=fps or CMU_FPS, up=up or "y", kind="AMC", unit_m=unit_m, matched=matched)
 
 
 def _numbers(path: object, what: str, words: Sequence[str], count: int | None = None) -> np.ndarray:

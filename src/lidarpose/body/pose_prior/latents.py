@@ -16,15 +16,7 @@ from importlib import resources
 import numpy as np
 
 from lidarpose.body.pose_prior import activities
-from lidarpose.body.pose_prior.activities import (
-    ANGLES,
-    ARM_ANGLES,
-    KIND_PACE,
-    KINDS,
-    LIMITS,
-    shoulder_angles,
-    shoulder_matrix,
-)  # fmt: skip
+from lidarpose.body.pose_prior.activities import ANGLES, KIND_PACE, KINDS, LIMITS, shoulder_angles, shoulder_matrix
 from lidarpose.geometry import axis_angle_to_matrix
 
 _CAPTURED, _FALL, _CYCLE = (KINDS.index(name) for name in ("captured", "fall", "cycle"))
@@ -151,7 +143,7 @@ SHOULDERS = tuple((slice(i, i + 3), sign) for i, sign in zip(_FIRST_ARM_ANGLE.va
 _SPREAD = 0.75
 # an arm is another pose's this often: one subject's poses then cover another's better
 _OTHER_ARM = 0.4
-_ARMS = tuple(np.arange(i, i + len(ARM_ANGLES)) for i in _FIRST_ARM_ANGLE.values())
+_ARMS = tuple(np.arange(i, i + len(activities.ARM_ANGLES)) for i in _FIRST_ARM_ANGLE.values())
 # where a Cholesky factor's numbers are
 LOWER = np.tril_indices(len(ANGLES))
 
