@@ -34,8 +34,7 @@ from lidarpose.inference.torch_backend import TorchBackend
 from lidarpose.io.files import write_atomic
 from lidarpose.models.checkpoint import Header, SafetensorsFile, load_checkpoint, read_header
 from lidarpose.models.config import NetworkConfig, preset
-from lidarpose.models.expand import expand_weights
-from lidarpose.models.posenet import PoseNet
+from lidarpose.models.posenet import PoseNet, expand_weights
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import SCENES, SceneConfig
 from lidarpose.train.augment import Example

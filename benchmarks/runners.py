@@ -161,7 +161,7 @@ class Ours(Runner):
         )
 
     def tables(self, people):
-        return Batch.from_pyramid(self.plan(people), self.device)
+        return Batch.from_arrays(self.plan(people).arrays(), self.device)
 
     @torch.inference_mode()
     def joints(self, tables):
@@ -205,7 +205,7 @@ class Onnx(Runner):
         self.outputs = [name for name in onnx.OUTPUTS if name != "part"]
 
     def tables(self, people):
-        arrays = self.file.network_inputs(self.plan(people))
+        arrays = self.plan(people).arrays()
         return {self.file.input_name(name): array for name, array in arrays.items()}
 
     def joints(self, tables):
@@ -248,7 +248,7 @@ class Paper(Runner):
 
     def __init__(self, device: str = "cpu"):
         from lidarpose.models.dapt.dapt_config import named_config
-        from lidarpose.models.dapt.dapt_net import DaptBatch, DaptNet
+        from lidarpose.models.dapt.dapt_net import DaptNet, to_tensors
         from lidarpose.models.dapt.voxel_tables import build_tables
 
         torch.manual_seed(0)
@@ -256,7 +256,7 @@ class Paper(Runner):
         super().__init__("paper", DaptNet(self.config), device)
         self.batch = PAPER_BATCH if device == "cpu" else BATCH
         self.layout = "ragged" if device == "cpu" else "padded"
-        self.build, self.tensors = build_tables, DaptBatch.from_tables
+        self.build, self.tensors = build_tables, to_tensors
         self.order = self.config.order_in(BODY26)
 
     def _tables(self, people: list[Example]):

@@ -212,7 +212,7 @@ def test_a_missing_an_extra_and_a_misshapen_tensor(stored, tmp_path):
     assert_one_line(without, "tensor vote.query.bias is missing", "tiny")
     assert_one_line(rewritten(stored, path, tensors=lambda t: t | {"more": torch.zeros(1)}), "unknown tensor more")
     wrong = rewritten(stored, path, tensors=lambda t: t | {"part.weight": torch.zeros(24, 48)})
-    assert_one_line(wrong, "part.weight should be (25, 48) by its configuration, got (24, 48)")
+    assert_one_line(wrong, "part.weight should be (25, 48) by its configuration (tiny), got (24, 48)")
 
 
 @pytest.mark.parametrize("change", [{"channels": [48, 64, 2**14]}, {"max_voxels": 10, "blocks": [1, 16_000, 1]}])
@@ -286,12 +286,12 @@ def test_a_tensor_that_is_no_finite_float(stored, tmp_path, value):
         (lambda h: h | {"config": h["config"] | {"rotary": True}}, "unknown setting rotary"),
         (lambda h: h | {"config": {"size": "tiny"}}, "channels"),
         (lambda h: h | {"config": 5}, "cannot be read"),
-        (lambda h: h | {"config": h["config"] | {"channels": 64.0}}, "channels must be three whole numbers"),
-        (lambda h: h | {"config": h["config"] | {"channels": [64, -1, 64]}}, "channels must be three whole numbers"),
+        (lambda h: h | {"config": h["config"] | {"channels": 64.0}}, "channels must be 3 whole numbers"),
+        (lambda h: h | {"config": h["config"] | {"channels": [64, -1, 64]}}, "channels must be 3 whole numbers"),
         (lambda h: h | {"config": h["config"] | {"head_channels": 0}}, "head_channels must be a whole number"),
         (lambda h: h | {"config": h["config"] | {"head_channels": 5}}, "must divide by head_channels"),
-        (lambda h: h | {"config": h["config"] | {"blocks": [1, 1]}}, "blocks must be three whole numbers"),
-        (lambda h: h | {"config": h["config"] | {"blocks": 3}}, "blocks must be three whole numbers"),
+        (lambda h: h | {"config": h["config"] | {"blocks": [1, 1]}}, "blocks must be 3 whole numbers"),
+        (lambda h: h | {"config": h["config"] | {"blocks": 3}}, "blocks must be 3 whole numbers"),
         (lambda h: h | {"config": h["config"] | {"grid": -1}}, "grid must be a positive number"),
         (lambda h: h | {"config": h["config"] | {"heatmap": "round"}}, "unknown heatmap 'round'"),
         (lambda h: h | {"config": h["config"] | {"skeleton": "body27"}}, "unknown skeleton 'body27'"),

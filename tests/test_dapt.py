@@ -15,9 +15,16 @@ from torch.nn import functional as F
 
 from lidarpose.errors import InputError
 from lidarpose.models import decode
-from lidarpose.models.dapt.blocks import DropPath, PatchAttention, RowNorm, Stage, SubmanifoldConvolution
 from lidarpose.models.dapt.dapt_config import CONFIGS, WAYMO_JOINTS, DaptConfig, named_config
-from lidarpose.models.dapt.dapt_net import DaptBatch, DaptNet
+from lidarpose.models.dapt.dapt_net import (
+    DaptNet,
+    DropPath,
+    PatchAttention,
+    RowNorm,
+    Stage,
+    SubmanifoldConvolution,
+    to_tensors,
+)
 from lidarpose.models.dapt.import_weights import import_dapt
 from lidarpose.models.dapt.voxel_tables import LAYOUTS, build_tables
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14
@@ -458,7 +465,7 @@ def test_convolution_equals_a_dense_one(kernel, layout):
     side = 7
     occupied = np.argwhere(rng.random((side, side, side)) < 0.4)
     tables = build_tables([(occupied + 0.5) * TINY.grid, (occupied[:20] + 0.5) * TINY.grid], TINY, layout=layout)
-    batch = DaptBatch.from_tables(tables)
+    batch = to_tensors(tables)
     near = batch.levels[0].near if kernel == 3 else batch.stem
     torch.manual_seed(0)
     conv = SubmanifoldConvolution(5, 4, kernel, bias=True)
@@ -539,7 +546,7 @@ def test_attention_equals_its_formula():
     torch.manual_seed(0)
     attention = PatchAttention(32, 2).eval()
     tables = build_tables([person(70), person(9, 1)], replace(TINY, patch=32))
-    level = DaptBatch.from_tables(tables).levels[0]
+    level = to_tensors(tables).levels[0]
     rows = torch.randn(int(level.patch_lengths.sum()), 32)
     for order in range(4):
         sequence = torch.from_numpy(tables.levels[0].sequence[order])
@@ -643,12 +650,12 @@ def test_bins_of_the_released_networks():
         ({"drop_path": 1.0}, "drop_path must be a probability"),
         ({"joints": ("nose", "nose")}, "joints must be joint names, each once"),
         ({"joints": ("noze",)}, "unknown joint of body26 'noze': did you mean nose"),
-        ({"bins": (44, 44)}, "bins must be three"),
+        ({"bins": (44, 44)}, "bins must be 3"),
         ({"ranges": ((1.0, -1.0),) * 3}, "ranges must be three pairs"),
         ({"bins": (), "ranges": (), "coordinates": False}, "it would predict nothing"),
         ({"parts": 1}, "parts must be 0"),
-        ({"parts": 10**19}, "parts must be 0 .* from 2 to 16384"),
-        ({"bins": (10**19, 1, 1)}, "bins must be three"),
+        ({"parts": 10**19}, "parts must be a whole number from 0 to 16384"),
+        ({"bins": (10**19, 1, 1)}, "bins must be 3"),
         ({"patch": 10**6}, "patch must be a whole number from 1 to 16384"),
         ({"legacy": 1}, "legacy must be true or false"),
     ],

@@ -15,7 +15,7 @@ from lidarpose.errors import InputError
 from lidarpose.models.checkpoint import save_checkpoint
 from lidarpose.models.config import preset
 from lidarpose.models.dapt.dapt_config import named_config
-from lidarpose.models.dapt.dapt_net import DaptBatch, DaptNet, DaptOutputs
+from lidarpose.models.dapt.dapt_net import DaptNet, DaptOutputs, to_tensors
 from lidarpose.models.dapt.voxel_tables import LAYOUTS
 from lidarpose.models.posenet import PoseNet
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14
@@ -308,7 +308,7 @@ def test_joints_of_a_network_with_every_head_are_those_that_the_stage_teaches():
     task = DaptObjective(config=config, stage="pretrain")
     net, arrays = network(task).eval(), task.collate([person(70)])
     with torch.no_grad():
-        outputs = net(DaptBatch.from_tables(arrays.tables))
+        outputs = net(to_tensors(arrays.tables))
     np.testing.assert_array_equal(task.joints(net, arrays), outputs.coordinates.numpy())
     np.testing.assert_array_equal(replace(task, stage="finetune").joints(net, arrays), outputs.joints().numpy())
 

@@ -26,7 +26,6 @@ from lidarpose.models.onnx import (
     check_digest,
     expected_inputs,
     input_name,
-    network_inputs,
     open_onnx,
     open_session,
     voxelize_people,
@@ -106,7 +105,7 @@ def test_float16_weights_stay_float16(folder):
     whole = model.SerializeToString()
     parameters = sum(value.numel() for value in network.parameters())
     assert len(packed) < len(whole) - 1.5 * parameters
-    arrays = network_inputs(voxelize_people(*people(300, 5, 900), header.config))
+    arrays = voxelize_people(*people(300, 5, 900), header.config).arrays()
     given = {input_name(name): array for name, array in arrays.items()}
     for ours, due in zip(*(open_session(file, threads=1).run(None, given) for file in (packed, whole)), strict=True):
         np.testing.assert_array_equal(ours, due)
@@ -144,7 +143,7 @@ def test_weights_that_need_all_of_float32_keep_it():
 def test_a_program_of_torch_runs_at_other_sizes(folder, program, sizes):
     clouds, view = people(*sizes)
     network, header = load_checkpoint(folder / "net.safetensors")
-    arrays = network_inputs(voxelize_people(clouds, view, header.config))
+    arrays = voxelize_people(clouds, view, header.config).arrays()
     tensors = [torch.as_tensor(array) for array in arrays.values()]
     with torch.inference_mode():
         due = ArrayModule(network, tuple(arrays))(*tensors)

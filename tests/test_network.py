@@ -56,7 +56,7 @@ def batch_of(clouds, max_voxels=TINY.max_voxels, known=True, neighbors=True):
     origin = np.array([-8.0, 1, 1]) if known else None
     view = np.stack([view_features(np.full(3, k), origin) for k in range(len(clouds))])
     options = {"grid": TINY.grid, "max_voxels": max_voxels, "view": view, "neighbors": neighbors}
-    return Batch.from_pyramid(voxelize(np.concatenate(clouds), np.array([len(c) for c in clouds]), **options))
+    return Batch.from_arrays(voxelize(np.concatenate(clouds), np.array([len(c) for c in clouds]), **options).arrays())
 
 
 def random_network(config):
@@ -164,9 +164,9 @@ SMALL_ONE = {"size": "x", "channels": [4, 8, 8], "head_channels": 8, "blocks": [
     "change, message",
     [
         ({"head_channels": 5}, r"must divide by head_channels, got \(4, 8, 8\) and 5"),
-        ({"channels": 8}, r"channels must be three whole numbers \(fine, mid, coarse\) from 1 to 16384, got 8"),
-        ({"channels": [4, 0, 8]}, "channels must be three whole numbers"),
-        ({"blocks": (1, -1, 1)}, r"blocks must be three whole numbers \(mid encoder, coarse, mid decoder\)"),
+        ({"channels": 8}, r"channels must be 3 whole numbers \(fine, mid, coarse\) from 1 to 16384, got 8"),
+        ({"channels": [4, 0, 8]}, "channels must be 3 whole numbers"),
+        ({"blocks": (1, -1, 1)}, r"blocks must be 3 whole numbers \(mid encoder, coarse, mid decoder\)"),
         ({"grid": 0}, "grid must be a positive number of meters, got 0"),
         ({"max_voxels": 1.5}, "max_voxels must be a whole number"),
         ({"heatmap": "wide"}, "unknown heatmap 'wide'.*window"),

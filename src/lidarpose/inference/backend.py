@@ -19,7 +19,7 @@ from lidarpose.io.files import content_digest, file_error
 from lidarpose.models.checkpoint import Header, read_header
 from lidarpose.models.config import BIN, NetworkConfig
 from lidarpose.models.decode import Decoder, out_of_range
-from lidarpose.models.onnx import OUTPUTS, input_name, network_inputs, open_onnx, voxelize_people
+from lidarpose.models.onnx import OUTPUTS, input_name, open_onnx, voxelize_people
 from lidarpose.sample import CONFIDENCE_RADIUS
 
 # people a call; more fill the memory without being faster
@@ -106,7 +106,7 @@ class OnnxBackend:
         return partial(OnnxBackend, path, threads=threads), ()
 
     def run(self, clouds: list[np.ndarray], view: np.ndarray) -> Raw:
-        inputs = network_inputs(voxelize_people(clouds, view, self._config))
+        inputs = voxelize_people(clouds, view, self._config).arrays()
         values = self.session.run(self._outputs, {input_name(name): array for name, array in inputs.items()})
         return Raw.from_pose(dict(zip(self._outputs, values, strict=True)))
 

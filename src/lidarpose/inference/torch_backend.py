@@ -8,10 +8,11 @@ import torch
 
 from lidarpose.errors import InputError
 from lidarpose.inference.backend import Backend, Raw
+from lidarpose.models import NETWORKS
 from lidarpose.models.checkpoint import Header, load_checkpoint
 from lidarpose.models.dapt.dapt_net import DaptNet
 from lidarpose.models.export import ArrayModule
-from lidarpose.models.onnx import OUTPUTS, network_inputs, voxelize_people
+from lidarpose.models.onnx import OUTPUTS, voxelize_people
 from lidarpose.models.posenet import PoseNet
 from lidarpose.models.voxelize import WINDOW
 
@@ -35,11 +36,7 @@ def torch_backend(path: str | os.PathLike, *, device: str = "cpu", compile: bool
         raise InputError(
             f"device {device!r} cannot be used ({reason}); expected cpu, or cuda where torch has it"
         ) from None
-    if isinstance(network, PoseNet):
-        return TorchBackend(network, header, device=device, compile=compile)
-    if compile:
-        raise InputError("torch.compile is not offered for the paper's network: leave compile away")
-    return DaptBackend(network, header)
+    return NETWORKS[header.network].part("backend")(network, header, device=device, compile=compile)
 
 
 class TorchBackend:
@@ -61,7 +58,7 @@ class TorchBackend:
 
     @torch.inference_mode()
     def run(self, clouds: list[np.ndarray], view: np.ndarray) -> Raw:
-        arrays = network_inputs(voxelize_people(clouds, view, self.network.config))
+        arrays = voxelize_people(clouds, view, self.network.config).arrays()
         tensors = [torch.as_tensor(array).to(self.device) for array in arrays.values()]
         if self._module is None:
             module = ArrayModule(self.network, tuple(arrays))
@@ -81,8 +78,10 @@ class DaptBackend:
     name = "torch"
     batch = _DAPT_BATCH
 
-    def __init__(self, network: DaptNet, header: Header):
-        self.network = network.eval()
+    def __init__(self, network: DaptNet, header: Header, *, device: str = "cpu", compile: bool = False):
+        if compile:
+            raise InputError("torch.compile is not offered for the paper's network: leave compile away")
+        self.network = network.to(device).eval()
         self.header = header
 
     def run(self, clouds: list[np.ndarray], view: np.ndarray) -> Raw:

@@ -1,10 +1,55 @@
-"""Networks, and the weights that ship with them: their names, and where they lie. No torch, no numpy here."""
+"""The kinds of network, and the weights that ship with them: their names, and where they lie. No torch, no numpy here.
+
+A further network is a module that holds it and its configuration, an objective that trains it, a backend that runs it,
+and an entry in `NETWORKS`. Its checkpoints then are written, read and checked as all others.
+"""
 
 import os
-from importlib import resources
+from dataclasses import dataclass
+from importlib import import_module, resources
 from pathlib import Path
+from typing import Any
 
 from lidarpose.errors import InputError, check_name
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkKind:
+    """Where the parts of a kind of network are defined, as "module:name": they are imported when first needed.
+
+    config: a frozen dataclass of plain values with `kind` (its key in `NETWORKS`), `name` (for messages), `joints`
+    (names, in the order of the outputs), `layers` (a lower bound of its tensors) and `to_dict`, which raises InputError
+    for what cannot be; network: a module made from the config alone, which it keeps as `config`; objective: a
+    `train.objectives.objective.Objective`; backend: called with (network, header, device=, compile=), an
+    `inference.backend.Backend`.
+    """
+
+    config: str
+    network: str
+    objective: str
+    backend: str
+
+    def part(self, name: str) -> Any:
+        """The class that `config`, `network`, `objective` or `backend` names."""
+        module, _, attribute = getattr(self, name).partition(":")
+        return getattr(import_module(module), attribute)
+
+
+# by the name that checkpoints give: this package's own, and the paper's
+NETWORKS = {
+    "pose": NetworkKind(
+        config="lidarpose.models.config:NetworkConfig",
+        network="lidarpose.models.posenet:PoseNet",
+        objective="lidarpose.train.objectives.posenet_objective:PoseNetObjective",
+        backend="lidarpose.inference.torch_backend:TorchBackend",
+    ),
+    "dapt": NetworkKind(
+        config="lidarpose.models.dapt.dapt_config:DaptConfig",
+        network="lidarpose.models.dapt.dapt_net:DaptNet",
+        objective="lidarpose.train.objectives.dapt_objective:DaptObjective",
+        backend="lidarpose.inference.torch_backend:DaptBackend",
+    ),
+}
 
 BUNDLED = ("tiny", "small")
 # what is taken where nothing is named: the best whose two files are at most 6 MB

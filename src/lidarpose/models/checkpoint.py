@@ -17,55 +17,50 @@ import os
 import struct
 import warnings
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lidarpose._version import __version__
-from lidarpose.errors import InputError, unknown_name
+from lidarpose.errors import InputError, check_name
 from lidarpose.io.files import file_error, read_bytes, write_atomic
-from lidarpose.models.config import NetworkConfig
-from lidarpose.skeleton import SKELETONS, Skeleton, skeleton
+from lidarpose.models import NETWORKS
+from lidarpose.skeleton import SKELETONS, Skeleton
 
 if TYPE_CHECKING:
     import torch
-
-    from lidarpose.models.dapt.dapt_config import DaptConfig
-    from lidarpose.models.dapt.dapt_net import DaptNet
-    from lidarpose.models.posenet import PoseNet
+    from torch import nn
 
 ENTRY, DIGEST = "lidarpose", "lidarpose.sha256"
 SCHEMA = "lidarpose.checkpoint/2"
 _FAMILY = SCHEMA.rpartition("/")[0]
-# kinds of network: this package's own, and the paper's
-KINDS = ("pose", "dapt")
 _EXPECTED = "a checkpoint (.safetensors)"
 # bytes: what safetensors allows
 _MOST_HEADER = 100_000_000
+_AGAIN = "get the file again"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Header:
-    """What a checkpoint says of itself. card: plain JSON values; version: the package's that wrote it."""
+    """What a checkpoint says of itself. config: as `models.NetworkKind` says; card: plain JSON values; version: the
+    package's that wrote it."""
 
-    config: NetworkConfig | DaptConfig
+    config: Any
     card: dict
     version: str = __version__
 
     @property
     def network(self) -> str:
-        """The kind of network, one of `KINDS`."""
-        return "pose" if isinstance(self.config, NetworkConfig) else "dapt"
+        """The kind of network, a key of `models.NETWORKS`."""
+        return self.config.kind
 
     @property
     def skeleton(self) -> Skeleton:
         """The joints that the network predicts. Raises InputError for a network whose joints make up no skeleton."""
-        if isinstance(self.config, NetworkConfig):
-            return skeleton(self.config.skeleton)
-        own = set(self.config.joints)
-        inside = [candidate for candidate in SKELETONS.values() if set(candidate.joints) <= own]
+        names = self.config.joints
+        inside = [candidate for candidate in SKELETONS.values() if set(candidate.joints) <= set(names)]
         if not inside:
             raise InputError(
-                f"the network {self.config.name} predicts {', '.join(self.config.joints)}, which hold none of the "
-                f"skeletons {', '.join(SKELETONS)}: its joints cannot be drawn or named"
+                f"the network {self.config.name} predicts {', '.join(names)}, which hold none of the skeletons "
+                f"{', '.join(SKELETONS)}: its joints cannot be drawn or named"
             )
         return max(inside, key=len)
 
@@ -93,7 +88,7 @@ def parameter_count(path: str | os.PathLike) -> int:
     return sum(map(math.prod, SafetensorsFile.open(path).shapes.values()))
 
 
-def save_checkpoint(path: str | os.PathLike, network: PoseNet | DaptNet, *, card: dict, half: bool = False) -> None:
+def save_checkpoint(path: str | os.PathLike, network: nn.Module, *, card: dict, half: bool = False) -> None:
     """Writes the network's weights and its card, whole or not at all; `half` stores them as float16.
 
     Raises InputError for weights that are not finite, or too large for float16: nothing could load them.
@@ -115,7 +110,7 @@ def save_checkpoint(path: str | os.PathLike, network: PoseNet | DaptNet, *, card
     write_atomic(path, with_digest(save(tensors, metadata={ENTRY: header})))
 
 
-def load_checkpoint(path: str | os.PathLike) -> tuple[PoseNet | DaptNet, Header]:
+def load_checkpoint(path: str | os.PathLike) -> tuple[Any, Header]:
     """The network in evaluation mode, float32 on the CPU, and its header.
 
     Warns of a file without a digest. Raises InputError that names the file and the tensor for anything that does not
@@ -124,47 +119,16 @@ def load_checkpoint(path: str | os.PathLike) -> tuple[PoseNet | DaptNet, Header]
     file = SafetensorsFile.open(path)
     has_digest = file.check_digest()
     header = parse_header(path, file.metadata.get(ENTRY))
-    config = header.config
-    name = config.size if isinstance(config, NetworkConfig) else config.name
-    older = f"use the lidarpose version that wrote it ({header.version})"
-    again = "get the file again"
-    wanted = empty_state(path, header.config, len(file.shapes), by="its configuration", remedy=again)
-    file.check_tensors(
-        wanted,
-        missing=f"so it is no whole {name} network: {again}",
-        unknown=f"which no {name} network has: {older}",
-        shape=f"by its configuration, got {{}}: {again}, or {older}",
-    )
-    network = build(header.config)
-    network.load_state_dict(file.load(wanted))
+    remedy = f"{_AGAIN}, or use the lidarpose version that wrote it ({header.version})"
+    network = file.network(header.config, source=f"its configuration ({header.config.name})", remedy=remedy)
     if not has_digest:
         warn_without_digest(path)
-    return network.eval(), header
+    return network, header
 
 
-def empty_state(
-    path: str | os.PathLike, config: NetworkConfig | DaptConfig, count: int, *, by: str, remedy: str
-) -> dict[str, torch.Tensor]:
-    """The tensors that a network of a configuration has, none of them in memory: whatever the header of a file of
-    `count` tensors says, nothing is allocated for it before the file is known to hold it. Raises InputError, which says
-    by what configuration, and what to do."""
-    import torch
-
-    if config.layers > count:
-        raise file_error(path, f"has {count} tensors, too few for {config.layers} layers by {by}: {remedy}")
-    with torch.device("meta"):
-        return build(config).state_dict()
-
-
-def build(config: NetworkConfig | DaptConfig) -> PoseNet | DaptNet:
+def build(config: Any) -> nn.Module:
     """A network of a configuration, its weights random."""
-    if isinstance(config, NetworkConfig):
-        from lidarpose.models.posenet import PoseNet
-
-        return PoseNet(config)
-    from lidarpose.models.dapt.dapt_net import DaptNet
-
-    return DaptNet(config)
+    return NETWORKS[config.kind].part("network")(config)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,18 +172,33 @@ class SafetensorsFile:
             raise file_error(self.path, DAMAGED)
         return expected is not None
 
-    def check_tensors(self, wanted: dict[str, torch.Tensor], *, missing: str, unknown: str, shape: str) -> None:
-        """Raises InputError for the first tensor that is missing, unknown or of another shape than wanted; the texts
-        say what that means and what to do, with {} for the shape in the file."""
+    def network(self, config: Any, *, source: str, remedy: str) -> Any:
+        """The network of a configuration with the file's tensors, in evaluation mode.
+
+        source: where the configuration is from; remedy: what to do where it does not fit. Raises InputError for the
+        first tensor that is missing, unknown, of another shape, or not of finite floats where floats belong. Whatever
+        the configuration says, nothing is allocated for it before the file is known to hold it.
+        """
+        import torch
+
         shapes = self.shapes
-        if absent := next((name for name in wanted if name not in shapes), None):
-            raise file_error(self.path, f"tensor {absent} is missing, {missing}")
-        if extra := sorted(set(shapes) - set(wanted)):
-            raise file_error(self.path, f"unknown tensor {extra[0]}, {unknown}")
+        if config.layers > len(shapes):
+            problem = f"has {len(shapes)} tensors, too few for {config.layers} layers by {source}: {remedy}"
+            raise file_error(self.path, problem)
+        with torch.device("meta"):
+            wanted = build(config).state_dict()
+        if absent := [name for name in wanted if name not in shapes]:
+            raise file_error(self.path, f"tensor {absent[0]} is missing, which {source} has: {remedy}")
+        if extra := sorted(shapes.keys() - wanted.keys()):
+            raise file_error(self.path, f"unknown tensor {extra[0]}, which {source} has not: {remedy}")
         for name, value in wanted.items():
             if shapes[name] != tuple(value.shape):
-                problem = f"tensor {name} should be {tuple(value.shape)} {shape.replace('{}', str(shapes[name]))}"
+                problem = f"tensor {name} should be {tuple(value.shape)} by {source}, got {shapes[name]}: {remedy}"
                 raise file_error(self.path, problem)
+        state = self.load(wanted)
+        network = build(config)
+        network.load_state_dict(state)
+        return network.eval()
 
     def load(self, wanted: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """The tensors in the types of those wanted. Raises InputError for anything but finite floats where a float is
@@ -230,15 +209,14 @@ class SafetensorsFile:
         try:
             stored = load(self.content)
         except (SafetensorError, ValueError, KeyError) as error:
-            raise file_error(self.path, f"its header is damaged ({error}): get the file again") from None
+            raise file_error(self.path, f"its header is damaged ({error}): {_AGAIN}") from None
         tensors = {}
         for name, like in wanted.items():
             value = stored[self.prefix + name]
             tensors[name] = value.to(like.dtype)
             is_float = value.is_floating_point() or not like.is_floating_point()
             if not is_float or not tensors[name].isfinite().all():
-                problem = f"tensor {name} holds numbers that are not finite or no floats: get the file again"
-                raise file_error(self.path, problem)
+                raise file_error(self.path, f"tensor {name} holds numbers that are not finite or no floats: {_AGAIN}")
         return tensors
 
 
@@ -254,26 +232,25 @@ def _parse_safetensors(path: str | os.PathLike, content: bytes) -> dict:
         raise file_error(path, f"expected {_EXPECTED}, but the file is something else: name a checkpoint")
     if size < 8 + length:
         raise file_error(path, f"the file ends at byte {size:,}, within its header of {length:,} bytes: {again}")
+    end = 0
     try:
         header = json.loads(content[8 : 8 + length])
-        ends = [0]
+        metadata = header.get("__metadata__", {})
+        if not all(isinstance(text, str) for text in metadata.values()):
+            raise TypeError("metadata that are no texts")
         for name, entry in header.items():
-            if name == "__metadata__":
-                if not all(isinstance(text, str) for text in entry.values()):
-                    raise TypeError("metadata that are no texts")
-                continue
-            start, end = entry["data_offsets"]
-            if not 0 <= start <= end or not all(isinstance(n, int) and n >= 0 for n in (start, *entry["shape"])):
-                raise ValueError(f"tensor {name}")
-            ends.append(end)
+            if name != "__metadata__":
+                start, stop = entry["data_offsets"]
+                if not 0 <= start <= stop or not all(isinstance(n, int) and n >= 0 for n in (start, *entry["shape"])):
+                    raise ValueError(f"tensor {name}")
+                end = max(end, stop)
     except json.JSONDecodeError as error:
-        problem = f"its header is damaged at byte {8 + error.pos:,} ({error.msg}): get the file again"
-        raise file_error(path, problem) from None
+        raise file_error(path, f"its header is damaged at byte {8 + error.pos:,} ({error.msg}): {_AGAIN}") from None
     except (ValueError, AttributeError, KeyError, IndexError, TypeError, RecursionError) as error:
-        raise file_error(path, f"its header is damaged ({error}): get the file again") from None
-    if size != 8 + length + max(ends):
-        expected = 8 + length + max(ends)
-        raise file_error(path, f"the file ends at byte {size:,} where its header says {expected:,}: {again}")
+        raise file_error(path, f"its header is damaged ({error}): {_AGAIN}") from None
+    if size != 8 + length + end:
+        problem = f"the file ends at byte {size:,} where its header says {8 + length + end:,}: {again}"
+        raise file_error(path, problem)
     return header
 
 
@@ -324,49 +301,26 @@ def parse_header(path: str | os.PathLike, entry: str | None) -> Header:
         )
     try:
         header = json.loads(entry)
-        if header["schema"] != SCHEMA:
-            raise file_error(path, _other_schema(header["schema"], header.get("version")))
-        kind = header["network"]
-        if kind not in KINDS:
-            raise file_error(path, str(unknown_name("kind of network", kind, KINDS)))
-        config = _parse_config(path, kind, header["config"])
-        version, card = header["version"], header["card"]
-        if not isinstance(card, dict):
-            raise TypeError(f"card is a {type(card).__name__}")
-        return Header(version=str(version), config=config, card=card)
-    except InputError:
-        raise
+        schema, version = header["schema"], header.get("version")
+        if schema != SCHEMA:
+            by = f" of lidarpose {version}" if version else ""
+            remedy = f"use the lidarpose version that wrote it (this is {__version__})"
+            if schema == f"{_FAMILY}/1":
+                remedy = f"this version ({__version__}) has replaced that network: use lidarpose {version} for it, "
+                remedy += "or train anew"
+            raise InputError(f"expected schema {SCHEMA}, got {schema}{by}: {remedy}")
+        check_name("kind of network", header["network"], NETWORKS)
+        config_class = NETWORKS[header["network"]].part("config")
+        entries, card = header["config"], header["card"]
+        for name, value in (("config", entries), ("card", card)):
+            if not isinstance(value, dict):
+                raise TypeError(f"{name} is a {type(value).__name__}")
+        if extra := sorted(set(entries) - {field.name for field in fields(config_class)}):
+            raise InputError(f"unknown setting {extra[0]}: update lidarpose, a newer version wrote it")
+        return Header(version=str(header["version"]), config=config_class(**entries), card=card)
+    except InputError as error:
+        raise file_error(path, f"its header does not fit: {error}") from None
     # a number of thousands of digits is a plain ValueError
     except (KeyError, TypeError, AttributeError, RecursionError, ValueError) as error:
         reason = f"{type(error).__name__}: {error}"
-        raise file_error(path, f"its header cannot be read ({reason}): get the file again, or train anew") from None
-
-
-def _other_schema(schema: object, version: object) -> str:
-    got = f"expected schema {SCHEMA}, got {schema}"
-    if schema == f"{_FAMILY}/1":
-        return (
-            f"{got}: written by lidarpose {version}, whose network this version ({__version__}) has replaced: "
-            f"use lidarpose {version} for it, or train anew"
-        )
-    by = f" of lidarpose {version}" if version else ""
-    return f"{got}{by}: use the lidarpose version that wrote it (this is {__version__})"
-
-
-def _parse_config(path: str | os.PathLike, kind: str, entries: dict) -> NetworkConfig | DaptConfig:
-    if not isinstance(entries, dict):
-        raise TypeError(f"config is a {type(entries).__name__}")
-    config_class: type[NetworkConfig] | type[DaptConfig] = NetworkConfig
-    if kind == "dapt":
-        from lidarpose.models.dapt.dapt_config import DaptConfig
-
-        config_class = DaptConfig
-    extra = sorted(set(entries) - {field.name for field in fields(config_class)})
-    if extra:
-        raise file_error(
-            path, f"unknown setting {extra[0]} in its configuration: update lidarpose, a newer version wrote it"
-        )
-    try:
-        return config_class(**entries)
-    except InputError as error:
-        raise file_error(path, f"its configuration does not fit: {error}") from None
+        raise file_error(path, f"its header cannot be read ({reason}): {_AGAIN}, or train anew") from None

@@ -1,6 +1,8 @@
 """The sizes of the network: one dial, the rest derived."""
 
+from contextlib import suppress
 from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
 
 from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.skeleton import skeleton
@@ -13,15 +15,36 @@ BIN = 0.03
 MOST = 16_384
 
 
+def check_counts(name: str, value: Any, count: int, *, least: int = 1, levels: str = "") -> tuple[int, ...]:
+    """So many whole numbers from `least` to `MOST`, as a tuple. Raises InputError for anything else; levels: what they
+    are of."""
+    if isinstance(value, list | tuple) and len(value) == count:
+        with suppress(InputError):
+            return tuple(check_int(name, number, least=least, most=MOST) for number in value)
+    raise InputError(f"{name} must be {count} whole numbers{levels} from {least} to {MOST}, got {value!r}")
+
+
+def is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def check_grid(grid: Any) -> None:
+    """Raises InputError unless `grid` is an edge of a voxel."""
+    if not (is_number(grid) and grid > 0):
+        raise InputError(f"grid must be a positive number of meters, got {grid!r}")
+
+
 @dataclass(frozen=True, kw_only=True)
 class NetworkConfig:
-    """Widths and depths.
+    """Widths and depths of a `PoseNet`.
 
     channels: of the fine, mid and coarse level; head_channels: a head of attention; blocks: attention blocks (mid
     encoder, coarse, mid decoder); grid: edge of a fine voxel in meters (mid and coarse: 2 and 4 times); max_voxels:
     fine voxels a person at the most; parts: body parts and 0; heatmap: one of `HEATMAPS`; convolution: channels
     of the submanifold convolutions before the blocks of the mid and coarse level, 0 for none.
     """
+
+    kind: ClassVar[str] = "pose"
 
     size: str
     channels: tuple[int, int, int]
@@ -35,27 +58,33 @@ class NetworkConfig:
     convolution: int = 0
 
     def __post_init__(self):
+        # false in files of before it was a number
+        if self.convolution is False:
+            object.__setattr__(self, "convolution", 0)
         for name, least in (("head_channels", 1), ("max_voxels", 1), ("parts", 1), ("convolution", 0)):
-            value = getattr(self, name)
-            # false in files of before it was a number
-            value = 0 if name == "convolution" and value is False else value
-            object.__setattr__(self, name, check_int(name, value, least=least, most=MOST))
-        for name, least in (("channels", 1), ("blocks", 0)):
-            value = getattr(self, name)
-            counts = tuple(value) if isinstance(value, list | tuple) else ()
-            if len(counts) != 3 or not all(isinstance(count, int) and least <= count <= MOST for count in counts):
-                levels = "fine, mid, coarse" if name == "channels" else "mid encoder, coarse, mid decoder"
-                raise InputError(f"{name} must be three whole numbers ({levels}) from {least} to {MOST}, got {value!r}")
+            object.__setattr__(self, name, check_int(name, getattr(self, name), least=least, most=MOST))
+        for name, least, levels in (
+            ("channels", 1, "fine, mid, coarse"),
+            ("blocks", 0, "mid encoder, coarse, mid decoder"),
+        ):
+            counts = check_counts(name, getattr(self, name), 3, least=least, levels=f" ({levels})")
             object.__setattr__(self, name, counts)
         if any(width % self.head_channels for width in self.channels[1:]):
             raise InputError(
                 f"channels of the mid and coarse level must divide by head_channels, got {self.channels} "
                 f"and {self.head_channels}"
             )
-        if not isinstance(self.grid, int | float) or not self.grid > 0:
-            raise InputError(f"grid must be a positive number of meters, got {self.grid!r}")
+        check_grid(self.grid)
         check_name("heatmap", self.heatmap, HEATMAPS)
         skeleton(self.skeleton)
+
+    @property
+    def name(self) -> str:
+        return self.size
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        return skeleton(self.skeleton).joints
 
     @property
     def layers(self) -> int:

@@ -1,7 +1,6 @@
 """Networks as files that run elsewhere: ONNX, or a program of `torch.export`. Checked before they are written."""
 
 import contextlib
-import io
 import logging
 import os
 import warnings
@@ -11,15 +10,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lidarpose._version import __version__
 from lidarpose.errors import InputError, LidarPoseError, check_name, missing_extra
 from lidarpose.io.files import atomic_path, check_apart, check_suffix, check_writable, content_digest, write_atomic
-from lidarpose.models.checkpoint import DIGEST, ENTRY, Header, load_checkpoint
+from lidarpose.models.checkpoint import DIGEST, ENTRY, load_checkpoint
 from lidarpose.models.onnx import (
     NO_DIGEST,
     OUTPUTS,
     SOURCE,
     input_name,
-    network_inputs,
     open_session,
     voxelize_people,
     with_digest,
@@ -92,9 +91,10 @@ def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = 
 def trace(network: PoseNet) -> torch.export.ExportedProgram:
     """The network as a program whose numbers of people and rows are free."""
     arrays = _people(network, _TRACED)
+    free = tuple(dict.fromkeys(axes, torch.export.Dim.DYNAMIC) for axes in _axes(arrays))
     module = ArrayModule(network.eval(), tuple(arrays))
     with torch.no_grad():
-        program = torch.export.export(module, _tensors(arrays), dynamic_shapes=_free(arrays))
+        program = torch.export.export(module, _tensors(arrays), dynamic_shapes=(free,))
     for node in program.graph.nodes:
         # paths of the machine that traced it
         node.meta.pop("stack_trace", None)
@@ -111,9 +111,9 @@ def onnx_bytes(network: PoseNet, metadata: dict[str, str]) -> bytes:
     arrays = _people(network, _TRACED)
     with _silence(), torch.no_grad():
         program = torch.onnx.export(
-            ArrayModule(network.eval(), tuple(arrays)),
+            ArrayModule(network, tuple(arrays)).eval(),
             _tensors(arrays),
-            dynamic_shapes=_free(arrays),
+            dynamic_shapes=(_axes(arrays),),
             input_names=[input_name(name) for name in arrays],
             output_names=list(OUTPUTS),
             opset_version=_OPSET,
@@ -129,10 +129,9 @@ def onnx_bytes(network: PoseNet, metadata: dict[str, str]) -> bytes:
     for value in [*model.graph.input, *model.graph.output, *model.graph.initializer]:
         del value.metadata_props[:]
     del model.graph.metadata_props[:], model.graph.value_info[:]
-    _name_axes(model.graph, list(arrays))
     _pack(model.graph)
     onnx.helper.set_model_props(model, metadata)
-    model.producer_name, model.producer_version = "lidarpose", Header(config=network.config, card={}).version
+    model.producer_name, model.producer_version = "lidarpose", __version__
     onnx.checker.check_model(model)
     return model.SerializeToString(deterministic=True)
 
@@ -143,9 +142,8 @@ def check(network: PoseNet, run: Callable[[dict[str, np.ndarray]], list[np.ndarr
         arrays = _people(network, sizes)
         with torch.inference_mode():
             expected = ArrayModule(network.eval(), tuple(arrays))(*_tensors(arrays))
-        for name, expected_values, got in zip(OUTPUTS, expected, run(arrays), strict=True):
-            expected_values = expected_values.numpy()
-            off = float(np.abs(got - expected_values).max(initial=0)) if got.shape == expected_values.shape else np.inf
+        for name, tensor, got in zip(OUTPUTS, expected, run(arrays), strict=True):
+            off = np.abs(got - tensor.numpy()).max(initial=0) if got.shape == tensor.shape else np.inf
             if not off <= _TOLERANCE:
                 raise LidarPoseError(
                     f"the exported network's {name} is off by {off:g}, so nothing was written: report this with the "
@@ -157,17 +155,18 @@ def _people(network: PoseNet, sizes: tuple[int, ...]) -> dict[str, np.ndarray]:
     """What the network reads of random people of so many points."""
     rng = np.random.default_rng(0)
     clouds = [rng.normal(0, (0.2, 0.2, 0.5), (size, 3)) for size in sizes]
-    return network_inputs(voxelize_people(clouds, rng.normal(size=(len(sizes), 5)), network.config))
+    return voxelize_people(clouds, rng.normal(size=(len(sizes), 5)), network.config).arrays()
 
 
 def _tensors(arrays: dict[str, np.ndarray]) -> tuple[Tensor, ...]:
     return tuple(torch.as_tensor(array) for array in arrays.values())
 
 
-def _free(arrays: dict[str, np.ndarray]) -> tuple:
-    """Which axes may have any length: people, and rows of a level."""
-    free = torch.export.Dim.DYNAMIC
-    return (tuple({0: free} if name == "view" else {0: free, 1: free} for name in arrays),)
+def _axes(arrays: dict[str, np.ndarray]) -> tuple[dict[int, str], ...]:
+    """What the axes count that may have any length: people, and rows of a level."""
+    levels = [name.partition(".")[0] if "." in name else "fine" for name in arrays]
+    rows = [{0: "people", 1: f"{level}_rows"} for level in levels]
+    return tuple({0: "people"} if name == "view" else axes for name, axes in zip(arrays, rows, strict=True))
 
 
 def _pack(graph) -> None:
@@ -194,31 +193,13 @@ def _pack(graph) -> None:
     graph.node.extend(nodes)
 
 
-def _name_axes(graph, names: list[str]) -> None:
-    """Gives the free axes of an ONNX graph, which the exporter numbers, the names of what they count."""
-    called = {}
-    for name, value in zip(names, graph.input, strict=True):
-        level = name.partition(".")[0] if "." in name else "fine"
-        for axis, what in zip(value.type.tensor_type.shape.dim, ("people", f"{level}_rows"), strict=False):
-            if axis.dim_param:
-                called[axis.dim_param] = what
-    for value in [*graph.input, *graph.output]:
-        for axis in value.type.tensor_type.shape.dim:
-            if axis.dim_param:
-                axis.dim_param = called[axis.dim_param]
-
-
 @contextlib.contextmanager
 def _silence():
-    """Without what the exporter tells of its steps; errors are raised all the same."""
+    """Without what the exporter logs and warns of; errors are raised all the same."""
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
-        with (
-            warnings.catch_warnings(),
-            contextlib.redirect_stdout(io.StringIO()),
-            contextlib.redirect_stderr(io.StringIO()),
-        ):
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
     finally:

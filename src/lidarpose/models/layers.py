@@ -67,19 +67,26 @@ def key_bias(valid: Tensor, dtype: torch.dtype) -> Tensor:
     return torch.where(valid, 0.0, -1e4).to(dtype)[:, None, None, :]
 
 
-class SelfAttention(nn.Module):
-    """Multi-head self-attention of rows (B, N, C), all of a person's to all, with rotary places."""
+class Attention(nn.Module):
+    """Queries, keys, values and outputs of multi-head attention with rotary places."""
 
     frequencies: Tensor
 
-    def __init__(self, channels: int, heads: int):
+    def __init__(self, channels: int, heads: int, key_channels: int):
         super().__init__()
         self.heads = heads
         self.query = nn.Linear(channels, channels)
-        self.key = nn.Linear(channels, channels)
-        self.value = nn.Linear(channels, channels)
+        self.key = nn.Linear(key_channels, channels)
+        self.value = nn.Linear(key_channels, channels)
         self.out = nn.Linear(channels, channels)
         self.register_buffer("frequencies", head_frequencies(heads, channels // heads), persistent=False)
+
+
+class SelfAttention(Attention):
+    """Multi-head self-attention of rows (B, N, C), all of a person's to all, with rotary places."""
+
+    def __init__(self, channels: int, heads: int):
+        super().__init__(channels, heads, channels)
 
     def forward(self, rows: Tensor, places: RotaryEmbedding | None, bias: Tensor | None) -> Tensor:
         query, key, value = (
@@ -92,24 +99,16 @@ class SelfAttention(nn.Module):
         return self.out(mixed.transpose(1, 2).flatten(-2))
 
 
-class CrossAttention(nn.Module):
+class CrossAttention(Attention):
     """Attention of queries (B, J, C) to the voxels (B, K, E) of a level: by content, by place and by density.
 
     A head's weight of a voxel is multiplied by (its number of points) ** density, a learned exponent a head: 0 reads
     voxels alike, 1 reads points alike.
     """
 
-    frequencies: Tensor
-
     def __init__(self, channels: int, heads: int, key_channels: int):
-        super().__init__()
-        self.heads = heads
-        self.query = nn.Linear(channels, channels)
-        self.key = nn.Linear(key_channels, channels)
-        self.value = nn.Linear(key_channels, channels)
-        self.out = nn.Linear(channels, channels)
+        super().__init__(channels, heads, key_channels)
         self.density = nn.Parameter(torch.linspace(0, 1, heads))
-        self.register_buffer("frequencies", head_frequencies(heads, channels // heads), persistent=False)
 
     def forward(
         self,
@@ -182,8 +181,8 @@ class Exchange(nn.Module):
         log_count: Tensor,
         bias: Tensor,
     ) -> Tensor:
-        read = self.cross(self.norm_cross(anchors), believed, self.norm_voxels(voxels), places, log_count, bias)
-        anchors = anchors + read
+        voxels = self.norm_voxels(voxels)
+        anchors = anchors + self.cross(self.norm_cross(anchors), believed, voxels, places, log_count, bias)
         anchors = anchors + self.among(self.norm_self(anchors), None, None)
         return anchors + self.feed(self.norm_feed(anchors))
 
@@ -280,10 +279,9 @@ class VoteHead(nn.Module):
         """Returns vote (B, J, 3) m and the voters' mean features, (B, J, C)."""
         query = self.query(anchors) * voxels.shape[-1] ** -0.5
         weight = torch.softmax(query @ self.key(voxels).transpose(1, 2) + bias[:, 0], -1)
-        voter_features = weight @ voxels
-        return weight @ position + (voter_features[:, :, None] @ self.offset).squeeze(2) + self.residual(
-            anchors
-        ), voter_features
+        features = weight @ voxels
+        vote = weight @ position + (features[:, :, None] @ self.offset).squeeze(2) + self.residual(anchors)
+        return vote, features
 
 
 class JointHead(nn.Module):
@@ -300,7 +298,8 @@ class JointHead(nn.Module):
 
     def forward(self, anchors: Tensor, voter_features: Tensor, vote: Tensor) -> tuple[Tensor, ...]:
         """Returns heatmap (B, J, 3, W), of no bins (B, J, 1, 0); confidence, log_spread, visible (B, J)."""
-        hidden = self.hidden(torch.cat([self.norm(torch.cat([anchors, voter_features], -1)), vote.detach()], -1))
+        features = self.norm(torch.cat([anchors, voter_features], -1))
+        hidden = self.hidden(torch.cat([features, vote.detach()], -1))
         certainty = self.certainty(hidden).unbind(-1)
         if self.heatmap is None:
             return hidden[..., None, :0], *certainty

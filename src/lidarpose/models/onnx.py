@@ -29,14 +29,6 @@ OUTPUTS = ("vote", "heatmap", "part", "confidence", "log_spread", "visible")
 _MOST_THREADS = 8
 
 
-def network_inputs(pyramid: VoxelPyramid) -> dict[str, np.ndarray]:
-    """The arrays of a pyramid that a network reads, by dotted name, in the order that networks take them."""
-    arrays = pyramid.arrays()
-    # which voxel a point fell into: for who has parts to bring back to points
-    del arrays["point_voxel"]
-    return arrays
-
-
 def voxelize_people(clouds: list[np.ndarray], view: np.ndarray | None, config: NetworkConfig) -> VoxelPyramid:
     """The voxels of people's clouds (n, 3) m, each about its person's center, as `config` wants it; view (B, 5)."""
     return voxelize(
@@ -57,11 +49,8 @@ def input_name(name: str) -> str:
 
 def usable_threads() -> int:
     """Processors that this process may use, `_MOST_THREADS` at the most."""
-    try:
-        usable = len(os.sched_getaffinity(0))
-    except AttributeError:
-        # macOS and Windows cannot be asked
-        usable = os.cpu_count() or 1
+    # macOS and Windows cannot be asked
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min(usable, _MOST_THREADS)
 
 
@@ -116,16 +105,14 @@ def open_onnx(path: str | os.PathLike, *, threads: int | None = None) -> tuple[A
     header = parse_header(path, metadata.get(ENTRY))
     if not isinstance(header.config, NetworkConfig):
         raise file_error(path, f"expected a network of the kind pose, got {header.network}: use its .safetensors")
-    for what, found, due in (
-        ("input", {value.name for value in session.get_inputs()}, expected_inputs(header.config)),
-        ("output", {value.name for value in session.get_outputs()}, OUTPUTS),
+    for what, values, expected in (
+        ("input", session.get_inputs(), expected_inputs(header.config)),
+        ("output", session.get_outputs(), OUTPUTS),
     ):
-        wrong = sorted(found ^ set(due))
-        if wrong:
-            problem = "is missing" if wrong[0] in due else "is unknown"
-            raise file_error(
-                path, f"{what} {wrong[0]} {problem}: make the file anew with `lidarpose export` of this version"
-            )
+        if wrong := sorted({value.name for value in values} ^ set(expected)):
+            problem = "is missing" if wrong[0] in expected else "is unknown"
+            remedy = "make the file anew with `lidarpose export` of this version"
+            raise file_error(path, f"{what} {wrong[0]} {problem}: {remedy}")
     if not has_digest:
         warn_without_digest(path)
     return session, header, metadata.get(SOURCE, "")
@@ -161,4 +148,4 @@ def _digest(content: bytes, start: int) -> bytes:
 
 def expected_inputs(config: NetworkConfig) -> list[str]:
     """Names of an exported network's inputs."""
-    return [input_name(name) for name in network_inputs(voxelize_people([np.zeros((1, 3))], None, config))]
+    return [input_name(name) for name in voxelize_people([np.zeros((1, 3))], None, config).arrays()]

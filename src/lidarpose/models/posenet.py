@@ -5,12 +5,14 @@ Legend: B people, F / M / N rows of the fine, mid and coarse level (padded), J j
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from math import sqrt
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lidarpose.errors import InputError
 from lidarpose.models.config import BIN, NetworkConfig
 from lidarpose.models.layers import (
     PLACE_FEATURES,
@@ -26,7 +28,7 @@ from lidarpose.models.layers import (
     key_bias,
     membership,
 )
-from lidarpose.models.voxelize import VoxelLevel, VoxelPyramid
+from lidarpose.models.voxelize import VoxelLevel
 from lidarpose.skeleton import skeleton
 
 # what a fine voxel knows besides its place: offset in the cell (3), deviation (3), log counts of itself and its parents
@@ -46,12 +48,8 @@ class Batch:
     view: Tensor
 
     @classmethod
-    def from_pyramid(cls, pyramid: VoxelPyramid, device: torch.device | str = "cpu") -> "Batch":
-        return cls.from_arrays(pyramid.arrays(), device)
-
-    @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray | Tensor], device: torch.device | str = "cpu") -> "Batch":
-        """From arrays by dotted name, "fine.position"; names that a batch does not have are left out."""
+        """From `VoxelPyramid.arrays`; names that a batch does not have are left out."""
 
         def tensors(kind: type, prefix: str = "") -> dict[str, Any]:
             names = [field.name for field in fields(kind) if prefix + field.name in arrays]
@@ -73,16 +71,14 @@ class Targets:
     -1 where padded or unknown.
     """
 
-    joints: torch.Tensor
-    known: torch.Tensor
-    visible: torch.Tensor
-    part: torch.Tensor
+    joints: Tensor
+    known: Tensor
+    visible: Tensor
+    part: Tensor
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, np.ndarray], device: torch.device | str = "cpu") -> "Targets":
-        return cls(
-            **{name: torch.as_tensor(arrays[name]).to(device) for name in ("joints", "known", "visible", "part")}
-        )
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray], device: torch.device | str = "cpu") -> "Targets":
+        return cls(**{field.name: torch.as_tensor(arrays[field.name]).to(device) for field in fields(cls)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,20 +153,20 @@ class PoseNet(nn.Module):
         anchors = self.anchors + self.anchor_view(batch.view)[:, None]
         believed = RotaryEmbedding(torch.zeros_like(anchors[..., :3]))
         anchors = self.exchanges[0](anchors, believed, coarse_rows, coarse_places, coarse.log_count, coarse_bias)
-        level_joints = [self.level_joints[0](anchors)]
+        coarse_joints = self.level_joints[0](anchors)
 
         mid_rows = mid_rows + coarse_of_mid.transpose(1, 2) @ self.up_mid(coarse_rows)
         mid_rows = self.decoder(mid_rows, mid_places, mid_bias, mid.neighbors)
-        believed = RotaryEmbedding(level_joints[0].detach())
+        believed = RotaryEmbedding(coarse_joints.detach())
         anchors = self.exchanges[1](anchors, believed, mid_rows, mid_places, mid.log_count, mid_bias)
-        level_joints.append(self.level_joints[1](anchors))
+        mid_joints = self.level_joints[1](anchors)
 
         fine_rows = fine_rows + mid_of_fine.transpose(1, 2) @ self.up_fine(mid_rows)
         fine_rows = fine_rows + self.fine_feed(self.fine_norm(fine_rows))
-        believed = RotaryEmbedding(level_joints[1].detach())
+        believed = RotaryEmbedding(mid_joints.detach())
         anchors = self.exchanges[2](anchors, believed, fine_rows, fine_places, fine.log_count, fine_bias)
 
-        vote, voter_features = torch.zeros_like(level_joints[0]), anchors[..., :0]
+        vote, voter_features = torch.zeros_like(mid_joints), anchors[..., :0]
         if self.vote is not None:
             vote, voter_features = self.vote(anchors, fine_rows, fine.position, fine_bias)
         heatmap, confidence, log_spread, visible = self.joint(anchors, voter_features, vote)
@@ -181,7 +177,7 @@ class PoseNet(nn.Module):
             confidence=confidence,
             log_spread=log_spread,
             visible=visible,
-            level_joints=tuple(level_joints),
+            level_joints=(coarse_joints, mid_joints),
             has_votes=self.vote is not None,
         )
 
@@ -238,3 +234,94 @@ class _Stage(nn.Module):
                 rows = self.convolutions[k](rows, neighbors)
             rows = block(rows, places, bias)
         return rows
+
+
+# ---- a larger network that begins where a smaller one is, after Net2Net (Chen et al. 2016), by padding
+#
+# Channels that are new in a residual stream begin as the mean of the old ones: a layer norm over more channels then
+# sees the same mean, and a variance smaller by as much as its scale makes up for; what reads the stream without a norm
+# reads them by zero. Hidden units and heads that are new begin at random, and what reads them at zero; blocks and
+# convolutions that are new add nothing. What is left of the difference is the norm of the joint head, which sees two
+# streams at once: under a millimeter on average.
+
+# what must be alike for numbers to mean the same
+_SAME = ("grid", "skeleton", "parts", "heatmap", "head_channels")
+# layers that read hidden units
+_HIDDEN = ("stem.out", "attention.out", "among.out", "cross.out", "feed.2")
+# layers that write a residual stream: their new rows are the mean of the old ones
+_WRITERS = (*_HIDDEN, ".mix", ".place", "up_mid", "up_fine", "anchor_view")
+# layers that read hidden units, and those that read a stream without a norm: their new columns are zero
+_READERS = (
+    *(*_HIDDEN, "joint.hidden.0", "joint.heatmap", "joint.certainty", "up_mid", "up_fine", "level_joints.0"),
+    *("level_joints.1", "vote.query", "vote.key", "vote.residual", "part"),
+)
+
+
+def expand_weights(network: PoseNet, config: NetworkConfig) -> PoseNet:
+    """A network of `config`, in training mode, that answers nearly as `network` does; of the same depth and width, the
+    same. What is drawn comes from torch's global generator. Raises InputError, one line, where `config` is narrower or
+    shallower, or of another grid, skeleton, heatmap, width of heads or of convolutions.
+    """
+    small = network.config
+    # convolutions where there are none add nothing, as new blocks
+    same = (*_SAME, "convolution") if small.convolution else _SAME
+    for name in ("channels", "blocks", *same):
+        old, new = getattr(small, name), getattr(config, name)
+        shrinks = name not in same and any(b < a for a, b in zip(old, new, strict=True))
+        if shrinks or name in same and new != old:
+            raise InputError(
+                f"a {config.size} network cannot begin as this {small.size} one: {name} is {new!r}, there {old!r}"
+                f"{', and none may shrink' if shrinks else ''}"
+            )
+    larger = PoseNet(config)
+    learned = network.state_dict()
+    state = larger.state_dict()
+    for name, value in state.items():
+        if name in learned:
+            state[name] = _padded(name, learned[name], value, network, larger)
+        elif name.rpartition(".")[0].endswith(_WRITERS):
+            # of a new block: it adds nothing to what goes through it
+            state[name] = torch.zeros_like(value)
+    larger.load_state_dict(state)
+    return larger.train()
+
+
+def _padded(name: str, old: Tensor, new: Tensor, small: PoseNet, larger: PoseNet) -> Tensor:
+    """The old tensor in the larger one's shape; what is new of it as it was drawn, zero, or the mean of a stream."""
+    layer, _, entry = name.rpartition(".")
+    out = new.clone()
+    if name in ("anchors", "vote.offset"):
+        out[:] = old.mean(1, keepdim=True) if name == "anchors" else 0
+        out[:, : old.shape[1]] = old
+        return out
+    if "norm" in layer:
+        # the mean square over more channels is smaller by as much
+        value = old * sqrt(len(old) / len(new)) if entry == "weight" else old
+        out[_places(small, larger)[: len(old)] if layer == "joint.norm" else torch.arange(len(old))] = value
+        return out
+    if layer == "vote.query":
+        # its products are divided by the root of the width
+        old = old * sqrt(len(new) / len(old))
+    if layer.endswith(_WRITERS):
+        old = torch.cat([old, old.mean(0, keepdim=True).expand(len(new) - len(old), *old.shape[1:])])
+    elif layer == "vote.key":
+        out[len(old) :] = 0
+    if old.ndim == 1:
+        out[: len(old)] = old
+        return out
+    columns = _places(small, larger) if layer == "joint.hidden.0" else torch.arange(old.shape[1])
+    if layer.endswith(_READERS):
+        fresh = torch.ones(new.shape[1], dtype=torch.bool)
+        fresh[columns] = False
+        out[:, fresh] = 0
+    out[: len(old), columns] = old
+    return out
+
+
+def _places(small: PoseNet, larger: PoseNet) -> Tensor:
+    """Where the joint head's old inputs lie among the new ones: the anchors', the voters', and the vote."""
+    (voters, width), (more_voters, wider) = (
+        (net.config.channels[0] if net.vote is not None else 0, net.config.channels[1]) for net in (small, larger)
+    )
+    starts = ((0, width), (wider, voters), (wider + more_voters, 3))
+    return torch.cat([torch.arange(start, start + count) for start, count in starts])

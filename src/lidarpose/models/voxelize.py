@@ -20,6 +20,8 @@ Array = TypeVar("Array")
 WINDOW = 2.0
 # bits an axis of a voxel index: 2 * WINDOW / 0.04 m < 2 ** 7
 _BITS = 8
+# the cell at the person's center
+_HALF = 1 << (_BITS - 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,16 +59,13 @@ class VoxelPyramid:
     point_voxel: np.ndarray
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The arrays by dotted name ("fine.position"), for tensors, ONNX inputs and tests."""
-        out: dict[str, np.ndarray] = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, VoxelLevel):
-                tables = {f"{field.name}.{f.name}": getattr(value, f.name) for f in fields(value)}
-                out |= {name: table for name, table in tables.items() if table is not None}
-            else:
-                out[field.name] = value
-        return out
+        """What a network reads, by dotted name ("fine.position"): all but `point_voxel`."""
+        arrays = {}
+        for name in ("fine", "mid", "coarse"):
+            level = getattr(self, name)
+            arrays |= {f"{name}.{f.name}": getattr(level, f.name) for f in fields(VoxelLevel)}
+        arrays |= {"deviation": self.deviation, "offset": self.offset, "view": self.view}
+        return {name: array for name, array in arrays.items() if array is not None}
 
 
 def voxelize(
@@ -96,27 +95,27 @@ def voxelize(
 
     Raises InputError for a grid too fine for the voxel index.
     """
-    if WINDOW / grid > 1 << (_BITS - 1):
-        raise InputError(f"grid must be at least {WINDOW / (1 << (_BITS - 1)):.4f} m, got {grid}")
-    people = len(lengths)
+    if WINDOW / grid > _HALF:
+        raise InputError(f"grid must be at least {WINDOW / _HALF:.4f} m, got {grid}")
+    lengths = np.asarray(lengths)
     kept, key, voxel_of_point, count = _fine_voxels(points, lengths, grid, max_voxels, seeds)
     xyz = points[kept].astype(np.float64)
     mean = _segment_sum(voxel_of_point, xyz, len(key)) / count[:, None]
     square = _segment_sum(voxel_of_point, xyz**2, len(key)) / count[:, None]
     deviation = np.sqrt(np.maximum(square - mean**2, 0))
     # from the voxel's own cell: a mean on its border may round into the next one
-    offset = mean / grid - _cells(key) - 0.5
+    offset = mean / grid - (np.stack(_axes(key), 1) - _HALF) - 0.5
 
-    levels, slots = _levels(key, mean, count, people, neighbors)
+    (fine, mid, coarse), slots = _levels(key, mean, count, len(lengths), neighbors)
     point_voxel = np.full(len(points), -1)
     point_voxel[kept] = slots.row[voxel_of_point]
     return VoxelPyramid(
-        fine=levels[0],
-        mid=levels[1],
-        coarse=levels[2],
+        fine=fine,
+        mid=mid,
+        coarse=coarse,
         deviation=slots.pad(deviation.astype(np.float32)),
         offset=slots.pad(offset.astype(np.float32)),
-        view=np.zeros((people, 5), np.float32) if view is None else view.astype(np.float32),
+        view=np.zeros((len(lengths), 5), np.float32) if view is None else view.astype(np.float32),
         point_voxel=point_voxel,
     )
 
@@ -151,90 +150,76 @@ def _fine_voxels(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Indices (K,) of the points that count, sorted keys (V,) of their voxels, the voxel (K,) of each point, and how
     many points (V,) each voxel has."""
-    people = len(lengths)
-    kept = np.flatnonzero((np.abs(points) < WINDOW).all(1))
-    person = np.repeat(np.arange(people), lengths)[kept]
-    cell = np.floor(points[kept] / grid).astype(np.int64) + (1 << (_BITS - 1))
-    key = ((person << _BITS | cell[:, 0]) << _BITS | cell[:, 1]) << _BITS | cell[:, 2]
-    voxel_key, voxel_of_point, count = np.unique(key, return_inverse=True, return_counts=True)
-    chosen = _thin(voxel_key >> (3 * _BITS), people, most, seeds)
-    if chosen is None:
-        return kept, voxel_key, voxel_of_point, count
-    number = np.full(len(voxel_key), -1)
+    near = np.flatnonzero((np.abs(points) < WINDOW).all(1))
+    person = np.repeat(np.arange(len(lengths)), lengths)[near]
+    x, y, z = np.floor(points[near] / grid).astype(np.int64).T + _HALF
+    key, voxel, count = np.unique(_key(person, x, y, z), return_inverse=True, return_counts=True)
+    voxels = np.bincount(key >> (3 * _BITS), minlength=len(lengths))
+    if voxels.max(initial=0) <= most:
+        return near, key, voxel, count
+    start = np.cumsum(voxels) - voxels
+    chosen = np.concatenate([start[b] + _thinned(n, most, seeds, b) for b, n in enumerate(voxels)])
+    number = np.full(len(key), -1)
     number[chosen] = np.arange(len(chosen))
-    voxel_of_point = number[voxel_of_point]
-    left = voxel_of_point >= 0
-    return kept[left], voxel_key[chosen], voxel_of_point[left], count[chosen]
+    voxel = number[voxel]
+    left = voxel >= 0
+    return near[left], key[chosen], voxel[left], count[chosen]
+
+
+def _thinned(voxels: int, most: int, seeds: np.ndarray | None, person: int) -> np.ndarray:
+    """Which of a person's voxels to keep, in order."""
+    if voxels <= most:
+        return np.arange(voxels)
+    if seeds is None:
+        return np.arange(most) * voxels // most
+    return np.sort(np.random.default_rng(seeds[person]).choice(voxels, most, replace=False))
 
 
 def _levels(
     key: np.ndarray, mean: np.ndarray, count: np.ndarray, people: int, neighbors: bool
 ) -> tuple[list[VoxelLevel], _Slots]:
     """The three levels over fine voxels of sorted keys (V,), and where the fine ones lie."""
-    keys, means, counts, parents = [key], [mean], [count], []
-    total = mean * count[:, None]
-    for _ in range(2):
-        key, parent = np.unique(_parent(keys[-1]), return_inverse=True)
-        total = _segment_sum(parent, total, len(key))
-        keys.append(key)
-        counts.append(np.bincount(parent, counts[-1], len(key)))
-        means.append(total / counts[-1][:, None])
-        parents.append(parent)
-    slots = [_Slots(key >> (3 * _BITS), people) for key in keys]
-    levels = []
-    for k, own in enumerate(slots):
-        parent = slots[k + 1].slot[parents[k]] if k < 2 else np.zeros(len(keys[k]), np.int64)
-        near = own.pad(_neighbors(keys[k], own), own.shape[1]) if neighbors and k > 0 else None
+    levels, fine = [], _Slots(key >> (3 * _BITS), people)
+    own, total = fine, mean * count[:, None]
+    for level in range(3):
+        last = level == 2
+        # where it has a parent, and where it stands among its person's
+        x, y, z = _axes(key)
+        wider, parent = np.unique(_key(key >> (3 * _BITS), x >> 1, y >> 1, z >> 1), return_inverse=True)
+        above = _Slots(wider >> (3 * _BITS), people)
         levels.append(
             VoxelLevel(
-                position=own.pad(means[k].astype(np.float32)),
-                log_count=own.pad(np.log(counts[k]).astype(np.float32)),
-                valid=own.pad(np.ones(len(keys[k]), bool)),
-                parent=own.pad(parent),
-                neighbors=near,
+                position=own.pad(mean.astype(np.float32)),
+                log_count=own.pad(np.log(count).astype(np.float32)),
+                valid=own.pad(np.ones(len(key), bool)),
+                parent=own.pad(np.zeros_like(parent) if last else above.slot[parent]),
+                neighbors=own.pad(_neighbors(key, own), own.shape[1]) if neighbors and level else None,
             )
         )
-    return levels, slots[0]
+        total, count = _segment_sum(parent, total, len(wider)), np.bincount(parent, count, len(wider))
+        key, own, mean = wider, above, total / count[:, None]
+    return levels, fine
 
 
-def _cells(key: np.ndarray) -> np.ndarray:
-    """(V, 3) int: the cell of each fine voxel, that of the origin's corner being 0."""
-    return np.stack([key >> shift & (1 << _BITS) - 1 for shift in (2 * _BITS, _BITS, 0)], 1) - (1 << (_BITS - 1))
+def _key(person: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """One number for each cell of each person, in their order."""
+    return ((person << _BITS | x) << _BITS | y) << _BITS | z
+
+
+def _axes(key: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """x, y and z of `_key`."""
+    last = (1 << _BITS) - 1
+    return key >> (2 * _BITS) & last, key >> _BITS & last, key & last
 
 
 def _neighbors(key: np.ndarray, slots: _Slots) -> np.ndarray:
     """(V, 27) int: slots of the voxels around each, x slowest; the padded width where there is none."""
     # cells reach neither end of their bits: no step runs over into another axis
-    steps = np.array([[-1], [0], [1]]) * np.array([1 << (2 * _BITS), 1 << _BITS, 1])
-    wanted = key[:, None] + (steps[:, None, None, 0] + steps[:, None, 1] + steps[:, 2]).ravel()
+    steps = _key(np.zeros(1, np.int64), *np.mgrid[:3, :3, :3].reshape(3, 27)) - _key(*np.array([0, 1, 1, 1]))
+    wanted = key[:, None] + steps
     place = np.minimum(np.searchsorted(key, wanted), max(len(key) - 1, 0))
     return np.where(key[place] == wanted, slots.slot[place], slots.shape[1]) if len(key) else wanted
 
 
-def _parent(key: np.ndarray) -> np.ndarray:
-    """Keys of voxels twice as wide: every axis' index shifted right by one, the person kept."""
-    axis = (1 << _BITS) - 1
-    x, y, z = key >> (2 * _BITS) & axis, key >> _BITS & axis, key & axis
-    return ((key >> (3 * _BITS) << _BITS | x >> 1) << _BITS | y >> 1) << _BITS | z >> 1
-
-
 def _segment_sum(segment: np.ndarray, values: np.ndarray, size: int) -> np.ndarray:
     return np.stack([np.bincount(segment, values[:, k], size) for k in range(values.shape[1])], 1)
-
-
-def _thin(person: np.ndarray, people: int, most: int, seeds: np.ndarray | None) -> np.ndarray | None:
-    """Indices of the voxels to keep, in order, or None where nobody has more than `most`."""
-    lengths = np.bincount(person, minlength=people)
-    if lengths.max(initial=0) <= most:
-        return None
-    start = np.cumsum(lengths) - lengths
-    keep = []
-    for b in range(people):
-        if lengths[b] <= most:
-            pick = np.arange(lengths[b])
-        elif seeds is None:
-            pick = np.arange(most) * lengths[b] // most
-        else:
-            pick = np.sort(np.random.default_rng(seeds[b]).choice(lengths[b], most, replace=False))
-        keep.append(start[b] + pick)
-    return np.concatenate(keep)

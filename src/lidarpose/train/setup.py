@@ -18,8 +18,7 @@ from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.config import SIZES, NetworkConfig, preset
 from lidarpose.models.dapt.dapt_config import CONFIGS
 from lidarpose.models.dapt.dapt_net import DaptNet
-from lidarpose.models.expand import expand_weights
-from lidarpose.models.posenet import PoseNet
+from lidarpose.models.posenet import PoseNet, expand_weights
 from lidarpose.skeleton import HUMAN15, SMPL24, Skeleton, skeleton
 from lidarpose.train.augment import Augmentation, Example, augmentation, augmented
 from lidarpose.train.data_loader import MixedSource, Source, StoredSource, SyntheticSource

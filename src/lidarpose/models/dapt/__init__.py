@@ -1,4 +1,4 @@
 """The paper's own network, DAPT, in plain torch: it loads the released weights and trains anew.
 
-`config` sizes and names, `curves` and `tables` numpy only, `layers` and `network` torch, `released` the authors' files.
+`dapt_config`: sizes and names; `voxel_tables`: numpy only; `dapt_net`: torch; `import_weights`: the authors' files.
 """

@@ -4,12 +4,12 @@ Legend: L levels (0 = the finest), J joints, W heatmap bins an axis.
 """
 
 from dataclasses import asdict, dataclass, fields
+from typing import ClassVar
 
 import numpy as np
 
-from lidarpose.errors import InputError, check_name
-from lidarpose.models.config import MOST
-from lidarpose.models.dapt.space_filling_curves import CURVES
+from lidarpose.errors import InputError, check_int, check_name
+from lidarpose.models.config import MOST, check_counts, check_grid, is_number
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, Skeleton
 
 # the order in which the released Waymo network knows its joints: Waymo's own numbers, limb after limb
@@ -19,6 +19,8 @@ WAYMO_JOINTS = tuple(
 )
 # SMPL's 24 parts and 0 = not body
 PARTS = 25
+# space-filling curves, see `voxel_tables`
+CURVES = ("z", "z-trans", "hilbert", "hilbert-trans")
 # cells are counted in so many bits along each axis
 CELL_BITS = 16
 
@@ -37,8 +39,10 @@ class DaptConfig:
     than `patch` voxels; drop_path: the last block's; parts: classes of the part head, 0 for no such head; coordinates:
     a head that reads x, y, z off each anchor (the paper's pre-training); auxiliary: a head that reads all joints off
     the bottleneck (the released fine-tuning); legacy: True for the released weights, which need the data flow that they
-    were trained with (see `network`).
+    were trained with (see `dapt_net`).
     """
+
+    kind: ClassVar[str] = "dapt"
 
     name: str
     joints: tuple[str, ...]
@@ -57,7 +61,7 @@ class DaptConfig:
     patch: int = 1024
     grid: float = 0.01
     strides: tuple[int, ...] = (2, 2, 2, 2)
-    orders: tuple[str, ...] = ("z", "z-trans", "hilbert", "hilbert-trans")
+    orders: tuple[str, ...] = CURVES
     drop_path: float = 0.3
     parts: int = 0
     coordinates: bool = False
@@ -70,42 +74,34 @@ class DaptConfig:
             if isinstance(value, list):
                 value = tuple(tuple(x) if isinstance(x, list) else x for x in value)
                 object.__setattr__(self, field.name, value)
-        self._check_sizes()
-        self._check_heads()
-
-    def _check_sizes(self) -> None:
         levels = len(self.encoder_depths) if isinstance(self.encoder_depths, tuple) else 0
-        lengths = {"encoder_channels": levels, "encoder_heads": levels, "anchor_channels": levels}
+        lengths = {"encoder_depths": max(levels, 2)}
+        lengths |= dict.fromkeys(("encoder_channels", "encoder_heads", "anchor_channels"), levels)
         lengths |= dict.fromkeys(("decoder_depths", "decoder_channels", "decoder_heads", "strides"), levels - 1)
-        for name, length in ({"encoder_depths": max(levels, 2)} | lengths).items():
-            value = getattr(self, name)
-            if not isinstance(value, tuple) or len(value) != length or not all(map(_is_count, value)):
-                raise InputError(
-                    f"{name} must be {length} whole numbers from 1 to {MOST} (encoder_depths has {levels}), "
-                    f"got {value!r}"
-                )
+        for name, length in lengths.items():
+            counts = check_counts(name, getattr(self, name), length, levels=f" (encoder_depths has {levels})")
+            object.__setattr__(self, name, counts)
         for name in ("anchor_heads", "mlp_ratio", "patch"):
-            if not _is_count(getattr(self, name)):
-                raise InputError(f"{name} must be a whole number from 1 to {MOST}, got {getattr(self, name)!r}")
+            object.__setattr__(self, name, check_int(name, getattr(self, name), least=1, most=MOST))
         if not set(self.strides) <= {2, 4, 8} or np.prod(self.strides, dtype=float) > 1 << CELL_BITS:
             raise InputError(f"strides must be 2, 4 or 8 each and {1 << CELL_BITS} in all at most, got {self.strides}")
-        for part in ("encoder", "decoder"):
-            widths, heads = getattr(self, f"{part}_channels"), getattr(self, f"{part}_heads")
-            if any(c % h for c, h in zip(widths, heads, strict=True)):
-                raise InputError(f"{part}_channels must divide by {part}_heads, got {widths} and {heads}")
-        if any(c % self.anchor_heads for c in self.decoder_channels):
-            raise InputError(
-                f"decoder_channels must divide by anchor_heads, got {self.decoder_channels} and {self.anchor_heads}"
-            )
-        if not (_is_number(self.grid) and self.grid > 0):
-            raise InputError(f"grid must be a positive number of meters, got {self.grid!r}")
+        anchor_heads = (self.anchor_heads,) * len(self.decoder_channels)
+        for widths, heads, of, by in (
+            (self.encoder_channels, self.encoder_heads, "encoder_channels", "encoder_heads"),
+            (self.decoder_channels, self.decoder_heads, "decoder_channels", "decoder_heads"),
+            (self.decoder_channels, anchor_heads, "decoder_channels", "anchor_heads"),
+        ):
+            if any(width % number for width, number in zip(widths, heads, strict=True)):
+                raise InputError(f"{of} must divide by {by}, got {widths} and {getattr(self, by)}")
+        check_grid(self.grid)
         for name in ("drop_path", "anchor_dropout"):
-            if not (_is_number(getattr(self, name)) and 0 <= getattr(self, name) < 1):
+            if not (is_number(getattr(self, name)) and 0 <= getattr(self, name) < 1):
                 raise InputError(f"{name} must be a probability below 1, got {getattr(self, name)!r}")
         if not self.orders:
             raise InputError(f"orders must name at least one curve of {', '.join(CURVES)}, got none")
         for order in self.orders:
             check_name("curve", order, CURVES)
+        self._check_heads()
 
     def _check_heads(self) -> None:
         if not isinstance(self.joints, tuple) or not self.joints or len(set(self.joints)) != len(self.joints):
@@ -113,16 +109,13 @@ class DaptConfig:
         for joint in self.joints:
             BODY26.index(joint)
         if self.bins or self.ranges:
-            if not isinstance(self.bins, tuple) or len(self.bins) != 3 or not all(map(_is_count, self.bins)):
-                raise InputError(
-                    f"bins must be three whole numbers (x, y, z) from 1 to {MOST}, or none, got {self.bins!r}"
-                )
+            check_counts("bins", self.bins, 3, levels=" (x, y, z)")
             if not isinstance(self.ranges, tuple) or len(self.ranges) != 3 or not all(map(_is_range, self.ranges)):
                 raise InputError(f"ranges must be three pairs (low, high) of meters, or none, got {self.ranges!r}")
         elif not self.coordinates:
             raise InputError("a network needs heatmaps (bins and ranges) or coordinates=True: it would predict nothing")
-        if not isinstance(self.parts, int) or not 0 <= self.parts <= MOST or self.parts == 1:
-            raise InputError(f"parts must be 0 (no part head) or from 2 to {MOST}, got {self.parts!r}")
+        if check_int("parts", self.parts, least=0, most=MOST) == 1:
+            raise InputError(f"parts must be 0 (no part head) or from 2 to {MOST}, got 1")
         for name in ("coordinates", "auxiliary", "legacy"):
             if not isinstance(getattr(self, name), bool):
                 raise InputError(f"{name} must be true or false, got {getattr(self, name)!r}")
@@ -180,16 +173,8 @@ class DaptConfig:
         return cls(**entries)
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _is_count(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= MOST
-
-
 def _is_range(value: object) -> bool:
-    return isinstance(value, tuple) and len(value) == 2 and all(map(_is_number, value)) and value[0] < value[1]
+    return isinstance(value, tuple) and len(value) == 2 and all(map(is_number, value)) and value[0] < value[1]
 
 
 # the authors' names of what this package names otherwise
@@ -219,37 +204,35 @@ _FIXED = {
     "pdnorm_bn": False,
     "pdnorm_ln": False,
 }
-_JOINTS_BY_COUNT = {len(joints): joints for joints in (WAYMO_JOINTS, HUMAN15.joints, SMPL24.joints)}
-
-
-def _several(entries: dict, name: str) -> tuple:
-    value = entries.get(name, [1024])
-    return tuple(value) if isinstance(value, list | tuple) else (value,)
+_JOINTS = (WAYMO_JOINTS, HUMAN15.joints, SMPL24.joints)
 
 
 def _from_reference(entries: dict) -> dict:
+    """Settings of a `DaptConfig` from the constructor arguments of the authors' backbone."""
     for name, value in _FIXED.items():
         if entries.get(name, value) != value:
             raise InputError(f"{name} must be {value!r} for the paper's network, got {entries[name]!r}")
-    patches = {*_several(entries, "enc_patch_size"), *_several(entries, "dec_patch_size")}
+    sizes = [entries.get(name, 1024) for name in ("enc_patch_size", "dec_patch_size")]
+    patches = {patch for size in sizes for patch in (size if isinstance(size, list | tuple) else [size])}
     if len(patches) != 1:
         raise InputError(f"enc_patch_size and dec_patch_size must be one number throughout, got {sorted(patches)}")
-    out = {ours: entries[theirs] for theirs, ours in _REFERENCE.items() if theirs in entries}
+    settings = {ours: entries[theirs] for theirs, ours in _REFERENCE.items() if theirs in entries}
     count = entries.get("num_keypoints", 14)
-    if not _is_count(count) or "joints" not in entries and count not in _JOINTS_BY_COUNT:
+    joints = entries.get("joints", next((names for names in _JOINTS if len(names) == count), None))
+    if not isinstance(count, int) or joints is None:
         raise InputError(f"num_keypoints must be 14, 15 or 24 where no joints are named, got {count!r}: add 'joints'")
-    out |= {"joints": _JOINTS_BY_COUNT.get(count), "patch": patches.pop(), "legacy": True}
+    settings |= {"joints": joints, "patch": patches.pop(), "legacy": True}
     heatmaps = entries.get("grid")
     if heatmaps is None:
-        out |= {"name": "pretrain", "coordinates": True, "parts": PARTS}
+        settings |= {"name": "pretrain", "coordinates": True, "parts": PARTS}
     else:
         try:
-            out |= {"name": "released", "auxiliary": True, "bins": heatmaps["size"], "ranges": heatmaps["range"]}
+            settings |= {"bins": heatmaps["size"], "ranges": heatmaps["range"], "name": "released", "auxiliary": True}
         except (KeyError, TypeError):
             raise InputError(f"grid must be {{'size': ..., 'range': ...}} of the heatmaps, got {heatmaps!r}") from None
     # what their arguments do not say
-    ours = ("name", "joints", "parts", "coordinates", "auxiliary", "legacy")
-    return out | {name: entries[name] for name in ours if name in entries}
+    ours = ("name", "parts", "coordinates", "auxiliary", "legacy")
+    return settings | {name: entries[name] for name in ours if name in entries}
 
 
 def _released(name: str, joints: tuple[str, ...], bins: tuple[int, int], reach: Range) -> DaptConfig:

@@ -1,6 +1,9 @@
 """`DaptNet`: the paper's network. A Point Transformer V3 U-Net whose decoder feeds joint anchors, level by level.
 
-Legend: B people, M voxels of all people at level 0, J joints, C channels, A anchor channels, W heatmap bins, P parts.
+Legend: B people, M voxels of all people at a level, one after the other, N voxels a person at most, J joints, C
+channels, A anchor channels, W heatmap bins, P parts, Q patches, K voxels a patch at most, H heads, D channels a head.
+
+Modules bear the names of the released weights, so that these load by name.
 
 The legacy switch. In the released code a sparse tensor is not brought up to date after each block and each unpooling:
 the convolution of every later block reads the block's last branch instead of the sum, and the first one of a decoder
@@ -17,38 +20,242 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lidarpose.errors import InputError
-from lidarpose.models.dapt.blocks import (
-    Block,
-    Exchange,
-    Perceptron,
-    Pooling,
-    RowNorm,
-    Stage,
-    SubmanifoldConvolution,
-    Unpooling,
-)
 from lidarpose.models.dapt.dapt_config import DaptConfig
 from lidarpose.models.dapt.voxel_tables import Level, Neighbors, Tables, build_tables
 from lidarpose.models.layers import mean_bin
 
+# of the released code's batch norms
+_EPS, _MOMENTUM = 1e-3, 0.01
 
-@dataclass(frozen=True, kw_only=True)
-class DaptBatch:
-    """What the network reads of `Tables`, as tensors."""
 
-    features: Tensor
-    stem: Neighbors[Tensor]
-    levels: tuple[Level[Tensor], ...]
+class RowNorm(nn.BatchNorm1d):
+    """Batch norm over rows (M, C); one row alone has no variance and is normed by the running statistics."""
 
-    @classmethod
-    def from_tables(
-        cls, tables: Tables, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
-    ) -> "DaptBatch":
-        return cls(
-            features=torch.as_tensor(tables.features).to(device, dtype),
-            stem=_to_tensors(tables.stem, device),
-            levels=_to_tensors(tables.levels, device),
+    def __init__(self, channels: int, eps: float = _EPS, momentum: float = _MOMENTUM):
+        super().__init__(channels, eps=eps, momentum=momentum)
+
+    def forward(self, rows: Tensor) -> Tensor:
+        if self.training and rows.shape[0] > 1:
+            return super().forward(rows)
+        return F.batch_norm(rows, self.running_mean, self.running_var, self.weight, self.bias, eps=self.eps)
+
+
+class DropPath(nn.Module):
+    """In training drops a branch of each row with a probability, and scales the others up to keep the mean."""
+
+    def __init__(self, probability: float):
+        super().__init__()
+        self.probability = probability
+
+    def forward(self, rows: Tensor) -> Tensor:
+        if not self.training or self.probability == 0:
+            return rows
+        keep = 1 - self.probability
+        return rows * (torch.rand_like(rows[:, :1]) < keep) / keep
+
+
+class SubmanifoldConvolution(nn.Module):
+    """A convolution that computes at occupied cells only and reads occupied cells only.
+
+    out[p] = sum over taps k of weight[:, k] @ rows[p + k - middle] + bias. weight (C', k, k, k, C) over x, y, z.
+    """
+
+    def __init__(self, channels: int, out_channels: int, kernel: int, *, bias: bool):
+        super().__init__()
+        self.weight = nn.Parameter(torch.empty(out_channels, kernel, kernel, kernel, channels))
+        self.bias = nn.Parameter(torch.zeros(out_channels)) if bias else None
+        bound = (kernel**3 * channels) ** -0.5
+        nn.init.uniform_(self.weight, -bound, bound)
+
+    def forward(self, rows: Tensor, near: Neighbors[Tensor]) -> Tensor:
+        """rows (M, C) -> (M, C')."""
+        # unbound once: slicing tap after tap would give each slice's gradient the size of the whole weight
+        weights = self.weight.flatten(1, 3).unbind(1)
+        out = F.linear(rows, weights[len(weights) // 2], self.bias)
+        if near.table is not None:
+            # the row after the last is zero: an empty cell; the table has none for the middle tap, done above
+            read = F.pad(rows, (0, 0, 0, 1))[near.table.flatten()].view(rows.shape[0], -1)
+            return out + F.linear(read, self.weight.flatten(1))
+        # all set where there is no table
+        all_sources, all_targets, pairs = cast("tuple[Tensor, Tensor, Tensor]", (near.source, near.target, near.counts))
+        counts = pairs.tolist()
+        for weight, source, target in zip(weights, all_sources.split(counts), all_targets.split(counts), strict=True):
+            if source.shape[0]:
+                out = out.index_add_(0, target, F.linear(rows.index_select(0, source), weight))
+        return out
+
+
+class PatchAttention(nn.Module):
+    """Attention among the voxels of a patch: full attention of a person who is no larger than the patch."""
+
+    def __init__(self, channels: int, heads: int):
+        super().__init__()
+        self.heads = heads
+        self.qkv = nn.Linear(channels, 3 * channels)
+        self.proj = nn.Linear(channels, channels)
+
+    def forward(self, rows: Tensor, level: Level[Tensor], order: int) -> Tensor:
+        """rows (M, C) -> (M, C), patches along the `order`-th curve."""
+        qkv = self.qkv(rows)
+        if level.patch_slots is not None:
+            order = order % level.patch_slots.shape[0]
+            blocks = qkv[level.patch_slots[order]].unflatten(-1, (3, self.heads, -1))
+            # set with the slots
+            place = cast("Tensor", level.patch_place)[order]
+            mixed = self._attend(blocks, level.patch_valid).flatten(0, 1)[place]
+            return self.proj(mixed)
+        sequence = level.sequence[order % level.sequence.shape[0]]
+        # one curve alone: rows already stand patch after patch
+        is_sorted = level.sequence.shape[0] == 1
+        qkv = (qkv if is_sorted else qkv[sequence]).unflatten(-1, (3, self.heads, -1))
+        lengths = level.patch_lengths.tolist()
+        if len(set(lengths)) == 1:
+            mixed = self._attend(qkv.unflatten(0, (len(lengths), -1)), None).flatten(0, 1)
+        else:
+            mixed = torch.cat([self._attend(patch[None], None)[0] for patch in qkv.split(lengths)])
+        return self.proj(mixed if is_sorted else torch.empty_like(mixed).index_copy(0, sequence, mixed))
+
+    @staticmethod
+    def _attend(qkv: Tensor, mask: Tensor | None) -> Tensor:
+        """qkv (Q, K, 3, H, D), mask (Q, K) True = to be read, None for all -> (Q, K, H * D)."""
+        query, key, value = qkv.permute(2, 0, 3, 1, 4)
+        mask = None if mask is None else mask[:, None, None]
+        mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=mask)
+        return mixed.transpose(1, 2).flatten(2)
+
+
+class Perceptron(nn.Module):
+    """Linear, GELU, Linear."""
+
+    def __init__(self, channels: int, hidden: int, out_channels: int):
+        super().__init__()
+        self.fc1 = nn.Linear(channels, hidden)
+        self.fc2 = nn.Linear(hidden, out_channels)
+
+    def forward(self, rows: Tensor) -> Tensor:
+        return self.fc2(F.gelu(self.fc1(rows)))
+
+
+class Block(nn.Module):
+    """Convolution as position encoding, attention and feed-forward, each a residual branch; pre-norm.
+
+    The released code loses the sum at a block's end: the next block's convolution reads the last branch alone. `legacy`
+    does the same.
+    """
+
+    def __init__(self, channels: int, heads: int, mlp_ratio: int, drop_path: float, order: int):
+        super().__init__()
+        self.order = order
+        self.cpe = nn.Sequential(
+            SubmanifoldConvolution(channels, channels, 3, bias=True),
+            nn.Linear(channels, channels),
+            nn.LayerNorm(channels),
         )
+        self.norm1 = nn.Sequential(nn.LayerNorm(channels))
+        self.attn = PatchAttention(channels, heads)
+        self.norm2 = nn.Sequential(nn.LayerNorm(channels))
+        self.mlp = nn.Sequential(Perceptron(channels, mlp_ratio * channels, channels))
+        self.drop_path = DropPath(drop_path)
+
+    def forward(self, rows: Tensor, stale: Tensor, level: Level) -> tuple[Tensor, Tensor]:
+        """rows (M, C) and what the convolution reads (M, C): the rows, or the stale branch -> rows, last branch."""
+        convolution, mix, norm = self.cpe
+        rows = rows + norm(mix(convolution(stale, level.near)))
+        rows = rows + self.drop_path(self.attn(self.norm1(rows), level, self.order))
+        branch = self.drop_path(self.mlp(self.norm2(rows)))
+        return rows + branch, branch
+
+
+class Stage(nn.Module):
+    """The blocks of one level and the way to it: `down` from the finer level or `up` from the coarser one.
+
+    drops: `DropPath` of each block; finer: channels of the level to pool; coarser: channels of the level to unpool and
+    of the encoder's rows of this one.
+    """
+
+    def __init__(
+        self,
+        channels: int,
+        heads: int,
+        mlp_ratio: int,
+        drops: list[float],
+        *,
+        finer: int = 0,
+        coarser: tuple[int, int] | None = None,
+    ):
+        super().__init__()
+        self.depth = len(drops)
+        blocks = [Block(channels, heads, mlp_ratio, drop, order) for order, drop in enumerate(drops)]
+        if finer:
+            self.down = Pooling(finer, channels)
+        if coarser is not None:
+            self.up = Unpooling(*coarser, channels)
+        for k, block in enumerate(blocks):
+            self.add_module(f"block{k}", block)
+
+    def blocks(self, rows: Tensor, stale: Tensor, level: Level, *, legacy: bool) -> Tensor:
+        """rows (M, C) -> (M, C); `stale` is what the first convolution reads in the legacy flow."""
+        for k in range(self.depth):
+            block = getattr(self, f"block{k}")
+            rows, stale = block(rows, stale if legacy else rows, level)
+        return rows
+
+
+class Pooling(nn.Module):
+    """Rows of a level to the voxels of the next: Linear, the maximum of the children, norm, GELU."""
+
+    def __init__(self, channels: int, out_channels: int):
+        super().__init__()
+        self.proj = nn.Linear(channels, out_channels)
+        self.norm = nn.Sequential(RowNorm(out_channels))
+
+    def forward(self, rows: Tensor, children: Tensor) -> Tensor:
+        return F.gelu(self.norm(self.proj(rows)[children].amax(1)))
+
+
+class Unpooling(nn.Module):
+    """Rows of the coarser level, brought to their children, plus the encoder's rows of this level."""
+
+    def __init__(self, channels: int, skip_channels: int, out_channels: int):
+        super().__init__()
+        self.proj = nn.Sequential(nn.Linear(channels, out_channels), RowNorm(out_channels), nn.GELU())
+        self.proj_skip = nn.Sequential(nn.Linear(skip_channels, out_channels), RowNorm(out_channels), nn.GELU())
+
+    def forward(self, coarse: Tensor, skip: Tensor, parent: Tensor) -> tuple[Tensor, Tensor]:
+        """The sum (M, C), and the skip alone, which is what the released code's first convolution reads."""
+        skip = self.proj_skip(skip)
+        return skip + self.proj(coarse)[parent], skip
+
+
+class Exchange(nn.Module):
+    """Multi-density exchange: anchors (B, J, A) look at each other, then at the voxels of one level.
+
+    Paper: A_{m-1} = MDE_m(A_m, f_m). A stock post-norm decoder layer, anchors as its targets, voxels as its memory;
+    one-way, the voxels never see the anchors. As in the released code and unlike the paper's words, widths are aligned
+    by Linear and norm where they differ, and the coarsest level is not read.
+    """
+
+    def __init__(self, channels: int, voxel_channels: int, out_channels: int, heads: int, dropout: float):
+        super().__init__()
+        self.fc_in = _aligned(channels, voxel_channels)
+        self.transformer = nn.TransformerDecoderLayer(
+            voxel_channels, heads, 4 * voxel_channels, dropout, batch_first=True
+        )
+        self.fc_out = _aligned(voxel_channels, out_channels)
+
+    def forward(self, anchors: Tensor, rows: Tensor, level: Level) -> Tensor:
+        anchors = self.fc_in(anchors)
+        anchors = self.transformer(anchors, rows[level.slots], memory_key_padding_mask=~level.valid)
+        return self.fc_out(anchors)
+
+
+def _aligned(channels: int, out_channels: int) -> nn.Module:
+    if channels == out_channels:
+        return nn.Identity()
+    return nn.Sequential(nn.Linear(channels, out_channels), nn.LayerNorm(out_channels))
+
+
+# ---- the network
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +289,7 @@ class DaptOutputs:
 
 
 class DaptNet(nn.Module):
-    """Paper: "Density-aware pose transformer". A pure function of a `DaptBatch`; parameters bear the released names."""
+    """Paper: "Density-aware pose transformer". A pure function of `Tables` of tensors."""
 
     def __init__(self, config: DaptConfig):
         super().__init__()
@@ -101,37 +308,34 @@ class DaptNet(nn.Module):
             heads["feat"] = part_head(config.decoder_channels[0], config.parts)
         self.heads = nn.ModuleDict(heads)
 
-    def forward(self, batch: DaptBatch) -> DaptOutputs:
+    def forward(self, batch: Tables[Tensor]) -> DaptOutputs:
         config, heads = self.config, self.heads
         anchors, points, bottleneck = self.backbone(batch)
-        x = y = z = inter = coordinates = None
-        if config.bins:
-            x, y, z = heads["query"](anchors)
-        if config.coordinates:
-            coordinates = heads["coordinate" if config.bins else "query"](anchors)
-        if config.auxiliary:
-            inter = heads["inter_feat"](bottleneck).unflatten(-1, (-1, 3))
+        x, y, z = heads["query"](anchors) if config.bins else (None, None, None)
         return DaptOutputs(
             anchors=anchors,
             points=points,
             logits_x=x,
             logits_y=y,
             logits_z=z,
-            inter=inter,
+            inter=heads["inter_feat"](bottleneck).unflatten(-1, (-1, 3)) if config.auxiliary else None,
             parts=heads["feat"](points) if config.parts else None,
-            coordinates=coordinates,
+            coordinates=heads["coordinate" if config.bins else "query"](anchors) if config.coordinates else None,
             low=tuple(config.low.tolist()),
             step=tuple(config.step.tolist()),
         )
 
     def batch(
         self, clouds: list[np.ndarray], *, layout: str | None = None, rng: np.random.Generator | None = None
-    ) -> DaptBatch:
+    ) -> Tables[Tensor]:
         """Clouds (n, 3) m, each in its person's frame, as the network's device and precision read them.
 
-        layout and rng as in `tables.build_tables`; None takes the layout that suits the device.
+        layout and rng as in `build_tables`; None takes the layout that suits the device.
         """
-        return self._tensors(build_tables(clouds, self.config, layout=layout or self._layout(), rng=rng))
+        anchors = self.backbone.keypoint_embedding
+        layout = layout or ("ragged" if anchors.device.type == "cpu" else "padded")
+        tables = build_tables(clouds, self.config, layout=layout, rng=rng)
+        return to_tensors(tables, anchors.device, anchors.dtype)
 
     def outputs(self, clouds: list[np.ndarray]) -> dict[str, np.ndarray]:
         """Raw results, in evaluation mode, of people's clouds (n, 3) m, each in its person's frame.
@@ -142,27 +346,20 @@ class DaptNet(nn.Module):
         """
         clouds = [_cloud(cloud, k) for k, cloud in enumerate(clouds)]
         # nobody: the shapes of somebody, cut to none
-        tables = build_tables(clouds or [np.zeros((0, 3), np.float32)], self.config, layout=self._layout())
+        batch = self.batch(clouds or [np.zeros((0, 3), np.float32)])
         was_training = self.training
         self.eval()
         try:
             with torch.inference_mode():
-                out = self(self._tensors(tables))
+                out = self(batch)
         finally:
             self.train(was_training)
         names = ("anchors", "logits_x", "logits_y", "logits_z", "inter", "coordinates")
-        outputs = {name: _array(getattr(out, name))[: len(clouds)] for name in names if getattr(out, name) is not None}
-        outputs["point_feat_last"] = _array(out.points)[tables.point_voxel]
+        outputs = {name: value[: len(clouds)] for name in names if (value := getattr(out, name)) is not None}
+        outputs["point_feat_last"] = out.points[batch.point_voxel]
         if out.parts is not None:
-            outputs["parts"] = _array(out.parts)[tables.point_voxel]
-        return outputs
-
-    def _layout(self) -> str:
-        return "ragged" if self.backbone.keypoint_embedding.device.type == "cpu" else "padded"
-
-    def _tensors(self, tables: Tables) -> DaptBatch:
-        anchors = self.backbone.keypoint_embedding
-        return DaptBatch.from_tables(tables, anchors.device, anchors.dtype)
+            outputs["parts"] = out.parts[batch.point_voxel]
+        return {name: value.float().cpu().numpy() for name, value in outputs.items()}
 
 
 class _Backbone(nn.Module):
@@ -171,37 +368,33 @@ class _Backbone(nn.Module):
     def __init__(self, config: DaptConfig):
         super().__init__()
         self.legacy = config.legacy
-        widths, last = config.encoder_channels, len(config.encoder_depths) - 1
+        widths = config.encoder_channels
         self.embedding = nn.Module()
-        self.embedding.stem = nn.Sequential()
-        self.embedding.stem.add_module("conv", SubmanifoldConvolution(3, widths[0], 5, bias=False))
-        self.embedding.stem.add_module("norm", RowNorm(widths[0]))
-
-        drops = iter(np.linspace(0, config.drop_path, sum(config.encoder_depths)).tolist())
+        stem = OrderedDict(conv=SubmanifoldConvolution(3, widths[0], 5, bias=False), norm=RowNorm(widths[0]))
+        self.embedding.stem = nn.Sequential(stem)
         self.enc = nn.Module()
-        for s, depth in enumerate(config.encoder_depths):
-            blocks = _blocks(widths[s], config.encoder_heads[s], [next(drops) for _ in range(depth)], config)
-            down = Pooling(widths[s - 1], widths[s]) if s else None
-            self.enc.add_module(f"enc{s}", Stage(blocks, down=down))
+        for s, drops in enumerate(_drop_rates(config.encoder_depths, config.drop_path)):
+            finer = widths[s - 1] if s else 0
+            self.enc.add_module(
+                f"enc{s}", Stage(widths[s], config.encoder_heads[s], config.mlp_ratio, drops, finer=finer)
+            )
 
-        drops = iter(np.linspace(0, config.drop_path, sum(config.decoder_depths)).tolist())
         wide = (*config.decoder_channels, widths[-1])
         stages, exchanges = [], []
-        for s, depth in enumerate(config.decoder_depths):
+        for s, drops in enumerate(_drop_rates(config.decoder_depths, config.drop_path)):
+            coarser = wide[s + 1], widths[s]
             # within a stage the first block drops most
-            rates = [next(drops) for _ in range(depth)][::-1]
-            blocks = _blocks(wide[s], config.decoder_heads[s], rates, config)
-            stages.append(Stage(blocks, up=Unpooling(wide[s + 1], widths[s], wide[s])))
+            stages.append(Stage(wide[s], config.decoder_heads[s], config.mlp_ratio, drops[::-1], coarser=coarser))
             anchor_in, anchor_out = config.anchor_channels[s + 1], config.anchor_channels[s]
             exchanges.append(Exchange(anchor_in, wide[s], anchor_out, config.anchor_heads, config.anchor_dropout))
         self.dec = nn.Module()
-        for s in reversed(range(last)):
+        for s in reversed(range(len(stages))):
             self.dec.add_module(f"dec{s}", stages[s])
             self.dec.add_module(f"dec_ke{s}", exchanges[s])
         # small random numbers where the released code begins at zero
         self.keypoint_embedding = nn.Parameter(torch.randn(len(config.joints), config.anchor_channels[-1]) * 0.02)
 
-    def forward(self, batch: DaptBatch) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, batch: Tables[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Anchors (B, J, A), level 0's rows (M, C), and the bottleneck's maximum over each person (B, C')."""
         stem: Any = self.embedding.stem
         rows = F.gelu(stem.norm(stem.conv(batch.features, batch.stem)))
@@ -250,8 +443,10 @@ def part_head(channels: int, parts: int) -> nn.Sequential:
     return nn.Sequential(OrderedDict(fc=layers))
 
 
-def _blocks(channels: int, heads: int, drops: list[float], config: DaptConfig) -> list[Block]:
-    return [Block(channels, heads, config.mlp_ratio, drop, order) for order, drop in enumerate(drops)]
+def _drop_rates(depths: tuple[int, ...], largest: float) -> list[list[float]]:
+    """Of each stage those of its blocks, rising from 0 to `largest` over all stages."""
+    rates = np.linspace(0, largest, sum(depths))
+    return [stage.tolist() for stage in np.split(rates, np.cumsum(depths)[:-1])]
 
 
 def _cloud(cloud: np.ndarray, number: int) -> np.ndarray:
@@ -263,18 +458,13 @@ def _cloud(cloud: np.ndarray, number: int) -> np.ndarray:
     return np.ascontiguousarray(cloud, np.float32)
 
 
-def _array(values: Tensor) -> np.ndarray:
-    return values.float().cpu().numpy()
-
-
-def _to_tensors(value: Any, device: torch.device | str) -> Any:
-    """A record of arrays as the same record of tensors."""
-    if isinstance(value, np.ndarray):
-        return torch.as_tensor(value).to(device)
-    if isinstance(value, tuple):
-        return tuple(_to_tensors(part, device) for part in value)
-    if is_dataclass(value) and not isinstance(value, type):
-        return replace(
-            value, **{field.name: _to_tensors(getattr(value, field.name), device) for field in fields(value)}
-        )
-    return value
+def to_tensors(record: Any, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Any:
+    """A record of arrays as the same record of tensors, floats as `dtype`."""
+    if isinstance(record, np.ndarray):
+        return torch.as_tensor(record).to(device, dtype if record.dtype.kind == "f" else None)
+    if isinstance(record, tuple):
+        return tuple(to_tensors(part, device, dtype) for part in record)
+    if is_dataclass(record) and not isinstance(record, type):
+        parts = {field.name: to_tensors(getattr(record, field.name), device, dtype) for field in fields(record)}
+        return replace(record, **parts)
+    return record

@@ -12,7 +12,7 @@ import torch
 
 from lidarpose.errors import InputError
 from lidarpose.io.files import check_apart, check_suffix, file_error
-from lidarpose.models.checkpoint import Header, SafetensorsFile, empty_state, save_checkpoint
+from lidarpose.models.checkpoint import Header, SafetensorsFile, save_checkpoint
 from lidarpose.models.dapt.dapt_config import CONFIGS, DaptConfig, named_config
 from lidarpose.models.dapt.dapt_net import DaptNet
 
@@ -38,20 +38,17 @@ def import_dapt(path: str | os.PathLike, config: DaptConfig | dict | str | None 
         )
     file = SafetensorsFile.open(path, prefix=_PREFIX)
     config = _config(path, file.metadata, config)
-    source = f"the configuration {config.name}"
     remedy = f"name the configuration that it was trained with ({', '.join(CONFIGS)})"
-    wanted = empty_state(path, config, len(file.shapes), by=source, remedy=remedy)
-    file.check_tensors(
-        wanted,
-        missing=f"which {source} has: {remedy}",
-        unknown=f"which {source} has not: {remedy}",
-        shape=f"by {source}, got {{}}: {remedy}",
-    )
-    loaded = file.load(wanted)
-    _check_ranges(path, config, loaded)
-    network = DaptNet(config)
-    network.load_state_dict(loaded)
-    return network.eval()
+    network = file.network(config, source=f"the configuration {config.name}", remedy=remedy)
+    # the released heatmap head carries its ranges: they must be those that its logits will be read with
+    stored = network.state_dict().get("heads.query.coord_range")
+    if stored is not None and not torch.allclose(stored, torch.tensor(config.ranges), atol=1e-4):
+        raise file_error(
+            path,
+            f"tensor heads.query.coord_range says {stored.double().round(decimals=4).tolist()} m, the configuration "
+            f"{config.name} {[list(reach) for reach in config.ranges]}: {remedy}",
+        )
+    return network
 
 
 def import_released(source: str | os.PathLike, out: str | os.PathLike, *, config: str | None = None) -> Header:
@@ -71,22 +68,20 @@ def import_released(source: str | os.PathLike, out: str | os.PathLike, *, config
     return Header(config=network.config, card=card)
 
 
-def _config(path: Path, metadata: dict[str, str] | None, config: DaptConfig | dict | str | None) -> DaptConfig:
+def _config(path: Path, metadata: dict[str, str], config: DaptConfig | dict | str | None) -> DaptConfig:
     if isinstance(config, DaptConfig):
         return config
     if isinstance(config, str):
         return named_config(config)
-    where = "its header's configuration"
+    where, known = "the configuration given", f"name one of {', '.join(CONFIGS)}"
     if config is None:
-        raw = (metadata or {}).get("config")
-        if raw is None:
-            raise file_error(path, f"its header has no configuration: name one of {', '.join(CONFIGS)} (config=...)")
+        where = "its header's configuration"
         try:
-            config = json.loads(raw)
+            config = json.loads(metadata["config"])
+        except KeyError:
+            raise file_error(path, f"its header has no configuration: {known} (config=...)") from None
         except (ValueError, RecursionError) as error:
-            raise file_error(path, f"{where} is not JSON ({error}): name one of {', '.join(CONFIGS)}") from None
-    else:
-        where = "the configuration given"
+            raise file_error(path, f"{where} is not JSON ({error}): {known}") from None
     if not isinstance(config, dict):
         raise file_error(path, f"{where} should be a dict, a name or a DaptConfig, got {type(config).__name__}")
     try:
@@ -94,16 +89,3 @@ def _config(path: Path, metadata: dict[str, str] | None, config: DaptConfig | di
     # TypeError: lists and dicts where numbers and names belong
     except (InputError, TypeError) as error:
         raise file_error(path, f"{where} does not fit: {error}") from None
-
-
-def _check_ranges(path: Path, config: DaptConfig, loaded: dict[str, torch.Tensor]) -> None:
-    """The released heatmap head carries its ranges: they must be those that its logits will be read with."""
-    stored = loaded.get("heads.query.coord_range")
-    if stored is not None and not torch.allclose(stored, torch.tensor(config.ranges), atol=1e-4):
-        stored_ranges = stored.double().round(decimals=4).tolist()
-        expected = [list(reach) for reach in config.ranges]
-        raise file_error(
-            path,
-            f"tensor heads.query.coord_range says {stored_ranges} m, the configuration {config.name} {expected}: "
-            "name the configuration that it was trained with",
-        )

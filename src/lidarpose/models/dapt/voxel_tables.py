@@ -3,6 +3,9 @@
 Legend: B people, n points of a cloud, M voxels of all people at a level, one after the other, T taps of a kernel,
 P pairs of neighbors, W children at most, N voxels a person at most, Q patches, K voxels a patch at most, O curves.
 
+Paper (via Point Transformer V3): points of a large cloud are put in the order of a curve and cut into patches, within
+which attention is full.
+
 Voxels stand in Z-order within each person, at every level: the order of points never matters, and the children of a
 parent are neighbors in memory. A person without points is given one voxel at the center: every level then has a row
 for everybody, and nobody's batch mates need to know.
@@ -15,11 +18,10 @@ import numpy as np
 
 from lidarpose.errors import InputError, check_name
 from lidarpose.models.dapt.dapt_config import CELL_BITS, DaptConfig
-from lidarpose.models.dapt.space_filling_curves import curve, dilated, z_order
 from lidarpose.models.voxelize import Array
 
-# bits an axis of a cell, and of a neighbor's cell: one more, so that a step across the edge meets no cell
-_BITS, _WIDE = CELL_BITS, CELL_BITS + 1
+# bits an axis of a neighbor's cell: one more, so that a step across the edge meets no cell
+_WIDE = CELL_BITS + 1
 _MOST_PEOPLE = 1 << (63 - 3 * _WIDE)
 # how convolutions and attention run: see `build_tables`
 LAYOUTS = ("ragged", "padded")
@@ -66,19 +68,19 @@ class Level(Generic[Array]):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tables:
-    """What the network reads of a batch of people.
+class Tables(Generic[Array]):
+    """What the network reads of a batch of people, as numpy's arrays or torch's tensors.
 
     features (M, 3) float32 m: the kept point of each voxel of level 0; stem: its neighbors of 5 x 5 x 5; levels, fine
     to coarse; kept (M,): index of the kept point among all points, -1 for the stand-in of a person without points;
     point_voxel (all points,): each point's row of level 0.
     """
 
-    features: np.ndarray
-    stem: Neighbors
-    levels: tuple[Level, ...]
-    kept: np.ndarray
-    point_voxel: np.ndarray
+    features: Array
+    stem: Neighbors[Array]
+    levels: tuple[Level[Array], ...]
+    kept: Array
+    point_voxel: Array
 
 
 def build_tables(
@@ -87,7 +89,7 @@ def build_tables(
     *,
     layout: str = "ragged",
     rng: np.random.Generator | None = None,
-) -> Tables:
+) -> Tables[np.ndarray]:
     """Tables of people's clouds, each (n, 3) m in its person's frame, n = 0 included.
 
     layout: "ragged", pair lists and one patch after the other, for CPUs; "padded", gather tables and one block of
@@ -98,63 +100,57 @@ def build_tables(
     cells can count, and for more people than a batch can hold.
     """
     check_name("layout", layout, LAYOUTS)
-    lengths = np.array([len(cloud) for cloud in clouds], np.int64)
     if not 1 <= len(clouds) < _MOST_PEOPLE:
         raise InputError(f"a batch holds 1 to {_MOST_PEOPLE - 1} people, got {len(clouds)}: split it")
-    points = np.concatenate([np.asarray(cloud, np.float32).reshape(-1, 3) for cloud in clouds])
-    person = np.repeat(np.arange(len(clouds)), lengths)
+    filled = [len(cloud) > 0 for cloud in clouds]
+    # a stand-in: a voxel that no neighbor or parent can tell from a real one
+    clouds = [np.asarray(cloud, np.float32) if len(cloud) else np.zeros((1, 3), np.float32) for cloud in clouds]
+    lengths = np.array([len(cloud) for cloud in clouds], np.int64)
+    points, person = np.concatenate(clouds), np.repeat(np.arange(len(clouds)), lengths)
+    is_point = np.repeat(filled, lengths)
     cells = _cells(points, lengths, config)
-    key = person << (3 * _WIDE) | z_order(cells, _BITS)
+    key = person << (3 * _WIDE) | z_order(cells)
 
     kept, point_voxel = _one_a_voxel(key, points, config.grid, rng)
-    features, key, cells = points[kept], key[kept], cells[kept]
-    empty = np.flatnonzero(lengths == 0)
-    if len(empty):
-        # stand-ins: a voxel that no neighbor or parent can tell from a real one, of a point at the center
-        place = np.searchsorted(key, empty << (3 * _WIDE))
-        features = np.insert(features, place, 0, axis=0)
-        cells = np.insert(cells, place, 1 << (_BITS - 1), axis=0)
-        kept = np.insert(kept, place, -1)
-        point_voxel = point_voxel + np.searchsorted(empty, person)
-        key = np.insert(key, place, empty << (3 * _WIDE) | z_order(cells[:1] * 0 + (1 << (_BITS - 1)), _BITS))
-
-    levels = []
+    key, cells = key[kept], cells[kept]
+    levels: list[Level[np.ndarray]] = []
     stem = _neighbors(key, cells, 2, 0, layout)
     bits = 0
-    for level in range(len(config.encoder_depths)):
-        last = level == len(config.encoder_depths) - 1
-        shift = 0 if last else config.strides[level].bit_length() - 1
+    # the last level has no next one
+    for stride in (*config.strides, 1):
+        shift = stride.bit_length() - 1
         parent_key, first, parent = _grouped(key >> (3 * shift))
-        owner = key >> (3 * (_WIDE - bits))
-        near = _neighbors(key, cells, 1, bits, layout)
+        last = len(levels) == len(config.strides)
         levels.append(
             Level(
-                near=near,
+                near=_neighbors(key, cells, 1, bits, layout),
                 parent=None if last else parent,
                 children=None if last else _spread(first, len(key)),
-                **_people(owner, len(clouds), cells, config, layout, rng),
+                **_people(key >> (3 * (_WIDE - bits)), len(clouds), cells, config, layout, rng),
             )
         )
         key, cells, bits = parent_key, cells[first] >> shift, bits + shift
-    return Tables(features=features, stem=stem, levels=tuple(levels), kept=kept, point_voxel=point_voxel)
+    return Tables(
+        features=points[kept],
+        stem=stem,
+        levels=tuple(levels),
+        kept=np.where(is_point, np.cumsum(is_point) - 1, -1)[kept],
+        point_voxel=point_voxel[is_point],
+    )
 
 
 def _cells(points: np.ndarray, lengths: np.ndarray, config: DaptConfig) -> np.ndarray:
-    """(M, 3) int64 in [0, 2**_BITS)."""
+    """(M, 3) int64 in [0, 2**CELL_BITS)."""
     scaled = np.floor(points / config.grid)
     if not np.isfinite(scaled).all():
         raise InputError("points must be finite numbers of meters, got NaN or infinity: drop those points first")
-    middle = 1 << (_BITS - 1)
+    middle = 1 << (CELL_BITS - 1)
     if config.legacy:
-        filled = lengths > 0
-        low = np.zeros((len(lengths), 3))
-        starts = np.cumsum(lengths)[filled] - lengths[filled]
-        if len(starts):
-            low[filled] = np.minimum.reduceat(scaled, starts)
+        low = np.minimum.reduceat(scaled, np.cumsum(lengths) - lengths)
         scaled = scaled - np.repeat(low, lengths, axis=0)
     else:
         scaled = scaled + middle
-    if scaled.size and not (scaled.min() >= 0 and scaled.max() < 2 * middle):
+    if not (scaled.min() >= 0 and scaled.max() < 2 * middle):
         reach = middle * config.grid
         limit = f"span {2 * reach:.0f} m at most" if config.legacy else f"lie within {reach:.0f} m of their person"
         raise InputError(f"points must {limit}, got some beyond: crop to one person")
@@ -242,8 +238,10 @@ def _people(
         sequence, patch_lengths = np.arange(len(owner))[None], lengths
     else:
         orders = list(config.orders) if rng is None else rng.permutation(config.orders)
-        sequence = np.stack([np.lexsort((curve(str(order))(cells), owner)) for order in orders])
-        patch_lengths = np.concatenate([_cut(int(length), config.patch) for length in lengths])
+        sequence = np.stack([np.lexsort((curve(str(order), cells), owner)) for order in orders])
+        # full patches of each person, and what is left
+        ends = [np.append(np.arange(config.patch, n, config.patch), n) for n in lengths]
+        patch_lengths = np.concatenate([np.diff(end, prepend=0) for end in ends])
     out |= {"sequence": sequence, "patch_lengths": patch_lengths}
     if layout == "ragged":
         return out
@@ -259,6 +257,52 @@ def _people(
     }
 
 
-def _cut(length: int, patch: int) -> list[int]:
-    """Lengths of the patches of a person of `length` voxels: full ones, and what is left."""
-    return [patch] * (length // patch) + [length % patch] * (length % patch > 0)
+# ---- space-filling curves: cells near on the curve are near in space
+
+
+def z_order(cells: np.ndarray) -> np.ndarray:
+    """cells (n, 3), of up to 17 bits an axis -> (n,) int64 Z-order (Morton) codes, x the most significant.
+
+    A parent's code is the child's without its last three bits.
+    """
+    x, y, z = dilated(cells.T)
+    return x << 2 | y << 1 | z
+
+
+def hilbert(cells: np.ndarray, bits: int = CELL_BITS) -> np.ndarray:
+    """cells (n, 3) whole numbers in [0, 2**bits) -> (n,) int64 positions on a Hilbert curve through the cube.
+
+    Consecutive positions are neighboring cells. Method: Skilling 2004, "Programming the Hilbert curve": the axes are
+    turned into the transposed Gray code in place.
+    """
+    axes = list(cells.T)
+    for bit in range(bits - 1, 0, -1):
+        low = (1 << bit) - 1
+        for k in range(3):
+            # where the bit is set the lower bits of x are inverted, elsewhere exchanged with those of axis k
+            is_set = (axes[k] >> bit & 1).astype(bool)
+            exchanged = np.where(is_set, 0, (axes[0] ^ axes[k]) & low)
+            axes[0] = axes[0] ^ np.where(is_set, low, exchanged)
+            # for k = 0 nothing is exchanged: x ^ x is 0
+            axes[k] = axes[k] ^ exchanged
+    axes[1] = axes[1] ^ axes[0]
+    axes[2] = axes[2] ^ axes[1]
+    flip = np.zeros_like(axes[0])
+    for bit in range(bits - 1, 0, -1):
+        flip ^= np.where(axes[2] >> bit & 1, (1 << bit) - 1, 0)
+    return z_order(np.stack(axes, 1) ^ flip[:, None])
+
+
+def dilated(values: np.ndarray) -> np.ndarray:
+    """Whole numbers (int64) of up to 17 bits with two zero bits put before each of their bits."""
+    values = (values | values << 32) & 0x1F00000000FFFF
+    values = (values | values << 16) & 0x1F0000FF0000FF
+    values = (values | values << 8) & 0x100F00F00F00F00F
+    values = (values | values << 4) & 0x10C30C30C30C30C3
+    return (values | values << 2) & 0x1249249249249249
+
+
+def curve(name: str, cells: np.ndarray) -> np.ndarray:
+    """cells (n, 3) -> (n,) int64 codes along a curve of `CURVES`; "-trans" exchanges x and y."""
+    code = hilbert if name.startswith("hilbert") else z_order
+    return code(cells[:, [1, 0, 2]] if name.endswith("-trans") else cells)

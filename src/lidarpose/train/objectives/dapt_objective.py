@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lidarpose.errors import InputError, check_name
 from lidarpose.models.dapt.dapt_config import PARTS, DaptConfig, named_config
-from lidarpose.models.dapt.dapt_net import DaptBatch, DaptNet
+from lidarpose.models.dapt.dapt_net import DaptNet, to_tensors
 from lidarpose.models.dapt.voxel_tables import LAYOUTS, Tables, build_tables
 from lidarpose.skeleton import BODY26, HUMAN15
 from lidarpose.train.augment import UNKNOWN_PART, Example
@@ -114,7 +114,7 @@ class DaptObjective:
     ) -> dict[str, Tensor]:
         """`dapt_losses.pretraining` or `finetuning`. A joint's weight is 1 where it is labelled, seen or not, as in the
         released code."""
-        outputs, targets = network(DaptBatch.from_tables(arrays.tables, device)), arrays.targets(device)
+        outputs, targets = network(to_tensors(arrays.tables, device)), arrays.targets(device)
         if self.stage == "pretrain":
             weights = {"regression": self.regression, "segmentation": self.segmentation}
             terms, first = pretraining(outputs, targets, share=share, **weights), "regression"
@@ -129,7 +129,7 @@ class DaptObjective:
     @torch.no_grad()
     def joints(self, network: Callable, arrays: DaptArrays, *, device: torch.device | str = "cpu") -> np.ndarray:
         """Of the heatmaps; in pre-training of the coordinates, which are what it teaches."""
-        outputs = network(DaptBatch.from_tables(arrays.tables, device))
+        outputs = network(to_tensors(arrays.tables, device))
         own = outputs.coordinates if self.stage == "pretrain" else outputs.joints()
         joints = np.full((len(arrays.joints), len(BODY26), 3), np.nan, np.float32)
         joints[:, self._columns] = own.float().cpu().numpy()

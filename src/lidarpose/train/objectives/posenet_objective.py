@@ -63,9 +63,7 @@ class PoseNetObjective:
         valid = pyramid.fine.valid
         part = majority_part(pyramid.point_voxel, part, voxels=valid.size, parts=self.config.parts)
         joints = np.stack([e.joints for e in examples])
-        arrays = pyramid.arrays()
-        del arrays["point_voxel"]
-        return arrays | {
+        return pyramid.arrays() | {
             "joints": joints,
             "known": ~np.isnan(joints).any(-1),
             "visible": np.stack([e.visible for e in examples]),
