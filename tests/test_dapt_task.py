@@ -114,17 +114,12 @@ def numbers(value):
     return np.asarray(value, float)
 
 
-def distance(a, b):
-    return math.sqrt(sum((x - y) ** 2 for x, y in zip(a, b, strict=True)))
-
-
 def slow_regression(joints, targets, power):
-    true, weight = numbers(targets.joints), numbers(targets.weight)
     people = []
-    for b in range(len(true)):
-        if sum(weight[b]) > 0:
-            distances = [distance(joints[b, j], true[b, j]) ** power * weight[b, j] for j in range(len(true[b]))]
-            people.append(sum(distances) / sum(weight[b]))
+    for predicted, true, weight in zip(joints, numbers(targets.joints), numbers(targets.weight), strict=True):
+        if sum(weight) > 0:
+            distances = [math.dist(*pair) ** power * w for *pair, w in zip(predicted, true, weight, strict=True)]
+            people.append(sum(distances) / sum(weight))
     return sum(people) / len(people)
 
 
@@ -154,18 +149,13 @@ def slow_heatmap(outputs, targets):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_pretraining_is_equation_9(seed):
+def test_losses_are_equations_9_and_10_and_the_released_codes_other_term(seed):
     outputs, targets = made(seed)
     terms = pretraining(outputs, targets, regression=0.5, segmentation=2.0)
     regression = slow_regression(numbers(outputs.coordinates), targets, 1)
     assert terms["regression"].item() == pytest.approx(0.5 * regression, rel=1e-5)
     assert terms["segmentation"].item() == pytest.approx(2 * slow_segmentation(outputs.parts, targets.part), rel=1e-5)
     assert total(terms).item() == pytest.approx(terms["regression"].item() + terms["segmentation"].item(), rel=1e-6)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_finetuning_is_equation_10_and_the_released_codes_other_term(seed):
-    outputs, targets = made(seed)
     assert finetuning(outputs, targets).keys() == {"heatmap", "mpjpe"}
     terms = finetuning(outputs, targets, auxiliary=0.2)
     assert terms["heatmap"].item() == pytest.approx(slow_heatmap(outputs, targets), rel=1e-5)
@@ -240,9 +230,8 @@ def test_the_order_of_people_does_not_matter(task):
     net = network(task).eval()
     forth, back = (task.collate(order) for order in (people, people[::-1]))
     np.testing.assert_allclose(task.joints(net, forth), task.joints(net, back)[::-1], atol=1e-5)
-    terms = [task.terms(net, arrays) for arrays in (forth, back)]
-    for name in terms[0]:
-        torch.testing.assert_close(terms[0][name], terms[1][name], rtol=1e-5, atol=1e-6)
+    terms, reversed_terms = (task.terms(net, arrays) for arrays in (forth, back))
+    torch.testing.assert_close(terms, reversed_terms, rtol=1e-5, atol=1e-6)
 
 
 def test_people_larger_than_a_patch_only_shuffle_their_curves():
@@ -251,20 +240,6 @@ def test_people_larger_than_a_patch_only_shuffle_their_curves():
     alone_, among = task.collate([little]), task.collate([large, little])
     net = network(task).eval()
     np.testing.assert_allclose(task.joints(net, alone_)[0], task.joints(net, among)[1], atol=1e-5)
-
-
-def test_a_voxel_keeps_one_of_its_points_and_the_part_of_most():
-    cloud = np.float32([[0.001, 0.001, 0.001], [0.02, 0.02, 0.02], [0.039, 0.039, 0.039], [-0.01, 0, 0]])
-    one = replace(person(4), points=cloud, part=np.array([7, 3, 3, -1]))
-    kept = set()
-    for seed in range(40):
-        arrays = PRETRAIN.collate([replace(one, seed=seed)])
-        assert arrays.tables.features[0].tolist() == cloud[3].tolist() and arrays.part.tolist() == [-1, 3]
-        kept.add(arrays.tables.features[1, 0].item())
-    assert kept == set(cloud[:3, 0].tolist())
-    unknown = PRETRAIN.collate([replace(one, part=np.array([-1, 5, -1, 0]))])
-    assert unknown.part.tolist() == [0, 5]
-    assert PRETRAIN.collate([person(0), one]).part.tolist() == [-1, -1, 3]
 
 
 @settings(max_examples=25, deadline=None)
@@ -283,6 +258,14 @@ def test_parts_against_counting(seed, n, size):
         assert part == (-1 if not known else min(set(known), key=lambda p: (-known.count(p), p)))
 
 
+def test_any_point_of_a_voxel_may_be_kept():
+    cloud = np.float32([[0.001, 0.001, 0.001], [0.02, 0.02, 0.02], [0.039, 0.039, 0.039], [-0.01, 0, 0]])
+    cell = replace(person(4), points=cloud, part=np.array([7, 3, 3, -1]))
+    batches = [PRETRAIN.collate([person(0), replace(cell, seed=seed)]) for seed in range(40)]
+    assert {arrays.tables.features[2, 0] for arrays in batches} == set(cloud[:3, 0])
+    assert all(arrays.part.tolist() == [-1, -1, 3] for arrays in batches)
+
+
 @BOTH
 def test_task_and_arrays_survive_the_way_from_a_worker(task):
     assert pickle.loads(pickle.dumps(task)) == task
@@ -293,19 +276,14 @@ def test_task_and_arrays_survive_the_way_from_a_worker(task):
         assert torch.equal(a, b)
 
 
-def test_joints_are_body26s():
+def test_joints_are_body26s_and_those_that_the_stage_teaches():
     out = FINETUNE.joints(network(FINETUNE).eval(), FINETUNE.collate([person(50), person(5, 1)]))
     has = np.isin(BODY26.joints, WAYMO14.joints)
     assert out.shape == (2, 26, 3) and np.isfinite(out[:, has]).all() and np.isnan(out[:, ~has]).all()
-    people = [replace(person(9), joints=np.arange(78, dtype=np.float32).reshape(26, 3))]
-    arrays = FINETUNE.collate(people)
-    for j, name in enumerate(FINETUNE.config.joints):
-        np.testing.assert_array_equal(arrays.joints[0, j], people[0].joints[BODY26.index(name)])
-
-
-def test_joints_of_a_network_with_every_head_are_those_that_the_stage_teaches():
-    config = replace(named_config("paper"), **TINY)
-    task = DaptObjective(config=config, stage="pretrain")
+    joints = np.arange(78, dtype=np.float32).reshape(26, 3)
+    arrays = FINETUNE.collate([replace(person(9), joints=joints)])
+    np.testing.assert_array_equal(arrays.joints[0], joints[[BODY26.index(name) for name in FINETUNE.config.joints]])
+    task = DaptObjective(config=replace(named_config("paper"), **TINY), stage="pretrain")
     net, arrays = network(task).eval(), task.collate([person(70)])
     with torch.no_grad():
         outputs = net(to_tensors(arrays.tables))
@@ -331,28 +309,27 @@ def test_gradients_of_two_halves_average_to_those_of_the_whole(task, rare):
     whole = task.terms(net, task.collate(people))
     want = gradients(net, whole)
     halves = [task.collate(people[:1]), task.collate(people[1:])]
-    told = [[], []]
-    for half, counts in zip(halves, told, strict=True):
-        task.terms(net, half, share=lambda count, counts=counts: counts.append(count) or count)
-    assert len(told[0]) == len(told[1]) > 0
-    means = [(a + b) / 2 for a, b in zip(*told, strict=True)]
-    found, terms = [], []
+    counts = [[], []]
+    for half, shared in zip(halves, counts, strict=True):
+        task.terms(net, half, share=lambda count, shared=shared: shared.append(count) or count)
+    assert len(counts[0]) == len(counts[1]) > 0
+    means = [(a + b) / 2 for a, b in zip(*counts, strict=True)]
+    gradients_of, terms = [], []
     for half in halves:
         answers = iter(means)
         terms.append(task.terms(net, half, share=lambda _, answers=answers: next(answers)))
-        found.append(gradients(net, terms[-1]))
+        gradients_of.append(gradients(net, terms[-1]))
     for name, value in whole.items():
         torch.testing.assert_close((terms[0][name] + terms[1][name]) / 2, value, rtol=1e-4, atol=1e-6, msg=name)
     largest = max(value.abs().max() for value in want.values())
-    for name, value in want.items():
-        mean = (found[0][name] + found[1][name]) / 2
-        torch.testing.assert_close(mean, value, rtol=1e-3, atol=1e-6 * float(largest), msg=name)
-    # without it they would not
+    # without the share they would not
     naive = [gradients(net, task.terms(net, half, share=alone)) for half in halves]
-    assert any(
-        ((a + b) / 2 - value).abs().max() > 1e-2 * largest
-        for (a, b, value) in zip(naive[0].values(), naive[1].values(), want.values(), strict=True)
-    )
+    off = 0.0
+    for name, value in want.items():
+        mean, unshared = ((a[name] + b[name]) / 2 for a, b in (gradients_of, naive))
+        torch.testing.assert_close(mean, value, rtol=1e-3, atol=1e-6 * float(largest), msg=name)
+        off = max(off, float((unshared - value).abs().max()))
+    assert off > 1e-2 * largest
 
 
 @BOTH
@@ -380,14 +357,12 @@ def test_people_without_labels_or_points(task):
 
 
 @pytest.mark.parametrize("stage", ["pretrain", "finetune"])
-def test_heads_that_a_stage_does_not_ask_have_a_gradient_of_zero(stage):
+def test_all_learns_but_heads_that_a_stage_does_not_ask_whose_gradient_is_zero(stage):
     task = DaptObjective(config=replace(named_config("paper"), **TINY), stage=stage)
     net = network(task)
-    found = gradients(net, task.terms(net, task.collate([person(60), person(9, 1)])))
-    still = {name.split(".")[1] for name, value in found.items() if (value == 0).all()}
-    idle = {"query", "inter_feat"} if stage == "pretrain" else {"coordinate", "feat", "inter_feat"}
-    assert idle <= still
-    assert not [name for name in still if name not in idle]
+    of = gradients(net, task.terms(net, task.collate([person(60), person(9, 1)])))
+    still = {name.split(".")[1] for name, value in of.items() if (value == 0).all()}
+    assert still == ({"query", "inter_feat"} if stage == "pretrain" else {"coordinate", "feat", "inter_feat"})
 
 
 @BOTH
@@ -439,27 +414,20 @@ def trained(config, seed=3):
     return net
 
 
-def split_state(net):
-    """The tensors of the backbone without its anchors, and all others."""
-    state = net.state_dict()
-    body = {name for name in state if name.startswith("backbone.") and "keypoint_embedding" not in name}
-    return {name: state[name] for name in body}, {name: state[name] for name in state.keys() - body}
-
-
 def test_the_papers_transfer_keeps_the_backbone_alone(tmp_path):
-    source = trained(PRETRAIN.config)
+    source, path = trained(PRETRAIN.config), tmp_path / "pretrained.safetensors"
     before = {name: value.clone() for name, value in source.state_dict().items()}
-    save_checkpoint(tmp_path / "pretrained.safetensors", source, card={})
+    save_checkpoint(path, source, card={})
     config = replace(FINETUNE.config, joints=HUMAN15.joints)
     torch.manual_seed(8)
-    fresh = DaptNet(config)
-    for origin in (source, tmp_path / "pretrained.safetensors", str(tmp_path / "pretrained.safetensors")):
+    fresh = DaptNet(config).state_dict()
+    for origin in (source, path, str(path)):
         torch.manual_seed(8)
         net = transferred(origin, config)
-        body, rest = split_state(net)
-        assert net.config == config and net.training and len(body) > 50
-        assert all(torch.equal(value, before[name]) for name, value in body.items())
-        assert all(torch.equal(value, fresh.state_dict()[name]) for name, value in rest.items()) and rest
+        body = {n for n in fresh if n.startswith("backbone.") and "keypoint_embedding" not in n}
+        assert net.config == config and net.training and 50 < len(body) < len(fresh)
+        for name, value in net.state_dict().items():
+            assert torch.equal(value, before[name] if name in body else fresh[name]), name
     with torch.no_grad():
         for parameter in net.parameters():
             parameter += 1
@@ -499,18 +467,13 @@ def test_heads_go_on_where_they_say_the_same():
     rows = old["heads.inter_feat.fc.fc2.weight"].reshape(26, 3, -1)
     for j, name in enumerate(WAYMO14.joints):
         assert torch.equal(new["heads.inter_feat.fc.fc2.weight"].reshape(14, 3, -1)[j], rows[BODY26.index(name)])
+    again = transferred(source, whole, keep_anchors=True).state_dict()
+    buffers = ("heads.query.coord_range", "heads.query.joint_wise_weight")
+    assert all(torch.equal(value, again[name]) for name, value in old.items() if name not in buffers)
     # the coordinate head bears another name where there is no other head of anchors
     bare = transferred(source, replace(PRETRAIN.config, joints=SMPL24.joints), keep_anchors=True).state_dict()
     assert torch.equal(bare["heads.query.fc.fc2.weight"], old["heads.coordinate.fc.fc2.weight"])
     assert torch.equal(bare["heads.feat.fc.3.weight"], old["heads.feat.fc.3.weight"])
-
-
-def test_a_network_to_the_same_configuration_is_the_same_network():
-    source = trained(replace(named_config("paper"), **TINY))
-    again = transferred(source, source.config, keep_anchors=True).eval()
-    skipped = ("heads.query.coord_range", "heads.query.joint_wise_weight")
-    for name, value in source.state_dict().items():
-        assert name in skipped or torch.equal(value, again.state_dict()[name]), name
 
 
 @pytest.mark.parametrize(
@@ -584,13 +547,10 @@ def test_bad_settings(change, message):
         replace(FINETUNE, **change)
 
 
-@pytest.mark.parametrize("part", [np.array([0, 25, 3]), np.array([1, 2])])
-def test_bad_parts(part):
-    with pytest.raises(InputError, match="each of 3 points needs a part below 25"):
-        PRETRAIN.collate([replace(person(3), part=part)])
-
-
-def test_points_that_are_not_finite():
+def test_bad_people():
+    for part in (np.array([0, 25, 3]), np.array([1, 2])):
+        with pytest.raises(InputError, match="each of 3 points needs a part below 25"):
+            PRETRAIN.collate([replace(person(3), part=part)])
     broken = person(5).points.copy()
     broken[2, 1] = np.nan
     with pytest.raises(InputError, match="points must be finite"):

@@ -18,22 +18,13 @@ def gaussian(at, bins, sigma=2.0):
     return -0.5 * ((np.arange(bins) - np.asarray(at)[..., None]) / sigma) ** 2
 
 
-def blur_reference(logits):
-    """The released code's blur, bin after bin."""
+def dark_reference(logits):
+    """One heatmap -> index of the refined peak as the released code has it, bin after bin."""
+    bins, mode = len(logits), int(np.argmax(logits))
     taps = np.exp(-0.5 * (np.arange(-5, 6) / 2.0) ** 2)
     taps /= taps.sum()
-    return np.array(
-        [
-            sum(taps[k] * logits[i + k - 5] for k in range(11) if 0 <= i + k - 5 < len(logits))
-            for i in range(len(logits))
-        ]
-    )
-
-
-def dark_reference(logits):
-    """One heatmap -> index of the refined peak, step after step."""
-    mode = int(np.argmax(logits))
-    heights = np.log(np.clip(blur_reference(logits), 1e-3, 50))
+    blurred = [sum(taps[k] * logits[i + k - 5] for k in range(11) if 0 <= i + k - 5 < bins) for i in range(bins)]
+    heights = np.log(np.clip(blurred, 1e-3, 50))
     heights = [heights[0]] * 2 + list(heights) + [heights[-1]] * 2
     at = mode + 2
     slope = 0.5 * (heights[at + 1] - heights[at - 1])
@@ -48,16 +39,13 @@ def test_the_released_decoders(axis):
     low, step = WAYMO.low[axis], WAYMO.step[axis]
     index = ORACLE["argmax"][..., axis]
     lo, hi = WAYMO.ranges[axis]
+    peak, dark = (decode.decoder(name)(logits, low=low, step=step) for name in ("argmax", "dark"))
     # the released formula, spelled out
-    np.testing.assert_allclose(
-        decode.argmax(logits, low=low, step=step), index / logits.shape[-1] * (hi - lo) + lo, rtol=0, atol=1e-12
-    )
-    assert (np.rint((decode.argmax(logits, low=low, step=step) - low) / step) == index).all()
-    np.testing.assert_allclose(decode.dark(logits, low=low, step=step), ORACLE["dark"][..., axis], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(peak, index / logits.shape[-1] * (hi - lo) + lo, rtol=0, atol=1e-12)
+    assert (np.rint((peak - low) / step) == index).all()
+    np.testing.assert_allclose(dark, ORACLE["dark"][..., axis], rtol=0, atol=1e-4)
     # so tight a test of dark means something only where it moves the peak
-    assert (
-        np.abs(decode.dark(logits, low=low, step=step) - decode.argmax(logits, low=low, step=step)).max() > 0.2 * step
-    )
+    assert np.abs(dark - peak).max() > 0.2 * step
 
 
 @given(st.lists(st.integers(-40, 120), min_size=1, max_size=40))
@@ -79,29 +67,21 @@ def test_window_does_not_lean_near_an_edge(bins, data):
         assert decode.window(gaussian(at, bins), low=0.0, step=1.0) == pytest.approx(at, abs=0.35)
 
 
-def test_window_is_better_than_the_peak():
+def test_window_is_better_than_the_peak_and_keeps_to_one_of_two():
     at = np.random.default_rng(0).uniform(5, 66, 500)
-    error = [
-        np.abs(decoder(gaussian(at, 72), low=0.0, step=1.0) - at).mean() for decoder in (decode.argmax, decode.window)
-    ]
-    assert error[1] < 0.6 * error[0]
-
-
-def test_window_keeps_to_one_of_two_peaks():
+    peak, window = (np.abs(f(gaussian(at, 72), low=0.0, step=1.0) - at).mean() for f in (decode.argmax, decode.window))
+    assert window < 0.6 * peak
     two = np.logaddexp(gaussian(20, 72) + 0.1, gaussian(50, 72))
     assert decode.window(two, low=0.0, step=1.0) == pytest.approx(20, abs=0.01)
 
 
 def test_reach_is_the_width_of_the_window():
     logits = np.array([0.0, 0.0, 3.0, 1.0, 2.0, -50.0, -50.0])
-    assert decode.window(logits, low=0.0, step=1.0, reach=0) == 2
+    at = {reach: decode.window(logits, low=0.0, step=1.0, reach=reach) for reach in (0, 1, 2, 5)}
     weight = np.exp(logits[1:4])
-    assert decode.window(logits, low=0.0, step=1.0, reach=1) == pytest.approx((weight * [1, 2, 3]).sum() / weight.sum())
+    assert at[0] == 2 and at[1] == pytest.approx((weight * [1, 2, 3]).sum() / weight.sum())
     # two bins before the mode is the edge: wider windows are no wider
-    wide = decode.window(logits, low=0.0, step=1.0, reach=2)
-    assert (
-        wide == decode.window(logits, low=0.0, step=1.0, reach=5) != decode.window(logits, low=0.0, step=1.0, reach=1)
-    )
+    assert at[2] == at[5] != at[1]
 
 
 @pytest.mark.parametrize("name", decode.DECODERS)
@@ -120,18 +100,13 @@ def test_both_conventions_of_bins(name):
 
 
 @pytest.mark.parametrize("name", decode.DECODERS)
-@pytest.mark.parametrize("bins", [1, 2, 3])
-def test_few_bins(name, bins):
-    logits = np.zeros((4, bins))
-    logits[:, -1] = 1
-    assert np.isfinite(decode.decoder(name)(logits, low=0.0, step=1.0)).all()
-    assert decode.decoder(name)(np.zeros((0, 14, bins)), low=0.0, step=1.0).shape == (0, 14)
-
-
-def test_half_floats_and_far_logits_are_fine():
+def test_few_bins_half_floats_and_far_logits_are_fine(name):
+    find = decode.decoder(name)
+    for bins in (1, 2, 3):
+        assert np.isfinite(find(np.eye(4, bins), low=0.0, step=1.0)).all()
+        assert find(np.zeros((0, 14, bins)), low=0.0, step=1.0).shape == (0, 14)
     logits = (gaussian([30.0, 2.0], 72) * 50).astype(np.float16)
-    for find in decode.DECODERS.values():
-        np.testing.assert_allclose(find(logits, low=0.0, step=1.0), [30, 2], atol=0.01)
+    np.testing.assert_allclose(find(logits, low=0.0, step=1.0), [30, 2], atol=0.01)
 
 
 def test_out_of_range():

@@ -29,7 +29,7 @@ def arrays():
     return PoseNetObjective(config=preset("tiny")).collate(people)
 
 
-def told(network, arrays):
+def outputs_of(network, arrays):
     with torch.no_grad():
         return network.eval()(Batch.from_arrays(arrays))
 
@@ -40,7 +40,7 @@ def test_more_blocks_and_convolutions_change_nothing(arrays, heatmap):
     config = replace(preset("tiny"), heatmap=heatmap, convolution=0)
     small = PoseNet(config)
     larger = expand_weights(small, replace(config, size="deep", blocks=(2, 3, 2), convolution=8))
-    before, after = told(small, arrays), told(larger, arrays)
+    before, after = outputs_of(small, arrays), outputs_of(larger, arrays)
     for name in ("vote", "heatmap", "part", "confidence", "log_spread", "visible"):
         torch.testing.assert_close(getattr(after, name), getattr(before, name), atol=1e-5, rtol=1e-5)
 
@@ -49,13 +49,16 @@ def test_small_begins_where_tiny_is(arrays):
     """What is left is the norm of the joint head's two streams: joints move by next to nothing and are as good."""
     network, _ = load_checkpoint(bundled_path("tiny"))
     torch.manual_seed(0)
-    before, after = told(network, arrays).joints(), told(expand_weights(network, preset("small")), arrays).joints()
+    before, after = (
+        outputs_of(network, arrays).joints(),
+        outputs_of(expand_weights(network, preset("small")), arrays).joints(),
+    )
     true = torch.as_tensor(arrays["joints"])
     errors = [float((joints - true).norm(dim=-1).mean()) for joints in (before, after)]
     moved = float((after - before).norm(dim=-1).mean())
     assert moved < 0.02 * errors[0] and errors[1] < 1.05 * errors[0], (moved, errors)
-    # a network that is not grown is elsewhere
-    assert (told(PoseNet(preset("small")), arrays).joints() - before).norm(dim=-1).mean() > 0.2
+    # a network that is not expanded is elsewhere
+    assert (outputs_of(PoseNet(preset("small")), arrays).joints() - before).norm(dim=-1).mean() > 0.2
 
 
 def test_all_that_is_new_learns(arrays):
@@ -63,16 +66,14 @@ def test_all_that_is_new_learns(arrays):
     network, _ = load_checkpoint(bundled_path("tiny"))
     larger = expand_weights(network, preset("small"))
     before = {name: value.clone() for name, value in larger.named_parameters()}
-    made = optimizers(larger, Pretrain())
-    rows = arrays["joints"]
-    targets = PoseNetObjective(config=preset("small"))
+    steppers, objective = optimizers(larger, Pretrain()), PoseNetObjective(config=preset("small"))
     for _ in range(3):
-        terms = targets.terms(larger, arrays)
+        terms = objective.terms(larger, arrays)
         total(terms).backward()
-        for optimizer in made:
+        for optimizer in steppers:
             optimizer.step()
             optimizer.zero_grad()
-    assert np.isfinite(rows).all() and all(value.detach().isfinite() for value in terms.values())
+    assert all(value.detach().isfinite() for value in terms.values())
     for name, value in larger.named_parameters():
         still = value == before[name]
         if value.ndim > 1:
@@ -89,22 +90,21 @@ def test_growing_needs_room_and_the_same_meaning():
         ({"grid": 0.04}, "grid is 0.04, there 0.06"),
         ({"heatmap": "none"}, "heatmap"),
         ({"head_channels": 16}, "head_channels"),
+        ({"convolution": 0}, "convolution is 0, there 12"),
+        ({"convolution": 16}, "convolution is 16, there 12"),
     ):
         with pytest.raises(InputError, match=words):
             expand_weights(tiny, replace(preset("tiny"), **change))
-    for other in (0, 16):
-        with pytest.raises(InputError, match=f"convolution is {other}, there 12"):
-            expand_weights(tiny, replace(preset("tiny"), convolution=other))
 
 
 def test_pretraining_goes_on_from_weights(tmp_path):
-    job = make_setup(Pretrain(size="small", init="tiny"))
+    setup = make_setup(Pretrain(size="small", init="tiny"))
     torch.manual_seed(0)
-    network = job.network()
+    network = setup.network()
     assert network.config == preset("small") and network.training
-    assert job.card["init_card"]["people_seen"] > 0
+    assert setup.card["init_card"]["people_seen"] > 0
     torch.manual_seed(0)
-    assert all(map(torch.equal, network.state_dict().values(), job.network().state_dict().values()))
+    assert all(map(torch.equal, network.state_dict().values(), setup.network().state_dict().values()))
     with pytest.raises(InputError, match="cannot begin as this tiny one: grid"):
         make_setup(Pretrain(size="base", init="tiny"))
     with pytest.raises(InputError, match="the paper's begins at random"):
