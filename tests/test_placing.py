@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from lidarpose.lidar.presets import SENSORS, sensor
 from lidarpose.lidar.sensor import Sensor
-from lidarpose.synth.placement import draw_distance, draw_height, draw_place
-from lidarpose.synth.scene import SCENES
+from lidarpose.synth.scene import SCENES, draw_distance, draw_height, draw_place
 
 WILD = SCENES["wild"]
 

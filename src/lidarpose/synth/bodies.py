@@ -15,6 +15,7 @@ from lidarpose.body.rig import RestBody, clothing, load_rig, mean_adult_joints, 
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.geometry import axis_angle_to_matrix, rotation_about
 from lidarpose.skeleton import SMPL24
+from lidarpose.synth.scene import RandomStream
 
 try:
     from lidarpose.body.rig_kernels import dress_people
@@ -119,7 +120,7 @@ def draw_bodies(
         moving: False is faster; then nobody goes anywhere.
         clothes: see `SceneConfig`.
     """
-    rng = np.random.default_rng([seed, 0, block])
+    rng = np.random.default_rng([seed, RandomStream.BLOCK, block])
     rig = load_rig()
     prior = sample_rotations(rng, count, dt=FRAME_TIME if moving else 0.0)
     poses, step, kinds = np.stack([prior.rotations, prior.moved], 1), prior.step, np.array(KINDS)[prior.kind]

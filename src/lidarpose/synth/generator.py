@@ -20,9 +20,8 @@ from lidarpose.synth import noise
 from lidarpose.synth.bodies import Bodies, PoseBank, draw_bodies, draw_moving_body
 from lidarpose.synth.environment.mesh import Mesh
 from lidarpose.synth.environment.surroundings import ground, occluder, surroundings
-from lidarpose.synth.placement import Place, draw_place
 from lidarpose.synth.props import draw_props
-from lidarpose.synth.scene import SceneConfig, scene_config
+from lidarpose.synth.scene import Place, RandomStream, SceneConfig, draw_place, scene_config
 from lidarpose.synth.simulate import Scan, Scene, count_alone, draw_conditions, simulate_scan
 
 # people whose poses and shapes are drawn together
@@ -91,7 +90,7 @@ class Generator:
     def person(self, seed: int, index: int, *, hard: float | None = None) -> SyntheticPerson:
         """Person `index` of `seed`, at the scene's difficulty or at `hard` in [0, 1]."""
         seed, index = check_int("seed", seed, least=0), check_int("index", index, least=0)
-        rng = np.random.default_rng([seed, 1, index])
+        rng = np.random.default_rng([seed, RandomStream.PERSON, index])
         block, row = self._bodies(seed, index // BLOCK), index % BLOCK
         return self._observe(block, [row], block, row, rng, hard)[0]
 
@@ -102,7 +101,7 @@ class Generator:
         are. Frames in which nothing of the person is seen have samples without points."""
         frames = check_int("a clip's frames", frames, least=1)
         seed, index = check_int("seed", seed, least=0), check_int("index", index, least=0)
-        rng = np.random.default_rng([seed, 3, index])
+        rng = np.random.default_rng([seed, RandomStream.CLIP, index])
         bodies = draw_moving_body(self.bank, self.captured, frames, rng, clothes=self.config.clothes)
         block, row = self._bodies(seed, index // BLOCK), index % BLOCK
         return self._observe(bodies, range(frames), block, row, rng, hard)

@@ -9,8 +9,7 @@ from math import cos, sin
 import numpy as np
 
 from lidarpose.sample import Box
-from lidarpose.synth.placement import Place
-from lidarpose.synth.scene import CropErrors
+from lidarpose.synth.scene import CropErrors, Place
 
 # --- the paper's laser-level mask: patches of the laser grid go missing, as behind something in the foreground
 

@@ -14,7 +14,7 @@ from lidarpose.data.writer import Counts, locked, make_shards, open_folder
 from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.io.files import content_digest, file_error
 from lidarpose.lidar.presets import SENSORS, sensor
-from lidarpose.synth.scene import scene_config
+from lidarpose.synth.scene import RandomStream, scene_config
 
 if TYPE_CHECKING:
     from lidarpose.synth.generator import Generator
@@ -190,7 +190,7 @@ class Maker:
         # all of a street have a box, whose id is their track
         people = [
             person_row(sample, index=index, frame=frame, track=int(cast("Any", sample.box).id))
-            for frame, sample in samples(scene, np.random.default_rng([seed, 5, index]))
+            for frame, sample in samples(scene, np.random.default_rng([seed, RandomStream.STREET_BOXES, index]))
         ]
         frames = [
             {

@@ -12,9 +12,8 @@ from lidarpose.synth.bodies import Bodies
 from lidarpose.synth.environment.mesh import Mesh, union
 from lidarpose.synth.noise import direction_mask, laser_mask
 from lidarpose.synth.noise_kernels import lose_returns
-from lidarpose.synth.placement import Place
 from lidarpose.synth.props import Prop
-from lidarpose.synth.scene import SceneConfig
+from lidarpose.synth.scene import Place, SceneConfig
 
 # makers' range limits hold for targets that reflect about 80 percent; clothes at 20 percent are seen half as far
 REACH = 0.5

@@ -24,7 +24,7 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 from lidarpose.errors import InputError
 from lidarpose.synth.bodies import PoseBank
 from lidarpose.synth.generator import Generator
-from lidarpose.synth.scene import scene_config
+from lidarpose.synth.scene import RandomStream, scene_config
 from lidarpose.train.augment import REFINED, Augmentation, Example, augmented, disturbed, example
 from lidarpose.train.objectives.objective import Objective
 from lidarpose.train.torch_dataset import InMemoryDataset
@@ -37,8 +37,6 @@ LANES = 8
 _POLL = 1.0
 # scenes of which every sample is as the paper says, masked always
 _OF_ONE_DIFFICULTY = ("paper", "reference")
-# first words of generators' seeds: 1 is the synthetic person's own, 9 and 10 are the loop's
-_SYNTHETIC, _STORED, _EPOCH_ORDER, _BATCH_ORDER = 2, 5, 6, 8
 
 
 class Source(Protocol):
@@ -82,7 +80,7 @@ class SyntheticSource:
         return Generator(scene=scene_config(self.scene), bank=bank, captured=captured, measure=False)
 
     def example(self, index: int) -> Example:
-        rng = np.random.default_rng([self.seed, _SYNTHETIC, index])
+        rng = np.random.default_rng([self.seed, RandomStream.SYNTHETIC_AUGMENTATION, index])
         hard = min(index / self.easy, 1.0) if self.easy else 1.0
         if self.scene not in _OF_ONE_DIFFICULTY:
             hard *= np.sqrt(rng.random())
@@ -106,7 +104,7 @@ class StoredSource:
     def example(self, index: int) -> Example:
         epoch, place = divmod(index, len(self.dataset))
         row = int(_order(self.seed, epoch, len(self.dataset))[place])
-        rng = np.random.default_rng([self.seed, _STORED, index])
+        rng = np.random.default_rng([self.seed, RandomStream.STORED_AUGMENTATION, index])
         sample = self.dataset.sample(row)
         if self.strays or self.noise:
             sample = disturbed(sample, strays=self.strays, noise=self.noise, rng=rng)
@@ -116,7 +114,7 @@ class StoredSource:
 @lru_cache(maxsize=2)
 def _order(seed: int, epoch: int, count: int) -> np.ndarray:
     """(count,) int: the rows of an epoch in its order."""
-    return np.random.default_rng([seed, _EPOCH_ORDER, epoch]).permutation(count)
+    return np.random.default_rng([seed, RandomStream.EPOCH_ORDER, epoch]).permutation(count)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,7 +167,7 @@ class Chunks(IterableDataset):
             numbers = range(first + lane, first + batches * self.batch, lanes)
             mine.append(sorted(map(self.source.example, numbers), key=_voxels))
         share = self.batch // lanes
-        order = np.random.default_rng([self.seed, _BATCH_ORDER, chunk]).permutation(batches)
+        order = np.random.default_rng([self.seed, RandomStream.BATCH_ORDER, chunk]).permutation(batches)
         return [self.task.collate([e for lane in mine for e in lane[k * share : (k + 1) * share]]) for k in order]
 
 
