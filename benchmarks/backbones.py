@@ -237,7 +237,7 @@ class GroupedViT(nn.Module):
     mean and maximum.
     """
 
-    GROUPS, NEIGHBOURS = 64, 32
+    GROUPS, NEIGHBORS = 64, 32
     HEADS, DEPTH, POINT = 4, 4, 64
 
     def __init__(self, channels: int):
@@ -256,7 +256,7 @@ class GroupedViT(nn.Module):
 
     @torch.no_grad()
     def prepare(self, clouds: list[np.ndarray]) -> Groups:
-        return grouped(*padded(clouds), centers=self.GROUPS, neighbors=self.NEIGHBOURS)
+        return grouped(*padded(clouds), centers=self.GROUPS, neighbors=self.NEIGHBORS)
 
     def forward(self, groups: Groups) -> Tensor:
         """Joints (B, J, 3) m."""
@@ -297,7 +297,7 @@ class PointNet2(nn.Module):
     they cost as much as the products on a CPU. Of a ball the nearest points are taken.
     """
 
-    # centers, points a center, radius in metres
+    # centers, points a center, radius in meters
     SETS = ((128, 32, 0.2), (32, 32, 0.5))
 
     def __init__(self, width: int):

@@ -50,7 +50,7 @@ def facing(joints: np.ndarray) -> np.ndarray:
 
 
 def score(predicted, found: list[SyntheticPerson]) -> dict:
-    """Figures in millimetres or shares."""
+    """Figures in millimeters or shares."""
     pred = np.stack([p.pose.to(HUMAN15).joints for p in predicted])
     true = np.stack([p.sample.pose.to(HUMAN15).joints for p in found])
     facts = [p.facts for p in found]

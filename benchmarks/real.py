@@ -1,4 +1,4 @@
-"""Poses of labelled people in real sweeps, where boxes are labelled and joints are not.
+"""Poses of labeled people in real sweeps, where boxes are labeled and joints are not.
 
     python benchmarks/real.py FOLDER --json docs/scores/real.json
 
@@ -38,7 +38,7 @@ def distance_to_bones(points: np.ndarray, joints: np.ndarray) -> np.ndarray:
 
 
 def rows_of(model: Predictor, single: Predictor, folder: Path, least: int) -> Iterator[tuple[dict, PersonPose]]:
-    """Each labelled person of `least` points and more, sweep by sweep: their figures and their pose."""
+    """Each labeled person of `least` points and more, sweep by sweep: their figures and their pose."""
     for labels in sorted(folder.glob("sweep_*.json")):
         sweep = next(path for path in sorted(folder.glob(f"{labels.stem}.*")) if path.suffix != ".json")
         boxes = {"people": json.loads(labels.read_text())["people"]}

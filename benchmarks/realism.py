@@ -104,7 +104,7 @@ def rings_of(points: np.ndarray) -> np.ndarray:
 
 
 def real_people(folder: Path) -> list[tuple[str, float, np.ndarray, np.ndarray, Box]]:
-    """(name, distance m, points (n, 3), ring (n,), box) of the labelled people of at least `LEAST` points."""
+    """(name, distance m, points (n, 3), ring (n,), box) of the labeled people of at least `LEAST` points."""
     people = []
     for labels in sorted(folder.glob("sweep_*.json")):
         sweep = next(path for path in sorted(folder.glob(f"{labels.stem}.*")) if path.suffix != ".json")
@@ -223,7 +223,7 @@ def draw(rows: list[tuple], path: Path) -> None:
     axes.flat[-1].text(
         0,
         0.5,
-        "red: labelled people of real sweeps\ngrey: wild, same sensor and distance,\n"
+        "red: labeled people of real sweeps\ngray: wild, same sensor and distance,\n"
         "10 to 90 percent, median\nx: distance, m",
         fontsize=8,
         va="center",

@@ -96,7 +96,7 @@ def test_one_person_is_not_people(tmp_path):
     assert "alone: 1 person, scene wild" in page
 
 
-def test_labelled_people_are_drawn_on_a_sheet_and_on_a_page(tmp_path, monkeypatch):
+def test_labeled_people_are_drawn_on_a_sheet_and_on_a_page(tmp_path, monkeypatch):
     smpl = files.write_smpl(tmp_path / "SMPL_NEUTRAL.npz")
     files.write_sloper4d(tmp_path / "raw", smpl)
     prepare("sloper4d", tmp_path / "raw", tmp_path / "walks", smpl=smpl)

@@ -44,7 +44,7 @@ def add(commands) -> None:
         "lidarpose finetune humanm3 --epochs 20",
         "lidarpose finetune --out runs/finetune-001 --resume",
         description=_WHAT.format(
-            name="finetune", what="Trains on labelled people; each dataset supervises the joints that it labels."
+            name="finetune", what="Trains on labeled people; each dataset supervises the joints that it labels."
         ),
     )
     finetune.add_argument(

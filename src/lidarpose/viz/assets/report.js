@@ -1,5 +1,5 @@
 "use strict";
-// Turnable 3D views on 2D canvases. The house's frame: x forward, y left, z up; millimetres about the person's middle.
+// Turnable 3D views on 2D canvases. The level frame: x forward, y left, z up; millimeters about the person's middle.
 // A view looks from azimuth `turn` and elevation `tilt` at the person; depth grows towards the viewer.
 (() => {
   const data = JSON.parse(document.getElementById("data").textContent);
