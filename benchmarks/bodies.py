@@ -129,8 +129,9 @@ def draw_sheet(bodies: Bodies, path: Path) -> None:
         axes = figure.add_subplot(rows, PER_ROW, 1 + place, projection="3d")
         axes.add_collection3d(Poly3DCollection(triangles, facecolors=colors))
         x, y = bodies.vertices[row][:, :2].mean(0)
-        axes.set(xlim=(x - 0.6, x + 1.1), ylim=(y - 0.85, y + 0.85), zlim=(0, 1.9))
-        axes.set_box_aspect((1.7, 1.7, 1.9), zoom=1.35)
+        # room for a trolley ahead and an umbrella above
+        axes.set(xlim=(x - 0.6, x + 1.3), ylim=(y - 0.95, y + 0.95), zlim=(0, 2.2))
+        axes.set_box_aspect((1.9, 1.9, 2.2), zoom=1.3)
         axes.view_init(12, -60)
         axes.set_axis_off()
         axes.set_title(name, fontsize=9, y=0.98)

@@ -99,7 +99,7 @@ def _plot(curves: dict, path: str) -> None:
         axes.bar((np.arange(BINS) + 0.5) / BINS, count / count.sum(), 0.09, color="#d8dee6", label="share of joints")
         axes.plot([0, 1], [0, 1], color="#888888", linewidth=0.8)
         axes.plot(mean, share, "o-", color="#1f5f99", markersize=4, label="true share")
-        axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="stated", title=name)
+        axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="predicted", title=name.replace(": ", "\n"))
         axes.title.set_fontsize(10)
         axes.legend(fontsize=8, loc="upper left", frameon=False)
     canvas.print_png(path)
