@@ -214,13 +214,8 @@ def sample_people(rng: np.random.Generator, n: int) -> People:
         s = share.reshape(-1, *[1] * (table.ndim - 1))
         return (1 - s) * table[first] + s * table[second]
 
-    return People(
-        coefficients=mix(rig.coefficients),
-        sex=rig.sex[first],
-        age=mix(rig.age),
-        height=mix(rig.height),
-        bmi=mix(rig.bmi),
-    )
+    mixed = {name: mix(getattr(rig, name)) for name in ("coefficients", "age", "height", "bmi")}
+    return People(sex=rig.sex[first], **mixed)
 
 
 @cache

@@ -147,7 +147,7 @@ def tree_motion(
     matched = match_joints(path, tree.names, tree.parents) if matched is None else matched
     positions = tree.positions(values)
     name, finite = Path(path).stem, np.isfinite(positions).all((1, 2))
-    usable_clips(path, [name], [len(finite)], finite)
+    usable_clips(path, [name], [len(finite)], finite, fps)
     joints = np.full((len(finite), 24, 3), np.nan)
     with np.errstate(over="ignore", invalid="ignore"):
         joints[finite] = smpl_joints(tree.parents, matched, positions[finite])

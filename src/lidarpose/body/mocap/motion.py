@@ -222,12 +222,6 @@ def load_clips(path: str | PathLike) -> Clips:
         raise file_error(path, error) from None
 
 
-def check_rate(path: object, fps: float) -> None:
-    """Raises InputError unless `fps` is a rate."""
-    if not 0 < fps < np.inf:
-        raise file_error(path, f"the frame rate must be above 0, got {fps}; give load_motion fps=")
-
-
 def standing_axis(trunk: np.ndarray) -> str | None:
     """The axis, "-y" say, that people stand along whose trunks have these directions (F, 3) of length 1; None where
     they do not stand."""
@@ -241,21 +235,26 @@ def usable_clips(
     names: Sequence[str],
     length: Sequence[int] | np.ndarray,
     good: np.ndarray,
+    fps: float,
     number: np.ndarray | None = None,
-) -> dict:
+) -> dict[str, Any]:
     """Cuts clips at frames that cannot be used, so that no motion jumps over a gap.
 
     Args:
         names, length: Of the clips, one after the other.
         good: (F,) bool, frames that can be used.
+        fps: Frames a second of the recording.
         number: (F,) the frames' numbers in the recording, by default without gaps.
 
     Returns:
-        names and length of the clips among the good frames; a piece after the first is called NAME#2 and so on.
+        names, length, fps and dropped of the `Motion` of the good frames; a clip's pieces after the first are called
+        NAME#2 and so on.
 
     Raises:
-        InputError: Without frames, or where too large a share of a clip cannot be used.
+        InputError: For no rate, without frames, or where too large a share of a clip cannot be used.
     """
+    if not 0 < fps < np.inf:
+        raise file_error(path, f"the frame rate must be above 0, got {fps}; give load_motion fps=")
     number = np.arange(len(good)) if number is None else number
     pieces: list[tuple[str, int]] = []
     for name, end, count in zip(names, np.cumsum(length), length, strict=True):
@@ -273,7 +272,7 @@ def usable_clips(
     if not pieces:
         raise file_error(path, "holds no frame of motion")
     piece_names, counts = zip(*pieces, strict=True)
-    return {"names": piece_names, "length": np.array(counts)}
+    return {"names": piece_names, "length": np.array(counts), "fps": float(fps), "dropped": int((~good).sum())}
 
 
 def _is_of(name: str, subject: str) -> bool:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lidarpose.body.mocap.motion import Motion, check_rate, load_clips, standing_axis, usable_clips
+from lidarpose.body.mocap.motion import Motion, load_clips, standing_axis, usable_clips
 from lidarpose.body.rig import forward_kinematics, mean_adult_joints
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix, rotation_between, rotation_from_up, rotation_vector, unit
@@ -80,7 +80,6 @@ def motion_from_joints(
     Raises:
         InputError: For sizes or speeds that people do not have, upside down, or with too many frames to leave out.
     """
-    check_rate(path, fps)
     good = np.isfinite(joints).all((1, 2))
     if not good.any():
         raise file_error(path, "expected joints at finite positions, got no frame with any")
@@ -90,7 +89,7 @@ def motion_from_joints(
         raise file_error(path, "joints lie farther than 100 km from the origin; expected one unit throughout")
     joints = joints @ rotation_from_up(up or _up_axis(path, joints[good])).T
     good[good] = shortest_bone(joints[good])[0] > SHORTEST_BONE
-    clips = usable_clips(path, names, length, good)
+    clips = usable_clips(path, names, length, good, fps)
     joints = joints[good]
     _check_speed(path, joints, clips["length"], fps)
     rotations = retarget_positions(joints)
@@ -99,9 +98,7 @@ def motion_from_joints(
     return Motion(
         rotations=rotations,
         translation=(joints[:, _HIPS].mean(1) - at_origin[:, _HIPS].mean(1)).astype(np.float32),
-        fps=float(fps),
         source=f"{kind}: {path}",
-        dropped=int((~good).sum()),
         **clips,
     )
 

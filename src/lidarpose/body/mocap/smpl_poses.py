@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.body.mocap.motion import Motion, check_rate, join, standing_axis, usable_clips
+from lidarpose.body.mocap.motion import Motion, join, standing_axis, usable_clips
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_from_up
 from lidarpose.io.files import file_error, read_bytes, read_npz
 from lidarpose.io.pickles import load_pickle
@@ -77,9 +77,8 @@ def motion_from_smpl(
         raise file_error(path, "pose and trans must be numbers in rows of equal length") from None
     if pose.ndim != 2 or pose.shape[1] != _SMPL or trans.shape != (len(pose), 3):
         raise file_error(path, f"{kind} needs pose (frames, 72) and trans (frames, 3), got {pose.shape}, {trans.shape}")
-    check_rate(path, fps)
     good = np.isfinite(pose).all(1) & np.isfinite(trans).all(1)
-    clips = usable_clips(path, [name], [len(good)], good, number)
+    clips = usable_clips(path, [name], [len(good)], good, fps, number)
     pose, trans = pose[good].reshape(-1, 24, 3), trans[good]
     with np.errstate(over="ignore"):
         most, far = np.linalg.norm(pose, axis=-1).max(), np.linalg.norm(trans, axis=-1).max()
@@ -98,9 +97,7 @@ def motion_from_smpl(
     return Motion(
         rotations=rotations,
         translation=(trans @ world.T).astype(np.float32),
-        fps=float(fps),
         source=f"{kind}: {path}",
-        dropped=int((~good).sum()),
         **clips,
     )
 
