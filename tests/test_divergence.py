@@ -10,10 +10,10 @@ from reference.raycast_reference import (
     window_rays,
 )
 
-from lidarpose.errors import InputError
 from lidarpose.lidar.presets import sensor
 from lidarpose.lidar.raycast import Hits, footprint, scan, scan_divergent
 from lidarpose.lidar.scan_kernels import strongest_echo
+from lidarpose.synth.environment.mesh import box
 
 
 def wall(x: float, y: tuple[float, float], z: tuple[float, float] = (-3, 3)):
@@ -111,18 +111,54 @@ def test_the_strongest_echo_wins_and_faint_ones_are_lost():
     assert echo([np.inf, np.inf], [0.5, 0.5]) == (np.inf, -1)
 
 
-@pytest.mark.parametrize(
-    "change, message",
-    [
-        ({"divergence": 3.0}, "divergence must be between 0 and 0.1 rad, got 3.0: is it in mrad"),
-        ({"divergence": np.nan}, "divergence must be"),
-        ({"sub_beams": 0}, "sub_beams must be a whole number from 1 to 15"),
-        ({"sub_beams": 2.5}, "sub_beams must be"),
-        ({"pulse": -1.0}, "pulse must be"),
-        ({"margin": np.nan}, "margin must be"),
-        ({"window_vertices": np.full((2, 3), np.nan)}, "window_vertices must be finite"),
-    ],
-)
-def test_bad_widths_say_what_is_wrong(change, message):
-    with pytest.raises(InputError, match=message):
-        scan_divergent(*wall(5.0, (-1, 1)), sensor("vlp-16"), **{"divergence": 0.003, **change})
+# --- sensors with several origins
+
+AV2 = sensor("av2")
+
+
+def box_at(azimuth):
+    place = np.array([7 * np.cos(azimuth), 7 * np.sin(azimuth), -1.9])
+    return box((0.4, 0.6, 1.7)).moved(place, 0.3)
+
+
+@pytest.mark.parametrize("azimuth", [0.7, np.pi, -3.1])
+def test_beams_leave_from_their_own_origin(azimuth):
+    body = box_at(azimuth)
+    hits = scan(body.vertices, body.faces, AV2)
+    assert len(hits.points) > 150
+    heights = AV2.origin_heights[hits.ring]
+    assert set(heights) == {0.0, -0.11} and AV2.heads is AV2.origins
+    beams = hits.points.astype(float) - np.stack([0 * heights, 0 * heights, heights], -1)
+    np.testing.assert_allclose(
+        np.arctan2(beams[:, 2], np.hypot(beams[:, 0], beams[:, 1])), AV2.elevations[hits.ring], atol=1e-6
+    )
+    azimuths = -np.pi + (hits.column + hits.column0) * AV2.azimuth_step + AV2.azimuth_shifts[hits.ring]
+    away = np.arctan2(beams[:, 1], beams[:, 0]) - azimuths
+    np.testing.assert_allclose(np.mod(away + np.pi, 2 * np.pi), np.pi, atol=1e-5)
+    # the slow twin, an origin at a time
+    for height in (0.0, -0.11):
+        own = heights == height
+        moved = body.vertices - np.float32([0, 0, height])
+        distance, _ = cast_ray_list_reference(moved, body.faces, beams[own])
+        np.testing.assert_allclose(distance, np.linalg.norm(beams[own], axis=1), atol=1e-4)
+    # in order, inside the window
+    key = hits.column.astype(np.int64) * 100 + hits.ring
+    assert (np.diff(key) > 0).all()
+    assert hits.column.max() < hits.columns and hits.row0 <= hits.ring.min()
+    assert hits.ring.max() < hits.row0 + hits.rows
+
+
+def test_origins_at_one_height_are_one_sensor():
+    body = box_at(1.1)
+    together = scan(body.vertices, body.faces, replace(AV2, origin_heights=None))
+    apart = scan(body.vertices, body.faces, replace(AV2, origin_heights=np.zeros(64)))
+    np.testing.assert_array_equal(apart.ring, together.ring)
+    np.testing.assert_allclose(apart.points, together.points, atol=1e-6)
+
+
+def test_divergent_beams_of_several_origins():
+    body = box_at(1.1)
+    lines, wide = scan(body.vertices, body.faces, AV2), scan_divergent(body.vertices, body.faces, AV2, divergence=0.003)
+    assert len(lines.points) < len(wide.points) < 1.2 * len(lines.points)
+    far = body.moved(np.array([0, 0, 500.0]))
+    assert len(scan(far.vertices, far.faces, AV2).points) == 0

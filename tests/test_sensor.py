@@ -3,9 +3,11 @@ import json
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
-from lidarpose.lidar.presets import SENSORS, sensor
+from lidarpose.lidar.presets import SENSORS, listing, sensor
 from lidarpose.lidar.sensor import Sensor, Window
 from lidarpose.lidar.sensor_file import load_sensor
 
@@ -32,7 +34,7 @@ def test_presets_are_what_their_names_say():
 
 
 def test_unknown_name_lists_the_nearest():
-    with pytest.raises(InputError, match="did you mean vlp-32c"):
+    with pytest.raises(InputError, match="unknown sensor 'vlp32c'.*did you mean vlp-32c"):
         sensor("vlp32c")
 
 
@@ -55,6 +57,8 @@ def test_a_sensor_is_frozen():
         ({"azimuth_step": 0.1}, "divide 2 pi"),
         ({"azimuth_step": -np.pi}, "divide 2 pi"),
         ({"azimuth_offsets": np.zeros(3)}, "one a ring"),
+        ({"origin_heights": np.zeros(3)}, "one a ring"),
+        ({"origin_heights": [0.0, np.nan]}, "origin_heights must be a list of finite heights in meters"),
         ({"range_min": 5.0, "range_max": 4.0}, "min < max"),
         ({"dropout": 1.0}, "dropout"),
         ({"range_sigma": -0.1}, "range_sigma"),
@@ -104,48 +108,154 @@ def test_window_over_the_seam_and_all_round():
     assert s.window(0, 1e-6, 0, 1e-6).columns in (0, 1) and s.window(0, 1, 0.5, 0.6).rows == 0
 
 
-def test_user_tables_that_go_wrong_are_told_in_one_line(tmp_path):
-    def refused(name, content, message):
-        path = tmp_path / name
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        with pytest.raises(InputError, match=message) as caught:
-            sensor(path)
-        assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+# --- the user's tables, and the list of those that ship
 
-    refused("a.json", '{"elevations_deg": [1, 2], "height": 1' + "0" * 400 + "}", "height must be a finite number")
-    refused("b.json", '{"elevations_deg": [1, 2], "tilt_deg": "down"}', "tilt_deg must be a number")
-    refused("c.json", "[1, 2, NaN]", "number 2 is not finite")
-    refused("d.json", "[" * 100_000, "is not JSON")
-    refused("e.csv", '"' + "9" * 200_000 + '"', "is not CSV")
-    refused("f.csv", b"1\n" * 2**23 + b"1\n", "is it a recording")
-    refused("g.csv", b"", "is empty")
-    refused(
-        "h.json", '{"beam_altitude_angles": [1, 2], "lidar_mode": "0x10"}', "a lidar_mode such as 1024x10, got '0x10'"
-    )
-    refused("h.json", '{"beam_altitude_angles": [1, 2], "lidar_mode": "\u00b2x10"}', "a lidar_mode such as 1024x10")
-    refused("h.json", '{"beam_altitude_angles": [1, 2], "lidar_mode": 5}', "a lidar_mode such as 1024x10, got '5'")
+ANGLES = [15.0, 5.0, -5.0, -15.0]
 
 
-def test_ouster_files_of_all_ages_say_their_columns(tmp_path):
-    angles, path = [16.6, 0.5, -16.6], tmp_path / "os.json"
-    for content, columns in (
-        ({"beam_altitude_angles": angles, "lidar_mode": "2048x10"}, 2048),
-        ({"beam_intrinsics": {"beam_altitude_angles": angles}, "config_params": {"lidar_mode": "512x20"}}, 512),
-        ({"beam_intrinsics": {"beam_altitude_angles": angles}, "lidar_data_format": {"columns_per_frame": 1024}}, 1024),
-        ({"beam_altitude_angles": angles, "lidar_mode": "MODE_4096x5"}, 4096),
-        ({"beam_altitude_angles": angles, "lidar_mode": "?", "lidar_data_format": {"columns_per_frame": 512}}, 512),
-        ({"beam_altitude_angles": angles}, 1024),
-    ):
-        path.write_text(json.dumps(content))
-        found = load_sensor(path)
-        assert found.columns == columns and found.rows == 3
-        assert np.degrees(found.elevations) == pytest.approx(sorted(angles))
+def written(path, content):
+    content = content if isinstance(content, str | bytes) else json.dumps(content)
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
 
 
-def test_csv_files_of_any_line_end_are_read(tmp_path):
-    for number, end in enumerate(("\n", "\r\n", "\r")):
-        path = tmp_path / f"{number}.csv"
-        path.write_bytes(end.join(["\ufeffChannel,Elevation,Azimuth", "1,10,1.0", "2,-10,-1.0", ""]).encode())
-        found = load_sensor(path)
-        assert np.degrees(found.elevations) == pytest.approx([-10, 10])
-        assert abs(np.degrees(found.azimuth_offsets[0] - found.azimuth_offsets[1])) == pytest.approx(2)
+OUSTER = {"beam_altitude_angles": ANGLES, "beam_azimuth_angles": [4.2, 1.4, -1.4, -4.2]}
+CSV = "\ufeffLaser id,Elevation,Azimuth\n1,15,1.0\n2,5,2.0\n3,-5,3.0\n4,-15,4.0\n"
+
+
+@pytest.mark.parametrize(
+    ("suffix", "content", "columns", "offsets"),
+    [
+        ("json", ANGLES, 1800, None),
+        ("json", {"elevations_deg": ANGLES}, 1800, None),
+        ("csv", "15\n5\n-5\n-15\n", 1800, None),
+        ("csv", "# made by hand\nelevation (deg)\n15\n5\n-5\n-15\n", 1800, None),
+        *[("csv", CSV.replace("\n", end), 1800, [-4.0, -3.0, -2.0, -1.0]) for end in ("\n", "\r\n", "\r")],
+        # Ouster's, of all ages
+        ("json", OUSTER, 1024, [4.2, 1.4, -1.4, -4.2]),
+        ("json", OUSTER | {"lidar_mode": "2048x10"}, 2048, [4.2, 1.4, -1.4, -4.2]),
+        ("json", OUSTER | {"lidar_mode": "MODE_4096x5"}, 4096, [4.2, 1.4, -1.4, -4.2]),
+        ("json", {"beam_intrinsics": OUSTER, "config_params": {"lidar_mode": "512x20"}}, 512, [4.2, 1.4, -1.4, -4.2]),
+        ("json", {"a": {"beam_altitude_angles": ANGLES}, "b": {"columns_per_frame": 1024}}, 1024, None),
+        ("json", OUSTER | {"lidar_mode": "?", "b": {"columns_per_frame": 512}}, 512, [4.2, 1.4, -1.4, -4.2]),
+    ],
+)
+def test_tables_are_read_in_any_order_of_lasers(tmp_path, suffix, content, columns, offsets):
+    path = written(tmp_path / f"mine.{suffix}", content)
+    table = load_sensor(path)
+    np.testing.assert_allclose(np.degrees(table.elevations), sorted(ANGLES))
+    assert table.name == "mine" and table.columns == columns
+    if offsets is None:
+        assert table.azimuth_offsets is None
+    else:
+        np.testing.assert_allclose(np.degrees(table.azimuth_offsets), offsets)
+    # the same through the name, as on the command line
+    np.testing.assert_array_equal(sensor(str(path)).elevations, table.elevations)
+
+
+@pytest.mark.parametrize(
+    ("named", "sign"),
+    [("azimuth_offset", 1), ("azimuth_offset_deg", 1), ("Azimuth offsets (deg)", 1), ("azimuth-offsets-deg", 1)]
+    + [("azimuth", -1), ("azimuth_deg", -1), ("Horizontal", -1)],
+)
+def test_offsets_of_a_csv_by_any_of_their_names(tmp_path, named, sign):
+    table = load_sensor(written(tmp_path / "a.csv", f"laser,elevation_deg,{named}\n1,-1,5\n2,0,3\n3,1,2\n"))
+    np.testing.assert_allclose(np.degrees(table.azimuth_offsets), np.multiply(sign, [5, 3, 2]))
+
+
+def test_the_own_form_sets_every_field(tmp_path):
+    given = {
+        "name": "mine", "elevations_deg": ANGLES, "azimuth_offsets_deg": [0, 1, 2, 3], "columns": 720,
+        "range_min": 1.0, "range_max": 50.0, "range_sigma": 0.03, "dropout": 0.1, "height": 2.5, "tilt_deg": 20.0,
+    }  # fmt: skip
+    table = load_sensor(written(tmp_path / "x.json", given))
+    assert (table.name, table.columns, table.range_min, table.range_max) == ("mine", 720, 1.0, 50.0)
+    assert (table.range_sigma, table.dropout, table.height) == (0.03, 0.1, 2.5)
+    assert np.degrees(table.tilt) == pytest.approx(20)
+    np.testing.assert_allclose(np.degrees(table.azimuth_offsets), [3, 2, 1, 0])
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.json", "{", "is not JSON"),
+        ("a.json", "[]", "holds no elevations"),
+        ("a.json", {"beams": 3}, "holds no beams"),
+        ("a.json", "3", "holds no beams"),
+        ("a.json", ["up", "down"], "list of numbers"),
+        ("a.json", [[1, 2], [3, 4]], "list of finite numbers"),
+        ("a.json", [0, 95.0], "within .*90 degrees"),
+        ("a.json", np.radians(np.linspace(-25, 15, 32)).tolist(), "seem to be radians"),
+        ("a.json", {"elevations_deg": ANGLES, "azimuth_offsets_deg": [1, 2]}, "4 elevations and 2 azimuth offsets"),
+        ("a.json", {"elevations_deg": ANGLES, "columns": 0}, "columns must be"),
+        ("a.json", {"elevations_deg": ANGLES, "azimuth_offset_deg": ANGLES}, "unknown key .* azimuth_offsets_deg"),
+        ("a.json", {"elevations_deg": ANGLES, "height": -5}, "height must be above 0 m"),
+        ("a.json", {"elevations_deg": ANGLES, "tilt_deg": 400}, "within .*90 degrees, got 400"),
+        ("a.json", {"elevations_deg": ANGLES, "range_max": "far"}, "range_max must be a number"),
+        ("a.json", {"elevations_deg": ANGLES, "tilt_deg": "down"}, "tilt_deg must be a number"),
+        ("a.json", {"elevations_deg": ANGLES, "range_min": 9.0, "range_max": 1.0}, "min < max"),
+        ("a.csv", "elevation,azimuths\n1,2\n3,4\n", "unknown column 'azimuths': name it azimuth_offset"),
+        ("a.csv", "\n\n", "no rows"),
+        ("a.csv", "1,2\n3,4\n", "no header"),
+        ("a.csv", "laser,azimuth\n1,2\n", "no column named elevation"),
+        ("a.csv", "elevation\n1\nup\n", "number of degrees in every row"),
+        ("a.csv", "azimuth,elevation\n1,2\n1\n", "number of degrees in every row"),
+        pytest.param(
+            "a.json",
+            '{"elevations_deg": [1, 2], "height": 1' + "0" * 400 + "}",
+            "height must be a finite number",
+            id="long number",
+        ),
+        ("a.json", "[1, 2, NaN]", "number 2 is not finite"),
+        pytest.param("a.json", "[" * 100_000, "is not JSON", id="deep"),
+        pytest.param("a.csv", '"' + "9" * 200_000 + '"', "is not CSV", id="long cell"),
+        pytest.param("a.csv", b"1\n" * 2**23 + b"1\n", "is it a recording", id="large"),
+        ("a.csv", b"", "is empty"),
+        *[
+            ("a.json", OUSTER | {"lidar_mode": mode}, f"a lidar_mode such as 1024x10, got '{mode}'")
+            for mode in ("0x10", "\u00b2x10", 5)
+        ],
+    ],
+)
+def test_wrong_tables_are_told_in_one_line(tmp_path, name, content, message):
+    path = written(tmp_path / name, content)
+    with pytest.raises(InputError, match=message) as caught:
+        load_sensor(path)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_missing_table_is_named(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        sensor(str(tmp_path / "none.json"))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.binary(min_size=1, max_size=200), st.sampled_from([".json", ".csv"]))
+def test_no_bytes_make_it_fail_otherwise(tmp_path_factory, content, suffix):
+    path = tmp_path_factory.mktemp("t") / f"x{suffix}"
+    path.write_bytes(content)
+    try:
+        table = load_sensor(path)
+    except InputError as error:
+        assert "\n" not in str(error)
+    else:
+        assert np.isfinite(table.elevations).all()
+
+
+def test_the_list_names_all_sensors():
+    lines = listing()
+    assert len(lines) == 1 + len(SENSORS) >= 13 and {line.split()[0] for line in lines[1:]} == set(SENSORS)
+    assert all(len(line) < 100 for line in lines)
+
+
+def test_a_table_that_has_changed_is_read_again(tmp_path, monkeypatch):
+    path = written(tmp_path / "mine.json", ANGLES)
+    assert sensor(path).rows == 4 and sensor(path) is sensor(path)
+    written(path, [*ANGLES, 25.0])
+    assert sensor(path).rows == 5
+    # of the same name in another folder
+    (tmp_path / "other").mkdir()
+    written(tmp_path / "other" / "mine.json", ANGLES[:3])
+    for folder, rows in ((tmp_path, 5), (tmp_path / "other", 3)):
+        monkeypatch.chdir(folder)
+        assert sensor("mine.json").rows == rows

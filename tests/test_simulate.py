@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from walkers import HEADINGS, bone_distance, goer
 
+from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.lidar.presets import sensor
 from lidarpose.sample import Pose, Sample
@@ -257,9 +258,14 @@ def test_every_try_is_nearer_and_easier_and_the_best_counts(monkeypatch):
     assert len(person.sample.points) == 9 and (person.sample.points == 1).all()
 
 
-def test_the_reference_preset_is_the_released_code_s():
-    reference = scene_config("reference")
-    noise = reference.noise
-    assert reference.distance == (5.0, 20.0) and np.degrees(reference.margin) == pytest.approx(1.8)
-    assert noise.dapt_compat and (noise.clutter, noise.missing_part, noise.mask) == (0.5, 0.5, 1.0)
-    assert noise.mask_keep == (0.6, 0.6)
+def test_presets_are_the_paper_s_and_the_released_code_s():
+    paper, reference = (scene_config(name) for name in ("paper", "reference"))
+    assert (paper.distance, paper.sensors) == ((4.0, 20.0), ("dapt64",)) and reference.distance == (5.0, 20.0)
+    assert np.degrees([paper.margin, reference.margin]) == pytest.approx([0, 1.8])
+    for config, clutter in ((paper, 0.0), (reference, 0.5)):
+        assert (config.noise.mask, config.noise.mask_keep) == (1.0, (0.6, 0.6))
+        assert config.noise.clutter == config.noise.missing_part == clutter
+        assert config.noise.dapt_compat == bool(clutter)
+    assert sensor("dapt64").rows == 64 and sensor("dapt64").columns in (2649, 2650)
+    with pytest.raises(InputError, match="unknown scene 'papr'"):
+        scene_config("papr")
