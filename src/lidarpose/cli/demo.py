@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.errors import InputError, MissingExtra
+from lidarpose.errors import check_int
 from lidarpose.inference.predictor import TTA, Predictor, load
 from lidarpose.io.files import atomic_path, check_writable
 from lidarpose.models import DEFAULT
@@ -23,13 +23,10 @@ def run(folder: str | Path, *, seed: int, weights: str = DEFAULT) -> None:
 
     Raises MissingExtra without numba; InputError for a negative seed or a folder that cannot be written.
     """
-    if seed < 0:
-        raise InputError(f"expected a seed of at least 0, got {seed}")
-    try:
-        from lidarpose.synth.generator import Generator
-        from lidarpose.synth.scene import scene_config
-    except MissingExtra:
-        raise MissingExtra("the demo synthesizes people and", "synth") from None
+    from lidarpose.synth.generator import Generator
+    from lidarpose.synth.scene import scene_config
+
+    check_int("seed", seed, least=0)
     folder = Path(folder)
     names = ["index.html", *(f"{name}.png" for name in SENSORS)]
     # a folder without write access is known at once; files are opened when there is something to write, since whoever
