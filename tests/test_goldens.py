@@ -24,6 +24,8 @@ from safetensors import safe_open
 import lidarpose
 from lidarpose.cli import main
 from lidarpose.errors import InputError
+from lidarpose.models import BUNDLED, DEFAULT, bundled_path
+from lidarpose.skeleton import SMPL24
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.street import street
 
@@ -32,8 +34,8 @@ SEED = 3
 SCENES, INDICES, FRAMES = ("wild", "paper", "reference"), (0, 1, 2, 33, 70), 2
 PEOPLE = [f"{scene} {index}" for scene in SCENES for index in INDICES]
 PEOPLE += [f"clip, frame {frame}" for frame in range(FRAMES)] + ["street"]
-# as far as another processor may round: m, and points of a cloud at the edge of a body
-POSITION, COUNT = 1e-3, 2
+# as far as another processor may round: m, m of a predicted joint, and points of a cloud at the edge of a body
+POSITION, POSE, COUNT = 1e-3, 5e-4, 2
 
 
 def recorded(name):
@@ -184,6 +186,33 @@ def weights():
 
 def test_the_shipped_weights_are_of_the_recorded_networks():
     assert list(differences(recorded("weights"), weights())) == []
+
+
+# ---- what the weights that ship say of one cloud, on any machine and by either backend
+
+# a synthesized walker of 221 points, 10 m from a VLP-32C; its joints were written by tools/ship_weights.py
+GOLDEN_POSES = json.loads((FOLDER.parent / "golden_poses.json").read_text())
+
+
+@pytest.mark.parametrize("backend", ["onnx", "torch"])
+@pytest.mark.parametrize("name", BUNDLED)
+def test_the_pose_of_a_fixed_cloud(name, backend):
+    model = lidarpose.load(name, backend=backend, tta=1)
+    pose = model.predict(np.array(GOLDEN_POSES["points"]), sensor_origin=GOLDEN_POSES["sensor_origin"])
+    np.testing.assert_allclose(pose.joints, GOLDEN_POSES["joints"][name], atol=POSE)
+
+
+@pytest.mark.parametrize("name", BUNDLED)
+def test_the_golden_pose_is_a_good_one(name):
+    """Within 6 cm of the truth on average, so that what is held is no nonsense."""
+    error = np.linalg.norm(np.array(GOLDEN_POSES["joints"][name]) - np.array(GOLDEN_POSES["truth"]), axis=-1)
+    assert len(error) == len(SMPL24) and error.mean() < 0.06, f"{error.mean() * 1e3:.0f} mm"
+
+
+def test_the_files_are_small():
+    """What is taken by default is at most 6 MB with its ONNX twin, any file at most 12."""
+    sizes = {name: [bundled_path(name, end).stat().st_size for end in (".safetensors", ".onnx")] for name in BUNDLED}
+    assert sum(sizes[DEFAULT]) < 6e6 and max(map(max, sizes.values())) < 12e6
 
 
 # ---- synthetic people

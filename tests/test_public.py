@@ -39,9 +39,11 @@ FORBIDDEN = {
 
 def loaded_by(code):
     """Which of the heavy libraries a program loads."""
-    heavy = ("torch", "numba", "numpy", "pandas", "matplotlib", "lzf")
+    heavy = ("torch", "numba", "numpy", "pandas", "matplotlib", "matplotlib.pyplot", "lzf")
     tail = f"\nimport sys; print(*[name for name in {heavy} if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code + tail], capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code + tail], capture_output=True, text=True, timeout=60, check=True
+    )
     return set(done.stdout.split("\n")[-2].split())
 
 
@@ -54,6 +56,14 @@ def test_reading_casting_and_predicting_need_no_torch():
     predicting = "lidarpose.load, lidarpose.predict, lidarpose.Poses, lidarpose.read_points, lidarpose.read_boxes"
     assert loaded_by(f"import lidarpose; {predicting}, lidarpose.Sample") <= {"numpy"}
     assert "torch" not in loaded_by("import lidarpose; lidarpose.cast_rays, lidarpose.sample_poses")
+
+
+def test_drawing_leaves_pyplot_alone():
+    assert "matplotlib" not in loaded_by("from lidarpose.viz import draw, html")
+    drawing = (
+        "import numpy as np; from lidarpose.viz import draw; draw.draw_people([draw.Panel(points=np.ones((9, 3)))])"
+    )
+    assert loaded_by(drawing) == {"numpy", "matplotlib"}
 
 
 def test_every_public_name_is_there():
