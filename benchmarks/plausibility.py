@@ -10,7 +10,7 @@ import argparse
 import numpy as np
 
 import lidarpose
-from lidarpose.eval.bench import load_bench
+from lidarpose.eval.dataset import load_bench
 
 CHANGES = {
     "as it is": 1.0,

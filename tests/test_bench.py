@@ -7,9 +7,15 @@ import numpy as np
 import pytest
 
 from lidarpose.errors import InputError
-from lidarpose.eval import bench as module
-from lidarpose.eval.bench import SHA256, bench_path, facing, load_bench, mean_poses
-from lidarpose.eval.dataset import open_eval_dataset
+from lidarpose.eval import dataset as module
+from lidarpose.eval.dataset import (
+    BENCH_SHA256,
+    bench_path,
+    facing,
+    load_bench,
+    mean_poses,
+    open_eval_dataset,
+)
 from lidarpose.geometry import rotation_about
 from lidarpose.sample import Box
 from lidarpose.skeleton import BODY26, HUMAN15
@@ -22,8 +28,8 @@ def bench():
 
 def test_the_file_is_the_frozen_one():
     data = bench_path().read_bytes()
-    assert hashlib.sha256(data).hexdigest() == SHA256
-    assert SHA256.startswith("8abcafc6628c") and len(data) < 12e6
+    assert hashlib.sha256(data).hexdigest() == BENCH_SHA256
+    assert BENCH_SHA256.startswith("8abcafc6628c") and len(data) < 12e6
 
 
 def test_parts_are_equal():

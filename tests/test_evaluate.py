@@ -24,10 +24,8 @@ from lidarpose.data.shards import open_dataset, read_rows, shard_path
 from lidarpose.errors import InputError
 from lidarpose.eval import robustness
 from lidarpose.eval import run as run_module
-from lidarpose.eval.bench import load_bench
-from lidarpose.eval.dataset import open_eval_dataset, spread
+from lidarpose.eval.dataset import load_bench, open_eval_dataset, spread
 from lidarpose.eval.metric_rows import facing_flipped, metric_rows, triples
-from lidarpose.eval.metrics import bootstrap
 from lidarpose.eval.protocols import cropped, eval_setup, jittered
 from lidarpose.eval.run import evaluate_dataset
 from lidarpose.geometry import rotation_about
@@ -351,7 +349,7 @@ def test_few_sequences_have_no_interval_and_are_drawn_whole(sets, monkeypatch):
     for name, words in (("lidarhuman26m", "one sequence alone"), ("humanm3", "2 sequences alone")):
         result = evaluated(sets, name, Fake(standing)).result
         assert result.line("mpjpe").low is None and any(note.startswith(words) for note in result.notes)
-    monkeypatch.setattr(bootstrap, "LEAST_UNITS", 2)
+    monkeypatch.setattr(aggregate, "LEAST_UNITS", 2)
     found = evaluated(sets, "humanm3", Fake(standing))
     row, table = found.result.line("mpjpe"), found.predictions.errors()
     means = [np.nanmean(table[found.predictions.sequence == name]) for name in ("test/b", "test/c")]

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from lidarpose import metrics
 from lidarpose.errors import InputError
-from lidarpose.eval.metrics import bootstrap
-from lidarpose.eval.metrics.bootstrap import LEAST_UNITS
+from lidarpose.eval.metrics import aggregate
+from lidarpose.eval.metrics.aggregate import LEAST_UNITS
 from lidarpose.skeleton import HUMAN15, SKELETONS, WAYMO14
 
 quick = settings(max_examples=40, deadline=None)
@@ -76,7 +76,7 @@ def test_own_groups_and_groups_of_nobody():
         (lambda: metrics.by_group(drawn(0), "waymo"), "unknown skeleton 'waymo'"),
         (lambda: metrics.mean(np.zeros((1, 2, 3))), r"\(people, joints\) or \(people,\), got \(1, 2, 3\)"),
         (lambda: metrics.mean([np.inf]), "got infinity"),
-        (lambda: metrics.mean([[1, 2], [3]]), "rows of equal length"),
+        (lambda: metrics.mean([[1, 2], [3]]), "lists of equal length"),
         (lambda: metrics.mean([1.0], "joint", empty=0.0), 'empty is for average="person"'),
         (lambda: metrics.interval([1.0, 2], 0), "numpy.random.Generator"),
         (lambda: metrics.interval([1.0, 2], np.random.default_rng(0), clusters=[0]), r"clusters must be \(2,\)"),
@@ -143,7 +143,7 @@ def test_slices_carry_intervals_of_their_own_people():
         ({"values": np.zeros(29)}, r"values of slices must be \(30,\), one a person, got \(29,\)"),
         ({"edges": (0, 0, 1)}, "two or more rising numbers"),
         ({"edges": (0,)}, "two or more rising numbers"),
-        ({"values": ["near"] * 30}, "must be numbers"),
+        ({"values": ["near"] * 30}, "values of slices must hold numbers"),
         ({"clusters": np.zeros(3)}, r"clusters must be \(30,\)"),
     ],
 )
@@ -173,7 +173,7 @@ def test_draws_against_a_loop(seed, average, clustered):
     table = drawn(seed, n=12, joints=3, labelled=0.4)
     table[0] = 1.0
     clusters = np.random.default_rng(seed).integers(4, size=12) if clustered else np.arange(12)
-    fast, units = bootstrap.bootstrap_means(
+    fast, units = aggregate.bootstrap_means(
         table, np.random.default_rng(seed), average, clusters=clusters if clustered else None, repeats=20
     )
     np.testing.assert_allclose(fast, slow_means(table, np.random.default_rng(seed), average, clusters, 20))
@@ -183,7 +183,7 @@ def test_draws_against_a_loop(seed, average, clustered):
 def test_draws_do_not_depend_on_how_many_are_held_at_once(monkeypatch):
     table = drawn(2)
     whole = metrics.interval(table, np.random.default_rng(0))
-    monkeypatch.setattr(bootstrap, "_BLOCK", 100)
+    monkeypatch.setattr(aggregate, "_BLOCK", 100)
     assert metrics.interval(table, np.random.default_rng(0)) == whole
     assert metrics.interval(table, np.random.default_rng(1)) != whole
 

@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lidarpose._version import __version__
-from lidarpose.eval.bench import METADATA, NAME, schema
+from lidarpose.eval.dataset import BENCH_METADATA, BENCH_NAME
 from lidarpose.io.files import atomic_path
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import PoseBank
@@ -33,6 +33,33 @@ SUBJECTS = ("006", "007")
 SOURCES = ("prior", "captured")
 PEOPLE, CLIPS = 2000, 60
 LEAST, LEAST_BODY = 20, 10
+# column -> type, of a value or of the values of a list
+COLUMNS = {
+    "clip": "int16",
+    "frame": "int16",
+    "condition": "string",
+    "poses": "string",
+    "sensor": "string",
+    "kind": "string",
+    "distance": "float32",
+    "visible": "float32",
+    "clutter": "float32",
+    "upright": "bool",
+    "origin": ["float64"],
+    "points_mm": ["int16"],
+    "part": ["uint8"],
+    "joints": ["float32"],
+    "box": ["float64"],
+}
+
+
+def schema() -> pa.Schema:
+    """The file's Arrow schema; its columns are described in `lidarpose.eval.dataset`."""
+    types = {
+        name: pa.list_(pa.type_for_alias(kind[0])) if isinstance(kind, list) else pa.type_for_alias(kind)
+        for name, kind in COLUMNS.items()
+    }
+    return pa.schema(list(types.items()))
 
 
 def conditions() -> dict[str, SceneConfig]:
@@ -65,7 +92,7 @@ def main() -> None:
     bank = PoseBank.from_clips(options.motion, SUBJECTS)
     rows = [*people(bank), *clips(bank)]
     card = {
-        "name": NAME,
+        "name": BENCH_NAME,
         "lidarpose": __version__,
         "seed": SEED,
         "sensors": SENSORS,
@@ -77,7 +104,7 @@ def main() -> None:
         "(mocap.cs.cmu.edu), created with funding from NSF EIA-0196217; their joint positions on other bodies, "
         "nothing of the files themselves",
     }
-    table = pa.Table.from_pylist(rows, schema()).replace_schema_metadata({METADATA: json.dumps(card)})
+    table = pa.Table.from_pylist(rows, schema()).replace_schema_metadata({BENCH_METADATA: json.dumps(card)})
     out = Path(options.out)
     out.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(out) as path:

@@ -10,18 +10,23 @@
 Meters in; millimeters or percent out. docs/evaluate.md defines every metric.
 """
 
-from lidarpose.eval.metrics.aggregate import AVERAGES, Score, mean
-from lidarpose.eval.metrics.bootstrap import Interval, interval, paired_interval
-from lidarpose.eval.metrics.calibration import auroc, calibration_error
-from lidarpose.eval.metrics.groups import (
+from lidarpose.eval.metrics.aggregate import (
+    AVERAGES,
     DISTANCE_EDGES,
     GROUPS,
     OCCLUSION_EDGES,
     POINT_EDGES,
+    Interval,
+    Score,
     Slice,
+    auroc,
     by_group,
     by_span,
+    calibration_error,
+    interval,
     joint_groups,
+    mean,
+    paired_interval,
 )
 from lidarpose.eval.metrics.joint_errors import (
     LEAST_ALIGNED,

@@ -1,7 +1,24 @@
-"""Datasets to evaluate on: folders that `lidarpose prepare` or `synth` wrote, and lidarpose-bench."""
+"""Datasets to evaluate on: folders that `lidarpose prepare` or `synth` wrote, and lidarpose-bench.
 
+lidarpose-bench is a frozen set of synthetic people and clips on which weights are scored: one Parquet file that ships
+with the package and that no later version of the generator touches (`tools/make_bench.py` made it once). A row is one
+person in one frame:
+
+    clip, frame         number of the clip and frame of it; clip -1: a person alone
+    condition           clean, occluded, cluttered, crop (a poor detector's box) or company (a second person)
+    poses               prior (procedural) or captured (subjects kept out of all training)
+    sensor, kind, distance, visible, clutter, upright      as in `sample.PersonInfo`
+    origin              (3,) m in the level frame at the sensor; points_mm: x, y, z of all points from it, millimeters
+    part                one a point: 0 = not body, 1 + j = the bone of SMPL-24's joint j
+    joints              x, y, z of body26's joints, m, in the level frame at the sensor, which stands at its origin
+    box                 center (3), size (3), yaw of the detector's box: m, rad
+"""
+
+import hashlib
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from importlib import resources
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -9,15 +26,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lidarpose.data.shards import DatasetReader, open_dataset, read_rows, rows_of_shard, shard_path
+from lidarpose.data.shards import DatasetReader, open_dataset, pyarrow, read_rows
 from lidarpose.errors import InputError, check_int
-from lidarpose.eval.bench import NAME, Bench, load_bench
-from lidarpose.io.files import file_error
-from lidarpose.sample import SEEN, Box, LabeledSample, PersonInfo, Pose, is_plain
+from lidarpose.geometry import rotation_about
+from lidarpose.io.files import file_error, read_bytes
+from lidarpose.sample import SEEN, Box, LabeledSample, PersonInfo, Pose, center_of, is_plain
 from lidarpose.skeleton import BODY26, HUMAN15, Skeleton, skeleton
 
-# the word for the set that ships with the package
-BENCH = "bench"
+# the word for the set that ships with the package, its name, the key of its card in the file's metadata
+BENCH, BENCH_NAME, BENCH_METADATA = "bench", "lidarpose-bench-1", "lidarpose-bench"
+BENCH_SHA256 = "8abcafc6628c7580b8bdf91f9c05992c7c6e4098d6922973c7cfc39d8fe0e0d2"
 # the word for everybody, whatever split
 EVERYBODY = "all"
 # splits that are scored where none is named, the first that there is. Waymo's papers report on its validation folder
@@ -66,9 +84,9 @@ class EvalDataset:
     """A dataset, opened.
 
     name; kind: the raw dataset's name, "synth" or "bench"; skeleton of the joints; scored: the joints that are scored
-    by default; split: name or "none"; split_by, split_source: of the split, "" where there is none; leaks, in words;
-    level: sequences out of level were turned; settings: of the dataset's card; count: people to score, of `total`;
-    limit as asked for; clusters: people of one `sequence` are not independent; skipped: of the last iteration.
+    by default; split: name or "none"; split_source: of the split, "" where there is none; leaks, in words; settings: of
+    the dataset's card; count: people to score, of `total`; limit as asked for, None where it takes nobody away;
+    clusters: people of one `sequence` are not independent; skipped: of the last iteration.
     """
 
     name: str
@@ -76,17 +94,15 @@ class EvalDataset:
     skeleton: Skeleton
     scored: Skeleton
     read: Callable[[Skipped], Iterator[EvalSample]]
-    split: str = "none"
-    split_by: str = ""
-    split_source: str = ""
-    leaks: str = ""
-    level: bool = False
-    settings: dict[str, Any] = field(default_factory=dict)
-    bench: Bench | None = None
     count: int
     total: int
     limit: int | None
     clusters: bool
+    split: str = "none"
+    split_source: str = ""
+    leaks: str = ""
+    settings: dict[str, Any] = field(default_factory=dict)
+    bench: "Bench | None" = None
     skipped: Skipped = field(default_factory=dict)
 
     def __iter__(self) -> Iterator[EvalSample]:
@@ -126,8 +142,8 @@ def spread(total: int, limit: int | None) -> np.ndarray:
 
 
 def _open_folder(folder: Path, split: str | None, limit: int | None) -> EvalDataset:
-    dataset = open_dataset(folder)
-    card, damaged = dataset.card, Skipped()
+    dataset, damaged = open_dataset(folder), Skipped()
+    card = dataset.card
     synthetic = card.people != "labelled"
     if synthetic and split not in (None, EVERYBODY):
         raise file_error(folder, f"holds synthetic people, which have no splits, got {split!r}: leave --split out")
@@ -143,7 +159,6 @@ def _open_folder(folder: Path, split: str | None, limit: int | None) -> EvalData
         known = ", ".join(splits) or "no splits"
         raise file_error(folder, f"has nobody in the split {split!r}; there are {known}: say one with --split")
     chosen = chosen.iloc[spread(total, limit)]
-    split_by = card.settings.get("split_by") or ""
     source, _, leaks = str(card.about.get("split", "")).partition("; LEAKS: ")
     own = skeleton(card.skeleton)
     return EvalDataset(
@@ -153,10 +168,8 @@ def _open_folder(folder: Path, split: str | None, limit: int | None) -> EvalData
         scored=_SYNTHETIC if synthetic else own,
         read=lambda skipped: _read_folder(dataset, chosen, damaged, skipped),
         split="none" if synthetic or not splits else split,
-        split_by=split_by,
-        split_source=source.removeprefix(f"{split_by}: "),
+        split_source=source.removeprefix(f"{card.settings.get('split_by') or ''}: "),
         leaks=leaks,
-        level=bool(card.settings.get("level")),
         settings=card.settings,
         count=len(chosen),
         total=total,
@@ -168,39 +181,37 @@ def _open_folder(folder: Path, split: str | None, limit: int | None) -> EvalData
 def _stored_rows(dataset: DatasetReader, damaged: Skipped) -> pd.DataFrame:
     """(shard, row, split) of everybody stored. Damaged shards are left out and counted; raises InputError for a missing
     one, and where all are damaged."""
-    table, card, parts = dataset.card.people, dataset.card, []
+    card, rows = dataset.card, []
     for shard in range(card.shards):
-        path = shard_path(dataset.folder, table, shard)
+        path = dataset.path(shard)
         if not path.is_file():
             raise file_error(path, f"is missing: the dataset is not finished; run the same {card.writer} again")
         try:
-            if table == "labelled":
-                splits = [row["split"] for row in read_rows(path, table, ("split",))]
-            elif (count := rows_of_shard(path)) is not None:
-                splits = [None] * count
+            if card.people == "labelled":
+                splits = [row["split"] for row in read_rows(path, card.people, ("split",))]
             else:
-                raise file_error(path, "cannot be read as Parquet; delete it and make it again")
-            parts.append(
-                pd.DataFrame({"shard": shard, "row": range(len(splits)), "split": pd.Series(splits, dtype=object)})
-            )
+                splits = [None] * dataset.rows_of(card.people, shard)
         except InputError as error:
             count_skipped(damaged, "damaged shards", error)
-    if not parts:
-        first = next(iter(damaged.values()))["first"]
-        raise InputError(f"none of the {card.shards} shards of {dataset.folder} can be read; the first: {first}")
-    return pd.concat(parts, ignore_index=True)
+        else:
+            rows += [(shard, row, split) for row, split in enumerate(splits)]
+    for entry in damaged.values():
+        if entry["count"] == card.shards:
+            raise InputError(
+                f"none of the {card.shards} shards of {dataset.folder} can be read; the first: {entry['first']}"
+            )
+    return pd.DataFrame(rows, columns=["shard", "row", "split"])
 
 
 def _read_folder(
     dataset: DatasetReader, chosen: pd.DataFrame, damaged: Skipped, skipped: Skipped
 ) -> Iterator[EvalSample]:
-    table = dataset.card.people
     skipped.update({reason: dict(entry) for reason, entry in damaged.items()})
     for shard, rows in chosen.groupby("shard")["row"]:
-        path = shard_path(dataset.folder, table, shard)
+        path = dataset.path(shard)
         try:
             # a shard that turns out to be damaged half way is left out as a whole
-            stored = list(read_rows(path, table))
+            stored = list(read_rows(path, dataset.card.people))
         except InputError as error:
             count_skipped(skipped, "damaged shards", error)
             count_skipped(skipped, "people of damaged shards", path.name, len(rows))
@@ -217,10 +228,55 @@ def _read_folder(
 # ---- the set that ships
 
 
+@dataclass(frozen=True, kw_only=True)
+class Bench:
+    """lidarpose-bench in memory. points: one (n, 3) float64 m a row, in the level frame at the sensor; joints
+    (N, 26, 3) m; columns: the others by name, (N,) or (N, k); card: how it was made."""
+
+    points: tuple[np.ndarray, ...]
+    joints: np.ndarray
+    columns: dict[str, np.ndarray]
+    card: dict
+
+    @property
+    def people(self) -> np.ndarray:
+        """Rows of people alone."""
+        return np.flatnonzero(self.columns["clip"] < 0)
+
+    @property
+    def clips(self) -> list[np.ndarray]:
+        """Rows of each clip, in order of time."""
+        clip = self.columns["clip"]
+        return [np.flatnonzero(clip == k) for k in range(int(clip.max(initial=-1)) + 1)]
+
+
+def bench_path() -> Path:
+    """Where the package keeps the file."""
+    return Path(str(resources.files("lidarpose.eval") / "assets" / f"{BENCH_NAME}.parquet"))
+
+
+def load_bench() -> Bench:
+    """The set. Raises InputError where the file is not the one that was frozen, MissingExtra without pyarrow."""
+    pa, parquet = pyarrow()
+    path = bench_path()
+    data = read_bytes(path, expected=f"{BENCH_NAME}, a Parquet file")
+    if hashlib.sha256(data).hexdigest() != BENCH_SHA256:
+        raise file_error(path, f"is not {BENCH_NAME} as it was frozen: install lidarpose again")
+    table = parquet.read_table(pa.BufferReader(data))
+    columns: dict[str, Any] = {name: values.to_numpy() for name, values in table.to_pandas().items()}
+    columns |= {name: np.stack(columns[name]) for name in ("origin", "joints", "box")}
+    shifts = zip(columns["origin"], columns.pop("points_mm"), strict=True)
+    points = tuple(origin + millimeters.reshape(-1, 3) / 1e3 for origin, millimeters in shifts)
+    columns["num_points"] = np.array([len(cloud) for cloud in points])
+    joints = columns.pop("joints").reshape(-1, len(BODY26), 3)
+    card = json.loads(table.schema.metadata[BENCH_METADATA.encode()])
+    return Bench(points=points, joints=joints, columns=columns, card=card)
+
+
 def _open_bench(split: str | None, limit: int | None) -> EvalDataset:
     """lidarpose-bench: its people alone, and without a limit the frames of its clips for motion."""
     if split not in (None, EVERYBODY):
-        raise InputError(f"{NAME} is one test set without splits, got {split!r}: leave --split out")
+        raise InputError(f"{BENCH_NAME} is one test set without splits, got {split!r}: leave --split out")
     bench = load_bench()
     total = len(bench.people)
     limit = limit if limit is not None and limit < total else None
@@ -228,7 +284,7 @@ def _open_bench(split: str | None, limit: int | None) -> EvalDataset:
     if limit is None:
         rows = np.concatenate([rows, *bench.clips])
     return EvalDataset(
-        name=NAME,
+        name=BENCH_NAME,
         kind=BENCH,
         skeleton=BODY26,
         scored=_SYNTHETIC,
@@ -258,3 +314,26 @@ def _bench_sample(bench: Bench, row: int) -> EvalSample:
     )
     words = {name: str(columns[name]) for name in ("condition", "poses")}
     return EvalSample(sample=sample, points=bench.points[row], shard=0, row=row, moving=clip >= 0, **words)
+
+
+def facing(joints: np.ndarray) -> np.ndarray:
+    """joints (N, 26, 3) m of body26 -> (N,) rad: the direction that hips and shoulders face, from above."""
+    at = BODY26.index
+    left = joints[:, at("left_hip")] - joints[:, at("right_hip")]
+    left = left + joints[:, at("left_shoulder")] - joints[:, at("right_shoulder")]
+    return np.arctan2(-left[:, 0], left[:, 1])
+
+
+def mean_poses(bench: Bench) -> dict[str, np.ndarray]:
+    """Baselines that know no points: joints (N, 26, 3) m of the mean skeleton about the points' center, turned to the
+    true facing ("mean pose, true facing") and not turned at all ("mean pose"). The means are over this set's people."""
+    clouds = zip(bench.points, bench.columns["origin"], strict=True)
+    center = np.stack([center_of(points) if len(points) else origin for points, origin in clouds])
+    offset = bench.joints - center[:, None]
+    R_level_person = rotation_about("z", facing(bench.joints))
+    # row vectors: x_person = x_level @ R_level_person
+    turned = (offset @ R_level_person)[bench.people].mean(0)
+    return {
+        "mean pose, true facing": center[:, None] + turned @ np.swapaxes(R_level_person, -1, -2),
+        "mean pose": center[:, None] + offset[bench.people].mean(0),
+    }

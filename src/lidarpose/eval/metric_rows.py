@@ -17,10 +17,18 @@ from typing import Any
 import numpy as np
 
 from lidarpose.errors import InputError
-from lidarpose.eval.metrics.aggregate import Score, mean
-from lidarpose.eval.metrics.bootstrap import interval
-from lidarpose.eval.metrics.calibration import auroc, calibration_error
-from lidarpose.eval.metrics.groups import DISTANCE_EDGES, OCCLUSION_EDGES, POINT_EDGES, joint_groups, span_rows
+from lidarpose.eval.metrics.aggregate import (
+    DISTANCE_EDGES,
+    OCCLUSION_EDGES,
+    POINT_EDGES,
+    Score,
+    auroc,
+    calibration_error,
+    interval,
+    joint_groups,
+    mean,
+    span_rows,
+)
 from lidarpose.eval.metrics.joint_errors import acceleration_errors, aligned_errors, joint_hits
 from lidarpose.eval.metrics.keypoints import PCK_THRESHOLDS, box_hits, oks, oks_hits, oks_sigmas, pem
 from lidarpose.eval.predictions import Predictions

@@ -73,7 +73,7 @@ _LEAST_EDGE = 1e-6
 def check_protocol(protocol: str, dataset: EvalDataset) -> None:
     """Raises InputError, one line, where the dataset cannot be scored by the protocol."""
     check_name("protocol", protocol, PROTOCOLS)
-    name, kind, split_by = dataset.name, dataset.kind, dataset.split_by
+    name, kind, split_by = dataset.name, dataset.kind, dataset.settings.get("split_by")
     if protocol == "clean":
         if split_by == "dapt":
             raise InputError(

@@ -14,9 +14,7 @@ import numpy as np
 
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.eval.dataset import BENCH, EvalSample, spread
-from lidarpose.eval.metrics.aggregate import mean
-from lidarpose.eval.metrics.bootstrap import interval, paired_interval
-from lidarpose.eval.metrics.groups import joint_groups
+from lidarpose.eval.metrics.aggregate import interval, joint_groups, mean, paired_interval
 from lidarpose.eval.predictions import Predictions, stack
 from lidarpose.eval.protocols import EvalSetup
 from lidarpose.eval.scores import Setting, number

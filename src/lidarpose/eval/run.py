@@ -15,10 +15,9 @@ import numpy as np
 from lidarpose._version import __version__
 from lidarpose.data.shards import pyarrow
 from lidarpose.errors import InputError
-from lidarpose.eval.bench import Bench, mean_poses
-from lidarpose.eval.dataset import BENCH, EvalDataset, EvalSample, count_skipped, open_eval_dataset
+from lidarpose.eval.dataset import BENCH, Bench, EvalDataset, EvalSample, count_skipped, mean_poses, open_eval_dataset
 from lidarpose.eval.metric_rows import baseline_rows, metric_rows
-from lidarpose.eval.metrics.bootstrap import LEAST_UNITS
+from lidarpose.eval.metrics.aggregate import LEAST_UNITS
 from lidarpose.eval.predictions import Predictions, stack, write_poses
 from lidarpose.eval.protocols import EvalSetup, Model, eval_setup
 from lidarpose.eval.robustness import Stability, people_to_perturb, study, to_json
@@ -138,7 +137,7 @@ def _notes(setup: EvalSetup, setting: Setting, predictions: Predictions) -> Iter
         yield f"the split leaks: {setting.leaks}"
     if setting.protocol == "dapt":
         yield "crop and center are made of labels, as in the released code: not comparable with the protocol clean"
-        if setup.dataset.level:
+        if setup.dataset.settings.get("level"):
             yield "sequences out of level were turned; for the released code's frame, prepare with --no-level"
     if setting.kind == "waymo" and not (predictions.labels == UNLABELED).all():
         yield "joints that are labelled as hidden count, but in PEM; people are predicted in their labelled boxes"

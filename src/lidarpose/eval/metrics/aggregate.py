@@ -1,16 +1,96 @@
-"""From errors of joints to one score. Tables are plain arrays.
+"""From errors of joints to scores: means, bootstrap intervals, groups of joints, spans of people, calibration.
 
 A table is (n, J), a row a person and a column a joint, in millimeters or percent, or (n,) for a value of the whole
 person. NaN stands where there is nothing to score: a joint without a label.
+
+Intervals are percentile bootstraps (Efron & Tibshirani 1993, chapter 13). With clusters, whole clusters are drawn
+instead of people: frames of one sequence show the same person in nearly the same pose, and drawing them one by one
+gives far too narrow intervals. Intervals of few units are too narrow as well: of normal ones, 95 % intervals held the
+truth in 93 % of trials with 20 units, in 90 % with 10, in 49 % with two.
 """
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lidarpose.errors import InputError, check_name
+from lidarpose.errors import InputError, check_int, check_name
+from lidarpose.skeleton import Skeleton, skeleton
 
 # how people and joints are averaged: over people the mean of each one's joints, or over all joints alike
 AVERAGES = ("person", "joint")
+_LIMB_JOINTS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+# the groups that the paper and Waymo report (head to ankles), and groups for the joints that only SMPL has
+GROUPS = {
+    "head": ("head", "nose", "head_center"),
+    **{
+        f"{name}s": (f"left_{name}", f"right_{name}") for name in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+    },
+    "trunk": ("pelvis", "spine1", "spine2", "spine3", "neck", "left_collar", "right_collar"),
+    "hands": ("left_hand", "right_hand"),
+    "feet": ("left_foot", "right_foot"),
+}
+# edges of this project's own reports: meters, points a person, share of the body that is hidden
+DISTANCE_EDGES = (0.0, 10.0, 20.0, 30.0, np.inf)
+POINT_EDGES = (0, 50, 100, 200, 400, np.inf)
+OCCLUSION_EDGES = (0.0, 0.1, 0.3, 0.5, 1.0)
+# an evaluation states no interval of fewer people or clusters
+LEAST_UNITS = 10
+# random indices held in memory at once
+_BLOCK = 1 << 21
+
+
+# ---- arguments, checked once where they come in
+
+
+def as_numbers(name: str, value: ArrayLike) -> np.ndarray:
+    """An array of floats; raises InputError where it holds something else, or lists of unequal length."""
+    try:
+        return np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must hold numbers, in lists of equal length") from None
+
+
+def as_flags(name: str, value: ArrayLike, shape: tuple[int, ...], *, of: str = "joint") -> np.ndarray:
+    """bool of a shape, one a joint or another thing, from bool or 0 and 1; raises InputError otherwise."""
+    flags = as_numbers(name, value)
+    if flags.shape != shape:
+        raise InputError(f"{name} must be {shape}, one a {of}, got {flags.shape}")
+    if not ((flags == 0) | (flags == 1)).all():
+        raise InputError(f"{name} must be bool, or 0 and 1; of other codes pass a comparison, such as codes > 0")
+    return flags == 1
+
+
+def as_table(table: ArrayLike) -> np.ndarray:
+    """A table as (n, J) float; raises InputError for another shape or for infinite entries."""
+    table = as_numbers("a table of scores", table)
+    if table.ndim not in (1, 2):
+        raise InputError(f"a table of scores must be (people, joints) or (people,), got {table.shape}")
+    if np.isinf(table).any():
+        raise InputError("a table of scores must be finite, or NaN where a joint has no label; got infinity")
+    return table[:, None] if table.ndim == 1 else table
+
+
+def as_skeleton(of: Skeleton | str) -> Skeleton:
+    """A skeleton, by name too."""
+    return skeleton(of) if isinstance(of, str) else of
+
+
+def check_positive(name: str, value: float) -> None:
+    """Raises InputError unless `value` is a positive, finite number."""
+    if not (isinstance(value, Real) and np.isfinite(value) and value > 0):
+        raise InputError(f"{name} must be a positive number, got {value!r}")
+
+
+def _cluster_labels(clusters: ArrayLike | None, count: int) -> np.ndarray | None:
+    if clusters is not None and np.shape(clusters) != (count,):
+        raise InputError(f"clusters must be ({count},), one label a person, got {np.shape(clusters)}")
+    return None if clusters is None else np.asarray(clusters)
+
+
+# ---- means
 
 
 class Score(float):
@@ -30,25 +110,6 @@ class Score(float):
         return score
 
 
-def as_table(table: ArrayLike) -> np.ndarray:
-    """A table as (n, J) float; raises InputError for another shape or for infinite entries."""
-    try:
-        table = np.asarray(table, float)
-    except (TypeError, ValueError):
-        raise InputError("a table of scores must hold numbers, rows of equal length") from None
-    if table.ndim not in (1, 2):
-        raise InputError(f"a table of scores must be (people, joints) or (people,), got {table.shape}")
-    if np.isinf(table).any():
-        raise InputError("a table of scores must be finite, or NaN where a joint has no label; got infinity")
-    return table[:, None] if table.ndim == 1 else table
-
-
-def person_sums(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Table (n, J) -> (n,) sum over each person's labeled joints, (n,) their number."""
-    labeled = ~np.isnan(table)
-    return np.where(labeled, table, 0.0).sum(1), labeled.sum(1)
-
-
 def mean(table: ArrayLike, average: str = "person", *, empty: float | None = None) -> Score:
     """The mean of a table (n, J) or (n,).
 
@@ -59,15 +120,249 @@ def mean(table: ArrayLike, average: str = "person", *, empty: float | None = Non
             and counts them as skipped.
     """
     check_name("average", average, AVERAGES)
-    total, count = person_sums(as_table(table))
-    seen = count > 0
-    if average == "joint":
-        if empty is not None:
-            raise InputError('empty is for average="person": people without labeled joints add none to the other')
-        value = total.sum() / count.sum() if seen.any() else np.nan
-    else:
-        each = np.where(seen, total / np.maximum(count, 1), np.nan if empty is None else empty)
-        each = each if empty is not None else each[seen]
-        value = each.mean() if len(each) else np.nan
-    people = len(seen) if empty is not None else int(seen.sum())
-    return Score(value, people=people, joints=int(count.sum()), skipped=len(seen) - people)
+    if average == "joint" and empty is not None:
+        raise InputError('empty is for average="person": people without labeled joints add none to the other')
+    total, count = _person_sums(as_table(table))
+    counted = count > 0 if empty is None else np.ones(len(count), bool)
+    each = np.where(count > 0, total / np.maximum(count, 1), np.nan if empty is None else empty)
+    people, joints = int(counted.sum()), int(count.sum())
+    value = np.nan
+    if people:
+        value = total.sum() / joints if average == "joint" else each[counted].mean()
+    return Score(value, people=people, joints=joints, skipped=len(count) - people)
+
+
+def _person_sums(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Table (n, J) -> (n,) sum over each person's labeled joints, (n,) their number."""
+    labeled = ~np.isnan(table)
+    return np.where(labeled, table, 0.0).sum(1), labeled.sum(1)
+
+
+# ---- intervals
+
+
+@dataclass(frozen=True, kw_only=True)
+class Interval:
+    """low, high: ends, in the table's unit, NaN where nothing was drawn; level: share of draws between them; units: how
+    many people or clusters were drawn from; repeats: how often."""
+
+    low: float
+    high: float
+    level: float
+    units: int
+    repeats: int
+
+    @property
+    def stated(self) -> tuple[float, float] | tuple[None, None]:
+        """low and high as an evaluation states them: None of fewer than `LEAST_UNITS`."""
+        return (self.low, self.high) if self.units >= LEAST_UNITS else (None, None)
+
+
+def interval(
+    table: ArrayLike,
+    rng: np.random.Generator,
+    average: str = "person",
+    *,
+    clusters: ArrayLike | None = None,
+    level: float = 0.95,
+    repeats: int = 2000,
+) -> Interval:
+    """The interval of `mean` of a table (n, J) or (n,), by drawing people with replacement.
+
+    Args:
+        clusters: (n,) a label a person, sequence or subject, which are drawn whole. People without labeled joints are
+            left out, as in the mean.
+    """
+    if not isinstance(rng, np.random.Generator):
+        raise InputError(f"rng must be a numpy.random.Generator, such as default_rng(0), got {type(rng).__name__}")
+    if not 0 < level < 1:
+        raise InputError(f"level must lie between 0 and 1, got {level}")
+    if repeats < 1:
+        raise InputError(f"repeats must be 1 or more, got {repeats}")
+    check_name("average", average, AVERAGES)
+    table = as_table(table)
+    draws, units = bootstrap_means(table, rng, average, clusters=_cluster_labels(clusters, len(table)), repeats=repeats)
+    low, high = np.quantile(draws, [(1 - level) / 2, (1 + level) / 2]).tolist() if units else (np.nan, np.nan)
+    return Interval(low=low, high=high, level=level, units=units, repeats=repeats)
+
+
+def paired_interval(
+    first: ArrayLike,
+    second: ArrayLike,
+    rng: np.random.Generator,
+    average: str = "person",
+    *,
+    clusters: ArrayLike | None = None,
+    level: float = 0.95,
+    repeats: int = 2000,
+) -> Interval:
+    """The interval of mean(first) - mean(second): two models' tables of the same people with the same labels.
+
+    Both are drawn with the same people, so what is hard for both does not widen it.
+    """
+    first, second = as_table(first), as_table(second)
+    if first.shape != second.shape or (np.isnan(first) != np.isnan(second)).any():
+        raise InputError("tables to compare must be of the same people, with the same joints labeled")
+    return interval(first - second, rng, average, clusters=clusters, level=level, repeats=repeats)
+
+
+def bootstrap_means(
+    table: np.ndarray, rng: np.random.Generator, average: str, *, clusters: np.ndarray | None, repeats: int
+) -> tuple[np.ndarray, int]:
+    """The means of `repeats` draws (repeats,), and how many units were drawn from; of nobody NaN and 0."""
+    total, count = _person_sums(table)
+    labeled = count > 0
+    total, count = total[labeled], count[labeled]
+    if average == "person":
+        total, count = total / count, np.ones(len(count))
+    if clusters is not None:
+        labels, cluster = np.unique(clusters[labeled], return_inverse=True)
+        total, count = (np.bincount(cluster, values, minlength=len(labels)) for values in (total, count))
+    units = len(total)
+    means = np.full(repeats, np.nan)
+    at_once = max(1, _BLOCK // max(units, 1))
+    for start in range(0, repeats if units else 0, at_once):
+        drawn = rng.integers(units, size=(min(at_once, repeats - start), units))
+        means[start : start + len(drawn)] = total[drawn].sum(1) / count[drawn].sum(1)
+    return means, units
+
+
+# ---- groups of joints
+
+
+def joint_groups(of: Skeleton | str, groups: Mapping[str, Sequence[str]] = GROUPS) -> dict[str, np.ndarray]:
+    """Group -> indices of its joints in the skeleton, by name; groups without a joint there are left out, "all" is
+    last. of: a skeleton or its name."""
+    of = as_skeleton(of)
+    indices = {
+        name: np.array([of.index(joint) for joint in joints if joint in of.joints], int)
+        for name, joints in groups.items()
+    }
+    return {name: index for name, index in indices.items() if len(index)} | {"all": np.arange(len(of))}
+
+
+def by_group(
+    table: ArrayLike,
+    of: Skeleton | str,
+    average: str = "person",
+    *,
+    groups: Mapping[str, Sequence[str]] = GROUPS,
+    empty: float | None = None,
+) -> dict[str, Score]:
+    """`mean` of a table (n, J) for each joint group of the skeleton. A group that nobody has a label in is NaN."""
+    table, of = as_table(table), as_skeleton(of)
+    if table.shape[1] != len(of):
+        raise InputError(f"a table of {of.name} has {len(of)} columns, one a joint, got {table.shape[1]}")
+    return {name: mean(table[:, index], average, empty=empty) for name, index in joint_groups(of, groups).items()}
+
+
+# ---- spans of people: distance, number of points, occlusion or any other number that each person has
+
+
+@dataclass(frozen=True, kw_only=True)
+class Slice:
+    """People of one span of distance, points or occlusion: their score and, where asked for, its interval."""
+
+    score: Score
+    interval: Interval | None = None
+
+
+def span_rows(values: np.ndarray, edges: Sequence[float] | np.ndarray) -> dict[str, np.ndarray]:
+    """Span -> (n,) bool: whose value (n,) lies in it. A span holds its lower edge, the last one its upper edge too."""
+    rows = {}
+    for low, high in zip(edges[:-1], edges[1:], strict=True):
+        name = f"{low:g} and more" if np.isinf(high) else f"{low:g} to {high:g}"
+        rows[name] = (values >= low) & ((values < high) | ((values == high) & (high == edges[-1])))
+    return rows
+
+
+def by_span(
+    table: ArrayLike,
+    values: ArrayLike,
+    edges: ArrayLike,
+    average: str = "person",
+    *,
+    rng: np.random.Generator | None = None,
+    clusters: ArrayLike | None = None,
+) -> dict[str, Slice]:
+    """The mean of a table (n, J) or (n,) for people whose value lies between two edges: distance, points, occlusion.
+
+    Args:
+        values: (n,) one a person.
+        edges: (k,) rising; see `span_rows`. People in no span, or whose value is NaN, come last as "elsewhere".
+        rng: adds an interval to each span.
+        clusters: (n,), see `interval`.
+    """
+    table = as_table(table)
+    values, edges = as_numbers("values of slices", values), as_numbers("edges of slices", edges)
+    if values.shape != (len(table),):
+        raise InputError(f"values of slices must be ({len(table)},), one a person, got {values.shape}")
+    if edges.ndim != 1 or len(edges) < 2 or not (np.diff(edges) > 0).all():
+        raise InputError(f"edges of slices must be two or more rising numbers, got {edges.tolist()}")
+    labels = _cluster_labels(clusters, len(table))
+    spans = span_rows(values, edges)
+    elsewhere = ~np.any(list(spans.values()), axis=0)
+    if elsewhere.any():
+        spans["elsewhere"] = elsewhere
+    slices = {}
+    for name, rows in spans.items():
+        own = None if labels is None else labels[rows]
+        drawn = None if rng is None else interval(table[rows], rng, average, clusters=own)
+        slices[name] = Slice(score=mean(table[rows], average), interval=drawn)
+    return slices
+
+
+# ---- whether confidence means what it says, and whether it ranks hits before misses
+
+
+def calibration_error(confidence: ArrayLike, hit: ArrayLike, *, bins: int = 10) -> float:
+    """Expected calibration error, 0 to 1: mean distance of confidence (n,) and share of hits (n,), over equal bins; NaN
+    of nothing.
+
+    Args:
+        confidence: (n,) 0 to 1. hit: (n,) bool or 0/1.
+
+    Raises:
+        InputError: for NaN and other values: leave out what is not known.
+    """
+    bins = check_int("bins", bins, least=1)
+    confidence = _without_nan("confidence", confidence)
+    if not ((confidence >= 0) & (confidence <= 1)).all():
+        raise InputError(f"confidence must be within 0 and 1, got {confidence.min():g} to {confidence.max():g}")
+    hit = as_flags("hit", hit, confidence.shape, of="confidence")
+    if not len(confidence):
+        return float("nan")
+    index = np.minimum((confidence * bins).astype(int), bins - 1)
+    stated, true = np.bincount(index, confidence, bins), np.bincount(index, hit, bins)
+    return float(np.abs(stated - true).sum() / len(confidence))
+
+
+def auroc(score: ArrayLike, hit: ArrayLike) -> float:
+    """Area under the ROC curve, 0 to 1, of scores (n,) for hits (n,): how well the score ranks hits before misses.
+
+    Args:
+        score: (n,) any numbers, more is surer. hit: (n,) bool or 0/1.
+
+    Raises:
+        InputError: for NaN, which has no rank, and where there are not both hits and misses.
+    """
+    score = _without_nan("score", score)
+    hit = as_flags("hit", hit, score.shape, of="score")
+    positives, negatives = int(hit.sum()), int((~hit).sum())
+    if not positives or not negatives:
+        raise InputError(f"AUROC needs hits and misses, got {positives} hits and {negatives} misses")
+    _, inverse, counts = np.unique(score, return_inverse=True, return_counts=True)
+    # ties share the mean of their ranks
+    rank = (np.cumsum(counts) - (counts - 1) / 2)[inverse]
+    return float((rank[hit].sum() - positives * (positives + 1) / 2) / (positives * negatives))
+
+
+def _without_nan(name: str, values: ArrayLike) -> np.ndarray:
+    values = as_numbers(name, values)
+    if values.ndim != 1:
+        raise InputError(f"{name} must be (n,), got {values.shape}: pass values.ravel()")
+    if unknown := int(np.isnan(values).sum()):
+        raise InputError(
+            f"{name} must hold numbers, got NaN in {unknown} of {len(values)}: leave these and their hits out"
+        )
+    return values

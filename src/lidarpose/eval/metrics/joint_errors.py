@@ -10,17 +10,17 @@ dapt_compat=True (`legacy` is its old name): the arithmetic of the paper's relea
 docs/evaluate.md says which.
 """
 
-from numbers import Real
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lidarpose.errors import InputError, check_name
-from lidarpose.eval.metrics.aggregate import AVERAGES, Score, mean
+from lidarpose.eval.metrics.aggregate import AVERAGES, Score, as_flags, as_numbers, check_positive, mean
 from lidarpose.geometry import similarity_align
 
 # the released code's length of a torso, m, the same for everybody; it comes from LiDARCap
 TORSO = 0.5127067
+# shares of the torso within which a joint is correct: PCK-3 (15.4 cm), PCK-5 (25.6 cm)
+PCK3, PCK5 = 0.3, 0.5
 # a similarity has 7 unknowns; two joints always fit
 LEAST_ALIGNED = 3
 
@@ -65,14 +65,14 @@ def pck(
     visible: ArrayLike | None = None,
     dapt_compat: bool = False,
     *,
-    threshold: float = 0.3,
+    threshold: float = PCK3,
     torso: float = TORSO,
     average: str = "person",
     legacy: bool = False,
 ) -> Score:
     """Percentage of correct keypoints: joints nearer to the truth than threshold times torso, meters.
 
-    PCK-3 is threshold 0.3 (15.4 cm), PCK-5 is 0.5 (25.6 cm). dapt_compat: NaN as soon as one person has no label.
+    By default PCK-3; `threshold=0.5` is PCK-5. dapt_compat: NaN as soon as one person has no label.
     """
     table = joint_hits(pred, true, visible, threshold=threshold, torso=torso)
     return _mean(table, average, dapt_compat or legacy, empty=np.nan)
@@ -139,7 +139,7 @@ def acceleration_errors(pred: ArrayLike, true: ArrayLike, rate: float, visible: 
 
 
 def joint_hits(
-    pred: ArrayLike, true: ArrayLike, visible: ArrayLike | None = None, *, threshold: float = 0.3, torso: float = TORSO
+    pred: ArrayLike, true: ArrayLike, visible: ArrayLike | None = None, *, threshold: float = PCK3, torso: float = TORSO
 ) -> np.ndarray:
     """(n, J) percent: 100 where a joint is nearer to the truth than threshold * torso, m, else 0; NaN without label."""
     check_positive("threshold", threshold)
@@ -161,30 +161,6 @@ def _mean(table: np.ndarray, average: str, dapt_compat: bool, *, empty: float) -
 
 
 # ---- arguments, checked once where they come in
-
-
-def as_numbers(name: str, value: ArrayLike) -> np.ndarray:
-    """An array of floats; raises InputError where it holds something else, or lists of unequal length."""
-    try:
-        return np.asarray(value, float)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} must hold numbers, in lists of equal length") from None
-
-
-def as_flags(name: str, value: ArrayLike, shape: tuple[int, ...], *, of: str = "joint") -> np.ndarray:
-    """bool of a shape, one a joint or another thing, from bool or 0 and 1; raises InputError otherwise."""
-    flags = as_numbers(name, value)
-    if flags.shape != shape:
-        raise InputError(f"{name} must be {shape}, one a {of}, got {flags.shape}")
-    if not ((flags == 0) | (flags == 1)).all():
-        raise InputError(f"{name} must be bool, or 0 and 1; of other codes pass a comparison, such as codes > 0")
-    return flags == 1
-
-
-def check_positive(name: str, value: float) -> None:
-    """Raises InputError unless `value` is a positive, finite number."""
-    if not (isinstance(value, Real) and np.isfinite(value) and value > 0):
-        raise InputError(f"{name} must be a positive number, got {value!r}")
 
 
 def checked_poses(pred, true, visible, trailing=("joints", "3")) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

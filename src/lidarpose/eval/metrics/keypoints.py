@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lidarpose.errors import InputError
-from lidarpose.eval.metrics.aggregate import Score, mean
-from lidarpose.eval.metrics.joint_errors import as_flags, as_numbers, check_positive, checked_poses, joint_errors
-from lidarpose.skeleton import WAYMO14, Skeleton, skeleton
+from lidarpose.eval.metrics.aggregate import Score, as_flags, as_numbers, as_skeleton, check_positive, mean
+from lidarpose.eval.metrics.joint_errors import checked_poses, joint_errors
+from lidarpose.skeleton import WAYMO14, Skeleton
 
 # spread of each joint in units of the box's scale; twice COCO's sigmas, the head's center by the same method
 SIGMAS = {
@@ -37,7 +37,7 @@ _WITHIN = 1e-5
 
 def oks_sigmas(of: Skeleton | str = WAYMO14) -> np.ndarray:
     """(J,) Waymo's sigmas for a skeleton's joints; raises InputError where Waymo has none for a joint."""
-    of = skeleton(of) if isinstance(of, str) else of
+    of = as_skeleton(of)
     sigmas = [SIGMAS.get(name.removeprefix("left_").removeprefix("right_")) for name in of.joints]
     if None in sigmas:
         missing = ", ".join(name for name, sigma in zip(of.joints, sigmas, strict=True) if sigma is None)
@@ -220,8 +220,8 @@ def _frame_totals(pred, true, boxes, visible, predicted, penalty: float) -> np.n
     pred, true = pred.reshape(-1, joints, 3), true.reshape(-1, joints, 3)
     checked_poses(pred, pred, None)
     _, true, labeled = checked_poses(np.zeros_like(true), true, visible if len(true) else None)
-    given = predicted is not None and len(pred)
-    predicted = as_flags("predicted", predicted, pred.shape[:2]) if given else np.ones(pred.shape[:2], bool)
+    claimed = np.ones(pred.shape[:2], bool)
+    predicted = claimed if predicted is None or not len(pred) else as_flags("predicted", predicted, claimed.shape)
     boxes = as_numbers("boxes", boxes)
     boxes = boxes.reshape(0, 7) if not boxes.size else boxes
     if boxes.shape != (len(true), 7) or not np.isfinite(boxes).all() or not (boxes[:, 3:6] > 0).all():
@@ -329,30 +329,28 @@ def assign(cost: ArrayLike) -> np.ndarray:
         swapped = assign(cost.T)[:, ::-1]
         return swapped[np.argsort(swapped[:, 0])]
     n, m = cost.shape
-    row_price, column_price = np.zeros(n), np.zeros(m)
-    row_of = np.full(m, -1)
-    for start in range(n):
-        # Dijkstra over columns: reduced costs are never negative
-        length, before = np.full(m, np.inf), np.full(m, -1)
-        settled = np.zeros(m, bool)
-        row, here, reached = start, -1, 0.0
-        while True:
-            onward = reached + cost[row] - row_price[row] - column_price
-            shorter = ~settled & (onward < length)
-            length[shorter], before[shorter] = onward[shorter], here
-            here = int(np.argmin(np.where(settled, np.inf, length)))
-            reached = length[here]
-            settled[here] = True
-            if row_of[here] < 0:
-                break
-            row = row_of[here]
-        passed = settled & (row_of >= 0)
-        row_price[start] += reached
-        row_price[row_of[passed]] += reached - length[passed]
-        column_price[passed] -= reached - length[passed]
-        while here >= 0:
-            row_of[here] = row_of[before[here]] if before[here] >= 0 else start
-            here = before[here]
-    columns = np.flatnonzero(row_of >= 0)
+    row_price, column_price = np.zeros(n), np.zeros(m + 1)
+    # row_of[m] is the row that is being added, as if it had a column of its own
+    row_of = np.full(m + 1, -1)
+    for row in range(n):
+        row_of[m] = row
+        column, reached, before = m, np.zeros(m + 1, bool), np.full(m, m)
+        length = np.full(m, np.inf)
+        # Dijkstra over columns: reduced costs are never negative, and lengths are from the last column that was reached
+        while row_of[column] >= 0:
+            reached[column] = True
+            row = row_of[column]
+            reduced = cost[row] - row_price[row] - column_price[:m]
+            shorter = ~reached[:m] & (reduced < length)
+            length[shorter], before[shorter] = reduced[shorter], column
+            column = int(np.argmin(np.where(reached[:m], np.inf, length)))
+            step = length[column]
+            row_price[row_of[reached]] += step
+            column_price[reached] -= step
+            length -= step
+        while column < m:
+            row_of[column] = row_of[before[column]]
+            column = before[column]
+    columns = np.flatnonzero(row_of[:m] >= 0)
     pairs = np.stack([row_of[columns], columns], -1)
     return pairs[np.argsort(pairs[:, 0])]
