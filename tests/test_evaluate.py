@@ -26,6 +26,7 @@ from lidarpose.eval import robustness
 from lidarpose.eval import run as run_module
 from lidarpose.eval.dataset import load_bench, open_eval_dataset, spread
 from lidarpose.eval.metric_rows import facing_flipped, metric_rows, triples
+from lidarpose.eval.metrics import aggregate
 from lidarpose.eval.protocols import cropped, eval_setup, jittered
 from lidarpose.eval.run import evaluate_dataset
 from lidarpose.geometry import rotation_about
@@ -601,9 +602,7 @@ def test_folders_are_numbered(tmp_path):
 def test_names_until_0_2_are_there(written):
     assert lidarpose.evaluation.evaluate is evaluation.evaluate and "evaluation" in dir(lidarpose)
     first = written[0].evaluations[0]
-    assert evaluation.Judged is type(first.judged) and evaluation.Line is type(first.result.lines[0])
-    assert (first.judged.labelled == first.predictions.labeled).all() and len(first.judged.of([0])) == 1
-    assert first.result.setting.told == first.result.setting.summary
+    assert evaluation.Judged is type(first.predictions) and evaluation.Line is type(first.result.lines[0])
 
 
 @pytest.mark.slow

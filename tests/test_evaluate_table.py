@@ -117,11 +117,14 @@ def test_evaluate_and_table_from_the_command_line(tmp_path, monkeypatch, capsys)
         "scores.json", "poses.parquet", "lidarpose-bench-1-errors.png", "lidarpose-bench-1-reliability.png",
         "lidarpose-bench-1-worst.png",
     }  # fmt: skip
-    lines = [line for line in shown.out.splitlines() if "MPJPE" in line]
-    assert lines and all("clean · points alone · no split · 25 of 2,000 people" in line for line in lines)
+    # the headline first, then once how it was found
+    headline, setting, *rows = shown.out.splitlines()
+    assert "clean · points alone · no split · 25 of 2,000 people" in setting
+    assert not any("points alone · no split" in row for row in rows) and sum("MPJPE" in row for row in rows) > 10
     made = evaluation.read_scores(tmp_path / "evaluation/tiny")
     assert made.command == "lidarpose evaluate tiny bench --limit 25 --seed 3" and made.seed == 3
-    assert f"{made.results[0].line('mpjpe').value:.1f}" in lines[0]
+    assert headline.startswith(f"lidarpose-bench-1: MPJPE {made.results[0].line('mpjpe').value:.1f} mm [")
+    assert " of 25 people · tiny" in headline
 
     assert run("table", "evaluation/tiny") == 0
     assert f"{made.results[0].line('mpjpe').value:.2f} [" in capsys.readouterr().out

@@ -4,17 +4,40 @@ import argparse
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from typing import Any
 
 from lidarpose.cli.terminal import add_command, tell
 from lidarpose.models import BUNDLED
 from lidarpose.progress import Progress
 
-# options of `evaluation.run` and their defaults, and those that are on or off
-_DEFAULTS = {
-    **{"protocol": "clean", "split": None, "skeleton": None, "limit": None, "seed": 0},
-    **{"device": "cpu", "backend": None, "decode": "window", "tta": 1},
+# options of `evaluation.run`: type, default, metavar, help
+_OPTIONS: dict[str, tuple[Any, Any, str, str]] = {
+    "protocol": (
+        str,
+        "clean",
+        "NAME",
+        "clean (default), or dapt: crops and centers from labels, as in the released code",
+    ),
+    "split": (str, None, "NAME", "split to score, or all (default: test, else val, else all)"),
+    "skeleton": (str, None, "NAME", "score the joints of this skeleton (default: the dataset's)"),
+    "limit": (int, None, "N", "score only N people, evenly spread"),
+    "seed": (int, 0, "N", "random seed for displaced boxes and intervals (default 0)"),
+    "device": (str, "cpu", "NAME", "cpu (default), or cuda (backend torch)"),
+    "backend": (str, None, "NAME", "onnx or torch, as in lidarpose predict"),
+    "decode": (str, "window", "NAME", "as in lidarpose predict; the released code uses dark"),
+    "tta": (
+        int,
+        1,
+        "N",
+        "test-time augmentation: average N predictions of each person, 1 (default) to 8; protocol clean only",
+    ),
 }
-_SWITCHES = ("stability", "legacy", "sensor_unknown")
+# those that are on or off
+_SWITCHES = {
+    "stability": "also perturb the points and draw the curves",
+    "legacy": "also score with the released code's arithmetic",
+    "sensor_unknown": "hide the sensor's position from the network",
+}
 # groups of rows that the terminal shows; the others are in scores.json
 _SHOWN = ("condition", "plain", "joints", "distance, m", "points", "hidden share")
 # metrics of these groups that it shows, besides those of everybody
@@ -36,42 +59,15 @@ def add(commands) -> None:
         description="Prints metrics and writes scores.json, poses.parquet and pictures into a folder.",
     )
     evaluate.set_defaults(run=_evaluate)
-    evaluate.add_argument(
-        "weights", metavar="CHECKPOINT", help=f"{', '.join(BUNDLED)}, a checkpoint, or an exported .onnx"
-    )
-    evaluate.add_argument(
-        "datasets", nargs="+", metavar="DATASET", help="a folder written by prepare or synth, or bench"
-    )
-    evaluate.add_argument(
-        "--protocol",
-        default="clean",
-        metavar="NAME",
-        help="clean (default), or dapt: crops and centers from labels, as in the released code",
-    )
-    evaluate.add_argument("--split", metavar="NAME", help="split to score, or all (default: test, else val, else all)")
-    evaluate.add_argument(
-        "--skeleton", metavar="NAME", help="score the joints of this skeleton (default: the dataset's)"
-    )
-    evaluate.add_argument("--limit", type=int, metavar="N", help="score only N people, evenly spread")
-    evaluate.add_argument("--stability", action="store_true", help="also perturb the points and draw the curves")
-    evaluate.add_argument("--legacy", action="store_true", help="also score with the released code's arithmetic")
-    evaluate.add_argument("--sensor-unknown", action="store_true", help="hide the sensor's position from the network")
-    evaluate.add_argument(
-        "--seed", type=int, default=0, metavar="N", help="random seed for displaced boxes and intervals (default 0)"
-    )
+    words = f"{', '.join(BUNDLED)}, a checkpoint, or an exported .onnx"
+    evaluate.add_argument("weights", metavar="CHECKPOINT", help=words)
+    words = "a folder written by prepare or synth, or bench"
+    evaluate.add_argument("datasets", nargs="+", metavar="DATASET", help=words)
+    for name, (kind, default, metavar, words) in _OPTIONS.items():
+        evaluate.add_argument(f"--{name}", type=kind, default=default, metavar=metavar, help=words)
+    for name, words in _SWITCHES.items():
+        evaluate.add_argument(_flag(name), action="store_true", help=words)
     evaluate.add_argument("--out", metavar="DIR", help="a new or empty folder (default evaluation/NAME, numbered)")
-    evaluate.add_argument("--device", default="cpu", metavar="NAME", help="cpu (default), or cuda (backend torch)")
-    evaluate.add_argument(
-        "--decode", default="window", metavar="NAME", help="as in lidarpose predict; the released code uses dark"
-    )
-    evaluate.add_argument("--backend", metavar="NAME", help="onnx or torch, as in lidarpose predict")
-    evaluate.add_argument(
-        "--tta",
-        type=int,
-        default=1,
-        metavar="N",
-        help="test-time augmentation: average N predictions of each person, 1 (default) to 8; protocol clean only",
-    )
 
     table = add_command(
         commands,
@@ -86,14 +82,19 @@ def add(commands) -> None:
     table.add_argument("--out", metavar="FILE", help="write to FILE (default: print)")
 
 
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
 def _evaluate(options: argparse.Namespace) -> None:
     from lidarpose import evaluation
 
     folder = evaluation.new_folder(options.weights) if options.out is None else evaluation.check_folder(options.out)
-    asked = {name: getattr(options, name) for name in (*_DEFAULTS, *_SWITCHES)}
+    settings = {name: getattr(options, name) for name in (*_OPTIONS, *_SWITCHES)}
     with ExitStack() as stack:
+        progress = _progress(stack)
         run = evaluation.run(
-            options.weights, options.datasets, command=_command(options), progress=_progress(stack), **asked
+            options.weights, options.datasets, command=_command(options), progress=progress, **settings
         )
     written = evaluation.write(run, folder)
     for result in run.scores.results:
@@ -120,11 +121,10 @@ def _table(options: argparse.Namespace) -> None:
 def _command(options: argparse.Namespace) -> str:
     """What was asked for, as it would be typed."""
     words = ["lidarpose", "evaluate", options.weights, *options.datasets]
-    for name, default in _DEFAULTS.items():
+    for name, (_, default, _, _) in _OPTIONS.items():
         if (value := getattr(options, name)) != default:
-            words += [f"--{name}", str(value)]
-    words += [f"--{name.replace('_', '-')}" for name in _SWITCHES if getattr(options, name)]
-    return shlex.join(words)
+            words += [_flag(name), str(value)]
+    return shlex.join([*words, *(_flag(name) for name in _SWITCHES if getattr(options, name))])
 
 
 def _progress(stack: ExitStack) -> Callable[[str, int, int], None]:
@@ -141,52 +141,52 @@ def _progress(stack: ExitStack) -> Callable[[str, int, int], None]:
 
 
 def _lines(result) -> Iterator[str]:
-    """The result for a terminal: everybody first, then by condition, joint, distance, points, hidden share."""
+    """The result for a terminal: the headline figure, how it was found, then all figures: of everybody, by condition,
+    joint, distance, points, hidden share."""
     setting, counts = result.setting, result.counts
-    yield f"{setting.dataset}: {counts['people']:,} people, {len(setting.joints)} joints, {setting.method}"
-    yield f"  protocol {setting.protocol}; center: {setting.centring}; crop: {setting.crop}"
+    mpjpe = result.line("mpjpe")
+    headline = f"MPJPE {_value(mpjpe)} mm {_ends(mpjpe)}".rstrip()
+    yield f"{setting.dataset}: {headline} of {mpjpe.people:,} people · {setting.method}"
+    yield f"  {setting.summary} · {counts['people']:,} people · {len(setting.joints)} joints"
     split = setting.split + (f" ({setting.split_source})" if setting.split_source else "")
-    yield f"  split {split}; sensor position {setting.sensor}"
+    yield f"  center: {setting.centring}; crop: {setting.crop}; split {split}; sensor position {setting.sensor}"
     for note in result.notes:
         yield f"  note: {note}"
     if counts["without a pose"]:
-        but = " but PEM" if any(line.figure == "pem" for line in result.lines) else ""
+        but = " but PEM" if any(row.figure == "pem" for row in result.lines) else ""
         yield f"  without a pose, and in no metric{but}: {counts['without a pose']:,} people"
     for reason, entry in result.skipped.items():
         yield f"  skipped {entry['count']:,}: {reason} (first: {entry['first']})"
-    shown = [line for line in result.lines if _is_shown(line)]
-    names = [_named(line, setting) for line in shown]
-    wide = max(map(len, names), default=0)
+    rows = [(_named(row, setting), row) for row in result.lines if _is_shown(row)]
+    wide = max(len(name) for name, _ in rows)
     yield f"  {'':<{wide}}{'value':>8}  {'95 % interval':<16}{'people':>8}"
-    for name, line in zip(names, shown, strict=True):
-        yield f"  {name:<{wide}}{_value(line):>8}  {_ends(line):<16}{line.people:>8,}  {setting.summary}"
+    for name, row in rows:
+        yield f"  {name:<{wide}}{_value(row):>8}  {_ends(row):<16}{row.people:>8,}"
 
 
-def _is_shown(line) -> bool:
-    return (
-        line.group == "all" or line.group in _SHOWN and line.figure in _GROUP_METRICS and line.arithmetic == "lidarpose"
-    )
+def _is_shown(row) -> bool:
+    return row.group == "all" or row.group in _SHOWN and row.figure in _GROUP_METRICS and row.arithmetic == "lidarpose"
 
 
-def _named(line, setting) -> str:
-    words = _TITLES.get(line.figure, line.figure.replace("_", " "))
-    if line.group == "plain":
-        words += f", {line.of}"
-    elif line.group != "all":
-        words += f", {line.group.removesuffix(', m')} {line.of}{' m' if line.group.endswith(', m') else ''}"
-    if line.arithmetic != "lidarpose":
+def _named(row, setting) -> str:
+    words = _TITLES.get(row.figure, row.figure.replace("_", " "))
+    if row.group == "plain":
+        words += f", {row.of}"
+    elif row.group != "all":
+        words += f", {row.group.removesuffix(', m')} {row.of}{' m' if row.group.endswith(', m') else ''}"
+    if row.arithmetic != "lidarpose":
         words += ", released arithmetic"
-    if line.method != setting.method:
-        words = f"baseline {line.method.removeprefix('floor: ')}: {words}"
-    return f"{words}, {line.unit}"
+    if row.method != setting.method:
+        words = f"baseline {row.method.removeprefix('floor: ')}: {words}"
+    return f"{words}, {row.unit}"
 
 
-def _value(line) -> str:
-    return "-" if line.value is None else f"{line.value:.1f}"
+def _value(row) -> str:
+    return "-" if row.value is None else f"{row.value:.1f}"
 
 
-def _ends(line) -> str:
-    return "" if line.low is None else f"[{line.low:.1f}, {line.high:.1f}]"
+def _ends(row) -> str:
+    return "" if row.low is None else f"[{row.low:.1f}, {row.high:.1f}]"
 
 
 def _study(study) -> Iterator[str]:

@@ -17,20 +17,9 @@ from typing import Any
 import numpy as np
 
 from lidarpose.errors import InputError
-from lidarpose.eval.metrics.aggregate import (
-    DISTANCE_EDGES,
-    OCCLUSION_EDGES,
-    POINT_EDGES,
-    Score,
-    auroc,
-    calibration_error,
-    interval,
-    joint_groups,
-    mean,
-    span_rows,
-)
-from lidarpose.eval.metrics.joint_errors import acceleration_errors, aligned_errors, joint_hits
-from lidarpose.eval.metrics.keypoints import PCK_THRESHOLDS, box_hits, oks, oks_hits, oks_sigmas, pem
+from lidarpose.eval.metrics import aggregate, keypoints
+from lidarpose.eval.metrics.aggregate import Score, joint_groups, mean
+from lidarpose.eval.metrics.joint_errors import PCK3, PCK5, acceleration_errors, aligned_errors, joint_hits
 from lidarpose.eval.predictions import Predictions
 from lidarpose.eval.scores import RELEASED, MetricRow, Setting, number
 from lidarpose.sample import CONFIDENCE_RADIUS, HIDDEN, SEEN, UNLABELED
@@ -66,17 +55,18 @@ def _pck(p: Predictions, threshold: float) -> np.ndarray:
     return joint_hits(p.filled, p.true, p.labeled, threshold=threshold)
 
 
-def _box_size(p: Predictions) -> np.ndarray:
-    # people without a box are not in the section "boxes"
-    return np.where(p.boxed[:, None], p.box[:, 3:6], 1.0)
-
-
 def _pck_box(p: Predictions, threshold: float) -> np.ndarray:
-    return box_hits(p.filled, p.true, _box_size(p), p.labeled, threshold=threshold)
+    return keypoints.box_hits(p.filled, p.true, _box_size(p), p.labeled, threshold=threshold)
 
 
 def _oks_precision(p: Predictions) -> np.ndarray:
-    return oks_hits(oks(p.filled, p.true, _box_size(p), p.labeled, sigmas=oks_sigmas(p.skeleton)))
+    sigmas = keypoints.oks_sigmas(p.skeleton)
+    return keypoints.oks_hits(keypoints.oks(p.filled, p.true, _box_size(p), p.labeled, sigmas=sigmas))
+
+
+def _box_size(p: Predictions) -> np.ndarray:
+    # people without a box are not in the section "boxes"
+    return np.where(p.boxed[:, None], p.box[:, 3:6], 1.0)
 
 
 @dataclass(frozen=True)
@@ -89,15 +79,17 @@ class Metric:
     average: str = "person"
 
 
+_EVERYWHERE = ("all", "joints", "conditions", "spans")
 METRICS = {
-    "mpjpe": Metric(Predictions.errors, "mm", ("all", "joints", "conditions", "spans")),
-    "pa_mpjpe": Metric(
-        lambda p: aligned_errors(p.filled, p.true, p.labeled), "mm", ("all", "joints", "conditions", "spans")
-    ),
-    "pck3": Metric(partial(_pck, threshold=0.3), "%", ("all", "joints")),
-    "pck5": Metric(partial(_pck, threshold=0.5), "%", ("all", "joints")),
+    "mpjpe": Metric(Predictions.errors, "mm", _EVERYWHERE),
+    "pa_mpjpe": Metric(lambda p: aligned_errors(p.filled, p.true, p.labeled), "mm", _EVERYWHERE),
+    "pck3": Metric(partial(_pck, threshold=PCK3), "%", ("all", "joints")),
+    "pck5": Metric(partial(_pck, threshold=PCK5), "%", ("all", "joints")),
     "turned_round": Metric(facing_flipped, "%", ("dense",)),
-    **{f"pck_box@{t:g}": Metric(partial(_pck_box, threshold=t), "%", ("boxes",), "joint") for t in PCK_THRESHOLDS},
+    **{
+        f"pck_box@{threshold:g}": Metric(partial(_pck_box, threshold=threshold), "%", ("boxes",), "joint")
+        for threshold in keypoints.PCK_THRESHOLDS
+    },
     "oks_ap": Metric(_oks_precision, "%", ("boxes",)),
 }
 
@@ -112,7 +104,8 @@ def _pem(p: Predictions, setting: Setting) -> Score | None:
         frames.setdefault((p.sequence[k], p.frame[k]), []).append(k)
     rows = [np.array(own) for own in frames.values()]
     columns = (p.true, p.box, p.labels == SEEN)
-    result = pem([p.pred[own][p.posed[own]] for own in rows], *([column[own] for own in rows] for column in columns))
+    pred = [p.pred[own][p.posed[own]] for own in rows]
+    result = keypoints.pem(pred, *([column[own] for own in rows] for column in columns))
     joints = result.matched + result.missed + result.extra
     return Score(result.pem, people=result.people, joints=joints, skipped=result.people_excused)
 
@@ -122,7 +115,7 @@ def _of_confidence(p: Predictions, setting: Setting, metric: Callable) -> Score 
     error = p.errors()
     known = ~np.isnan(error) & ~np.isnan(p.confidence)
     hit = error[known] < 1e3 * CONFIDENCE_RADIUS
-    if not known.any() or (metric is auroc and hit.all() == hit.any()):
+    if not known.any() or (metric is aggregate.auroc and hit.all() == hit.any()):
         return None
     people = known.any(1)
     value = 100 * metric(p.confidence[known].astype(float), hit)
@@ -132,8 +125,8 @@ def _of_confidence(p: Predictions, setting: Setting, metric: Callable) -> Score 
 # metrics of everybody at once, without an interval: (Predictions, Setting) -> Score or None, unit
 SUMMARIES: dict[str, tuple[Callable[[Predictions, Setting], Score | None], str]] = {
     "pem": (_pem, "mm"),
-    "calibration_error": (partial(_of_confidence, metric=calibration_error), "%"),
-    "auroc": (partial(_of_confidence, metric=auroc), "%"),
+    "calibration_error": (partial(_of_confidence, metric=aggregate.calibration_error), "%"),
+    "auroc": (partial(_of_confidence, metric=aggregate.auroc), "%"),
 }
 
 
@@ -161,9 +154,9 @@ def _groups(section: str, p: Predictions, setting: Setting) -> Iterator[tuple[st
         yield "plain", "upright, whole, uncluttered, 100 points", p.plain, None
     elif section == "spans":
         hidden = p.hidden if not np.isnan(p.hidden).all() else hidden_share(p.labels)
-        spans = {"distance, m": (p.distance, DISTANCE_EDGES), "points": (p.points, POINT_EDGES)}
-        for title, (values, edges) in (spans | {"hidden share": (hidden, OCCLUSION_EDGES)}).items():
-            for of, rows in span_rows(values, edges).items():
+        spans = {"distance, m": (p.distance, aggregate.DISTANCE_EDGES), "points": (p.points, aggregate.POINT_EDGES)}
+        for title, (values, edges) in (spans | {"hidden share": (hidden, aggregate.OCCLUSION_EDGES)}).items():
+            for of, rows in aggregate.span_rows(values, edges).items():
                 yield title, of, rows, None
     elif section == "boxes" and _has_waymo_boxes(p, setting) and (p.boxed & p.posed).any():
         yield "all", "all", p.boxed, None
@@ -172,7 +165,7 @@ def _groups(section: str, p: Predictions, setting: Setting) -> Iterator[tuple[st
 def _has_waymo_boxes(p: Predictions, setting: Setting) -> bool:
     """Whether Waymo's own metrics apply: somebody has a labeled box, and each joint has a sigma."""
     try:
-        oks_sigmas(p.skeleton)
+        keypoints.oks_sigmas(p.skeleton)
     except InputError:
         return False
     return setting.kind == "waymo" and bool(p.boxed.any())
@@ -214,43 +207,33 @@ def _mean_rows(
     tables: dict[str, np.ndarray] = {}
     for section in sections:
         for group, of, rows, joints in _groups(section, p, setting):
+            clusters = p.sequence[rows] if setting.clusters else None
+            no_pose = int((~p.posed[rows]).sum())
             for name in (metrics or METRICS) if rows.any() else ():
-                metric = METRICS[name]
-                if section in metric.sections:
+                if section in METRICS[name].sections:
                     if name not in tables:
-                        tables[name] = metric.values(p)
+                        tables[name] = METRICS[name].values(p)
                     table = tables[name][rows] if joints is None else tables[name][rows][:, joints]
-                    clusters = p.sequence[rows] if setting.clusters else None
-                    no_pose = int((~p.posed[rows]).sum())
-                    options: dict[str, Any] = {"unit": metric.unit, "average": metric.average, "no_pose": no_pose}
-                    yield _mean_row(table, setting, name, group, of, clusters=clusters, **options)
+                    yield _mean_row(table, setting, name, METRICS[name], group, of, clusters=clusters, no_pose=no_pose)
 
 
 def _mean_row(
-    table: np.ndarray,
-    setting: Setting,
-    metric: str,
-    group: str,
-    of: str,
-    *,
-    average: str = "person",
-    clusters=None,
-    **more,
+    table: np.ndarray, setting: Setting, figure: str, metric: Metric, group: str, of: str, *, clusters=None, no_pose=0
 ) -> MetricRow:
     """The mean of a table (n, J) or (n,) as a row, with its interval: see `Interval.stated`."""
-    name = f"{setting.method}/{metric}/{group}/{of}"
+    name = f"{setting.method}/{figure}/{group}/{of}"
     rng = np.random.default_rng([setting.seed, zlib.crc32(name.encode())])
-    low, high = interval(table, rng, average, clusters=clusters, repeats=_REPEATS).stated
-    score = mean(table, average)
-    score.skipped -= more.get("no_pose", 0)
-    return _row(score, setting, metric, group=group, of=of, low=low, high=high, **more)
+    low, high = aggregate.interval(table, rng, metric.average, clusters=clusters, repeats=_REPEATS).stated
+    score = mean(table, metric.average)
+    score.skipped -= no_pose
+    return _row(score, setting, figure, unit=metric.unit, group=group, of=of, low=low, high=high, no_pose=no_pose)
 
 
-def _row(score: Score, setting: Setting, metric: str, *, group: str = "all", of: str = "all", **more: Any) -> MetricRow:
+def _row(score: Score, setting: Setting, figure: str, *, group: str = "all", of: str = "all", **more: Any) -> MetricRow:
     """A row of a score; more: the other fields of `MetricRow`."""
     counts: dict[str, Any] = {name: int(getattr(score, name)) for name in ("people", "joints", "skipped")}
     shared = {name: getattr(setting, name) for name in ("method", "protocol", "centring", "split", "limit")}
-    return MetricRow(figure=metric, group=group, of=of, value=number(score), **counts | shared | more)
+    return MetricRow(figure=figure, group=group, of=of, value=number(score), **counts | shared | more)
 
 
 def _dapt_compat_rows(p: Predictions, setting: Setting) -> Iterator[MetricRow]:
@@ -300,6 +283,9 @@ def _acceleration(p: Predictions, setting: Setting) -> Iterator[MetricRow]:
     # people evenly picked out of sequences do not follow each other
     rows = triples(p) if setting.limit is None else np.empty((0, 3), int)
     if len(rows):
-        table = acceleration_errors(p.filled[rows], p.true[rows], 1.0, p.labeled[rows])
-        clusters = p.sequence[rows[:, 0]]
-        yield _mean_row(table, setting, "acceleration", "all", "frames in a row", unit="mm/frame²", clusters=clusters)
+        table, clusters = (
+            acceleration_errors(p.filled[rows], p.true[rows], 1.0, p.labeled[rows]),
+            p.sequence[rows[:, 0]],
+        )
+        metric = Metric(lambda _: table, "mm/frame²", ("all",))
+        yield _mean_row(table, setting, "acceleration", metric, "all", "frames in a row", clusters=clusters)

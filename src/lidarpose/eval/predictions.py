@@ -14,14 +14,14 @@ A row is one person in one frame; columns:
     box                 center (3), size (3), yaw of the box before any jitter: m, rad; null where there is none
     pred, true          x, y, z of the joints that the file's metadata names, m, in the dataset's frame; pred null
                         without a pose, true NaN without a label
-    labels              one a joint: 0 not labelled, 1 hidden or uncertain, 2 seen
+    labels              one a joint: 0 not labeled, 1 hidden or uncertain, 2 seen
     confidence, spread, visible         one a joint, null where the network does not tell; spread in m
-    error_mm            one a joint, NaN where there is nothing to judge
+    error_mm            one a joint, NaN where there is nothing to score
 """
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,22 +35,11 @@ from lidarpose.skeleton import Skeleton
 
 # key of the joints' names in the file's metadata
 METADATA = "lidarpose.poses"
-# columns of one value a person
-_VALUES = {
-    **{"shard": np.int32, "row": np.int64, "sequence": str, "frame": np.int64, "track": str, "time": np.float64},
-    **{"sensor": str, "condition": str, "poses": str, "plain": bool, "moving": bool},
-    **{"points": np.int32, "distance": np.float32, "hidden": np.float32},
-}
-# columns of a list a person: type, shape of one person's with J joints as -1
-_LISTS: dict[str, tuple[type, tuple[int, ...]]] = {
-    "box": (np.float64, (7,)),
-    "pred": (np.float32, (-1, 3)),
-    "true": (np.float32, (-1, 3)),
-    "labels": (np.uint8, (-1,)),
-    **dict.fromkeys(("confidence", "spread", "visible"), (np.float32, (-1,))),
-}
-# of these NaN all over is null in the file: there is none
-_NULLABLE = ("box", "pred", "confidence", "spread", "visible")
+
+
+def _column(kind: type, *shape: int, null: bool = False) -> Any:
+    """A column: type; shape of one person's values, -1 for J; whether NaN all over is null in the file."""
+    return field(metadata={"kind": kind, "shape": shape, "null": null})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,27 +49,27 @@ class Predictions:
     NaN where there is none; the others (N,)."""
 
     skeleton: Skeleton
-    pred: np.ndarray
-    true: np.ndarray
-    labels: np.ndarray
-    confidence: np.ndarray
-    spread: np.ndarray
-    visible: np.ndarray
-    box: np.ndarray
-    shard: np.ndarray
-    row: np.ndarray
-    sequence: np.ndarray
-    frame: np.ndarray
-    track: np.ndarray
-    time: np.ndarray
-    sensor: np.ndarray
-    condition: np.ndarray
-    poses: np.ndarray
-    plain: np.ndarray
-    moving: np.ndarray
-    points: np.ndarray
-    distance: np.ndarray
-    hidden: np.ndarray
+    shard: np.ndarray = _column(np.int32)
+    row: np.ndarray = _column(np.int64)
+    sequence: np.ndarray = _column(str)
+    frame: np.ndarray = _column(np.int64)
+    track: np.ndarray = _column(str)
+    time: np.ndarray = _column(np.float64)
+    sensor: np.ndarray = _column(str)
+    condition: np.ndarray = _column(str)
+    poses: np.ndarray = _column(str)
+    plain: np.ndarray = _column(bool)
+    moving: np.ndarray = _column(bool)
+    points: np.ndarray = _column(np.int32)
+    distance: np.ndarray = _column(np.float32)
+    hidden: np.ndarray = _column(np.float32)
+    box: np.ndarray = _column(np.float64, 7, null=True)
+    pred: np.ndarray = _column(np.float32, -1, 3, null=True)
+    true: np.ndarray = _column(np.float32, -1, 3)
+    labels: np.ndarray = _column(np.uint8, -1)
+    confidence: np.ndarray = _column(np.float32, -1, null=True)
+    spread: np.ndarray = _column(np.float32, -1, null=True)
+    visible: np.ndarray = _column(np.float32, -1, null=True)
 
     def __len__(self) -> int:
         return len(self.pred)
@@ -100,9 +89,6 @@ class Predictions:
         """(N, J) bool: a joint that counts, hidden or seen, of a person with a pose."""
         return (self.labels != UNLABELED) & self.posed[:, None]
 
-    # names until 0.2
-    labelled = labeled
-
     @property
     def filled(self) -> np.ndarray:
         """(N, J, 3): pred, 0 without a pose; such people have no labeled joints."""
@@ -114,38 +100,25 @@ class Predictions:
 
     def select(self, rows: np.ndarray) -> "Predictions":
         """Some of the people."""
-        return replace(self, **{f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "skeleton"})
+        return replace(self, **{column.name: getattr(self, column.name)[rows] for column in _COLUMNS})
 
-    of = select
+
+_COLUMNS = [column for column in fields(Predictions) if column.metadata]
 
 
 def stack(skeleton: Skeleton, rows: Sequence[dict[str, Any]]) -> Predictions:
     """Predictions from a dict a person, whose keys are the columns' names; None or nothing where the file
     would have null; numbers become as wide as in the file."""
-    columns: dict[str, np.ndarray] = {
-        name: np.array([row[name] for row in rows], kind) for name, kind in _VALUES.items()
-    }
-    for name, (kind, shape) in _LISTS.items():
-        shape = (len(rows), *(len(skeleton) if size == -1 else size for size in shape))
-        columns[name] = np.full(shape, 0 if kind is np.uint8 else np.nan, kind)
-        for k, row in enumerate(rows):
-            if (value := row.get(name) if name in _NULLABLE else row[name]) is not None:
-                columns[name][k] = np.reshape(value, shape[1:])
+    columns: dict[str, np.ndarray] = {}
+    for column in _COLUMNS:
+        name, kind = column.name, column.metadata["kind"]
+        shape = [len(skeleton) if size == -1 else size for size in column.metadata["shape"]]
+        if column.metadata["null"]:
+            values = [np.full(shape, np.nan) if row.get(name) is None else np.reshape(row[name], shape) for row in rows]
+        else:
+            values = [row[name] for row in rows]
+        columns[name] = np.array(values, kind).reshape(len(rows), *shape)
     return Predictions(skeleton=skeleton, **columns)
-
-
-def subset(of: Skeleton, joints: Sequence[str]) -> Skeleton:
-    """A skeleton of some joints of another, in its order; each hangs on the nearest of its ancestors that is left, or
-    on the first."""
-    if tuple(joints) == of.joints:
-        return of
-    parents: list[int] = []
-    for name in joints:
-        parent = of.parents[of.index(name)]
-        while parent >= 0 and of.joints[parent] not in joints:
-            parent = of.parents[parent]
-        parents.append(joints.index(of.joints[parent]) if parent >= 0 else min(len(parents), 1) - 1)
-    return Skeleton(name=f"{len(joints)} joints of {of.name}", joints=tuple(joints), parents=tuple(parents))
 
 
 # ---- poses.parquet
@@ -154,24 +127,27 @@ def subset(of: Skeleton, joints: Sequence[str]) -> Skeleton:
 def write_poses(path: str | Path, predictions: dict[str, Predictions]) -> None:
     """Writes poses.parquet, people of all datasets by their names, into a file that nothing else writes."""
     pa, parquet = pyarrow()
-    types = {str: pa.string(), bool: pa.bool_()}
-    columns = [("dataset", pa.string())]
-    columns += [(name, types[kind] if kind in types else pa.from_numpy_dtype(kind)) for name, kind in _VALUES.items()]
-    columns += [(name, pa.list_(pa.from_numpy_dtype(kind))) for name, (kind, _) in _LISTS.items()]
+    types = [("dataset", pa.string())]
+    for column in _COLUMNS:
+        kind, shape = column.metadata["kind"], column.metadata["shape"]
+        value = pa.string() if kind is str else pa.from_numpy_dtype(kind)
+        types.append((column.name, pa.list_(value) if shape else value))
     skeletons = {name: own.skeleton for name, own in predictions.items()}
     about = {k: {"skeleton": of.name, "joints": of.joints, "parents": of.parents} for k, of in skeletons.items()}
     schema = pa.schema(
-        [*columns, ("error_mm", pa.list_(pa.float32()))],
+        [*types, ("error_mm", pa.list_(pa.float32()))],
         metadata={METADATA: json.dumps({"unit": "m", "datasets": about})},
     )
     with parquet.ParquetWriter(path, schema, compression="zstd", write_page_checksum=True) as writer:
         for name, own in predictions.items():
-            values: dict[str, Any] = {"dataset": [name] * len(own)} | {key: getattr(own, key) for key in _VALUES}
-            values["error_mm"] = list(own.errors().astype(np.float32))
-            for key in _LISTS:
-                flat = getattr(own, key).reshape(len(own), -1)
-                null = np.isnan(flat).all(1) & (key in _NULLABLE)
-                values[key] = [None if is_null else row for is_null, row in zip(null, flat, strict=True)]
+            values: dict[str, Any] = {"dataset": [name] * len(own), "error_mm": list(own.errors().astype(np.float32))}
+            for column in _COLUMNS:
+                array = getattr(own, column.name)
+                if column.metadata["shape"]:
+                    flat = array.reshape(len(own), -1)
+                    null = np.isnan(flat).all(1) & column.metadata["null"]
+                    array = [None if is_null else row for is_null, row in zip(null, flat, strict=True)]
+                values[column.name] = array
             writer.write_table(pa.Table.from_pydict(values, schema=schema))
 
 

@@ -14,7 +14,6 @@ import numpy as np
 
 from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.eval.dataset import EvalDataset, EvalSample
-from lidarpose.eval.predictions import subset
 from lidarpose.eval.scores import Setting
 from lidarpose.sample import UNLABELED, Box
 from lidarpose.skeleton import Skeleton
@@ -298,5 +297,19 @@ def eval_setup(
         seed=seed,
         **described(protocol, dataset.kind) | {name: getattr(dataset, name) for name in fields},
     )
-    joints = subset(wanted, shared)
+    joints = _subset(wanted, shared)
     return EvalSetup(model=model, dataset=dataset, setting=setting, joints=joints, sensor_unknown=sensor_unknown)
+
+
+def _subset(of: Skeleton, joints: Sequence[str]) -> Skeleton:
+    """A skeleton of some joints of another, in its order; each hangs on the nearest of its ancestors that is left, or
+    on the first."""
+    if tuple(joints) == of.joints:
+        return of
+    parents: list[int] = []
+    for name in joints:
+        parent = of.parents[of.index(name)]
+        while parent >= 0 and of.joints[parent] not in joints:
+            parent = of.parents[parent]
+        parents.append(joints.index(of.joints[parent]) if parent >= 0 else min(len(parents), 1) - 1)
+    return Skeleton(name=f"{len(joints)} joints of {of.name}", joints=tuple(joints), parents=tuple(parents))

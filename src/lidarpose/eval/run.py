@@ -48,11 +48,6 @@ class Evaluation:
     predictions: Predictions
     worst: tuple[tuple[EvalSample, int], ...]
 
-    @property
-    def judged(self) -> Predictions:
-        """The predictions, by their name until 0.2."""
-        return self.predictions
-
 
 def evaluate_dataset(
     setup: EvalSetup, *, dapt_compat: bool = False, progress: Callable[[int], None] | None = None

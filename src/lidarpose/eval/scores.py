@@ -60,9 +60,6 @@ class Setting:
             words.append(f"{self.limit:,} of {self.total:,} people")
         return " · ".join(words)
 
-    # its name until 0.2
-    told = summary
-
 
 @dataclass(frozen=True, kw_only=True)
 class MetricRow:
@@ -213,21 +210,6 @@ _BLOCKS = {
 _OTHERS = "Evaluated here on sets that the paper does not have"
 
 
-@dataclass(frozen=True, kw_only=True)
-class TableEntry:
-    """One method's result on a dataset. row: the method's name in the table; figures: metric -> value or None; note:
-    what the reader must know; path of the scores.json; weights: their digest, None of baselines."""
-
-    row: str
-    kind: str
-    dataset: str
-    protocol: str
-    figures: dict[str, float | None]
-    note: str
-    path: str
-    weights: str | None
-
-
 def published() -> dict[str, Any]:
     """The paper's results: source, note, datasets with their protocols, methods with theirs and their figures."""
     return json.loads((resources.files("lidarpose.eval") / "assets" / "published.json").read_text("utf-8"))
@@ -243,11 +225,13 @@ def table(paths: str | PathLike | Sequence[str | PathLike], *, format: str = "ma
     if format == "markdown":
         return _markdown(entries)
     units = {name: unit for name, (_, unit) in COLUMNS.items()}
-    content = {"schema": TABLE_SCHEMA, "unit": units, "published": published()}
-    return json.dumps(content | {"evaluated": [asdict(entry) for entry in entries]}, indent=1) + "\n"
+    content = {"schema": TABLE_SCHEMA, "unit": units, "published": published(), "evaluated": entries}
+    return json.dumps(content, indent=1) + "\n"
 
 
-def _entries(path: str, scores: Scores) -> Iterator[TableEntry]:
+def _entries(path: str, scores: Scores) -> Iterator[dict[str, Any]]:
+    """A method's result on a dataset, one by one. row: the method's name in the table; figures: metric -> value or
+    None; note: what the reader must know; path of the scores.json; weights: their digest, None of baselines."""
     digest = scores.weights.get("digest") or None
     for result in scores.results:
         setting = result.setting
@@ -255,30 +239,27 @@ def _entries(path: str, scores: Scores) -> Iterator[TableEntry]:
         for method, arithmetic in dict.fromkeys((row.method, row.arithmetic) for row in result.lines):
             values = {row.figure: row.value for row in overall if (row.method, row.arithmetic) == (method, arithmetic)}
             own = method == setting.method
-            weights = f"weights {digest[:12]}" if digest else ""
             words = [
                 *_setting_words(result),
                 "arithmetic of the released code, faults included" if arithmetic == RELEASED else "",
-                weights if own else "uses no points",
+                "uses no points" if not own else f"weights {digest[:12]}" if digest else "",
                 path,
             ]
-            yield TableEntry(
-                row=method if arithmetic == OURS else f"{method}, released arithmetic",
-                kind=setting.kind,
-                dataset=setting.dataset,
-                protocol=setting.protocol,
-                figures={name: values.get(name) for name in COLUMNS},
-                note="; ".join(word for word in words if word),
-                path=path,
-                weights=digest if own else None,
-            )
+            yield {
+                "row": method if arithmetic == OURS else f"{method}, released arithmetic",
+                **{name: getattr(setting, name) for name in ("kind", "dataset", "protocol")},
+                "figures": {name: values.get(name) for name in COLUMNS},
+                "note": "; ".join(filter(None, words)),
+                "path": path,
+                "weights": digest if own else None,
+            }
 
 
 def _setting_words(result: Result) -> Iterator[str]:
     setting, no_pose = result.setting, result.counts["without a pose"]
     split = setting.split
-    if split != "none":
-        split += f" ({setting.split_source})" if setting.split_source else ""
+    if split != "none" and setting.split_source:
+        split += f" ({setting.split_source})"
     limited = "" if setting.limit is None else f", evenly picked from {setting.total:,}"
     left_out = sum(entry["count"] for reason, entry in result.skipped.items() if reason.startswith("people"))
     yield f"{setting.dataset}: protocol {setting.protocol}"
@@ -292,8 +273,8 @@ def _setting_words(result: Result) -> Iterator[str]:
     yield f"{left_out:,} left out" if left_out else ""
 
 
-def _markdown(entries: list[TableEntry]) -> str:
-    known = published()
+def _markdown(entries: list[dict[str, Any]]) -> str:
+    paper = published()
     notes: list[str] = []
 
     def mark(note: str) -> str:
@@ -301,43 +282,37 @@ def _markdown(entries: list[TableEntry]) -> str:
             notes.append(note)
         return f"[{notes.index(note) + 1}]"
 
-    titles = {kind: about["title"] for kind, about in known["datasets"].items()}
-    marked = {k: f"{titles[k]} {mark(f'{titles[k]}: ' + about['protocol'])}" for k, about in known["datasets"].items()}
+    titles = {kind: about["title"] for kind, about in paper["datasets"].items()}
+    marked = {k: f"{titles[k]} {mark(f'{titles[k]}: ' + about['protocol'])}" for k, about in paper["datasets"].items()}
     rows = []
-    for method in known["methods"]:
+    for method in paper["methods"]:
         name = method["method"]
-        cells = {(kind, m): _cell(value) for kind, values in method["figures"].items() for m, value in values.items()}
+        cells = {(kind, m): f"{value:.2f}" for kind, own in method["figures"].items() for m, value in own.items()}
         rows.append((f"{name} {mark(name + ': ' + method['protocol'])}" if method["protocol"] else name, cells))
-    lines = [f"**Published**: {known['source']}; {known['note']}", "", *_grid(marked, rows)]
+    lines = [f"**Published**: {paper['source']}; {paper['note']}", "", *_grid(marked, rows)]
     for protocol, title in _BLOCKS.items():
-        if own := [entry for entry in entries if entry.protocol == protocol and entry.kind in titles]:
+        if own := [entry for entry in entries if entry["protocol"] == protocol and entry["kind"] in titles]:
             lines += ["", f"**{title}.**", "", *_grid(titles, _rows(own, "kind", mark))]
-    if others := [entry for entry in entries if entry.kind not in titles]:
-        columns = {entry.dataset: entry.dataset for entry in others}
+    if others := [entry for entry in entries if entry["kind"] not in titles]:
+        columns = {entry["dataset"]: entry["dataset"] for entry in others}
         lines += ["", f"**{_OTHERS}.**", "", *_grid(columns, _rows(others, "dataset", mark))]
     lines += ["", "mm and percent; lower MPJPE and higher PCK are better.", ""]
     return "\n".join([*lines, *(f"[{k}] {note}  " for k, note in enumerate(notes, 1))]) + "\n"
 
 
-def _rows(entries: list[TableEntry], by: str, mark: Callable[[str], str]) -> list[tuple[str, dict]]:
+def _rows(entries: list[dict[str, Any]], by: str, mark: Callable[[str], str]) -> list[tuple[str, dict]]:
     """Rows of (name, cells): one a method and its weights, another one where a column comes twice. by: what a column
     is of, "kind" or "dataset"."""
     rows: list[tuple[tuple[str, str | None], dict]] = []
     for entry in entries:
-        name = entry.row.replace(BASELINE, "baseline: ")
-        key, column = (name, entry.weights), getattr(entry, by)
+        key, column = (entry["row"].replace(BASELINE, "baseline: "), entry["weights"]), entry[by]
         cells = next((cells for own, cells in rows if own == key and (column, "mpjpe") not in cells), None)
         if cells is None:
             rows.append((key, cells := {}))
-        note = mark(entry.note)
-        cells |= {
-            (column, name): _cell(value, note if name == "mpjpe" else "") for name, value in entry.figures.items()
-        }
+        for name, value in entry["figures"].items():
+            cells[column, name] = "-" if value is None else f"{value:.2f}"
+        cells[column, "mpjpe"] += f" {mark(entry['note'])}"
     return [(name, cells) for (name, _), cells in rows]
-
-
-def _cell(value: float | None, note: str = "") -> str:
-    return "-" if value is None else f"{value:.2f} {note}".rstrip()
 
 
 def _grid(columns: dict[str, str], rows: list[tuple[str, dict]]) -> list[str]:
