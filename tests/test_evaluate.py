@@ -27,7 +27,7 @@ from lidarpose.eval import run as run_module
 from lidarpose.eval.dataset import load_bench, open_eval_dataset, spread
 from lidarpose.eval.metric_rows import facing_flipped, metric_rows, triples
 from lidarpose.eval.metrics import aggregate
-from lidarpose.eval.protocols import cropped, eval_setup, jittered
+from lidarpose.eval.protocols import eval_setup, jittered
 from lidarpose.eval.run import evaluate_dataset
 from lidarpose.geometry import rotation_about
 from lidarpose.inference.backend import Estimates
@@ -176,7 +176,8 @@ def test_dapt_crops_and_centers_as_released(sets):
         np.testing.assert_array_equal(cloud, one.points[one.sample.box.contains(one.points)])
         np.testing.assert_array_equal(center, one.sample.box.center)
     box = replace(people[0].sample.box, size=people[0].sample.box.size * 0.6)
-    shown = cropped("dapt", "waymo", replace(people[0], sample=replace(people[0].sample, box=box)), 0).points
+    setup = eval_setup(model, open_eval_dataset(sets / "waymo"), protocol="dapt")
+    shown, _ = setup.crop(replace(people[0], sample=replace(people[0].sample, box=box)))
     assert 0 < len(shown) < len(people[0].points) and box.contains(shown).all()
 
     model = Fake(standing)

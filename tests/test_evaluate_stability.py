@@ -238,7 +238,7 @@ def test_a_frame_out_of_level_moves_points_and_labels_alike(synthetic, monkeypat
     monkeypatch.setattr(module, "PERTURBATIONS", {"tilt": PERTURBATIONS["tilt"]})
 
     def curve(setup):
-        (own,) = study(setup, evaluate_dataset(setup).predictions, sensors=False).curves
+        (own,) = study(setup, evaluate_dataset(setup).predictions).curves
         return own.points
 
     # who knows no up errs as much in any frame; who takes z for up does not
@@ -266,7 +266,7 @@ def test_intervals_are_of_the_seed_and_nobody_posed_is_drawn(synthetic):
     first, again, other = (module._point(*args, setup_of_seed(seed)) for seed in (0, 0, 1))
     assert first == again and first.mpjpe == other.mpjpe and first.low != other.low
     nobody = set_up(synthetic, lambda points: None)
-    found = study(nobody, evaluate_dataset(nobody).predictions, sensors=False)
+    found = study(nobody, evaluate_dataset(nobody).predictions)
     assert all(point.mpjpe is None for curve in found.curves for point in curve.points) and not found.ends
     sensors = replace(found.curves[0], name="sensors")
     assert draw_stability(replace(found, curves=(*found.curves, sensors)))[:4] == b"\x89PNG"

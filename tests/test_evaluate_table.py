@@ -124,7 +124,7 @@ def test_evaluate_and_table_from_the_command_line(tmp_path, monkeypatch, capsys)
     made = evaluation.read_scores(tmp_path / "evaluation/tiny")
     assert made.command == "lidarpose evaluate tiny bench --limit 25 --seed 3" and made.seed == 3
     assert headline.startswith(f"lidarpose-bench-1: MPJPE {made.results[0].line('mpjpe').value:.1f} mm [")
-    assert " of 25 people · tiny" in headline
+    assert ", 25 of 25 people · tiny" in headline
 
     assert run("table", "evaluation/tiny") == 0
     assert f"{made.results[0].line('mpjpe').value:.2f} [" in capsys.readouterr().out

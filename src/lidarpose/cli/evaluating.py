@@ -146,8 +146,8 @@ def _lines(result) -> Iterator[str]:
     setting, counts = result.setting, result.counts
     mpjpe = result.line("mpjpe")
     headline = f"MPJPE {_value(mpjpe)} mm {_ends(mpjpe)}".rstrip()
-    yield f"{setting.dataset}: {headline} of {mpjpe.people:,} people · {setting.method}"
-    yield f"  {setting.summary} · {counts['people']:,} people · {len(setting.joints)} joints"
+    yield f"{setting.dataset}: {headline}, {mpjpe.people:,} of {counts['people']:,} people · {setting.method}"
+    yield f"  {setting.summary} · {len(setting.joints)} joints"
     split = setting.split + (f" ({setting.split_source})" if setting.split_source else "")
     yield f"  center: {setting.centring}; crop: {setting.crop}; split {split}; sensor position {setting.sensor}"
     for note in result.notes:

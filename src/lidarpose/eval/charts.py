@@ -3,7 +3,6 @@
 Drawn with matplotlib's Agg canvas through its object interface; every function returns the bytes of a PNG.
 """
 
-import io
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,9 +11,9 @@ import numpy as np
 from lidarpose.eval.dataset import EvalSample
 from lidarpose.eval.predictions import Predictions
 from lidarpose.eval.robustness import Curve, End, Stability
-from lidarpose.eval.scores import BASELINE, OURS, MetricRow, Result, Setting
+from lidarpose.eval.scores import BASELINE, OURS, Result, Setting
 from lidarpose.sample import CONFIDENCE_RADIUS, Pose
-from lidarpose.viz.draw import Panel, draw_people
+from lidarpose.viz.draw import Panel, draw_people, png_of
 
 # blue and orange of Okabe and Ito's color-blind-safe palette (2008), the orange darker to stand out on white
 _BLUE, _ORANGE = "#0072b2", "#e07000"
@@ -38,23 +37,22 @@ def draw_errors(result: Result) -> bytes:
     setting = result.setting
     figure = _figure(9.6, 6.6, f"{setting.dataset}: MPJPE of {setting.method}, mm", setting.summary)
     rows = [row for row in result.lines if row.figure == "mpjpe" and row.arithmetic == OURS and row.value is not None]
-    own = [row for row in rows if row.method == setting.method]
-    overall = [(row.method, row.value) for row in rows if row.group == "all" and row.value is not None]
-    baselines = [(name.removeprefix(BASELINE), value) for name, value in overall if name != setting.method]
     for axes, (group, (title, missing)) in zip(figure.subplots(2, 2).ravel(), panels.items(), strict=True):
         axes.set_title(title, fontsize=10, loc="left", color=_INK)
-        shown = [row for row in own if row.group == group]
+        shown = [row for row in rows if row.group == group and row.method == setting.method]
         if not shown:
             _empty(axes, missing)
             continue
-        _bars(axes, shown)
-        for value in (value for name, value in overall if name == setting.method):
-            _level(axes, value, f"all {value:.1f}", _INK)
-        for name, value in baselines:
-            if value < axes.get_ylim()[1] * 1.6:
-                axes.set_ylim(0, max(axes.get_ylim()[1], value * 1.12))
-                _level(axes, value, name, _ORANGE)
-    return _png(figure)
+        values, low, high = _intervals(shown, "value")
+        names = [f"{row.of}\n{row.people:,}" for row in shown]
+        _bars(axes, values, low, high, names, [f"{value:.0f}" for value in values])
+        for row in rows:
+            if row.group == "all" and row.method == setting.method:
+                _level(axes, row.value, f"all {row.value:.1f}", _INK)
+            elif row.group == "all" and row.value < axes.get_ylim()[1] * 1.6:
+                axes.set_ylim(0, max(axes.get_ylim()[1], row.value * 1.12))
+                _level(axes, row.value, row.method.removeprefix(BASELINE), _ORANGE)
+    return png_of(figure, None)
 
 
 def draw_reliability(predictions: Predictions, result: Result) -> bytes | None:
@@ -71,28 +69,30 @@ def draw_reliability(predictions: Predictions, result: Result) -> bytes | None:
     left, right = (figure := _figure(9.0, 4.3, title, setting.summary)).subplots(1, 2)
     _confidence(left, confidence, error < 1e3 * CONFIDENCE_RADIUS, result)
     _spread(right, spread * 1e3, error)
-    return _png(figure)
+    return png_of(figure, None)
 
 
 def draw_stability(study: Stability) -> bytes:
     """The curves of a study, the other sensors, and the errors of end joints over the worst people."""
-    curves = [curve for curve in study.curves if curve.name != "sensors"]
-    sensors = [curve for curve in study.curves if curve.name == "sensors"]
     columns, count = 4, len(study.curves) + bool(study.ends)
     rows = -(-count // columns)
     title = f"{study.setting.method}, points perturbed: MPJPE of {study.who}, mm"
     figure = _figure(13.6, 0.5 + 3.0 * rows, title, study.setting.summary)
     axes = iter(np.ravel(figure.subplots(rows, columns)))
+    curves = [curve for curve in study.curves if curve.name != "sensors"]
     values = [p.high or p.mpjpe for curve in curves for p in curve.points if p.mpjpe is not None]
-    for curve in curves:
-        _curve(next(axes), curve, 1.08 * max(values, default=1.0))
-    for curve in sensors:
-        _sensors(next(axes), curve)
+    for curve in study.curves:
+        if all(point.mpjpe is None for point in curve.points):
+            _empty(next(axes), "nobody has a pose", curve.title)
+        elif curve.name == "sensors":
+            _sensors(next(axes), curve)
+        else:
+            _curve(next(axes), curve, 1.08 * max(values))
     if study.ends:
         _end_joints(next(axes), study.ends)
     for unused in axes:
         unused.set_axis_off()
-    return _png(figure)
+    return png_of(figure, None)
 
 
 def draw_worst(p: Predictions, setting: Setting, worst: Sequence[tuple[EvalSample, int]]) -> bytes:
@@ -120,22 +120,26 @@ def draw_worst(p: Predictions, setting: Setting, worst: Sequence[tuple[EvalSampl
 # ---- panels
 
 
-def _bars(axes, rows: Sequence[MetricRow]) -> None:
-    """A bar a row, its interval, its value, and below how many people it is of."""
-    at, values = np.arange(len(rows)), np.array([row.value for row in rows])
-    low, high = _ends(values, rows)
-    axes.bar(at, values, 0.7, color=_BAR, zorder=1)
-    axes.vlines(at, low, high, color=_BLUE, lw=1.6, zorder=4)
-    axes.plot(at, values, "o", ms=4, color=_BLUE, zorder=5)
-    for x, value, top in zip(at, values, high, strict=True):
-        text = _text(axes, f"{value:.0f}", (x, top), (0, 4), zorder=6)
-        text.set_bbox({"fc": "white", "ec": "none", "alpha": 0.75, "pad": 0.6})
-    axes.set_xticks(at, [f"{row.of}\n{row.people:,}" for row in rows], fontsize=7.5)
-    axes.set_ylim(0, 1.18 * high.max())
+def _bars(axes, values: np.ndarray, low, high, names: list[str], texts: list[str], *, level: bool = False) -> None:
+    """A bar a value with its interval and a text at its end, upright or `level`."""
+    at = np.arange(len(values))
+    bar, lines, set_names = (
+        (axes.barh, axes.hlines, axes.set_yticks) if level else (axes.bar, axes.vlines, axes.set_xticks)
+    )
+    bar(at, values, 0.7, color=_BAR, zorder=1)
+    lines(at, low, high, color=_BLUE, lw=1.6, zorder=4)
+    axes.plot(*((values, at) if level else (at, values)), "o", ms=4, color=_BLUE, zorder=5)
+    ends = np.maximum(values, high)
+    for k, end, text in zip(at, ends, texts, strict=True):
+        place, offset = ((end, k), (4, -3)) if level else ((k, end), (0, 4))
+        shown = _text(axes, text, place, offset, ha="left" if level else "center", zorder=6)
+        shown.set_bbox({"fc": "white", "ec": "none", "alpha": 0.75, "pad": 0.6})
+    (axes.set_yticks if level else axes.set_xticks)(at, names, fontsize=7.5)
+    (axes.set_xlim if level else axes.set_ylim)(0, 1.18 * ends.max())
     # a single bar is no wider than one of four
-    spare = max(4 - len(rows), 0) / 2
-    axes.set_xlim(-0.6 - spare, len(rows) - 0.4 + spare)
-    _styled(axes)
+    spare = max(4 - len(at), 0) / 2
+    (axes.set_ylim if level else axes.set_xlim)(-0.6 - spare, len(at) - 0.4 + spare)
+    _styled(axes, grid="x" if level else "y")
 
 
 def _confidence(axes, stated: np.ndarray, hit: np.ndarray, result: Result) -> None:
@@ -172,14 +176,11 @@ def _spread(axes, stated: np.ndarray, error: np.ndarray) -> None:
 
 
 def _curve(axes, curve: Curve, top: float) -> None:
-    points = [point for point in curve.points if point.mpjpe is not None]
-    if not points:
-        _empty(axes, "nobody has a pose", curve.title)
-        return
     # amounts are not evenly apart, but each is one step of the study
     at = np.array([k for k, point in enumerate(curve.points) if point.mpjpe is not None])
-    values = np.array([point.mpjpe for point in points])
-    axes.fill_between(at, *_ends(values, points), color=_BAR, lw=0, zorder=1)
+    points = [curve.points[k] for k in at]
+    values, low, high = _intervals(points, "mpjpe")
+    axes.fill_between(at, low, high, color=_BAR, lw=0, zorder=1)
     axes.plot(at, values, "o-", color=_BLUE, ms=4.5, lw=1.4, zorder=3)
     axes.axhline(values[0], color=_GRAY, lw=0.8, ls=(0, (4, 3)), zorder=2)
     for x, value in zip(at, values, strict=True):
@@ -191,32 +192,18 @@ def _curve(axes, curve: Curve, top: float) -> None:
 
 
 def _sensors(axes, curve: Curve) -> None:
-    points = sorted((p for p in curve.points if p.mpjpe is not None), key=lambda point: point.points)
-    if not points:
-        _empty(axes, "nobody has a pose", curve.title)
-        return
-    at, values = np.arange(len(points))[::-1], np.array([point.mpjpe for point in points])
-    low, high = _ends(values, points)
-    axes.barh(at, values, 0.72, color=_BAR, zorder=1)
-    axes.hlines(at, low, high, color=_BLUE, lw=1.6, zorder=3)
-    axes.plot(values, at, "o", ms=3.5, color=_BLUE, zorder=4)
-    for y, value, end in zip(at, values, high, strict=True):
-        _text(axes, f"{value:.0f}", (end, y), (4, -3), ha="left")
-    axes.set_yticks(at, [f"{point.label} · {point.points:.0f}" for point in points], fontsize=7.5)
-    axes.set_xlim(0, 1.15 * high.max())
+    points = sorted((p for p in curve.points if p.mpjpe is not None), key=lambda point: -point.points)
+    values, low, high = _intervals(points, "mpjpe")
+    names = [f"{point.label} · {point.points:.0f}" for point in points]
+    _bars(axes, values, low, high, names, [f"{value:.0f}" for value in values], level=True)
     _styled(axes, "other sensors · median number of points", grid="x")
 
 
 def _end_joints(axes, ends: Sequence[End]) -> None:
-    at, (low, middle, high) = np.arange(len(ends)), np.array([end.quartiles for end in ends]).T
-    tops = np.maximum(high, [end.mean for end in ends])
-    axes.bar(at, [end.mean for end in ends], 0.6, color=_BAR, zorder=1)
-    axes.vlines(at, low, high, color=_BLUE, lw=5, alpha=0.55)
-    axes.plot(at, middle, "o", ms=5, color=_BLUE, mec="white", zorder=4)
-    for x, top, end in zip(at, tops, ends, strict=True):
-        _text(axes, f"{end.mean:.0f} ± {end.deviation:.0f}", (x, top), (0, 4))
-    axes.set_xticks(at, [end.group for end in ends], fontsize=8.5)
-    axes.set(xlim=(-0.6, len(ends) - 0.4), ylim=(0, 1.15 * tops.max()))
+    low, middle, high = np.array([end.quartiles for end in ends]).T
+    texts = [f"{end.mean:.0f} ± {end.deviation:.0f}" for end in ends]
+    _bars(axes, np.array([end.mean for end in ends]), low, high, [end.group for end in ends], texts)
+    axes.plot(np.arange(len(ends)), middle, "o", ms=5, color=_GRAY, mec="white", zorder=4)
     _styled(axes, f"end joints of the worst {ends[0].worst:,}: mean, quartiles")
 
 
@@ -224,20 +211,18 @@ def _end_joints(axes, ends: Sequence[End]) -> None:
 
 
 def _figure(width: float, height: float, title: str, subtitle: str):
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
     options = {"parse_math": False, "family": "DejaVu Sans"}
     figure.suptitle(f"{title}\n{subtitle}", x=0.01, ha="left", fontsize=10.5, color=_INK, **options)
     return figure
 
 
-def _ends(values: np.ndarray, rows: Sequence) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of the rows' intervals; the values themselves where there is none."""
-    low, high = (np.array([getattr(row, end) for row in rows], float) for end in ("low", "high"))
-    return np.where(np.isnan(low), values, low), np.where(np.isnan(high), values, high)
+def _intervals(rows: Sequence, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Values of this name and the ends of their intervals; the values themselves where there is none."""
+    values, low, high = (np.array([getattr(row, key) for row in rows], float) for key in (name, "low", "high"))
+    return values, np.where(np.isnan(low), values, low), np.where(np.isnan(high), values, high)
 
 
 def _styled(
@@ -275,10 +260,3 @@ def _empty(axes, words: str, title: str = "") -> None:
         axes.set_title(title, fontsize=9.5, loc="left", color=_INK)
     axes.set_axis_off()
     axes.text(0.5, 0.5, words, transform=axes.transAxes, ha="center", va="center", fontsize=9, color=_FAINT)
-
-
-def _png(figure) -> bytes:
-    buffer = io.BytesIO()
-    # print_figure would follow the user's savefig settings
-    figure.canvas.print_png(buffer, metadata={"Software": None})
-    return buffer.getvalue()

@@ -121,6 +121,12 @@ def stack(skeleton: Skeleton, rows: Sequence[dict[str, Any]]) -> Predictions:
     return Predictions(skeleton=skeleton, **columns)
 
 
+def concatenate(parts: Sequence[Predictions]) -> Predictions:
+    """One or more predictions of the same joints as one."""
+    columns = {column.name: [getattr(part, column.name) for part in parts] for column in _COLUMNS}
+    return replace(parts[0], **{name: np.concatenate(arrays) for name, arrays in columns.items()})
+
+
 # ---- poses.parquet
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.eval.dataset import EvalDataset, EvalSample
+from lidarpose.eval.predictions import Predictions, stack
 from lidarpose.eval.scores import Setting
 from lidarpose.sample import UNLABELED, Box
 from lidarpose.skeleton import Skeleton
@@ -59,6 +60,7 @@ _CLEAN_CROPS = {
     "bench": "the set's own detector's box",
     "synth": "the set's own detector's box",
 }
+_UNBOXED = f"{_SEGMENTED}: there is no box, so none could be displaced"
 # sets whose crops are a detector's already
 _OWN_CROP = ("bench", "synth")
 
@@ -93,14 +95,6 @@ def check_protocol(protocol: str, dataset: EvalDataset) -> None:
         )
 
 
-def described(protocol: str, kind: str) -> dict[str, Any]:
-    """What the center is found from (centring) and how the person was cut out (crop), in words."""
-    if protocol == "dapt":
-        return {"centring": DAPT[kind].centring, "crop": DAPT[kind].crop}
-    unboxed = f"{_SEGMENTED}: there is no box, so none could be displaced"
-    return {"centring": "points alone", "crop": _CLEAN_CROPS.get(kind, unboxed)}
-
-
 def jittered(box: Box, rng: np.random.Generator) -> Box:
     """The box as a detector might have drawn it: its center off by 10 cm (5 cm in height), its edges by 5 %, its yaw by
     0.1 rad, standard deviations of normal errors cut at twice that."""
@@ -114,30 +108,17 @@ def jittered(box: Box, rng: np.random.Generator) -> Box:
     )
 
 
-def detector_box(kind: str, person: EvalSample, seed: int) -> Box | None:
-    """The displaced box that a person of a real dataset is cut out by in the protocol clean; None where they come as
-    they are. It depends on `seed` and the person's place in the dataset alone."""
-    if kind in _OWN_CROP or kind not in _CLEAN_CROPS or person.sample.box is None:
-        return None
-    return jittered(person.sample.box, np.random.default_rng([seed, person.shard, person.row]))
-
-
 def released_view(
     points: np.ndarray, joints: np.ndarray, centers: dict[str, np.ndarray], box: Box | None
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """points (n, 3) m, joints (J, 3) m, NaN without a label -> (n,) bool of what is kept, and the center (3,) m.
+    """points (n, 3) m, joints (J, 3) m, NaN without a label -> (n,) bool of what is inside, and the center (3,) m.
 
     "trans" (LiDARHuman26M, SLOPER4D): all points, about SMPL's translation; "joints_box" (HumanM3): an upright box of
-    1.25 times the joints' extent; "box" (Waymo): the labelled box. All true and None for a dataset with none of these.
+    1.25 times the joints' extent; "box" (Waymo): the labeled box. All true and None for a dataset with none of these.
     """
-    everything = np.ones(len(points), bool)
-    if "trans" in centers:
-        return everything, centers["trans"]
-    crop = released_box(joints, centers, box)
-    for name in ("joints_box", "box"):
-        if name in centers:
-            return everything if crop is None else crop.contains(points), centers[name]
-    return everything, None
+    center = next((centers[name] for name in ("trans", "joints_box", "box") if name in centers), None)
+    crop = None if center is None or "trans" in centers else released_box(joints, centers, box)
+    return np.ones(len(points), bool) if crop is None else crop.contains(points), center
 
 
 def released_box(joints: np.ndarray, centers: dict[str, np.ndarray], box: Box | None) -> Box | None:
@@ -145,17 +126,8 @@ def released_box(joints: np.ndarray, centers: dict[str, np.ndarray], box: Box | 
     if "trans" in centers or "joints_box" not in centers:
         return box
     low, high = np.nanmin(joints, 0), np.nanmax(joints, 0)
-    # of a single labelled joint too
+    # of a single labeled joint too
     return Box(center=(low + high) / 2, size=np.maximum(_ROOM * (high - low), _LEAST_EDGE))
-
-
-def cropped(protocol: str, kind: str, person: EvalSample, seed: int) -> EvalSample:
-    """The person with the points that the protocol lets the network see."""
-    if protocol == "dapt":
-        inside, _ = released_view(person.points, person.sample.joints, person.sample.centers, person.sample.box)
-        return replace(person, points=person.points[inside])
-    box = detector_box(kind, person, seed)
-    return person if box is None else replace(person, points=person.points[box.contains(person.points)])
 
 
 class Model(Protocol):
@@ -180,39 +152,43 @@ class EvalSetup:
     joints: Skeleton
     sensor_unknown: bool
 
+    def crop(self, person: EvalSample) -> tuple[np.ndarray, Box | None]:
+        """The points that the protocol lets the network see, and the box they are cut out by: of the released code in
+        dapt, else a detector's, which depends on the seed and the person's place in the dataset alone; where nothing is
+        cut, the dataset's own, if any."""
+        sample, setting = person.sample, self.setting
+        if setting.protocol == "dapt":
+            inside, _ = released_view(person.points, sample.joints, sample.centers, sample.box)
+            return person.points[inside], released_box(sample.joints, sample.centers, sample.box)
+        if setting.kind in _OWN_CROP or setting.kind not in _CLEAN_CROPS or sample.box is None:
+            return person.points, sample.box
+        box = jittered(sample.box, np.random.default_rng([setting.seed, person.shard, person.row]))
+        return person.points[box.contains(person.points)], box
+
     def shown(self, person: EvalSample) -> tuple[EvalSample | None, str]:
         """The person as the protocol shows them; or None, and why it leaves them out."""
-        protocol, kind = self.setting.protocol, self.setting.kind
-        if protocol == "clean":
-            return cropped(protocol, kind, person, self.setting.seed), ""
-        rules = DAPT[kind]
-        if rules.center not in person.sample.centers:
-            return None, f"people without the center {rules.center!r}"
-        if kind == "humanm3" and (person.sample.joint_labels == UNLABELED).all():
-            return None, "people without a labelled joint, whom their box is made of"
-        shown = cropped(protocol, kind, person, self.setting.seed)
-        if len(shown.points) < rules.least:
-            return None, f"people of under {rules.least} points, as the released code skips them"
-        return shown, ""
-
-    def crop_box(self, person: EvalSample) -> Box | None:
-        """The box of a person's crop: a detector's in the protocol clean, the released code's in dapt, else the
-        dataset's, if any."""
+        kind, least = self.setting.kind, 0
         if self.setting.protocol == "dapt":
-            return released_box(person.sample.joints, person.sample.centers, person.sample.box)
-        return detector_box(self.setting.kind, person, self.setting.seed) or person.sample.box
+            center, least = DAPT[kind].center, DAPT[kind].least
+            if center not in person.sample.centers:
+                return None, f"people without the center {center!r}"
+            if kind == "humanm3" and (person.sample.joint_labels == UNLABELED).all():
+                return None, "people without a labelled joint, whom their box is made of"
+        points, _ = self.crop(person)
+        if len(points) < least:
+            return None, f"people of under {least} points, as the released code skips them"
+        return replace(person, points=points), ""
 
-    def predict(self, samples: Sequence[EvalSample]) -> list[dict[str, Any]]:
-        """A row of `predictions.stack` for each person as the protocol shows them: what is known of them and what the
-        network answers."""
+    def predict(self, samples: Sequence[EvalSample]) -> Predictions:
+        """What is known of people as the protocol shows them, and what the network answers."""
         answers: list[dict] = [{} for _ in samples]
         answer = self._predict_clean if self.setting.protocol == "clean" else self._predict_dapt
         for known in (True, False):
             origin = np.zeros(3) if known else None
             rows = [k for k, s in enumerate(samples) if (s.sample.sensor_known and not self.sensor_unknown) == known]
             for k, values in zip(rows, answer([samples[k] for k in rows], origin) if rows else (), strict=True):
-                answers[k] = values
-        return [self._known(person) | values for person, values in zip(samples, answers, strict=True)]
+                answers[k] = self._known(samples[k]) | values
+        return stack(self.joints, answers)
 
     def _predict_clean(self, samples: list[EvalSample], origin: np.ndarray | None) -> Iterator[dict]:
         clouds = [person.points for person in samples]
@@ -295,7 +271,9 @@ def eval_setup(
         not_judged="; ".join(f"{reason} {', '.join(names)}" for reason, names in reasons.items() if names),
         sensor="unknown" if sensor_unknown else "known",
         seed=seed,
-        **described(protocol, dataset.kind) | {name: getattr(dataset, name) for name in fields},
+        centring=DAPT[dataset.kind].centring if protocol == "dapt" else "points alone",
+        crop=DAPT[dataset.kind].crop if protocol == "dapt" else _CLEAN_CROPS.get(dataset.kind, _UNBOXED),
+        **{name: getattr(dataset, name) for name in fields},
     )
     joints = _subset(wanted, shared)
     return EvalSetup(model=model, dataset=dataset, setting=setting, joints=joints, sensor_unknown=sensor_unknown)

@@ -15,7 +15,7 @@ import numpy as np
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.eval.dataset import BENCH, EvalSample, spread
 from lidarpose.eval.metrics.aggregate import interval, joint_groups, mean, paired_interval
-from lidarpose.eval.predictions import Predictions, stack
+from lidarpose.eval.predictions import Predictions
 from lidarpose.eval.protocols import EvalSetup
 from lidarpose.eval.scores import Setting, number
 from lidarpose.geometry import axis_angle_to_matrix
@@ -238,7 +238,7 @@ def people_to_perturb(setup: EvalSetup) -> list[CroppedPerson]:
     # who is not scored is not perturbed either
     shown = [(setup.shown(person)[0], person) for person in chosen]
     people = [
-        CroppedPerson(shown=cropped, whole=person, box=setup.crop_box(person))
+        CroppedPerson(shown=cropped, whole=person, box=setup.crop(person)[1])
         for cropped, person in shown
         if cropped is not None and len(cropped.points)
     ]
@@ -254,39 +254,37 @@ def study(
     predictions: Predictions,
     *,
     people: list[CroppedPerson] | None = None,
-    sensors: bool = True,
     progress: Callable[[int], None] | None = None,
 ) -> Stability:
     """The study of a dataset's people, whom `predictions` holds unperturbed.
 
     Args:
         people: whom to perturb, by default `people_to_perturb`.
-        sensors: also people simulated anew for other sensors.
         progress: progress(n) is called with every n people done.
     """
     people = people_to_perturb(setup) if people is None else people
     progress = progress or (lambda count: None)
     shown = [person.shown for person in people]
     clusters = np.array([person.sample.sequence for person in shown]) if setup.setting.clusters else None
-    unperturbed = _predict(setup, shown)
+    unperturbed = setup.predict(shown)
     base = unperturbed.errors()
     first = _point(unperturbed, base, 0.0, "0", setup, clusters)
     curves = []
     for name, perturbation in PERTURBATIONS.items():
         points = [first]
         for amount in perturbation.amounts:
-            perturbed = _predict(setup, [_perturbed(setup, person, name, amount) for person in people])
+            perturbed = setup.predict([_perturbed(setup, person, name, amount) for person in people])
             label = f"{amount * perturbation.scale:.4g}"
             points.append(_point(perturbed, base, amount, label, setup, clusters))
             progress(len(people))
         curves.append(Curve(name=name, title=perturbation.title, says=perturbation.says, points=tuple(points)))
     notes = []
-    if sensors and setup.setting.protocol == "clean":
+    if setup.setting.protocol == "clean":
         try:
             curves.append(_sensor_curve(setup, progress))
         except (MissingExtra, ModuleNotFoundError):
             notes.append("other sensors need people cast anew: in the clone, pip install '.[synth]'")
-    elif sensors:
+    else:
         notes.append("other sensors: people cast anew have no released center")
     who = f"{len(people):,} {_who(setup)}"
     ends = end_errors(predictions)
@@ -316,10 +314,6 @@ def end_errors(predictions: Predictions) -> tuple[End, ...]:
 
 def _who(setup: EvalSetup) -> str:
     return f"{'clean ' if setup.setting.kind == BENCH else ''}people of {setup.setting.dataset}"
-
-
-def _predict(setup: EvalSetup, samples: list[EvalSample]) -> Predictions:
-    return stack(setup.joints, setup.predict(samples))
 
 
 def _perturbed(setup: EvalSetup, person: CroppedPerson, name: str, amount: float) -> EvalSample:
@@ -394,7 +388,7 @@ def _sensor_curve(setup: EvalSetup, progress: Callable[[int], None]) -> Curve:
     for k, name in enumerate(SENSORS):
         generator = Generator(scene=replace(scene, sensors=(name,)), measure=False, redraw=False)
         samples = [generator.person(_SEED, index).sample for index in range(CAST)]
-        predictions = _predict(setup, [_simulated(sample, setup, k, row) for row, sample in enumerate(samples)])
+        predictions = setup.predict([_simulated(sample, setup, k, row) for row, sample in enumerate(samples)])
         point = _point(predictions, predictions.errors(), float(k), name, setup)
         points.append(replace(point, increase=None, increase_low=None, increase_high=None))
         progress(len(samples))

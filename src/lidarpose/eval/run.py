@@ -17,8 +17,8 @@ from lidarpose.data.shards import pyarrow
 from lidarpose.errors import InputError
 from lidarpose.eval.dataset import BENCH, Bench, EvalDataset, EvalSample, count_skipped, mean_poses, open_eval_dataset
 from lidarpose.eval.metric_rows import baseline_rows, metric_rows
-from lidarpose.eval.metrics.aggregate import LEAST_UNITS
-from lidarpose.eval.predictions import Predictions, stack, write_poses
+from lidarpose.eval.metrics import aggregate
+from lidarpose.eval.predictions import Predictions, concatenate, write_poses
 from lidarpose.eval.protocols import EvalSetup, Model, eval_setup
 from lidarpose.eval.robustness import Stability, people_to_perturb, study, to_json
 from lidarpose.eval.scores import BASELINE, FILE, MetricRow, Result, Scores, Setting
@@ -55,25 +55,27 @@ def evaluate_dataset(
     """Predicts everybody and scores it; progress(n) is called with every n people done. Raises InputError where nobody
     could be read."""
     dataset, setting = setup.dataset, setup.setting
-    rows: list[dict[str, Any]] = []
+    parts: list[Predictions] = []
     worst: list[tuple[float, int, EvalSample]] = []
-    unknown = 0
+    people = unknown = 0
     for chunk in _chunks(setup):
-        for person, row in zip(chunk, setup.predict(chunk), strict=True):
-            unknown += not person.sample.sensor_known
-            if (error := _mean_error(row)) is not None and not person.moving:
-                worst.append((error, len(rows), person))
-            rows.append(row)
+        predicted = setup.predict(chunk)
+        errors = predicted.errors()
+        for k in np.flatnonzero(~np.isnan(errors).all(1) & ~predicted.moving).tolist():
+            worst.append((float(np.nanmean(errors[k])), people + k, chunk[k]))
         # the points of the worst people alone are kept
         worst = sorted(worst, key=lambda entry: (-entry[0], entry[1]))[:WORST]
+        parts.append(predicted)
+        people += len(chunk)
+        unknown += sum(not person.sample.sensor_known for person in chunk)
         if progress is not None:
             progress(len(chunk))
-    if not rows:
+    if not parts:
         left = "; ".join(f"{reason}: {entry['first']}" for reason, entry in dataset.skipped.items())
         raise InputError(f"nobody of {dataset.name} could be scored ({left})")
-    predictions = stack(setup.joints, rows)
+    predictions = concatenate(parts)
     if setting.sensor == "known" and unknown:
-        setting = replace(setting, sensor="unknown" if unknown == len(rows) else "of some people")
+        setting = replace(setting, sensor="unknown" if unknown == people else "of some people")
     lines = metric_rows(predictions, setting, dapt_compat=dapt_compat)
     if dataset.bench is not None:
         lines += _baselines(dataset.bench, predictions, setting)
@@ -103,14 +105,6 @@ def _chunks(setup: EvalSetup) -> Iterator[list[EvalSample]]:
         yield chunk
 
 
-def _mean_error(row: dict[str, Any]) -> float | None:
-    """m, over the labeled joints."""
-    labeled = row["labels"] != UNLABELED
-    if "pred" not in row or not labeled.any():
-        return None
-    return float(np.linalg.norm(row["pred"] - row["true"], axis=1)[labeled].mean())
-
-
 def _baselines(bench: Bench, predictions: Predictions, setting: Setting) -> tuple[MetricRow, ...]:
     """What knows no points, scored on the same people."""
     pick = BODY26.map_to(predictions.skeleton)
@@ -136,9 +130,12 @@ def _notes(setup: EvalSetup, setting: Setting, predictions: Predictions) -> Iter
             yield "sequences out of level were turned; for the released code's frame, prepare with --no-level"
     if setting.kind == "waymo" and not (predictions.labels == UNLABELED).all():
         yield "joints that are labelled as hidden count, but in PEM; people are predicted in their labelled boxes"
-    if setting.clusters and (sequences := len(np.unique(predictions.sequence[~predictions.moving]))) < LEAST_UNITS:
+    if (
+        setting.clusters
+        and (sequences := len(np.unique(predictions.sequence[~predictions.moving]))) < aggregate.LEAST_UNITS
+    ):
         few = "one sequence alone" if sequences == 1 else f"{sequences} sequences alone"
-        yield f"{few}: no intervals, which take {LEAST_UNITS}, since frames of a sequence are not independent"
+        yield f"{few}: no intervals, which take {aggregate.LEAST_UNITS}, since frames of a sequence are not independent"
     if setting.kind == BENCH:
         yield "baselines use no points: the mean skeleton about the points' center, with the true facing or one for all"
 
