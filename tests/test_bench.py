@@ -26,10 +26,15 @@ def bench():
     return load_bench()
 
 
-def test_the_file_is_the_frozen_one():
+def test_the_file_is_the_frozen_one_and_a_damaged_one_is_named(monkeypatch, tmp_path):
     data = bench_path().read_bytes()
     assert hashlib.sha256(data).hexdigest() == BENCH_SHA256
     assert BENCH_SHA256.startswith("8abcafc6628c") and len(data) < 12e6
+    damaged = tmp_path / "b.parquet"
+    damaged.write_bytes(data[:-1])
+    monkeypatch.setattr(module, "bench_path", lambda: damaged)
+    with pytest.raises(InputError, match="is not lidarpose-bench-1 as it was frozen"):
+        load_bench()
 
 
 def test_parts_are_equal():
@@ -54,21 +59,13 @@ def test_points_lie_in_their_box_and_bodies_about_their_joints():
         assert np.median(nearest) < 0.5
 
 
-def test_a_damaged_file_is_told(monkeypatch, tmp_path):
-    damaged = tmp_path / "b.parquet"
-    damaged.write_bytes(bench_path().read_bytes()[:-1])
-    monkeypatch.setattr(module, "bench_path", lambda: damaged)
-    with pytest.raises(InputError, match="is not lidarpose-bench-1 as it was frozen"):
-        load_bench()
-
-
-def test_floors_know_no_points():
-    found = mean_poses(bench())
+def test_baselines_know_no_points():
+    baselines = mean_poses(bench())
     people, pick = bench().people, BODY26.map_to(HUMAN15)
-    true, alike = (found[name] - bench().joints for name in ("mean pose, true facing", "mean pose"))
+    true, alike = (baselines[name] - bench().joints for name in ("mean pose, true facing", "mean pose"))
     true, alike = (np.linalg.norm(away[people][:, pick], axis=-1).mean() for away in (true, alike))
     assert 0.2 < true < alike < 0.45
-    turn = {name: np.cos(facing(joints) - facing(bench().joints))[people] for name, joints in found.items()}
+    turn = {name: np.cos(facing(joints) - facing(bench().joints))[people] for name, joints in baselines.items()}
     assert (turn["mean pose, true facing"] > 0.99).all()
     assert 0.4 < (turn["mean pose"] < 0).mean() < 0.6
 
@@ -85,8 +82,5 @@ def test_plain_people_are_whole_and_of_many_points():
     rows = np.array([one.row for one in open_eval_dataset("bench") if one.plain and not one.moving])
     columns = bench().columns
     assert len(rows) == 706 and columns["num_points"][rows].min() >= 100
-    assert (
-        columns["visible"][rows].min() > 0.8
-        and columns["clutter"][rows].max() < 0.05
-        and columns["upright"][rows].all()
-    )
+    assert columns["visible"][rows].min() > 0.8 and columns["clutter"][rows].max() < 0.05
+    assert columns["upright"][rows].all()

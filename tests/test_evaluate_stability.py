@@ -212,11 +212,11 @@ def test_curves_say_what_was_done(synthetic, monkeypatch):
     setup = set_up(synthetic, lambda points: None if len(points) < 60 else standing(points))
     base = evaluate_dataset(setup).predictions
     done = []
-    result = study(setup, base, progress=done.append)
+    result = study(setup, base, progress=lambda count, total: done.append(count))
     curves = {curve.name: curve.points for curve in result.curves}
     assert list(curves) == [*PERTURBATIONS, "sensors"]
     assert "12 people of people" in result.who and not result.notes
-    assert sum(done) == 12 * sum(len(own.amounts) for own in PERTURBATIONS.values()) + 4
+    assert done[-1] == 12 * sum(len(own.amounts) for own in PERTURBATIONS.values()) + 4
     for name, perturbation in PERTURBATIONS.items():
         first, *others = curves[name]
         assert (first.amount, first.increase) == (0.0, 0.0) and first.mpjpe == pytest.approx(np.nanmean(base.errors()))
@@ -292,9 +292,10 @@ def test_a_crop_moved_by_nothing_is_the_crop(humanm3, protocol):
 def test_no_pose_stays_out_of_the_increase_and_intervals_are_of_the_seed():
     def point(base, errors, clusters=None, seed=0):
         errors = np.array(errors, float)[:, None]
-        answers = SimpleNamespace(errors=lambda: errors, posed=~np.isnan(errors[:, 0]), points=[5, 6, 7])
-        setup = SimpleNamespace(setting=SimpleNamespace(seed=seed))
-        return module._point(answers, np.array(base)[:, None], 1.0, "1", setup, clusters)
+        posed = ~np.isnan(errors[:, 0])
+        answers = SimpleNamespace(errors=lambda: errors, posed=posed, points=[5, 6, 7], sequence=clusters)
+        setting = SimpleNamespace(seed=seed, clusters=clusters is not None)
+        return module._point(answers, np.array(base)[:, None], 1.0, "1", setting)
 
     found = point([100.0, 200.0, 300.0], [110.0, np.nan, 330.0])
     assert (found.mpjpe, found.increase, found.no_pose, found.people, found.points) == (220.0, 20.0, 1, 3, 6.0)

@@ -78,7 +78,7 @@ def check_protocol(protocol: str, dataset: EvalDataset) -> None:
     if protocol == "clean":
         if split_by == "dapt":
             raise InputError(
-                f"{name} was split by dapt, where neighbouring frames are in train and test: use --protocol dapt, or "
+                f"{name} was split by dapt, where neighboring frames are in train and test: use --protocol dapt, or "
                 f"run lidarpose prepare {kind} RAW OUT again without --split-by dapt"
             )
         return

@@ -254,40 +254,43 @@ def study(
     predictions: Predictions,
     *,
     people: list[CroppedPerson] | None = None,
-    progress: Callable[[int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Stability:
     """The study of a dataset's people, whom `predictions` holds unperturbed.
 
     Args:
         people: whom to perturb, by default `people_to_perturb`.
-        progress: progress(n) is called with every n people done.
+        progress: progress(done, 0) is called as people are predicted.
     """
     people = people_to_perturb(setup) if people is None else people
-    progress = progress or (lambda count: None)
-    shown = [person.shown for person in people]
-    clusters = np.array([person.sample.sequence for person in shown]) if setup.setting.clusters else None
-    unperturbed = setup.predict(shown)
+    done = 0
+
+    def advance(count: int) -> None:
+        nonlocal done
+        progress(done := done + count, 0)
+
+    advance(0)
+    unperturbed = setup.predict([person.shown for person in people])
     base = unperturbed.errors()
-    first = _point(unperturbed, base, 0.0, "0", setup, clusters)
+    first = _point(unperturbed, base, 0.0, "0", setup.setting)
     curves = []
     for name, perturbation in PERTURBATIONS.items():
         points = [first]
         for amount in perturbation.amounts:
             perturbed = setup.predict([_perturbed(setup, person, name, amount) for person in people])
             label = f"{amount * perturbation.scale:.4g}"
-            points.append(_point(perturbed, base, amount, label, setup, clusters))
-            progress(len(people))
+            points.append(_point(perturbed, base, amount, label, setup.setting))
+            advance(len(people))
         curves.append(Curve(name=name, title=perturbation.title, says=perturbation.says, points=tuple(points)))
     notes = []
     if setup.setting.protocol == "clean":
         try:
-            curves.append(_sensor_curve(setup, progress))
+            curves.append(_sensor_curve(setup, advance))
         except (MissingExtra, ModuleNotFoundError):
             notes.append("other sensors need people cast anew: in the clone, pip install '.[synth]'")
     else:
         notes.append("other sensors: people cast anew have no released center")
-    who = f"{len(people):,} {_who(setup)}"
-    ends = end_errors(predictions)
+    who, ends = f"{len(people):,} {_who(setup)}", end_errors(predictions)
     return Stability(setting=setup.setting, who=who, curves=tuple(curves), ends=ends, notes=tuple(notes))
 
 
@@ -335,16 +338,10 @@ def _perturbed(setup: EvalSetup, person: CroppedPerson, name: str, amount: float
     return replace(shown, points=apply(points), sample=sample)
 
 
-def _point(
-    predictions: Predictions,
-    base: np.ndarray,
-    amount: float,
-    label: str,
-    setup: EvalSetup,
-    clusters: np.ndarray | None = None,
-) -> Point:
+def _point(predictions: Predictions, base: np.ndarray, amount: float, label: str, setting: Setting) -> Point:
     """One amount's point; base (n, J) mm: the errors of the same people unperturbed."""
-    rng = np.random.default_rng([zlib.crc32(label.encode()), setup.setting.seed])
+    rng = np.random.default_rng([zlib.crc32(label.encode()), setting.seed])
+    clusters = predictions.sequence if setting.clusters else None
     # NaN without a label, a row of NaN without a pose
     errors = predictions.errors()
     both = ~np.isnan(errors) & ~np.isnan(base)
@@ -366,7 +363,7 @@ def _point(
     )
 
 
-def _sensor_curve(setup: EvalSetup, progress: Callable[[int], None]) -> Curve:
+def _sensor_curve(setup: EvalSetup, advance: Callable[[int], None]) -> Curve:
     """The same bodies in the same poses at the same places before each sensor, however little it sees of them, nothing
     around them."""
     from lidarpose.synth.generator import Generator
@@ -389,9 +386,11 @@ def _sensor_curve(setup: EvalSetup, progress: Callable[[int], None]) -> Curve:
         generator = Generator(scene=replace(scene, sensors=(name,)), measure=False, redraw=False)
         samples = [generator.person(_SEED, index).sample for index in range(CAST)]
         predictions = setup.predict([_simulated(sample, setup, k, row) for row, sample in enumerate(samples)])
-        point = _point(predictions, predictions.errors(), float(k), name, setup)
+        # everybody is a sequence of their own
+        setting = replace(setup.setting, clusters=False)
+        point = _point(predictions, predictions.errors(), float(k), name, setting)
         points.append(replace(point, increase=None, increase_low=None, increase_high=None))
-        progress(len(samples))
+        advance(len(samples))
     return Curve(
         name="sensors",
         title="other sensors",

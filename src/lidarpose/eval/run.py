@@ -7,6 +7,8 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -50,15 +52,17 @@ class Evaluation:
 
 
 def evaluate_dataset(
-    setup: EvalSetup, *, dapt_compat: bool = False, progress: Callable[[int], None] | None = None
+    setup: EvalSetup, *, dapt_compat: bool = False, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> Evaluation:
-    """Predicts everybody and scores it; progress(n) is called with every n people done. Raises InputError where nobody
-    could be read."""
+    """Predicts everybody and scores it; progress(done, total) is called as people are predicted. Raises InputError
+    where nobody could be read."""
     dataset, setting = setup.dataset, setup.setting
     parts: list[Predictions] = []
     worst: list[tuple[float, int, EvalSample]] = []
     people = unknown = 0
-    for chunk in _chunks(setup):
+    samples = _shown(setup)
+    progress(0, dataset.count)
+    while chunk := list(islice(samples, _CHUNK)):
         predicted = setup.predict(chunk)
         errors = predicted.errors()
         for k in np.flatnonzero(~np.isnan(errors).all(1) & ~predicted.moving).tolist():
@@ -68,8 +72,7 @@ def evaluate_dataset(
         parts.append(predicted)
         people += len(chunk)
         unknown += sum(not person.sample.sensor_known for person in chunk)
-        if progress is not None:
-            progress(len(chunk))
+        progress(people, dataset.count)
     if not parts:
         left = "; ".join(f"{reason}: {entry['first']}" for reason, entry in dataset.skipped.items())
         raise InputError(f"nobody of {dataset.name} could be scored ({left})")
@@ -88,21 +91,15 @@ def evaluate_dataset(
     return Evaluation(result=result, predictions=predictions, worst=tuple((person, k) for _, k, person in worst))
 
 
-def _chunks(setup: EvalSetup) -> Iterator[list[EvalSample]]:
+def _shown(setup: EvalSetup) -> Iterator[EvalSample]:
     """The people as the protocol shows them; who has nothing to show is counted."""
-    chunk: list[EvalSample] = []
     for person in setup.dataset:
         shown, reason = setup.shown(person)
         if shown is None:
             where = f"{person.sample.sequence}, frame {person.sample.frame}, track {person.sample.track}"
             count_skipped(setup.dataset.skipped, reason, where)
-            continue
-        chunk.append(shown)
-        if len(chunk) == _CHUNK:
-            yield chunk
-            chunk = []
-    if chunk:
-        yield chunk
+        else:
+            yield shown
 
 
 def _baselines(bench: Bench, predictions: Predictions, setting: Setting) -> tuple[MetricRow, ...]:
@@ -129,7 +126,7 @@ def _notes(setup: EvalSetup, setting: Setting, predictions: Predictions) -> Iter
         if setup.dataset.settings.get("level"):
             yield "sequences out of level were turned; for the released code's frame, prepare with --no-level"
     if setting.kind == "waymo" and not (predictions.labels == UNLABELED).all():
-        yield "joints that are labelled as hidden count, but in PEM; people are predicted in their labelled boxes"
+        yield "joints that are labeled as hidden count, but in PEM; people are predicted in their labeled boxes"
     if (
         setting.clusters
         and (sequences := len(np.unique(predictions.sequence[~predictions.moving]))) < aggregate.LEAST_UNITS
@@ -232,13 +229,14 @@ def run(
     options: dict[str, Any] = {"protocol": protocol, "seed": seed, "skeleton": skeleton}
     setups = [eval_setup(predictor, dataset, sensor_unknown=sensor_unknown, **options) for dataset in opened]
     perturbed = [people_to_perturb(setup) if stability else None for setup in setups]
+    progress = progress or (lambda dataset, done, total: None)
     evaluations, studies = [], []
     for setup, people in zip(setups, perturbed, strict=True):
-        done = _counter(setup.setting.dataset, setup.dataset.count, progress)
-        evaluations.append(evaluate_dataset(setup, dapt_compat=dapt_compat or legacy, progress=done))
+        name, legacy = setup.dataset.name, dapt_compat or legacy
+        evaluations.append(evaluate_dataset(setup, dapt_compat=legacy, progress=partial(progress, name)))
         if people is not None:
-            done = _counter(f"{setup.setting.dataset}, perturbed", 0, progress)
-            studies.append(study(setup, evaluations[-1].predictions, people=people, progress=done))
+            shown = partial(progress, f"{name}, perturbed")
+            studies.append(study(setup, evaluations[-1].predictions, people=people, progress=shown))
     results = tuple(evaluation.result for evaluation in evaluations)
     scores = Scores(weights=weights, command=command, seed=setups[0].setting.seed, results=results)
     return Run(scores=scores, evaluations=tuple(evaluations), studies=tuple(studies))
@@ -272,20 +270,6 @@ def _loaded(model: Model | str | os.PathLike, **options: Any) -> tuple[Model, di
     # whether a dataset's own sequences were trained on shows only in the checkpoint
     card = getattr(getattr(model, "header", None), "card", {})
     return model, dict(model.model) | weights | {"skeleton": model.skeleton.name, "trained by": card.get("command")}
-
-
-def _counter(name: str, total: int, progress: Callable[[str, int, int], None] | None) -> Callable[[int], None] | None:
-    if progress is None:
-        return None
-    done = 0
-
-    def add(more: int) -> None:
-        nonlocal done
-        done += more
-        progress(name, done, total)
-
-    add(0)
-    return add
 
 
 # ---- the folder of results
