@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lidarpose._version import __version__
-from lidarpose.eval.dataset import BENCH_METADATA, BENCH_NAME
+from lidarpose.eval.dataset import BENCH_NAME
 from lidarpose.io.files import atomic_path
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import PoseBank
@@ -33,6 +33,8 @@ SUBJECTS = ("006", "007")
 SOURCES = ("prior", "captured")
 PEOPLE, CLIPS = 2000, 60
 LEAST, LEAST_BODY = 20, 10
+# key of the card in the file's metadata
+METADATA = "lidarpose-bench"
 # column -> type, of a value or of the values of a list
 COLUMNS = {
     "clip": "int16",
@@ -104,7 +106,7 @@ def main() -> None:
         "(mocap.cs.cmu.edu), created with funding from NSF EIA-0196217; their joint positions on other bodies, "
         "nothing of the files themselves",
     }
-    table = pa.Table.from_pylist(rows, schema()).replace_schema_metadata({BENCH_METADATA: json.dumps(card)})
+    table = pa.Table.from_pylist(rows, schema()).replace_schema_metadata({METADATA: json.dumps(card)})
     out = Path(options.out)
     out.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(out) as path:

@@ -15,7 +15,6 @@ person in one frame:
 """
 
 import hashlib
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from importlib import resources
@@ -33,8 +32,8 @@ from lidarpose.io.files import file_error, read_bytes
 from lidarpose.sample import SEEN, Box, LabeledSample, PersonInfo, Pose, center_of, is_plain
 from lidarpose.skeleton import BODY26, HUMAN15, Skeleton, skeleton
 
-# the word for the set that ships with the package, its name, the key of its card in the file's metadata
-BENCH, BENCH_NAME, BENCH_METADATA = "bench", "lidarpose-bench-1", "lidarpose-bench"
+# the word for the set that ships with the package, and its name
+BENCH, BENCH_NAME = "bench", "lidarpose-bench-1"
 BENCH_SHA256 = "8abcafc6628c7580b8bdf91f9c05992c7c6e4098d6922973c7cfc39d8fe0e0d2"
 # the word for everybody, whatever split
 EVERYBODY = "all"
@@ -231,12 +230,11 @@ def _read_folder(
 @dataclass(frozen=True, kw_only=True)
 class Bench:
     """lidarpose-bench in memory. points: one (n, 3) float64 m a row, in the level frame at the sensor; joints
-    (N, 26, 3) m; columns: the others by name, (N,) or (N, k); card: how it was made."""
+    (N, 26, 3) m; columns: the others by name, (N,) or (N, k)."""
 
     points: tuple[np.ndarray, ...]
     joints: np.ndarray
     columns: dict[str, np.ndarray]
-    card: dict
 
     @property
     def people(self) -> np.ndarray:
@@ -262,15 +260,14 @@ def load_bench() -> Bench:
     data = read_bytes(path, expected=f"{BENCH_NAME}, a Parquet file")
     if hashlib.sha256(data).hexdigest() != BENCH_SHA256:
         raise file_error(path, f"is not {BENCH_NAME} as it was frozen: install lidarpose again")
-    table = parquet.read_table(pa.BufferReader(data))
-    columns: dict[str, Any] = {name: values.to_numpy() for name, values in table.to_pandas().items()}
+    table = parquet.read_table(pa.BufferReader(data)).to_pandas()
+    columns: dict[str, Any] = {name: values.to_numpy() for name, values in table.items()}
     columns |= {name: np.stack(columns[name]) for name in ("origin", "joints", "box")}
     shifts = zip(columns["origin"], columns.pop("points_mm"), strict=True)
     points = tuple(origin + millimeters.reshape(-1, 3) / 1e3 for origin, millimeters in shifts)
     columns["num_points"] = np.array([len(cloud) for cloud in points])
     joints = columns.pop("joints").reshape(-1, len(BODY26), 3)
-    card = json.loads(table.schema.metadata[BENCH_METADATA.encode()])
-    return Bench(points=points, joints=joints, columns=columns, card=card)
+    return Bench(points=points, joints=joints, columns=columns)
 
 
 def _open_bench(split: str | None, limit: int | None) -> EvalDataset:
