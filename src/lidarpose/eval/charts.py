@@ -37,6 +37,7 @@ def draw_errors(result: Result) -> bytes:
     setting = result.setting
     figure = _figure(9.6, 6.6, f"{setting.dataset}: MPJPE of {setting.method}, mm", setting.summary)
     rows = [row for row in result.lines if row.figure == "mpjpe" and row.arithmetic == OURS and row.value is not None]
+    overall = {row.method: row.value for row in rows if row.group == "all" and row.value is not None}
     for axes, (group, (title, missing)) in zip(figure.subplots(2, 2).ravel(), panels.items(), strict=True):
         axes.set_title(title, fontsize=10, loc="left", color=_INK)
         shown = [row for row in rows if row.group == group and row.method == setting.method]
@@ -46,12 +47,12 @@ def draw_errors(result: Result) -> bytes:
         values, low, high = _intervals(shown, "value")
         names = [f"{row.of}\n{row.people:,}" for row in shown]
         _bars(axes, values, low, high, names, [f"{value:.0f}" for value in values])
-        for row in rows:
-            if row.group == "all" and row.method == setting.method:
-                _level(axes, row.value, f"all {row.value:.1f}", _INK)
-            elif row.group == "all" and row.value < axes.get_ylim()[1] * 1.6:
-                axes.set_ylim(0, max(axes.get_ylim()[1], row.value * 1.12))
-                _level(axes, row.value, row.method.removeprefix(BASELINE), _ORANGE)
+        for method, value in overall.items():
+            if method == setting.method:
+                _level(axes, value, f"all {value:.1f}", _INK)
+            elif value < axes.get_ylim()[1] * 1.6:
+                axes.set_ylim(0, max(axes.get_ylim()[1], value * 1.12))
+                _level(axes, value, method.removeprefix(BASELINE), _ORANGE)
     return png_of(figure, None)
 
 

@@ -123,8 +123,10 @@ def stack(skeleton: Skeleton, rows: Sequence[dict[str, Any]]) -> Predictions:
 
 def concatenate(parts: Sequence[Predictions]) -> Predictions:
     """One or more predictions of the same joints as one."""
-    columns = {column.name: [getattr(part, column.name) for part in parts] for column in _COLUMNS}
-    return replace(parts[0], **{name: np.concatenate(arrays) for name, arrays in columns.items()})
+    columns: dict[str, Any] = {
+        column.name: np.concatenate([getattr(part, column.name) for part in parts]) for column in _COLUMNS
+    }
+    return replace(parts[0], **columns)
 
 
 # ---- poses.parquet

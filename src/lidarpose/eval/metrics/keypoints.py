@@ -332,8 +332,8 @@ def assign(cost: ArrayLike) -> np.ndarray:
     row_price, column_price = np.zeros(n), np.zeros(m + 1)
     # row_of[m] is the row that is being added, as if it had a column of its own
     row_of = np.full(m + 1, -1)
-    for row in range(n):
-        row_of[m] = row
+    for start in range(n):
+        row_of[m] = start
         column, reached, before = m, np.zeros(m + 1, bool), np.full(m, m)
         length = np.full(m, np.inf)
         # Dijkstra over columns: reduced costs are never negative, and lengths are from the last column that was reached
