@@ -14,6 +14,7 @@ from shard_files import sample, write_shard
 from lidarpose.cli import main
 from lidarpose.data import shards
 from lidarpose.data.shards import DatasetCard, open_dataset, person_row, read_card, read_rows, write_card
+from lidarpose.data.writer import check_settings
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.sample import PersonInfo
 from lidarpose.skeleton import BODY26
@@ -130,10 +131,10 @@ def test_a_wrong_card_is_told(folder, change, message):
 
 def test_settings_that_differ_are_named(folder):
     card = read_card(folder)
-    shards.check_settings(folder, card, card)
+    check_settings(folder, card, card)
     other = replace(card, count=9, settings=card.settings | {"seed": 3})
     problem = "count 4 there, 9 asked for; seed null there, 3 asked for"
-    refused(lambda: shards.check_settings(folder, card, other), problem)
+    refused(lambda: check_settings(folder, card, other), problem)
 
 
 def test_rows_that_come_one_by_one_are_written_in_groups(tmp_path, people, monkeypatch):

@@ -1,6 +1,5 @@
 """Waymo, both versions: points of every laser and return come out where they went in; joins, quirks, wrong input."""
 
-import itertools
 import re
 import shutil
 import subprocess
@@ -21,7 +20,7 @@ from lidarpose.data.prepare import prepare, reader
 from lidarpose.data.readers import waymo_v1
 from lidarpose.data.readers.base import Skipped
 from lidarpose.data.readers.waymo import COMPONENTS, Waymo, images
-from lidarpose.data.readers.waymo_frames import MARGIN, Calibration, Frame, person, points_of_image, transform
+from lidarpose.data.readers.waymo_frames import MARGIN, Calibration, person, points_of_image, transform
 from lidarpose.data.shards import open_dataset
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
@@ -185,21 +184,6 @@ def top(T=None, **given):
     return Calibration(T_vehicle_laser=np.eye(4) if T is None else T, **given)
 
 
-@pytest.mark.parametrize("yaw", [0.0, 1.5, -2.6])
-def test_rows_begin_with_the_last_beam_and_columns_behind_the_car_however_the_laser_is_turned(yaw):
-    T = files.rigid(1.0, 2.0, 3.0, yaw)
-    points, row = points_of_image(np.full((3, 4), 2.0), top(T))
-    points -= [1.0, 2.0, 3.0]
-    np.testing.assert_allclose(np.arcsin(points[:, 2] / 2), np.repeat([0.2, -0.1, -0.3], 4))
-    np.testing.assert_allclose(np.degrees(np.arctan2(points[:, 1], points[:, 0])), [135, 45, -45, -135] * 3)
-    np.testing.assert_array_equal(row, np.repeat([0, 1, 2], 4))
-
-
-def test_even_beams_divide_their_range_in_its_middles():
-    calibration = top(inclinations=None, low=-0.4, high=0.2)
-    np.testing.assert_allclose(calibration.rows(3), [0.1, -0.1, -0.3])
-
-
 def test_pixel_poses_turn_about_x_then_y_then_z_and_end_in_the_frame():
     image = np.zeros((3, 4))
     image[1, 1] = 2.0
@@ -242,18 +226,6 @@ def test_the_scene_tells_wrong_readings_apart():
 
 
 @pytest.mark.parametrize(
-    "image, calibration, poses, problem",
-    [
-        (np.ones((4, 5)), top(), None, "laser 1 has 3 inclinations, its range image 4 rows"),
-        (np.ones((3, 5)), top(), np.zeros((3, 4, 6)), r"pixel poses are \(3, 4, 6\), of a range image 3 x 5"),
-    ],
-)
-def test_sizes_that_do_not_fit_are_refused(image, calibration, poses, problem):
-    with pytest.raises(InputError, match=problem):
-        points_of_image(image, calibration, poses, np.eye(4))
-
-
-@pytest.mark.parametrize(
     "values",
     [
         None,
@@ -288,45 +260,6 @@ def test_keypoints_by_type_in_any_order():
     assert person("a", [(5, (np.nan, 0, 0), False)], BOX).reason == "no joint is labelled"
     problem = person("a", [(5, (0, 0, 0), False)], (0, 0, 0, 1, 1, 0, 0.5))
     assert problem.reason == "label of another form" and "size" in problem.why
-
-
-def one_frame(**given):
-    somebody = person("a", [(5, (2.0, 0, 0), False)], (2.0, 0, 0, 1, 3, 4, 0.0))
-    settings = {"sequence": "s", "timestamp": 7, "start": 5, "people": [somebody], "calibrations": {1: top()}}
-    return Frame(**{**settings, "T_world_vehicle": np.eye(4), **given})
-
-
-@pytest.mark.parametrize(
-    "given, laser, poses, reason",
-    [
-        ({}, None, None, "no range image of the frame"),
-        ({}, 1, None, "no pixel poses of the top laser"),
-        ({"T_world_vehicle": None}, 1, np.zeros((3, 4, 6)), "no vehicle pose of the frame"),
-        ({"calibrations": {}}, 1, np.zeros((3, 4, 6)), "range image cannot be read"),
-        ({}, 1, np.zeros((3, 5, 6)), "range image cannot be read"),
-    ],
-)
-def test_a_frame_that_lacks_something_is_skipped(given, laser, poses, reason):
-    frame = one_frame(**given)
-    if laser is not None:
-        frame.add(laser, 1, np.full((3, 4), 2.0), poses)
-    (found,) = frame.samples()
-    assert found.reason == reason and found.where.startswith("s/7/a")
-
-
-def test_images_added_in_any_order_are_the_same_and_twice_is_once():
-    results = []
-    for order in itertools.permutations([(1, 1), (1, 2), (2, 1)]):
-        frame = one_frame(calibrations={1: top(), 2: top(laser=2)})
-        for laser, which in (*order, order[0]):
-            image = np.full((3, 4), 2.0 + 0.1 * which)
-            frame.add(laser, which, image, np.zeros((3, 4, 6)) if laser == 1 else None)
-        (item,) = frame.samples()
-        results.append(item)
-    assert len(results[0].points) and set(results[0].ring.tolist()) == {-1, 0, 1, 2}
-    for sample in results[1:]:
-        np.testing.assert_array_equal(sample.points, results[0].points)
-        np.testing.assert_array_equal(sample.ring, results[0].ring)
 
 
 # --- version 2: wrong input, memory
@@ -430,36 +363,39 @@ def test_an_unknown_laser_is_told(tmp_path):
 FIRST = files.scene()[0].time
 _KEYPOINT = "[LiDARHumanKeypointsComponent].lidar_keypoints[*]"
 _POSE = "[VehiclePoseComponent].world_from_vehicle.transform"
-_SHAPE = "[LiDARComponent].range_image_return1.shape"
+_BEAMS, _TIME = "[LiDARCalibrationComponent].beam_inclination.values", "key.frame_timestamp_micros"
+_SHAPE, _POSE_SHAPE = (f"[{name}Component].range_image_return1.shape" for name in ("LiDAR", "LiDARPose"))
 
 
 @pytest.mark.parametrize(
-    "name, changed, reason, lost",
+    "name, change, reason, lost",
     [
-        # None: all rows of the first frame are missing, else what the first row holds
-        ("lidar_pose", None, "no pixel poses of the top laser", 2),
-        ("vehicle_pose", None, "no vehicle pose of the frame", 2),
-        ("lidar", None, "no range image of the frame", 2),
+        # a dict: what the first row holds; else the rows
+        ("lidar_pose", lambda rows: [row for row in rows if row[_TIME] != FIRST], "no pixel poses of the top laser", 2),
+        ("vehicle_pose", lambda rows: [row for row in rows if row[_TIME] != FIRST], "no vehicle pose of the frame", 2),
+        ("lidar", lambda rows: [row for row in rows if row[_TIME] != FIRST], "no range image of the frame", 2),
+        ("lidar", lambda rows: [*rows, *rows[:2]], "no points in the box", 0),
+        ("lidar_calibration", lambda rows: rows[1:], "range image cannot be read", 4),
+        ("lidar_calibration", {_BEAMS: [0.1] * 39}, "range image cannot be read", 4),
         ("vehicle_pose", {_POSE: [0.0] * 16}, "frame cannot be read", 2),
         ("vehicle_pose", {_POSE: [1.0] * 15 + [None]}, "frame cannot be read", 2),
-        ("vehicle_pose", {"key.frame_timestamp_micros": None}, "no vehicle pose of the frame", 2),
+        ("vehicle_pose", {_TIME: None}, "no vehicle pose of the frame", 2),
         ("lidar", {_SHAPE: [1, 2, 3]}, "range image cannot be read", 2),
         ("lidar", {_SHAPE: [1, None, 3]}, "range image cannot be read", 2),
-        ("lidar_hkp", {"key.frame_timestamp_micros": None}, "label of another form", 1),
+        ("lidar_pose", {_POSE_SHAPE: [600, 40, 6]}, "range image cannot be read", 2),
+        ("lidar_hkp", {_TIME: None}, "label of another form", 1),
         ("lidar_hkp", {"key.laser_object_id": None}, "label of another form", 1),
         ("lidar_hkp", {f"{_KEYPOINT}.keypoint_3d.location_m.y": [1.0]}, "label of another form", 1),
         ("lidar_box", {"[LiDARBoxComponent].box.center.x": 1e10}, "label of another form", 1),
     ],
 )
-def test_one_bad_value_costs_one_frame_or_person(copy, name, changed, reason, lost):
-    def change(rows):
-        if changed is None:
-            return [row for row in rows if row["key.frame_timestamp_micros"] != FIRST]
-        return [rows[0] | changed, *rows[1:]]
-
-    rewritten(component(copy, name), change)
+def test_one_bad_value_costs_one_frame_or_person(copy, name, change, reason, lost):
+    rewritten(component(copy, name), change if callable(change) else lambda rows: [rows[0] | change, *rows[1:]])
     items, skipped = everything(copy)
-    assert len(items) == 4 - lost and Counter(one.reason for one in skipped)[reason] == lost
+    # where all are lost, so is the one in whose box no points are
+    assert len(items) == 4 - lost and Counter(one.reason for one in skipped)[reason] == {0: 1, 4: 5}.get(lost, lost)
+    if not lost:
+        check(items)
 
 
 @pytest.mark.parametrize(

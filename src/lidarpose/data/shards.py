@@ -33,7 +33,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -310,6 +310,13 @@ class DatasetCard:
         return json.dumps(content, indent=2) + "\n"
 
 
+_CARD_TYPES: dict[str, Callable[[Any], Any]] = {
+    **{"settings": dict, "count": int, "per_shard": int, "tables": lambda names: tuple(map(str, names))},
+    **{"skeleton": str, "version": str, "frame": str, "about": dict, "summary": dict},
+}
+_OPTIONAL = ("frame", "about", "summary")
+
+
 def read_card(folder: str | Path) -> DatasetCard:
     """The card of a dataset's folder. Raises InputError where it is missing, damaged or of another schema."""
     path = Path(folder) / CARD
@@ -321,17 +328,8 @@ def read_card(folder: str | Path) -> DatasetCard:
             version = content.get("version", "of the version that wrote it")
             problem = f"is of schema {content['schema']!r}, this lidarpose reads {SCHEMA}: install lidarpose {version}"
             raise file_error(path, problem)
-        card = DatasetCard(
-            settings=dict(content["settings"]),
-            count=int(content["count"]),
-            per_shard=int(content["per_shard"]),
-            tables=tuple(map(str, content["tables"])),
-            skeleton=str(content["skeleton"]),
-            version=str(content["version"]),
-            frame=str(content.get("frame", SENSOR_FRAME)),
-            about=dict(content.get("about", {})),
-            summary=None if content.get("summary") is None else dict(content["summary"]),
-        )
+        names = [name for name in _CARD_TYPES if name in content or name not in _OPTIONAL]
+        card = DatasetCard(**{name: _CARD_TYPES[name](content[name]) for name in names})
     except InputError:
         raise
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
@@ -346,21 +344,6 @@ def read_card(folder: str | Path) -> DatasetCard:
 def write_card(folder: str | Path, card: DatasetCard) -> None:
     """Writes dataset.json, whole or not at all."""
     write_atomic(Path(folder) / CARD, card.to_json())
-
-
-def check_settings(folder: str | Path, present: DatasetCard, wanted: DatasetCard) -> None:
-    """Raises InputError that names the settings in which a dataset differs from what is wanted."""
-    old, new = (
-        {"count": c.count, "per_shard": c.per_shard, "version": c.version, **c.settings} for c in (present, wanted)
-    )
-    differ = [
-        f"{name} {json.dumps(old.get(name))} there, {json.dumps(new.get(name))} asked for"
-        for name in sorted(old | new)
-        if old.get(name) != new.get(name)
-    ]
-    if differ:
-        problem = f"{folder} holds a dataset of other settings: {'; '.join(differ)}"
-        raise InputError(f"{problem}; give another folder or the same settings")
 
 
 # ---- files
@@ -398,15 +381,26 @@ def shard_writer(path: str | Path, table: str) -> Iterator[Callable[[dict[str, A
             flush()
 
 
+@contextmanager
+def open_parquet(path: str | Path, remedy: str, **options: Any) -> Iterator[Any]:
+    """An open Parquet file. Whatever goes wrong with it in the block is an InputError of one line that names it."""
+    pa, parquet = pyarrow()
+    try:
+        with parquet.ParquetFile(path, **options) as file:
+            yield file
+    except InputError as error:
+        raise file_error(path, error) from None
+    except FileNotFoundError:
+        raise file_error(path, "is missing") from None
+    except (pa.ArrowException, OSError, ValueError, TypeError, AttributeError, KeyError, MemoryError) as error:
+        raise file_error(path, f"cannot be read as Parquet ({error}); {remedy}") from None
+
+
 def rows_of_shard(path: str | Path) -> int | None:
     """How many rows a shard says it holds; None where it is missing or damaged."""
-    _, parquet = pyarrow()
-    try:
-        with parquet.ParquetFile(path) as file:
-            return file.metadata.num_rows
-    except Exception:
-        # pyarrow raises many kinds for damaged files; what matters is that it is to be written again
-        return None
+    with suppress(InputError), open_parquet(path, "") as file:
+        return file.metadata.num_rows
+    return None
 
 
 def read_rows(path: str | Path, table: str, columns: tuple[str, ...] | None = None) -> Iterator[dict[str, Any]]:
@@ -414,20 +408,15 @@ def read_rows(path: str | Path, table: str, columns: tuple[str, ...] | None = No
 
     Raises InputError for a damaged file, and for a column that is missing or of another type.
     """
-    pa, parquet = pyarrow()
-    try:
-        with parquet.ParquetFile(path, page_checksum_verification=True) as file:
-            names = file.schema_arrow.names
-            missing = [name for name, column in TABLES[table].items() if name not in names and not column.optional]
-            if missing:
-                raise InputError(f"is no shard of {table}: the columns {', '.join(missing)} are missing")
-            wanted = [name for name in TABLES[table] if name in names and (columns is None or name in columns)]
-            for batch in file.iter_batches(batch_size=_ROW_GROUP[table], columns=wanted):
-                yield from _rows_of(pa, batch, table)
-    except InputError as error:
-        raise file_error(path, error) from None
-    except (pa.ArrowException, OSError, ValueError, TypeError, AttributeError, MemoryError) as error:
-        raise file_error(path, f"cannot be read as Parquet ({error}); delete it and make it again") from None
+    pa, _ = pyarrow()
+    with open_parquet(path, "delete it and make it again", page_checksum_verification=True) as file:
+        names = file.schema_arrow.names
+        missing = [name for name, column in TABLES[table].items() if name not in names and not column.optional]
+        if missing:
+            raise InputError(f"is no shard of {table}: the columns {', '.join(missing)} are missing")
+        wanted = [name for name in TABLES[table] if name in names and (columns is None or name in columns)]
+        for batch in file.iter_batches(batch_size=_ROW_GROUP[table], columns=wanted):
+            yield from _rows_of(pa, batch, table)
 
 
 @dataclass(frozen=True, kw_only=True)

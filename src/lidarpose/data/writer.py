@@ -5,6 +5,7 @@ and its number alone. So nothing else need be remembered: what is missing is mad
 up the same byte for byte.
 """
 
+import json
 import multiprocessing
 import os
 import re
@@ -16,7 +17,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
-from lidarpose.data.shards import CARD, TABLES, DatasetCard, check_settings, read_card, rows_of_shard, shard_path
+from lidarpose.data.shards import CARD, TABLES, DatasetCard, read_card, rows_of_shard, shard_path
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.io.files import TEMPORARY, check_writable, file_error
 
@@ -53,10 +54,25 @@ def open_folder(folder: Path, card: DatasetCard, rows: Mapping[str, int] | None 
     return [shard for shard in range(card.shards) if not _is_whole(folder, card, shard, rows or {})]
 
 
+def check_settings(folder: str | Path, present: DatasetCard, wanted: DatasetCard) -> None:
+    """Raises InputError that names the settings in which a dataset differs from what is wanted."""
+    old, new = (
+        {"count": c.count, "per_shard": c.per_shard, "version": c.version, **c.settings} for c in (present, wanted)
+    )
+    differ = [
+        f"{name} {json.dumps(old.get(name))} there, {json.dumps(new.get(name))} asked for"
+        for name in sorted(old | new)
+        if old.get(name) != new.get(name)
+    ]
+    if differ:
+        problem = f"{folder} holds a dataset of other settings: {'; '.join(differ)}"
+        raise InputError(f"{problem}; give another folder or the same settings")
+
+
 def _is_whole(folder: Path, card: DatasetCard, shard: int, rows: Mapping[str, int]) -> bool:
     for table in card.tables:
-        found = rows_of_shard(shard_path(folder, table, shard))
-        if found is None or table in rows and found != rows[table] * card.size(shard):
+        count = rows_of_shard(shard_path(folder, table, shard))
+        if count is None or table in rows and count != rows[table] * card.size(shard):
             return False
     return True
 

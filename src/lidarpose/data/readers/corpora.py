@@ -17,16 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.base import (
-    Reader,
-    Skipped,
-    SmplJoints,
-    as_cloud,
-    find_below,
-    labeled_sample,
-    numbers,
-    read_cloud,
-)
+from lidarpose.data.readers import base
+from lidarpose.data.readers.base import Reader, Skipped, SmplJoints
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
 from lidarpose.io.pickles import load_pickle
@@ -49,20 +41,20 @@ class _Entry:
     frame: int
 
     def numbers(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
-        return numbers(self.where, self.content[name], shape, name)
+        return base.numbers(self.where, self.content[name], shape, name)
 
     def points(self, name: str) -> np.ndarray:
         """(n, 3) of an array or of a file's path."""
         value = self.content[name]
         if not isinstance(value, str):
-            return as_cloud(self.where, value)
-        path = find_below(self.root, value)
+            return base.as_cloud(self.where, value)
+        path = base.find_below(self.root, value)
         if path is None:
             raise InputError(f"{self.where}: the cloud {value} is not in {self.root}: copy it there")
         if path.suffix != ".bin":
-            return read_cloud(path)
+            return base.read_cloud(path)
         try:
-            return as_cloud(path, np.fromfile(path, "<f4"))
+            return base.as_cloud(path, np.fromfile(path, "<f4"))
         except OSError as error:
             raise file_error(path, f"cannot be read ({error.strerror or error})") from None
 
@@ -73,7 +65,7 @@ class _Entry:
             return Skipped("empty cloud", self.where)
         if _apart(points, joints) > _NEAR:
             return Skipped("joints are not where the points are", self.where)
-        return labeled_sample(
+        return base.labeled_sample(
             points,
             joints,
             sequence=self.sequence,

@@ -17,18 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.base import (
-    Reader,
-    Skipped,
-    entries,
-    find_below,
-    labeled_sample,
-    numbered,
-    numbers,
-    paired,
-    read_cloud,
-    read_json,
-)
+from lidarpose.data.readers import base
+from lidarpose.data.readers.base import Reader, Skipped
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
 from lidarpose.io.pickles import load_pickle
@@ -70,7 +60,7 @@ class HumanM3(Reader):
         if sequences and incomplete:
             raise file_error(root, f"has {incomplete}: get that folder too, or move its sequence away")
         if not sequences and not databases:
-            raise self.wrong_root(root, f"got {incomplete or entries(root)}")
+            raise self.wrong_root(root, f"got {incomplete or base.entries(root)}")
         return sequences or databases
 
     def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
@@ -87,15 +77,15 @@ def _folders(folder: Path, depth: int) -> Iterator[Path]:
 
 
 def _read_sequence(root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
-    labels = numbered(root / part / "pose_calib", ".json")
+    labels = base.numbered(root / part / "pose_calib", ".json")
     first = min(labels, default=0)
-    for pair in paired(labels, numbered(root / part / "pointcloud", ".pcd"), f"{part}/{{}}"):
+    for pair in base.paired(labels, base.numbered(root / part / "pointcloud", ".pcd"), f"{part}/{{}}"):
         if isinstance(pair, Skipped):
             yield pair
             continue
         frame, path, cloud = pair
         try:
-            bodies = read_json(path, "people's joints")
+            bodies = base.read_json(path, "people's joints")
         except InputError as error:
             yield Skipped("labels cannot be read", str(error))
             continue
@@ -105,7 +95,7 @@ def _read_sequence(root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         people = {}
         for track in sorted(bodies, key=lambda track: (int(track) if track.isdecimal() else -1, track)):
             try:
-                people[track] = numbers(path, bodies[track], (15, 3), f"joints of {track}")
+                people[track] = base.numbers(path, bodies[track], (15, 3), f"joints of {track}")
             except InputError as error:
                 yield Skipped("not 15 joints", str(error))
         yield from _people(cloud, people, part, frame, (frame - first) / _FPS)
@@ -119,7 +109,7 @@ def _read_database(root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         where = f"{part}: entry {number}"
         try:
             people = _without_copies(entry["info"], where)
-            path = find_below(root, str(entry["pcd"]))
+            path = base.find_below(root, str(entry["pcd"]))
         except (InputError, TypeError, KeyError) as error:
             yield Skipped("entry of another form", f"{where}: {error!r}")
             continue
@@ -135,10 +125,10 @@ def _without_copies(info: list[dict], where: str) -> dict[str, np.ndarray]:
     """Joints (15, 3) of everybody in a frame, NaN where no camera says visible: each has copies of the same people."""
     people: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
     for camera in info:
-        joints = numbers(where, camera["joints_3d"], (-1, 15, 3), "joints_3d")
+        joints = base.numbers(where, camera["joints_3d"], (-1, 15, 3), "joints_3d")
         seen = np.ones(joints.shape)
         if camera.get("joints_3d_vis") is not None:
-            seen = numbers(where, camera["joints_3d_vis"], joints.shape, "joints_3d_vis")
+            seen = base.numbers(where, camera["joints_3d_vis"], joints.shape, "joints_3d_vis")
         for person, visible in zip(joints, np.all(seen > 0, axis=-1), strict=True):
             _, before = people.get(person.tobytes(), (None, False))
             people[person.tobytes()] = person, visible | before
@@ -153,7 +143,7 @@ def _people(
         yield Skipped("frame without people", frame_id)
         return
     try:
-        cloud = read_cloud(path)
+        cloud = base.read_cloud(path)
     except InputError as error:
         # everybody in it is lost
         yield from (Skipped("cloud cannot be read", f"{error} ({track})") for track in people)
@@ -173,7 +163,7 @@ def _people(
         if not len(points):
             yield Skipped("no points in the box", where)
             continue
-        yield labeled_sample(
+        yield base.labeled_sample(
             points,
             joints,
             HUMAN15,

@@ -13,17 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.base import (
-    Reader,
-    Skipped,
-    SmplJoints,
-    labeled_sample,
-    numbered,
-    numbers,
-    paired,
-    read_cloud,
-    read_json,
-)
+from lidarpose.data.readers import base
+from lidarpose.data.readers.base import Reader, Skipped, SmplJoints
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_between, unit
 from lidarpose.io.files import file_error
@@ -75,7 +66,7 @@ class LidarHuman26M(Reader):
 
     def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         """The person of a sequence, frame by frame."""
-        poses = numbered(root / _POSE / part, ".json")
+        poses = base.numbered(root / _POSE / part, ".json")
         labels, damaged = {}, {}
         for frame, paths in poses.items():
             try:
@@ -89,27 +80,28 @@ class LidarHuman26M(Reader):
             joints = dict(zip(labels, people, strict=True))
             # one out of reach will be skipped, and says nothing about the others
             turn = leveling(people[within_reach(people).all(-1)]) if self._level else None
-        for pair in paired(poses, numbered(root / _SEGMENT / part, ".ply"), f"{part}/{{:06d}}"):
+        for pair in base.paired(poses, base.numbered(root / _SEGMENT / part, ".ply"), f"{part}/{{:06d}}"):
             if isinstance(pair, Skipped):
                 yield pair
-            elif pair[0] in damaged:
-                yield Skipped("labels cannot be read", damaged[pair[0]])
-            elif pair[2] is None:
-                yield Skipped("labels without a cloud", f"{part}/{pair[0]:06d}")
+                continue
+            frame, _, cloud = pair
+            if frame in damaged:
+                yield Skipped("labels cannot be read", damaged[frame])
+            elif cloud is None:
+                yield Skipped("labels without a cloud", f"{part}/{frame:06d}")
             else:
-                frame, _, path = pair
                 time = (frame - min(poses)) / _FPS
-                yield _sample(path, joints[frame], labels[frame][2], part, frame, time, turn)
+                yield _sample(cloud, joints[frame], labels[frame][2], part, frame, time, turn)
 
 
 def _labels(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """betas (10,), pose (72,) rad and trans (3,) m."""
-    content = read_json(path, "SMPL's beta, pose and trans")
+    content = base.read_json(path, "SMPL's beta, pose and trans")
     missing = [key for key in ("beta", "pose", "trans") if key not in content]
     if missing:
         raise file_error(path, f"expected beta, pose and trans, got no {', '.join(missing)}")
     sizes = {"beta": 10, "pose": 72, "trans": 3}
-    beta, pose, trans = (numbers(path, content[key], (size,), key) for key, size in sizes.items())
+    beta, pose, trans = (base.numbers(path, content[key], (size,), key) for key, size in sizes.items())
     return beta, pose, trans
 
 
@@ -118,7 +110,7 @@ def _sample(
 ) -> LabeledSample | Skipped:
     """turn: R_level_sensor, None to stay in the sensor's frame."""
     try:
-        points = read_cloud(path)
+        points = base.read_cloud(path)
     except InputError as error:
         return Skipped("cloud cannot be read", str(error))
     if not len(points):
@@ -127,7 +119,7 @@ def _sample(
     if turn is not None:
         points, joints, trans = (x @ turn.T for x in (points, joints, trans))
         source += f", turned level by {np.degrees(np.arccos(np.clip(turn[2, 2], -1, 1))):.0f} deg"
-    return labeled_sample(
+    return base.labeled_sample(
         points,
         joints,
         sequence=part,

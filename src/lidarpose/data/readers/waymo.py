@@ -10,7 +10,6 @@ Source: waymo-research/waymo-open-dataset src/waymo_open_dataset/v2.
 
 import shlex
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from lidarpose.data.readers import waymo_frames as frames
 from lidarpose.data.readers import waymo_v1
 from lidarpose.data.readers.base import Reader, Skipped, entries, numbers
 from lidarpose.data.readers.waymo_v1 import SPLITS
-from lidarpose.data.shards import pyarrow
+from lidarpose.data.shards import open_parquet, rows_of_shard
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
 from lidarpose.sample import LabeledSample
@@ -35,10 +34,13 @@ SEGMENT, TIME, LASER, OBJECT = (
 # segment and timestamp; and the laser
 FrameKey = tuple[str, int]
 LaserKey = tuple[str, int, int]
+Names = tuple[str, ...]
 # the values of the key columns, and the others by name
 Row = tuple[tuple, dict[str, Any]]
-# what is read of a file at once: its column chunks are larger than a machine's memory should have to hold
-_BUFFER = 1 << 20
+_IMAGE_KEYS = (SEGMENT, TIME, LASER)
+# column chunks are larger than what a machine's memory should have to hold: this much of a file is read at once
+_LITTLE_MEMORY = {"buffer_size": 1 << 20, "pre_buffer": False}
+_REMEDY = "fetch it again"
 
 _KEYPOINTS = "[LiDARHumanKeypointsComponent].lidar_keypoints[*]"
 _KEYPOINT_COLUMNS = tuple(
@@ -111,7 +113,7 @@ def _segments(root: Path) -> list[str]:
             raise file_error(folder, f"lacks {', '.join(missing)}; fetch with: {fetch}")
         # a damaged file is a part too: reading it reports it
         labels = sorted((folder / "lidar_hkp").glob("*.parquet"))
-        segments = [path.stem for path in labels if count_rows(path) != 0]
+        segments = [path.stem for path in labels if rows_of_shard(path) != 0]
         for name in COMPONENTS:
             missing = [segment for segment in segments if not (folder / name / f"{segment}.parquet").is_file()]
             if missing:
@@ -208,7 +210,7 @@ def _add_images(files: dict[str, Path], joined: dict[FrameKey, frames.Frame]) ->
     wanted = {key for key, frame in joined.items() if frame.wanted}
     if not wanted:
         return
-    posed = laser_keys(files["lidar_pose"], wanted)
+    posed = {key for key, _ in table(files["lidar_pose"], _IMAGE_KEYS)}
     poses = images(files["lidar_pose"], (_PIXEL_POSES,), wanted)
     # both files usually have their frames in the same order, then there is never more than one in it
     waiting: dict[LaserKey, np.ndarray | None] = {}
@@ -228,31 +230,19 @@ def _add_images(files: dict[str, Path], joined: dict[FrameKey, frames.Frame]) ->
 # by key, so that their order, row groups, the width of numbers, and further columns do not matter
 
 
-def count_rows(path: Path) -> int | None:
-    """How many rows a file says it has; None where it is damaged."""
-    try:
-        with _opened(path) as file:
-            return file.metadata.num_rows
-    except InputError:
-        return None
-
-
-def table(path: Path, keys: tuple[str, ...], columns: tuple[str, ...], optional: tuple[str, ...] = ()) -> list[Row]:
-    """All rows of a small file: the values of its key columns, and the others by name, None where an optional column is
-    missing or a value null. Raises InputError."""
-    with _opened(path) as file:
-        _check(path, (*keys, *columns), file.schema_arrow.names)
-        names = [name for name in (*columns, *optional) if name in file.schema_arrow.names]
+def table(
+    path: Path, keys: tuple[str, ...], columns: tuple[str, ...] = (), optional: tuple[str, ...] = ()
+) -> list[Row]:
+    """All rows: the values of the key columns, and the others by name, None where an optional column is missing or a
+    value null. Raises InputError."""
+    with open_parquet(path, _REMEDY, **_LITTLE_MEMORY) as file:
+        _check(file, (*keys, *columns))
+        names = [name for name in (*keys, *columns, *optional) if name in file.schema_arrow.names]
         values = file.read(columns=names, use_threads=False).to_pydict()
-        empty = dict.fromkeys(optional)
-        rows = [empty | dict(zip(names, row, strict=True)) for row in zip(*map(values.get, names), strict=True)]
-        return list(zip(_keys(path, file, keys), rows, strict=True))
-
-
-def laser_keys(path: Path, wanted: Collection[FrameKey]) -> set[LaserKey]:
-    """The keys of a file of range images that are of wanted frames. Raises InputError."""
-    with _opened(path) as file:
-        return {key for key in _keys(path, file) if key[:2] in wanted}
+        if LASER in values:
+            values[LASER] = list(map(_laser, values[LASER]))
+        rows = (dict(zip(names, row, strict=True)) for row in zip(*(values[name] for name in names), strict=True))
+        return [(tuple(row[name] for name in keys), dict.fromkeys(optional) | row) for row in rows]
 
 
 def images(
@@ -264,9 +254,9 @@ def images(
     fit its shape. Raises InputError for a damaged file and missing columns.
     """
     names = tuple(f"{column}.{part}" for column in columns for part in ("values", "shape"))
-    with _opened(path) as file:
-        _check(path, names, file.schema_arrow.names)
-        keys, first = _keys(path, file), 0
+    keys, first = [key for key, _ in table(path, _IMAGE_KEYS)], 0
+    with open_parquet(path, _REMEDY, **_LITTLE_MEMORY) as file:
+        _check(file, names)
         for group in range(file.num_row_groups):
             own = keys[first : first + file.metadata.row_group(group).num_rows]
             first += len(own)
@@ -289,40 +279,16 @@ def _image(values, shape) -> np.ndarray | None:
     return flat.reshape(size)
 
 
-def _keys(path: Path, file, names: tuple[str, ...] = (SEGMENT, TIME, LASER)) -> list[tuple]:
-    """The key columns of all rows."""
-    _check(path, names, file.schema_arrow.names)
-    values = file.read(columns=list(names), use_threads=False).to_pydict()
-    if LASER in values:
-        values[LASER] = [_laser(path, laser) for laser in values[LASER]]
-    return list(zip(*(values[name] for name in names), strict=True))
-
-
-def _laser(path: Path, name: int | str) -> int:
+def _laser(name: int | str) -> int:
     """A laser's number, from its number or its name."""
     if isinstance(name, str) and not name.isdecimal():
         if name not in frames.LASERS:
-            raise file_error(path, f"names the laser {name!r}; known are {', '.join(frames.LASERS)}")
+            raise InputError(f"names the laser {name!r}; known are {', '.join(frames.LASERS)}")
         return frames.LASERS[name]
     return int(name)
 
 
-def _check(path: Path, needed: tuple[str, ...], there: Collection[str]) -> None:
-    missing = [name for name in needed if name not in there]
+def _check(file, needed: tuple[str, ...]) -> None:
+    missing = [name for name in needed if name not in file.schema_arrow.names]
     if missing:
-        raise file_error(path, f"has no column {missing[0]}: is it of this component of Waymo v2.0?")
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """An open file. Whatever goes wrong with it in the block is an InputError."""
-    pa, parquet = pyarrow()
-    try:
-        with parquet.ParquetFile(path, buffer_size=_BUFFER, pre_buffer=False) as file:
-            yield file
-    except InputError:
-        raise
-    except FileNotFoundError:
-        raise file_error(path, "is missing") from None
-    except (pa.ArrowException, OSError, ValueError, TypeError, AttributeError, KeyError, MemoryError) as error:
-        raise file_error(path, f"cannot be read as Parquet ({error}); fetch it again") from None
+        raise InputError(f"has no column {missing[0]}: is it of this component of Waymo v2.0?")
