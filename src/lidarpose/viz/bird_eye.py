@@ -44,7 +44,19 @@ class ScanPanel:
 
 
 def draw_scans(panels: Sequence[ScanPanel], path: str | Path | None = None, *, title: str = "") -> bytes:
-    """Scans from above side by side, at most the first 12. Returns the PNG's bytes; writes `path` too where given."""
+    """Scans from above, side by side.
+
+    Args:
+        panels: at most the first 12 are drawn.
+        path: where to write the PNG, too.
+        title: above all.
+
+    Returns:
+        The PNG's bytes.
+
+    Raises:
+        InputError: a path that does not end in .png or cannot be written.
+    """
     from matplotlib.figure import Figure
 
     if path is not None:

@@ -16,11 +16,19 @@ from lidarpose.viz.html import write_report
 
 
 def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out: str | Path | None = None) -> Path:
-    """Draws `count` people of a dataset, evenly spread over it, and returns the file's path. A picture of streets shows
-    at most 12 of them from above.
+    """Draws people of a dataset that `synth` or `prepare` wrote; of streets the streets themselves, from above.
 
-    out: the file, by default the folder's name with .png or .html in the current folder. Raises InputError for a
-    folder that is no dataset or has no shard yet, and a file that cannot be written.
+    Args:
+        folder: the dataset's.
+        count: how many people, or at most 12 streets, evenly spread over the shards that are there.
+        html: a page with 3D views instead of a picture; of streets, too, it shows the people.
+        out: the file; by default the folder's name with .png or .html in the current folder.
+
+    Returns:
+        The file's path.
+
+    Raises:
+        InputError: a folder that is no dataset or has no shard yet, a file that cannot be written or is the dataset's.
     """
     most = 400 if html else MAX_PEOPLE
     if not 1 <= count <= most:

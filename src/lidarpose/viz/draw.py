@@ -57,10 +57,21 @@ _DEPTH_SPAN = 0.35  # m in front of and behind the middle, over which the points
 
 
 def draw_people(panels: list[Panel], path: str | Path | None = None, *, title: str = "") -> bytes:
-    """People from the front and from the side on one sheet, at most the first 60. Returns the PNG's bytes.
+    """People from the front and from the side on one sheet.
 
-    The front is where the predicted pose looks to, else the true one, else +x. Left limbs are blue, right ones
-    orange; a bone is the fainter and thinner the less confident its ends are. Writes `path` too where given.
+    The front is where the predicted pose faces, else the true one, else +x. Left limbs are blue, right ones orange; a
+    bone is the fainter and thinner the less confident its ends are.
+
+    Args:
+        panels: the people; at most the first 60 are drawn, and the sheet says so.
+        path: where to write the PNG, too.
+        title: above all.
+
+    Returns:
+        The PNG's bytes.
+
+    Raises:
+        InputError: a path that does not end in .png or cannot be written.
     """
     from matplotlib.figure import Figure
 

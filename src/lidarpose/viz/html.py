@@ -35,8 +35,15 @@ _SCHEMA = 1
 def write_report(path: str | Path, people: list[Panel], *, title: str, summary: list[dict]) -> None:
     """Writes the report to `path`, whole or not at all.
 
-    `summary` holds the rows of the table on top; its columns are the rows' keys in order of appearance, and a column
-    of numbers is aligned to the right. More than 60,000 points in all are thinned evenly for the views.
+    Args:
+        path: ends in .html or .htm.
+        people: a 3D view each; more than 60,000 points in all are thinned evenly.
+        title: above all.
+        summary: rows of the table on top: the columns are the rows' keys in order of appearance, a column of numbers is
+            aligned to the right.
+
+    Raises:
+        InputError: a path of another suffix, or one that cannot be written.
     """
     check_suffix(path, ".html", ".htm")
     write_atomic(path, render_report(people, title=title, summary=summary).encode("utf-8", "replace"))
