@@ -133,34 +133,32 @@ def test_24_rotations_pose_the_larger_models(bodies):
             np.testing.assert_array_equal(a, b)
 
 
-def test_house_frame(bodies):
+def test_level_frame(bodies):
     rng = np.random.default_rng(4)
     turns, move = axis_angle_to_matrix(rng.normal(0, 0.5, (3, 24, 3))), rng.normal(0, 3, (3, 3))
+    at_rest, origin = np.broadcast_to(np.eye(3), (3, 24, 3, 3)), np.zeros((3, 3))
     for joints in (24, 55):
         body, _ = bodies[joints]
         betas = rng.normal(size=(3, 10))
         vertices, joints26 = body.pose_level(betas, turns, move)
         assert vertices.dtype == joints26.dtype == np.float32 and joints26.shape == (3, 26, 3)
         np.testing.assert_allclose(joints26[:, 0], move, atol=1e-6)
-        there, at = body.pose(betas, R_LEVEL_SMPL.T @ turns @ R_LEVEL_SMPL)
-        np.testing.assert_allclose(vertices, (there - at[:, :1]) @ R_LEVEL_SMPL.T + move[:, None], atol=1e-5)
-        np.testing.assert_allclose(
-            joints26[:, :22], (at[:, :22] - at[:, :1]) @ R_LEVEL_SMPL.T + move[:, None], atol=1e-5
-        )
+        own = body.pose(betas, R_LEVEL_SMPL.T @ turns @ R_LEVEL_SMPL)
+        level = [(points - own[1][:, :1]) @ R_LEVEL_SMPL.T + move[:, None] for points in own]
+        np.testing.assert_allclose(vertices, level[0], atol=1e-5)
+        np.testing.assert_allclose(joints26[:, :22], level[1][:, :22], atol=1e-5)
         # nose and middle of the head ride on the head
-        still, rest = body.pose_level(betas, np.broadcast_to(np.eye(3), (3, 24, 3, 3)), np.zeros((3, 3)))
+        still, rest = body.pose_level(betas, at_rest, origin)
         apart = [np.linalg.norm(j[:, J("nose")] - j[:, J("head_center")], axis=-1) for j in (rest, joints26)]
         np.testing.assert_allclose(*apart, atol=1e-5)
         assert (rest[:, J("nose"), 0] > rest[:, J("head_center"), 0] + 0.05).all()
-        _, mean = body.pose_level(np.zeros((1, 0)), np.eye(3) + np.zeros((1, 24, 1, 1)), np.zeros((1, 3)))
-        assert abs(mean[0, J("head_center"), 1]) < 0.01
         assert (rest[:, J("left_hand"), 1] > 0.4).all() and (rest[:, J("left_foot"), 2] < -0.6).all()
+        _, mean = body.pose_level(np.zeros((1, 0)), at_rest[:1], origin[:1])
+        assert abs(mean[0, J("head_center"), 1]) < 0.01
     # facing +x, the left at +y, the head up
-    turn = rotation_about("z", np.pi / 2)
-    turns = np.broadcast_to(np.eye(3), (1, 24, 3, 3)).copy()
+    turn, turns = rotation_about("z", np.pi / 2), at_rest[:1].copy()
     turns[0, 0] = turn
-    turned, _ = body.pose_level(betas[:1], turns, np.zeros((1, 3)))
-    np.testing.assert_allclose(turned[0], still[0] @ turn.T, atol=1e-5)
+    np.testing.assert_allclose(body.pose_level(betas[:1], turns, origin[:1])[0][0], still[0] @ turn.T, atol=1e-5)
 
 
 def test_part_labels(bodies):

@@ -1,4 +1,4 @@
-"""The compiled inner loops of `rig` and `shape`: importing this module needs numba.
+"""The compiled inner loops of `rig`: importing this module needs numba.
 
 All arrays are float32 and C-contiguous. Every kernel works on one core without the interpreter lock, so threads can
 pose people side by side. Slow twins: tests/reference/rig.py.
