@@ -128,34 +128,6 @@ def job(**settings):
     return Job(what="people", count=COUNT, per_shard=PER_SHARD, sensors=("os1-64", "vlp-16"), seed=5, **settings)
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_motion_that_cannot_be_read_is_one_line_and_leaves_no_folder(tmp_path, workers):
-    motion = tmp_path / "motion.npz"
-    motion.write_bytes(b"PK no motion")
-    with pytest.raises(InputError, match="motion.npz") as caught:
-        write_dataset(job(motion=str(motion)), tmp_path / "out", workers=workers)
-    assert "\n" not in str(caught.value) and [path.name for path in tmp_path.iterdir()] == ["motion.npz"]
-
-
-def test_what_made_nothing_leaves_no_folder(tmp_path, capsys):
-    near = tmp_path / "near.json"
-    near.write_text('{"elevations_deg": [-2, -1, 0], "range_max": 1.2}')
-    out = tmp_path / "out"
-    assert synth(out, "-n", 3, "--sensor", near) == 2
-    assert "sensors such as near" in one_line(capsys) and not out.exists()
-    # nor anything in a folder that was there
-    out.mkdir()
-    assert synth(out, "-n", 3, "--sensor", near) == 2
-    assert not list(out.iterdir())
-
-
-def test_clips_of_motion_that_is_too_short_are_refused(tmp_path, capsys):
-    motion = tmp_path / "motion.npz"
-    write_amass(motion, *a_clip(frames=16), fps=10.0)
-    assert synth(tmp_path / "out", "-n", 2, "--clips", "--motion", motion) == 2
-    assert "no clip lasts 1.6 s" in one_line(capsys) and not (tmp_path / "out").exists()
-
-
 def test_other_settings_are_refused_by_name(dataset, capsys):
     before = content(dataset)
     words = [*WORDS[:-2], "--seed", "6", "--hard", "0.5"]
@@ -175,6 +147,11 @@ def test_clips_have_frames(tmp_path):
 
 
 BAD = {
+    "unreadable motion": (["-n", "5", "--motion", "../broken.npz"], "broken.npz"),
+    "unreadable motion, workers": (["-n", "5", "--motion", "../broken.npz", "--workers", "2"], "broken.npz"),
+    "short motion": (["-n", "2", "--clips", "--motion", "../short.npz"], "no clip lasts 1.6 s"),
+    "nobody seen": (["-n", "3", "--sensor", "../near.json"], "sensors such as near"),
+    "scene of streets": (["-n", "1", "--scenes", "--scene", "paper"], "of their own"),
     "none": (["-n", "0"], "the number of people must be a whole number of at least 1, got 0"),
     "negative": (["-n", "-3"], "got -3"),
     "sensor": (["-n", "5", "--sensor", "os1-129"], "did you mean os1-128"),
@@ -197,15 +174,21 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_a_bad_command_is_one_line_and_leaves_nothing(tmp_path, capsys, monkeypatch, case):
+@pytest.mark.parametrize("out", ["out", "."], ids=["new folder", "empty folder"])
+def test_a_bad_command_is_one_line_and_leaves_nothing(tmp_path, capsys, monkeypatch, case, out):
     words, message = BAD[case]
-    monkeypatch.chdir(tmp_path)
+    (tmp_path / "broken.npz").write_bytes(b"PK no motion")
+    (tmp_path / "near.json").write_text('{"elevations_deg": [-2, -1, 0], "range_max": 1.2}')
+    write_amass(tmp_path / "short.npz", *a_clip(frames=16), fps=10.0)
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
     try:
-        code = synth("out", *words)
+        code = synth(out, *words)
     except SystemExit as exit:
         code = exit.code
     assert code == 2 and message in one_line(capsys)
-    assert not list(tmp_path.iterdir())
+    assert not list(here.iterdir())
 
 
 def test_a_folder_that_is_none_or_another_ones_is_refused(tmp_path, capsys):
@@ -319,14 +302,6 @@ def test_people_go_on_without_end_and_settings_are_checked():
             SyntheticPeople(**{"scene": SCENE, "seed": 0} | wrong)
     with pytest.raises(InputError, match="is no dataset"):
         ShardPeople(folder="none")
-
-
-# --- streets
-
-
-def test_streets_take_no_scene():
-    with pytest.raises(InputError, match="of their own"):
-        Job(what="streets", count=1, scene="paper")
 
 
 def test_difficulty_asked_for_is_the_people_s(tmp_path):
