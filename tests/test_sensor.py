@@ -7,9 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
-from lidarpose.lidar.presets import SENSORS, listing, sensor
+from lidarpose.lidar.presets import SENSORS, listing, load_sensor, sensor
 from lidarpose.lidar.sensor import Sensor, Window
-from lidarpose.lidar.sensor_file import load_sensor
 
 ROWS = {
     "dapt64": 64, "vlp-16": 16, "vlp-32c": 32, "hdl-32e": 32, "hdl-64e": 64, "os1-64": 64, "os1-128": 128,

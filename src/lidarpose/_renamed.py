@@ -23,6 +23,7 @@ RENAMED = {
     "io.formats": "io.point_cloud",
     "lidar.catalog": "lidar.presets",
     "lidar.pattern": "lidar.ray_pattern",
+    "lidar.sensor_file": "lidar.presets",
     "model": "models",
     "model.bundled": "models",
     "model.checkpoint": "models.checkpoint",

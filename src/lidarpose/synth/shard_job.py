@@ -52,11 +52,11 @@ class Job:
     def __post_init__(self):
         check_name("kind of dataset", self.what, PER_SHARD)
         check_int(f"the number of {self.what}", self.count, least=1)
-        check_int("--per-shard", PER_SHARD[self.what] if self.per_shard is None else self.per_shard, least=1)
+        check_int("--per-shard", self.shard_size, least=1)
         check_int("the seed", self.seed, least=0)
         if self.what == "streets" and (self.scene != "wild" or self.hard != 1 or self.motion is not None):
             raise InputError("streets have scene, difficulty and walkers of their own: leave these options out")
-        if -(-self.count // (self.per_shard or PER_SHARD[self.what])) > _MOST_SHARDS:
+        if -(-self.count // self.shard_size) > _MOST_SHARDS:
             raise InputError(
                 f"{self.count:,} {self.what} would take more than {_MOST_SHARDS:,} shards: give a larger --per-shard"
             )
@@ -71,6 +71,11 @@ class Job:
             sensor(name)
         if self.sensors is not None and not self.sensors:
             raise InputError("expected the names of sensors, got none; lidarpose sensors lists them")
+
+    @property
+    def shard_size(self) -> int:
+        """Persons, clips or streets a file."""
+        return PER_SHARD[self.what] if self.per_shard is None else self.per_shard
 
     @property
     def share(self) -> float:
@@ -110,8 +115,7 @@ class Job:
             settings["motion"] = motion_digest(self.motion)
             settings["captured"] = self.share
             settings["subjects"] = list(self.subjects) if self.subjects else None
-        per_shard = self.per_shard or PER_SHARD[self.what]
-        return DatasetCard(settings=settings, count=self.count, per_shard=per_shard, tables=_TABLES[self.what])
+        return DatasetCard(settings=settings, count=self.count, per_shard=self.shard_size, tables=_TABLES[self.what])
 
 
 def write_dataset(
