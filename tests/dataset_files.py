@@ -154,7 +154,8 @@ def sloper4d_labels(smpl, sequence, *, frames=4, without=(1,), total=None, refin
         heading, pitch, roll = 0.4 + 0.1 * f, 0.25, -0.1
         turns = [axis_angle_to_matrix(vector) for vector in ([0, 0, heading], [0, pitch, 0], [roll, 0, 0])]
         R_world_sensor = turns[0] @ turns[1] @ turns[2]
-        way.append([f, *place, *quaternion(R_world_sensor), 1641234567.5 + 0.05 * f])
+        # a quaternion and its negative are one rotation
+        way.append([f, *place, *(-1) ** f * quaternion(R_world_sensor), 1641234567.5 + 0.05 * f])
         if f in without:
             continue
         clouds.append(one.cloud(f, rng, sensor=place))

@@ -22,7 +22,7 @@ from lidarpose.data import writer
 from lidarpose.data.prepare import READERS, PartWriter, prepare, summary_lines
 from lidarpose.data.readers.humanm3 import HumanM3
 from lidarpose.data.shards import labeled_row, open_dataset, read_rows, sample_of
-from lidarpose.data.splits import SplitRule, _published, split_rule
+from lidarpose.data.splits import _published, split_rule
 from lidarpose.errors import InputError
 from lidarpose.sample import SEEN, UNLABELED, Box, LabeledSample, Pose, center_of
 from lidarpose.skeleton import HUMAN15, WAYMO14
@@ -324,17 +324,6 @@ def test_the_split_in_chunks_leaks_and_says_so(tmp_path, smpl):
     assert all(len(set(splits[k : k + 16])) == 1 for k in range(0, 100, 16))
     tests = prepare("sloper4d", root, tmp_path / "test", smpl=smpl, split_by="dapt", split="test")
     assert tests["people"] == splits.count("test") and tests["skipped"] == summary["skipped"]
-
-
-@settings(deadline=None)
-@given(st.integers(0, 3000), st.text(max_size=5))
-def test_chunks_are_drawn_by_the_part_s_name_alone(people, part):
-    rule = SplitRule(name="x", source="", rule="chunks", length=16, share=0.7)
-    splits = rule.of_chunks(part, people)
-    assert splits == rule.of_chunks(part, people) and len(splits) == people
-    chunks = [splits[k : k + 16] for k in range(0, people, 16)]
-    assert all(len(set(chunk)) == 1 for chunk in chunks)
-    assert sum(chunk[0] == "train" for chunk in chunks) == int(0.7 * len(chunks))
 
 
 def test_published_splits_are_apart_and_name_their_source(tmp_path):

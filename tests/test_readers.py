@@ -8,15 +8,11 @@ from collections import Counter
 import dataset_files as files
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from lidarpose.body.smpl import load_body
 from lidarpose.data.prepare import READERS, reader
-from lidarpose.data.readers.base import Skipped, SmplJoints, find_below, numbered, numbers, read_cloud
-from lidarpose.data.readers.sloper4d import _heading
+from lidarpose.data.readers.base import Skipped, SmplJoints, read_cloud
 from lidarpose.errors import InputError
-from lidarpose.geometry import axis_angle_to_matrix, rotation_about
+from lidarpose.geometry import rotation_about
 from lidarpose.sample import SEEN, UNLABELED, LabeledSample, center_of
 
 WRITERS = {
@@ -110,6 +106,8 @@ def test_humanm3_s_database_has_everybody_once(tmp_path, smpl):
     folders, _ = everything("humanm3", tmp_path, smpl)
     for folder in tmp_path.glob("**/pose_calib"):
         shutil.rmtree(folder)
+    # of two clouds that a path may mean, it is the one of more of its folders
+    files.write_pcd(tmp_path / "000007.pcd", np.zeros((1, 3)))
     source = made("humanm3", smpl)
     assert source.parts(tmp_path) == ["train.pkl"]
     items = list(source.read(tmp_path, "train.pkl"))
@@ -122,7 +120,7 @@ def test_humanm3_s_database_has_everybody_once(tmp_path, smpl):
     flat = tmp_path / "flat"
     flat.mkdir()
     shutil.copy(tmp_path / "train.pkl", flat)
-    shutil.copy(next(tmp_path.rglob("000007.pcd")), flat)
+    shutil.copy(tmp_path / folders[0].sequence / "pointcloud/000007.pcd", flat)
     found = [one for one in source.read(flat, "train.pkl") if isinstance(one, LabeledSample)]
     assert found and {(item.sequence, item.frame) for item in found} == {(".", 7)}
     (tmp_path / "train.pkl").unlink()
@@ -146,6 +144,19 @@ def test_humanm3_s_database_tells_who_is_visible(tmp_path, smpl):
     assert [int((item.joint_labels == UNLABELED).sum()) for item in items] == [1, 0, 0, 0]
     assert np.isnan(items[0].joints[5]).all()
     assert reasons(found[len(items) :]) == {"entry of another form": 1, "labels without a cloud": 1}
+
+
+def test_humanm3_says_which_folder_is_incomplete_or_above_the_root(tmp_path, smpl):
+    files.write_humanm3(tmp_path / "HumanM3", smpl, sequences=("train/a", "train/plaza/p1", "test/c"), frames=1)
+    with pytest.raises(InputError, match="is a folder above HumanM3's root, which is likely .*HumanM3: name that"):
+        made("humanm3", smpl).parts(tmp_path)
+    assert made("humanm3", smpl).parts(tmp_path / "HumanM3") == ["test/c", "train/a", "train/plaza/p1"]
+    shutil.rmtree(tmp_path / "HumanM3/train/a/pose_calib")
+    # its body is no database of people; nor is the database read where a sequence is complete
+    for name in ("SMPL_NEUTRAL.pkl", "train.pkl"):
+        (tmp_path / "HumanM3" / name).write_bytes(pickle.dumps({}))
+        with pytest.raises(InputError, match="has .*train/a without pose_calib: get that folder too"):
+            made("humanm3", smpl).parts(tmp_path / "HumanM3")
 
 
 def test_humanm3_skips_are_counted_and_named(tmp_path, smpl):
@@ -242,22 +253,6 @@ def test_lidarhuman26m_s_trans_is_a_center(tmp_path, smpl):
 
 
 # --- SLOPER4D
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.floats(-3, 3), st.floats(-1.2, 1.2), st.floats(-1.2, 1.2))
-def test_heading_is_where_x_points_from_above(yaw, pitch, roll):
-    matrix = rotation_about("z", yaw) @ rotation_about("y", pitch) @ rotation_about("x", roll)
-    half = [axis_angle_to_matrix(np.array(v)) for v in ([0, 0, yaw], [0, pitch, 0], [roll, 0, 0])]
-    np.testing.assert_allclose(half[0] @ half[1] @ half[2], matrix, atol=1e-12)
-    if 1 + np.trace(matrix) < 1e-3:
-        return
-    found = _heading(np.stack([files.quaternion(matrix), -files.quaternion(matrix)]))
-    np.testing.assert_allclose(np.exp(1j * found), np.exp(1j * yaw), atol=1e-6)
-
-
-def test_heading_of_no_rotation_is_nan():
-    assert np.isnan(_heading(np.array([[0.0, 0, 0, 0], [0, 0, 0, 2], [np.nan, 0, 0, 1]]))).all()
 
 
 def test_sloper4d_reads_refined_poses_and_else_the_others(tmp_path, smpl):
@@ -452,15 +447,6 @@ def test_smpl_where_it_is_needed(tmp_path, smpl):
         SmplJoints(tmp_path / "y.npz", "x")(np.zeros((1, 10)), np.zeros((1, 72)), np.zeros((1, 3)))
 
 
-@settings(max_examples=10, deadline=None)
-@given(st.integers(0, 10**6), st.integers(1, 4))
-def test_joints_alone_are_the_body_s(smpl, seed, people):
-    rng = np.random.default_rng(seed)
-    betas, pose, trans = rng.normal(size=(people, 10)), rng.normal(0, 0.8, (people, 72)), rng.normal(size=(people, 3))
-    expected = load_body(smpl).pose(betas, pose, trans)[1]
-    np.testing.assert_allclose(SmplJoints(smpl, "x")(betas, pose, trans), expected, atol=1e-6)
-
-
 def test_published_names_of_smpl_are_known(tmp_path):
     names = ("basicModel_f_lbs_10_207_0_v1.0.0", "basicmodel_m_lbs_10_207_0_v1.1.0", "SMPL_NEUTRAL", "other")
     for name in names:
@@ -473,30 +459,3 @@ def test_published_names_of_smpl_are_known(tmp_path):
         "female": names[0], "male": names[1], "neutral": names[2]
     }  # fmt: skip
     assert [found.kind(g) for g in ("male", "female", "robot")] == ["male", "female", "neutral"]
-
-
-@given(st.lists(st.lists(st.floats(), max_size=4), max_size=4), st.sampled_from([(-1, 3), (2, 2), (3,)]))
-def test_numbers_are_of_the_shape_asked_for_or_an_input_error(value, shape):
-    try:
-        found = numbers("f", value, shape, "it")
-    except InputError as error:
-        assert "\n" not in str(error)
-    else:
-        assert found.ndim == len(shape) and np.isfinite(found).all() and found.dtype == float
-        assert all(n in (-1, m) for n, m in zip(shape, found.shape, strict=True))
-
-
-def test_numbered_files_by_number(tmp_path):
-    for name in ("10.json", "9.json", "0009.json", "a.json", "8.txt", "x9.json"):
-        (tmp_path / name).write_text("")
-    found = {n: [p.name for p in paths] for n, paths in numbered(tmp_path, ".json").items()}
-    assert found == {9: ["0009.json", "9.json"], 10: ["10.json"]} and list(found) == [9, 10]
-    assert numbered(tmp_path / "none", ".json") == {}
-
-
-def test_the_longest_end_of_a_path_is_the_cloud(tmp_path):
-    for path in (tmp_path / "a/b.pcd", tmp_path / "b.pcd"):
-        path.parent.mkdir(exist_ok=True)
-        path.write_text("")
-    assert find_below(tmp_path, "/their/machine/a/b.pcd") == tmp_path / "a/b.pcd"
-    assert find_below(tmp_path, "/their/machine/c/b.pcd") == tmp_path / "b.pcd"
