@@ -14,6 +14,7 @@ from lidarpose.lidar.raycast_kernels import AXIS, STEEP, compiled, njit, raster
 # a sector spans at most this much azimuth, so that tan(a) stays near 1
 SECTOR = np.radians(92.0)
 
+_MOST = np.int64(2**63 - 1)
 # no sub-beam beyond the zenith
 _ZENITH = np.pi / 2 - 1e-6
 
@@ -42,8 +43,21 @@ class Beams(NamedTuple):
     farthest: float
 
 
-# sums may be taken in any order, and there is no NaN: so all is found many at a time
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"nsz", "reassoc", "nnan"})
+@compiled
+def _ordered(value):
+    """A whole number that orders as the value does: the least of whole numbers is found many at a time."""
+    bits = np.float64(value).view(np.int64)
+    return bits ^ ((bits >> 63) & _MOST)
+
+
+@compiled
+def _number(ordered):
+    """The value of `_ordered`."""
+    return np.int64(ordered ^ ((ordered >> 63) & _MOST)).view(np.float64)
+
+
+# sums may be taken in any order
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"nsz", "reassoc"})
 def bounds(vertices):
     """Mean azimuth, and the vertices' least and greatest azimuth relative to it and elevation, rad."""
     flat, east, north = vertices.reshape(-1), 0.0, 0.0
@@ -52,17 +66,18 @@ def bounds(vertices):
         north += flat[np.uintp(3 * i + 1)]
     center = np.arctan2(north, east)
     c, s = np.cos(center), np.sin(center)
-    left, right, low, high, ahead = np.inf, -np.inf, np.inf, -np.inf, np.inf
+    left, right, low, high, ahead = _MOST, -_MOST, _MOST, -_MOST, _MOST
     for i in range(len(vertices)):
         vx, vy, vz = flat[np.uintp(3 * i)], flat[np.uintp(3 * i + 1)], flat[np.uintp(3 * i + 2)]
         x, y = c * vx + s * vy, c * vy - s * vx
-        ahead = min(ahead, x * STEEP - abs(y), x - AXIS)
-        azimuth = y * (1 / (x if x > AXIS else 1.0))
+        ahead = min(ahead, _ordered(min(x * STEEP - abs(y), x - AXIS)))
+        azimuth = _ordered(y * (1 / (x if x > AXIS else 1.0)))
         # squared, with its sign
-        slope = vz * abs(vz) / (x * x + y * y if x > AXIS else 1.0)
+        slope = _ordered(vz * abs(vz) / (x * x + y * y if x > AXIS else 1.0))
         left, right = min(left, azimuth), max(right, azimuth)
         low, high = min(low, slope), max(high, slope)
     if ahead > 0:
+        left, right, low, high = _number(left), _number(right), _number(low), _number(high)
         low, high = np.sign(low) * np.sqrt(abs(low)), np.sign(high) * np.sqrt(abs(high))
         return center, np.arctan(left), np.arctan(right), np.arctan(low), np.arctan(high)
     left, right, low, high = np.inf, -np.inf, np.inf, -np.inf
