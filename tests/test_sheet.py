@@ -189,6 +189,9 @@ def test_view_of_streets_shows_them_from_above(tmp_path, monkeypatch):
         assert [box.id for box in shown.boxes] == [box.id for box in frames[0].boxes]
         ways = np.array([[box.center[:2] for box in frame.boxes] for frame in frames])
         np.testing.assert_allclose(np.stack(shown.tracks, 1), ways, atol=1e-5)
+    # a page shows their people
+    page = draw_dataset(tmp_path / "s", html=True, out=tmp_path / "s.html").read_text()
+    assert re.search(r"<strong>#\d frame 0 track \d vlp-16</strong>", page)
     for path in (tmp_path / "s").glob("frames*"):
         path.unlink()
     with pytest.raises(InputError, match="holds no shard yet"):
