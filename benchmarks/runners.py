@@ -216,7 +216,7 @@ class Onnx(Runner):
 
     def decode(self, values: list[np.ndarray]) -> np.ndarray:
         raw = self.backend.Raw.from_pose(dict(zip(self.outputs, values, strict=True)))
-        return self.backend.estimates(raw, self.decoder).joints
+        return self.backend.estimates(raw, self.decoder, BODY26).joints
 
 
 class Session(Onnx):

@@ -17,10 +17,11 @@ import numpy as np
 from ablation_tables import figures
 
 from lidarpose import evaluation
-from lidarpose.inference.backend import Estimates, Raw, estimates
+from lidarpose.inference.backend import Raw, estimates
 from lidarpose.inference.predictor import PASSES, Predictor, load
 from lidarpose.inference.tta import TRANSFORMS, TTATransform, apply, average
 from lidarpose.io.files import write_atomic
+from lidarpose.sample import Pose
 from lidarpose.skeleton import BODY26
 
 # a logarithm that stands for a bin out of the heatmap, or of next to no weight
@@ -59,12 +60,12 @@ class Averaging(Predictor):
         super().__init__(predictor.backend, name=predictor.model["name"], decode=predictor.model["decode"])
         self._passes, self._tta, self.heatmaps = way.passes, way.looks, way.heatmaps
 
-    def _looks(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Estimates:
+    def _looks(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Pose:
         if not self.heatmaps:
             # the first look may be any here
             return average([self._look(look, clouds, centers, origin) for look in self._tta])
         raws = [self._raw(look, clouds, centers, origin) for look in self._tta]
-        return estimates(_fused(raws), self._decoder)
+        return estimates(_fused(raws), self._decoder, self.skeleton)
 
     def _raw(self, look: TTATransform, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Raw:
         """What the network says of people shown so, brought back before it is decoded: heatmaps turn exactly."""

@@ -82,12 +82,10 @@ def test_backends_agree_to_the_end(models):
     for a, b in zip(ours, due, strict=True):
         assert np.abs(a.joints - b.joints).max() < 1e-4 and a.warnings == b.warnings
     assert (ours.model["backend"], due.model["backend"]) == ("onnx", "torch")
-
-
-def test_the_bundled_twins_are_of_one_network():
-    model = load(tta=1)
-    assert model.backend.source == content_digest(bundled_path(), expected="a checkpoint")
-    assert model.header == read_header(bundled_path())
+    # the bundled twins are of one network
+    onnx = models["onnx"]
+    assert onnx.backend.source == content_digest(bundled_path(), expected="a checkpoint")
+    assert onnx.header == models["torch"].header == read_header(bundled_path())
 
 
 @pytest.mark.parametrize("name", ["onnx", "torch"])
@@ -99,7 +97,7 @@ def test_a_batch_is_as_one_by_one_in_another_process_too(models, name):
     np.testing.assert_array_equal(other.predict(clouds[0]).joints, alone[0])
 
 
-def test_compiling_is_asked_for(models, monkeypatch):
+def test_compiling_is_asked_for_and_a_failure_is_one_line(models, monkeypatch):
     asked = []
     monkeypatch.setattr(torch, "compile", lambda module, **settings: asked.append(settings) or module)
     compiled = load(compile=True, tta=1)
@@ -107,6 +105,10 @@ def test_compiling_is_asked_for(models, monkeypatch):
     for count in (300, 60):
         np.testing.assert_array_equal(compiled.predict(blob(count)).joints, models["torch"].predict(blob(count)).joints)
     assert asked == [{"dynamic": True}]
+    failing = mock.Mock(side_effect=torch._dynamo.exc.TorchDynamoException("no\ncompiler"))
+    monkeypatch.setattr(torch, "compile", lambda module, **settings: failing)
+    with pytest.raises(InputError, match="torch.compile failed .no compiler.: leave compile away"):
+        load(compile=True).predict(blob(30))
 
 
 @pytest.mark.slow
@@ -115,15 +117,6 @@ def test_compiled_is_the_same(models):
     for count in (300, 60, 5):
         due = models["torch"].predict(blob(count)).joints
         np.testing.assert_allclose(compiled.predict(blob(count)).joints, due, atol=1e-4)
-
-
-def test_a_failed_compilation_is_one_line(monkeypatch):
-    def fails(*tensors):
-        raise torch._dynamo.exc.TorchDynamoException("no\ncompiler")
-
-    monkeypatch.setattr(torch, "compile", lambda module, **settings: fails)
-    with pytest.raises(InputError, match="torch.compile failed .no compiler.: leave compile away"):
-        load(compile=True).predict(blob(30))
 
 
 # ---- from raw outputs to joints
@@ -136,7 +129,7 @@ def test_numpy_and_torch_decode_alike(kind):
     logits = rng.normal(0, 3, (50, 26, 3, bins)).astype(np.float32)
     logits[..., 0] += 4 * (rng.random((50, 26, 3)) < 0.2)
     raw = raw_of(logits)
-    out = estimates(raw, decode.window)
+    out = estimates(raw, decode.window, BODY26)
     due = raw.vote + layers.decode(torch.from_numpy(logits)).numpy()
     np.testing.assert_allclose(out.joints, due, atol=2e-6)
     ends = (logits.argmax(-1) % (bins - 1) == 0).any(-1)
@@ -162,7 +155,7 @@ def test_decoders_differ_and_each_is_taken(models):
     for name in ("window", "argmax", "dark"):
         model = Predictor(models["onnx"].backend, name="x", decode=name)
         joints[name] = model.outputs([cloud], center[None], None).joints
-        np.testing.assert_allclose(joints[name], estimates(raw, decode.decoder(name)).joints, atol=1e-6)
+        np.testing.assert_allclose(joints[name], estimates(raw, decode.decoder(name), BODY26).joints, atol=1e-6)
         assert load(decode=name).model["decode"] == model.predict(cloud).model["decode"] == name
     # a peak's bin and what is refined about it are less than the window apart
     assert 0 < np.abs(joints["window"] - joints["argmax"]).max() < 4 * BIN
@@ -171,34 +164,31 @@ def test_decoders_differ_and_each_is_taken(models):
 
 
 def test_extreme_outputs_stay_in_their_ranges():
-    huge = np.array([[-1e4, 1e4, 0.0]], np.float32)
-    logits = np.zeros((1, 3, 3, 24), np.float32)
+    huge = np.resize(np.array([-1e4, 1e4, 0.0], np.float32), (1, 26))
+    logits = np.zeros((1, 26, 3, 24), np.float32)
     logits[..., 5] = 1e4
-    out = estimates(raw_of(logits, confidence=huge, log_spread=huge, visible=huge), decode.window)
-    np.testing.assert_array_equal(out.confidence, [[0, 1, 0.5]])
-    np.testing.assert_array_equal(out.visible, [[0, 1, 0.5]])
+    out = estimates(raw_of(logits, confidence=huge, log_spread=huge, visible=huge), decode.window, BODY26)
+    for value in (out.confidence, out.visible):
+        np.testing.assert_array_equal(value, np.resize([0, 1, 0.5], (1, 26)))
     assert np.isfinite(out.spread).all() and (out.spread >= 0).all() and np.isfinite(out.joints).all()
-
-
-def test_a_network_without_heatmaps_knows_no_range():
+    # a network without heatmaps knows no range
     raw = raw_of(np.zeros((2, 26, 3, 0), np.float32))
-    out = estimates(raw, decode.window)
+    out = estimates(raw, decode.window, BODY26)
     np.testing.assert_array_equal(out.joints, raw.vote)
     assert out.in_range is None and out.confidence.shape == (2, 26)
 
 
 def test_confidence_read_off_heatmaps():
-    # bins of 2 cm; three quarters of the first joint's weight at bin 50, a quarter 30 cm off; the second is sure
-    logits = np.full((1, 2, 100), -1e4, np.float32)
-    logits[0, :, 50] = 0
-    logits[0, 0, 65] = -np.log(3)
-    sure = np.full((1, 2, 100), -1e4, np.float32)
+    # bins of 2 cm; three quarters of every other joint's weight at bin 50, a quarter 30 cm off; the others are sure
+    sure = np.full((1, 26, 100), -1e4, np.float32)
     sure[..., 50] = 0
-    raw = Raw(vote=np.zeros((1, 2, 3)), heatmaps=(logits, sure, sure), low=np.full(3, -1.0), step=np.full(3, 0.02))
-    out = estimates(raw, decode.window)
+    logits = sure.copy()
+    logits[0, ::2, 65] = -np.log(3)
+    raw = Raw(vote=np.zeros((1, 26, 3)), heatmaps=(logits, sure, sure), low=np.full(3, -1.0), step=np.full(3, 0.02))
+    out = estimates(raw, decode.window, BODY26)
     np.testing.assert_allclose(out.joints, 0, atol=1e-9)
-    np.testing.assert_allclose(out.confidence, [[0.75, 1]], atol=1e-6)
-    np.testing.assert_allclose(out.spread, [[0.15, 0]], atol=1e-6)
+    np.testing.assert_allclose(out.confidence, np.resize([0.75, 1], (1, 26)), atol=1e-6)
+    np.testing.assert_allclose(out.spread, np.resize([0.15, 0], (1, 26)), atol=1e-6)
     assert out.visible is None and out.in_range.all()
 
 
@@ -239,16 +229,14 @@ def test_joints_at_the_end_of_the_range_are_named():
     # nothing is said where all are in range
     pose = Predictor(Scripted(np.full((26, 3), 10)), name="x").predict(blob(30))
     assert pose.warnings == () and pose.out_of_range == [] and pose.in_range.all()
-
-
-def test_a_person_without_joints_has_nothing_to_tell(models):
-    pose = models["onnx"].predict(blob(3))
+    # nor of a person without joints
+    pose = Predictor(Scripted(mode), name="x").predict(blob(3))
     assert pose.visible is None and pose.in_range is None and pose.out_of_range == []
     entry = json.loads(pose.to_json())["people"][0]
     assert entry["joints"] is None and entry["visible"] == entry["out_of_range"] == entry["confidence"] == []
 
 
-def test_the_second_pass_is_centered_on_the_pelvis_to_a_centimetre():
+def test_the_second_pass_is_centered_on_the_pelvis_to_a_centimeter():
     joints = np.zeros((26, 3), np.float32)
     joints[0] = 0.1234, -0.0567, 0.301
     scripted = Scripted(np.full((26, 3), 11), joints)
@@ -402,7 +390,7 @@ def test_a_network_that_only_regresses(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "settings, words", [({"backend": "onnx"}, "does not run as ONNX"), ({"compile": True}, "is not offered")]
+    "settings, words", [({"backend": "onnx"}, "not run as ONNX"), ({"compile": True}, "not offered")]
 )
 def test_what_a_released_network_cannot_do_is_one_line(released, settings, words):
     with pytest.raises(InputError, match=words):

@@ -30,7 +30,6 @@ from lidarpose.eval.metrics import aggregate
 from lidarpose.eval.protocols import eval_setup, jittered
 from lidarpose.eval.run import evaluate_dataset
 from lidarpose.geometry import rotation_about
-from lidarpose.inference.backend import Estimates
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.models import DEFAULT
 from lidarpose.sample import Box, Pose, center_of
@@ -64,7 +63,7 @@ class Fake:
         self.centers += list(centers)
         self.origins += [origin] * len(clouds)
         joints = np.stack([self.answer(cloud) - center for cloud, center in zip(clouds, centers, strict=True)])
-        return Estimates(joints=joints, **dict.fromkeys(("confidence", "spread", "visible", "in_range")))
+        return Pose(joints=joints, skeleton=self.skeleton)
 
 
 def standing(cloud):

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 import lidarpose
 from lidarpose.errors import InputError
-from lidarpose.inference.backend import Estimates
 from lidarpose.inference.tta import TRANSFORMS, TTATransform, apply, average, invert, tta_transforms
+from lidarpose.sample import Pose
 from lidarpose.skeleton import HUMAN15
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
@@ -27,7 +27,7 @@ def answer(about, features):
     height = np.array([0.05 * min(j, HUMAN15.flip[j]) for j in range(len(HUMAN15))])
     joints = mean[:, None] + side[:, None] * aside[:, None] + height[:, None] * [0, 0, 1]
     confidence = np.broadcast_to(0.5 + 0.3 * LEFT, joints.shape[:2])
-    return Estimates(joints=joints, confidence=confidence, spread=None, visible=None, in_range=confidence > 0.6)
+    return Pose(joints=joints, skeleton=HUMAN15, confidence=confidence, in_range=confidence > 0.6)
 
 
 @settings(max_examples=40, deadline=None)
@@ -42,11 +42,11 @@ def test_estimates_are_brought_back(turns, mirrored, shift, seed):
     centers = rng.normal(0, 5, (3, 3)) + [20, 0, 0]
     clouds = [center + rng.normal(0, 0.4, (30, 3)) for center in centers]
 
-    def looked_at(look):
+    def seen_by(transform):
         # from a sensor so far away that a shift turns nothing
-        return invert(answer(*apply(look, clouds, centers, np.array([1e7, 3e6, 0]))), look, HUMAN15)
+        return invert(answer(*apply(transform, clouds, centers, np.array([1e7, 3e6, 0]))), transform)
 
-    plain, other = looked_at(TTATransform()), looked_at(TTATransform(turns, mirrored, shift))
+    plain, other = seen_by(TTATransform()), seen_by(TTATransform(turns, mirrored, shift))
     np.testing.assert_allclose(other.joints, plain.joints, atol=1e-5)
     # a mirrored left hand is the right one's
     flip = np.array(HUMAN15.flip) if mirrored else np.arange(len(HUMAN15))
@@ -55,10 +55,9 @@ def test_estimates_are_brought_back(turns, mirrored, shift, seed):
     assert other.spread is None and other.visible is None
 
 
-def estimate(value, confidence, people=2, joints=3):
-    each = None if confidence is None else np.full((people, joints), confidence)
-    position = np.full((people, joints, 3), float(value))
-    return Estimates(joints=position, confidence=each, spread=each, visible=None, in_range=None)
+def estimate(value, confidence, people=2):
+    each = None if confidence is None else np.full((people, 15), confidence)
+    return Pose(joints=np.full((people, 15, 3), float(value)), skeleton=HUMAN15, confidence=each, spread=each)
 
 
 def test_the_surer_estimate_counts_more():
@@ -79,23 +78,15 @@ def test_transforms_are_different_and_the_first_is_the_identity():
     assert len(set(TRANSFORMS)) == len(TRANSFORMS) == len(tta_transforms(8))
     # no two put the fine grid in the same place
     assert len({tuple(np.round(np.mod(each.shift, 0.06), 6)) for each in TRANSFORMS}) == len(TRANSFORMS)
+    for tta in (0, 9, -1, 1.5, True, "four"):
+        with pytest.raises(InputError, match="tta must be a whole number from 1 to 8"):
+            lidarpose.load(tta=tta)
 
 
-@pytest.mark.parametrize("tta", [0, 9, -1, 1.5, True, "four"])
-def test_a_number_of_transforms_that_cannot_be(tta):
-    with pytest.raises(InputError, match="tta must be a whole number from 1 to 8"):
-        lidarpose.load(tta=tta)
-
-
-@pytest.fixture(scope="module")
-def people():
+def test_more_transforms_are_better_and_results_say_how_many():
     generator = Generator(scene=scene_config("wild"), measure=False)
-    return [generator.person(4711, k).sample for k in range(32)]
-
-
-def test_more_transforms_are_better_and_results_say_how_many(people):
-    clouds = [sample.points for sample in people]
-    truth = np.stack([sample.pose.joints for sample in people])
+    people = [generator.person(4711, k).sample for k in range(32)]
+    clouds, truth = [sample.points for sample in people], np.stack([sample.pose.joints for sample in people])
     errors = {}
     for tta in (1, 4):
         model = lidarpose.load(tta=tta)

@@ -3,7 +3,7 @@
 Legend: B people, J joints, W bins of a heatmap.
 
 A backend has a `name`, the network's `header`, `batch` (people a call) and `run(clouds, view)`. There are two: ONNX
-Runtime, here, and torch (`backend_torch`).
+Runtime, here, and torch (`torch_backend`).
 """
 
 import os
@@ -14,13 +14,14 @@ from typing import Protocol, cast
 
 import numpy as np
 
-from lidarpose.errors import InputError, check_int
+from lidarpose.errors import InputError
 from lidarpose.io.files import content_digest, file_error
 from lidarpose.models.checkpoint import Header, read_header
 from lidarpose.models.config import BIN, NetworkConfig
 from lidarpose.models.decode import Decoder, out_of_range
 from lidarpose.models.onnx import OUTPUTS, input_name, open_onnx, voxelize_people
-from lidarpose.sample import CONFIDENCE_RADIUS
+from lidarpose.sample import CONFIDENCE_RADIUS, Pose
+from lidarpose.skeleton import Skeleton
 
 # people a call; more fill the memory without being faster
 _BATCH = 64
@@ -63,20 +64,8 @@ class Raw:
         )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Estimates:
-    """Joints of B people about their centers: joints (B, J, 3) m, confidence (B, J), spread (B, J) m, visible (B, J),
-    in_range (B, J) bool, as in `Pose`; None for what the network does not say."""
-
-    joints: np.ndarray
-    confidence: np.ndarray | None
-    spread: np.ndarray | None
-    visible: np.ndarray | None
-    in_range: np.ndarray | None
-
-
 class Backend(Protocol):
-    """clouds: B arrays (n, 3) m, each about its person's center, n = 0 is legal; view (B, 5): see `plan.Plan`."""
+    """clouds: B arrays (n, 3) m, each about its person's center, n = 0 is legal; view (B, 5): see `VoxelPyramid`."""
 
     name: str
     header: Header
@@ -92,8 +81,6 @@ class OnnxBackend:
     batch = _BATCH
 
     def __init__(self, path: str | os.PathLike, *, threads: int | None = None):
-        if threads is not None:
-            threads = check_int("threads", threads, least=1)
         self._opened = os.path.abspath(path), threads
         self.session, self.header, self.source = open_onnx(path, threads=threads)
         self._config = cast(NetworkConfig, self.header.config)
@@ -130,14 +117,15 @@ def exported_beside(path: str | os.PathLike, *, threads: int | None = None) -> O
     return backend
 
 
-def estimates(raw: Raw, decoder: Decoder) -> Estimates:
-    """Joints and what is known of them from raw outputs; `decoder` reads the heatmaps.
+def estimates(raw: Raw, decoder: Decoder, skeleton: Skeleton) -> Pose:
+    """The poses of B people about their centers from raw outputs; `decoder` reads the heatmaps.
 
     Raises InputError where none is finite.
     """
     joints, in_range = raw.vote.astype(float), None
     if raw.heatmaps is not None:
-        joints = joints + _decoded(raw, raw.heatmaps, decoder)
+        axes = zip(raw.heatmaps, raw.low, raw.step, strict=True)
+        joints = joints + np.stack([decoder(heatmap, low=low, step=step) for heatmap, low, step in axes], -1)
         # a vote can be too far off on any axis
         in_range = ~np.any([out_of_range(heatmap) for heatmap in raw.heatmaps], axis=0)
     if joints.size and not np.isfinite(joints).any():
@@ -146,14 +134,14 @@ def estimates(raw: Raw, decoder: Decoder) -> Estimates:
     spread = None if raw.log_spread is None else np.exp(np.minimum(raw.log_spread.astype(float), _LARGEST_LOG_SPREAD))
     if confidence is None and raw.heatmaps is not None:
         confidence, spread = _from_heatmaps(raw, raw.heatmaps, joints - raw.vote)
-    visible = None if raw.visible is None else _probability(raw.visible)
-    return Estimates(joints=joints, confidence=confidence, spread=spread, visible=visible, in_range=in_range)
-
-
-def _decoded(raw: Raw, heatmaps: tuple[np.ndarray, ...], decoder: Decoder) -> np.ndarray:
-    """(B, J, 3) m about the vote."""
-    axes = zip(heatmaps, raw.low, raw.step, strict=True)
-    return np.stack([decoder(heatmap, low=low, step=step) for heatmap, low, step in axes], -1)
+    return Pose(
+        joints=joints,
+        skeleton=skeleton,
+        confidence=confidence,
+        spread=spread,
+        visible=None if raw.visible is None else _probability(raw.visible),
+        in_range=in_range,
+    )
 
 
 def _from_heatmaps(raw: Raw, heatmaps: tuple[np.ndarray, ...], offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

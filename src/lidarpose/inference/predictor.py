@@ -2,13 +2,14 @@
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
 from lidarpose.errors import InputError, check_int, check_name, missing_extra
-from lidarpose.inference.backend import Backend, Estimates, OnnxBackend, estimates, exported_beside
+from lidarpose.inference.backend import Backend, OnnxBackend, estimates, exported_beside
 from lidarpose.inference.checks import UPSIDE_DOWN, looks_unsure, oversize_warning, upside_down_warning
 from lidarpose.inference.inputs import as_origin, as_points, candidates, clean, is_few, only_returns, unit_warning
 from lidarpose.inference.results import PersonPose, Poses, first_names
@@ -261,19 +262,19 @@ class Predictor:
                 poses.append(None)
                 continue
             values = {name: getattr(estimated, name) for name in PER_JOINT}
-            of_person: dict[str, Any] = {name: None if value is None else value[k] for name, value in values.items()}
-            poses.append(Pose(joints=estimated.joints[k] + centers[k], skeleton=self.skeleton, **of_person))
+            of_person: dict[str, Any] = {name: value[k] for name, value in values.items() if value is not None}
+            poses.append(replace(estimated, joints=estimated.joints[k] + centers[k], **of_person))
         return poses
 
-    def outputs(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Estimates:
+    def outputs(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Pose:
         """What the network says of clouds (n, 3) m seen about centers (B, 3), from a sensor at origin (3,) or None."""
         return self._transformed(TTATransform(), clouds, centers, origin)
 
     def _transformed(
         self, transform: TTATransform, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None
-    ) -> Estimates:
+    ) -> Pose:
         about, view = apply(transform, clouds, centers, origin)
-        return invert(estimates(self.backend.run(about, view), self._decoder), transform, self.skeleton)
+        return invert(estimates(self.backend.run(about, view), self._decoder, self.skeleton), transform)
 
 
 def _surer(pose: Pose, best: Pose) -> bool:

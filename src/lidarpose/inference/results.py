@@ -11,7 +11,7 @@ import numpy as np
 
 from lidarpose.geometry import UP_AXES, rotation_from_up
 from lidarpose.io.files import write_atomic
-from lidarpose.sample import Box, Pose
+from lidarpose.sample import PER_JOINT, Box, Pose
 from lidarpose.skeleton import Skeleton
 
 if TYPE_CHECKING:
@@ -190,20 +190,13 @@ class Poses(Sequence):
         return f"Poses({posed} of {len(self)} people, {self.skeleton.name}{source}{_count(self.warnings, 'warning')})"
 
     def _repr_html_(self) -> str:
-        head = ("id", "points", "confidence", "warnings")
-        rows = [
-            (
-                "" if person.id is None else str(person.id),
-                f"{person.num_points:,}",
-                "no pose" if person.pose is None else _mean(person.pose.confidence),
-                "; ".join(person.warnings),
-            )
-            for person in self.people
-        ]
-        cells = [[f"<td>{escape(cell)}</td>" for cell in row] for row in rows]
-        body = "".join(f"<tr>{''.join(row)}</tr>" for row in cells)
-        title = "".join(f"<th>{name}</th>" for name in head)
-        return f"<p>{escape(repr(self))}</p><table><tr>{title}</tr>{body}</table>"
+        rows = [("th", ("id", "points", "confidence", "warnings"))]
+        for person in self.people:
+            confidence = "no pose" if person.pose is None else _mean(person.pose.confidence)
+            name = "" if person.id is None else str(person.id)
+            rows.append(("td", (name, f"{person.num_points:,}", confidence, "; ".join(person.warnings))))
+        cells = ("".join(f"<{tag}>{escape(cell)}</{tag}>" for cell in row) for tag, row in rows)
+        return f"<p>{escape(repr(self))}</p><table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
 
     def to_numpy(self) -> np.ndarray:
         """Joints (N, J, 3) m, NaN for a person without a pose."""
@@ -218,17 +211,15 @@ class Poses(Sequence):
         confidence, spread (m), visible, in_range; NaN for what the network does not say."""
         import pandas
 
-        names = ("confidence", "spread", "visible", "in_range")
-        columns = ("person", "id", "joint", "x", "y", "z", *names)
         rows = []
         for number, person in enumerate(self.people):
             if person.pose is None:
                 continue
-            values = [getattr(person.pose, name) for name in names]
+            values = [getattr(person.pose, name) for name in PER_JOINT]
             for j, joint in enumerate(self.skeleton.joints):
                 known = [np.nan if value is None else value[j] for value in values]
                 rows.append((number, person.id, joint, *person.pose.joints[j], *known))
-        return pandas.DataFrame(rows, columns=list(columns))
+        return pandas.DataFrame(rows, columns=["person", "id", "joint", "x", "y", "z", *PER_JOINT])
 
     def to_dict(self) -> dict:
         """The document of the schema lidarpose.poses/1; "warnings" beside it concern the whole input."""

@@ -1,4 +1,4 @@
-"""Test-time augmentation: a person is seen under several transforms, whose estimates are averaged.
+"""Test-time augmentation: a person is seen under several transforms, whose poses are averaged.
 
 A transform turns the person by quarters, mirrors them, and shifts the grid of voxels. The answers differ a little,
 where a point falls into another voxel; their mean is better than any of them.
@@ -12,14 +12,11 @@ from typing import Any
 import numpy as np
 
 from lidarpose.errors import check_int
-from lidarpose.inference.backend import Estimates
 from lidarpose.models.voxelize import view_features
-from lidarpose.sample import PER_JOINT
-from lidarpose.skeleton import Skeleton
+from lidarpose.sample import PER_JOINT, Pose
 
 # a transform's answer counts by its mean confidence to this power: one flipped facing of four is outvoted
 _POWER = 8
-_NAMES = ("joints", *PER_JOINT)
 _QUARTERS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 
 
@@ -68,36 +65,38 @@ def apply(
     return [(points - center) @ R.T for points, center in zip(clouds, middle, strict=True)], view
 
 
-def invert(estimates: Estimates, transform: TTATransform, skeleton: Skeleton) -> Estimates:
-    """Estimates under the transform, brought back to the people's own frames."""
-    estimates = replace(estimates, joints=estimates.joints @ transform.R_view_person + transform.shift)
+def invert(poses: Pose, transform: TTATransform) -> Pose:
+    """Poses of B people under the transform, brought back to the people's own frames."""
+    poses = replace(poses, joints=poses.joints @ transform.R_view_person + transform.shift)
     if not transform.mirrored:
-        return estimates
-    flip = np.array(skeleton.flip)
-    values = {name: getattr(estimates, name) for name in _NAMES}
-    flipped: dict[str, Any] = {name: None if value is None else value[:, flip] for name, value in values.items()}
-    return replace(estimates, **flipped)
+        return poses
+    flip = np.array(poses.skeleton.flip)
+    flipped: dict[str, Any] = {name: value[:, flip] for name, value in _values(poses).items()}
+    return replace(poses, **flipped)
 
 
-def average(estimates: list[Estimates]) -> Estimates:
-    """One answer: the mean of all, a person's answers weighted by their confidence where the network has it."""
-    if len(estimates) == 1:
-        return estimates[0]
-    values = {name: [getattr(each, name) for each in estimates] for name in _NAMES}
-    joints = np.stack(values["joints"])
-    weight = np.ones(joints.shape[:2])
-    if values["confidence"][0] is not None:
-        weight = np.stack(values["confidence"]).mean(-1) ** _POWER
+def average(poses: list[Pose]) -> Pose:
+    """One answer for B people: the mean of all, a person's answers weighted by their confidence where the network has
+    it."""
+    if len(poses) == 1:
+        return poses[0]
+    stacks = {name: np.stack([getattr(each, name) for each in poses]).astype(float) for name in _values(poses[0])}
+    weight = np.ones(stacks["joints"].shape[:2])
+    if "confidence" in stacks:
+        weight = stacks["confidence"].mean(-1) ** _POWER
         # where no answer is sure at all, all count the same
         weight = np.where(weight.sum(0) > 0, weight, 1.0)
+    out: dict[str, Any] = {
+        name: np.average(stack, 0, np.broadcast_to(weight.reshape(weight.shape + (1,) * (stack.ndim - 2)), stack.shape))
+        for name, stack in stacks.items()
+    }
+    if "in_range" in out:
+        # out of range where most answers say so
+        out["in_range"] = out["in_range"] > 0.5
+    return replace(poses[0], **out)
 
-    def mean(stack: list[np.ndarray] | list[None]) -> np.ndarray | None:
-        if stack[0] is None:
-            return None
-        rows = np.stack(stack).astype(float)
-        return np.average(rows, 0, weight.reshape(weight.shape + (1,) * (rows.ndim - 2)) * np.ones_like(rows))
 
-    out: dict[str, Any] = {name: mean(values[name]) for name in _NAMES}
-    # out of range where most answers say so
-    out["in_range"] = None if out["in_range"] is None else out["in_range"] > 0.5
-    return Estimates(**out)
+def _values(poses: Pose) -> dict[str, np.ndarray]:
+    """Joints and what the network says of each."""
+    named = {name: getattr(poses, name) for name in ("joints", *PER_JOINT)}
+    return {name: value for name, value in named.items() if value is not None}
