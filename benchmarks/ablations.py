@@ -163,7 +163,7 @@ def job(variant: Variant, settings: Pretrain) -> TrainSetup:
     network = task.network
     if settings.init:
         network = partial(expand_weights, load_checkpoint(settings.init)[0], config)
-    return replace(usual, task=task, source=SceneSource(config=variant.scene, **values), network=network)
+    return replace(usual, objective=task, source=SceneSource(config=variant.scene, **values), network=network)
 
 
 def run(options: argparse.Namespace, name: str, seed: int, folder: Path) -> dict:
@@ -178,9 +178,9 @@ def run(options: argparse.Namespace, name: str, seed: int, folder: Path) -> dict
     own = job(variant, settings)
     model = train(settings, folder, setup=own)
     taken = {"seconds": time.perf_counter() - started, "processor_seconds": time.process_time() - used}
-    network = own.task.network()
+    network = own.objective.network()
     network.load_state_dict(SafetensorsFile.open(model).load(network.state_dict()))
-    predictor = Predictor(TorchBackend(network, Header(config=own.task.config, card={})), name=name)
+    predictor = Predictor(TorchBackend(network, Header(config=own.objective.config, card={})), name=name)
     result = evaluation.run(predictor, ["bench"]).scores.results[0]
     return record(
         name,

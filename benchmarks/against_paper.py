@@ -78,7 +78,7 @@ def run(options: argparse.Namespace, name: str, seed: int, folder: Path) -> dict
     changes |= {"strays": 0.2, "noise": 0.15} if way.scene == "wild" else {}
     first = DaptObjective(config=sized(pretraining_config()), stage="pretrain")
     settings = recipe(Pretrain, "paper", **changes, seed=seed, rate=way.rates[0])
-    own = replace(make_setup(settings), task=first, network=first.network)
+    own = replace(make_setup(settings), objective=first, network=first.network)
     model = train(settings, folder / "pretrain", setup=own)
     # other people than those of the first half
     settings = replace(settings, seed=seed + 1_000, rate=way.rates[1])
@@ -88,7 +88,7 @@ def run(options: argparse.Namespace, name: str, seed: int, folder: Path) -> dict
     def begun():
         return transferred(trained, second.config, keep_anchors=way.anchors)
 
-    own = replace(make_setup(settings), task=second, network=begun)
+    own = replace(make_setup(settings), objective=second, network=begun)
     model = train(settings, folder / "finetune", setup=own)
     taken = {"seconds": time.perf_counter() - started, "processor_seconds": time.process_time() - used}
     results = [

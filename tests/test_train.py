@@ -1,4 +1,4 @@
-"""Losses, schedule, and runs that can be killed and taken up again."""
+"""Losses, schedules, optimizers, settings, and the batches of a run."""
 
 import json
 import multiprocessing
@@ -19,7 +19,7 @@ from lidarpose.models.config import BIN, preset
 from lidarpose.models.layers import REACH, encode
 from lidarpose.models.posenet import Outputs, PoseNet, Targets
 from lidarpose.sample import center_of
-from lidarpose.skeleton import BODY26, SMPL24
+from lidarpose.skeleton import BODY26
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import SCENES
 from lidarpose.train.augment import disturbed
@@ -37,162 +37,140 @@ from lidarpose.train.objectives.posenet_objective import (
     losses,
 )
 from lidarpose.train.optim import average, optimizers, rate_factor
-from lidarpose.train.recipes import Finetune, Pretrain
-from lidarpose.train.recipes import recipe as recipe_of
-from lidarpose.train.setup import make_setup
-from lidarpose.train.validation import Validation
+from lidarpose.train.recipes import Finetune, Pretrain, recipe
+from lidarpose.train.setup import Job, make_setup
+from lidarpose.train.validation import validate
 
 # three chunks of `BATCHES` batches
 RECIPE = Pretrain(scene="paper", people=3 * BATCHES * 2, batch=2, workers=0, seed=5, easy=0.15, pictures=0)
-TASK = PoseNetObjective(config=preset("tiny"))
 TINY = preset("tiny")
+OBJECTIVE = PoseNetObjective(config=TINY)
 WINDOW = REACH["window"]
 BINS = round(2 * WINDOW / BIN)
+EXACT = torch.randn(3, 26, 3, generator=torch.Generator().manual_seed(0)) * 0.4
+# votes whose errors are on both sides of ten centimeters
+SPREAD_OUT = torch.randn(40, 26, 3, generator=torch.Generator().manual_seed(0)) * 0.4
+ASTRAY = SPREAD_OUT + torch.randn(40, 26, 3, generator=torch.Generator().manual_seed(1)) * 0.07
 
 
 # --- losses
 
 
-def outputs(vote, *, heatmap=None, confidence=0.0, log_spread=0.0):
+def outputs(vote, **more):
     people, joints = vote.shape[:2]
-    if heatmap is None:
-        heatmap = encode(torch.zeros(people, joints, 3), SIGMA, BINS).log()
-    return Outputs(
-        vote=vote,
-        heatmap=heatmap,
-        part=torch.zeros(people, 4, 25),
-        confidence=torch.full((people, joints), float(confidence)),
-        log_spread=torch.full((people, joints), float(log_spread)),
-        visible=torch.zeros(people, joints),
-        level_joints=(vote, vote),
-    )
+    values = {
+        "vote": vote,
+        "heatmap": encode(torch.zeros(people, joints, 3), SIGMA, BINS).log(),
+        "part": torch.zeros(people, 4, 25),
+        **{name: torch.zeros(people, joints) for name in ("confidence", "log_spread", "visible")},
+        "level_joints": (vote, vote),
+    }
+    return Outputs(**(values | more))
 
 
-def targets(joints):
+def targets(joints, **more):
     known = torch.ones(joints.shape[:2], dtype=torch.bool)
-    return Targets(joints=joints, known=known, visible=known.float(), part=torch.tensor([[1, 2, 0, -1]] * len(joints)))
+    part = torch.tensor([[1, 2, 0, -1]] * len(joints))
+    return Targets(**({"joints": joints, "known": known, "visible": known.float(), "part": part} | more))
 
 
-def truth(people=3):
-    return torch.randn(people, 26, 3, generator=torch.Generator().manual_seed(0)) * 0.4
+def gradient(name, value, vote=ASTRAY, aims=None):
+    """Of the loss term `name`, or of them all, by an output."""
+    field, value = value if isinstance(value, tuple) else (name, value)
+    value = value.clone().requires_grad_()
+    terms = losses(outputs(**{"vote": vote, field: value}), aims or targets(SPREAD_OUT))
+    (total(terms) if name == "total" else terms[name]).backward()
+    return value.grad
 
 
-def test_exact_joints_cost_nothing():
-    terms = losses(outputs(truth()), targets(truth()))
-    assert terms["vote"] == 0 and terms["level"] == 0
-    # the heatmap has no bin at zero: what is left of its decoding is half a millimetre an axis
-    assert terms["mpjpe"] < 2e-3
-    assert total(terms).item() == pytest.approx(sum(v.item() for n, v in terms.items() if n != "mpjpe"), rel=1e-5)
-
-
-def test_the_vote_costs_its_distance():
-    shift = torch.tensor([0.3, 0.0, -0.4])
-    assert losses(outputs(truth() + shift), targets(truth()))["vote"].item() == pytest.approx(VOTE * 0.5, rel=1e-4)
-
-
-def test_every_level_and_the_joints_cost_their_distance_too():
-    """Not its square, as in the released code."""
-    shift = torch.tensor([0.3, 0.0, -0.4])
-    terms = losses(outputs(truth() + shift), targets(truth()))
-    assert terms["level"].item() == pytest.approx(2 * LEVEL * 0.5, rel=1e-4)
-    # a heatmap about the vote is decoded half a millimetre off an axis
-    assert terms["joints"].item() == pytest.approx(JOINTS * 0.5, rel=5e-3)
-
-
-def test_gradients_at_exact_joints_are_finite():
-    vote = truth().requires_grad_()
-    total(losses(outputs(vote), targets(truth()))).backward()
-    assert torch.isfinite(vote.grad).all()
+def test_every_term_costs_its_distance():
+    """Not its square, as in the released code; exact joints cost nothing, and their gradient is finite."""
+    exact = losses(outputs(EXACT), targets(EXACT))
+    assert exact["vote"] == 0 and exact["level"] == 0
+    # the heatmap has no bin at zero: what is left of its decoding is half a millimeter an axis
+    assert exact["mpjpe"] < 2e-3
+    assert total(exact).item() == pytest.approx(sum(v.item() for n, v in exact.items() if n != "mpjpe"), rel=1e-5)
+    assert gradient("total", ("vote", EXACT), aims=targets(EXACT)).isfinite().all()
+    shifted = losses(outputs(EXACT + torch.tensor([0.3, 0.0, -0.4])), targets(EXACT))
+    for name, weight, within in (("vote", VOTE, 1e-4), ("level", 2 * LEVEL, 1e-4), ("joints", JOINTS, 5e-3)):
+        assert shifted[name].item() == pytest.approx(weight * 0.5, rel=within)
 
 
 def test_the_heatmap_is_learned_about_the_vote_and_only_within_reach():
-    joints = truth()
-    far = joints.clone()
+    far = EXACT.clone()
     far[0] += WINDOW + 0.1
-    heatmap = encode(torch.zeros(3, 26, 3), SIGMA, BINS).log().requires_grad_()
-    losses(outputs(far, heatmap=heatmap), targets(joints))["heatmap"].backward()
     # the right heatmap is the optimum, and one out of reach is not pulled at all
-    assert heatmap.grad.abs().max() < 1e-6
-    wrong = torch.zeros(3, 26, 3, BINS, requires_grad=True)
-    losses(outputs(far, heatmap=wrong), targets(joints))["heatmap"].backward()
-    assert wrong.grad[0].abs().max() == 0 and wrong.grad[1:].abs().min() > 0
+    right = encode(torch.zeros(3, 26, 3), SIGMA, BINS).log()
+    assert gradient("heatmap", right, far, targets(EXACT)).abs().max() < 1e-6
+    wrong = gradient("heatmap", torch.zeros(3, 26, 3, BINS), far, targets(EXACT))
+    assert wrong[0].abs().max() == 0 and wrong[1:].abs().min() > 0
     entropy = -(encode(torch.tensor(0.0), SIGMA, BINS) * encode(torch.tensor(0.0), SIGMA, BINS).log()).sum()
-    best = losses(outputs(joints), targets(joints))["heatmap"]
+    best = losses(outputs(EXACT), targets(EXACT))["heatmap"]
     assert best.item() == pytest.approx(HEATMAP * entropy.item(), rel=1e-4)
 
 
-def spoiled(seed=1):
-    """Votes whose errors are on both sides of ten centimetres, and those errors."""
-    shift = torch.randn(40, 26, 3, generator=torch.Generator().manual_seed(seed)) * 0.07
-    joints = truth(40)
-    made = outputs(joints + shift)
-    return joints, made, (made.joints() - joints).norm(dim=-1)
-
-
-def test_confidence_is_best_at_the_probability_of_a_hit():
-    joints, made, error = spoiled()
+def test_confidence_and_spread_are_best_at_what_they_mean():
+    """The probability of a hit, and the expected distance; neither ever pulls at the joints."""
+    error = (outputs(ASTRAY).joints() - SPREAD_OUT).norm(dim=-1)
     rate = (error < 0.1).float().mean()
     assert 0.1 < rate < 0.9
-    logit = torch.logit(rate)
-    at = {d: losses(replace(made, confidence=made.confidence * 0 + logit + d), targets(joints)) for d in (-0.2, 0, 0.2)}
-    assert at[0]["confidence"] < min(at[-0.2]["confidence"], at[0.2]["confidence"])
-    confidence = (made.confidence * 0 + logit).requires_grad_()
-    losses(replace(made, confidence=confidence), targets(joints))["confidence"].backward()
-    assert abs(confidence.grad.sum()) < 1e-5 * CONFIDENCE
-
-
-def test_spread_is_best_at_the_expected_distance():
-    joints, made, error = spoiled()
-    log_spread = (made.log_spread * 0 + error.mean().log()).requires_grad_()
-    losses(replace(made, log_spread=log_spread), targets(joints))["spread"].backward()
-    assert abs(log_spread.grad.sum()) < 1e-5 * SPREAD
-    for other in (0.8, 1.25):
-        there = losses(replace(made, log_spread=log_spread + np.log(other)), targets(joints))["spread"]
-        assert there > losses(replace(made, log_spread=log_spread), targets(joints))["spread"]
-
-
-def test_confidence_and_spread_never_pull_at_the_joints():
-    joints, made, _ = spoiled()
-    vote = made.vote.clone().requires_grad_()
-    terms = losses(replace(made, vote=vote), targets(joints))
+    for name, field, best, weight in (
+        ("confidence", "confidence", torch.logit(rate), CONFIDENCE),
+        ("spread", "log_spread", error.mean().log(), SPREAD),
+    ):
+        value = torch.full((40, 26), best.item())
+        assert abs(gradient(name, (field, value)).sum()) < 1e-5 * weight
+        below, at, above = (
+            losses(outputs(ASTRAY, **{field: value + d}), targets(SPREAD_OUT))[name] for d in (-0.2, 0, 0.2)
+        )
+        assert at < min(below, above)
+    terms = losses(outputs(ASTRAY.clone().requires_grad_()), targets(SPREAD_OUT))
     assert not (terms["confidence"] + terms["spread"] + terms["heatmap"]).requires_grad
     assert terms["vote"].requires_grad and terms["joints"].requires_grad
 
 
 def test_padding_has_no_part():
-    made = outputs(truth())
     part = torch.zeros(3, 4, 25)
     part[:, 3, 7] = 50.0
-    a, b = (losses(replace(made, part=p), targets(truth()))["part"] for p in (torch.zeros(3, 4, 25), part))
+    a, b = (losses(outputs(EXACT, part=p), targets(EXACT))["part"] for p in (torch.zeros(3, 4, 25), part))
     assert a == b
 
 
 def test_joints_whose_truth_is_unknown_teach_nothing():
-    joints, made, _ = spoiled()
-    aims = targets(joints)
-    known = aims.known.clone()
+    known = targets(SPREAD_OUT).known.clone()
     known[:, 5] = False
     known[3] = False
-    lost = joints.clone()
-    lost[~known] = float("nan")
-    told = losses(made, replace(aims, known=known))
-    blind = losses(made, replace(aims, joints=lost, known=known))
-    for name, value in told.items():
+    lost = torch.where(known[..., None], SPREAD_OUT, float("nan"))
+    made = outputs(ASTRAY)
+    terms, blind = (losses(made, targets(joints, known=known)) for joints in (SPREAD_OUT, lost))
+    for name, value in terms.items():
         assert value == blind[name] and torch.isfinite(value), name
-    assert told["vote"] != losses(made, aims)["vote"]
-    nobody = losses(made, replace(aims, known=known & False))
+    assert terms["vote"] != losses(made, targets(SPREAD_OUT))["vote"]
+    nobody = losses(made, targets(SPREAD_OUT, known=known & False))
     assert nobody["vote"] == nobody["joints"] == nobody["heatmap"] == 0
-    vote = made.vote.clone().requires_grad_()
-    total(losses(replace(made, vote=vote), replace(aims, joints=lost, known=known))).backward()
-    assert torch.isfinite(vote.grad).all() and not vote.grad[~known].any() and vote.grad[known].any()
+    pull = gradient("total", ("vote", ASTRAY), aims=targets(lost, known=known))
+    assert torch.isfinite(pull).all() and not pull[~known].any() and pull[known].any()
 
 
 def test_visibility_is_learned():
-    aims = targets(truth())
-    aims = replace(aims, visible=aims.visible * (torch.arange(26) % 2 == 0))
-    visible = torch.zeros(3, 26, requires_grad=True)
-    losses(replace(outputs(truth()), visible=visible), aims)["visible"].backward()
-    assert (visible.grad[:, ::2] < 0).all() and (visible.grad[:, 1::2] > 0).all()
+    aims = targets(EXACT, visible=(torch.arange(26) % 2 == 0).float().expand(3, 26))
+    pull = gradient("visible", torch.zeros(3, 26), EXACT, aims)
+    assert (pull[:, ::2] < 0).all() and (pull[:, 1::2] > 0).all()
+
+
+def test_lengths_of_bones_and_their_symmetry():
+    exact = losses(outputs(EXACT), targets(EXACT), bone=2.0, symmetry=3.0)
+    # what the heatmap has no bin for is half a millimeter an axis
+    assert exact["bone"] < 2 * 3e-3 and exact["symmetry"] > 0.1
+    stretched = losses(outputs(EXACT * 1.1), targets(EXACT), bone=2.0)
+    lengths = torch.stack([(EXACT[:, a] - EXACT[:, b]).norm(dim=-1) for a, b in BODY26.bones])
+    assert stretched["bone"].item() == pytest.approx(2.0 * 0.1 * lengths.mean().item(), abs=4e-3)
+    # a body and its mirror image have even sides together
+    even = EXACT.clone()
+    left = [j for j, name in enumerate(BODY26.joints) if "left" in name]
+    even[:, [BODY26.flip[j] for j in left]] = even[:, left] * torch.tensor([-1.0, 1, 1])
+    even[:, [j for j, name in enumerate(BODY26.joints) if "_" not in name or name == "head_center"], 0] = 0.0
+    assert losses(outputs(even), targets(EXACT), symmetry=3.0)["symmetry"] < 3 * 3e-3
 
 
 # --- schedule and optimizers
@@ -201,25 +179,33 @@ def test_visibility_is_learned():
 def test_the_rate_rises_stays_and_falls_to_nothing():
     done = np.linspace(0, 1, 2001)
     factor = np.array([rate_factor(d, RECIPE) for d in done])
-    assert (factor >= 0).all() and (factor <= 1).all() and factor[0] > 0 and factor[-1] == 0
+    assert (factor >= 0).all() and (factor <= 1).all() and factor[0] > 0 and factor[-1] == rate_factor(1.5, RECIPE) == 0
     rise, fall = done < RECIPE.warmup, done > 1 - RECIPE.cool
     assert (np.diff(factor[rise]) >= 0).all() and (np.diff(factor[fall]) < 0).all()
     np.testing.assert_array_equal(factor[~rise & ~fall], 1)
     assert np.abs(np.diff(factor)).max() < 0.03
-    assert rate_factor(1.5, RECIPE) == 0
 
 
-def test_every_weight_is_learned_once():
+def test_the_released_schedule():
+    cosine = recipe(Pretrain, "paper")
+    # half of the way down, half of the rate
+    middle = cosine.warmup + (1 - cosine.warmup) / 2
+    for done, factor in ((0, 0.1), (cosine.warmup, 1), (middle, (1 + 1e-3) / 2), (1, 1e-3)):
+        assert rate_factor(done, cosine) == pytest.approx(factor)
+    assert (np.diff([rate_factor(d, cosine) for d in np.linspace(cosine.warmup, 1, 500)]) < 0).all()
+
+
+def test_every_weight_is_learned_once_and_decays():
     network = PoseNet(TINY)
-    made = optimizers(network, RECIPE)
-    grouped = [id(p) for o in made for group in o.param_groups for p in group["params"]]
-    assert sorted(grouped) == sorted(id(p) for p in network.parameters())
-    hidden = {id(p) for group in made[1].param_groups for p in group["params"]}
+    made, (alone,) = optimizers(network, RECIPE), optimizers(network, replace(RECIPE, muon_rate=0.0))
+    groups = [group for optimizer in made for group in optimizer.param_groups]
+    assert sorted(id(p) for group in groups for p in group["params"]) == sorted(id(p) for p in network.parameters())
+    assert {group["weight_decay"] for group in [*groups, *alone.param_groups]} == {RECIPE.decay} != {0.0}
+    hidden = {id(p) for p in made[1].param_groups[0]["params"]}
     names = {name for name, value in network.named_parameters() if id(value) in hidden}
     assert "bottleneck.blocks.0.attention.query.weight" in names
     assert not any(name.startswith(("anchors", "part", "stem.voxel", "joint.heatmap")) for name in names)
-    assert all(dict(network.named_parameters())[name].ndim == 2 for name in names)
-    assert len(optimizers(network, replace(RECIPE, muon_rate=0.0))) == 1
+    assert all(value.ndim == 2 for name, value in network.named_parameters() if name in names)
 
 
 def test_the_mean_of_the_weights_follows_them():
@@ -230,36 +216,6 @@ def test_the_mean_of_the_weights_follows_them():
     for step in range(1, 60):
         average(mean, network, step, 0.999)
     torch.testing.assert_close(mean["weight"], network.weight.detach(), rtol=1e-3, atol=1e-6)
-
-
-def test_the_released_schedule():
-    cosine = recipe_of(Pretrain, "paper")
-    assert rate_factor(0, cosine) == pytest.approx(0.1) and rate_factor(1, cosine) == pytest.approx(1e-3)
-    assert rate_factor(cosine.warmup, cosine) == 1
-    # half of the way down, half of the rate
-    middle = cosine.warmup + (1 - cosine.warmup) / 2
-    assert rate_factor(middle, cosine) == pytest.approx((1 + 1e-3) / 2)
-    factor = np.array([rate_factor(d, cosine) for d in np.linspace(cosine.warmup, 1, 500)])
-    assert (np.diff(factor) < 0).all()
-
-
-def test_lengths_of_bones_and_their_symmetry():
-    joints = truth()
-    exact = losses(outputs(joints), targets(joints), bone=2.0, symmetry=3.0)
-    # what the heatmap has no bin for is half a millimetre an axis
-    assert exact["bone"] < 2 * 3e-3
-    stretched = losses(outputs(joints * 1.1), targets(joints), bone=2.0)
-    lengths = torch.stack([(joints[:, a] - joints[:, b]).norm(dim=-1) for a, b in BODY26.bones])
-    assert stretched["bone"].item() == pytest.approx(2.0 * 0.1 * lengths.mean().item(), abs=4e-3)
-    # a body and its mirror image have even sides together
-    even = joints.clone()
-    even[:, [BODY26.flip[j] for j in range(26) if "left" in BODY26.joints[j]]] = even[
-        :, [j for j in range(26) if "left" in BODY26.joints[j]]
-    ] * torch.tensor([-1.0, 1, 1])
-    middle = [j for j, name in enumerate(BODY26.joints) if "_" not in name or name == "head_center"]
-    even[:, middle, 0] = 0.0
-    assert losses(outputs(even), targets(joints), symmetry=3.0)["symmetry"] < 3 * 3e-3
-    assert losses(outputs(joints), targets(joints), symmetry=3.0)["symmetry"] > 0.1
 
 
 # --- batches
@@ -273,68 +229,59 @@ def assert_same_chunks(a, b):
                 np.testing.assert_array_equal(np.asarray(x[name]), np.asarray(y[name]), err_msg=name)
 
 
-def chunks(recipe, start=0, steps=3 * BATCHES):
-    people = Chunks(
-        source=make_setup(recipe).source, task=TASK, batch=recipe.batch, seed=recipe.seed, start=start, steps=steps
-    )
-    return list(loader(people, workers=recipe.workers))
+def chunks(recipe, workers=0, **more):
+    settings = {"batch": recipe.batch, "seed": recipe.seed, "start": 0, "steps": 3 * BATCHES} | more
+    return loader(Chunks(source=make_setup(recipe).source, objective=OBJECTIVE, **settings), workers=workers)
 
 
-def test_chunks_are_the_same_from_any_start():
-    whole = chunks(RECIPE)
+@pytest.fixture(scope="module")
+def whole():
+    return list(chunks(RECIPE))
+
+
+def test_chunks_are_the_same_from_any_start_by_any_number_of_workers(whole):
     assert len(whole) == 3 and all(len(batches) == BATCHES for batches in whole)
-    assert_same_chunks(whole[1:], chunks(RECIPE, start=1))
-    assert_same_chunks(whole[2:], chunks(RECIPE, start=2))
     joints = np.concatenate([b["joints"] for batches in whole for b in batches])
     assert len(np.unique(joints[:, 5], axis=0)) == len(joints) == RECIPE.people
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_workers_go_on_when_their_whole_group_is_told_to_stop(number):
-    """The run needs them for the batches that it finishes before it saves."""
-    people = Chunks(
-        source=make_setup(RECIPE).source, task=TASK, batch=RECIPE.batch, seed=RECIPE.seed, start=0, steps=3 * BATCHES
-    )
-    made = []
-    for batches in loader(people, workers=1):
-        for worker in multiprocessing.active_children():
-            os.kill(worker.pid, number)
-        made.append(batches)
-    assert_same_chunks(made, chunks(RECIPE))
-
-
-def test_the_last_chunk_may_be_short():
-    whole, short = chunks(RECIPE), chunks(RECIPE, steps=BATCHES + 3)
+    for start in (1, 2):
+        assert_same_chunks(whole[start:], chunks(RECIPE, start=start))
+    for workers in (1, 2):
+        assert_same_chunks(whole, chunks(RECIPE, workers))
+    # the last one may be short
+    short = list(chunks(RECIPE, steps=BATCHES + 3))
     assert [len(batches) for batches in short] == [BATCHES, 3]
     assert_same_chunks(whole[:1], short[:1])
 
 
-@pytest.mark.parametrize("ranks", [2, 4])
-def test_processes_share_every_batch_out(ranks):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_workers_go_on_when_their_whole_group_is_told_to_stop(whole, number):
+    """The run needs them for the batches that it finishes before it saves."""
+    made = []
+    for batches in chunks(RECIPE, 1):
+        for worker in multiprocessing.active_children():
+            os.kill(worker.pid, number)
+        made.append(batches)
+    assert_same_chunks(made, whole)
+
+
+def test_processes_share_every_batch_out():
     """Together they show the people of one process, batch by batch, and nobody twice."""
-    common = {
-        "source": make_setup(RECIPE).source,
-        "task": TASK,
-        "batch": 8,
-        "seed": 5,
-        "start": 0,
-        "steps": BATCHES + 1,
-    }
-    (alone,) = (list(loader(Chunks(**common), workers=0)),)
-    shared = [list(loader(Chunks(**common, rank=rank, ranks=ranks), workers=0)) for rank in range(ranks)]
-    for c, batches in enumerate(alone):
-        for k, batch in enumerate(batches):
-            joints = np.concatenate([one[c][k]["joints"] for one in shared])
-            assert len(joints) == 8
-            order = [np.argsort(j[:, 0, 0], kind="stable") for j in (joints, batch["joints"])]
-            np.testing.assert_array_equal(joints[order[0]], batch["joints"][order[1]])
+    settings = {"batch": 8, "steps": BATCHES + 1}
+    alone = list(chunks(RECIPE, **settings))
+    for ranks in (2, 4):
+        shared = [list(chunks(RECIPE, **settings, rank=rank, ranks=ranks)) for rank in range(ranks)]
+        for c, batches in enumerate(alone):
+            for k, batch in enumerate(batches):
+                joints = np.concatenate([own[c][k]["joints"] for own in shared])
+                assert len(joints) == 8
+                order = [np.argsort(j[:, 0, 0], kind="stable") for j in (joints, batch["joints"])]
+                np.testing.assert_array_equal(joints[order[0]], batch["joints"][order[1]])
 
 
 @pytest.fixture
 def asked(monkeypatch):
     """(index, hard) of everybody who is made."""
-    made = []
-    original = Generator.person
+    made, original = [], Generator.person
 
     def person(self, seed, index, *, hard):
         made.append((index, hard))
@@ -345,7 +292,7 @@ def asked(monkeypatch):
 
 
 def test_difficulty_rises_over_the_first_share_of_the_run(asked):
-    chunks(replace(RECIPE, scene="wild", easy=0.5, batch=4, people=96))
+    list(chunks(replace(RECIPE, scene="wild", easy=0.5, batch=4, people=96)))
     # lane by lane
     index, hard = np.array(sorted(asked)).T
     np.testing.assert_array_equal(index, np.arange(96))
@@ -358,10 +305,10 @@ def test_difficulty_rises_over_the_first_share_of_the_run(asked):
 @pytest.mark.parametrize("scene", ["paper", "reference"])
 def test_the_paper_s_people_are_all_as_hard_as_the_paper_s(asked, scene):
     """Everybody masked: `hard` would take the mask away."""
-    chunks(replace(recipe_of(Pretrain, "paper"), size="tiny", scene=scene, batch=4, people=32, workers=0))
+    list(chunks(replace(recipe(Pretrain, "paper"), size="tiny", scene=scene, batch=4, people=32)))
     assert {hard for _, hard in asked} == {1.0}
     asked.clear()
-    chunks(replace(RECIPE, scene=scene, easy=0.5, batch=4, people=96))
+    list(chunks(replace(RECIPE, scene=scene, easy=0.5, batch=4, people=96)))
     assert [hard for _, hard in sorted(asked)] == [min(k / 48, 1.0) for k in range(96)]
 
 
@@ -371,9 +318,42 @@ def test_easier_people_are_seen_better():
     assert easy > full + 0.03
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_workers_change_nothing(workers):
-    assert_same_chunks(chunks(RECIPE), chunks(replace(RECIPE, workers=workers)))
+def test_sources_go_to_processes_that_do_not_fork(tmp_path):
+    motion = write_amass(tmp_path / "walk_poses.npz", *a_clip(40))
+    source = SyntheticSource(scene="wild", seed=3, motion=str(motion), captured=0.5)
+    want = source.example(1)
+    # what is remembered stays behind
+    sent = pickle.dumps(Chunks(source=source, objective=OBJECTIVE, batch=2, seed=3, start=0, steps=8))
+    assert len(sent) < 20_000
+    np.testing.assert_array_equal(pickle.loads(sent).source.example(1).points, want.points)
+    generator = Generator(scene="paper")
+    there = pickle.loads(pickle.dumps(generator))
+    np.testing.assert_array_equal(there.person(1, 2).sample.points, generator.person(1, 2).sample.points)
+
+
+def test_disturbed_people_have_their_joints_and_more_or_other_points():
+    sample = Generator(scene=SCENES["wild"], measure=False).person(2, 0).sample
+    before, count = sample.points.copy(), len(sample.points)
+
+    def changed(strays, noise, seeds=40):
+        return [disturbed(sample, strays=strays, noise=noise, rng=np.random.default_rng(k)) for k in range(seeds)]
+
+    assert all(same is sample for same in changed(0.0, 0.0, 1))
+    cluttered = changed(1.0, 0.0)
+    for other in cluttered:
+        np.testing.assert_array_equal(other.points[:count], sample.points)
+        assert (other.part[count:] == 0).all() and len(other.part) == len(other.points) and other.pose is sample.pose
+        np.testing.assert_array_equal(other.center, center_of(other.points))
+    assert max(len(other.points) for other in cluttered) > count + 50
+    blurred = changed(0.0, 1.0)
+    assert all(other.points.dtype == np.float32 and np.array_equal(other.part, sample.part) for other in blurred)
+    steps = [(other.points - sample.points).std() for other in blurred]
+    assert 0.003 < min(steps) < 0.01 and 0.04 < max(steps) < 0.09
+    assert 0.2 < np.mean([other is not sample for other in changed(0.3, 0.0, 300)]) < 0.4
+    np.testing.assert_array_equal(sample.points, before)
+
+
+# --- settings
 
 
 def test_numbers_of_numpy_paths_and_one_name_alone_are_settings_too():
@@ -398,64 +378,39 @@ def test_numbers_of_numpy_paths_and_one_name_alone_are_settings_too():
         ({"shards": [3]}, r"shards must be a list of texts, got \[3\]"),
         # without a file they would choose nobody
         ({"subjects": ("a",)}, "subjects are of captured clips: name their file by motion too"),
-        *(({"keep_anchors": value}, "keep_anchors must be True or False, got .*") for value in ("false", 0, None)),
+        *(({"keep_anchors": value}, "keep_anchors must be true or false, got .*") for value in ("false", 0, None)),
     ],
 )
 def test_a_recipe_refuses_what_is_no_such_setting(change, message):
     with pytest.raises(InputError, match=f"^{message}$"):
-        recipe_of(Finetune, data="a", **change) if "keep_anchors" in change else Pretrain(**change)
+        recipe(Finetune, data="a", **change) if "keep_anchors" in change else Pretrain(**change)
 
 
-def test_disturbed_people_have_their_joints_and_more_or_other_points():
-    sample = Generator(scene=SCENES["wild"], measure=False).person(2, 0).sample
-    kept = sample.points.copy()
-    assert disturbed(sample, strays=0.0, noise=0.0, rng=np.random.default_rng(0)) is sample
-    more = [disturbed(sample, strays=1.0, noise=0.0, rng=np.random.default_rng(k)) for k in range(40)]
-    for one in more:
-        count = len(sample.points)
-        np.testing.assert_array_equal(one.points[:count], sample.points)
-        assert (one.part[count:] == 0).all() and len(one.part) == len(one.points) and one.pose is sample.pose
-        np.testing.assert_array_equal(one.center, center_of(one.points))
-    assert max(len(one.points) for one in more) > len(sample.points) + 50
-    steps = []
-    for seed in range(40):
-        one = disturbed(sample, strays=0.0, noise=1.0, rng=np.random.default_rng(seed))
-        steps.append((one.points - sample.points).std())
-        assert one.points.dtype == np.float32 and np.array_equal(one.part, sample.part)
-    assert 0.003 < min(steps) < 0.01 and 0.04 < max(steps) < 0.09
-    share = [disturbed(sample, strays=0.3, noise=0.0, rng=np.random.default_rng(k)) is not sample for k in range(300)]
-    assert 0.2 < np.mean(share) < 0.4
-    np.testing.assert_array_equal(sample.points, kept)
+def test_named_recipes():
+    assert recipe(Pretrain) == Pretrain()
+    paper = recipe(Pretrain, "paper", people=5)
+    # Paper: AdamW, cosine, batch 64, 3e-4 and 5e-4, 50 epochs
+    assert (paper.size, paper.scene, paper.batch, paper.rate, paper.people) == ("paper", "paper", 64, 3e-4, 5)
+    assert paper.schedule == "cosine" and not (paper.muon_rate or paper.ema or paper.clip)
+    fine = recipe(Finetune, "paper", data=("a",), init="first.safetensors")
+    assert (fine.rate, fine.epochs, fine.mix, fine.augment, fine.keep_anchors) == (5e-4, 50, 0, "paper", False)
+    # the paper's figures are of networks that learned from every training sequence
+    assert fine.hold_out == 0
 
 
-def test_sources_go_to_processes_that_do_not_fork(tmp_path):
-    motion = write_amass(tmp_path / "walk_poses.npz", *a_clip(40))
-    source = SyntheticSource(scene="wild", seed=3, motion=str(motion), captured=0.5)
-    want = source.example(1)
-    chunks = Chunks(source=source, task=TASK, batch=2, seed=3, start=0, steps=8)
-    # what is remembered stays behind
-    sent = pickle.dumps(chunks)
-    assert len(sent) < 20_000
-    np.testing.assert_array_equal(pickle.loads(sent).source.example(1).points, want.points)
-    generator = Generator(scene="paper")
-    there = pickle.loads(pickle.dumps(generator))
-    np.testing.assert_array_equal(there.person(1, 2).sample.points, generator.person(1, 2).sample.points)
+def test_a_setup_by_its_old_names():
+    new = make_setup(RECIPE)
+    old = Job(task=new.task, **{name: value for name, value in vars(new).items() if name != "objective"})
+    assert old == new and new.task is new.objective
 
 
-def test_weights_decay():
-    groups = [g for o in optimizers(PoseNet(preset("tiny")), RECIPE) for g in o.param_groups]
-    (alone,) = optimizers(PoseNet(preset("tiny")), replace(RECIPE, muon_rate=0.0))
-    assert {g["weight_decay"] for g in [*groups, *alone.param_groups]} == {RECIPE.decay} != {0.0}
-
-
-def test_a_validation_is_the_mean_error_in_mm(tmp_path):
+def test_a_validation_is_the_mean_error_in_mm():
     joints = np.random.default_rng(0).normal(size=(3, 26, 3))
     joints[0, 4] = np.nan
-    people = [SimpleNamespace(joints=one) for one in joints]
 
-    def found(network, some, *, device):
-        return np.nan_to_num(np.stack(some)) + [0.03, 0.0, 0.04]
+    def predicted(network, batch, *, device):
+        return np.nan_to_num(np.stack(batch)) + [0.03, 0.0, 0.04]
 
-    task = SimpleNamespace(collate=lambda some: [one.joints for one in some], joints=found)
-    job = SimpleNamespace(validation=lambda: people, task=task, joints=SMPL24)
-    assert Validation(job, RECIPE, tmp_path).run(None, 0, "cpu") == pytest.approx(50)
+    objective = SimpleNamespace(collate=lambda examples: [each.joints for each in examples], joints=predicted)
+    examples = [SimpleNamespace(joints=each) for each in joints]
+    assert validate(objective, torch.nn.Linear(1, 1), examples, 2)[0] == pytest.approx(50)

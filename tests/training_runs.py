@@ -5,7 +5,7 @@ from contextlib import contextmanager
 import pytest
 
 from lidarpose.errors import InputError
-from lidarpose.train import loop, setup
+from lidarpose.train import loop, run_dir, setup
 
 FEW = 16
 
@@ -32,7 +32,7 @@ class Killed(BaseException):
 
 def train_until_killed(recipe, folder, name, call):
     """Lets the named function of the loop be called `call` times, then kills the run; saves after every chunk."""
-    where = loop if hasattr(loop, name) else loop._Run
+    where = run_dir if hasattr(run_dir, name) else loop._Run
     original, calls = getattr(where, name), []
 
     def counted(*args, **kwargs):

@@ -3,28 +3,23 @@
 import argparse
 import os
 import shlex
-from dataclasses import fields
+from collections.abc import Callable
+from dataclasses import Field, fields
 from pathlib import Path
 from typing import Any
 
 from lidarpose.cli.terminal import add_command, names
 from lidarpose.errors import InputError
-from lidarpose.train.recipes import Finetune, Pretrain, Recipe
+from lidarpose.train.recipes import TYPES, Finetune, Pretrain, Recipe
 
 _WHAT = (
     "{what} The run's folder holds config.json, log.jsonl, model.safetensors, best.safetensors, pictures, and "
     "state.safetensors to resume from. After an interruption, --resume continues with the same losses. Several "
     "processes: `torchrun --nproc_per_node N -m lidarpose {name} ...`, with the run's folder named."
 )
-# what stands for a value of a setting that names none
-_METAVARS: dict[Any, str] = {
-    int: "N",
-    float: "X",
-    bool: "true|false",
-    str: "NAME",
-    str | None: "FILE",
-    tuple[str, ...]: "A,B",
-}
+# a value of a setting from its text, by type; others are texts
+_BOOLS = {"true": True, "false": False}
+_PARSERS: dict[Any, Callable] = {int: int, float: float, bool: _BOOLS.__getitem__, tuple[str, ...]: names}
 
 
 def add(commands) -> None:
@@ -76,7 +71,7 @@ def _add(parser, kind: type[Recipe]) -> None:
             (common if field.name in shared else own).add_argument(
                 f"--{field.name.replace('_', '-')}",
                 dest=f"set_{field.name}",
-                metavar=field.metadata.get("metavar") or _METAVARS[field.type],
+                metavar=field.metadata.get("metavar") or TYPES[field.type][2],
                 help=field.metadata["help"] + default,
             )
 
@@ -84,13 +79,13 @@ def _add(parser, kind: type[Recipe]) -> None:
 def _train(options: argparse.Namespace) -> None:
     from lidarpose.train.loop import train
     from lidarpose.train.recipes import recipe
-    from lidarpose.train.run_dir import latest, stored_recipe
+    from lidarpose.train.run_dir import latest, read_config
     from lidarpose.train.validation import draw_examples
 
     kind: type[Pretrain | Finetune] = options.kind
     name = kind.__name__.lower()
     changes: dict[str, Any] = {
-        field.name: _parsed(field.name, text, field.type)
+        field.name: _parsed(field, text)
         for field in fields(kind)
         if (text := getattr(options, f"set_{field.name}", None)) is not None
     }
@@ -102,7 +97,7 @@ def _train(options: argparse.Namespace) -> None:
             raise InputError("a run keeps its recipe: leave --recipe away with --resume")
         folder = folder or latest(name)
         # a run keeps its recipe: what is not said again stays
-        wanted = kind(**(stored_recipe(Path(folder), kind).to_dict() | changes))
+        wanted = kind(**(read_config(Path(folder), kind)[0].to_dict() | changes))
     else:
         wanted = recipe(kind, options.recipe or "default", **changes)
     words = [f"--{key.replace('_', '-')} {_said(value)}" for key, value in changes.items() if key != "data"]
@@ -116,20 +111,12 @@ def _train(options: argparse.Namespace) -> None:
         print(path)
 
 
-def _parsed(name: str, text: str, kind: Any) -> object:
-    """An option's value. Raises InputError for a text of another type."""
-    option = f"--{name.replace('_', '-')}"
-    if kind is bool:
-        if text not in ("true", "false"):
-            raise InputError(f"{option}: expected true or false, got {text!r}")
-        return text == "true"
-    if kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            what = "a whole number" if kind is int else "a number"
-            raise InputError(f"{option}: expected {what}, got {text!r}") from None
-    return names(text) if kind == tuple[str, ...] else text
+def _parsed(field: Field, text: str) -> object:
+    """The value of an option; a text of another type stays, and the recipe refuses it."""
+    try:
+        return _PARSERS.get(field.type, str)(text)
+    except (KeyError, ValueError):
+        return text
 
 
 def _said(value: Any) -> str:

@@ -28,7 +28,7 @@ from lidarpose.data.shards import (
     write_card,
 )
 from lidarpose.data.splits import SplitRule, split_rule
-from lidarpose.data.writer import Counts, locked, make_shards, open_folder
+from lidarpose.data.writer import Counts, lock_dataset, make_shards, open_folder
 from lidarpose.errors import InputError, check_name
 from lidarpose.io.files import file_error, one_line
 from lidarpose.progress import Progress
@@ -117,7 +117,7 @@ def prepare(
     missing = open_folder(out, card)
     make = PartWriter(reader=source, root=root, out=out, parts=tuple(parts), rule=rule, only=split)
     finished = len(parts) - len(missing)
-    with locked(out):
+    with lock_dataset(out):
         # the summary of a run that is not over would be wrong
         if missing or not (out / CARD).is_file():
             write_card(out, card)

@@ -212,7 +212,7 @@ def _arrow_type(pa, column: Column):
     return value if column.shape is None else pa.list_(value)
 
 
-def _to_arrow(pa, table: str, rows: list[dict[str, Any]]):
+def to_arrow(pa, table: str, rows: list[dict[str, Any]]):
     """Rows as an Arrow table."""
     schema = pa.schema([(name, _arrow_type(pa, column)) for name, column in TABLES[table].items()])
     arrays = []
@@ -364,7 +364,7 @@ def shard_writer(path: str | Path, table: str) -> Iterator[Callable[[dict[str, A
     waiting: list[dict[str, Any]] = []
 
     def flush() -> None:
-        writer.write_table(_to_arrow(pa, table, waiting), row_group_size=_ROW_GROUP[table])
+        writer.write_table(to_arrow(pa, table, waiting), row_group_size=_ROW_GROUP[table])
         waiting.clear()
 
     def add(row: dict[str, Any]) -> None:
@@ -374,7 +374,7 @@ def shard_writer(path: str | Path, table: str) -> Iterator[Callable[[dict[str, A
 
     # a flipped bit in points would pass unnoticed
     options = {"compression": "zstd", "use_dictionary": False, "write_page_checksum": True}
-    schema = _to_arrow(pa, table, []).schema
+    schema = to_arrow(pa, table, []).schema
     with atomic_path(path) as temporary, parquet.ParquetWriter(temporary, schema, **options) as writer:
         yield add
         if waiting:

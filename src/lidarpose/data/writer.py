@@ -14,17 +14,13 @@ import threading
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 from lidarpose.data.shards import CARD, TABLES, DatasetCard, read_card, rows_of_shard, shard_path
-from lidarpose.errors import InputError, MissingExtra
-from lidarpose.io.files import TEMPORARY, check_writable, file_error
-
-try:
-    from filelock import FileLock, Timeout
-except ImportError:
-    raise MissingExtra("writing a dataset", "synth") from None
+from lidarpose.errors import InputError
+from lidarpose.io.files import file_error, is_unused, locked
 
 # how many people, clips or streets are done since it last told
 Counts = Generator[int, None, None]
@@ -33,10 +29,12 @@ Make = Callable[[int], Counts]
 
 # how often progress is told, s
 _TICK = 0.5
-# in a dataset's folder while a process writes there
-LOCK = ".lock"
-# what `files.atomic_path` leaves of a process that was killed
-_LEFT = re.compile(rf"{TEMPORARY}(?:(?:{'|'.join(TABLES)})-\d{{5}}\.parquet|{re.escape(CARD)})")
+# of the files in a dataset's folder
+_NAMES = rf"(?:(?:{'|'.join(TABLES)})-\d{{5}}\.parquet|{re.escape(CARD)})"
+# keeps other processes from writing into a dataset's folder
+lock_dataset = partial(
+    locked, names=_NAMES, busy="another process writes this dataset: wait for its end, or give another folder"
+)
 
 
 def open_folder(folder: Path, card: DatasetCard, rows: Mapping[str, int] | None = None) -> list[int]:
@@ -49,7 +47,7 @@ def open_folder(folder: Path, card: DatasetCard, rows: Mapping[str, int] | None 
         raise file_error(folder, "is a file; give a folder for the dataset")
     if (folder / CARD).is_file():
         check_settings(folder, read_card(folder), card)
-    elif folder.is_dir() and any(not _LEFT.fullmatch(path.name) and path.name != LOCK for path in folder.iterdir()):
+    elif not is_unused(folder, _NAMES):
         raise file_error(folder, f"holds other files and no {CARD}; give a new or empty folder for the dataset")
     return [shard for shard in range(card.shards) if not _is_whole(folder, card, shard, rows or {})]
 
@@ -75,45 +73,6 @@ def _is_whole(folder: Path, card: DatasetCard, shard: int, rows: Mapping[str, in
         if count is None or table in rows and count != rows[table] * card.size(shard):
             return False
     return True
-
-
-@contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Keeps other processes from writing into a dataset's folder, and removes what killed ones left of files.
-
-    The folder is made, and removed again where nothing came into it. Raises InputError where another process writes
-    there; one that was killed does not.
-    """
-    check_writable(folder / CARD)
-    is_new = not folder.exists()
-    folder.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder / LOCK)
-    try:
-        # a file system may know no locks
-        with suppress(NotImplementedError):
-            lock.acquire(timeout=0)
-    except Timeout:
-        raise file_error(
-            folder, "another process writes this dataset: wait for its end, or give another folder"
-        ) from None
-    try:
-        _clean(folder)
-        yield
-        _clean(folder)
-    finally:
-        # Windows does not let go of a file that is open
-        with suppress(OSError):
-            (folder / LOCK).unlink()
-        lock.release()
-        if is_new:
-            with suppress(OSError):
-                folder.rmdir()
-
-
-def _clean(folder: Path) -> None:
-    for path in folder.glob(".*"):
-        if _LEFT.fullmatch(path.name):
-            path.unlink(missing_ok=True)
 
 
 def make_shards(make: Make, shards: list[int], *, workers: int = 1) -> Iterator[tuple[int, int]]:

@@ -8,6 +8,7 @@ import errno
 import hashlib
 import io
 import os
+import re
 import reprlib
 import secrets
 import stat
@@ -16,7 +17,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lidarpose.errors import InputError
+from lidarpose.errors import InputError, MissingExtra
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,7 +26,9 @@ if TYPE_CHECKING:
 _MAX_KEPT_NAME = 100
 
 # how the names of temporary files begin; with process ids in version 0.2
-TEMPORARY = r"\.(?:[0-9a-f]{16}|\d+-\d+)-"
+_TEMPORARY = r"\.(?:[0-9a-f]{16}|\d+-\d+)-"
+# in a folder while a process writes there
+LOCK = ".lock"
 
 _REMEDIES = {
     errno.ENOSPC: "free some space or write to another disk",
@@ -276,6 +279,66 @@ def write_atomic(path: str | os.PathLike, data: bytes | str) -> None:
     content = data.encode("utf-8") if isinstance(data, str) else data
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(content)
+
+
+def is_unused(folder: Path, names: str) -> bool:
+    """Whether a folder is missing, or holds nothing but what killed processes left of files with such names (a regular
+    expression)."""
+    return (
+        not folder.exists()
+        or folder.is_dir()
+        and all(path.name == LOCK or re.fullmatch(_TEMPORARY + names, path.name) for path in folder.iterdir())
+    )
+
+
+@contextmanager
+def locked(folder: Path, names: str, *, busy: str, wait: float = 0.0) -> Iterator[None]:
+    """Keeps other processes from writing into a folder, and removes what killed ones left of files.
+
+    The folder is made, and removed again where nothing came into it. A process that was killed keeps nobody out. A file
+    system that knows no locks goes without.
+
+    Args:
+        names: Of the files that are written there and in its subfolders, a regular expression.
+        busy: What to say where another process holds the lock for longer than `wait` seconds.
+
+    Raises:
+        InputError: Where the folder is in use, or cannot be written.
+        MissingExtra: Without filelock.
+    """
+    try:
+        from filelock import FileLock, Timeout
+    except ImportError:
+        raise MissingExtra("writing a dataset or a run", "synth") from None
+    check_writable(folder / LOCK)
+    is_new = not folder.exists()
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / LOCK)
+    try:
+        with suppress(NotImplementedError):
+            lock.acquire(timeout=wait)
+    except Timeout:
+        raise file_error(folder, busy) from None
+    except OSError as error:
+        raise _write_error(folder / LOCK, folder, error) from None
+    try:
+        _remove_leftovers(folder, names)
+        yield
+        _remove_leftovers(folder, names)
+    finally:
+        # Windows does not let go of a file that is open
+        with suppress(OSError):
+            (folder / LOCK).unlink()
+        lock.release()
+        if is_new:
+            with suppress(OSError):
+                folder.rmdir()
+
+
+def _remove_leftovers(folder: Path, names: str) -> None:
+    for path in folder.rglob(".*"):
+        if re.fullmatch(_TEMPORARY + names, path.name):
+            path.unlink(missing_ok=True)
 
 
 def _is_about(error: OSError, temporary: Path) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 
 from lidarpose.body.mocap import digest as motion_digest
 from lidarpose.data.shards import CARD, DatasetCard, person_row, shard_path, shard_writer, write_card
-from lidarpose.data.writer import Counts, locked, make_shards, open_folder
+from lidarpose.data.writer import Counts, lock_dataset, make_shards, open_folder
 from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.io.files import content_digest, file_error
 from lidarpose.lidar.presets import SENSORS, sensor
@@ -133,7 +133,7 @@ def write_dataset(
     done = card.count - left
     # before anything is written, so that motion that cannot be read leaves no folder
     make = Maker(job=job, card=card, folder=folder, generator=job.generator()) if missing else None
-    with locked(folder):
+    with lock_dataset(folder):
         has_card = (folder / CARD).is_file()
         if not has_card:
             write_card(folder, card)

@@ -104,7 +104,7 @@ def example(sample: Sample, rng: np.random.Generator, *, refined: float = REFINE
     origin = None if rng.random() < BLIND else np.zeros(3)
     points, joints = sample.points - center, sample.pose.joints - center
     visible = seen(joints, points[sample.part > 0]).astype(np.float32)
-    return _example(points, sample.part, joints, visible, view_features(center, origin), rng)
+    return _example(rng, points, joints, part=sample.part, visible=visible, view=view_features(center, origin))
 
 
 def augmented(sample: LabeledSample, kind: Augmentation, rng: np.random.Generator) -> Example:
@@ -130,20 +130,12 @@ def augmented(sample: LabeledSample, kind: Augmentation, rng: np.random.Generato
         points = jitter(points, sigma=kind.jitter, clip=4 * kind.jitter, rng=rng)
     if rng.random() < kind.strays:
         points, part = _with_clutter(points, part, np.zeros(3), _CLUTTER, rng)
-    return _example(points, part, joints, visible, view, rng)
+    return _example(rng, points, joints, part=part, visible=visible, view=view)
 
 
-def _example(
-    points: np.ndarray,
-    part: np.ndarray,
-    joints: np.ndarray,
-    visible: np.ndarray,
-    view: np.ndarray,
-    rng: np.random.Generator,
-) -> Example:
+def _example(rng: np.random.Generator, points: np.ndarray, joints: np.ndarray, **known: np.ndarray) -> Example:
     seed = int(rng.integers(2**31))
-    points, joints = points.astype(np.float32), joints.astype(np.float32)
-    return Example(points=points, part=part, joints=joints, visible=visible, view=view, seed=seed)
+    return Example(points=points.astype(np.float32), joints=joints.astype(np.float32), seed=seed, **known)
 
 
 def disturbed(sample: _Sample, *, strays: float, noise: float, rng: np.random.Generator) -> _Sample:
@@ -195,7 +187,7 @@ def _view(sample: LabeledSample, kind: Augmentation, rng: np.random.Generator) -
         keep &= half_space_keep(sample.points, most=0.4, rng=rng)
     sample = _cropped(sample, keep)
     center = center_of(sample.points)
-    # where the pelvis is not labelled, half way between the hips: what a second pass centers on
+    # where the pelvis is not labeled, half way between the hips: what a second pass centers on
     pelvis = sample.joints[_PELVIS]
     root = sample.joints[_HIPS].mean(0) if np.isnan(pelvis).any() else pelvis
     if not np.isnan(root).any() and rng.random() < kind.refined:

@@ -132,14 +132,14 @@ class MixedSource:
 
 @dataclass(frozen=True, kw_only=True)
 class Chunks(IterableDataset):
-    """The chunks of a run of so many `steps` from chunk `start` on, each a list of `BATCHES` batches as the task
-    collates them, the last one perhaps shorter.
+    """The chunks of a run of so many `steps` from chunk `start` on, each a list of `BATCHES` batches as the
+    objective collates them, the last one perhaps shorter.
 
     batch: samples of a step in all processes; rank, ranks: which process this is, of how many.
     """
 
     source: Source
-    task: Objective
+    objective: Objective
     batch: int
     seed: int
     start: int
@@ -168,7 +168,7 @@ class Chunks(IterableDataset):
             mine.append(sorted(map(self.source.example, numbers), key=_voxels))
         share = self.batch // lanes
         order = np.random.default_rng([self.seed, RandomStream.BATCH_ORDER, chunk]).permutation(batches)
-        return [self.task.collate([e for lane in mine for e in lane[k * share : (k + 1) * share]]) for k in order]
+        return [self.objective.collate([e for lane in mine for e in lane[k * share : (k + 1) * share]]) for k in order]
 
 
 def chunks_of(steps: int) -> int:
@@ -204,7 +204,7 @@ def loader(chunks: Chunks, *, workers: int) -> DataLoader:
 
 
 def _unchanged(batches: list[Any]) -> list[Any]:
-    # torch would turn arrays into tensors; the task does so, on its device
+    # torch would turn arrays into tensors; the objective does so, on its device
     return batches
 
 

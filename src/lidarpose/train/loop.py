@@ -11,8 +11,9 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
+from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
@@ -24,34 +25,18 @@ from accelerate import Accelerator
 from torch import Tensor, nn
 
 from lidarpose.errors import InputError, check_name
+from lidarpose.io.files import write_atomic
 from lidarpose.models.checkpoint import save_checkpoint
 from lidarpose.progress import Progress
+from lidarpose.train import run_dir
+from lidarpose.train.augment import Example
 from lidarpose.train.data_loader import BATCHES, Chunks, chunks_of, lanes_of, loader
 from lidarpose.train.objectives.objective import total
 from lidarpose.train.optim import average, optimizers, set_rates
 from lidarpose.train.recipes import Finetune, Pretrain
-from lidarpose.train.run_dir import (
-    BEST,
-    LOG,
-    MODEL,
-    PATHS,
-    STATE,
-    begin,
-    check_new,
-    check_same,
-    clean,
-    cut_log,
-    folder_names,
-    held,
-    latest,
-    load_state,
-    numbered,
-    save_state,
-    stored_command,
-    stored_recipe,
-)
+from lidarpose.train.run_dir import BEST, LOG, MODEL, STATE
 from lidarpose.train.setup import TrainSetup, make_setup
-from lidarpose.train.validation import Draw, Validation
+from lidarpose.train.validation import Draw, validate
 
 # of Accelerate's, those that are known to work with a run's folder
 TRACKERS = ("tensorboard", "wandb")
@@ -68,7 +53,8 @@ class Interrupted(KeyboardInterrupt):
 
     def __init__(self, message: str, number: int):
         super().__init__(message)
-        self.status = 128 + number
+        # another process may have got the signal
+        self.status = 128 + (number or signal.SIGTERM)
 
 
 class StopRequest:
@@ -117,30 +103,31 @@ def train(
     state then stays. Raises `Interrupted` after SIGINT or SIGTERM, once the state is saved.
     """
     _check(device, tracker)
-    kind = type(recipe)
     if resume:
-        folder = latest(kind.__name__.lower()) if folder is None else Path(folder)
-        check_same(folder, stored_recipe(folder, kind), recipe)
-        command = "; then ".join(text for text in (stored_command(folder), command) if text)
-    elif folder is None and int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        raise InputError("several processes need to know the run's folder: name it")
+        folder = run_dir.latest(recipe.kind) if folder is None else Path(folder)
+        stored, before = run_dir.read_config(folder, type(recipe))
+        run_dir.check_resumable(folder, stored, recipe)
+        command = "; then ".join(filter(None, (before, command)))
     elif folder is not None:
-        check_new(Path(folder))
-    setup = setup or job or make_setup(recipe, on_cpu=_on_cpu(device))
-    accelerator = _accelerator(recipe, device, tracker)
+        run_dir.check_new(Path(folder))
+    elif int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        raise InputError("several processes need to know the run's folder: name it")
+    on_cpu = device == "cpu" or not torch.cuda.is_available()
+    setup = setup or job or make_setup(recipe, on_cpu=on_cpu)
+    accelerator = _accelerator(recipe, on_cpu, tracker)
     lanes_of(recipe.batch, accelerator.num_processes)
     # every process has looked before the first one writes
     accelerator.wait_for_everyone()
-    folder = numbered(kind.__name__.lower()) if folder is None else Path(folder)
+    folder = run_dir.numbered(recipe.kind) if folder is None else Path(folder)
     accelerator.project_configuration.set_directories(str(folder))
     run = _Run(recipe, setup, folder, accelerator, command, draw)
-    for warning in setup.warnings if accelerator.is_main_process else ():
+    for warning in setup.warnings if run.is_main else ():
         _warn(warning)
-    with held(folder) if accelerator.is_main_process else nullcontext(), StopRequest() as stop:
+    with run_dir.lock(folder) if run.is_main else nullcontext(), StopRequest() as stop:
         if resume:
             run.resume()
-        elif accelerator.is_main_process:
-            begin(folder, recipe, command)
+        elif run.is_main:
+            run_dir.begin(folder, recipe, command)
         accelerator.wait_for_everyone()
         if tracker is not None:
             settings = {name: value for name, value in recipe.to_dict().items() if isinstance(value, int | float | str)}
@@ -157,8 +144,7 @@ def _warn(text: str) -> None:
     print(f"lidarpose: warning: {text}", file=sys.stderr)
 
 
-def _accelerator(recipe: Pretrain | Finetune, device: str | None, tracker: str | None) -> Accelerator:
-    on_cpu = _on_cpu(device)
+def _accelerator(recipe: Pretrain | Finetune, on_cpu: bool, tracker: str | None) -> Accelerator:
     half = recipe.precision == "bf16" or recipe.precision == "auto" and not on_cpu and torch.cuda.is_bf16_supported()
     try:
         return Accelerator(cpu=on_cpu, mixed_precision="bf16" if half else "no", log_with=tracker)
@@ -178,12 +164,11 @@ def _check(device: str | None, tracker: str | None) -> None:
             raise InputError(f"--tracker {tracker} needs the package {tracker}: pip install {tracker}")
 
 
-def _on_cpu(device: str | None) -> bool:
-    return device == "cpu" or not torch.cuda.is_available()
-
-
 class _Run:
-    """A run that goes on: the network, the mean of its weights, its optimizers, how far it is."""
+    """A run that goes on: the network, the mean of its weights, its optimizers, how far it is.
+
+    best, error: of the best and of the last validation, mm; infinite and None before.
+    """
 
     def __init__(
         self,
@@ -194,22 +179,28 @@ class _Run:
         command: str,
         draw: Draw | None,
     ):
-        self.recipe, self.setup, self.folder, self.command = recipe, setup, folder, command
-        self.accelerator = accelerator
-        torch.manual_seed(_number(recipe.seed, _INIT))
+        self.recipe, self.setup, self.folder, self.command, self.draw = recipe, setup, folder, command, draw
+        self.accelerator, self.is_main = accelerator, accelerator.is_main_process
+        torch.manual_seed(_seed(recipe.seed, _INIT))
         self.network: nn.Module = setup.network().to(accelerator.device).train()
         self.mean = {name: value.detach().clone() for name, value in self.network.named_parameters()}
         self.optimizers = optimizers(self.network, recipe)
         self.wrapped = accelerator.prepare(self.network) if accelerator.num_processes > 1 else self.network
         self.steps = -(-setup.people // recipe.batch)
         self.chunks = chunks_of(self.steps)
-        self.chunk, self.seconds, self.best = 0, 0.0, float("inf")
-        self.validation = Validation(setup, recipe, folder, draw)
+        self.chunk, self.seconds = 0, 0.0
+        self.best = float("inf")
+        self.error: float | None = None
+
+    @cached_property
+    def _watched(self) -> list[Example]:
+        """The samples to validate on."""
+        return self.setup.validation()
 
     def resume(self) -> None:
         """Loads the state of the run that was stopped; stays at the beginning, where none was saved yet."""
         if (self.folder / STATE).is_file():
-            progress = load_state(self.folder / STATE, self.network, self.mean, self.optimizers)
+            progress = run_dir.load_state(self.folder / STATE, self.network, self.mean, self.optimizers)
             done, self.seconds = progress["steps"], progress["seconds"]
             if done > self.steps:
                 seen = done * self.recipe.batch
@@ -219,12 +210,11 @@ class _Run:
             # a longer run makes the last chunk of a shorter one anew, whole
             self.chunk = self.chunks if done == self.steps else done // BATCHES
             self.best = float("inf") if progress["best"] is None else progress["best"]
-            self.validation.last = progress["validation"]
-        elif self.accelerator.is_main_process:
+            self.error = progress["validation"]
+        elif self.is_main:
             _warn(f"{self.folder} has no {STATE}, it was stopped before its first was saved: the run starts over")
-        if self.accelerator.is_main_process:
-            clean(self.folder)
-            cut_log(self.folder, self.seen)
+        if self.is_main:
+            run_dir.cut_log(self.folder, self.seen)
 
     @property
     def steps_done(self) -> int:
@@ -238,20 +228,30 @@ class _Run:
 
     def steps_until(self, stop: StopRequest) -> None:
         """All that is left of the run, or until `stop` is asked for. Raises `Interrupted` in the latter case."""
-        main, people = self.accelerator.is_main_process, self.setup.people
-        validate_every = self.recipe.validate or max(people // _VALIDATIONS, 1)
+        people, recipe = self.setup.people, self.recipe
+        validate_every = recipe.validate or max(people // _VALIDATIONS, 1)
         started = saved = time.monotonic()
         seconds_before = self.seconds
         with _dead_worker_named(), ExitStack() as stack:
-            log = stack.enter_context(open(self.folder / LOG, "a")) if main else None
-            bar = stack.enter_context(Progress(people, unit="people", done=min(self.seen, people), shown=main))
-            for batches in self._chunks():
+            log = stack.enter_context(open(self.folder / LOG, "a")) if self.is_main else None
+            bar = stack.enter_context(Progress(people, unit="people", done=min(self.seen, people), shown=self.is_main))
+            chunks = Chunks(
+                source=self.setup.source,
+                objective=self.setup.objective,
+                batch=recipe.batch,
+                seed=recipe.seed,
+                start=self.chunk,
+                steps=self.steps,
+                rank=self.accelerator.process_index,
+                ranks=self.accelerator.num_processes,
+            )
+            for batches in loader(chunks, workers=recipe.workers):
                 seen_before = self.seen
                 terms, stopping = self._chunk(batches, stop)
                 self.seconds = seconds_before + time.monotonic() - started
                 entry = {"people": self.seen, "seconds": round(self.seconds, 1)} | terms
                 last = self.chunk == self.chunks
-                if main and (last or self.seen // validate_every > seen_before // validate_every):
+                if self.is_main and (last or self.seen // validate_every > seen_before // validate_every):
                     entry |= self._validated()
                 self.accelerator.log({k: v for k, v in entry.items() if k != "people"}, step=self.seen)
                 bar.update(min(self.seen, people), self._note(terms))
@@ -265,33 +265,16 @@ class _Run:
                         saved = time.monotonic()
                 if stopping and not last:
                     # all processes take this branch: the request was shared with the losses
-                    kind, where = type(self.recipe).__name__.lower(), shlex.quote(str(self.folder))
-                    where = where if kind == "pretrain" else f"--out {where}"
-                    raise Interrupted(
-                        f"stopped after {self.seen:,} samples, saved: go on with lidarpose {kind} {where} --resume",
-                        stop.number or signal.SIGTERM,
-                    )
+                    where = ("--out " if recipe.kind == "finetune" else "") + shlex.quote(str(self.folder))
+                    remedy = f"go on with lidarpose {recipe.kind} {where} --resume"
+                    raise Interrupted(f"stopped after {self.seen:,} samples, saved: {remedy}", stop.number)
         self.accelerator.wait_for_everyone()
 
     def _note(self, terms: dict[str, float]) -> str:
         """What the progress bar shows."""
         loss = sum(value for name, value in terms.items() if name not in ("mpjpe", "gradient"))
         note = f"loss {loss:.3f}, mpjpe {terms['mpjpe'] * 1e3:.0f} mm"
-        return note if self.validation.last is None else f"{note}, validation {self.validation.last:.0f} mm"
-
-    def _chunks(self) -> Iterable[list]:
-        """The chunks that are left."""
-        chunks = Chunks(
-            source=self.setup.source,
-            task=self.setup.task,
-            batch=self.recipe.batch,
-            seed=self.recipe.seed,
-            start=self.chunk,
-            steps=self.steps,
-            rank=self.accelerator.process_index,
-            ranks=self.accelerator.num_processes,
-        )
-        return loader(chunks, workers=self.recipe.workers)
+        return note if self.error is None else f"{note}, validation {self.error:.0f} mm"
 
     def _chunk(self, batches: list, stop: StopRequest) -> tuple[dict[str, float], bool]:
         """Takes the steps of a chunk; returns the mean of each term and of the gradient's norm over them, and whether
@@ -315,12 +298,12 @@ class _Run:
     def _step(self, arrays: object, k: int) -> dict[str, Tensor]:
         step, recipe, accelerator = self.chunk * BATCHES + k, self.recipe, self.accelerator
         # what a network drops at random follows from the step alone
-        torch.manual_seed(_number(recipe.seed, _STEP, step, accelerator.process_index))
+        torch.manual_seed(_seed(recipe.seed, _STEP, step, accelerator.process_index))
         set_rates(self.optimizers, recipe, step / self.steps)
         for optimizer in self.optimizers:
             optimizer.zero_grad(set_to_none=True)
         with accelerator.autocast():
-            terms = self.setup.task.terms(self.wrapped, arrays, device=accelerator.device, share=self._share)
+            terms = self.setup.objective.terms(self.wrapped, arrays, device=accelerator.device, share=self._share)
         accelerator.backward(total(terms))
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), recipe.clip or float("inf"))
         for optimizer in self.optimizers:
@@ -333,46 +316,51 @@ class _Run:
 
     def _averaged(self) -> nn.Module:
         """A network with the mean weights, in evaluation mode."""
-        network = self.setup.task.network().to(self.accelerator.device)
+        network = self.setup.objective.network().to(self.accelerator.device)
         network.load_state_dict(self.network.state_dict() | self.mean)
         return network.eval()
 
     def _validated(self) -> dict[str, float]:
         """On the main process; the weights of the best validation are kept."""
-        network = self._averaged()
-        error = self.validation.run(network, self.seen, self.accelerator.device)
-        if error is None:
+        if not self._watched:
             return {}
-        if error < self.best:
-            self.best = error
+        network, pictures = self._averaged(), self.recipe.pictures
+        self.error, joints = validate(self.setup.objective, network, self._watched, self.recipe.batch)
+        if pictures and self.draw is not None:
+            rows = np.unique(np.linspace(0, len(joints) - 1, min(pictures, len(joints))).astype(int))
+            examples = [self._watched[k] for k in rows]
+            picture = self.draw(examples, joints[rows], self.setup.joints, f"after {self.seen:,} people")
+            write_atomic(self.folder / run_dir.PICTURES / f"people-{self.seen:09d}.png", picture)
+        if self.error < self.best:
+            self.best = self.error
             self._save_weights(BEST, network)
-        return {"validation_mm": round(error, 2)}
+        return {"validation_mm": round(self.error, 2)}
 
     def _save(self) -> None:
         # the state last: killed between the two, a run goes on from the older one and writes both again
         self._save_weights(MODEL, self._averaged())
         best = self.best if np.isfinite(self.best) else None
-        progress = {"steps": self.steps_done, "seconds": self.seconds, "best": best, "validation": self.validation.last}
-        save_state(self.folder / STATE, self.network, self.mean, self.optimizers, progress)
+        progress = {"steps": self.steps_done, "seconds": self.seconds, "best": best, "validation": self.error}
+        run_dir.save_state(self.folder / STATE, self.network, self.mean, self.optimizers, progress)
 
     def _save_weights(self, name: str, network: Any) -> None:
         recipe = self.recipe.to_dict()
-        for field in PATHS:
+        for field in run_dir.PATHS:
             if value := recipe.get(field):
                 # names of files, not where they lie
-                recipe[field] = Path(value).name if isinstance(value, str) else folder_names(value)
+                recipe[field] = Path(value).name if isinstance(value, str) else run_dir.folder_names(value)
         card = {
             "command": self.command or "lidarpose.train.loop.train",
             "recipe": recipe,
             "people_seen": self.seen,
             "hours": round(self.seconds / 3600, 3),
         }
-        if self.validation.last is not None:
-            card["validation_mm"] = round(self.validation.last, 2)
+        if self.error is not None:
+            card["validation_mm"] = round(self.error, 2)
         save_checkpoint(self.folder / name, network, card=card | self.setup.card)
 
 
-def _number(*words: int) -> int:
+def _seed(*words: int) -> int:
     """A seed of torch's from words."""
     return int(np.random.SeedSequence(words).generate_state(1)[0])
 

@@ -3,7 +3,6 @@
 A field's help is what the command line says of it; this module stays light for that.
 """
 
-from collections.abc import Callable
 from dataclasses import Field, asdict, dataclass, field, fields
 from operator import index
 from os import fspath
@@ -20,33 +19,50 @@ PRECISIONS = ("auto", "float32", "bf16")
 PAPER, SMALL_PAPER = "paper", "paper-small"
 # what changes no sample: a resumed run may have others
 FREE = ("workers", "validate", "pictures", "precision")
+# shares of a whole that cannot be all of it
+_BELOW_ONE = ("ema", "mix", "hold_out")
+_LEAST = {"batch": 1, "people": 1}
+
+
+def _to_bool(value: Any) -> bool:
+    # by name: numpy's is one too, and is not loaded for that
+    if type(value).__name__ not in ("bool", "bool_"):
+        raise TypeError
+    return bool(value)
+
+
+# by type of a setting: what makes one of a value, so that numpy's numbers and paths are as good as Python's and can be
+# stored; what is expected; and what stands for the value in the command's help
+TYPES: dict[Any, tuple] = {
+    int: (index, "a whole number", "N"),
+    float: (float, "a number", "X"),
+    bool: (_to_bool, "true or false", "true|false"),
+    str: (fspath, "text", "NAME"),
+    str | None: (lambda value: None if value is None else fspath(value), "text", "FILE"),
+    tuple[str, ...]: (lambda value: tuple(fspath(path) for path in listed(value)), "a list of texts", "A,B"),
+}
 
 
 def _setting(default: Any, words: str, metavar: str = "") -> Any:
-    """A field with its help and what stands for its value there; by default that of its type."""
+    """A field with its help and what stands for its value there, by default that of its type; SHARE: from 0 to 1."""
     return field(default=default, metadata={"help": words, "metavar": metavar})
 
 
-def _declared(f: Field, value: Any) -> Any:
-    """A setting as its field declares it, so that numpy's numbers and paths are as good as Python's and can be stored.
-    Raises InputError for what is none."""
+def _checked(f: Field, value: Any) -> Any:
+    """A setting as its field declares it. Raises InputError for what is none."""
+    convert, expected, _ = TYPES[f.type]
     try:
-        if f.type is int:
-            return index(value)
-        if f.type is float:
-            return float(value)
-        if isinstance(f.default, tuple):
-            return tuple(map(fspath, listed(value)))
-        if f.type is bool:
-            # by name: numpy's is one too, and is not loaded for that
-            if type(value).__name__ not in ("bool", "bool_"):
-                raise TypeError
-            return bool(value)
-        return None if value is None and f.default is None else fspath(value)
+        value = convert(value)
     except (TypeError, ValueError, OverflowError):
-        wanted: dict[Any, str] = {int: "a whole number", float: "a number", bool: "True or False"}
-        expected = "a list of texts" if isinstance(f.default, tuple) else wanted.get(f.type, "text")
         raise InputError(f"{f.name} must be {expected}, got {value!r}") from None
+    if f.type in (int, float):
+        least, below = _LEAST.get(f.name, 0), f.name in _BELOW_ONE
+        if not value >= least:
+            raise InputError(f"{f.name} must be at least {least}, got {value:g}")
+        check_finite(f.name, value)
+        if f.metadata["metavar"] == "SHARE" and (value > 1 or below and value == 1):
+            raise InputError(f"{f.name} must be a share, {'below' if below else 'at most'} 1, got {value}")
+    return value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,27 +88,14 @@ class Recipe:
 
     def __post_init__(self):
         for f in fields(self):
-            object.__setattr__(self, f.name, _declared(f, getattr(self, f.name)))
-        least = {f.name: int(f.name in ("batch", "people")) for f in fields(self) if f.type in (int, float)}
-        for name, bound in least.items():
-            if not getattr(self, name) >= bound:
-                raise InputError(f"{name} must be at least {bound}, got {getattr(self, name):g}")
-        for name in (f.name for f in fields(self) if f.type is float):
-            check_finite(name, getattr(self, name))
-        self._check_shares("warmup", "cool")
-        self._check_shares("ema", below=True)
-        for name, known in (("schedule", SCHEDULES), ("precision", PRECISIONS)):
-            check_name(name, getattr(self, name), known)
+            object.__setattr__(self, f.name, _checked(f, getattr(self, f.name)))
+        check_name("schedule", self.schedule, SCHEDULES)
+        check_name("precision", self.precision, PRECISIONS)
 
-    def check_no_lengths(self) -> None:
-        if self.bone or self.symmetry:
-            raise InputError("bone and symmetry are terms of the package's own networks: leave them at 0")
-
-    def _check_shares(self, *names: str, below: bool = False) -> None:
-        for name in names:
-            value = getattr(self, name)
-            if value > 1 or below and value == 1:
-                raise InputError(f"{name} must be a share, {'below' if below else 'at most'} 1, got {value}")
+    @property
+    def kind(self) -> str:
+        """The command, "pretrain" or "finetune"."""
+        return type(self).__name__.lower()
 
     def to_dict(self) -> dict:
         return asdict(self)
@@ -122,13 +125,8 @@ class Pretrain(Recipe):
 
     def __post_init__(self):
         super().__post_init__()
-        self._check_shares("easy", "captured", "strays", "noise")
         if self.subjects and not self.motion:
             raise InputError("subjects are of captured clips: name their file by motion too")
-        if self.size in (PAPER, SMALL_PAPER):
-            self.check_no_lengths()
-            if self.init:
-                raise InputError("init is for the package's own networks: the paper's begins at random")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +154,6 @@ class Finetune(Recipe):
             raise InputError("fine-tuning needs a dataset: name a folder that lidarpose prepare wrote")
         if not self.epochs > 0 or self.interval < 1:
             raise InputError(f"epochs must be above 0 and interval at least 1, got {self.epochs} and {self.interval}")
-        self._check_shares("mix", "hold_out", below=True)
         if not self.init:
             raise InputError(
                 "the paper's fine-tuning goes on from a checkpoint of pretrain --recipe paper: name it by --init"
@@ -165,42 +162,28 @@ class Finetune(Recipe):
 
 # the released OneCycle schedule, AdamW on everything, neither mean of weights nor clipping
 _RELEASED = {"muon_rate": 0.0, "decay": 0.005, "schedule": "cosine", "warmup": 0.04, "ema": 0.0, "clip": 0.0}
-
-
-def pretrain_default() -> dict:
-    """The recipe of the bundled weights but for its length."""
-    return {}
-
-
-def pretrain_paper() -> dict:
-    """Paper: implementation details. 50 epochs; an epoch is here 50,000 people, since the paper's follow frames of
-    LiDARHuman26M, and every pose is new."""
-    # its law of noise is the scene's
-    noise = {"strays": 0.0, "noise": 0.0}
-    own = {"size": PAPER, "scene": "paper", "rate": 3e-4, "people": 2_500_000, "easy": 0.0}
-    return _RELEASED | own | noise
-
-
-def finetune_default() -> dict:
-    """Anchors and heads stay, every joint has its name, synthesized people are mixed in."""
-    return {}
-
-
-def finetune_paper() -> dict:
-    """Paper: implementation details. 50 epochs on all training sequences and no others; anchors and heads anew."""
-    own = {"init": "", "epochs": 50.0, "augment": "paper", "mix": 0.0, "hold_out": 0.0, "keep_anchors": False}
-    return _RELEASED | own
-
-
-AnyRecipe = TypeVar("AnyRecipe", bound=Recipe)
-RECIPES: dict[type[Recipe], dict[str, Callable[[], dict]]] = {
-    Pretrain: {"default": pretrain_default, "paper": pretrain_paper},
-    Finetune: {"default": finetune_default, "paper": finetune_paper},
+# by kind and name, what differs from the recipe of the bundled weights. Paper: implementation details
+RECIPES: dict[type[Recipe], dict[str, dict[str, Any]]] = {
+    Pretrain: {
+        "default": {},
+        # 50 epochs; an epoch is here 50,000 people, since the paper's follow frames of LiDARHuman26M, and every pose is
+        # new. Its law of noise is the scene's
+        "paper": _RELEASED
+        | {"size": PAPER, "scene": "paper", "rate": 3e-4, "people": 2_500_000, "easy": 0.0}
+        | {"strays": 0.0, "noise": 0.0},
+    },
+    Finetune: {
+        # anchors and heads stay, every joint has its name, synthesized people are mixed in
+        "default": {},
+        # 50 epochs on all training sequences and no others; anchors and heads anew
+        "paper": _RELEASED
+        | {"init": "", "epochs": 50.0, "augment": "paper", "mix": 0.0, "hold_out": 0.0, "keep_anchors": False},
+    },
 }
+AnyRecipe = TypeVar("AnyRecipe", bound=Recipe)
 
 
 def recipe(kind: type[AnyRecipe], name: str = "default", **changes: Any) -> AnyRecipe:
     """A named recipe of `Pretrain` or `Finetune`, some of its fields changed."""
-    known = RECIPES[kind]
-    check_name("recipe", name, known)
-    return kind(**(known[name]() | changes))
+    check_name("recipe", name, RECIPES[kind])
+    return kind(**(RECIPES[kind][name] | changes))

@@ -1,4 +1,8 @@
-"""What a recipe means: the objective, the source of samples, the initial weights, and the validation samples."""
+"""What a recipe means: the objective, the source of samples, the initial weights, and the validation samples.
+
+To train a further kind of network of `models.NETWORKS`: its sizes in `PRETRAINED`, its objective's settings in
+`objective_of`, its recipes in `recipes.RECIPES`.
+"""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -13,20 +17,19 @@ from torch import nn
 from lidarpose.data.shards import read_card
 from lidarpose.errors import InputError, check_name
 from lidarpose.io.files import file_error
-from lidarpose.models import weights_path
+from lidarpose.models import NETWORKS, weights_path
 from lidarpose.models.checkpoint import load_checkpoint
-from lidarpose.models.config import SIZES, NetworkConfig, preset
-from lidarpose.models.dapt.dapt_config import CONFIGS
+from lidarpose.models.config import SIZES, NetworkConfig
+from lidarpose.models.dapt.dapt_config import CONFIGS, DaptConfig
 from lidarpose.models.dapt.dapt_net import DaptNet
 from lidarpose.models.posenet import PoseNet, expand_weights
 from lidarpose.skeleton import HUMAN15, SMPL24, Skeleton, skeleton
 from lidarpose.train.augment import Augmentation, Example, augmentation, augmented
 from lidarpose.train.data_loader import MixedSource, Source, StoredSource, SyntheticSource
-from lidarpose.train.objectives.dapt_objective import DaptObjective, pretraining_config, small
+from lidarpose.train.objectives.dapt_objective import pretraining_config, small
 from lidarpose.train.objectives.dapt_transfer import transferred
 from lidarpose.train.objectives.objective import Objective
-from lidarpose.train.objectives.posenet_objective import PoseNetObjective
-from lidarpose.train.recipes import PAPER, SMALL_PAPER, Finetune, Pretrain
+from lidarpose.train.recipes import PAPER, SMALL_PAPER, Finetune, Pretrain, Recipe
 from lidarpose.train.run_dir import folder_names
 from lidarpose.train.torch_dataset import InMemoryDataset
 
@@ -40,12 +43,20 @@ _NO_VALIDATION = (
 _LEAST_SEQUENCES = 3
 
 
+# by size: the configuration of a network before fine-tuning, and the skeleton in which its people are drawn
+PRETRAINED: dict[str, tuple[Any, Skeleton]] = {
+    **{size: (config, SMPL24) for size, config in SIZES.items()},
+    PAPER: (pretraining_config(), HUMAN15),
+    SMALL_PAPER: (small(pretraining_config()), HUMAN15),
+}
+
+
 @dataclass(frozen=True, kw_only=True)
 class TrainSetup:
     """people: how many samples are seen in all; validation: makes those to validate on, once, none for no validation;
     joints: the skeleton to draw them in; card: what the checkpoint says besides the recipe; warnings: for the user."""
 
-    task: Objective
+    objective: Objective
     source: Source
     people: int
     network: Callable[[], nn.Module]
@@ -54,9 +65,26 @@ class TrainSetup:
     card: dict
     warnings: tuple[str, ...] = ()
 
+    @property
+    def task(self) -> Objective:
+        """The name of `objective` in 0.2."""
+        return self.objective
 
-# the name in 0.2
-Job = TrainSetup
+
+def Job(*, task: Objective, **settings: Any) -> TrainSetup:  # noqa: N802
+    """`TrainSetup` by its name in 0.2."""
+    return TrainSetup(objective=task, **settings)
+
+
+def objective_of(config: NetworkConfig | DaptConfig, recipe: Recipe, layout: str = "ragged") -> Objective:
+    """What a network of a configuration minimizes: its entry in `models.NETWORKS`, by its settings of a recipe.
+    layout: of the paper's tables."""
+    lengths = {"bone": recipe.bone, "symmetry": recipe.symmetry}
+    of_kind: dict[str, dict] = {"pose": lengths, "dapt": {"stage": recipe.kind, "layout": layout}}
+    settings = of_kind[config.kind]
+    if settings is not lengths and any(lengths.values()):
+        raise InputError("bone and symmetry are terms of the package's own networks: leave them at 0")
+    return NETWORKS[config.kind].part("objective")(config=config, **settings)
 
 
 def make_setup(recipe: Pretrain | Finetune, *, on_cpu: bool = True) -> TrainSetup:
@@ -67,20 +95,13 @@ def make_setup(recipe: Pretrain | Finetune, *, on_cpu: bool = True) -> TrainSetu
 
 
 def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
-    check_name("network size", recipe.size, (*SIZES, PAPER, SMALL_PAPER))
+    check_name("network size", recipe.size, PRETRAINED)
+    config, joints = PRETRAINED[recipe.size]
+    objective = objective_of(config, recipe, layout)
+    network: Callable[[], nn.Module] = objective.network
     card: dict = {"motion": None if recipe.motion is None else Path(recipe.motion).name}
-    task: Objective
-    if recipe.size in SIZES:
-        config = preset(recipe.size)
-        task = PoseNetObjective(config=config, bone=recipe.bone, symmetry=recipe.symmetry)
-        network: Callable[[], nn.Module] = task.network
-        if recipe.init:
-            network, card["init_card"] = _expanded(recipe.init, config)
-    else:
-        paper = pretraining_config()
-        task = DaptObjective(config=paper if recipe.size == PAPER else small(paper), stage="pretrain", layout=layout)
-        network = task.network
-
+    if recipe.init:
+        network, card["init_card"] = _expanded(recipe.init, config)
     names = ("scene", "motion", "subjects", "captured", "strays", "noise")
     synthetic: dict[str, Any] = {name: getattr(recipe, name) for name in names}
 
@@ -89,47 +110,41 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
         held_out = SyntheticSource(seed=_VALIDATION_SEED, refined=0.0, **synthetic)
         return [held_out.example(index) for index in range(VALIDATION)]
 
-    warnings: tuple[str, ...] = ()
-    source: Source
-    if recipe.shards:
-        _check_no_test(recipe.shards)
-        dataset = InMemoryDataset.load(recipe.shards)
-        source = StoredSource(
-            dataset=dataset,
-            seed=recipe.seed,
-            augmentation=Augmentation(turn=1.0, flip=0.5),
-            strays=recipe.strays,
-            noise=recipe.noise,
-        )
-        warnings = _damage(dataset)
-    else:
-        source = SyntheticSource(seed=recipe.seed, easy=recipe.easy * recipe.people, **synthetic)
-    return TrainSetup(
-        task=task,
-        source=source,
+    setup = TrainSetup(
+        objective=objective,
+        source=SyntheticSource(seed=recipe.seed, easy=recipe.easy * recipe.people, **synthetic),
         people=recipe.people,
         network=network,
         validation=validation,
-        joints=SMPL24 if recipe.size in SIZES else HUMAN15,
+        joints=joints,
         card=card,
-        warnings=warnings,
     )
+    if not recipe.shards:
+        return setup
+    for folder in recipe.shards:
+        _check_no_test(folder)
+    dataset = InMemoryDataset.load(recipe.shards)
+    turned = Augmentation(turn=1.0, flip=0.5)
+    noise = {"strays": recipe.strays, "noise": recipe.noise}
+    source = StoredSource(dataset=dataset, seed=recipe.seed, augmentation=turned, **noise)
+    return replace(setup, source=source, warnings=_damage(dataset))
 
 
-def _check_no_test(shards: tuple[str, ...]) -> None:
-    """Raises InputError for datasets of which a part is kept for testing: pre-training takes every sample."""
-    for folder in shards:
-        settings = read_card(folder).settings
-        if settings.get("split_by") and settings.get("split") != "train":
-            raise file_error(
-                folder,
-                f"has people for testing, by the split {settings['split_by']}, and pre-training takes everybody: "
-                "prepare it with --split train, or learn from it by lidarpose finetune",
-            )
+def _check_no_test(folder: str) -> None:
+    """Raises InputError for a dataset of which a part is kept for testing: pre-training takes every sample."""
+    settings = read_card(folder).settings
+    if settings.get("split_by") and settings.get("split") != "train":
+        raise file_error(
+            folder,
+            f"has people for testing, by the split {settings['split_by']}, and pre-training takes everybody: "
+            "prepare it with --split train, or learn from it by lidarpose finetune",
+        )
 
 
-def _expanded(init: str, config: NetworkConfig) -> tuple[Callable[[], nn.Module], dict]:
+def _expanded(init: str, config: NetworkConfig | DaptConfig) -> tuple[Callable[[], nn.Module], dict]:
     """What makes a network of this configuration that begins as the weights named, and their card."""
+    if not isinstance(config, NetworkConfig):
+        raise InputError("init is for the package's own networks: the paper's begins at random")
     path = weights_path(init)
     smaller, header = load_checkpoint(path)
     if not isinstance(smaller, PoseNet):
@@ -149,18 +164,18 @@ def _damage(dataset: InMemoryDataset) -> tuple[str, ...]:
 
 def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
     path = weights_path(recipe.init)
-    network, header = load_checkpoint(path)
+    trained, header = load_checkpoint(path)
     split = None if recipe.split == "all" else recipe.split
     kind = augmentation(recipe.augment)
     full = InMemoryDataset.load(recipe.data, split=split, interval=recipe.interval)
     held_out, watched = _held_out(recipe, split, full)
     dataset = full.without(held_out)
+    joints = skeleton(dataset.skeleton)
+    config, network = _finetuned(recipe, trained, joints, dataset.dataset)
     source: Source = StoredSource(dataset=dataset, seed=recipe.seed, augmentation=kind)
     if recipe.mix:
         synthetic = SyntheticSource(scene=recipe.scene, seed=recipe.seed)
         source = MixedSource(main=source, other=synthetic, share=recipe.mix)
-    joints = skeleton(dataset.skeleton)
-    task, initial = _initial(recipe, network, joints, dataset.dataset, layout)
 
     def validation() -> list[Example]:
         if watched is None:
@@ -171,11 +186,11 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
         return [augmented(watched.sample(k), quiet, np.random.default_rng([recipe.seed, k])) for k in rows]
 
     return TrainSetup(
-        task=task,
+        objective=objective_of(config, recipe, layout),
         source=source,
         # those that are mixed in come on top
         people=max(round(recipe.epochs * len(dataset) / (1 - recipe.mix)), 1),
-        network=initial,
+        network=network,
         validation=validation,
         joints=joints,
         card={
@@ -205,29 +220,25 @@ def _held_out(
     return full.sequences[-number:], full.without(full.sequences[:-number])
 
 
-def _initial(
-    recipe: Finetune, network: PoseNet | DaptNet, joints: Skeleton, dataset: str, layout: str
-) -> tuple[Objective, Callable[[], nn.Module]]:
-    """The objective, and what makes the network with the weights that it begins with."""
-    if isinstance(network, PoseNet):
+def _finetuned(
+    recipe: Finetune, trained: PoseNet | DaptNet, joints: Skeleton, dataset: str
+) -> tuple[NetworkConfig | DaptConfig, Callable[[], nn.Module]]:
+    """The configuration for a dataset's joints, and what makes the network with the weights that it begins with."""
+    if isinstance(trained, PoseNet):
         if not recipe.keep_anchors:
             raise InputError(
                 "keep_anchors=false is for the paper's network, and --init names one of the package's own: name a "
                 "checkpoint of pretrain --recipe paper, or leave --recipe paper and --keep-anchors away"
             )
-        return PoseNetObjective(config=network.config, bone=recipe.bone, symmetry=recipe.symmetry), lambda: network
-    recipe.check_no_lengths()
+        return trained.config, lambda: trained
     fitting = [c for c in CONFIGS.values() if c.bins and set(c.joints) == set(joints.joints)]
     if not fitting:
         raise InputError(f"the paper's network has no configuration for the joints of {joints.name}")
-    like, own = next((c for c in fitting if c.name == dataset), fitting[0]), network.config
+    like, own = next((c for c in fitting if c.name == dataset), fitting[0]), trained.config
     if recipe.keep_anchors and (own.joints, own.bins, own.ranges) == (like.joints, like.bins, like.ranges):
         # a network of this dataset already, as released ones are
-        return DaptObjective(config=own, stage="finetune", layout=layout), lambda: network
+        return own, lambda: trained
     # the paper fine-tunes by heatmaps alone
     heads: dict[str, Any] = {"parts": 0, "coordinates": False, "auxiliary": False}
     config = replace(own, name=like.name, joints=like.joints, bins=like.bins, ranges=like.ranges, **heads)
-    return (
-        DaptObjective(config=config, stage="finetune", layout=layout),
-        partial(transferred, network, config, keep_anchors=recipe.keep_anchors),
-    )
+    return config, partial(transferred, trained, config, keep_anchors=recipe.keep_anchors)
