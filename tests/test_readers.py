@@ -207,7 +207,8 @@ def test_lidarhuman26m_one_bad_file_costs_one_frame(tmp_path, smpl):
     files.write_ply(segment / "000007.ply", np.zeros((0, 3)))
     changed(8, lambda content: {k: v for k, v in content.items() if k != "beta"})
     shutil.copy(segment / "000009.ply", segment / "9.ply")
-    (segment / "notes.txt").write_text("mine")
+    for name in ("notes.ply", "000010.txt"):
+        (segment / name).write_text("mine")
     items, skipped = everything("lidarhuman26m", tmp_path, smpl)
     check(items, {key: joints for key, joints in truth.items() if key[1] > 9})
     assert reasons(skipped) == {
