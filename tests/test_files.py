@@ -5,6 +5,7 @@ import os
 import random
 import re
 import stat
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -13,7 +14,17 @@ from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
 from lidarpose.io import files
-from lidarpose.io.files import atomic_path, check_suffix, file_error, read_bytes, read_npz, write_atomic
+from lidarpose.io.files import (
+    LOCK,
+    atomic_path,
+    check_suffix,
+    file_error,
+    is_unused,
+    locked,
+    read_bytes,
+    read_npz,
+    write_atomic,
+)
 
 
 def tree(folder):
@@ -204,3 +215,37 @@ def test_messages_are_printable_lines():
     message = str(file_error("a\nb\x1b[31m\udcff.pcd", "one\r\ntwo\tthree\x00"))
     assert message.isprintable() and message.encode()
     assert message.startswith("a b") and "one two" in message
+
+
+def test_a_locked_folder_is_tidied_and_has_one_writer(tmp_path):
+    folder, left = tmp_path / "out", ".0123456789abcdef-a.json"
+    with locked(folder, r"a\.json", busy="somebody writes"):
+        assert is_unused(folder, r"a\.json")
+        with (
+            pytest.raises(InputError, match="out: somebody writes$"),
+            locked(folder, r"a\.json", busy="somebody writes"),
+        ):
+            pass
+    # made for nothing
+    assert not folder.exists()
+    (folder / "deep").mkdir(parents=True)
+    for name in (left, f"deep/{left}", ".0123456789abcdef-b.json", LOCK):
+        (folder / name).touch()
+    with locked(folder, r"a\.json", busy=""):
+        (folder / left).touch()
+    assert tree(folder) == [".0123456789abcdef-b.json", "deep"] and not is_unused(folder, r"a\.json")
+
+
+@pytest.mark.parametrize(
+    "error, message", [(NotImplementedError(), None), (PermissionError(13, "no"), "cannot write into")]
+)
+def test_a_file_system_without_locks_does_without(tmp_path, monkeypatch, error, message):
+    filelock = pytest.importorskip("filelock")
+    monkeypatch.setattr(filelock.FileLock, "acquire", mock.Mock(side_effect=error))
+    if message is None:
+        with locked(tmp_path / "out", "a", busy=""):
+            (tmp_path / "out" / "a").touch()
+        assert tree(tmp_path / "out") == ["a"]
+    else:
+        with pytest.raises(InputError, match=message), locked(tmp_path / "out", "a", busy=""):
+            pass
