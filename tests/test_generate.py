@@ -65,6 +65,8 @@ def test_a_scene_s_name_and_numpy_s_numbers_do():
             maker.person(seed, index)
     with pytest.raises(InputError, match="did you mean wild"):
         Generator(scene="wilt")
+    with pytest.raises(InputError, match="must name at least one sensor"):
+        replace(SCENES["wild"], sensors=())
 
 
 def test_difficulty_asked_for_leaves_the_others_alone():

@@ -30,13 +30,13 @@ def bodies():
 @pytest.fixture(scope="module")
 def drawn(bodies):
     """name -> (prop, its person's row), the people of the block asked a few times."""
-    found: dict[str, list] = {}
+    by_name: dict[str, list] = {}
     rng = np.random.default_rng(0)
     for _ in range(4):
         for row, kind in enumerate(bodies.kinds):
             for prop in draw_props(rng, kind=kind, joints=bodies.joints[row]):
-                found.setdefault(prop.name, []).append((prop, row))
-    return found
+                by_name.setdefault(prop.name, []).append((prop, row))
+    return by_name
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from reference.raycast_reference import (
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.lidar.presets import SENSORS, sensor
-from lidarpose.lidar.raycast import cast_ray_list, cast_rays, scan, scan_divergent
+from lidarpose.lidar.raycast import cast_ray_list, cast_rays, scan, scan_divergent, scan_pattern
 from lidarpose.lidar.raycast_kernels import raster
 from lidarpose.lidar.sensor import Sensor
 
@@ -242,6 +242,7 @@ def test_empty_input_gives_empty_output():
         assert np.isinf(cast_rays(*mesh, [0.0, 1.0], [0.0])[0]).all()
         assert cast_ray_list(*mesh, np.eye(3))[1].tolist() == [-1, -1, -1]
         assert len(scan(*mesh, sensor("vlp-16")).points) == 0
+        assert len(scan_pattern(*mesh, sensor("livox-avia"), 0).points) == 0
     assert cast_ray_list(vertices, faces, none)[0].shape == (0,)
 
 
