@@ -37,8 +37,8 @@ def scores(folder, *, method="mine", kind="waymo", protocol="clean", value=70.0,
 
 
 def test_published_figures_are_the_paper_s():
-    found = evaluation.published()
-    methods = {method["method"]: method["figures"] for method in found["methods"]}
+    published = evaluation.published()
+    methods = {method["method"]: method["figures"] for method in published["methods"]}
     assert list(methods) == ["LiDARCap", "NE", "LPFormer", "PRN", "DAPT"]
     assert methods["DAPT"] == {
         "waymo": {"mpjpe": 51.59, "pck3": 97.34, "pck5": 98.98},
@@ -47,8 +47,8 @@ def test_published_figures_are_the_paper_s():
         "sloper4d": {"mpjpe": 28.01, "pa_mpjpe": 21.52, "pck3": 99.30, "pck5": 99.87},
     }
     assert set(methods["NE"]) == set(methods["LiDARCap"]) == {"lidarhuman26m", "sloper4d"}
-    assert "not run here" in found["note"] and "Table 1" in found["source"]
-    assert all("oracle" in told["protocol"] for told in found["datasets"].values())
+    assert "not run here" in published["note"] and "Table 1" in published["source"]
+    assert all("oracle" in about["protocol"] for about in published["datasets"].values())
 
 
 def test_without_scores_there_is_no_figure_of_ours():
@@ -72,10 +72,8 @@ def test_protocols_stand_in_blocks_of_their_own(tmp_path):
     note = next(line for line in text.splitlines() if line.startswith(mark + " "))
     words = "protocol clean", "center: somewhere", "crop: so", "split: val (a list)", "9 people", "2 joints", "abababab"
     assert all(word in note for word in (*words, "2 without a pose")) and "which leaks: much" in text
-
-
-def test_a_limit_is_in_the_note_and_other_sets_stand_apart(tmp_path):
-    text = evaluation.table([scores(tmp_path / "a", kind="bench", dataset="lidarpose-bench-1", limit=9)])
+    # other sets stand apart
+    text = evaluation.table([scores(tmp_path / "c", kind="bench", dataset="lidarpose-bench-1", limit=9)])
     assert "9 people, evenly picked from 200" in text
     assert "**Evaluated here on sets that the paper does not have.**" in text and "| baseline: nobody | 300.00" in text
 
@@ -91,10 +89,10 @@ def test_two_weights_of_one_name_are_two_rows(tmp_path):
 
 
 def test_json_holds_both(tmp_path):
-    found = json.loads(evaluation.table([scores(tmp_path / "a")], format="json"))
-    assert found["published"] == evaluation.published()
-    assert [entry["row"] for entry in found["evaluated"]] == ["mine", "mine, released arithmetic", "floor: nobody"]
-    first = found["evaluated"][0]
+    content = json.loads(evaluation.table([scores(tmp_path / "a")], format="json"))
+    assert content["published"] == evaluation.published()
+    assert [entry["row"] for entry in content["evaluated"]] == ["mine", "mine, released arithmetic", "floor: nobody"]
+    first = content["evaluated"][0]
     assert first["figures"] == {"mpjpe": 70.0, "pa_mpjpe": None, "pck3": None, "pck5": None}
     assert first["protocol"] == "clean" and first["weights"] == "ab" * 32
 
@@ -104,7 +102,7 @@ def test_json_holds_both(tmp_path):
 
 def run(*arguments):
     try:
-        return main([str(argument) for argument in arguments])
+        return main(list(arguments))
     except SystemExit as done:
         return done.code
 

@@ -16,6 +16,8 @@ from lidarpose.errors import InputError
 from lidarpose.io.files import file_error, listed, read_bytes
 
 SCHEMA = "lidarpose.scores/1"
+# keys of scores.json beside its results, and their types
+_HEAD: dict[str, Any] = {"version": str, "command": str, "seed": int, "weights": dict}
 FILE = "scores.json"
 # whose arithmetic: this package's, or the paper's released code's, see docs/evaluate.md
 OURS, RELEASED = "lidarpose", "released"
@@ -126,8 +128,8 @@ class Scores:
 
     def to_json(self) -> str:
         """One line of text a row."""
-        head = {"schema": SCHEMA, "version": self.version, "command": self.command, "seed": self.seed}
-        head |= {"unit": {"mm": "millimetres", "%": "percent"}, "weights": self.weights}
+        head = {"schema": SCHEMA, "unit": {"mm": "millimetres", "%": "percent"}}
+        head |= {name: getattr(self, name) for name in _HEAD}
         results = []
         for result in self.results:
             parts = {"setting": asdict(result.setting), "counts": result.counts, "skipped": result.skipped}
@@ -154,18 +156,11 @@ def read_scores(path: str | PathLike) -> Scores:
     data = read_bytes(path, expected=f"{FILE} of lidarpose evaluate")
     try:
         content = json.loads(data)
-        if content["schema"] == SCHEMA:
-            weights = dict(content["weights"])
-            if not isinstance(weights.get("digest") or "", str):
+        if (schema := content["schema"]) == SCHEMA:
+            head = {name: kind(content[name]) for name, kind in _HEAD.items()}
+            if not isinstance(head["weights"].get("digest") or "", str):
                 raise TypeError("the digest of the weights is no text")
-            return Scores(
-                weights=weights,
-                command=str(content["command"]),
-                seed=int(content["seed"]),
-                results=tuple(map(_result, content["results"])),
-                version=str(content["version"]),
-            )
-        schema = content["schema"]
+            return Scores(**head, results=tuple(map(_result, content["results"])))
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         problem = f"{error} is missing" if isinstance(error, KeyError) else error
         raise file_error(path, f"is no {FILE} of lidarpose evaluate ({problem})") from None
