@@ -150,7 +150,6 @@ class EvalSetup:
     dataset: EvalDataset
     setting: Setting
     joints: Skeleton
-    sensor_unknown: bool
 
     def crop(self, person: EvalSample) -> tuple[np.ndarray, Box | None]:
         """The points that the protocol lets the network see, and the box they are cut out by: of the released code in
@@ -183,9 +182,9 @@ class EvalSetup:
         """What is known of people as the protocol shows them, and what the network answers."""
         answers: list[dict] = [{} for _ in samples]
         answer = self._predict_clean if self.setting.protocol == "clean" else self._predict_dapt
-        for known in (True, False):
-            origin = np.zeros(3) if known else None
-            rows = [k for k, s in enumerate(samples) if (s.sample.sensor_known and not self.sensor_unknown) == known]
+        known = [person.sample.sensor_known and self.setting.sensor == "known" for person in samples]
+        for origin in (np.zeros(3), None):
+            rows = [k for k, is_known in enumerate(known) if is_known == (origin is not None)]
             for k, values in zip(rows, answer([samples[k] for k in rows], origin) if rows else (), strict=True):
                 answers[k] = self._known(samples[k]) | values
         return stack(self.joints, answers)
@@ -275,8 +274,7 @@ def eval_setup(
         crop=DAPT[dataset.kind].crop if protocol == "dapt" else _CLEAN_CROPS.get(dataset.kind, _UNBOXED),
         **{name: getattr(dataset, name) for name in fields},
     )
-    joints = _subset(wanted, shared)
-    return EvalSetup(model=model, dataset=dataset, setting=setting, joints=joints, sensor_unknown=sensor_unknown)
+    return EvalSetup(model=model, dataset=dataset, setting=setting, joints=_subset(wanted, shared))
 
 
 def _subset(of: Skeleton, joints: Sequence[str]) -> Skeleton:
