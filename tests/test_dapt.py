@@ -172,13 +172,12 @@ def test_batch_mates_do_not_matter(config, n):
 @pytest.mark.parametrize("n", [60, 900])
 def test_the_order_of_points_does_not_matter(n):
     # some voxels have several points
-    net, one = network(), person(n, size=0.05 if n < 100 else 0.2)
+    net, cloud = network(), person(n, size=0.05 if n < 100 else 0.2)
     order = np.random.default_rng(0).permutation(n)
-    straight, shuffled = net.outputs([one]), net.outputs([one[order]])
-    for name in ("point_feat_last", "parts"):
-        straight[name] = straight[name][order]
-    assert_outputs(straight, shuffled)
-    assert build_tables([one], net.config).features.shape[0] < n
+    straight = net.outputs([cloud])
+    per_point = {name: straight[name][order] for name in ("point_feat_last", "parts")}
+    assert_outputs(straight | per_point, net.outputs([cloud[order]]))
+    assert build_tables([cloud], net.config).features.shape[0] < n
 
 
 def test_the_form_of_the_input_does_not_matter(released):
@@ -439,31 +438,25 @@ def test_convolution_equals_a_dense_one(kernel, layout):
 
 @pytest.mark.parametrize("legacy", [False, True])
 def test_a_large_cloud_is_cut_into_patches(legacy):
-    config = replace(TINY, legacy=legacy)
-    cloud = person(3400, size=0.3)
-    net = network(config)
+    config, cloud = replace(TINY, legacy=legacy), person(3400, size=0.3)
     tables = build_tables([cloud, person(40, 1)], config)
     level = tables.levels[0]
     assert level.lengths[0] > 3000 and level.sequence.shape[0] == 4
     whole = [512] * (level.lengths[0] // 512)
     assert level.patch_lengths.tolist() == [*whole, level.lengths[0] % 512, level.lengths[1]]
-    ends = np.cumsum(level.patch_lengths)[:-1]
     for sequence in level.sequence:
         assert sorted(sequence) == list(range(len(sequence)))
+        patches = np.split(sequence, np.cumsum(level.patch_lengths)[:-1])
         # patches are compact, and nobody's points are lent to somebody else
-        for rows in np.split(sequence, ends):
-            assert len(set(rows < level.lengths[0])) == 1
-        spread = np.mean([tables.features[rows].std(0).mean() for rows in np.split(sequence, ends)[:-1]])
+        assert all(len(set(rows < level.lengths[0])) == 1 for rows in patches)
+        spread = np.mean([tables.features[rows].std(0).mean() for rows in patches[:-1]])
         assert spread < 0.8 * tables.features[: level.lengths[0]].std(0).mean()
     assert len({tuple(sequence) for sequence in level.sequence}) == 4
 
-    out = net.outputs([cloud])
-    assert_outputs(out, net.outputs([cloud]), atol=0)
-    assert_outputs(
-        out,
-        net.outputs([np.random.default_rng(1).permutation(cloud)])
-        | {name: out[name] for name in ("point_feat_last", "parts")},
-    )
+    net = network(config)
+    out, order = net.outputs([cloud]), np.random.default_rng(1).permutation(3400)
+    per_point = {name: out[name][order] for name in ("point_feat_last", "parts")}
+    assert_outputs(out | per_point, net.outputs([cloud[order]]))
     whole = network(replace(config, patch=4096)).outputs([cloud])
     assert np.abs(whole["point_feat_last"] - out["point_feat_last"]).max() > 1e-3
 

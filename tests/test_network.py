@@ -233,22 +233,6 @@ def test_attention_sees_distances_not_places():
     torch.testing.assert_close(product(here, here), (query * key).sum(-1), atol=1e-5, rtol=1e-5)
 
 
-def test_dense_voxels_weigh_as_points():
-    """At density 1 a voxel of many points counts as that many voxels of one."""
-    torch.manual_seed(0)
-    layer = CrossAttention(8, 2, 8)
-    with torch.no_grad():
-        layer.density.fill_(1.0)
-    anchors, voxels, position = torch.randn(1, 3, 8), torch.randn(1, 2, 8), torch.randn(1, 2, 3)
-    believed = RotaryEmbedding(torch.zeros(1, 3, 3))
-    count = torch.tensor([[3.0, 1.0]])
-    four = torch.tensor([0, 0, 0, 1])
-    no_bias = torch.zeros(1, 1, 1, 1)
-    merged = layer(anchors, believed, voxels, RotaryEmbedding(position), count.log(), no_bias)
-    apart = layer(anchors, believed, voxels[:, four], RotaryEmbedding(position[:, four]), torch.zeros(1, 4), no_bias)
-    torch.testing.assert_close(merged, apart, atol=1e-6, rtol=1e-5)
-
-
 def test_an_anchor_reads_the_mean_of_the_voxels_values():
     """The twin: one query, one head and one voxel at a time."""
     torch.manual_seed(0)
@@ -257,7 +241,7 @@ def test_an_anchor_reads_the_mean_of_the_voxels_values():
     voxels, position, count = torch.randn(1, 4, 5), torch.randn(1, 4, 3), torch.tensor([[1.0, 5.0, 2.0, 9.0]])
     valid = torch.tensor([[True, True, True, False]])
     places, bias = RotaryEmbedding(position), key_bias(valid, torch.float32)
-    found = layer(anchors, RotaryEmbedding(believed), voxels, places, count.log(), bias)
+    read = layer(anchors, RotaryEmbedding(believed), voxels, places, count.log(), bias)
     for j in range(3):
         mixed = []
         for h in range(2):
@@ -272,7 +256,7 @@ def test_an_anchor_reads_the_mean_of_the_voxels_values():
                 score.append(rotated[0] @ rotated[1] / 7**0.5 + layer.density[h] * count[0, n].log())
             weight = torch.stack(score).softmax(0)
             mixed.append(sum(w * layer.value(voxels[0, n])[channels] for n, w in enumerate(weight)))
-        torch.testing.assert_close(found[0, j], layer.out(torch.cat(mixed)), atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(read[0, j], layer.out(torch.cat(mixed)), atol=1e-5, rtol=1e-4)
 
 
 def test_a_vote_is_what_each_voxel_says():
@@ -338,18 +322,17 @@ def people(count=12):
 def test_points_and_joints_move_together():
     kinds = set()
     for k, known in enumerate(people()):
-        shown = example(known.sample, np.random.default_rng(k))
+        shown, sample = example(known.sample, np.random.default_rng(k)), known.sample
         # between a joint and a point lies what lies between them in the sensor's frame
-        np.testing.assert_allclose(
-            shown.points[0] - shown.joints, known.sample.points[0] - known.sample.pose.joints, atol=1e-5
-        )
-        np.testing.assert_array_equal(shown.part, known.sample.part)
+        offsets = sample.points[0] - sample.pose.joints
+        np.testing.assert_allclose(shown.points[0] - shown.joints, offsets, atol=1e-5)
+        np.testing.assert_array_equal(shown.part, sample.part)
         assert np.abs(np.median(shown.points, axis=0)).max() < 1.0
         kinds.add(bool(shown.view[4]))
         if shown.view[4]:
             # the person's frame has the sensor's axes, and the view leads back to the sensor
             sensor = shown.view[:3] * np.exp(shown.view[3])
-            np.testing.assert_allclose(shown.joints - sensor, known.sample.pose.joints, atol=1e-3)
+            np.testing.assert_allclose(shown.joints - sensor, sample.pose.joints, atol=1e-3)
         else:
             assert not shown.view.any()
     assert kinds == {True, False}

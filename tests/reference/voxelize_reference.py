@@ -1,4 +1,4 @@
-"""Slow twin of `plan.plan`: dictionaries of voxels, one person and one point after the other."""
+"""Slow twin of `voxelize`: dictionaries of voxels, one person and one point after the other."""
 
 from collections import defaultdict
 
@@ -19,7 +19,7 @@ def voxelize_reference(
     seeds: np.ndarray | None = None,
     neighbors: bool = False,
 ) -> VoxelPyramid:
-    """The same arguments and result as `plan.plan`; with `seeds` it draws the same numbers."""
+    """The same arguments and result as `voxelize`; with `seeds` it draws the same numbers."""
     fine, mid, coarse = [], [], []
     start = 0
     for b, length in enumerate(lengths):

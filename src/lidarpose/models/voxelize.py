@@ -60,7 +60,7 @@ class VoxelPyramid:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What a network reads, by dotted name ("fine.position"): all but `point_voxel`."""
-        arrays = {}
+        arrays: dict[str, np.ndarray] = {}
         for name in ("fine", "mid", "coarse"):
             level = getattr(self, name)
             arrays |= {f"{name}.{f.name}": getattr(level, f.name) for f in fields(VoxelLevel)}
@@ -179,25 +179,28 @@ def _levels(
     key: np.ndarray, mean: np.ndarray, count: np.ndarray, people: int, neighbors: bool
 ) -> tuple[list[VoxelLevel], _Slots]:
     """The three levels over fine voxels of sorted keys (V,), and where the fine ones lie."""
-    levels, fine = [], _Slots(key >> (3 * _BITS), people)
-    own, total = fine, mean * count[:, None]
+    levels: list[VoxelLevel] = []
+    fine = own = _Slots(key >> (3 * _BITS), people)
+    total = mean * count[:, None]
     for level in range(3):
-        last = level == 2
-        # where it has a parent, and where it stands among its person's
-        x, y, z = _axes(key)
-        wider, parent = np.unique(_key(key >> (3 * _BITS), x >> 1, y >> 1, z >> 1), return_inverse=True)
-        above = _Slots(wider >> (3 * _BITS), people)
+        parent = slot_of_parent = np.zeros(len(key), np.int64)
+        if level < 2:
+            x, y, z = _axes(key)
+            wider, parent = np.unique(_key(key >> (3 * _BITS), x >> 1, y >> 1, z >> 1), return_inverse=True)
+            above = _Slots(wider >> (3 * _BITS), people)
+            slot_of_parent = above.slot[parent]
         levels.append(
             VoxelLevel(
-                position=own.pad(mean.astype(np.float32)),
+                position=own.pad((total / count[:, None] if level else mean).astype(np.float32)),
                 log_count=own.pad(np.log(count).astype(np.float32)),
                 valid=own.pad(np.ones(len(key), bool)),
-                parent=own.pad(np.zeros_like(parent) if last else above.slot[parent]),
+                parent=own.pad(slot_of_parent),
                 neighbors=own.pad(_neighbors(key, own), own.shape[1]) if neighbors and level else None,
             )
         )
-        total, count = _segment_sum(parent, total, len(wider)), np.bincount(parent, count, len(wider))
-        key, own, mean = wider, above, total / count[:, None]
+        if level < 2:
+            total, count = _segment_sum(parent, total, len(wider)), np.bincount(parent, count, len(wider))
+            key, own = wider, above
     return levels, fine
 
 

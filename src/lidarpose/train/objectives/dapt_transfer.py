@@ -1,13 +1,9 @@
 """From the pre-trained network to the one to be fine-tuned. Strict: what is to be kept must fit, tensor by tensor."""
 
-import os
-
 import torch
 from torch import Tensor
 
 from lidarpose.errors import InputError
-from lidarpose.io.files import file_error
-from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.dapt.dapt_config import DaptConfig
 from lidarpose.models.dapt.dapt_net import DaptNet
 
@@ -16,35 +12,23 @@ _ANCHORS = "keypoint_embedding"
 _MEANING = ("legacy", "grid", "strides", "encoder_heads", "decoder_heads", "anchor_heads")
 
 
-def transferred(source: DaptNet | str | os.PathLike, config: DaptConfig, *, keep_anchors: bool = False) -> DaptNet:
-    """A network of `config` that begins with the backbone of the pre-trained one, in training mode.
+def transferred(source: DaptNet, config: DaptConfig, *, keep_anchors: bool = False) -> DaptNet:
+    """A network of `config` that begins with the backbone of the pre-trained one, in training mode; `source` stays.
 
-    source: the network, which stays as it is, or the path of its checkpoint. Anchors and heads are new, drawn from
-    torch's global generator, as in the released code. With `keep_anchors` anchors go on by joint name, as does the
-    auxiliary head, and every other head that both have, the last layer of a heatmap's only where its bins and range are
-    the same; those of new joints are new. Raises InputError, one line, for a file that holds no such network and for
-    the first setting or tensor of the backbone that does not fit.
+    Anchors and heads are new, drawn from torch's global generator, as in the released code. With `keep_anchors` anchors
+    go on by joint name, as does the auxiliary head, and every other head that both have, the last layer of a heatmap's
+    only where its bins and range are the same; those of new joints are new. Raises InputError, one line, for the first
+    setting or tensor of the backbone that does not fit.
     """
-    # before anything else draws
     network = DaptNet(config)
-    if isinstance(source, DaptNet):
-        kept, trained = _backbone(source, network), source
-    else:
-        stored, _ = load_checkpoint(source)
-        if not isinstance(stored, DaptNet):
-            kind = type(stored).__name__
-            raise file_error(source, f"expected the paper's network, got {kind}: name one pre-trained as such")
-        try:
-            kept, trained = _backbone(stored, network), stored
-        except InputError as error:
-            raise file_error(source, error) from None
     wanted = network.state_dict()
+    state = wanted | _backbone(source, network)
     if keep_anchors:
         # the backbones fit, so the widths of their anchors do
         name = f"backbone.{_ANCHORS}"
-        kept[name] = _by_joint(trained.state_dict()[name], wanted[name], trained.config.joints, config.joints)
-        kept |= _heads(trained, network)
-    network.load_state_dict(wanted | kept)
+        state[name] = _by_joint(source.state_dict()[name], wanted[name], source.config.joints, config.joints)
+        state |= _heads(source, network)
+    network.load_state_dict(state)
     return network
 
 
@@ -72,37 +56,33 @@ def _backbone(trained: DaptNet, network: DaptNet) -> dict[str, Tensor]:
 def _heads(trained: DaptNet, network: DaptNet) -> dict[str, Tensor]:
     """Tensors of the heads that both networks have, by what they do: the coordinate head has two names."""
     old, new = trained.config, network.config
-    kept: dict[str, Tensor] = {}
+    stored, wanted = trained.state_dict(), network.state_dict()
+    # modules whose tensors go on, by their old names and by their new ones
+    modules = {}
     if old.coordinates and new.coordinates:
-        names = ["heads.coordinate" if config.bins else "heads.query" for config in (old, new)]
-        kept |= _alike(trained, network, *names)
+        before, after = ("heads.coordinate." if config.bins else "heads.query." for config in (old, new))
+        modules[before] = after
     if old.parts and new.parts:
-        kept |= _alike(trained, network, "heads.feat", "heads.feat")
+        modules["heads.feat."] = "heads.feat."
     if old.bins and new.bins:
         for k in range(3):
-            fc = f"heads.query.fcs.{k}"
-            same = old.bins[k] == new.bins[k] and old.ranges[k] == new.ranges[k]
             # bins of another place or width mean something else
-            kept |= {name: v for name, v in _alike(trained, network, fc, fc).items() if same or ".fc2." not in name}
+            same = old.bins[k] == new.bins[k] and old.ranges[k] == new.ranges[k]
+            fc = f"heads.query.fcs.{k}." if same else f"heads.query.fcs.{k}.fc1."
+            modules[fc] = fc
+    heads: dict[str, Tensor] = {}
     if old.auxiliary and new.auxiliary:
-        stored, wanted = trained.state_dict(), network.state_dict()
-        kept |= _alike(trained, network, "heads.inter_feat.fc.fc1", "heads.inter_feat.fc.fc1")
+        modules["heads.inter_feat.fc.fc1."] = "heads.inter_feat.fc.fc1."
         for name in ("heads.inter_feat.fc.fc2.weight", "heads.inter_feat.fc.fc2.bias"):
             # three rows a joint
-            before, after = (state[name].unflatten(0, (-1, 3)) for state in (stored, wanted))
-            kept[name] = _by_joint(before, after, old.joints, new.joints).flatten(0, 1)
-    return kept
-
-
-def _alike(trained: DaptNet, network: DaptNet, before: str, after: str) -> dict[str, Tensor]:
-    """Tensors under `before` by their names under `after`, where they have the same shape."""
-    stored, wanted = trained.state_dict(), network.state_dict()
-    names = {name: after + name.removeprefix(before) for name in stored if name.startswith(f"{before}.")}
-    return {
-        ours: stored[name]
-        for name, ours in names.items()
-        if ours in wanted and stored[name].shape == wanted[ours].shape
-    }
+            ours, fresh = (state[name].unflatten(0, (-1, 3)) for state in (stored, wanted))
+            heads[name] = _by_joint(ours, fresh, old.joints, new.joints).flatten(0, 1)
+    for name, value in stored.items():
+        for before, after in modules.items():
+            new_name = after + name.removeprefix(before)
+            if name.startswith(before) and new_name in wanted and value.shape == wanted[new_name].shape:
+                heads[new_name] = value
+    return heads
 
 
 def _by_joint(before: Tensor, after: Tensor, had: tuple[str, ...], has: tuple[str, ...]) -> Tensor:
