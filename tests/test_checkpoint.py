@@ -148,23 +148,23 @@ def test_a_file_without_a_digest_loads_with_a_note(stored, tmp_path):
     assert all(torch.equal(value, same.state_dict()[name]) for name, value in network.state_dict().items())
 
 
-def test_a_file_may_be_cut_off_once_it_is_read(stored, tmp_path):
+def test_a_file_may_be_cut_off_once_it_is_read(network, stored, tmp_path):
     """A mapped file would end the process."""
     path = tmp_path / "x.safetensors"
     path.write_bytes(stored.read_bytes())
     file = SafetensorsFile.open(path)
     path.write_bytes(b"")
-    network = PoseNet(preset("tiny"))
-    loaded = file.load(network.state_dict())
-    assert file.check_digest() and all(torch.isfinite(value).all() for value in loaded.values())
+    assert file.check_digest()
+    assert all(
+        torch.equal(value, network.state_dict()[name]) for name, value in file.load(network.state_dict()).items()
+    )
 
 
 def test_somebody_else_s_safetensors(tmp_path):
     path = tmp_path / "foreign.safetensors"
-    save_file({"weight": torch.zeros(3)}, path)
-    assert_one_line(path, "not a checkpoint of lidarpose")
-    save_file({"weight": torch.zeros(3)}, path, metadata={"format": "pt"})
-    assert_one_line(path, "not a checkpoint of lidarpose")
+    for metadata in (None, {"format": "pt"}):
+        save_file({"weight": torch.zeros(3)}, path, metadata=metadata)
+        assert_one_line(path, "not a checkpoint of lidarpose")
 
 
 def rewritten(stored, path, *, tensors=dict, header=lambda entry: entry, config=None):
