@@ -14,11 +14,12 @@ from types import SimpleNamespace
 import numpy as np
 import pandas
 import pytest
+from hostile_files import CALIBRATION, KITTI
 from safetensors.numpy import save_file
 
-from lidarpose.cli import demo, main
+from lidarpose.cli import demo, main, weights
 from lidarpose.errors import InputError
-from lidarpose.inference import info, predictor
+from lidarpose.inference import predictor
 from lidarpose.models import BUNDLED, DEFAULT, bundled_path
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
@@ -189,10 +190,10 @@ def test_info(capsys):
 def test_info_counts_the_people_of_all_runs(monkeypatch):
     before = {"people_seen": 1_000, "hours": 1.25}
     header = SimpleNamespace(card={"people_seen": 500, "hours": 0.5, "init_card": before})
-    monkeypatch.setattr(info, "read_header", lambda path: header)
-    assert "           500 people, 0.50 hours; with the runs before it 1,500 people, 1.75 hours" in info.lines()
+    monkeypatch.setattr("lidarpose.models.checkpoint.read_header", lambda path: header)
+    assert "           500 people, 0.50 hours; with the runs before it 1,500 people, 1.75 hours" in weights.info_lines()
     header.card = before
-    assert "           1,000 people, 1.25 hours" in info.lines()
+    assert "           1,000 people, 1.25 hours" in weights.info_lines()
 
 
 def test_backends_decoders_and_tta(crop, capsys):
@@ -248,6 +249,16 @@ def test_released_weights_are_imported_and_predict(crop, tmp_path, monkeypatch, 
     assert run("import", "mine.safetensors", "again.safetensors", "--config", "waymo") == 2
     assert "tensor " in one_line(capsys)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["crop.npy", "crop.poses.json", "mine.safetensors"]
+
+
+def test_a_calibration_of_boxes_may_lie_anywhere(crop, tmp_path, out, capsys):
+    label, calib = write(tmp_path / "label.txt", KITTI), write(tmp_path / "mine.txt", CALIBRATION)
+    assert run("predict", crop, "--boxes", label, "--out", out) == 2
+    assert "expected its calibration at" in one_line(capsys)
+    assert run("predict", crop, "--boxes", label, "--calib", calib, "--out", out) == 0
+    (person,) = json.loads((out / "crop.poses.json").read_text())["people"]
+    # 8.41 m ahead of the camera is so far along the LiDAR's x
+    assert person["box"]["center"][0] == pytest.approx(8.41)
 
 
 # ---- what is wrong
@@ -319,7 +330,7 @@ def test_absurd_coordinates_are_one_line(crop, points, boxes, tmp_path, out, cap
     np.save(tmp_path / "far.npy", np.resize([scale, -scale], (10, 3)))
     assert run("predict", tmp_path / "far.npy", *flags, "--out", out) == 2
     line = one_line(capsys)
-    assert "expected points in metres, got none within 1e+09 m" in line and len(line) < 300
+    assert "expected points in meters, got none within 1e+09 m" in line and len(line) < 300
     # among good ones they are dropped
     np.save(tmp_path / "some.npy", np.concatenate([points, np.full((3, 3), scale)]))
     assert run("predict", tmp_path / "some.npy", *flags, "--out", out) == 0
@@ -367,7 +378,7 @@ BAD_COMMANDS = {
     "boxes missing": ("predict CROP --boxes DIR/no.json", "no.json: no such file"),
     "boxes a folder": ("predict CROP --boxes DIR", "got a folder"),
     "both": ("predict CROP --crop --boxes BOXES", "got both"),
-    "up": ("predict CROP --up w", "z, y, x"),
+    "up": ("predict CROP --up w", "expected z, y, x, -z, -y, -x or a direction x,y,z, got 'w'"),
     "up direction": ("predict CROP --up -1,0", "expected z, y, x, -z, -y, -x or a direction x,y,z, got '-1,0'"),
     "up that points down": ("predict DIR/crob.npy --up -y", "did you mean crop.npy"),
     "up of no length": ("predict CROP --up 0,0,0", "or a direction x,y,z, got '0,0,0'"),

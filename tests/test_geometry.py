@@ -114,9 +114,7 @@ def test_up_axes_known_and_unknown():
     np.testing.assert_array_equal(rotation_from_up("z"), np.eye(3))
     # a camera looks along z, its x to the right and its y down
     np.testing.assert_array_equal(rotation_from_up("-y"), np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
-    with pytest.raises(InputError, match="unknown up axis 'Z'"):
-        rotation_from_up("Z")
-    for wrong in (None, 3, (1, 2), (0, 0, 0), (0, np.nan, 1), "1,2", "a,b,c", ["x", "y", "z"]):
+    for wrong in ("Z", None, 3, (1, 2), (0, 0, 0), (0, np.nan, 1), "1,2", "a,b,c", ["x", "y", "z"]):
         with pytest.raises(InputError, match="a direction x,y,z, got"):
             rotation_from_up(wrong)
 

@@ -16,15 +16,12 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about
 from lidarpose.inference import inputs as people_module
 from lidarpose.inference.backend import Raw
-from lidarpose.inference.checks import rows_inside
+from lidarpose.inference.checks import flat_axis, lies, rows_inside, unit_warning
 from lidarpose.inference.inputs import (
     MAX_POINTS,
     as_origin,
     candidates,
     clean,
-    flat_axis,
-    lies,
-    unit_warning,
 )
 from lidarpose.inference.predictor import Predictor
 from lidarpose.io.boxes import read_boxes
@@ -187,7 +184,7 @@ def test_no_returns_are_no_points(model, points, tmp_path):
     np.testing.assert_array_equal(pose.points, points)
     assert model.predict(empty).joints is None
     np.save(tmp_path / "empty.npy", empty)
-    with pytest.raises(InputError, match="expected points in metres, got only 0,0,0"):
+    with pytest.raises(InputError, match="expected points in meters, got only 0,0,0"):
         lidarpose.predict(tmp_path / "empty.npy", model=model)
     # one may be a point of a cloud that is about its middle
     alone, notes = clean(np.concatenate([empty[:1], points - points.mean(0)]))
@@ -304,9 +301,9 @@ def test_map_coordinates_cost_no_accuracy(model, points):
 @pytest.mark.parametrize(
     "size, unit",
     [
-        *((np.array([0.5, 0.6, tall]) * 1000, "millimetres") for tall in (0.9, 1.75)),
-        *((np.array([0.5, 0.6, tall]) * 100, "centimetres") for tall in (0.9, 1.75)),
-        *((np.array([0.5, 0.6, tall]) * 0.001, "kilometres") for tall in (0.9, 1.75)),
+        *((np.array([0.5, 0.6, tall]) * 1000, "millimeters") for tall in (0.9, 1.75)),
+        *((np.array([0.5, 0.6, tall]) * 100, "centimeters") for tall in (0.9, 1.75)),
+        *((np.array([0.5, 0.6, tall]) * 0.001, "kilometers") for tall in (0.9, 1.75)),
         *((np.array([0.5, 0.6, tall]) * factor, None) for tall in (0.9, 1.75) for factor in (1, 1.3)),
         # flat or wide
         *((np.array(size), None) for size in ([0.4, 0.3, 0.0], [150.0, 200.0, 33.0], [0.0, 0, 0])),
@@ -319,7 +316,7 @@ def test_units_are_named(size, unit):
 
 def test_a_wrong_sensor_origin_is_one_line(model, points):
     for given in (5, "1,2", "1,2,x", (1, 2, np.nan), "", [1, 2, 3, 4], "nowhere", object(), np.eye(3)):
-        with pytest.raises(InputError, match="sensor origin: expected x,y,z in metres or unknown") as raised:
+        with pytest.raises(InputError, match="sensor origin: expected x,y,z in meters or unknown") as raised:
             model.predict(points, sensor_origin=given)
         assert "\n" not in str(raised.value)
 
@@ -453,7 +450,7 @@ def scaled(box, center, size):
     "scale, change, words, alone",
     [
         (1, lambda box: scaled(box, 1000, 1), "no box holds 5 points: expected", False),
-        (1000, lambda box: scaled(box, 1000, 1000), "a person's box .* millimetres", False),
+        (1000, lambda box: scaled(box, 1000, 1000), "a person's box .* millimeters", False),
         (1, lambda box: {**box, "size": box["size"][::-1]}, "m\\): size is length, width, height", True),
         (
             1,
@@ -462,7 +459,7 @@ def scaled(box, center, size):
             True,
         ),
     ],
-    ids=["elsewhere", "millimetres", "height first", "feet"],
+    ids=["elsewhere", "millimeters", "height first", "feet"],
 )
 def test_boxes_in_another_unit_or_convention_are_warned_about(model, sweep, tmp_path, scale, change, words, alone):
     _, clouds, boxes = sweep
@@ -510,10 +507,10 @@ def test_the_size_of_a_file_decides_without_flags(model, sweep, tmp_path, points
 
 def test_a_crop_in_other_units_is_told_by_name(model, tmp_path, points):
     np.save(tmp_path / "mm.npy", points * 1000)
-    with pytest.raises(InputError, match="millimetres"):
+    with pytest.raises(InputError, match="millimeters"):
         lidarpose.predict(tmp_path / "mm.npy", model=model)
     people = lidarpose.predict(tmp_path / "mm.npy", crop=True, model=model)
-    assert any("millimetres" in warning for warning in people[0].warnings)
+    assert any("millimeters" in warning for warning in people[0].warnings)
 
 
 TILTED = axis_angle_to_matrix([0.0, np.radians(20), 0.0])
@@ -731,12 +728,12 @@ def test_boxes_of_points_in_memory_and_of_a_file_give_the_same(model, points, tm
     np.testing.assert_array_equal(of_points.to_numpy(), of_file.to_numpy())
 
 
-def test_one_box_in_centimetres_among_boxes_in_metres_is_noticed(model, points):
-    metres = {"center": points.mean(0).tolist(), "size": [1.5, 1.5, 2.2]}
-    wrong = metres | {"size": [60, 60, 180], "id": "c"}
-    warnings = model.predict(points, boxes=[metres, wrong, metres]).warnings
+def test_one_box_in_centimeters_among_boxes_in_metres_is_noticed(model, points):
+    meters = {"center": points.mean(0).tolist(), "size": [1.5, 1.5, 2.2]}
+    wrong = meters | {"size": [60, 60, 180], "id": "c"}
+    warnings = model.predict(points, boxes=[meters, wrong, meters]).warnings
     assert any(line.startswith("box c is unlike the others: it is 180 m tall: are the units") for line in warnings)
-    assert not any("unlike" in line for line in model.predict(points, boxes=[metres, metres]).warnings)
+    assert not any("unlike" in line for line in model.predict(points, boxes=[meters, meters]).warnings)
 
 
 STREET = np.random.default_rng(0).uniform([-200, -200, -2], [200, 200, -1.9], (3000, 3))

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from lidarpose.body.pose_prior.sampling import sample_poses as sample_poses
     from lidarpose.errors import InputError as InputError
     from lidarpose.errors import LidarPoseError as LidarPoseError
-    from lidarpose.inference.predict_file import predict as predict
     from lidarpose.inference.predictor import Predictor as Predictor
     from lidarpose.inference.predictor import load as load
+    from lidarpose.inference.predictor import predict as predict
     from lidarpose.inference.results import PersonPose as PersonPose
     from lidarpose.inference.results import Poses as Poses
     from lidarpose.io.boxes import read_boxes as read_boxes
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "load": "lidarpose.inference.predictor",
     "Predictor": "lidarpose.inference.predictor",
-    "predict": "lidarpose.inference.predict_file",
+    "predict": "lidarpose.inference.predictor",
     "export": "lidarpose.models.export",
     "import_dapt": "lidarpose.models.dapt.import_weights",
     "PersonPose": "lidarpose.inference.results",

@@ -17,7 +17,7 @@ RENAMED = {
     "evaluate": "eval",
     "evaluate.metrics": "metrics",
     "infer": "inference",
-    "infer.files": "inference.predict_file",
+    "infer.files": "inference.predictor",
     "infer.predictor": "inference.predictor",
     "infer.results": "inference.results",
     "io.formats": "io.point_cloud",

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.errors import InputError, check_name
+from lidarpose.errors import InputError
 
 
 def axis_angle_to_matrix(vector: np.ndarray) -> np.ndarray:
@@ -99,8 +99,7 @@ def rotation_from_up(up: str | Sequence[float]) -> np.ndarray:
     up: an axis, "z", "y" or "x", with a minus where it points down, or a direction of any length > 0 in the input's
     coordinates, three numbers or "x,y,z", which is turned up by the smallest rotation. Raises InputError.
     """
-    if isinstance(up, str) and "," not in up:
-        check_name("up axis", up, UP_AXES)
+    if isinstance(up, str) and up in UP_AXES:
         return UP_AXES[up]
     direction = vector_of(up)
     if direction is None or not np.abs(direction).max() > 0:

@@ -33,6 +33,7 @@ def add(commands) -> None:
     predict.add_argument("file", metavar="FILE", help=".pcd .ply .bin .npy .npz .csv .xyz .txt")
     scan = predict.add_argument_group("what is in the file")
     scan.add_argument("--boxes", metavar="FILE", help=_BOXES)
+    scan.add_argument("--calib", metavar="FILE", help="KITTI's calibration (default: calib/N.txt beside label_2)")
     scan.add_argument("--crop", action="store_true", help="the file holds one person (assumed under 4 m across)")
     scan.add_argument(
         "--sensor-origin",
@@ -81,8 +82,7 @@ def add(commands) -> None:
 
 
 def _predict(options: argparse.Namespace) -> None:
-    from lidarpose.inference.predict_file import predict
-    from lidarpose.inference.predictor import TTA, load
+    from lidarpose.inference.predictor import TTA, load, predict
     from lidarpose.io.files import atomic_path, check_apart, check_writable
 
     file = Path(options.file)
@@ -93,7 +93,7 @@ def _predict(options: argparse.Namespace) -> None:
     if options.picture:
         picture = (result or Path(f"{file.stem}.poses.json")).with_suffix(".png")
     for path in filter(None, (result, picture)):
-        check_apart(path, options.file, options.boxes, options.weights)
+        check_apart(path, options.file, options.boxes, options.calib, options.weights)
         # before the work
         check_writable(path)
     choices = {"backend": options.backend, "device": options.device, "decode": options.decode}
@@ -101,6 +101,7 @@ def _predict(options: argparse.Namespace) -> None:
     poses = predict(
         options.file,
         boxes=options.boxes,
+        calib=options.calib,
         crop=options.crop,
         sensor_origin=options.sensor_origin,
         skeleton=options.skeleton,

@@ -1,4 +1,4 @@
-"""From a user's cloud to one person's points: checks, where the person may stand, what looks wrong about the input."""
+"""From a user's cloud to one person's points: what an array must be, and where the person may stand."""
 
 import os
 from typing import Any
@@ -9,10 +9,7 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import vector_of
 from lidarpose.io.files import FormatError, one_line
 from lidarpose.io.text import is_transposed, pick_xyz
-from lidarpose.sample import FARTHEST, MIN_POINTS, Pose, center_of, within_reach
-
-# joints that every skeleton has
-_TRUNK = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
+from lidarpose.sample import FARTHEST, MIN_POINTS, center_of, within_reach
 
 # a person of more points is thinned: no sensor sees so many, and no voxel needs them
 MAX_POINTS = 50_000
@@ -29,16 +26,6 @@ _COLUMN, _RING = (0.0, 2.0), (3.5, 5.0)
 _RING_WEIGHT = 0.5
 # columns a crop, m from one to the next, and m around each that a person takes
 _COLUMNS, _APART, _AROUND = 3, 0.6, 0.75
-
-# bounds of what a person measures in other units, taken for meters
-_LARGEST_IN_CENTIMETRES, _SMALLEST_IN_OTHER_UNITS, _LARGEST_IN_KILOMETRES = 500, 20, 0.02
-# a person with the ground around is at most so many times as wide as tall
-_WIDEST = 4
-# points of a whole person that lies spread at least so far along, m, and so many times as far as upwards: so spread 97
-# of 100 synthetic people who were laid down, and none that stood
-_LONG, _LONG_TO_TALL = 0.25, 1.5
-# a sweep's extent leaves out the farthest percents; level, it is so long, m, and so many times what it is upright
-_MOST, _STREET, _FLATTER = (10, 90), 10.0, 3.0
 
 
 def as_points(points: Any, what: str = "points") -> np.ndarray:
@@ -88,13 +75,13 @@ def _by_name(points: Any, what: str) -> Any:
         raise InputError(f"{what}: {problem}") from None
 
 
-def as_origin(given: object) -> np.ndarray | None:
+def as_origin(value: object) -> np.ndarray | None:
     """The sensor's place (3,) m from three numbers or "x,y,z"; None, also for "unknown". Raises InputError."""
-    if given is None or isinstance(given, str) and given.strip() == "unknown":
+    if value is None or isinstance(value, str) and value.strip() == "unknown":
         return None
-    origin = vector_of(given)
+    origin = vector_of(value)
     if origin is None or not (np.abs(origin) < FARTHEST).all():
-        raise InputError(one_line(f"sensor origin: expected x,y,z in metres or unknown, got {given!r}"))
+        raise InputError(one_line(f"sensor origin: expected x,y,z in meters or unknown, got {value!r}"))
     return origin
 
 
@@ -115,7 +102,7 @@ def only_returns(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
     usable = within_reach(points)
     if dropped := int((~usable).sum()):
         notes.append(f"dropped {dropped} of {len(points)} points that were NaN, infinite or beyond {FARTHEST:g} m")
-    # so organised clouds fill the pixels that nothing came back from; a single one may be a point of a centered cloud
+    # so organized clouds fill the pixels that nothing came back from; a single one may be a point of a centered cloud
     empty = ~points.any(1)
     if (zeros := int(empty.sum())) > 1:
         notes.append(f"dropped {zeros} of {len(points)} points at 0,0,0, which are no returns")
@@ -186,41 +173,3 @@ def _heights(grid: np.ndarray, near: float, far: float) -> np.ndarray:
 def _distance(points: np.ndarray, place: np.ndarray) -> np.ndarray:
     """(n,) m: horizontal distance of points (n, 2+) from place (2,)."""
     return np.hypot(points[:, 0] - place[0], points[:, 1] - place[1])
-
-
-def unit_warning(size: np.ndarray, *, what: str) -> str | None:
-    """What is likely wrong where a person's extent `size` (3,), z up, is no person's in meters."""
-    tall, largest = float(size[2]), float(size.max())
-    if 0 < largest < _LARGEST_IN_KILOMETRES:
-        return f"{what} is {largest:.2g} m in size: are the units kilometres? multiply all coordinates by 1000"
-    # a few returns may all lie at one height, and a whole street is large, but far wider than tall
-    if tall < _SMALLEST_IN_OTHER_UNITS or tall < largest / _WIDEST:
-        return None
-    unit, factor = ("millimetres", 1000) if tall > _LARGEST_IN_CENTIMETRES else ("centimetres", 100)
-    return f"{what} is {tall:,.0f} m tall: are the units {unit}? divide all coordinates by {factor}"
-
-
-def lies(pose: Pose, points: np.ndarray) -> bool:
-    """The trunk of a pose, z up, is nearer to level than to upright, or its points (n, 3) m are.
-
-    A network that has seen few people lie draws a person standing in points that lie.
-    """
-    if len(points) and (np.ptp(points[:, :2], axis=0) < _TIGHT).all():
-        spread = points.std(0)
-        if spread[:2].max() > max(_LONG, _LONG_TO_TALL * spread[2]):
-            return True
-    at = {name: pose.joints[pose.skeleton.index(name)] for name in _TRUNK}
-    trunk = at["left_shoulder"] + at["right_shoulder"] - at["left_hip"] - at["right_hip"]
-    return bool(abs(trunk[2]) < np.sin(np.radians(35)) * np.linalg.norm(trunk))
-
-
-def flat_axis(points: np.ndarray) -> str | None:
-    """points (n, 3) m of a whole sweep -> the axis that they hardly extend along, "x", "y" or "z": its up axis.
-
-    None where no axis stands out, as in a small room.
-    """
-    low, high = np.percentile(points, _MOST, axis=0)
-    spread = high - low
-    axis = int(np.argmin(spread))
-    others = np.delete(spread, axis)
-    return "xyz"[axis] if others.min() > max(_STREET, _FLATTER * spread[axis]) else None

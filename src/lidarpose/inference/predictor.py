@@ -1,7 +1,8 @@
-"""`load` a network and `predict` poses of clouds: any number type, one or many, empty ones too."""
+"""`load` a network and `predict` poses: of files, and of clouds of any number type, one or many, empty ones too."""
 
 import os
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -9,31 +10,35 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 
 from lidarpose.errors import InputError, check_int, check_name, missing_extra
+from lidarpose.geometry import rotation_from_up
 from lidarpose.inference.backend import Backend, OnnxBackend, estimates, exported_beside
-from lidarpose.inference.checks import UPSIDE_DOWN, looks_unsure, oversize_warning, upside_down_warning
-from lidarpose.inference.inputs import as_origin, as_points, candidates, clean, is_few, only_returns, unit_warning
+from lidarpose.inference.checks import UPSIDE_DOWN, looks_unsure, oversize_warning, unit_warning, upside_down_warning
+from lidarpose.inference.inputs import as_origin, as_points, candidates, clean, is_few, only_returns
 from lidarpose.inference.results import PersonPose, Poses, first_names
+from lidarpose.inference.scan import Scan, pose_scan
 from lidarpose.inference.tta import TTATransform, apply, average, invert, tta_transforms
+from lidarpose.io.boxes import read_boxes
 from lidarpose.io.files import file_error
+from lidarpose.io.point_cloud import read_points
 from lidarpose.models import BUNDLED, DEFAULT, weights_path
 from lidarpose.models.checkpoint import read_header
 from lidarpose.models.decode import decoder
 from lidarpose.models.voxelize import WINDOW
 from lidarpose.progress import Progress
-from lidarpose.sample import MIN_POINTS, PER_JOINT, Pose, center_of
+from lidarpose.sample import FARTHEST, MIN_POINTS, PER_JOINT, Box, Pose, center_of
 from lidarpose.skeleton import SMPL24, Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from lidarpose.sample import Box
-
 BACKENDS = ("onnx", "torch")
 # default number of test-time augmentation passes
 TTA = 4
 # passes: the second is centered on the pelvis that the first estimated
 PASSES = 2
+# a file of less than this across is taken for a crop, m
+CROP_SIZE = 4.0
 # to which the center of the second pass is rounded, m: backends differ by less than a micrometer, which must not move a
 # point to another voxel
 _CENTER_STEP = 0.01
@@ -85,6 +90,78 @@ def load(
             path = path.with_suffix(".onnx")
         chosen = OnnxBackend(path, threads=threads) if bundled or exported else exported_beside(path, threads=threads)
     return Predictor(chosen, name=path.stem, decode=decode, tta=tta)
+
+
+def predict(
+    path: str | os.PathLike,
+    *,
+    boxes: "str | os.PathLike | dict | Box | list | tuple | np.ndarray | None" = None,
+    calib: str | os.PathLike | None = None,
+    crop: bool = False,
+    sensor_origin: tuple[float, float, float] | str | None = None,
+    skeleton: str | None = None,
+    up: str | Sequence[float] = "z",
+    columns: int | None = None,
+    model: "Predictor | str | os.PathLike | Callable[[], Predictor]" = DEFAULT,
+    progress: bool = False,
+) -> Poses:
+    """Poses of the people in a point file, in the file's own frame.
+
+    boxes: whatever `read_boxes` takes (a JSON file, a KITTI label, rows, a `Box` or several), their length and width
+    level, their height and yaw along and about the up axis (the file's z where `up` is a direction); calib: of a KITTI
+    label, None for `../calib/N.txt` beside it; crop: the file is one person already. With
+    neither, a file of less than 4 m across is taken as a crop and anything else asks for boxes. sensor_origin:
+    (x, y, z) m in the file's frame, or "unknown"; None means 0, 0, 0 with boxes and unknown for a crop. skeleton: a
+    name, or None for smpl24, or for the network's own where it has other joints. up: the file's up axis, "z", "y" or
+    "x", with a minus where it points down ("-y": cameras), or for a sensor mounted askew the direction that is up,
+    (x, y, z) or "x,y,z" in the file's frame. columns: values a row of a .bin; model: a predictor, what `load` takes
+    (with its defaults), or a function that gives the predictor when it is needed. Raises
+    InputError, one line that says what to do.
+    """
+    if boxes is not None and crop:
+        raise InputError("expected boxes or a crop, got both: a crop is one person already, so leave the boxes away")
+    if not isinstance(path, str | os.PathLike):
+        kind = type(path).__name__
+        raise InputError(
+            f"expected the path of a point file, got {kind}: for points use lidarpose.load().predict(points)"
+        )
+    started = time.perf_counter()
+    rotation_from_up(up)
+    scan = Scan(
+        points=np.zeros((0, 3)),
+        boxes=None if boxes is None else read_boxes(boxes, calib=calib),
+        origin=np.zeros(3) if sensor_origin is None and boxes is not None else as_origin(sensor_origin),
+        up=up if isinstance(up, str) else ",".join(repr(float(value)) for value in up),
+        source=os.fsdecode(path),
+    )
+    scan = _with_points(scan, path, columns, is_crop=crop)
+    read = time.perf_counter()
+    # loaded once the input has proved readable
+    predictor = model if isinstance(model, Predictor) else model() if callable(model) else load(model)
+    loaded = time.perf_counter()
+    poses = pose_scan(scan, predictor, skeleton=skeleton, progress=progress)
+    timing = {"read": (read - started) * 1e3, "load": (loaded - read) * 1e3}
+    return replace(poses, timing_ms=timing | poses.timing_ms)
+
+
+def _with_points(scan: Scan, path: str | os.PathLike, columns: int | None, *, is_crop: bool) -> Scan:
+    """The scan with the returns of a file. Raises InputError where it has none, or is too large for one person."""
+    cloud = read_points(path, columns=columns)
+    points, notes = only_returns(cloud.points)
+    if not len(points):
+        problem = f"none within {FARTHEST:g} m" if cloud.points.any() else "only 0,0,0, which are no returns"
+        raise file_error(path, f"expected points in meters, got {problem}: export it again")
+    scan = replace(scan, points=points, warnings=(*cloud.warnings, *notes))
+    if scan.boxes is None and not is_crop:
+        size = np.ptp(scan.clouds()[0], axis=0)
+        if size.max() >= CROP_SIZE:
+            unit = unit_warning(size, what="it")
+            raise file_error(
+                path,
+                f"expected one person, less than {CROP_SIZE:.0f} m across, got {size.max():,.1f} m: give the people's "
+                "boxes, or say that it is a crop all the same" + (f"; {unit}" if unit else ""),
+            )
+    return scan
 
 
 def _torch_backend(path: Path, device: str, compile: bool) -> Backend:
@@ -176,9 +253,6 @@ class Predictor:
         """
         wanted = self.in_skeleton(skeleton)
         if boxes is not None:
-            from lidarpose.inference.scan import Scan, pose_scan
-            from lidarpose.io.boxes import read_boxes
-
             cloud, notes = only_returns(as_points(points))
             origin = np.zeros(3) if sensor_origin is None else as_origin(sensor_origin)
             scan = Scan(points=cloud, boxes=read_boxes(boxes), origin=origin, warnings=tuple(notes))
@@ -207,6 +281,7 @@ class Predictor:
             if pose is not None and (i not in best or _surer(pose, best[i][0])):
                 best[i] = pose, part
         poses: list[Pose | None] = [None] * len(clouds)
+        doubtful: list[int] = []
         for i in sorted(set(owner)):
             points, notes = cleaned[i]
             unit = unit_warning(np.ptp(points, axis=0), what="the person")
@@ -217,19 +292,22 @@ class Predictor:
             pose, part = best[i]
             poses[i] = wanted_pose = pose.to(wanted)
             notes += filter(None, (unit, _range_warning(wanted_pose)))
-            if not unit and (warning := oversize_warning(points, pose) or self._upside_down(pose, part, origin)):
+            if unit:
+                continue
+            if warning := oversize_warning(points, pose):
                 notes.append(warning)
+            elif looks_unsure(pose, part):
+                doubtful.append(i)
+        # a second look at the few whose pose looks unsure
+        flipped = [best[i][1] * UPSIDE_DOWN for i in doubtful]
+        flipped_poses = self._all_poses(flipped, None if origin is None else origin * UPSIDE_DOWN, False)
+        for i, pose in zip(doubtful, flipped_poses, strict=True):
+            if warning := upside_down_warning(best[i][0], pose):
+                cleaned[i][1].append(warning)
         return [
             PersonPose(pose=pose, skeleton=wanted, points=points, warnings=tuple(notes), model=self.model)
             for pose, (points, notes) in zip(poses, cleaned, strict=True)
         ]
-
-    def _upside_down(self, pose: Pose, points: np.ndarray, origin: np.ndarray | None) -> str | None:
-        """A warning where the person is upside down: costs a pass for the few whose pose looks unsure."""
-        if not looks_unsure(pose, points):
-            return None
-        turned = self._poses([points * UPSIDE_DOWN], None if origin is None else origin * UPSIDE_DOWN)[0]
-        return upside_down_warning(pose, turned)
 
     def _all_poses(self, clouds: list[np.ndarray], origin: np.ndarray | None, progress: bool) -> list[Pose | None]:
         """The pose of each cloud (n, 3) m in batches. People of like size go together: a batch costs as much as if all

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidarpose.geometry import UP_AXES, rotation_from_up
-from lidarpose.inference.checks import check_scan, origin_warning, rows_inside
+from lidarpose.inference.checks import check_scan, origin_warning, rows_inside, unit_warning
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.sample import Box
 
@@ -77,13 +77,9 @@ def pose_scan(scan: Scan, predictor: Predictor, *, skeleton: str | None = None, 
     if warning := origin_warning(scan):
         warnings.append(warning)
         scan = replace(scan, origin=None)
-    level = predictor.predict(
-        clouds,
-        sensor_origin=None if scan.origin is None else scan.R_level_input @ scan.origin,
-        skeleton=skeleton,
-        progress=progress,
-    )
-    done = time.perf_counter()
+    origin = None if scan.origin is None else scan.R_level_input @ scan.origin
+    level = predictor.predict(clouds, sensor_origin=origin, skeleton=skeleton, progress=progress)
+    predict_ms = (time.perf_counter() - cropped) * 1e3
     level = replace(level, people=_named(level, scan.boxes))
     warnings += check_scan(scan, level)
     people = [_in_input(person, scan) for person in level]
@@ -91,18 +87,13 @@ def pose_scan(scan: Scan, predictor: Predictor, *, skeleton: str | None = None, 
         # a crop's warnings are its person's
         people = [replace(people[0], warnings=(*scan.warnings, *people[0].warnings))]
         warnings = warnings[len(scan.warnings) :]
-    posed = sum(person.pose is not None for person in people)
-    return Poses(
+    per_person = predict_ms / max(sum(person.has_pose for person in people), 1)
+    return replace(
+        level,
         people=tuple(people),
-        skeleton=level.skeleton,
         source=scan.source,
-        model=level.model,
         warnings=tuple(warnings),
-        timing_ms={
-            "crop": (cropped - started) * 1e3,
-            "predict": (done - cropped) * 1e3,
-            "per_person": (done - cropped) * 1e3 / max(posed, 1),
-        },
+        timing_ms={"crop": (cropped - started) * 1e3, "predict": predict_ms, "per_person": per_person},
         up=scan.up,
     )
 
@@ -113,8 +104,13 @@ def _named(people: Sequence[PersonPose], boxes: list[Box] | None) -> tuple[Perso
         return (replace(people[0], id=0),)
     taken = {box.id for box in boxes}
     free = (number for number in count(len(boxes)) if number not in taken)
-    ids = [(next(free) if i in taken else i) if box.id is None else box.id for i, box in enumerate(boxes)]
-    return tuple(replace(person, id=id, box=box) for person, id, box in zip(people, ids, boxes, strict=True))
+    named = []
+    for i, (person, box) in enumerate(zip(people, boxes, strict=True)):
+        id = box.id if box.id is not None else next(free) if i in taken else i
+        # where a box is of other units, which the scan's warnings say, its points are not the person's fault
+        is_misfit = person.has_pose and unit_warning(box.size, what="it")
+        named.append(replace(person, id=id, box=box, warnings=() if is_misfit else person.warnings))
+    return tuple(named)
 
 
 def _in_input(person: PersonPose, scan: Scan) -> PersonPose:

@@ -85,12 +85,12 @@ class _Name(Unread):
         return self.run(self.name, args)
 
 
+@dataclass(frozen=True, eq=False)
 class _Stub(Unread):
     """What a call made that still lacks its state; `value` is set with the state."""
 
-    def __init__(self, name: str, args: tuple):
-        super().__init__(name)
-        self.__dict__.update(args=args, value=None)
+    args: tuple
+    value: Any = None
 
 
 class _Memo(dict):
@@ -115,6 +115,7 @@ class _DataUnpickler(pickle._Unpickler):
 
     dispatch: ClassVar[dict[int, Any]] = dict(pickle._Unpickler.dispatch)
     # Python's own, which its type stubs leave out
+    append: Callable[[object], None]
     pop_mark: Callable[[], list]
     stack: list[Any]
 
@@ -175,7 +176,8 @@ class _DataUnpickler(pickle._Unpickler):
             value = _dense(stub.name, state, self.dense_left)
             # many entries may add up in one number
             self.dense_left -= value.size + state["data"].size
-        stub.__dict__["value"] = self.stack[-1] = value
+        self.stack[-1] = value
+        object.__setattr__(stub, "value", value)
 
     def charged(self, made: Any) -> Any:
         """The value, once it is sure that all values together do not outgrow the file."""
@@ -188,9 +190,9 @@ class _DataUnpickler(pickle._Unpickler):
         """A dict of keys and values by turns."""
         return dict(zip(self.keys(items[::2]), items[1::2], strict=True))
 
-    def fill(self, kind: type, items: Any) -> None:
+    def fill(self, kind: type[set] | type[dict], items: Any) -> None:
         """Adds items to the set or dict on the stack."""
-        target = self.stack[-1]
+        target: Any = self.stack[-1]
         if type(target) is not kind:
             raise TypeError(f"items of a {type(target).__name__}")
         target.update(items)
@@ -301,7 +303,8 @@ def _array(data: Any, dtype: object, shape: object, order: object = "C") -> np.n
     # Python 2 kept the content as text
     data = data.encode("latin1") if isinstance(data, str) else data
     is_object = dtype.kind == "O"
-    if not isinstance(data, list if is_object else bytes):
+    expected: Any = list if is_object else bytes
+    if not isinstance(data, expected):
         raise FormatError(f"has an array of a {type(data).__name__}: {_REMEDY}")
     # the product of thousands of numbers would take long
     if len(shape) > 64 or len(data) != math.prod(shape) * (1 if is_object else dtype.itemsize):
