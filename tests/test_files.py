@@ -22,9 +22,9 @@ from lidarpose.io.files import (
     is_unused,
     locked,
     read_bytes,
-    read_npz,
     write_atomic,
 )
+from lidarpose.io.npz import read_npz
 
 
 def tree(folder):
@@ -44,12 +44,6 @@ def test_round_trip(tmp_path_factory, data):
         assert read_bytes(path, expected="a test") == path.read_bytes()
 
 
-def test_relative_path(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    write_atomic("a.txt", "new")
-    assert tree(tmp_path) == ["a.txt"]
-
-
 @pytest.mark.skipif(os.name != "posix", reason="modes are POSIX's")
 def test_new_files_have_the_usual_mode(tmp_path):
     write_atomic(tmp_path / "a.txt", "new")
@@ -67,19 +61,11 @@ def test_other_libraries_see_the_suffix(tmp_path):
     assert tree(tmp_path) == ["a.npz"]
 
 
-@pytest.mark.parametrize("name", ["a" * 250 + ".png", "点" * 84, "é" * 125 + ".png"])
-def test_long_names(tmp_path, name):
-    path = tmp_path / name
-    write_atomic(path, b"x")
-    assert path.read_bytes() == b"x"
-
-
-def test_names_that_the_disk_refuses(tmp_path):
-    with pytest.raises(InputError, match="choose a shorter name"):
-        write_atomic(tmp_path / ("a" * 300), "x")
-    with pytest.raises(InputError, match="^'': is a folder"):
-        write_atomic("", "x")
-    assert tree(tmp_path) == []
+@pytest.mark.parametrize("name", ["a.txt", "a" * 250 + ".png", "点" * 84, "é" * 125 + ".png"])
+def test_names_long_and_relative(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    write_atomic(name, b"x")
+    assert tree(tmp_path) == [name] and (tmp_path / name).read_bytes() == b"x"
 
 
 def test_temporary_names_are_nobody_elses(tmp_path, monkeypatch):
@@ -150,13 +136,25 @@ def test_disk_that_refuses(tmp_path, monkeypatch, call, number):
     assert tree(tmp_path) == []
 
 
-def test_file_as_parent_folder(tmp_path):
+@pytest.mark.parametrize(
+    "path, words",
+    [
+        ("a" * 300, "choose a shorter name"),
+        ("", "^'': is a folder; give the name of a file"),
+        (".", "is a folder; give the name of a file"),
+        ("file/a.txt", "file .*is a file: choose another folder"),
+        ("file/deeper/a.txt", "file/deeper .*is a file: choose another folder"),
+        *((path, "expected the path of a file to write") for path in (3, None, "a\0b")),
+    ],
+)
+def test_what_is_no_place_for_a_file(tmp_path, monkeypatch, path, words):
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("x")
-    for path in (tmp_path / "file" / "a.txt", tmp_path / "file" / "deeper" / "a.txt"):
-        with pytest.raises(InputError, match="is a file: choose another folder") as caught:
-            write_atomic(path, "x")
-        assert str(path.parent) in str(caught.value) and "\n" not in str(caught.value)
-    assert tree(tmp_path) == ["file"]
+    with pytest.raises(InputError, match=words) as caught:
+        write_atomic(path, "x")
+    assert "\n" not in str(caught.value) and tree(tmp_path) == ["file"]
+    with pytest.raises(InputError, match="3: expected the path of a file to write"):
+        check_suffix(3, ".png")
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")
@@ -165,23 +163,6 @@ def test_folder_without_write_access(tmp_path):
     for path in (tmp_path / "a.txt", tmp_path / "made" / "a.txt"):
         with pytest.raises(InputError, match="Permission denied.*choose another folder"):
             write_atomic(path, "x")
-
-
-@pytest.mark.parametrize("bad", [3, None, "a\0b"])
-def test_not_a_path(bad):
-    with pytest.raises(InputError, match="expected the path of a file to write"):
-        write_atomic(bad, "x")
-
-
-def test_what_is_no_path_has_no_suffix():
-    with pytest.raises(InputError, match="3: expected the path of a file to write"):
-        check_suffix(3, ".png")
-
-
-def test_folder_as_target(tmp_path):
-    with pytest.raises(InputError, match="is a folder; give the name of a file"):
-        write_atomic(tmp_path, "x")
-    assert tree(tmp_path) == []
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes with names are POSIX's")

@@ -2,12 +2,10 @@
 
 import gzip
 import io
-import json
 import os
 import struct
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,11 +15,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from lidarpose.errors import InputError
-from lidarpose.io.boxes import read_boxes
 from lidarpose.io.files import check_unpacked
 from lidarpose.io.point_cloud import SUFFIXES, Cloud, read_points
-
-REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "real"
 
 float32_points = hnp.arrays(
     np.float32,
@@ -198,25 +193,28 @@ def test_number_types_of_numpy(folder, dtype):
 # ---- what the formats allow
 
 
-def test_cells_in_quotes_of_either_kind(folder):
-    for quote in "'\"":
-        text = "".join(",".join(f"{quote}{value:.3f}{quote}" for value in row) + "\n" for row in POINTS[:, :3])
-        same(read(folder, "a.csv", "x,y,z\n" + text), POINTS[:, :3].round(3))
-
-
-@pytest.mark.parametrize(("separator", "suffix"), [(",", "csv"), (";", "csv"), ("\t", "txt"), (" ", "xyz")])
-def test_a_separator_in_quotes_separates_nothing(folder, separator, suffix):
-    rows = (("name", "x", "y", "z"), (f'"person{separator}sitting"', "1.5", "2", "3"), ('"car"', "4", "5", "6"))
-    text = "\n".join(separator.join(row) for row in rows)
-    same(read(folder, f"a.{suffix}", text), np.array([[1.5, 2, 3], [4, 5, 6]]))
-
-
-@pytest.mark.parametrize("missing", ["nan", "NAN", "NaN", "Nan", "-NAN", "NULL", "Null", "n/a", "N/A", "none"])
-def test_a_missing_value_has_many_spellings(folder, missing):
-    same(
-        read(folder, "a.csv", f"x,y,z\n1,2,3\n{missing},{missing},{missing}\n4,5,6\n"),
-        np.array([[1, 2, 3], [4, 5, 6.0]]),
-    )
+@pytest.mark.parametrize(
+    "name, text, expected",
+    [
+        *(("a.csv", f"x,y,z\n{q}1.5{q},{q}-2{q},{q}3{q}\n4,{q}5{q},6\n", [[1.5, -2, 3], [4, 5, 6]]) for q in "'\""),
+        # a separator in quotes separates nothing
+        *(
+            (
+                f"a.{suffix}",
+                'name,x,y,z\n"person,sitting",1.5,2,3\n"car",4,5,6'.replace(",", mark),
+                [[1.5, 2, 3], [4, 5, 6]],
+            )
+            for mark, suffix in ((",", "csv"), (";", "csv"), ("\t", "txt"), (" ", "xyz"))
+        ),
+        # a missing value has many spellings
+        *(
+            ("a.csv", f"x,y,z\n1,2,3\n{missing},{missing},{missing}\n4,5,6\n", [[1, 2, 3], [4, 5, 6]])
+            for missing in "nan NAN NaN Nan -NAN NULL Null n/a N/A none".split()
+        ),
+    ],
+)
+def test_cells_of_text(folder, name, text, expected):
+    same(read(folder, name, text), expected)
 
 
 def test_pcd_variants(folder):
@@ -420,8 +418,6 @@ BAD = {
     "gzip by suffix": ("a.pcd.gz", gzip.compress(pcd_header() + ROWS), ["gzip-compressed", "unpack it first"]),
     "zip as ply": ("a.ply", zipped("a.ply", b"ply\n"), ["zip", "unpack it first"]),
     "png as pcd": ("a.pcd", PNG, ["PNG"]),
-    "png as bin": ("a.bin", PNG, ["PNG"]),
-    "png as txt": ("a.txt", PNG, ["PNG"]),
     "web page": ("a.ply", b"<!DOCTYPE html><html>", ["web page"]),
     "git lfs": ("a.pcd", b"version https://git-lfs.github.com/spec/v1\n", ["git lfs pull"]),
     "ply as pcd": ("a.pcd", ply_header() + ROWS, [".ply"]),
@@ -470,12 +466,7 @@ BAD = {
     "pcd all nan": ("a.pcd", pcd_header() + np.full((3, 4), np.nan, "f4").tobytes(), ["NaN", "all 3"]),
     "ply cut off": ("a.ply", ply_header() + ROWS[:-1], ["cut off"]),
     "ply of 10^12": ("a.ply", ply_header(HUGE) + ROWS, ["cut off", "1000000000000"]),
-    "ply ascii of 10^12": ("a.ply", ply_header(HUGE, "ascii") + b"1 2 3 4\n", ["cut off"]),
     "ply ascii cut off": ("a.ply", ply_header(3, "ascii") + b"1 2 3 4\n1 2 3 4\n", ["cut off"]),
-    "ply ascii words": ("a.ply", ply_header(2, "ascii") + b"1 2 3 4\n1 b 3 4\n", ["'1 b 3 4'", "line 2"]),
-    "ply ascii all words": ("a.ply", ply_header(2, "ascii") + b"1 b 3 4\n" * 2, ["'1 b 3 4'", "line 1"]),
-    "ply ascii stops": ("a.ply", ply_header(2, "ascii") + b"1 2 3 4\n1 2 3,5 4\n", ["'1 2 3,5 4'", "line 2"]),
-    "ply ascii short": ("a.ply", ply_header(2, "ascii") + b"1 2\n" * 2, ["'1 2'", "line 1"]),
     "ply lines before of 10^17": (
         "a.ply",
         ply_header(form="ascii", before=f"element u {10**17}\nproperty int a\n") + b"1\n",
@@ -483,7 +474,6 @@ BAD = {
     ),
     "ply without end": ("a.ply", ply_header()[:50], ["end_header"]),
     "ply without vertex": ("a.ply", b"ply\nformat ascii 1.0\nelement face 1\nend_header\n1\n", ["'vertex'"]),
-    "ply without xyz": ("a.ply", ply_header(names="a b c d") + ROWS, ["x, y and z"]),
     "ply without format": ("a.ply", b"ply\nelement vertex 1\nproperty float x\nend_header\n1\n", ["format"]),
     "ply odd line": ("a.ply", b"ply\nformat ascii 1.0\nwhat is this\nend_header\n", ["'what is this'"]),
     "ply list": ("a.ply", ply_header(kind="list uchar int") + ROWS, ["list uchar int"]),
@@ -492,8 +482,8 @@ BAD = {
     "ply odd count": ("a.ply", ply_header("many") + ROWS, ["'many'"]),
     "bin odd size": ("a.bin", ROWS[:-1], ["47 bytes", "cut off"]),
     "bin of three": ("a.bin", np.ones((7, 3), "f4").tobytes(), ["84 bytes", "columns 3"]),
+    "bin of three or six": ("a.bin", np.ones((102, 3), "f4").tobytes(), ["values a row has (columns 3 or 6)"]),
     "bin garbage": ("a.bin", np.random.default_rng(0).bytes(4000), ["beyond"]),
-    "bin all nan": ("a.bin", np.full((3, 4), np.nan, "f4").tobytes(), ["NaN"]),
     "npy objects": ("a.npy", OBJECTS, ["dtype object"]),
     "npz objects": ("a.npz", npz(points=np.array([[1, 2, "a"]], dtype=object)), ["dtype object"]),
     "npy cut off": ("a.npy", npy(POINTS)[:-1], ["cut off"]),
@@ -504,21 +494,15 @@ BAD = {
     "npy flat": ("a.npy", npy(POINTS.ravel()), ["(12,)", "(n, 3+)"]),
     "npy two columns": ("a.npy", npy(np.ones((9, 2))), ["(9, 2)", "save x, y and z"]),
     "npy transposed": ("a.npy", npy(np.ones((2, 3)).T[:, :2]), ["points.T"]),
-    "npy really transposed": ("a.npy", npy(np.ones((3, 60))), ["(3, 60)", "points.T"]),
     "npy transposed records": ("a.npy", npy(np.ones((5, 51))), ["(5, 51)", "points.T"]),
     "npy batch": ("a.npy", npy(np.ones((2, 5, 4))), ["(2, 5, 4)", "reshape(-1, 4)"]),
     "npy words": ("a.npy", npy(np.array([["a", "b", "c"]])), ["<U1"]),
     "npy complex": ("a.npy", npy(np.ones((2, 3), complex)), ["complex128"]),
-    "npy booleans": ("a.npy", npy(np.ones((2, 3), bool)), ["bool"]),
-    "npy no points": ("a.npy", npy(np.ones((0, 3))), ["has no points"]),
-    "npy records without xyz": ("a.npy", npy(np.zeros(3, [("a", "f4"), ("b", "f4")])), ["x, y and z"]),
-    "npy all inf": ("a.npy", npy(np.full((3, 3), np.inf)), ["infinity"]),
     "npz cut off": ("a.npz", npz(points=POINTS)[:-30], [".npz", "cut off"]),
     "npz damaged": ("a.npz", npz(points=POINTS).replace(ROWS[:8], ROWS[8:16]), [".npz", "damaged"]),
     "npy of python": ("a.npy", npy(POINTS).replace(b"}", b"("), ["damaged"]),
     "npz of two": ("a.npz", npz(a=POINTS, b=POINTS), ["'points'", "a, b"]),
     "npz of none": ("a.npz", npz(a=np.ones(3)), ["'points'", "got a"]),
-    "npz of words": ("a.npz", npz(a=np.array("me")), ["'points'", "got a"]),
     "npz of 10^12": ("a.npz", zipped("points.npy", npy_header((HUGE, 3))), ["cut off"]),
     "txt of words": ("a.txt", "hello world this is\nsome text\n", ["'hello world this is'", "line 1"]),
     "txt transposed": ("a.txt", "\n".join(["1.5 " * 60] * 3), ["got 3 of 60", "transpose"]),
@@ -606,19 +590,6 @@ def test_import_loads_no_heavy_library():
     assert done.stdout.strip() == "[]"
 
 
-@pytest.mark.skipif(not REAL.is_dir(), reason="the real sweeps are not on this machine")
-@pytest.mark.parametrize("name", ["sweep_0.pcd", "sweep_1.bin", "sweep_2.ply"])
-def test_real_sweeps(name):
-    cloud = read_points(REAL / name)
-    labels = REAL / f"{name[:7]}.json"
-    assert cloud.num_dropped == 0 and cloud.warnings == () and cloud.fields == ("x", "y", "z", "intensity")
-    expected = [person["num_points"] for person in json.loads(labels.read_text())["people"]]
-    found = [int(box.contains(cloud.points).sum()) for box in read_boxes(labels)]
-    many = [(a, b) for a, b in zip(found, expected, strict=True) if b >= 50]
-    assert len(many) == 3
-    assert all(abs(a - b) <= 3 for a, b in many)
-
-
 @pytest.mark.parametrize(
     "text", ['"x" "y" "z"\n"1" 0.1 0.2 0.3\n"2" 1.1 1.2 1.3\n', "x,y,z\n0,0.1,0.2,0.3\n", "# rows\nx y z\n\n1 2 3 4\n"]
 )
@@ -630,13 +601,6 @@ def test_more_values_than_the_header_names_are_refused(tmp_path, text):
         read_points(path)
     path.write_text("x,y,z\n0.1,0.2,0.3,\n")
     np.testing.assert_allclose(read_points(path).points, [[0.1, 0.2, 0.3]])
-
-
-def test_raw_rows_of_another_width_are_told_all_that_fit(tmp_path):
-    path = tmp_path / "xyz.bin"
-    np.ones((102, 3), "f4").tofile(path)
-    with pytest.raises(InputError, match=r"say how many values a row has \(columns 3 or 6\)"):
-        read_points(path)
 
 
 @pytest.mark.parametrize("text", ["1 2 3{}# note\n", "1e-05{}2 3\n0,5 1 2\n", "1\t2{}\t3 # a\n4\t{}5,5\t6\n"])

@@ -479,7 +479,7 @@ def test_what_is_no_motion_at_all(tmp_path):
         (tmp_path / name).write_bytes(content)
         refused(tmp_path / name, message)
     np.save(tmp_path / "one.npy", np.zeros(3))
-    refused((tmp_path / "one.npy").rename(tmp_path / "one.npz"), "not an npz")
+    refused((tmp_path / "one.npy").rename(tmp_path / "one.npz"), "an npz of plain arrays")
     path = files.write_amass(tmp_path / "e.npz", *files.a_clip(4))
     whole = path.read_bytes()
     for share in (0.1, 0.5, 0.9, 0.999):

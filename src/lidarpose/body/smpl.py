@@ -18,7 +18,8 @@ import numpy as np
 from lidarpose.body.rig import forward_kinematics
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix
-from lidarpose.io.files import file_error, read_npz
+from lidarpose.io.files import file_error
+from lidarpose.io.npz import read_npz
 from lidarpose.io.pickles import Unread, load_pickle
 from lidarpose.skeleton import SMPL24
 

@@ -81,9 +81,8 @@ def oversize_warning(points: np.ndarray, pose: Pose) -> str | None:
             "of one person: give the people's boxes, or crop closer"
         )
     low, high = np.percentile(points[:, 2], _TRIMMED)
-    # what is wider than tall holds walls and trees too
     bound = _UNSURE_OF_SIZE if high - low < _GIANT else _UNSURE_OF_GIANT
-    if high - low < max(_TALLEST, across) or pose.spread is None or pose.spread.mean() < bound:
+    if high - low < _TALLEST or pose.spread is None or pose.spread.mean() < bound:
         return None
     return (
         f"the points are {high - low:.1f} m tall, taller than a person: expected meters, perhaps they are in feet or "

@@ -9,13 +9,13 @@ import json
 import math
 import os
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.io.files import FormatError, file_error, read_bytes, shorten
-from lidarpose.io.point_cloud import load_array
+from lidarpose.io.npz import load_array
 from lidarpose.sample import FARTHEST, Box, box_id
 
 # nobody writes more than two full turns in radians; 30, 90 or 180 are degrees
@@ -107,7 +107,7 @@ def _is_kitti(text: str) -> bool:
     """Whether the first line has a label's values: class, truncation, occlusion, angle, 4 of the picture, 7 of the box,
     and a score where it is a result."""
     words = text.lstrip().partition("\n")[0].split()
-    return len(words) in (15, 16) and all(_number_of(word) is not None for word in words[1:])
+    return len(words) in (15, 16) and _parse_numbers(words[1:], len(words) - 1) is not None
 
 
 def _read_kitti(path: str | os.PathLike, text: str, calib: str | os.PathLike | None) -> list[list[float]]:
@@ -117,8 +117,8 @@ def _read_kitti(path: str | os.PathLike, text: str, calib: str | os.PathLike | N
         words = line.split()
         if not words or words[0] not in _KITTI_PEOPLE:
             continue
-        values = [_number_of(word) for word in words[8:15]]
-        if not _are_numbers(values, 7):
+        values = _parse_numbers(words[8:15], 7)
+        if values is None:
             raise FormatError(
                 f"expected a KITTI label of 15 values on line {number}, got {shorten(line)!r}: correct it"
             )
@@ -147,8 +147,8 @@ def _read_calibration(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
     lines = {words[0].rstrip(":"): words[1:] for words in map(str.split, text.splitlines()) if words}
     matrices = []
     for keys, shape in ((("R0_rect", "R_rect"), (3, 3)), (("Tr_velo_to_cam", "Tr_velo_cam"), (3, 4))):
-        values = [_number_of(word) for key in keys for word in lines.get(key, ())]
-        if not _are_numbers(values, math.prod(shape)):
+        values = _parse_numbers([word for key in keys for word in lines.get(key, ())], math.prod(shape))
+        if values is None:
             came = shorten(", ".join(lines)) or "nothing"
             raise file_error(path, f"expected {keys[0]}: and {math.prod(shape)} numbers, got {came}: copy it again")
         matrix = np.array(values).reshape(shape)
@@ -159,17 +159,12 @@ def _read_calibration(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
     return rectify @ T_cam_velo[:, :3], rectify @ T_cam_velo[:, 3]
 
 
-def _number_of(word: str) -> float | None:
-    """A word's number, else None."""
+def _parse_numbers(words: list[str], count: int) -> list[float] | None:
+    """The finite numbers that `count` words say, else None."""
     try:
-        return _number(float(word))
+        return _as_numbers(map(float, words), count)
     except ValueError:
         return None
-
-
-def _are_numbers(values: list[float | None], count: int) -> TypeGuard[list[float]]:
-    """Whether there are `count` values, each a number."""
-    return len(values) == count and None not in values
 
 
 # ---- one entry
@@ -201,13 +196,19 @@ def _triple(entry: dict, key: str, where: str, *, meaning: str) -> list[float]:
     if key not in entry:
         raise FormatError(f'{where}: expected the key "{key}" {meaning} in meters, {_keys(entry, key)}')
     value = entry[key]
-    try:
-        numbers = [_number(v) for v in value] if not isinstance(value, str | bytes | dict) else []
-    except TypeError:
-        numbers = []
-    if not _are_numbers(numbers, 3):
+    numbers = _as_numbers(value, 3)
+    if numbers is None:
         raise FormatError(f"{where}.{key}: expected three finite numbers {meaning} in meters, got {_show(value)}")
     return numbers
+
+
+def _as_numbers(values: Any, count: int) -> list[float] | None:
+    """The `count` finite numbers of anything that can be looped over but text and keys, else None."""
+    try:
+        values = [_number(value) for value in values] if not isinstance(values, str | bytes | dict) else []
+    except TypeError:
+        return None
+    return values if len(values) == count and None not in values else None
 
 
 def _number(value: Any) -> float | None:
@@ -225,11 +226,11 @@ def _id(entry: dict, where: str) -> str | int | None:
     for key in ("id", "track"):
         value = entry.get(key)
         try:
-            found = box_id(value)
+            id = box_id(value)
         except InputError:
             raise FormatError(f"{where}.{key}: expected text or a whole number, got {_show(value)}") from None
-        if found is not None:
-            return found
+        if id is not None:
+            return id
     return None
 
 

@@ -6,7 +6,6 @@ Every failure that the user can cause is an `InputError` of one line that names 
 import difflib
 import errno
 import hashlib
-import io
 import os
 import re
 import reprlib
@@ -15,12 +14,8 @@ import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from lidarpose.errors import InputError, MissingExtra
-
-if TYPE_CHECKING:
-    import numpy as np
 
 # bytes: a name may have 255 on the usual file systems, of which the temporary name needs some itself
 _MAX_KEPT_NAME = 100
@@ -82,18 +77,12 @@ def check_apart(out: str | os.PathLike, *inputs: object) -> None:
     """Raises InputError where the file to write is one of those that are read, by whatever name. Inputs that are no
     paths, or of files that are not there, do not count."""
     for source in inputs:
-        if _is_same(out, source):
+        is_same = False
+        # a bare number, for one, would be taken for an open file's handle
+        with suppress(OSError, TypeError, ValueError):
+            is_same = os.path.samefile(out, os.fspath(source))  # type: ignore[call-overload]
+        if is_same:
             raise file_error(out, "is itself what is read, and would be lost: name another file to write")
-
-
-def _is_same(out: str | os.PathLike, source: object) -> bool:
-    # a bare number would be taken for an open file's handle
-    if not isinstance(source, str | os.PathLike):
-        return False
-    try:
-        return os.path.samefile(out, source)
-    except (OSError, ValueError):
-        return False
 
 
 def content_digest(path: str | os.PathLike, *, expected: str) -> str:
@@ -133,41 +122,6 @@ def read_bytes(path: str | os.PathLike, *, expected: str, most: int | None = Non
     if not data:
         raise file_error(path, f"is empty; expected {expected}: was it copied completely?")
     return data
-
-
-def read_npz(
-    path: str | os.PathLike, wanted: Iterable[str], *, expected: str
-) -> "tuple[dict[str, np.ndarray], list[str]]":
-    """Arrays of an npz file, without running anything that is pickled in it.
-
-    Args:
-        wanted: Names of the arrays to read; those that are missing are left out.
-        expected: As of `read_bytes`.
-
-    Returns:
-        The arrays by name, and all names in the file, sorted.
-
-    Raises:
-        InputError: For a missing, damaged or truncated file, Python objects among the arrays, too large a file.
-    """
-    # the command line's help imports this module, and does without numpy
-    import numpy as np
-
-    data = read_bytes(path, expected=expected)
-    try:
-        if not data.startswith(b"PK"):
-            raise ValueError("no zip archive")
-        with np.load(io.BytesIO(data), allow_pickle=False) as file:
-            names = [name for name in wanted if name in file.files]
-            members = [member for member in file.zip.infolist() if member.filename.removesuffix(".npy") in names]
-            check_unpacked(sum(m.compress_size for m in members), sum(m.file_size for m in members))
-            return {name: file[name] for name in names}, sorted(file.files)
-    except FormatError as problem:
-        raise file_error(path, problem) from None
-    except MemoryError:
-        raise file_error(path, "does not fit in memory; split it first") from None
-    except Exception as error:  # numpy, zipfile and zlib raise many kinds for a damaged archive
-        raise file_error(path, f"not an npz of plain arrays ({error}); was it copied completely?") from None
 
 
 def check_unpacked(packed: int, unpacked: int) -> None:

@@ -9,22 +9,18 @@ and returns its x y z (n, 3), the names of its columns and warnings; it raises `
 adds the file's name.
 """
 
-import io
-import math
 import os
 import re
 import warnings
-import zipfile
 from dataclasses import dataclass
-from typing import IO, Literal
 
 import numpy as np
 
 from lidarpose.errors import check_int
 from lidarpose.io.files import FormatError, check_unpacked, file_error, read_bytes, shorten
-from lidarpose.io.pcd import parse_pcd
-from lidarpose.io.ply import parse_ply
-from lidarpose.io.text import FEW_ROWS, check_bytes, is_transposed, numbered, parse_text, pick_xyz
+from lidarpose.io.npz import array_header, load_array, open_npz
+from lidarpose.io.pcd_ply import parse_pcd, parse_ply
+from lidarpose.io.text import FEW_ROWS, is_transposed, numbered, parse_text, pick_xyz
 
 KITTI_FIELDS = ("x", "y", "z", "intensity")
 NUSCENES_FIELDS = ("x", "y", "z", "intensity", "ring")
@@ -201,7 +197,7 @@ def _width(rows: np.ndarray) -> float:
     return float(np.nan_to_num(np.log(spread + _NARROWEST).mean(), nan=np.inf))
 
 
-# ---- NumPy: https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html
+# ---- NumPy
 
 
 def _parse_npy(data: bytes):
@@ -209,58 +205,20 @@ def _parse_npy(data: bytes):
 
 
 def _parse_npz(data: bytes):
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            key, content = _choose_array(archive)
-    except (FormatError, MemoryError):
-        raise
-    except Exception as error:
-        reason = shorten(str(error))
-        raise FormatError("a NumPy .npz archive", f"a damaged or cut off one ({reason})", "save it again") from None
-    return _points_of(load_array(content), f"the array {shorten(key)!r}")
-
-
-def _choose_array(archive: zipfile.ZipFile) -> tuple[str, bytes]:
-    """(name, .npy content) of the array of points: `points`, else `xyz`, else the only one of their shape."""
-    keys = {name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")}
-    named: list[str] = [key for key in ("points", "xyz") if key in keys]
-    if not named:
-        for key, name in keys.items():
-            with archive.open(name) as file:
-                shape, dtype, _ = _array_header(file)
+    """Of the array `points`, else `xyz`, else the only one of their shape."""
+    with open_npz(data) as (archive, members):
+        keys = [key for key in ("points", "xyz") if key in members]
+        for key, member in members.items() if not keys else ():
+            with archive.open(member) as file:
+                shape, dtype, _ = array_header(file)
             if (len(shape) == 2 and shape[1] >= 3 and dtype.kind in "fiu") or (dtype.names and len(shape) == 1):
-                named.append(key)
-        if len(named) != 1:
-            came = shorten(", ".join(keys)) or "no array"
+                keys.append(key)
+        if not keys or len(keys) > 1 and keys[0] not in ("points", "xyz"):
+            came = shorten(", ".join(members)) or "no array"
             raise FormatError("'points', 'xyz' or one (n, 3+) array alone", came, "save it with points=")
-    member = archive.getinfo(keys[named[0]])
-    check_unpacked(member.compress_size, member.file_size)
-    return named[0], archive.read(member)
-
-
-def _array_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype, Literal["C", "F"]]:
-    """(shape, dtype, order) of a .npy stream, which is left at its first value."""
-    try:
-        version = np.lib.format.read_magic(file)
-        # version 3 differs from 2 by the characters that field names may have
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, is_fortran, dtype = read(file)
-        return shape, dtype, "F" if is_fortran else "C"
-    except Exception as error:
-        reason = shorten(str(error))
-        raise FormatError("a NumPy .npy header", f"another or a damaged one ({reason})", "save it again") from None
-
-
-def load_array(data: bytes) -> np.ndarray:
-    """The array in a .npy file's bytes; nothing is unpickled, and the size is checked before the values are read."""
-    file = io.BytesIO(data)
-    shape, dtype, order = _array_header(file)
-    if dtype.hasobject:
-        raise FormatError("an array of numbers", "dtype object", "save a float array with numpy.save")
-    if any(n < 0 for n in shape):
-        raise FormatError("an array (n, 3+)", f"the shape {shape}", "save it again")
-    check_bytes(data, file.tell(), math.prod(shape) * dtype.itemsize, shape[0] if shape else 1)
-    return np.ndarray(shape, dtype, data, file.tell(), order=order)
+        member = members[keys[0]]
+        check_unpacked(member.compress_size, member.file_size)
+        return _points_of(load_array(archive.read(member)), f"the array {shorten(keys[0])!r}")
 
 
 def _points_of(array: np.ndarray, what: str):

@@ -22,7 +22,8 @@ from lidarpose.body.mocap.skeleton_files import load_amc, load_bvh
 from lidarpose.body.mocap.smpl_poses import load_amass, load_lidarhuman26m, load_sloper4d, pose_files
 from lidarpose.errors import check_name
 from lidarpose.geometry import UP_AXES
-from lidarpose.io.files import content_digest, file_error, read_bytes, read_npz
+from lidarpose.io.files import content_digest, file_error, read_bytes
+from lidarpose.io.npz import read_npz
 
 
 def load_npz(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:

@@ -15,7 +15,8 @@ import numpy as np
 from lidarpose.body.rig import heading, without_yaw
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix, rotation_about, rotation_vector
-from lidarpose.io.files import file_error, read_npz
+from lidarpose.io.files import file_error
+from lidarpose.io.npz import read_npz
 from lidarpose.skeleton import SMPL24
 
 _KEYS = ("joints", "clip", "clip_start", "clip_length", "fps")

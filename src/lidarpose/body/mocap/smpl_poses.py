@@ -30,7 +30,8 @@ import numpy as np
 
 from lidarpose.body.mocap.motion import Motion, join, standing_axis, usable_clips
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_from_up
-from lidarpose.io.files import file_error, read_bytes, read_npz
+from lidarpose.io.files import file_error, read_bytes
+from lidarpose.io.npz import read_npz
 from lidarpose.io.pickles import load_pickle
 
 _R_LEVEL_SMPL = UP_AXES["y"]
