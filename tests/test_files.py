@@ -80,7 +80,7 @@ def test_temporary_names_are_nobody_elses(tmp_path, monkeypatch):
             names.add(temporary.name)
             temporary.write_text("new")
     assert len(names) == 2 and (tmp_path / "a.txt").read_text() == "new"
-    assert all(re.fullmatch(files.TEMPORARY + "a.txt", name) for name in (*names, ".1-8-a.txt"))
+    assert all(re.fullmatch(files._TEMPORARY + "a.txt", name) for name in (*names, ".1-8-a.txt"))
 
 
 def test_nested_and_simultaneous_paths_differ(tmp_path):
