@@ -166,6 +166,8 @@ def test_configurations_that_cannot_be(change, message):
     with pytest.raises(InputError, match=message):
         NetworkConfig(**SMALL_ONE | change)
     assert NetworkConfig(**SMALL_ONE).blocks == (1, 0, 1)
+    # false in files of before it was a number
+    assert NetworkConfig(**SMALL_ONE | {"convolution": False}).convolution == 0
     with pytest.raises(InputError, match="unknown network size 'huge'.*tiny"):
         preset("huge")
 
