@@ -197,11 +197,11 @@ def _crop(scene: Scene, bodies: Bodies, row: int, scan: Scan, rng: np.random.Gen
         points = np.concatenate([points, clusters.astype(np.float32)])
         ring = np.concatenate([ring, np.zeros(len(clusters), ring.dtype)])
         part = np.concatenate([part, np.zeros(len(clusters), np.uint8)])
-    kept = box.contains(points)
-    points, ring, part = points[kept], ring[kept], part[kept]
+    inside = box.contains(points)
+    points, ring, part = points[inside], ring[inside], part[inside]
     if missing_part < config.noise.missing_part * config.hard:
-        kept = noise.part_removal(part, rng=rng)
-        points, ring, part = points[kept], ring[kept], part[kept]
+        left = noise.part_removal(part, rng=rng)
+        points, ring, part = points[left], ring[left], part[left]
     return Sample(
         points=points,
         center=center_of(points) if len(points) else box.center,

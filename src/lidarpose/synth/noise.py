@@ -28,8 +28,8 @@ def laser_mask(columns: int, rows: int, *, keep: float, rng: np.random.Generator
     """
     patch = max(min(columns, rows) // _PATCHES, 1)
     across, down = -(-columns // patch), -(-rows // patch)
-    kept = _kept_patches(across * down, keep, rng)
-    return kept.reshape(across, down).repeat(patch, 0).repeat(patch, 1)[:columns, :rows]
+    mask = _kept_patches(across * down, keep, rng)
+    return mask.reshape(across, down).repeat(patch, 0).repeat(patch, 1)[:columns, :rows]
 
 
 def direction_mask(directions: np.ndarray, *, keep: float, rng: np.random.Generator) -> np.ndarray:
@@ -60,9 +60,9 @@ def direction_mask(directions: np.ndarray, *, keep: float, rng: np.random.Genera
 
 def _kept_patches(patches: int, keep: float, rng: np.random.Generator) -> np.ndarray:
     """(patches,) bool: a share `keep` of them, rounded down, drawn at random."""
-    kept = np.zeros(patches, bool)
-    kept[rng.permutation(patches)[: int(patches * keep)]] = True
-    return kept
+    mask = np.zeros(patches, bool)
+    mask[rng.permutation(patches)[: int(patches * keep)]] = True
+    return mask
 
 
 # --- clutter points

@@ -26,7 +26,7 @@ def lose_returns(points, face, vertices, faces, keep, error, chance, dropout, in
     differ in reflectivity, which makes the step soft: 1 / (1 + power^2) is lost, power 1 there. What a face without
     area returns is weak.
     """
-    kept = np.empty(len(points), np.int64)
+    returned = np.empty(len(points), np.int64)
     moved = np.empty((len(points), 3), np.float32)
     n = 0
     for i in range(len(points)):
@@ -54,6 +54,6 @@ def lose_returns(points, face, vertices, faces, keep, error, chance, dropout, in
         moved[n, 0] = x * scale
         moved[n, 1] = y * scale
         moved[n, 2] = z * scale
-        kept[n] = i
+        returned[n] = i
         n += 1
-    return moved[:n], kept[:n]
+    return moved[:n], returned[:n]

@@ -127,11 +127,11 @@ def simulate_scan(scene: Scene, meshes: list[Mesh], rng: np.random.Generator, *,
     """
     sensor = scene.sensor
     hits, mesh = _cast(scene, meshes, frame)
-    points, kept = add_sensor_noise(hits, mesh, sensor, scene.conditions, rng)
+    points, returned = add_sensor_noise(hits, mesh, sensor, scene.conditions, rng)
     # a union has parts
-    ring, part = hits.ring[kept], cast("np.ndarray", mesh.part)[hits.face[kept]]
+    ring, part = hits.ring[returned], cast("np.ndarray", mesh.part)[hits.face[returned]]
     if scene.config.noise.dapt_compat and isinstance(sensor, Sensor):
-        seam = np.flatnonzero((hits.column[kept] + hits.column0) % sensor.columns == 0)
+        seam = np.flatnonzero((hits.column[returned] + hits.column0) % sensor.columns == 0)
         points, ring, part = (np.concatenate([a, a[seam]]) for a in (points, ring, part))
     return Scan(points=scene.place.to_level(points), ring=ring, part=part)
 

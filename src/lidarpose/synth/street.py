@@ -326,14 +326,14 @@ def _scan_turn(
     else:
         hits = scan(mesh.vertices, mesh.faces, device)
     conditions = ScanConditions(sigma=device.range_sigma, bias=_RING_BIAS, intensity_dropout=_INTENSITY_DROPOUT)
-    points, kept = add_sensor_noise(hits, mesh, device, conditions, rng, ring_normals=ring_normals)
-    face = hits.face[kept]
+    points, returned = add_sensor_noise(hits, mesh, device, conditions, rng, ring_normals=ring_normals)
+    face = hits.face[returned]
     # the people's faces come first, one person after the other
     owner = np.repeat(np.arange(len(people) + 1), [len(m.faces) for m in (*people, still)]).astype(np.int16)
     owner[owner == len(people)] = -1
     return StreetFrame(
         points=points @ R_sensor_level,
-        ring=hits.ring[kept],
+        ring=hits.ring[returned],
         person=owner[face],
         part=np.zeros(len(face), np.uint8) if scene.part is None else scene.part[face],
         boxes=tuple(_label(walker, frame, track) for track, walker in enumerate(walkers)),
