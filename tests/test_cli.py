@@ -17,7 +17,8 @@ import pytest
 from hostile_files import CALIBRATION, KITTI
 from safetensors.numpy import save_file
 
-from lidarpose.cli import demo, main, weights
+import lidarpose
+from lidarpose.cli import demo, main
 from lidarpose.errors import InputError
 from lidarpose.inference import predictor
 from lidarpose.models import BUNDLED, DEFAULT, bundled_path
@@ -169,31 +170,31 @@ def test_people_without_a_pose_are_no_error_and_share_a_warning_line(crop, tmp_p
     assert [person["joints"] for person in people] == [None] * 5 and people[0]["warnings"]
 
 
-def test_info(capsys):
-    assert run("info") == 0
-    text = capsys.readouterr().out
-    for word in (
-        "lidarpose ",
-        "ONNX Runtime ",
-        "torch ",
-        "device ",
-        "tiny",
-        "small",
-        "MB",
-        "default",
-        "parameters",
-        "trained",
-    ):
-        assert word in text
+def test_info_is_short_long_or_json(capsys):
+    printed = {}
+    for flag in ("", "-v", "--json"):
+        assert run("info", *flag.split()) == 0
+        printed[flag] = capsys.readouterr().out
+    facts = json.loads(printed["--json"])
+    assert facts["lidarpose"] == lidarpose.__version__ and facts["threads"] > 0 and "device" in facts["torch"]
+    assert set(facts["weights"]) == set(BUNDLED) and len(printed[""].splitlines()) <= 10
+    for name, entry in facts["weights"].items():
+        assert entry["default"] == (name == DEFAULT) and Path(entry["file"]).stat().st_size == entry["bytes"]
+        assert entry["people_seen_in_all"] > entry["last_run"]["people_seen"] and entry["scores"]
+        for text in (printed[""], printed["-v"]):
+            size = f"{entry['parameters']:,} parameters, {entry['bytes'] / 1e6:.2f} MB"
+            assert f"{name}{', the default' * entry['default']}: {size}" in text
+        for label, score in entry["scores"].items():
+            assert f"{label}: {score}" in printed["-v"]
+        assert entry["last_run"]["command"] in printed["-v"] and entry["last_run"]["command"] not in printed[""]
 
 
-def test_info_counts_the_people_of_all_runs(monkeypatch):
+def test_info_counts_the_people_of_all_runs(monkeypatch, capsys):
     before = {"people_seen": 1_000, "hours": 1.25}
     header = SimpleNamespace(card={"people_seen": 500, "hours": 0.5, "init_card": before})
     monkeypatch.setattr("lidarpose.models.checkpoint.read_header", lambda path: header)
-    assert "           500 people, 0.50 hours; with the runs before it 1,500 people, 1.75 hours" in weights.info_lines()
-    header.card = before
-    assert "           1,000 people, 1.25 hours" in weights.info_lines()
+    assert run("info", "--verbose") == 0
+    assert "  500 people, 0.50 hours; all its runs 1,500 people, 1.75 hours" in capsys.readouterr().out
 
 
 def test_backends_decoders_and_tta(crop, capsys):

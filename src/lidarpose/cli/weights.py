@@ -1,11 +1,13 @@
 """`lidarpose info`, `export` and `import`."""
 
 import argparse
+import json
 import platform
+from collections.abc import Iterator
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from lidarpose._version import __version__
 from lidarpose.cli.terminal import add_command, tell
@@ -16,6 +18,8 @@ def add(commands) -> None:
     """Adds the commands to the parser's."""
     info = add_command(commands, "info", "show versions, device, bundled weights and their scores", "lidarpose info")
     info.set_defaults(run=_info)
+    info.add_argument("-v", "--verbose", action="store_true", help="also how the weights were trained, and all scores")
+    info.add_argument("--json", action="store_true", help="print everything as JSON")
 
     export = add_command(
         commands,
@@ -48,52 +52,72 @@ def add(commands) -> None:
 
 
 def _info(options: argparse.Namespace) -> None:
-    print("\n".join(info_lines()))
+    facts = installed()
+    print(json.dumps(facts, indent=1) if options.json else "\n".join(_lines(facts, verbose=options.verbose)))
 
 
-def info_lines() -> list[str]:
-    """Versions, backends, device, and of each bundled checkpoint its size, parameters, training and score."""
+def installed() -> dict[str, Any]:
+    """Versions, threads, torch and its device, and of each bundled network its size, training and scores."""
     import onnxruntime
 
-    from lidarpose.models.checkpoint import parameter_count, read_header
+    from lidarpose.models.checkpoint import parameter_count, read_header, runs_of
     from lidarpose.models.onnx import usable_threads
 
-    lines = [
-        f"lidarpose  {__version__}",
-        f"python     {platform.python_version()}",
-        f"onnx       ONNX Runtime {onnxruntime.__version__}, cpu, {usable_threads()} threads: the default backend",
-        _torch_line(),
-    ]
+    weights = {}
     for name in BUNDLED:
         path = bundled_path(name)
         card = read_header(path).card
-        exported = bundled_path(name, ".onnx").stat().st_size / 1e6
-        lines += [
-            f"weights    {name}: {path.stat().st_size / 1e6:.2f} MB, {parameter_count(path):,} parameters, "
-            f"as ONNX {exported:.2f} MB{', the default' if name == DEFAULT else ''}",
-            f"  trained  {card.get('command', 'unknown')}",
-            f"           {_people_and_hours(card)}",
-        ]
-        lines += [f"           {card['note']}"] if "note" in card else []
-        lines += [f"  score    {key}: {value}" for key, value in card.get("scores", {}).items()]
-    return lines
+        runs = runs_of(card)
+        weights[name] = {
+            "default": name == DEFAULT,
+            "file": str(path),
+            "parameters": parameter_count(path),
+            "bytes": path.stat().st_size,
+            "onnx_bytes": bundled_path(name, ".onnx").stat().st_size,
+            # of all runs, those included that made the weights with which the last one began
+            "people_seen_in_all": sum(run.get("people_seen", 0) for run in runs),
+            "hours_in_all": round(sum(run.get("hours", 0) for run in runs), 2),
+            "last_run": {key: card[key] for key in ("command", "people_seen", "hours", "note") if key in card},
+            "scores": card.get("scores", {}),
+        }
+    return {
+        "lidarpose": __version__,
+        "python": platform.python_version(),
+        "onnxruntime": onnxruntime.__version__,
+        "threads": usable_threads(),
+        "torch": _torch(),
+        "weights": weights,
+    }
 
 
-def _people_and_hours(card: dict) -> str:
-    """People and hours of the run, and of those before it."""
-    from lidarpose.models.checkpoint import runs_of
+def _lines(facts: dict[str, Any], *, verbose: bool) -> Iterator[str]:
+    """`installed` for reading: what a user needs, or everything."""
+    yield f"lidarpose  {facts['lidarpose']}, Python {facts['python']}"
+    yield f"onnx       ONNX Runtime {facts['onnxruntime']}, cpu, {facts['threads']} threads: the default backend"
+    yield f"torch      {facts['torch']}"
+    for name, entry in facts["weights"].items():
+        size = f"{entry['parameters']:,} parameters, {entry['bytes'] / 1e6:.2f} MB"
+        yield f"weights    {name}{', the default' * entry['default']}: {size}"
+        scores = list(entry["scores"].items())
+        if verbose:
+            run = entry["last_run"]
+            yield f"           as ONNX {entry['onnx_bytes'] / 1e6:.2f} MB; {entry['file']}"
+            yield f"  trained  {run.get('command', 'unknown')}"
+            yield (
+                f"           {run.get('people_seen', 0):,} people, {run.get('hours', 0):.2f} hours; all its runs "
+                f"{entry['people_seen_in_all']:,} people, {entry['hours_in_all']:.2f} hours"
+            )
+            if "note" in run:
+                yield f"           {run['note']}"
+        for label, score in scores if verbose else scores[:1]:
+            yield f"  score    {label}: {score}"
+    if not verbose:
+        yield "more       lidarpose info --verbose: training and all scores; --json: the same for programs"
 
-    runs = runs_of(card)
-    people, hours = ([run.get(name, 0) for run in runs] for name in ("people_seen", "hours"))
-    line = f"{people[0]:,} people, {hours[0]:.2f} hours"
-    if len(runs) == 1:
-        return line
-    return f"{line}; with the runs before it {sum(people):,} people, {sum(hours):.2f} hours"
 
-
-def _torch_line() -> str:
+def _torch() -> str:
     if find_spec("torch") is None:
-        return "torch      not installed, training and --device need it: in the clone, pip install '.[train]'"
+        return "not installed, training and --device need it: in the clone, pip install '.[train]'"
     try:
         # torch may be installed and still fail to load its libraries
         import torch
@@ -102,8 +126,8 @@ def _torch_line() -> str:
             torch.cuda.get_device_name() if torch.cuda.is_available() else f"cpu, {torch.get_num_threads()} threads"
         )
     except (ImportError, OSError, RuntimeError) as error:
-        return f"torch      {metadata.version('torch')}, which cannot be used ({' '.join(str(error).split())[:120]})"
-    return f"torch      {torch.__version__}, device {device}"
+        return f"{metadata.version('torch')}, which cannot be used ({' '.join(str(error).split())[:120]})"
+    return f"{torch.__version__}, device {device}"
 
 
 def _export(options: argparse.Namespace) -> None:
