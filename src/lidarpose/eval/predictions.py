@@ -89,6 +89,9 @@ class Predictions:
         """(N, J) bool: a joint that counts, hidden or seen, of a person with a pose."""
         return (self.labels != UNLABELED) & self.posed[:, None]
 
+    # the name until 0.2
+    labelled = labeled
+
     @property
     def filled(self) -> np.ndarray:
         """(N, J, 3): pred, 0 without a pose; such people have no labeled joints."""
@@ -101,6 +104,9 @@ class Predictions:
     def select(self, rows: np.ndarray) -> "Predictions":
         """Some of the people."""
         return replace(self, **{column.name: getattr(self, column.name)[rows] for column in _COLUMNS})
+
+    # the name until 0.2
+    of = select
 
 
 _COLUMNS = [column for column in fields(Predictions) if column.metadata]

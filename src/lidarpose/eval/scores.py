@@ -62,6 +62,9 @@ class Setting:
             words.append(f"{self.limit:,} of {self.total:,} people")
         return " · ".join(words)
 
+    # the name until 0.2
+    told = summary
+
 
 @dataclass(frozen=True, kw_only=True)
 class MetricRow:
