@@ -206,6 +206,7 @@ def test_number_types_of_numpy(folder, dtype):
             )
             for mark, suffix in ((",", "csv"), (";", "csv"), ("\t", "txt"), (" ", "xyz"))
         ),
+        ("a.xyz", "1,5 2,5 3,5\n4 5 6,5\n", [[1.5, 2.5, 3.5], [4, 5, 6.5]]),
         # a missing value has many spellings
         *(
             ("a.csv", f"x,y,z\n1,2,3\n{missing},{missing},{missing}\n4,5,6\n", [[1, 2, 3], [4, 5, 6]])
