@@ -1,0 +1,184 @@
+"""LiDARCap (Li et al. 2022): PointNet++ of each frame, a recurrent net for joints, a graph net for rotations.
+
+A clip is 16 frames of 512 points; joints are those of SMPL, relative to each frame's center.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from lidarpose.models.baselines.point_ops import ball_query, farthest_points, gather_points
+from lidarpose.skeleton import SMPL24
+
+FRAMES, POINTS = 16, 512
+FEATURES = 1024
+# how far the graph's convolutions reach in time, frames
+TIME_KERNEL = 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClipOutputs:
+    """Of B clips of T frames: joints (B, T, 24, 3) m of the first stage; rotations (B, T, 24, 3, 3) of SMPL, each
+    joint's relative to its parent's, the pelvis' to the world."""
+
+    joints: Tensor
+    rotations: Tensor
+
+
+class Lidarcap(nn.Module):
+    """34.9 M parameters. as_published: neighborhoods that depend on the order of the points, as its CUDA kernels'."""
+
+    def __init__(self, *, as_published: bool = False):
+        super().__init__()
+        self.encoder = PointNet2(FEATURES, as_published=as_published)
+        self.embed = nn.Linear(FEATURES, 1024)
+        self.recurrent = nn.GRU(1024, 1024, num_layers=2, batch_first=True, bidirectional=True)
+        self.joints = nn.Linear(2048, 3 * len(SMPL24))
+        self.rotations = StGcn(3 + FEATURES)
+
+    def forward(self, points: Tensor, valid: Tensor) -> ClipOutputs:
+        """points (B, T, N, 3) m about each frame's center, valid (B, T, N) bool, at least one a frame."""
+        clips, frames = points.shape[:2]
+        features = self.encoder(points.flatten(0, 1), valid.flatten(0, 1)).unflatten(0, (clips, frames))
+        hidden = F.dropout(self.embed(features), 0.5, self.training).relu()
+        joints = self.joints(self.recurrent(hidden)[0]).unflatten(-1, (-1, 3))
+        return ClipOutputs(joints=joints, rotations=self.rotations(joints, features))
+
+
+class PointNet2(nn.Module):
+    """PointNet++ on coordinates alone: points (B, N, 3), valid (B, N) -> (B, C)."""
+
+    def __init__(self, channels: int, *, as_published: bool = False):
+        super().__init__()
+        self.local = nn.ModuleList(
+            [
+                SetAbstraction(256, 0.2, (3, 64, 64, 128), as_published=as_published),
+                SetAbstraction(128, 0.4, (131, 128, 128, 256), as_published=as_published),
+            ]
+        )
+        self.all = _perceptron((259, 256, 512, channels))
+
+    def forward(self, points: Tensor, valid: Tensor) -> Tensor:
+        features = points[..., :0]
+        for layer in self.local:
+            points, valid, features = layer(points, valid, features)
+        rows = torch.cat([points, features], -1)
+        return self.all(rows.flatten(0, 1)).unflatten(0, rows.shape[:2]).amax(1)
+
+
+class SetAbstraction(nn.Module):
+    """Features of centers from at most 32 points within a radius (m) of each."""
+
+    def __init__(self, centers: int, radius: float, channels: tuple[int, ...], *, as_published: bool = False):
+        super().__init__()
+        self.centers, self.radius, self.as_published = centers, radius, as_published
+        self.layers = _perceptron(channels)
+
+    def forward(self, points: Tensor, valid: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        chosen = farthest_points(points, valid, self.centers, as_published=self.as_published)
+        centers = gather_points(points, chosen)
+        index = ball_query(centers, points, valid, self.radius, 32, as_published=self.as_published)
+        offsets = gather_points(points, index) - centers[:, :, None]
+        rows = torch.cat([offsets, gather_points(features, index)], -1)
+        shape = rows.shape[:3]
+        pooled = self.layers(rows.flatten(0, 2)).unflatten(0, shape).amax(2)
+        # centers that were chosen twice do not change a maximum, so all count from here on
+        return centers, torch.ones_like(chosen, dtype=torch.bool), pooled
+
+
+class StGcn(nn.Module):
+    """Spatial and temporal graph convolutions over SMPL's tree -> a rotation of each joint in each frame."""
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.norm = nn.BatchNorm1d(channels * len(SMPL24))
+        widths = (channels, 256, 128, 64)
+        self.layers = nn.ModuleList(
+            GraphLayer(widths[k], widths[k + 1], residual=k > 0) for k in range(len(widths) - 1)
+        )
+        self.output = nn.Conv2d(widths[-1], 6, 1)
+
+    def forward(self, joints: Tensor, features: Tensor) -> Tensor:
+        """joints (B, T, J, 3), features (B, T, C) -> (B, T, J, 3, 3)."""
+        number = joints.shape[2]
+        x = torch.cat([joints, features[:, :, None].expand(-1, -1, number, -1)], -1)
+        # joints and their channels are the channels of the norm, joint by joint
+        x = self.norm(x.flatten(2).transpose(1, 2)).unflatten(1, (number, -1)).permute(0, 2, 3, 1)
+        for layer in self.layers:
+            x = layer(x)
+        return rotations_from_6d(self.output(x).permute(0, 2, 3, 1))
+
+
+class GraphLayer(nn.Module):
+    """(B, C, T, J) -> (B, C', T, J)."""
+
+    def __init__(self, in_channels: int, out_channels: int, *, residual: bool):
+        super().__init__()
+        graph = tree_partition(SMPL24.parents)
+        self.graph: Tensor
+        self.register_buffer("graph", graph, persistent=False)
+        self.edge = nn.Parameter(torch.ones_like(graph))
+        self.space = nn.Conv2d(in_channels, len(graph) * out_channels, 1)
+        self.time = nn.Sequential(
+            nn.BatchNorm2d(out_channels),
+            nn.ReLU(),
+            nn.Conv2d(out_channels, out_channels, (TIME_KERNEL, 1), padding=(TIME_KERNEL // 2, 0)),
+            nn.BatchNorm2d(out_channels),
+            nn.Dropout(0.5),
+        )
+        self.residual = (
+            nn.Sequential(nn.Conv2d(in_channels, out_channels, 1), nn.BatchNorm2d(out_channels)) if residual else None
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        mixed = self.space(x).unflatten(1, (len(self.graph), -1))
+        y = self.time(torch.einsum("bkctv,kvw->bctw", mixed, self.graph * self.edge))
+        return (y if self.residual is None else y + self.residual(x)).relu()
+
+
+def tree_partition(parents: tuple[int, ...]) -> Tensor:
+    """(3, J, J) weights from joint v to joint w: itself; neighbors as far from the root or farther; neighbors nearer to
+    it. Each column is divided by the joint's number of neighbors, itself among them."""
+    joints = len(parents)
+    depth = [0] * joints
+    weights = torch.zeros(3, joints, joints)
+    weights[0] = torch.eye(joints)
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            depth[joint] = depth[parent] + 1
+            weights[1, joint, parent] = 1
+            weights[2, parent, joint] = 1
+    return weights / weights.sum((0, 1))
+
+
+def rotations_from_6d(numbers: Tensor) -> Tensor:
+    """(..., 6), a 3x2 matrix row by row, -> (..., 3, 3): its columns made orthonormal, and their cross product."""
+    first, second = numbers.unflatten(-1, (3, 2)).unbind(-1)
+    x = F.normalize(first, dim=-1)
+    y = F.normalize(second - (x * second).sum(-1, keepdim=True) * x, dim=-1)
+    return torch.stack([x, y, torch.linalg.cross(x, y)], -1)
+
+
+def forward_kinematics(rotations: Tensor, offsets: Tensor, parents: tuple[int, ...]) -> Tensor:
+    """rotations (..., J, 3, 3), offsets (J, 3) m of each joint from its parent at rest -> joints (..., J, 3) m, the
+    first one at 0."""
+    world: list[Tensor] = []
+    joints: list[Tensor] = []
+    for joint, parent in enumerate(parents):
+        own = rotations[..., joint, :, :]
+        if parent < 0:
+            world.append(own)
+            joints.append(torch.zeros_like(own[..., 0]))
+        else:
+            joints.append(joints[parent] + world[parent] @ offsets[joint])
+            world.append(world[parent] @ own)
+    return torch.stack(joints, -2)
+
+
+def _perceptron(channels: tuple[int, ...]) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for before, after in zip(channels, channels[1:], strict=False):
+        layers += [nn.Linear(before, after, bias=False), nn.BatchNorm1d(after), nn.ReLU()]
+    return nn.Sequential(*layers)

@@ -1,0 +1,126 @@
+"""LPFormer for crops, as LiDAR-HMR rebuilt it (Ye et al. 2024): a 3D convolutional net of occupancy and a transformer.
+
+The original finds people in whole sweeps by a detector, whose features it reads; it has no public code.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from lidarpose.models.baselines.prn import BareAttention
+
+# half the side of the occupancy grid, and how far out a point may ask for features, m
+HALF, REACH = 1.0, 1.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class LpformerOutputs:
+    """joints (B, J, 3) m; visible (B, J, 2) logits; parts (B, N, J + 1) logits, the last one background."""
+
+    joints: Tensor
+    visible: Tensor
+    parts: Tensor
+
+
+class Lpformer(nn.Module):
+    """4.81 M parameters. grid: cells a side, 64 as published; 32 costs an eighth, with weights of the same shapes."""
+
+    def __init__(self, joints: int, *, grid: int = 64):
+        super().__init__()
+        self.grid = grid
+        self.volume = V2V()
+        self.token = nn.Sequential(nn.Linear(38, 1024), nn.Linear(1024, 512), nn.Linear(512, 256))
+        self.joint = nn.Parameter(torch.randn(joints, 256))
+        self.attention = nn.ModuleList(BareAttention(256, heads=8) for _ in range(4))
+        self.xy, self.z, self.visible = (_joint_head(size) for size in (2, 1, 2))
+        self.parts = nn.Sequential(nn.Linear(256, 256), nn.Linear(256, 16), nn.ReLU(), nn.Linear(16, joints + 1))
+
+    def forward(self, points: Tensor, valid: Tensor, center: Tensor | None = None) -> LpformerOutputs:
+        """points (B, N, 3) m about the person's center, valid (B, N) bool; center (B, 3) m from the sensor, by default
+        0, so that a point's place is told twice, as in the DAPT repository."""
+        volume = self.volume(self.occupancy(points, valid))
+        # grid_sample wants x last in the volume and first in the places
+        place = points.clamp(-REACH, REACH)[:, :, None, None]
+        local = F.grid_sample(volume, place, align_corners=False)[..., 0, 0].transpose(1, 2)
+        absolute = points if center is None else points + center[:, None]
+        tokens = self.token(torch.cat([absolute, points, local], -1))
+        joints = self.joint.expand(len(points), -1, -1)
+        tokens = torch.cat([joints, tokens], 1)
+        mask = torch.cat([valid.new_ones(joints.shape[:2]), valid], 1)
+        for layer in self.attention:
+            tokens = layer(tokens, mask)
+        queries, points_out = tokens[:, : joints.shape[1]], tokens[:, joints.shape[1] :]
+        return LpformerOutputs(
+            joints=torch.cat([self.xy(queries), self.z(queries)], -1),
+            visible=self.visible(queries),
+            parts=self.parts(points_out),
+        )
+
+    def occupancy(self, points: Tensor, valid: Tensor) -> Tensor:
+        """(B, 1, grid z, grid y, grid x): 1 where a point is; points beyond the grid count in its border cells."""
+        cell = ((points / HALF + 1) * 0.5 * self.grid).floor().long().clamp(0, self.grid - 1)
+        person = torch.arange(len(points), device=points.device)[:, None].expand_as(valid)
+        volume = points.new_zeros(len(points), 1, self.grid, self.grid, self.grid)
+        x, y, z = cell[valid].unbind(1)
+        volume[person[valid], 0, z, y, x] = 1
+        return volume
+
+
+class V2V(nn.Module):
+    """Moon et al. 2018, two levels deep: occupancy (B, 1, G, G, G) -> 32 channels. 3.24 M parameters."""
+
+    def __init__(self):
+        super().__init__()
+        self.stem = nn.Sequential(_conv(1, 16, 7), Residual(16, 32))
+        self.skips = nn.ModuleList([Residual(32, 32), Residual(64, 64)])
+        self.down = nn.ModuleList([Residual(32, 64), Residual(64, 128)])
+        self.middle = nn.Sequential(Residual(128, 128), Residual(128, 128))
+        self.up = nn.ModuleList([_up(64, 32), _up(128, 64)])
+        self.after = nn.ModuleList([nn.Identity(), Residual(64, 64)])
+        self.last = nn.Conv3d(32, 32, 1)
+        for module in self.modules():
+            if isinstance(module, nn.Conv3d | nn.ConvTranspose3d):
+                nn.init.normal_(module.weight, 0, 0.001)
+                assert module.bias is not None
+                nn.init.zeros_(module.bias)
+
+    def forward(self, volume: Tensor) -> Tensor:
+        x = self.stem(volume)
+        skips = []
+        for skip, down in zip(self.skips, self.down, strict=True):
+            skips.append(skip(x))
+            x = down(F.max_pool3d(x, 2))
+        x = self.middle(x)
+        for level in (1, 0):
+            x = self.after[level](self.up[level](x) + skips[level])
+        return self.last(x)
+
+
+class Residual(nn.Module):
+    def __init__(self, in_channels: int, out_channels: int):
+        super().__init__()
+        last = [nn.Conv3d(out_channels, out_channels, 3, padding=1), nn.BatchNorm3d(out_channels)]
+        self.branch = nn.Sequential(_conv(in_channels, out_channels, 3), *last)
+        self.skip: nn.Module = nn.Identity()
+        if in_channels != out_channels:
+            self.skip = nn.Sequential(nn.Conv3d(in_channels, out_channels, 1), nn.BatchNorm3d(out_channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return (self.branch(x) + self.skip(x)).relu()
+
+
+def _conv(in_channels: int, out_channels: int, size: int) -> nn.Sequential:
+    conv = nn.Conv3d(in_channels, out_channels, size, padding=size // 2)
+    return nn.Sequential(conv, nn.BatchNorm3d(out_channels), nn.ReLU())
+
+
+def _up(in_channels: int, out_channels: int) -> nn.Sequential:
+    conv = nn.ConvTranspose3d(in_channels, out_channels, 2, stride=2)
+    return nn.Sequential(conv, nn.BatchNorm3d(out_channels), nn.ReLU())
+
+
+def _joint_head(size: int) -> nn.Sequential:
+    # no activation between the last two: as published
+    return nn.Sequential(nn.Linear(256, 16), nn.ReLU(), nn.Linear(16, 8), nn.Linear(8, size))

@@ -1,0 +1,92 @@
+"""NE (Zhang et al., "Neighborhood-Enhanced 3D Human Pose Estimation with Monocular LiDAR", AAAI 2024).
+
+As LiDARCap, with two further clouds of each frame: the static background behind the person, and the frame's other
+points about it; attention exchanges what the three say.
+"""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from lidarpose.models.baselines.lidarcap import FRAMES, ClipOutputs, PointNet2, StGcn
+from lidarpose.skeleton import SMPL24
+
+WIDTH, LAYERS = 512, 8
+CLOUDS = ("person", "background", "neighbors")
+
+
+class Ne(nn.Module):
+    """129.7 M parameters.
+
+    across_batch: the exchange attends over the clips of a batch instead of a clip's frames, as published; with one clip
+    it does nothing then.
+    """
+
+    def __init__(self, *, across_batch: bool = False, as_published: bool = False):
+        super().__init__()
+        self.across_batch = across_batch
+        self.encoders = nn.ModuleDict({name: PointNet2(WIDTH, as_published=as_published) for name in CLOUDS})
+        self.neighbors = _transformer(WIDTH)
+        self.exchange = Exchange()
+        self.norm = nn.LayerNorm(3 * WIDTH)
+        self.clip = _transformer(3 * WIDTH)
+        self.joints = nn.Linear(3 * WIDTH, 3 * len(SMPL24))
+        self.shrink = nn.Linear(3 * WIDTH, 1024, bias=False)
+        # frames are its channels: clips have 16
+        self.frame_norm = nn.BatchNorm1d(FRAMES)
+        self.widen = nn.Linear(1024, 1024)
+        self.rotations = StGcn(3 + 1024)
+
+    def forward(self, clouds: dict[str, tuple[Tensor, Tensor]]) -> ClipOutputs:
+        """clouds: of each of `CLOUDS` points (B, 16, N, 3) m about the frame's center and valid (B, 16, N) bool, one or
+        more a frame."""
+        features = {}
+        for name, (points, valid) in clouds.items():
+            own = self.encoders[name](points.flatten(0, 1), valid.flatten(0, 1))
+            features[name] = own.unflatten(0, points.shape[:2])
+        everything = torch.cat([features[name] for name in CLOUDS], -1)
+        person, background = features["person"], features["background"]
+        neighbors = self.neighbors(features["neighbors"])
+        if self.across_batch:
+            mixed = self.exchange(*(x.transpose(0, 1) for x in (person, background, neighbors))).transpose(0, 1)
+        else:
+            mixed = self.exchange(person, background, neighbors)
+        joints = self.joints(self.clip(self.norm(mixed))).unflatten(-1, (-1, 3))
+        hidden = F.dropout(self.frame_norm(self.shrink(everything)).relu(), 0.5, self.training)
+        return ClipOutputs(joints=joints, rotations=self.rotations(joints, self.widen(hidden)))
+
+
+class Exchange(nn.Module):
+    """Person, background and neighbors (B, T, 512) -> (B, T, 1536): each asks with one, by the keys of another."""
+
+    def __init__(self):
+        super().__init__()
+        # of each of the three attentions: query, key, value
+        self.norms = nn.ModuleList(nn.ModuleList(nn.LayerNorm(WIDTH, eps=1e-6) for _ in range(3)) for _ in range(3))
+        self.attention = nn.ModuleList(nn.MultiheadAttention(WIDTH, 8, dropout=0.1, batch_first=True) for _ in range(3))
+        self.norm = nn.LayerNorm(3 * WIDTH, eps=1e-6)
+        self.mlp = nn.Sequential(nn.Linear(3 * WIDTH, 1024), nn.GELU(), nn.Linear(1024, 3 * WIDTH))
+
+    def forward(self, person: Tensor, background: Tensor, neighbors: Tensor) -> Tensor:
+        person = person + self._attend(0, neighbors, background, person)
+        neighbors = neighbors + self._attend(1, person, background, neighbors)
+        background = background + self._attend(2, person, neighbors, background)
+        x = torch.cat([person, neighbors, background], -1)
+        return x + drop_path(self.mlp(self.norm(x)), 0.2, self.training)
+
+    def _attend(self, number: int, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
+        query, key, value = (norm(x) for norm, x in zip(self.norms[number], (query, key, value), strict=True))
+        return drop_path(self.attention[number](query, key, value, need_weights=False)[0], 0.2, self.training)
+
+
+def drop_path(branch: Tensor, rate: float, training: bool) -> Tensor:
+    """A residual branch (B, ...), left out for some of B in training."""
+    if not training:
+        return branch
+    keep = torch.rand(len(branch), *(1,) * (branch.dim() - 1), device=branch.device) >= rate
+    return branch * keep / (1 - rate)
+
+
+def _transformer(width: int) -> nn.TransformerEncoder:
+    layer = nn.TransformerEncoderLayer(width, 4, 1024, dropout=0.1, activation="gelu", batch_first=True)
+    return nn.TransformerEncoder(layer, LAYERS, enable_nested_tensor=False)

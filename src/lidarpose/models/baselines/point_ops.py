@@ -1,0 +1,82 @@
+"""Neighborhoods within padded clouds, in plain torch: farthest points, balls, nearest neighbors.
+
+Clouds are (B, N, 3) m with valid (B, N), False where a row is padding. Dense distance matrices: meant for some
+thousand points.
+"""
+
+import torch
+from torch import Tensor
+
+# square distance of what is no neighbor, m²
+_FAR = 1e10
+
+
+def gather_points(values: Tensor, index: Tensor) -> Tensor:
+    """values (B, N, C), index (B, ...) -> (B, ..., C): rows of each cloud."""
+    flat = index.flatten(1)
+    rows = values.gather(1, flat[..., None].expand(-1, -1, values.shape[-1]))
+    return rows.unflatten(1, index.shape[1:])
+
+
+def square_distances(a: Tensor, b: Tensor) -> Tensor:
+    """a (B, M, 3), b (B, N, 3) -> (B, M, N) m²; by differences, since a product of near points loses digits."""
+    x, y, z = ((a[:, :, None, k] - b[:, None, :, k]).square() for k in range(3))
+    return x + y + z
+
+
+def farthest_points(points: Tensor, valid: Tensor, count: int, *, as_published: bool = False) -> Tensor:
+    """(B, count) indices: each next point is the farthest from those before; the first of equals.
+
+    Args:
+        points: (B, N, 3) m.
+        valid: (B, N); a cloud of fewer points than `count` repeats its first choice.
+        count: how many.
+        as_published: begin at point 0 and never choose a point within 3.2 cm of the origin, as the CUDA kernel of
+            PointNet++ does; else begin at the point farthest from the mean, whatever the order of the points.
+    """
+    points, own = points.detach(), torch.arange(len(points), device=points.device)
+    usable = valid & (points.square().sum(-1) > 1e-3) if as_published else valid
+    if as_published:
+        chosen = torch.zeros(len(points), dtype=torch.long, device=points.device)
+    else:
+        weight = valid[..., None].to(points.dtype)
+        mean = (points * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp(min=1)
+        chosen = _masked(square_distances(points, mean)[..., 0], usable).argmax(1)
+    nearest = torch.full(valid.shape, _FAR, dtype=points.dtype, device=points.device)
+    nearest = _masked(nearest, usable)
+    indices = [chosen]
+    for _ in range(count - 1):
+        nearest = torch.minimum(nearest, (points - points[own, chosen][:, None]).square().sum(-1))
+        # rows of padding are below every distance; once every point is chosen, the first one again
+        chosen = torch.where(nearest.amax(1) > 0, nearest.argmax(1), indices[0])
+        indices.append(chosen)
+    return torch.stack(indices, 1)
+
+
+def ball_query(
+    centers: Tensor, points: Tensor, valid: Tensor, radius: float, count: int, *, as_published: bool = False
+) -> Tensor:
+    """(B, M, count) indices of points within `radius` m of centers (B, M, 3); the nearest ones, repeating the nearest.
+
+    as_published: the first ones in the order of the points, repeating the first, as the CUDA kernel does.
+    """
+    distance = square_distances(centers, points)
+    inside = (distance < radius * radius) & valid[:, None]
+    if as_published:
+        number = torch.arange(points.shape[1], device=points.device, dtype=points.dtype)
+        distance = number.expand_as(distance)
+    value, index = distance.masked_fill(~inside, _FAR).topk(min(count, points.shape[1]), largest=False)
+    index = torch.where(value < _FAR, index, index[..., :1])
+    return torch.cat([index, index[..., :1].expand(*index.shape[:-1], count - index.shape[-1])], -1)
+
+
+def nearest_neighbors(points: Tensor, valid: Tensor, count: int) -> Tensor:
+    """(B, N, count) indices of each point's nearest points, itself among them; -1 where a cloud has fewer."""
+    distance = square_distances(points, points).masked_fill(~valid[:, None], _FAR)
+    value, index = distance.topk(min(count, points.shape[1]), largest=False)
+    index = index.masked_fill((value >= _FAR) | ~valid[..., None], -1)
+    return torch.cat([index, index.new_full((*index.shape[:-1], count - index.shape[-1]), -1)], -1)
+
+
+def _masked(values: Tensor, usable: Tensor) -> Tensor:
+    return values.masked_fill(~usable, -1.0)

@@ -1,0 +1,144 @@
+"""Point Transformer V2 as LiDAR-HMR's pose network uses it: a U-Net of grouped vector attention over 16 neighbors.
+
+Rows of all people lie one after the other: M rows, of which `person` says whose they are.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from lidarpose.models.baselines.point_ops import nearest_neighbors
+
+# channels, groups of attention and grid (m) of the encoder's stages, and of the decoder's, fine to coarse
+EMBEDDING, EMBEDDING_GROUPS, EMBEDDING_NEIGHBORS = 48, 6, 8
+ENCODER, ENCODER_GROUPS, ENCODER_DEPTH = (16, 32, 64, 128), (2, 4, 8, 16), 2
+DECODER, DECODER_GROUPS, DECODER_DEPTH = (48, 96, 192, 384), (6, 12, 24, 48), 1
+GRID = (0.06, 0.12, 0.24, 0.48)
+NEIGHBORS = 16
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rows:
+    """Points of B people: xyz (M, 3) m; person (M,) in ascending order; count (B,) of each."""
+
+    xyz: Tensor
+    person: Tensor
+    count: Tensor
+
+    def padded(self) -> tuple[Tensor, Tensor]:
+        """Row numbers (B, N), 0 where `valid` (B, N) is False."""
+        column = torch.arange(int(self.count.max()), device=self.count.device)
+        valid = column < self.count[:, None]
+        return ((self.count.cumsum(0) - self.count)[:, None] + column).masked_fill(~valid, 0), valid
+
+    def neighbors(self, count: int) -> Tensor:
+        """(M, count) numbers of each row's nearest rows of the same person, itself first; -1 for none."""
+        rows, valid = self.padded()
+        index = nearest_neighbors(self.xyz[rows], valid, count)
+        start = rows[:, :1, None]
+        return torch.where(index >= 0, index + start, -1)[valid]
+
+    def pooled(self, grid: float) -> tuple["Rows", Tensor]:
+        """Cells of `grid` m, counted from each person's minimum, as rows at their points' mean; and each row's cell."""
+        low = segment_reduce(self.xyz, self.person, len(self.count), "amin")
+        cell = ((self.xyz - low[self.person]) / grid).floor().long()
+        _, inverse = torch.unique(torch.cat([self.person[:, None], cell], 1), dim=0, return_inverse=True)
+        cells = int(inverse.max()) + 1
+        person = self.person.new_zeros(cells).scatter_(0, inverse, self.person)
+        xyz = segment_reduce(self.xyz, inverse, cells, "mean")
+        return Rows(xyz=xyz, person=person, count=torch.bincount(person, minlength=len(self.count))), inverse
+
+
+def segment_reduce(values: Tensor, segment: Tensor, segments: int, reduce: str) -> Tensor:
+    """values (M, C) of rows of `segment` (M,) -> (segments, C); 0 for a segment without rows."""
+    empty = values.new_zeros(segments, values.shape[1])
+    return empty.scatter_reduce(0, segment[:, None].expand_as(values), values, reduce, include_self=False)
+
+
+def linear_norm(in_channels: int, out_channels: int, *, bias: bool) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(in_channels, out_channels, bias=bias), nn.BatchNorm1d(out_channels), nn.ReLU())
+
+
+class PointTransformerV2(nn.Module):
+    """xyz of each row -> features (M, 48) of each row."""
+
+    def __init__(self):
+        super().__init__()
+        self.embedding = linear_norm(3, EMBEDDING, bias=False)
+        self.block = Block(EMBEDDING, EMBEDDING_GROUPS)
+        widths = (EMBEDDING, *ENCODER)
+        self.down = nn.ModuleList(linear_norm(widths[s], widths[s + 1], bias=False) for s in range(len(GRID)))
+        self.encoder = nn.ModuleList(
+            nn.ModuleList(Block(c, g) for _ in range(ENCODER_DEPTH))
+            for c, g in zip(ENCODER, ENCODER_GROUPS, strict=True)
+        )
+        coarse = (*DECODER[1:], ENCODER[-1])
+        self.up = nn.ModuleList(linear_norm(c, own, bias=True) for c, own in zip(coarse, DECODER, strict=True))
+        self.skip = nn.ModuleList(linear_norm(s, own, bias=True) for s, own in zip(widths, DECODER, strict=False))
+        self.decoder = nn.ModuleList(
+            nn.ModuleList(Block(c, g) for _ in range(DECODER_DEPTH))
+            for c, g in zip(DECODER, DECODER_GROUPS, strict=True)
+        )
+
+    def forward(self, rows: Rows) -> Tensor:
+        x = self.block(self.embedding(rows.xyz), rows.xyz, rows.neighbors(EMBEDDING_NEIGHBORS))
+        levels, skips, parents = [rows], [x], []
+        for stage, grid in enumerate(GRID):
+            rows, parent = levels[-1].pooled(grid)
+            x = segment_reduce(self.down[stage](x), parent, len(rows.xyz), "amax")
+            neighbors = rows.neighbors(NEIGHBORS)
+            for block in self.encoder[stage]:
+                x = block(x, rows.xyz, neighbors)
+            levels.append(rows)
+            skips.append(x)
+            parents.append(parent)
+        for stage in reversed(range(len(GRID))):
+            rows = levels[stage]
+            x = self.up[stage](x)[parents[stage]] + self.skip[stage](skips[stage])
+            neighbors = rows.neighbors(NEIGHBORS)
+            for block in self.decoder[stage]:
+                x = block(x, rows.xyz, neighbors)
+        return x
+
+
+class Block(nn.Module):
+    """Linear, attention, Linear, each with a batch norm, about a residual."""
+
+    def __init__(self, channels: int, groups: int):
+        super().__init__()
+        self.first = linear_norm(channels, channels, bias=False)
+        self.attention = GroupedVectorAttention(channels, groups)
+        self.norm = nn.BatchNorm1d(channels)
+        self.last = nn.Sequential(nn.Linear(channels, channels, bias=False), nn.BatchNorm1d(channels))
+
+    def forward(self, x: Tensor, xyz: Tensor, neighbors: Tensor) -> Tensor:
+        attended = self.attention(self.first(x), xyz, neighbors)
+        return (x + self.last(self.norm(attended).relu())).relu()
+
+
+class GroupedVectorAttention(nn.Module):
+    """Wu et al., Point Transformer V2, Eq. 4 to 6: a weight for each neighbor and group of channels."""
+
+    def __init__(self, channels: int, groups: int):
+        super().__init__()
+        self.groups = groups
+        self.query = linear_norm(channels, channels, bias=True)
+        self.key = linear_norm(channels, channels, bias=True)
+        self.value = nn.Linear(channels, channels)
+        self.position = nn.ModuleList([linear_norm(3, channels, bias=True), nn.Linear(channels, channels)])
+        self.group_weight = nn.Parameter(torch.empty(channels).uniform_(-1, 1) / (channels // groups) ** 0.5)
+        self.weight = nn.Sequential(nn.BatchNorm1d(groups), nn.ReLU(), nn.Linear(groups, groups))
+
+    def forward(self, x: Tensor, xyz: Tensor, neighbors: Tensor) -> Tensor:
+        """x (M, C), xyz (M, 3), neighbors (M, k), -1 for none -> (M, C)."""
+        # rows of neighbors that exist, all in one list: batch norms see no others
+        own, slot = (neighbors >= 0).nonzero(as_tuple=True)
+        other = neighbors[own, slot]
+        bias = self.position[1](self.position[0](xyz[other] - xyz[own]))
+        relation = self.key(x)[other] - self.query(x)[own] + bias
+        scores = self.weight((relation * self.group_weight).unflatten(1, (self.groups, -1)).sum(-1))
+        weight = scores.new_full((*neighbors.shape, self.groups), -torch.inf).index_put((own, slot), scores).softmax(1)
+        value = (self.value(x)[other] + bias).unflatten(1, (self.groups, -1))
+        weighted = (value * weight[own, slot][..., None]).flatten(1)
+        return torch.zeros_like(x).index_add(0, own, weighted)

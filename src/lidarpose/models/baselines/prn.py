@@ -1,0 +1,149 @@
+"""PRN, the pose regression network of LiDAR-HMR (Fan et al. 2023): points vote for joints, attention refines them.
+
+`Prn` is the published one on Point Transformer V2. `PrnNeck` is the same idea on the features of any backbone, as the
+paper exchanges it.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from lidarpose.models.baselines.point_transformer_v2 import EMBEDDING, PointTransformerV2, Rows, segment_reduce
+
+# a point votes where body is this likely and one joint is
+VOTES = 0.6
+
+
+@dataclass(frozen=True, kw_only=True)
+class PrnOutputs:
+    """joints (B, J, 3) m, refined; voted (B, J, 3) m; parts (M, J + 1) logits; offsets (M, 3) m from points to their
+    joints."""
+
+    joints: Tensor
+    voted: Tensor
+    parts: Tensor
+    offsets: Tensor
+
+
+class Prn(nn.Module):
+    """1.74 M parameters. Of the published network: background is the last part."""
+
+    def __init__(self, joints: int):
+        super().__init__()
+        self.backbone = PointTransformerV2()
+        # a classifier that the published network has and does not read
+        self.unused = nn.Sequential(
+            nn.Linear(EMBEDDING, EMBEDDING), nn.BatchNorm1d(EMBEDDING), nn.ReLU(), nn.Linear(EMBEDDING, joints + 1)
+        )
+        self.vote = VoteHead(EMBEDDING, joints, background=joints)
+        width = EMBEDDING + 3
+        self.joint = nn.Embedding(joints, 32)
+        self.embed = nn.Linear(32 + 3, EMBEDDING)
+        self.attention = nn.ModuleList(BareAttention(width, heads=3) for _ in range(2))
+        # no activation between the last two: as published
+        self.output = nn.Sequential(nn.Linear(width, 16), nn.ReLU(), nn.Linear(16, 8), nn.Linear(8, 3))
+
+    def forward(self, points: Tensor, valid: Tensor) -> PrnOutputs:
+        """points (B, N, 3) m about the middle of their extent, valid (B, N) bool, at least one a person."""
+        person = torch.arange(len(points), device=points.device)[:, None].expand_as(valid)[valid]
+        rows = Rows(xyz=points[valid], person=person, count=valid.sum(1))
+        features = self.backbone(rows)
+        voted, parts, offsets = self.vote(features, rows)
+        own = torch.cat([voted, self.joint.weight.expand(len(voted), -1, -1)], -1)
+        tokens = torch.cat([voted, self.embed(own)], -1)
+        context = points.new_zeros(*valid.shape, tokens.shape[-1])
+        context[valid] = torch.cat([rows.xyz, features], -1)
+        tokens = torch.cat([tokens, context], 1)
+        mask = torch.cat([valid.new_ones(voted.shape[:2]), valid], 1)
+        for layer in self.attention:
+            tokens = layer(tokens, mask)
+        return PrnOutputs(joints=self.output(tokens[:, : voted.shape[1]]), voted=voted, parts=parts, offsets=offsets)
+
+
+class VoteHead(nn.Module):
+    """Parts and offsets of points, from their features beside the maximum and mean of the person's; and the joints that
+    they vote for. background: which of the parts is not body."""
+
+    def __init__(self, channels: int, joints: int, *, background: int):
+        super().__init__()
+        self.background = background
+        self.parts = _point_head(channels, joints + 1)
+        self.offsets = _point_head(channels, 3)
+
+    def forward(self, features: Tensor, rows: Rows) -> tuple[Tensor, Tensor, Tensor]:
+        people = len(rows.count)
+        shared = [segment_reduce(features, rows.person, people, kind)[rows.person] for kind in ("amax", "mean")]
+        context = torch.cat([features, *shared], 1)
+        parts, offsets = self.parts(context), self.offsets(context)
+        share = parts.softmax(1)
+        background = share[:, self.background]
+        joint = torch.cat([share[:, : self.background], share[:, self.background + 1 :]], 1)
+        voting = (background < VOTES) & (share.amax(1) > VOTES)
+        weight = joint * voting[:, None]
+        target = rows.xyz + offsets
+        total = weight.new_zeros(people, joint.shape[1]).index_add(0, rows.person, weight)
+        summed = weight.new_zeros(people, joint.shape[1], 3).index_add(
+            0, rows.person, weight[..., None] * target[:, None]
+        )
+        return summed / (total[..., None] + 1e-8), parts, offsets
+
+
+class BareAttention(nn.Module):
+    """x + attention(x): neither norm nor feed-forward nor output layer. Dropout is on the weights."""
+
+    def __init__(self, channels: int, heads: int, dropout: float = 0.1):
+        super().__init__()
+        self.heads, self.dropout = heads, dropout
+        self.query, self.key, self.value = (nn.Linear(channels, channels) for _ in range(3))
+
+    def forward(self, x: Tensor, valid: Tensor) -> Tensor:
+        """x (B, N, C), valid (B, N): rows that may be attended to."""
+        query, key, value = (
+            layer(x).unflatten(-1, (self.heads, -1)).transpose(1, 2) for layer in (self.query, self.key, self.value)
+        )
+        dropout = self.dropout if self.training else 0.0
+        attended = nn.functional.scaled_dot_product_attention(
+            query, key, value, attn_mask=valid[:, None, None], dropout_p=dropout
+        )
+        return x + attended.transpose(1, 2).flatten(2)
+
+
+class PrnNeck(nn.Module):
+    """The neck of the DAPT repository: votes and three layers of stock attention on features (M, C) of a backbone.
+
+    Background is part 0. Of its training no configuration is published; see docs/paper.md for ours.
+    """
+
+    def __init__(self, channels: int, joints: int):
+        super().__init__()
+        self.vote = VoteHead(channels, joints, background=0)
+        self.joint = nn.Parameter(torch.zeros(joints, channels))
+        self.embed = nn.Linear(channels + 3, channels)
+        self.token = nn.Linear(channels + 3, channels)
+        layer = nn.TransformerEncoderLayer(channels, 4, 4 * channels, dropout=0.1, batch_first=True)
+        self.layers = nn.TransformerEncoder(layer, 3, enable_nested_tensor=False)
+        self.norm = nn.LayerNorm(channels)
+        self.output = nn.Sequential(nn.Linear(channels, 16), nn.ReLU(), nn.Linear(16, 8), nn.Linear(8, 3))
+
+    def forward(self, features: Tensor, rows: Rows) -> PrnOutputs:
+        voted, parts, offsets = self.vote(features, rows)
+        own = self.embed(torch.cat([voted, self.joint.expand(len(voted), -1, -1)], -1))
+        slots, valid = rows.padded()
+        tokens = torch.cat([torch.cat([voted, own], -1), torch.cat([rows.xyz, features], -1)[slots]], 1)
+        mask = torch.cat([valid.new_ones(voted.shape[:2]), valid], 1)
+        tokens = self.norm(self.layers(self.token(tokens), src_key_padding_mask=~mask))
+        return PrnOutputs(joints=self.output(tokens[:, : voted.shape[1]]), voted=voted, parts=parts, offsets=offsets)
+
+
+def _point_head(channels: int, out_channels: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Linear(3 * channels, 2 * channels),
+        nn.BatchNorm1d(2 * channels),
+        nn.ReLU(),
+        nn.Dropout(0.5),
+        nn.Linear(2 * channels, channels),
+        nn.BatchNorm1d(channels),
+        nn.ReLU(),
+        nn.Linear(channels, out_channels),
+    )

@@ -1,0 +1,84 @@
+"""What the baselines minimize, as their authors' code does; all weights are 1.
+
+Legend: B people, N points, J joints, T frames.
+"""
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from lidarpose.models.baselines.lidarcap import ClipOutputs, forward_kinematics
+from lidarpose.models.baselines.lpformer import LpformerOutputs
+from lidarpose.models.baselines.prn import PrnOutputs
+from lidarpose.skeleton import SMPL24
+
+# a point is labelled with the nearest joint within this distance, m
+LABEL_RADIUS = 0.25
+
+
+def point_labels(points: Tensor, valid: Tensor, joints: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+    """Labels (B, N): the number of the nearest joint with a label, J for background, -1 for padding; and the offsets
+    (B, N, 3) m from the points to those joints.
+
+    joints (B, J, 3) m, known (B, J).
+    """
+    distance = torch.cdist(points, joints).masked_fill(~known[:, None], torch.inf)
+    nearest, joint = distance.min(-1)
+    offsets = joints.gather(1, joint[..., None].expand(-1, -1, 3)) - points
+    label = torch.where(nearest < LABEL_RADIUS, joint, joints.shape[1])
+    return label.masked_fill(~valid, -1), offsets
+
+
+def prn_losses(outputs: PrnOutputs, points: Tensor, valid: Tensor, joints: Tensor, known: Tensor) -> dict[str, Tensor]:
+    """Distances of refined and of voted joints, cross entropy of parts, distances of the points' offsets."""
+    label, offset = point_labels(points, valid, joints, known)
+    label, offset = label[valid], offset[valid]
+    background = joints.shape[1]
+    missed = (outputs.offsets - offset).norm(dim=-1)
+    return {
+        "joints": mean_distance(outputs.joints, joints, known),
+        "vote": mean_distance(outputs.voted, joints, known),
+        "part": F.cross_entropy(outputs.parts, label),
+        "offset": missed[label < background].sum() / (label < background).sum().clamp(min=1),
+    }
+
+
+def lpformer_losses(
+    outputs: LpformerOutputs,
+    points: Tensor,
+    valid: Tensor,
+    joints: Tensor,
+    known: Tensor,
+    *,
+    second_softmax: bool = False,
+) -> dict[str, Tensor]:
+    """Distances of joints and cross entropy of parts. second_softmax: of probabilities instead of logits, as
+    published."""
+    label, _ = point_labels(points, valid, joints, known)
+    parts = outputs.parts.softmax(-1) if second_softmax else outputs.parts
+    return {
+        "joints": mean_distance(outputs.joints, joints, known),
+        "part": F.cross_entropy(parts.flatten(0, 1), label.flatten(), ignore_index=-1),
+    }
+
+
+def clip_losses(outputs: ClipOutputs, rotations: Tensor, offsets: Tensor) -> dict[str, Tensor]:
+    """LiDARCap's and NE's: mean square errors of rotations, of the joints that they lead to, and of the first stage's.
+
+    rotations (B, T, 24, 3, 3), SMPL's; offsets (24, 3) m: the skeleton at rest. Joints are of this one skeleton,
+    prediction and truth alike, where the published code regresses them from posed vertices; both are relative to the
+    pelvis.
+    """
+    true = forward_kinematics(rotations, offsets, SMPL24.parents)
+    posed = forward_kinematics(outputs.rotations, offsets, SMPL24.parents)
+    return {
+        "rotation": F.mse_loss(outputs.rotations, rotations),
+        "joints": F.mse_loss(posed, true),
+        "first": F.mse_loss(outputs.joints, true),
+    }
+
+
+def mean_distance(joints: Tensor, true: Tensor, known: Tensor) -> Tensor:
+    """m, over joints with a label."""
+    distance = (joints - torch.where(known[..., None], true, 0.0)).norm(dim=-1)
+    return (distance * known).sum() / known.sum().clamp(min=1)

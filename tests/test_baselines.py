@@ -1,0 +1,179 @@
+"""The networks that the paper compares with: layer sizes as published, padding, order of points."""
+
+import numpy as np
+import pytest
+import torch
+
+from lidarpose.models.baselines.lidarcap import (
+    FRAMES,
+    Lidarcap,
+    PointNet2,
+    forward_kinematics,
+    rotations_from_6d,
+    tree_partition,
+)
+from lidarpose.models.baselines.lpformer import V2V, Lpformer
+from lidarpose.models.baselines.ne import CLOUDS, Ne
+from lidarpose.models.baselines.point_ops import ball_query, farthest_points, nearest_neighbors
+from lidarpose.models.baselines.prn import Prn, PrnNeck
+from lidarpose.skeleton import SMPL24
+
+# numbers of parameters, counted layer by layer from the authors' code
+PARAMETERS = {
+    "prn 15": (lambda: Prn(15), 1_738_482),
+    "prn 24": (lambda: Prn(24), 1_739_652),
+    "prn neck 64": (lambda: PrnNeck(64, 15), 228_870),
+    "prn neck 128": (lambda: PrnNeck(128, 15), 899_910),
+    "v2v": (V2V, 3_242_112),
+    "lpformer 14": (lambda: Lpformer(14), 4_814_212),
+    "lpformer 15": (lambda: Lpformer(15), 4_814_485),
+    "lpformer 24": (lambda: Lpformer(24, grid=32), 4_816_942),
+    "pointnet++ 1024": (lambda: PointNet2(1024), 805_184),
+    "pointnet++ 512": (lambda: PointNet2(512), 542_016),
+    "lidarcap": (Lidarcap, 34_925_854),
+    "ne": (Ne, 129_720_766),
+}
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_parameters_are_as_many_as_published(name):
+    make, count = PARAMETERS[name]
+    with torch.device("meta"):
+        assert sum(p.numel() for p in make().parameters()) == count
+
+
+# ---- neighborhoods
+
+
+def _cloud(seed: int, counts: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Points of people's size (B, N, 3), padded with numbers that would show, and valid (B, N)."""
+    rng = torch.Generator().manual_seed(seed)
+    points = torch.randn(len(counts), max(counts), 3, generator=rng) * torch.tensor([0.25, 0.25, 0.5])
+    valid = torch.arange(max(counts)) < torch.tensor(counts)[:, None]
+    return points.masked_fill(~valid[..., None], 0.4), valid
+
+
+@pytest.mark.parametrize("as_published", [False, True])
+def test_farthest_points_as_by_definition(as_published):
+    points, valid = _cloud(0, (40, 23))
+    indices = farthest_points(points, valid, 30, as_published=as_published)
+    for cloud, chosen, count in zip(points, indices.tolist(), (40, 23), strict=True):
+        first = 0 if as_published else int((cloud[:count] - cloud[:count].mean(0)).norm(dim=1).argmax())
+        usable = [i for i in range(count) if not as_published or cloud[i].square().sum() > 1e-3]
+        expected = [first]
+        while len(expected) < min(30, count):
+            rest = [min(float((cloud[i] - cloud[j]).norm()) for j in expected) for i in usable]
+            expected.append(usable[int(np.argmax(rest))])
+        assert chosen == expected + [first] * (30 - len(expected))
+
+
+@pytest.mark.parametrize("as_published", [False, True])
+def test_balls_as_by_definition(as_published):
+    points, valid = _cloud(1, (50, 31))
+    index = ball_query(points[:, :7], points, valid, 0.4, 12, as_published=as_published)
+    for b, count in enumerate((50, 31)):
+        for m in range(7):
+            distance = (points[b, :count] - points[b, m]).norm(dim=1)
+            inside = [i for i in range(count) if distance[i] < 0.4]
+            expected = inside if as_published else sorted(inside, key=lambda i: float(distance[i]))
+            assert index[b, m].tolist() == (expected + [expected[0]] * 12)[:12]
+
+
+def test_neighbors_as_by_definition():
+    points, valid = _cloud(2, (30, 5))
+    index = nearest_neighbors(points, valid, 8)
+    for b, count in enumerate((30, 5)):
+        for m in range(count):
+            order = (points[b, :count] - points[b, m]).norm(dim=1).argsort()[:8].tolist()
+            assert index[b, m].tolist() == order + [-1] * (8 - len(order))
+
+
+# ---- rotations
+
+
+def test_rotations_are_proper_and_published_as_columns():
+    rotations = rotations_from_6d(torch.randn(50, 6))
+    assert torch.allclose(rotations @ rotations.mT, torch.eye(3).expand(50, 3, 3), atol=1e-5)
+    assert torch.allclose(torch.linalg.det(rotations), torch.ones(50), atol=1e-5)
+    # a 3x2 matrix, row by row
+    assert torch.allclose(rotations_from_6d(torch.tensor([1.0, 0, 0, 1, 0, 0])), torch.eye(3))
+
+
+def test_kinematics_follow_the_tree():
+    offsets = torch.randn(24, 3)
+    turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    rotations = torch.eye(3).expand(24, 3, 3).clone()
+    rest = forward_kinematics(rotations, offsets, SMPL24.parents)
+    rotations[4] = turn
+    posed = forward_kinematics(rotations, offsets, SMPL24.parents)
+    below = [j for j in range(24) if _descends(j, 4)]
+    assert torch.allclose(posed[below] - posed[4], (rest[below] - rest[4]) @ turn.T, atol=1e-6)
+    above = [j for j in range(24) if j not in below]
+    assert torch.equal(posed[above], rest[above])
+
+
+def _descends(joint: int, ancestor: int) -> bool:
+    while joint >= 0 and joint != ancestor:
+        joint = SMPL24.parents[joint]
+    return joint == ancestor
+
+
+def test_graph_is_normalized_and_splits_by_the_root():
+    graph = tree_partition(SMPL24.parents)
+    assert torch.allclose(graph.sum((0, 1)), torch.ones(24))
+    knee, hip, ankle = 4, 1, 7
+    assert graph[2, hip, knee] > 0 and graph[1, ankle, knee] > 0 and graph[0, knee, knee] > 0
+    assert graph[1, hip, knee] == graph[2, ankle, knee] == 0
+
+
+# ---- order and padding
+
+
+def _run(name: str, points: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+    """Joints of the network `name` with fixed weights, in evaluation mode; clips show the cloud in every frame."""
+    torch.manual_seed(3)
+    if name == "prn":
+        return Prn(15).eval()(points, valid).joints
+    if name == "lpformer":
+        return Lpformer(15, grid=32).eval()(points, valid).joints
+    encoder = PointNet2(64).eval()
+    return encoder(points, valid)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", ["prn", "lpformer", "pointnet++"])
+def test_order_and_padding_change_nothing(name):
+    points, valid = _cloud(4, (150, 90, 8))
+    expected = _run(name, points, valid)
+    order = torch.randperm(150, generator=torch.Generator().manual_seed(5))
+    assert torch.allclose(_run(name, points[:, order], valid[:, order]), expected, atol=2e-6)
+    more = torch.cat([points, torch.full((3, 40, 3), 0.2)], 1)
+    wide = torch.cat([valid, torch.zeros(3, 40, dtype=torch.bool)], 1)
+    assert torch.allclose(_run(name, more, wide), expected, atol=2e-6)
+    # nor do batch mates
+    assert torch.allclose(_run(name, points[2:, :8], valid[2:, :8]), expected[2:], atol=2e-6)
+
+
+@torch.no_grad()
+def test_clips_have_rotations_of_every_frame_and_clips_do_not_mix():
+    points, valid = _cloud(6, (40,) * 2 * FRAMES)
+    points, valid = points.unflatten(0, (2, FRAMES)), valid.unflatten(0, (2, FRAMES))
+    torch.manual_seed(0)
+    network = Lidarcap().eval()
+    both, first = network(points, valid), network(points[:1], valid[:1])
+    assert both.joints.shape == (2, FRAMES, 24, 3) and both.rotations.shape == (2, FRAMES, 24, 3, 3)
+    assert torch.allclose(both.rotations[:1], first.rotations, atol=1e-5)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("across_batch", [False, True])
+def test_ne_exchanges_over_frames_and_as_published_over_the_batch(across_batch):
+    points, valid = _cloud(7, (20,) * 2 * FRAMES)
+    points, valid = points.unflatten(0, (2, FRAMES)), valid.unflatten(0, (2, FRAMES))
+    clouds = {name: (points + k, valid) for k, name in enumerate(CLOUDS)}
+    torch.manual_seed(0)
+    network = Ne(across_batch=across_batch).eval()
+    both = network(clouds)
+    alone = network({name: (points[:1], valid[:1]) for name, (points, valid) in clouds.items()})
+    assert both.rotations.shape == (2, FRAMES, 24, 3, 3)
+    assert torch.allclose(both.joints[:1], alone.joints, atol=1e-5) == (not across_batch)
