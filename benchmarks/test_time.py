@@ -2,7 +2,7 @@
 
     python benchmarks/test_time.py tiny --limit 1000 --out docs/scores/test_time.json
 
-Passes: each but the first is about the pelvis that the one before found. Looks: the last pass is repeated with the
+Passes: each but the first is about the pelvis of the one before. Transforms: the last pass is repeated with the
 person mirrored, turned by quarters, or shifted in the grid of voxels, and joints are averaged (`inference/tta.py`), or
 heatmaps are (as logarithms, brought to the mean vote). Rejection: the error of the most confident people and joints.
 """
@@ -19,7 +19,7 @@ from ablation_tables import figures
 from lidarpose import evaluation
 from lidarpose.inference.backend import Raw, estimates
 from lidarpose.inference.predictor import PASSES, Predictor, load
-from lidarpose.inference.tta import TRANSFORMS, TTATransform, apply, average
+from lidarpose.inference.tta import TRANSFORMS, TTATransform, apply
 from lidarpose.io.files import write_atomic
 from lidarpose.sample import Pose
 from lidarpose.skeleton import BODY26
@@ -33,7 +33,7 @@ _FLIP = np.array(BODY26.flip)
 class Way:
     what: str
     passes: int = PASSES
-    looks: tuple[TTATransform, ...] = (TTATransform(),)
+    transforms: tuple[TTATransform, ...] = (TTATransform(),)
     heatmaps: bool = False
 
 
@@ -43,40 +43,41 @@ WAYS = (
     Way("one pass", passes=1),
     USUAL,
     Way("three passes", passes=3),
-    Way("and mirrored, joints averaged", looks=_SYMMETRIES[:2]),
-    Way("and mirrored, heatmaps averaged", looks=_SYMMETRIES[:2], heatmaps=True),
-    Way("four quarter rotations, joints averaged", looks=_SYMMETRIES[::2]),
-    Way("four rotations, each mirrored too, joints averaged", looks=_SYMMETRIES),
-    Way("`--tta 2`: rotated, mirrored and shifted", looks=TRANSFORMS[:2]),
-    Way("`--tta 4`", looks=TRANSFORMS[:4]),
-    Way("`--tta 8`", looks=TRANSFORMS),
+    Way("and mirrored, joints averaged", transforms=_SYMMETRIES[:2]),
+    Way("and mirrored, heatmaps averaged", transforms=_SYMMETRIES[:2], heatmaps=True),
+    Way("four quarter rotations, joints averaged", transforms=_SYMMETRIES[::2]),
+    Way("four rotations, each mirrored too, joints averaged", transforms=_SYMMETRIES),
+    Way("`--tta 2`: rotated, mirrored and shifted", transforms=TRANSFORMS[:2]),
+    Way("`--tta 4`", transforms=TRANSFORMS[:4]),
+    Way("`--tta 8`", transforms=TRANSFORMS),
 )
 
 
 class Averaging(Predictor):
-    """A predictor of other passes and looks."""
+    """A predictor of other passes and transforms."""
 
     def __init__(self, predictor: Predictor, way: Way):
         super().__init__(predictor.backend, name=predictor.model["name"], decode=predictor.model["decode"])
-        self._passes, self._tta, self.heatmaps = way.passes, way.looks, way.heatmaps
+        self._passes, self._tta, self.heatmaps = way.passes, way.transforms, way.heatmaps
 
-    def _looks(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Pose:
+    def _augmented(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Pose:
         if not self.heatmaps:
-            # the first look may be any here
-            return average([self._look(look, clouds, centers, origin) for look in self._tta])
-        raws = [self._raw(look, clouds, centers, origin) for look in self._tta]
+            return super()._augmented(clouds, centers, origin)
+        raws = [self._raw(transform, clouds, centers, origin) for transform in self._tta]
         return estimates(_fused(raws), self._decoder, self.skeleton)
 
-    def _raw(self, look: TTATransform, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Raw:
+    def _raw(
+        self, transform: TTATransform, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None
+    ) -> Raw:
         """What the network says of people shown so, brought back before it is decoded: heatmaps turn exactly."""
-        R, heatmaps = look.R_view_person, []
-        raw = self.backend.run(*apply(look, clouds, centers, origin))
+        R, heatmaps = transform.R_view_person, []
+        raw = self.backend.run(*apply(transform, clouds, centers, origin))
         for axis in range(3):
             source = int(np.abs(R[:, axis]).argmax())
             heatmaps.append(raw.heatmaps[source][..., :: int(R[source, axis])])
         values = {name: getattr(raw, name) for name in ("confidence", "log_spread", "visible")}
-        values |= {"vote": raw.vote @ R + look.shift, "heatmaps": tuple(heatmaps)}
-        if look.mirrored:
+        values |= {"vote": raw.vote @ R + transform.shift, "heatmaps": tuple(heatmaps)}
+        if transform.mirrored:
             values = {k: tuple(h[:, _FLIP] for h in v) if k == "heatmaps" else v[:, _FLIP] for k, v in values.items()}
         return replace(raw, **values)
 

@@ -329,10 +329,7 @@ class Predictor:
             root = self.outputs(clouds, centers, origin).joints[:, self._root].mean(1)
             # an answer that is no number stays one
             centers = centers + np.round(np.clip(root, -WINDOW / 2, WINDOW / 2) / _CENTER_STEP) * _CENTER_STEP
-        estimated = self.outputs(clouds, centers, origin)
-        if len(self._tta) > 1:
-            others = [self._transformed(transform, clouds, centers, origin) for transform in self._tta[1:]]
-            estimated = average([estimated, *others])
+        estimated = self._augmented(clouds, centers, origin)
         poses: list[Pose | None] = []
         for k, points in enumerate(clouds):
             near = (np.abs(points - centers[k]) < WINDOW).all(1).sum()
@@ -347,6 +344,10 @@ class Predictor:
     def outputs(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Pose:
         """What the network says of clouds (n, 3) m seen about centers (B, 3), from a sensor at origin (3,) or None."""
         return self._transformed(TTATransform(), clouds, centers, origin)
+
+    def _augmented(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Pose:
+        """The mean of what the network says under each transform."""
+        return average([self._transformed(transform, clouds, centers, origin) for transform in self._tta])
 
     def _transformed(
         self, transform: TTATransform, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None
