@@ -108,7 +108,7 @@ def test_pretraining_goes_on_from_weights(tmp_path):
     with pytest.raises(InputError, match="cannot begin as this tiny one: grid"):
         make_setup(Pretrain(size="base", init="tiny"))
     with pytest.raises(InputError, match="the paper's begins at random"):
-        Pretrain(size="paper-small", init="tiny")
+        make_setup(Pretrain(size="paper-small", init="tiny"))
     path = tmp_path / "small.safetensors"
     save_checkpoint(path, network, card={})
     with pytest.raises(InputError, match="none may shrink"):
