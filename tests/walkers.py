@@ -21,7 +21,8 @@ def goer(still=False):
         local = vertices[-1] @ rotation_about("z", heading)
         extent.append((local.min(0).tolist(), local.max(0).tolist()))
     return Bodies(
-        vertices=np.array(vertices), joints=np.array(joints), heading=headings, extent=tuple(extent),
+        vertices=np.array(vertices), joints=np.array(joints), rotations=np.tile(np.eye(3), (3, 24, 1, 1)),
+        heading=headings, extent=tuple(extent),
         moved=lambda frame: (vertices[frame], joints[frame]), kinds=("walk",) * 3, faces=mesh.faces,
         face_part=np.full(12, 3, np.uint8),
     )  # fmt: skip

@@ -24,12 +24,20 @@ def axis_angle_to_matrix(vector: np.ndarray) -> np.ndarray:
 
 
 def rotation_vector(matrix: np.ndarray) -> np.ndarray:
-    """The inverse of `axis_angle_to_matrix` for angles under pi. (..., 3, 3) -> (..., 3) rad."""
+    """The inverse of `axis_angle_to_matrix` for angles up to pi. (..., 3, 3) -> (..., 3) rad."""
     m = np.asarray(matrix)
     skew = np.stack([m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], -1)
     sine = np.linalg.norm(skew, axis=-1, keepdims=True) / 2
     angle = np.arctan2(sine, (np.trace(m, axis1=-2, axis2=-1)[..., None] - 1) / 2)
-    return unit(skew) * angle
+    axis = unit(skew)
+    # half a turn has no skew part: R = 2 a a^T - 1, of which the column with the largest diagonal is along the axis
+    half = (sine < 1e-3) & (angle > 1)
+    if half.any():
+        square = (m + np.swapaxes(m, -1, -2)) / 2 + np.eye(3)
+        largest = np.diagonal(square, axis1=-2, axis2=-1).argmax(-1)
+        along = unit(np.take_along_axis(square, largest[..., None, None], -1)[..., 0])
+        axis = np.where(half, np.where((along * skew).sum(-1, keepdims=True) < 0, -along, along), axis)
+    return axis * angle
 
 
 def rotation_about(axis: str, angle: np.ndarray | float) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.errors import InputError
-from lidarpose.skeleton import Skeleton
+from lidarpose.skeleton import SMPL24, Skeleton
 
 # no coordinate on Earth is larger, m; arithmetic on what is would overflow
 FARTHEST = 1e9
@@ -121,6 +121,11 @@ class Sample:
     points (n, 3) float32 m in the sensor's frame, n = 0 is legal; center (3,) m, the origin of the person's own
     frame, which has the sensor's axes; part (n,) uint8, 0 = not body, 1 + j = the bone of SMPL-24's joint j;
     ring (n,) int, the beam; pose in the sensor's frame; source tells where the sample came from.
+
+    What networks of clips need besides: rotations (24, 3) rad, axis-angles of SMPL's joints, each relative to its
+    parent, the pelvis' from SMPL's rest frame (y up, facing +z) to the sensor's; translation (3,) m, SMPL's trans as a
+    point of the sensor's frame, of synthesized bodies the pelvis; background (b, 3) float32 m, what stands still in the
+    person's window of azimuth and elevation, +-1 degree; neighbors (k, 3) float32 m, the frame's other points in it.
     """
 
     points: np.ndarray
@@ -131,9 +136,13 @@ class Sample:
     box: Box | None = None
     source: str = ""
     frame_id: str = ""
+    rotations: np.ndarray | None = None
+    translation: np.ndarray | None = None
+    background: np.ndarray | None = None
+    neighbors: np.ndarray | None = None
 
     def __post_init__(self):
-        _as_arrays(self, "points", "center", "part", "ring")
+        _as_arrays(self, "points", "center", "part", "ring", "rotations", "translation", "background", "neighbors")
         if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.dtype != np.float32:
             raise InputError(f"Sample.points must be (n, 3) float32, got {self.points.shape} {self.points.dtype}")
         if self.center.shape != (3,):
@@ -142,6 +151,12 @@ class Sample:
             value = getattr(self, name)
             if value is not None and value.shape != (len(self.points),):
                 raise InputError(f"Sample.{name} must be ({len(self.points)},), one a point, got {value.shape}")
+        if self.rotations is not None and self.rotations.shape != (len(SMPL24), 3):
+            raise InputError(f"Sample.rotations must be ({len(SMPL24)}, 3), got {self.rotations.shape}")
+        for name in ("background", "neighbors"):
+            value = getattr(self, name)
+            if value is not None and (value.ndim != 2 or value.shape[1] != 3):
+                raise InputError(f"Sample.{name} must be (n, 3), got {value.shape}")
 
 
 @dataclass(frozen=True, kw_only=True)

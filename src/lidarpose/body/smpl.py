@@ -17,7 +17,7 @@ import numpy as np
 
 from lidarpose.body.rig import forward_kinematics
 from lidarpose.errors import InputError
-from lidarpose.geometry import UP_AXES, axis_angle_to_matrix
+from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_vector
 from lidarpose.io.files import file_error
 from lidarpose.io.npz import read_npz
 from lidarpose.io.pickles import Unread, load_pickle
@@ -35,6 +35,13 @@ _EXPRESSIONS = {(55, 400): 300, (55, 20): 10}
 _SUM_TOLERANCE = 1e-2
 # a body in other units than meters is larger or smaller than this
 _HEIGHTS = (0.3, 3.0)
+
+
+def smpl_axis_angles(rotations: np.ndarray, R_world_level: np.ndarray) -> np.ndarray:
+    """Poses (n, 24, 3, 3) of `body.rig` as SMPL's (n, 24, 3) rad, in a world that the level frame is turned to."""
+    local = _R_LEVEL_SMPL.T @ np.asarray(rotations, float) @ _R_LEVEL_SMPL
+    local[:, 0] = R_world_level @ _R_LEVEL_SMPL @ local[:, 0]
+    return rotation_vector(local)
 
 
 @dataclass(frozen=True, kw_only=True)

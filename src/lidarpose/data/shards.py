@@ -11,6 +11,7 @@ one synthetic person in one frame:
     center                  origin of the person's own frame, computed from the points
     box_center, box_size, box_yaw    a detector's box: m, m, rad
     source, frame_id        as in `Sample`
+    rotations, translation, background, neighbors    the same, for networks of clips; null where nobody knows them
     sensor, kind, ...       the fields of `PersonInfo`; null where it was not measured
 
 Datasets of real people, which `lidarpose prepare` wrote, have a part of the raw files (a sequence, a file) in each
@@ -82,12 +83,13 @@ def _columns(text: str) -> dict[str, Column]:
 # name:type[shape], of n points, J joints, P people; "?": null for what is unknown, and missing in older shards.
 # A column of the name of a field of `LabeledSample` or `PersonInfo` is that field
 _BOX = "box_center:float64[3]? box_size:float64[3]? box_yaw:float64?"
+_CLIP = "rotations:float32[24,3]? translation:float64[3]? background:float32[b,3]? neighbors:float32[k,3]?"
 TABLES = {
     "people": _columns(f"""
         index:int64 frame:int32 track:int32
         points:float32[n,3] part:uint8[n]? ring:int32[n]? joints:float32[J,3] center:float64[3] {_BOX}
         source:string frame_id:string sensor:string? kind:string? distance:float32? visible:float32?
-        height_seen:float32? clutter:float32? upright:bool?"""),
+        height_seen:float32? clutter:float32? upright:bool? {_CLIP}"""),
     "frames": _columns("""
         index:int64 frame:int32 sensor:string points:float32[n,3] ring:int32[n] person:int16[n] part:uint8[n]
         track:int16[P] box:float64[P,7] joints:float32[P,26,3]"""),
@@ -95,9 +97,10 @@ TABLES = {
         index:int64 sequence:string frame:int64 track:string time:float64 split:string?
         points:float32[n,3] part:uint8[n]? ring:int32[n]? joints:float32[J,3] joint_labels:uint8[J] center:float64[3]
         center_trans:float64[3]? center_box:float64[3]? center_joints_box:float64[3]? {_BOX} distance:float32?
-        source:string frame_id:string"""),
+        source:string frame_id:string {_CLIP}"""),
     "skipped": _columns("index:int64 reason:string where:string"),
 }
+_CLIP_COLUMNS = tuple(_columns(_CLIP))
 _FIELDS = {info.name for info in fields(LabeledSample)}
 _INFO = tuple(info.name for info in fields(PersonInfo))
 
@@ -156,7 +159,8 @@ def sample_of(row: dict[str, Any], skeleton_name: str = BODY26.name, what: str =
     if row["box_center"] is not None:
         track = row["track"] if is_real or what == "streets" else None
         values["box"] = Box(center=row["box_center"], size=row["box_size"], yaw=row["box_yaw"], id=track)
-    values["points"] = row["points"].reshape(-1, 3)
+    for name in ("points", "rotations", "background", "neighbors"):
+        values[name] = None if row[name] is None else row[name].reshape(-1, 3)
     return LabeledSample(**values, pose=Pose(joints=row["joints"].reshape(-1, 3), skeleton=joints, frame="sensor"))
 
 
@@ -168,11 +172,12 @@ def _check_row(row: dict[str, Any], table: str, joints: int) -> None:
     if len({row[name] is None for name in ("box_center", "box_size", "box_yaw")}) > 1:
         raise InputError("columns box_center, box_size, box_yaw: some are null, expected all or none")
     _check_lengths(row, table, joints)
-    for name in ("points", "center"):
+    clip = [name for name in _CLIP_COLUMNS if row[name] is not None]
+    for name in ("points", "center", *clip):
         if not np.isfinite(row[name]).all():
             raise InputError(f"column {name} has values that are no finite numbers")
     # a joint may be NaN
-    for name in ("points", "center", "joints"):
+    for name in ("points", "center", "joints", *clip):
         if (np.abs(row[name]) > FARTHEST).any():
             raise InputError(f"column {name} has values beyond {FARTHEST:g} m")
     if row["part"] is not None and row["part"].max(initial=0) > len(SMPL24):

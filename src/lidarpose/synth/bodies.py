@@ -84,6 +84,7 @@ class Bodies:
     Args:
         vertices: (n, V, 3) float32 m.
         joints: (n, 26, 3) float32 m, BODY26.
+        rotations: (n, 24, 3, 3) as in `body.rig`.
         kinds: (n,) activities, names of `body.pose_prior.activities.KINDS`.
         heading: (n,) rad.
         extent: (n,), least and greatest x, y, z along the heading, m.
@@ -93,6 +94,7 @@ class Bodies:
 
     vertices: np.ndarray
     joints: np.ndarray
+    rotations: np.ndarray
     kinds: tuple[str, ...]
     heading: tuple[float, ...]
     extent: tuple[tuple[list[float], list[float]], ...]
@@ -150,6 +152,7 @@ def draw_bodies(
     return Bodies(
         vertices=vertices,
         joints=joints,
+        rotations=poses[:, 0],
         kinds=tuple(kinds.tolist()),
         heading=(0.0,) * count,
         extent=_extents(low, high),
@@ -194,6 +197,7 @@ def draw_moving_body(
     return Bodies(
         vertices=vertices[:frames],
         joints=joints[:frames],
+        rotations=rotations[:frames],
         kinds=(kind,) * frames,
         heading=tuple(heading.tolist()),
         extent=_extents(turned.min(1), turned.max(1)),

@@ -5,16 +5,19 @@ Person i of a seed is the same whatever was asked for before and whoever asks: p
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from typing import cast
 
 import numpy as np
 
+from lidarpose.body.smpl import smpl_axis_angles
+from lidarpose.data.clips import window_points
 from lidarpose.errors import InputError, check_int
+from lidarpose.geometry import rotation_about
 from lidarpose.lidar.presets import sensor
 from lidarpose.lidar.ray_pattern import RayPattern
-from lidarpose.sample import PersonInfo, Pose, Sample, center_of
+from lidarpose.sample import Box, PersonInfo, Pose, Sample, center_of
 from lidarpose.skeleton import BODY26
 from lidarpose.synth import noise
 from lidarpose.synth.bodies import Bodies, PoseBank, draw_bodies, draw_moving_body
@@ -22,7 +25,7 @@ from lidarpose.synth.environment.mesh import Mesh
 from lidarpose.synth.environment.surroundings import ground, occluder, surroundings
 from lidarpose.synth.props import draw_props
 from lidarpose.synth.scene import Place, RandomStream, SceneConfig, draw_place, scene_config
-from lidarpose.synth.simulate import Scan, Scene, count_alone, draw_conditions, simulate_scan
+from lidarpose.synth.simulate import Scan, Scene, count_alone, draw_conditions, scan_background, simulate_scan
 
 # people whose poses and shapes are drawn together
 BLOCK = 256
@@ -98,26 +101,36 @@ class Generator:
         self, seed: int, index: int, *, frames: int = CLIP_FRAMES, hard: float | None = None
     ) -> list[SyntheticPerson]:
         """Clip `index` of `seed`: one person who moves, `frames` samples at 10 Hz; things and sensor stay where they
-        are. Frames in which nothing of the person is seen have samples without points."""
+        are. Frames in which nothing of the person is seen have samples without points. Samples have what networks of
+        clips need: the pose's rotations, the pelvis, and the two clouds about the person."""
         frames = check_int("a clip's frames", frames, least=1)
         seed, index = check_int("seed", seed, least=0), check_int("index", index, least=0)
         rng = np.random.default_rng([seed, RandomStream.CLIP, index])
         bodies = draw_moving_body(self.bank, self.captured, frames, rng, clothes=self.config.clothes)
         block, row = self._bodies(seed, index // BLOCK), index % BLOCK
-        return self._observe(bodies, range(frames), block, row, rng, hard)
+        return self._observe(bodies, range(frames), block, row, rng, hard, in_clip=True)
 
     def _observe(
-        self, bodies: Bodies, rows: Sequence[int], block: Bodies, row: int, rng: np.random.Generator, hard: float | None
+        self,
+        bodies: Bodies,
+        rows: Sequence[int],
+        block: Bodies,
+        row: int,
+        rng: np.random.Generator,
+        hard: float | None,
+        *,
+        in_clip: bool = False,
     ) -> list[SyntheticPerson]:
         """A person's frames, `rows` of `bodies`. While hardly anything of them is seen, the scene is drawn again,
         easier each time; after the last try the best one counts, if it has any points at all. A second person is
         anybody of `block` but `row`."""
         config = self.config if hard is None else self.config.eased(hard)
         best, most_points = None, 0.0
+        draw = _draw_clip_frame if in_clip else _draw_sample
         for attempt in range(_TRIES if self.redraw else 1):
             eased = config.eased(config.hard * (1 - attempt / (_TRIES - 1))) if attempt else config
             scene = _draw_scene(eased, bodies, rows[0], block, row, 0.8**attempt, rng)
-            samples = [_draw_sample(scene, bodies, k, frame, rng) for frame, k in enumerate(rows)]
+            samples = [draw(scene, bodies, k, frame, rng) for frame, k in enumerate(rows)]
             # of the middle frame: half of a clip's frames have more
             points = float(np.median([np.count_nonzero(_truth(sample)[0]) for sample in samples]))
             if points > most_points or not self.redraw:
@@ -148,13 +161,22 @@ def _draw_scene(
     background = [ground(config, place.feet, rng), *surroundings(config, place.feet, reach, rng)]
     if (front := occluder(config, place.feet, height, rng)) is not None:
         background.append(front)
+    still = len(background)
     if rng.random() < config.company * config.hard:
         background.append(_second_person(block, row, place, rng))
     props = []
     if rng.random() < config.carry * config.hard:
         props = draw_props(rng, kind=bodies.kinds[first], joints=bodies.joints[first])
     conditions = draw_conditions(config, device, rng)
-    return Scene(config=config, sensor=device, place=place, conditions=conditions, background=background, props=props)
+    return Scene(
+        config=config,
+        sensor=device,
+        place=place,
+        conditions=conditions,
+        background=background,
+        props=props,
+        still=still,
+    )
 
 
 # a second person: how often before the first one, as seen by the sensor; else beside
@@ -180,6 +202,27 @@ def _second_person(block: Bodies, row: int, place: Place, rng: np.random.Generat
 
 def _draw_sample(scene: Scene, bodies: Bodies, row: int, frame: int, rng: np.random.Generator) -> Sample:
     return _crop(scene, bodies, row, simulate_scan(scene, scene.meshes(bodies, row), rng, frame=frame), rng)
+
+
+def _draw_clip_frame(scene: Scene, bodies: Bodies, row: int, frame: int, rng: np.random.Generator) -> Sample:
+    """The same with the pose's rotations and the clouds about the person."""
+    meshes = scene.meshes(bodies, row)
+    scan = simulate_scan(scene, meshes, rng, frame=frame)
+    sample = _crop(scene, bodies, row, scan, rng)
+    others = scan.points[~cast("Box", sample.box).contains(scan.points)]
+    return replace(
+        sample,
+        rotations=_smpl_pose(scene.body_place, bodies, row),
+        translation=cast("Pose", sample.pose).joints[0],
+        background=window_points(scan_background(scene, meshes[0], frame), sample.points),
+        neighbors=window_points(others, sample.points),
+    )
+
+
+def _smpl_pose(place: Place, bodies: Bodies, row: int) -> np.ndarray:
+    """(24, 3) float32 rad, as in `Sample`."""
+    turned = smpl_axis_angles(bodies.rotations[row, None], rotation_about("z", place.yaw))
+    return turned[0].astype(np.float32)
 
 
 def _crop(scene: Scene, bodies: Bodies, row: int, scan: Scan, rng: np.random.Generator) -> Sample:

@@ -5,6 +5,7 @@ from typing import cast
 
 import numpy as np
 
+from lidarpose.data.clips import MARGIN
 from lidarpose.lidar.ray_pattern import RayPattern
 from lidarpose.lidar.raycast import Hits, scan_divergent, scan_pattern
 from lidarpose.lidar.sensor import Sensor
@@ -57,6 +58,7 @@ class Scene:
         conditions: the sensor's noise.
         background: meshes in the level frame at the sensor: ground, things, another person.
         props: what the person wears and uses.
+        still: how many of `background` stand still: all but the other person, who is the last one.
     """
 
     config: SceneConfig
@@ -65,6 +67,7 @@ class Scene:
     conditions: ScanConditions
     background: list[Mesh]
     props: list[Prop]
+    still: int = 0
 
     @property
     def body_place(self) -> Place:
@@ -141,12 +144,20 @@ def count_alone(scene: Scene, body: Mesh, frame: int) -> int:
     return len(_cast(scene, [body], frame)[0].face)
 
 
-def _cast(scene: Scene, meshes: list[Mesh], frame: int) -> tuple[Hits, Mesh]:
-    """The hits, and all meshes as one, in the sensor's frame."""
+def scan_background(scene: Scene, body: Mesh, frame: int) -> np.ndarray:
+    """Points (n, 3) float32 m in the level frame of what stands still about a body, what the body hides too: a map has
+    them without noise."""
+    away = replace(body, faces=body.faces[:0], part=None)
+    hits, _ = _cast(scene, [away, *scene.background[: scene.still]], frame, margin=MARGIN)
+    return scene.place.to_level(hits.points)
+
+
+def _cast(scene: Scene, meshes: list[Mesh], frame: int, *, margin: float = 0.0) -> tuple[Hits, Mesh]:
+    """The hits, and all meshes as one, in the sensor's frame. margin rad: beams beyond those of the scene."""
     mesh, place, sensor = union(meshes), scene.place, scene.sensor
     mesh = replace(mesh, vertices=place.to_sensor(mesh.vertices))
     body_vertices = len(meshes[0].vertices)
-    margin = scene.config.margin + np.arctan2(scene.config.around, place.distance)
+    margin += scene.config.margin + np.arctan2(scene.config.around, place.distance)
     if isinstance(sensor, Sensor):
         body, divergence = mesh.vertices[:body_vertices], scene.conditions.divergence
         hits = scan_divergent(

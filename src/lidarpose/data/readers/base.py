@@ -8,7 +8,7 @@ import json
 import os
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -20,8 +20,9 @@ import numpy as np
 
 from lidarpose.body.rig import forward_kinematics
 from lidarpose.body.smpl import load_body
+from lidarpose.data.clips import SCANS, static_points, window_points, without_person
 from lidarpose.errors import InputError
-from lidarpose.geometry import axis_angle_to_matrix
+from lidarpose.geometry import axis_angle_to_matrix, rotation_vector
 from lidarpose.io.files import content_digest, file_error, read_bytes
 from lidarpose.io.point_cloud import read_points
 from lidarpose.sample import FARTHEST, SEEN, UNLABELED, LabeledSample, Pose, center_of, within_reach
@@ -238,6 +239,46 @@ class SmplJoints:
     def digests(self) -> dict[str, str]:
         """By kind, what tells one file from another."""
         return {kind: content_digest(path, expected="SMPL")[:12] for kind, path in self.files.items()}
+
+
+def turned_pose(pose: np.ndarray, R_to_world: np.ndarray) -> np.ndarray:
+    """SMPL's pose (72,) rad in a world turned by R_to_world (3, 3), as `Sample.rotations` has it."""
+    rotations = pose.reshape(-1, 3).astype(np.float32)
+    rotations[0] = rotation_vector(R_to_world @ axis_angle_to_matrix(pose[:3]))
+    return rotations
+
+
+class SceneClouds:
+    """The whole scans of a sequence, where they are there, and the map of what stands still in them.
+
+    paths: frame -> its file; people: frame -> points (n, 3) m of the person, in the coordinates of the scans.
+    """
+
+    def __init__(self, paths: dict[int, Path], people: Callable[[int], np.ndarray]):
+        self._paths, self._people = paths, people
+
+    def _others(self, frame: int) -> np.ndarray | None:
+        """The scan without the person; None where it cannot be read."""
+        try:
+            return without_person(read_cloud(self._paths[frame]), self._people(frame))
+        except (KeyError, InputError):
+            return None
+
+    @cached_property
+    def _static(self) -> np.ndarray:
+        frames = sorted(self._paths)
+        chosen = np.unique(np.linspace(0, len(frames) - 1, SCANS).astype(int)).tolist()
+        return static_points(scan for k in chosen if (scan := self._others(frames[k])) is not None)
+
+    def around(self, frame: int, R_sensor_scan: np.ndarray, origin: np.ndarray | None = None) -> dict[str, Any]:
+        """The fields background and neighbors of a frame's sample, in a frame turned by R_sensor_scan (3, 3) about the
+        sensor at origin (3,), by default 0; none where there is no scan."""
+        others = self._others(frame)
+        if others is None:
+            return {}
+        origin = np.zeros(3) if origin is None else origin
+        person, others, static = ((x - origin) @ R_sensor_scan.T for x in (self._people(frame), others, self._static))
+        return {"background": window_points(static, person), "neighbors": window_points(others, person)}
 
 
 def labeled_sample(

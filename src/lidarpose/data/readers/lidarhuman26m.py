@@ -2,6 +2,7 @@
 
     ROOT/labels/3d/pose/7/000001.json       beta (10), pose (72) rad, trans (3) m: SMPL, neutral
     ROOT/labels/3d/segment/7/000001.ply     the person's points, m, in the LiDAR's frame, as pose and trans
+    ROOT/pointclouds/7/000001.pcd           whole scans, which not everybody has: what stands about the person
 
 Joints are SMPL's, so the user's SMPL file is needed. The LiDAR looks down on the people, and its frame is as it was
 mounted, so each sequence is turned level by one rotation. Source: the dataset's page, AutoCONFIG/Neighborhood-enhanced-
@@ -23,7 +24,7 @@ from lidarpose.skeleton import SMPL24
 
 # frames a second of the LiDAR
 _FPS = 10.0
-_POSE, _SEGMENT = "labels/3d/pose", "labels/3d/segment"
+_POSE, _SEGMENT, _SCANS = "labels/3d/pose", "labels/3d/segment", "pointclouds"
 # fewer frames say too little
 LEAST_FRAMES = 100
 # what the estimate may err by, rad: where people turn round, and where they all face about one way, so that leaning
@@ -80,7 +81,10 @@ class LidarHuman26M(Reader):
             joints = dict(zip(labels, people, strict=True))
             # one out of reach will be skipped, and says nothing about the others
             turn = leveling(people[within_reach(people).all(-1)]) if self._level else None
-        for pair in base.paired(poses, base.numbered(root / _SEGMENT / part, ".ply"), f"{part}/{{:06d}}"):
+        segments = base.numbered(root / _SEGMENT / part, ".ply")
+        scans = {frame: paths[0] for frame, paths in base.numbered(root / _SCANS / part, ".pcd").items()}
+        clouds = base.SceneClouds(scans, lambda frame: base.read_cloud(segments[frame][0]))
+        for pair in base.paired(poses, segments, f"{part}/{{:06d}}"):
             if isinstance(pair, Skipped):
                 yield pair
                 continue
@@ -91,7 +95,9 @@ class LidarHuman26M(Reader):
                 yield Skipped("labels without a cloud", f"{part}/{frame:06d}")
             else:
                 time = (frame - min(poses)) / _FPS
-                yield _sample(cloud, joints[frame], labels[frame][2], part, frame, time, turn)
+                R = np.eye(3) if turn is None else turn
+                clip = {"rotations": base.turned_pose(labels[frame][1], R)} | clouds.around(frame, R)
+                yield _sample(cloud, joints[frame], labels[frame][2], part, frame, time, turn, clip)
 
 
 def _labels(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -106,9 +112,16 @@ def _labels(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _sample(
-    path: Path, joints: np.ndarray, trans: np.ndarray, part: str, frame: int, time: float, turn: np.ndarray | None
+    path: Path,
+    joints: np.ndarray,
+    trans: np.ndarray,
+    part: str,
+    frame: int,
+    time: float,
+    turn: np.ndarray | None,
+    clip: dict,
 ) -> LabeledSample | Skipped:
-    """turn: R_level_sensor, None to stay in the sensor's frame."""
+    """turn: R_level_sensor, None to stay in the sensor's frame; clip: fields of clips, turned already."""
     try:
         points = base.read_cloud(path)
     except InputError as error:
@@ -129,6 +142,8 @@ def _sample(
         time=time,
         source=source,
         centers={"trans": trans},
+        translation=trans,
+        **clip,
     )
 
 

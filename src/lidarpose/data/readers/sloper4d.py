@@ -6,17 +6,29 @@
         second_person           opt_pose or pose (n, 72) rad, opt_trans or trans (n, 3) m, beta (10), gender;
                                 point_clouds, a list of (k, 3) m in the world's frame, and point_frame, whose they are;
                                 rows that are no numbers are no points
+    ROOT/SEQUENCE/lidar_data/lidar_frames_rot/1641234567_123.pcd
+                            whole scans in the world's frame, by time, which not everybody has
 
 Joints are SMPL's, so the user's SMPL file is needed. Pickles are read without running them.
 Source: climbingdaily/SLOPER4D src/data_loader.py, guidodumont/SMPLify-3D datasets/sloper4d.py.
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.readers.base import Reader, Skipped, SmplJoints, as_cloud, labeled_sample, numbers
+from lidarpose.data.readers.base import (
+    Reader,
+    SceneClouds,
+    Skipped,
+    SmplJoints,
+    as_cloud,
+    labeled_sample,
+    numbers,
+    turned_pose,
+)
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.io.files import file_error
@@ -25,6 +37,9 @@ from lidarpose.sample import LabeledSample
 from lidarpose.skeleton import SMPL24
 
 _SUFFIX = "_labels.pkl"
+_SCANS = "lidar_data/lidar_frames_rot"
+# the LiDAR's frames are 50 ms apart, s
+_SAME_TIME = 0.02
 # a quaternion is no rotation where its length is further from 1
 _UNIT = 0.01
 
@@ -67,6 +82,9 @@ class Sloper4D(Reader):
         pose, trans = (np.where(has_pose[:, None], x, 0.0) for x in (pose, trans))
         has_place = np.isfinite(position).all(1) & np.isfinite(heading)
         joints = self._smpl(betas, pose, trans, gender)
+        paths = _scans(path.parent, dict(zip(frames, way[:, 8].tolist(), strict=False)))
+        people = {frame: cloud for frame, cloud in clouds.items() if not isinstance(cloud, str)}
+        scans = SceneClouds(paths, people.__getitem__)
         for index, frame in enumerate(frames):
             where, cloud = f"{part}/{frame}", clouds.get(frame)
             if index >= total:
@@ -96,6 +114,9 @@ class Sloper4D(Reader):
                     time=float(way[index, 8] - way[0, 8]),
                     source=f"sloper4d/{which}, {body}",
                     centers={"trans": center},
+                    rotations=turned_pose(pose[index], R_sensor_world),
+                    translation=center,
+                    **scans.around(frame, R_sensor_world, position[index]),
                 )
         yield from (
             Skipped("cloud of a frame without labels", f"{part}/{frame}")
@@ -118,6 +139,17 @@ def _content(path: Path) -> tuple[dict, dict, dict]:
         raise file_error(path, f"expected labels of SLOPER4D 1.0, with second_person, got {got}: {get}")
     walker = content.get("first_person")
     return content, content["second_person"], walker if isinstance(walker, dict) else {}
+
+
+def _scans(folder: Path, times: dict[int, float]) -> dict[int, Path]:
+    """Frame -> its whole scan: files are named by times, s, with _ for the point."""
+    files: dict[float, Path] = {}
+    for path in sorted((folder / _SCANS).glob("*.pcd")):
+        with suppress(ValueError):
+            files[float(path.stem.replace("_", "."))] = path
+    stamps = np.array(sorted(files))
+    nearest = {frame: float(stamps[np.abs(stamps - time).argmin()]) for frame, time in times.items() if len(stamps)}
+    return {frame: files[stamp] for frame, stamp in nearest.items() if abs(stamp - times[frame]) < _SAME_TIME}
 
 
 def _poses(path: Path, person: dict) -> tuple[np.ndarray, np.ndarray, str]:
