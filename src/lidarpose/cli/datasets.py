@@ -2,7 +2,7 @@
 
 import argparse
 
-from lidarpose.cli.terminal import add_command, names, tell
+from lidarpose.cli.terminal import add_command, add_keep, names, scene_changes, tell
 from lidarpose.models import DEFAULT, NAMES
 from lidarpose.progress import Progress
 
@@ -53,6 +53,13 @@ def _add_synth(commands) -> None:
     )
     scene.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
     scene.add_argument("--hard", type=float, default=1.0, metavar="H", help="difficulty from 0 (easy) to 1 (default)")
+    add_keep(scene)
+    scene.add_argument(
+        "--set",
+        dest="set_set",
+        metavar="A=X,B=Y",
+        help="changes of the scene: its numbers (docs/synthesis.md), recorded=1 keeps the places of --motion",
+    )
     several = scene.add_mutually_exclusive_group()
     several.add_argument(
         "--clips", action="store_true", help="write clips of 16 frames at 10 Hz instead of single people"
@@ -139,6 +146,7 @@ def _synth(options: argparse.Namespace) -> None:
         what="clips" if options.clips else "streets" if options.scenes else "people",
         sensors=None if options.sensor is None else names(options.sensor),
         subjects=None if options.subjects is None else names(options.subjects),
+        set=scene_changes(options) or (),
         **{name: getattr(options, name) for name in fields},
     )
     with Progress(job.count, unit=job.what) as bar:

@@ -31,6 +31,18 @@ def names(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
+def scene_changes(options: argparse.Namespace) -> tuple[str, ...] | None:
+    """The changes of the scene that `--keep` and `--set` ask for; None for none."""
+    keep = () if options.keep is None else (f"keep={options.keep}",)
+    return keep + (() if options.set_set is None else names(options.set_set)) or None
+
+
+def add_keep(parser) -> None:
+    """The option --keep, which stands for a change of the scene."""
+    words = "laser mask: every sample keeps a share R of its patches, the paper's r_keep; as --set keep=R"
+    parser.add_argument("--keep", metavar="R", help=words)
+
+
 def tell(text: str, *, error: bool = False) -> None:
     """One line for the user, on stderr; nowhere where that is closed, since stdout may be somebody's JSON. With
     --quiet only errors are printed."""

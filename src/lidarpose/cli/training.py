@@ -8,7 +8,7 @@ from dataclasses import Field, fields
 from pathlib import Path
 from typing import Any
 
-from lidarpose.cli.terminal import add_command, names
+from lidarpose.cli.terminal import add_command, add_keep, names, scene_changes
 from lidarpose.errors import InputError
 from lidarpose.train.recipes import TYPES, Finetune, Pretrain, Recipe
 
@@ -64,6 +64,8 @@ def _add(parser, kind: type[Recipe]) -> None:
     # first the settings of this kind of training, then those that both have
     own = parser.add_argument_group(f"settings of {name}")
     common = parser.add_argument_group("settings of optimizer and run")
+    if kind is Pretrain:
+        add_keep(own)
     shared = {field.name for field in fields(Recipe)}
     for field in fields(kind):
         if field.name != "data":
@@ -89,6 +91,8 @@ def _train(options: argparse.Namespace) -> None:
         for field in fields(kind)
         if (text := getattr(options, f"set_{field.name}", None)) is not None
     }
+    if kind is Pretrain and (settings := scene_changes(options)):
+        changes["set"] = settings
     if kind is Finetune and options.data:
         changes["data"] = tuple(options.data)
     folder = options.folder

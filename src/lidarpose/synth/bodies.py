@@ -32,17 +32,21 @@ _VARIATION = 0.06
 _MIRROR = np.diag([1.0, -1.0, 1.0])
 # how high a captured foot may be above its clip's lowest and still stand on the ground, m
 _JUMP = 0.06
+# a recording whose median distance from its origin is between these was made by a LiDAR that stands there, as
+# LiDARHuman26M; others are of rooms or walks, and their middle is set so far ahead of the sensor, m
+_SENSED, _AHEAD = (4.0, 40.0), 12.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class PoseBank:
     """Captured poses in the rest frame of `body.rig`: local rotations (n, 24, 3, 3) float32, facing +x; moved
-    (n, 24, 3, 3) and step (n, 3) m, `FRAME_TIME` s later (see `Motion.pairs`); clips: their
-    motion."""
+    (n, 24, 3, 3) and step (n, 3) m, `FRAME_TIME` s later (see `Motion.pairs`); places (n, 3): where a sensor at
+    the origin saw them, x, y m and heading rad; clips: their motion."""
 
     rotations: np.ndarray
     moved: np.ndarray
     step: np.ndarray
+    places: np.ndarray
     clips: Motion
 
     @classmethod
@@ -51,7 +55,10 @@ class PoseBank:
         rotations, moved, step = motion.pairs(FRAME_TIME)
         if not len(rotations):
             raise InputError(f"{motion.source}: no clip goes on for {FRAME_TIME:g} s")
-        return cls(rotations=rotations, moved=moved, step=step, clips=motion.resampled(CLIP_HZ))
+        places = motion.places(FRAME_TIME)
+        if not _SENSED[0] <= np.median(np.hypot(places[:, 0], places[:, 1])) <= _SENSED[1]:
+            places[:, :2] += np.array([_AHEAD, 0.0], np.float32) - np.median(places[:, :2], 0)
+        return cls(rotations=rotations, moved=moved, step=step, places=places, clips=motion.resampled(CLIP_HZ))
 
     @classmethod
     def from_clips(cls, path: str | Path, subjects: tuple[str, ...] | None = None) -> "PoseBank":
@@ -90,6 +97,7 @@ class Bodies:
         extent: (n,), least and greatest x, y, z along the heading, m.
         faces, face_part: (Q, 3) and (Q,) as in `body.rig`.
         moved: row -> vertices (V, 3) and joints (26, 3) of a body `FRAME_TIME` s later.
+        places: (n, 3), where captured poses were recorded, see `PoseBank`; NaN of other poses; None without a bank.
     """
 
     vertices: np.ndarray
@@ -101,6 +109,7 @@ class Bodies:
     faces: np.ndarray
     face_part: np.ndarray
     moved: Callable[[int], tuple[np.ndarray, np.ndarray]]
+    places: np.ndarray | None = None
 
 
 def draw_bodies(
@@ -126,6 +135,7 @@ def draw_bodies(
     rig = load_rig()
     prior = sample_rotations(rng, count, dt=FRAME_TIME if moving else 0.0)
     poses, step, kinds = np.stack([prior.rotations, prior.moved], 1), prior.step, np.array(KINDS)[prior.kind]
+    places = None
     if bank is not None:
         picked = rng.integers(len(bank.rotations), size=count)
         both, (way,) = _vary(np.stack([bank.rotations[picked], bank.moved[picked]], 1), rng, bank.step[picked, None])
@@ -133,6 +143,7 @@ def draw_bodies(
         poses = np.where(chosen[:, None, None, None, None], both if moving else both[:, :1], poses)
         step = np.where(chosen[:, None], way[:, 0] if moving else 0, step)
         kinds = np.where(chosen, "captured", kinds)
+        places = np.where(chosen[:, None], bank.places[picked], np.nan)
     rest = rig.rest(sample_people(rng, count).coefficients)
     worn = clothing(rng, count) * np.float32(clothes)
     vertices, joints, low, high = _dressed(rest, worn, poses[:, 0], np.zeros((count, 3), np.float32))
@@ -159,6 +170,7 @@ def draw_bodies(
         faces=rig.faces,
         face_part=rig.face_part,
         moved=moved,
+        places=places,
     )
 
 

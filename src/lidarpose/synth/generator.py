@@ -24,7 +24,7 @@ from lidarpose.synth.bodies import Bodies, PoseBank, draw_bodies, draw_moving_bo
 from lidarpose.synth.environment.mesh import Mesh
 from lidarpose.synth.environment.surroundings import ground, occluder, surroundings
 from lidarpose.synth.props import draw_props
-from lidarpose.synth.scene import Place, RandomStream, SceneConfig, draw_place, scene_config
+from lidarpose.synth.scene import Place, RandomStream, SceneConfig, draw_place, recorded_place, scene_config
 from lidarpose.synth.simulate import Scan, Scene, count_alone, draw_conditions, scan_background, simulate_scan
 
 # people whose poses and shapes are drawn together
@@ -70,6 +70,8 @@ class Generator:
             raise InputError("Generator.captured needs a bank of captured poses, got none")
         if not 0 <= self.captured <= 1:
             raise InputError(f"Generator.captured must be a share in [0, 1], got {self.captured}")
+        if self.config.recorded and not self.captured:
+            raise InputError("recorded=1 keeps the places of captured motion: name its file by --motion")
         # at once: an unknown sensor is an error here
         self._bodies  # noqa: B018
 
@@ -158,6 +160,8 @@ def _draw_scene(
     low, high = bodies.extent[first]
     height, reach = high[2], max(-low[0], -low[1], high[0], high[1])
     place = draw_place(config, device, height, reach, nearer, rng)
+    if config.recorded and bodies.places is not None and np.isfinite(bodies.places[first]).all():
+        place = recorded_place(place, bodies.places[first])
     background = [ground(config, place.feet, rng), *surroundings(config, place.feet, reach, rng)]
     if (front := occluder(config, place.feet, height, rng)) is not None:
         background.append(front)

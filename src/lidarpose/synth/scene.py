@@ -4,10 +4,12 @@ A scene is laid out in a level frame at the sensor: sensor at the origin, z up. 
 -height.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from functools import lru_cache
-from math import atan2, cos, sin, tan
+from math import atan2, cos, inf, sin, tan
+from typing import Any
 
 import numpy as np
 
@@ -93,6 +95,8 @@ class SceneConfig:
         carry: how often something is carried or used, relative to the street's habit.
         noise: what goes wrong with returns.
         crop: errors of the crop's box.
+        recorded: 1: captured people stay where they were recorded, as without the paper's scene sampling; 0: they are
+            placed at random.
         clothes: how far cloth and hair stand off the skin, relative to the street's; 0: bare.
         hard: difficulty in [0, 1]; scales what hides a person or spoils their crop, not the sensor's own noise.
             Whatever it is, boxes jitter and the field of view ends.
@@ -112,6 +116,7 @@ class SceneConfig:
     carry: float = 0.0
     noise: NoiseConfig
     crop: CropErrors = CropErrors()
+    recorded: float = 0.0
     clothes: float = 1.0
     hard: float = 1.0
 
@@ -124,6 +129,52 @@ class SceneConfig:
     def eased(self, hard: float) -> "SceneConfig":
         """The same scenes at a difficulty of `hard` in [0, 1]."""
         return replace(self, hard=hard)
+
+    def changed(self, settings: Sequence[str]) -> "SceneConfig":
+        """The same scenes but for some fields, each given as "name=value": of the scene, its noise or its crops; two
+        ends as "distance=4:12"; the noise's clutter is "noise.clutter". "keep=R" is the paper's r_keep: every sample is
+        masked and keeps a share R. Raises InputError for what is no field or no value of it.
+        """
+        scene = self
+        for setting in settings:
+            scene = _changed(scene, *setting.partition("=")[::2])
+        return scene
+
+
+# fields that are between 0 and 1
+_SHARES = frozenset(
+    "clutter occluder company recorded hard mask mask_keep missing_part intensity_dropout beam_divergence dapt_compat "
+    "loose cut".split()
+)
+
+
+def _changed(scene: SceneConfig, name: str, text: str) -> SceneConfig:
+    """The scene with one field changed, see `SceneConfig.changed`."""
+    groups: dict[str, Any] = {"": scene, "noise": scene.noise, "crop": scene.crop}
+    known: dict[str, tuple[str, str]] = {"keep": ("noise", "mask_keep")}
+    for group, config in groups.items():
+        for field in fields(config):
+            if isinstance(getattr(config, field.name), int | float | tuple) and field.name != "sensors":
+                # two have a field clutter
+                known[f"{group}.{field.name}" if field.name in known else field.name] = (group, field.name)
+    check_name("setting of the scene", name, known)
+    group, field_name = known[name]
+    before = getattr(groups[group], field_name)
+    try:
+        numbers = [float(part) for part in text.split(":")]
+        fits = len(numbers) in ((1, 2) if isinstance(before, tuple) else (1,)) and all(0 <= n < inf for n in numbers)
+        if not fits or numbers[0] > numbers[-1]:
+            raise ValueError
+    except ValueError:
+        expected = "a number or two, LOW:HIGH" if isinstance(before, tuple) else "a number"
+        raise InputError(f"expected {name}={expected}, at least 0, got {name}={text}") from None
+    if field_name in _SHARES and numbers[-1] > 1:
+        raise InputError(f"{name} must be between 0 and 1, got {text}")
+    value = (numbers[0], numbers[-1]) if isinstance(before, tuple) else type(before)(numbers[0])
+    changes: dict[str, Any] = {field_name: value} | ({"mask": 1.0} if name == "keep" else {})
+    if not group:
+        return replace(scene, **changes)
+    return replace(scene, **{group: replace(groups[group], **changes)})
 
 
 # Paper: section "Scene sampling": r in [4, 20] m, a tilted square of ground, the effective window without a margin,
@@ -254,6 +305,12 @@ def draw_place(
         distance=float(distance),
         R_sensor_level=mount,
     )
+
+
+def recorded_place(place: Place, recorded: np.ndarray) -> Place:
+    """`place` with x, y m and heading rad of a recording (3,) instead of random ones."""
+    x, y, yaw = recorded.astype(float)
+    return replace(place, feet=np.array([x, y, place.feet[2]]), yaw=float(yaw), distance=float(np.hypot(x, y)))
 
 
 def _azimuth(device: Sensor | RayPattern, half_width: float, share: float, cut: bool) -> float:

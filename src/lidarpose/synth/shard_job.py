@@ -36,7 +36,8 @@ _MOST_SHARDS = 100_000
 class Job:
     """What to make. what: people, clips or streets; count of them; scene: a preset's name; sensors: names or files of
     tables, None: the scene's; hard in [0, 1]; motion: a file of captured clips whose poses make up a share `captured`
-    of all (None: half), subjects: which of them; per_shard: persons, clips or streets a file, None: as `PER_SHARD`."""
+    of all (None: half), subjects: which of them; set: changes of the scene, see
+    `SceneConfig.changed`; per_shard: persons, clips or streets a file, None: as `PER_SHARD`."""
 
     what: str
     count: int
@@ -48,13 +49,14 @@ class Job:
     subjects: tuple[str, ...] | None = None
     captured: float | None = None
     per_shard: int | None = None
+    set: tuple[str, ...] = ()
 
     def __post_init__(self):
         check_name("kind of dataset", self.what, PER_SHARD)
         check_int(f"the number of {self.what}", self.count, least=1)
         check_int("--per-shard", self.shard_size, least=1)
         check_int("the seed", self.seed, least=0)
-        if self.what == "streets" and (self.scene != "wild" or self.hard != 1 or self.motion is not None):
+        if self.what == "streets" and (self.scene != "wild" or self.hard != 1 or self.motion is not None or self.set):
             raise InputError("streets have scene, difficulty and walkers of their own: leave these options out")
         if -(-self.count // self.shard_size) > _MOST_SHARDS:
             raise InputError(
@@ -66,7 +68,9 @@ class Job:
             raise InputError("expected the subjects of clips, got none: leave --subjects away for all of them")
         if self.captured is not None and not 0 <= self.captured <= 1:
             raise InputError(f"expected a share of captured poses between 0 and 1, got {self.captured}")
-        scene_config(self.scene).eased(self.hard)
+        scene = scene_config(self.scene).eased(self.hard).changed(self.set)
+        if scene.recorded and self.what == "clips":
+            raise InputError("recorded=1 keeps the places of single poses: leave it or --clips away")
         for name in self.sensors or ():
             sensor(name)
         if self.sensors is not None and not self.sensors:
@@ -87,7 +91,7 @@ class Job:
         from lidarpose.synth.bodies import CLIP_HZ, PoseBank
         from lidarpose.synth.generator import Generator
 
-        scene = scene_config(self.scene).eased(self.hard)
+        scene = scene_config(self.scene).eased(self.hard).changed(self.set)
         if self.sensors is not None:
             scene = replace(scene, sensors=self.sensors)
         bank = PoseBank.from_clips(self.motion, self.subjects) if self.motion is not None else None
@@ -106,7 +110,7 @@ class Job:
             "seed": self.seed,
         }
         if self.what != "streets":
-            settings |= {"scene": self.scene, "hard": self.hard}
+            settings |= {"scene": self.scene, "hard": self.hard} | ({"set": list(self.set)} if self.set else {})
         # files by content, so that another file of the same name is noticed and the same one elsewhere is not
         tables = [name for name in dict.fromkeys(sensors) if name not in SENSORS]
         if tables:

@@ -51,8 +51,8 @@ class SyntheticSource:
 
     easy: how many samples it takes to rise from nothing to full; below the ceiling every difficulty is still sampled,
     harder ones more often, except in the paper's scenes, which have one difficulty; motion, subjects, captured,
-    strays, noise: see `recipes.Pretrain`; refined: see `example`. Raises InputError, at once, for an unknown scene and
-    for clips that cannot be read.
+    strays, noise, set: see `recipes.Pretrain`; refined: see `example`. Raises InputError, at once, for an unknown scene
+    and for clips that cannot be read.
     """
 
     scene: str
@@ -63,6 +63,7 @@ class SyntheticSource:
     captured: float = 0.0
     strays: float = 0.0
     noise: float = 0.0
+    set: tuple[str, ...] = ()
     refined: float = REFINED
 
     def __post_init__(self):
@@ -77,7 +78,8 @@ class SyntheticSource:
     def _generator(self) -> Generator:
         bank = PoseBank.from_clips(self.motion, self.subjects) if self.motion else None
         captured = self.captured if bank is not None else 0.0
-        return Generator(scene=scene_config(self.scene), bank=bank, captured=captured, measure=False)
+        scene = scene_config(self.scene).changed(self.set)
+        return Generator(scene=scene, bank=bank, captured=captured, measure=False)
 
     def example(self, index: int) -> Example:
         rng = np.random.default_rng([self.seed, RandomStream.SYNTHETIC_AUGMENTATION, index])

@@ -17,6 +17,8 @@ SCHEDULES = ("plateau", "cosine")
 PRECISIONS = ("auto", "float32", "bf16")
 # the paper's network, and one of the same design for CPUs, besides the sizes of the package's own
 PAPER, SMALL_PAPER = "paper", "paper-small"
+# instead of weights: fine-tuning begins with none
+RANDOM = "random"
 # what changes no sample: a resumed run may have others
 FREE = ("workers", "validate", "pictures", "precision")
 # shares of a whole that cannot be all of it
@@ -108,6 +110,9 @@ class Pretrain(Recipe):
     size: str = _setting("tiny", "of the network: tiny, small, base; paper or paper-small for the paper's design")
     init: str = _setting("", "weights to begin with, of this size or smaller: bundled, or a checkpoint", "NAME|FILE")
     scene: str = _setting("wild", "wild, paper or reference")
+    set: tuple[str, ...] = _setting(
+        (), "changes of the scene: its numbers, keep=R (laser mask), recorded=1 (places of the motion)", "A=X,B=Y"
+    )
     people: int = _setting(300_000, "seen in all")
     easy: float = _setting(
         0.05, "share of the run in which the largest difficulty rises to full; that of shards is what it is", "SHARE"
@@ -136,7 +141,8 @@ class Finetune(Recipe):
     rate: float = _setting(5e-4, "peak learning rate of AdamW", "RATE")
     muon_rate: float = _setting(5e-3, "peak learning rate of Muon for hidden matrices; 0: AdamW for all", "RATE")
     data: tuple[str, ...] = _setting((), "their folders")
-    init: str = _setting(DEFAULT, "weights to begin with: bundled, or a checkpoint", "NAME|FILE")
+    init: str = _setting(DEFAULT, "weights to begin with: bundled, a checkpoint, or random", "NAME|FILE")
+    size: str = _setting("", "with --init random, of the network, as of pretrain")
     epochs: float = _setting(20.0, "how often each sample is seen")
     split: str = _setting("train", "samples to learn from; all: of every split")
     interval: int = _setting(1, "only every so many frames, as published recipes thin out")
@@ -154,6 +160,10 @@ class Finetune(Recipe):
             raise InputError("fine-tuning needs a dataset: name a folder that lidarpose prepare wrote")
         if not self.epochs > 0 or self.interval < 1:
             raise InputError(f"epochs must be above 0 and interval at least 1, got {self.epochs} and {self.interval}")
+        if (self.init == RANDOM) != bool(self.size):
+            raise InputError(
+                f"random weights need a size, and others have theirs: give --init {RANDOM} --size NAME, or no --size"
+            )
         if not self.init:
             raise InputError(
                 "the paper's fine-tuning goes on from a checkpoint of pretrain --recipe paper: name it by --init"

@@ -29,7 +29,7 @@ from lidarpose.train.data_loader import MixedSource, Source, StoredSource, Synth
 from lidarpose.train.objectives.dapt_objective import pretraining_config, small
 from lidarpose.train.objectives.dapt_transfer import transferred
 from lidarpose.train.objectives.objective import Objective
-from lidarpose.train.recipes import PAPER, SMALL_PAPER, Finetune, Pretrain, Recipe
+from lidarpose.train.recipes import PAPER, RANDOM, SMALL_PAPER, Finetune, Pretrain, Recipe
 from lidarpose.train.run_dir import folder_names
 from lidarpose.train.torch_dataset import InMemoryDataset
 
@@ -102,7 +102,7 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
     card: dict = {"motion": None if recipe.motion is None else Path(recipe.motion).name}
     if recipe.init:
         network, card["init_card"] = _expanded(recipe.init, config)
-    names = ("scene", "motion", "subjects", "captured", "strays", "noise")
+    names = ("scene", "set", "motion", "subjects", "captured", "strays", "noise")
     synthetic: dict[str, Any] = {name: getattr(recipe, name) for name in names}
 
     def validation() -> list[Example]:
@@ -127,7 +127,7 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
     turned = Augmentation(turn=1.0, flip=0.5)
     noise = {"strays": recipe.strays, "noise": recipe.noise}
     source = StoredSource(dataset=dataset, seed=recipe.seed, augmentation=turned, **noise)
-    return replace(setup, source=source, warnings=_damage(dataset))
+    return replace(setup, source=source, warnings=_damage(dataset) + _no_parts(dataset))
 
 
 def _check_no_test(folder: str) -> None:
@@ -162,9 +162,15 @@ def _damage(dataset: InMemoryDataset) -> tuple[str, ...]:
     return (f"left out {len(dataset.damaged)} damaged shards: {first}" + (f", and {more} more" if more else ""),)
 
 
+def _no_parts(dataset: InMemoryDataset) -> tuple[str, ...]:
+    """A warning where points have no body parts, of which half of the loss of pre-training is."""
+    if any(rows.num_rows and rows["part"].null_count < rows.num_rows for _, rows, _ in dataset.parts):
+        return ()
+    return ("no point of these datasets has a body part: the loss of parts (the paper's L_seg) is absent",)
+
+
 def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
-    path = weights_path(recipe.init)
-    trained, header = load_checkpoint(path)
+    trained, init_card = _initial(recipe)
     split = None if recipe.split == "all" else recipe.split
     kind = augmentation(recipe.augment)
     full = InMemoryDataset.load(recipe.data, split=split, interval=recipe.interval)
@@ -194,14 +200,23 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
         validation=validation,
         joints=joints,
         card={
-            "init": path.name,
-            "init_card": header.card,
+            "init": Path(recipe.init).name if recipe.init == RANDOM else weights_path(recipe.init).name,
+            "init_card": init_card,
             "data": folder_names(recipe.data),
             "held_out_sequences": list(held_out),
             "damaged": list(dataset.damaged),
         },
         warnings=_damage(dataset) + ((_NO_VALIDATION,) if watched is None else ()),
     )
+
+
+def _initial(recipe: Finetune) -> tuple[PoseNet | DaptNet | None, dict]:
+    """The network that fine-tuning goes on from and its card; None and {} for none, as the recipe says."""
+    if recipe.init != RANDOM:
+        trained, header = load_checkpoint(weights_path(recipe.init))
+        return trained, header.card
+    check_name("network size", recipe.size, PRETRAINED)
+    return None, {}
 
 
 def _held_out(
@@ -221,24 +236,32 @@ def _held_out(
 
 
 def _finetuned(
-    recipe: Finetune, trained: PoseNet | DaptNet, joints: Skeleton, dataset: str
+    recipe: Finetune, trained: PoseNet | DaptNet | None, joints: Skeleton, dataset: str
 ) -> tuple[NetworkConfig | DaptConfig, Callable[[], nn.Module]]:
-    """The configuration for a dataset's joints, and what makes the network with the weights that it begins with."""
-    if isinstance(trained, PoseNet):
-        if not recipe.keep_anchors:
+    """The configuration for a dataset's joints, and what makes the network with the weights that it begins with.
+    trained: None for random weights."""
+    own = PRETRAINED[recipe.size][0] if trained is None else trained.config
+    if isinstance(own, NetworkConfig):
+        if not recipe.keep_anchors and trained is not None:
             raise InputError(
                 "keep_anchors=false is for the paper's network, and --init names one of the package's own: name a "
                 "checkpoint of pretrain --recipe paper, or leave --recipe paper and --keep-anchors away"
             )
-        return trained.config, lambda: trained
+        return own, partial(PoseNet, own) if trained is None else lambda: trained
+    if not dataset:
+        # synthesized people have every joint; the paper's network those that it is pre-trained on
+        joints = HUMAN15
     fitting = [c for c in CONFIGS.values() if c.bins and set(c.joints) == set(joints.joints)]
     if not fitting:
         raise InputError(f"the paper's network has no configuration for the joints of {joints.name}")
-    like, own = next((c for c in fitting if c.name == dataset), fitting[0]), trained.config
-    if recipe.keep_anchors and (own.joints, own.bins, own.ranges) == (like.joints, like.bins, like.ranges):
+    like = next((c for c in fitting if c.name == dataset), fitting[0])
+    same = (own.joints, own.bins, own.ranges) == (like.joints, like.bins, like.ranges)
+    if trained is not None and recipe.keep_anchors and same:
         # a network of this dataset already, as released ones are
         return own, lambda: trained
     # the paper fine-tunes by heatmaps alone
     heads: dict[str, Any] = {"parts": 0, "coordinates": False, "auxiliary": False}
     config = replace(own, name=like.name, joints=like.joints, bins=like.bins, ranges=like.ranges, **heads)
+    if not isinstance(trained, DaptNet):
+        return config, partial(DaptNet, config)
     return config, partial(transferred, trained, config, keep_anchors=recipe.keep_anchors)

@@ -6,6 +6,7 @@
     bvh              .bvh of any skeleton whose joints have usual names; retargeted
     amc              .amc beside its .asf; retargeted
     sloper4d         SLOPER4D's _labels.pkl
+    corpus           .pkl of LIPD, FreeMotion or NoiseMotion
     lidarhuman26m    a folder of numbered pose .json files
 A folder is searched for all of these.
 """
@@ -19,7 +20,7 @@ from pathlib import Path
 from lidarpose.body.mocap.motion import Motion, join
 from lidarpose.body.mocap.retarget import load_clip_positions
 from lidarpose.body.mocap.skeleton_files import load_amc, load_bvh
-from lidarpose.body.mocap.smpl_poses import load_amass, load_lidarhuman26m, load_sloper4d, pose_files
+from lidarpose.body.mocap.smpl_poses import load_amass, load_lidarhuman26m, load_pkl, pose_files
 from lidarpose.errors import check_name
 from lidarpose.geometry import UP_AXES
 from lidarpose.io.files import content_digest, file_error, read_bytes
@@ -38,7 +39,8 @@ FORMATS: dict[str, tuple[Callable[..., Motion], str]] = {
     "amass": (load_npz, ".npz"),
     "bvh": (load_bvh, ".bvh"),
     "amc": (load_amc, ".amc"),
-    "sloper4d": (load_sloper4d, ".pkl"),
+    "sloper4d": (load_pkl, ".pkl"),
+    "corpus": (load_pkl, ".pkl"),
     "lidarhuman26m": (load_lidarhuman26m, ".json"),
 }
 _SUFFIXES = tuple(dict.fromkeys(suffix for _, suffix in FORMATS.values()))
@@ -56,8 +58,8 @@ def load_motion(
 ) -> Motion:
     """Reads the motion of a file, or of all files in a folder and its folders, as rotations of the shipped body.
 
-    Rotation formats (AMASS, LiDARHuman26M, SLOPER4D) keep every turn; the others are retargeted by positions. Frames
-    that are not finite are left out and counted.
+    Rotation formats (AMASS, LiDARHuman26M, SLOPER4D, corpora) keep every turn; the others are retargeted by positions.
+    Frames that are not finite are left out and counted.
 
     Args:
         path: A folder's clips are named by their paths in it, and get the lowest rate among its files unless `hz` is

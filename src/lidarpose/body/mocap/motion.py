@@ -132,15 +132,24 @@ class Motion(_ClipTable):
             The poses (n, 24, 3, 3), facing +x; those `dt` later (n, 24, 3, 3) and the way of the pelvis until then
             (n, 3) m, both in the axes of the first; float32.
         """
-        frame, last = self._last_frames()
-        has_later = frame + dt * self.fps <= last + 1e-6
-        frame, last = frame[has_later], last[has_later]
+        frame, last = self._with_later(dt)
         later, translation = self._between(frame + dt * self.fps, last)
         first = self.rotations[frame]
         unyaw = rotation_about("z", -heading(first))
         step = (unyaw @ (translation - self.translation[frame])[..., None])[..., 0]
         later[:, 0] = unyaw @ later[:, 0]
         return without_yaw(first), later, step.astype(np.float32)
+
+    def places(self, dt: float) -> np.ndarray:
+        """Where the poses of `pairs` were recorded: (n, 3) float32, the pelvis's x and y m and the heading rad."""
+        frame, _ = self._with_later(dt)
+        return np.column_stack([self.translation[frame, :2], heading(self.rotations[frame])]).astype(np.float32)
+
+    def _with_later(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
+        """The frames (n,) that have one `dt` s later in their clip, and the last one (n,) of that clip."""
+        frame, last = self._last_frames()
+        has_later = frame + dt * self.fps <= last + 1e-6
+        return frame[has_later], last[has_later]
 
     def _last_frames(self) -> tuple[np.ndarray, np.ndarray]:
         """All frames (F,), and the last one (F,) of the clip that each is in."""

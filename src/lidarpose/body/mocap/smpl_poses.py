@@ -17,6 +17,10 @@ the published loader.
 
 LiDARHuman26M: a folder of one JSON file a frame, labels/3d/pose/<sequence>/<frame>.json, with `pose` (72) rad and
 `trans` (3) m in the sensor's frame. Source: LiDARCap, Li et al. 2022, the data set's page and published loaders.
+
+LIPD, FreeMotion, NoiseMotion: pickles of a list of dicts as in `data.readers.corpora`, of which `gt` (72 or (3, 72)
+rad, the middle one) and `T_1` or `trans` (3) m are taken, or LIPD's `gt_joint` (24, 3) m where there are no poses.
+Consecutive entries of one `motion_id` or `seq_path` are a clip.
 """
 
 import json
@@ -29,6 +33,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.body.mocap.motion import Motion, join, standing_axis, usable_clips
+from lidarpose.body.mocap.retarget import motion_from_joints
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_from_up
 from lidarpose.io.files import file_error, read_bytes
 from lidarpose.io.npz import read_npz
@@ -149,6 +154,44 @@ def load_sloper4d(path: str | os.PathLike, *, up: str | None = None, fps: float 
         keys = ", ".join(map(str, labels)) or "nothing"
         raise file_error(path, f"expected second_person with pose (n, 72) and trans (n, 3), got {keys}")
     return join(motions, source=f"SLOPER4D: {path}")
+
+
+def load_pkl(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
+    """The motion of a pickle: SLOPER4D's labels, or a corpus of LIPD, FreeMotion or NoiseMotion."""
+    content = load_pickle(path)
+    return _load_corpus(path, content, up, fps) if isinstance(content, list) else load_sloper4d(path, up=up, fps=fps)
+
+
+def _load_corpus(path: str | os.PathLike, entries: list, up: str | None, fps: float | None) -> Motion:
+    """A clip for each sequence of a corpus's entries; those of another form are left out where some are left."""
+    clips: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
+    for entry in (entry for entry in entries if isinstance(entry, dict)):
+        name = str(entry.get("seq_path", entry.get("motion_id", Path(path).stem)))
+        try:
+            pose = np.asarray(entry["gt"] if entry.get("gt") is not None else entry["gt_joint"], float)
+            place = next((entry[key] for key in ("T_1", "trans") if entry.get(key) is not None), np.zeros(3))
+            trans = np.asarray(place, float).reshape(3)
+            # of NoiseMotion's three the middle one, as its reader
+            pose = pose.reshape(-1, _SMPL)[pose.size // _SMPL // 2]
+        except (KeyError, TypeError, ValueError, OverflowError, IndexError):
+            continue
+        clips.setdefault(name, []).append((pose, trans))
+    if not clips:
+        raise file_error(path, "expected LIPD's, FreeMotion's or NoiseMotion's dicts with gt (72) or gt_joint (24, 3)")
+    posed = any(isinstance(entry, dict) and entry.get("gt") is not None for entry in entries)
+    rate, length = fps or LIDARHUMAN26M_FPS, [len(frames) for frames in clips.values()]
+    poses, places = map(np.array, zip(*(frame for frames in clips.values() for frame in frames), strict=True))
+    if not posed:
+        joints = poses.reshape(-1, 24, 3) + places[:, None]
+        return motion_from_joints(path, joints, list(clips), length, fps=rate, up=up, kind="LIPD", unit_m=1.0)
+    # their loaders do not say which axis is up
+    up = up or standing_axis(axis_angle_to_matrix(poses[:, :3])[..., 1]) or "z"
+    ends = np.cumsum(length)
+    motions = [
+        motion_from_smpl(path, poses[e - n : e], places[e - n : e], name=name, fps=rate, up=up, kind="a corpus")
+        for name, n, e in zip(clips, length, ends, strict=True)
+    ]
+    return join(motions, source=f"corpus: {path}")
 
 
 def _frame_rate(path: object, rate: object, key: str) -> float:

@@ -1,0 +1,201 @@
+"""Switches that the paper's tables need: random weights, fields of the scene, recorded places, corpora as motion."""
+
+import pickle
+from dataclasses import replace
+
+import dataset_files
+import motion_files as files
+import numpy as np
+import pytest
+
+from lidarpose.body.mocap import load_motion
+from lidarpose.body.rig import heading
+from lidarpose.cli import main
+from lidarpose.data.prepare import prepare
+from lidarpose.data.shards import read_card
+from lidarpose.errors import InputError
+from lidarpose.models.checkpoint import load_checkpoint
+from lidarpose.skeleton import BODY26
+from lidarpose.synth.bodies import PoseBank
+from lidarpose.synth.generator import Generator
+from lidarpose.synth.scene import scene_config
+from lidarpose.synth.shard_job import Job, write_dataset
+from lidarpose.train.recipes import Finetune, Pretrain
+from lidarpose.train.setup import make_setup
+
+_SHORT = ["--workers", "0", "--pictures", "0", "--validate", "1000", "--batch", "4"]
+
+
+# --- the scene's fields
+
+
+def test_fields_of_the_scene_by_name():
+    scene = scene_config("wild")
+    changed = scene.changed(("slope=0", "distance=4:12", "noise.clutter=0.5", "clutter=0.25", "most_clutter=30"))
+    noise = replace(scene.noise, clutter=0.5, most_clutter=30)
+    assert changed == replace(scene, slope=0.0, distance=(4.0, 12.0), clutter=0.25, noise=noise)
+    assert type(changed.noise.most_clutter) is int
+    masked = scene.changed(("keep=0.6",)).noise
+    assert (masked.mask, masked.mask_keep) == (1.0, (0.6, 0.6))
+    assert scene.changed(()) == scene
+
+
+@pytest.mark.parametrize(
+    "setting, told",
+    [
+        ("kep=1", "unknown setting of the scene 'kep'"),
+        ("sensors=os1-64", "unknown setting"),
+        ("noise=1", "unknown setting"),
+        ("keep", "expected keep=a number or two"),
+        ("keep=1.2", "keep must be between 0 and 1"),
+        ("slope=1:2", "expected slope=a number, "),
+        ("slope=-1", "at least 0"),
+        ("slope=nan", "expected slope"),
+        ("distance=9:4", "LOW:HIGH"),
+    ],
+)
+def test_what_is_no_field_or_no_value_is_refused(setting, told):
+    with pytest.raises(InputError, match=told):
+        scene_config("paper").changed((setting,))
+
+
+def test_the_mask_of_pretrain_and_synth_is_the_scene_s(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert not main(["synth", "--out", "people", "-n", "4", "--scene", "paper", "--keep", "1", "--set", "slope=0"])
+    assert read_card(tmp_path / "people").settings["set"] == ["keep=1", "slope=0"]
+    assert not main(["pretrain", "run", "--people", "8", "--scene", "paper", "--keep", "0.5", *_SHORT])
+    card = load_checkpoint("run/model.safetensors")[1].card
+    assert card["recipe"]["set"] == ["keep=0.5"] and "--set keep=0.5" in card["command"]
+    full, half = (
+        make_setup(Pretrain(scene="paper", people=16, strays=0.0, noise=0.0, set=(f"keep={keep}",))).source
+        for keep in ("1", "0.5")
+    )
+    counts = np.array([[len(source.example(k).points) for source in (full, half)] for k in range(8)]).mean(0)
+    assert counts[1] < 0.75 * counts[0]
+    assert main(["pretrain", "other", "--keep", "2", *_SHORT]) == 2 and not (tmp_path / "other").exists()
+
+
+# --- places as recorded
+
+
+def _bank(offset):
+    rotations, way = files.a_clip(8)
+    folder_motion = load_motion_of(rotations, way + offset)
+    return PoseBank.of_motion(folder_motion), folder_motion
+
+
+def load_motion_of(rotations, way, *, names=("a",)):
+    from lidarpose.body.mocap.motion import Motion
+
+    return Motion(
+        rotations=rotations.astype(np.float32), translation=way.astype(np.float32), names=names,
+        length=np.array([len(way)]), fps=10.0, source="test",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("offset", [(14.0, 5.0, 0.0), (0.0, 0.0, 0.0), (400.0, 0.0, 0.0)])
+def test_captured_people_stay_where_they_were_recorded(offset):
+    """A LiDAR's recording as it is; one of a room or a far walk about a place 12 m ahead."""
+    bank, motion = _bank(np.array(offset))
+    scene = scene_config("paper").changed(("recorded=1", "keep=1"))
+    generator = Generator(scene=scene, bank=bank, captured=1.0, measure=False)
+    places, facings = motion.translation[:-1, :2].copy(), heading(motion.rotations[:-1])
+    if offset[0] != 14.0:
+        places += np.array([12.0, 0.0]) - np.median(places, 0)
+    for index in range(6):
+        joints = generator.person(3, index).sample.pose.joints
+        pelvis = joints[BODY26.index("pelvis"), :2]
+        # the body's origin is not its pelvis, and poses vary a little
+        nearest = np.linalg.norm(places - pelvis, axis=1).argmin()
+        assert np.linalg.norm(places[nearest] - pelvis) < 0.35
+        left = (joints[BODY26.index("left_hip")] - joints[BODY26.index("right_hip")])[:2]
+        away = np.arctan2(-left[0], left[1]) - facings
+        assert np.abs((away + np.pi) % (2 * np.pi) - np.pi).min() < 0.6
+
+
+def test_recorded_places_need_motion_and_single_people(tmp_path):
+    scene = scene_config("paper").changed(("recorded=1",))
+    with pytest.raises(InputError, match="--motion"):
+        Generator(scene=scene)
+    with pytest.raises(InputError, match="--clips"):
+        Job(what="clips", count=1, motion="m.npz", set=("recorded=1",))
+
+
+# --- random weights
+
+
+@pytest.fixture(scope="module")
+def people(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("synthetic") / "people"
+    write_dataset(Job(what="people", count=6, scene="paper", seed=3), folder)
+    return folder
+
+
+@pytest.mark.parametrize("size, recipe", [("tiny", "default"), ("paper-small", "paper")])
+def test_fine_tuning_begins_at_random(people, tmp_path, monkeypatch, size, recipe):
+    monkeypatch.chdir(tmp_path)
+    words = ["finetune", str(people), "--out", "run", "--init", "random", "--size", size, "--recipe", recipe]
+    assert not main([*words, "--split", "all", "--epochs", "2", "--mix", "0", *_SHORT])
+    header = load_checkpoint("run/model.safetensors")[1]
+    assert header.card["init"] == "random" and header.card["init_card"] == {}
+    if size == "paper-small":
+        assert header.config.bins and not header.config.coordinates and len(header.config.joints) == 15
+    assert not main(["evaluate", "run/model.safetensors", str(people), "--out", "scores"])
+    assert not main(["finetune", "--out", "run", "--resume", "--epochs", "3"])
+
+
+@pytest.mark.parametrize("changes", [{"init": "random"}, {"size": "tiny"}])
+def test_random_weights_need_a_size_and_others_have_theirs(changes):
+    with pytest.raises(InputError, match="--init random --size NAME"):
+        Finetune(data=("x",), **changes)
+
+
+def test_an_unknown_size_is_refused(people):
+    with pytest.raises(InputError, match="unknown network size 'huge'"):
+        make_setup(Finetune(data=(str(people),), split="all", init="random", size="huge"))
+
+
+# --- corpora
+
+
+def test_a_corpus_without_parts_is_pointed_out(people, tmp_path):
+    dataset_files.write_lipd(tmp_path / "raw", dataset_files.write_smpl(tmp_path / "SMPL_NEUTRAL.npz"))
+    prepare("lipd", tmp_path / "raw", tmp_path / "corpus", progress=False)
+    warnings = make_setup(Pretrain(shards=(str(tmp_path / "corpus"),))).warnings
+    assert any("L_seg" in warning for warning in warnings)
+    assert not make_setup(Pretrain(shards=(str(people),))).warnings
+
+
+def _written(folder, entries):
+    (folder / "train.pkl").write_bytes(pickle.dumps(entries))
+    return folder / "train.pkl"
+
+
+@pytest.mark.parametrize("which, up", [("freemotion", "y"), ("noisemotion", "z")])
+def test_poses_of_a_corpus_are_motion(tmp_path, which, up):
+    rotations, way = files.a_clip(10)
+    poses = files.to_smpl(rotations, up)
+    entries = []
+    for k, pose in enumerate(poses):
+        gt = pose if which == "freemotion" else np.stack([pose * 0, pose, pose * 0])
+        place = files.UP_AXES[up].T @ way[k]
+        entries.append({"motion_id": "a" if k < 6 else "b", "gt": gt, "T_1": place, "shape": np.zeros(10), "pc": None})
+    motion = load_motion(_written(tmp_path, [*entries[:3], {"motion_id": "a"}, *entries[3:]]))
+    assert motion.names == ("a", "b") and motion.length.tolist() == [6, 4] and motion.fps == 10
+    np.testing.assert_allclose(motion.rotations, rotations, atol=1e-4)
+    np.testing.assert_allclose(motion.translation, way, atol=1e-4)
+
+
+def test_lipd_s_joints_are_motion_where_there_are_no_poses(tmp_path):
+    rotations, way = files.a_clip(6)
+    joints = files.joints_of(rotations)
+    entries = [{"seq_path": "s", "gt_joint": j, "trans": w} for j, w in zip(joints, way, strict=True)]
+    motion = load_motion(_written(tmp_path, entries))
+    assert motion.names == ("s",) and len(motion.rotations) == 6
+    again = files.joints_of(motion.rotations)
+    assert np.linalg.norm(again - joints, axis=-1)[:, files.MAIN].max() < 0.03
+
+
+def test_a_list_without_poses_is_no_motion(tmp_path):
+    with pytest.raises(InputError, match="gt_joint"):
+        load_motion(_written(tmp_path, [{"pc": 3}, 4]))
