@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from lidarpose.models.baselines.config import LpformerConfig, PrnConfig
 from lidarpose.models.baselines.lidarcap import (
     FRAMES,
     Lidarcap,
@@ -16,18 +17,18 @@ from lidarpose.models.baselines.lpformer import V2V, Lpformer
 from lidarpose.models.baselines.ne import CLOUDS, Ne
 from lidarpose.models.baselines.point_ops import ball_query, farthest_points, nearest_neighbors
 from lidarpose.models.baselines.prn import Prn, PrnNeck
-from lidarpose.skeleton import SMPL24
+from lidarpose.skeleton import SMPL24, WAYMO14
 
 # numbers of parameters, counted layer by layer from the authors' code
 PARAMETERS = {
-    "prn 15": (lambda: Prn(15), 1_738_482),
-    "prn 24": (lambda: Prn(24), 1_739_652),
+    "prn 15": (lambda: Prn(PrnConfig()), 1_738_482),
+    "prn 24": (lambda: Prn(PrnConfig(joints=SMPL24.joints)), 1_739_652),
     "prn neck 64": (lambda: PrnNeck(64, 15), 228_870),
     "prn neck 128": (lambda: PrnNeck(128, 15), 899_910),
     "v2v": (V2V, 3_242_112),
-    "lpformer 14": (lambda: Lpformer(14), 4_814_212),
-    "lpformer 15": (lambda: Lpformer(15), 4_814_485),
-    "lpformer 24": (lambda: Lpformer(24, grid=32), 4_816_942),
+    "lpformer 14": (lambda: Lpformer(LpformerConfig(joints=WAYMO14.joints)), 4_814_212),
+    "lpformer 15": (lambda: Lpformer(LpformerConfig()), 4_814_485),
+    "lpformer 24": (lambda: Lpformer(LpformerConfig(joints=SMPL24.joints, grid=32)), 4_816_942),
     "pointnet++ 1024": (lambda: PointNet2(1024), 805_184),
     "pointnet++ 512": (lambda: PointNet2(512), 542_016),
     "lidarcap": (Lidarcap, 34_925_854),
@@ -133,9 +134,9 @@ def _run(name: str, points: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
     """Joints of the network `name` with fixed weights, in evaluation mode; clips show the cloud in every frame."""
     torch.manual_seed(3)
     if name == "prn":
-        return Prn(15).eval()(points, valid).joints
+        return Prn(PrnConfig()).eval()(points, valid).joints
     if name == "lpformer":
-        return Lpformer(15, grid=32).eval()(points, valid).joints
+        return Lpformer(LpformerConfig(grid=32)).eval()(points, valid).joints
     encoder = PointNet2(64).eval()
     return encoder(points, valid)
 

@@ -27,7 +27,7 @@ NAMED = sorted(set(re.findall(r"`([\w/]+\.py): ([\w.]+)", (DOCS / "method.md").r
 FLAG = re.compile(r"(?<![\w-])--[a-z][a-z0-9_-]*")
 COMMANDS = (
     "predict", "demo", "synth", "prepare", "sensors", "view", "pretrain", "finetune", "evaluate", "table", "info",
-    "export", "import",
+    "models", "export", "import",
 )  # fmt: skip
 LINK = re.compile(r"\[[^]]*\]\((?!https?:)([^)#]*)(#[^)]*)?\)")
 

@@ -19,7 +19,13 @@ _WHAT = (
 )
 # a value of a setting from its text, by type; others are texts
 _BOOLS = {"true": True, "false": False}
-_PARSERS: dict[Any, Callable] = {int: int, float: float, bool: _BOOLS.__getitem__, tuple[str, ...]: names}
+_PARSERS: dict[Any, Callable] = {
+    int: int,
+    float: float,
+    bool: _BOOLS.__getitem__,
+    tuple[str, ...]: names,
+    tuple[float, ...]: names,
+}
 
 
 def add(commands) -> None:
@@ -58,7 +64,11 @@ def _add(parser, kind: type[Recipe]) -> None:
     else:
         parser.add_argument("--out", dest="folder", metavar="RUN", help=where)
     parser.add_argument("--resume", action="store_true", help="continue an interrupted run (default: the latest)")
-    parser.add_argument("--recipe", metavar="NAME", help="default or paper; other options override its settings")
+    parser.add_argument(
+        "--recipe",
+        metavar="NAME",
+        help="default or paper; prn or lpformer, as with --model; other options override its settings",
+    )
     parser.add_argument("--device", metavar="NAME", help="cpu (default: a GPU if there is one)")
     parser.add_argument("--tracker", metavar="NAME", help="also log to tensorboard or wandb, if installed")
     # first the settings of this kind of training, then those that both have
@@ -80,7 +90,7 @@ def _add(parser, kind: type[Recipe]) -> None:
 
 def _train(options: argparse.Namespace) -> None:
     from lidarpose.train.loop import train
-    from lidarpose.train.recipes import recipe
+    from lidarpose.train.recipes import RECIPES, recipe
     from lidarpose.train.run_dir import latest, read_config
     from lidarpose.train.validation import draw_examples
 
@@ -103,7 +113,9 @@ def _train(options: argparse.Namespace) -> None:
         # a run keeps its recipe: what is not said again stays
         wanted = kind(**(read_config(Path(folder), kind)[0].to_dict() | changes))
     else:
-        wanted = recipe(kind, options.recipe or "default", **changes)
+        # a baseline is trained as published
+        model = changes.get("model")
+        wanted = recipe(kind, options.recipe or (model if model in RECIPES[kind] else "default"), **changes)
     words = [f"--{key.replace('_', '-')} {_said(value)}" for key, value in changes.items() if key != "data"]
     words += [f"--recipe {options.recipe}"] * (options.recipe not in (None, "default"))
     words += ["--resume"] * options.resume

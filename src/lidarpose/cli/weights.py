@@ -1,4 +1,4 @@
-"""`lidarpose info`, `export` and `import`."""
+"""`lidarpose info`, `models`, `export` and `import`."""
 
 import argparse
 import json
@@ -20,6 +20,10 @@ def add(commands) -> None:
     info.set_defaults(run=_info)
     info.add_argument("-v", "--verbose", action="store_true", help="also how the weights were trained, and all scores")
     info.add_argument("--json", action="store_true", help="print everything as JSON")
+
+    models = add_command(commands, "models", "list the networks: joints, frames, parameters", "lidarpose models --json")
+    models.set_defaults(run=_models)
+    models.add_argument("--json", action="store_true", help="print them as JSON")
 
     export = add_command(
         commands,
@@ -113,6 +117,18 @@ def _lines(facts: dict[str, Any], *, verbose: bool) -> Iterator[str]:
             yield f"  score    {label}: {score}"
     if not verbose:
         yield "more       lidarpose info --verbose: training and all scores; --json: the same for programs"
+
+
+def _models(options: argparse.Namespace) -> None:
+    from lidarpose.train.setup import networks
+
+    rows = networks()
+    if options.json:
+        print(json.dumps(rows, indent=1))
+        return
+    print(f"{'name':10}{'size':14}{'joints':>6}{'frames':>8}{'parameters':>14}")
+    for row in rows:
+        print(f"{row['name']:10}{row['size']:14}{row['joints']:6}{row['frames']:8}{row['parameters']:14,}")
 
 
 def _torch() -> str:

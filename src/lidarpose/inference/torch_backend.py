@@ -1,4 +1,4 @@
-"""Networks run by torch: any device, the paper's network too."""
+"""Networks run by torch: any device; the paper's network and its baselines too."""
 
 import os
 from collections.abc import Callable
@@ -9,6 +9,9 @@ import torch
 from lidarpose.errors import InputError
 from lidarpose.inference.backend import Backend, Raw
 from lidarpose.models import NETWORKS
+from lidarpose.models.baselines.config import pad_clouds
+from lidarpose.models.baselines.lpformer import Lpformer
+from lidarpose.models.baselines.prn import Prn
 from lidarpose.models.checkpoint import Header, load_checkpoint
 from lidarpose.models.dapt.dapt_net import DaptNet
 from lidarpose.models.export import ArrayModule
@@ -16,8 +19,8 @@ from lidarpose.models.onnx import OUTPUTS, voxelize_people
 from lidarpose.models.posenet import PoseNet
 from lidarpose.models.voxelize import WINDOW
 
-# people a call; the paper's network is a hundred times as large
-_BATCH, _DAPT_BATCH = 64, 8
+# people a call; the paper's network and its baselines are a hundred times as large
+_BATCH, _SLOW_BATCH = 64, 8
 
 
 def torch_backend(path: str | os.PathLike, *, device: str = "cpu", compile: bool = False) -> Backend:
@@ -76,11 +79,10 @@ class DaptBackend:
     package's own networks see, the points within `WINDOW`; it has no use for the sensor's place."""
 
     name = "torch"
-    batch = _DAPT_BATCH
+    batch = _SLOW_BATCH
 
     def __init__(self, network: DaptNet, header: Header, *, device: str = "cpu", compile: bool = False):
-        if compile:
-            raise InputError("torch.compile is not offered for the paper's network: leave compile away")
+        _no_compile(compile)
         self.network = network.to(device).eval()
         self.header = header
 
@@ -97,3 +99,32 @@ class DaptBackend:
             low=config.low,
             step=config.step,
         )
+
+
+class BaselineBackend:
+    """PRN or LPFormer. They subtract the middle of the cloud's extent themselves and add it back, so they answer in the
+    frame of the cloud. Of more points than they read a fixed draw stays."""
+
+    name = "torch"
+    batch = _SLOW_BATCH
+
+    def __init__(self, network: Prn | Lpformer, header: Header, *, device: str = "cpu", compile: bool = False):
+        _no_compile(compile)
+        self.network = network.to(device).eval()
+        self.header = header
+        self.device = device
+
+    @torch.inference_mode()
+    def run(self, clouds: list[np.ndarray], view: np.ndarray) -> Raw:
+        config = self.network.config
+        again = config.resample_with_replacement
+        arrays = pad_clouds(clouds, view, resample_with_replacement=again, seeds=[0] * len(clouds))
+        inputs = (torch.as_tensor(arrays[name]).to(self.device) for name in ("points", "valid", "center"))
+        joints = self.network(*inputs).joints.float().cpu().numpy() + arrays["middle"][:, None]
+        order = [config.joints.index(joint) for joint in self.header.skeleton.joints]
+        return Raw(vote=joints[:, order], heatmaps=None, low=np.zeros(3), step=np.ones(3))
+
+
+def _no_compile(compile: bool) -> None:
+    if compile:
+        raise InputError("torch.compile is not offered for the paper's network and its baselines: leave compile away")

@@ -35,7 +35,7 @@ class NetworkKind:
         return getattr(import_module(module), attribute)
 
 
-# by the name that checkpoints give: this package's own, and the paper's
+# by the name that checkpoints give: this package's own, the paper's, and its baselines
 NETWORKS = {
     "pose": NetworkKind(
         config="lidarpose.models.config:NetworkConfig",
@@ -48,6 +48,19 @@ NETWORKS = {
         network="lidarpose.models.dapt.dapt_net:DaptNet",
         objective="lidarpose.train.objectives.dapt_objective:DaptObjective",
         backend="lidarpose.inference.torch_backend:DaptBackend",
+    ),
+    # those that the paper compares with
+    "prn": NetworkKind(
+        config="lidarpose.models.baselines.config:PrnConfig",
+        network="lidarpose.models.baselines.prn:Prn",
+        objective="lidarpose.train.objectives.baseline_objective:BaselineObjective",
+        backend="lidarpose.inference.torch_backend:BaselineBackend",
+    ),
+    "lpformer": NetworkKind(
+        config="lidarpose.models.baselines.config:LpformerConfig",
+        network="lidarpose.models.baselines.lpformer:Lpformer",
+        objective="lidarpose.train.objectives.baseline_objective:BaselineObjective",
+        backend="lidarpose.inference.torch_backend:BaselineBackend",
     ),
 }
 

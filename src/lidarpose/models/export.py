@@ -64,7 +64,7 @@ def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = 
     network, header = load_checkpoint(weights)
     if not isinstance(network, PoseNet):
         raise InputError(
-            f"{os.fspath(weights)}: the paper's network ({network.config.name}) is not offered as {format}: "
+            f"{os.fspath(weights)}: a network of the paper ({network.config.name}) is not offered as {format}: "
             "it runs with torch, and networks that `lidarpose pretrain` trains are exported"
         )
     # tracing takes a minute

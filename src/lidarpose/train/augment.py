@@ -59,10 +59,10 @@ class Augmentation:
 
     released: crop and center as the released code's, else by a box and by the points; box: probability that a box has a
     detector's errors, those of the protocol clean, else it crops nothing; refined: that the center is a guess of the
-    pelvis; cut: that part of the cloud is cut off by a plane; turn: of a turn about z by any angle; scale: sizes from
-    1 - scale to 1 + scale; flip: of a mirror, across x and across y on their own; jitter: standard deviation of each
+    pelvis; cut: that part of the cloud is cut off by a plane; turn: of a turn about z by up to `angle` rad; scale:
+    sizes from 1 - scale to 1 + scale; flip: of a mirror, across x and across y on their own; jitter: deviation of each
     coordinate, m, cut at four times that; drop: probability that a fifth of the points is lost; strays: of clusters of
-    clutter points.
+    clutter points; shift: largest step along x, y and z alike of what a baseline reads, m.
     """
 
     released: bool = False
@@ -70,23 +70,27 @@ class Augmentation:
     refined: float = REFINED
     cut: float = 0.0
     turn: float = 0.0
+    angle: float = np.pi
     scale: float = 0.0
     flip: float = 0.0
     jitter: float = 0.0
     drop: float = 0.0
     strays: float = 0.0
+    shift: float = 0.0
 
 
 AUGMENTATIONS = {
     "none": Augmentation(),
     # Paper: none are named; those of the released fine-tuning. Its box of HumanM3 knows the joints
     "paper": Augmentation(released=True, turn=0.5, scale=0.1, flip=0.3, jitter=0.005, drop=0.5),
+    # LiDAR-HMR's, of PRN and LPFormer
+    "lidarhmr": Augmentation(refined=0.0, turn=1.0, angle=np.pi / 4, scale=0.2, shift=0.2),
     "default": Augmentation(box=0.9, cut=0.15, turn=1.0, scale=0.1, flip=0.5, jitter=0.005, drop=0.5, strays=0.15),
 }
 
 
 def augmentation(name: str) -> Augmentation:
-    """A named augmentation: none, paper or default."""
+    """A named augmentation: none, paper, lidarhmr or default."""
     check_name("augmentation", name, AUGMENTATIONS)
     return AUGMENTATIONS[name]
 
@@ -114,7 +118,7 @@ def augmented(sample: LabeledSample, kind: Augmentation, rng: np.random.Generato
     view = view_features(center, origin)
     part, visible = part_and_visible(sample)
     points, joints = sample.points - center, sample.joints - center
-    yaw = rng.uniform(-np.pi, np.pi)
+    yaw = rng.uniform(-kind.angle, kind.angle)
     R = rotation_about("z", yaw if rng.random() < kind.turn else 0.0) * (1 + kind.scale * rng.uniform(-1, 1))
     mirrors = rng.random(2) < kind.flip
     R = np.diag([*np.where(mirrors, -1.0, 1.0), 1.0]) @ R

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from math import cos, pi
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -21,22 +22,27 @@ _COEFFICIENTS, _ITERATIONS, _EPS = (3.4445, -4.775, 2.0315), 5, 1e-7
 
 
 def optimizers(network: nn.Module, recipe: Recipe) -> list[torch.optim.Optimizer]:
-    """AdamW; with a muon_rate Muon besides, for the hidden matrices of a `PoseNet`."""
+    """AdamW or Adam; with a muon_rate AdamW, and Muon for the hidden matrices of a `PoseNet`."""
+    betas: Any = recipe.betas
+    settings: dict[str, Any] = {"lr": recipe.rate, "weight_decay": recipe.decay, "fused": True}
     if not recipe.muon_rate or not isinstance(network, PoseNet):
+        kind = torch.optim.Adam if recipe.optimizer == "adam" else torch.optim.AdamW
         # the paper's: torch's own settings
-        return [torch.optim.AdamW(network.parameters(), lr=recipe.rate, weight_decay=recipe.decay, fused=True)]
+        return [kind(network.parameters(), betas=betas or (0.9, 0.999), **settings)]
     hidden: list[nn.Parameter] = []
     other: list[nn.Parameter] = []
     for name, value in network.named_parameters():
         (other if value.ndim != 2 or any(end in name for end in _ENDS) else hidden).append(value)
     return [
-        torch.optim.AdamW(other, lr=recipe.rate, betas=(0.9, 0.98), weight_decay=recipe.decay, fused=True),
+        torch.optim.AdamW(other, betas=betas or (0.9, 0.98), **settings),
         Muon(hidden, lr=recipe.muon_rate, weight_decay=recipe.decay, momentum=0.95),
     ]
 
 
 def rate_factor(done: float, recipe: Recipe) -> float:
     """Share of the peak rate when `done` in [0, 1] of the run is over."""
+    if recipe.schedule == "constant":
+        return 1.0
     if recipe.schedule == "cosine":
         # torch's OneCycleLR: half a cosine up, half a cosine down
         if done < recipe.warmup:

@@ -12,17 +12,27 @@ from lidarpose.errors import InputError, check_finite, check_name
 from lidarpose.io.files import listed
 from lidarpose.models import DEFAULT
 
-# rises, stays, falls to nothing; or rises and falls as a cosine
-SCHEDULES = ("plateau", "cosine")
+# rises, stays, falls to nothing; rises and falls as a cosine; or never changes
+SCHEDULES = ("plateau", "cosine", "constant")
+OPTIMIZERS = ("adamw", "adam")
 PRECISIONS = ("auto", "float32", "bf16")
 # the paper's network, and one of the same design for CPUs, besides the sizes of the package's own
 PAPER, SMALL_PAPER = "paper", "paper-small"
+# the networks of --model, and their sizes, the first one by default
+MODELS: dict[str, tuple[str, ...]] = {
+    "ours": ("tiny", "small", "base"),
+    "dapt": (PAPER, SMALL_PAPER),
+    "prn": ("prn",),
+    "lpformer": ("lpformer",),
+}
 # instead of weights: fine-tuning begins with none
 RANDOM = "random"
 # what changes no sample: a resumed run may have others
 FREE = ("workers", "validate", "pictures", "precision")
 # shares of a whole that cannot be all of it
 _BELOW_ONE = ("ema", "mix", "hold_out")
+_MODEL = "ours, dapt, prn or lpformer"
+_OPTIONS = "options of a baseline's network: resample_with_replacement=true, grid=32, ... (docs/train.md)"
 _LEAST = {"batch": 1, "people": 1}
 
 
@@ -42,6 +52,7 @@ TYPES: dict[Any, tuple] = {
     str: (fspath, "text", "NAME"),
     str | None: (lambda value: None if value is None else fspath(value), "text", "FILE"),
     tuple[str, ...]: (lambda value: tuple(fspath(path) for path in listed(value)), "a list of texts", "A,B"),
+    tuple[float, ...]: (lambda value: tuple(map(float, value)), "a list of numbers", "X,Y"),
 }
 
 
@@ -75,7 +86,9 @@ class Recipe:
     rate: float = _setting(2e-3, "peak learning rate of AdamW", "RATE")
     muon_rate: float = _setting(0.02, "peak learning rate of Muon for hidden matrices; 0: AdamW for all", "RATE")
     decay: float = _setting(0.01, "weight decay")
-    schedule: str = _setting("plateau", "plateau (rise, stay, fall) or cosine")
+    optimizer: str = _setting("adamw", "adamw or adam, where Muon is off")
+    betas: tuple[float, ...] = _setting((), "its two betas (default: those of the network)")
+    schedule: str = _setting("plateau", "plateau (rise, stay, fall), cosine or constant")
     warmup: float = _setting(0.02, "share of the run in which the rate rises", "SHARE")
     cool: float = _setting(0.3, "share of the run in which a plateau's rate falls to nothing", "SHARE")
     ema: float = _setting(0.999, "how much the running mean of the weights keeps each step; 0: no mean", "SHARE")
@@ -91,6 +104,9 @@ class Recipe:
     def __post_init__(self):
         for f in fields(self):
             object.__setattr__(self, f.name, _checked(f, getattr(self, f.name)))
+        check_name("optimizer", self.optimizer, OPTIMIZERS)
+        if self.betas and not (len(self.betas) == 2 and all(0 <= beta < 1 for beta in self.betas)):
+            raise InputError(f"betas must be two numbers from 0 to below 1, got {self.betas}")
         check_name("schedule", self.schedule, SCHEDULES)
         check_name("precision", self.precision, PRECISIONS)
 
@@ -103,11 +119,21 @@ class Recipe:
         return asdict(self)
 
 
+def _size_of(model: str, size: str) -> str:
+    """The size of a model that a recipe means. Raises InputError for an unknown model or another's size."""
+    check_name("model", model, MODELS)
+    if size and size not in MODELS[model]:
+        raise InputError(f"the model {model} has the size {' or '.join(MODELS[model])}, got {size}")
+    return size or MODELS[model][0]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Pretrain(Recipe):
     """Pre-training on synthesized people, made while the network learns, or read from shards."""
 
-    size: str = _setting("tiny", "of the network: tiny, small, base; paper or paper-small for the paper's design")
+    model: str = _setting("", f"{_MODEL} (default: the one that --size is of)")
+    size: str = _setting("", "of the network: tiny, small, base (ours; default tiny); paper, paper-small (dapt)")
+    options: tuple[str, ...] = _setting((), _OPTIONS)
     init: str = _setting("", "weights to begin with, of this size or smaller: bundled, or a checkpoint", "NAME|FILE")
     scene: str = _setting("wild", "wild, paper or reference")
     set: tuple[str, ...] = _setting(
@@ -130,6 +156,7 @@ class Pretrain(Recipe):
 
     def __post_init__(self):
         super().__post_init__()
+        object.__setattr__(self, "size", self.size or "tiny" if not self.model else _size_of(self.model, self.size))
         if self.subjects and not self.motion:
             raise InputError("subjects are of captured clips: name their file by motion too")
 
@@ -141,12 +168,14 @@ class Finetune(Recipe):
     rate: float = _setting(5e-4, "peak learning rate of AdamW", "RATE")
     muon_rate: float = _setting(5e-3, "peak learning rate of Muon for hidden matrices; 0: AdamW for all", "RATE")
     data: tuple[str, ...] = _setting((), "their folders")
+    model: str = _setting("", f"{_MODEL}: the network of --init (default: whichever it holds)")
+    options: tuple[str, ...] = _setting((), _OPTIONS)
     init: str = _setting(DEFAULT, "weights to begin with: bundled, a checkpoint, or random", "NAME|FILE")
     size: str = _setting("", "with --init random, of the network, as of pretrain")
     epochs: float = _setting(20.0, "how often each sample is seen")
     split: str = _setting("train", "samples to learn from; all: of every split")
     interval: int = _setting(1, "only every so many frames, as published recipes thin out")
-    augment: str = _setting("default", "what happens to people: default, paper or none")
+    augment: str = _setting("default", "what happens to people: default, paper, lidarhmr or none")
     mix: float = _setting(0.25, "share of synthesized people, below 1", "SHARE")
     scene: str = _setting("wild", "of the synthesized people: wild, paper or reference")
     hold_out: float = _setting(
@@ -156,6 +185,10 @@ class Finetune(Recipe):
 
     def __post_init__(self):
         super().__post_init__()
+        if self.model and (self.init == RANDOM or self.size):
+            object.__setattr__(self, "size", _size_of(self.model, self.size))
+        elif self.model:
+            check_name("model", self.model, MODELS)
         if not self.data:
             raise InputError("fine-tuning needs a dataset: name a folder that lidarpose prepare wrote")
         if not self.epochs > 0 or self.interval < 1:
@@ -172,6 +205,13 @@ class Finetune(Recipe):
 
 # the released OneCycle schedule, AdamW on everything, neither mean of weights nor clipping
 _RELEASED = {"muon_rate": 0.0, "decay": 0.005, "schedule": "cosine", "warmup": 0.04, "ema": 0.0, "clip": 0.0}
+# LiDAR-HMR's, of PRN and of its LPFormer: a constant rate, neither mean of weights nor clipping
+_LIDARHMR = {"muon_rate": 0.0, "rate": 5e-4, "schedule": "constant", "warmup": 0.0, "ema": 0.0, "clip": 0.0}
+_PRN = _LIDARHMR | {"model": "prn", "optimizer": "adam", "decay": 0.0}
+# the decay is torch's
+_LPFORMER = _LIDARHMR | {"model": "lpformer", "betas": (0.85, 0.95), "batch": 16}
+# 50 epochs on all training sequences and no others, from random weights
+_LIDARHMR_DATA = {"init": RANDOM, "epochs": 50.0, "augment": "lidarhmr", "mix": 0.0, "hold_out": 0.0}
 # by kind and name, what differs from the recipe of the bundled weights. Paper: implementation details
 RECIPES: dict[type[Recipe], dict[str, dict[str, Any]]] = {
     Pretrain: {
@@ -181,6 +221,9 @@ RECIPES: dict[type[Recipe], dict[str, dict[str, Any]]] = {
         "paper": _RELEASED
         | {"size": PAPER, "scene": "paper", "rate": 3e-4, "people": 2_500_000, "easy": 0.0}
         | {"strays": 0.0, "noise": 0.0},
+        # people as for our own: the published ones are not pre-trained
+        "prn": _PRN,
+        "lpformer": _LPFORMER,
     },
     Finetune: {
         # anchors and heads stay, every joint has its name, synthesized people are mixed in
@@ -188,6 +231,8 @@ RECIPES: dict[type[Recipe], dict[str, dict[str, Any]]] = {
         # 50 epochs on all training sequences and no others; anchors and heads anew
         "paper": _RELEASED
         | {"init": "", "epochs": 50.0, "augment": "paper", "mix": 0.0, "hold_out": 0.0, "keep_anchors": False},
+        "prn": _PRN | _LIDARHMR_DATA,
+        "lpformer": _LPFORMER | _LIDARHMR_DATA,
     },
 }
 AnyRecipe = TypeVar("AnyRecipe", bound=Recipe)

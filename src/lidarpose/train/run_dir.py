@@ -42,7 +42,8 @@ LENGTHS = ("people", "epochs")
 _ERROR = (int, float, NoneType)
 _PROGRESS = {"steps": (int,), "seconds": (int, float), "best": _ERROR, "validation": _ERROR}
 # entries that an optimizer cannot go on without
-MEMORY = {torch.optim.AdamW: ("step", "exp_avg", "exp_avg_sq"), Muon: ("momentum_buffer",)}
+_MOMENTS = ("step", "exp_avg", "exp_avg_sq")
+MEMORY = {torch.optim.AdamW: _MOMENTS, torch.optim.Adam: _MOMENTS, Muon: ("momentum_buffer",)}
 
 
 def numbered(kind: str, parent: str | Path = RUNS) -> Path:

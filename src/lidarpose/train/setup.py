@@ -6,30 +6,34 @@ To train a further kind of network of `models.NETWORKS`: its sizes in `PRETRAINE
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from torch import nn
 
 from lidarpose.data.shards import read_card
 from lidarpose.errors import InputError, check_name
 from lidarpose.io.files import file_error
 from lidarpose.models import NETWORKS, weights_path
-from lidarpose.models.checkpoint import load_checkpoint
+from lidarpose.models.baselines.config import BaselineConfig, LpformerConfig, PrnConfig
+from lidarpose.models.baselines.lidarcap import FRAMES, Lidarcap
+from lidarpose.models.baselines.ne import Ne
+from lidarpose.models.checkpoint import build, load_checkpoint
 from lidarpose.models.config import SIZES, NetworkConfig
 from lidarpose.models.dapt.dapt_config import CONFIGS, DaptConfig
-from lidarpose.models.dapt.dapt_net import DaptNet
 from lidarpose.models.posenet import PoseNet, expand_weights
 from lidarpose.skeleton import HUMAN15, SMPL24, Skeleton, skeleton
 from lidarpose.train.augment import Augmentation, Example, augmentation, augmented
 from lidarpose.train.data_loader import MixedSource, Source, StoredSource, SyntheticSource
+from lidarpose.train.objectives.baseline_objective import with_joints
 from lidarpose.train.objectives.dapt_objective import pretraining_config, small
 from lidarpose.train.objectives.dapt_transfer import transferred
 from lidarpose.train.objectives.objective import Objective
-from lidarpose.train.recipes import PAPER, RANDOM, SMALL_PAPER, Finetune, Pretrain, Recipe
+from lidarpose.train.recipes import MODELS, PAPER, RANDOM, SMALL_PAPER, Finetune, Pretrain, Recipe
 from lidarpose.train.run_dir import folder_names
 from lidarpose.train.torch_dataset import InMemoryDataset
 
@@ -43,12 +47,34 @@ _NO_VALIDATION = (
 _LEAST_SEQUENCES = 3
 
 
+Config = NetworkConfig | DaptConfig | BaselineConfig
+
 # by size: the configuration of a network before fine-tuning, and the skeleton in which its people are drawn
 PRETRAINED: dict[str, tuple[Any, Skeleton]] = {
     **{size: (config, SMPL24) for size, config in SIZES.items()},
     PAPER: (pretraining_config(), HUMAN15),
     SMALL_PAPER: (small(pretraining_config()), HUMAN15),
+    "prn": (PrnConfig(), HUMAN15),
+    "lpformer": (LpformerConfig(), HUMAN15),
 }
+
+
+def networks() -> list[dict[str, Any]]:
+    """name, size, joints, frames and parameters of every network, without its weights."""
+    rows = []
+    for name, sizes in MODELS.items():
+        for size in sizes:
+            config = PRETRAINED[size][0]
+            with torch.device("meta"):
+                parameters = sum(value.numel() for value in build(config).parameters())
+            frames = getattr(config, "frames", 1)
+            counts = {"joints": len(config.joints), "frames": frames, "parameters": parameters}
+            rows.append({"name": name, "size": size} | counts)
+    for name, network in (("lidarcap", Lidarcap), ("ne", Ne)):
+        with torch.device("meta"):
+            parameters = sum(value.numel() for value in network().parameters())
+        rows.append({"name": name, "size": name, "joints": 24, "frames": FRAMES, "parameters": parameters})
+    return rows
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,12 +102,17 @@ def Job(*, task: Objective, **settings: Any) -> TrainSetup:  # noqa: N802
     return TrainSetup(objective=task, **settings)
 
 
-def objective_of(config: NetworkConfig | DaptConfig, recipe: Recipe, layout: str = "ragged") -> Objective:
+def objective_of(config: Config, recipe: Recipe, layout: str = "ragged") -> Objective:
     """What a network of a configuration minimizes: its entry in `models.NETWORKS`, by its settings of a recipe.
     layout: of the paper's tables."""
     lengths = {"bone": recipe.bone, "symmetry": recipe.symmetry}
+    # what a baseline is shown beside what happens to examples
+    shift = augmentation(recipe.augment).shift if isinstance(recipe, Finetune) else 0.0
     of_kind: dict[str, dict] = {"pose": lengths, "dapt": {"stage": recipe.kind, "layout": layout}}
+    of_kind |= dict.fromkeys(("prn", "lpformer"), {"shift": shift})
     settings = of_kind[config.kind]
+    if config.kind == "prn" and recipe.batch < 2:
+        raise InputError("batch must be at least 2 for prn, whose batch norms see a few points a person, got 1")
     if settings is not lengths and any(lengths.values()):
         raise InputError("bone and symmetry are terms of the package's own networks: leave them at 0")
     return NETWORKS[config.kind].part("objective")(config=config, **settings)
@@ -97,6 +128,7 @@ def make_setup(recipe: Pretrain | Finetune, *, on_cpu: bool = True) -> TrainSetu
 def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
     check_name("network size", recipe.size, PRETRAINED)
     config, joints = PRETRAINED[recipe.size]
+    config = _with_options(config, recipe.options)
     objective = objective_of(config, recipe, layout)
     network: Callable[[], nn.Module] = objective.network
     card: dict = {"motion": None if recipe.motion is None else Path(recipe.motion).name}
@@ -141,14 +173,29 @@ def _check_no_test(folder: str) -> None:
         )
 
 
-def _expanded(init: str, config: NetworkConfig | DaptConfig) -> tuple[Callable[[], nn.Module], dict]:
+def _with_options(config: Any, options: tuple[str, ...]) -> Any:
+    """A configuration with options NAME=VALUE or NAME for true, of a baseline. Raises InputError for unknown ones."""
+    if not options:
+        return config
+    if not isinstance(config, BaselineConfig):
+        raise InputError(f"options are of the baselines' networks, {config.name} has none: leave --options away")
+    known = [field.name for field in fields(config) if field.name != "joints"]
+    changes: dict[str, Any] = {}
+    for option in options:
+        name, _, value = option.partition("=")
+        check_name(f"option of {config.name}", name, known)
+        changes[name] = {"": True, "true": True, "false": False}.get(value, int(value) if value.isdecimal() else value)
+    return replace(config, **changes)
+
+
+def _expanded(init: str, config: Config) -> tuple[Callable[[], nn.Module], dict]:
     """What makes a network of this configuration that begins as the weights named, and their card."""
     if not isinstance(config, NetworkConfig):
-        raise InputError("init is for the package's own networks: the paper's begins at random")
+        raise InputError("init is for the package's own networks: the paper's begin at random")
     path = weights_path(init)
     smaller, header = load_checkpoint(path)
     if not isinstance(smaller, PoseNet):
-        raise file_error(path, "holds the paper's network: --init names one of the package's own")
+        raise file_error(path, "holds a network of the paper: --init names one of the package's own")
     # tried at once, so that an error comes before a folder is made
     expand_weights(smaller, config)
     return partial(expand_weights, smaller, config), header.card
@@ -170,7 +217,7 @@ def _no_parts(dataset: InMemoryDataset) -> tuple[str, ...]:
 
 
 def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
-    trained, init_card = _initial(recipe)
+    trained, card = _initial(recipe)
     split = None if recipe.split == "all" else recipe.split
     kind = augmentation(recipe.augment)
     full = InMemoryDataset.load(recipe.data, split=split, interval=recipe.interval)
@@ -200,8 +247,7 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
         validation=validation,
         joints=joints,
         card={
-            "init": Path(recipe.init).name if recipe.init == RANDOM else weights_path(recipe.init).name,
-            "init_card": init_card,
+            **card,
             "data": folder_names(recipe.data),
             "held_out_sequences": list(held_out),
             "damaged": list(dataset.damaged),
@@ -210,13 +256,16 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
     )
 
 
-def _initial(recipe: Finetune) -> tuple[PoseNet | DaptNet | None, dict]:
-    """The network that fine-tuning goes on from and its card; None and {} for none, as the recipe says."""
-    if recipe.init != RANDOM:
-        trained, header = load_checkpoint(weights_path(recipe.init))
-        return trained, header.card
-    check_name("network size", recipe.size, PRETRAINED)
-    return None, {}
+def _initial(recipe: Finetune) -> tuple[Any, dict]:
+    """The network that fine-tuning goes on from, None for random weights, and what the card says of it."""
+    if recipe.init == RANDOM:
+        check_name("network size", recipe.size, PRETRAINED)
+        return None, {"init": RANDOM, "init_card": {}}
+    path = weights_path(recipe.init)
+    trained, header = load_checkpoint(path)
+    if recipe.model and header.network != PRETRAINED[MODELS[recipe.model][0]][0].kind:
+        raise file_error(path, f"holds the network {header.config.name}, not {recipe.model}: name a checkpoint of it")
+    return trained, {"init": path.name, "init_card": header.card}
 
 
 def _held_out(
@@ -236,11 +285,15 @@ def _held_out(
 
 
 def _finetuned(
-    recipe: Finetune, trained: PoseNet | DaptNet | None, joints: Skeleton, dataset: str
-) -> tuple[NetworkConfig | DaptConfig, Callable[[], nn.Module]]:
+    recipe: Finetune, trained: Any, joints: Skeleton, dataset: str
+) -> tuple[Config, Callable[[], nn.Module]]:
     """The configuration for a dataset's joints, and what makes the network with the weights that it begins with.
     trained: None for random weights."""
     own = PRETRAINED[recipe.size][0] if trained is None else trained.config
+    if isinstance(own, BaselineConfig):
+        config = _with_options(replace(own, joints=joints.joints), recipe.options)
+        return config, partial(build, config) if trained is None else partial(with_joints, trained, config)
+    own = _with_options(own, recipe.options)
     if isinstance(own, NetworkConfig):
         if not recipe.keep_anchors and trained is not None:
             raise InputError(
@@ -262,6 +315,6 @@ def _finetuned(
     # the paper fine-tunes by heatmaps alone
     heads: dict[str, Any] = {"parts": 0, "coordinates": False, "auxiliary": False}
     config = replace(own, name=like.name, joints=like.joints, bins=like.bins, ranges=like.ranges, **heads)
-    if not isinstance(trained, DaptNet):
-        return config, partial(DaptNet, config)
+    if trained is None:
+        return config, partial(build, config)
     return config, partial(transferred, trained, config, keep_anchors=recipe.keep_anchors)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from lidarpose.models.baselines.config import LpformerConfig
 from lidarpose.models.baselines.prn import BareAttention
 
 # half the side of the occupancy grid, and how far out a point may ask for features, m
@@ -25,11 +26,16 @@ class LpformerOutputs:
 
 
 class Lpformer(nn.Module):
-    """4.81 M parameters. grid: cells a side, 64 as published; 32 costs an eighth, with weights of the same shapes."""
+    """4.81 M parameters."""
 
-    def __init__(self, joints: int, *, grid: int = 64):
+    # tensors with a row for each joint, in this order, and perhaps one more for background
+    per_joint = ("joint", "parts.3.")
+
+    def __init__(self, config: LpformerConfig):
         super().__init__()
-        self.grid = grid
+        self.config = config
+        self.grid = config.grid
+        joints = len(config.joints)
         self.volume = V2V()
         self.token = nn.Sequential(nn.Linear(38, 1024), nn.Linear(1024, 512), nn.Linear(512, 256))
         self.joint = nn.Parameter(torch.randn(joints, 256))
@@ -38,13 +44,15 @@ class Lpformer(nn.Module):
         self.parts = nn.Sequential(nn.Linear(256, 256), nn.Linear(256, 16), nn.ReLU(), nn.Linear(16, joints + 1))
 
     def forward(self, points: Tensor, valid: Tensor, center: Tensor | None = None) -> LpformerOutputs:
-        """points (B, N, 3) m about the person's center, valid (B, N) bool; center (B, 3) m from the sensor, by default
-        0, so that a point's place is told twice, as in the DAPT repository."""
+        """points (B, N, 3) m about the middle of their extent, valid (B, N) bool; center (B, 3) m: the middle from the
+        sensor, read with `sensor_position`, by default 0."""
         volume = self.volume(self.occupancy(points, valid))
         # grid_sample wants x last in the volume and first in the places
         place = points.clamp(-REACH, REACH)[:, :, None, None]
         local = F.grid_sample(volume, place, align_corners=False)[..., 0, 0].transpose(1, 2)
-        absolute = points if center is None else points + center[:, None]
+        absolute = points
+        if self.config.sensor_position and center is not None:
+            absolute = points + center[:, None]
         tokens = self.token(torch.cat([absolute, points, local], -1))
         joints = self.joint.expand(len(points), -1, -1)
         tokens = torch.cat([joints, tokens], 1)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from lidarpose.models.baselines.config import PrnConfig
 from lidarpose.models.baselines.point_transformer_v2 import EMBEDDING, PointTransformerV2, Rows, segment_reduce
 
 # a point votes where body is this likely and one joint is
@@ -29,13 +30,18 @@ class PrnOutputs:
 class Prn(nn.Module):
     """1.74 M parameters. Of the published network: background is the last part."""
 
-    def __init__(self, joints: int):
+    # tensors with a row for each joint, in this order, and perhaps one more for background
+    per_joint = ("joint.", "vote.parts.7.", "unused.3.")
+
+    def __init__(self, config: PrnConfig):
         super().__init__()
+        self.config = config
+        joints = len(config.joints)
         self.backbone = PointTransformerV2()
         # a classifier that the published network has and does not read
         self.unused = nn.Sequential(
             nn.Linear(EMBEDDING, EMBEDDING), nn.BatchNorm1d(EMBEDDING), nn.ReLU(), nn.Linear(EMBEDDING, joints + 1)
-        )
+        ).requires_grad_(False)
         self.vote = VoteHead(EMBEDDING, joints, background=joints)
         width = EMBEDDING + 3
         self.joint = nn.Embedding(joints, 32)
@@ -44,8 +50,9 @@ class Prn(nn.Module):
         # no activation between the last two: as published
         self.output = nn.Sequential(nn.Linear(width, 16), nn.ReLU(), nn.Linear(16, 8), nn.Linear(8, 3))
 
-    def forward(self, points: Tensor, valid: Tensor) -> PrnOutputs:
-        """points (B, N, 3) m about the middle of their extent, valid (B, N) bool, at least one a person."""
+    def forward(self, points: Tensor, valid: Tensor, center: Tensor | None = None) -> PrnOutputs:
+        """points (B, N, 3) m about the middle of their extent, valid (B, N) bool, at least one a person; center: for
+        `Lpformer` alone."""
         person = torch.arange(len(points), device=points.device)[:, None].expand_as(valid)[valid]
         rows = Rows(xyz=points[valid], person=person, count=valid.sum(1))
         features = self.backbone(rows)

@@ -11,6 +11,7 @@ from lidarpose.models.baselines.lidarcap import ClipOutputs, forward_kinematics
 from lidarpose.models.baselines.lpformer import LpformerOutputs
 from lidarpose.models.baselines.prn import PrnOutputs
 from lidarpose.skeleton import SMPL24
+from lidarpose.train.objectives.objective import Share, alone, at_least_one
 
 # a point is labelled with the nearest joint within this distance, m
 LABEL_RADIUS = 0.25
@@ -29,17 +30,18 @@ def point_labels(points: Tensor, valid: Tensor, joints: Tensor, known: Tensor) -
     return label.masked_fill(~valid, -1), offsets
 
 
-def prn_losses(outputs: PrnOutputs, points: Tensor, valid: Tensor, joints: Tensor, known: Tensor) -> dict[str, Tensor]:
+def prn_losses(
+    outputs: PrnOutputs, points: Tensor, valid: Tensor, joints: Tensor, known: Tensor, *, share: Share = alone
+) -> dict[str, Tensor]:
     """Distances of refined and of voted joints, cross entropy of parts, distances of the points' offsets."""
     label, offset = point_labels(points, valid, joints, known)
-    label, offset = label[valid], offset[valid]
-    background = joints.shape[1]
-    missed = (outputs.offsets - offset).norm(dim=-1)
+    label, is_body = label[valid], label[valid] < joints.shape[1]
+    missed = (outputs.offsets - offset[valid]).norm(dim=-1)[is_body]
     return {
-        "joints": mean_distance(outputs.joints, joints, known),
-        "vote": mean_distance(outputs.voted, joints, known),
-        "part": F.cross_entropy(outputs.parts, label),
-        "offset": missed[label < background].sum() / (label < background).sum().clamp(min=1),
+        "joints": mean_distance(outputs.joints, joints, known, share),
+        "vote": mean_distance(outputs.voted, joints, known, share),
+        "part": _cross_entropy(outputs.parts, label, share),
+        "offset": missed.sum() / at_least_one(share(is_body.sum())),
     }
 
 
@@ -51,14 +53,16 @@ def lpformer_losses(
     known: Tensor,
     *,
     second_softmax: bool = False,
+    share: Share = alone,
 ) -> dict[str, Tensor]:
     """Distances of joints and cross entropy of parts. second_softmax: of probabilities instead of logits, as
     published."""
     label, _ = point_labels(points, valid, joints, known)
     parts = outputs.parts.softmax(-1) if second_softmax else outputs.parts
     return {
-        "joints": mean_distance(outputs.joints, joints, known),
-        "part": F.cross_entropy(parts.flatten(0, 1), label.flatten(), ignore_index=-1),
+        # zero, of the head without a loss: processes that average gradients wait for all heads
+        "joints": mean_distance(outputs.joints, joints, known, share) + 0 * outputs.visible.sum(),
+        "part": _cross_entropy(parts[valid], label[valid], share),
     }
 
 
@@ -78,7 +82,11 @@ def clip_losses(outputs: ClipOutputs, rotations: Tensor, offsets: Tensor) -> dic
     }
 
 
-def mean_distance(joints: Tensor, true: Tensor, known: Tensor) -> Tensor:
+def mean_distance(joints: Tensor, true: Tensor, known: Tensor, share: Share = alone) -> Tensor:
     """m, over joints with a label."""
     distance = (joints - torch.where(known[..., None], true, 0.0)).norm(dim=-1)
-    return (distance * known).sum() / known.sum().clamp(min=1)
+    return (distance * known).sum() / at_least_one(share(known.sum()))
+
+
+def _cross_entropy(logits: Tensor, label: Tensor, share: Share) -> Tensor:
+    return F.cross_entropy(logits.float(), label, reduction="sum") / at_least_one(share(label.new_tensor(len(label))))

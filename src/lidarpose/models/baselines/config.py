@@ -1,0 +1,129 @@
+"""Configurations of the baselines, and how a person's cloud reaches those of a single frame. Numpy only.
+
+Legend: B people, N points of the largest.
+"""
+
+from dataclasses import asdict, dataclass, fields
+from typing import ClassVar
+
+import numpy as np
+
+from lidarpose.errors import InputError
+from lidarpose.models.voxelize import WINDOW
+from lidarpose.skeleton import BODY26, HUMAN15
+
+# points of a person that a network reads at most, as published
+MOST_POINTS = 1024
+GRIDS = (64, 32)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaselineConfig:
+    """What all baselines have. frames: of a clip, 1 for networks of single frames; layers: a lower bound of its
+    tensors; joints: names, in the order of the outputs. Each option is False for the behavior that its class calls
+    mended. Raises InputError for unknown joints and for options that are neither true nor false."""
+
+    kind: ClassVar[str] = ""
+    frames: ClassVar[int] = 1
+    layers: ClassVar[int] = 1
+
+    joints: tuple[str, ...] = HUMAN15.joints
+
+    def __post_init__(self):
+        joints = tuple(self.joints) if isinstance(self.joints, list) else self.joints
+        if not isinstance(joints, tuple) or not joints or len(set(joints)) != len(joints):
+            raise InputError(f"joints must be joint names, each once, got {joints!r}")
+        for joint in joints:
+            BODY26.index(joint)
+        object.__setattr__(self, "joints", joints)
+        for field in fields(self):
+            if field.type is bool and not isinstance(getattr(self, field.name), bool):
+                raise InputError(f"{field.name} must be true or false, got {getattr(self, field.name)!r}")
+
+    @property
+    def name(self) -> str:
+        return self.kind
+
+    @property
+    def columns(self) -> list[int]:
+        """Columns of body26 that the network's joints are."""
+        return [BODY26.index(joint) for joint in self.joints]
+
+    def to_dict(self) -> dict:
+        return asdict(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PrnConfig(BaselineConfig):
+    """PRN, the pose network of LiDAR-HMR. resample_with_replacement: `MOST_POINTS` points are drawn, some of them
+    several times, in evaluation too, as published; else each point is there once, and of more that many stay."""
+
+    kind: ClassVar[str] = "prn"
+    layers: ClassVar[int] = 100
+
+    resample_with_replacement: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class LpformerConfig(BaselineConfig):
+    """LPFormer for crops. resample_with_replacement: as for `PrnConfig`; grid: cells a side of the occupancy grid, 64
+    as published, or 32, an eighth of the work, with weights of the same shapes; second_softmax: the cross entropy of
+    parts is computed of probabilities, as published; sensor_position: a point's token has its place from the sensor
+    beside the local one, as in LiDAR-HMR, else the local one twice, as in the DAPT repository."""
+
+    kind: ClassVar[str] = "lpformer"
+    layers: ClassVar[int] = 50
+
+    grid: int = 64
+    resample_with_replacement: bool = False
+    second_softmax: bool = False
+    sensor_position: bool = False
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.grid not in GRIDS or isinstance(self.grid, bool):
+            raise InputError(f"grid must be {' or '.join(map(str, GRIDS))} cells, got {self.grid!r}")
+
+
+def pad_clouds(
+    clouds: list[np.ndarray], view: np.ndarray, *, resample_with_replacement: bool = False, seeds: list[int]
+) -> dict[str, np.ndarray]:
+    """Clouds (n, 3) m of people, n = 0 is legal, as a network of single frames reads them.
+
+    Args:
+        clouds: each in its person's frame; what is beyond `WINDOW` of it is left out.
+        view: (B, 5), see `voxelize.view_features`.
+        resample_with_replacement: see `PrnConfig`.
+        seeds: of what is drawn, a number a person.
+
+    Returns:
+        points (B, N, 3) float32 m, about the middle of the cloud's extent; valid (B, N) bool, False for padding;
+        middle (B, 3) float32 m in the person's frame; center (B, 3) float32 m: the middle from the sensor, 0 where its
+        place is not known.
+    """
+    chosen, middles = [], []
+    for cloud, seed in zip(clouds, seeds, strict=True):
+        near = cloud[(np.abs(cloud) < WINDOW).all(1)]
+        near = near if len(near) else np.zeros((1, 3))
+        rng = np.random.default_rng(seed)
+        middles.append((near.min(0) + near.max(0)) / 2)
+        if resample_with_replacement:
+            extra = rng.integers(len(near), size=MOST_POINTS - len(near) * (len(near) <= MOST_POINTS))
+            rows = extra if len(near) > MOST_POINTS else np.concatenate([np.arange(len(near)), extra])
+            near = near[rows]
+        elif len(near) > MOST_POINTS:
+            near = near[rng.choice(len(near), MOST_POINTS, replace=False)]
+        chosen.append(near - middles[-1])
+    middle = np.stack(middles)
+    toward, distance, known = view[:, :3], np.exp(view[:, 3:4]), view[:, 4:] > 0
+    points = np.zeros((len(chosen), max(map(len, chosen)), 3), np.float32)
+    valid = np.zeros(points.shape[:2], bool)
+    for row, cloud in enumerate(chosen):
+        points[row, : len(cloud)], valid[row, : len(cloud)] = cloud, True
+    center = np.where(known, middle - toward * distance, 0)
+    return {
+        "points": points,
+        "valid": valid,
+        "middle": middle.astype(np.float32),
+        "center": center.astype(np.float32),
+    }
