@@ -27,6 +27,7 @@ LAYERS = (
     {"inference"},
     {"eval"},
     {"train"},
+    {"paper"},
     {"cli", "metrics", "evaluation", "__init__", "__main__"},
 )
 NO_TORCH = ({"torch", "safetensors"}, set().union(*LAYERS[:5]))

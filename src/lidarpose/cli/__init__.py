@@ -6,7 +6,7 @@ import sys
 from contextlib import suppress
 
 from lidarpose._version import __version__
-from lidarpose.cli import datasets, evaluating, predicting, training, weights
+from lidarpose.cli import datasets, evaluating, paper, predicting, training, weights
 from lidarpose.cli.terminal import tell
 from lidarpose.errors import InputError, LidarPoseError, missing_extra
 from lidarpose.progress import set_quiet
@@ -94,6 +94,6 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="lidarpose", description="3D human pose from LiDAR.")
     parser.add_argument("--version", action="version", version=f"lidarpose {__version__}")
     commands = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND")
-    for module in (predicting, datasets, training, evaluating, weights):
+    for module in (predicting, datasets, training, evaluating, paper, weights):
         module.add(commands)
     return parser

@@ -4,6 +4,7 @@ Drawn with matplotlib's Agg canvas through its object interface; every function 
 """
 
 from collections.abc import Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from lidarpose.viz.draw import Panel, draw_people, png_of
 
 # blue and orange of Okabe and Ito's color-blind-safe palette (2008), the orange darker to stand out on white
 _BLUE, _ORANGE = "#0072b2", "#e07000"
+# of several networks, from the same palette
+_PALETTE = (_BLUE, _ORANGE, "#009e73", "#cc79a7", "#56b4e9", "#7a828c", "#b59a00")
 _BAR, _GRAY, _INK, _FAINT, _HAIRLINE = "#c9deec", "#9aa3ad", "#1f2328", "#7a828c", "#e3e6ea"
 _DPI = 100
 _BINS = 10
@@ -94,6 +97,47 @@ def draw_stability(study: Stability) -> bytes:
     for unused in axes:
         unused.set_axis_off()
     return png_of(figure, None)
+
+
+def compare_stability(studies: dict[str, dict[str, Any]], names: Sequence[str] = ("jitter", "clusters")) -> bytes:
+    """Curves of several networks in one chart. Paper: Figure 7. studies: name of a network -> a study of
+    stability.json; names: of its curves."""
+    figure = _figure(5.2 * len(names), 4.2, "points perturbed: MPJPE in mm", _of_whom(studies))
+    for axes, name in zip(np.ravel(figure.subplots(1, len(names))), names, strict=True):
+        for (network, study), color in zip(studies.items(), cycle(_PALETTE), strict=False):
+            curve = next(curve for curve in study["curves"] if curve["name"] == name)
+            points = [point for point in curve["points"] if point["mpjpe"] is not None]
+            at, values = range(len(points)), [point["mpjpe"] for point in points]
+            axes.plot(at, values, "o-", color=color, ms=4, lw=1.5, label=network)
+            axes.set_xticks(at, [point["label"] for point in points], fontsize=8)
+            title = curve["title"]
+        axes.set_ylim(0, None)
+        _styled(axes, title, legend=True)
+        axes.legend(fontsize=8, loc="lower right", frameon=False)
+    return png_of(figure, None)
+
+
+def compare_ends(studies: dict[str, dict[str, Any]]) -> bytes:
+    """Errors of end joints over the worst people, of several networks: means, and quartiles as lines. Paper: Figure 8.
+    studies: as of `compare_stability`."""
+    figure = _figure(9.6, 4.4, "end joints of each network's worst people: error in mm", _of_whom(studies))
+    axes, width = figure.subplots(), 0.8 / max(len(studies), 1)
+    for k, ((network, study), color) in enumerate(zip(studies.items(), cycle(_PALETTE), strict=False)):
+        ends = study["ends"]
+        at = np.arange(len(ends)) + (k - (len(studies) - 1) / 2) * width
+        axes.bar(at, [end["mean"] for end in ends], 0.9 * width, color=color, label=network, zorder=2)
+        low, _, high = np.array([end["quartiles"] for end in ends]).T
+        axes.vlines(at, low, high, color=_INK, lw=1, zorder=3)
+        axes.set_xticks(np.arange(len(ends)), [f"{end['group']}\nworst {end['worst']:,}" for end in ends])
+    _styled(axes, "means; lines from the lower to the upper quartile")
+    axes.legend(fontsize=8, frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.5, -0.32))
+    return png_of(figure, None)
+
+
+def _of_whom(studies: dict[str, dict[str, Any]]) -> str:
+    """The people and the protocol of studies, which are the same for all."""
+    first = next(iter(studies.values()))
+    return f"{first['setting']['dataset']}: {first['who']} · {first['setting']['protocol']}"
 
 
 def draw_worst(p: Predictions, setting: Setting, worst: Sequence[tuple[EvalSample, int]]) -> bytes:

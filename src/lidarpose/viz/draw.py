@@ -56,7 +56,9 @@ _TALLEST = 1.8  # m that a view's height shows at least, so that people on a she
 _DEPTH_SPAN = 0.35  # m in front of and behind the middle, over which the points' gray runs
 
 
-def draw_people(panels: list[Panel], path: str | Path | None = None, *, title: str = "") -> bytes:
+def draw_people(
+    panels: list[Panel], path: str | Path | None = None, *, title: str = "", per_row: int = _PER_ROW
+) -> bytes:
     """People from the front and from the side on one sheet.
 
     The front is where the predicted pose faces, else the true one, else +x. Left limbs are blue, right ones orange; a
@@ -66,6 +68,7 @@ def draw_people(panels: list[Panel], path: str | Path | None = None, *, title: s
         panels: the people; at most the first 60 are drawn, and the sheet says so.
         path: where to write the PNG, too.
         title: above all.
+        per_row: people beside each other.
 
     Returns:
         The PNG's bytes.
@@ -79,7 +82,7 @@ def draw_people(panels: list[Panel], path: str | Path | None = None, *, title: s
         check_suffix(path, ".png")
     panels = list(panels)
     shown = panels[:MAX_PEOPLE]
-    columns = min(_PER_ROW, max(len(shown), 1))
+    columns = min(per_row, max(len(shown), 1))
     rows = -(-max(len(shown), 1) // columns)
     zoom = {1: 2.0, 2: 1.4}.get(columns, 1.0)
     card_width, card_height = _CARD_WIDTH * zoom, _VIEW_HEIGHT * zoom + _CAPTION

@@ -1,0 +1,102 @@
+"""The paper's figures 5 to 8, from what the cells of their tables left."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from lidarpose.eval.charts import compare_ends, compare_stability
+from lidarpose.eval.dataset import open_eval_dataset
+from lidarpose.eval.predictions import Predictions, read_poses
+from lidarpose.io.files import write_atomic
+from lidarpose.paper.steps import Step, is_done
+from lidarpose.paper.tables import Cell
+from lidarpose.sample import Pose
+from lidarpose.skeleton import SMPL24
+from lidarpose.synth.bodies import PoseBank
+from lidarpose.synth.generator import Generator
+from lidarpose.synth.scene import scene_config
+from lidarpose.viz.draw import Panel, draw_people
+
+# people side by side: those of the largest errors, averaged over the methods
+HARDEST = 6
+# distances m and shares kept of one body's pictures
+_DISTANCES, _KEPT = (5.0, 8.0, 12.0, 16.0, 20.0), (1.0, 0.8, 0.6, 0.4)
+# who is so tall from the lowest to the highest joint stands, m; people looked at
+_STANDS, _TRIED = 1.5, 100
+
+
+def draw(name: str, cells: Sequence[Cell], out: Path) -> Path | None:
+    """Draws fig5, fig7 or fig8 of the cells that are done, of the first seed and column; None where there are none."""
+    done = {}
+    for cell in cells:
+        if cell.seed == 0 and cell.column == cells[0].column and cell.evaluation and is_done(cell.evaluation, out):
+            done[cell.row] = cell
+    if not done:
+        return None
+    if name == "fig5":
+        content = _side_by_side(done, out)
+    else:
+        paths = {row: cell.evaluation.product(out) / "stability.json" for row, cell in done.items() if cell.evaluation}
+        studies = {row: json.loads(path.read_text())["studies"][0] for row, path in paths.items()}
+        content = (compare_stability if name == "fig7" else compare_ends)(studies)
+    write_atomic(out / f"{name}.png", content)
+    return out / f"{name}.png"
+
+
+def _side_by_side(done: dict[str, Cell], out: Path) -> bytes:
+    """The hardest people, a row a person, a column a method."""
+    predictions: dict[str, Predictions] = {}
+    for row, cell in done.items():
+        if cell.evaluation:
+            predictions[row] = next(iter(read_poses(cell.evaluation.product(out) / "poses.parquet").values()))
+    places = [{(s, r): k for k, (s, r) in enumerate(zip(p.shard, p.row, strict=True))} for p in predictions.values()]
+    everywhere = sorted(set.intersection(*map(set, places)))
+    errors = np.array(
+        [[p.errors()[at[key]] for key in everywhere] for p, at in zip(predictions.values(), places, strict=True)]
+    )
+    # without labels there is no error
+    mean = np.nan_to_num(np.where(np.isnan(errors), 0, errors).sum(-1) / np.maximum((~np.isnan(errors)).sum(-1), 1))
+    hardest = [everywhere[k] for k in np.argsort(-mean.mean(0), kind="stable")[:HARDEST]]
+    target = next(iter(done.values())).target
+    folder = target.test.product(out) if isinstance(target.test, Step) else target.test
+    clouds = {(p.shard, p.row): p.points for p in open_eval_dataset(folder) if (p.shard, p.row) in set(hardest)}
+    panels = []
+    for key in hardest:
+        for k, (row, p) in enumerate(predictions.items()):
+            at = places[k][key]
+            poses = [Pose(joints=joints[at].astype(float), skeleton=p.skeleton) for joints in (p.pred, p.true)]
+            label = f"{row}: {mean[k, everywhere.index(key)]:.0f} mm"
+            distance = float(p.distance[at])
+            panels.append(Panel(points=clouds[key], pose=poses[0], truth=poses[1], label=label, distance=distance))
+    return draw_people(panels, title=f"{target.title}: the hardest people", per_row=len(predictions))
+
+
+def draw_one_body(out: Path, *, seed: int, motion: str | None = None) -> Path:
+    """Figure 6: one synthesized body at several distances (rows) under several laser masks (columns)."""
+    bank = PoseBank.from_clips(motion) if motion else None
+    panels, index = [], -1
+    for distance in _DISTANCES:
+        for keep in _KEPT:
+            scene = replace(scene_config("paper").changed((f"keep={keep}",)), distance=(distance, distance))
+            generator = Generator(scene=scene, bank=bank, captured=float(bank is not None), redraw=False, measure=False)
+            # of one seed and index the body is the same in every scene
+            index = index if index >= 0 else _standing(generator, seed)
+            sample = generator.person(seed, index).sample
+            joints = sample.pose.to(SMPL24).joints if sample.pose else None
+            truth = None if joints is None else Pose(joints=joints, skeleton=SMPL24)
+            label = f"{distance:g} m, r_keep {keep:g}"
+            panels.append(Panel(points=sample.points, truth=truth, part=sample.part, label=label))
+    draw_people(panels, out / "fig6.png", title="one body, its places and masks", per_row=len(_KEPT))
+    return out / "fig6.png"
+
+
+def _standing(generator: Generator, seed: int) -> int:
+    """The first of a seed's people who stands, else the first."""
+    for index in range(_TRIED):
+        pose = generator.person(seed, index).sample.pose
+        if pose is not None and np.ptp(pose.joints[:, 2]) > _STANDS:
+            return index
+    return 0

@@ -1,0 +1,228 @@
+"""What a table says: of each cell its result, what it cost, and the mean pose's error beside it; Markdown and JSON."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidarpose._version import __version__
+from lidarpose.errors import LidarPoseError
+from lidarpose.eval.dataset import EvalSample, open_eval_dataset
+from lidarpose.eval.scores import COLUMNS, FILE, Result, read_scores
+from lidarpose.io.files import write_atomic
+from lidarpose.models.checkpoint import load_checkpoint, read_header, runs_of
+from lidarpose.paper.steps import Execute, Step, StepFailed, check_out, is_done, run_steps
+from lidarpose.paper.tables import Cell, Options, Table, Target, cells, row_key
+from lidarpose.sample import center_of
+
+SCHEMA = "lidarpose.paper/1"
+CELLS = "cells"
+# a network that is not so much better than the mean pose, as a share of its error, has not learned enough to compare
+_UNDERTRAINED = 0.2
+_LEGEND = (
+    "MPJPE in mm, the mean over seeds; in brackets the 95 % interval over people, of several seeds the least and the "
+    "greatest. *undertrained*: not 20 % better than the mean pose about the points' center; nothing can be concluded "
+    "from it."
+)
+# people of whom the mean pose is taken at most
+_MEAN_POSE = 5_000
+
+
+def run_table(
+    table: Table, options: Options, out: Path, chosen: Sequence[str], execute: Execute, tell: Any
+) -> dict[str, Any]:
+    """Runs what is not done of a table, cell by cell, and writes it anew after each; returns it. A cell that fails is
+    told and written as failed, and the others go on."""
+    check_out(out)
+    selected = cells(table, options, chosen)
+    failed: dict[int, str] = {}
+    for k, cell in enumerate(selected):
+        if cell.evaluation is not None:
+            try:
+                run_steps(cell.evaluation, out, execute, tell)
+            except StepFailed as error:
+                failed[k] = str(error)
+                tell(f"{cell.row}, {cell.column}: failed: {error}")
+        content = write_table(table, selected, options, out, failed)
+    return content
+
+
+def write_table(
+    table: Table, selected: Sequence[Cell], options: Options, out: Path, failed: dict[int, str] | None = None
+) -> dict[str, Any]:
+    """Writes OUT/TABLE.json and OUT/TABLE.md of what is there, and each done cell's own JSON."""
+    failed = failed or {}
+    content = {
+        "schema": SCHEMA,
+        "version": __version__,
+        "table": table.name,
+        "title": table.title,
+        "target": "real sets, the paper's protocol" if options.real else "stand-in: synthesized people",
+        "people": options.people,
+        "hours": options.hours,
+        "cells": [_entry(table, cell, out, failed.get(k, "")) for k, cell in enumerate(selected)],
+    }
+    write_atomic(out / f"{table.name}.json", json.dumps(content, indent=1) + "\n")
+    write_atomic(out / f"{table.name}.md", markdown(content))
+    return content
+
+
+def _entry(table: Table, cell: Cell, out: Path, failure: str) -> dict[str, Any]:
+    """A cell as JSON. state: done, failed, not run, not possible; the figures of cells that are done."""
+    steps = list(cell.evaluation.all()) if cell.evaluation else []
+    entry: dict[str, Any] = {"row": cell.row, "column": cell.column, "seed": cell.seed, "published": cell.published}
+    entry["commands"] = [step.line(out) for step in steps]
+    if cell.evaluation is None:
+        return entry | {"state": "not possible", "reason": cell.why}
+    if failure:
+        return entry | {"state": "failed", "reason": failure}
+    if not is_done(cell.evaluation, out):
+        return entry | {"state": "not run", "reason": "its command was not run, or not to its end"}
+    path = out / CELLS / f"{cell.evaluation.name}.json"
+    if path.is_file():
+        return entry | json.loads(path.read_text())
+    figures = {"state": "done"} | _figures(cell, cell.evaluation, out)
+    write_atomic(path, json.dumps(figures, indent=1) + "\n")
+    return entry | figures
+
+
+def _figures(cell: Cell, evaluation: Step, out: Path) -> dict[str, Any]:
+    """What an evaluation found, what the training cost, and the mean pose's error on the same people."""
+    result = read_scores(evaluation.product(out) / FILE).results[0]
+    weights = cell.training[-1].product(out)
+    runs = runs_of(read_header(weights).card)
+    network = load_checkpoint(weights)[0]
+    hours = [run.get("hours", 0.0) for run in runs]
+    seen = [run.get("people_seen", 0) for run in runs]
+    row = result.line("mpjpe")
+    mean_pose = mean_pose_error(cell.target, result, out)
+    return {
+        **{name: _value(result, name) for name in COLUMNS},
+        "low": row.low,
+        "high": row.high,
+        "people_scored": row.people,
+        "joints": list(result.setting.joints),
+        "protocol": result.setting.summary,
+        "people_seen": sum(seen),
+        "hours": round(sum(hours), 3),
+        "people_per_second": round(seen[0] / (3600 * hours[0]), 1) if hours[0] else None,
+        "parameters": sum(value.numel() for value in network.parameters()),
+        "mean_pose": mean_pose,
+        "undertrained": row.value is None or row.value > (1 - _UNDERTRAINED) * mean_pose,
+        "scores": str(evaluation.product(out) / FILE),
+    }
+
+
+def _value(result: Result, name: str) -> float | None:
+    try:
+        return result.line(name).value
+    except LidarPoseError:
+        # not every dataset has every metric
+        return None
+
+
+def mean_pose_error(target: Target, result: Result, out: Path) -> float:
+    """MPJPE in mm, over the scored joints of the people scored, of the mean skeleton of those learned from, about the
+    center of a person's points."""
+    name = f"mean-pose-{result.setting.dataset}-{len(result.setting.joints)}.json"
+    path = out / CELLS / name
+    if not path.is_file():
+        folders = [str(part.product(out)) if isinstance(part, Step) else part for part in (target.train, target.test)]
+        split = None if isinstance(target.train, Step) else "train"
+        learned = [_offset(person, result) for person in open_eval_dataset(folders[0], split=split, limit=_MEAN_POSE)]
+        scored = [_offset(person, result) for person in open_eval_dataset(folders[1], split=None)]
+        mean = np.nanmean(learned, 0)
+        error = 1e3 * float(np.nanmean(np.linalg.norm(np.array(scored) - mean, axis=-1)))
+        write_atomic(path, json.dumps({"mpjpe": round(error, 1), "people": len(scored)}) + "\n")
+    return json.loads(path.read_text())["mpjpe"]
+
+
+def _offset(person: EvalSample, result: Result) -> np.ndarray:
+    """(J, 3) m: the scored joints from the center of the points, NaN without a label or points."""
+    sample = person.sample
+    columns = [sample.skeleton.index(joint) for joint in result.setting.joints]
+    known = (sample.joint_labels[columns] > 0)[:, None]
+    center = center_of(person.points) if len(person.points) else np.full(3, np.nan)
+    return np.where(known, sample.joints[columns] - center, np.nan)
+
+
+# ---- Markdown
+
+
+def markdown(content: dict[str, Any]) -> str:
+    """A table as a page: the figures, what each cell cost, and the commands."""
+    entries = content["cells"]
+    columns, rows = (list(dict.fromkeys(entry[name] for entry in entries)) for name in ("column", "row"))
+    lines = [f"# {content['title']}", "", f"Target: {content['target']}. {_LEGEND}", ""]
+    lines += _grid(["", *columns])
+    for row in rows:
+        own = [[e for e in entries if (e["row"], e["column"]) == (row, column)] for column in columns]
+        lines.append(_line([row, *map(_cell_text, own)]))
+    lines += ["", "## Cells", ""]
+    lines += _grid(
+        ["row", "column", "seed", "MPJPE", "PA", "PCK-3", "PCK-5", "mean pose", "people seen", "hours"]
+        + ["people/s in training", "parameters", "state"]
+    )
+    lines += [_line(_cost(entry)) for entry in entries]
+    return "\n".join([*lines, "", "## Commands", "", *_commands(entries)]) + "\n"
+
+
+def plan(table: Table, selected: Sequence[Cell], out: Path, problem: Any) -> str:
+    """The commands of each cell as a page, each in full where it comes first. problem(words): what the parser says
+    against a command, "" for nothing."""
+    entries = []
+    known: set[str] = set()
+    for cell in selected:
+        steps = list(cell.evaluation.all()) if cell.evaluation else []
+        wrong = next(filter(None, (problem(step.command(out)) for step in steps)), "")
+        where = {"row": cell.row, "column": cell.column, "seed": cell.seed}
+        commands = [f"{step.name}, as above" if step.name in known else step.line(out) for step in steps]
+        known.update(step.name for step in steps)
+        state = {"commands": commands, "reason": cell.why or wrong}
+        entries.append(where | state | {"state": "not possible" if cell.why or wrong else "done"})
+    rows = ", ".join(dict.fromkeys(row_key(cell.row) for cell in selected))
+    return "\n".join([f"# {table.title}", "", f"Rows for --rows: {rows}.", "", *_commands(entries)]) + "\n"
+
+
+def _commands(entries: list[dict[str, Any]]) -> list[str]:
+    lines = _grid(["row", "column", "seed", "commands"])
+    for entry in entries:
+        commands = "<br>".join(f"`{command}`" for command in entry["commands"])
+        if entry["state"] != "done":
+            commands = "<br>".join(filter(None, (commands, f"*{entry['state']}: {entry['reason']}*")))
+        lines.append(_line([entry["row"], entry["column"], str(entry["seed"]), commands.replace("|", "\\|")]))
+    return lines
+
+
+def _cell_text(entries: list[dict[str, Any]]) -> str:
+    done = [entry for entry in entries if entry["state"] == "done" and entry["mpjpe"] is not None]
+    printed = next((f" (paper {e['published']:.1f})" for e in entries if e["published"] is not None), "")
+    if not done:
+        first = entries[0]
+        return f"{first['state']}: {first['reason']}{printed}" if first["state"] != "not run" else f"not run{printed}"
+    values = [entry["mpjpe"] for entry in done]
+    ends = (done[0]["low"], done[0]["high"]) if len(done) == 1 else (min(values), max(values))
+    interval = "" if ends[0] is None else f" [{ends[0]:.1f}, {ends[1]:.1f}]"
+    seeds = f", {len(done)} of {len(entries)} seeds" if len(entries) > 1 else ""
+    weak = ", *undertrained*" if any(entry["undertrained"] for entry in done) else ""
+    return f"{np.mean(values):.1f}{interval}{seeds}{weak}{printed}"
+
+
+def _cost(entry: dict[str, Any]) -> list[str]:
+    where = [entry["row"], entry["column"], str(entry["seed"])]
+    if entry["state"] != "done":
+        return [*where, *["-"] * 9, entry["state"]]
+    figures = ["-" if entry[name] is None else f"{entry[name]:.1f}" for name in (*COLUMNS, "mean_pose")]
+    speed = "-" if entry["people_per_second"] is None else f"{entry['people_per_second']:.1f}"
+    cost = [f"{entry['people_seen']:,}", f"{entry['hours']:.2f}", speed, f"{entry['parameters']:,}"]
+    return [*where, *figures, *cost, "undertrained" if entry["undertrained"] else "done"]
+
+
+def _line(words: Sequence[str]) -> str:
+    return f"| {' | '.join(words)} |"
+
+
+def _grid(heads: Sequence[str]) -> list[str]:
+    return [_line(heads), "|---" * len(heads) + "|"]

@@ -1,0 +1,248 @@
+"""Steps: lidarpose commands that make one folder each, from what other steps make.
+
+A step's folder is OUT/runs/NAME, and NAME follows from the command alone: tables share what they have in common, and
+what is done is never done again. OUT/runs/NAME.json says that a step is done; without it the step goes on, a training
+by --resume.
+"""
+
+import hashlib
+import io
+import json
+import os
+import shlex
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import redirect_stderr
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from lidarpose.errors import InputError, LidarPoseError
+from lidarpose.io.files import write_atomic
+from lidarpose.train.recipes import Finetune, Pretrain
+from lidarpose.train.run_dir import CONFIG, LENGTHS, LOG, MODEL, read_config
+
+RUNS = "runs"
+# the kinds of training, by command
+KINDS: dict[str, type[Pretrain] | type[Finetune]] = {"pretrain": Pretrain, "finetune": Finetune}
+# how long a training is watched before its speed is known: at most so many seconds, or this share of its hours
+_WATCH, _WATCH_SHARE = 120.0, 0.05
+_POLL = 0.5
+# options whose values are part of a folder's name
+_TELLING: dict[Any, str] = {"--keep": "keep"} | dict.fromkeys(
+    ("--model", "--size", "--neck", "--head", "--set", "-n"), ""
+)
+# runs a command, as `lidarpose.cli.main`: its exit status
+Execute = Callable[[list[str]], int]
+
+
+@dataclass(frozen=True)
+class Step:
+    """A command. words: the command and its options, in which a step stands for what it makes; hours: a training that
+    would take longer is made shorter, schedule and all; None: no limit."""
+
+    words: tuple["str | Step", ...]
+    hours: float | None = None
+
+    @property
+    def kind(self) -> str:
+        """synth, pretrain, finetune or evaluate."""
+        return str(self.words[0])
+
+    @cached_property
+    def name(self) -> str:
+        """The folder's, which tells commands apart: the command, what it is of, and a digest of all its words."""
+        words = [word.name if isinstance(word, Step) else word for word in self.words]
+        if "--workers" in words:
+            # changes nothing that is made
+            at = words.index("--workers")
+            words[at : at + 2] = []
+        digest = hashlib.sha256(json.dumps([words, self.hours]).encode()).hexdigest()[:8]
+        about = "".join(c if c.isalnum() or c in ".-" else "-" for c in self._about)
+        return "-".join(filter(None, (self.kind, about, digest)))
+
+    @property
+    def _about(self) -> str:
+        """Values of the options that tell most, of this step or of those that it needs."""
+        pairs = zip(self.words, self.words[1:], strict=False)
+        own = [f"{_TELLING[option]}{value}" for option, value in pairs if option in _TELLING]
+        return "-".join(own) or next((need._about for need in self.needs if need.kind in KINDS), "")
+
+    @property
+    def needs(self) -> tuple["Step", ...]:
+        """The steps whose folders the command reads."""
+        return tuple(word for word in self.words if isinstance(word, Step))
+
+    def all(self) -> Iterator["Step"]:
+        """This step and all before it, in the order in which they run."""
+        for step in self.needs:
+            yield from step.all()
+        yield self
+
+    def folder(self, out: Path) -> Path:
+        return out / RUNS / self.name
+
+    def product(self, out: Path) -> Path:
+        """What other steps read: weights, or the folder."""
+        return self.folder(out) / MODEL if self.kind in KINDS else self.folder(out)
+
+    def command(self, out: Path) -> list[str]:
+        """The words after `lidarpose`."""
+        words = [str(word.product(out)) if isinstance(word, Step) else word for word in self.words]
+        folder = str(self.folder(out))
+        return [words[0], folder, *words[1:]] if self.kind == "pretrain" else [*words, "--out", folder]
+
+    def line(self, out: Path) -> str:
+        """The command as it would be typed."""
+        return shlex.join(["lidarpose", *self.command(out)])
+
+
+class StepFailed(LidarPoseError):
+    """A command that ended with an error, which is the message."""
+
+
+def is_done(step: Step, out: Path) -> bool:
+    """Whether its command has ended well."""
+    return _state(step, out).get("done", False)
+
+
+def run_steps(step: Step, out: Path, execute: Execute, tell: Callable[[str], None]) -> None:
+    """Runs what is not done of a step and those before it. Raises StepFailed with the command's own message,
+    KeyboardInterrupt where it was stopped."""
+    for part in step.all():
+        if not is_done(part, out):
+            tell(part.line(out))
+            _run(part, out, execute)
+            _note(part, out, done=True, command=part.line(out))
+
+
+def _state(step: Step, out: Path) -> dict[str, Any]:
+    path = out / RUNS / f"{step.name}.json"
+    return json.loads(path.read_text()) if path.is_file() else {}
+
+
+def _note(step: Step, out: Path, **entries: Any) -> None:
+    content = _state(step, out) | entries
+    write_atomic(out / RUNS / f"{step.name}.json", json.dumps(content, indent=1) + "\n")
+
+
+def _run(step: Step, out: Path, execute: Execute) -> None:
+    folder = step.folder(out)
+    if step.kind == "evaluate" and folder.is_dir() and any(folder.iterdir()):
+        # written all at once: the process ended before it could be noted
+        return
+    words = step.command(out)
+    if step.kind in KINDS and (folder / CONFIG).is_file():
+        where = [str(folder)] if step.kind == "pretrain" else ["--out", str(folder)]
+        words = [step.kind, *where, "--resume", *_state(step, out).get("length", ())]
+    if step.hours is None or step.kind not in KINDS or "length" in _state(step, out):
+        _execute(words, execute)
+        return
+    with _Watch(folder, step.hours) as watch:
+        try:
+            _execute(words, execute)
+        except KeyboardInterrupt:
+            if not watch.share:
+                raise
+    if watch.share:
+        length = _shortened(step, folder, watch.share)
+        _note(step, out, length=length)
+        _run(step, out, execute)
+
+
+def _execute(words: list[str], execute: Execute) -> None:
+    last = _LastLine(sys.stderr)
+    with redirect_stderr(last):
+        try:
+            status = execute(words)
+        except SystemExit as stopped:
+            # a command line that the parser refuses
+            status = stopped.code if isinstance(stopped.code, int) else 2
+    if status >= 128:
+        raise KeyboardInterrupt(last.line)
+    if status:
+        raise StepFailed(last.line.removeprefix("lidarpose: error: ") or f"ended with status {status}")
+
+
+class _LastLine(io.TextIOBase):
+    """Passes text on and keeps its last line."""
+
+    def __init__(self, to: Any):
+        self._to, self.line = to, ""
+
+    def write(self, text: str) -> int:
+        self.line = next((line for line in reversed(text.splitlines()) if line.strip()), self.line)
+        return self._to.write(text)
+
+    def flush(self) -> None:
+        self._to.flush()
+
+    def isatty(self) -> bool:
+        return self._to.isatty()
+
+
+class _Watch:
+    """Stops the training of this process, by SIGINT, once its log shows that it will take longer than its hours.
+    share: of the run's people that fit into them; None while nothing was stopped."""
+
+    def __init__(self, folder: Path, hours: float):
+        self.share: float | None = None
+        self._folder, self._seconds, self._over = folder, 3600 * hours, threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+
+    def __enter__(self) -> "_Watch":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        while not self._over.wait(_POLL):
+            entry = last_entry(self._folder)
+            if entry is None or entry["seconds"] < min(_WATCH, _WATCH_SHARE * self._seconds):
+                continue
+            people = _people(self._folder)
+            fit = entry["people"] * self._seconds / entry["seconds"]
+            # what was seen cannot be taken back
+            share = max(fit, entry["people"] * 1.1) / people
+            if share < 1 and not self._over.is_set():
+                self.share = share
+                os.kill(os.getpid(), signal.SIGINT)
+            return
+
+
+def last_entry(folder: Path) -> dict[str, Any] | None:
+    """The last line of a run's log; None before the first."""
+    try:
+        lines = (folder / LOG).read_text().splitlines()
+        return json.loads(lines[-1]) if lines else None
+    except (OSError, ValueError):
+        # not begun, or just being written
+        return None
+
+
+def _people(folder: Path) -> int:
+    """How many samples the run sees in all."""
+    from lidarpose.train.setup import make_setup
+
+    kind = KINDS[json.loads((folder / CONFIG).read_text())["kind"]]
+    return make_setup(read_config(folder, kind)[0]).people
+
+
+def _shortened(step: Step, folder: Path, share: float) -> list[str]:
+    """The options that make a run this share as long."""
+    recipe = read_config(folder, KINDS[step.kind])[0].to_dict()
+    name = next(name for name in LENGTHS if name in recipe)
+    length = recipe[name] * share
+    return [f"--{name}", str(max(round(length), 1)) if name == "people" else f"{length:.4g}"]
+
+
+def check_out(out: Path) -> None:
+    """Raises InputError for a folder that holds something else."""
+    if out.is_file() or out.is_dir() and any(out.iterdir()) and not (out / RUNS).is_dir():
+        raise InputError(f"{out}: expected a new or empty folder, or one of lidarpose paper: name another by --out")

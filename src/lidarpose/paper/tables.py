@@ -1,0 +1,374 @@
+"""The paper's tables 1 to 4 and figures 5, 7, 8 as data: rows, columns, and for each cell the steps that fill it.
+
+With prepared real sets the commands are the paper's protocol. Without, synthesized people stand in: pre-training on the
+scene `paper` (one simulated LiDAR), a target of the scene `wild` of another seed and other sensors, of which every
+method learns the same people and is scored on the same others.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from lidarpose.data.shards import CARD
+from lidarpose.errors import InputError, check_name
+from lidarpose.paper.steps import Step
+from lidarpose.train.recipes import PAPER, SMALL_PAPER
+
+# real sets of a table's columns, and what else a row may read
+REAL = ("waymo", "humanm3", "lidarhuman26m", "sloper4d")
+CORPORA = ("lipd", "freemotion", "noisemotion")
+POSES = ("freemotion-poses", "lidarhuman26m-poses")
+# people of the stand-in: to learn from at most, to be scored on at most, and their seeds, which nothing else has
+_TRAIN, _TEST = 10_000, 2_000
+_SEEDS = {"train": 1_000_003, "test": 1_000_033}
+# sensors of the stand-in's target, none of them the pre-training's
+_SENSORS = "waymo-top,os1-128,hdl-64e,vlp-32c"
+_CLIP = 16
+# published rates are those of the full size
+_RATES = {PAPER: (), SMALL_PAPER: ("--rate", "2e-3")}
+_KEPT = ("0.5", "0.6", "0.7", "0.8", "0.9")
+# r_keep of the recipe, which needs no option
+_RECIPE_KEEP = "0.6"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What was asked for. people: budget of a stage of training; hours: of a row's training in all; size: of the
+    paper's network; seeds; data: name -> folder, see `REAL`, `CORPORA` and `POSES`; motion: files of captured motion,
+    subjects of the first one to learn from and held_out ones for the target; workers: of each command."""
+
+    people: int = 200_000
+    hours: float | None = None
+    size: str = SMALL_PAPER
+    seeds: int = 1
+    data: dict[str, str] = field(default_factory=dict)
+    motion: tuple[str, ...] = ()
+    subjects: str = ""
+    held_out: str = ""
+    workers: int = 1
+
+    def __post_init__(self):
+        if self.people < 1 or self.seeds < 1 or self.workers < 1 or self.hours is not None and not self.hours > 0:
+            raise InputError("expected --people, --seeds and --workers of at least 1 and --hours above 0")
+        check_name("size of the paper's network", self.size, _RATES)
+        for name, folder in self.data.items():
+            check_name("dataset", name, (*REAL, *CORPORA, *POSES))
+            if name not in POSES and not (Path(folder) / CARD).is_file():
+                raise InputError(f"{name}={folder} is no prepared dataset: run lidarpose prepare first")
+        if (self.subjects or self.held_out) and not self.motion:
+            raise InputError("--subjects and --held-out are of captured motion: name its file by --motion")
+        if self.data and not self.real:
+            raise InputError(f"--data needs a dataset to score on, one of {', '.join(REAL)}")
+
+    @property
+    def real(self) -> tuple[str, ...]:
+        """The real sets that are there."""
+        return tuple(name for name in REAL if name in self.data)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Target:
+    """A column: what is learned from and what is scored, a step or a folder; learn, score: options of finetune and
+    evaluate; clips: of consecutive frames with rotations."""
+
+    name: str
+    title: str
+    train: Step | str
+    test: Step | str
+    learn: tuple[str, ...]
+    score: tuple[str, ...]
+    clips: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """A row's place in a column. evaluation: its last step, None where there is none, and why; published: MPJPE mm of
+    the paper."""
+
+    row: str
+    column: str
+    seed: int
+    evaluation: Step | None
+    why: str = ""
+    published: float | None = None
+    target: Target
+
+    @property
+    def training(self) -> tuple[Step, ...]:
+        """Its training steps, the last one last."""
+        steps = self.evaluation.all() if self.evaluation else ()
+        return tuple(step for step in steps if step.kind in ("pretrain", "finetune"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """name; title; columns: real sets that it is of; rows: (options) -> each row."""
+
+    name: str
+    title: str
+    columns: tuple[str, ...]
+    rows: Callable[[Options], "Sequence[Row]"]
+    score: tuple[str, ...] = ()
+    single: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """A method. pretrain: options of its pre-training, None for none; finetune: its options besides --init; stands: why
+    the row cannot be run, "" where it can; clips: it needs clips; published: MPJPE mm by real set."""
+
+    name: str
+    finetune: tuple[str, ...]
+    pretrain: tuple[str, ...] | None = None
+    why: str = ""
+    clips: bool = False
+    published: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def heatmaps(self) -> bool:
+        """Whether it is the paper's network with its own head."""
+        return "--recipe" in self.finetune and not {"prn", "coordinates"} & set(self.finetune)
+
+
+def row_key(name: str) -> str:
+    """A row's name as --rows has it."""
+    return "-".join("".join(c if c.isalnum() or c == "." else " " for c in name.lower()).split())
+
+
+def cells(table: Table, options: Options, chosen: Sequence[str] = ()) -> list[Cell]:
+    """The cells of a table, those of the rows chosen, by default of all. Raises InputError for an unknown row."""
+    rows = table.rows(options)
+    for key in chosen:
+        check_name(f"row of {table.name}", key, [row_key(row.name) for row in rows])
+    rows = [row for row in rows if not chosen or row_key(row.name) in chosen]
+    targets = _targets(table, options)
+    return [
+        _cell(row, target, seed, table.score, options)
+        for row in rows
+        for target in targets
+        for seed in range(options.seeds)
+    ]
+
+
+def _cell(row: Row, target: Target, seed: int, score: tuple[str, ...], options: Options) -> Cell:
+    common = {"row": row.name, "column": target.name, "seed": seed, "target": target}
+    published = row.published.get(target.name)
+    why = row.why or ("needs clips of consecutive frames with rotations" if row.clips and not target.clips else "")
+    if why:
+        return Cell(evaluation=None, why=why, published=published, **common)  # type: ignore[arg-type]
+    stages = 1 + (row.pretrain is not None)
+    hours = None if options.hours is None else options.hours / stages
+    run = ("--seed", str(seed), "--workers", str(options.workers))
+    begin: tuple[Step | str, ...] = ("--init", "random")
+    if row.pretrain is not None:
+        first = Step(("pretrain", *row.pretrain, "--people", str(options.people), *run), hours)
+        begin = ("--init", first)
+    tuned = Step(("finetune", target.train, *row.finetune, *begin, *target.learn, *run), hours)
+    # as the released code decodes heatmaps
+    dark = ("--decode", "dark") if options.real and row.heatmaps else ()
+    words = ("evaluate", tuned, target.test, *target.score, *dark, *score)
+    return Cell(evaluation=Step(words), published=published, **common)  # type: ignore[arg-type]
+
+
+# ---- columns
+
+
+def _targets(table: Table, options: Options) -> list[Target]:
+    if options.real:
+        return [_real(name, options.data[name]) for name in options.real if name in table.columns]
+    targets = [_stand_in("people", "synthesized people", options)]
+    if not table.single and {"lidarhuman26m", "sloper4d"} <= set(table.columns):
+        targets.append(_stand_in("clips", "synthesized clips", options))
+    return targets
+
+
+def _real(name: str, folder: str) -> Target:
+    """Paper: implementation details. HumanM3 and LiDARHuman26M are thinned out by 5."""
+    thinned = ("--interval", "5") if name in ("humanm3", "lidarhuman26m") else ()
+    clips = name in ("lidarhuman26m", "sloper4d")
+    score = ("--protocol", "dapt")
+    return Target(name=name, title=name, train=folder, test=folder, learn=thinned, score=score, clips=clips)
+
+
+def _stand_in(name: str, title: str, options: Options) -> Target:
+    clips = name == "clips"
+    learned = min(options.people, _TRAIN)
+    counts = {"train": learned, "test": min(max(learned // 4, 1), _TEST)}
+    poses: tuple[str, ...] = ()
+    if options.motion:
+        poses = ("--motion", options.motion[0], *(("--subjects", options.held_out) if options.held_out else ()))
+    steps = {}
+    for part, count in counts.items():
+        number = -(-count // _CLIP) if clips else count
+        words = ("synth", *(("--clips",) if clips else ()), "-n", str(number), "--scene", "wild")
+        words += ("--sensor", _SENSORS, "--seed", str(_SEEDS[part]), "--workers", str(options.workers), *poses)
+        steps[part] = Step(words)
+    people = -(-learned // _CLIP) * _CLIP if clips else learned
+    learn = ("--split", "all", "--mix", "0", "--epochs", f"{options.people / people:.6g}")
+    return Target(name=name, title=title, train=steps["train"], test=steps["test"], learn=learn, score=(), clips=clips)
+
+
+# ---- rows
+
+
+def _paper(options: Options, *more: str) -> tuple[str, ...]:
+    """Options of a training of the paper's network; fine-tuning on synthesized people is centered on the points, as
+    everybody's there, where the paper's own is centered on labels."""
+    return ("--recipe", "paper", *_RATES[options.size], *more)
+
+
+def _pretrained(options: Options, *more: str, motion: tuple[str, ...] | None = None) -> tuple[str, ...]:
+    """Options of the paper's pre-training."""
+    poses = _motion(options) if motion is None else motion
+    return _paper(options, "--size", options.size, *poses, *more)
+
+
+def _motion(options: Options) -> tuple[str, ...]:
+    """Where poses of pre-training come from: LiDARHuman26M's where they are, else the first file of motion."""
+    if source := options.data.get("lidarhuman26m-poses"):
+        return ("--motion", source, "--captured", "1")
+    if not options.motion:
+        return ()
+    subjects = ("--subjects", options.subjects) if options.subjects else ()
+    return ("--motion", options.motion[0], *subjects, "--captured", "1")
+
+
+def _tuned(options: Options, *more: str) -> tuple[str, ...]:
+    return _paper(options, *(() if options.real else ("--augment", "default")), *more)
+
+
+def _random(options: Options, *more: str) -> tuple[str, ...]:
+    return _tuned(options, "--size", options.size, *more)
+
+
+def _published(*values: float | None) -> dict[str, float]:
+    return {name: value for name, value in zip(REAL, values, strict=False) if value is not None}
+
+
+def _methods(options: Options) -> list[Row]:
+    """Table 1."""
+    prn = ("--neck", "prn")
+    # its convolutions over 64^3 cells want a GPU; with 32^3 it has the same weights
+    lpformer = ("--model", "lpformer", *(() if options.size == PAPER else ("--options", "grid=32")))
+    return [
+        _of_clips("LiDARCap", 79.31, 101.89),
+        _of_clips("NE", 72.23, 96.80),
+        Row(name="LPFormer", finetune=lpformer, published=_published(61.60, 83.69, 95.72, 49.31)),
+        Row(name="PRN as published", finetune=("--model", "prn")),
+        Row(name="PRN", finetune=_random(options, *prn), published=_published(68.48, 70.56, 80.01, 48.76)),
+        _dapt(options, _published(51.59, 59.76, 73.47, 28.01)),
+        Row(name="ours", finetune=(), pretrain=("--size", "small", "--scene", "paper", *_motion(options))),
+    ]
+
+
+def _of_clips(name: str, *published: float) -> Row:
+    printed = _published(None, None, *published)
+    return Row(name=name, finetune=("--model", name.lower()), clips=True, published=printed)
+
+
+def _dapt(options: Options, published: dict[str, float], name: str = "DAPT") -> Row:
+    return Row(name=name, finetune=_tuned(options), pretrain=_pretrained(options), published=published)
+
+
+def _corpora(options: Options) -> list[Row]:
+    """Table 2. The stand-in has no corpora: poses of each file of motion, and those of the procedural prior."""
+
+    def poses(source: str, *subjects: str) -> tuple[str, ...]:
+        return _pretrained(options, motion=("--motion", source, *subjects, "--captured", "1"))
+
+    def waymo(value: float, other: float) -> dict[str, float]:
+        return {"waymo": value, "lidarhuman26m": other}
+
+    tuned = _tuned(options)
+    rows = [Row(name="w/o", finetune=_random(options), published=waymo(59.2, 76.5))]
+    if not options.real:
+        rows.append(Row(name="procedural prior", finetune=tuned, pretrain=_pretrained(options, motion=())))
+        for k, source in enumerate(options.motion):
+            subjects = ("--subjects", options.subjects) if options.subjects and k == 0 else ()
+            rows.append(Row(name=f"poses of {Path(source).stem}", finetune=tuned, pretrain=poses(source, *subjects)))
+        return rows
+    for name, title, printed in (
+        ("lipd", "LIPD", waymo(58.7, 75.6)),
+        ("freemotion", "FreeMotion", waymo(57.9, 74.3)),
+        ("noisemotion", "NoiseMotion", waymo(59.0, 76.3)),
+    ):
+        own = _pretrained(options, "--shards", options.data.get(name, ""), motion=())
+        why = "" if name in options.data else f"needs --data {name}=DIR, prepared with --split train"
+        rows.append(Row(name=title, finetune=tuned, pretrain=own, why=why, published=printed))
+    for name, title, printed in (
+        ("freemotion-poses", "FreeMotion†", waymo(54.6, 73.2)),
+        ("lidarhuman26m-poses", "LiDARH26M†", waymo(51.6, 73.4)),
+    ):
+        why = "" if name in options.data else f"needs --data {name}=DIR, the raw files of its poses"
+        own = poses(options.data.get(name, ""))
+        rows.append(Row(name=title, finetune=tuned, pretrain=own, why=why, published=printed))
+    return rows
+
+
+def _components(options: Options) -> list[Row]:
+    """Table 3."""
+    finest, coordinates = ("--neck", "finest"), ("--head", "coordinates")
+    plain, level = _pretrained(options), _pretrained(options, *finest)
+    tuned = _tuned(options)
+    return [
+        Row(name="PRN baseline", finetune=_random(options, "--neck", "prn"), published={"waymo": 68.5}),
+        Row(name="anchors", finetune=(*tuned, *coordinates), pretrain=level, published={"waymo": 54.3}),
+        Row(name="anchors + MDE", finetune=(*tuned, *coordinates), pretrain=plain, published={"waymo": 52.3}),
+        Row(name="anchors + heatmaps", finetune=tuned, pretrain=level, published={"waymo": 53.8}),
+        _dapt(options, {"waymo": 51.7}, "anchors + MDE + heatmaps"),
+    ]
+
+
+def _augmentations(options: Options) -> list[Row]:
+    """Table 4a, and Table 4b, whose r_keep of 0.6 is the last row of 4a."""
+    tuned, motion = _tuned(options), _motion(options)
+    recorded = Row(
+        name="+ pre-training",
+        finetune=tuned,
+        pretrain=_pretrained(options, "--set", "recorded=1,keep=1"),
+        why="" if motion else "places as recorded need captured motion: --motion FILE",
+        published={"waymo": 52.9},
+    )
+    sampled = _pretrained(options, "--keep", "1")
+    rows = [
+        Row(name="scratch", finetune=_random(options), published={"waymo": 59.2}),
+        recorded,
+        Row(name="+ scene sampling", finetune=tuned, pretrain=sampled, published={"waymo": 52.4}),
+        _dapt(options, {"waymo": 51.7}, "+ laser masking"),
+    ]
+    for keep, printed in zip(_KEPT, (53.0, 51.7, 51.9, 52.5, 52.4), strict=True):
+        more = () if keep == _RECIPE_KEEP else ("--keep", keep)
+        own = _pretrained(options, *more)
+        rows.append(Row(name=f"r_keep {keep}", finetune=tuned, pretrain=own, published={"waymo": printed}))
+    return rows
+
+
+def _compared(options: Options) -> list[Row]:
+    """Figures 7 and 8: the methods, and the paper's network without its parts."""
+    rows = {row.name: row for row in (*_components(options), *_augmentations(options), *_methods(options))}
+    names = {"PRN": "PRN", "LPFormer": "LPFormer", "DAPT": "DAPT", "anchors + heatmaps": "DAPT without MDE"}
+    names |= {"scratch": "DAPT without pre-training", "ours": "ours"}
+    return [replace(rows[name], name=title, published={}) for name, title in names.items()]
+
+
+def _side_by_side(options: Options) -> list[Row]:
+    return [row for row in _methods(options) if not row.clips and row.name != "PRN as published"]
+
+
+_ONE = ("waymo",)
+TABLES = {
+    table.name: table
+    for table in (
+        Table(name="table1", title="Table 1: comparison with other methods", columns=REAL, rows=_methods),
+        Table(name="table2", title="Table 2: pre-training corpora", columns=("waymo", "lidarhuman26m"), rows=_corpora),
+        Table(name="table3", title="Table 3: components", columns=_ONE, rows=_components),
+        Table(name="table4", title="Table 4: synthesis, and r_keep", columns=_ONE, rows=_augmentations),
+        Table(name="fig5", title="Figure 5: the hardest people", columns=REAL, rows=_side_by_side, single=True),
+        Table(
+            name="fig7", title="Figure 7: stability", columns=_ONE, rows=_compared, score=("--stability",), single=True
+        ),
+        Table(
+            name="fig8", title="Figure 8: end joints", columns=_ONE, rows=_compared, score=("--stability",), single=True
+        ),
+    )
+}

@@ -1,0 +1,322 @@
+"""`lidarpose paper`: tables as data, sub-runs that are done once and taken up, what a table says, its figures."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+from training_runs import Killed, few_to_validate_on  # noqa: F401
+
+from lidarpose.cli import main
+from lidarpose.cli.paper import _problem
+from lidarpose.data.shards import open_dataset
+from lidarpose.errors import InputError
+from lidarpose.eval.scores import published, read_scores
+from lidarpose.models.checkpoint import read_header
+from lidarpose.paper import figures, report, steps
+from lidarpose.paper.report import markdown, run_table
+from lidarpose.paper.steps import Step, StepFailed, run_steps
+from lidarpose.paper.tables import REAL, TABLES, Options, cells, row_key
+from lidarpose.sample import center_of
+from lidarpose.skeleton import BODY26, HUMAN15
+from lidarpose.train import loop, run_dir
+
+_ROWS = ["scratch", "laser-masking"]
+_TABLE = ["paper", "table4", "--people", "128", "--rows", ",".join(_ROWS), "--out"]
+
+
+def _content(out, name="table4"):
+    return json.loads((out / f"{name}.json").read_text())
+
+
+# --- a table from its command to its page
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """Table 4's first and last row on 128 people each, killed while the second row's fine-tuning saves."""
+    out = tmp_path_factory.mktemp("paper") / "paper"
+    with pytest.MonkeyPatch.context() as patch:
+        save, saved = run_dir.save_state, []
+
+        def save_twice(*arguments):
+            saved.append(arguments)
+            if len(saved) > 2:
+                raise Killed
+            return save(*arguments)
+
+        patch.setattr(loop.run_dir, "save_state", save_twice)
+        with pytest.raises(Killed):
+            main([*_TABLE, str(out)])
+    killed = _content(out)
+    before = {path: path.stat().st_mtime_ns for path in (out / "runs").glob("*.json")}
+    assert main([*_TABLE, str(out)]) == 0
+    return out, killed, before
+
+
+def test_a_table_that_was_killed_goes_on(finished):
+    out, killed, before = finished
+    assert [cell["state"] for cell in killed["cells"]] == ["done", "not run"]
+    done = _content(out)["cells"]
+    assert [cell["state"] for cell in done] == ["done", "done"]
+    # the first row, both target sets' parts that were there and the pre-training are not made again
+    assert len(before) >= 4 and all(path.stat().st_mtime_ns == at for path, at in before.items())
+    assert done[0] == killed["cells"][0]
+    (tuned,) = [log for log in (out / "runs").glob("finetune-*/log.jsonl") if "--resume" in _command(log.parent)]
+    assert json.loads(tuned.read_text().splitlines()[-1])["people"] == 128
+
+
+def _command(run):
+    return read_header(run / "model.safetensors").card["command"]
+
+
+def test_a_cell_states_what_it_cost_and_the_mean_pose(finished):
+    out, _, _ = finished
+    scratch, masked = _content(out)["cells"]
+    assert (scratch["people_seen"], masked["people_seen"]) == (128, 256)
+    assert scratch["parameters"] == masked["parameters"] > 1e6
+    assert scratch["people_scored"] == 32 and scratch["undertrained"] and scratch["mean_pose"] == masked["mean_pose"]
+    assert [command.split()[1] for command in masked["commands"]] == [
+        "synth",
+        "pretrain",
+        "finetune",
+        "synth",
+        "evaluate",
+    ]
+    assert scratch["mpjpe"] == read_scores(scratch["scores"]).results[0].line("mpjpe").value
+    page = (out / "table4.md").read_text()
+    assert "*undertrained*" in page.split("## Cells")[0].splitlines()[-2]
+    assert all(command in page for command in masked["commands"])
+
+
+def test_the_mean_pose_is_the_mean_about_the_points_center(finished):
+    out, _, _ = finished
+    wanted = _content(out)["cells"][0]["mean_pose"]
+    learned, scored = [], []
+    for path in sorted((out / "runs").glob("synth-*/dataset.json")):
+        people = list(open_dataset(path.parent).items())
+        own = [p.joints[BODY26.map_to(HUMAN15)] - center_of(p.points) for p in people]
+        (learned if len(own) == 128 else scored).extend(own)
+    assert len(learned) == 128 and len(scored) == 32
+    error = np.linalg.norm(np.array(scored) - np.mean(learned, 0), axis=-1).mean()
+    assert wanted == pytest.approx(1e3 * error, abs=0.1)
+
+
+def test_a_table_of_what_is_there(finished, capsys):
+    out, _, _ = finished
+    assert main([*_TABLE, str(out), "--table-only", "--seeds", "2"]) == 0
+    assert [cell["state"] for cell in _content(out)["cells"]] == ["done", "not run"] * 2
+    assert "1 of 2 seeds" in (out / "table4.md").read_text()
+    assert main([*_TABLE, str(out), "--table-only"]) == 0
+
+
+def test_the_hardest_people_side_by_side(finished):
+    out, _, _ = finished
+    selected = cells(TABLES["table4"], Options(people=128), _ROWS)
+    assert figures.draw("fig5", selected, out).read_bytes().startswith(b"\x89PNG")
+    assert figures.draw("fig5", cells(TABLES["fig5"], Options(people=96)), out) is None
+
+
+# --- the tables as data
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_rows_have_names_of_their_own_and_every_cell_a_command_or_a_reason(name):
+    for options in (Options(), Options(motion=("a.npz", "b.npz"), subjects="1", held_out="2", seeds=2, hours=2.0)):
+        table = cells(TABLES[name], options)
+        keys = [(row_key(cell.row), cell.column, cell.seed) for cell in table]
+        assert len(set(keys)) == len(keys)
+        for cell in table:
+            assert (cell.evaluation is None) == bool(cell.why)
+            assert sum(step.hours or 0 for step in cell.training) == pytest.approx(options.hours or 0) or cell.why
+
+
+def test_the_published_figures_are_those_of_the_published_table(tmp_path):
+    for name in REAL:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "dataset.json").write_text("{}")
+    data = {name: str(tmp_path / name) for name in REAL}
+    printed = {method["method"]: method["figures"] for method in published()["methods"]}
+    for cell in cells(TABLES["table1"], Options(data=data)):
+        wanted = printed.get(next((name for name in printed if name.startswith(cell.row)), ""), {}).get(cell.column)
+        assert cell.published == (wanted and wanted["mpjpe"])
+
+
+def test_tables_share_what_they_have_in_common():
+    def runs(name, row):
+        (cell,) = cells(TABLES[name], Options(), [row])[:1]
+        return [step.name for step in cell.evaluation.all()]
+
+    assert runs("table4", "laser-masking") == runs("table4", "r-keep-0.6") == runs("table1", "dapt")
+    assert runs("fig7", "dapt")[:-1] == runs("table1", "dapt")[:-1]
+    assert runs("fig7", "dapt") == runs("fig8", "dapt")
+    assert runs("table4", "scratch") == runs("table2", "w-o") != runs("table4", "r-keep-0.5")
+
+
+@pytest.mark.parametrize("name", ["table2", "table4"])
+def test_the_parser_knows_the_commands(name, tmp_path):
+    for cell in cells(TABLES[name], Options(motion=("a.npz",))):
+        for step in cell.evaluation.all():
+            assert _problem(step.command(tmp_path)) == ""
+
+
+def test_other_processes_do_not_make_another_run():
+    one, two = (cells(TABLES["table1"], Options(workers=n), ["dapt"])[0].evaluation.name for n in (1, 2))
+    assert one == two != cells(TABLES["table1"], Options(hours=1.0), ["dapt"])[0].evaluation.name
+
+
+def test_a_plan_runs_nothing(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["paper", "table4", "--dry-run"]) == 0
+    text = capsys.readouterr().out
+    assert "lidarpose pretrain paper/runs/" in text and "--keep 0.5" in text and "as above" in text
+    assert "need captured motion" in text
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "words, told",
+    [
+        (["table9"], "unknown table or figure 'table9'"),
+        (["table1", "--rows", "hers"], "unknown row of table1 'hers'"),
+        (["table1", "--people", "0"], "at least 1"),
+        (["table1", "--hours", "0"], "above 0"),
+        (["table1", "--size", "huge"], "unknown size of the paper's network"),
+        (["table1", "--data", "waymo"], "NAME=DIR"),
+        (["table1", "--data", "wymo=x"], "unknown dataset 'wymo'"),
+        (["table1", "--data", "waymo=nowhere"], "is no prepared dataset"),
+        (["table1", "--data", "freemotion-poses=x"], "needs a dataset to score on"),
+        (["table1", "--held-out", "2"], "--motion"),
+        (["table1", "--out", "file"], "name another by --out"),
+    ],
+)
+def test_wrong_words_are_one_line(tmp_path, monkeypatch, capsys, words, told):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("x")
+    assert main(["paper", *words]) == 2
+    error = capsys.readouterr().err
+    assert told in error and error.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+# --- steps
+
+
+def test_a_step_that_fails_is_a_cell_that_says_so_and_the_others_go_on(tmp_path):
+    asked = []
+
+    def execute(words):
+        asked.append(words[0])
+        if words[0] == "finetune":
+            print("lidarpose: error: unrecognized arguments: --model prn", file=sys.stderr)
+            raise SystemExit(2)
+        return 0
+
+    told = []
+    chosen = ["scratch", "laser-masking"]
+    content = run_table(TABLES["table4"], Options(people=64), tmp_path / "out", chosen, execute, told.append)
+    assert [cell["state"] for cell in content["cells"]] == ["failed", "failed"]
+    assert {cell["reason"] for cell in content["cells"]} == {"unrecognized arguments: --model prn"}
+    # the target is made once
+    assert asked == ["synth", "finetune", "pretrain", "finetune"]
+    assert "failed: unrecognized arguments" in (tmp_path / "out" / "table4.md").read_text()
+
+
+def test_a_stopped_step_stops_the_table(tmp_path):
+    step = Step(("synth", "-n", "3"))
+    with pytest.raises(KeyboardInterrupt):
+        run_steps(step, tmp_path, lambda words: 143, print)
+    with pytest.raises(StepFailed, match="status 1"):
+        run_steps(step, tmp_path, lambda words: 1, print)
+    asked = []
+    for _ in range(2):
+        run_steps(step, tmp_path, lambda words: asked.append(words) or 0, print)
+    assert asked == [["synth", "-n", "3", "--out", str(step.folder(tmp_path))]]
+
+
+def test_a_training_that_takes_longer_than_its_hours_is_made_shorter(tmp_path):
+    words = ("pretrain", "--size", "tiny", "--people", "200000", "--batch", "4", "--workers", "0", "--pictures", "0")
+    step = Step(words, hours=0.001)
+    run_steps(step, tmp_path, main, print)
+    (option, people) = json.loads((tmp_path / "runs" / f"{step.name}.json").read_text())["length"]
+    assert option == "--people" and 8 <= int(people) < 20_000
+    seen = steps.last_entry(step.folder(tmp_path))["people"]
+    assert seen == -(-int(people) // 4) * 4
+
+
+# --- what a table says
+
+
+def _entry(**changes):
+    entry = {"row": "a", "column": "x", "seed": 0, "published": None, "commands": ["lidarpose x"], "state": "done"}
+    entry |= {"mpjpe": 100.0, "low": 95.0, "high": 105.0, "pa_mpjpe": 60.0, "pck3": 90.0, "pck5": None}
+    entry |= {"mean_pose": 200.0, "people_seen": 1000, "hours": 0.5, "people_per_second": None, "parameters": 1234}
+    return entry | {"undertrained": False} | changes
+
+
+def test_cells_in_words():
+    entries = [
+        _entry(published=51.6),
+        _entry(row="b"), _entry(row="b", seed=1, mpjpe=120.0, undertrained=True),
+        _entry(row="c", state="failed", reason="no such flag"),
+        _entry(row="d", state="not run", reason="its command was not run", published=60.0),
+        _entry(row="e", low=None, high=None),
+    ]  # fmt: skip
+    page = markdown({"title": "T", "target": "stand-in", "cells": entries})
+    for line in (
+        "| a | 100.0 [95.0, 105.0] (paper 51.6) |",
+        "| b | 110.0 [100.0, 120.0], 2 of 2 seeds, *undertrained* |",
+        "| c | failed: no such flag |",
+        "| d | not run (paper 60.0) |",
+        "| e | 100.0 |",
+        "| b | x | 1 | 120.0 | 60.0 | 90.0 | - | 200.0 | 1,000 | 0.50 | - | 1,234 | undertrained |",
+        "| d | x | 0 | - | - | - | - | - | - | - | - | - | not run |",
+    ):
+        assert line in page.splitlines()
+
+
+# --- figures
+
+
+def _study(scale):
+    points = [{"label": str(k), "mpjpe": scale * (100 + 10 * k)} for k in range(4)]
+    points.append({"label": "9", "mpjpe": None})
+    curves = [{"name": name, "title": name, "points": points} for name in ("jitter", "clusters")]
+    ends = [{"group": g, "mean": 90.0 * scale, "quartiles": [50, 80, 120], "worst": 600} for g in ("head", "wrists")]
+    setting = {"dataset": "people", "protocol": "clean"}
+    return {"curves": curves, "ends": ends, "who": "9 people", "setting": setting}
+
+
+@pytest.mark.parametrize("name", ["fig7", "fig8"])
+def test_curves_and_ends_of_several_networks(tmp_path, name):
+    selected = cells(TABLES[name], Options(), ["dapt", "ours"])
+    for scale, cell in enumerate(selected, 1):
+        folder = cell.evaluation.product(tmp_path)
+        folder.mkdir(parents=True)
+        (folder / "stability.json").write_text(json.dumps({"studies": [_study(scale)]}))
+        steps._note(cell.evaluation, tmp_path, done=True)
+    path = figures.draw(name, selected, tmp_path)
+    assert path == tmp_path / f"{name}.png" and path.read_bytes().startswith(b"\x89PNG")
+    assert path.read_bytes() != _drawn_alone(name, selected[:1], tmp_path)
+
+
+def _drawn_alone(name, selected, out):
+    return figures.draw(name, selected, out).read_bytes()
+
+
+def test_one_body_at_many_places(tmp_path, monkeypatch, capsys):
+    drawn = []
+    monkeypatch.setattr(figures, "draw_people", lambda panels, *_, **__: drawn.extend(panels))
+    assert main(["paper", "fig6", "--out", str(tmp_path / "out")]) == 0
+    bodies = np.array([panel.truth.joints - panel.truth.joints[0] for panel in drawn])
+    # one body, turned alike: masks and distances change the points alone
+    np.testing.assert_allclose(bodies, np.broadcast_to(bodies[0], bodies.shape), atol=1e-4)
+    counts = np.array([len(panel.points) for panel in drawn]).reshape(len(figures._DISTANCES), -1)
+    assert (np.diff(counts[:, 0]) < 0).all() and (counts[:, -1] < counts[:, 0]).all()
+
+
+def test_an_out_folder_of_something_else_is_refused(tmp_path):
+    (tmp_path / "x").write_text("")
+    with pytest.raises(InputError, match="expected a new or empty folder"):
+        steps.check_out(tmp_path)
+    assert report.SCHEMA == "lidarpose.paper/1"
