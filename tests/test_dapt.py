@@ -156,7 +156,15 @@ def test_the_corrected_flow_is_blocks_one_after_the_other():
 # ---- what may not matter
 
 
-@pytest.mark.parametrize("config", [TINY, replace(TINY, legacy=True)], ids=["corrected", "legacy"])
+NECKS = {
+    "corrected": TINY,
+    "legacy": replace(TINY, legacy=True),
+    "finest": replace(TINY, neck="finest"),
+    "prn": replace(TINY, neck="prn", bins=(), ranges=(), parts=0),
+}
+
+
+@pytest.mark.parametrize("config", NECKS.values(), ids=NECKS)
 @pytest.mark.parametrize("n", [1, 2, 40, 700])
 def test_batch_mates_do_not_matter(config, n):
     net, one = network(config), person(n)
@@ -212,10 +220,12 @@ def test_the_points_matter():
 
 @pytest.mark.parametrize("sizes", [[0], [0, 0], [0, 40, 0], [1], []])
 def test_people_of_few_points(sizes):
-    for config in (TINY, replace(TINY, legacy=True)):
+    for name, config in NECKS.items():
         net = network(config)
         out = net.outputs([person(n, k) for k, n in enumerate(sizes)])
         joints = {"anchors", "logits_x", "logits_y", "logits_z", "inter", "coordinates"}
+        if name == "prn":
+            joints = {"voted", "inter", "coordinates"}
         assert out.keys() == joints | {"point_feat_last", "parts"}
         for name, values in out.items():
             assert np.isfinite(values).all() and len(values) == (len(sizes) if name in joints else sum(sizes)), name
@@ -530,6 +540,25 @@ def test_sizes_and_bins():
         assert DaptConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
 
+@pytest.mark.parametrize("width, finest, prn", [(64, 267_136, 228_870), (128, 1_058_560, 899_910)])
+def test_necks_have_as_many_parameters_as_published(width, finest, prn):
+    """More than plain Point Transformer V3: its decoder of `width` channels, 15 joints."""
+    widths = {"decoder_channels": (width, 128, 128, 256), "anchor_channels": (width, 128, 128, 256, 256)}
+    plain = replace(named_config("pretrain"), parts=0, **widths)
+    whole = parameters(replace(plain, neck="prn"))
+    head = 3 * width + 3 + width**2 + width
+    assert parameters(replace(plain, neck="finest")) == whole - prn + finest + width * 15 + head
+    with torch.device("meta"):
+        backbone = DaptNet(replace(plain, neck="prn")).backbone
+    assert whole - prn == sum(p.numel() for p in backbone.parameters())
+
+
+def test_a_header_without_a_neck_means_mde():
+    entries = TINY.to_dict()
+    assert entries.pop("neck") == "mde" and DaptConfig.from_dict(entries) == TINY
+    assert DaptConfig.from_dict(json.loads(json.dumps(NECKS["finest"].to_dict()))) == NECKS["finest"]
+
+
 def test_joints_of_the_released_networks_by_name():
     # the authors' order: rows 1 to 13 and 15 of Waymo's table of keypoints
     limbs = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
@@ -577,6 +606,8 @@ def test_joints_of_the_released_networks_by_name():
         ({"bins": (10**19, 1, 1)}, "bins must be 3"),
         ({"patch": 10**6}, "patch must be a whole number from 1 to 16384"),
         ({"legacy": 1}, "legacy must be true or false"),
+        ({"neck": "giraffe"}, "unknown neck 'giraffe'"),
+        ({"neck": "prn"}, "the neck prn has joints and parts of its own: leave bins, ranges and parts empty"),
     ],
 )
 def test_bad_configurations(change, message):

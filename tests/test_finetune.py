@@ -430,6 +430,25 @@ def test_the_paper_s_two_stages(datasets, tmp_path, capsys, monkeypatch, keep):
     assert "MPJPE" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("neck", ["finest", "prn"])
+def test_necks_from_the_command_line_and_coordinates_in_both_stages(datasets, tmp_path, capsys, monkeypatch, neck):
+    monkeypatch.chdir(tmp_path)
+    common = ["--recipe", "paper", "--batch", "4", "--workers", "0", "--pictures", "0", "--validate", "1000"]
+    assert not main(["pretrain", "first", "--size", "paper-small", "--neck", neck, "--people", "32", *common])
+    words = ["finetune", str(datasets["humanm3"]), "--out", "second", "--init", "first/model.safetensors"]
+    assert not main([*words, "--epochs", "1", "--head", "coordinates", *common])
+    trained, header = load_checkpoint("second/model.safetensors")
+    assert header.config.neck == neck and header.config.coordinates and not header.config.bins
+    log = [json.loads(line) for line in (tmp_path / "second" / run_dir.LOG).read_text().splitlines()]
+    assert "regression" in log[-1] and ("vote" in log[-1]) == (neck == "prn")
+    assert not main(["evaluate", "second/model.safetensors", str(datasets["humanm3"]), "--protocol", "dapt"])
+    assert "MPJPE" in capsys.readouterr().out
+    # random weights have the neck that is asked for, and so for a dataset without pre-training
+    scratch = {"init": "random", "size": "paper-small", "neck": neck, "head": "coordinates", "augment": "paper"}
+    setup = make_setup(Finetune(data=(str(datasets["humanm3"]),), mix=0.0, **scratch))
+    assert setup.network().state_dict().keys() == trained.state_dict().keys()
+
+
 def test_a_run_on_a_dataset_is_taken_up(datasets, tmp_path):
     recipe = Finetune(
         data=(str(datasets["lidarhuman26m"]),), epochs=6, batch=2, workers=0, pictures=0, scene="paper", validate=1000

@@ -378,12 +378,29 @@ def test_numbers_of_numpy_paths_and_one_name_alone_are_settings_too():
         ({"shards": [3]}, r"shards must be a list of texts, got \[3\]"),
         # without a file they would choose nobody
         ({"subjects": ("a",)}, "subjects are of captured clips: name their file by motion too"),
+        ({"head": "arms"}, "unknown head 'arms': .*"),
+        ({"drop_path": "much"}, "drop_path must be a number, got 'much'"),
         *(({"keep_anchors": value}, "keep_anchors must be true or false, got .*") for value in ("false", 0, None)),
     ],
 )
 def test_a_recipe_refuses_what_is_no_such_setting(change, message):
     with pytest.raises(InputError, match=f"^{message}$"):
         recipe(Finetune, data="a", **change) if "keep_anchors" in change else Pretrain(**change)
+
+
+@pytest.mark.parametrize(
+    "kind, change, message",
+    [
+        (Pretrain, {"neck": "prn"}, "neck, head and drop_path are of the paper's network: add --size paper"),
+        (Pretrain, {"size": "paper-small", "neck": "giraffe"}, "unknown neck 'giraffe'"),
+        (Pretrain, {"size": "paper-small", "neck": "prn", "head": "heatmaps"}, "has coordinates and no heatmaps"),
+        (Pretrain, {"size": "paper-small", "drop_path": 1.5}, "drop_path must be a probability below 1"),
+        (Finetune, {"data": "a", "neck": "prn"}, "a checkpoint has its neck: leave --neck away"),
+    ],
+)
+def test_switches_of_the_papers_network_are_checked(kind, change, message):
+    with pytest.raises(InputError, match=message):
+        make_setup(kind(**change))
 
 
 def test_named_recipes():
@@ -394,6 +411,8 @@ def test_named_recipes():
     assert paper.schedule == "cosine" and not (paper.muon_rate or paper.ema or paper.clip)
     fine = recipe(Finetune, "paper", data=("a",), init="first.safetensors")
     assert (fine.rate, fine.epochs, fine.mix, fine.augment, fine.keep_anchors) == (5e-4, 50, 0, "paper", False)
+    one = make_setup(recipe(Pretrain, "paper-one-stage", people=64)).objective
+    assert one.stage == "finetune" and one.config.bins and one.config.drop_path == 0.05 and one.config.neck == "mde"
     # the paper's figures are of networks that learned from every training sequence
     assert fine.hold_out == 0
 

@@ -22,6 +22,7 @@ _BOOLS = {"true": True, "false": False}
 _PARSERS: dict[Any, Callable] = {
     int: int,
     float: float,
+    float | None: float,
     bool: _BOOLS.__getitem__,
     tuple[str, ...]: names,
     tuple[float, ...]: names,
@@ -67,7 +68,7 @@ def _add(parser, kind: type[Recipe]) -> None:
     parser.add_argument(
         "--recipe",
         metavar="NAME",
-        help="default or paper; prn or lpformer, as with --model; other options override its settings",
+        help="default, paper, paper-one-stage; prn or lpformer, as with --model; other options override its settings",
     )
     parser.add_argument("--device", metavar="NAME", help="cpu (default: a GPU if there is one)")
     parser.add_argument("--tracker", metavar="NAME", help="also log to tensorboard or wandb, if installed")

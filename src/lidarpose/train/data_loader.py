@@ -156,12 +156,15 @@ class Chunks(IterableDataset):
         worker = get_worker_info()
         first, stride = (0, 1) if worker is None else (worker.id, worker.num_workers)
         for chunk in range(self.start + first, chunks_of(self.steps), stride):
-            # products of a few thousand numbers: threads of BLAS only get in each other's way
-            with threadpool_limits(limits=1, user_api="blas"):
-                batches = self._chunk(chunk)
-            yield batches
+            yield self.batches_of(chunk)
 
-    def _chunk(self, chunk: int) -> list[Any]:
+    def batches_of(self, chunk: int) -> list[Any]:
+        """The batches of one chunk of the run, those before `start` too."""
+        # products of a few thousand numbers: threads of BLAS only get in each other's way
+        with threadpool_limits(limits=1, user_api="blas"):
+            return self._batches_of(chunk)
+
+    def _batches_of(self, chunk: int) -> list[Any]:
         first, batches = chunk * BATCHES * self.batch, min(self.steps - chunk * BATCHES, BATCHES)
         lanes = lanes_of(self.batch, self.ranks)
         mine = []

@@ -36,7 +36,7 @@ from lidarpose.train.optim import average, optimizers, set_rates
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.run_dir import BEST, LOG, MODEL, STATE
 from lidarpose.train.setup import TrainSetup, make_setup
-from lidarpose.train.validation import Draw, validate
+from lidarpose.train.validation import Draw, batch_norms, update_batch_norms, validate
 
 # of Accelerate's, those that are known to work with a run's folder
 TRACKERS = ("tensorboard", "wandb")
@@ -189,6 +189,8 @@ class _Run:
         self.steps = -(-setup.people // recipe.batch)
         self.chunks = chunks_of(self.steps)
         self.chunk, self.seconds = 0, 0.0
+        # this process's batches of the chunk that was done last
+        self._trained_on: list = []
         self.best = float("inf")
         self.error: float | None = None
 
@@ -235,19 +237,11 @@ class _Run:
         with _dead_worker_named(), ExitStack() as stack:
             log = stack.enter_context(open(self.folder / LOG, "a")) if self.is_main else None
             bar = stack.enter_context(Progress(people, unit="people", done=min(self.seen, people), shown=self.is_main))
-            chunks = Chunks(
-                source=self.setup.source,
-                objective=self.setup.objective,
-                batch=recipe.batch,
-                seed=recipe.seed,
-                start=self.chunk,
-                steps=self.steps,
-                rank=self.accelerator.process_index,
-                ranks=self.accelerator.num_processes,
-            )
+            chunks = self._chunks(self.accelerator.process_index, self.accelerator.num_processes)
             for batches in loader(chunks, workers=recipe.workers):
                 seen_before = self.seen
                 terms, stopping = self._chunk(batches, stop)
+                self._trained_on = batches
                 self.seconds = seconds_before + time.monotonic() - started
                 entry = {"people": self.seen, "seconds": round(self.seconds, 1)} | terms
                 last = self.chunk == self.chunks
@@ -269,6 +263,19 @@ class _Run:
                     remedy = f"go on with lidarpose {recipe.kind} {where} --resume"
                     raise Interrupted(f"stopped after {self.seen:,} samples, saved: {remedy}", stop.number)
         self.accelerator.wait_for_everyone()
+
+    def _chunks(self, rank: int = 0, ranks: int = 1) -> Chunks:
+        """What is left of the run for one of so many processes."""
+        return Chunks(
+            source=self.setup.source,
+            objective=self.setup.objective,
+            batch=self.recipe.batch,
+            seed=self.recipe.seed,
+            start=self.chunk,
+            steps=self.steps,
+            rank=rank,
+            ranks=ranks,
+        )
 
     def _note(self, terms: dict[str, float]) -> str:
         """What the progress bar shows."""
@@ -315,10 +322,20 @@ class _Run:
         return self.accelerator.reduce(count.detach().float(), "mean") if self.wrapped is not self.network else count
 
     def _averaged(self) -> nn.Module:
-        """A network with the mean weights, in evaluation mode."""
+        """A network with the mean weights and the batch statistics that belong to them, in evaluation mode."""
         network = self.setup.objective.network().to(self.accelerator.device)
         network.load_state_dict(self.network.state_dict() | self.mean)
+        if batch_norms(network):
+            update_batch_norms(network, self.setup.objective, self._recent_batches())
         return network.eval()
+
+    def _recent_batches(self) -> list:
+        """All processes' batches of the last whole chunk: they follow from the step alone."""
+        whole = max(self.steps_done // BATCHES, 1) - 1
+        if whole == self.chunk - 1 and self.accelerator.num_processes == 1:
+            return self._trained_on
+        # the last chunk may be a single batch, and other processes' batches are not here: made anew
+        return self._chunks().batches_of(whole)
 
     def _validated(self) -> dict[str, float]:
         """On the main process; the weights of the best validation are kept."""

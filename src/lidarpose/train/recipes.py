@@ -27,6 +27,8 @@ MODELS: dict[str, tuple[str, ...]] = {
 }
 # instead of weights: fine-tuning begins with none
 RANDOM = "random"
+# what it learns: coordinates of joints (in pre-training parts too), or heatmaps
+HEADS = ("coordinates", "heatmaps")
 # what changes no sample: a resumed run may have others
 FREE = ("workers", "validate", "pictures", "precision")
 # shares of a whole that cannot be all of it
@@ -50,6 +52,7 @@ TYPES: dict[Any, tuple] = {
     float: (float, "a number", "X"),
     bool: (_to_bool, "true or false", "true|false"),
     str: (fspath, "text", "NAME"),
+    float | None: (lambda value: None if value is None else float(value), "a number", "X"),
     str | None: (lambda value: None if value is None else fspath(value), "text", "FILE"),
     tuple[str, ...]: (lambda value: tuple(fspath(path) for path in listed(value)), "a list of texts", "A,B"),
     tuple[float, ...]: (lambda value: tuple(map(float, value)), "a list of numbers", "X,Y"),
@@ -68,7 +71,7 @@ def _checked(f: Field, value: Any) -> Any:
         value = convert(value)
     except (TypeError, ValueError, OverflowError):
         raise InputError(f"{f.name} must be {expected}, got {value!r}") from None
-    if f.type in (int, float):
+    if f.type in (int, float, float | None) and value is not None:
         least, below = _LEAST.get(f.name, 0), f.name in _BELOW_ONE
         if not value >= least:
             raise InputError(f"{f.name} must be at least {least}, got {value:g}")
@@ -134,6 +137,11 @@ class Pretrain(Recipe):
     model: str = _setting("", f"{_MODEL} (default: the one that --size is of)")
     size: str = _setting("", "of the network: tiny, small, base (ours; default tiny); paper, paper-small (dapt)")
     options: tuple[str, ...] = _setting((), _OPTIONS)
+    neck: str = _setting("mde", "of the paper's network: mde, finest or prn (docs/train.md)")
+    head: str = _setting(
+        "coordinates", "of the paper's network: coordinates (and parts), or heatmaps alone, in one stage"
+    )
+    drop_path: float | None = _setting(None, "of the paper's network: share of the last block's branches dropped")
     init: str = _setting("", "weights to begin with, of this size or smaller: bundled, or a checkpoint", "NAME|FILE")
     scene: str = _setting("wild", "wild, paper or reference")
     set: tuple[str, ...] = _setting(
@@ -157,6 +165,7 @@ class Pretrain(Recipe):
     def __post_init__(self):
         super().__post_init__()
         object.__setattr__(self, "size", self.size or "tiny" if not self.model else _size_of(self.model, self.size))
+        check_name("head", self.head, HEADS)
         if self.subjects and not self.motion:
             raise InputError("subjects are of captured clips: name their file by motion too")
 
@@ -172,6 +181,7 @@ class Finetune(Recipe):
     options: tuple[str, ...] = _setting((), _OPTIONS)
     init: str = _setting(DEFAULT, "weights to begin with: bundled, a checkpoint, or random", "NAME|FILE")
     size: str = _setting("", "with --init random, of the network, as of pretrain")
+    neck: str = _setting("mde", "with --init random, of the paper's network, as of pretrain; else the checkpoint's")
     epochs: float = _setting(20.0, "how often each sample is seen")
     split: str = _setting("train", "samples to learn from; all: of every split")
     interval: int = _setting(1, "only every so many frames, as published recipes thin out")
@@ -182,9 +192,11 @@ class Finetune(Recipe):
         0.1, "share of sequences kept for validation where the dataset has no split val", "SHARE"
     )
     keep_anchors: bool = _setting(True, "of the paper's network: go on with pre-trained anchors and heads")
+    head: str = _setting("heatmaps", "of the paper's network: heatmaps or coordinates")
 
     def __post_init__(self):
         super().__post_init__()
+        check_name("head", self.head, HEADS)
         if self.model and (self.init == RANDOM or self.size):
             object.__setattr__(self, "size", _size_of(self.model, self.size))
         elif self.model:
@@ -193,6 +205,8 @@ class Finetune(Recipe):
             raise InputError("fine-tuning needs a dataset: name a folder that lidarpose prepare wrote")
         if not self.epochs > 0 or self.interval < 1:
             raise InputError(f"epochs must be above 0 and interval at least 1, got {self.epochs} and {self.interval}")
+        if self.neck != "mde" and self.init != RANDOM:
+            raise InputError(f"a checkpoint has its neck: leave --neck away, or give --init {RANDOM}")
         if (self.init == RANDOM) != bool(self.size):
             raise InputError(
                 f"random weights need a size, and others have theirs: give --init {RANDOM} --size NAME, or no --size"
@@ -212,6 +226,8 @@ _PRN = _LIDARHMR | {"model": "prn", "optimizer": "adam", "decay": 0.0}
 _LPFORMER = _LIDARHMR | {"model": "lpformer", "betas": (0.85, 0.95), "batch": 16}
 # 50 epochs on all training sequences and no others, from random weights
 _LIDARHMR_DATA = {"init": RANDOM, "epochs": 50.0, "augment": "lidarhmr", "mix": 0.0, "hold_out": 0.0}
+# AdamW on everything in one cycle at a rate at which the small network learns within 100,000 people
+_ONE_CYCLE = {"rate": 2e-3, "muon_rate": 0.0, "schedule": "cosine", "warmup": 0.1, "ema": 0.0, "clip": 35.0}
 # by kind and name, what differs from the recipe of the bundled weights. Paper: implementation details
 RECIPES: dict[type[Recipe], dict[str, dict[str, Any]]] = {
     Pretrain: {
@@ -224,6 +240,10 @@ RECIPES: dict[type[Recipe], dict[str, dict[str, Any]]] = {
         # people as for our own: the published ones are not pre-trained
         "prn": _PRN,
         "lpformer": _LPFORMER,
+        # one stage of heatmaps: see docs/log.md for what it reached
+        "paper-one-stage": _ONE_CYCLE
+        | {"size": SMALL_PAPER, "head": "heatmaps", "drop_path": 0.05, "scene": "paper", "people": 100_000}
+        | {"easy": 0.0, "strays": 0.0, "noise": 0.0},
     },
     Finetune: {
         # anchors and heads stay, every joint has its name, synthesized people are mixed in
@@ -233,6 +253,8 @@ RECIPES: dict[type[Recipe], dict[str, dict[str, Any]]] = {
         | {"init": "", "epochs": 50.0, "augment": "paper", "mix": 0.0, "hold_out": 0.0, "keep_anchors": False},
         "prn": _PRN | _LIDARHMR_DATA,
         "lpformer": _LPFORMER | _LIDARHMR_DATA,
+        # goes on from a network of that recipe, heads and all
+        "paper-one-stage": _ONE_CYCLE | {"init": "", "rate": 5e-4, "mix": 0.0},
     },
 }
 AnyRecipe = TypeVar("AnyRecipe", bound=Recipe)

@@ -30,7 +30,7 @@ from lidarpose.skeleton import HUMAN15, SMPL24, Skeleton, skeleton
 from lidarpose.train.augment import Augmentation, Example, augmentation, augmented
 from lidarpose.train.data_loader import MixedSource, Source, StoredSource, SyntheticSource
 from lidarpose.train.objectives.baseline_objective import with_joints
-from lidarpose.train.objectives.dapt_objective import pretraining_config, small
+from lidarpose.train.objectives.dapt_objective import finetuning_config, pretraining_config, small
 from lidarpose.train.objectives.dapt_transfer import transferred
 from lidarpose.train.objectives.objective import Objective
 from lidarpose.train.recipes import MODELS, PAPER, RANDOM, SMALL_PAPER, Finetune, Pretrain, Recipe
@@ -108,7 +108,9 @@ def objective_of(config: Config, recipe: Recipe, layout: str = "ragged") -> Obje
     lengths = {"bone": recipe.bone, "symmetry": recipe.symmetry}
     # what a baseline is shown beside what happens to examples
     shift = augmentation(recipe.augment).shift if isinstance(recipe, Finetune) else 0.0
-    of_kind: dict[str, dict] = {"pose": lengths, "dapt": {"stage": recipe.kind, "layout": layout}}
+    # heatmaps are learned the same way in both stages
+    stage = "finetune" if isinstance(config, DaptConfig) and config.bins else recipe.kind
+    of_kind: dict[str, dict] = {"pose": lengths, "dapt": {"stage": stage, "layout": layout}}
     of_kind |= dict.fromkeys(("prn", "lpformer"), {"shift": shift})
     settings = of_kind[config.kind]
     if config.kind == "prn" and recipe.batch < 2:
@@ -129,6 +131,8 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
     check_name("network size", recipe.size, PRETRAINED)
     config, joints = PRETRAINED[recipe.size]
     config = _with_options(config, recipe.options)
+    if (recipe.neck, recipe.head, recipe.drop_path) != ("mde", "coordinates", None):
+        config = _switched(recipe, config)
     objective = objective_of(config, recipe, layout)
     network: Callable[[], nn.Module] = objective.network
     card: dict = {"motion": None if recipe.motion is None else Path(recipe.motion).name}
@@ -160,6 +164,23 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
     noise = {"strays": recipe.strays, "noise": recipe.noise}
     source = StoredSource(dataset=dataset, seed=recipe.seed, augmentation=turned, **noise)
     return replace(setup, source=source, warnings=_damage(dataset) + _no_parts(dataset))
+
+
+def _switched(recipe: Pretrain, config: NetworkConfig | DaptConfig) -> DaptConfig:
+    """The paper's network with the neck and the head that the recipe names."""
+    if not isinstance(config, DaptConfig):
+        raise InputError(f"neck, head and drop_path are of the paper's network: add --size {PAPER} or {SMALL_PAPER}")
+    if recipe.head == "heatmaps":
+        if recipe.neck == "prn":
+            raise InputError("the neck prn has coordinates and no heatmaps: leave --head away")
+        heatmaps = finetuning_config("humanm3")
+        config = small(heatmaps) if recipe.size == SMALL_PAPER else heatmaps
+    drop_path = config.drop_path if recipe.drop_path is None else recipe.drop_path
+    return _with_neck(replace(config, drop_path=drop_path), recipe.neck)
+
+
+def _with_neck(config: DaptConfig, neck: str) -> DaptConfig:
+    return replace(config, neck=neck, parts=0 if neck == "prn" else config.parts)
 
 
 def _check_no_test(folder: str) -> None:
@@ -290,6 +311,8 @@ def _finetuned(
     """The configuration for a dataset's joints, and what makes the network with the weights that it begins with.
     trained: None for random weights."""
     own = PRETRAINED[recipe.size][0] if trained is None else trained.config
+    if recipe.neck != "mde" and not isinstance(own, DaptConfig):
+        raise InputError(f"neck is of the paper's network: give --size {PAPER} or {SMALL_PAPER}")
     if isinstance(own, BaselineConfig):
         config = _with_options(replace(own, joints=joints.joints), recipe.options)
         return config, partial(build, config) if trained is None else partial(with_joints, trained, config)
@@ -308,13 +331,17 @@ def _finetuned(
     if not fitting:
         raise InputError(f"the paper's network has no configuration for the joints of {joints.name}")
     like = next((c for c in fitting if c.name == dataset), fitting[0])
-    same = (own.joints, own.bins, own.ranges) == (like.joints, like.bins, like.ranges)
-    if trained is not None and recipe.keep_anchors and same:
+    if trained is None:
+        own = _with_neck(replace(own, bins=(), ranges=(), coordinates=True), recipe.neck)
+    # the paper fine-tunes by heatmaps alone, Table 3 by coordinates too; the neck prn knows no others
+    coordinates = recipe.head == "coordinates" or own.neck == "prn"
+    bins, ranges = ((), ()) if coordinates else (like.bins, like.ranges)
+    same = (own.joints, own.bins, own.ranges) == (like.joints, bins, ranges)
+    if trained is not None and recipe.keep_anchors and same and not (coordinates and own.parts):
         # a network of this dataset already, as released ones are
         return own, lambda: trained
-    # the paper fine-tunes by heatmaps alone
-    heads: dict[str, Any] = {"parts": 0, "coordinates": False, "auxiliary": False}
-    config = replace(own, name=like.name, joints=like.joints, bins=like.bins, ranges=like.ranges, **heads)
+    heads: dict[str, Any] = {"parts": 0, "coordinates": coordinates, "auxiliary": False}
+    config = replace(own, name=like.name, joints=like.joints, bins=bins, ranges=ranges, **heads)
     if trained is None:
         return config, partial(build, config)
     return config, partial(transferred, trained, config, keep_anchors=recipe.keep_anchors)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 from torch import nn
+from torch.nn.modules.batchnorm import _BatchNorm
 
 from lidarpose.sample import Pose
 from lidarpose.skeleton import BODY26, Skeleton
@@ -23,6 +24,32 @@ def validate(objective: Objective, network: nn.Module, examples: list[Example], 
     # labeled, and of a joint that the network has; what is not finite though it should be, must be seen
     counted = ~np.isnan(true).any(-1) & ~np.isnan(joints).all((0, 2))
     return float(np.linalg.norm(joints - true, axis=-1)[counted].mean() * 1e3), joints
+
+
+def batch_norms(network: nn.Module) -> list[_BatchNorm]:
+    return [module for module in network.modules() if isinstance(module, _BatchNorm)]
+
+
+def update_batch_norms(network: nn.Module, objective: Objective, batches: list) -> None:
+    """Estimates the statistics of a network's batch norms anew, as their means over collated batches. In place.
+
+    As `torch.optim.swa_utils.update_bn`, but nothing is dropped, so that they are those of evaluation. Statistics that
+    run along with training are of weights some hundred steps old, and of no averaged weights at all.
+    """
+    network.eval()
+    norms = batch_norms(network)
+    momenta = [norm.momentum for norm in norms]
+    for norm in norms:
+        norm.reset_running_stats()
+        # None: the cumulative mean
+        norm.momentum = None
+        norm.train()
+    device = next(network.parameters()).device
+    for arrays in batches:
+        objective.joints(network, arrays, device=device)
+    for norm, momentum in zip(norms, momenta, strict=True):
+        norm.momentum = momentum
+    network.eval()
 
 
 def draw_examples(examples: list[Example], joints: np.ndarray, skeleton: Skeleton, title: str) -> bytes:

@@ -83,7 +83,8 @@ class VoteHead(nn.Module):
         shared = [segment_reduce(features, rows.person, people, kind)[rows.person] for kind in ("amax", "mean")]
         context = torch.cat([features, *shared], 1)
         parts, offsets = self.parts(context), self.offsets(context)
-        share = parts.softmax(1)
+        # in half precision too votes are summed in single
+        share = parts.float().softmax(1)
         background = share[:, self.background]
         joint = torch.cat([share[:, : self.background], share[:, self.background + 1 :]], 1)
         voting = (background < VOTES) & (share.amax(1) > VOTES)

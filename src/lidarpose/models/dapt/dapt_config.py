@@ -21,6 +21,8 @@ WAYMO_JOINTS = tuple(
 PARTS = 25
 # space-filling curves, see `voxel_tables`
 CURVES = ("z", "z-trans", "hilbert", "hilbert-trans")
+# how joints come out of the decoder, see `DaptConfig`
+NECKS = ("mde", "finest", "prn")
 # cells are counted in so many bits along each axis
 CELL_BITS = 16
 
@@ -34,12 +36,14 @@ class DaptConfig:
     name: of the configuration; joints: names in the network's own order; bins, ranges: heatmap bins (W) and (low, high)
     in meters for x, y and z, both empty where there are no heatmaps; encoder_*: one entry a level; decoder_*: one entry
     a level but the last; anchor_channels: width of the anchors after each level's exchange, the last where they begin;
-    anchor_heads, anchor_dropout: of the exchanges; patch: voxels within which attention is full; grid: edge of a voxel
-    of level 0, meters; strides: how many times wider the next level's voxels are; orders: curves for people of more
-    than `patch` voxels; drop_path: the last block's; parts: classes of the part head, 0 for no such head; coordinates:
-    a head that reads x, y, z off each anchor (the paper's pre-training); auxiliary: a head that reads all joints off
-    the bottleneck (the released fine-tuning); legacy: True for the released weights, which need the data flow that they
-    were trained with (see `dapt_net`).
+    anchor_heads, anchor_dropout: of the exchanges; neck: "mde", anchors read every level of the decoder (the paper's
+    network); "finest", four layers read the finest level alone (Table 3 without MDE), anchors and layers as wide as it;
+    "prn", no anchors, voxels vote and attention refines (`PrnNeck`), coordinates come from there; patch: voxels within
+    which attention is full; grid: edge of a voxel of level 0, meters; strides: how many times wider the next level's
+    voxels are; orders: curves for people of more than `patch` voxels; drop_path: the last block's; parts: classes of
+    the part head, 0 for no such head; coordinates: a head that reads x, y, z off each anchor (the paper's
+    pre-training); auxiliary: a head that reads all joints off the bottleneck (the released fine-tuning); legacy: True
+    for the released weights, which need the data flow that they were trained with (see `dapt_net`).
     """
 
     kind: ClassVar[str] = "dapt"
@@ -57,6 +61,7 @@ class DaptConfig:
     anchor_channels: tuple[int, ...] = (128, 128, 128, 256, 256)
     anchor_heads: int = 4
     anchor_dropout: float = 0.1
+    neck: str = "mde"
     mlp_ratio: int = 4
     patch: int = 1024
     grid: float = 0.01
@@ -116,6 +121,12 @@ class DaptConfig:
             raise InputError("a network needs heatmaps (bins and ranges) or coordinates=True: it would predict nothing")
         if check_int("parts", self.parts, least=0, most=MOST) == 1:
             raise InputError(f"parts must be 0 (no part head) or from 2 to {MOST}, got 1")
+        check_name("neck", self.neck, NECKS)
+        if self.neck == "prn" and (self.bins or self.parts or not self.coordinates):
+            raise InputError(
+                "the neck prn has joints and parts of its own: leave bins, ranges and parts empty and set "
+                "coordinates=True"
+            )
         for name in ("coordinates", "auxiliary", "legacy"):
             if not isinstance(getattr(self, name), bool):
                 raise InputError(f"{name} must be true or false, got {getattr(self, name)!r}")
@@ -124,6 +135,11 @@ class DaptConfig:
     def layers(self) -> int:
         """Blocks of all levels, encoder and decoder."""
         return sum(self.encoder_depths) + sum(self.decoder_depths)
+
+    @property
+    def anchor_width(self) -> int:
+        """Channels of the anchors that the heads read."""
+        return self.anchor_channels[0] if self.neck == "mde" else self.decoder_channels[0]
 
     @property
     def low(self) -> np.ndarray:

@@ -20,10 +20,14 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lidarpose.errors import InputError
+from lidarpose.models.baselines.point_transformer_v2 import Rows
+from lidarpose.models.baselines.prn import PrnNeck
 from lidarpose.models.dapt.dapt_config import DaptConfig
 from lidarpose.models.dapt.voxel_tables import Level, Neighbors, Tables, build_tables
 from lidarpose.models.layers import mean_bin
 
+# layers of the neck that reads the finest level alone
+FINEST_LAYERS = 4
 # of the released code's batch norms
 _EPS, _MOMENTUM = 1e-3, 0.01
 
@@ -249,6 +253,21 @@ class Exchange(nn.Module):
         return self.fc_out(anchors)
 
 
+class FinestNeck(nn.Module):
+    """Stock post-norm decoder layers, anchors (B, J, C) as targets, the voxels of level 0 as memory; LayerNorm.
+
+    Paper: Table 3, anchors without MDE.
+    """
+
+    def __init__(self, channels: int, heads: int, dropout: float):
+        super().__init__()
+        layer = nn.TransformerDecoderLayer(channels, heads, 4 * channels, dropout, batch_first=True)
+        self.transformer = nn.TransformerDecoder(layer, FINEST_LAYERS, nn.LayerNorm(channels))
+
+    def forward(self, anchors: Tensor, rows: Tensor, level: Level) -> Tensor:
+        return self.transformer(anchors, rows[level.slots], memory_key_padding_mask=~level.valid)
+
+
 def _aligned(channels: int, out_channels: int) -> nn.Module:
     if channels == out_channels:
         return nn.Identity()
@@ -262,12 +281,13 @@ def _aligned(channels: int, out_channels: int) -> nn.Module:
 class DaptOutputs:
     """Raw results in the person's frame; None where the network has no such head.
 
-    anchors (B, J, A) after the last exchange; logits_x, logits_y, logits_z (B, J, W) heatmaps; inter (B, J, 3) m, the
-    auxiliary head's joints; points (M, C) features of the voxels of level 0; parts (M, P) logits, 0 = not body;
-    coordinates (B, J, 3) m, the coordinate head's joints; low, step: where bin 0 lies and how far apart bins are, m.
+    anchors (B, J, A) after the neck; logits_x, logits_y, logits_z (B, J, W) heatmaps; inter (B, J, 3) m, the
+    auxiliary head's joints; points (M, C) features of the voxels of level 0; parts (M, P) logits, 0 = not body, of
+    the neck prn's (M, J + 1) the joint nearest; coordinates (B, J, 3) m, the coordinate head's joints or prn's refined
+    ones; voted (B, J, 3) m, prn's before; low, step: where bin 0 lies and how far apart bins are, m.
     """
 
-    anchors: Tensor
+    anchors: Tensor | None
     points: Tensor
     logits_x: Tensor | None
     logits_y: Tensor | None
@@ -277,6 +297,7 @@ class DaptOutputs:
     coordinates: Tensor | None
     low: tuple[float, ...]
     step: tuple[float, ...]
+    voted: Tensor | None = None
 
     def joints(self) -> Tensor:
         """(B, J, 3) m, differentiable: the heatmaps' windowed mean, as `decode.window`; else the coordinates."""
@@ -295,11 +316,13 @@ class DaptNet(nn.Module):
         super().__init__()
         self.config = config
         self.backbone = _Backbone(config)
-        width = config.anchor_channels[0]
+        width = config.anchor_width
         heads: dict[str, nn.Module] = {}
         if config.bins:
             heads["query"] = HeatmapHead(width, config)
-        if config.coordinates:
+        if config.neck == "prn":
+            heads["prn"] = PrnNeck(width, len(config.joints))
+        elif config.coordinates:
             # the released files hold one of the two heads of an anchor, under one name
             heads["coordinate" if config.bins else "query"] = coordinate_head(width, 3)
         if config.auxiliary:
@@ -312,6 +335,15 @@ class DaptNet(nn.Module):
         config, heads = self.config, self.heads
         anchors, points, bottleneck = self.backbone(batch)
         x, y, z = heads["query"](anchors) if config.bins else (None, None, None)
+        parts = heads["feat"](points) if config.parts else None
+        voted = coordinates = None
+        if config.neck == "prn":
+            lengths = batch.levels[0].lengths
+            person = torch.repeat_interleave(torch.arange(len(lengths), device=lengths.device), lengths)
+            prn = heads["prn"](points, Rows(xyz=batch.features, person=person, count=lengths))
+            coordinates, voted, parts = prn.joints, prn.voted, prn.parts
+        elif config.coordinates:
+            coordinates = heads["coordinate" if config.bins else "query"](anchors)
         return DaptOutputs(
             anchors=anchors,
             points=points,
@@ -319,10 +351,11 @@ class DaptNet(nn.Module):
             logits_y=y,
             logits_z=z,
             inter=heads["inter_feat"](bottleneck).unflatten(-1, (-1, 3)) if config.auxiliary else None,
-            parts=heads["feat"](points) if config.parts else None,
-            coordinates=heads["coordinate" if config.bins else "query"](anchors) if config.coordinates else None,
+            parts=parts,
+            coordinates=coordinates,
             low=tuple(config.low.tolist()),
             step=tuple(config.step.tolist()),
+            voted=voted,
         )
 
     def batch(
@@ -332,10 +365,10 @@ class DaptNet(nn.Module):
 
         layout and rng as in `build_tables`; None takes the layout that suits the device.
         """
-        anchors = self.backbone.keypoint_embedding
-        layout = layout or ("ragged" if anchors.device.type == "cpu" else "padded")
+        parameter = next(self.parameters())
+        layout = layout or ("ragged" if parameter.device.type == "cpu" else "padded")
         tables = build_tables(clouds, self.config, layout=layout, rng=rng)
-        return to_tensors(tables, anchors.device, anchors.dtype)
+        return to_tensors(tables, parameter.device, parameter.dtype)
 
     def outputs(self, clouds: list[np.ndarray]) -> dict[str, np.ndarray]:
         """Raw results, in evaluation mode, of people's clouds (n, 3) m, each in its person's frame.
@@ -354,7 +387,7 @@ class DaptNet(nn.Module):
                 out = self(batch)
         finally:
             self.train(was_training)
-        names = ("anchors", "logits_x", "logits_y", "logits_z", "inter", "coordinates")
+        names = ("anchors", "logits_x", "logits_y", "logits_z", "inter", "coordinates", "voted")
         outputs = {name: value[: len(clouds)] for name in names if (value := getattr(out, name)) is not None}
         outputs["point_feat_last"] = out.points[batch.point_voxel]
         if out.parts is not None:
@@ -363,11 +396,11 @@ class DaptNet(nn.Module):
 
 
 class _Backbone(nn.Module):
-    """Encoder, decoder with an exchange after each of its stages."""
+    """Encoder, decoder, and the anchors that read it: after each of its stages, or the last one's voxels."""
 
     def __init__(self, config: DaptConfig):
         super().__init__()
-        self.legacy = config.legacy
+        self.legacy, self.neck = config.legacy, config.neck
         widths = config.encoder_channels
         self.embedding = nn.Module()
         stem = OrderedDict(conv=SubmanifoldConvolution(3, widths[0], 5, bias=False), norm=RowNorm(widths[0]))
@@ -380,22 +413,29 @@ class _Backbone(nn.Module):
             )
 
         wide = (*config.decoder_channels, widths[-1])
-        stages, exchanges = [], []
+        stages: list[Stage] = []
+        necks: dict[int, nn.Module] = {}
         for s, drops in enumerate(_drop_rates(config.decoder_depths, config.drop_path)):
             coarser = wide[s + 1], widths[s]
             # within a stage the first block drops most
             stages.append(Stage(wide[s], config.decoder_heads[s], config.mlp_ratio, drops[::-1], coarser=coarser))
             anchor_in, anchor_out = config.anchor_channels[s + 1], config.anchor_channels[s]
-            exchanges.append(Exchange(anchor_in, wide[s], anchor_out, config.anchor_heads, config.anchor_dropout))
+            if self.neck == "mde":
+                necks[s] = Exchange(anchor_in, wide[s], anchor_out, config.anchor_heads, config.anchor_dropout)
+            elif self.neck == "finest" and s == 0:
+                necks[s] = FinestNeck(wide[0], config.anchor_heads, config.anchor_dropout)
         self.dec = nn.Module()
         for s in reversed(range(len(stages))):
             self.dec.add_module(f"dec{s}", stages[s])
-            self.dec.add_module(f"dec_ke{s}", exchanges[s])
-        # small random numbers where the released code begins at zero
-        self.keypoint_embedding = nn.Parameter(torch.randn(len(config.joints), config.anchor_channels[-1]) * 0.02)
+            if s in necks:
+                self.dec.add_module(f"dec_ke{s}", necks[s])
+        if necks:
+            # small random numbers where the released code begins at zero
+            width = config.anchor_channels[-1] if self.neck == "mde" else wide[0]
+            self.keypoint_embedding = nn.Parameter(torch.randn(len(config.joints), width) * 0.02)
 
-    def forward(self, batch: Tables[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        """Anchors (B, J, A), level 0's rows (M, C), and the bottleneck's maximum over each person (B, C')."""
+    def forward(self, batch: Tables[Tensor]) -> tuple[Tensor | None, Tensor, Tensor]:
+        """Anchors (B, J, A), None without; level 0's rows (M, C); the bottleneck's maximum over each person (B, C')."""
         stem: Any = self.embedding.stem
         rows = F.gelu(stem.norm(stem.conv(batch.features, batch.stem)))
         skips = []
@@ -408,12 +448,13 @@ class _Backbone(nn.Module):
         # rows of a person are repeated in its empty slots, which a maximum does not notice
         bottleneck = rows[batch.levels[-1].slots].amax(1)
 
-        anchors = self.keypoint_embedding.expand(bottleneck.shape[0], -1, -1)
+        anchors = None if self.neck == "prn" else self.keypoint_embedding.expand(bottleneck.shape[0], -1, -1)
         for s in reversed(range(len(batch.levels) - 1)):
             level, stage = batch.levels[s], getattr(self.dec, f"dec{s}")
             rows, skip = stage.up(rows, skips[s], level.parent)
             rows = stage.blocks(rows, skip, level, legacy=self.legacy)
-            anchors = getattr(self.dec, f"dec_ke{s}")(anchors, rows, level)
+            if hasattr(self.dec, f"dec_ke{s}"):
+                anchors = getattr(self.dec, f"dec_ke{s}")(anchors, rows, level)
         return anchors, rows, bottleneck
 
 

@@ -60,18 +60,34 @@ def finetuning(
     """Paper: Eq. 10, L_ft = L_hm, of the heatmaps alone.
 
     The released code adds 0.2 times a term of the auxiliary head, of which the paper has no word: `auxiliary`. Terms
-    "heatmap", with an `auxiliary` weight above 0 "auxiliary", and "mpjpe" of the decoded heatmaps for the log; share:
-    see `objective`.
+    "heatmap" or "regression", with an `auxiliary` weight above 0 "auxiliary", and "mpjpe" of the joints for the log;
+    share: see `objective`.
     """
     people, labels = _divisors(targets, share)
-    terms = {
-        "heatmap": heatmap_loss(outputs, targets, people),
-        "mpjpe": _mpjpe(outputs.joints().float(), targets, labels),
-    }
+    joints = outputs.joints()
+    if outputs.logits_x is None:
+        terms = {"regression": distance_loss(joints, targets, people)}
+    else:
+        terms = {"heatmap": heatmap_loss(outputs, targets, people)}
+    terms["mpjpe"] = _mpjpe(joints.float(), targets, labels)
     if auxiliary:
         assert outputs.inter is not None
         terms["auxiliary"] = auxiliary * distance_loss(outputs.inter, targets, people, squared=True)
     return terms
+
+
+def prn(outputs: DaptOutputs, targets: DaptTargets, *, share: Share = alone) -> dict[str, Tensor]:
+    """Of the neck prn in either stage: distances of refined and of voted joints, and the cross entropy of the joint
+    that a voxel is nearest to, background among them; weights of 1 are ours, none are published."""
+    coordinates, voted, parts, part = outputs.coordinates, outputs.voted, outputs.parts, targets.part
+    assert coordinates is not None and voted is not None and parts is not None and part is not None
+    people, labels, voxels = _divisors(targets, share, (part >= 0).sum())
+    return {
+        "regression": distance_loss(coordinates, targets, people),
+        "vote": distance_loss(voted, targets, people),
+        "segmentation": segmentation_loss(parts.float(), part, voxels),
+        "mpjpe": _mpjpe(coordinates.float(), targets, labels),
+    }
 
 
 def distance_loss(joints: Tensor, targets: DaptTargets, people: Tensor, *, squared: bool = False) -> Tensor:

@@ -16,13 +16,14 @@ from lidarpose.models.dapt.dapt_net import DaptNet, to_tensors
 from lidarpose.models.dapt.voxel_tables import LAYOUTS, Tables, build_tables
 from lidarpose.skeleton import BODY26, HUMAN15
 from lidarpose.train.augment import UNKNOWN_PART, Example
-from lidarpose.train.objectives.dapt_losses import DaptTargets, finetuning, pretraining
+from lidarpose.train.objectives.dapt_losses import DaptTargets, finetuning, pretraining, prn
 from lidarpose.train.objectives.objective import Share, alone, majority_part
 
 STAGES = ("pretrain", "finetune")
-# outputs of heads, and those that a stage's terms read besides the auxiliary head
+# outputs of heads
 _HEADS = ("logits_x", "logits_y", "logits_z", "inter", "parts", "coordinates")
-_ASKED = {"pretrain": {"coordinates", "parts"}, "finetune": {"logits_x", "logits_y", "logits_z"}}
+# a voxel is a joint's within this distance of it, m: the released code's, for the neck prn
+PRN_RADIUS = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +31,8 @@ class DaptArrays:
     """A batch of people.
 
     tables: what the network reads; joints (B, J, 3) float32 m in the network's order, NaN where there is no label;
-    part (M,) int64: the part most of a voxel's points are of, -1 where none is known; None in fine-tuning.
+    part (M,) int64: the part most of a voxel's points are of, -1 where none is known; for the neck prn 1 + the number
+    of the joint nearest to the voxel, 0 for background; None in fine-tuning with other necks.
     """
 
     tables: Tables
@@ -50,7 +52,8 @@ class DaptArrays:
 class DaptObjective:
     """The `Objective` of a `DaptNet` with this configuration.
 
-    stage: "pretrain", which needs coordinates and parts, or "finetune", which needs heatmaps; layout: of the tables,
+    stage: "pretrain", which needs coordinates and parts, or "finetune", which learns heatmaps, or coordinates where
+    there are none; the neck prn learns the same in both; layout: of the tables,
     "ragged" for CPUs and "padded" for accelerators; regression, segmentation, auxiliary: weights, see `dapt_losses`.
     Heads that a stage does not use get a gradient of zero. Raises InputError where the configuration lacks a head.
     """
@@ -69,13 +72,11 @@ class DaptObjective:
         for name in ("regression", "segmentation", "auxiliary"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise InputError(f"{name} must be a weight of at least 0, got {getattr(self, name)}")
-        if self.stage == "pretrain" and not (config.coordinates and config.parts == PARTS):
+        if self.stage == "pretrain" and config.neck != "prn" and not (config.coordinates and config.parts == PARTS):
             raise InputError(
                 f"pre-training needs coordinates and {PARTS} parts, {config.name} has coordinates={config.coordinates} "
                 f"and parts={config.parts}: see pretraining_config"
             )
-        if self.stage == "finetune" and not config.bins:
-            raise InputError(f"fine-tuning needs heatmaps, {config.name} has no bins and ranges: see finetuning_config")
         if self.stage == "finetune" and self.auxiliary and not config.auxiliary:
             raise InputError(
                 f"auxiliary={self.auxiliary} needs the auxiliary head, which {config.name} lacks: set auxiliary=True "
@@ -107,21 +108,30 @@ class DaptObjective:
         # the last entry: of the stand-in for an empty cloud
         part = np.concatenate([*(part for _, part in thinned), [UNKNOWN_PART]])
         joints = np.stack([example.joints for example in examples])[:, self._columns].astype(np.float32)
-        return DaptArrays(tables=tables, joints=joints, part=part[tables.kept] if self.stage == "pretrain" else None)
+        if self.config.neck == "prn":
+            nearest = nearest_joints(tables.features, np.repeat(joints, tables.levels[0].lengths, axis=0))
+            labels: np.ndarray | None = np.where(tables.kept < 0, UNKNOWN_PART, nearest)
+        else:
+            labels = part[tables.kept] if self.stage == "pretrain" else None
+        return DaptArrays(tables=tables, joints=joints, part=labels)
 
     def terms(
         self, network: Callable, arrays: DaptArrays, *, device: torch.device | str = "cpu", share: Share = alone
     ) -> dict[str, Tensor]:
-        """`dapt_losses.pretraining` or `finetuning`. A joint's weight is 1 where it is labelled, seen or not, as in the
-        released code."""
+        """`dapt_losses.pretraining`, `finetuning` or `prn`. A joint's weight is 1 where it is labelled, seen or not, as
+        in the released code."""
         outputs, targets = network(to_tensors(arrays.tables, device)), arrays.targets(device)
-        if self.stage == "pretrain":
+        if self.config.neck == "prn":
+            terms, asked = prn(outputs, targets, share=share), {"coordinates", "parts"}
+        elif self.stage == "pretrain":
             weights = {"regression": self.regression, "segmentation": self.segmentation}
-            terms, first = pretraining(outputs, targets, share=share, **weights), "regression"
+            terms, asked = pretraining(outputs, targets, share=share, **weights), {"coordinates", "parts"}
         else:
-            terms, first = finetuning(outputs, targets, share=share, auxiliary=self.auxiliary), "heatmap"
+            terms = finetuning(outputs, targets, share=share, auxiliary=self.auxiliary)
+            asked = {"logits_x", "logits_y", "logits_z"} if self.config.bins else {"coordinates"}
+            asked |= {"inter"} if self.auxiliary else set()
         # zero, of the heads that the stage does not use: processes that average gradients wait for all of them
-        asked = _ASKED[self.stage] | ({"inter"} if self.stage == "finetune" and self.auxiliary else set())
+        first = next(iter(terms))
         idle = [value for name in _HEADS if name not in asked and (value := getattr(outputs, name)) is not None]
         terms[first] = sum((value.float().sum() * 0 for value in idle), terms[first])
         return terms
@@ -165,6 +175,16 @@ def small(config: DaptConfig) -> DaptConfig:
         grid=0.04,
         drop_path=0.1,
     )
+
+
+def nearest_joints(points: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    """points (M, 3) m, joints (M, J, 3) m of each point's person, NaN where unknown -> (M,) int64: 1 + the number of
+    the nearest joint within `PRN_RADIUS`, 0 for background, -1 for people without any label."""
+    distance = np.linalg.norm(joints - points[:, None], axis=-1)
+    known = np.isfinite(distance)
+    distance = np.where(known, distance, np.inf)
+    label = np.where(distance.min(1) < PRN_RADIUS, 1 + distance.argmin(1), 0)
+    return np.where(known.any(1), label, UNKNOWN_PART)
 
 
 def _thinned(example: Example, grid: float) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ from lidarpose.models.dapt.dapt_net import DaptNet
 
 _ANCHORS = "keypoint_embedding"
 # settings that no tensor's shape betrays, but without which its numbers mean something else
-_MEANING = ("legacy", "grid", "strides", "encoder_heads", "decoder_heads", "anchor_heads")
+_MEANING = ("legacy", "grid", "strides", "encoder_heads", "decoder_heads", "anchor_heads", "neck")
 
 
 def transferred(source: DaptNet, config: DaptConfig, *, keep_anchors: bool = False) -> DaptNet:
@@ -24,9 +24,9 @@ def transferred(source: DaptNet, config: DaptConfig, *, keep_anchors: bool = Fal
     wanted = network.state_dict()
     state = wanted | _backbone(source, network)
     if keep_anchors:
-        # the backbones fit, so the widths of their anchors do
-        name = f"backbone.{_ANCHORS}"
-        state[name] = _by_joint(source.state_dict()[name], wanted[name], source.config.joints, config.joints)
+        # the backbones fit, so the widths of their anchors do; the neck prn has none
+        if (name := f"backbone.{_ANCHORS}") in wanted:
+            state[name] = _by_joint(source.state_dict()[name], wanted[name], source.config.joints, config.joints)
         state |= _heads(source, network)
     network.load_state_dict(state)
     return network
@@ -59,7 +59,9 @@ def _heads(trained: DaptNet, network: DaptNet) -> dict[str, Tensor]:
     stored, wanted = trained.state_dict(), network.state_dict()
     # modules whose tensors go on, by their old names and by their new ones
     modules = {}
-    if old.coordinates and new.coordinates:
+    if new.neck == "prn":
+        modules["heads.prn."] = "heads.prn."
+    elif old.coordinates and new.coordinates:
         before, after = ("heads.coordinate." if config.bins else "heads.query." for config in (old, new))
         modules[before] = after
     if old.parts and new.parts:
@@ -82,6 +84,15 @@ def _heads(trained: DaptNet, network: DaptNet) -> dict[str, Tensor]:
             new_name = after + name.removeprefix(before)
             if name.startswith(before) and new_name in wanted and value.shape == wanted[new_name].shape:
                 heads[new_name] = value
+    if new.neck == "prn":
+        # a row a joint, of parts background before them
+        heads["heads.prn.joint"] = _by_joint(
+            stored["heads.prn.joint"], wanted["heads.prn.joint"], old.joints, new.joints
+        )
+        last = max(name for name in wanted if name.startswith("heads.prn.vote.parts.")).rpartition(".")[0]
+        for name in (f"{last}.weight", f"{last}.bias"):
+            rows = _by_joint(stored[name][1:], wanted[name][1:], old.joints, new.joints)
+            heads[name] = torch.cat([stored[name][:1], rows])
     return heads
 
 
