@@ -113,7 +113,7 @@ def objective_of(config: Config, recipe: Recipe, layout: str = "ragged") -> Obje
     of_kind: dict[str, dict] = {"pose": lengths, "dapt": {"stage": stage, "layout": layout}}
     of_kind |= dict.fromkeys(("prn", "lpformer"), {"shift": shift})
     settings = of_kind[config.kind]
-    if config.kind == "prn" and recipe.batch < 2:
+    if "prn" in (config.kind, getattr(config, "neck", "")) and recipe.batch < 2:
         raise InputError("batch must be at least 2 for prn, whose batch norms see a few points a person, got 1")
     if settings is not lengths and any(lengths.values()):
         raise InputError("bone and symmetry are terms of the package's own networks: leave them at 0")
