@@ -82,23 +82,23 @@ class PointTransformerV2(nn.Module):
         )
 
     def forward(self, rows: Rows) -> Tensor:
-        x = self.block(self.embedding(rows.xyz), rows.xyz, rows.neighbors(EMBEDDING_NEIGHBORS))
+        # nearest first, so fewer are the first ones
+        tables = [rows.neighbors(NEIGHBORS)]
+        x = self.block(self.embedding(rows.xyz), rows.xyz, tables[0][:, :EMBEDDING_NEIGHBORS])
         levels, skips, parents = [rows], [x], []
         for stage, grid in enumerate(GRID):
             rows, parent = levels[-1].pooled(grid)
             x = segment_reduce(self.down[stage](x), parent, len(rows.xyz), "amax")
-            neighbors = rows.neighbors(NEIGHBORS)
+            tables.append(rows.neighbors(NEIGHBORS))
             for block in self.encoder[stage]:
-                x = block(x, rows.xyz, neighbors)
+                x = block(x, rows.xyz, tables[-1])
             levels.append(rows)
             skips.append(x)
             parents.append(parent)
         for stage in reversed(range(len(GRID))):
-            rows = levels[stage]
             x = self.up[stage](x)[parents[stage]] + self.skip[stage](skips[stage])
-            neighbors = rows.neighbors(NEIGHBORS)
             for block in self.decoder[stage]:
-                x = block(x, rows.xyz, neighbors)
+                x = block(x, levels[stage].xyz, tables[stage])
         return x
 
 
@@ -136,9 +136,16 @@ class GroupedVectorAttention(nn.Module):
         own, slot = (neighbors >= 0).nonzero(as_tuple=True)
         other = neighbors[own, slot]
         bias = self.position[1](self.position[0](xyz[other] - xyz[own]))
-        relation = self.key(x)[other] - self.query(x)[own] + bias
-        scores = self.weight((relation * self.group_weight).unflatten(1, (self.groups, -1)).sum(-1))
+        # of relation = key - query + bias, summed within groups: keys and queries before they are copied to neighbors
+        key, query = self._summed(self.key(x)), self._summed(self.query(x))
+        scores = self.weight(key[other] - query[own] + self._summed(bias))
         weight = scores.new_full((*neighbors.shape, self.groups), -torch.inf).index_put((own, slot), scores).softmax(1)
         value = (self.value(x)[other] + bias).unflatten(1, (self.groups, -1))
         weighted = (value * weight[own, slot][..., None]).flatten(1)
         return torch.zeros_like(x).index_add(0, own, weighted)
+
+    def _summed(self, values: Tensor) -> Tensor:
+        """(..., C) -> (..., G): weighted sums within each group, as a product with a block-diagonal matrix."""
+        width = len(self.group_weight) // self.groups
+        group = torch.arange(self.groups, device=values.device).repeat_interleave(width)
+        return values @ (nn.functional.one_hot(group, self.groups) * self.group_weight[:, None]).to(values.dtype)

@@ -63,9 +63,9 @@ class Prn(nn.Module):
         context[valid] = torch.cat([rows.xyz, features], -1)
         tokens = torch.cat([tokens, context], 1)
         mask = torch.cat([valid.new_ones(voted.shape[:2]), valid], 1)
-        for layer in self.attention:
-            tokens = layer(tokens, mask)
-        return PrnOutputs(joints=self.output(tokens[:, : voted.shape[1]]), voted=voted, parts=parts, offsets=offsets)
+        first, last = self.attention
+        tokens = last(first(tokens, mask), mask, queries=voted.shape[1])
+        return PrnOutputs(joints=self.output(tokens), voted=voted, parts=parts, offsets=offsets)
 
 
 class VoteHead(nn.Module):
@@ -105,16 +105,18 @@ class BareAttention(nn.Module):
         self.heads, self.dropout = heads, dropout
         self.query, self.key, self.value = (nn.Linear(channels, channels) for _ in range(3))
 
-    def forward(self, x: Tensor, valid: Tensor) -> Tensor:
-        """x (B, N, C), valid (B, N): rows that may be attended to."""
+    def forward(self, x: Tensor, valid: Tensor, queries: int | None = None) -> Tensor:
+        """x (B, N, C), valid (B, N): rows that may be attended to -> (B, N, C), or the first `queries` rows of it."""
+        own = x[:, :queries]
         query, key, value = (
-            layer(x).unflatten(-1, (self.heads, -1)).transpose(1, 2) for layer in (self.query, self.key, self.value)
+            layer(rows).unflatten(-1, (self.heads, -1)).transpose(1, 2)
+            for layer, rows in ((self.query, own), (self.key, x), (self.value, x))
         )
         dropout = self.dropout if self.training else 0.0
         attended = nn.functional.scaled_dot_product_attention(
             query, key, value, attn_mask=valid[:, None, None], dropout_p=dropout
         )
-        return x + attended.transpose(1, 2).flatten(2)
+        return own + attended.transpose(1, 2).flatten(2)
 
 
 class PrnNeck(nn.Module):

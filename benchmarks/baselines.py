@@ -1,0 +1,72 @@
+"""People a second of each network, in a training step and in inference, on people synthesized for training.
+
+    python benchmarks/baselines.py prn lpformer dapt ours --threads 1
+
+Times are of this process's processor, so other programs count little. Quote ratios of one run.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from lidarpose.train.data_loader import SyntheticSource
+from lidarpose.train.objectives.objective import total
+from lidarpose.train.optim import optimizers
+from lidarpose.train.recipes import MODELS, RECIPES, Pretrain, recipe
+from lidarpose.train.setup import PRETRAINED, objective_of
+
+ROUNDS = 2
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("models", nargs="*", default=list(MODELS), metavar="MODEL")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--people", type=int, default=16, help="a batch")
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    source = SyntheticSource(scene="wild", seed=0)
+    # a run sorts its people by size, so a batch has people of like size
+    examples = sorted(map(source.example, range(4 * options.people)), key=lambda example: len(example.points))
+    examples = examples[2 * options.people : 3 * options.people]
+    print(f"{np.mean([len(example.points) for example in examples]):.0f} points a person")
+    for model in options.models:
+        wanted = recipe(Pretrain, model if model in RECIPES[Pretrain] else "default", model=model)
+        config = PRETRAINED[wanted.size][0]
+        configs = [config, replace(config, grid=32)] if model == "lpformer" else [config]
+        for config in configs:
+            objective = objective_of(config, wanted)
+            network = objective.network()
+            made, arrays = optimizers(network, wanted), objective.collate(examples)
+
+            def step(objective=objective, network=network, made=made, arrays=arrays) -> None:
+                total(objective.terms(network.train(), arrays)).backward()
+                for optimizer in made:
+                    optimizer.step()
+                    optimizer.zero_grad()
+
+            def inference(objective=objective, network=network, arrays=arrays) -> None:
+                objective.joints(network.eval(), arrays)
+
+            rates = [len(examples) / _seconds(task) for task in (step, inference)]
+            name = f"{wanted.size}, {config.grid}^3" if model == "lpformer" else wanted.size
+            print(f"{name:20} training {rates[0]:8.2f} people/s, inference {rates[1]:8.2f}", flush=True)
+
+
+def _seconds(task: Callable[[], None]) -> float:
+    """The least of some rounds after one that warms up."""
+    task()
+    times = []
+    for _ in range(ROUNDS):
+        started = time.process_time()
+        task()
+        times.append(time.process_time() - started)
+    return min(times)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,306 @@
+"""PRN and LPFormer as networks like any other: batches, losses, checkpoints, commands; and that they learn."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from training_runs import few_to_validate_on  # noqa: F401
+
+from lidarpose.cli import main
+from lidarpose.errors import InputError
+from lidarpose.inference.predictor import load
+from lidarpose.models.baselines.config import MOST_POINTS, LpformerConfig, PrnConfig, pad_clouds
+from lidarpose.models.baselines.point_transformer_v2 import GroupedVectorAttention
+from lidarpose.models.baselines.prn import BareAttention
+from lidarpose.models.checkpoint import load_checkpoint, save_checkpoint
+from lidarpose.models.voxelize import view_features
+from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14
+from lidarpose.train.augment import Example
+from lidarpose.train.data_loader import SyntheticSource
+from lidarpose.train.objectives.baseline_losses import point_labels
+from lidarpose.train.objectives.baseline_objective import BaselineObjective, with_joints
+from lidarpose.train.objectives.objective import total
+from lidarpose.train.recipes import Finetune, Pretrain, recipe
+from lidarpose.train.setup import _with_options, networks
+from lidarpose.train.validation import validate
+
+PRN, LPFORMER = PrnConfig(), LpformerConfig(grid=32)
+BOTH = pytest.mark.parametrize("config", [PRN, LPFORMER], ids=["prn", "lpformer"])
+
+
+def person(n, seed=0):
+    rng = np.random.default_rng([seed, n])
+    joints = rng.normal(0, (0.2, 0.3, 0.5), (26, 3)).astype(np.float32)
+    points = joints[rng.integers(26, size=n)] + rng.normal(0, 0.05, (n, 3))
+    visible, view = np.full(26, np.nan, np.float32), np.zeros(5, np.float32)
+    return Example(points=points, part=np.zeros(n, int), joints=joints, visible=visible, view=view, seed=seed)
+
+
+# ---- what a network reads
+
+
+def test_clouds_are_about_the_middle_of_their_extent_and_know_the_sensor():
+    rng = np.random.default_rng(0)
+    clouds = [rng.uniform((-0.2, -0.3, -1), (0.4, 0.1, 0.9), (n, 3)) for n in (50, 7, 0)]
+    # beyond the window
+    clouds[1] = np.concatenate([clouds[1], [[9.0, 0, 0]]])
+    origin = np.array([4.0, -3.0, 1.0])
+    view = np.stack([view_features(np.zeros(3), origin), *np.zeros((2, 5))])
+    arrays = pad_clouds(clouds, view, seeds=[1, 2, 3])
+    assert arrays["valid"].sum(1).tolist() == [50, 7, 1]
+    for row, cloud in enumerate((clouds[0], clouds[1][:7])):
+        points = arrays["points"][row][arrays["valid"][row]]
+        np.testing.assert_allclose(points + arrays["middle"][row], cloud, atol=1e-6)
+        np.testing.assert_allclose(points.min(0), -points.max(0), atol=1e-6)
+    np.testing.assert_allclose(arrays["center"][0], arrays["middle"][0] - origin, atol=1e-5)
+    assert not arrays["center"][1:].any()
+
+
+def test_points_are_there_once_or_as_published_drawn_again():
+    rng = np.random.default_rng(0)
+    clouds, view = [rng.normal(0, 0.3, (n, 3)) for n in (300, 1500)], np.zeros((2, 5))
+    once = pad_clouds(clouds, view, seeds=[5, 6])
+    again = pad_clouds(clouds, view, resample_with_replacement=True, seeds=[5, 6])
+    distinct = [[len(np.unique(points[valid], axis=0)) for points, valid in zip(a["points"], a["valid"], strict=True)]
+                for a in (once, again)]  # fmt: skip
+    assert once["valid"].sum(1).tolist() == [300, MOST_POINTS] and distinct[0] == [300, MOST_POINTS]
+    # every point of a small cloud; of a large one about 1 - exp(-1024 / 1500) of its points
+    assert again["valid"].sum(1).tolist() == [MOST_POINTS] * 2 and distinct[1][0] == 300 and 650 < distinct[1][1] < 830
+    assert not np.array_equal(again["points"], pad_clouds(
+        clouds, view, resample_with_replacement=True, seeds=[7, 8])["points"])  # fmt: skip
+
+
+# ---- what is minimized
+
+
+def test_labels_are_the_nearest_labelled_joint_within_reach():
+    points = torch.tensor([[[0.0, 0, 0], [0.3, 0, 0], [1.0, 0, 0], [0.0, 0, 0]]])
+    joints = torch.tensor([[[0.01, 0, 0], [0.2, 0, 0], [0.45, 0, 0]]])
+    valid, known = torch.tensor([[True, True, True, False]]), torch.tensor([[False, True, True]])
+    label, offset = point_labels(points, valid, joints, known)
+    assert label.tolist() == [[1, 1, 3, -1]]
+    assert torch.allclose(offset[0, :2], torch.tensor([[0.2, 0, 0], [-0.1, 0, 0]]))
+
+
+@BOTH
+def test_joints_without_a_label_teach_nothing_and_answers_are_in_the_cloud_s_frame(config):
+    objective = BaselineObjective(config=config)
+    torch.manual_seed(0)
+    network = objective.network().eval()
+    examples = [person(40, 1), person(25, 2)]
+    hidden = BODY26.index(config.joints[3])
+    examples[0].joints[hidden] = np.nan
+    arrays = objective.collate(examples)
+    terms = objective.terms(network, arrays)
+    assert set(terms) >= {"joints", "part", "mpjpe"} and total(terms).isfinite()
+    true = np.stack([example.joints for example in examples])[:, config.columns]
+    error = np.linalg.norm(objective.joints(network, arrays)[:, config.columns] - true, axis=-1)
+    assert float(terms["mpjpe"]) == pytest.approx(np.nanmean(error), rel=1e-4) == float(terms["joints"].detach())
+    total(terms).backward()
+    gradients = [value.grad for value in network.parameters() if value.requires_grad]
+    assert all(gradient is not None and gradient.isfinite().all() for gradient in gradients)
+    # joints that the network lacks are NaN; a cloud that is moved has its answers moved
+    joints = objective.joints(network, arrays)
+    assert np.isnan(joints).all((0, 2)).sum() == 26 - len(config.joints)
+    step = np.float32([0.3, -0.2, 0.1])
+    moved = [replace(e, points=e.points + step, joints=e.joints + step) for e in examples]
+    np.testing.assert_allclose(objective.joints(network, objective.collate(moved)), joints + step, atol=1e-4)
+
+
+def test_people_are_shifted_in_training_alone():
+    still, moved = (BaselineObjective(config=PRN, shift=shift) for shift in (0.0, 0.2))
+    torch.manual_seed(0)
+    network = still.network().eval()
+    arrays = moved.collate([person(40, seed) for seed in range(6)])
+    assert len(set(arrays["shift"].tolist())) == 6 and np.abs(arrays["shift"]).max() <= 0.2
+    expected = still.joints(network, still.collate([person(40, seed) for seed in range(6)]))
+    np.testing.assert_array_equal(moved.joints(network, arrays), expected)
+    # a network that always answers with the middle misses by what people are moved
+    seen = {}
+
+    def spy(points, valid, center):
+        seen["points"] = points
+        return network(points, valid, center)
+
+    moved.terms(spy, arrays)
+    step = seen["points"] - torch.as_tensor(arrays["points"])
+    assert torch.allclose(step, torch.as_tensor(arrays["shift"])[:, None, None].expand_as(step), atol=1e-6)
+
+
+def test_the_second_softmax_flattens_the_loss_of_parts():
+    torch.manual_seed(0)
+    terms = {}
+    for second in (False, True):
+        objective = BaselineObjective(config=replace(LPFORMER, second_softmax=second))
+        torch.manual_seed(0)
+        terms[second] = objective.terms(objective.network().eval(), objective.collate([person(30)]))
+    assert terms[True]["joints"] == terms[False]["joints"] and terms[True]["part"] != terms[False]["part"]
+    # of probabilities, whatever they are, no loss is below log(1 + 15 / e)
+    assert terms[True]["part"] > np.log(1 + 15 / np.e) - 1e-3
+
+
+# ---- fast paths
+
+
+def test_attention_in_groups_as_by_definition():
+    torch.manual_seed(0)
+    attention = GroupedVectorAttention(12, 3).eval()
+    x, xyz = torch.randn(9, 12), torch.randn(9, 3)
+    neighbors = torch.tensor([[m, (m + 1) % 9, (m + 4) % 9 if m % 2 else -1] for m in range(9)])
+    rows = []
+    for m in range(9):
+        own = [n for n in neighbors[m].tolist() if n >= 0]
+        bias = attention.position[1](attention.position[0](xyz[own] - xyz[m]))
+        relation = attention.key(x[own]) - attention.query(x[[m]]) + bias
+        scores = attention.weight((relation * attention.group_weight).unflatten(1, (3, 4)).sum(-1)).softmax(0)
+        value = (attention.value(x[own]) + bias).unflatten(1, (3, 4))
+        rows.append((value * scores[..., None]).sum(0).flatten())
+    assert torch.allclose(attention(x, xyz, neighbors), torch.stack(rows), atol=1e-6)
+
+
+def test_attention_of_the_first_rows_alone_is_that_of_all():
+    torch.manual_seed(0)
+    attention = BareAttention(12, heads=3).eval()
+    x, valid = torch.randn(2, 10, 12), torch.arange(10) < torch.tensor([[10], [6]])
+    assert torch.allclose(attention(x, valid, queries=4), attention(x, valid)[:, :4], atol=1e-6)
+
+
+# ---- configurations, checkpoints, commands
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: LpformerConfig(grid=48), "grid must be 64 or 32 cells, got 48"),
+        (lambda: PrnConfig(joints=("nose", "nose")), "each once"),
+        (lambda: PrnConfig(joints=("tail",)), "unknown joint"),
+        (lambda: LpformerConfig(second_softmax=1), "second_softmax must be true or false, got 1"),
+        (lambda: _with_options(PRN, ("grid=32",)), "unknown option of prn 'grid'"),
+        (lambda: Pretrain(model="prn", size="tiny"), "the model prn has the size prn, got tiny"),
+        (lambda: Pretrain(model="best"), "unknown model 'best'"),
+        (lambda: Pretrain(betas=(0.9, 1.0)), "betas must be two numbers"),
+    ],
+)
+def test_what_cannot_be_is_refused(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+def test_options_by_name():
+    options = ("grid=32", "second_softmax", "sensor_position=true", "resample_with_replacement=false")
+    expected = LpformerConfig(grid=32, second_softmax=True, sensor_position=True)
+    assert _with_options(LpformerConfig(), options) == expected
+
+
+def test_recipes_are_as_published():
+    prn, lpformer = (recipe(Pretrain, name) for name in ("prn", "lpformer"))
+    assert (prn.rate, prn.optimizer, prn.decay, prn.batch, prn.schedule) == (5e-4, "adam", 0, 64, "constant")
+    assert (lpformer.rate, lpformer.betas, lpformer.batch, lpformer.decay) == (5e-4, (0.85, 0.95), 16, 0.01)
+    fine = recipe(Finetune, "prn", data=("a",))
+    assert (fine.init, fine.size, fine.epochs, fine.augment, fine.mix) == ("random", "prn", 50, "lidarhmr", 0)
+    assert recipe(Finetune, "prn", data=("a",), init="first.safetensors").size == ""
+    assert Pretrain(model="dapt").size == "paper" and Pretrain(model="ours") == replace(Pretrain(), model="ours")
+
+
+def test_all_networks_are_listed(capsys):
+    assert not main(["models", "--json"])
+    rows = json.loads(capsys.readouterr().out)
+    assert rows == networks()
+    counts = {row["name"]: (row["joints"], row["frames"], row["parameters"]) for row in rows}
+    assert counts["prn"] == (15, 1, 1_738_482) and counts["lpformer"] == (15, 1, 4_814_485)
+    assert counts["lidarcap"] == (24, 16, 34_925_854) and counts["ne"] == (24, 16, 129_720_766)
+    assert {"ours", "dapt"} < counts.keys() and {"tiny", "paper", "paper-small"} <= {row["size"] for row in rows}
+    assert not main(["models"])
+    assert "129,720,766" in capsys.readouterr().out
+
+
+@BOTH
+@pytest.mark.parametrize("skeleton", [WAYMO14, SMPL24])
+def test_weights_go_on_by_the_names_of_joints(config, skeleton, tmp_path):
+    trained = BaselineObjective(config=config).network()
+    other = replace(config, joints=skeleton.joints)
+    network = with_joints(trained, other)
+    for name, value in network.state_dict().items():
+        before = trained.state_dict()[name]
+        if not name.startswith(trained.per_joint):
+            assert torch.equal(value, before)
+            continue
+        for joint in set(config.joints) & set(skeleton.joints):
+            assert torch.equal(value[other.joints.index(joint)], before[config.joints.index(joint)])
+        if len(value) > len(skeleton):
+            assert torch.equal(value[-1], before[-1])
+    save_checkpoint(tmp_path / "a.safetensors", network, card={})
+    again, header = load_checkpoint(tmp_path / "a.safetensors")
+    assert header.config == other and header.skeleton is skeleton
+    assert all(
+        torch.equal(a, b) for a, b in zip(again.state_dict().values(), network.state_dict().values(), strict=True)
+    )
+
+
+def test_pretrain_predict_evaluate_and_finetune(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = ["--workers", "0", "--pictures", "0", "--validate", "1000"]
+    assert not main(["pretrain", "run", "--model", "prn", "--people", "16", "--batch", "8", "--scene", "paper", *words])
+    network, header = load_checkpoint("run/model.safetensors")
+    assert header.network == "prn" and header.card["recipe"]["optimizer"] == "adam"
+    (line,) = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert {"joints", "vote", "part", "offset", "mpjpe"} <= line.keys() and line["validation_mm"] > 0
+    assert not main(["evaluate", "run/model.safetensors", "bench", "--limit", "4"])
+    assert "MPJPE" in capsys.readouterr().out
+    # the same answer as of the objective, in the frame of the cloud
+    example = person(60)
+    cloud = np.float32(example.points) + [20, 0, 1]
+    pose = load("run/model.safetensors", tta=1).predict(cloud)
+    assert pose.skeleton.joints == HUMAN15.joints
+    objective = BaselineObjective(config=header.config)
+    expected = objective.joints(network, objective.collate([example]))[0, header.config.columns]
+    np.testing.assert_allclose(pose.joints, expected + [20, 0, 1], atol=2e-3)
+    # and goes on, if it is what is asked for
+    assert main(["pretrain", "more", "--model", "prn", "--init", "run/model.safetensors"]) == 2
+    assert "begin at random" in capsys.readouterr().err
+    folder = tmp_path / "people"
+    assert not main(["synth", "--out", str(folder), "--count", "8", "--scene", "paper"])
+    common = [str(folder), "--split", "all", "--epochs", "1", "--batch", "4", *words]
+    assert not main(["finetune", *common, "--model", "prn", "--init", "run/model.safetensors", "--out", "second"])
+    assert load_checkpoint("second/model.safetensors")[1].config.joints == BODY26.joints
+    assert not main(["finetune", *common, "--model", "prn", "--options", "resample_with_replacement", "--out", "third"])
+    third = load_checkpoint("third/model.safetensors")[1]
+    assert third.config.resample_with_replacement and third.card["init"] == "random"
+    assert main(["finetune", *common, "--model", "lpformer", "--init", "run/model.safetensors", "--out", "no"]) == 2
+    assert "holds the network prn, not lpformer" in capsys.readouterr().err
+
+
+# ---- learning
+
+
+def _learned(config, people, points, steps, rate):
+    """Error in mm, in evaluation mode, on the fixed people that are learned; the rate falls in the second half."""
+    source = SyntheticSource(scene="paper", seed=5, refined=0.0)
+    examples = [e for e in map(source.example, range(3 * people)) if len(e.points) >= 30][:people]
+    assert len(examples) == people
+    rows = [np.random.default_rng(e.seed).permutation(len(e.points))[:points] for e in examples]
+    examples = [replace(e, points=e.points[r], part=e.part[r]) for e, r in zip(examples, rows, strict=True)]
+    objective = BaselineObjective(config=config)
+    torch.manual_seed(0)
+    network = objective.network().train()
+    arrays = objective.collate(examples)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=0)
+    for step in range(steps):
+        optimizer.param_groups[0]["lr"] = rate * min(1, 2 * (1 - step / steps))
+        optimizer.zero_grad()
+        total(objective.terms(network, arrays)).backward()
+        optimizer.step()
+    return validate(objective, network.eval(), examples, people)[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "config, people, points, steps, rate, most",
+    [(PRN, 8, 60, 120, 2e-3, 80), (LPFORMER, 4, 100, 50, 1e-3, 80)],
+    ids=["prn", "lpformer"],
+)
+def test_a_few_people_are_learned_by_heart(config, people, points, steps, rate, most):
+    # the mean of all poses is about 200 mm from them
+    assert _learned(config, people, points, steps, rate) < most
