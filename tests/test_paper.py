@@ -2,6 +2,7 @@
 
 import json
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -131,11 +132,18 @@ def test_rows_have_names_of_their_own_and_every_cell_a_command_or_a_reason(name)
             assert sum(step.hours or 0 for step in cell.training) == pytest.approx(options.hours or 0) or cell.why
 
 
-def test_the_published_figures_are_those_of_the_published_table(tmp_path):
-    for name in REAL:
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "dataset.json").write_text("{}")
-    data = {name: str(tmp_path / name) for name in REAL}
+@pytest.fixture
+def data(tmp_path):
+    """Real sets and a corpus by name, as far as options look at them."""
+    folders = {name: tmp_path / name for name in (*REAL, "lipd", "freemotion", "noisemotion")}
+    for folder in folders.values():
+        folder.mkdir()
+        (folder / "dataset.json").write_text("{}")
+    poses = {name: "raw" for name in ("freemotion-poses", "lidarhuman26m-poses")}
+    return {name: str(folder) for name, folder in folders.items()} | poses
+
+
+def test_the_published_figures_are_those_of_the_published_table(data):
     printed = {method["method"]: method["figures"] for method in published()["methods"]}
     for cell in cells(TABLES["table1"], Options(data=data)):
         wanted = printed.get(next((name for name in printed if name.startswith(cell.row)), ""), {}).get(cell.column)
@@ -153,11 +161,31 @@ def test_tables_share_what_they_have_in_common():
     assert runs("table4", "scratch") == runs("table2", "w-o") != runs("table4", "r-keep-0.5")
 
 
-@pytest.mark.parametrize("name", ["table2", "table4"])
-def test_the_parser_knows_the_commands(name, tmp_path):
-    for cell in cells(TABLES[name], Options(motion=("a.npz",))):
-        for step in cell.evaluation.all():
+@pytest.mark.parametrize("name", TABLES)
+def test_the_parser_knows_the_commands(name, tmp_path, data):
+    for options in (Options(motion=("a.npz",)), Options(data=data, size="paper")):
+        steps_of = [list(cell.evaluation.all()) for cell in cells(TABLES[name], options) if cell.evaluation]
+        assert steps_of
+        for step in {step.name: step for steps_ in steps_of for step in steps_}.values():
             assert _problem(step.command(tmp_path)) == ""
+
+
+def test_the_paper_s_protocol_on_real_sets(data):
+    options = Options(data=data, size="paper")
+    lines = {}
+    for cell in cells(TABLES["table1"], options):
+        own = cell.evaluation.all() if cell.evaluation else ()
+        lines[cell.row, cell.column] = [" ".join(step.command(Path("o"))) for step in own]
+    assert not lines["NE", "waymo"] and lines["NE", "sloper4d"] and lines["LiDARCap", "lidarhuman26m"]
+    for (row, column), (*_, tuned, scored) in ((key, own) for key, own in lines.items() if own):
+        assert ("--interval 5" in tuned) == (column in ("humanm3", "lidarhuman26m"))
+        assert "--protocol dapt" in scored and ("--decode dark" in scored) == (row == "DAPT")
+        assert "--rate" not in tuned and "--epochs" not in tuned
+    assert "--recipe paper --size paper" in lines["DAPT", "waymo"][0] and "--motion raw" in lines["DAPT", "waymo"][0]
+    assert all(cell.evaluation for cell in cells(TABLES["table2"], options))
+    some = Options(data={name: data[name] for name in ("waymo", "lipd")})
+    reasons = {cell.row: cell.why for cell in cells(TABLES["table2"], some)}
+    assert reasons["LIPD"] == "" and "--data freemotion=DIR" in reasons["FreeMotion"]
 
 
 def test_other_processes_do_not_make_another_run():
