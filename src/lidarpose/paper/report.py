@@ -13,7 +13,7 @@ from lidarpose.eval.dataset import EvalSample, open_eval_dataset
 from lidarpose.eval.scores import COLUMNS, FILE, Result, read_scores
 from lidarpose.io.files import write_atomic
 from lidarpose.models.checkpoint import load_checkpoint, read_header, runs_of
-from lidarpose.paper.steps import Execute, Step, StepFailed, check_out, is_done, run_steps
+from lidarpose.paper.steps import Execute, Step, StepFailed, check_out, is_done, last_entry, run_steps
 from lidarpose.paper.tables import Cell, Options, Table, Target, cells, row_key
 from lidarpose.sample import center_of
 
@@ -96,6 +96,7 @@ def _figures(cell: Cell, evaluation: Step, out: Path) -> dict[str, Any]:
     network = load_checkpoint(weights)[0]
     hours = [run.get("hours", 0.0) for run in runs]
     seen = [run.get("people_seen", 0) for run in runs]
+    last = last_entry(cell.training[-1].folder(out))
     row = result.line("mpjpe")
     mean_pose = mean_pose_error(cell.target, result, out)
     return {
@@ -107,7 +108,7 @@ def _figures(cell: Cell, evaluation: Step, out: Path) -> dict[str, Any]:
         "protocol": result.setting.summary,
         "people_seen": sum(seen),
         "hours": round(sum(hours), 3),
-        "people_per_second": round(seen[0] / (3600 * hours[0]), 1) if hours[0] else None,
+        "people_per_second": round(last["people"] / last["seconds"], 1) if last and last["seconds"] else None,
         "parameters": sum(value.numel() for value in network.parameters()),
         "mean_pose": mean_pose,
         "undertrained": row.value is None or row.value > (1 - _UNDERTRAINED) * mean_pose,
