@@ -60,9 +60,9 @@ class Averaging(Predictor):
         super().__init__(predictor.backend, name=predictor.model["name"], decode=predictor.model["decode"])
         self._passes, self._tta, self.heatmaps = way.passes, way.transforms, way.heatmaps
 
-    def _augmented(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Pose:
+    def _augmented(self, clouds, centers, origin, clip=None) -> Pose:
         if not self.heatmaps:
-            return super()._augmented(clouds, centers, origin)
+            return super()._augmented(clouds, centers, origin, clip)
         raws = [self._raw(transform, clouds, centers, origin) for transform in self._tta]
         return estimates(_fused(raws), self._decoder, self.skeleton)
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from lidarpose.models.baselines.config import LpformerConfig, PrnConfig
+from lidarpose.data.clips import FRAMES
+from lidarpose.models.baselines.config import CLOUDS, LidarcapConfig, LpformerConfig, NeConfig, PrnConfig
 from lidarpose.models.baselines.lidarcap import (
-    FRAMES,
     Lidarcap,
     PointNet2,
     forward_kinematics,
@@ -14,7 +14,7 @@ from lidarpose.models.baselines.lidarcap import (
     tree_partition,
 )
 from lidarpose.models.baselines.lpformer import V2V, Lpformer
-from lidarpose.models.baselines.ne import CLOUDS, Ne
+from lidarpose.models.baselines.ne import Ne
 from lidarpose.models.baselines.point_ops import ball_query, farthest_points, nearest_neighbors
 from lidarpose.models.baselines.prn import Prn, PrnNeck
 from lidarpose.skeleton import SMPL24, WAYMO14
@@ -31,8 +31,8 @@ PARAMETERS = {
     "lpformer 24": (lambda: Lpformer(LpformerConfig(joints=SMPL24.joints, grid=32)), 4_816_942),
     "pointnet++ 1024": (lambda: PointNet2(1024), 805_184),
     "pointnet++ 512": (lambda: PointNet2(512), 542_016),
-    "lidarcap": (Lidarcap, 34_925_854),
-    "ne": (Ne, 129_720_766),
+    "lidarcap": (lambda: Lidarcap(LidarcapConfig()), 34_925_854),
+    "ne": (lambda: Ne(NeConfig()), 129_720_766),
 }
 
 
@@ -160,8 +160,8 @@ def test_clips_have_rotations_of_every_frame_and_clips_do_not_mix():
     points, valid = _cloud(6, (40,) * 2 * FRAMES)
     points, valid = points.unflatten(0, (2, FRAMES)), valid.unflatten(0, (2, FRAMES))
     torch.manual_seed(0)
-    network = Lidarcap().eval()
-    both, first = network(points, valid), network(points[:1], valid[:1])
+    network = Lidarcap(LidarcapConfig()).eval()
+    both, first = network({"person": (points, valid)}), network({"person": (points[:1], valid[:1])})
     assert both.joints.shape == (2, FRAMES, 24, 3) and both.rotations.shape == (2, FRAMES, 24, 3, 3)
     assert torch.allclose(both.rotations[:1], first.rotations, atol=1e-5)
 
@@ -173,7 +173,7 @@ def test_ne_exchanges_over_frames_and_as_published_over_the_batch(across_batch):
     points, valid = points.unflatten(0, (2, FRAMES)), valid.unflatten(0, (2, FRAMES))
     clouds = {name: (points + k, valid) for k, name in enumerate(CLOUDS)}
     torch.manual_seed(0)
-    network = Ne(across_batch=across_batch).eval()
+    network = Ne(NeConfig(exchange_across_batch=across_batch)).eval()
     both = network(clouds)
     alone = network({name: (points[:1], valid[:1]) for name, (points, valid) in clouds.items()})
     assert both.rotations.shape == (2, FRAMES, 24, 3, 3)

@@ -431,5 +431,5 @@ def test_a_validation_is_the_mean_error_in_mm():
         return np.nan_to_num(np.stack(batch)) + [0.03, 0.0, 0.04]
 
     objective = SimpleNamespace(collate=lambda examples: [each.joints for each in examples], joints=predicted)
-    examples = [SimpleNamespace(joints=each) for each in joints]
+    examples = [SimpleNamespace(joints=each, frames=(SimpleNamespace(joints=each),)) for each in joints]
     assert validate(objective, torch.nn.Linear(1, 1), examples, 2)[0] == pytest.approx(50)

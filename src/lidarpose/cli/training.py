@@ -68,7 +68,7 @@ def _add(parser, kind: type[Recipe]) -> None:
     parser.add_argument(
         "--recipe",
         metavar="NAME",
-        help="default, paper, paper-one-stage; prn or lpformer, as with --model; other options override its settings",
+        help="default, paper, paper-one-stage; prn, lpformer, lidarcap, ne, as with --model; other options override it",
     )
     parser.add_argument("--device", metavar="NAME", help="cpu (default: a GPU if there is one)")
     parser.add_argument("--tracker", metavar="NAME", help="also log to tensorboard or wandb, if installed")

@@ -6,16 +6,18 @@ clean   what a user has: the crop is a detector's box (the labeled one, displace
 dapt    what the paper's released code does: crop and center from the labels, one pass, its splits
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 
+from lidarpose.data.clips import consecutive, windows
 from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.eval.dataset import EvalDataset, EvalSample
 from lidarpose.eval.predictions import Predictions, stack
 from lidarpose.eval.scores import Setting
+from lidarpose.inference.inputs import Clips
 from lidarpose.sample import UNLABELED, Box
 from lidarpose.skeleton import Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
@@ -131,7 +133,8 @@ def released_box(joints: np.ndarray, centers: dict[str, np.ndarray], box: Box | 
 
 
 class Model(Protocol):
-    """What is evaluated: `lidarpose.Predictor`, or anything that answers as it does."""
+    """What is evaluated: `lidarpose.Predictor`, or anything that answers as it does. One of clips, whose backend has
+    `frames`, also takes `predict(clips=)` and `outputs(clip=)`."""
 
     skeleton: Skeleton
     model: dict[str, Any]
@@ -191,20 +194,41 @@ class EvalSetup:
 
     def _predict_clean(self, samples: list[EvalSample], origin: np.ndarray | None) -> Iterator[dict]:
         clouds = [person.points for person in samples]
-        for person in self.model.predict(clouds, sensor_origin=origin, skeleton=self.model.skeleton.name):
+        model: Any = self.model
+        clips = self._clips(samples)
+        for person in model.predict(clouds, sensor_origin=origin, skeleton=model.skeleton.name, **clips):
             yield {} if person.pose is None else self._picked(person.pose, ())
 
     def _predict_dapt(self, samples: list[EvalSample], origin: np.ndarray | None) -> Iterator[dict]:
         """One pass about the released code's center."""
-        batch = self.model.backend.batch
-        for start in range(0, len(samples), batch):
-            some = samples[start : start + batch]
+        model: Any = self.model
+        batch = model.backend.batch
+        answers: dict[int, dict] = {}
+        starts = range(0, len(samples), batch)
+        batches: Iterable = ((range(start, min(start + batch, len(samples))), {}) for start in starts)
+        if clips := self._clips(samples):
+            batches = ((rows, {"clip": clip}) for rows, clip in clips["clips"].batches(batch))
+        for rows, clip in batches:
+            some = [samples[row] for row in rows]
             centers = np.stack([person.sample.centers[DAPT[self.setting.kind].center] for person in some])
-            estimates = self.model.outputs([person.points.astype(float) for person in some], centers, origin)
-            for k, center in enumerate(centers):
+            estimates = model.outputs([person.points.astype(float) for person in some], centers, origin, **clip)
+            for k, (row, center) in enumerate(zip(rows, centers, strict=True)):
                 values = self._picked(estimates, k)
                 values["pred"] = values["pred"] + center
-                yield values if np.isfinite(values["pred"]).all() else {}
+                answers[row] = values if np.isfinite(values["pred"]).all() else {}
+        yield from (answers[row] for row in range(len(samples)))
+
+    def _clips(self, samples: Sequence[EvalSample]) -> dict[str, Clips]:
+        """What a network of clips is told: which people are frames that follow each other."""
+        if getattr(self.model.backend, "frames", 1) == 1:
+            return {}
+        own = [person.sample for person in samples]
+        runs = consecutive([(sample.sequence, sample.track) for sample in own], [sample.frame for sample in own])
+        around = {
+            name: [np.zeros((0, 3)) if (cloud := getattr(sample, name)) is None else cloud for sample in own]
+            for name in ("background", "neighbors")
+        }
+        return {"clips": Clips(windows=np.concatenate([windows(run) for run in runs]), **around)}
 
     def _picked(self, estimates, index) -> dict:
         """Of a pose, or of person `index` of many: the scored joints."""

@@ -65,7 +65,8 @@ class Raw:
 
 
 class Backend(Protocol):
-    """clouds: B arrays (n, 3) m, each about its person's center, n = 0 is legal; view (B, 5): see `VoxelPyramid`."""
+    """clouds: B arrays (n, 3) m, each about its person's center, n = 0 is legal; view (B, 5): see `VoxelPyramid`.
+    Networks of clips have `frames`, and take `clip`, an `inputs.Clips` of the clouds, about the same centers."""
 
     name: str
     header: Header

@@ -1,10 +1,13 @@
 """From a user's cloud to one person's points: what an array must be, and where the person may stand."""
 
 import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from lidarpose.data.clips import FRAMES, windows
 from lidarpose.errors import InputError
 from lidarpose.geometry import vector_of
 from lidarpose.io.files import FormatError, one_line
@@ -26,6 +29,56 @@ _COLUMN, _RING = (0.0, 2.0), (3.5, 5.0)
 _RING_WEIGHT = 0.5
 # columns a crop, m from one to the next, and m around each that a person takes
 _COLUMNS, _APART, _AROUND = 3, 0.6, 0.75
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Clips:
+    """Which of N clouds are frames of one person that follow each other, for networks of clips.
+
+    Args:
+        windows: (C, 16) int, rows of the clouds; a row may repeat in its window, and is in no other.
+        background, neighbors: (N,) clouds (n, 3) m about each frame's person, as in `Sample`, in the clouds' frame; by
+            default none.
+    """
+
+    windows: np.ndarray
+    background: Sequence[np.ndarray] | None = None
+    neighbors: Sequence[np.ndarray] | None = None
+
+    @classmethod
+    def of_run(cls, count: int, **clouds: Sequence[np.ndarray]) -> "Clips":
+        """So many clouds, all frames of one person in order of time."""
+        return cls(windows=windows(np.arange(count)), **clouds)
+
+    def around(self, rows: np.ndarray) -> dict[str, list[np.ndarray]]:
+        """The clouds about the persons of some rows, by name."""
+        clouds = {"background": self.background, "neighbors": self.neighbors}
+        return {
+            name: [np.zeros((0, 3)) if given is None else np.asarray(given[row], float) for row in rows]
+            for name, given in clouds.items()
+        }
+
+    def mapped(self, change: Callable[[list[np.ndarray]], list[np.ndarray]]) -> "Clips":
+        """With the clouds about the persons changed."""
+        rows = np.arange(1 + self.windows.max())
+        around = self.around(rows)
+        return replace(self, background=change(around["background"]), neighbors=change(around["neighbors"]))
+
+    def usable(self, keep: np.ndarray) -> "Clips":
+        """Of windows the rows that are to be kept (N,) bool, the next or the last one filling up for each other;
+        windows without any are gone."""
+        filled = []
+        for window in self.windows:
+            kept = np.flatnonzero(keep[window])
+            if len(kept):
+                filled.append(window[kept[np.searchsorted(kept, np.arange(FRAMES)).clip(0, len(kept) - 1)]])
+        return replace(self, windows=np.array(filled, int).reshape(-1, FRAMES))
+
+    def batches(self, count: int) -> Iterator[tuple[np.ndarray, "Clips"]]:
+        """So many windows at a time: rows (n,) of their clouds, and the clips of these alone."""
+        for start in range(0, len(self.windows), count):
+            rows, own = np.unique(self.windows[start : start + count], return_inverse=True)
+            yield rows, Clips(windows=own.reshape(-1, FRAMES), **self.around(rows))
 
 
 def as_points(points: Any, what: str = "points") -> np.ndarray:

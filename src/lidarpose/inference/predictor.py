@@ -13,7 +13,7 @@ from lidarpose.errors import InputError, check_int, check_name, missing_extra
 from lidarpose.geometry import rotation_from_up
 from lidarpose.inference.backend import Backend, OnnxBackend, estimates, exported_beside
 from lidarpose.inference.checks import UPSIDE_DOWN, looks_unsure, oversize_warning, unit_warning, upside_down_warning
-from lidarpose.inference.inputs import as_origin, as_points, candidates, clean, is_few, only_returns
+from lidarpose.inference.inputs import Clips, as_origin, as_points, candidates, clean, is_few, only_returns
 from lidarpose.inference.results import PersonPose, Poses, first_names
 from lidarpose.inference.scan import Scan, pose_scan
 from lidarpose.inference.tta import TTATransform, apply, average, invert, tta_transforms
@@ -218,6 +218,7 @@ class Predictor:
         sensor_origin: "np.ndarray | Sequence[float] | str | None" = None,
         skeleton: str | None = None,
         progress: bool = False,
+        clips: Clips | None = None,
     ) -> Poses: ...
 
     @overload
@@ -242,16 +243,21 @@ class Predictor:
         progress: bool = False,
     ) -> Poses: ...
 
-    def predict(self, points, *, boxes=None, sensor_origin=None, skeleton=None, progress=False) -> PersonPose | Poses:
+    def predict(
+        self, points, *, boxes=None, sensor_origin=None, skeleton=None, progress=False, clips=None
+    ) -> PersonPose | Poses:
         """One cloud (n, 3+) -> `PersonPose`; a list of clouds, or a cloud with boxes -> `Poses`, in their order.
 
         points: x, y, z in meters, z up, any frame, each cloud one person, ground and clutter allowed; more columns are
         ignored, those of tables and records are taken by name. boxes: the people of a whole scan, as in
         `lidarpose.predict`. sensor_origin (3,) m: where the sensor stood in that frame, or "unknown"; None means
-        0, 0, 0 with boxes and unknown without. skeleton: see `in_skeleton`. A cloud of under 5 different points
-        gets a result without joints and a warning. Raises InputError for arrays of another shape or type.
+        0, 0, 0 with boxes and unknown without. skeleton: see `in_skeleton`. clips: which of a list's clouds are frames
+        of one person, for networks of clips, by default none: a cloud then fills a clip. A cloud of under 5 different
+        points gets a result without joints and a warning. Raises InputError for arrays of another shape or type.
         """
         wanted = self.in_skeleton(skeleton)
+        if clips is not None and getattr(self.backend, "frames", 1) == 1:
+            raise InputError(f"clips are for networks of clips, {self.model['name']} reads single frames")
         if boxes is not None:
             cloud, notes = only_returns(as_points(points))
             origin = np.zeros(3) if sensor_origin is None else as_origin(sensor_origin)
@@ -261,28 +267,25 @@ class Predictor:
         if not _is_many(points):
             return self._people([as_points(points)], origin, wanted, False)[0]
         clouds = [as_points(cloud, f"points[{i}]") for i, cloud in enumerate(points)]
-        people = self._people(clouds, origin, wanted, progress)
+        people = self._people(clouds, origin, wanted, progress, clips)
         return Poses(people=tuple(people), skeleton=wanted, model=self.model)
 
-    def _people(self, clouds, origin, wanted, progress) -> list[PersonPose]:
+    def _people(self, clouds, origin, wanted, progress, clips=None) -> list[PersonPose]:
         cleaned = [clean(cloud) for cloud in clouds]
-        parts, owner = [], []
+        usable = {}
         for i, (points, notes) in enumerate(cleaned):
             if is_few(points):
                 points_of = "points" if len(points) < MIN_POINTS else "different points"
                 notes.append(f"no pose: under {MIN_POINTS} {points_of}")
-                continue
-            searched = candidates(points)
-            parts += searched
-            owner += [i] * len(searched)
-        # a person's first candidate is the whole cloud
-        best: dict[int, tuple[Pose, np.ndarray]] = {}
-        for i, part, pose in zip(owner, parts, self._all_poses(parts, origin, progress), strict=True):
-            if pose is not None and (i not in best or _surer(pose, best[i][0])):
-                best[i] = pose, part
+            else:
+                usable[i] = points
+        if clips is None:
+            best = self._best_poses(usable, origin, progress)
+        else:
+            best = self._clip_poses(usable, origin, clips.usable(np.isin(np.arange(len(clouds)), list(usable))))
         poses: list[Pose | None] = [None] * len(clouds)
         doubtful: list[int] = []
-        for i in sorted(set(owner)):
+        for i in usable:
             points, notes = cleaned[i]
             unit = unit_warning(np.ptp(points, axis=0), what="the person")
             if i not in best:
@@ -301,13 +304,37 @@ class Predictor:
         # a second look at the few whose pose looks unsure
         flipped = [best[i][1] * UPSIDE_DOWN for i in doubtful]
         flipped_poses = self._all_poses(flipped, None if origin is None else origin * UPSIDE_DOWN, False)
-        for i, pose in zip(doubtful, flipped_poses, strict=True):
-            if warning := upside_down_warning(best[i][0], pose):
+        for i, turned in zip(doubtful, flipped_poses, strict=True):
+            if warning := upside_down_warning(best[i][0], turned):
                 cleaned[i][1].append(warning)
         return [
             PersonPose(pose=pose, skeleton=wanted, points=points, warnings=tuple(notes), model=self.model)
             for pose, (points, notes) in zip(poses, cleaned, strict=True)
         ]
+
+    def _best_poses(
+        self, clouds: dict[int, np.ndarray], origin: np.ndarray | None, progress: bool
+    ) -> dict[int, tuple[Pose, np.ndarray]]:
+        """By person the pose, where there is one, and what of the cloud (n, 3) m it is of: the surest candidate."""
+        # a person's first candidate is the whole cloud
+        parts = [(i, part) for i, points in clouds.items() for part in candidates(points)]
+        best: dict[int, tuple[Pose, np.ndarray]] = {}
+        for (i, part), pose in zip(parts, self._all_poses([part for _, part in parts], origin, progress), strict=True):
+            if pose is not None and (i not in best or _surer(pose, best[i][0])):
+                best[i] = pose, part
+        return best
+
+    def _clip_poses(
+        self, clouds: dict[int, np.ndarray], origin: np.ndarray | None, clips: Clips
+    ) -> dict[int, tuple[Pose, np.ndarray]]:
+        """The same of frames that are read in clips."""
+        best: dict[int, tuple[Pose, np.ndarray]] = {}
+        for rows, clip in clips.batches(self.backend.batch):
+            poses = self._poses([clouds[row] for row in rows], origin, clip)
+            best |= {
+                row: (pose, clouds[row]) for row, pose in zip(rows.tolist(), poses, strict=True) if pose is not None
+            }
+        return best
 
     def _all_poses(self, clouds: list[np.ndarray], origin: np.ndarray | None, progress: bool) -> list[Pose | None]:
         """The pose of each cloud (n, 3) m in batches. People of like size go together: a batch costs as much as if all
@@ -322,14 +349,16 @@ class Predictor:
                 shown.update(start + len(batch))
         return poses
 
-    def _poses(self, clouds: list[np.ndarray], origin: np.ndarray | None) -> list[Pose | None]:
-        """The pose of each cloud (n, 3) m, None where too little of it is near its middle."""
+    def _poses(
+        self, clouds: list[np.ndarray], origin: np.ndarray | None, clip: Clips | None = None
+    ) -> list[Pose | None]:
+        """The pose of each cloud (n, 3) m, None where too little of it is near its middle. clip: of frames of clips."""
         centers = np.stack([center_of(points) for points in clouds])
         for _ in range(self._passes - 1):
-            root = self.outputs(clouds, centers, origin).joints[:, self._root].mean(1)
+            root = self.outputs(clouds, centers, origin, clip).joints[:, self._root].mean(1)
             # an answer that is no number stays one
             centers = centers + np.round(np.clip(root, -WINDOW / 2, WINDOW / 2) / _CENTER_STEP) * _CENTER_STEP
-        estimated = self._augmented(clouds, centers, origin)
+        estimated = self._augmented(clouds, centers, origin, clip)
         poses: list[Pose | None] = []
         for k, points in enumerate(clouds):
             near = (np.abs(points - centers[k]) < WINDOW).all(1).sum()
@@ -341,19 +370,32 @@ class Predictor:
             poses.append(replace(estimated, joints=estimated.joints[k] + centers[k], **of_person))
         return poses
 
-    def outputs(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Pose:
-        """What the network says of clouds (n, 3) m seen about centers (B, 3), from a sensor at origin (3,) or None."""
-        return self._transformed(TTATransform(), clouds, centers, origin)
+    def outputs(
+        self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None, clip: Clips | None = None
+    ) -> Pose:
+        """What the network says of clouds (n, 3) m seen about centers (B, 3), from a sensor at origin (3,) or None;
+        clip: of networks of clips, which of the clouds are frames of one person."""
+        return self._transformed(TTATransform(), clouds, centers, origin, clip)
 
-    def _augmented(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> Pose:
+    def _augmented(
+        self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None, clip: Clips | None = None
+    ) -> Pose:
         """The mean of what the network says under each transform."""
-        return average([self._transformed(transform, clouds, centers, origin) for transform in self._tta])
+        return average([self._transformed(transform, clouds, centers, origin, clip) for transform in self._tta])
 
     def _transformed(
-        self, transform: TTATransform, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None
+        self,
+        transform: TTATransform,
+        clouds: list[np.ndarray],
+        centers: np.ndarray,
+        origin: np.ndarray | None,
+        clip: Clips | None = None,
     ) -> Pose:
         about, view = apply(transform, clouds, centers, origin)
-        return invert(estimates(self.backend.run(about, view), self._decoder, self.skeleton), transform)
+        seen: dict[str, Any] = {}
+        if clip is not None:
+            seen["clip"] = clip.mapped(lambda around: apply(transform, around, centers, origin)[0])
+        return invert(estimates(self.backend.run(about, view, **seen), self._decoder, self.skeleton), transform)
 
 
 def _surer(pose: Pose, best: Pose) -> bool:

@@ -6,11 +6,15 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from lidarpose.data.clips import FRAMES
 from lidarpose.errors import InputError
 from lidarpose.inference.backend import Backend, Raw
+from lidarpose.inference.inputs import Clips
 from lidarpose.models import NETWORKS
-from lidarpose.models.baselines.config import pad_clouds
+from lidarpose.models.baselines.config import pad_clouds, pad_frames
+from lidarpose.models.baselines.lidarcap import Lidarcap
 from lidarpose.models.baselines.lpformer import Lpformer
+from lidarpose.models.baselines.ne import Ne
 from lidarpose.models.baselines.prn import Prn
 from lidarpose.models.checkpoint import Header, load_checkpoint
 from lidarpose.models.dapt.dapt_net import DaptNet
@@ -18,6 +22,7 @@ from lidarpose.models.export import ArrayModule
 from lidarpose.models.onnx import OUTPUTS, voxelize_people
 from lidarpose.models.posenet import PoseNet
 from lidarpose.models.voxelize import WINDOW
+from lidarpose.skeleton import SMPL24
 
 # people a call; the paper's network and its baselines are a hundred times as large
 _BATCH, _SLOW_BATCH = 64, 8
@@ -123,6 +128,45 @@ class BaselineBackend:
         joints = self.network(*inputs).joints.float().cpu().numpy() + arrays["middle"][:, None]
         order = [config.joints.index(joint) for joint in self.header.skeleton.joints]
         return Raw(vote=joints[:, order], heatmaps=None, low=np.zeros(3), step=np.ones(3))
+
+
+class ClipBackend:
+    """LiDARCap or NE. A person who is no frame of a clip fills a clip of equal frames. Of more points than the network
+    reads a fixed draw stays."""
+
+    name = "torch"
+    # clips a call
+    batch = _SLOW_BATCH
+    frames = FRAMES
+
+    def __init__(self, network: Lidarcap | Ne, header: Header, *, device: str = "cpu", compile: bool = False):
+        _no_compile(compile)
+        self.network = network.to(device).eval()
+        self.header = header
+        self.device = device
+
+    @torch.inference_mode()
+    def run(self, clouds: list[np.ndarray], view: np.ndarray, clip: Clips | None = None) -> Raw:
+        rows = np.arange(len(clouds))
+        clip = Clips(windows=np.repeat(rows[:, None], FRAMES, 1)) if clip is None else clip
+        config, given = self.network.config, {"person": clouds, **clip.around(rows)}
+        inputs = {}
+        for name in config.clouds:
+            reach = WINDOW if name == "person" else np.inf
+            again = config.resample_with_replacement
+            seeds = [0] * len(rows)
+            points, valid = pad_frames(given[name], resample_with_replacement=again, seeds=seeds, window=reach)
+            inputs[name] = torch.as_tensor(points).to(self.device), torch.as_tensor(valid).to(self.device)
+        index = torch.as_tensor(clip.windows, device=self.device)
+        # each frame once, however often it is in a clip
+        outputs = self.network.decode({name: value[index] for name, value in self.network.encode(inputs).items()})
+        joints = np.full((len(clouds), len(SMPL24), 3), np.nan, np.float32)
+        own, at = np.unique(clip.windows, return_index=True)
+        # who fills a clip alone is in the middle of it
+        is_alone = np.ptp(clip.windows, axis=1) == 0
+        at = at + FRAMES // 2 * is_alone[at // FRAMES]
+        joints[own] = outputs.posed().flatten(0, 1)[at].float().cpu().numpy()
+        return Raw(vote=joints, heatmaps=None, low=np.zeros(3), step=np.ones(3))
 
 
 def _no_compile(compile: bool) -> None:

@@ -62,6 +62,18 @@ NETWORKS = {
         objective="lidarpose.train.objectives.baseline_objective:BaselineObjective",
         backend="lidarpose.inference.torch_backend:BaselineBackend",
     ),
+    "lidarcap": NetworkKind(
+        config="lidarpose.models.baselines.config:LidarcapConfig",
+        network="lidarpose.models.baselines.lidarcap:Lidarcap",
+        objective="lidarpose.train.objectives.clip_objective:ClipObjective",
+        backend="lidarpose.inference.torch_backend:ClipBackend",
+    ),
+    "ne": NetworkKind(
+        config="lidarpose.models.baselines.config:NeConfig",
+        network="lidarpose.models.baselines.ne:Ne",
+        objective="lidarpose.train.objectives.clip_objective:ClipObjective",
+        backend="lidarpose.inference.torch_backend:ClipBackend",
+    ),
 }
 
 BUNDLED = ("tiny", "small")

@@ -3,6 +3,7 @@
 All happens in the person's own frame but for the crop. Legend: n points.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -51,6 +52,26 @@ class Example:
     visible: np.ndarray
     view: np.ndarray
     seed: int
+
+    @property
+    def frames(self) -> tuple["Example", ...]:
+        """Of a clip several, here one."""
+        return (self,)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClipExample:
+    """Frames of one person, each about its own center, its rotations (T, 24, 3) as in `Sample`, and by name the frames'
+    clouds (n, 3) float32 m about the same centers: person, background, neighbors."""
+
+    frames: tuple[Example, ...]
+    rotations: np.ndarray
+    clouds: dict[str, tuple[np.ndarray, ...]]
+
+    @property
+    def points(self) -> np.ndarray:
+        """(n, 3) m, of all frames."""
+        return np.concatenate([frame.points for frame in self.frames])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,6 +156,37 @@ def augmented(sample: LabeledSample, kind: Augmentation, rng: np.random.Generato
     if rng.random() < kind.strays:
         points, part = _with_clutter(points, part, np.zeros(3), _CLUTTER, rng)
     return _example(rng, points, joints, part=part, visible=visible, view=view)
+
+
+def clip_example(
+    samples: Sequence[Sample], rng: np.random.Generator, *, trans_center: bool = False, refined: float = REFINED
+) -> ClipExample:
+    """Frames of one person, with rotations and the joints of body26, as a training step shows them.
+
+    The centers are those of the points, or guesses of the pelvis (refined: how often); trans_center: SMPL's trans.
+    """
+    about_pelvis = rng.random() < refined
+    frames, clouds = [], []
+    for sample in samples:
+        assert sample.pose is not None
+        joints, center = sample.pose.joints, sample.center
+        if trans_center and sample.translation is not None:
+            center = sample.translation
+        elif about_pelvis:
+            center = joints[_PELVIS] + rng.normal(0, PELVIS_ERROR, 3)
+        points = sample.points - center
+        part, visible = np.full(len(points), UNKNOWN_PART), np.full(len(joints), np.nan, np.float32)
+        view = view_features(center, None)
+        frames.append(_example(rng, points, joints - center, part=part, visible=visible, view=view))
+        around = (
+            np.zeros((0, 3)) if cloud is None else cloud - center for cloud in (sample.background, sample.neighbors)
+        )
+        clouds.append((points, *around))
+    return ClipExample(
+        frames=tuple(frames),
+        rotations=np.stack([np.asarray(sample.rotations) for sample in samples]),
+        clouds=dict(zip(("person", "background", "neighbors"), zip(*clouds, strict=True), strict=True)),
+    )
 
 
 def _example(rng: np.random.Generator, points: np.ndarray, joints: np.ndarray, **known: np.ndarray) -> Example:

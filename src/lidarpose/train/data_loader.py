@@ -11,8 +11,9 @@ import os
 import signal
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
 from math import floor, gcd
 from typing import Any, Protocol
@@ -22,10 +23,20 @@ from threadpoolctl import threadpool_limits
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from lidarpose.errors import InputError
+from lidarpose.sample import Sample
 from lidarpose.synth.bodies import PoseBank
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import RandomStream, scene_config
-from lidarpose.train.augment import REFINED, Augmentation, Example, augmented, disturbed, example
+from lidarpose.train.augment import (
+    REFINED,
+    Augmentation,
+    ClipExample,
+    Example,
+    augmented,
+    clip_example,
+    disturbed,
+    example,
+)
 from lidarpose.train.objectives.objective import Objective
 from lidarpose.train.torch_dataset import InMemoryDataset
 
@@ -42,7 +53,7 @@ _OF_ONE_DIFFICULTY = ("paper", "reference")
 class Source(Protocol):
     """Examples by their number in a run. May be pickled."""
 
-    def example(self, index: int) -> Example: ...
+    def example(self, index: int) -> Example | ClipExample: ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +100,12 @@ class SyntheticSource:
         sample = self._generator.person(self.seed, index, hard=hard).sample
         return example(disturbed(sample, strays=self.strays, noise=self.noise, rng=rng), rng, refined=self.refined)
 
+    def clip(self, index: int, *, trans_center: bool) -> ClipExample:
+        """A clip of somebody as difficult as the scene is."""
+        rng = np.random.default_rng([self.seed, RandomStream.SYNTHETIC_AUGMENTATION, index])
+        samples = [person.sample for person in self._generator.clip(self.seed, index)]
+        return clip_example(samples, rng, trans_center=trans_center, refined=self.refined)
+
 
 @dataclass(frozen=True, kw_only=True)
 class StoredSource:
@@ -113,6 +130,40 @@ class StoredSource:
         return augmented(sample, self.augmentation, rng)
 
 
+@dataclass(frozen=True, kw_only=True)
+class ClipSource:
+    """Clips of datasets, all of them once an epoch in an order of its own.
+
+    dataset: see `InMemoryDataset.load`; clips, skipped: see `InMemoryDataset.clips`; trans_center: see `clip_example`;
+    strays, noise: see `disturbed`.
+    """
+
+    dataset: InMemoryDataset
+    clips: np.ndarray
+    seed: int
+    trans_center: bool
+    skipped: Counter[str] = field(default_factory=Counter)
+    strays: float = 0.0
+    noise: float = 0.0
+
+    def example(self, index: int) -> ClipExample:
+        epoch, place = divmod(index, len(self.clips))
+        rng = np.random.default_rng([self.seed, RandomStream.STORED_AUGMENTATION, index])
+        samples = self._samples(_order(self.seed, epoch, len(self.clips))[place])
+        if self.strays or self.noise:
+            samples = [disturbed(sample, strays=self.strays, noise=self.noise, rng=rng) for sample in samples]
+        return clip_example(samples, rng, trans_center=self.trans_center)
+
+    def _samples(self, clip: int) -> list[Sample]:
+        return [self.dataset.sample(row) for row in self.clips[clip]]
+
+    def some(self, count: int) -> list[ClipExample]:
+        """So many clips at most, evenly spread, to validate on: centered on their points."""
+        rng = np.random.default_rng(self.seed)
+        chosen = np.unique(np.linspace(0, len(self.clips) - 1, min(count, len(self.clips))).astype(int))
+        return [clip_example(self._samples(clip), rng, trans_center=self.trans_center, refined=0.0) for clip in chosen]
+
+
 @lru_cache(maxsize=2)
 def _order(seed: int, epoch: int, count: int) -> np.ndarray:
     """(count,) int: the rows of an epoch in its order."""
@@ -127,7 +178,7 @@ class MixedSource:
     other: Source
     share: float
 
-    def example(self, index: int) -> Example:
+    def example(self, index: int) -> Example | ClipExample:
         before, after = floor(index * self.share), floor((index + 1) * self.share)
         return self.other.example(before) if after > before else self.main.example(index - before)
 
@@ -191,7 +242,7 @@ def lanes_of(batch: int, ranks: int = 1) -> int:
     return lanes
 
 
-def _voxels(example: Example) -> int:
+def _voxels(example: Example | ClipExample) -> int:
     """Cells of 10 cm stand for voxels: what matters is that examples of like size share a batch."""
     return len(np.unique(np.floor(example.points * 10), axis=0))
 

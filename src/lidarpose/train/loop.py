@@ -11,7 +11,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from functools import cached_property
 from importlib.util import find_spec
@@ -29,7 +29,7 @@ from lidarpose.io.files import write_atomic
 from lidarpose.models.checkpoint import save_checkpoint
 from lidarpose.progress import Progress
 from lidarpose.train import run_dir
-from lidarpose.train.augment import Example
+from lidarpose.train.augment import ClipExample, Example
 from lidarpose.train.data_loader import BATCHES, Chunks, chunks_of, lanes_of, loader
 from lidarpose.train.objectives.objective import total
 from lidarpose.train.optim import average, optimizers, set_rates
@@ -115,7 +115,9 @@ def train(
     on_cpu = device == "cpu" or not torch.cuda.is_available()
     setup = setup or job or make_setup(recipe, on_cpu=on_cpu)
     accelerator = _accelerator(recipe, on_cpu, tracker)
-    lanes_of(recipe.batch, accelerator.num_processes)
+    if recipe.batch % setup.frames:
+        raise InputError(f"batch counts frames, so a clip counts {setup.frames}: give a multiple, got {recipe.batch}")
+    lanes_of(recipe.batch // setup.frames, accelerator.num_processes)
     # every process has looked before the first one writes
     accelerator.wait_for_everyone()
     folder = run_dir.numbered(recipe.kind) if folder is None else Path(folder)
@@ -195,7 +197,7 @@ class _Run:
         self.error: float | None = None
 
     @cached_property
-    def _watched(self) -> list[Example]:
+    def _watched(self) -> Sequence[Example | ClipExample]:
         """The samples to validate on."""
         return self.setup.validation()
 
@@ -269,7 +271,7 @@ class _Run:
         return Chunks(
             source=self.setup.source,
             objective=self.setup.objective,
-            batch=self.recipe.batch,
+            batch=self.recipe.batch // self.setup.frames,
             seed=self.recipe.seed,
             start=self.chunk,
             steps=self.steps,
@@ -342,10 +344,13 @@ class _Run:
         if not self._watched:
             return {}
         network, pictures = self._averaged(), self.recipe.pictures
-        self.error, joints = validate(self.setup.objective, network, self._watched, self.recipe.batch)
+        self.error, joints = validate(
+            self.setup.objective, network, self._watched, self.recipe.batch // self.setup.frames
+        )
         if pictures and self.draw is not None:
             rows = np.unique(np.linspace(0, len(joints) - 1, min(pictures, len(joints))).astype(int))
-            examples = [self._watched[k] for k in rows]
+            frames = [frame for example in self._watched for frame in example.frames]
+            examples = [frames[k] for k in rows]
             picture = self.draw(examples, joints[rows], self.setup.joints, f"after {self.seen:,} people")
             write_atomic(self.folder / run_dir.PICTURES / f"people-{self.seen:09d}.png", picture)
         if self.error < self.best:

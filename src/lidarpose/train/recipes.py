@@ -24,6 +24,8 @@ MODELS: dict[str, tuple[str, ...]] = {
     "dapt": (PAPER, SMALL_PAPER),
     "prn": ("prn",),
     "lpformer": ("lpformer",),
+    "lidarcap": ("lidarcap",),
+    "ne": ("ne",),
 }
 # instead of weights: fine-tuning begins with none
 RANDOM = "random"
@@ -33,7 +35,7 @@ HEADS = ("coordinates", "heatmaps")
 FREE = ("workers", "validate", "pictures", "precision")
 # shares of a whole that cannot be all of it
 _BELOW_ONE = ("ema", "mix", "hold_out")
-_MODEL = "ours, dapt, prn or lpformer"
+_MODEL = "ours, dapt, prn, lpformer, lidarcap or ne"
 _OPTIONS = "options of a baseline's network: resample_with_replacement=true, grid=32, ... (docs/train.md)"
 _LEAST = {"batch": 1, "people": 1}
 
@@ -85,7 +87,7 @@ def _checked(f: Field, value: Any) -> Any:
 class Recipe:
     """What pre-training and fine-tuning have in common. Raises InputError for a value that cannot be."""
 
-    batch: int = _setting(64, "people a step, in all processes together")
+    batch: int = _setting(64, "people a step, in all processes together; each frame of a clip counts as one")
     rate: float = _setting(2e-3, "peak learning rate of AdamW", "RATE")
     muon_rate: float = _setting(0.02, "peak learning rate of Muon for hidden matrices; 0: AdamW for all", "RATE")
     decay: float = _setting(0.01, "weight decay")
@@ -228,6 +230,12 @@ _LPFORMER = _LIDARHMR | {"model": "lpformer", "betas": (0.85, 0.95), "batch": 16
 _LIDARHMR_DATA = {"init": RANDOM, "epochs": 50.0, "augment": "lidarhmr", "mix": 0.0, "hold_out": 0.0}
 # AdamW on everything in one cycle at a rate at which the small network learns within 100,000 people
 _ONE_CYCLE = {"rate": 2e-3, "muon_rate": 0.0, "schedule": "cosine", "warmup": 0.1, "ema": 0.0, "clip": 35.0}
+# LiDARCap's and NE's, which both lower the rate, by a tenth where a pass of all data gains less than 1 %
+_CLIPS = {"muon_rate": 0.0, "rate": 1e-4, "schedule": "constant", "warmup": 0.0, "ema": 0.0, "clip": 0.0}
+# 8 clips
+_CLIPS |= {"optimizer": "adam", "decay": 1e-4, "batch": 128}
+_CLIPS_SHARDS = _CLIPS | {"easy": 0.0, "strays": 0.0, "noise": 0.0}
+_CLIPS_DATA = _CLIPS | {"init": RANDOM, "epochs": 200.0, "augment": "none", "mix": 0.0, "hold_out": 0.0}
 # by kind and name, what differs from the recipe of the bundled weights. Paper: implementation details
 RECIPES: dict[type[Recipe], dict[str, dict[str, Any]]] = {
     Pretrain: {
@@ -244,6 +252,8 @@ RECIPES: dict[type[Recipe], dict[str, dict[str, Any]]] = {
         "paper-one-stage": _ONE_CYCLE
         | {"size": SMALL_PAPER, "head": "heatmaps", "drop_path": 0.05, "scene": "paper", "people": 100_000}
         | {"easy": 0.0, "strays": 0.0, "noise": 0.0},
+        "lidarcap": _CLIPS_SHARDS | {"model": "lidarcap"},
+        "ne": _CLIPS_SHARDS | {"model": "ne"},
     },
     Finetune: {
         # anchors and heads stay, every joint has its name, synthesized people are mixed in
@@ -255,6 +265,8 @@ RECIPES: dict[type[Recipe], dict[str, dict[str, Any]]] = {
         "lpformer": _LPFORMER | _LIDARHMR_DATA,
         # goes on from a network of that recipe, heads and all
         "paper-one-stage": _ONE_CYCLE | {"init": "", "rate": 5e-4, "mix": 0.0},
+        "lidarcap": _CLIPS_DATA | {"model": "lidarcap"},
+        "ne": _CLIPS_DATA | {"model": "ne"},
     },
 }
 AnyRecipe = TypeVar("AnyRecipe", bound=Recipe)

@@ -4,7 +4,7 @@ To train a further kind of network of `models.NETWORKS`: its sizes in `PRETRAINE
 `objective_of`, its recipes in `recipes.RECIPES`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -19,16 +19,14 @@ from lidarpose.data.shards import read_card
 from lidarpose.errors import InputError, check_name
 from lidarpose.io.files import file_error
 from lidarpose.models import NETWORKS, weights_path
-from lidarpose.models.baselines.config import BaselineConfig, LpformerConfig, PrnConfig
-from lidarpose.models.baselines.lidarcap import FRAMES, Lidarcap
-from lidarpose.models.baselines.ne import Ne
+from lidarpose.models.baselines.config import BaselineConfig, LidarcapConfig, LpformerConfig, NeConfig, PrnConfig
 from lidarpose.models.checkpoint import build, load_checkpoint
 from lidarpose.models.config import SIZES, NetworkConfig
 from lidarpose.models.dapt.dapt_config import CONFIGS, DaptConfig
 from lidarpose.models.posenet import PoseNet, expand_weights
 from lidarpose.skeleton import HUMAN15, SMPL24, Skeleton, skeleton
-from lidarpose.train.augment import Augmentation, Example, augmentation, augmented
-from lidarpose.train.data_loader import MixedSource, Source, StoredSource, SyntheticSource
+from lidarpose.train.augment import Augmentation, ClipExample, Example, augmentation, augmented
+from lidarpose.train.data_loader import ClipSource, MixedSource, Source, StoredSource, SyntheticSource
 from lidarpose.train.objectives.baseline_objective import with_joints
 from lidarpose.train.objectives.dapt_objective import finetuning_config, pretraining_config, small
 from lidarpose.train.objectives.dapt_transfer import transferred
@@ -56,6 +54,8 @@ PRETRAINED: dict[str, tuple[Any, Skeleton]] = {
     SMALL_PAPER: (small(pretraining_config()), HUMAN15),
     "prn": (PrnConfig(), HUMAN15),
     "lpformer": (LpformerConfig(), HUMAN15),
+    "lidarcap": (LidarcapConfig(), SMPL24),
+    "ne": (NeConfig(), SMPL24),
 }
 
 
@@ -70,26 +70,24 @@ def networks() -> list[dict[str, Any]]:
             frames = getattr(config, "frames", 1)
             counts = {"joints": len(config.joints), "frames": frames, "parameters": parameters}
             rows.append({"name": name, "size": size} | counts)
-    for name, network in (("lidarcap", Lidarcap), ("ne", Ne)):
-        with torch.device("meta"):
-            parameters = sum(value.numel() for value in network().parameters())
-        rows.append({"name": name, "size": name, "joints": 24, "frames": FRAMES, "parameters": parameters})
     return rows
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainSetup:
     """people: how many samples are seen in all; validation: makes those to validate on, once, none for no validation;
-    joints: the skeleton to draw them in; card: what the checkpoint says besides the recipe; warnings: for the user."""
+    joints: the skeleton to draw them in; card: what the checkpoint says besides the recipe; warnings: for the user;
+    frames: of an example, each of which counts as one of `people`."""
 
     objective: Objective
     source: Source
     people: int
     network: Callable[[], nn.Module]
-    validation: Callable[[], list[Example]]
+    validation: Callable[[], Sequence[Example | ClipExample]]
     joints: Skeleton
     card: dict
     warnings: tuple[str, ...] = ()
+    frames: int = 1
 
     @property
     def task(self) -> Objective:
@@ -111,7 +109,7 @@ def objective_of(config: Config, recipe: Recipe, layout: str = "ragged") -> Obje
     # heatmaps are learned the same way in both stages
     stage = "finetune" if isinstance(config, DaptConfig) and config.bins else recipe.kind
     of_kind: dict[str, dict] = {"pose": lengths, "dapt": {"stage": stage, "layout": layout}}
-    of_kind |= dict.fromkeys(("prn", "lpformer"), {"shift": shift})
+    of_kind |= dict.fromkeys(("prn", "lpformer"), {"shift": shift}) | dict.fromkeys(("lidarcap", "ne"), {})
     settings = of_kind[config.kind]
     if "prn" in (config.kind, getattr(config, "neck", "")) and recipe.batch < 2:
         raise InputError("batch must be at least 2 for prn, whose batch norms see a few points a person, got 1")
@@ -141,9 +139,12 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
     names = ("scene", "set", "motion", "subjects", "captured", "strays", "noise")
     synthetic: dict[str, Any] = {name: getattr(recipe, name) for name in names}
 
-    def validation() -> list[Example]:
+    def validation() -> Sequence[Example | ClipExample]:
         # as a user's cloud: centered on its points
         held_out = SyntheticSource(seed=_VALIDATION_SEED, refined=0.0, **synthetic)
+        if isinstance(config, LidarcapConfig):
+            clips = range(VALIDATION // config.frames)
+            return [held_out.clip(index, trans_center=config.trans_center) for index in clips]
         return [held_out.example(index) for index in range(VALIDATION)]
 
     setup = TrainSetup(
@@ -155,6 +156,9 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
         joints=joints,
         card=card,
     )
+    is_clip = isinstance(config, LidarcapConfig)
+    if is_clip and not recipe.shards:
+        raise InputError(f"{config.name} learns from clips: name a folder of lidarpose synth --clips by --shards")
     if not recipe.shards:
         return setup
     for folder in recipe.shards:
@@ -162,6 +166,8 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
     dataset = InMemoryDataset.load(recipe.shards)
     turned = Augmentation(turn=1.0, flip=0.5)
     noise = {"strays": recipe.strays, "noise": recipe.noise}
+    if is_clip:
+        return _of_clips(setup, replace(_clips(dataset, config, recipe), strays=recipe.strays, noise=recipe.noise))
     source = StoredSource(dataset=dataset, seed=recipe.seed, augmentation=turned, **noise)
     return replace(setup, source=source, warnings=_damage(dataset) + _no_parts(dataset))
 
@@ -259,7 +265,7 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
         rows = np.unique(np.linspace(0, len(watched) - 1, min(VALIDATION, len(watched))).astype(int))
         return [augmented(watched.sample(k), quiet, np.random.default_rng([recipe.seed, k])) for k in rows]
 
-    return TrainSetup(
+    setup = TrainSetup(
         objective=objective_of(config, recipe, layout),
         source=source,
         # those that are mixed in come on top
@@ -275,6 +281,39 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
         },
         warnings=_damage(dataset) + ((_NO_VALIDATION,) if watched is None else ()),
     )
+    if not isinstance(config, LidarcapConfig):
+        return setup
+    if recipe.mix or recipe.augment != "none":
+        raise InputError(f"{config.name} learns from clips as they are: leave --mix at 0 and --augment at none")
+    own = _clips(dataset, config, recipe)
+    seen = None if watched is None else _clips(watched, config, recipe)
+    return replace(
+        _of_clips(setup, own),
+        people=max(round(recipe.epochs * len(own.clips)), 1) * config.frames,
+        validation=lambda: [] if seen is None else seen.some(VALIDATION // config.frames),
+    )
+
+
+def _clips(dataset: InMemoryDataset, config: LidarcapConfig, recipe: Pretrain | Finetune) -> ClipSource:
+    """The clips of a dataset. Raises InputError where it has none."""
+    clips, skipped = dataset.clips()
+    if not len(clips):
+        reasons = "; ".join(f"{count:,} {reason}" for reason, count in skipped.items())
+        raise InputError(
+            f"{config.name} needs {config.frames} consecutive frames of a person with rotations, got none: {reasons}; "
+            "lidarpose synth --clips writes some, and prepare of LiDARHuman26M and SLOPER4D"
+        )
+    return ClipSource(dataset=dataset, clips=clips, skipped=skipped, seed=recipe.seed, trans_center=config.trans_center)
+
+
+def _of_clips(setup: TrainSetup, source: ClipSource) -> TrainSetup:
+    """The setup that learns from clips instead."""
+    config = setup.objective.config
+    warnings = [f"left out {count:,} {reason}" for reason, count in source.skipped.items()]
+    parts = source.dataset.parts
+    if len(config.clouds) > 1 and all(rows["background"].null_count == rows.num_rows for _, rows, _ in parts):
+        warnings.append(f"nothing is known of what stands about these people: {config.name} sees them alone")
+    return replace(setup, source=source, frames=config.frames, warnings=(*setup.warnings, *warnings))
 
 
 def _initial(recipe: Finetune) -> tuple[Any, dict]:
@@ -314,7 +353,8 @@ def _finetuned(
     if recipe.neck != "mde" and not isinstance(own, DaptConfig):
         raise InputError(f"neck is of the paper's network: give --size {PAPER} or {SMALL_PAPER}")
     if isinstance(own, BaselineConfig):
-        config = _with_options(replace(own, joints=joints.joints), recipe.options)
+        named = own if isinstance(own, LidarcapConfig) else replace(own, joints=joints.joints)
+        config = _with_options(named, recipe.options)
         return config, partial(build, config) if trained is None else partial(with_joints, trained, config)
     own = _with_options(own, recipe.options)
     if isinstance(own, NetworkConfig):

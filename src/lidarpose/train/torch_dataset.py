@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from torch.utils.data import IterableDataset, get_worker_info
 
+from lidarpose.data.clips import FRAMES, consecutive, windows
 from lidarpose.data.shards import DatasetReader, open_dataset, pyarrow, to_arrow
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error, listed
@@ -100,6 +101,28 @@ class InMemoryDataset:
         # a dataset that never says hidden says nothing of what is seen
         unknown = np.full(len(BODY26), np.nan, np.float32)
         return replace(sample, pose=replace(sample.pose, visible=unknown))
+
+    def clips(self) -> tuple[np.ndarray, Counter[str]]:
+        """Rows (C, `FRAMES`) of the clips that consecutive frames with rotations make, and how many frames are left
+        out, by reason."""
+        tracks, frames, has_rotations = [], [], []
+        for dataset, rows, _ in self.parts:
+            name = "sequence" if "sequence" in rows.column_names else "index"
+            columns = (rows.column(column).to_pylist() for column in (name, "track", "frame"))
+            for sequence, track, frame in zip(*columns, strict=True):
+                tracks.append((dataset.folder, sequence, track))
+                frames.append(frame)
+            has_rotations += rows.column("rotations").is_valid().to_pylist()
+        # of all rows of the parts those of this dataset
+        start = np.cumsum([0, *(rows.num_rows for _, rows, _ in self.parts)])
+        stored = start[self.place[:, 0]] + self.place[:, 1]
+        usable = np.flatnonzero(np.array(has_rotations, bool)[stored])
+        skipped = Counter({"frames without rotations": len(stored) - len(usable)})
+        own = stored[usable].tolist()
+        runs = consecutive([tracks[k] for k in own], [frames[k] for k in own])
+        skipped["frames of fewer than 16 consecutive ones"] = sum(len(run) for run in runs if len(run) < FRAMES)
+        clips = [usable[windows(run)] for run in runs if len(run) >= FRAMES]
+        return np.concatenate([np.zeros((0, FRAMES), int), *clips]), +skipped
 
     def without(self, sequences: Sequence[str]) -> "InMemoryDataset":
         """The samples that are not of some sequences; the points are shared."""

@@ -1,6 +1,6 @@
 """A run's validation: the mean error of samples, and a picture of some of them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from torch import nn
@@ -8,19 +8,22 @@ from torch.nn.modules.batchnorm import _BatchNorm
 
 from lidarpose.sample import Pose
 from lidarpose.skeleton import BODY26, Skeleton
-from lidarpose.train.augment import Example
+from lidarpose.train.augment import ClipExample, Example
 from lidarpose.train.objectives.objective import Objective
 
 # examples in their own frames, predicted joints (N, 26, 3) m of body26, the skeleton to draw, a title -> PNG
 Draw = Callable[[list[Example], np.ndarray, Skeleton, str], bytes]
 
 
-def validate(objective: Objective, network: nn.Module, examples: list[Example], batch: int) -> tuple[float, np.ndarray]:
-    """MPJPE in mm of a network in evaluation mode over the labeled joints that it has, and its joints (N, 26, 3) m."""
+def validate(
+    objective: Objective, network: nn.Module, examples: Sequence[Example | ClipExample], batch: int
+) -> tuple[float, np.ndarray]:
+    """MPJPE in mm of a network in evaluation mode over the labeled joints that it has, and its joints (N, 26, 3) m, of
+    all N frames. batch: of examples."""
     device = next(network.parameters()).device
-    batches = [objective.collate(examples[k : k + batch]) for k in range(0, len(examples), batch)]
+    batches = [objective.collate(list(examples[k : k + batch])) for k in range(0, len(examples), batch)]
     joints = np.concatenate([objective.joints(network, arrays, device=device) for arrays in batches])
-    true = np.stack([example.joints for example in examples])
+    true = np.stack([frame.joints for example in examples for frame in example.frames])
     # labeled, and of a joint that the network has; what is not finite though it should be, must be seen
     counted = ~np.isnan(true).any(-1) & ~np.isnan(joints).all((0, 2))
     return float(np.linalg.norm(joints - true, axis=-1)[counted].mean() * 1e3), joints

@@ -10,7 +10,7 @@ import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.models.voxelize import WINDOW
-from lidarpose.skeleton import BODY26, HUMAN15
+from lidarpose.skeleton import BODY26, HUMAN15, SMPL24
 
 # points of a person that a network reads at most, as published
 MOST_POINTS = 1024
@@ -127,3 +127,77 @@ def pad_clouds(
         "middle": middle.astype(np.float32),
         "center": center.astype(np.float32),
     }
+
+
+# ---- networks of clips
+
+# clouds of a frame by name: the person, what stands still about them, and the frame's other points
+CLOUDS = ("person", "background", "neighbors")
+# frames of a clip, and points of each cloud that a network of clips reads at most, as published
+FRAMES = 16
+FRAME_POINTS = 512
+
+
+@dataclass(frozen=True, kw_only=True)
+class LidarcapConfig(BaselineConfig):
+    """LiDARCap. resample_with_replacement: every cloud has `FRAME_POINTS` points, fewer are repeated whole times and
+    then from the first on, of more some are drawn, perhaps twice, as published; else each point is there once;
+    order_dependent_neighbors: neighborhoods depend on the order of the points, as its CUDA kernels'; trans_center: in
+    training, frames are centered on SMPL's true trans, as published, so that where the pelvis is need not be learned;
+    else on the points, or on a guess of the pelvis."""
+
+    kind: ClassVar[str] = "lidarcap"
+    frames: ClassVar[int] = FRAMES
+    layers: ClassVar[int] = 50
+    clouds: ClassVar[tuple[str, ...]] = CLOUDS[:1]
+
+    joints: tuple[str, ...] = SMPL24.joints
+    resample_with_replacement: bool = False
+    order_dependent_neighbors: bool = False
+    trans_center: bool = False
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.joints != SMPL24.joints:
+            raise InputError(f"the joints of {self.kind} are SMPL's 24, got {', '.join(self.joints)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class NeConfig(LidarcapConfig):
+    """NE. exchange_across_batch: the three clouds' exchange attends over the clips of a batch instead of a clip's
+    frames, as published; with one clip it does nothing then."""
+
+    kind: ClassVar[str] = "ne"
+    clouds: ClassVar[tuple[str, ...]] = CLOUDS
+
+    exchange_across_batch: bool = False
+
+
+def pad_frames(
+    clouds: list[np.ndarray], *, resample_with_replacement: bool = False, seeds: list[int], window: float = np.inf
+) -> tuple[np.ndarray, np.ndarray]:
+    """Clouds (n, 3) m of frames, n = 0 is legal, about their centers, as a network of clips reads them.
+
+    Args:
+        clouds: of F frames.
+        resample_with_replacement: see `LidarcapConfig`.
+        seeds: of what is drawn, a number a frame.
+        window: what is farther from the center along an axis is left out, m.
+
+    Returns:
+        Points (F, N, 3) float32 m and valid (F, N) bool, False for padding.
+    """
+    chosen = []
+    for cloud, seed in zip(clouds, seeds, strict=True):
+        near = cloud[(np.abs(cloud) < window).all(1)]
+        near = near if len(near) else np.zeros((1, 3))
+        if len(near) > FRAME_POINTS:
+            rng = np.random.default_rng(seed)
+            near = near[rng.choice(len(near), FRAME_POINTS, replace=resample_with_replacement)]
+        # fewer are repeated from the first on
+        chosen.append(np.resize(near, (FRAME_POINTS, 3)) if resample_with_replacement else near)
+    points = np.zeros((len(chosen), max(map(len, chosen)), 3), np.float32)
+    valid = np.zeros(points.shape[:2], bool)
+    for row, cloud in enumerate(chosen):
+        points[row, : len(cloud)], valid[row, : len(cloud)] = cloud, True
+    return points, valid

@@ -3,17 +3,48 @@
 A clip is 16 frames of 512 points; joints are those of SMPL, relative to each frame's center.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from lidarpose.models.baselines.config import LidarcapConfig
 from lidarpose.models.baselines.point_ops import ball_query, farthest_points, gather_points
 from lidarpose.skeleton import SMPL24
 
-FRAMES, POINTS = 16, 512
+# what the networks of clips read: of each frame points (..., N, 3) m about its center, and valid (..., N) bool, one or
+# more a frame, by the name of the cloud
+Clouds = dict[str, tuple[Tensor, Tensor]]
 FEATURES = 1024
+# x, y, z of the package's mean adult's joints from their parents at rest, SMPL's frame and order, m
+_REST_OFFSETS = (
+    (0, 0, 0),
+    (0.075, -0.095, 0),
+    (-0.075, -0.095, 0),
+    (0, 0.1008, -0.0365),
+    (0.0239, -0.3892, 0.0086),
+    (-0.0239, -0.3892, 0.0086),
+    (0, 0.1296, -0.0081),
+    (0, -0.409, -0.0301),
+    (0, -0.409, -0.0301),
+    (0, 0.048, -0.0037),
+    (0, -0.0511, 0.145),
+    (0, -0.0511, 0.145),
+    (0, 0.2015, 0.0388),
+    (0.074, 0.1365, 0.0539),
+    (-0.074, 0.1365, 0.0539),
+    (0.0007, 0.0848, 0.0225),
+    (0.111, -0.0316, -0.0051),
+    (-0.111, -0.0316, -0.0051),
+    (0.2513, 0, 0),
+    (-0.2513, 0, 0),
+    (0.2309, 0, 0),
+    (-0.2308, 0, 0),
+    (0.1054, 0, 0),
+    (-0.1054, 0, 0),
+)
 # how far the graph's convolutions reach in time, frames
 TIME_KERNEL = 5
 
@@ -26,25 +57,48 @@ class ClipOutputs:
     joints: Tensor
     rotations: Tensor
 
+    def posed(self) -> Tensor:
+        """(B, T, 24, 3) m: the mean adult with these rotations, the pelvis where the first stage has it."""
+        offsets = rest_offsets().to(self.joints)
+        return self.joints[:, :, :1] + forward_kinematics(self.rotations, offsets, SMPL24.parents)
+
 
 class Lidarcap(nn.Module):
-    """34.9 M parameters. as_published: neighborhoods that depend on the order of the points, as its CUDA kernels'."""
+    """34.9 M parameters."""
 
-    def __init__(self, *, as_published: bool = False):
+    # tensors with a row for each joint: joints are always SMPL's
+    per_joint = ()
+
+    def __init__(self, config: LidarcapConfig):
         super().__init__()
-        self.encoder = PointNet2(FEATURES, as_published=as_published)
+        self.config = config
+        self.encoder = PointNet2(FEATURES, as_published=config.order_dependent_neighbors)
         self.embed = nn.Linear(FEATURES, 1024)
         self.recurrent = nn.GRU(1024, 1024, num_layers=2, batch_first=True, bidirectional=True)
         self.joints = nn.Linear(2048, 3 * len(SMPL24))
         self.rotations = StGcn(3 + FEATURES)
 
-    def forward(self, points: Tensor, valid: Tensor) -> ClipOutputs:
-        """points (B, T, N, 3) m about each frame's center, valid (B, T, N) bool, at least one a frame."""
-        clips, frames = points.shape[:2]
-        features = self.encoder(points.flatten(0, 1), valid.flatten(0, 1)).unflatten(0, (clips, frames))
+    def forward(self, clouds: Clouds) -> ClipOutputs:
+        """clouds: of B clips of T frames each."""
+        return self.decode(by_frame(self.encode, clouds))
+
+    def encode(self, clouds: Clouds) -> dict[str, Tensor]:
+        """Features (F, C) of F frames, which know nothing of each other."""
+        return {"person": self.encoder(*clouds["person"])}
+
+    def decode(self, encoded: dict[str, Tensor]) -> ClipOutputs:
+        """encoded (B, T, C)."""
+        features = encoded["person"]
         hidden = F.dropout(self.embed(features), 0.5, self.training).relu()
         joints = self.joints(self.recurrent(hidden)[0]).unflatten(-1, (-1, 3))
         return ClipOutputs(joints=joints, rotations=self.rotations(joints, features))
+
+
+def by_frame(encode: Callable[[Clouds], dict[str, Tensor]], clouds: Clouds) -> dict[str, Tensor]:
+    """Features (B, T, C) of clips' frames, by what encodes frames."""
+    shape = clouds["person"][0].shape[:2]
+    features = encode({name: (points.flatten(0, 1), valid.flatten(0, 1)) for name, (points, valid) in clouds.items()})
+    return {name: value.unflatten(0, shape) for name, value in features.items()}
 
 
 class PointNet2(nn.Module):
@@ -77,7 +131,9 @@ class SetAbstraction(nn.Module):
         self.layers = _perceptron(channels)
 
     def forward(self, points: Tensor, valid: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        chosen = farthest_points(points, valid, self.centers, as_published=self.as_published)
+        # of fewer points centers would repeat, which changes no maximum
+        count = self.centers if self.as_published else min(self.centers, points.shape[1])
+        chosen = farthest_points(points, valid, count, as_published=self.as_published)
         centers = gather_points(points, chosen)
         index = ball_query(centers, points, valid, self.radius, 32, as_published=self.as_published)
         offsets = gather_points(points, index) - centers[:, :, None]
@@ -159,6 +215,11 @@ def rotations_from_6d(numbers: Tensor) -> Tensor:
     x = F.normalize(first, dim=-1)
     y = F.normalize(second - (x * second).sum(-1, keepdim=True) * x, dim=-1)
     return torch.stack([x, y, torch.linalg.cross(x, y)], -1)
+
+
+def rest_offsets() -> Tensor:
+    """(24, 3) m: the mean adult's joints from their parents at rest, in SMPL's frame."""
+    return torch.tensor(_REST_OFFSETS)
 
 
 def forward_kinematics(rotations: Tensor, offsets: Tensor, parents: tuple[int, ...]) -> Tensor:

@@ -8,24 +8,24 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lidarpose.models.baselines.lidarcap import FRAMES, ClipOutputs, PointNet2, StGcn
+from lidarpose.models.baselines.config import CLOUDS, FRAMES, NeConfig
+from lidarpose.models.baselines.lidarcap import ClipOutputs, Clouds, PointNet2, StGcn, by_frame
 from lidarpose.skeleton import SMPL24
 
 WIDTH, LAYERS = 512, 8
-CLOUDS = ("person", "background", "neighbors")
 
 
 class Ne(nn.Module):
-    """129.7 M parameters.
+    """129.7 M parameters."""
 
-    across_batch: the exchange attends over the clips of a batch instead of a clip's frames, as published; with one clip
-    it does nothing then.
-    """
+    # tensors with a row for each joint: joints are always SMPL's
+    per_joint = ()
 
-    def __init__(self, *, across_batch: bool = False, as_published: bool = False):
+    def __init__(self, config: NeConfig):
         super().__init__()
-        self.across_batch = across_batch
-        self.encoders = nn.ModuleDict({name: PointNet2(WIDTH, as_published=as_published) for name in CLOUDS})
+        self.config = config
+        by_order = config.order_dependent_neighbors
+        self.encoders = nn.ModuleDict({name: PointNet2(WIDTH, as_published=by_order) for name in CLOUDS})
         self.neighbors = _transformer(WIDTH)
         self.exchange = Exchange()
         self.norm = nn.LayerNorm(3 * WIDTH)
@@ -37,17 +37,20 @@ class Ne(nn.Module):
         self.widen = nn.Linear(1024, 1024)
         self.rotations = StGcn(3 + 1024)
 
-    def forward(self, clouds: dict[str, tuple[Tensor, Tensor]]) -> ClipOutputs:
-        """clouds: of each of `CLOUDS` points (B, 16, N, 3) m about the frame's center and valid (B, 16, N) bool, one or
-        more a frame."""
-        features = {}
-        for name, (points, valid) in clouds.items():
-            own = self.encoders[name](points.flatten(0, 1), valid.flatten(0, 1))
-            features[name] = own.unflatten(0, points.shape[:2])
+    def forward(self, clouds: Clouds) -> ClipOutputs:
+        """clouds: each of `CLOUDS`, of B clips of 16 frames each."""
+        return self.decode(by_frame(self.encode, clouds))
+
+    def encode(self, clouds: Clouds) -> dict[str, Tensor]:
+        """Features (F, C) of each cloud of F frames, which know nothing of each other."""
+        return {name: self.encoders[name](*clouds[name]) for name in CLOUDS}
+
+    def decode(self, features: dict[str, Tensor]) -> ClipOutputs:
+        """features (B, 16, C)."""
         everything = torch.cat([features[name] for name in CLOUDS], -1)
         person, background = features["person"], features["background"]
         neighbors = self.neighbors(features["neighbors"])
-        if self.across_batch:
+        if self.config.exchange_across_batch:
             mixed = self.exchange(*(x.transpose(0, 1) for x in (person, background, neighbors))).transpose(0, 1)
         else:
             mixed = self.exchange(person, background, neighbors)

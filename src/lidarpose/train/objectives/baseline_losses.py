@@ -66,19 +66,19 @@ def lpformer_losses(
     }
 
 
-def clip_losses(outputs: ClipOutputs, rotations: Tensor, offsets: Tensor) -> dict[str, Tensor]:
+def clip_losses(outputs: ClipOutputs, rotations: Tensor, pelvis: Tensor, offsets: Tensor) -> dict[str, Tensor]:
     """LiDARCap's and NE's: mean square errors of rotations, of the joints that they lead to, and of the first stage's.
 
-    rotations (B, T, 24, 3, 3), SMPL's; offsets (24, 3) m: the skeleton at rest. Joints are of this one skeleton,
-    prediction and truth alike, where the published code regresses them from posed vertices; both are relative to the
-    pelvis.
+    rotations (B, T, 24, 3, 3), SMPL's; pelvis (B, T, 1, 3) m about the frame's center; offsets (24, 3) m: the skeleton
+    at rest. Joints are of this one skeleton, prediction and truth alike, where the published code regresses them from
+    posed vertices. The first stage's are about the frame's center, those of the rotations about the pelvis.
     """
     true = forward_kinematics(rotations, offsets, SMPL24.parents)
     posed = forward_kinematics(outputs.rotations, offsets, SMPL24.parents)
     return {
         "rotation": F.mse_loss(outputs.rotations, rotations),
         "joints": F.mse_loss(posed, true),
-        "first": F.mse_loss(outputs.joints, true),
+        "first": F.mse_loss(outputs.joints, pelvis + true),
     }
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lidarpose.train.augment import UNKNOWN_PART, Example
+from lidarpose.train.augment import UNKNOWN_PART
 
 # a sum over this process's people -> that over all processes', divided by their number. Gradients are averaged over
 # processes, so what is divided by it is the mean over all samples of the step, however they are shared out
@@ -32,9 +32,10 @@ class Objective(Protocol):
         """A new network, its weights drawn from torch's global generator."""
         ...
 
-    def collate(self, examples: list[Example]) -> Any:
-        """Examples of a batch, one or more, as what `terms` reads: numpy arrays, in a dict or a dataclass. Random
-        draws for an example are from a generator of `Example.seed` alone, so none depends on its batch mates."""
+    def collate(self, examples: list[Any]) -> Any:
+        """Examples of a batch, one or more, of clips `ClipExample`s, as what `terms` reads: numpy arrays, in a dict or
+        a dataclass. Random draws for an example are from a generator of `Example.seed` alone, so none depends on its
+        batch mates."""
         ...
 
     def terms(

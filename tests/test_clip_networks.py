@@ -1,0 +1,288 @@
+"""LiDARCap and NE from clips to scores: what they read of a frame, windows, losses, runs, predictions."""
+
+import json
+from dataclasses import replace
+
+import dataset_files as files
+import numpy as np
+import pytest
+import torch
+from training_runs import few_to_validate_on, refused  # noqa: F401 - a fixture
+
+from lidarpose import evaluation
+from lidarpose.body.rig import mean_adult_joints
+from lidarpose.data.clips import FRAMES, windows
+from lidarpose.data.prepare import prepare
+from lidarpose.data.shards import DatasetCard, person_row, shard_path, shard_writer, write_card
+from lidarpose.geometry import UP_AXES
+from lidarpose.inference.inputs import Clips
+from lidarpose.inference.predictor import Predictor, load
+from lidarpose.inference.torch_backend import ClipBackend
+from lidarpose.models.baselines.config import CLOUDS, FRAME_POINTS, LidarcapConfig, NeConfig, pad_frames
+from lidarpose.models.baselines.lidarcap import rest_offsets
+from lidarpose.models.checkpoint import Header, build, save_checkpoint
+from lidarpose.skeleton import BODY26, SMPL24
+from lidarpose.synth.generator import Generator
+from lidarpose.train import loop, setup
+from lidarpose.train.augment import clip_example
+from lidarpose.train.objectives.clip_objective import ClipObjective
+from lidarpose.train.objectives.objective import total
+from lidarpose.train.recipes import Finetune, Pretrain, recipe
+from lidarpose.train.setup import make_setup
+from lidarpose.train.torch_dataset import InMemoryDataset
+from lidarpose.train.validation import draw_examples
+
+CONFIGS = {"lidarcap": LidarcapConfig(), "ne": NeConfig()}
+# points of a cloud, that tests take seconds
+FEW = 24
+
+
+def thinned(sample, count=FEW):
+    rows = np.random.default_rng(len(sample.points)).permutation(len(sample.points))[:count]
+    clouds = {name: getattr(sample, name)[:count] for name in ("background", "neighbors")}
+    return replace(sample, points=sample.points[rows], part=sample.part[rows], ring=sample.ring[rows], **clouds)
+
+
+@pytest.fixture(scope="module")
+def clips():
+    generator = Generator(scene="paper", measure=False)
+    return [[thinned(person.sample) for person in generator.clip(3, k)] for k in range(2)]
+
+
+def write_clips(folder, clips):
+    folder.mkdir()
+    settings = {"what": "clips", "seed": 3, "scene": "paper"}
+    write_card(folder, DatasetCard(settings=settings, count=len(clips), per_shard=10, tables=("people",)))
+    with shard_writer(shard_path(folder, "people", 0), "people") as add:
+        for index, clip in enumerate(clips):
+            for frame, sample in enumerate(clip):
+                add(person_row(sample, index=index, frame=frame))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folder(clips, tmp_path_factory):
+    return write_clips(tmp_path_factory.mktemp("clips") / "clips", clips)
+
+
+@pytest.fixture(scope="module", params=CONFIGS)
+def predictor(request):
+    torch.manual_seed(0)
+    config = CONFIGS[request.param]
+    return Predictor(ClipBackend(build(config), Header(config=config, card={})), name=request.param)
+
+
+# ---- what is read of a frame
+
+
+def test_all_points_once_and_masked():
+    rng = np.random.default_rng(0)
+    clouds = [rng.normal(0, 0.5, (n, 3)) for n in (5, 0, 700)]
+    points, valid = pad_frames(clouds, seeds=[1, 2, 3])
+    assert points.shape == (3, FRAME_POINTS, 3) and valid.sum(1).tolist() == [5, 1, FRAME_POINTS]
+    np.testing.assert_allclose(points[0, :5], clouds[0], rtol=1e-6)
+    assert (points[1, 0] == 0).all()
+    assert len(np.unique(points[2], axis=0)) == FRAME_POINTS
+    assert (pad_frames(clouds[2:], seeds=[3])[0] == points[2]).all(), "a draw that follows from the seed alone"
+    assert pad_frames([np.array([[0.1, 0, 0], [9.0, 0, 0]])], seeds=[0], window=2.0)[1].sum() == 1
+
+
+def test_512_points_as_published():
+    rng = np.random.default_rng(0)
+    cloud = rng.normal(size=(200, 3)).astype(np.float32)
+    points, valid = pad_frames([cloud], resample_with_replacement=True, seeds=[0])
+    assert valid.all() and (points[0] == np.concatenate([cloud, cloud, cloud[:112]])).all()
+    many = rng.normal(size=(700, 3)).astype(np.float32)
+    drawn = pad_frames([many], resample_with_replacement=True, seeds=[0])[0][0]
+    assert drawn.shape == (FRAME_POINTS, 3) and len(np.unique(drawn, axis=0)) < 450
+    assert {tuple(p) for p in drawn.tolist()} <= {tuple(p) for p in many.tolist()}
+
+
+# ---- clips of datasets
+
+
+def test_what_makes_no_clip_is_counted_by_its_reason(clips, tmp_path):
+    without = [replace(sample, rotations=None) for sample in clips[1][:3]]
+    longer = [*clips[0], *clips[1][:4]]
+    dataset = InMemoryDataset.load([write_clips(tmp_path / "d", [longer, clips[1][:7], without])])
+    rows, skipped = dataset.clips()
+    assert dict(skipped) == {"frames without rotations": 3, "frames of fewer than 16 consecutive ones": 7}
+    assert (rows == windows(np.arange(20))).all() and rows.shape == (2, FRAMES)
+    source = make_setup(recipe(Pretrain, "lidarcap", shards=(str(tmp_path / "d"),)))
+    assert source.frames == FRAMES and sum("left out" in warning for warning in source.warnings) == 2
+
+
+def test_an_example_is_about_each_frame_s_center(clips):
+    rng = np.random.default_rng(0)
+    for trans_center, refined in ((False, 0.0), (False, 1.0), (True, 1.0)):
+        example = clip_example(clips[0], rng, trans_center=trans_center, refined=refined)
+        for frame, sample, cloud in zip(example.frames, clips[0], example.clouds["background"], strict=True):
+            center = sample.pose.joints[0] - frame.joints[0]
+            np.testing.assert_allclose(frame.points + center, sample.points, atol=1e-5)
+            np.testing.assert_allclose(cloud + center, sample.background, atol=1e-5)
+            if trans_center:
+                assert np.abs(frame.joints[0]).max() == 0, "of the package's body the pelvis is trans"
+            elif not refined:
+                np.testing.assert_allclose(center, sample.center, atol=1e-5)
+            else:
+                assert 0 < np.abs(frame.joints[0]).max() < 0.3
+
+
+# ---- losses
+
+
+def test_the_skeleton_at_rest_is_the_package_s_mean_adult():
+    rest = mean_adult_joints() @ UP_AXES["y"]
+    offsets = rest - rest[[max(parent, 0) for parent in SMPL24.parents]]
+    np.testing.assert_allclose(rest_offsets(), offsets, atol=1e-4)
+    assert FRAMES == LidarcapConfig.frames
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_losses_vanish_at_the_truth(name, clips):
+    """The first stage is about the frame's center: where the pelvis is, is learned."""
+    objective = ClipObjective(config=CONFIGS[name])
+    arrays = objective.collate([clip_example(clip, np.random.default_rng(1)) for clip in clips])
+    assert {f"{cloud}_valid" for cloud in objective.config.clouds} <= arrays.keys()
+    assert ("background" in arrays) == (name == "ne")
+
+    class Perfect:
+        def __call__(self, clouds):
+            from lidarpose.models.baselines.lidarcap import ClipOutputs, forward_kinematics
+
+            rotations = torch.as_tensor(arrays["rotations"])
+            joints = forward_kinematics(rotations, rest_offsets(), SMPL24.parents)
+            pelvis = torch.as_tensor(arrays["joints"][:, :, :1])
+            return ClipOutputs(joints=joints + pelvis, rotations=rotations)
+
+    terms = objective.terms(Perfect(), arrays)
+    assert float(total(terms)) < 1e-10
+    # the mean adult is not this person, but has the same pose
+    assert 0 < float(terms["mpjpe"]) < 0.12
+    joints = objective.joints(Perfect(), arrays)
+    assert joints.shape == (2 * FRAMES, 26, 3) and np.isnan(joints[:, 24:]).all()
+    true = np.concatenate([[sample.pose.joints[0] - sample.pose.joints[1] for sample in clip] for clip in clips])
+    assert (np.sum((joints[:, 0] - joints[:, 1]) * true, -1) > 0).all()
+
+
+# ---- runs
+
+
+@pytest.mark.slow
+def test_a_run_on_clips_is_evaluated_and_predicts(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(setup, "VALIDATION", FRAMES)
+    wanted = recipe(
+        Pretrain, "lidarcap", shards=(str(folder),), scene="paper", batch=32, people=40, workers=0, pictures=1
+    )
+    assert (wanted.optimizer, wanted.rate, wanted.decay, wanted.ema) == ("adam", 1e-4, 1e-4, 0)
+    assert recipe(Pretrain, "ne").batch == 8 * FRAMES
+    path = loop.train(wanted, tmp_path / "run", device="cpu", draw=draw_examples)
+    log = [json.loads(line) for line in (tmp_path / "run/log.jsonl").read_text().splitlines()]
+    # a clip counts 16 people: two steps of two clips
+    assert log[-1]["people"] == 64 and {"rotation", "joints", "first", "mpjpe"} <= log[-1].keys()
+    assert log[-1]["validation_mm"] > 0 and list((tmp_path / "run/pictures").glob("*.png"))
+    result = evaluation.evaluate(path, folder)
+    assert result.counts["people"] == 2 * FRAMES
+    assert any(line.figure.startswith("accel") and line.people for line in result.lines)
+    tuned = recipe(
+        Finetune, "lidarcap", data=(str(folder),), init=str(path), split="all", epochs=1.0, batch=32, workers=0
+    )
+    assert make_setup(tuned).people == 2 * FRAMES
+    went_on = make_setup(tuned).network().state_dict()
+    torch.testing.assert_close(went_on["embed.weight"], load(path).backend.network.state_dict()["embed.weight"])
+
+
+def test_settings_that_clips_cannot_have_are_refused(folder, tmp_path):
+    with refused("lidarcap learns from clips: .* by --shards"):
+        make_setup(recipe(Pretrain, "lidarcap"))
+    with refused("batch counts frames, so a clip counts 16: give a multiple, got 24"):
+        loop.train(recipe(Pretrain, "lidarcap", shards=(str(folder),), batch=24), tmp_path / "run", device="cpu")
+    with refused("leave --mix at 0 and --augment at none"):
+        make_setup(recipe(Finetune, "ne", data=(str(folder),), split="all", mix=0.25))
+    with refused("the joints of lidarcap are SMPL's 24"):
+        replace(LidarcapConfig(), joints=BODY26.joints)
+    with refused("option of lidarcap"):
+        make_setup(recipe(Pretrain, "lidarcap", shards=(str(folder),), options=("grid=32",)))
+
+
+def test_people_alone_make_no_clips(tmp_path):
+    people = [[Generator(scene="paper", measure=False).person(0, k).sample] for k in range(3)]
+    with refused("needs 16 consecutive frames of a person with rotations, got none: 3 frames without rotations"):
+        make_setup(recipe(Pretrain, "lidarcap", shards=(str(write_clips(tmp_path / "p", people)),)))
+
+
+def test_raw_files_of_lidarhuman26m_become_a_score(tmp_path):
+    """By the published protocol: centered on trans, as the network was trained."""
+    smpl = files.write_smpl(tmp_path / "SMPL_NEUTRAL.npz")
+    files.write_lidarhuman26m(tmp_path / "raw", smpl, sequences=("5", "7"), frames=18)
+    prepare("lidarhuman26m", tmp_path / "raw", tmp_path / "set", smpl=smpl)
+    wanted = recipe(
+        Finetune, "lidarcap", data=(str(tmp_path / "set"),), size="lidarcap", options=("trans_center",), batch=16
+    )
+    made = make_setup(wanted)
+    # sequence 5: two windows, the last filled
+    assert made.people == 200 * 2 * FRAMES and made.objective.config.trans_center
+    example = made.source.example(0)
+    assert np.ptp([frame.joints[0] for frame in example.frames], axis=0).max() < 1e-4
+    torch.manual_seed(0)
+    save_checkpoint(tmp_path / "w.safetensors", made.network(), card={})
+    result = evaluation.evaluate(tmp_path / "w.safetensors", tmp_path / "set", protocol="dapt")
+    assert result.counts["people"] == 18
+
+
+# ---- predictions
+
+
+def _joints(poses):
+    return np.stack([person.joints for person in poses])
+
+
+def test_a_person_alone_is_a_clip_of_equal_frames(predictor, clips):
+    clouds = [sample.points for sample in clips[0][:3]]
+    alone = predictor.predict(clouds)
+    equal = predictor.predict([clouds[1]] * FRAMES, clips=Clips.of_run(FRAMES))
+    np.testing.assert_allclose(equal[FRAMES // 2].joints, alone[1].joints, atol=1e-4)
+    assert alone[1].skeleton == SMPL24
+
+
+def test_frames_of_a_clip_know_of_each_other_and_of_their_order(predictor, clips):
+    clouds = [sample.points for sample in clips[0]]
+    around = {name: [getattr(sample, name) for sample in clips[0]] for name in CLOUDS[1:]}
+    joints = _joints(predictor.predict(clouds, clips=Clips.of_run(FRAMES, **around)))
+    backwards = Clips.of_run(FRAMES, **{name: given[::-1] for name, given in around.items()})
+    turned = _joints(predictor.predict(clouds[::-1], clips=backwards))
+    alone = _joints(predictor.predict(clouds))
+    assert np.abs(joints - alone).max() > 1e-3
+    assert np.abs(joints - turned[::-1]).max() > 1e-3
+    # only NE reads what stands about the person
+    bare = _joints(predictor.predict(clouds, clips=Clips.of_run(FRAMES)))
+    assert (np.abs(bare - joints).max() > 1e-5) == (predictor.model["name"] == "ne")
+
+
+def test_frames_that_show_nothing_have_no_pose_and_harm_no_other(predictor, clips):
+    clouds = [sample.points for sample in clips[0]]
+    clouds[4], clouds[15] = clouds[4][:2], clouds[15][:0]
+    poses = predictor.predict(clouds, clips=Clips.of_run(FRAMES))
+    assert [k for k, person in enumerate(poses) if person.pose is None] == [4, 15]
+    filled = list(clouds)
+    filled[4], filled[15] = clouds[5], clouds[14]
+    same = predictor.predict(filled, clips=Clips.of_run(FRAMES))
+    np.testing.assert_allclose(poses[0].joints, same[0].joints, atol=1e-4)
+
+
+def test_networks_of_single_frames_take_no_clips():
+    with refused("reads single frames"):
+        load("tiny").predict([np.zeros((10, 3))] * FRAMES, clips=Clips.of_run(FRAMES))
+
+
+def test_evaluation_shows_true_windows(predictor, folder, clips):
+    result = evaluation.run(predictor, [folder]).evaluations[0]
+    by_clip = []
+    for clip in clips:
+        around = {name: [getattr(sample, name) for sample in clip] for name in CLOUDS[1:]}
+        clouds = [sample.points for sample in clip]
+        poses = predictor.predict(clouds, sensor_origin=(0, 0, 0), clips=Clips.of_run(FRAMES, **around))
+        by_clip.append(_joints(poses))
+    names = list(result.predictions.skeleton.joints)
+    expected = np.concatenate(by_clip)[:, [SMPL24.index(name) for name in names]]
+    np.testing.assert_allclose(result.predictions.pred, expected, atol=1e-3)
