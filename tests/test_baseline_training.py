@@ -11,7 +11,7 @@ from training_runs import few_to_validate_on  # noqa: F401
 from lidarpose.cli import main
 from lidarpose.errors import InputError
 from lidarpose.inference.predictor import load
-from lidarpose.models.baselines.config import MOST_POINTS, LpformerConfig, PrnConfig, pad_clouds
+from lidarpose.models.baselines.baseline_config import MOST_POINTS, LpformerConfig, PrnConfig, pad_clouds
 from lidarpose.models.baselines.point_transformer_v2 import GroupedVectorAttention
 from lidarpose.models.baselines.prn import BareAttention
 from lidarpose.models.checkpoint import load_checkpoint, save_checkpoint

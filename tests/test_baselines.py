@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from lidarpose.data.clips import FRAMES
-from lidarpose.models.baselines.config import CLOUDS, LidarcapConfig, LpformerConfig, NeConfig, PrnConfig
+from lidarpose.models.baselines.baseline_config import CLOUDS, LidarcapConfig, LpformerConfig, NeConfig, PrnConfig
 from lidarpose.models.baselines.lidarcap import (
     Lidarcap,
     PointNet2,

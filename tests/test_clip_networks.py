@@ -18,7 +18,7 @@ from lidarpose.geometry import UP_AXES
 from lidarpose.inference.inputs import Clips
 from lidarpose.inference.predictor import Predictor, load
 from lidarpose.inference.torch_backend import ClipBackend
-from lidarpose.models.baselines.config import CLOUDS, FRAME_POINTS, LidarcapConfig, NeConfig, pad_frames
+from lidarpose.models.baselines.baseline_config import CLOUDS, FRAME_POINTS, LidarcapConfig, NeConfig, pad_frames
 from lidarpose.models.baselines.lidarcap import rest_offsets
 from lidarpose.models.checkpoint import Header, build, save_checkpoint
 from lidarpose.skeleton import BODY26, SMPL24

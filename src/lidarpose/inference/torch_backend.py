@@ -11,7 +11,7 @@ from lidarpose.errors import InputError
 from lidarpose.inference.backend import Backend, Raw
 from lidarpose.inference.inputs import Clips
 from lidarpose.models import NETWORKS
-from lidarpose.models.baselines.config import pad_clouds, pad_frames
+from lidarpose.models.baselines.baseline_config import pad_clouds, pad_frames
 from lidarpose.models.baselines.lidarcap import Lidarcap
 from lidarpose.models.baselines.lpformer import Lpformer
 from lidarpose.models.baselines.ne import Ne

@@ -51,25 +51,25 @@ NETWORKS = {
     ),
     # those that the paper compares with
     "prn": NetworkKind(
-        config="lidarpose.models.baselines.config:PrnConfig",
+        config="lidarpose.models.baselines.baseline_config:PrnConfig",
         network="lidarpose.models.baselines.prn:Prn",
         objective="lidarpose.train.objectives.baseline_objective:BaselineObjective",
         backend="lidarpose.inference.torch_backend:BaselineBackend",
     ),
     "lpformer": NetworkKind(
-        config="lidarpose.models.baselines.config:LpformerConfig",
+        config="lidarpose.models.baselines.baseline_config:LpformerConfig",
         network="lidarpose.models.baselines.lpformer:Lpformer",
         objective="lidarpose.train.objectives.baseline_objective:BaselineObjective",
         backend="lidarpose.inference.torch_backend:BaselineBackend",
     ),
     "lidarcap": NetworkKind(
-        config="lidarpose.models.baselines.config:LidarcapConfig",
+        config="lidarpose.models.baselines.baseline_config:LidarcapConfig",
         network="lidarpose.models.baselines.lidarcap:Lidarcap",
         objective="lidarpose.train.objectives.clip_objective:ClipObjective",
         backend="lidarpose.inference.torch_backend:ClipBackend",
     ),
     "ne": NetworkKind(
-        config="lidarpose.models.baselines.config:NeConfig",
+        config="lidarpose.models.baselines.baseline_config:NeConfig",
         network="lidarpose.models.baselines.ne:Ne",
         objective="lidarpose.train.objectives.clip_objective:ClipObjective",
         backend="lidarpose.inference.torch_backend:ClipBackend",

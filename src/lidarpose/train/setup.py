@@ -19,7 +19,13 @@ from lidarpose.data.shards import read_card
 from lidarpose.errors import InputError, check_name
 from lidarpose.io.files import file_error
 from lidarpose.models import NETWORKS, weights_path
-from lidarpose.models.baselines.config import BaselineConfig, LidarcapConfig, LpformerConfig, NeConfig, PrnConfig
+from lidarpose.models.baselines.baseline_config import (
+    BaselineConfig,
+    LidarcapConfig,
+    LpformerConfig,
+    NeConfig,
+    PrnConfig,
+)
 from lidarpose.models.checkpoint import build, load_checkpoint
 from lidarpose.models.config import SIZES, NetworkConfig
 from lidarpose.models.dapt.dapt_config import CONFIGS, DaptConfig

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lidarpose.models.baselines.config import LidarcapConfig
+from lidarpose.models.baselines.baseline_config import LidarcapConfig
 from lidarpose.models.baselines.point_ops import ball_query, farthest_points, gather_points
 from lidarpose.skeleton import SMPL24
 

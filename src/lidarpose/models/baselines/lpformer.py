@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lidarpose.models.baselines.config import LpformerConfig
+from lidarpose.models.baselines.baseline_config import LpformerConfig
 from lidarpose.models.baselines.prn import BareAttention
 
 # half the side of the occupancy grid, and how far out a point may ask for features, m

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lidarpose.models.baselines.config import CLOUDS, FRAMES, NeConfig
+from lidarpose.models.baselines.baseline_config import CLOUDS, FRAMES, NeConfig
 from lidarpose.models.baselines.lidarcap import ClipOutputs, Clouds, PointNet2, StGcn, by_frame
 from lidarpose.skeleton import SMPL24
 

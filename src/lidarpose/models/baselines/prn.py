@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from lidarpose.models.baselines.config import PrnConfig
+from lidarpose.models.baselines.baseline_config import PrnConfig
 from lidarpose.models.baselines.point_transformer_v2 import EMBEDDING, PointTransformerV2, Rows, segment_reduce
 
 # a point votes where body is this likely and one joint is

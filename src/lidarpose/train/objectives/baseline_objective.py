@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lidarpose.models.baselines.config import LpformerConfig, PrnConfig, pad_clouds
+from lidarpose.models.baselines.baseline_config import LpformerConfig, PrnConfig, pad_clouds
 from lidarpose.models.checkpoint import build
 from lidarpose.skeleton import BODY26
 from lidarpose.train.augment import Example

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from lidarpose.geometry import axis_angle_to_matrix
-from lidarpose.models.baselines.config import LidarcapConfig, pad_frames
+from lidarpose.models.baselines.baseline_config import LidarcapConfig, pad_frames
 from lidarpose.models.baselines.lidarcap import Clouds, rest_offsets
 from lidarpose.models.checkpoint import build
 from lidarpose.models.voxelize import WINDOW
