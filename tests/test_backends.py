@@ -358,8 +358,8 @@ def test_a_released_networks_joints_are_brought_in_order(dapt):
 def test_a_released_network_is_centered_on_the_hips(dapt, monkeypatch):
     transformed, calls = dapt._transformed, []
 
-    def recorded(transform, clouds, centers, origin):
-        calls.append((centers, transformed(transform, clouds, centers, origin)))
+    def recorded(transform, clouds, centers, *rest):
+        calls.append((centers, transformed(transform, clouds, centers, *rest)))
         return calls[-1][1]
 
     monkeypatch.setattr(dapt, "_transformed", recorded)

@@ -107,7 +107,7 @@ def test_pretraining_goes_on_from_weights(tmp_path):
     assert all(map(torch.equal, network.state_dict().values(), setup.network().state_dict().values()))
     with pytest.raises(InputError, match="cannot begin as this tiny one: grid"):
         make_setup(Pretrain(size="base", init="tiny"))
-    with pytest.raises(InputError, match="the paper's begins at random"):
+    with pytest.raises(InputError, match="the paper's begin at random"):
         make_setup(Pretrain(size="paper-small", init="tiny"))
     path = tmp_path / "small.safetensors"
     save_checkpoint(path, network, card={})
