@@ -141,7 +141,7 @@ def _progress(stack: ExitStack) -> Callable[[str, int, int], None]:
 
 
 def _lines(result) -> Iterator[str]:
-    """The result for a terminal: the headline figure, how it was found, then all figures: of everybody, by condition,
+    """The result for a terminal: the headline figure, its protocol, then all figures: of everybody, by condition,
     joint, distance, points, hidden share."""
     setting, counts = result.setting, result.counts
     mpjpe = result.line("mpjpe")

@@ -219,7 +219,7 @@ class EvalSetup:
         yield from (answers[row] for row in range(len(samples)))
 
     def _clips(self, samples: Sequence[EvalSample]) -> dict[str, Clips]:
-        """What a network of clips is told: which people are frames that follow each other."""
+        """What a network of clips reads besides clouds: which people are frames that follow each other."""
         if getattr(self.model.backend, "frames", 1) == 1:
             return {}
         own = [person.sample for person in samples]

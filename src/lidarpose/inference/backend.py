@@ -48,6 +48,11 @@ class Raw:
     visible: np.ndarray | None = None
 
     @classmethod
+    def from_joints(cls, joints: np.ndarray) -> "Raw":
+        """Of a network that answers with joints (B, J, 3) m alone."""
+        return cls(vote=joints, heatmaps=None, low=np.zeros(3), step=np.ones(3))
+
+    @classmethod
     def from_pose(cls, outputs: dict[str, np.ndarray]) -> "Raw":
         """From the outputs of a `PoseNet` by name."""
         heatmap = outputs["heatmap"]

@@ -2,9 +2,11 @@
 
 import os
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
 from lidarpose.data.clips import FRAMES
 from lidarpose.errors import InputError
@@ -12,12 +14,7 @@ from lidarpose.inference.backend import Backend, Raw
 from lidarpose.inference.inputs import Clips
 from lidarpose.models import NETWORKS
 from lidarpose.models.baselines.baseline_config import pad_clouds, pad_frames
-from lidarpose.models.baselines.lidarcap import Lidarcap
-from lidarpose.models.baselines.lpformer import Lpformer
-from lidarpose.models.baselines.ne import Ne
-from lidarpose.models.baselines.prn import Prn
 from lidarpose.models.checkpoint import Header, load_checkpoint
-from lidarpose.models.dapt.dapt_net import DaptNet
 from lidarpose.models.export import ArrayModule
 from lidarpose.models.onnx import OUTPUTS, voxelize_people
 from lidarpose.models.posenet import PoseNet
@@ -79,17 +76,25 @@ class TorchBackend:
         return Raw.from_pose({name: value.cpu().numpy() for name, value in zip(OUTPUTS, values, strict=True)})
 
 
-class DaptBackend:
-    """The paper's network, its joints brought into the order of its skeleton. What it sees of a person is what this
-    package's own networks see, the points within `WINDOW`; it has no use for the sensor's place."""
+class _PaperBackend:
+    """What the backends of the paper's network and its baselines have in common."""
 
     name = "torch"
     batch = _SLOW_BATCH
 
-    def __init__(self, network: DaptNet, header: Header, *, device: str = "cpu", compile: bool = False):
-        _no_compile(compile)
-        self.network = network.to(device).eval()
+    def __init__(self, network: nn.Module, header: Header, *, device: str = "cpu", compile: bool = False):
+        if compile:
+            raise InputError(
+                "torch.compile is not offered for the paper's network and its baselines: leave compile away"
+            )
+        self.network: Any = network.to(device).eval()
         self.header = header
+        self.device = device
+
+
+class DaptBackend(_PaperBackend):
+    """The paper's network, its joints brought into the order of its skeleton. What it sees of a person is what this
+    package's own networks see, the points within `WINDOW`; it has no use for the sensor's place."""
 
     def run(self, clouds: list[np.ndarray], view: np.ndarray) -> Raw:
         config = self.network.config
@@ -97,7 +102,7 @@ class DaptBackend:
         out = self.network.outputs(near)
         order = config.order_in(self.header.skeleton)
         if "logits_x" not in out:
-            return Raw(vote=out["coordinates"][:, order], heatmaps=None, low=np.zeros(3), step=np.ones(3))
+            return Raw.from_joints(out["coordinates"][:, order])
         return Raw(
             vote=np.zeros((len(clouds), len(order), 3), np.float32),
             heatmaps=tuple(out[f"logits_{axis}"][:, order] for axis in "xyz"),
@@ -106,18 +111,9 @@ class DaptBackend:
         )
 
 
-class BaselineBackend:
+class BaselineBackend(_PaperBackend):
     """PRN or LPFormer. They subtract the middle of the cloud's extent themselves and add it back, so they answer in the
     frame of the cloud. Of more points than they read a fixed draw stays."""
-
-    name = "torch"
-    batch = _SLOW_BATCH
-
-    def __init__(self, network: Prn | Lpformer, header: Header, *, device: str = "cpu", compile: bool = False):
-        _no_compile(compile)
-        self.network = network.to(device).eval()
-        self.header = header
-        self.device = device
 
     @torch.inference_mode()
     def run(self, clouds: list[np.ndarray], view: np.ndarray) -> Raw:
@@ -127,23 +123,14 @@ class BaselineBackend:
         inputs = (torch.as_tensor(arrays[name]).to(self.device) for name in ("points", "valid", "center"))
         joints = self.network(*inputs).joints.float().cpu().numpy() + arrays["middle"][:, None]
         order = [config.joints.index(joint) for joint in self.header.skeleton.joints]
-        return Raw(vote=joints[:, order], heatmaps=None, low=np.zeros(3), step=np.ones(3))
+        return Raw.from_joints(joints[:, order])
 
 
-class ClipBackend:
+class ClipBackend(_PaperBackend):
     """LiDARCap or NE. A person who is no frame of a clip fills a clip of equal frames. Of more points than the network
     reads a fixed draw stays."""
 
-    name = "torch"
-    # clips a call
-    batch = _SLOW_BATCH
     frames = FRAMES
-
-    def __init__(self, network: Lidarcap | Ne, header: Header, *, device: str = "cpu", compile: bool = False):
-        _no_compile(compile)
-        self.network = network.to(device).eval()
-        self.header = header
-        self.device = device
 
     @torch.inference_mode()
     def run(self, clouds: list[np.ndarray], view: np.ndarray, clip: Clips | None = None) -> Raw:
@@ -166,9 +153,4 @@ class ClipBackend:
         is_alone = np.ptp(clip.windows, axis=1) == 0
         at = at + FRAMES // 2 * is_alone[at // FRAMES]
         joints[own] = outputs.posed().flatten(0, 1)[at].float().cpu().numpy()
-        return Raw(vote=joints, heatmaps=None, low=np.zeros(3), step=np.ones(3))
-
-
-def _no_compile(compile: bool) -> None:
-    if compile:
-        raise InputError("torch.compile is not offered for the paper's network and its baselines: leave compile away")
+        return Raw.from_joints(joints)

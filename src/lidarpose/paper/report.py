@@ -34,7 +34,7 @@ def run_table(
     table: Table, options: Options, out: Path, chosen: Sequence[str], execute: Execute, tell: Any
 ) -> dict[str, Any]:
     """Runs what is not done of a table, cell by cell, and writes it anew after each; returns it. A cell that fails is
-    told and written as failed, and the others go on."""
+    reported and written as failed, and the others go on."""
     check_out(out)
     selected = cells(table, options, chosen)
     failed: dict[int, str] = {}
@@ -89,7 +89,7 @@ def _entry(table: Table, cell: Cell, out: Path, failure: str) -> dict[str, Any]:
 
 
 def _figures(cell: Cell, evaluation: Step, out: Path) -> dict[str, Any]:
-    """What an evaluation found, what the training cost, and the mean pose's error on the same people."""
+    """An evaluation's figures, what the training cost, and the mean pose's error on the same people."""
     result = read_scores(evaluation.product(out) / FILE).results[0]
     weights = cell.training[-1].product(out)
     runs = runs_of(read_header(weights).card)

@@ -103,8 +103,7 @@ def pad_clouds(
     """
     chosen, middles = [], []
     for cloud, seed in zip(clouds, seeds, strict=True):
-        near = cloud[(np.abs(cloud) < WINDOW).all(1)]
-        near = near if len(near) else np.zeros((1, 3))
+        near = _near(cloud, WINDOW)
         rng = np.random.default_rng(seed)
         middles.append((near.min(0) + near.max(0)) / 2)
         if resample_with_replacement:
@@ -116,10 +115,7 @@ def pad_clouds(
         chosen.append(near - middles[-1])
     middle = np.stack(middles)
     toward, distance, known = view[:, :3], np.exp(view[:, 3:4]), view[:, 4:] > 0
-    points = np.zeros((len(chosen), max(map(len, chosen)), 3), np.float32)
-    valid = np.zeros(points.shape[:2], bool)
-    for row, cloud in enumerate(chosen):
-        points[row, : len(cloud)], valid[row, : len(cloud)] = cloud, True
+    points, valid = _padded(chosen)
     center = np.where(known, middle - toward * distance, 0)
     return {
         "points": points,
@@ -189,15 +185,25 @@ def pad_frames(
     """
     chosen = []
     for cloud, seed in zip(clouds, seeds, strict=True):
-        near = cloud[(np.abs(cloud) < window).all(1)]
-        near = near if len(near) else np.zeros((1, 3))
+        near = _near(cloud, window)
         if len(near) > FRAME_POINTS:
             rng = np.random.default_rng(seed)
             near = near[rng.choice(len(near), FRAME_POINTS, replace=resample_with_replacement)]
         # fewer are repeated from the first on
         chosen.append(np.resize(near, (FRAME_POINTS, 3)) if resample_with_replacement else near)
-    points = np.zeros((len(chosen), max(map(len, chosen)), 3), np.float32)
+    return _padded(chosen)
+
+
+def _near(cloud: np.ndarray, window: float) -> np.ndarray:
+    """The points (n, 3) within `window` m of the origin along each axis; the origin itself where there is none."""
+    near = cloud[(np.abs(cloud) < window).all(1)]
+    return near if len(near) else np.zeros((1, 3))
+
+
+def _padded(clouds: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Clouds (n, 3) as points (B, N, 3) float32 and valid (B, N) bool, False for padding."""
+    points = np.zeros((len(clouds), max(map(len, clouds)), 3), np.float32)
     valid = np.zeros(points.shape[:2], bool)
-    for row, cloud in enumerate(chosen):
+    for row, cloud in enumerate(clouds):
         points[row, : len(cloud)], valid[row, : len(cloud)] = cloud, True
     return points, valid

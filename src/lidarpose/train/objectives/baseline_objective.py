@@ -13,10 +13,9 @@ from torch import Tensor, nn
 
 from lidarpose.models.baselines.baseline_config import LpformerConfig, PrnConfig, pad_clouds
 from lidarpose.models.checkpoint import build
-from lidarpose.skeleton import BODY26
 from lidarpose.train.augment import Example
 from lidarpose.train.objectives.baseline_losses import lpformer_losses, mean_distance, prn_losses
-from lidarpose.train.objectives.objective import Share, alone
+from lidarpose.train.objectives.objective import Share, alone, in_body26
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,10 +63,8 @@ class BaselineObjective:
     @torch.no_grad()
     def joints(self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu") -> np.ndarray:
         points, valid, center = (torch.as_tensor(arrays[name]).to(device) for name in ("points", "valid", "center"))
-        own = network(points, valid, center).joints.float().cpu().numpy()
-        joints = np.full((len(own), len(BODY26), 3), np.nan, np.float32)
-        joints[:, self.config.columns] = own + arrays["middle"][:, None]
-        return joints
+        own = in_body26(network(points, valid, center).joints, self.config.columns)
+        return own + arrays["middle"][:, None]
 
 
 @torch.no_grad()

@@ -18,7 +18,7 @@ from lidarpose.models.voxelize import WINDOW
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.train.augment import ClipExample
 from lidarpose.train.objectives.baseline_losses import clip_losses, mean_distance
-from lidarpose.train.objectives.objective import Share, alone
+from lidarpose.train.objectives.objective import Share, alone, in_body26
 
 _COLUMNS = BODY26.map_to(SMPL24)
 
@@ -66,7 +66,4 @@ class ClipObjective:
 
     @torch.no_grad()
     def joints(self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu") -> np.ndarray:
-        own = network(self._clouds(arrays, device)).posed().float().cpu().numpy()
-        joints = np.full((own.shape[0] * own.shape[1], len(BODY26), 3), np.nan, np.float32)
-        joints[:, _COLUMNS] = own.reshape(-1, len(SMPL24), 3)
-        return joints
+        return in_body26(network(self._clouds(arrays, device)).posed().flatten(0, 1), _COLUMNS)

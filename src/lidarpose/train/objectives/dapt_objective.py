@@ -17,7 +17,7 @@ from lidarpose.models.dapt.voxel_tables import LAYOUTS, Tables, build_tables
 from lidarpose.skeleton import BODY26, HUMAN15
 from lidarpose.train.augment import UNKNOWN_PART, Example
 from lidarpose.train.objectives.dapt_losses import DaptTargets, finetuning, pretraining, prn
-from lidarpose.train.objectives.objective import Share, alone, majority_part
+from lidarpose.train.objectives.objective import Share, alone, in_body26, majority_part
 
 STAGES = ("pretrain", "finetune")
 # outputs of heads
@@ -141,9 +141,7 @@ class DaptObjective:
         """Of the heatmaps; in pre-training of the coordinates, which are what it teaches."""
         outputs = network(to_tensors(arrays.tables, device))
         own = outputs.coordinates if self.stage == "pretrain" else outputs.joints()
-        joints = np.full((len(arrays.joints), len(BODY26), 3), np.nan, np.float32)
-        joints[:, self._columns] = own.float().cpu().numpy()
-        return joints
+        return in_body26(own, self._columns)
 
 
 def pretraining_config(joints: tuple[str, ...] = HUMAN15.joints) -> DaptConfig:

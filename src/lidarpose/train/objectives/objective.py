@@ -3,13 +3,14 @@
 Legend: B people, J joints of body26.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lidarpose.skeleton import BODY26
 from lidarpose.train.augment import UNKNOWN_PART
 
 # a sum over this process's people -> that over all processes', divided by their number. Gradients are averaged over
@@ -48,6 +49,13 @@ class Objective(Protocol):
     def joints(self, network: Callable, arrays: Any, *, device: torch.device | str = "cpu") -> np.ndarray:
         """Decoded joints (B, J, 3) m of body26 in each person's frame, NaN where the network has no such joint."""
         ...
+
+
+def in_body26(joints: Tensor, columns: Sequence[int] | np.ndarray) -> np.ndarray:
+    """Joints (B, J, 3) that are these columns of body26 -> (B, 26, 3) float32, NaN in all others."""
+    out = np.full((len(joints), len(BODY26), 3), np.nan, np.float32)
+    out[:, columns] = joints.float().cpu().numpy()
+    return out
 
 
 def total(terms: dict[str, Tensor]) -> Tensor:
