@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from lidarpose.data.clips import FRAMES
 from lidarpose.models.baselines.baseline_config import CLOUDS, LidarcapConfig, LpformerConfig, NeConfig, PrnConfig
 from lidarpose.models.baselines.lidarcap import (
     Lidarcap,
@@ -17,6 +16,7 @@ from lidarpose.models.baselines.lpformer import V2V, Lpformer
 from lidarpose.models.baselines.ne import Ne
 from lidarpose.models.baselines.point_ops import ball_query, farthest_points, nearest_neighbors
 from lidarpose.models.baselines.prn import Prn, PrnNeck
+from lidarpose.sample import CLIP_FRAMES
 from lidarpose.skeleton import SMPL24, WAYMO14
 
 # numbers of parameters, counted layer by layer from the authors' code
@@ -157,24 +157,24 @@ def test_order_and_padding_change_nothing(name):
 
 @torch.no_grad()
 def test_clips_have_rotations_of_every_frame_and_clips_do_not_mix():
-    points, valid = _cloud(6, (40,) * 2 * FRAMES)
-    points, valid = points.unflatten(0, (2, FRAMES)), valid.unflatten(0, (2, FRAMES))
+    points, valid = _cloud(6, (40,) * 2 * CLIP_FRAMES)
+    points, valid = points.unflatten(0, (2, CLIP_FRAMES)), valid.unflatten(0, (2, CLIP_FRAMES))
     torch.manual_seed(0)
     network = Lidarcap(LidarcapConfig()).eval()
     both, first = network({"person": (points, valid)}), network({"person": (points[:1], valid[:1])})
-    assert both.joints.shape == (2, FRAMES, 24, 3) and both.rotations.shape == (2, FRAMES, 24, 3, 3)
+    assert both.joints.shape == (2, CLIP_FRAMES, 24, 3) and both.rotations.shape == (2, CLIP_FRAMES, 24, 3, 3)
     assert torch.allclose(both.rotations[:1], first.rotations, atol=1e-5)
 
 
 @torch.no_grad()
 @pytest.mark.parametrize("across_batch", [False, True])
 def test_ne_exchanges_over_frames_and_as_published_over_the_batch(across_batch):
-    points, valid = _cloud(7, (20,) * 2 * FRAMES)
-    points, valid = points.unflatten(0, (2, FRAMES)), valid.unflatten(0, (2, FRAMES))
+    points, valid = _cloud(7, (20,) * 2 * CLIP_FRAMES)
+    points, valid = points.unflatten(0, (2, CLIP_FRAMES)), valid.unflatten(0, (2, CLIP_FRAMES))
     clouds = {name: (points + k, valid) for k, name in enumerate(CLOUDS)}
     torch.manual_seed(0)
     network = Ne(NeConfig(exchange_across_batch=across_batch)).eval()
     both = network(clouds)
     alone = network({name: (points[:1], valid[:1]) for name, (points, valid) in clouds.items()})
-    assert both.rotations.shape == (2, FRAMES, 24, 3, 3)
+    assert both.rotations.shape == (2, CLIP_FRAMES, 24, 3, 3)
     assert torch.allclose(both.joints[:1], alone.joints, atol=1e-5) == (not across_batch)

@@ -9,7 +9,6 @@ from shard_files import write_shard
 from lidarpose.body.rig import forward_kinematics
 from lidarpose.body.smpl import load_body
 from lidarpose.data.clips import (
-    FRAMES,
     MARGIN,
     MOST,
     consecutive,
@@ -22,7 +21,7 @@ from lidarpose.data.prepare import reader
 from lidarpose.data.shards import person_row, read_rows, sample_of
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix, rotation_vector
-from lidarpose.sample import LabeledSample, Sample
+from lidarpose.sample import CLIP_FRAMES, LabeledSample, Sample
 from lidarpose.skeleton import SMPL24
 from lidarpose.synth.generator import Generator
 
@@ -215,6 +214,6 @@ def test_runs_end_at_gaps_and_belong_to_one_track():
 def test_windows_do_not_overlap_and_the_last_frame_fills_the_last(count):
     rows = 100 + np.arange(count)
     clips = windows(rows)
-    assert clips.shape == (-(-count // FRAMES), FRAMES)
+    assert clips.shape == (-(-count // CLIP_FRAMES), CLIP_FRAMES)
     flat = clips.ravel()
     assert (flat[:count] == rows).all() and (flat[count:] == rows[-1]).all()

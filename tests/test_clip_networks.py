@@ -11,7 +11,7 @@ from training_runs import few_to_validate_on, refused  # noqa: F401 - a fixture
 
 from lidarpose import evaluation
 from lidarpose.body.rig import mean_adult_joints
-from lidarpose.data.clips import FRAMES, windows
+from lidarpose.data.clips import windows
 from lidarpose.data.prepare import prepare
 from lidarpose.data.shards import DatasetCard, person_row, shard_path, shard_writer, write_card
 from lidarpose.geometry import UP_AXES
@@ -21,6 +21,7 @@ from lidarpose.inference.torch_backend import ClipBackend
 from lidarpose.models.baselines.baseline_config import CLOUDS, FRAME_POINTS, LidarcapConfig, NeConfig, pad_frames
 from lidarpose.models.baselines.lidarcap import rest_offsets
 from lidarpose.models.checkpoint import Header, build, save_checkpoint
+from lidarpose.sample import CLIP_FRAMES
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth.generator import Generator
 from lidarpose.train import loop, setup
@@ -107,9 +108,9 @@ def test_what_makes_no_clip_is_counted_by_its_reason(clips, tmp_path):
     dataset = InMemoryDataset.load([write_clips(tmp_path / "d", [longer, clips[1][:7], without])])
     rows, skipped = dataset.clips()
     assert dict(skipped) == {"frames without rotations": 3, "frames of fewer than 16 consecutive ones": 7}
-    assert (rows == windows(np.arange(20))).all() and rows.shape == (2, FRAMES)
+    assert (rows == windows(np.arange(20))).all() and rows.shape == (2, CLIP_FRAMES)
     source = make_setup(recipe(Pretrain, "lidarcap", shards=(str(tmp_path / "d"),)))
-    assert source.frames == FRAMES and sum("left out" in warning for warning in source.warnings) == 2
+    assert source.frames == CLIP_FRAMES and sum("left out" in warning for warning in source.warnings) == 2
 
 
 def test_an_example_is_about_each_frame_s_center(clips):
@@ -135,7 +136,6 @@ def test_the_skeleton_at_rest_is_the_package_s_mean_adult():
     rest = mean_adult_joints() @ UP_AXES["y"]
     offsets = rest - rest[[max(parent, 0) for parent in SMPL24.parents]]
     np.testing.assert_allclose(rest_offsets(), offsets, atol=1e-4)
-    assert FRAMES == LidarcapConfig.frames
 
 
 @pytest.mark.parametrize("name", CONFIGS)
@@ -160,7 +160,7 @@ def test_losses_vanish_at_the_truth(name, clips):
     # the mean adult is not this person, but has the same pose
     assert 0 < float(terms["mpjpe"]) < 0.12
     joints = objective.joints(Perfect(), arrays)
-    assert joints.shape == (2 * FRAMES, 26, 3) and np.isnan(joints[:, 24:]).all()
+    assert joints.shape == (2 * CLIP_FRAMES, 26, 3) and np.isnan(joints[:, 24:]).all()
     true = np.concatenate([[sample.pose.joints[0] - sample.pose.joints[1] for sample in clip] for clip in clips])
     assert (np.sum((joints[:, 0] - joints[:, 1]) * true, -1) > 0).all()
 
@@ -170,24 +170,24 @@ def test_losses_vanish_at_the_truth(name, clips):
 
 @pytest.mark.slow
 def test_a_run_on_clips_is_evaluated_and_predicts(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr(setup, "VALIDATION", FRAMES)
+    monkeypatch.setattr(setup, "VALIDATION", CLIP_FRAMES)
     wanted = recipe(
         Pretrain, "lidarcap", shards=(str(folder),), scene="paper", batch=32, people=40, workers=0, pictures=1
     )
     assert (wanted.optimizer, wanted.rate, wanted.decay, wanted.ema) == ("adam", 1e-4, 1e-4, 0)
-    assert recipe(Pretrain, "ne").batch == 8 * FRAMES
+    assert recipe(Pretrain, "ne").batch == 8 * CLIP_FRAMES
     path = loop.train(wanted, tmp_path / "run", device="cpu", draw=draw_examples)
     log = [json.loads(line) for line in (tmp_path / "run/log.jsonl").read_text().splitlines()]
     # a clip counts 16 people: two steps of two clips
     assert log[-1]["people"] == 64 and {"rotation", "joints", "first", "mpjpe"} <= log[-1].keys()
     assert log[-1]["validation_mm"] > 0 and list((tmp_path / "run/pictures").glob("*.png"))
     result = evaluation.evaluate(path, folder)
-    assert result.counts["people"] == 2 * FRAMES
+    assert result.counts["people"] == 2 * CLIP_FRAMES
     assert any(line.figure.startswith("accel") and line.people for line in result.lines)
     tuned = recipe(
         Finetune, "lidarcap", data=(str(folder),), init=str(path), split="all", epochs=1.0, batch=32, workers=0
     )
-    assert make_setup(tuned).people == 2 * FRAMES
+    assert make_setup(tuned).people == 2 * CLIP_FRAMES
     went_on = make_setup(tuned).network().state_dict()
     torch.testing.assert_close(went_on["embed.weight"], load(path).backend.network.state_dict()["embed.weight"])
 
@@ -221,7 +221,7 @@ def test_raw_files_of_lidarhuman26m_become_a_score(tmp_path):
     )
     made = make_setup(wanted)
     # sequence 5: two windows, the last filled
-    assert made.people == 200 * 2 * FRAMES and made.objective.config.trans_center
+    assert made.people == 200 * 2 * CLIP_FRAMES and made.objective.config.trans_center
     example = made.source.example(0)
     assert np.ptp([frame.joints[0] for frame in example.frames], axis=0).max() < 1e-4
     torch.manual_seed(0)
@@ -240,39 +240,39 @@ def _joints(poses):
 def test_a_person_alone_is_a_clip_of_equal_frames(predictor, clips):
     clouds = [sample.points for sample in clips[0][:3]]
     alone = predictor.predict(clouds)
-    equal = predictor.predict([clouds[1]] * FRAMES, clips=Clips.of_run(FRAMES))
-    np.testing.assert_allclose(equal[FRAMES // 2].joints, alone[1].joints, atol=1e-4)
+    equal = predictor.predict([clouds[1]] * CLIP_FRAMES, clips=Clips.of_run(CLIP_FRAMES))
+    np.testing.assert_allclose(equal[CLIP_FRAMES // 2].joints, alone[1].joints, atol=1e-4)
     assert alone[1].skeleton == SMPL24
 
 
 def test_frames_of_a_clip_know_of_each_other_and_of_their_order(predictor, clips):
     clouds = [sample.points for sample in clips[0]]
     around = {name: [getattr(sample, name) for sample in clips[0]] for name in CLOUDS[1:]}
-    joints = _joints(predictor.predict(clouds, clips=Clips.of_run(FRAMES, **around)))
-    backwards = Clips.of_run(FRAMES, **{name: given[::-1] for name, given in around.items()})
+    joints = _joints(predictor.predict(clouds, clips=Clips.of_run(CLIP_FRAMES, **around)))
+    backwards = Clips.of_run(CLIP_FRAMES, **{name: given[::-1] for name, given in around.items()})
     turned = _joints(predictor.predict(clouds[::-1], clips=backwards))
     alone = _joints(predictor.predict(clouds))
     assert np.abs(joints - alone).max() > 1e-3
     assert np.abs(joints - turned[::-1]).max() > 1e-3
     # only NE reads what stands about the person
-    bare = _joints(predictor.predict(clouds, clips=Clips.of_run(FRAMES)))
+    bare = _joints(predictor.predict(clouds, clips=Clips.of_run(CLIP_FRAMES)))
     assert (np.abs(bare - joints).max() > 1e-5) == (predictor.model["name"] == "ne")
 
 
 def test_frames_that_show_nothing_have_no_pose_and_harm_no_other(predictor, clips):
     clouds = [sample.points for sample in clips[0]]
     clouds[4], clouds[15] = clouds[4][:2], clouds[15][:0]
-    poses = predictor.predict(clouds, clips=Clips.of_run(FRAMES))
+    poses = predictor.predict(clouds, clips=Clips.of_run(CLIP_FRAMES))
     assert [k for k, person in enumerate(poses) if person.pose is None] == [4, 15]
     filled = list(clouds)
     filled[4], filled[15] = clouds[5], clouds[14]
-    same = predictor.predict(filled, clips=Clips.of_run(FRAMES))
+    same = predictor.predict(filled, clips=Clips.of_run(CLIP_FRAMES))
     np.testing.assert_allclose(poses[0].joints, same[0].joints, atol=1e-4)
 
 
 def test_networks_of_single_frames_take_no_clips():
     with refused("reads single frames"):
-        load("tiny").predict([np.zeros((10, 3))] * FRAMES, clips=Clips.of_run(FRAMES))
+        load("tiny").predict([np.zeros((10, 3))] * CLIP_FRAMES, clips=Clips.of_run(CLIP_FRAMES))
 
 
 def test_evaluation_shows_true_windows(predictor, folder, clips):
@@ -281,7 +281,7 @@ def test_evaluation_shows_true_windows(predictor, folder, clips):
     for clip in clips:
         around = {name: [getattr(sample, name) for sample in clip] for name in CLOUDS[1:]}
         clouds = [sample.points for sample in clip]
-        poses = predictor.predict(clouds, sensor_origin=(0, 0, 0), clips=Clips.of_run(FRAMES, **around))
+        poses = predictor.predict(clouds, sensor_origin=(0, 0, 0), clips=Clips.of_run(CLIP_FRAMES, **around))
         by_clip.append(_joints(poses))
     names = list(result.predictions.skeleton.joints)
     expected = np.concatenate(by_clip)[:, [SMPL24.index(name) for name in names]]

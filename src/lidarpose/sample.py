@@ -19,6 +19,8 @@ FARTHEST = 1e9
 CONFIDENCE_RADIUS = 0.1
 # fewer points than this say nothing about a pose
 MIN_POINTS = 5
+# frames of a clip. Source: LiDARCap; NE, whose layers hold as many
+CLIP_FRAMES = 16
 # what a pose may say of each joint
 PER_JOINT = ("confidence", "spread", "visible", "in_range")
 # the label of a joint: not labeled (its position is NaN), labeled though hidden or uncertain, labeled and seen

@@ -9,9 +9,8 @@ from collections.abc import Hashable, Iterable, Sequence
 import numpy as np
 
 from lidarpose.geometry import to_spherical
+from lidarpose.sample import CLIP_FRAMES
 
-# frames of a clip. Source: LiDARCap; NE, whose layers hold as many
-FRAMES = 16
 # how far the window about a person reaches beyond the person, rad, and how many of its points are kept. Source: NE
 MARGIN, MOST = np.radians(1.0), 512
 # a step between frames of more than this many usual ones ends a run
@@ -42,9 +41,9 @@ def consecutive(tracks: Sequence[Hashable], frames: Sequence[int]) -> list[np.nd
 
 
 def windows(run: np.ndarray) -> np.ndarray:
-    """A run's rows (n,) as clips (c, `FRAMES`) that do not overlap; the last one is filled with the last row.
+    """A run's rows (n,) as clips (c, `CLIP_FRAMES`) that do not overlap; the last one is filled with the last row.
     Source: LiDARCap."""
-    return run[np.minimum(np.arange(-(-len(run) // FRAMES) * FRAMES), len(run) - 1)].reshape(-1, FRAMES)
+    return run[np.minimum(np.arange(-(-len(run) // CLIP_FRAMES) * CLIP_FRAMES), len(run) - 1)].reshape(-1, CLIP_FRAMES)
 
 
 # ---- what stands about a person

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.data.clips import FRAMES, windows
+from lidarpose.data.clips import windows
 from lidarpose.errors import InputError
 from lidarpose.geometry import vector_of
 from lidarpose.io.files import FormatError, one_line
 from lidarpose.io.text import is_transposed, pick_xyz
-from lidarpose.sample import FARTHEST, MIN_POINTS, center_of, within_reach
+from lidarpose.sample import CLIP_FRAMES, FARTHEST, MIN_POINTS, center_of, within_reach
 
 # a person of more points is thinned: no sensor sees so many, and no voxel needs them
 MAX_POINTS = 50_000
@@ -71,14 +71,14 @@ class Clips:
         for window in self.windows:
             kept = np.flatnonzero(keep[window])
             if len(kept):
-                filled.append(window[kept[np.searchsorted(kept, np.arange(FRAMES)).clip(0, len(kept) - 1)]])
-        return replace(self, windows=np.array(filled, int).reshape(-1, FRAMES))
+                filled.append(window[kept[np.searchsorted(kept, np.arange(CLIP_FRAMES)).clip(0, len(kept) - 1)]])
+        return replace(self, windows=np.array(filled, int).reshape(-1, CLIP_FRAMES))
 
     def batches(self, count: int) -> Iterator[tuple[np.ndarray, "Clips"]]:
         """So many windows at a time: rows (n,) of their clouds, and the clips of these alone."""
         for start in range(0, len(self.windows), count):
             rows, own = np.unique(self.windows[start : start + count], return_inverse=True)
-            yield rows, Clips(windows=own.reshape(-1, FRAMES), **self.around(rows))
+            yield rows, Clips(windows=own.reshape(-1, CLIP_FRAMES), **self.around(rows))
 
 
 def as_points(points: Any, what: str = "points") -> np.ndarray:

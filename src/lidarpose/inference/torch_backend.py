@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import nn
 
-from lidarpose.data.clips import FRAMES
 from lidarpose.errors import InputError
 from lidarpose.inference.backend import Backend, Raw
 from lidarpose.inference.inputs import Clips
@@ -19,6 +18,7 @@ from lidarpose.models.export import ArrayModule
 from lidarpose.models.onnx import OUTPUTS, voxelize_people
 from lidarpose.models.posenet import PoseNet
 from lidarpose.models.voxelize import WINDOW
+from lidarpose.sample import CLIP_FRAMES
 from lidarpose.skeleton import SMPL24
 
 # people a call; the paper's network and its baselines are a hundred times as large
@@ -130,12 +130,12 @@ class ClipBackend(_PaperBackend):
     """LiDARCap or NE. A person who is no frame of a clip fills a clip of equal frames. Of more points than the network
     reads a fixed draw stays."""
 
-    frames = FRAMES
+    frames = CLIP_FRAMES
 
     @torch.inference_mode()
     def run(self, clouds: list[np.ndarray], view: np.ndarray, clip: Clips | None = None) -> Raw:
         rows = np.arange(len(clouds))
-        clip = Clips(windows=np.repeat(rows[:, None], FRAMES, 1)) if clip is None else clip
+        clip = Clips(windows=np.repeat(rows[:, None], CLIP_FRAMES, 1)) if clip is None else clip
         config, given = self.network.config, {"person": clouds, **clip.around(rows)}
         inputs = {}
         for name in config.clouds:
@@ -151,6 +151,6 @@ class ClipBackend(_PaperBackend):
         own, at = np.unique(clip.windows, return_index=True)
         # who fills a clip alone is in the middle of it
         is_alone = np.ptp(clip.windows, axis=1) == 0
-        at = at + FRAMES // 2 * is_alone[at // FRAMES]
+        at = at + CLIP_FRAMES // 2 * is_alone[at // CLIP_FRAMES]
         joints[own] = outputs.posed().flatten(0, 1)[at].float().cpu().numpy()
         return Raw.from_joints(joints)

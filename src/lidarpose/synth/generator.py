@@ -17,7 +17,7 @@ from lidarpose.errors import InputError, check_int
 from lidarpose.geometry import rotation_about
 from lidarpose.lidar.presets import sensor
 from lidarpose.lidar.ray_pattern import RayPattern
-from lidarpose.sample import Box, PersonInfo, Pose, Sample, center_of
+from lidarpose.sample import CLIP_FRAMES, Box, PersonInfo, Pose, Sample, center_of
 from lidarpose.skeleton import BODY26
 from lidarpose.synth import noise
 from lidarpose.synth.bodies import Bodies, PoseBank, draw_bodies, draw_moving_body
@@ -32,8 +32,6 @@ BLOCK = 256
 # a person of fewer returns is drawn again, so often at most, each time easier to see
 LEAST_POINTS = 15
 _TRIES = 8
-# frames of a clip
-CLIP_FRAMES = 16
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

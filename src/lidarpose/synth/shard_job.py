@@ -14,6 +14,7 @@ from lidarpose.data.writer import Counts, lock_dataset, make_shards, open_folder
 from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.io.files import content_digest, file_error
 from lidarpose.lidar.presets import SENSORS, sensor
+from lidarpose.sample import CLIP_FRAMES
 from lidarpose.synth.scene import RandomStream, scene_config
 
 if TYPE_CHECKING:
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 # persons, clips or streets a shard
 PER_SHARD = {"people": 2000, "clips": 125, "streets": 2}
 _TABLES = {"people": ("people",), "clips": ("people",), "streets": ("people", "frames")}
-CLIP_FRAMES = 16
 STREET_FRAMES = 10
 # rows of a table that one of them has, where that is known
 _ROWS = {"people": {"people": 1}, "clips": {"people": CLIP_FRAMES}}

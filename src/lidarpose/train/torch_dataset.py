@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 from torch.utils.data import IterableDataset, get_worker_info
 
-from lidarpose.data.clips import FRAMES, consecutive, windows
+from lidarpose.data.clips import consecutive, windows
 from lidarpose.data.shards import DatasetReader, open_dataset, pyarrow, to_arrow
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error, listed
-from lidarpose.sample import HIDDEN, SEEN, UNLABELED, LabeledSample, Pose, Sample
+from lidarpose.sample import CLIP_FRAMES, HIDDEN, SEEN, UNLABELED, LabeledSample, Pose, Sample
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import PoseBank
 from lidarpose.synth.generator import Generator
@@ -103,8 +103,8 @@ class InMemoryDataset:
         return replace(sample, pose=replace(sample.pose, visible=unknown))
 
     def clips(self) -> tuple[np.ndarray, Counter[str]]:
-        """Rows (C, `FRAMES`) of the clips that consecutive frames with rotations make, and how many frames are left
-        out, by reason."""
+        """Rows (C, `CLIP_FRAMES`) of the clips that consecutive frames with rotations make, and how many frames are
+        left out, by reason."""
         tracks, frames, has_rotations = [], [], []
         for dataset, rows, _ in self.parts:
             name = "sequence" if "sequence" in rows.column_names else "index"
@@ -120,9 +120,9 @@ class InMemoryDataset:
         skipped = Counter({"frames without rotations": len(stored) - len(usable)})
         own = stored[usable].tolist()
         runs = consecutive([tracks[k] for k in own], [frames[k] for k in own])
-        skipped["frames of fewer than 16 consecutive ones"] = sum(len(run) for run in runs if len(run) < FRAMES)
-        clips = [usable[windows(run)] for run in runs if len(run) >= FRAMES]
-        return np.concatenate([np.zeros((0, FRAMES), int), *clips]), +skipped
+        skipped["frames of fewer than 16 consecutive ones"] = sum(len(run) for run in runs if len(run) < CLIP_FRAMES)
+        clips = [usable[windows(run)] for run in runs if len(run) >= CLIP_FRAMES]
+        return np.concatenate([np.zeros((0, CLIP_FRAMES), int), *clips]), +skipped
 
     def without(self, sequences: Sequence[str]) -> "InMemoryDataset":
         """The samples that are not of some sequences; the points are shared."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.models.voxelize import WINDOW
+from lidarpose.sample import CLIP_FRAMES
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24
 
 # points of a person that a network reads at most, as published
@@ -129,8 +130,7 @@ def pad_clouds(
 
 # clouds of a frame by name: the person, what stands still about them, and the frame's other points
 CLOUDS = ("person", "background", "neighbors")
-# frames of a clip, and points of each cloud that a network of clips reads at most, as published
-FRAMES = 16
+# points of each cloud that a network of clips reads at most, as published
 FRAME_POINTS = 512
 
 
@@ -143,7 +143,7 @@ class LidarcapConfig(BaselineConfig):
     else on the points, or on a guess of the pelvis."""
 
     kind: ClassVar[str] = "lidarcap"
-    frames: ClassVar[int] = FRAMES
+    frames: ClassVar[int] = CLIP_FRAMES
     layers: ClassVar[int] = 50
     clouds: ClassVar[tuple[str, ...]] = CLOUDS[:1]
 

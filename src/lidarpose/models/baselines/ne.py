@@ -8,8 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lidarpose.models.baselines.baseline_config import CLOUDS, FRAMES, NeConfig
+from lidarpose.models.baselines.baseline_config import CLOUDS, NeConfig
 from lidarpose.models.baselines.lidarcap import ClipOutputs, Clouds, PointNet2, StGcn, by_frame
+from lidarpose.sample import CLIP_FRAMES
 from lidarpose.skeleton import SMPL24
 
 WIDTH, LAYERS = 512, 8
@@ -33,7 +34,7 @@ class Ne(nn.Module):
         self.joints = nn.Linear(3 * WIDTH, 3 * len(SMPL24))
         self.shrink = nn.Linear(3 * WIDTH, 1024, bias=False)
         # frames are its channels: clips have 16
-        self.frame_norm = nn.BatchNorm1d(FRAMES)
+        self.frame_norm = nn.BatchNorm1d(CLIP_FRAMES)
         self.widen = nn.Linear(1024, 1024)
         self.rotations = StGcn(3 + 1024)
 
