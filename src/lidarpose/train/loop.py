@@ -28,6 +28,7 @@ from lidarpose.errors import InputError, check_name
 from lidarpose.io.files import write_atomic
 from lidarpose.models.checkpoint import save_checkpoint
 from lidarpose.progress import Progress
+from lidarpose.synth.scene import RandomStream
 from lidarpose.train import run_dir
 from lidarpose.train.augment import ClipExample, Example
 from lidarpose.train.data_loader import BATCHES, Chunks, chunks_of, lanes_of, loader
@@ -44,8 +45,6 @@ TRACKERS = ("tensorboard", "wandb")
 SAVE_EVERY = 120
 # validations in a run whose recipe does not say how many
 _VALIDATIONS = 20
-# first words of generators' seeds; see `data_loader`
-_INIT, _STEP = 9, 10
 
 
 class Interrupted(KeyboardInterrupt):
@@ -183,7 +182,7 @@ class _Run:
     ):
         self.recipe, self.setup, self.folder, self.command, self.draw = recipe, setup, folder, command, draw
         self.accelerator, self.is_main = accelerator, accelerator.is_main_process
-        torch.manual_seed(_seed(recipe.seed, _INIT))
+        torch.manual_seed(_seed(recipe.seed, RandomStream.INITIAL_WEIGHTS))
         self.network: nn.Module = setup.network().to(accelerator.device).train()
         self.mean = {name: value.detach().clone() for name, value in self.network.named_parameters()}
         self.optimizers = optimizers(self.network, recipe)
@@ -307,7 +306,7 @@ class _Run:
     def _step(self, arrays: object, k: int) -> dict[str, Tensor]:
         step, recipe, accelerator = self.chunk * BATCHES + k, self.recipe, self.accelerator
         # what a network drops at random follows from the step alone
-        torch.manual_seed(_seed(recipe.seed, _STEP, step, accelerator.process_index))
+        torch.manual_seed(_seed(recipe.seed, RandomStream.TRAINING_STEP, step, accelerator.process_index))
         set_rates(self.optimizers, recipe, step / self.steps)
         for optimizer in self.optimizers:
             optimizer.zero_grad(set_to_none=True)
