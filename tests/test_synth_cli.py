@@ -206,7 +206,7 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_shard(tmp_path):
     resource = pytest.importorskip("resource")
     limit = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (20000, {resource.RLIM_INFINITY}))"
     code = f"{limit}; from lidarpose.cli import main; raise SystemExit(main())"
-    words = ["synth", "--out", str(tmp_path / "full"), *WORDS[:2], "--per-shard", str(COUNT)]
+    words = ["synth", "--quiet", "--out", str(tmp_path / "full"), *WORDS[:2], "--per-shard", str(COUNT)]
     done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True)
     assert done.returncode == 2, done.stderr
     assert done.stderr.startswith("lidarpose: error: ") and done.stderr.count("\n") == 1, done.stderr
