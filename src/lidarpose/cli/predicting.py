@@ -49,7 +49,11 @@ def add(commands) -> None:
     scan.add_argument(
         "--columns", type=int, metavar="N", help="values per point in a .bin: 4 for KITTI, 5 for nuScenes"
     )
-    output = predict.add_argument_group("output")
+    _add_output(predict.add_argument_group("output"))
+    _add_network(predict.add_argument_group("network"))
+
+
+def _add_output(output) -> None:
     output.add_argument(
         "--out",
         default=".",
@@ -60,7 +64,9 @@ def add(commands) -> None:
     output.add_argument(
         "--skeleton", metavar="NAME", help="smpl24, human15, waymo14 or body26 (default smpl24, else the network's own)"
     )
-    network = predict.add_argument_group("network")
+
+
+def _add_network(network) -> None:
     network.add_argument(
         "--weights", default=DEFAULT, metavar="NAME|FILE", help=f"{NAMES}, a checkpoint, or an exported .onnx"
     )
