@@ -11,8 +11,9 @@ from hostile_files import KITTI, npy, refusal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix
-from lidarpose.io.boxes import read_boxes
+from lidarpose.io.boxes import Boxes, read_boxes
 from lidarpose.sample import Box
 
 PERSON = {"center": [10.0, -2.0, 0.5], "size": [0.6, 0.7, 1.8], "yaw": 0.3, "id": "a"}
@@ -66,6 +67,25 @@ def test_arrays_and_numpy_numbers_are_numbers():
         [{"center": np.array([1, 2, 3]), "size": (np.float32(1), 2, np.int64(3)), "yaw": np.float64(1)}]
     )
     assert box.center.tolist() == [1, 2, 3] and box.size.tolist() == [1, 2, 3] and box.yaw == 1
+
+
+def test_found_boxes_are_read_as_they_were_written(tmp_path):
+    box = Box(center=[1.0, -2.0, 0.25], size=[0.6, 0.7, 1.8], yaw=0.3, id=0, score=np.float32(0.75), mounted=True)
+    for boxes in ([box], []):
+        Boxes(boxes, source="a.pcd", warnings=["odd"], detector="1").save(tmp_path / "boxes.json")
+        read = read_boxes(tmp_path / "boxes.json")
+        assert [vars(b) | {"center": 0, "size": 0} for b in read] == [vars(b) | {"center": 0, "size": 0} for b in boxes]
+        assert all((b.center == box.center).all() and (b.size == box.size).all() for b in read)
+    assert json.loads((tmp_path / "boxes.json").read_text())["warnings"] == ["odd"]
+
+
+def test_scores_of_other_detectors_may_be_anything():
+    for score in (12.5, -1, "high", None, math.nan, [1], True):
+        assert read_boxes([{**PERSON, "score": score, "mounted": "no"}])[0].score is None
+    assert read_boxes([{**PERSON, "score": 1}])[0].score == 1.0
+    for score in (1.5, "0.5", math.nan):
+        with pytest.raises(InputError, match="Box.score must be a probability"):
+            Box(center=[0, 0, 0], size=[1, 1, 1], score=score)
 
 
 def test_nobody_is_legal():

@@ -2,9 +2,10 @@
 
 import numpy as np
 
+import lidarpose.viz.bird_eye as bird_eye
 import lidarpose.viz.draw as picture
 from lidarpose.geometry import UP_AXES, rotation_from_up
-from lidarpose.inference.results import PersonPose
+from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import SMPL24
 
@@ -18,6 +19,17 @@ def test_json_says_what_the_pose_says():
     for name, digits in (("joints", 4), ("confidence", 3), ("spread", 4), ("visible", 3)):
         np.testing.assert_array_equal(entry[name], np.round(getattr(pose, name), digits))
     assert entry["box"] == {"center": [1, 2, 3], "size": [0.6, 0.7, 1.8], "yaw": 0.3}
+    assert entry["score"] is entry["mounted"] is None
+
+
+def test_the_score_of_a_box_is_that_of_its_person():
+    box = Box(center=[1, 2, 3], size=[0.6, 0.7, 1.8], score=0.87654, mounted=False)
+    pose = Pose(joints=np.zeros((24, 3)), skeleton=SMPL24)
+    person = PersonPose(pose=pose, skeleton=SMPL24, points=np.zeros((7, 3)), box=box)
+    assert person.score == 0.87654
+    assert person.to_dict()["score"] == 0.8765 and person.to_dict()["mounted"] is False
+    table = person.to_dataframe()
+    assert table.columns[-1] == "score" and (table["score"] == 0.87654).all()
 
 
 def test_pictures_stand_upright_whatever_the_axes(monkeypatch):
@@ -37,3 +49,28 @@ def test_pictures_stand_upright_whatever_the_axes(monkeypatch):
         else:
             # a box of a frame that leans is not upright
             assert drawn[-1].box is None
+
+
+def test_a_searched_scan_is_drawn_from_above(monkeypatch, tmp_path):
+    """With z up whatever the axes, with the sensor where its place is known; above the people's cards."""
+    panels = []
+    draw = bird_eye.draw_scans
+    monkeypatch.setattr(bird_eye, "draw_scans", lambda given, **more: panels.extend(given) or draw(given, **more))
+    rng = np.random.default_rng(0)
+    center, origin = np.array([6.0, 1.0, -0.5]), np.array([1.0, 2.0, 3.0])
+    scan = rng.uniform((-9, -9, -2), (9, 9, 2), (500, 3))
+    points, joints = center + rng.normal(0, 0.2, (60, 3)), center + rng.normal(0, 0.2, (24, 3))
+    for up in ("z", "-y", "0.26,0,0.97"):
+        R = rotation_from_up(up)
+        pose, box = Pose(joints=joints @ R, skeleton=SMPL24), Box(center=R.T @ center, size=[1, 1, 2], score=0.9)
+        person = PersonPose(pose=pose, skeleton=SMPL24, points=points @ R, box=box, id=7, up=up)
+        poses = Poses(people=(person,), skeleton=SMPL24, up=up, scan=scan @ R, origin=R.T @ origin)
+        sheet = poses.picture(tmp_path / "sheet.png")
+        assert sheet == (tmp_path / "sheet.png").read_bytes()
+        panel = panels.pop()
+        np.testing.assert_allclose(panel.points, scan)
+        np.testing.assert_allclose(panel.poses.joints, joints[None])
+        np.testing.assert_allclose(panel.sensor, origin[:2])
+        assert np.abs(panel.boxes[0].center - center).max() < (1e-9 if up in UP_AXES else 0.3)
+    alone = Poses(people=(), skeleton=SMPL24, scan=scan, source="a.pcd").picture()
+    assert len(alone) < len(sheet) and panels[-1].sensor is None and panels[-1].label == "nobody found"

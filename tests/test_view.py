@@ -16,7 +16,7 @@ from lidarpose.geometry import rotation_about
 from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14, Skeleton
 from lidarpose.viz import draw
-from lidarpose.viz.draw import _shortened, draw_people
+from lidarpose.viz.draw import draw_people, shortened
 from lidarpose.viz.html import MAX_POINTS, render_report, write_report
 from lidarpose.viz.person_view import Panel, bone_sides, describe, facing, project, side, thinned, view_directions
 
@@ -205,7 +205,7 @@ def test_what_is_said_under_a_person():
 
 def test_names_and_titles_of_any_length_and_script(recwarn):
     name = "0aa51a7c-6c2d-4c0e-9d5e-7f1b2a3c4d5e"
-    assert _shortened(name, 36) == name and _shortened(name, 11) == "0aa51…c4d5e"
+    assert shortened(name, 36) == name and shortened(name, 11) == "0aa51…c4d5e"
     image = decoded(draw_people([EMPTY], title="0123456789abcdef" * 4 + ".npy"))
     assert (image[:, -8:] == 255).all()
     # what the font lacks is no warning

@@ -74,12 +74,18 @@ class Pose:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Box:
-    """A person's box: center (3,) m, size (length, width, height) m, yaw rad about z. It may only crop."""
+    """A person's box: center (3,) m, size (length, width, height) m, yaw rad about z. It may only crop.
+
+    score: the probability that it is a person, None where nobody says; mounted: whether the person rides, or sits in a
+    wheelchair, None where nobody says.
+    """
 
     center: np.ndarray
     size: np.ndarray
     yaw: float = 0.0
     id: str | int | None = None
+    score: float | None = None
+    mounted: bool | None = None
 
     def __post_init__(self):
         for name in ("center", "size"):
@@ -98,6 +104,15 @@ class Box:
         if not isinstance(self.yaw, Real) or not np.isfinite(self.yaw):
             raise InputError(f"Box.yaw must be a finite number in radians, got {self.yaw!r}")
         object.__setattr__(self, "id", box_id(self.id))
+        if self.score is not None:
+            if not isinstance(self.score, Real) or not 0 <= self.score <= 1:
+                raise InputError(f"Box.score must be a probability from 0 to 1, got {self.score!r}")
+            # numpy's numbers are none for JSON
+            object.__setattr__(self, "score", float(self.score))
+
+    def to_dict(self) -> dict[str, Any]:
+        """center, size and yaw, as JSON holds them."""
+        return {"center": self.center.tolist(), "size": self.size.tolist(), "yaw": float(self.yaw)}
 
     def contains(self, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """points (n, 3) m -> (n,) bool: inside the box grown by `margin` m on each side."""

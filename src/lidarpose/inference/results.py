@@ -1,6 +1,5 @@
 """What a prediction returns: one person (`PersonPose`) or all people of a call (`Poses`); JSON, files, pictures."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
@@ -10,12 +9,15 @@ from typing import TYPE_CHECKING, cast, overload
 import numpy as np
 
 from lidarpose.geometry import UP_AXES, rotation_from_up
+from lidarpose.io.boxes import people_json
 from lidarpose.io.files import write_atomic
 from lidarpose.sample import PER_JOINT, Box, Pose
 from lidarpose.skeleton import Skeleton
 
 if TYPE_CHECKING:
     import pandas
+
+    from lidarpose.viz.bird_eye import ScanPanel
 
 SCHEMA = "lidarpose.poses/1"
 
@@ -89,19 +91,21 @@ class PersonPose:
         return [name for name, inside in zip(self.skeleton.joints, self.in_range, strict=True) if not inside]
 
     @property
+    def score(self) -> float | None:
+        """The probability that it is a person, as of the box; None where nobody says."""
+        return None if self.box is None else self.box.score
+
+    @property
     def num_points(self) -> int:
         return len(self.points)
 
     def to_dict(self) -> dict:
         """The entry of this person under "people"."""
-        box = self.box and {
-            "center": self.box.center.tolist(),
-            "size": self.box.size.tolist(),
-            "yaw": float(self.box.yaw),
-        }
         return {
             "id": self.id,
-            "box": box,
+            "box": self.box and self.box.to_dict(),
+            "score": None if self.score is None else round(self.score, 4),
+            "mounted": self.box and self.box.mounted,
             "num_points": self.num_points,
             "joints": None if self.pose is None else _rounded(self.joints, 4),
             "confidence": _rounded(self.confidence, 3),
@@ -153,7 +157,8 @@ class PersonPose:
 class Poses(Sequence):
     """The people of one call, in the order of the boxes or arrays. A sequence of `PersonPose`.
 
-    warnings concern the whole input; timing_ms: what took how long; up: the frame's up axis, which pictures need.
+    warnings concern the whole input; timing_ms: what took how long; up: the frame's up axis, which pictures need. Where
+    people were searched for, scan (n, 3) m is all that was searched, and origin (3,) m the sensor's place or None.
     """
 
     people: tuple[PersonPose, ...]
@@ -163,6 +168,8 @@ class Poses(Sequence):
     warnings: tuple[str, ...] = ()
     timing_ms: dict[str, float] = field(default_factory=dict)
     up: str = "z"
+    scan: np.ndarray | None = None
+    origin: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.people)
@@ -208,7 +215,7 @@ class Poses(Sequence):
 
     def to_dataframe(self) -> "pandas.DataFrame":
         """A row for each joint of each person who has a pose: person (place in this sequence), id, joint, x, y, z (m),
-        confidence, spread (m), visible, in_range; NaN for what the network does not say."""
+        confidence, spread (m), visible, in_range, score; NaN for what is not known."""
         import pandas
 
         rows = []
@@ -218,8 +225,9 @@ class Poses(Sequence):
             values = [getattr(person.pose, name) for name in PER_JOINT]
             for j, joint in enumerate(self.skeleton.joints):
                 known = [np.nan if value is None else value[j] for value in values]
-                rows.append((number, person.id, joint, *person.pose.joints[j], *known))
-        return pandas.DataFrame(rows, columns=["person", "id", "joint", "x", "y", "z", *PER_JOINT])
+                score = np.nan if person.score is None else person.score
+                rows.append((number, person.id, joint, *person.pose.joints[j], *known, score))
+        return pandas.DataFrame(rows, columns=["person", "id", "joint", "x", "y", "z", *PER_JOINT, "score"])
 
     def to_dict(self) -> dict:
         """The document of the schema lidarpose.poses/1; "warnings" beside it concern the whole input."""
@@ -240,28 +248,54 @@ class Poses(Sequence):
         }
 
     def to_json(self) -> str:
-        """`to_dict` as JSON, people and joints a line each."""
+        """`to_dict` as JSON, people a line each."""
         document = self.to_dict()
-        people = document.pop("people")
-        timing = document.pop("timing_ms")
-        head = ",\n".join(f" {json.dumps(key)}: {json.dumps(value)}" for key, value in document.items())
-        rows = ",\n".join("  " + json.dumps(person) for person in people)
-        body = f"[\n{rows}\n ]" if people else "[]"
-        return f'{{\n{head},\n "people": {body},\n "timing_ms": {json.dumps(timing)}\n}}\n'
+        last = {key: document.pop(key) for key in ("people", "timing_ms")}
+        return people_json(document | last)
 
     def save(self, path: str | Path) -> None:
         """Writes `to_json` to a file, whole or not at all."""
         write_atomic(path, self.to_json())
 
     def picture(self, path: str | Path | None = None, *, title: str = "") -> Picture:
-        """Everybody from the front and the side on one PNG; also written to `path` where given."""
-        from lidarpose.viz.draw import Panel, draw_people
+        """Everybody from the front and the side on one PNG; also written to `path` where given.
 
+        Where people were searched for, the scan from above is over them.
+        """
+        from lidarpose.viz.bird_eye import draw_scans
+        from lidarpose.viz.draw import Panel, draw_people, stack_pictures
+
+        title = title or (self.source or "")
         upright = [_upright(person, self.up) for person in self.people]
         panels = [
-            Panel(points=p.points, pose=p.pose, label="" if p.id is None else str(p.id), box=p.box) for p in upright
+            Panel(points=p.points, pose=p.pose, label=_label(given), box=p.box, distance=self._distance(given))
+            for p, given in zip(upright, self.people, strict=True)
         ]
-        return Picture(draw_people(panels, path, title=title or (self.source or "")))
+        if self.scan is None:
+            return Picture(draw_people(panels, path, title=title))
+        above = draw_scans([self._from_above(self.scan, upright)], title=title)
+        return Picture(stack_pictures([above, draw_people(panels)] if panels else [above], path))
+
+    def _distance(self, person: PersonPose) -> float | None:
+        """From the sensor, m, where people were searched for; NaN where its place is unknown."""
+        if self.scan is None or not person.num_points:
+            return None
+        return np.nan if self.origin is None else float(np.linalg.norm(np.median(person.points, 0) - self.origin))
+
+    def _from_above(self, points: np.ndarray, upright: list[PersonPose]) -> "ScanPanel":
+        """What was searched, points (n, 3) m, with the people, z up."""
+        from lidarpose.viz.bird_eye import ScanPanel
+
+        R_level_input = rotation_from_up(self.up)
+        posed = [person.pose.joints for person in upright if person.pose is not None]
+        found = f"{len(upright)} {'person' if len(upright) == 1 else 'people'} found"
+        return ScanPanel(
+            points=points @ R_level_input.T,
+            boxes=[box for person in upright if (box := person.box or _box_around(person))],
+            poses=Pose(joints=np.stack(posed), skeleton=self.skeleton) if posed else None,
+            label=found if upright else "nobody found",
+            sensor=None if self.origin is None else tuple((R_level_input @ self.origin)[:2].tolist()),
+        )
 
 
 def _upright(person: PersonPose, up: str) -> PersonPose:
@@ -274,6 +308,20 @@ def _upright(person: PersonPose, up: str) -> PersonPose:
         pose=pose and replace(pose, joints=pose.joints @ R_level_input.T),
         box=box and replace(box, center=R_level_input @ box.center),
     )
+
+
+def _box_around(person: PersonPose) -> Box | None:
+    """The extent of a person's points."""
+    if not person.num_points:
+        return None
+    low, high = person.points.min(0), person.points.max(0)
+    return Box(center=(low + high) / 2, size=high - low + 0.1, id=person.id)
+
+
+def _label(person: PersonPose) -> str:
+    """The id, and the score where there is one."""
+    words = [] if person.id is None else [str(person.id)]
+    return " · ".join(words if person.score is None else [*words, f"score {person.score:.2f}"])
 
 
 def first_names(names: Sequence[str], most: int = 3) -> str:

@@ -1,20 +1,21 @@
 """People's boxes: a detector's JSON, arrays of seven numbers, and KITTI's labels with their calibration.
 
 JSON is `{"people": [{"center": [x, y, z], "size": [l, w, h], "yaw": r, "id": ...}]}` or the bare list; an entry may be
-the row [x, y, z, l, w, h, yaw] too.
+the row [x, y, z, l, w, h, yaw] too. `Boxes` writes it.
 """
 
 import difflib
 import json
 import math
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lidarpose.errors import InputError
-from lidarpose.io.files import FormatError, file_error, read_bytes, shorten
+from lidarpose.io.files import FormatError, file_error, read_bytes, shorten, write_atomic
 from lidarpose.io.npz import load_array
 from lidarpose.sample import FARTHEST, Box, box_id
 
@@ -30,6 +31,51 @@ _ROTATION_TOLERANCE = 1e-3
 
 _Content = dict | list | tuple | np.ndarray | Box
 
+SCHEMA = "lidarpose.boxes/1"
+
+
+class Boxes(list[Box]):
+    """People found in a scan, surest first: a list of `Box`, each with a score. source: the file; warnings: lines
+    about the scan; detector: the version of what found them."""
+
+    def __init__(
+        self, boxes: Iterable[Box] = (), *, source: str | None = None, warnings: Iterable[str] = (), detector: str = ""
+    ):
+        super().__init__(boxes)
+        self.source, self.warnings, self.detector = source, tuple(warnings), detector
+
+    def to_dict(self) -> dict:
+        """The document of the schema lidarpose.boxes/1, which `read_boxes` reads."""
+        people = [{"id": box.id, **box.to_dict(), "score": box.score, "mounted": box.mounted} for box in self]
+        return {
+            "schema": SCHEMA,
+            "source": self.source,
+            "frame": "input",
+            "unit": "m",
+            "detector": self.detector,
+            "people": people,
+            "warnings": list(self.warnings),
+        }
+
+    def to_json(self) -> str:
+        """`to_dict` as JSON, people a line each."""
+        return people_json(self.to_dict())
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Writes `to_json` to a file, whole or not at all."""
+        write_atomic(path, self.to_json())
+
+
+def people_json(document: dict) -> str:
+    """A document as JSON, its "people" a line each."""
+    lines = []
+    for key, value in document.items():
+        text = json.dumps(value)
+        if key == "people" and value:
+            text = "[\n" + ",\n".join("  " + json.dumps(person) for person in value) + "\n ]"
+        lines.append(f" {json.dumps(key)}: {text}")
+    return "{\n" + ",\n".join(lines) + "\n}\n"
+
 
 def read_boxes(source: str | os.PathLike | _Content, *, calib: str | os.PathLike | None = None) -> list[Box]:
     """The boxes of people, in the frame of the points, meters and radians.
@@ -39,7 +85,8 @@ def read_boxes(source: str | os.PathLike | _Content, *, calib: str | os.PathLike
             of which pedestrians, sitting people and cyclists are read, moved to the LiDAR's frame). Content is
             `{"people": [...]}` or the bare list, of which each entry is a `Box`, a row [x, y, z, l, w, h, yaw] or a
             dict: `center` [x, y, z], `size` [length, width, height], `yaw` about z (0 where it is absent), and as id
-            `id`, else `track`, else None; other keys are ignored. An array (n, 7) has such rows.
+            `id`, else `track`, else None, and `score` (0 to 1) and `mounted` (true or false) where they are that; other
+            keys are ignored. An array (n, 7) has such rows.
         calib: KITTI's calibration file; None for `../calib/N.txt` beside a label.
 
     Returns:
@@ -189,7 +236,17 @@ def _box(entry: object, where: str) -> Box:
         raise FormatError(f"{where}.yaw: expected a finite number in radians, got {_show(entry['yaw'])}")
     if abs(yaw) > _MAX_YAW:
         raise FormatError(f"{where}.yaw: expected radians, got {yaw:g}; if it is in degrees, multiply by pi / 180")
-    return Box(center=np.array(center), size=np.array(size), yaw=yaw, id=_id(entry, where))
+    # of other detectors a score may be anything, and nothing depends on it
+    score = _number(entry.get("score"))
+    mounted = entry.get("mounted")
+    return Box(
+        center=np.array(center),
+        size=np.array(size),
+        yaw=yaw,
+        id=_id(entry, where),
+        score=score if score is not None and 0 <= score <= 1 else None,
+        mounted=mounted if isinstance(mounted, bool) else None,
+    )
 
 
 def _triple(entry: dict, key: str, where: str, *, meaning: str) -> list[float]:

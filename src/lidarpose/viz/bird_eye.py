@@ -11,7 +11,7 @@ import numpy as np
 
 from lidarpose.io.files import check_suffix
 from lidarpose.sample import Box, Pose
-from lidarpose.viz.draw import SIDE_COLORS, png_of
+from lidarpose.viz.draw import SIDE_COLORS, png_of, shortened
 from lidarpose.viz.person_view import bone_pairs, bone_sides, box_edges, finite, is_known, thinned
 
 MAX_SCANS = 12
@@ -28,7 +28,7 @@ class ScanPanel:
 
     Args:
         points: (n, 3).
-        boxes: of people; an id is printed beside its box, the side that a box faces is marked.
+        boxes: of people; an id and a score are printed beside the box, the side that a box faces is marked.
         poses: joints (P, J, 3).
         tracks: positions (F, 2) or (F, 3) of people over time.
         label: printed above.
@@ -66,8 +66,17 @@ def draw_scans(panels: Sequence[ScanPanel], path: str | Path | None = None, *, t
     rows = max(-(-len(panels) // columns), 1)
     width, height = columns * _PANEL, rows * _PANEL + _TITLE
     figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white")
-    figure.text(0.15 / width, 1 - 0.15 / height, title, fontsize=13, weight="bold", va="top", parse_math=False)
-    note = "arrow: facing; dotted: the way over the frames; left limbs blue, right ones orange"
+    figure.text(
+        0.15 / width,
+        1 - 0.15 / height,
+        shortened(title, 36 * columns),
+        fontsize=13,
+        weight="bold",
+        va="top",
+        parse_math=False,
+    )
+    tracks = "dotted: the way over the frames; " if any(panel.tracks for panel in panels) else ""
+    note = f"arrow: facing; {tracks}left limbs blue, right ones orange"
     figure.text(1 - 0.15 / width, 1 - 0.2 / height, note, fontsize=8, color=_FAINT, va="top", ha="right")
     for number, panel in enumerate(panels):
         row, column = divmod(number, columns)
@@ -145,7 +154,8 @@ def _draw_box(ax, box: Box) -> None:
     nose = box.center[:2] + np.array([np.cos(box.yaw), np.sin(box.yaw)]) * (box.size[0] / 2 + 0.6)
     ax.annotate("", nose, box.center[:2], arrowprops={"arrowstyle": "->", "color": _BOX, "lw": 1.1}, zorder=5)
     if box.id is not None:
+        words = str(box.id) if box.score is None else f"{box.id} ({box.score:.2f})"
         ax.annotate(
-            str(box.id), box.center[:2], (9, 9), textcoords="offset points", fontsize=9, weight="bold", color=_BOX,
+            words, box.center[:2], (9, 9), textcoords="offset points", fontsize=9, weight="bold", color=_BOX,
             zorder=7, parse_math=False, bbox={"fc": "white", "ec": "none", "alpha": 0.7, "pad": 0.8},
         )  # fmt: skip

@@ -120,11 +120,30 @@ def png_of(figure, path: str | Path | None) -> bytes:
     return buffer.getvalue()
 
 
+def stack_pictures(pictures: list[bytes], path: str | Path | None = None) -> bytes:
+    """PNGs below each other on one, white beside the narrower ones; also written to `path`."""
+    from PIL import Image
+
+    if path is not None:
+        check_suffix(path, ".png")
+    images = [Image.open(io.BytesIO(picture)).convert("RGB") for picture in pictures]
+    sheet = Image.new("RGB", (max(i.width for i in images), sum(i.height for i in images)), "white")
+    top = 0
+    for image in images:
+        sheet.paste(image, (0, top))
+        top += image.height
+    buffer = io.BytesIO()
+    sheet.save(buffer, "PNG")
+    if path is not None:
+        write_atomic(path, buffer.getvalue())
+    return buffer.getvalue()
+
+
 def _text(artist, x: float, y: float, words: str, *, size: float, color: str = _INK, **more) -> None:
     artist.text(x, y, words, fontsize=size, color=color, family="DejaVu Sans", parse_math=False, usetex=False, **more)
 
 
-def _shortened(words: str, limit: int) -> str:
+def shortened(words: str, limit: int) -> str:
     # names of files may hold lone surrogates, and no font draws control letters
     words = " ".join("".join(c if c.isprintable() else " " for c in str(words)).split())
     # ids and paths tell most by their ends
@@ -139,7 +158,7 @@ def _draw_header(figure, panels: list[Panel], shown: list[Panel], title: str) ->
     note = f"the first {len(shown)} of {len(panels)} people" if len(shown) < len(panels) else ""
     # a hash fits
     room = int((width - 2 * _MARGIN) / 0.127) - len(note)
-    _text(figure, left, top, _shortened(title, max(room, 12)), size=13, weight="bold", va="top")
+    _text(figure, left, top, shortened(title, max(room, 12)), size=13, weight="bold", va="top")
     _text(figure, 1 - left, top - 0.03 / height, note, size=9, color=_FAINT, va="top", ha="right")
     if handles := _legend_handles(shown):
         figure.legend(
@@ -188,7 +207,7 @@ def _draw_card(ax, panel: Panel, width: float, height: float) -> None:
         _text(ax, right / width, up / height, words, ha="center", transform=ax.transAxes, **style)
 
     # a UUID fits on the narrowest card
-    write(_shortened(panel.label, int(width / 0.083)), up=0.25, size=8.5, weight="bold")
+    write(shortened(panel.label, int(width / 0.083)), up=0.25, size=8.5, weight="bold")
     write(describe(panel), up=0.09, size=7.5, color=_FAINT)
     anchor, note = middle(panel), missing_pose(panel)
     if anchor is None:
