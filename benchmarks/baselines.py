@@ -1,8 +1,9 @@
 """People a second of each network, in a training step and in inference, on people synthesized for training.
 
-    python benchmarks/baselines.py prn lpformer dapt ours --threads 1
+    python benchmarks/baselines.py prn lpformer dapt paper-small ours lidarcap ne --threads 1
 
-Times are of this process's processor, so other programs count little. Quote ratios of one run.
+Names are those of models or of their sizes. For networks of clips a person is a frame. Times are of this process's
+processor, so other programs count little. Quote ratios of one run.
 """
 
 import argparse
@@ -13,10 +14,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from lidarpose.train.augment import ClipExample
 from lidarpose.train.data_loader import SyntheticSource
 from lidarpose.train.objectives.objective import total
 from lidarpose.train.optim import optimizers
-from lidarpose.train.recipes import MODELS, RECIPES, Pretrain, recipe
+from lidarpose.train.recipes import MODELS, Pretrain, recipe
 from lidarpose.train.setup import PRETRAINED, objective_of
 
 ROUNDS = 2
@@ -31,12 +33,17 @@ def main() -> None:
     torch.set_num_threads(options.threads)
     source = SyntheticSource(scene="wild", seed=0)
     # a run sorts its people by size, so a batch has people of like size
-    examples = sorted(map(source.example, range(4 * options.people)), key=lambda example: len(example.points))
-    examples = examples[2 * options.people : 3 * options.people]
-    print(f"{np.mean([len(example.points) for example in examples]):.0f} points a person")
-    for model in options.models:
-        wanted = recipe(Pretrain, model if model in RECIPES[Pretrain] else "default", model=model)
+    people = sorted(map(source.example, range(4 * options.people)), key=lambda example: len(example.points))
+    people = people[2 * options.people : 3 * options.people]
+    print(f"{np.mean([len(example.points) for example in people]):.0f} points a person")
+    for name in options.models:
+        model = next((model for model, sizes in MODELS.items() if name in sizes), name)
+        size = "" if model == name else name
+        named = {"dapt": "paper", "ours": "default"}.get(model, model)
+        wanted = recipe(Pretrain, named, model=model, size=size)
         config = PRETRAINED[wanted.size][0]
+        frames = getattr(config, "frames", 1)
+        examples = people if frames == 1 else clips(source, options.people // frames)
         configs = [config, replace(config, grid=32)] if model == "lpformer" else [config]
         for config in configs:
             objective = objective_of(config, wanted)
@@ -52,9 +59,17 @@ def main() -> None:
             def inference(objective=objective, network=network, arrays=arrays) -> None:
                 objective.joints(network.eval(), arrays)
 
-            rates = [len(examples) / _seconds(task) for task in (step, inference)]
+            rates = [len(examples) * frames / _seconds(task) for task in (step, inference)]
             name = f"{wanted.size}, {config.grid}^3" if model == "lpformer" else wanted.size
             print(f"{name:20} training {rates[0]:8.2f} people/s, inference {rates[1]:8.2f}", flush=True)
+
+
+def clips(source: SyntheticSource, count: int) -> list[ClipExample]:
+    """At least one synthesized clip."""
+    made = [source.clip(index, trans_center=False) for index in range(max(count, 1))]
+    points = [len(frame.points) for clip in made for frame in clip.frames]
+    print(f"{len(made)} clips, {np.mean(points):.0f} points a frame")
+    return made
 
 
 def _seconds(task: Callable[[], None]) -> float:
