@@ -7,7 +7,8 @@ from contextlib import ExitStack
 from typing import Any
 
 from lidarpose.cli.terminal import add_command, tell
-from lidarpose.models import BUNDLED
+from lidarpose.errors import InputError
+from lidarpose.models import BUNDLED, DEFAULT
 from lidarpose.progress import Progress
 
 # options of `evaluation.run`: type, default, metavar, help
@@ -20,7 +21,7 @@ _OPTIONS: dict[str, tuple[Any, Any, str, str]] = {
     ),
     "split": (str, None, "NAME", "split to score, or all (default: test, else val, else all)"),
     "skeleton": (str, None, "NAME", "score the joints of this skeleton (default: the dataset's)"),
-    "limit": (int, None, "N", "score only N people, evenly spread"),
+    "limit": (int, None, "N", "score only N people (of detector: scans), evenly spread"),
     "seed": (int, 0, "N", "random seed for displaced boxes and intervals (default 0)"),
     "device": (str, "cpu", "NAME", "cpu (default), or cuda (backend torch)"),
     "backend": (str, None, "NAME", "onnx or torch, as in lidarpose predict"),
@@ -38,6 +39,9 @@ _SWITCHES = {
     "legacy": "also score with the released code's arithmetic",
     "sensor_unknown": "hide the sensor's position from the network",
 }
+# in place of a network: what finds people; and its own options
+DETECTOR = "detector"
+_DETECTOR = ("scans", "method", "range", "network", "pictures")
 # groups of rows that the terminal shows; the others are in scores.json
 _SHOWN = ("condition", "plain", "joints", "distance, m", "points", "hidden share")
 # metrics of these groups that it shows, besides those of everybody
@@ -56,18 +60,31 @@ def add(commands) -> None:
         "score a checkpoint on datasets",
         "lidarpose evaluate small bench",
         "lidarpose evaluate small prepared/waymo --out scores/waymo",
+        "lidarpose evaluate detector --scans labeled --pictures look",
         description="Prints metrics and writes scores.json, poses.parquet and pictures into a folder.",
     )
     evaluate.set_defaults(run=_evaluate)
-    words = f"{', '.join(BUNDLED)}, a checkpoint, or an exported .onnx"
+    words = f"{', '.join(BUNDLED)}, a checkpoint, an exported .onnx, or detector: what finds people in whole scans"
     evaluate.add_argument("weights", metavar="CHECKPOINT", help=words)
-    words = "a folder written by prepare or synth, or bench"
-    evaluate.add_argument("datasets", nargs="+", metavar="DATASET", help=words)
+    words = "a folder written by prepare or synth, or bench; of detector heldout (default without --scans)"
+    evaluate.add_argument("datasets", nargs="*", metavar="DATASET", help=words)
     for name, (kind, default, metavar, words) in _OPTIONS.items():
         evaluate.add_argument(f"--{name}", type=kind, default=default, metavar=metavar, help=words)
     for name, words in _SWITCHES.items():
         evaluate.add_argument(_flag(name), action="store_true", help=words)
     evaluate.add_argument("--out", metavar="DIR", help="a new or empty folder (default evaluation/NAME, numbered)")
+
+    detector = evaluate.add_argument_group("evaluate detector")
+    words = "a folder of SCAN.json of labeled people beside SCAN.pcd, .bin, .ply, .npy or another; may be repeated"
+    detector.add_argument("--scans", action="append", metavar="DIR", help=words)
+    words = "detector (default), scorer: without poses, or baselines: pose, candidates"
+    detector.add_argument("--method", metavar="NAME", help=words)
+    words = "people farther from the sensor do not count (default 40)"
+    detector.add_argument("--range", type=float, metavar="M", help=words)
+    words = "compare poses in found boxes with those in labeled ones: a checkpoint (default small), or none"
+    detector.add_argument("--network", metavar="NAME", help=words)
+    words = "draw the strongest false people and those who are missed into DIR"
+    detector.add_argument("--pictures", metavar="DIR", help=words)
 
     table = add_command(
         commands,
@@ -89,6 +106,12 @@ def _flag(name: str) -> str:
 def _evaluate(options: argparse.Namespace) -> None:
     from lidarpose import evaluation
 
+    if options.weights == DETECTOR:
+        return _evaluate_detector(options)
+    if wrong := [f"--{name}" for name in _DETECTOR if getattr(options, name) is not None]:
+        raise InputError(
+            f"{wrong[0]} is of lidarpose evaluate detector, got the network {options.weights}: leave it out"
+        )
     folder = evaluation.new_folder(options.weights) if options.out is None else evaluation.check_folder(options.out)
     settings = {name: getattr(options, name) for name in (*_OPTIONS, *_SWITCHES)}
     with ExitStack() as stack:
@@ -102,6 +125,68 @@ def _evaluate(options: argparse.Namespace) -> None:
     for study in run.studies:
         print("\n".join(_study(study)))
     tell(f"{', '.join(path.name for path in written)} -> {folder}")
+
+
+def _evaluate_detector(options: argparse.Namespace) -> None:
+    from lidarpose import evaluation
+    from lidarpose.eval.detector.evaluate_detector import run_detector, write_detector
+    from lidarpose.eval.detector.labeled_scans import HELDOUT
+
+    for name, (_, default, _, _) in (_OPTIONS | dict.fromkeys(_SWITCHES, (bool, False, "", ""))).items():
+        if name not in ("limit", "seed") and getattr(options, name) != default:
+            raise InputError(f"{_flag(name)} is of networks, got the detector: leave it out")
+    if set(options.datasets) - {HELDOUT}:
+        raise InputError(
+            f"expected {HELDOUT} or nothing as the detector's dataset, got {options.datasets[0]}: use --scans"
+        )
+    folder = evaluation.new_folder(f"{DETECTOR}.onnx") if options.out is None else evaluation.check_folder(options.out)
+    pictures = None if options.pictures is None else evaluation.check_folder(options.pictures)
+    settings = {name: value for name in ("limit", "seed") if (value := getattr(options, name)) is not None}
+    settings |= {"method": options.method or DETECTOR, "max_range": 40.0 if options.range is None else options.range}
+    network = {None: DEFAULT, "none": None}.get(options.network, options.network)
+    with ExitStack() as stack:
+        progress = _progress(stack, unit="scans")
+        results, sets = run_detector(
+            heldout=bool(options.datasets) or not options.scans,
+            folders=options.scans or (),
+            network=network,
+            progress=progress,
+            **settings,
+        )
+    about = {"command": _command(options), **settings, "network": network}
+    written = write_detector(results, sets, folder, about, pictures)
+    for result in results:
+        print("\n".join(_detector_lines(result)))
+    tell(f"{', '.join(path.name for path in written)} -> {folder}{'' if pictures is None else f', {pictures}'}")
+
+
+def _detector_lines(result) -> Iterator[str]:
+    """A table of recall by operating point and group, and the other figures."""
+    points = list(result.thresholds)
+    people, mounted = len(result.people), int(result.people.mounted.sum())
+    yield f"{result.dataset}: {len(result.scans):,} scans, {people - mounted:,} people on foot, {mounted:,} mounted"
+    rows = {(row["figure"], row["at"], row["group"], row["of"]): row for row in result.rows}
+    groups = dict.fromkeys((row["group"], row["of"]) for row in result.rows if row["figure"] == "recall")
+    names = {key: " ".join(dict.fromkeys(key)) for key in groups}
+    wide = max(map(len, [*names.values(), "average precision, %"]))
+    yield f"  {'recall, %, at false people a scan':<{wide + 9}}" + "".join(f"{at:>22}" for at in points)
+    yield f"  {'score from':<{wide + 9}}" + "".join(f"{result.thresholds[at]:>22.3f}" for at in points)
+    for key, name in names.items():
+        cells = [rows["recall", at, *key] for at in points]
+        yield f"  {name:<{wide}}{cells[0]['count']:>9,}" + "".join(f"{_cell(row):>22}" for row in cells)
+    for (figure, at, group, of), row in rows.items():
+        if figure != "recall" and (figure != "false_people" or at in ("1", "default")):
+            words = " ".join(
+                filter(None, (figure.replace("_", " "), at and f"at {at}", group != "all" and f"{group} {of}"))
+            )
+            yield f"  {words}, {row['unit']}: {_cell(row)}"
+    for entry in result.things:
+        yield f"  false at 1 a scan: {entry['false']:,} {entry['thing']}"
+
+
+def _cell(row: dict) -> str:
+    ends = "" if row["low"] is None else f" [{row['low']:.1f}, {row['high']:.1f}]"
+    return "-" if row["value"] is None else f"{row['value']:.1f}{ends}"
 
 
 def _table(options: argparse.Namespace) -> None:
@@ -124,17 +209,21 @@ def _command(options: argparse.Namespace) -> str:
     for name, (_, default, _, _) in _OPTIONS.items():
         if (value := getattr(options, name)) != default:
             words += [_flag(name), str(value)]
+    for name in _DETECTOR:
+        value = getattr(options, name)
+        for part in value if isinstance(value, list) else [value] * (value is not None):
+            words += [_flag(name), str(part)]
     return shlex.join([*words, *(_flag(name) for name in _SWITCHES if getattr(options, name))])
 
 
-def _progress(stack: ExitStack) -> Callable[[str, int, int], None]:
+def _progress(stack: ExitStack, unit: str = "people") -> Callable[[str, int, int], None]:
     """progress(dataset, done, total), which shows one dataset after the other; `stack` ends the last."""
     shown: dict[str, Progress] = {}
 
     def progress(dataset: str, done: int, total: int) -> None:
         if dataset not in shown:
             stack.close()
-            shown[dataset] = stack.enter_context(Progress(total or None, unit="people", label=dataset))
+            shown[dataset] = stack.enter_context(Progress(total or None, unit=unit, label=dataset))
         shown[dataset].update(done)
 
     return progress

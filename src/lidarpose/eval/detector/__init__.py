@@ -1,0 +1,1 @@
+"""People found in whole scans against labeled ones: `lidarpose evaluate detector`."""

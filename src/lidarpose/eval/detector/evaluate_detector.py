@@ -1,0 +1,141 @@
+"""One call of `lidarpose evaluate detector`: the detector, the sets of scans, the folder of results."""
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidarpose._version import __version__
+from lidarpose.errors import check_name
+from lidarpose.eval.detector.detection_pictures import draw_curves, draw_false, draw_missed
+from lidarpose.eval.detector.detection_scores import Detect, DetectorResult, score_detector
+from lidarpose.eval.detector.labeled_scans import ScanSet, heldout_scans, labeled_scans
+from lidarpose.inference.checks import rows_inside
+from lidarpose.inference.predictor import Predictor, load
+from lidarpose.io.files import atomic_path
+from lidarpose.sample import Box
+
+SCHEMA = "lidarpose.detector-scores/1"
+FILE = "detector.json"
+METHODS = ("detector", "scorer", "pose", "candidates")
+# the box about a candidate, m
+_CANDIDATE = np.array([0.9, 0.9, 2.0])
+# mean spread at which a pose's score has fallen to 1 / e, m
+_SPREAD = 0.1
+
+
+def detector_of(method: str, *, max_range: float) -> Detect:
+    """What looks for people: "detector", as `lidarpose.detect`; "scorer", the same without poses; and baselines on its
+    candidates, which nothing was trained for: "pose", by the spread of `tiny`'s pose, and "candidates" by their order.
+    """
+    if method == "detector":
+        return partial(_detect, max_range=max_range)
+    if method == "scorer":
+        return partial(_scorer, _bundled(), max_range=max_range)
+    return partial(_baseline, load("tiny", tta=1) if method == "pose" else None)
+
+
+def _bundled():
+    from lidarpose.models.detector.detector import Detector
+
+    return Detector()
+
+
+def _detect(points: np.ndarray, origin: np.ndarray | None, *, max_range: float) -> tuple[Sequence[Box], np.ndarray]:
+    from lidarpose.inference.detection import detect
+
+    boxes = detect(points, sensor_origin="unknown" if origin is None else origin, max_range=max_range, min_score=0.0)
+    return boxes, np.array([box.score for box in boxes], float)
+
+
+def _scorer(detector, points: np.ndarray, origin: np.ndarray | None, *, max_range: float):
+    found = detector.detect(points, origin, max_range=max_range, limit=None)
+    boxes = zip(found.centers, found.sizes, found.yaws, strict=True)
+    return [Box(center=center, size=size, yaw=float(yaw)) for center, size, yaw in boxes], found.score
+
+
+def _baseline(predictor: Predictor | None, points: np.ndarray, origin: np.ndarray | None):
+    from lidarpose.models.detector.candidates import suppress
+    from lidarpose.models.detector.ground import estimate_ground
+    from lidarpose.models.detector.proposals import propose
+
+    centers = propose(points, estimate_ground(points, origin))
+    boxes = [Box(center=center + [0, 0, _CANDIDATE[2] / 2], size=_CANDIDATE) for center in centers]
+    scores = 1 - np.arange(len(boxes)) / max(len(boxes), 1)
+    if predictor is None or not boxes:
+        return boxes, scores
+    poses = predictor.predict(points, boxes=boxes, sensor_origin="unknown" if origin is None else origin)
+    scores = np.array([np.exp(-person.spread.mean() / _SPREAD) if person.has_pose else 0.0 for person in poses])
+    kept = suppress(rows_inside(boxes, points), scores)
+    return [boxes[k] for k in kept], scores[kept]
+
+
+def run_detector(
+    method: str = "detector",
+    *,
+    heldout: bool = True,
+    folders: Sequence[str | os.PathLike] = (),
+    max_range: float = 40.0,
+    network: str | None = None,
+    limit: int | None = None,
+    seed: int = 0,
+    detect: Detect | None = None,
+    progress: Callable[[str, int, int], None] = lambda dataset, done, total: None,
+) -> tuple[list[DetectorResult], list[ScanSet]]:
+    """Scores a detector on the frozen scenes and on folders of labeled scans.
+
+    Args:
+        method: see `detector_of`; detect: another detector.
+        folders: see `labeled_scans`.
+        max_range: m, people farther away do not count.
+        network: whose poses in found boxes are compared with those in labeled boxes; None leaves this out.
+        limit: so many scans of each set, evenly spread.
+    """
+    check_name("method", method, METHODS)
+    sets = [heldout_scans(limit)] if heldout else []
+    sets += [labeled_scans(folder, limit) for folder in folders]
+    default = _bundled().header.get("default_score") if method == "detector" and detect is None else None
+    detect = detect or detector_of(method, max_range=max_range)
+    predictor = None if network is None else load(network, tta=1)
+    score = partial(score_detector, detect, max_range=max_range, predictor=predictor, seed=seed, default_score=default)
+    return [score(scans, progress=partial(progress, scans.name)) for scans in sets], sets
+
+
+def to_json(results: Sequence[DetectorResult], about: dict[str, Any]) -> str:
+    """detector.json: one line of text a row."""
+    head = {"schema": SCHEMA, "version": __version__} | about
+    parts = []
+    for result in results:
+        content = result.to_dict()
+        rows = ",\n".join(f"   {json.dumps(row)}" for row in content.pop("rows"))
+        parts.append(f'  {json.dumps(content)[:-1]}, "rows": [\n{rows}\n  ]}}')
+    return f'{json.dumps(head)[:-1]}, "results": [\n' + ",\n".join(parts) + "\n]}\n"
+
+
+def write_detector(
+    results: Sequence[DetectorResult],
+    sets: Sequence[ScanSet],
+    folder: Path,
+    about: dict[str, Any],
+    pictures: str | os.PathLike | None = None,
+) -> list[Path]:
+    """Writes detector.json and curves.png, and pictures of false and missed people into a folder of their own; returns
+    their paths."""
+    files: dict[Path, bytes | None] = {
+        folder / FILE: to_json(results, about).encode(),
+        folder / "curves.png": draw_curves(results),
+    }
+    if pictures is not None:
+        for result, scans in zip(results, sets, strict=True):
+            files[Path(pictures) / f"{scans.name}-false.png"] = draw_false(result, scans)
+            files[Path(pictures) / f"{scans.name}-missed.png"] = draw_missed(result, scans)
+    written = {path: content for path, content in files.items() if content}
+    with ExitStack() as stack:
+        for path, content in written.items():
+            stack.enter_context(atomic_path(path)).write_bytes(content)
+    return list(written)

@@ -1,0 +1,143 @@
+"""Whole scans whose people are labeled: the frozen list of synthesized ones, and folders of real ones."""
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidarpose.errors import InputError
+from lidarpose.eval.dataset import spread
+from lidarpose.inference.checks import rows_inside
+from lidarpose.inference.inputs import as_origin, only_returns
+from lidarpose.io.boxes import read_boxes
+from lidarpose.io.files import file_error, read_bytes
+from lidarpose.io.point_cloud import SUFFIXES, read_points
+from lidarpose.sample import Box
+
+HELDOUT = "heldout"
+_HELDOUT_FILE = "detector-heldout-1.json"
+# what labels call people on foot, and people with wheels; other things, as strollers and dogs, are no people
+_ON_FOOT = ("pedestrian", "person", "people", "signaler", "human", "adult", "child")
+_MOUNTED = ("cycl", "rider", "wheelchair", "mounted")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LabeledScan:
+    """A scan with P labeled people, z up.
+
+    points (n, 3) m; origin: the sensor's position (3,) m, None where nobody knows it; boxes: P; num_points (P,): how
+    many points each person has; is_person (P,) bool: False where something else is labeled; mounted (P,) bool: riders
+    and wheelchairs; sensor, kind of scene: "" where it is not known; thing (n,): the kind of thing that a point lies
+    on, an index of `things`, or -1; person (n,): an index of `boxes`, or -1; joints (P, 26, 3) m, body26.
+    """
+
+    name: str
+    points: np.ndarray
+    origin: np.ndarray | None
+    boxes: Sequence[Box]
+    num_points: np.ndarray
+    is_person: np.ndarray
+    mounted: np.ndarray
+    sensor: str = ""
+    kind: str = ""
+    thing: np.ndarray | None = None
+    things: Sequence[str] = ()
+    person: np.ndarray | None = None
+    joints: np.ndarray | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanSet:
+    """Scans that are made or read when they are needed."""
+
+    name: str
+    loaders: Sequence[Callable[[], LabeledScan]]
+
+
+def heldout_scans(limit: int | None = None) -> ScanSet:
+    """The frozen scenes with kinds of things, rooms and poses that no detector was trained on."""
+    content = json.loads((resources.files("lidarpose.eval") / "assets" / _HELDOUT_FILE).read_text("utf-8"))
+    indices = [content["indices"][k] for k in spread(len(content["indices"]), limit).tolist()]
+    return ScanSet(name=HELDOUT, loaders=[partial(synthetic_scan, content["seed"], index) for index in indices])
+
+
+def synthetic_scan(seed: int, index: int, family: str = HELDOUT) -> LabeledScan:
+    """A scene of `synth.detection_scene` as a labeled scan."""
+    from lidarpose.synth.detection_scene import detection_scene
+
+    scene = detection_scene(seed, index, family=family)
+    people = len(scene.boxes)
+    return LabeledScan(
+        name=f"{family} {index}",
+        points=scene.points,
+        origin=scene.origin,
+        boxes=scene.boxes,
+        num_points=np.bincount(scene.person[scene.person >= 0], minlength=people),
+        is_person=np.ones(people, bool),
+        mounted=scene.mounted,
+        sensor=scene.sensor,
+        kind=scene.kind,
+        thing=scene.thing,
+        things=scene.things,
+        person=scene.person,
+        joints=scene.joints,
+    )
+
+
+def labeled_scans(folder: str | os.PathLike, limit: int | None = None) -> ScanSet:
+    """The scans of a folder: SCAN.json of people beside SCAN.pcd, .bin, .ply, .npy or another format.
+
+    SCAN.json holds what `read_boxes` takes, and of each of its "people" a `category` ("PEDESTRIAN" where it is
+    missing; riders and wheelchairs are mounted; strollers and animals are no people) and `num_points`, else the points
+    in the box are counted; beside "people" `sensor`, `kind` of scene and `sensor_origin` (0, 0, 0 where it is missing).
+    Raises InputError where the folder has none, or labels have no scan.
+    """
+    folder = Path(folder)
+    labels = sorted(folder.glob("*.json"))
+    clouds = [next((p for s in SUFFIXES if (p := path.with_suffix(s)).is_file()), None) for path in labels]
+    if not labels:
+        raise file_error(folder, "expected labeled scans, SCAN.json of people beside SCAN.pcd or another, got no .json")
+    for path, cloud in zip(labels, clouds, strict=True):
+        if cloud is None:
+            raise file_error(path, f"expected its scan beside it, {path.stem} with {' '.join(SUFFIXES)}, got none")
+    pairs = list(zip(labels, clouds, strict=True))
+    return ScanSet(
+        name=folder.resolve().name, loaders=[partial(_read_scan, *pairs[k]) for k in spread(len(pairs), limit).tolist()]
+    )
+
+
+def _read_scan(labels: Path, cloud: Path) -> LabeledScan:
+    boxes = read_boxes(labels)
+    content = json.loads(read_bytes(labels, expected="labels of people"))
+    about: dict[str, Any] = content if isinstance(content, dict) else {"people": content}
+    people = [entry if isinstance(entry, dict) else {} for entry in about["people"]]
+    category = [str(entry.get("category", "pedestrian")).lower() for entry in people]
+    mounted = np.array([any(word in name for word in _MOUNTED) for name in category], bool)
+    on_foot = np.array([any(word in name for word in _ON_FOOT) for name in category], bool)
+    points = only_returns(read_points(cloud).points)[0]
+    counted = [len(rows) for rows in rows_inside(boxes, points)]
+    try:
+        num_points = [int(entry.get("num_points", own)) for entry, own in zip(people, counted, strict=True)]
+    except (TypeError, ValueError):
+        raise file_error(labels, "expected whole numbers as num_points of people: correct or drop them") from None
+    try:
+        origin = as_origin(about.get("sensor_origin", (0.0, 0.0, 0.0)))
+    except InputError as error:
+        raise file_error(labels, error) from None
+    return LabeledScan(
+        name=labels.stem,
+        points=points,
+        origin=origin,
+        boxes=boxes,
+        num_points=np.array(num_points, int),
+        is_person=on_foot | mounted,
+        mounted=mounted,
+        sensor=str(about.get("sensor", "")),
+        kind=str(about.get("kind", "")),
+    )

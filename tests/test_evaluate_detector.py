@@ -1,0 +1,329 @@
+"""People found in whole scans: matching, recall at so many false people a scan, and the command."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lidarpose.cli import main
+from lidarpose.errors import InputError
+from lidarpose.eval.detector import evaluate_detector as run_module
+from lidarpose.eval.detector.detection_scores import (
+    FALSE,
+    MATCH_RADIUS,
+    NEITHER,
+    PERSON,
+    average_precision,
+    exclusive_thresholds,
+    match,
+    score_detector,
+    score_scan,
+)
+from lidarpose.eval.detector.labeled_scans import LabeledScan, ScanSet, labeled_scans
+from lidarpose.sample import Box
+
+SIZE = (0.8, 0.8, 1.8)
+
+
+def box(x, y, height=1.8):
+    return Box(center=(x, y, height / 2 - 1.7), size=(0.8, 0.8, height))
+
+
+def scan(people, **more):
+    """A scan of a point cloud about each person, a dict or x."""
+    people = [{"x": entry} if isinstance(entry, float | int) else entry for entry in people]
+    boxes = [box(entry["x"], entry.get("y", 0.0), entry.get("height", 1.8)) for entry in people]
+    rng = np.random.default_rng(0)
+    clouds = [own.center + rng.uniform(-0.3, 0.3, (60, 3)) for own in boxes]
+    about = {
+        "name": "made",
+        "points": np.concatenate([*clouds, np.zeros((0, 3))]),
+        "origin": np.zeros(3),
+        "boxes": boxes,
+        "num_points": np.array([entry.get("points", 60) for entry in people], int),
+        "is_person": np.array([entry.get("is_person", True) for entry in people], bool),
+        "mounted": np.array([entry.get("mounted", False) for entry in people], bool),
+    }
+    return LabeledScan(**about | more)
+
+
+def scan_set(scans):
+    return ScanSet(name="made", loaders=[lambda own=own: own for own in scans])
+
+
+def answers(*scans):
+    """A detector that answers call after call with (x, score) pairs."""
+    left = iter(scans)
+
+    def detect(points, origin):
+        found = next(left)
+        return [box(x, 0.0) for x, _ in found], np.array([score for _, score in found])
+
+    return detect
+
+
+# ---- matching
+
+places = st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), max_size=7).map(lambda p: np.array(p).reshape(-1, 2))
+
+
+def match_reference(centers, scores, people, wanted):
+    """`match`, a pair at a time."""
+    of_person = [-1] * len(centers)
+    for d in sorted(range(len(centers)), key=lambda d: -scores[d]):
+        for only_wanted in (True, False):
+            best = None
+            for p in range(len(people)):
+                away = np.hypot(*(centers[d] - people[p]))
+                usable = p not in of_person and away <= MATCH_RADIUS and (wanted[p] or not only_wanted)
+                if usable and (best is None or away < best[0]):
+                    best = (away, p)
+            if best is not None:
+                of_person[d] = best[1]
+                break
+    return of_person
+
+
+@given(places, places, st.data())
+def test_matching_is_one_to_one_near_and_leaves_no_pair(centers, people, data):
+    scores = np.array(
+        data.draw(st.lists(st.sampled_from([0.1, 0.5, 0.9]), min_size=len(centers), max_size=len(centers)))
+    )
+    wanted = np.array(data.draw(st.lists(st.booleans(), min_size=len(people), max_size=len(people))), bool)
+    of_person = match(centers, scores, people, wanted)
+    assert of_person.tolist() == match_reference(centers, scores, people, wanted)
+    matched = of_person >= 0
+    assert len(set(of_person[matched])) == matched.sum()
+    assert (np.linalg.norm(centers[matched] - people[of_person[matched]], axis=1) <= MATCH_RADIUS).all()
+    free = np.setdiff1d(np.arange(len(people)), of_person)
+    assert (np.linalg.norm(centers[~matched][:, None] - people[free][None], axis=-1) > MATCH_RADIUS).all()
+
+
+def test_the_surer_detection_has_the_person_and_the_other_is_false():
+    own = scan([5.0])
+    people, detections = score_scan(0, own, [box(5.0, 0.0), box(5.3, 0.0)], np.array([0.4, 0.8]), max_range=40)
+    assert [row["status"] for row in detections] == [FALSE, PERSON]
+    assert people[0]["score"] == 0.8 and people[0]["detection"] == 1
+
+
+def test_few_points_other_things_and_what_is_far_are_neither_wanted_nor_false():
+    own = scan([{"x": 5, "points": 9}, {"x": 10, "is_person": False}, 45, {"x": 15, "mounted": True}, 20])
+    found = [box(x, 0.0) for x in (5, 10, 45, 50, 15, 20, 30)]
+    people, detections = score_scan(0, own, found, np.linspace(0.9, 0.3, 7), max_range=40)
+    assert [row["status"] for row in detections] == [NEITHER] * 4 + [PERSON, PERSON, FALSE]
+    assert [(row["person"], row["mounted"]) for row in people] == [(3, True), (4, False)]
+
+
+def test_who_is_wanted_comes_first():
+    own = scan([{"x": 5.0, "points": 3}, 5.4])
+    people, detections = score_scan(0, own, [box(5.0, 0.0)], np.array([0.5]), max_range=40)
+    assert people[0]["detection"] == 0 and detections[0]["status"] == PERSON
+
+
+def test_conditions_and_what_false_people_are():
+    points = np.concatenate([box(x, 0).center + np.random.default_rng(1).uniform(-0.3, 0.3, (40, 3)) for x in (5, 20)])
+    thing, person = np.repeat([-1, 1], 40), np.repeat([0, -1], 40)
+    about = {"points": points, "thing": thing, "things": ("hedge", "pillar"), "person": person}
+    own = scan([{"x": 5}, {"x": 5.8, "height": 1.2}, 20.3], **about)
+    found = [box(5.0, 0), box(4.4, 0), box(19.5, 0), box(20.0, 0), box(30.0, 0)]
+    people, detections = score_scan(0, own, found, np.linspace(0.9, 0.5, 5), max_range=40)
+    near, touching, low = "person within 1 m", "thing within 0.3 m", "under 1.4 m tall"
+    assert [row["condition"] for row in people] == [(near,), (near, low), (touching,)]
+    assert [row["thing"] for row in detections] == ["", "part of a person", "pillar", "", "no points"]
+
+
+# ---- recall
+
+
+def ten_scans():
+    """Ten scans of two people, 60 and 15 points; scores fall with the scan's number, a false one each in between."""
+    scans, found = [], []
+    for k in range(10):
+        scans.append(scan([5, {"x": 10, "points": 15}], sensor="a" if k < 5 else "b"))
+        found.append([(5.1, 0.95 - 0.05 * k), (30.0, 0.93 - 0.05 * k)] + [(10.2, 0.2)] * (k == 9))
+    return scan_set(scans), answers(*found)
+
+
+def test_recall_at_so_many_false_people_is_what_counting_says():
+    scans, detect = ten_scans()
+    result = score_detector(detect, scans, default_score=0.7)
+    # three false detections of ten scans, of scores 0.93, 0.88 and 0.83, lie above those that find the fifth
+    assert result.row("recall", "0.3")["value"] == 100 * 4 / 20
+    assert result.row("recall", "0.3", "points", "50 and more")["value"] == 40
+    assert result.row("recall", "0.3", "points", "10 to 20")["value"] == 0
+    assert result.row("recall", "1", "points", "10 to 20")["value"] == 10
+    assert result.row("recall", "1")["value"] == 55 and result.row("recall", "10")["value"] == 55
+    assert result.row("recall", "0.3", "sensor, 50 points and more", "a")["value"] == 80
+    assert result.row("recall", "0.3", "distance, m", "0 to 10")["value"] == 40
+    assert result.thresholds["0.3"] == pytest.approx(0.8) and result.thresholds["default"] == 0.7
+    assert result.row("recall", "default")["value"] == 100 * 6 / 20
+    assert result.row("false_people", "0.3")["value"] == 0.3
+    assert result.row("false_people", "0.3", "sensor", "a")["value"] == 0.6
+    assert result.row("false_people", "1", "worst", "scan")["value"] == 1
+    row = result.row("recall", "1", "points", "10 to 20")
+    assert row["low"] == 0 and 10 <= row["high"] <= 50 and row["count"] == 10
+    # of the detections at a recall of k / 20, k of 2 k - 1 are people
+    expected = sum(k / (2 * k - 1) for k in range(1, 11)) / 20 + (11 / 21) / 20
+    assert result.row("average_precision")["value"] == pytest.approx(100 * expected, abs=0.01)
+
+
+def test_mounted_people_are_told_apart_and_change_nothing_for_the_others():
+    others = [scan([5, {"x": 10, "mounted": True}]), scan([5, {"x": 10, "mounted": True}])]
+    result = score_detector(answers([(5, 0.9), (10, 0.8)], [(5, 0.7)]), scan_set(others))
+    assert result.row("recall", "1")["value"] == 100 and result.row("recall", "1")["count"] == 2
+    assert result.row("recall", "1", "mounted")["value"] == 50
+    assert result.row("average_precision")["value"] == 100 and result.row("false_people", "10")["value"] == 0
+
+
+def test_calibration_is_of_people_and_false_ones():
+    scans = scan_set([scan([5, 10, {"x": 15, "points": 2}])])
+    result = score_detector(answers([(5, 0.75), (30, 0.75), (10, 1.0), (15, 0.4)]), scans)
+    assert result.row("calibration_error")["value"] == pytest.approx(100 * (2 * 0.25) / 3, abs=0.01)
+    assert result.reliability == [
+        {"score": 0.75, "people": 0.5, "detections": 2},
+        {"score": 1.0, "people": 1.0, "detections": 1},
+    ]
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 3), st.sampled_from([0.1, 0.2, 0.5, 0.8])), max_size=12),
+    st.lists(st.integers(0, 3), min_size=4, max_size=4).filter(any),
+    st.sampled_from([0.3, 1.0, 3.0]),
+)
+def test_no_lower_bound_has_so_few_false_people(found, weights, budget):
+    false = pd.DataFrame(found, columns=["scan", "score"]).sort_values("score", ascending=False)
+    weights = np.array([weights])
+
+    def above(bound):
+        return sum(weights[0, k] for k, score in found if score > bound)
+
+    bound = exclusive_thresholds(false, weights, budget)[0]
+    assert above(bound) <= budget * weights.sum()
+    lower = [other for other in (-1.0, *false.score) if other < bound]
+    assert all(above(other) > budget * weights.sum() for other in lower)
+
+
+def test_average_precision_does_not_depend_on_the_order_of_equal_scores():
+    detections = pd.DataFrame({"scan": 0, "score": [0.5] * 4, "status": [PERSON, FALSE, FALSE, PERSON]})
+    people = pd.DataFrame({"scan": [0, 0, 0, 0]})
+    for order in ([0, 1, 2, 3], [1, 2, 0, 3]):
+        assert average_precision(detections.iloc[order], people, np.ones(1)) == 0.5 * 0.5
+
+
+def test_poses_in_found_boxes_are_compared_with_those_in_labeled_boxes():
+    joints = np.stack([np.full((26, 3), (5.0, 0, 0)), np.full((26, 3), (10.0, 0, 0))])
+
+    def predict(points, *, boxes, sensor_origin, skeleton):
+        assert skeleton == "human15" and (sensor_origin == 0).all()
+        joints = [np.tile(own.center * [1, 1, 0], (15, 1)) for own in boxes]
+        return [SimpleNamespace(has_pose=own[0, 0] < 9, joints=own) for own in joints]
+
+    predictor = SimpleNamespace(predict=predict)
+    scans = scan_set([scan([5, 10], joints=joints)])
+    result = score_detector(answers([(5.03, 0.9), (10.0, 0.8)]), scans, predictor=predictor)
+    values = [result.row(name, "1") for name in ("mpjpe_found", "mpjpe_given", "mpjpe_difference")]
+    assert [row["value"] for row in values] == pytest.approx([30, 0, 30]) and values[0]["count"] == 1
+
+
+def test_nobody_to_find_is_an_error():
+    with pytest.raises(InputError, match="made has nobody of 10 points and more within 3 m"):
+        score_detector(answers([]), scan_set([scan([5])]), max_range=3.0)
+
+
+# ---- the command
+
+
+def write_scans(folder):
+    """Two scans: one of two people and a stroller, one of a rider; a false person in each."""
+    rng = np.random.default_rng(0)
+    folder.mkdir()
+    for name, xs, categories in (
+        ("a", (5, 8, 12), ("PEDESTRIAN", "PEDESTRIAN", "STROLLER")),
+        ("b", (6,), ("BICYCLIST",)),
+    ):
+        clouds = [box(x, 0).center + rng.uniform(-0.3, 0.3, (60, 3)) for x in (*xs, 20)]
+        np.save(folder / f"{name}.npy", np.concatenate(clouds).astype(np.float32))
+        people = [
+            {"center": [x, 0, -0.8], "size": SIZE, "category": category}
+            for x, category in zip(xs, categories, strict=True)
+        ]
+        people[0]["num_points"] = 12
+        (folder / f"{name}.json").write_text(json.dumps({"sensor": "os1-32", "people": people}))
+
+
+def fake(points, origin):
+    """Everything that stands on the x axis, at whole meters, the nearer the surer."""
+    found = sorted(set(np.round(points[:, 0]).tolist()) - {12.0})
+    assert origin is not None
+    return [box(x, 0.0) for x in found], np.array([0.9 - 0.03 * x for x in found])
+
+
+def test_the_command_scores_labeled_scans(tmp_path, capsys, monkeypatch):
+    write_scans(tmp_path / "labeled")
+    monkeypatch.setattr(run_module, "detector_of", lambda method, max_range: fake)
+    arguments = ["evaluate", "detector", "--method", "scorer", "--scans", str(tmp_path / "labeled"), "--range", "30"]
+    arguments += ["--out", str(tmp_path / "out"), "--pictures", str(tmp_path / "look")]
+    assert main(arguments) == 0
+    printed = capsys.readouterr().out
+    assert "labeled: 2 scans, 2 people on foot, 1 mounted" in printed
+    document = json.loads((tmp_path / "out" / "detector.json").read_text())
+    assert document["schema"] == "lidarpose.detector-scores/1" and document["max_range"] == 30
+    assert document["command"].startswith("lidarpose evaluate detector --scans ")
+    rows = document["results"][0]["rows"]
+    recall = {(row["at"], row["group"], row["of"]): row for row in rows if row["figure"] == "recall"}
+    assert recall["1", "points", "10 to 20"]["count"] == 1 and recall["1", "points", "50 and more"]["value"] == 100
+    assert recall["1", "sensor", "os1-32"]["value"] == 100 and recall["1", "mounted", "all"]["value"] == 100
+    false = next(row for row in rows if (row["figure"], row["at"], row["group"]) == ("false_people", "1", "all"))
+    assert false["value"] == 1
+    # nobody is missed, so there is no picture of them
+    assert [path.name for path in (tmp_path / "look").iterdir()] == ["labeled-false.png"]
+    assert (tmp_path / "out" / "curves.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_missed_people_are_drawn(tmp_path, monkeypatch):
+    write_scans(tmp_path / "labeled")
+    monkeypatch.setattr(run_module, "detector_of", lambda method, max_range: lambda points, origin: ([], np.zeros(0)))
+    arguments = ["evaluate", "detector", "--method", "scorer", "--scans", str(tmp_path / "labeled")]
+    assert main([*arguments, "--out", str(tmp_path / "out"), "--pictures", str(tmp_path / "look")]) == 0
+    assert [path.name for path in (tmp_path / "look").iterdir()] == ["labeled-missed.png"]
+    rows = json.loads((tmp_path / "out" / "detector.json").read_text())["results"][0]["rows"]
+    assert {row["value"] for row in rows if row["figure"] == "recall"} <= {0, None}
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["detector", "bench"], "expected heldout or nothing as the detector's dataset, got bench: use --scans"),
+        (["detector", "--protocol", "dapt"], "--protocol is of networks, got the detector: leave it out"),
+        (["detector", "--method", "yolo"], "method"),
+        (["small", "bench", "--range", "20"], "--range is of lidarpose evaluate detector, got the network small"),
+        (["small"], "expected a dataset to evaluate on"),
+        (["detector", "--scans", "."], "expected labeled scans"),
+    ],
+)
+def test_what_does_not_fit_is_one_line(arguments, message, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["evaluate", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_labels_without_a_scan_and_wrong_ones_are_named(tmp_path):
+    write_scans(tmp_path / "labeled")
+    (tmp_path / "labeled" / "a.npy").unlink()
+    with pytest.raises(InputError, match=r"a\.json.*expected its scan beside it"):
+        labeled_scans(tmp_path / "labeled")
+    (tmp_path / "labeled" / "a.json").unlink()
+    path = tmp_path / "labeled" / "b.json"
+    content = json.loads(path.read_text())
+    for key, value, message in (("num_points", "many", "num_points"), ("sensor_origin", "here", "sensor origin")):
+        changed = json.loads(json.dumps(content))
+        (changed["people"][0] if key == "num_points" else changed)[key] = value
+        path.write_text(json.dumps(changed))
+        with pytest.raises(InputError, match=rf"b\.json.*{message}"):
+            labeled_scans(tmp_path / "labeled").loaders[0]()
