@@ -4,6 +4,7 @@ import argparse
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from types import SimpleNamespace
 from typing import Any
 
 from lidarpose.cli.terminal import add_command, tell
@@ -162,31 +163,20 @@ def _evaluate_detector(options: argparse.Namespace) -> None:
 
 def _detector_lines(result) -> Iterator[str]:
     """A table of recall by operating point and group, and the other figures."""
-    points = list(result.thresholds)
-    people, mounted = len(result.people), int(result.people.mounted.sum())
-    yield f"{result.dataset}: {len(result.scans):,} scans, {people - mounted:,} people on foot, {mounted:,} mounted"
-    rows = {(row["figure"], row["at"], row["group"], row["of"]): row for row in result.rows}
-    groups = dict.fromkeys((row["group"], row["of"]) for row in result.rows if row["figure"] == "recall")
-    names = {key: " ".join(dict.fromkeys(key)) for key in groups}
-    wide = max(map(len, [*names.values(), "average precision, %"]))
-    yield f"  {'recall, %, at false people a scan':<{wide + 9}}" + "".join(f"{at:>22}" for at in points)
-    yield f"  {'score from':<{wide + 9}}" + "".join(f"{result.thresholds[at]:>22.3f}" for at in points)
-    for key, name in names.items():
-        cells = [rows["recall", at, *key] for at in points]
-        yield f"  {name:<{wide}}{cells[0]['count']:>9,}" + "".join(f"{_cell(row):>22}" for row in cells)
-    for (figure, at, group, of), row in rows.items():
-        if figure != "recall" and (figure != "false_people" or at in ("1", "default")):
-            words = " ".join(
-                filter(None, (figure.replace("_", " "), at and f"at {at}", group != "all" and f"{group} {of}"))
-            )
-            yield f"  {words}, {row['unit']}: {_cell(row)}"
-    for entry in result.things:
-        yield f"  false at 1 a scan: {entry['false']:,} {entry['thing']}"
+    import pandas
 
-
-def _cell(row: dict) -> str:
-    ends = "" if row["low"] is None else f" [{row['low']:.1f}, {row['high']:.1f}]"
-    return "-" if row["value"] is None else f"{row['value']:.1f}{ends}"
+    rows = pandas.DataFrame(result.rows)
+    named = [SimpleNamespace(**row) for row in result.rows]
+    rows["cell"] = [f"{_value(row)} {_ends(row)}".rstrip() for row in named]
+    recall = rows[rows.figure == "recall"].set_index(["group", "of", "count", "at"]).cell.unstack(sort=False)
+    recall.columns = [f"at {at} (score {score:.2f})" for at, score in result.thresholds.items()]
+    yield f"{result.dataset}: {result.scans:,} scans; recall, %, at so many false people a scan:"
+    yield recall.to_string()
+    for row in rows[(rows.figure != "recall") & rows["at"].isin(["", "1", "default"])].itertuples():
+        words = (row.figure.replace("_", " "), row.at and f"at {row.at}", row.group, row.of if row.of != "all" else "")
+        yield f"  {' '.join(filter(None, words))}: {row.cell} {row.unit}"
+    for thing, count in result.things.items():
+        yield f"  false at 1 a scan: {count:,} {thing}"
 
 
 def _table(options: argparse.Namespace) -> None:

@@ -1,11 +1,11 @@
-"""Pictures of a detector's evaluation: crops of false and missed people from above and from the side, and curves."""
+"""Pictures of a detector's evaluation: crops of false and missed people from above and from the side."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from lidarpose.eval.detector.detection_scores import FALSE, FALSE_PER_SCAN, REFERENCE, DetectorResult
+from lidarpose.eval.detector.detection_scores import FALSE, REFERENCE, DetectorResult
 from lidarpose.eval.detector.labeled_scans import LabeledScan, ScanSet
 from lidarpose.sample import Box
 from lidarpose.viz.draw import png_of
@@ -33,10 +33,9 @@ def draw_false(result: DetectorResult, scans: ScanSet) -> bytes | None:
     false = result.detections[result.detections.status == FALSE].sort_values("score", ascending=False, kind="stable")
     crops = []
     for row in false.head(MOST).itertuples():
-        scan, box = scans.loaders[row.scan](), result.boxes[row.scan][row.detection]
-        words = [f"{row.score:.2f}", row.thing, f"{row.distance:.0f} m"]
-        crops.append(_crop(scan, box, words))
-    return _sheet(crops, f"{result.dataset}: the strongest false people (red), labeled people blue") if crops else None
+        words = (f"{row.score:.2f}", row.thing, f"{row.distance:.0f} m")
+        crops.append(_crop(scans.loaders[row.scan](), result.boxes[row.scan][row.detection], words))
+    return _sheet(crops, f"{result.dataset}: the strongest false people (red), labeled people blue")
 
 
 def draw_missed(result: DetectorResult, scans: ScanSet) -> bytes | None:
@@ -45,15 +44,15 @@ def draw_missed(result: DetectorResult, scans: ScanSet) -> bytes | None:
     missed = result.people[result.people.score < threshold].sort_values("points", ascending=False, kind="stable")
     crops = []
     for row in missed.head(MOST).itertuples():
-        scan = scans.loaders[row.scan]()
-        words = [f"{row.score:.2f}" if row.detection >= 0 else "no score", f"{row.points} points"]
-        words += [f"{row.distance:.0f} m", *(["mounted"] if row.mounted else [])]
+        scan, score = scans.loaders[row.scan](), f"{row.score:.2f}" if row.detection >= 0 else "no score"
+        words = (score, f"{row.points} points", f"{row.distance:.0f} m", "mounted" * row.mounted)
         crops.append(_crop(scan, scan.boxes[row.person], words))
-    title = f"{result.dataset}: {len(missed)} people missed above {threshold:.2f}, the most points first (red)"
-    return _sheet(crops, title) if crops else None
+    return _sheet(
+        crops, f"{result.dataset}: {len(missed)} people missed above {threshold:.2f}, the most points first (red)"
+    )
 
 
-def _crop(scan: LabeledScan, box: Box, words: list[str]) -> _Crop:
+def _crop(scan: LabeledScan, box: Box, words: Sequence[str]) -> _Crop:
     near = scan.points[(np.abs(scan.points[:, :2] - box.center[:2]) < 1.5 * _REACH).all(1)]
     own = int(box.contains(near).sum())
     people = [person for person in scan.boxes if np.hypot(*(person.center - box.center)[:2]) < _REACH]
@@ -68,10 +67,12 @@ def _crop(scan: LabeledScan, box: Box, words: list[str]) -> _Crop:
     )
 
 
-def _sheet(crops: Sequence[_Crop], title: str) -> bytes:
+def _sheet(crops: Sequence[_Crop], title: str) -> bytes | None:
     """Each crop from above, the sensor below, and under it from the sensor's side."""
     from matplotlib.figure import Figure
 
+    if not crops:
+        return None
     rows = -(-len(crops) // _PER_ROW)
     figure = Figure(figsize=(2.6 * _PER_ROW, 5.5 * rows + 0.4), dpi=_DPI, facecolor="white", layout="constrained")
     figure.suptitle(title, x=0.01, ha="left", fontsize=11, color=_INK, parse_math=False)
@@ -103,29 +104,3 @@ def _draw_crop(ax, crop: _Crop, right: np.ndarray, up: np.ndarray) -> None:
         ax.add_collection(LineCollection(list(edges), colors=color, lw=0.9), autolim=False)
     ax.plot([-_REACH, -_REACH + 1], [-0.97 * _REACH] * 2, color=_FAINT, lw=1.5)
     ax.set(xlim=(-_REACH, _REACH), ylim=(-_REACH, _REACH), aspect="equal")
-
-
-def draw_curves(results: Sequence[DetectorResult]) -> bytes:
-    """Recall over false people a scan by number of points, and the share of people over the score."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.6, 4.0 * len(results)), dpi=_DPI, facecolor="white", layout="constrained")
-    for (left, right), result in zip(figure.subplots(len(results), 2, squeeze=False), results, strict=True):
-        by_points = [row for row in result.rows if row["group"] in ("points", "mounted, points")]
-        for group, of in dict.fromkeys((row["group"], row["of"]) for row in by_points):
-            values = [result.row("recall", f"{at:g}", group, of)["value"] for at in FALSE_PER_SCAN]
-            if None not in values:
-                style = "o--" if group.startswith("mounted") else "o-"
-                left.plot(FALSE_PER_SCAN, values, style, ms=4, lw=1.3, label=f"{group} {of}")
-        left.set(xscale="log", ylim=(0, 100), xlabel="false people a scan", title=f"{result.dataset}: recall, %")
-        left.set_xticks(FALSE_PER_SCAN, [f"{at:g}" for at in FALSE_PER_SCAN])
-        left.legend(fontsize=7, frameon=False)
-        score, share = ([entry[name] for entry in result.reliability] for name in ("score", "people"))
-        right.plot([0, 1], [0, 1], color=_FAINT, lw=0.9)
-        right.plot(score, share, "o-", color=_BLUE, ms=4, lw=1.3)
-        error = result.row("calibration_error")["value"]
-        right.set(xlim=(0, 1), ylim=(0, 1), xlabel="score", title=f"share of people, calibration error {error:.1f} %")
-        for ax in (left, right):
-            ax.grid(color="#e3e6ea", lw=0.8)
-            ax.title.set_fontsize(9.5)
-    return png_of(figure, None)

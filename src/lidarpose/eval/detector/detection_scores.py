@@ -31,6 +31,7 @@ POINT_EDGES = (LEAST_POINTS, 20, 50, np.inf)
 DISTANCE_EDGES = (0.0, 10.0, 20.0, 30.0, np.inf)
 # conditions: another person or a thing so near, m, and people who are less tall, m
 _COMPANY, _TOUCHING, _LOW = 1.0, 0.3, 1.4
+CONDITIONS = ("person within 1 m", "thing within 0.3 m", "under 1.4 m tall", "none of these")
 _REPEATS, _BINS = 1000, 10
 # what a detection is of
 PERSON, FALSE, NEITHER = "person", "false", "neither"
@@ -65,65 +66,52 @@ def match(centers: np.ndarray, scores: np.ndarray, people: np.ndarray, wanted: n
 
 def score_scan(
     number: int, scan: LabeledScan, boxes: Sequence[Box], scores: np.ndarray, *, max_range: float
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Rows of the scan's wanted people, and of its detections."""
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """The scan's wanted people, a row each, and its detections. Whom nothing finds has the score -inf."""
     origin = np.zeros(2) if scan.origin is None else scan.origin[:2]
-    people = np.array([box.center[:2] for box in scan.boxes]).reshape(-1, 2)
-    centers = np.array([box.center[:2] for box in boxes]).reshape(-1, 2)
-    far, distance = (np.linalg.norm(at - origin, axis=1) for at in (centers, people))
+    places, centers = (np.array([box.center[:2] for box in some]).reshape(-1, 2) for some in (scan.boxes, boxes))
+    distance, far = (np.linalg.norm(at - origin, axis=1) for at in (places, centers))
     wanted = scan.is_person & (scan.num_points >= LEAST_POINTS) & (distance <= max_range)
-    of_person = match(centers, scores, people, wanted)
+    of_person = match(centers, scores, places, wanted)
     finds = np.append(wanted, False)[of_person]
-    status = np.where(finds, PERSON, np.where((of_person >= 0) | (far > max_range), NEITHER, FALSE))
-    detection_of = {int(p): d for d, p in enumerate(of_person) if p >= 0}
-    conditions = _conditions(scan, people)
+    detection = np.full(len(places), -1)
+    detection[of_person[of_person >= 0]] = np.flatnonzero(of_person >= 0)
     where = {"scan": number, "sensor": scan.sensor, "kind": scan.kind}
-    people_rows = [
+    people = pd.DataFrame(
         where
-        | {"person": p, "points": int(scan.num_points[p]), "distance": float(distance[p]), "condition": conditions[p]}
-        | {"mounted": bool(scan.mounted[p]), "detection": detection_of.get(p, -1)}
-        | {"score": float(scores[detection_of[p]]) if p in detection_of else -np.inf}
-        for p in np.flatnonzero(wanted).tolist()
-    ]
-    things = _things(scan, [box for box, is_of in zip(boxes, status, strict=True) if is_of == FALSE])
-    detection_rows = [
+        | {"person": np.arange(len(places)), "points": scan.num_points, "distance": distance}
+        | {"mounted": scan.mounted, "detection": detection, "score": np.append(scores, -np.inf)[detection]}
+        | _conditions(scan, places)
+    )
+    status = np.where(finds, PERSON, np.where((of_person >= 0) | (far > max_range), NEITHER, FALSE))
+    detections = pd.DataFrame(
         where
-        | {"detection": d, "score": float(scores[d]), "status": str(status[d])}
-        | {"mounted": bool(finds[d] and scan.mounted[of_person[d]])}
-        | {"thing": next(things) if status[d] == FALSE else "", "distance": float(far[d])}
-        for d in range(len(boxes))
-    ]
-    return people_rows, detection_rows
+        | {"detection": np.arange(len(boxes)), "score": scores, "distance": far, "status": status.astype(object)}
+        | {"mounted": finds & np.append(scan.mounted, False)[of_person], "thing": _things(scan, boxes)}
+    )
+    return people[wanted], detections
 
 
-def _conditions(scan: LabeledScan, people: np.ndarray) -> list[tuple[str, ...]]:
-    """What may make each person hard to find."""
-    apart = np.linalg.norm(people[:, None] - people[None], axis=-1) + 1e9 * np.eye(len(people))
-    touching = np.zeros(len(people), bool)
-    if scan.thing is not None:
-        wide = [replace(box, size=box.size + [2 * _TOUCHING, 2 * _TOUCHING, 0]) for box in scan.boxes]
-        touching = np.array([(scan.thing[rows] >= 0).any() for rows in rows_inside(wide, scan.points)], bool)
-    conditions = []
-    for p, box in enumerate(scan.boxes):
-        has = {
-            f"person within {_COMPANY:g} m": bool((apart[p] < _COMPANY).any()),
-            f"thing within {_TOUCHING:g} m": bool(touching[p]),
-            f"under {_LOW:g} m tall": bool(box.size[2] < _LOW),
-        }
-        conditions.append(tuple(name for name, holds in has.items() if holds) or ("none of these",))
-    return conditions
+def _conditions(scan: LabeledScan, places: np.ndarray) -> dict[str, np.ndarray]:
+    """What may make people hard to find, each (P,) bool."""
+    apart = np.linalg.norm(places[:, None] - places[None], axis=-1)
+    # each is near itself
+    company = (apart < _COMPANY).sum(1) > 1
+    wide = [replace(box, size=box.size + [2 * _TOUCHING, 2 * _TOUCHING, 0]) for box in scan.boxes]
+    thing = np.full(len(scan.points), -1) if scan.thing is None else scan.thing
+    touching = np.array([(thing[rows] >= 0).any() for rows in rows_inside(wide, scan.points)], bool)
+    low = np.array([box.size[2] < _LOW for box in scan.boxes], bool)
+    return dict(zip(CONDITIONS, (company, touching, low, ~(company | touching | low)), strict=True))
 
 
-def _things(scan: LabeledScan, boxes: Sequence[Box]) -> Iterator[str]:
+def _things(scan: LabeledScan, boxes: Sequence[Box]) -> list[str]:
     """What most points of each box lie on; "" where the scan does not say."""
-    for rows in rows_inside(list(boxes), scan.points):
-        if scan.thing is None:
-            yield ""
-            continue
-        names = np.array([*scan.things, "ground or building"], object)[scan.thing[rows]]
-        if scan.person is not None:
-            names[scan.person[rows] >= 0] = "part of a person"
-        yield str(pd.Series(names).mode().iloc[0]) if len(rows) else "no points"
+    if scan.thing is None or scan.person is None:
+        return [""] * len(boxes)
+    names = np.array([*scan.things, "ground or building"], object)[scan.thing]
+    names[scan.person >= 0] = "part of a person"
+    inside = rows_inside(list(boxes), scan.points)
+    return [pd.Series(names[rows]).mode().iloc[0] if len(rows) else "no points" for rows in inside]
 
 
 # ---- all scans
@@ -133,33 +121,25 @@ def _things(scan: LabeledScan, boxes: Sequence[Box]) -> Iterator[str]:
 class DetectorResult:
     """A detector on one set of scans.
 
-    scans: name, sensor, kind of each; people, detections: rows as of `score_scan`, with pose errors `mpjpe_found` and
-    `mpjpe_given`, mm; boxes: of each scan's detections; rows: the figures; thresholds: operating point -> score;
-    things: what false people are, at the reference point.
+    people, detections: rows as of `score_scan`, people with pose errors `mpjpe_found` and `mpjpe_given`, mm; boxes: of
+    each scan's detections; rows: the figures; thresholds: operating point -> score; reliability: by bins of the score
+    its mean, the share of people and the number of detections; things: what false people are, at `REFERENCE`.
     """
 
     dataset: str
-    scans: pd.DataFrame
+    scans: int
     people: pd.DataFrame
     detections: pd.DataFrame
     boxes: Sequence[Sequence[Box]]
     rows: list[dict[str, Any]]
     thresholds: dict[str, float]
     reliability: list[dict[str, float]]
-    things: list[dict[str, Any]]
+    things: dict[str, int]
 
     def row(self, figure: str, at: str = "", group: str = "all", of: str = "all") -> dict[str, Any]:
-        """The row of a figure. Raises InputError where there is none."""
+        """The row of a figure, which must be there."""
         wanted = {"figure": figure, "at": at, "group": group, "of": of}
-        for row in self.rows:
-            if wanted.items() <= row.items():
-                return row
-        raise InputError(f"{self.dataset} has no row {', '.join(wanted.values())}")
-
-    def to_dict(self) -> dict[str, Any]:
-        counts = {"scans": len(self.scans), "people": len(self.people), "mounted": int(self.people.mounted.sum())}
-        shown = {"thresholds": self.thresholds, "reliability": self.reliability, "false by thing": self.things}
-        return {"dataset": self.dataset, **counts, **shown, "rows": self.rows}
+        return next(row for row in self.rows if wanted.items() <= row.items())
 
 
 def score_detector(
@@ -181,45 +161,42 @@ def score_detector(
         predictor: poses matched people in found and in labeled boxes, where joints are known.
         seed: of the intervals.
     """
-    people_rows: list[dict[str, Any]] = []
-    detection_rows: list[dict[str, Any]] = []
+    tables: list[tuple[pd.DataFrame, pd.DataFrame]] = []
     about: list[dict[str, str]] = []
     found: list[Sequence[Box]] = []
+    progress(0, len(scans.loaders))
     for number, load in enumerate(scans.loaders):
-        progress(number, len(scans.loaders))
         scan = load()
         boxes, scores = detect(scan.points, scan.origin)
-        own_people, own_detections = score_scan(number, scan, boxes, np.asarray(scores, float), max_range=max_range)
+        people, detections = score_scan(number, scan, boxes, np.asarray(scores, float), max_range=max_range)
         if predictor is not None and scan.joints is not None:
-            _add_pose_errors(own_people, scan, boxes, predictor)
-        people_rows += own_people
-        detection_rows += own_detections
+            people = people.assign(**_pose_errors(people, scan, boxes, predictor))
+        tables.append((people, detections))
         found.append(boxes)
-        about.append({"name": scan.name, "sensor": scan.sensor, "kind": scan.kind})
-    progress(len(scans.loaders), len(scans.loaders))
-    if not people_rows:
+        about.append({"sensor": scan.sensor, "kind": scan.kind})
+        progress(number + 1, len(scans.loaders))
+    people, detections = (pd.concat(parts, ignore_index=True) for parts in zip(*tables, strict=True))
+    if people.empty:
         raise InputError(f"{scans.name} has nobody of {LEAST_POINTS} points and more within {max_range:g} m")
-    people, table = pd.DataFrame(people_rows), pd.DataFrame(about)
-    columns = ["scan", "sensor", "kind", "detection", "score", "status", "mounted", "thing", "distance"]
-    detections = pd.DataFrame(detection_rows, columns=columns).astype({"score": float, "scan": int, "mounted": bool})
     rng = np.random.default_rng(seed)
-    rows, thresholds = figures(people, detections, table, rng, default_score)
-    rows += pose_rows(people, thresholds[f"{REFERENCE:g}"], rng)
-    judged = detections[detections.status != NEITHER]
-    error = aggregate.calibration_error(judged.score, judged.status == PERSON)
+    rows, thresholds = _figures(people, detections, pd.DataFrame(about), rng, default_score)
+    rows += _pose_rows(people, thresholds[f"{REFERENCE:g}"], rng)
+    judged = detections[detections.status != NEITHER].assign(people=lambda table: table.status == PERSON)
+    error = aggregate.calibration_error(judged.score, judged.people)
     rows.append(_row("calibration_error", value=100 * error, unit="%", count=len(judged)))
+    bins = judged.groupby(np.minimum((judged.score * _BINS).astype(int), _BINS - 1))
+    reliability = bins.agg(score=("score", "mean"), people=("people", "mean"), detections=("people", "size"))
     false = detections[(detections.status == FALSE) & (detections.score >= thresholds[f"{REFERENCE:g}"])]
-    things = [{"thing": name, "false": count} for name, count in false.thing.value_counts().items() if name]
     return DetectorResult(
         dataset=scans.name,
-        scans=table,
+        scans=len(found),
         people=people,
         detections=detections,
         boxes=found,
         rows=rows,
         thresholds=thresholds,
-        reliability=_reliability(judged),
-        things=things,
+        reliability=reliability.round(4).to_dict("records"),
+        things=false.thing[false.thing != ""].value_counts().to_dict(),
     )
 
 
@@ -229,7 +206,7 @@ def _row(figure: str, at: str = "", group: str = "all", of: str = "all", **value
     return row | {name: None if row[name] is None else round(float(row[name]), 4) for name in ("value", "low", "high")}
 
 
-def figures(
+def _figures(
     people: pd.DataFrame,
     detections: pd.DataFrame,
     scans: pd.DataFrame,
@@ -238,144 +215,123 @@ def figures(
 ) -> tuple[list[dict[str, Any]], dict[str, float]]:
     """Recall, false people a scan and average precision with intervals; operating point -> score."""
     count = len(scans)
+    # how often each scan counts: once, and as drawn
     weights = np.vstack([np.ones(count, int), rng.multinomial(count, np.full(count, 1 / count), size=_REPEATS)])
     false = detections[detections.status == FALSE].sort_values("score", ascending=False, kind="stable")
-    rows: list[dict[str, Any]] = []
-    thresholds: dict[str, float] = {}
+    above = {f"{budget:g}": exclusive_thresholds(false, weights, budget) for budget in FALSE_PER_SCAN}
+    if default_score is not None:
+        above["default"] = np.full(len(weights), np.nextafter(default_score, -1))
     groups = list(_groups_of_people(people))
     masks = np.array([mask for _, _, mask in groups], float)
     person_weights = weights[:, people.scan]
-    total = person_weights @ masks.T
-    spread_over = [people.scan[mask].nunique() for _, _, mask in groups]
-    points = {f"{budget:g}": exclusive_thresholds(false, weights, budget) for budget in FALSE_PER_SCAN}
-    if default_score is not None:
-        points["default"] = np.full(len(weights), np.nextafter(default_score, -1))
-    for at, above in points.items():
-        higher = detections.score[detections.score > above[0]]
-        thresholds[at] = float(higher.min()) if len(higher) else 1.0
-        hits = (people.score.to_numpy()[None] > above[:, None]) * person_weights
+    rows: list[dict[str, Any]] = []
+    thresholds: dict[str, float] = {}
+    for at, bounds in above.items():
+        thresholds[at] = float(detections.score[detections.score > bounds[0]].min())
+        hits = (people.score.to_numpy() > bounds[:, None]) * person_weights
         with np.errstate(invalid="ignore"):
-            recall = 100 * (hits @ masks.T) / total
-        for k, (group, of, mask) in enumerate(groups):
-            rows.append(
-                _row("recall", at, group, of, **_stated(recall[:, k], spread_over[k]), unit="%", count=int(mask.sum()))
-            )
-        rows += _false_rows(at, false[false.score > above[0]], scans)
+            recall = 100 * (hits @ masks.T) / (person_weights @ masks.T)
+        for (group, of, mask), draws in zip(groups, recall.T, strict=True):
+            ends = _with_interval(draws, people.scan[mask].nunique())
+            rows.append(_row("recall", at, group, of, **ends, unit="%", count=int(mask.sum())))
+        rows += _false_rows(at, false[false.score > bounds[0]], scans)
     on_foot = people[~people.mounted]
     judged = detections[(detections.status == FALSE) | (detections.status == PERSON) & ~detections.mounted]
     precision = 100 * np.array([average_precision(judged, on_foot, own) for own in weights])
-    rows.append(_row("average_precision", **_stated(precision, count), unit="%", count=len(on_foot)))
-    return rows, thresholds
+    rows.append(_row("average_precision", **_with_interval(precision, count), unit="%", count=len(on_foot)))
+    return rows, {at: 1.0 if np.isnan(score) else score for at, score in thresholds.items()}
 
 
 def exclusive_thresholds(false: pd.DataFrame, weights: np.ndarray, budget: float) -> np.ndarray:
     """(R,) of each row of weights (R, scans) the lowest bound that at most `budget` false detections a scan, sorted by
     falling score, lie above; -1 where all may."""
     scores, scan = np.append(false.score.to_numpy(float), -1.0), false.scan.to_numpy(int)
+    most = budget * weights.sum(1) + 1e-9
     return np.array(
-        [scores[np.searchsorted(np.cumsum(w[scan]), budget * w.sum() + 1e-9, side="right")] for w in weights]
+        [scores[np.searchsorted(np.cumsum(own[scan]), m, side="right")] for own, m in zip(weights, most, strict=True)]
     )
 
 
 def average_precision(detections: pd.DataFrame, people: pd.DataFrame, weights: np.ndarray) -> float:
-    """Area under precision over recall, precision made falling, 0 to 1; weights (scans,)."""
-    order = np.argsort(-detections.score.to_numpy(), kind="stable")
-    score, own = detections.score.to_numpy()[order], weights[detections.scan.to_numpy()[order]]
-    hits = np.cumsum(own * (detections.status == PERSON).to_numpy()[order])
-    count, wanted = np.cumsum(own), weights[people.scan.to_numpy()].sum()
-    if not wanted or not len(score):
-        return float("nan") if not wanted else 0.0
+    """Area under precision over recall, precision made falling, 0 to 1, NaN of nobody; weights (scans,)."""
+    detections = detections.sort_values("score", ascending=False, kind="stable")
+    own = weights[detections.scan.to_numpy(int)]
+    hits, count = np.cumsum(own * (detections.status == PERSON)), np.cumsum(own)
     # equal scores come together
-    last = np.append(score[1:] != score[:-1], True) & (count > 0)
+    last = (~detections.score.duplicated(keep="last")).to_numpy() & (count > 0)
+    wanted = weights[people.scan.to_numpy(int)].sum()
     precision = np.maximum.accumulate((hits[last] / count[last])[::-1])[::-1]
-    return float((np.diff(hits[last] / wanted, prepend=0) * precision).sum())
+    return float((np.diff(hits[last], prepend=0) * precision).sum() / wanted) if wanted else float("nan")
 
 
-def _stated(draws: np.ndarray, units: int) -> dict[str, Any]:
-    """The value, which comes first, and the ends of its interval; None of too few scans."""
-    value: dict[str, Any] = {"value": None if np.isnan(draws[0]) else float(draws[0])}
-    if units >= aggregate.LEAST_UNITS and value["value"] is not None:
-        value |= dict(zip(("low", "high"), np.nanquantile(draws[1:], (0.025, 0.975)).tolist(), strict=True))
-    return value
+def _with_interval(draws: np.ndarray, units: int) -> dict[str, Any]:
+    """The value, which comes first, and the ends of its interval; None of nobody and of too few scans."""
+    if np.isnan(draws[0]):
+        return {"value": None}
+    ends = np.nanquantile(draws[1:], (0.025, 0.975)) if units >= aggregate.LEAST_UNITS else (None, None)
+    return {"value": draws[0], "low": ends[0], "high": ends[1]}
 
 
 def _groups_of_people(people: pd.DataFrame) -> Iterator[tuple[str, str, np.ndarray]]:
     """Group, of what of it, and whose rows: people on foot by all that is known of them, mounted ones apart."""
     on_foot, points = ~people.mounted.to_numpy(), people.points.to_numpy()
-    spans = aggregate.span_rows(points, POINT_EDGES)
-    yield "all", "all", on_foot
-    for who, some in (("points", on_foot), ("mounted, points", ~on_foot)):
-        for name, rows in spans.items():
-            yield who, name, some & rows
-    yield "mounted", "all", ~on_foot
+    for prefix, some in (("", on_foot), ("mounted, ", ~on_foot)):
+        yield f"{prefix}all", "all", some
+        for name, rows in aggregate.span_rows(points, POINT_EDGES).items():
+            yield f"{prefix}points", name, some & rows
     for least, some in (("", on_foot), (", 50 points and more", on_foot & (points >= 50))):
         for column in ("sensor", "kind"):
             for name in sorted(set(people[column]) - {""}):
                 yield f"{column}{least}", name, some & (people[column] == name).to_numpy()
-        for name in sorted({name for names in people.condition for name in names}):
-            yield f"condition{least}", name, some & people.condition.map(lambda names, n=name: n in names).to_numpy()
+        for name in CONDITIONS:
+            yield f"condition{least}", name, some & people[name].to_numpy(bool)
         for name, rows in aggregate.span_rows(people.distance.to_numpy(), DISTANCE_EDGES).items():
             yield f"distance, m{least}", name, some & rows
 
 
 def _false_rows(at: str, false: pd.DataFrame, scans: pd.DataFrame) -> Iterator[dict[str, Any]]:
     """False people a scan: of all, of the worst scan, by sensor and kind of scene."""
-    yield _row("false_people", at, value=len(false) / len(scans), unit="a scan", count=len(scans))
-    worst = false.scan.value_counts().max() if len(false) else 0
-    yield _row("false_people", at, "worst", "scan", value=worst, unit="a scan", count=1)
+    counts = false.scan.value_counts().reindex(scans.index, fill_value=0)
+    yield _row("false_people", at, value=counts.mean(), unit="a scan", count=len(scans))
+    yield _row("false_people", at, "worst", "scan", value=counts.max(), unit="a scan", count=1)
     for column in ("sensor", "kind"):
-        for name, own in scans[column].value_counts().sort_index().items():
+        for name, own in counts.groupby(scans[column]):
             if name:
-                mean = (false[column] == name).sum() / own
-                yield _row("false_people", at, column, name, value=mean, unit="a scan", count=int(own))
-
-
-def _reliability(judged: pd.DataFrame) -> list[dict[str, float]]:
-    """By bins of the score: its mean, the share of people, and how many detections."""
-    bins = np.minimum((judged.score * _BINS).astype(int), _BINS - 1)
-    return [
-        {"score": round(float(some.score.mean()), 4), "people": round(float((some.status == PERSON).mean()), 4)}
-        | {"detections": len(some)}
-        for _, some in judged.groupby(bins)
-    ]
+                yield _row("false_people", at, column, name, value=own.mean(), unit="a scan", count=len(own))
 
 
 # ---- poses
 
 
-def _add_pose_errors(
-    people: list[dict[str, Any]], scan: LabeledScan, boxes: Sequence[Box], predictor: Predictor
-) -> None:
-    """Errors of the poses in found and in labeled boxes, mm, NaN without a pose."""
+def _pose_errors(
+    people: pd.DataFrame, scan: LabeledScan, boxes: Sequence[Box], predictor: Predictor
+) -> dict[str, np.ndarray]:
+    """Errors of poses in found and in labeled boxes, mm, NaN without a pose."""
     assert scan.joints is not None
-    matched = [row for row in people if row["detection"] >= 0]
-    true = scan.joints[[row["person"] for row in matched]][:, BODY26.map_to(HUMAN15)]
+    matched = people[people.detection >= 0]
     sources = {
-        "mpjpe_found": [boxes[row["detection"]] for row in matched],
-        "mpjpe_given": [scan.boxes[row["person"]] for row in matched],
+        "mpjpe_found": [boxes[k] for k in matched.detection],
+        "mpjpe_given": [scan.boxes[k] for k in matched.person],
     }
+    true = scan.joints[matched.person][:, BODY26.map_to(HUMAN15)]
     origin = "unknown" if scan.origin is None else scan.origin
+    errors = {name: np.full(len(people), np.nan) for name in sources}
     for name, own in sources.items():
-        if not matched:
-            continue
-        crops = [Box(center=box.center, size=box.size, yaw=box.yaw) for box in own]
+        crops = [replace(box, id=None) for box in own]
         poses = predictor.predict(scan.points, boxes=crops, sensor_origin=origin, skeleton=HUMAN15.name)
-        for row, person, joints in zip(matched, poses, true, strict=True):
-            errors = joint_errors(person.joints[None], joints[None]) if person.has_pose else np.array([np.nan])
-            row[name] = float(errors.mean())
+        errors[name][people.detection >= 0] = [
+            joint_errors(person.joints[None], joints[None]).mean() if person.has_pose else np.nan
+            for person, joints in zip(poses, true, strict=True)
+        ]
+    return errors
 
 
-def pose_rows(people: pd.DataFrame, threshold: float, rng: np.random.Generator) -> list[dict[str, Any]]:
+def _pose_rows(people: pd.DataFrame, threshold: float, rng: np.random.Generator) -> Iterator[dict[str, Any]]:
     """MPJPE of people found at the reference point who have a pose in both boxes, and the mean difference."""
     if "mpjpe_found" not in people:
-        return []
+        return
     both = people[(people.score >= threshold) & people.mpjpe_found.notna() & people.mpjpe_given.notna()]
-    columns = {"mpjpe_found": both.mpjpe_found, "mpjpe_given": both.mpjpe_given}
-    columns["mpjpe_difference"] = both.mpjpe_found - both.mpjpe_given
-    rows = []
-    for name, values in columns.items():
-        if len(both):
-            drawn = aggregate.interval(values.to_numpy(), rng, clusters=both.scan.to_numpy())
-            ends: dict[str, Any] = dict(zip(("low", "high"), drawn.stated, strict=True))
-            rows.append(_row(name, f"{REFERENCE:g}", value=values.mean(), unit="mm", count=len(both), **ends))
-    return rows
+    for name in ("mpjpe_found", "mpjpe_given", "mpjpe_difference") if len(both) else ():
+        values = both.mpjpe_found - both.mpjpe_given if name == "mpjpe_difference" else both[name]
+        low, high = aggregate.interval(values, rng, clusters=both.scan.to_numpy()).stated
+        yield _row(name, f"{REFERENCE:g}", value=values.mean(), low=low, high=high, unit="mm", count=len(both))

@@ -12,7 +12,7 @@ import numpy as np
 
 from lidarpose._version import __version__
 from lidarpose.errors import check_name
-from lidarpose.eval.detector.detection_pictures import draw_curves, draw_false, draw_missed
+from lidarpose.eval.detector.detection_pictures import draw_false, draw_missed
 from lidarpose.eval.detector.detection_scores import Detect, DetectorResult, score_detector
 from lidarpose.eval.detector.labeled_scans import ScanSet, heldout_scans, labeled_scans
 from lidarpose.inference.checks import rows_inside
@@ -106,34 +106,23 @@ def run_detector(
     return [score(scans, progress=partial(progress, scans.name)) for scans in sets], sets
 
 
-def to_json(results: Sequence[DetectorResult], about: dict[str, Any]) -> str:
-    """detector.json: one line of text a row."""
-    head = {"schema": SCHEMA, "version": __version__} | about
-    parts = []
-    for result in results:
-        content = result.to_dict()
-        rows = ",\n".join(f"   {json.dumps(row)}" for row in content.pop("rows"))
-        parts.append(f'  {json.dumps(content)[:-1]}, "rows": [\n{rows}\n  ]}}')
-    return f'{json.dumps(head)[:-1]}, "results": [\n' + ",\n".join(parts) + "\n]}\n"
-
-
 def write_detector(
     results: Sequence[DetectorResult],
     sets: Sequence[ScanSet],
     folder: Path,
     about: dict[str, Any],
-    pictures: str | os.PathLike | None = None,
+    pictures: Path | None = None,
 ) -> list[Path]:
-    """Writes detector.json and curves.png, and pictures of false and missed people into a folder of their own; returns
-    their paths."""
-    files: dict[Path, bytes | None] = {
-        folder / FILE: to_json(results, about).encode(),
-        folder / "curves.png": draw_curves(results),
-    }
+    """Writes detector.json, and pictures of false and missed people into a folder of their own; returns their paths."""
+    names = ("dataset", "scans", "thresholds", "reliability", "things", "rows")
+    entries = [{name: getattr(result, name) for name in names} for result in results]
+    text = json.dumps({"schema": SCHEMA, "version": __version__} | about | {"results": entries})
+    # a line each row
+    files: dict[Path, bytes | None] = {folder / FILE: text.replace('{"figure"', '\n{"figure"').encode() + b"\n"}
     if pictures is not None:
         for result, scans in zip(results, sets, strict=True):
-            files[Path(pictures) / f"{scans.name}-false.png"] = draw_false(result, scans)
-            files[Path(pictures) / f"{scans.name}-missed.png"] = draw_missed(result, scans)
+            files[pictures / f"{scans.name}-false.png"] = draw_false(result, scans)
+            files[pictures / f"{scans.name}-missed.png"] = draw_missed(result, scans)
     written = {path: content for path, content in files.items() if content}
     with ExitStack() as stack:
         for path, content in written.items():
