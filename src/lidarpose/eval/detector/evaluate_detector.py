@@ -60,7 +60,7 @@ def _scorer(detector, points: np.ndarray, origin: np.ndarray | None, *, max_rang
 
 
 def _baseline(predictor: Predictor | None, points: np.ndarray, origin: np.ndarray | None):
-    from lidarpose.models.detector.candidates import suppress
+    from lidarpose.models.detector.detector import suppress
     from lidarpose.models.detector.ground import estimate_ground
     from lidarpose.models.detector.proposals import propose
 
