@@ -10,6 +10,8 @@ from lidarpose.lidar.raycast_kernels import AXIS, ROUNDING, STEEP, compiled
 
 # most cells hold no ray, so most triangles meet none; and no more cells than this along a side
 _CELLS_A_RAY, _MOST_CELLS = 4.0, 256.0
+# room for rounding at the edges of a side
+_SLACK = 1.0 + 1e-6
 
 
 @compiled
@@ -75,16 +77,23 @@ def ray_list(vertices, faces, directions, shift, time):
             if not rays:
                 continue
             front = -np.inf
+            low_p, high_p, low_q, high_q = np.inf, -np.inf, np.inf, -np.inf
             for j in range(3):
                 i = faces[f, j]
                 w[j] = sign * vertices[i, axis]
                 p[j], q[j] = vertices[i, across], vertices[i, along]
                 front = max(front, w[j])
+                low_p, high_p = min(low_p, p[j]), max(high_p, p[j])
+                low_q, high_q = min(low_q, q[j]), max(high_q, q[j])
                 if shift is not None:
                     dw[j] = sign * shift[i, axis]
                     dp[j], dq[j] = shift[i, across], shift[i, along]
                     front = max(front, w[j] + dw[j])
-            if front <= 0:
+                    low_p, high_p = min(low_p, p[j] + dp[j]), max(high_p, p[j] + dp[j])
+                    low_q, high_q = min(low_q, q[j] + dq[j]), max(high_q, q[j] + dq[j])
+            # rays of this side go at most as far aside as ahead: what lies farther aside meets none of them
+            aside = max(low_p, -high_p, low_q, -high_q)
+            if front <= 0 or front * _SLACK < aside:
                 continue
             w0, w1, w2 = w[0], w[1], w[2]
             p0, p1, p2 = p[0], p[1], p[2]
