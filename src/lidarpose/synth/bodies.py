@@ -121,6 +121,7 @@ def draw_bodies(
     *,
     moving: bool = True,
     clothes: float = 1.0,
+    mix: dict[str, float] | None = None,
 ) -> Bodies:
     """The people of a block; a function of (seed, block) and of where poses come from.
 
@@ -130,10 +131,11 @@ def draw_bodies(
         count: number of bodies.
         moving: False is faster; then nobody goes anywhere.
         clothes: see `SceneConfig`.
+        mix: see `sample_rotations`.
     """
     rng = np.random.default_rng([seed, RandomStream.BLOCK, block])
     rig = load_rig()
-    prior = sample_rotations(rng, count, dt=FRAME_TIME if moving else 0.0)
+    prior = sample_rotations(rng, count, mix=mix, dt=FRAME_TIME if moving else 0.0)
     poses, step, kinds = np.stack([prior.rotations, prior.moved], 1), prior.step, np.array(KINDS)[prior.kind]
     places = None
     if bank is not None:

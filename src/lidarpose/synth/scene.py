@@ -23,8 +23,7 @@ class RandomStream(IntEnum):
     """Second word of a generator's seed, (seed, stream, index): what is drawn for one never shifts another.
 
     Values must not change: every dataset and bench was made with them. 5 has two uses: boxes in datasets of streets and
-    stored people in training, which never share a sample. The last two are the training loop's,
-    of torch.
+    stored people in training, which never share a sample. 9 and 10 are the training loop's, of torch.
     """
 
     BLOCK = 0
@@ -38,6 +37,7 @@ class RandomStream(IntEnum):
     BATCH_ORDER = 8
     INITIAL_WEIGHTS = 9
     TRAINING_STEP = 10
+    DETECTION = 11
 
 
 @dataclass(frozen=True, kw_only=True)

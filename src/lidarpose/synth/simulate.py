@@ -1,14 +1,17 @@
 """What a sensor returns of a person's scene: its triangles, the cast, and the sensor's noise."""
 
 from dataclasses import dataclass, replace
+from math import pi
 from typing import cast
 
 import numpy as np
 
 from lidarpose.data.clips import MARGIN
+from lidarpose.geometry import rotation_about
 from lidarpose.lidar.ray_pattern import RayPattern
 from lidarpose.lidar.raycast import Hits, scan_divergent, scan_pattern
 from lidarpose.lidar.sensor import Sensor
+from lidarpose.sample import Box
 from lidarpose.synth.bodies import Bodies
 from lidarpose.synth.environment.mesh import Mesh, union
 from lidarpose.synth.noise import direction_mask, laser_mask
@@ -18,6 +21,8 @@ from lidarpose.synth.scene import Place, SceneConfig
 
 # makers' range limits hold for targets that reflect about 80 percent; clothes at 20 percent are seen half as far
 REACH = 0.5
+# what a label's box adds to the body's extent, m
+_BOX_ROOM = 0.1
 # full divergence of beams, rad: 3 to 6 cm at 20 m
 _DIVERGENCE = (0.0015, 0.003)
 # ranges of the released code are too long by up to this, m
@@ -100,6 +105,14 @@ class Scan:
     points: np.ndarray
     ring: np.ndarray
     part: np.ndarray
+
+
+def label_box(vertices: np.ndarray, yaw: float, id: int) -> Box:
+    """The label of a body: the box around its vertices (V, 3) m along a heading of `yaw` rad, `_BOX_ROOM` added."""
+    local = vertices.astype(float) @ rotation_about("z", yaw)
+    low, high = local.min(0), local.max(0)
+    center = rotation_about("z", yaw) @ ((low + high) / 2)
+    return Box(center=center, size=high - low + _BOX_ROOM, yaw=float((yaw + pi) % (2 * pi) - pi), id=id)
 
 
 def draw_conditions(config: SceneConfig, sensor: Sensor | RayPattern, rng: np.random.Generator) -> ScanConditions:

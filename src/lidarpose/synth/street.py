@@ -24,7 +24,7 @@ from lidarpose.synth.bodies import Bodies, draw_moving_body
 from lidarpose.synth.environment import mesh as shapes
 from lidarpose.synth.environment.mesh import Mesh, shape, union
 from lidarpose.synth.scene import Place, RandomStream
-from lidarpose.synth.simulate import ScanConditions, add_sensor_noise
+from lidarpose.synth.simulate import ScanConditions, add_sensor_noise, label_box
 
 # furniture stands so far behind the kerb, and half of the street's length that is built, m
 _RAIL, _LENGTH = 0.45, 45.0
@@ -38,8 +38,6 @@ _KIND_TRIES = 12
 _INTENSITY_DROPOUT, _RING_BIAS = 0.6, 0.008
 # that errors are drawn for, if the sensor has no more: so what is drawn after them does not depend on the sensor
 _RINGS = 256
-# what a label's box adds to the body's extent, m
-_BOX_ROOM = 0.1
 # errors of a detector's box in `samples`: center m, size m, yaw rad
 _OFF, _GROWN, _TURNED = 0.06, (0.0, 0.2), 0.08
 
@@ -294,11 +292,7 @@ def _draw_start(plan: StreetPlan, bodies: Bodies, rng: np.random.Generator) -> t
 def _label(walker: Walker, frame: int, track: int) -> Box:
     """The box around somebody, along their heading."""
     bodies, place = walker
-    yaw = place.yaw + bodies.heading[frame]
-    local = place.of_body(bodies.vertices[frame]).astype(float) @ rotation_about("z", yaw)
-    low, high = local.min(0), local.max(0)
-    center = rotation_about("z", yaw) @ ((low + high) / 2)
-    return Box(center=center, size=high - low + _BOX_ROOM, yaw=float((yaw + pi) % (2 * pi) - pi), id=track)
+    return label_box(place.of_body(bodies.vertices[frame]), place.yaw + bodies.heading[frame], track)
 
 
 # --- a turn of the sensor

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.synth.environment.mesh import Mesh, shape, union
+from lidarpose.synth.environment.things import moped
 from lidarpose.synth.props.garments import JOINT, Point, Points, distance, girth, hat_frame, heading, middle, skirt
 
 PELVIS = JOINT["pelvis"]
@@ -362,6 +363,19 @@ def _wheelchair(points: Points, u: list[float]) -> Prop | None:
     return rigid_prop("wheelchair", union([shape("wheelchair"), rest]), frame, lift=_FOOT_REST)
 
 
+# the seat of `things.moped` and its foot board, m
+_MOPED_SEAT, _FOOT_BOARD = 0.75, 0.28
+
+
+def _moped(points: Points, u: list[float]) -> Prop | None:
+    """A scooter under who sits: seat under the hips, the foot board under the feet."""
+    high = _seat_height(points) + _FOOT_BOARD
+    if not 0.6 < high < 0.95:
+        return None
+    frame = _under_hips((1.0, 1.0, high / _MOPED_SEAT), -_FOOT_BOARD)
+    return rigid_prop("moped", moped(), frame, lift=_FOOT_BOARD)
+
+
 # --- bicycles
 
 # of the mesh, on the ground, the saddle above the origin: where (x, z) its parts are, m
@@ -412,6 +426,14 @@ def _rod(start: tuple, end: tuple) -> Mesh:
     return shape("rod").placed(*rod_rows(start, end, _TUBE))
 
 
+# what people sit on by name, for who wants a certain one: joints as lists and uniforms (12,) -> a prop, or None where
+# the pose does not suit it
+MOUNTS: dict[str, Callable[[Points, list[float]], Prop | None]] = {
+    "bicycle": _bicycle,
+    "moped": _moped,
+    "wheelchair": _wheelchair,
+    "chair": _seat,
+}
 # by activity: (cumulative share, what they use)
 _RIDES: dict[str, tuple[tuple[float, Callable[[Points, list[float]], Prop | None]], ...]] = {
     "cycle": ((1.0, _bicycle),),

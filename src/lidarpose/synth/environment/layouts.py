@@ -1,0 +1,321 @@
+"""Where detection scenes take place: streets, open places, paths, rooms, corridors and car parks.
+
+A layout is drawn in its own frame, whose z = 0 is flat ground: its named meshes, the free areas where people and things
+may stand, and where the sensor is. Rooms of `LEFT_OUT` shapes are kept for judging.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import pi
+
+import numpy as np
+
+from lidarpose.synth.environment import mesh as shapes
+from lidarpose.synth.environment.mesh import Mesh, shape
+from lidarpose.synth.environment.things import car, draw_thing, facade
+
+Item = tuple[str, Mesh]
+# half of what is built outdoors, m
+_REACH = 45.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """A place.
+
+    Args:
+        items: kinds (names of `things.KINDS`) and meshes; ground is one of them.
+        areas: (x from, x to, y from, y to, z) of free ground, m.
+        sensor: x, y m and the ground's z there.
+        ahead: where a sensor that does not turn may look, rad.
+        indoors: things of rooms stand about, nothing is sloped.
+        ceiling: m; inf outdoors.
+        by_car: the sensor may be a car's.
+        things: how many more stand about, relative to others.
+    """
+
+    items: list[Item]
+    areas: list[tuple[float, float, float, float, float]]
+    sensor: tuple[float, float, float]
+    ahead: tuple[float, ...] = (0.0, pi)
+    indoors: bool = False
+    ceiling: float = np.inf
+    by_car: bool = False
+    things: float = 1.0
+
+
+def ground(xs: np.ndarray, ys: np.ndarray, z: np.ndarray | float = 0.0) -> Mesh:
+    """A grid of quads at z (X, Y) or one height."""
+    count = (len(xs), len(ys))
+    vertices = np.stack([*np.meshgrid(xs, ys, indexing="ij"), np.broadcast_to(z, count)], -1).reshape(-1, 3)
+    number = np.arange(len(vertices)).reshape(count)
+    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+    faces = np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)], -2).reshape(-1, 3)
+    return Mesh(vertices.astype(np.float32), faces.astype(np.int32))
+
+
+_XS = np.concatenate([np.linspace(-70, -42, 5), np.arange(-38, 39, 2.5), np.linspace(42, 70, 5)])
+
+
+def _field(rng: np.random.Generator, rough: float) -> Mesh:
+    """Open ground that is uneven by `rough` m."""
+    return ground(_XS, _XS, rng.normal(0, rough, (len(_XS), len(_XS))) if rough else 0.0)
+
+
+# --- outdoors
+
+
+def street(rng: np.random.Generator) -> Layout:
+    """A road between two pavements one kerb higher, fronts behind them, cars parked at the kerbs."""
+    road, kerb = rng.uniform(2.6, 5.5), rng.choice([0.0, rng.uniform(0.06, 0.16)], p=[0.15, 0.85])
+    front = road + rng.uniform(1.5, 5.0)
+    inner = np.arange(-road, road + 0.1, 2 * road / 4)
+    ys = np.concatenate([[-70, -40, -20, -front, -road - 0.02], inner, [road + 0.02, front, 20, 40, 70]])
+    heights = np.where(np.abs(ys) > road + 0.01, kerb, 0.0)
+    items: list[Item] = [("ground", ground(_XS, ys, heights[None]))]
+    for side in (-1, 1):
+        items += _fronts(side, front, kerb, rng)
+        items += _parked(side, road, kerb, rng)
+    areas = [(-40.0, 40.0, side * road + side * 0.3, side * front - side * 0.2, kerb) for side in (-1, 1)]
+    areas = [(a, b, min(c, d), max(c, d), z) for a, b, c, d, z in areas]
+    areas.append((-40.0, 40.0, -road + 2.0, road - 2.0, 0.0))
+    on_road = rng.random() < 0.6
+    y = rng.uniform(-1, 1) * (road - 2.0) if on_road else rng.choice([-1, 1]) * rng.uniform(road + 0.5, front - 0.5)
+    return Layout(items=items, areas=areas, sensor=(0.0, y, 0.0 if on_road else kerb), by_car=on_road)
+
+
+def _fronts(side: int, front: float, z: float, rng: np.random.Generator) -> list[Item]:
+    """Houses, garden walls, hedges, fences and gaps behind a pavement."""
+    items: list[Item] = []
+    x, yaw = -_REACH, -side * pi / 2
+    while x < _REACH:
+        kind, long = rng.random(), rng.uniform(4, 13)
+        y = side * (front + rng.choice([0.0, rng.uniform(0, 3)], p=[0.7, 0.3]))
+        middle = (x + long / 2, y, z)
+        if kind < 0.62:
+            for name, mesh in facade(long, rng.uniform(2.6, 8), rng):
+                items.append((name, mesh.moved(middle, yaw)))
+        elif kind < 0.75:
+            for k in range(max(1, int(long / 3))):
+                items.append(("hedge", draw_thing("hedge", rng).moved((x + 3 * k + 1.5, y, z), yaw)))
+        elif kind < 0.83:
+            items.append(("wall", shapes.wall(long, rng.uniform(0.5, 2.2), thick=0.25).moved(middle, yaw)))
+        elif kind < 0.93:
+            items.append(("fence", draw_thing("fence", rng).moved(middle, yaw)))
+        x += long + (0 if kind < 0.5 else rng.uniform(0.3, 2.5))
+    return items
+
+
+def _parked(side: int, road: float, kerb: float, rng: np.random.Generator) -> list[Item]:
+    """Cars along the kerb or across it; with gaps that people and corners show through."""
+    items: list[Item] = []
+    across, full = rng.random() < 0.2, rng.choice([0.0, 0.35, 0.75], p=[0.25, 0.45, 0.3])
+    x = -_REACH + 5 * rng.random()
+    while x < _REACH:
+        u = rng.random(8)
+        vehicle = car(u, rng)
+        long = float(np.ptp(vehicle.vertices[:, 0]))
+        if rng.random() < full:
+            yaw = (pi / 2 if across else 0.0 if side < 0 else pi) + rng.normal(0, 0.04)
+            y = side * (road + (0.5 - long / 2 if across else -1.05 + 0.2 * u[7]))
+            items.append(("car", vehicle.moved((x + (1.2 if across else long / 2), y, 0.0), yaw)))
+        x += (2.3 if across else long) + rng.uniform(0.5, 2.0)
+    return items
+
+
+def square(rng: np.random.Generator) -> Layout:
+    """An open place, some houses and cars at its edges."""
+    items: list[Item] = [("ground", _field(rng, rng.choice([0.0, 0.02])))]
+    for turn in np.flatnonzero(rng.random(4) < 0.45) * (pi / 2):
+        far, y = rng.uniform(9, 38), -_REACH
+        while y < _REACH:
+            long = rng.uniform(5, 15)
+            if rng.random() < 0.8:
+                for name, mesh in facade(long, rng.uniform(2.8, 10), rng):
+                    # faces the middle
+                    items.append((name, mesh.moved((0, 0, 0), pi).moved((far, y + long / 2, 0)).moved((0, 0, 0), turn)))
+            y += long
+    for _ in range(rng.integers(0, 3)):
+        x, y, turn = *rng.uniform(-25, 25, 2), rng.uniform(-pi, pi)
+        for k in range(rng.integers(2, 8)):
+            vehicle = car(rng.random(8), rng)
+            if rng.random() < 0.8:
+                place = (x - 2.6 * k * np.sin(turn), y + 2.6 * k * np.cos(turn), 0)
+                items.append(("car", vehicle.moved(place, turn + (pi if rng.random() < 0.5 else 0))))
+    for _ in range(rng.integers(0, 9)):
+        items.append(("tree", draw_thing("tree", rng).moved((*rng.uniform(-35, 35, 2), 0))))
+    free = (-38.0, 38.0, -38.0, 38.0, 0.0)
+    return Layout(items=items, areas=[free], sensor=(0, 0, 0), ahead=(0.0,), by_car=rng.random() < 0.5)
+
+
+def path(rng: np.random.Generator) -> Layout:
+    """A path with hedges, trees, bushes and fences on both sides."""
+    half, rough = rng.uniform(0.8, 3.5), rng.choice([0.0, 0.03, 0.08])
+    items: list[Item] = [("ground", _field(rng, rough))]
+    for side in (-1, 1):
+        names, weights = ("hedge", "tree", "bush", "fence", "young tree", "low crown"), rng.random(6) ** 2
+        x = -_REACH
+        while x < _REACH:
+            name = str(rng.choice(names, p=weights / weights.sum()))
+            y = side * (half + rng.uniform(0.5, 1.2) + (rng.exponential(2.5) if name not in ("hedge", "fence") else 0))
+            yaw = -side * pi / 2 + rng.normal(0, 0.1)
+            items.append((name, draw_thing(name, rng).moved((x, y, 0), yaw)))
+            x += rng.uniform(1.0, 5.5)
+    if rng.random() < 0.4:
+        # a wood
+        for _ in range(rng.integers(10, 40)):
+            x, y = rng.uniform(-38, 38), rng.choice([-1, 1]) * rng.uniform(half + 2, 30)
+            items.append(("tree", draw_thing("tree", rng).moved((x, y, 0))))
+    areas = [(-40.0, 40.0, -half, half, 0.0)] * 3 + [(-35.0, 35.0, -18.0, 18.0, 0.0)]
+    return Layout(items=items, areas=areas, sensor=(0, rng.uniform(-half, half), 0))
+
+
+# --- indoors
+
+
+def _walls(wide: float, long: float, high: float, rng: np.random.Generator, *, windows: float = 0.5) -> list[Item]:
+    """Four walls with doorways and windows, floor and ceiling; the inside is (wide, long) about the origin."""
+    items: list[Item] = [("ground", ground(np.array([-wide, wide]), np.array([-long, long])))]
+    items.append(("ceiling", ground(np.array([-wide, wide]), np.array([-long, long]), high)))
+    for turn, length, far in ((0, long, wide / 2), (1, wide, long / 2), (2, long, wide / 2), (3, wide, long / 2)):
+        bays = max(1, int(length / 2.5))
+        bay = length / bays
+        for k in range(bays):
+            u, opening = rng.random(3), None
+            if u[0] < 0.15:
+                opening = (-0.45, 0.45, 0.0, 2.05)
+            elif u[0] < 0.15 + windows * 0.5:
+                opening = (-0.3 * bay, 0.35 * bay, 0.9, min(2.2, high - 0.2))
+            wall = shapes.wall(bay, high, thick=0.2, opening=opening)
+            wall = wall.moved((far + 0.1, (k + 0.5) * bay - length / 2, 0)).moved((0, 0, 0), turn * pi / 2)
+            items.append(("wall", wall))
+    if rng.random() < 0.5:
+        for _ in range(rng.integers(2, 9)):
+            x, y = (rng.random(2) - 0.5) * [wide - 1, long - 1]
+            items.append(("ceiling", shapes.box((0.2, 1.2, 0.08)).moved((x, y, high - 0.1 - 0.4 * rng.random()))))
+    return items
+
+
+def _against_walls(wide: float, long: float, rng: np.random.Generator) -> list[Item]:
+    """Shelves, cupboards, tables and doors along the walls, tables with chairs within."""
+    items: list[Item] = []
+    for name in rng.choice(
+        ["shelf", "cupboard", "table", "door", "chair"], int(rng.integers(2, int(5 + (wide + long) / 3)))
+    ):
+        mesh, turn = draw_thing(str(name), rng), int(rng.integers(4))
+        deep = -float(mesh.vertices[:, 0].min())
+        far, along = (wide / 2, long) if turn % 2 == 0 else (long / 2, wide)
+        items.append(
+            (
+                str(name),
+                mesh.moved((-far + deep + 0.03, (rng.random() - 0.5) * along * 0.85, 0)).moved(
+                    (0, 0, 0), turn * pi / 2
+                ),
+            )
+        )
+    for _ in range(int(rng.integers(0, int(2 + wide * long / 12)))):
+        x, y, turn = (rng.random() - 0.5) * (wide - 2), (rng.random() - 0.5) * (long - 2), rng.choice([0.0, pi / 2])
+        deep, size = rng.uniform(0.6, 1.0), rng.uniform(0.8, 2.2)
+        items.append(("table", shape("table", deep, size, 0.74).moved((x, y, 0), turn)))
+        for k in range(rng.integers(0, 6)):
+            # faces the table
+            place = (-deep / 2 - rng.uniform(0.1, 0.5), (rng.random() - 0.5) * size, 0)
+            chair = draw_thing("chair", rng).moved(place).moved((0, 0, 0), pi * (k % 2))
+            items.append(("chair", chair.moved((x, y, 0), turn)))
+    return items
+
+
+def room(rng: np.random.Generator) -> Layout:
+    """An office, a class or a living room."""
+    wide, long, high = rng.uniform(3.5, 12), rng.uniform(4, 18), rng.uniform(2.3, 4.0)
+    items = _walls(wide, long, high, rng) + _against_walls(wide, long, rng)
+    x, y = (rng.random(2) - 0.5) * [wide - 1, long - 1]
+    if rng.random() < 0.5:
+        y = -long / 2 + 0.4
+    free = (-wide / 2 + 0.3, wide / 2 - 0.3, -long / 2 + 0.3, long / 2 - 0.3, 0.0)
+    return Layout(
+        items=items, areas=[free], sensor=(x, y, 0), ahead=(float(np.arctan2(-y, -x)),), indoors=True, ceiling=high
+    )
+
+
+def car_park(rng: np.random.Generator) -> Layout:
+    """Rows of cars under a low ceiling with beams."""
+    wide, long, high = rng.uniform(15, 34), rng.uniform(20, 44), rng.uniform(2.2, 3.2)
+    items = _walls(wide, long, high, rng, windows=0.1)
+    for y in np.arange(-long / 2 + 3, long / 2, rng.uniform(4, 8)):
+        items.append(("ceiling", shapes.box((wide, 0.35, 0.3)).moved((0, y, high - 0.3))))
+    lanes = []
+    for x in np.arange(-wide / 2 + 2.6, wide / 2 - 2, rng.uniform(7.5, 9)):
+        lanes.append((max(x + 2.6, -wide / 2 + 0.5), min(x + 5.0, wide / 2 - 0.5), -long / 2 + 1, long / 2 - 1, 0.0))
+        full = rng.uniform(0.1, 0.9)
+        for y in np.arange(-long / 2 + 2, long / 2 - 2, 2.5):
+            if rng.random() < full:
+                vehicle = shape("car", *rng.uniform([3.6, 1.65, 1.4], [4.9, 1.9, 1.75]))
+                items.append(("car", vehicle.moved((x + rng.normal(0, 0.15), y, 0), rng.choice([0.0, pi]))))
+    lanes = [lane for lane in lanes if lane[1] - lane[0] > 1.0]
+    free = (-wide / 2 + 0.5, wide / 2 - 0.5, -long / 2 + 0.5, long / 2 - 0.5, 0.0)
+    x, y = (lanes[0][0] + lanes[0][1]) / 2, rng.uniform(-0.5, 0.5) * long
+    return Layout(
+        items=items, areas=[*lanes, free], sensor=(x, y * 0.8, 0), ahead=(pi / 2 if y < 0 else -pi / 2,), indoors=True,
+        ceiling=high, things=0.5,
+    )  # fmt: skip
+
+
+def corridor(rng: np.random.Generator) -> Layout:
+    """A long corridor with niches, doors and glass; left out of training."""
+    wide, long, high = rng.uniform(1.7, 4.0), rng.uniform(14, 38), rng.uniform(2.3, 3.2)
+    items: list[Item] = [("ground", ground(np.array([-9.0, 9.0]), np.array([-long, long])))]
+    items.append(("ceiling", ground(np.array([-9.0, 9.0]), np.array([-long, long]), high)))
+    for side in (-1, 1):
+        for name, mesh in facade(long, high, rng, bars=0.0, niches=0.5):
+            items.append(
+                ("wall" if name == "facade" else name, mesh.moved((side * wide / 2, 0, 0), 0 if side < 0 else pi))
+            )
+        end = shapes.wall(wide, high, opening=(-0.4, 0.4, 0, 2.05) if rng.random() < 0.5 else None)
+        items.append(("wall", end.moved((0, side * long / 2, 0), pi / 2)))
+    for y in rng.uniform(-0.45, 0.45, rng.integers(0, 8)) * long:
+        name = str(rng.choice(["chair", "cupboard", "bin", "pot plant", "cart", "bench"]))
+        side = rng.choice([-1, 1])
+        items.append((name, draw_thing(name, rng).moved((side * (wide / 2 - 0.35), y, 0), 0 if side < 0 else pi)))
+    y = rng.uniform(-0.48, 0.48) * long
+    free = (-wide / 2 + 0.3, wide / 2 - 0.3, -long / 2 + 0.4, long / 2 - 0.4, 0.0)
+    return Layout(
+        items=items, areas=[free], sensor=(0.3 * wide * (rng.random() - 0.5), y, 0),
+        ahead=(pi / 2 if y < 0 else -pi / 2,), indoors=True, ceiling=high, things=0.5,
+    )  # fmt: skip
+
+
+def hall(rng: np.random.Generator) -> Layout:
+    """A hall or a shop: an angled room with half-high partitions, rows of shelves, counters; left out of training."""
+    wide, long, high = rng.uniform(9, 26), rng.uniform(12, 36), rng.uniform(3.0, 7.0)
+    items = _walls(wide, long, high, rng)
+    # a block takes a corner off
+    block = rng.uniform(0.2, 0.45, 2) * [wide, long]
+    items.append(("wall", shapes.box((*block, high)).moved(((wide - block[0]) / 2, (long - block[1]) / 2, 0))))
+    for _ in range(rng.integers(1, 7)):
+        x, y, turn = (rng.random() - 0.5) * wide * 0.8, (rng.random() - 0.5) * long * 0.8, rng.choice([0.0, pi / 2])
+        if rng.random() < 0.5:
+            partition = shapes.wall(rng.uniform(1.2, 4), rng.uniform(1.1, 1.9), thick=0.06)
+            items.append(("wall", partition.moved((x, y, 0), turn)))
+        else:
+            for k in range(rng.integers(1, 6)):
+                place = np.array([np.cos(turn + pi / 2), np.sin(turn + pi / 2)]) * 1.1 * k + [x, y]
+                if (np.abs(place) < [wide / 2 - 0.5, long / 2 - 0.5]).all():
+                    items.append(("shelf", draw_thing("shelf", rng).moved((*place, 0), turn)))
+    free = (-wide / 2 + 0.4, wide / 2 - 0.4, -long / 2 + 0.4, long / 2 - 0.4, 0.0)
+    x, y = -wide / 2 + rng.uniform(0.5, wide / 2), -long / 2 + rng.uniform(0.5, long / 2)
+    return Layout(
+        items=items, areas=[free], sensor=(x, y, 0), ahead=(float(np.arctan2(-y, -x)),), indoors=True, ceiling=high
+    )
+
+
+LAYOUTS: dict[str, Callable[[np.random.Generator], Layout]] = {
+    "street": street,
+    "square": square,
+    "path": path,
+    "room": room,
+    "car park": car_park,
+    "corridor": corridor,
+    "hall": hall,
+}
+LEFT_OUT = ("corridor", "hall")

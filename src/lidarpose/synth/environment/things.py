@@ -1,0 +1,556 @@
+"""Things that stand where people are and are none: what a detector of people takes for one.
+
+Each stands on the origin, its front along +x, its length along y; sizes in meters. `THINGS` names them, says how often
+they stand outdoors and indoors, and which of them are kept for judging. Builders take uniforms (8,) and a generator.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from math import cos, pi, sin
+
+import numpy as np
+
+from lidarpose.synth.environment import mesh as shapes
+from lidarpose.synth.environment.mesh import Mesh, shape, union
+
+Uniforms = np.ndarray
+Builder = Callable[[Uniforms, np.random.Generator], Mesh]
+
+
+@dataclass(frozen=True)
+class Thing:
+    """A kind of thing: its builder, how often it stands outdoors and indoors beside the others, and whether training
+    never sees it."""
+
+    build: Builder
+    outdoors: float = 0.0
+    indoors: float = 0.0
+    left_out: bool = False
+
+
+def _at(mesh: Mesh, x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> Mesh:
+    return mesh.moved((x, y, z), yaw)
+
+
+def _post(radius: float, height: float) -> Mesh:
+    return shape("pole", radius, radius, height)
+
+
+def _disc(radius: float, wide: float) -> Mesh:
+    """A wheel in the x-z plane that stands on the origin."""
+    return _at(shape("ball", radius, wide, radius), z=radius)
+
+
+# --- buildings
+
+
+def facade(
+    length: float, height: float, rng: np.random.Generator, *, bars: float = 0.2, niches: float = 0.25
+) -> list[tuple[str, Mesh]]:
+    """A house front along y, its face at x = 0, with a depth: windows set back, some with bars, niches and doorways,
+    pilasters, drainpipes, ledges; behind glass a room."""
+    middle, size, rods = [], [], []
+
+    def block(y: float, wide: float, low: float, high: float, near: float, deep: float) -> None:
+        """From x = near backwards."""
+        middle.append((near - deep / 2, y, low))
+        size.append((deep, wide, high - low))
+
+    thick, y = rng.uniform(0.15, 0.5), -length / 2
+    sill, top = rng.uniform(0.5, 1.1), rng.uniform(1.9, 2.6)
+    while y < length / 2 - 0.3:
+        wide = min(rng.uniform(0.8, 2.6), length / 2 - y)
+        kind, open_share, deep, u, v = rng.random(5)
+        center, opening = y + wide / 2, wide * (0.45 + 0.35 * open_share)
+        if kind < 0.3 or height < 2.8:
+            block(center, wide, 0, height, 0, thick)
+            if u < 0.25:
+                rods.append(_at(_post(0.04 + 0.03 * v, height), 0.07, center))
+        elif kind < 0.3 + niches:
+            # a doorway or a niche
+            back = 0.15 + 1.0 * deep * deep
+            for side in (-1, 1):
+                block(center + side * (wide + opening) / 4, (wide - opening) / 2, 0, height, 0, back)
+            block(center, opening, 2.0 + 0.5 * u, height, 0, back)
+            block(center, opening, 0, 2.6, -back, 0.05)
+            if v < 0.4:
+                block(center, opening, 0, 0.1 + 0.3 * u, -0.1, back)
+        elif kind < 0.88:
+            block(center, wide, 0, sill, 0, thick)
+            block(center, wide, top, height, 0, thick)
+            for side in (-1, 1):
+                block(center + side * (wide + opening) / 4, (wide - opening) / 2, sill, top, 0, thick)
+            if u < 0.7:
+                block(center, opening, sill, top, -thick * (0.3 + 0.6 * deep), 0.03)
+            block(center, opening + 0.1, sill - 0.06, sill, 0.08, 0.1)
+            if v < bars:
+                rods.append(_at(_window_bars(opening, top - sill, rng), 0.03, center, sill))
+        else:
+            # a pilaster or a corner of a projection
+            proud = 0.08 + 0.5 * deep * deep
+            block(center, wide, 0, height, 0, thick)
+            block(center, 0.25 + 0.5 * u, 0, height, proud, proud + 0.05)
+        y += wide
+    if rng.random() < 0.4:
+        block(0, length, height * 0.6, height * 0.6 + 0.2, 0.15, 0.2)
+    # rooms end somewhere
+    block(0, length, 0, height, -1.5 - 3 * rng.random(), 0.1)
+    front = shapes.boxes(np.array(middle), np.array(size))
+    return [("facade", front)] + [("window bars" if len(rod.faces) > 30 else "pole", rod) for rod in rods]
+
+
+def _window_bars(wide: float, tall: float, rng: np.random.Generator) -> Mesh:
+    count = max(3, int(wide / rng.uniform(0.09, 0.16)))
+    middle, size = np.zeros((count + 2, 3)), np.empty((count + 2, 3))
+    middle[:count, 1] = (np.arange(count) + 0.5) * (wide / count) - wide / 2
+    size[:count] = (0.02, 0.02, tall)
+    middle[count:, 2], size[count:] = (0.1 * tall, 0.85 * tall), (0.02, wide, 0.03)
+    return shapes.boxes(middle, size)
+
+
+def _bars(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    """A barred opening in a piece of wall."""
+    wide, low = 0.8 + u[0], 0.3 + 0.7 * u[1]
+    wall = shapes.wall(wide + 0.8, 2.4 + u[2], thick=0.25, opening=(-wide / 2, wide / 2, low, low + 1.3))
+    return union([wall, _at(_window_bars(wide, 1.3, rng), 0.1, 0, low)])
+
+
+def _wall_end(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    """A short wall seen on its end, or a corner of two."""
+    high, long = 1.2 + 1.8 * u[0], 0.5 + 2.5 * u[1]
+    wall = shapes.box((long, 0.15 + 0.3 * u[2], high))
+    wall = _at(wall, -long / 2)
+    if u[3] < 0.4:
+        side = 1 if u[4] < 0.5 else -1
+        return union([wall, _at(shapes.box((0.2, 0.4 + u[5], high)), 0, side * (0.2 + u[5] / 2))])
+    # a post at the end, with a cap
+    return union([wall, shapes.box((0.3, 0.3, high + 0.1))]) if u[3] < 0.7 else wall
+
+
+def _cabinet(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    """Of a street's power or telephone: a plinth, a body, a roof."""
+    deep, wide, high = 0.25 + 0.3 * u[0], 0.4 + 0.9 * u[1] ** 2, 0.9 + 0.9 * u[2]
+    parts = [shapes.box((deep, wide, 0.15)), _at(shapes.box((0.94 * deep, 0.96 * wide, high - 0.15)), z=0.15)]
+    if u[3] < 0.6:
+        parts.append(_at(shapes.box((deep + 0.06, wide + 0.06, 0.05)), z=high))
+    if u[4] < 0.3:
+        parts.append(_at(shapes.box((deep, 0.5 * wide + 0.2, 0.7 * high)), 0, 0.75 * wide + 0.15))
+    return union(parts)
+
+
+def _pillar(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    """Round or square, up to a ceiling or with a base and a cap."""
+    half, high = 0.1 + 0.22 * u[0], 1.6 + 2.4 * u[1]
+    mesh = _post(half, high) if u[2] < 0.5 else shapes.box((2 * half, 2 * half * (0.6 + 0.8 * u[5]), high))
+    if u[3] < 0.4:
+        return union([mesh, shapes.box((2.6 * half, 2.6 * half, 0.15 + 0.6 * u[4] ** 2))])
+    return mesh
+
+
+# --- plants
+
+
+def crown(size: tuple[float, float, float], rng: np.random.Generator, *, dense: float = 1.0) -> Mesh:
+    """An irregular crown of leaves, standing on the origin: several balls."""
+    count = 1 + int(2.5 * rng.random() + (max(size) > 2))
+    balls = []
+    for _ in range(count):
+        share = rng.uniform(0.55, 1.0, 3) if count > 1 else np.ones(3)
+        off = (1 - share) * (rng.random(3) - [0.5, 0.5, 0])
+        leaf = max(0.05, 0.09 * max(size)) * rng.uniform(0.7, 1.3)
+        ball = shapes.foliage(share * size, int(min(120, 70 + 50 * dense)), leaf, rng)
+        balls.append(ball.moved(off * size))
+    return union(balls)
+
+
+def _clipped(size: tuple[float, float, float], rng: np.random.Generator) -> Mesh:
+    """A clipped hedge: a box whose sides are leaves, with a dense inside."""
+    deep, long, high = size
+    leaf = 0.1
+    count = int(min(260, 22 * (2 * long * high + 2 * deep * high + deep * long)))
+    where = rng.random((count, 3)) * [deep, long, high] - [deep / 2, long / 2, 0]
+    # to the nearest of a side that is drawn by its area
+    area = np.array([long * high, long * high, deep * high, deep * high, deep * long])
+    side = rng.choice(5, count, p=area / area.sum())
+    for number, (axis, value) in enumerate(((0, deep / 2), (0, -deep / 2), (1, long / 2), (1, -long / 2), (2, high))):
+        where[side == number, axis] = value
+    where += rng.normal(0, 0.04, where.shape)
+    leaves = where[:, None] + rng.normal(0, leaf, (count, 3, 3))
+    leaves[..., 2] = np.maximum(leaves[..., 2], 0)
+    inside = shapes.box((max(deep - 0.25, 0.05), max(long - 0.2, 0.05), max(high - 0.15, 0.1)))
+    return union([Mesh(leaves.reshape(-1, 3).astype(np.float32), shapes.repeated(count, 3, "triangle")), inside])
+
+
+def _hedge(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    size = (0.35 + 0.6 * u[0], 0.5 + 4.5 * u[1] ** 2, 0.6 + 1.5 * u[2])
+    if u[3] < 0.65:
+        return _clipped(size, rng)
+    count = max(1, int(size[1] / 0.8))
+    return union(
+        [
+            _at(shapes.foliage((size[0] + 0.3, 1.2, size[2] * rng.uniform(0.7, 1.1)), 110, 0.1, rng), y=0.8 * k)
+            for k in range(count)
+        ]
+    )
+
+
+def _hedge_at_wall(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    """A hedge, a climber or a pot plant close to a wall."""
+    long = 1.0 + 3.5 * u[4]
+    plant = _hedge(u, rng) if u[5] < 0.6 else crown((0.4 + 0.3 * u[0], 0.4 + 0.5 * u[1], 1.0 + 0.9 * u[2]), rng)
+    low, high = plant.vertices.min(0), plant.vertices.max(0)
+    wall = shapes.box((0.2, long, 0.8 + 2.2 * u[6]))
+    return union([_at(plant, y=-(low[1] + high[1]) / 2), _at(wall, low[0] - 0.12)])
+
+
+def _bush(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    wide = 0.4 + 1.2 * u[0]
+    return crown((wide, wide * (0.7 + 0.6 * u[1]), 0.5 + 1.4 * u[2]), rng)
+
+
+def _tree(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    """A trunk and a crown above heads."""
+    clear, wide = 2.0 + 1.2 * u[0], 2.0 + 3.0 * u[1]
+    radius = 0.08 + 0.25 * u[2] ** 2
+    parts = [_post(radius, clear + 0.8), _at(crown((wide, wide, 2 + 2.5 * u[3]), rng), z=clear)]
+    if u[4] < 0.3:
+        # suckers at the foot
+        parts.append(shapes.foliage((0.6, 0.6, 0.3 + 0.7 * u[5]), 70, 0.06, rng))
+    return union(parts)
+
+
+def _young_tree(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    """A thin trunk and a small crown that begins low."""
+    clear, wide = 0.7 + 1.3 * u[0], 0.4 + 1.0 * u[1]
+    height = 1.0 + 1.8 * u[3]
+    return union(
+        [_post(0.012 + 0.035 * u[2], clear + height * 0.6), _at(crown((wide, wide, height), rng, dense=0.3), z=clear)]
+    )
+
+
+def _low_crown(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    """A trunk with a crown down to knees or hips: thuja, spruce, an old shrub."""
+    clear, wide, high = 0.1 + 1.0 * u[0], 0.6 + 2.2 * u[1], 1.6 + 3.0 * u[2]
+    return union([_post(0.05 + 0.15 * u[3], clear + 0.5), _at(crown((wide, wide, high), rng), z=clear)])
+
+
+def _staked_tree(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    """A young tree tied to one to three stakes."""
+    parts, count, tall = [_young_tree(u, rng)], 1 + int(3 * u[4]), 0.9 + 0.9 * u[5]
+    away = 0.12 + 0.25 * u[6]
+    for k in range(count):
+        angle = 2 * pi * (k / count + u[7])
+        parts.append(_at(_post(0.025 + 0.02 * u[6], tall), away * cos(angle), away * sin(angle)))
+        if count > 1:
+            bar = _at(shapes.box((0.04, 1.6 * away, 0.07)), away * cos(angle) / 2, away * sin(angle) / 2, 0.92 * tall)
+            parts.append(bar)
+    if u[0] < 0.3:
+        parts.append(_post(0.08 + 0.06 * u[1], 0.9 + 0.5 * u[2]))
+    return union(parts)
+
+
+# --- street furniture and what stands about
+
+
+def _bollard(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    half, high = 0.05 + 0.12 * u[0], 0.5 + 0.8 * u[1]
+    mesh = _post(half, high) if u[2] < 0.7 else shapes.box((2 * half, 2 * half, high))
+    return union([mesh, _at(shape("ball", 1.15 * half, 1.15 * half, 1.1 * half), z=high)]) if u[3] < 0.4 else mesh
+
+
+def _pole(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    """A lamp post, a flagpole, a post with a box on it."""
+    radius, high = 0.025 + 0.1 * u[0] ** 2, 1.5 + 6 * u[1]
+    parts = [_post(radius, high)]
+    if u[2] < 0.3:
+        parts.append(_post(1.7 * radius, 0.8 + 0.5 * u[3]))
+    if u[4] < 0.35:
+        # a box, a bin or a parking meter at the height of a chest
+        parts.append(_at(shapes.box((0.2 + 0.2 * u[5], 0.25 + 0.2 * u[6], 0.3 + 0.5 * u[7])), 0.1, 0, 0.6 + 0.7 * u[3]))
+    return union(parts)
+
+
+def _sign(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    if u[0] < 0.55:
+        return shapes.sign(1.7 + 1.2 * u[1], 0.35 + 0.5 * u[2])
+    if u[0] < 0.8:
+        # a board on two feet
+        wide, high = 0.5 + 0.8 * u[1], 1.0 + 1.0 * u[2]
+        board = _at(shapes.box((0.04, wide, 0.75 * high)), z=0.25 * high)
+        return union([board, _at(_post(0.03, high), y=wide / 2), _at(_post(0.03, high), y=-wide / 2)])
+    # an advertising column or a stele
+    return shapes.box((0.12 + 0.3 * u[1] ** 2, 0.5 + 0.6 * u[2], 1.3 + 1.1 * u[3]))
+
+
+def _bin(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    if u[0] < 0.6:
+        return shape("wheeled bin", 0.5 + 0.3 * u[1], 0.45 + 0.35 * u[2], 0.9 + 0.4 * u[3])
+    if u[0] < 0.85:
+        return _post(0.18 + 0.12 * u[1], 0.7 + 0.4 * u[2])
+    return shapes.box((0.8 + 0.5 * u[1], 1.2 + 0.8 * u[2], 1.1 + 0.4 * u[3]))
+
+
+def _bench(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    return shape("bench" if u[0] < 0.65 else "bench without back", 1.0, 1.2 + 0.8 * u[1])
+
+
+def _chair(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    """Alone, stacked, or an office's with a high back."""
+    chair = shape("chair", 0.9 + 0.3 * u[0], 0.42 + 0.15 * u[1], 0.43 + 0.06 * u[2])
+    if u[3] < 0.15:
+        return union([_at(chair, z=0.09 * k) for k in range(2 + int(4 * u[4]))])
+    return union([chair, _at(shapes.box((0.08, 0.45, 0.4)), -0.2, 0, 0.8)]) if u[3] < 0.35 else chair
+
+
+def _table(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    long, deep, high = 0.6 + 1.4 * u[0], 0.5 + 0.5 * u[1], 0.7 + 0.4 * u[2] ** 3
+    parts = [shape("table", deep, long, high)]
+    if u[3] < 0.4:
+        # a screen, a case or a pile on it
+        parts.append(
+            _at(shapes.box((0.05 + 0.3 * u[4], 0.3 + 0.3 * u[5], 0.2 + 0.4 * u[6])), 0, long * (u[7] - 0.5) / 2, high)
+        )
+    return union(parts)
+
+
+def _cart(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    if u[0] < 0.4:
+        return _at(shape("trolley"), -0.45)
+    if u[0] < 0.65:
+        return _at(shape("pram"), -0.5)
+    # a cage or a luggage cart
+    deep, wide, high = 0.6 + 0.3 * u[1], 0.5 + 0.3 * u[2], 0.9 + 0.8 * u[3]
+    parts = [_at(shapes.box((deep, wide, 0.06)), z=0.15), _at(shapes.box((deep, wide, 0.5 * high * u[4])), z=0.2)]
+    parts += [_at(shapes.lattice_fence(wide, high, 0.12, 0.02), side * deep / 2) for side in (-1, 1)]
+    return union(parts)
+
+
+def _bicycle(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    """Parked, one or a few side by side."""
+    size = 0.9 + 0.2 * u[0]
+    single = union([shape("bicycle"), _at(shapes.box((0.04, 0.56, 0.035)), 0.52, 0, 1.02)]).scaled((size,) * 3)
+    if u[1] < 0.3:
+        single = union([single, _at(shapes.box((0.3, 0.35, 0.25)), -0.4 if u[2] < 0.5 else 0.7, 0, 0.75)])
+    count = 1 + int(4 * max(0.0, u[3] - 0.5))
+    return union([_at(single, 0.05 * k, 0.45 * k + 0.05 * u[4], yaw=0.1 * (u[5] - 0.5)) for k in range(count)])
+
+
+def moped() -> Mesh:
+    """A scooter that faces +x, its seat's middle above the origin at 0.75 m, the foot board at 0.28 m."""
+    parts = [_at(_disc(0.23, 0.06), 0.85), _at(_disc(0.23, 0.07), -0.35)]
+    parts += [
+        _at(shapes.box((0.5, 0.3, 0.08)), 0.42, 0, 0.2),
+        _at(shapes.box((0.75, 0.3, 0.38)), -0.15, 0, 0.3),
+        _at(shapes.box((0.7, 0.26, 0.07)), -0.1, 0, 0.68),
+        shapes.box((0.08, 0.42, 0.55)).placed([[1, 0, 0], [0, 1, 0], [-0.2, 0, 1]], (0.76, 0, 0.3)),
+        _at(shapes.box((0.14, 0.16, 0.2)), 0.64, 0, 0.85),
+        _at(shapes.box((0.04, 0.62, 0.04)), 0.58, 0, 1.0),
+        _at(shapes.box((0.16, 0.1, 0.5)), 0.85, 0, 0.15),
+    ]
+    return union(parts)
+
+
+def _moped(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    mesh = moped().scaled((0.9 + 0.2 * u[0], 1.0, 0.9 + 0.2 * u[1]))
+    if u[2] < 0.35:
+        # a top box or a wind screen
+        box = _at(shapes.box((0.35, 0.38, 0.35)), -0.6, 0, 0.75)
+        mesh = union([mesh, box if u[3] < 0.6 else _at(shapes.box((0.04, 0.45, 0.5)), 0.66, 0, 0.95)])
+    return mesh
+
+
+def _cone(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    high = 0.4 + 0.6 * u[0]
+    return shape("traffic cone", 0.9 * high, 0.9 * high, high)
+
+
+def _sacks(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    """Sacks, boxes or cases in a heap."""
+    parts, high = [], 0.0
+    for k in range(1 + int(5 * u[0])):
+        a, b, c, d, e = rng.random(5)
+        size = (0.3 + 0.4 * a, 0.3 + 0.5 * b, 0.2 + 0.4 * c)
+        up = high if u[1] < 0.5 else high * (k % 2)
+        where = {"x": 0.4 * (d - 0.5), "y": (0.3 if u[1] < 0.5 else 1.0) * (e - 0.5), "z": up, "yaw": pi * d}
+        half = np.array(size) / 2
+        part = shapes.box(size) if u[2] < 0.5 else _at(shape("ball", *half), z=half[2] * 0.9)
+        parts.append(_at(part, **where))
+        high = min(high + 0.85 * size[2], 1.5)
+    return union(parts)
+
+
+def _fence(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    long, high = 1.5 + 5 * u[0], 0.7 + 1.2 * u[1]
+    if u[2] < 0.35:
+        return shapes.rail_fence(long, high, 2 + int(3 * u[3]))
+    if u[2] < 0.8:
+        return shapes.lattice_fence(long, high, 0.08 + 0.14 * u[3], 0.015 + 0.06 * u[4])
+    # boards between posts
+    return union([_at(shapes.box((0.04, long, high - 0.1)), z=0.1), shapes.rail_fence(long, high + 0.05, 1)])
+
+
+def car(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    """A car, an estate or a van, heading along +x."""
+    if u[0] < 0.75:
+        return shape("car", 3.6 + 1.3 * u[1], 1.65 + 0.25 * u[2], 1.38 + 0.35 * u[3])
+    if u[0] < 0.95:
+        return shape("van", 4.4 + 1.6 * u[1], 1.85 + 0.25 * u[2], 1.8 + 0.9 * u[3])
+    return union([_at(shapes.box((6 + 3 * u[1], 2.4, 2.2 + u[2])), z=0.8), _at(shapes.box((5, 2.2, 0.5)), z=0.3)])
+
+
+def _car_corner(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    """A car's corner beside what hides the rest: only a strip of it is seen."""
+    vehicle, hides = car(u * [0.9] + [0.0] * 8, rng), shapes.box((0.15, 2.0 + 2 * u[4], 1.6 + 0.8 * u[5]))
+    gap = 0.25 + 0.5 * u[6]
+    low, high = vehicle.vertices.min(0), vehicle.vertices.max(0)
+    front = union([_at(hides, 0.8, gap + (2.0 + 2 * u[4]) / 2), _at(hides, 0.8, -(2.0 + 2 * u[4]) / 2)])
+    return union([_at(vehicle, -(high[0] if u[7] < 0.5 else -low[0]), (u[3] - 0.5) * high[1] * 2), front])
+
+
+# --- indoors
+
+
+def _shelf(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    """Uprights, boards and what lies on them."""
+    deep, long, high = 0.3 + 0.3 * u[0], 0.7 + 1.8 * u[1], 1.2 + 1.2 * u[2]
+    levels = 3 + int(3 * u[3])
+    middle = [(0, side * long / 2, 0) for side in (-1, 1)]
+    size = [(deep, 0.03, high)] * 2
+    for k in range(levels):
+        z = 0.05 + k * (high - 0.1) / (levels - 1)
+        middle.append((0, 0, z))
+        size.append((deep, long, 0.025))
+        for y in rng.uniform(-0.45, 0.45, 3) * long:
+            middle.append((0, y, z + 0.02))
+            size.append((deep * 0.8, 0.1 + 0.3 * rng.random(), 0.1 + 0.2 * rng.random()))
+    if u[4] < 0.5:
+        middle.append((-deep / 2, 0, 0))
+        size.append((0.01, long, high))
+    return shapes.boxes(np.array(middle), np.array(size))
+
+
+def _cupboard(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    deep, wide, high = 0.35 + 0.3 * u[0], 0.5 + 1.2 * u[1], 0.8 + 1.4 * u[2]
+    parts = [shapes.box((deep, wide, high))]
+    if u[3] < 0.35:
+        # an open door
+        parts.append(_at(shapes.box((0.5, 0.02, high)), deep / 2 + 0.25, wide / 2))
+    if u[4] < 0.3:
+        parts.append(_at(shapes.box((0.3, 0.4, 0.3)), 0, wide * (u[5] - 0.5) / 2, high))
+    return union(parts)
+
+
+def _door(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    """A door leaf that stands open, with a piece of its frame."""
+    leaf = _at(shapes.box((0.04, 0.85, 2.0)), 0, 0.42).moved((0, 0, 0), 1.5 * u[0])
+    return union([leaf, _at(shapes.box((0.12, 0.08, 2.1)), y=-0.05)])
+
+
+def _plant(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    """A pot plant."""
+    pot = 0.25 + 0.35 * u[0]
+    wide = 0.3 + 0.6 * u[1]
+    return union([_post(0.5 * pot, pot), _at(crown((wide, wide, 0.4 + 1.1 * u[2]), rng, dense=0.5), z=pot)])
+
+
+def _floor_lamp(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    """A floor lamp, a coat stand, a music stand, a screen on a stand."""
+    high = 1.2 + 0.7 * u[0]
+    parts = [_post(0.015 + 0.01 * u[1], high), _post(0.14, 0.03)]
+    if u[2] < 0.4:
+        parts.append(_at(_post(0.12 + 0.12 * u[3], 0.25), z=high - 0.1))
+    elif u[2] < 0.7:
+        parts.append(_at(shapes.box((0.05, 0.5 + 0.5 * u[3], 0.35 + 0.3 * u[4])), z=high - 0.3))
+    return union(parts)
+
+
+# --- pieces
+
+
+def _fragment(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    """A piece as large as a person or smaller, of no particular thing: a plate, a clump, a corner, some posts."""
+    high, wide = 0.5 + 1.4 * u[0], 0.15 + 0.6 * u[1]
+    if u[2] < 0.3:
+        piece = shapes.box((0.05, wide, high))
+    elif u[2] < 0.5:
+        piece = shapes.foliage((wide, wide, high), 40 + int(70 * u[3]), 0.1, rng)
+    elif u[2] < 0.7:
+        half = _at(shapes.box((0.05, wide, high)), 0, wide / 2)
+        piece = union([half, half.moved((0, 0, 0), 1.2 + 0.6 * u[3])])
+    elif u[2] < 0.85:
+        piece = union([_at(_post(0.05, high * (0.4 + 0.6 * rng.random())), y=wide * rng.random()) for _ in range(4)])
+    else:
+        piece = union(
+            [_at(shapes.box(0.15 + 0.35 * rng.random(3)), *(rng.random(3) * [wide, wide, high])) for _ in "abc"]
+        )
+    return _at(piece, z=0.7 * max(0.0, u[4] - 0.6))
+
+
+def _floating(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    """What hangs, or stands on legs too thin to be seen: a sign, a lamp, a banner, a branch, a machine."""
+    z, high, wide = 0.35 + 1.1 * u[0], 0.3 + 0.9 * u[1], 0.2 + 0.7 * u[2]
+    if u[3] < 0.5:
+        return _at(shapes.box((0.04 + 0.3 * u[4] ** 2, wide, high)), z=z)
+    return _at(shapes.foliage((wide, wide, high), 60, 0.1, rng), z=z)
+
+
+def _mannequin(u: Uniforms, rng: np.random.Generator) -> Mesh:
+    """As tall and as wide as a person, of a few rough parts: a column, a wrapped pile, a dummy without limbs."""
+    tall, wide = 1.3 + 0.6 * u[0], 0.3 + 0.3 * u[1]
+    if u[2] < 0.4:
+        cuts = np.sort(rng.uniform(0.1, 0.9, 2)) * tall
+        edges = [0.0, *cuts, tall]
+        sizes = [
+            (wide * (0.5 + 0.5 * rng.random()), wide * (0.6 + 0.4 * rng.random()), b - a) for a, b in pairwise(edges)
+        ]
+        return union([_at(shapes.box(size), z=low) for size, low in zip(sizes, edges[:-1], strict=True)])
+    if u[2] < 0.7:
+        return _at(shape("ball", wide / 2, wide / 2, tall / 2), z=tall / 2)
+    return union([_post(wide / 2 * (0.7 + 0.3 * u[3]), tall * (0.6 + 0.3 * u[4])), shapes.box((0.1, wide, tall))])
+
+
+THINGS: dict[str, Thing] = {
+    "wall end": Thing(_wall_end, 1.0, 0.6),
+    "window bars": Thing(_bars, 0.5, 0.1),
+    "cabinet": Thing(_cabinet, 1.0, 0.4, left_out=True),
+    "pillar": Thing(_pillar, 1.0, 1.5, left_out=True),
+    "tree": Thing(_tree, 1.2),
+    "young tree": Thing(_young_tree, 1.0),
+    "low crown": Thing(_low_crown, 1.0),
+    "staked tree": Thing(_staked_tree, 1.2, left_out=True),
+    "hedge": Thing(_hedge, 1.0),
+    "hedge at wall": Thing(_hedge_at_wall, 1.0, 0.2, left_out=True),
+    "bush": Thing(_bush, 1.0),
+    "bollard": Thing(_bollard, 1.0, 0.1),
+    "pole": Thing(_pole, 1.2, 0.2),
+    "sign": Thing(_sign, 1.2, 0.5),
+    "bin": Thing(_bin, 1.0, 0.5),
+    "bench": Thing(_bench, 0.6, 0.4),
+    "chair": Thing(_chair, 0.5, 2.0),
+    "table": Thing(_table, 0.4, 1.5),
+    "cart": Thing(_cart, 0.5, 0.5),
+    "bicycle": Thing(_bicycle, 0.8, 0.1),
+    "moped": Thing(_moped, 0.8),
+    "traffic cone": Thing(_cone, 0.4, 0.1),
+    "sacks": Thing(_sacks, 0.8, 0.8),
+    "fence": Thing(_fence, 0.8),
+    "car": Thing(car, 0.4),
+    "car corner": Thing(_car_corner, 0.5),
+    "shelf": Thing(_shelf, 0.1, 1.2),
+    "cupboard": Thing(_cupboard, 0.0, 1.2),
+    "door": Thing(_door, 0.1, 0.8),
+    "pot plant": Thing(_plant, 0.3, 0.8),
+    "floor lamp": Thing(_floor_lamp, 0.1, 0.8),
+    "fragment": Thing(_fragment, 0.6, 0.3),
+    "floating piece": Thing(_floating, 0.5, 0.3),
+    "mannequin": Thing(_mannequin, 0.3, 0.0, left_out=True),
+}
+# what else points may lie on
+STRUCTURES = ("ground", "facade", "wall", "ceiling", "belongings", "own vehicle", "screen")
+KINDS = (*THINGS, *STRUCTURES)
+
+
+def draw_thing(name: str, rng: np.random.Generator) -> Mesh:
+    """A thing of `THINGS`."""
+    return THINGS[name].build(rng.random(8), rng)

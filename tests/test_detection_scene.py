@@ -1,0 +1,87 @@
+"""Scenes to find people in: whose points are whose, what each family may hold, and that nothing else draws along."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from lidarpose.errors import InputError
+from lidarpose.synth.detection_scene import DetectionScene, detection_scene
+from lidarpose.synth.environment.layouts import LEFT_OUT
+from lidarpose.synth.environment.things import KINDS, THINGS
+
+LEFT_OUT_THINGS = {name for name, thing in THINGS.items() if thing.left_out}
+
+
+@pytest.fixture(scope="module")
+def train() -> list[DetectionScene]:
+    return [detection_scene(5, index) for index in range(60)]
+
+
+@pytest.fixture(scope="module")
+def heldout() -> list[DetectionScene]:
+    return [detection_scene(5, index, family="heldout") for index in range(30)]
+
+
+def test_a_scene_is_a_function_of_seed_index_and_family(train):
+    again, others = detection_scene(5, 3), [detection_scene(6, 3), detection_scene(5, 3, family="bench")]
+    for name in ("points", "origin", "person", "thing", "joints", "mounted", "up"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(train[3], name))
+    assert (again.sensor, again.kind, again.negatives) == (train[3].sensor, train[3].kind, train[3].negatives)
+    for other in others:
+        assert other.points.shape != again.points.shape or (other.points != again.points).any()
+
+
+def test_points_of_people_lie_in_their_boxes_and_boxes_on_the_ground(train, heldout):
+    strays = people = 0
+    for scene in [*train, *heldout]:
+        count = len(scene.boxes)
+        assert scene.points.dtype == np.float32 and scene.points.shape == (len(scene.person), 3)
+        assert np.isfinite(scene.points).all() and scene.person.dtype == scene.thing.dtype == np.int16
+        assert scene.person.min(initial=-1) >= -1 and scene.person.max(initial=-1) < count
+        assert scene.thing.min(initial=-1) >= -1 and scene.thing.max(initial=-1) < len(KINDS)
+        assert not ((scene.person >= 0) & (scene.thing >= 0)).any()
+        assert scene.joints.shape == (count, 26, 3) and scene.mounted.shape == (count,)
+        assert {KINDS[k] for k in np.unique(scene.thing) if k >= 0} <= set(scene.negatives)
+        np.testing.assert_allclose(np.linalg.norm(scene.up), 1, atol=1e-6)
+        for number, box in enumerate(scene.boxes):
+            own = scene.points[scene.person == number]
+            people += 1
+            # clothes, skirts, hats and range noise beyond the tight box
+            assert box.contains(own, 0.3).all()
+            assert box.contains(scene.joints[number], 0.02).all()
+            assert 0.3 < box.size[2] < 2.6 and box.id == number
+        centers = np.array([box.center for box in scene.boxes]).reshape(-1, 3)
+        gaps = np.linalg.norm(centers[:, None] - centers, axis=-1) + 9 * np.eye(count)
+        # half of a wide stride nearer than where they stand
+        strays += int((gaps < 0.2).sum())
+    # some walk towards each other
+    assert people > 300 and strays < 0.01 * people
+
+
+def test_training_never_draws_what_is_left_out(train, heldout):
+    for scene in train:
+        assert scene.kind not in LEFT_OUT and not LEFT_OUT_THINGS & set(scene.negatives)
+    assert set(LEFT_OUT) & {scene.kind for scene in heldout}
+    assert set().union(*(scene.negatives for scene in heldout)) >= LEFT_OUT_THINGS
+
+
+def test_all_kinds_places_and_sensors_occur(train, heldout):
+    present = Counter(name for scene in train for name in scene.negatives)
+    assert set(present) | LEFT_OUT_THINGS == set(KINDS)
+    assert {scene.kind for scene in train} == {"street", "square", "path", "room", "car park", "fragment"}
+    assert len({scene.sensor for scene in train}) >= 9
+    seen = [np.bincount(scene.person[scene.person >= 0], minlength=len(scene.boxes)) for scene in train]
+    # most scenes show people, and riders are among them
+    assert np.mean([(counts >= 20).any() for counts in seen]) > 0.6
+    assert sum(int(scene.mounted.sum()) for scene in train) > 20
+    tilt = np.degrees([np.arccos(min(scene.up[2], 1.0)) for scene in train])
+    assert np.median(tilt) < 2 and 3 < tilt.max() < 16
+    assert 0 < np.mean([(scene.origin != 0).any() for scene in train]) < 0.6
+    assert min(scene.height for scene in train) < 0.6 and max(scene.height for scene in train) > 3
+
+
+@pytest.mark.parametrize("wrong", [{"seed": -1}, {"index": 1.5}, {"family": "test"}])
+def test_wrong_arguments_say_what_is_expected(wrong):
+    with pytest.raises(InputError):
+        detection_scene(**({"seed": 1, "index": 0} | wrong))
