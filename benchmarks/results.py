@@ -245,6 +245,20 @@ def moved() -> str:
     return table(("person", "mean over joints, mm"), rows)
 
 
+def detector(dataset: str, *groups: str) -> str:
+    """Recall of people in whole scans by false people a scan; see `lidarpose evaluate detector`."""
+    result = next(one for one in _read("detector")["results"] if one["dataset"] == dataset)
+    rows = [row for row in result["rows"] if row["figure"] == "recall" and row["group"] in groups]
+    cells: dict[tuple[str, str], dict[str, str]] = {}
+    for row in rows:
+        ends = "" if row["low"] is None else f" [{row['low']:.0f}, {row['high']:.0f}]"
+        value = "" if row["value"] is None else f"{row['value']:.1f}{ends}"
+        name = row["group"] if row["of"] == "all" else f"{row['group']}: {row['of']}"
+        cells.setdefault((name, f"{row['count']:,}"), {})[row["at"]] = value
+    header = ("recall, % (false people a scan)", "people", *result["thresholds"])
+    return table(header, [(*key, *(own[at] for at in result["thresholds"])) for key, own in cells.items()])
+
+
 def calibration() -> str:
     """Whether confidence and visibility can be taken at their word; see calibration.py."""
     rows = [(one["what"], f"{one['ece']:.3f}", f"{one['auroc']:.3f}") for one in _read("calibration")["stated"]]
@@ -294,6 +308,9 @@ def tables() -> dict[str, Callable[[], str]]:
     made["speed"] = lambda: table(*timed.medians(_read("speed")))
     made["speed ratios"] = lambda: table(*timed.ratios(_read("speed")["targets"]))
     made |= {"calibration": calibration, "spread": spread, "real moved": moved}
+    for group in ("points", "kind", "sensor", "activity", "condition", "distance, m"):
+        own = ("all", "points", "mounted, all") if group == "points" else (group, f"{group}, 50 points and more")
+        made |= {f"detector {name} by {group}": partial(detector, name, *own) for name in ("heldout", "real")}
     made |= {"visibility": visibility, "real": real}
     made["headline"] = partial(headline, *BUNDLED)
     made |= {"readme": readme, "conditions": conditions}

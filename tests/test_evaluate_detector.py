@@ -144,7 +144,8 @@ def ten_scans():
     """Ten scans of two people, 60 and 15 points; scores fall with the scan's number, a false one each in between."""
     scans, found = [], []
     for k in range(10):
-        scans.append(scan([5, {"x": 10, "points": 15}], sensor="a" if k < 5 else "b"))
+        people = [5, {"x": 10, "points": 15}]
+        scans.append(scan(people, sensor="a" if k < 5 else "b", activities=("walk", "sit")))
         found.append([(5.1, 0.95 - 0.05 * k), (30.0, 0.93 - 0.05 * k)] + [(10.2, 0.2)] * (k == 9))
     return scan_set(scans), answers(*found)
 
@@ -160,6 +161,7 @@ def test_recall_at_so_many_false_people_is_what_counting_says():
     assert result.row("recall", "1")["value"] == 55 and result.row("recall", "10")["value"] == 55
     assert result.row("recall", "0.3", "sensor, 50 points and more", "a")["value"] == 80
     assert result.row("recall", "0.3", "distance, m", "0 to 10")["value"] == 40
+    assert result.row("recall", "0.3", "activity", "walk")["value"] == 40
     assert result.thresholds["0.3"] == pytest.approx(0.8) and result.thresholds["default"] == 0.7
     assert result.row("recall", "default")["value"] == 100 * 6 / 20
     assert result.row("false_people", "0.3")["value"] == 0.3

@@ -127,3 +127,19 @@ def test_runs_are_added_to_those_known(changed, tmp_path):
 def test_a_doubling_of_people(changed):
     _, rows = changed.scaling([run("base", 1, 200.0), run("base", 1, 180.0, 200), run("base", 1, 150.0, 800)])
     assert [row[2] for row in rows] == ["", "-20.0", "-15.0"]
+
+
+def test_recall_of_people_in_scans_is_a_table(results, monkeypatch):
+    rows = [
+        {"figure": "recall", "at": at, "group": group, "of": of, "value": value, "low": low, "high": low, "count": 1200}
+        for at, value, low in (("1", 91.26, 90.0), ("default", None, None))
+        for group, of in (("all", "all"), ("points", "50 and more"), ("kind", "room"))
+    ]
+    document = {"results": [{"dataset": "heldout", "thresholds": {"1": 0.5, "default": 0.6}, "rows": rows}]}
+    monkeypatch.setattr(results, "_read", lambda name: {"detector": document}[name])
+    assert results.detector("heldout", "all", "points").splitlines() == [
+        "| recall, % (false people a scan) | people | 1 | default |",
+        "| --- | --- | --- | --- |",
+        "| all | 1,200 | 91.3 [90, 90] |  |",
+        "| points: 50 and more | 1,200 | 91.3 [90, 90] |  |",
+    ]

@@ -81,6 +81,7 @@ def score_scan(
         where
         | {"person": np.arange(len(places)), "points": scan.num_points, "distance": distance}
         | {"mounted": scan.mounted, "detection": detection, "score": np.append(scores, -np.inf)[detection]}
+        | {"activity": list(scan.activities or [""] * len(places))}
         | _conditions(scan, places)
     )
     status = np.where(finds, PERSON, np.where((of_person >= 0) | (far > max_range), NEITHER, FALSE))
@@ -280,7 +281,7 @@ def _groups_of_people(people: pd.DataFrame) -> Iterator[tuple[str, str, np.ndarr
         for name, rows in aggregate.span_rows(points, POINT_EDGES).items():
             yield f"{prefix}points", name, some & rows
     for least, some in (("", on_foot), (", 50 points and more", on_foot & (points >= 50))):
-        for column in ("sensor", "kind"):
+        for column in ("sensor", "kind", "activity"):
             for name in sorted(set(people[column]) - {""}):
                 yield f"{column}{least}", name, some & (people[column] == name).to_numpy()
         for name in CONDITIONS:

@@ -33,8 +33,9 @@ class LabeledScan:
 
     points (n, 3) m; origin: the sensor's position (3,) m, None where nobody knows it; boxes: P; num_points (P,): how
     many points each person has; is_person (P,) bool: False where something else is labeled; mounted (P,) bool: riders
-    and wheelchairs; sensor, kind of scene: "" where it is not known; thing (n,): the kind of thing that a point lies
-    on, an index of `things`, or -1; person (n,): an index of `boxes`, or -1; joints (P, 26, 3) m, body26.
+    and wheelchairs; activities: P names; sensor, kind of scene: "" where it is not known; thing (n,): the kind of thing
+    that a point lies on, an index of `things`, or -1; person (n,): an index of `boxes`, or -1; joints (P, 26, 3) m,
+    body26.
     """
 
     name: str
@@ -44,6 +45,7 @@ class LabeledScan:
     num_points: np.ndarray
     is_person: np.ndarray
     mounted: np.ndarray
+    activities: Sequence[str] | None = None
     sensor: str = ""
     kind: str = ""
     thing: np.ndarray | None = None
@@ -70,6 +72,7 @@ def heldout_scans(limit: int | None = None) -> ScanSet:
 def synthetic_scan(seed: int, index: int, family: str = HELDOUT) -> LabeledScan:
     """A scene of `synth.detection_scene` as a labeled scan."""
     from lidarpose.synth.detection_scene import detection_scene
+    from lidarpose.synth.environment.things import KINDS
 
     scene = detection_scene(seed, index, family=family)
     people = len(scene.boxes)
@@ -81,10 +84,11 @@ def synthetic_scan(seed: int, index: int, family: str = HELDOUT) -> LabeledScan:
         num_points=np.bincount(scene.person[scene.person >= 0], minlength=people),
         is_person=np.ones(people, bool),
         mounted=scene.mounted,
+        activities=scene.activities,
         sensor=scene.sensor,
         kind=scene.kind,
         thing=scene.thing,
-        things=scene.things,
+        things=KINDS,
         person=scene.person,
         joints=scene.joints,
     )
@@ -94,8 +98,9 @@ def labeled_scans(folder: str | os.PathLike, limit: int | None = None) -> ScanSe
     """The scans of a folder: SCAN.json of people beside SCAN.pcd, .bin, .ply, .npy or another format.
 
     SCAN.json holds what `read_boxes` takes, and of each of its "people" a `category` ("PEDESTRIAN" where it is
-    missing; riders and wheelchairs are mounted; strollers and animals are no people) and `num_points`, else the points
-    in the box are counted; beside "people" `sensor`, `kind` of scene and `sensor_origin` (0, 0, 0 where it is missing).
+    missing; riders and wheelchairs are mounted, as is who has `mounted`; strollers and animals are no people) and
+    `num_points`, else the points in the box are counted; beside "people" `sensor`, `kind` of scene and `sensor_origin`
+    (0, 0, 0 where it is missing).
     Raises InputError where the folder has none, or labels have no scan.
     """
     folder = Path(folder)
@@ -118,7 +123,8 @@ def _read_scan(labels: Path, cloud: Path) -> LabeledScan:
     about: dict[str, Any] = content if isinstance(content, dict) else {"people": content}
     people = [entry if isinstance(entry, dict) else {} for entry in about["people"]]
     category = [str(entry.get("category", "pedestrian")).lower() for entry in people]
-    mounted = np.array([any(word in name for word in _MOUNTED) for name in category], bool)
+    riding = [any(word in name for word in _MOUNTED) for name in category]
+    mounted = np.array([own or bool(box.mounted) for own, box in zip(riding, boxes, strict=True)], bool)
     on_foot = np.array([any(word in name for word in _ON_FOOT) for name in category], bool)
     points = only_returns(read_points(cloud).points)[0]
     counted = [len(rows) for rows in rows_inside(boxes, points)]
