@@ -7,6 +7,7 @@ import numpy as np
 
 from lidarpose.eval.detector.detection_scores import FALSE, REFERENCE, DetectorResult
 from lidarpose.eval.detector.labeled_scans import LabeledScan, ScanSet
+from lidarpose.io.files import shorten
 from lidarpose.sample import Box
 from lidarpose.viz.draw import png_of
 from lidarpose.viz.person_view import box_edges, thinned
@@ -57,7 +58,10 @@ def _crop(scan: LabeledScan, box: Box, words: Sequence[str]) -> _Crop:
     own = int(box.contains(near).sum())
     people = [person for person in scan.boxes if np.hypot(*(person.center - box.center)[:2]) < _REACH]
     towards = (np.zeros(3) if scan.origin is None else scan.origin)[:2] - box.center[:2]
-    label = " · ".join(filter(None, words)) + f"\n{scan.name} {scan.sensor} {scan.kind} · {own} in the box"
+    label = (
+        " · ".join(filter(None, words))
+        + f"\n{shorten(' '.join((scan.name, scan.sensor, scan.kind)), 36)} · {own} inside"
+    )
     return _Crop(
         points=near[thinned(len(near), _MAX_POINTS)],
         box=box,

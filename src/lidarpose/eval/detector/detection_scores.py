@@ -222,7 +222,7 @@ def _figures(
     above = {f"{budget:g}": exclusive_thresholds(false, weights, budget) for budget in FALSE_PER_SCAN}
     if default_score is not None:
         above["default"] = np.full(len(weights), np.nextafter(default_score, -1))
-    groups = list(_groups_of_people(people))
+    groups = [group for group in _groups_of_people(people) if group[2].any()]
     masks = np.array([mask for _, _, mask in groups], float)
     person_weights = weights[:, people.scan]
     rows: list[dict[str, Any]] = []
@@ -230,6 +230,7 @@ def _figures(
     for at, bounds in above.items():
         thresholds[at] = float(detections.score[detections.score > bounds[0]].min())
         hits = (people.score.to_numpy() > bounds[:, None]) * person_weights
+        # draws without anybody of a group are NaN
         with np.errstate(invalid="ignore"):
             recall = 100 * (hits @ masks.T) / (person_weights @ masks.T)
         for (group, of, mask), draws in zip(groups, recall.T, strict=True):
