@@ -98,7 +98,9 @@ def _conditions(scan: LabeledScan, places: np.ndarray) -> dict[str, np.ndarray]:
     apart = np.linalg.norm(places[:, None] - places[None], axis=-1)
     # each is near itself
     company = (apart < _COMPANY).sum(1) > 1
-    wide = [replace(box, size=box.size + [2 * _TOUCHING, 2 * _TOUCHING, 0]) for box in scan.boxes]
+    # without the ground and the ceiling
+    grown = [2 * _TOUCHING, 2 * _TOUCHING, -2 * _TOUCHING]
+    wide = [replace(box, size=np.maximum(box.size + grown, 0.1)) for box in scan.boxes]
     thing = np.full(len(scan.points), -1) if scan.thing is None else scan.thing
     touching = np.array([(thing[rows] >= 0).any() for rows in rows_inside(wide, scan.points)], bool)
     low = np.array([box.size[2] < _LOW for box in scan.boxes], bool)
