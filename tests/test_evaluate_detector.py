@@ -214,7 +214,7 @@ def test_average_precision_does_not_depend_on_the_order_of_equal_scores():
     detections = pd.DataFrame({"scan": 0, "score": [0.5] * 4, "status": [PERSON, FALSE, FALSE, PERSON]})
     people = pd.DataFrame({"scan": [0, 0, 0, 0]})
     for order in ([0, 1, 2, 3], [1, 2, 0, 3]):
-        assert average_precision(detections.iloc[order], people, np.ones(1)) == 0.5 * 0.5
+        assert average_precision(detections.iloc[order], people, np.ones((1, 1))) == 0.5 * 0.5
 
 
 def test_poses_in_found_boxes_are_compared_with_those_in_labeled_boxes():

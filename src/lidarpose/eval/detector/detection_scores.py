@@ -219,7 +219,7 @@ def _figures(
     """Recall, false people a scan and average precision with intervals; operating point -> score."""
     count = len(scans)
     # how often each scan counts: once, and as drawn
-    weights = np.vstack([np.ones(count, int), rng.multinomial(count, np.full(count, 1 / count), size=_REPEATS)])
+    weights = np.vstack([np.ones(count), rng.multinomial(count, np.full(count, 1 / count), size=_REPEATS)])
     false = detections[detections.status == FALSE].sort_values("score", ascending=False, kind="stable")
     above = {f"{budget:g}": exclusive_thresholds(false, weights, budget) for budget in FALSE_PER_SCAN}
     if default_score is not None:
@@ -227,6 +227,7 @@ def _figures(
     groups = [group for group in _groups_of_people(people) if group[2].any()]
     masks = np.array([mask for _, _, mask in groups], float)
     person_weights = weights[:, people.scan]
+    total = person_weights @ masks.T
     rows: list[dict[str, Any]] = []
     thresholds: dict[str, float] = {}
     for at, bounds in above.items():
@@ -234,14 +235,14 @@ def _figures(
         hits = (people.score.to_numpy() > bounds[:, None]) * person_weights
         # draws without anybody of a group are NaN
         with np.errstate(invalid="ignore"):
-            recall = 100 * (hits @ masks.T) / (person_weights @ masks.T)
+            recall = 100 * (hits @ masks.T) / total
         for (group, of, mask), draws in zip(groups, recall.T, strict=True):
             ends = _with_interval(draws, people.scan[mask].nunique())
             rows.append(_row("recall", at, group, of, **ends, unit="%", count=int(mask.sum())))
         rows += _false_rows(at, false[false.score > bounds[0]], scans)
     on_foot = people[~people.mounted]
     judged = detections[(detections.status == FALSE) | (detections.status == PERSON) & ~detections.mounted]
-    precision = 100 * np.array([average_precision(judged, on_foot, own) for own in weights])
+    precision = 100 * average_precision(judged, on_foot, weights)
     rows.append(_row("average_precision", **_with_interval(precision, count), unit="%", count=len(on_foot)))
     return rows, {at: 1.0 if np.isnan(score) else score for at, score in thresholds.items()}
 
@@ -256,16 +257,19 @@ def exclusive_thresholds(false: pd.DataFrame, weights: np.ndarray, budget: float
     )
 
 
-def average_precision(detections: pd.DataFrame, people: pd.DataFrame, weights: np.ndarray) -> float:
-    """Area under precision over recall, precision made falling, 0 to 1, NaN of nobody; weights (scans,)."""
+def average_precision(detections: pd.DataFrame, people: pd.DataFrame, weights: np.ndarray) -> np.ndarray:
+    """Area under precision over recall, precision made falling, 0 to 1, NaN of nobody, for weights (R, scans): (R,)."""
     detections = detections.sort_values("score", ascending=False, kind="stable")
-    own = weights[detections.scan.to_numpy(int)]
-    hits, count = np.cumsum(own * (detections.status == PERSON)), np.cumsum(own)
+    scan, finds = detections.scan.to_numpy(int), (detections.status == PERSON).to_numpy()
     # equal scores come together
-    last = (~detections.score.duplicated(keep="last")).to_numpy() & (count > 0)
-    wanted = weights[people.scan.to_numpy(int)].sum()
-    precision = np.maximum.accumulate((hits[last] / count[last])[::-1])[::-1]
-    return float((np.diff(hits[last], prepend=0) * precision).sum() / wanted) if wanted else float("nan")
+    last = ~detections.score.duplicated(keep="last").to_numpy()
+    areas = np.full(len(weights), np.nan)
+    for row, wanted in enumerate(weights[:, people.scan.to_numpy(int)].sum(1)):
+        own = weights[row][scan]
+        hits, count = np.cumsum(own * finds)[last], np.cumsum(own)[last]
+        precision = np.maximum.accumulate((hits / np.maximum(count, 1))[::-1])[::-1]
+        areas[row] = (np.diff(hits, prepend=0) * precision).sum() / wanted if wanted else np.nan
+    return areas
 
 
 def _with_interval(draws: np.ndarray, units: int) -> dict[str, Any]:

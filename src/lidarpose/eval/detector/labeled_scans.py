@@ -76,21 +76,13 @@ def synthetic_scan(seed: int, index: int, family: str = HELDOUT) -> LabeledScan:
 
     scene = detection_scene(seed, index, family=family)
     people = len(scene.boxes)
+    alike = "points origin boxes mounted activities sensor kind thing person joints".split()
     return LabeledScan(
         name=f"{family} {index}",
-        points=scene.points,
-        origin=scene.origin,
-        boxes=scene.boxes,
         num_points=np.bincount(scene.person[scene.person >= 0], minlength=people),
         is_person=np.ones(people, bool),
-        mounted=scene.mounted,
-        activities=scene.activities,
-        sensor=scene.sensor,
-        kind=scene.kind,
-        thing=scene.thing,
         things=KINDS,
-        person=scene.person,
-        joints=scene.joints,
+        **{name: getattr(scene, name) for name in alike},
     )
 
 
