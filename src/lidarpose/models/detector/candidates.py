@@ -1,0 +1,470 @@
+"""What the detector's network sees of a candidate: the points there, what the sensor sees past it, and what is around.
+
+The view frame of a candidate: x away from the sensor, level, y left, z up from the ground at the candidate's center;
+of an unknown sensor, x and y are the level frame's. Inputs, K candidates first:
+
+    fine (K, 28, 24, 24): slices of 10 cm from -0.5 to 2.3 m, cells of 10 cm: .5 + .125 log2(1 + points), 0 if empty
+    range_view (K, 4, 28, 24): directions, as a picture of 2.4 x 2.8 m at the candidate's distance, rows from below,
+        columns from the right to the left: nearest and farthest return beyond the candidate (m / 4, to +-1), how many
+        returns there are, and how many around, .125 log2(1 + returns)
+    context (K, 4, 20, 20): 10 x 10 m from above, x first: highest point above the ground (m / 4, to 1), share of the
+        heights 0.3-2.1 m that hold points, .125 log2(1 + points), the same of points near the ground
+    scalars (K, 4): log of the distance, height of the sensor above the ground there (m / 4), log of the number of
+        points, 1 where the sensor is known; without a sensor, range_view and the first two are 0
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import pi
+
+import numpy as np
+
+from lidarpose.models.detector.ground import Ground
+from lidarpose.models.detector.proposals import heights_above
+
+# fine: slices and cells of a side, their size m, the lowest slice's bottom m
+SLICES, SIDE, CELL, BOTTOM = 28, 24, 0.1, -0.5
+# range view: channels; as stored cells of a margin to each side, so that it can be moved and scaled
+RANGE_CHANNELS, _MARGIN, _FAR = 4, 3, 4.0
+# context: channels, cells of a side, their size m, what height is 1
+CONTEXT_CHANNELS, CONTEXT_SIDE, CONTEXT_CELL, _TALL = 4, 20, 0.5, 4.0
+# points of a candidate lie within this, and so far above and below the slices, m
+RADIUS, _ROOM = 1.75, 0.2
+# the most that are kept, and the unit they are kept in, m
+_MOST_POINTS, _UNIT = 1000, 5e-4
+# points lie sorted by cells of this size, m, in tables of at most so many cells
+_INDEX_CELL, _MOST_INDEX_CELLS = 0.5, 4_000_000
+# the finest cells of the range image, rad, and how many coarser levels there are, each of twice the size
+_ANGLE, _LEVELS = pi / 1024, 5
+_LEAST_DISTANCE = 0.5
+# heights above the ground: of the slices whose filling is counted, and what is near the ground, m
+_BAND, _BAND_SLICES, _NEAR_GROUND = (0.3, 2.1), 6, 0.2
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Candidate:
+    """A place where a person may stand, ready to be drawn: small, so that many can be kept.
+
+    center (3,) m, level frame: x, y, and z of the ground; yaw rad of the view frame's x; distance m from the sensor
+    and its height m above the ground there, None if unknown; count: points within `RADIUS` at a person's heights, of
+    which `packed` (n, 3) int16 holds up to 1000 in units of 0.5 mm; range_view (4, 34, 30) and context (4, 20, 20)
+    uint8: as drawn, before augmentation.
+    """
+
+    center: np.ndarray
+    yaw: float
+    distance: float | None
+    sensor_height: float | None
+    count: int
+    packed: np.ndarray
+    range_view: np.ndarray
+    context: np.ndarray
+
+    @property
+    def points(self) -> np.ndarray:
+        """Points (n, 3) float32 m in the view frame."""
+        return self.packed * np.float32(_UNIT)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Augmentation:
+    """How a candidate is changed in training. Of points in the view frame, in this order: mirror, turn, scale, shift.
+
+    turn rad about z; mirror: y to -y; scale; shift (2,) m; keep: share of points; noise m: standard deviation along
+    x, away from the sensor; drop_origin: as if the sensor was unknown; seed of what is drawn for each point.
+    """
+
+    turn: float = 0.0
+    mirror: bool = False
+    scale: float = 1.0
+    shift: tuple[float, float] = (0.0, 0.0)
+    keep: float = 1.0
+    noise: float = 0.0
+    drop_origin: bool = False
+    seed: int = 0
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """points (n, 2) or (n, 3) m mirrored, turned, scaled and shifted."""
+        moved = np.array(points, float)
+        moved[:, :2] = moved[:, :2] @ self._matrix().T + self.shift
+        moved[:, 2:] *= self.scale
+        return moved
+
+    def _matrix(self) -> np.ndarray:
+        """(2, 2) of x and y."""
+        c, s = self.scale * np.cos(self.turn), self.scale * np.sin(self.turn)
+        return np.array([[c, -s], [s, c]]) * [1, -1 if self.mirror else 1]
+
+
+def draw_augmentation(rng: np.random.Generator, *, drop_origin: float = 0.15) -> Augmentation:
+    """A random augmentation; in a share `drop_origin` the sensor is dropped, and the turn is any instead of small."""
+    is_dropped = bool(rng.random() < drop_origin)
+    return Augmentation(
+        turn=float(rng.uniform(-pi, pi) if is_dropped else rng.normal(0, 0.1)),
+        mirror=bool(rng.random() < 0.5),
+        scale=float(rng.uniform(0.92, 1.08)),
+        shift=tuple(rng.uniform(-0.1, 0.1, 2).tolist()),
+        keep=float(rng.uniform(0.25, 1.0) if rng.random() < 0.6 else 1.0),
+        noise=float(rng.uniform(0, 0.025)),
+        drop_origin=is_dropped,
+        seed=int(rng.integers(2**63)),
+    )
+
+
+class SceneIndex:
+    """A scan prepared once, from which candidates are cut.
+
+    Args:
+        points: (n, 3) m, z up.
+        ground: under them.
+        origin: (3,) m, the sensor, or None where it is unknown.
+        heights: (n,) m of the points above the ground, where they are known.
+    """
+
+    def __init__(
+        self, points: np.ndarray, ground: Ground, origin: np.ndarray | None, *, heights: np.ndarray | None = None
+    ):
+        points = np.asarray(points)
+        if heights is None:
+            heights = heights_above(points, ground)
+        self.origin = None if origin is None else np.asarray(origin, float)
+        self._corner = np.floor(points[:, :2].min(0)) if len(points) else np.zeros(2)
+        extent = np.floor(points[:, :2].max(0)) - self._corner + 1 if len(points) else np.ones(2)
+        # a wide map has larger cells instead of a larger table
+        self._cell = max(_INDEX_CELL, float(np.sqrt(extent.prod() / _MOST_INDEX_CELLS)))
+        self._shape = tuple(int(n) for n in extent // self._cell + 2)
+        cells = ((points[:, :2] - self._corner) * (1 / self._cell)).astype(np.int32)
+        flat = cells[:, 0] * self._shape[1] + cells[:, 1]
+        self._order = np.argsort(flat)
+        self._start = np.zeros(self._shape[0] * self._shape[1] + 1, np.int64)
+        np.cumsum(np.bincount(flat, minlength=len(self._start) - 1), out=self._start[1:])
+        # relative to the corner, float32 holds millimeters of the widest map
+        self._points = (points[self._order] - [*self._corner, 0.0]).astype(np.float32)
+        self._maps = _draw_maps(flat[self._order], heights[self._order], self._shape)
+        self._image = None if self.origin is None else _RangeImage(points - self.origin)
+
+    def rows(self, centers: np.ndarray, radius: float = 0.35) -> list[np.ndarray]:
+        """Of each of centers (K, 2 or 3) m the rows of the scan's points within `radius` m of its axis."""
+        if not len(centers):
+            return []
+        owner, near = self._near(np.asarray(centers)[:, :2], radius)
+        rows = self._order[near]
+        return np.split(rows, np.searchsorted(owner, np.arange(1, len(centers))))
+
+    def candidates(self, centers: np.ndarray) -> list[Candidate]:
+        """The candidates at centers (K, 3) m: x, y, and z of the ground there."""
+        centers = np.asarray(centers, float)
+        if not len(centers):
+            return []
+        yaw = distance = np.zeros(len(centers))
+        if self.origin is not None:
+            away = centers[:, :2] - self.origin[:2]
+            yaw, distance = np.arctan2(away[:, 1], away[:, 0]), np.maximum(np.hypot(*away.T), _LEAST_DISTANCE)
+        owner, near = self._near(centers[:, :2], RADIUS)
+        height = self._points[near, 2] - centers[owner, 2].astype(np.float32)
+        is_near = (height > BOTTOM - _ROOM) & (height < BOTTOM + SLICES * CELL + _ROOM)
+        owner, near = owner[is_near], near[is_near]
+        count = np.bincount(owner, minlength=len(centers))
+        # every so manieth of a place that has too many, in an order that is no pattern of the scan's
+        number = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
+        share = np.minimum(1.0, _MOST_POINTS / np.maximum(count, 1))[owner]
+        chosen = np.floor((number + 1) * share) > np.floor(number * share)
+        owner, near = owner[chosen], near[chosen]
+        middle = centers - [*self._corner, 0.0]
+        local = self._points[near] - middle[owner].astype(np.float32)
+        c, s = np.cos(yaw).astype(np.float32)[owner], np.sin(yaw).astype(np.float32)[owner]
+        x, y = local[:, 0] * c + local[:, 1] * s, local[:, 1] * c - local[:, 0] * s
+        local[:, 0], local[:, 1] = x, y
+        packed = np.rint(local * np.float32(1 / _UNIT)).astype(np.int16)
+        ends = np.cumsum(np.bincount(owner, minlength=len(centers)))
+        context = self._context(centers, yaw)
+        ranges = np.zeros((len(centers), RANGE_CHANNELS, SLICES + 2 * _MARGIN, SIDE + 2 * _MARGIN), np.uint8)
+        if self._image is not None and self.origin is not None:
+            ranges = self._image.views(centers - self.origin, yaw, distance)
+        return [
+            Candidate(
+                center=centers[k],
+                yaw=float(yaw[k]),
+                distance=None if self.origin is None else float(distance[k]),
+                sensor_height=None if self.origin is None else float(self.origin[2] - centers[k, 2]),
+                count=int(count[k]),
+                packed=packed[ends[k - 1] if k else 0 : ends[k]].copy(),
+                range_view=ranges[k],
+                context=context[k],
+            )
+            for k in range(len(centers))
+        ]
+
+    def _near(self, xy: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """(owner (m,), sorted row (m,)) of all points within `radius` of the places (K, 2) m, by place."""
+        place = xy - self._corner
+        low = np.floor((place - radius) / self._cell).astype(np.int64)
+        high = np.floor((place + radius) / self._cell).astype(np.int64)
+        low, high = np.maximum(low, 0), np.minimum(high, np.array(self._shape) - 1)
+        # a run of cells for each row of the square: its points lie one after the other
+        lines = np.maximum(high[:, 0] - low[:, 0] + 1, 0)
+        lines[(high < low).any(1)] = 0
+        owner = np.repeat(np.arange(len(xy)), lines)
+        line = np.arange(len(owner)) - np.repeat(np.cumsum(lines) - lines, lines)
+        base = (low[owner, 0] + line) * self._shape[1]
+        start, end = self._start[base + low[owner, 1]], self._start[base + high[owner, 1] + 1]
+        size = end - start
+        row = np.arange(size.sum()) + np.repeat(start - (np.cumsum(size) - size), size)
+        owner = np.repeat(owner, size)
+        place = place.astype(np.float32)
+        away = self._points[row, :2] - place[owner]
+        inside = away[:, 0] ** 2 + away[:, 1] ** 2 < np.float32(radius**2)
+        return owner[inside], row[inside]
+
+    def _context(self, centers: np.ndarray, yaw: np.ndarray) -> np.ndarray:
+        """Contexts (K, 4, 20, 20) uint8, nearest cells of the maps."""
+        side = (np.arange(CONTEXT_SIDE) - (CONTEXT_SIDE - 1) / 2) * CONTEXT_CELL
+        x, y = np.repeat(side, CONTEXT_SIDE), np.tile(side, CONTEXT_SIDE)
+        c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+        place = centers[:, :2] - self._corner
+        i = np.floor((place[:, :1] + c * x - s * y) / self._cell).astype(np.int64)
+        j = np.floor((place[:, 1:] + s * x + c * y) / self._cell).astype(np.int64)
+        inside = (i >= 0) & (j >= 0) & (i < self._shape[0]) & (j < self._shape[1])
+        values = self._maps[np.where(inside, i * self._shape[1] + j, 0)] * inside[..., None]
+        return np.moveaxis(values, -1, 1).reshape(-1, CONTEXT_CHANNELS, CONTEXT_SIDE, CONTEXT_SIDE).astype(np.uint8)
+
+
+def _draw_maps(cells: np.ndarray, heights: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """The context's channels (cells, 4) uint8 of points sorted by their flat cells (n,), heights (n,) m."""
+    size = shape[0] * shape[1]
+    maps = np.zeros((size, CONTEXT_CHANNELS), np.uint8)
+    if not len(cells):
+        return maps
+    first = np.flatnonzero(np.concatenate([[True], cells[1:] != cells[:-1]]))
+    occupied = cells[first]
+    highest = np.maximum.reduceat(heights, first)
+    maps[occupied, 0] = np.clip(highest * (255 / _TALL), 0, 255)
+    in_band = (heights > _BAND[0]) & (heights < _BAND[1])
+    level = ((heights[in_band] - _BAND[0]) * (_BAND_SLICES / (_BAND[1] - _BAND[0]))).astype(np.uint8)
+    filled = np.zeros(len(cells), np.uint8)
+    filled[in_band] = np.left_shift(np.uint8(1), np.minimum(level, _BAND_SLICES - 1))
+    bits = np.bitwise_or.reduceat(filled, first)
+    maps[occupied, 1] = np.unpackbits(bits[:, None], axis=1).sum(1) * (255 / _BAND_SLICES)
+    maps[occupied, 2] = _log_bytes(np.diff(np.append(first, len(cells))))
+    maps[occupied, 3] = _log_bytes(np.add.reduceat((np.abs(heights) < _NEAR_GROUND).astype(np.int64), first))
+    return maps
+
+
+def _log_bytes(count: np.ndarray) -> np.ndarray:
+    """.125 log2(1 + count) as bytes, 255 for 1."""
+    return np.minimum(np.log2(1.0 + count) * (0.125 * 255), 255).astype(np.uint8)
+
+
+class _RangeImage:
+    """Nearest and farthest range and number of returns by direction, in levels of ever coarser cells."""
+
+    def __init__(self, points: np.ndarray):
+        """points (n, 3) m from the sensor."""
+        x, y, z = np.asarray(points, np.float32).T
+        level = np.hypot(x, y)
+        azimuth = ((np.arctan2(y, x) + np.float32(pi)) * np.float32(1 / _ANGLE)).astype(np.int32)
+        elevation = np.arctan2(z, np.maximum(level, 1e-6))
+        row = ((elevation + np.float32(pi / 2)) * np.float32(1 / _ANGLE)).astype(np.int32)
+        rows, columns = round(pi / _ANGLE), round(2 * pi / _ANGLE)
+        flat = np.minimum(row, rows - 1) * columns + np.minimum(azimuth, columns - 1)
+        order = np.argsort(flat)
+        flat, ranges = flat[order], level[order]
+        near = np.full((rows, columns), np.inf, np.float32)
+        far = np.zeros((rows, columns), np.float32)
+        count = np.bincount(flat, minlength=rows * columns).astype(np.float32).reshape(rows, columns)
+        if len(flat):
+            first = np.flatnonzero(np.concatenate([[True], flat[1:] != flat[:-1]]))
+            near.ravel()[flat[first]] = np.minimum.reduceat(ranges, first)
+            far.ravel()[flat[first]] = np.maximum.reduceat(ranges, first)
+        # each level: (near, far, count)
+        self.levels = [(near, far, count)]
+        for _ in range(_LEVELS):
+            near, far, count = _halved(near, np.minimum), _halved(far, np.maximum), _halved(count, np.add)
+            self.levels.append((near, far, count))
+
+    def views(self, centers: np.ndarray, yaw: np.ndarray, distance: np.ndarray) -> np.ndarray:
+        """Pictures (K, 4, 34, 30) uint8 of centers (K, 3) m from the sensor; see `Candidate`."""
+        rows, columns = SLICES + 2 * _MARGIN, SIDE + 2 * _MARGIN
+        height = (np.arange(rows) - _MARGIN + 0.5) * CELL + BOTTOM
+        lateral = (np.arange(columns) - _MARGIN + 0.5) * CELL - SIDE * CELL / 2
+        azimuth = yaw[:, None] + np.arctan2(lateral, distance[:, None])
+        slant = np.hypot(lateral, distance[:, None])
+        elevation = np.arctan2((centers[:, 2:] + height)[:, :, None], slant[:, None, :])
+        azimuth = np.broadcast_to(azimuth[:, None], elevation.shape)
+        # cells as large as the picture's, or the next smaller ones
+        level = np.clip(np.floor(np.log2(CELL / distance / _ANGLE) + 0.5), 0, _LEVELS - 1).astype(np.int64)
+        views = np.zeros((len(centers), RANGE_CHANNELS, rows, columns), np.uint8)
+        for number in np.unique(level):
+            own = np.flatnonzero(level == number)
+            near, far, count = self._at(number, azimuth[own], elevation[own])
+            around = self._at(number + 1, azimuth[own], elevation[own])[2]
+            middle = slant[own][:, None]
+            views[own, 0] = np.where(count > 0, _range_bytes(near - middle), 0)
+            views[own, 1] = np.where(count > 0, _range_bytes(far - middle), 0)
+            views[own, 2], views[own, 3] = _log_bytes(count), _log_bytes(around)
+        return views
+
+    def _at(self, level: int, azimuth: np.ndarray, elevation: np.ndarray) -> list[np.ndarray]:
+        size = _ANGLE * 2**level
+        images = self.levels[level]
+        rows, columns = images[0].shape
+        i = np.minimum(((elevation + pi / 2) / size).astype(np.int64), rows - 1)
+        j = np.minimum((((azimuth + pi) % (2 * pi)) / size).astype(np.int64), columns - 1)
+        flat = i * columns + j
+        return [image.ravel()[flat] for image in images]
+
+
+def _halved(image: np.ndarray, reduce: np.ufunc) -> np.ndarray:
+    """An image of half the size: four cells become one."""
+    image = reduce(image[::2], image[1::2])
+    return reduce(image[:, ::2], image[:, 1::2])
+
+
+def _range_bytes(meters: np.ndarray) -> np.ndarray:
+    """-4 to 4 m as 1 to 255; 0 is nothing."""
+    return np.clip(meters * (127 / _FAR) + 128, 1, 255).astype(np.uint8)
+
+
+def render(
+    candidates: Sequence[Candidate], augmentations: Sequence[Augmentation] | None = None
+) -> dict[str, np.ndarray]:
+    """The network's inputs, float32: see the module. augmentations: one for each candidate, or None for none."""
+    known = np.array([c.distance is not None for c in candidates], bool)
+    if augmentations is not None:
+        known &= ~np.array([a.drop_origin for a in augmentations], bool)
+    points, owner, count = _moved_points(candidates, augmentations)
+    with_origin = known.astype(np.float32)
+    scalars = np.zeros((len(candidates), 4), np.float32)
+    scalars[:, 0] = with_origin * np.log([1.0 if c.distance is None else c.distance for c in candidates])
+    scalars[:, 1] = with_origin * [(c.sensor_height or 0.0) / 4 for c in candidates]
+    scalars[:, 2] = np.log1p(count)
+    scalars[:, 3] = with_origin
+    return {
+        "fine": _fine(points, owner, candidates),
+        "range_view": _range_views(candidates, known, augmentations),
+        "context": _contexts(candidates, augmentations),
+        "scalars": scalars,
+    }
+
+
+def _moved_points(
+    candidates: Sequence[Candidate], changes: Sequence[Augmentation] | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(points (n, 3) float32 m, owner (n,), counts (K,) of all points within `RADIUS`)."""
+    sizes = np.array([len(c.packed) for c in candidates], np.int64)
+    count = np.array([c.count for c in candidates], float)
+    points = np.concatenate([np.zeros((0, 3), np.int16), *(c.packed for c in candidates)]) * np.float32(_UNIT)
+    owner = np.repeat(np.arange(len(candidates)), sizes)
+    if changes is None:
+        return points, owner, count
+    draws = []
+    for size, change in zip(sizes.tolist(), changes, strict=True):
+        rng = np.random.default_rng(change.seed)
+        draws.append(np.stack([rng.random(size, np.float32), rng.standard_normal(size, np.float32) * change.noise]))
+    chance, noise = np.concatenate([np.zeros((2, 0), np.float32), *draws], axis=1)
+    kept = chance < np.array([a.keep for a in changes], np.float32)[owner]
+    points, owner, noise = points[kept], owner[kept], noise[kept]
+    points[:, 0] += noise
+    matrix = np.array([a._matrix() for a in changes], np.float32).reshape(-1, 2, 2)[owner]
+    shift = np.array([a.shift for a in changes], np.float32).reshape(-1, 2)[owner]
+    x, y = (matrix[:, i, 0] * points[:, 0] + matrix[:, i, 1] * points[:, 1] + shift[:, i] for i in (0, 1))
+    z = points[:, 2] * np.array([a.scale for a in changes], np.float32)[owner]
+    return np.stack([x, y, z], 1), owner, count * [a.keep for a in changes]
+
+
+def _fine(points: np.ndarray, owner: np.ndarray, candidates: Sequence[Candidate]) -> np.ndarray:
+    scaled = points * np.float32(1 / CELL)
+    i = np.floor(scaled[:, 2] - BOTTOM / CELL).astype(np.int64)
+    j, k = (np.floor(scaled[:, axis]).astype(np.int64) + SIDE // 2 for axis in (0, 1))
+    inside = (i >= 0) & (i < SLICES) & (j >= 0) & (j < SIDE) & (k >= 0) & (k < SIDE)
+    flat = (((owner * SLICES + i) * SIDE + j) * SIDE + k)[inside]
+    cells, number = np.unique(flat, return_counts=True)
+    # of a place with more points than are kept, those stand for all
+    weight = np.array([c.count / max(len(c.packed), 1) for c in candidates])
+    fine = np.zeros((len(candidates), SLICES, SIDE, SIDE), np.float32)
+    owner_of_cell = cells // (SLICES * SIDE * SIDE)
+    fine.ravel()[cells] = 0.5 + 0.125 * np.log2(1 + number * weight[owner_of_cell])
+    return fine
+
+
+def _range_views(
+    candidates: Sequence[Candidate], known: np.ndarray, changes: Sequence[Augmentation] | None
+) -> np.ndarray:
+    views = np.zeros((len(candidates), RANGE_CHANNELS, SLICES, SIDE), np.float32)
+    if not known.any():
+        return views
+    rows = np.flatnonzero(known).tolist()
+    stored = np.stack([candidates[k].range_view for k in rows])
+    inner = np.s_[_MARGIN:-_MARGIN]
+    if changes is None:
+        stored = stored[:, :, inner, inner]
+    else:
+        chosen = [changes[k] for k in rows]
+        scale = np.array([a.scale for a in chosen])[:, None]
+        sign = np.array([-1.0 if a.mirror else 1.0 for a in chosen])[:, None]
+        shift = np.array([a.shift[1] for a in chosen])[:, None]
+        height = ((np.arange(SLICES) + 0.5) * CELL + BOTTOM) / scale
+        lateral = sign * (((np.arange(SIDE) + 0.5) * CELL - SIDE * CELL / 2) - shift) / scale
+        i = np.floor((height - BOTTOM) / CELL).astype(np.int64) + _MARGIN
+        j = np.floor((lateral + SIDE * CELL / 2) / CELL).astype(np.int64) + _MARGIN
+        i, j = np.clip(i, 0, stored.shape[2] - 1), np.clip(j, 0, stored.shape[3] - 1)
+        stored = stored[np.arange(len(stored))[:, None, None], :, i[:, :, None], j[:, None, :]]
+        stored = np.moveaxis(stored, -1, 1)
+        stored = _lost(stored, chosen)
+    tables = np.arange(256, dtype=np.float32)
+    ranges, logs = np.where(tables > 0, (tables - 128) / 127, 0), tables / 255
+    drawn = np.empty(stored.shape, np.float32)
+    drawn[:, :2], drawn[:, 2:] = ranges[stored[:, :2]], logs[stored[:, 2:]]
+    views[known] = drawn
+    return views
+
+
+def _lost(stored: np.ndarray, changes: Sequence[Augmentation]) -> np.ndarray:
+    """Range views of which only a share of the returns is kept: a cell is empty where all of its returns are lost."""
+    keep = np.array([a.keep for a in changes])[:, None, None]
+    count = np.exp2(stored[:, 2] / (0.125 * 255)) - 1
+    chance = np.stack([np.random.default_rng([a.seed, 1]).random(stored.shape[2:], np.float32) for a in changes])
+    stays = chance >= (1 - keep) ** count
+    stored[:, :3] *= stays[:, None]
+    fewer = np.log2(keep) * (0.125 * 255)
+    stored[:, 2:] = np.where(stored[:, 2:] > 0, np.maximum(stored[:, 2:] + fewer[:, None], 1), 0)
+    return stored
+
+
+def _contexts(candidates: Sequence[Candidate], changes: Sequence[Augmentation] | None) -> np.ndarray:
+    stored = np.stack([c.context for c in candidates]) if candidates else np.zeros((0, 4, 20, 20), np.uint8)
+    if changes is not None and len(stored):
+        side = (np.arange(CONTEXT_SIDE) - (CONTEXT_SIDE - 1) / 2) * CONTEXT_CELL
+        to = np.stack(np.meshgrid(side, side, indexing="ij"), -1).reshape(-1, 2)
+        inverse = np.linalg.inv(np.array([a._matrix() for a in changes]))
+        shift = np.array([a.shift for a in changes])[:, None]
+        source = (to - shift) @ np.swapaxes(inverse, 1, 2)
+        i, j = np.moveaxis(np.floor(source / CONTEXT_CELL).astype(np.int64) + CONTEXT_SIDE // 2, -1, 0)
+        i, j = np.clip(i, 0, CONTEXT_SIDE - 1), np.clip(j, 0, CONTEXT_SIDE - 1)
+        stored = np.moveaxis(stored[np.arange(len(stored))[:, None], :, i, j], -1, 1)
+        stored = stored.reshape(-1, CONTEXT_CHANNELS, CONTEXT_SIDE, CONTEXT_SIDE)
+    return stored * np.float32(1 / 255)
+
+
+def suppress(rows: Sequence[np.ndarray], strength: np.ndarray, *, most_shared: float = 0.5) -> np.ndarray:
+    """Indices of the candidates that stay, the strongest first, where of two that share points the weaker goes.
+
+    rows: of each candidate (K) the rows of its points; strength (K,). A candidate goes that shares more than
+    `most_shared` of the points of the one of the two that has fewer, with a stronger one that stays. Two people side by
+    side share few points however near they stand. A candidate without points shares none.
+    """
+    order = np.argsort(-np.asarray(strength), kind="stable")
+    owners: dict[int, list[int]] = {}
+    kept = []
+    for k in order.tolist():
+        own = rows[k].tolist()
+        shared: dict[int, int] = {}
+        for row in own:
+            for other in owners.get(row, ()):
+                shared[other] = shared.get(other, 0) + 1
+        if any(count > most_shared * min(len(own), len(rows[other])) for other, count in shared.items()):
+            continue
+        kept.append(k)
+        for row in own:
+            owners.setdefault(row, []).append(k)
+    return np.array(kept, np.int64)

@@ -1,0 +1,355 @@
+"""Finding people: the ground under a scan, places where somebody may stand, and what the network sees there."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from lidarpose.geometry import rotation_about
+from lidarpose.models.detector.candidates import (
+    Augmentation,
+    SceneIndex,
+    draw_augmentation,
+    render,
+    suppress,
+)
+from lidarpose.models.detector.ground import estimate_ground, estimate_up, without_ground
+from lidarpose.models.detector.proposals import heights_above, propose
+from lidarpose.synth.street import street
+from tests.reference.detector_reference import (
+    context_reference,
+    fine_reference,
+    range_reference,
+    suppress_reference,
+)
+
+ORIGIN = np.zeros(3)
+
+
+def plane(*, slope=(0.0, 0.0), height=-1.8, reach=20.0, step=0.25, noise=0.02, seed=0):
+    """Points of a sloping plane around the sensor."""
+    side = np.arange(-reach, reach, step)
+    x, y = (values.ravel() for values in np.meshgrid(side, side))
+    rng = np.random.default_rng(seed)
+    return np.stack([x, y, height + slope[0] * x + slope[1] * y + rng.normal(0, noise, len(x))], 1)
+
+
+def column(x, y, *, ground=-1.8, height=1.75, count=150, radius=0.2, seed=1):
+    """Points of an upright cylinder with a narrow head, as a person's."""
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(0, 2 * np.pi, count)
+    z = ground + rng.uniform(0.02, height, count)
+    radius = np.where(z > ground + height - 0.25, radius / 2, radius)
+    return np.stack([x + radius * np.cos(angle), y + radius * np.sin(angle), z], 1)
+
+
+def box(low, high, *, count=2000, seed=2):
+    """Points on the sides and the top of an upright box."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(low, high, (count, 3))
+    axis = rng.choice([0, 1, 2], count)
+    points[np.arange(count), axis] = np.where(
+        (axis == 2) | (rng.random(count) < 0.5), np.array(high)[axis], np.array(low)[axis]
+    )
+    return points
+
+
+def nearest(centers, x, y):
+    return np.hypot(centers[:, 0] - x, centers[:, 1] - y).min(initial=np.inf)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    frame = street(5, 0, sensor="hdl-32e", people=(8, 12)).frames[0]
+    # rays of even angles lie on the borders of cells
+    points = frame.points + np.random.default_rng(0).normal(0, 0.01, frame.points.shape)
+    return frame, points, estimate_ground(points, ORIGIN)
+
+
+# --- ground
+
+
+@pytest.mark.parametrize("height", [-0.3, -1.8, -6.0])
+@pytest.mark.parametrize("slope", [(0.0, 0.0), (0.12, -0.05), (0.0, 0.25)])
+def test_a_plane_is_its_own_ground_whatever_stands_on_it(height, slope):
+    points = plane(slope=slope, height=height)
+    on_it = [
+        box([4, -1, height + 8 * slope[0]], [8, 1, height + 1.5 + 8 * slope[0]]),
+        column(-6, 2, ground=height - 6 * slope[0] + 2 * slope[1]),
+    ]
+    ghosts = np.array([[3.0, 9, height - 4], [3.1, 9, height - 4.02]])
+    ground = estimate_ground(np.concatenate([points, *on_it, ghosts]), ORIGIN)
+    at = np.array([[0.0, 0], [6, 0], [-6, 2], [3, 9], [-15, -15]])
+    assert np.abs(ground.at(at) - (height + at @ slope)).max() < 0.2
+
+
+def test_the_ground_goes_on_where_nothing_was_seen():
+    points = plane(slope=(0.05, 0.0))
+    away = np.hypot(points[:, 0], points[:, 1])
+    ring = points[(away > 7) & (away < 15)]
+    hood = box([0.5, -0.8, -1.0], [2.2, 0.8, -0.8])
+    ground = estimate_ground(np.concatenate([ring, hood]), ORIGIN)
+    at = np.array([[0.0, 0], [1.5, 0], [3, 3]])
+    assert np.abs(ground.at(at) - (-1.8 + 0.05 * at[:, 0])).max() < 0.15
+    # outside as at the border
+    np.testing.assert_allclose(ground.at(np.array([[1000.0, 0]])), ground.at(np.array([[500.0, 0]])))
+
+
+def test_indoors_the_floor_is_the_ground():
+    floor = plane(reach=4, height=-1.1, step=0.1)
+    things = [
+        plane(reach=4, height=1.5, step=0.1),
+        box([0, 0, -0.4], [1.6, 0.8, -0.35]),
+        box([-3, 1, -1.1], [-1, 2, -0.6]),
+    ]
+    hidden = (floor[:, 0] > 0) & (floor[:, 0] < 1.6) & (floor[:, 1] > 0) & (floor[:, 1] < 0.8)
+    ground = estimate_ground(np.concatenate([floor[~hidden], *things]), ORIGIN)
+    assert np.abs(ground.at(np.array([[0.8, 0.4], [-2, 1.5], [0, -2]])) + 1.1).max() < 0.12
+
+
+def test_where_there_is_no_ground_there_is_none():
+    rng = np.random.default_rng(0)
+    assert estimate_ground(np.zeros((0, 3)), ORIGIN) is None
+    assert estimate_ground(rng.uniform(-10, 10, (1, 3)), ORIGIN) is None
+    assert estimate_ground(rng.uniform(-15, 15, (4000, 3)), None) is None
+    cloud = column(3, 0)
+    stand_in = without_ground(cloud)
+    assert np.abs(stand_in.at(cloud[:, :2]) + 1.8).max() < 0.15
+    assert without_ground(np.zeros((0, 3))).at(np.zeros((2, 2))).tolist() == [0, 0]
+
+
+def test_ground_moves_with_the_points(scene):
+    _, points, ground = scene
+    shift = np.array([7.0, -3.0, 2.0])
+    moved = estimate_ground(points + shift, ORIGIN + shift)
+    xy = points[::50, :2]
+    np.testing.assert_allclose(moved.at(xy + shift[:2]), ground.at(xy) + 2, atol=0.02)
+    R = rotation_about("z", np.pi / 2)
+    turned = estimate_ground(points @ R.T, ORIGIN)
+    assert np.median(np.abs(turned.at(xy @ R[:2, :2].T) - ground.at(xy))) < 0.02
+
+
+@pytest.mark.parametrize("degrees", [0, 6, 18, 30])
+def test_a_tilted_cloud_is_told_from_a_level_one(scene, degrees):
+    points = scene[1]
+    R = rotation_about("y", np.radians(degrees)) @ rotation_about("z", 0.7)
+    up = estimate_up(points @ R.T, ORIGIN)
+    if degrees < 10:
+        assert up is None
+    else:
+        assert np.degrees(np.arccos(up @ R[:, 2])) < 2
+
+
+def test_up_of_nothing_is_unknown():
+    assert estimate_up(np.zeros((0, 3)), ORIGIN) is None
+
+
+# --- proposals
+
+
+def test_people_of_a_street_have_candidates(scene):
+    frame, points, ground = scene
+    centers = propose(points, ground)
+    counts = np.bincount(frame.person[frame.person >= 0], minlength=len(frame.boxes))
+    seen = [box for box, count in zip(frame.boxes, counts, strict=True) if count >= 10]
+    assert len(seen) >= 4
+    assert all(nearest(centers, *box.center[:2]) < 0.5 for box in seen)
+    np.testing.assert_allclose(centers[:, 2], ground.at(centers[:, :2]))
+
+
+@pytest.mark.parametrize(
+    ("points", "places"),
+    [
+        ([column(5, 0), column(5, 0.5, seed=3)], [(5, 0), (5, 0.5)]),
+        ([column(5, 0), box([5.35, -4, -1.8], [5.6, 4, 1.5], count=6000)], [(5, 0)]),
+        ([column(5, 0, height=0.95, count=40)], [(5, 0)]),
+        ([column(9, 1, height=1.3, radius=0.3, count=30)], [(9, 1)]),
+        ([column(9, 1, count=7)], [(9, 1)]),
+        # a head that looks over a hedge
+        ([column(9, 1, ground=-0.4, height=0.25, count=15, radius=0.1)], [(9, 1)]),
+    ],
+    ids=["pair", "wall", "child", "sitting", "few", "head"],
+)
+def test_candidates_stand_where_people_do(points, places):
+    points = np.concatenate([plane(), *points])
+    centers = propose(points, estimate_ground(points, ORIGIN))
+    assert [nearest(centers, *place) < 0.25 for place in places] == [True] * len(places)
+
+
+def test_bare_ground_and_nothing_have_no_candidates():
+    points = plane()
+    ground = estimate_ground(points, ORIGIN)
+    assert propose(points, ground).shape == (0, 3)
+    assert propose(np.zeros((0, 3)), ground).shape == (0, 3)
+
+
+def test_candidates_do_not_depend_on_the_order_of_points_and_move_with_them(scene):
+    _, points, ground = scene
+    centers = propose(points, ground)
+    order = np.random.default_rng(0).permutation(len(points))
+    np.testing.assert_array_equal(propose(points[order], ground), centers)
+    shift = np.array([30.0, -20.0, 0.0])
+    moved = propose(points + shift, estimate_ground(points + shift, shift))
+    # cells are cut at whole decimeters: rounding may move single points to the next
+    gaps = [nearest(moved - shift, *center[:2]) for center in centers]
+    assert np.mean(np.array(gaps) < 0.05) > 0.95
+    np.testing.assert_array_equal(propose(points, ground, limit=7), centers[:7])
+
+
+def test_a_map_wider_than_a_tile_has_the_candidates_of_its_parts():
+    near = np.concatenate([plane(), column(5, 0)])
+    # at a border of tiles, and far away
+    places = [(0, 0), (64 * 3 - 6, 0), (500, 300)]
+    points = np.concatenate([near + [x, y, 0] for x, y in places])
+    centers = propose(points, estimate_ground(points))
+    assert all(nearest(centers, x + 5, y) < 0.1 for x, y in places)
+    assert len(centers) == 3
+
+
+# --- candidates
+
+
+def test_candidates_see_what_the_words_say(scene):
+    _, points, ground = scene
+    origin = np.array([0.3, -0.2, 0.1])
+    heights = heights_above(points, ground)
+    centers = propose(points, ground)
+    chosen = SceneIndex(points, ground, origin).candidates(centers[::12])
+    inputs = render(chosen)
+    assert {name: array.shape[1:] for name, array in inputs.items()} == {
+        "fine": (28, 24, 24),
+        "range_view": (4, 28, 24),
+        "context": (4, 20, 20),
+        "scalars": (4,),
+    }
+    assert all(array.dtype == np.float32 for array in inputs.values())
+    for k, candidate in enumerate(chosen):
+        away = candidate.center - origin
+        assert candidate.distance == pytest.approx(np.hypot(*away[:2]))
+        R = rotation_about("z", -candidate.yaw)
+        np.testing.assert_allclose(R @ [away[0], away[1], 0], [candidate.distance, 0, 0], atol=1e-9)
+        local = (points - candidate.center) @ R.T
+        near = local[(np.hypot(*local[:, :2].T) < 1.75) & (np.abs(local[:, 2] - 0.9) < 1.6)]
+        if candidate.count <= 1000:
+            assert candidate.count == len(near)
+            # a point on the border of cells may fall to either side
+            assert np.mean(np.abs(fine_reference(near) - inputs["fine"][k]) > 1e-5) < 2e-4
+            assert inputs["fine"][k].any()
+        context = context_reference(points, heights, candidate.center, candidate.yaw)
+        assert np.mean(np.abs(context - inputs["context"][k]) > 0.005) < 0.01
+        seen = range_reference(points, origin, candidate)
+        drawn = inputs["range_view"][k, 2] > 0
+        # the tables' cells are up to 1.4 times smaller or larger than the picture's
+        grown = np.pad(seen, 1)
+        grown = np.stack([grown[i : i + 28, j : j + 24] for i in range(3) for j in range(3)]).any(0)
+        assert np.mean(grown[drawn]) > 0.97
+        assert drawn.sum() > 0.3 * seen.sum()
+        assert len(pickle.dumps(candidate)) < 12_500
+
+
+def test_a_wall_before_the_candidate_hides_and_one_behind_it_is_seen_past():
+    wall = np.stack(np.meshgrid(np.linspace(-3, 3, 400), np.linspace(-1.8, 2, 300)), -1).reshape(-1, 2)
+    person = column(8, 0, count=400)
+    for at, sign in ((5.0, -1), (10.0, 1)):
+        points = np.concatenate([plane(), np.concatenate([np.full((len(wall), 1), at), wall], 1), person])
+        ground = estimate_ground(points, ORIGIN)
+        view = render(SceneIndex(points, ground, ORIGIN).candidates(np.array([[8.0, 0, -1.8]])))["range_view"][0]
+        beside = view[:, 13:20, :6]
+        assert (beside[2] > 0).mean() > 0.8
+        distance = np.median(beside[0][beside[2] > 0]) * 4
+        assert distance == pytest.approx(at - 8, abs=0.5) and np.sign(distance) == sign
+
+
+def test_without_a_sensor_candidates_keep_the_level_frame(scene):
+    _, points, ground = scene
+    centers = propose(points, ground)[:5]
+    chosen = SceneIndex(points, ground, None).candidates(centers)
+    inputs = render(chosen)
+    assert not inputs["range_view"].any() and not inputs["scalars"][:, [0, 1, 3]].any()
+    assert all(c.yaw == 0 and c.distance is None for c in chosen)
+    # as with a sensor that is dropped
+    seen = SceneIndex(points, ground, ORIGIN).candidates(centers)
+    dropped = render(seen, [Augmentation(drop_origin=True, turn=c.yaw) for c in seen])
+    assert not dropped["range_view"].any() and not dropped["scalars"][:, [0, 1, 3]].any()
+    assert np.mean(np.abs(dropped["fine"] - inputs["fine"]) > 1e-5) < 1e-3
+
+
+def test_turning_the_scene_about_the_sensor_changes_nothing_that_the_network_sees(scene):
+    _, points, ground = scene
+    centers = propose(points, ground)
+    centers = centers[np.hypot(*centers[:, :2].T) > 8][:20]
+    R = rotation_about("z", np.pi / 2)
+    turned = render(SceneIndex(points @ R.T, estimate_ground(points @ R.T, ORIGIN), ORIGIN).candidates(centers @ R.T))
+    plain = render(SceneIndex(points, ground, ORIGIN).candidates(centers))
+    assert np.mean(np.abs(turned["fine"] - plain["fine"]) > 1e-5) < 1e-3
+    assert np.mean(np.abs(turned["range_view"] - plain["range_view"]) > 0.02) < 0.02
+    np.testing.assert_allclose(turned["scalars"], plain["scalars"], atol=0.02)
+
+
+def test_duplicate_points_only_add_to_counts(scene):
+    _, points, ground = scene
+    centers = propose(points, ground)
+    twice = np.repeat(points, 2, 0)
+    again = propose(twice, ground)
+    assert all(nearest(again, *center[:2]) < 0.35 for center in centers)
+    one, two = (render(SceneIndex(p, ground, ORIGIN).candidates(centers[-20:])) for p in (points, twice))
+    assert ((one["fine"] > 0) == (two["fine"] > 0)).mean() > 0.999
+
+
+def test_augmentation_moves_points_and_labels_alike():
+    rng = np.random.default_rng(4)
+    change = Augmentation(turn=0.3, mirror=True, scale=1.05, shift=(0.06, -0.04))
+    ball = rng.normal(0, 0.03, (300, 3)) + [0.4, 0.3, 1.0]
+    points = np.concatenate([plane(), ball + [6, 0, -1.8]])
+    chosen = SceneIndex(points, estimate_ground(points, ORIGIN), ORIGIN).candidates(np.array([[6.0, 0, -1.8]]))
+    fine = render(chosen, [change])["fine"][0]
+    high = fine[10:]
+    middle = (np.argwhere(high > 0) * high[high > 0][:, None]).sum(0) / high.sum()
+    expected = change.apply(np.array([[0.4, 0.3, 1.0]]))[0]
+    np.testing.assert_allclose((middle[1:] - 11.5) / 10, expected[:2], atol=0.04)
+    assert (middle[0] + 10.5) / 10 - 0.5 == pytest.approx(expected[2], abs=0.04)
+    # by hand: mirror, turn, scale, shift
+    x, y = 0.4, -0.3
+    x, y = np.cos(0.3) * x - np.sin(0.3) * y, np.sin(0.3) * x + np.cos(0.3) * y
+    np.testing.assert_allclose(expected, [1.05 * x + 0.06, 1.05 * y - 0.04, 1.05])
+
+
+def test_augmented_candidates_depend_on_their_own_augmentation_alone(scene):
+    _, points, ground = scene
+    chosen = SceneIndex(points, ground, ORIGIN).candidates(propose(points, ground)[:6])
+    changes = [draw_augmentation(np.random.default_rng([1, k])) for k in range(6)]
+    together = render(chosen, changes)
+    alone = render(chosen[3:4], changes[3:4])
+    for name, values in together.items():
+        np.testing.assert_allclose(values[3], alone[name][0], atol=1e-6)
+    unchanged = render(chosen, [Augmentation()] * 6)
+    for name, values in render(chosen).items():
+        np.testing.assert_allclose(unchanged[name], values, atol=0.005)
+    half = render(chosen, [Augmentation(keep=0.5, seed=k) for k in range(6)])
+    assert 0.3 < (half["fine"] > 0).sum() / (unchanged["fine"] > 0).sum() < 0.9
+
+
+def test_no_points_and_no_candidates_are_legal():
+    ground = estimate_ground(plane(), ORIGIN)
+    empty = SceneIndex(np.zeros((0, 3)), ground, ORIGIN)
+    assert empty.candidates(np.zeros((0, 3))) == [] and empty.rows(np.zeros((0, 2))) == []
+    assert render([])["fine"].shape == (0, 28, 24, 24)
+    alone = empty.candidates(np.array([[4.0, 1, -1.8]]))
+    assert alone[0].count == 0 and not render(alone)["fine"].any()
+    outside = SceneIndex(plane(), ground, ORIGIN).candidates(np.array([[400.0, 100, -1.8]]))
+    assert outside[0].count == 0 and not render(outside)["context"].any()
+
+
+def test_rows_are_those_of_the_column_and_suppression_is_by_shared_points(scene):
+    _, points, ground = scene
+    centers = propose(points, ground)
+    rows = SceneIndex(points, ground, ORIGIN).rows(centers)
+    for center, own in zip(centers[::10], rows[::10], strict=True):
+        near = np.hypot(*(points[:, :2] - center[:2]).T) < 0.35
+        assert len(np.setxor1d(own, np.flatnonzero(near))) <= 1
+    strength = np.random.default_rng(0).permutation(len(rows))
+    kept = suppress(rows, strength)
+    assert kept.tolist() == suppress_reference(rows, strength)
+    assert 0 < len(kept) < len(rows)
+    pair = [np.arange(10), np.arange(6, 20), np.arange(5), np.zeros(0, int)]
+    assert suppress(pair, np.array([3.0, 2, 1, 0])).tolist() == [0, 1, 3]
