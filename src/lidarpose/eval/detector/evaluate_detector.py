@@ -15,7 +15,6 @@ from lidarpose.errors import check_name
 from lidarpose.eval.detector.detection_pictures import draw_false, draw_missed
 from lidarpose.eval.detector.detection_scores import Detect, DetectorResult, score_detector
 from lidarpose.eval.detector.labeled_scans import ScanSet, heldout_scans, labeled_scans
-from lidarpose.inference.checks import rows_inside
 from lidarpose.inference.predictor import Predictor, load
 from lidarpose.io.files import atomic_path
 from lidarpose.sample import Box
@@ -60,18 +59,18 @@ def _scorer(detector, points: np.ndarray, origin: np.ndarray | None, *, max_rang
 
 
 def _baseline(predictor: Predictor | None, points: np.ndarray, origin: np.ndarray | None):
-    from lidarpose.models.detector.detector import suppress
-    from lidarpose.models.detector.ground import estimate_ground
+    from lidarpose.models.detector.candidates import SceneIndex, suppress
+    from lidarpose.models.detector.ground import estimate_ground, without_ground
     from lidarpose.models.detector.proposals import propose
 
-    centers = propose(points, estimate_ground(points, origin))
+    ground = estimate_ground(points, origin) or without_ground(points, origin)
+    centers = propose(points, ground)
     boxes = [Box(center=center + [0, 0, _CANDIDATE[2] / 2], size=_CANDIDATE) for center in centers]
     scores = 1 - np.arange(len(boxes)) / max(len(boxes), 1)
-    if predictor is None or not boxes:
-        return boxes, scores
-    poses = predictor.predict(points, boxes=boxes, sensor_origin="unknown" if origin is None else origin)
-    scores = np.array([np.exp(-person.spread.mean() / _SPREAD) if person.has_pose else 0.0 for person in poses])
-    kept = suppress(rows_inside(boxes, points), scores)
+    if predictor is not None and boxes:
+        poses = predictor.predict(points, boxes=boxes, sensor_origin="unknown" if origin is None else origin)
+        scores = np.array([np.exp(-person.spread.mean() / _SPREAD) if person.has_pose else 0.0 for person in poses])
+    kept = suppress(SceneIndex(points, ground, origin).rows(centers), scores)
     return [boxes[k] for k in kept], scores[kept]
 
 
