@@ -1,0 +1,215 @@
+"""Blocks of Point Transformer V3 as DAPT's released code has them: convolutions over voxels, patch attention, pooling.
+
+Legend: M voxels of all people at a level, one after the other, C channels, Q patches, K voxels a patch at most, H
+heads, D channels a head. Modules bear the names of the released weights. The legacy switch: see `dapt_net`.
+"""
+
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from lidarpose.models.dapt.voxel_tables import Level, Neighbors
+
+# of the released code's batch norms
+_EPS, _MOMENTUM = 1e-3, 0.01
+
+
+class RowNorm(nn.BatchNorm1d):
+    """Batch norm over rows (M, C); one row alone has no variance and is normed by the running statistics."""
+
+    def __init__(self, channels: int, eps: float = _EPS, momentum: float = _MOMENTUM):
+        super().__init__(channels, eps=eps, momentum=momentum)
+
+    def forward(self, rows: Tensor) -> Tensor:
+        if self.training and rows.shape[0] > 1:
+            return super().forward(rows)
+        return F.batch_norm(rows, self.running_mean, self.running_var, self.weight, self.bias, eps=self.eps)
+
+
+class DropPath(nn.Module):
+    """In training drops a branch of each row with a probability, and scales the others up to keep the mean."""
+
+    def __init__(self, probability: float):
+        super().__init__()
+        self.probability = probability
+
+    def forward(self, rows: Tensor) -> Tensor:
+        if not self.training or self.probability == 0:
+            return rows
+        keep = 1 - self.probability
+        return rows * (torch.rand_like(rows[:, :1]) < keep) / keep
+
+
+class SubmanifoldConvolution(nn.Module):
+    """A convolution that computes at occupied cells only and reads occupied cells only.
+
+    out[p] = sum over taps k of weight[:, k] @ rows[p + k - middle] + bias. weight (C', k, k, k, C) over x, y, z.
+    """
+
+    def __init__(self, channels: int, out_channels: int, kernel: int, *, bias: bool):
+        super().__init__()
+        self.weight = nn.Parameter(torch.empty(out_channels, kernel, kernel, kernel, channels))
+        self.bias = nn.Parameter(torch.zeros(out_channels)) if bias else None
+        bound = (kernel**3 * channels) ** -0.5
+        nn.init.uniform_(self.weight, -bound, bound)
+
+    def forward(self, rows: Tensor, near: Neighbors[Tensor]) -> Tensor:
+        """rows (M, C) -> (M, C')."""
+        # unbound once: slicing tap after tap would give each slice's gradient the size of the whole weight
+        weights = self.weight.flatten(1, 3).unbind(1)
+        out = F.linear(rows, weights[len(weights) // 2], self.bias)
+        if near.table is not None:
+            # the row after the last is zero: an empty cell; the table has none for the middle tap, done above
+            read = F.pad(rows, (0, 0, 0, 1))[near.table.flatten()].view(rows.shape[0], -1)
+            return out + F.linear(read, self.weight.flatten(1))
+        # all set where there is no table
+        all_sources, all_targets, pairs = cast("tuple[Tensor, Tensor, Tensor]", (near.source, near.target, near.counts))
+        counts = pairs.tolist()
+        for weight, source, target in zip(weights, all_sources.split(counts), all_targets.split(counts), strict=True):
+            if source.shape[0]:
+                out = out.index_add_(0, target, F.linear(rows.index_select(0, source), weight))
+        return out
+
+
+class PatchAttention(nn.Module):
+    """Attention among the voxels of a patch: full attention of a person who is no larger than the patch."""
+
+    def __init__(self, channels: int, heads: int):
+        super().__init__()
+        self.heads = heads
+        self.qkv = nn.Linear(channels, 3 * channels)
+        self.proj = nn.Linear(channels, channels)
+
+    def forward(self, rows: Tensor, level: Level[Tensor], order: int) -> Tensor:
+        """rows (M, C) -> (M, C), patches along the `order`-th curve."""
+        qkv = self.qkv(rows)
+        if level.patch_slots is not None:
+            order = order % level.patch_slots.shape[0]
+            blocks = qkv[level.patch_slots[order]].unflatten(-1, (3, self.heads, -1))
+            # set with the slots
+            place = cast("Tensor", level.patch_place)[order]
+            mixed = self._attend(blocks, level.patch_valid).flatten(0, 1)[place]
+            return self.proj(mixed)
+        sequence = level.sequence[order % level.sequence.shape[0]]
+        # one curve alone: rows already stand patch after patch
+        is_sorted = level.sequence.shape[0] == 1
+        qkv = (qkv if is_sorted else qkv[sequence]).unflatten(-1, (3, self.heads, -1))
+        lengths = level.patch_lengths.tolist()
+        if len(set(lengths)) == 1:
+            mixed = self._attend(qkv.unflatten(0, (len(lengths), -1)), None).flatten(0, 1)
+        else:
+            mixed = torch.cat([self._attend(patch[None], None)[0] for patch in qkv.split(lengths)])
+        return self.proj(mixed if is_sorted else torch.empty_like(mixed).index_copy(0, sequence, mixed))
+
+    @staticmethod
+    def _attend(qkv: Tensor, mask: Tensor | None) -> Tensor:
+        """qkv (Q, K, 3, H, D), mask (Q, K) True = to be read, None for all -> (Q, K, H * D)."""
+        query, key, value = qkv.permute(2, 0, 3, 1, 4)
+        mask = None if mask is None else mask[:, None, None]
+        mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=mask)
+        return mixed.transpose(1, 2).flatten(2)
+
+
+class Perceptron(nn.Module):
+    """Linear, GELU, Linear."""
+
+    def __init__(self, channels: int, hidden: int, out_channels: int):
+        super().__init__()
+        self.fc1 = nn.Linear(channels, hidden)
+        self.fc2 = nn.Linear(hidden, out_channels)
+
+    def forward(self, rows: Tensor) -> Tensor:
+        return self.fc2(F.gelu(self.fc1(rows)))
+
+
+class Block(nn.Module):
+    """Convolution as position encoding, attention and feed-forward, each a residual branch; pre-norm.
+
+    The released code loses the sum at a block's end: the next block's convolution reads the last branch alone. `legacy`
+    does the same.
+    """
+
+    def __init__(self, channels: int, heads: int, mlp_ratio: int, drop_path: float, order: int):
+        super().__init__()
+        self.order = order
+        self.cpe = nn.Sequential(
+            SubmanifoldConvolution(channels, channels, 3, bias=True),
+            nn.Linear(channels, channels),
+            nn.LayerNorm(channels),
+        )
+        self.norm1 = nn.Sequential(nn.LayerNorm(channels))
+        self.attn = PatchAttention(channels, heads)
+        self.norm2 = nn.Sequential(nn.LayerNorm(channels))
+        self.mlp = nn.Sequential(Perceptron(channels, mlp_ratio * channels, channels))
+        self.drop_path = DropPath(drop_path)
+
+    def forward(self, rows: Tensor, stale: Tensor, level: Level) -> tuple[Tensor, Tensor]:
+        """rows (M, C) and what the convolution reads (M, C): the rows, or the stale branch -> rows, last branch."""
+        convolution, mix, norm = self.cpe
+        rows = rows + norm(mix(convolution(stale, level.near)))
+        rows = rows + self.drop_path(self.attn(self.norm1(rows), level, self.order))
+        branch = self.drop_path(self.mlp(self.norm2(rows)))
+        return rows + branch, branch
+
+
+class Stage(nn.Module):
+    """The blocks of one level and the way to it: `down` from the finer level or `up` from the coarser one.
+
+    drops: `DropPath` of each block; finer: channels of the level to pool; coarser: channels of the level to unpool and
+    of the encoder's rows of this one.
+    """
+
+    def __init__(
+        self,
+        channels: int,
+        heads: int,
+        mlp_ratio: int,
+        drops: list[float],
+        *,
+        finer: int = 0,
+        coarser: tuple[int, int] | None = None,
+    ):
+        super().__init__()
+        self.depth = len(drops)
+        blocks = [Block(channels, heads, mlp_ratio, drop, order) for order, drop in enumerate(drops)]
+        if finer:
+            self.down = Pooling(finer, channels)
+        if coarser is not None:
+            self.up = Unpooling(*coarser, channels)
+        for k, block in enumerate(blocks):
+            self.add_module(f"block{k}", block)
+
+    def blocks(self, rows: Tensor, stale: Tensor, level: Level, *, legacy: bool) -> Tensor:
+        """rows (M, C) -> (M, C); `stale` is what the first convolution reads in the legacy flow."""
+        for k in range(self.depth):
+            block = getattr(self, f"block{k}")
+            rows, stale = block(rows, stale if legacy else rows, level)
+        return rows
+
+
+class Pooling(nn.Module):
+    """Rows of a level to the voxels of the next: Linear, the maximum of the children, norm, GELU."""
+
+    def __init__(self, channels: int, out_channels: int):
+        super().__init__()
+        self.proj = nn.Linear(channels, out_channels)
+        self.norm = nn.Sequential(RowNorm(out_channels))
+
+    def forward(self, rows: Tensor, children: Tensor) -> Tensor:
+        return F.gelu(self.norm(self.proj(rows)[children].amax(1)))
+
+
+class Unpooling(nn.Module):
+    """Rows of the coarser level, brought to their children, plus the encoder's rows of this level."""
+
+    def __init__(self, channels: int, skip_channels: int, out_channels: int):
+        super().__init__()
+        self.proj = nn.Sequential(nn.Linear(channels, out_channels), RowNorm(out_channels), nn.GELU())
+        self.proj_skip = nn.Sequential(nn.Linear(skip_channels, out_channels), RowNorm(out_channels), nn.GELU())
+
+    def forward(self, coarse: Tensor, skip: Tensor, parent: Tensor) -> tuple[Tensor, Tensor]:
+        """The sum (M, C), and the skip alone, which is what the released code's first convolution reads."""
+        skip = self.proj_skip(skip)
+        return skip + self.proj(coarse)[parent], skip
