@@ -31,6 +31,8 @@ KINDS: dict[str, type[Pretrain] | type[Finetune]] = {"pretrain": Pretrain, "fine
 # how long a training is watched before its speed is known: at most so many seconds, or this share of its hours
 _WATCH, _WATCH_SHARE = 120.0, 0.05
 _POLL = 0.5
+# times what was seen: a run that is made shorter still sees this many people
+_MORE = 1.1
 # options whose values are part of a folder's name
 _TELLING: dict[Any, str] = {"--keep": "keep"} | dict.fromkeys(
     ("--model", "--size", "--neck", "--head", "--set", "-n"), ""
@@ -145,11 +147,10 @@ def _run(step: Step, out: Path, execute: Execute) -> None:
         try:
             _execute(words, execute)
         except KeyboardInterrupt:
-            if not watch.share:
+            if not watch.fit:
                 raise
-    if watch.share:
-        length = _shortened(step, folder, watch.share)
-        _note(step, out, length=length)
+    if watch.fit:
+        _note(step, out, length=_shortened(step, folder, watch.fit))
         _run(step, out, execute)
 
 
@@ -186,10 +187,10 @@ class _LastLine(io.TextIOBase):
 
 class _Watch:
     """Stops the training of this process, by SIGINT, once its log shows that it will take longer than its hours.
-    share: of the run's people that fit into them; None while nothing was stopped."""
+    fit: how many people fit into them; None while nothing was stopped."""
 
     def __init__(self, folder: Path, hours: float):
-        self.share: float | None = None
+        self.fit: float | None = None
         self._folder, self._seconds, self._over = folder, 3600 * hours, threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
@@ -206,12 +207,9 @@ class _Watch:
             entry = last_entry(self._folder)
             if entry is None or entry["seconds"] < min(_WATCH, _WATCH_SHARE * self._seconds):
                 continue
-            people = _people(self._folder)
             fit = entry["people"] * self._seconds / entry["seconds"]
-            # what was seen cannot be taken back
-            share = max(fit, entry["people"] * 1.1) / people
-            if share < 1 and not self._over.is_set():
-                self.share = share
+            if max(fit, _MORE * entry["people"]) < _people(self._folder) and not self._over.is_set():
+                self.fit = fit
                 os.kill(os.getpid(), signal.SIGINT)
             return
 
@@ -234,8 +232,11 @@ def _people(folder: Path) -> int:
     return make_setup(read_config(folder, kind)[0]).people
 
 
-def _shortened(step: Step, folder: Path, share: float) -> list[str]:
-    """The options that make a run this share as long."""
+def _shortened(step: Step, folder: Path, fit: float) -> list[str]:
+    """The options that make a run as long as `fit` people, or a little longer than it has become meanwhile."""
+    # what was seen cannot be taken back
+    seen = (last_entry(folder) or {}).get("people", 0)
+    share = min(max(fit, _MORE * seen) / _people(folder), 1.0)
     recipe = read_config(folder, KINDS[step.kind])[0].to_dict()
     name = next(name for name in LENGTHS if name in recipe)
     length = recipe[name] * share
