@@ -222,8 +222,9 @@ def test_weights_go_on_by_the_names_of_joints(config, skeleton, tmp_path):
     trained = BaselineObjective(config=config).network()
     other = replace(config, joints=skeleton.joints)
     network = with_joints(trained, other)
-    for name, value in network.state_dict().items():
-        before = trained.state_dict()[name]
+    old, new = trained.state_dict(), network.state_dict()
+    for name, value in new.items():
+        before = old[name]
         if not name.startswith(trained.per_joint):
             assert torch.equal(value, before)
             continue
@@ -234,9 +235,7 @@ def test_weights_go_on_by_the_names_of_joints(config, skeleton, tmp_path):
     save_checkpoint(tmp_path / "a.safetensors", network, card={})
     again, header = load_checkpoint(tmp_path / "a.safetensors")
     assert header.config == other and header.skeleton is skeleton
-    assert all(
-        torch.equal(a, b) for a, b in zip(again.state_dict().values(), network.state_dict().values(), strict=True)
-    )
+    assert all(torch.equal(a, b) for a, b in zip(again.state_dict().values(), new.values(), strict=True))
 
 
 def test_pretrain_predict_evaluate_and_finetune(tmp_path, capsys, monkeypatch):

@@ -346,7 +346,7 @@ def test_gradients_of_two_halves_average_to_those_of_the_whole(task, rare):
 
 @BOTH
 @pytest.mark.parametrize("layout", LAYOUTS)
-@pytest.mark.parametrize("n", [1, 2, 5000])
+@pytest.mark.parametrize("n", [1, 2, 1500])
 def test_gradients_are_finite(task, layout, n):
     if task is PRN and n == 1:
         pytest.skip("its norms are torch's own, which need two rows")

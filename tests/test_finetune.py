@@ -380,9 +380,11 @@ def test_pretraining_takes_nobody_who_is_kept_for_testing(datasets, tmp_path):
 
 # --- runs
 
+SHORT = {"workers": 0, "pictures": 0, "validate": 1000}
+
 
 def test_pretraining_on_shards(synthetic, tmp_path):
-    recipe = Pretrain(shards=(str(synthetic),), people=32, batch=4, workers=0, pictures=0, validate=1000, scene="paper")
+    recipe = Pretrain(shards=(str(synthetic),), people=32, batch=4, scene="paper", **SHORT)
     loop.train(recipe, tmp_path / "run")
     assert read_header(tmp_path / "run" / run_dir.MODEL).card["recipe"]["shards"] == ["people"]
 
@@ -410,39 +412,41 @@ def test_from_raw_files_to_scores(datasets, name, epochs, tmp_path, capsys, monk
         np.testing.assert_allclose(judged.true[row], known, atol=1e-3)
 
 
-@pytest.mark.parametrize("keep", ["true", "false"])
-def test_the_paper_s_two_stages(datasets, tmp_path, capsys, monkeypatch, keep):
+PAPER = ["--recipe", "paper", "--batch", "4", "--workers", "0", "--pictures", "0", "--validate", "1000"]
+
+
+def two_stages(people, neck, *words):
+    """Both stages of the paper's network from the command line, evaluated."""
+    assert not main(["pretrain", "first", "--size", "paper-small", "--neck", neck, "--people", "16", *PAPER])
+    tuned = ["finetune", str(people), "--out", "second", "--init", "first/model.safetensors", "--epochs", "1"]
+    assert not main([*tuned, *words, *PAPER])
+    assert not main(["evaluate", "second/model.safetensors", str(people), "--protocol", "dapt"])
+
+
+def test_the_paper_s_two_stages(datasets, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    common = ["--recipe", "paper", "--batch", "4", "--workers", "0", "--pictures", "0", "--validate", "1000"]
-    assert not main(["pretrain", "first", "--size", "paper-small", "--people", "32", *common])
-    words = ["finetune", str(datasets["humanm3"]), "--out", "second", "--init", "first/model.safetensors"]
-    assert not main([*words, "--epochs", "2", "--keep-anchors", keep, *common])
-    _, first = load_checkpoint("first/model.safetensors")
-    _, second = load_checkpoint("second/model.safetensors")
+    two_stages(datasets["humanm3"], "mde", "--keep-anchors", "true")
+    assert "MPJPE" in capsys.readouterr().out
+    (pretrained, first), (_, second) = (load_checkpoint(f"{name}/model.safetensors") for name in ("first", "second"))
     assert first.config.coordinates and not first.config.bins and first.config.parts == 25
     assert second.config.bins == (140, 140, 220) and not (second.config.coordinates or second.config.parts)
     assert second.config.joints == HUMAN15.joints and not second.config.legacy
-    begun = make_setup(run_dir.read_config(tmp_path / "second", Finetune)[0]).network().state_dict()
-    anchors = "backbone.keypoint_embedding"
-    kept = torch.equal(begun[anchors], load_checkpoint("first/model.safetensors")[0].state_dict()[anchors])
-    assert kept == (keep == "true")
-    assert not main(["evaluate", "second/model.safetensors", str(datasets["humanm3"]), "--protocol", "dapt"])
-    assert "MPJPE" in capsys.readouterr().out
+    recipe, anchors = run_dir.read_config(tmp_path / "second", Finetune)[0], "backbone.keypoint_embedding"
+    assert recipe.keep_anchors
+    for keep in (True, False):
+        begun = make_setup(replace(recipe, keep_anchors=keep)).network().state_dict()
+        assert torch.equal(begun[anchors], pretrained.state_dict()[anchors]) == keep
 
 
 @pytest.mark.parametrize("neck", ["finest", "prn"])
 def test_necks_from_the_command_line_and_coordinates_in_both_stages(datasets, tmp_path, capsys, monkeypatch, neck):
     monkeypatch.chdir(tmp_path)
-    common = ["--recipe", "paper", "--batch", "4", "--workers", "0", "--pictures", "0", "--validate", "1000"]
-    assert not main(["pretrain", "first", "--size", "paper-small", "--neck", neck, "--people", "32", *common])
-    words = ["finetune", str(datasets["humanm3"]), "--out", "second", "--init", "first/model.safetensors"]
-    assert not main([*words, "--epochs", "1", "--head", "coordinates", *common])
+    two_stages(datasets["humanm3"], neck, "--head", "coordinates")
+    assert "MPJPE" in capsys.readouterr().out
     trained, header = load_checkpoint("second/model.safetensors")
     assert header.config.neck == neck and header.config.coordinates and not header.config.bins
     log = [json.loads(line) for line in (tmp_path / "second" / run_dir.LOG).read_text().splitlines()]
     assert "regression" in log[-1] and ("vote" in log[-1]) == (neck == "prn")
-    assert not main(["evaluate", "second/model.safetensors", str(datasets["humanm3"]), "--protocol", "dapt"])
-    assert "MPJPE" in capsys.readouterr().out
     # random weights have the neck that is asked for, and so for a dataset without pre-training
     scratch = {"init": "random", "size": "paper-small", "neck": neck, "head": "coordinates", "augment": "paper"}
     setup = make_setup(Finetune(data=(str(datasets["humanm3"]),), mix=0.0, **scratch))
@@ -450,9 +454,8 @@ def test_necks_from_the_command_line_and_coordinates_in_both_stages(datasets, tm
 
 
 def test_a_run_on_a_dataset_is_taken_up(datasets, tmp_path):
-    recipe = Finetune(
-        data=(str(datasets["lidarhuman26m"]),), epochs=6, batch=2, workers=0, pictures=0, scene="paper", validate=1000
-    )
+    data = (str(datasets["lidarhuman26m"]),)
+    recipe = Finetune(data=data, init="tiny", epochs=6, batch=2, scene="paper", **SHORT)
     loop.train(recipe, tmp_path / "whole")
     train_until_killed(recipe, tmp_path / "run", "_chunk", 2)
     # the dataset may have moved meanwhile

@@ -323,7 +323,7 @@ def test_an_unknown_laser_is_told(tmp_path):
         everything(tmp_path)
 
 
-FIRST = files.scene()[0].time
+FIRST = files.START
 _KEYPOINT = "[LiDARHumanKeypointsComponent].lidar_keypoints[*]"
 _POSE = "[VehiclePoseComponent].world_from_vehicle.transform"
 _BEAMS, _TIME = "[LiDARCalibrationComponent].beam_inclination.values", "key.frame_timestamp_micros"

@@ -24,6 +24,8 @@ NAMES = {1: "TOP", 2: "FRONT", 3: "SIDE_LEFT", 4: "SIDE_RIGHT", 5: "REAR"}
 # of the 14 joints, in the skeleton's order
 TYPES = (1, 5, 13, 6, 14, 7, 15, 8, 16, 9, 17, 10, 18, 20)
 HIDDEN, SEEN = 1, 2
+# time of the first frame of `scene`, us
+START = 1_550_083_467_346_370
 SWEEP = 0.1
 FACES = load_rig().faces
 
@@ -199,7 +201,7 @@ def near_columns(laser, middles):
 @cache
 def scene():
     """Two frames of a segment: people with all, some and no labelled joints, without a box, and without points."""
-    start, frames = 1_550_083_467_346_370, []
+    frames = []
     for k in range(2):
         seconds = 1.3 + 0.5 * k
         one, a = someone("ped-b", 0, [-3.5 + k, 4.0, 0.95], 0.7)
@@ -212,11 +214,11 @@ def scene():
             unlabeled, _ = someone("ped-unlabeled", 2, [9.0, 9.0, 1.0], 0.0, missing=range(14))
             people += [far, nowhere, unlabeled]
         people += [Someone("sign-1", 3, box=(10.0, 10.0, 2.0, 0.2, 0.6, 0.7, 0.1))]
-        frame = Frame(start + 500_000 * k, at(car(seconds)), people)
+        frame = Frame(START + 500_000 * k, at(car(seconds)), people)
         cast(frame, seconds, np.array(casts), shown)
         frames.append(frame)
     # a frame that nobody is labelled in
-    frames.append(Frame(start + 700_000, at(car(2.0)), [Someone("sign-1", 3, box=(9.0, 9.0, 2.0, 0.2, 0.6, 0.7, 0.1))]))
+    frames.append(Frame(START + 700_000, at(car(2.0)), [Someone("sign-1", 3, box=(9.0, 9.0, 2.0, 0.2, 0.6, 0.7, 0.1))]))
     frames[-1].images, frames[-1].poses = frames[0].images, frames[0].poses
     return frames
 
