@@ -1,6 +1,8 @@
 """Scenes to find people in: whose points are whose, what each family may hold, and that nothing else draws along."""
 
+import json
 from collections import Counter
+from importlib import resources
 
 import numpy as np
 import pytest
@@ -85,3 +87,12 @@ def test_all_kinds_places_and_sensors_occur(train, heldout):
 def test_wrong_arguments_say_what_is_expected(wrong):
     with pytest.raises(InputError):
         detection_scene(**({"seed": 1, "index": 0} | wrong))
+
+
+@pytest.mark.parametrize("row", [0, 77, 202])
+def test_the_frozen_scenes_for_judging_are_made_again(row):
+    frozen = json.loads(resources.files("lidarpose.eval").joinpath("assets/detector-heldout-1.json").read_text())
+    assert frozen["indices"] == list(range(240)) and set(frozen["left_out"]) == LEFT_OUT_THINGS | set(LEFT_OUT)
+    scene = detection_scene(frozen["seed"], frozen["indices"][row], family=frozen["family"])
+    assert (scene.kind, scene.sensor) == (frozen["kinds"][row], frozen["sensors"][row])
+    assert scene.points_digest() == frozen["sha256"][row]

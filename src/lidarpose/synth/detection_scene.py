@@ -8,6 +8,7 @@ draws the things and rooms that are left out for judging; "heldout" draws them m
 Letters: P people, n points of a scene, M meshes.
 """
 
+import hashlib
 from dataclasses import dataclass, replace
 from functools import cache
 from math import pi
@@ -26,7 +27,7 @@ from lidarpose.synth.bodies import FRAME_TIME, Bodies, draw_bodies
 from lidarpose.synth.environment import mesh as shapes
 from lidarpose.synth.environment.layouts import LAYOUTS, LEFT_OUT, Item, Layout
 from lidarpose.synth.environment.mesh import Mesh, shape, union
-from lidarpose.synth.environment.things import KINDS, THINGS, draw_thing
+from lidarpose.synth.environment.things import KINDS, LEAVES, THINGS, draw_thing
 from lidarpose.synth.props import Prop, draw_props
 from lidarpose.synth.props.attachments import MOUNTS
 from lidarpose.synth.scene import Place, RandomStream
@@ -60,7 +61,7 @@ _MOST_BEAMS = 140_000
 # people by activity, outdoors and indoors
 _MIX_OUTDOORS = {
     **{"idle": 0.31, "walk": 0.34, "captured": 0.07, "run": 0.03, "step": 0.02, "bend": 0.035, "crouch": 0.035},
-    **{"kneel": 0.01, "sit": 0.09, "cycle": 0.07, "push": 0.05, "sport": 0.02},
+    **{"kneel": 0.01, "sit": 0.1, "cycle": 0.09, "push": 0.05, "sport": 0.02},
 }
 _MIX_INDOORS = _MIX_OUTDOORS | {"idle": 0.36, "walk": 0.2, "sit": 0.25, "cycle": 0.004, "run": 0.0}
 # who sits, outdoors: what on, and how often
@@ -71,8 +72,12 @@ _PROP_KINDS = {"chair": "chair", "bicycle": "bicycle", "moped": "moped", "pram":
 _NEAREST, _FARTHEST, _APART = 1.5, 40.0, 0.42
 # points of a piece of a place at least
 _LEAST_PIECE = 300
+# share of the things beside people among those that are added last, a quarter of all
+_BESIDE = 0.8
 # half of a standing person's width, and what riders and who push something need more, m
 _HALF, _MORE = 0.24, 0.4
+# height of what of a person is to be seen, m
+_CHEST = 1.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,6 +114,15 @@ class DetectionScene:
     height: float
     activities: tuple[str, ...]
 
+    @property
+    def things(self) -> tuple[str, ...]:
+        """Names of all kinds, which `thing` counts."""
+        return KINDS
+
+    def points_digest(self) -> str:
+        """sha256 of the points in whole millimeters, as hexadecimal digits."""
+        return hashlib.sha256(np.round(self.points.astype(float) * 1000).astype("<i8").tobytes()).hexdigest()
+
 
 def detection_scene(seed: int, index: int, *, family: str = "train") -> DetectionScene:
     """Scene `index` of `seed`. family: "train", "heldout" or "bench". Raises InputError."""
@@ -122,8 +136,14 @@ def detection_scene(seed: int, index: int, *, family: str = "train") -> Detectio
     mount = _draw_mount(device, layout, rng)
     duration = device.duration if isinstance(device, RayPattern) else 0.0
     site = _Site(layout, device, mount)
+    weights = _draw_habits(layout.indoors, family, rng)
+    count = int((rng.integers(3, 16) if layout.indoors else rng.integers(15, 61)) * layout.things)
+    _add_own_vehicle(site, rng)
+    _scatter(site, weights, count - count // 4, np.zeros((0, 2)), rng)
     people = _draw_people(site, duration > 0, rng)
-    _scatter(site, [person.place.feet[:2] for person in people], family, rng)
+    feet = np.array([person.place.feet[:2] for person in people]).reshape(-1, 2)
+    _scatter(site, weights, count // 4, feet, rng)
+    _add_screens(site, feet, rng)
     relief = _Relief.draw(layout.indoors, rng)
     shift = np.array([0, 0, -mount.height - layout.sensor[2]])
     meshes, owners, kinds = [], [], []
@@ -135,13 +155,16 @@ def detection_scene(seed: int, index: int, *, family: str = "train") -> Detectio
             kinds.append(-1 if name is None else KINDS.index(name))
     for name, mesh in site.items:
         mesh.vertices[:, 2] += relief.at(mesh.vertices.T)
-        meshes.append(Mesh((mesh.vertices + shift).astype(np.float32), mesh.faces))
+        meshes.append(Mesh((mesh.vertices + shift).astype(np.float32), mesh.faces, mesh.part))
         owners.append(-1)
         kinds.append(KINDS.index(name))
     turn = rotation_about("z", mount.turn).T
-    points, face = _scan(device, _turned(union(meshes), turn.astype(np.float32)), mount.R_sensor_level, rng)
+    scene = union(meshes)
+    points, face = _scan(device, _turned(scene, turn.astype(np.float32)), mount.R_sensor_level, rng)
     counts = [len(mesh.faces) for mesh in meshes]
     person_of, thing_of = (np.repeat(np.array(values, np.int16), counts)[face] for values in (owners, kinds))
+    if scene.part is not None:
+        points = _into_leaves(points, scene.part[face] == LEAVES, rng)
     points, stray = _go_astray(points, rng)
     person_of[stray], thing_of[stray] = -1, -1
     kept, is_piece = _cut(points, thing_of, rng)
@@ -271,16 +294,17 @@ def _draw_mount(device: Sensor | RayPattern, layout: Layout, rng: np.random.Gene
 class _Site:
     """A layout about the sensor: its meshes, and where there is room.
 
-    items: kinds and meshes, the sensor's ground at x = y = 0; low: (M, 4), what each takes of the ground.
+    items: kinds and meshes, the sensor's ground at x = y = 0; low: (M, 5), what each takes of the ground, and its top.
     """
 
     def __init__(self, layout: Layout, device: Sensor | RayPattern, mount: _Mount):
         x, y, _ = layout.sensor
         self.layout, self.mount = layout, mount
+        self.elevations = device.elevations[0], device.elevations[-1]
         self.reach = min(_FARTHEST, 0.95 * device.range_max)
         self.areas = np.array(layout.areas) - [x, x, y, y, 0]
         self.items: list[Item] = []
-        self.low = np.zeros((0, 4))
+        self.low = np.zeros((0, 5))
         moved = [(name, mesh.moved((-x, -y, 0))) for name, mesh in layout.items]
         rows = np.array([_footprint(mesh) for _, mesh in moved])
         fixed = np.array([name in ("ground", "ceiling", "wall") for name, _ in moved])
@@ -305,8 +329,23 @@ class _Site:
     def is_free(self, place: np.ndarray, room: float) -> bool:
         return bool(np.hypot(*place) > max(room, 0.3) and (_gap(self.low, place) > room).all())
 
-    def spot(self, distance: float, room: float, rng: np.random.Generator) -> np.ndarray:
-        """Some free place (2,) m in the areas about so far from the sensor, in view where the view is narrow."""
+    def is_hidden(self, places: np.ndarray) -> np.ndarray:
+        """(k,) bool: whether something stands between the sensor and the chest of a person at places (k, 2) m, or the
+        chest is above or below all beams."""
+        up = np.full((len(places), 1), _CHEST - self.mount.height)
+        chest = np.hstack([places, up]) @ rotation_about("z", self.mount.turn).T @ self.mount.R_sensor_level.T
+        elevation = np.arctan2(chest[:, 2], np.hypot(*chest[:, :2].T))
+        outside = (elevation < self.elevations[0]) | (elevation > self.elevations[1])
+        ways = places[:, None, :]
+        ways = np.where(np.abs(ways) < 1e-6, 1e-6, ways)
+        near, far = self.low[:, :2] / ways, self.low[:, 2:4] / ways
+        enter, leave = np.minimum(near, far).max(2), np.maximum(near, far).min(2)
+        beam = self.mount.height + (_CHEST - self.mount.height) * enter
+        return outside | np.any((enter < leave) & (enter > 0) & (enter < 0.97) & (self.low[:, 4] > beam), axis=1)
+
+    def spot(self, distance: float, room: float, rng: np.random.Generator, *, seen: bool = False) -> np.ndarray:
+        """Some free place (2,) m in the areas about so far from the sensor, in view where the view is narrow; where
+        a person is `seen` if there is such a place."""
         middle, half = self.mount.view
         u = rng.random((48, 3))
         angle = middle + half * 0.95 * (2 * u[:24, 0] - 1)
@@ -322,14 +361,15 @@ class _Site:
         cost += 200 * ~np.any(np.all(in_area, axis=2), axis=1)
         if len(self.low):
             cost += 200 * (_gap(self.low, places) < room).any(1)
+            cost += 30 * self.is_hidden(places) if seen else 0
         return places[np.argmin(cost)]
 
     def beside(self, rng: np.random.Generator, gap: float) -> np.ndarray:
         """A place (2,) m so near to something that stands there."""
-        near = self.low[np.hypot(*((self.low[:, :2] + self.low[:, 2:]) / 2).T) < self.reach]
+        near = self.low[np.hypot(*((self.low[:, :2] + self.low[:, 2:4]) / 2).T) < self.reach]
         if not len(near):
             return self.spot(rng.uniform(_NEAREST, self.reach), _HALF, rng)
-        low_x, low_y, high_x, high_y = near[rng.integers(len(near))]
+        low_x, low_y, high_x, high_y, _ = near[rng.integers(len(near))]
         u = rng.random(2)
         x, y = low_x + u[0] * (high_x - low_x), low_y + u[0] * (high_y - low_y)
         sides = [(low_x - gap, y), (high_x + gap, y), (x, low_y - gap), (x, high_y + gap)]
@@ -337,15 +377,17 @@ class _Site:
 
 
 def _footprint(mesh: Mesh) -> np.ndarray:
-    """(4,): least x, y, greatest x, y of what is below 1.9 m; inf where nothing is."""
+    """(5,): least x, y, greatest x, y of what is below 1.9 m, inf where nothing is, and the top's z."""
     low = mesh.vertices[mesh.vertices[:, 2] < 1.9, :2]
-    return np.concatenate([low.min(0), low.max(0)]) if len(low) else np.full(4, np.inf)
+    if not len(low):
+        return np.full(5, np.inf)
+    return np.array([*low.min(0), *low.max(0), mesh.vertices[:, 2].max()])
 
 
 def _gap(low: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Distance of places (..., 2) from footprints (M, 4): (..., M) m, 0 within."""
+    """Distance of places (..., 2) from footprints (M, 5): (..., M) m, 0 within."""
     places = places[..., None, :]
-    outside = np.maximum(np.maximum(low[:, :2] - places, places - low[:, 2:]), 0)
+    outside = np.maximum(np.maximum(low[:, :2] - places, places - low[:, 2:4]), 0)
     return np.hypot(outside[..., 0], outside[..., 1])
 
 
@@ -409,7 +451,11 @@ def _draw_people(site: _Site, is_smeared: bool, rng: np.random.Generator) -> lis
     for size in sizes:
         distance = 2 + (site.reach - 2) * rng.random() ** 1.7
         beside = rng.random() < 0.25
-        middle = site.beside(rng, _HALF + 0.4 * rng.random()) if beside else site.spot(distance, _HALF, rng)
+        middle = (
+            site.beside(rng, _HALF + 0.4 * rng.random())
+            if beside
+            else site.spot(distance, _HALF, rng, seen=rng.random() < 0.85)
+        )
         style, course = rng.random(), rng.choice([0.0, pi / 2, pi, -pi / 2]) + rng.normal(0, 0.25)
         members: list[np.ndarray] = []
         for _ in range(size):
@@ -446,53 +492,62 @@ def _draw_belongings(bodies: Bodies, row: int, indoors: bool, rng: np.random.Gen
     return draw_props(rng, kind=kind, joints=joints)
 
 
-def _scatter(site: _Site, people: list[np.ndarray], family: str, rng: np.random.Generator) -> None:
-    """What is taken for people, a fifth of it beside people; screens before the sensor and its own vehicle."""
-    indoors, height = site.layout.indoors, site.mount.height
+def _draw_habits(indoors: bool, family: str, rng: np.random.Generator) -> dict[str, float]:
+    """How often things stand in a scene: each scene has habits of its own."""
     weights = {}
     for name, row in THINGS.items():
         weights[name] = (row.indoors if indoors else row.outdoors) * (family != "train" or not row.left_out)
         if row.left_out and family == "heldout":
             weights[name] *= _LEFT_OUT_WEIGHT
-    # each scene has its own habits
-    weights = {name: weight * rng.gamma(0.7) for name, weight in weights.items()}
-    feet = np.array(people).reshape(-1, 2)
-    count = int((rng.integers(3, 16) if indoors else rng.integers(15, 61)) * site.layout.things)
+    return {name: weight * rng.gamma(0.7) for name, weight in weights.items()}
+
+
+def _scatter(site: _Site, weights: dict[str, float], count: int, feet: np.ndarray, rng: np.random.Generator) -> None:
+    """Adds `count` things that are taken for people; where there are people at feet (k, 2) m most stand beside them."""
+    ceiling = site.layout.ceiling
     for _ in range(count):
         name = _pick(rng, weights)
         mesh = draw_thing(name, rng)
         mesh = mesh.moved((0, 0, 0), rng.choice([0.0, pi / 2, pi, -pi / 2]) + rng.normal(0, 0.15))
+        if mesh.vertices[:, 2].max() > ceiling:
+            mesh = mesh.scaled((1, 1, 0.97 * min(ceiling, 3.0) / mesh.vertices[:, 2].max()))
         low = _footprint(mesh)
-        if not np.isfinite(low[0]) or mesh.vertices[:, 2].max() > site.layout.ceiling:
-            mesh = mesh.scaled((1, 1, 0.97 * min(site.layout.ceiling, 3.0) / mesh.vertices[:, 2].max()))
-            low = _footprint(mesh)
         for _attempt in range(3):
-            if len(feet) and rng.random() < 0.2:
+            if len(feet) and name != "mannequin" and rng.random() < _BESIDE:
                 angle, near = rng.uniform(-pi, pi), feet[rng.integers(len(feet))]
                 across = np.array([np.cos(angle), np.sin(angle)])
-                place = near + across * (_HALF + 0.05 + 0.45 * rng.random()) - np.where(across > 0, low[:2], low[2:])
+                place = near + across * (_HALF + 0.05 + 0.45 * rng.random()) - np.where(across > 0, low[:2], low[2:4])
                 place = np.where(np.abs(across) < 0.3, near, place)
-            elif name in ("fragment", "mannequin") and not indoors:
-                place = site.spot(rng.uniform(18, 40), 0.3, rng)
+            elif name in ("fragment", "mannequin") and not site.layout.indoors:
+                place = site.spot(rng.uniform(18, 40), 0.3, rng, seen=True)
             else:
                 place = site.spot(_NEAREST + (site.reach - _NEAREST) * rng.random() ** 1.2, 0.3, rng)
-            row = low + [*place, *place]
+            row = low + [*place, *place, 0]
             if _gap(row[None], np.zeros(2)).min() > 0.6 and (not len(feet) or _gap(row[None], feet).min() > 0.2):
                 site.add(name, mesh.moved((*place, site.level(place))))
                 break
+
+
+def _add_screens(site: _Site, feet: np.ndarray, rng: np.random.Generator) -> None:
+    """Plates and leaves close before the sensor, in a quarter of the scenes; none in people at feet (k, 2) m."""
     for _ in range(rng.integers(1, 7) if rng.random() < 0.25 else 0):
         far, angle, u = rng.uniform(0.6, 3.0), rng.uniform(-pi, pi), rng.random(3).tolist()
-        wide, bottom = (0.03 + 0.5 * u[0] ** 2) * far, max(0.0, height - u[1] * far)
-        screen = shapes.box((0.03, wide, min(0.1 + 1.2 * u[2], site.layout.ceiling - bottom)))
+        wide, low = (0.03 + 0.5 * u[0] ** 2) * far, max(0.0, site.mount.height - u[1] * far)
+        screen = shapes.box((0.03, wide, min(0.1 + 1.2 * u[2], site.layout.ceiling - low)))
         if rng.random() < 0.3:
             screen = shapes.foliage((wide, wide, 0.2 + 1.0 * u[2]), 80, 0.08, rng)
         place = np.array([far * np.cos(angle), far * np.sin(angle)])
         if not len(feet) or np.hypot(*(feet - place).T).min() > 0.3 + wide / 2:
-            site.add("screen", screen.moved((*place, bottom + site.level(place)), angle))
+            site.add("screen", screen.moved((*place, low + site.level(place)), angle))
+
+
+def _add_own_vehicle(site: _Site, rng: np.random.Generator) -> None:
+    """What carries the sensor, where the sensor sees it."""
     if rng.random() < 0.4:
-        own = _own_vehicle(height, site.layout.by_car, rng)
-        if not len(feet) or _gap(_footprint(own)[None], feet).min() > 0.15:
-            site.add("own vehicle", own.moved((0, 0, site.layout.sensor[2])))
+        own = _own_vehicle(site.mount.height, site.layout.by_car, rng)
+        site.items.append(("own vehicle", own.moved((0, 0, site.layout.sensor[2]))))
+        # nobody stands in it, and it hides nothing that is higher than it
+        site.low = np.concatenate([site.low, [[*_footprint(own)[:4], 0]]])
 
 
 def _own_vehicle(height: float, by_car: bool, rng: np.random.Generator) -> Mesh:
@@ -559,7 +614,7 @@ def _scan(
     conditions = ScanConditions(
         sigma=device.range_sigma * rng.uniform(0.3, 1.3),
         bias=rng.uniform(0.002, 0.015),
-        intensity_dropout=0.9 * rng.random(),
+        intensity_dropout=0.9 * rng.random() ** 2,
     )
     points, returned = add_sensor_noise(hits, Mesh(vertices, mesh.faces), device, conditions, rng)
     face = hits.face[returned]
@@ -568,6 +623,15 @@ def _scan(
         left = hits.ring[returned] >= rng.uniform(0.05, 0.5) * device.rows
         points, face = points[left], face[left]
     return points @ R, face
+
+
+def _into_leaves(points: np.ndarray, leaves: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Points (n, 3) m, those on leaves (n,) a little behind the few large ones of a mesh."""
+    rows = np.flatnonzero(leaves)
+    deep = rng.uniform(0.02, 0.2) * rng.standard_exponential(len(rows))
+    moved = points.copy()
+    moved[rows] *= (1 + deep / np.maximum(np.linalg.norm(points[rows], axis=1), 0.3))[:, None].astype(np.float32)
+    return moved
 
 
 def _go_astray(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

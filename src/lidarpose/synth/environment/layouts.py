@@ -67,9 +67,10 @@ def _field(rng: np.random.Generator, rough: float) -> Mesh:
 
 def street(rng: np.random.Generator) -> Layout:
     """A road between two pavements one kerb higher, fronts behind them, cars parked at the kerbs."""
-    road, kerb = rng.uniform(2.6, 5.5), rng.choice([0.0, rng.uniform(0.06, 0.16)], p=[0.15, 0.85])
-    front = road + rng.uniform(1.5, 5.0)
-    inner = np.arange(-road, road + 0.1, 2 * road / 4)
+    road = rng.uniform(2.6, 5.5) if rng.random() < 0.6 else rng.uniform(5, 11)
+    kerb = rng.choice([0.0, rng.uniform(0.06, 0.16)], p=[0.15, 0.85])
+    front = road + rng.uniform(1.5, 5.0) * rng.choice([1.0, 1.8])
+    inner = np.linspace(-road, road, 5)
     ys = np.concatenate([[-70, -40, -20, -front, -road - 0.02], inner, [road + 0.02, front, 20, 40, 70]])
     heights = np.where(np.abs(ys) > road + 0.01, kerb, 0.0)
     items: list[Item] = [("ground", ground(_XS, ys, heights[None]))]

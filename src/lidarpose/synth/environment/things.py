@@ -5,7 +5,7 @@ they stand outdoors and indoors, and which of them are kept for judging. Builder
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import cos, pi, sin
 
@@ -150,6 +150,13 @@ def _pillar(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 # --- plants
 
+# part of a mesh's faces that are leaves, which beams enter a little
+LEAVES = 1
+
+
+def _leaves(mesh: Mesh) -> Mesh:
+    return replace(mesh, part=np.full(len(mesh.faces), LEAVES, np.uint8))
+
 
 def crown(size: tuple[float, float, float], rng: np.random.Generator, *, dense: float = 1.0) -> Mesh:
     """An irregular crown of leaves, standing on the origin: several balls."""
@@ -160,7 +167,11 @@ def crown(size: tuple[float, float, float], rng: np.random.Generator, *, dense: 
         off = (1 - share) * (rng.random(3) - [0.5, 0.5, 0])
         leaf = max(0.05, 0.09 * max(size)) * rng.uniform(0.7, 1.3)
         ball = shapes.foliage(share * size, int(min(120, 70 + 50 * dense)), leaf, rng)
-        balls.append(ball.moved(off * size))
+        balls.append(_leaves(ball).moved(off * size))
+        if rng.random() < 0.6 * dense:
+            # no beam passes the middle
+            half = 0.3 * share * size
+            balls.append(shape("ball", *half).moved(off * size + [0, 0, share[2] * size[2] / 2]))
     return union(balls)
 
 
@@ -179,17 +190,20 @@ def _clipped(size: tuple[float, float, float], rng: np.random.Generator) -> Mesh
     leaves = where[:, None] + rng.normal(0, leaf, (count, 3, 3))
     leaves[..., 2] = np.maximum(leaves[..., 2], 0)
     inside = shapes.box((max(deep - 0.25, 0.05), max(long - 0.2, 0.05), max(high - 0.15, 0.1)))
-    return union([Mesh(leaves.reshape(-1, 3).astype(np.float32), shapes.repeated(count, 3, "triangle")), inside])
+    outside = Mesh(leaves.reshape(-1, 3).astype(np.float32), shapes.repeated(count, 3, "triangle"))
+    return union([_leaves(outside), inside])
 
 
 def _hedge(u: Uniforms, rng: np.random.Generator) -> Mesh:
     size = (0.35 + 0.6 * u[0], 0.5 + 4.5 * u[1] ** 2, 0.6 + 1.5 * u[2])
-    if u[3] < 0.65:
+    if u[3] < 0.8:
         return _clipped(size, rng)
     count = max(1, int(size[1] / 0.8))
     return union(
         [
-            _at(shapes.foliage((size[0] + 0.3, 1.2, size[2] * rng.uniform(0.7, 1.1)), 110, 0.1, rng), y=0.8 * k)
+            _at(
+                _leaves(shapes.foliage((size[0] + 0.3, 1.2, size[2] * rng.uniform(0.7, 1.1)), 110, 0.1, rng)), y=0.8 * k
+            )
             for k in range(count)
         ]
     )
@@ -232,7 +246,7 @@ def _young_tree(u: Uniforms, rng: np.random.Generator) -> Mesh:
 def _low_crown(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A trunk with a crown down to knees or hips: thuja, spruce, an old shrub."""
     clear, wide, high = 0.1 + 1.0 * u[0], 0.6 + 2.2 * u[1], 1.6 + 3.0 * u[2]
-    return union([_post(0.05 + 0.15 * u[3], clear + 0.5), _at(crown((wide, wide, high), rng), z=clear)])
+    return union([_post(0.05 + 0.15 * u[3], clear + 0.6 * high), _at(crown((wide, wide, high), rng), z=clear)])
 
 
 def _staked_tree(u: Uniforms, rng: np.random.Generator) -> Mesh:
@@ -368,10 +382,10 @@ def _cone(u: Uniforms, rng: np.random.Generator) -> Mesh:
 def _sacks(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """Sacks, boxes or cases in a heap."""
     parts, high = [], 0.0
-    for k in range(1 + int(5 * u[0])):
+    for _ in range(1 + int(5 * u[0])):
         a, b, c, d, e = rng.random(5)
         size = (0.3 + 0.4 * a, 0.3 + 0.5 * b, 0.2 + 0.4 * c)
-        up = high if u[1] < 0.5 else high * (k % 2)
+        up = high if u[1] < 0.5 else 0.0
         where = {"x": 0.4 * (d - 0.5), "y": (0.3 if u[1] < 0.5 else 1.0) * (e - 0.5), "z": up, "yaw": pi * d}
         half = np.array(size) / 2
         part = shapes.box(size) if u[2] < 0.5 else _at(shape("ball", *half), z=half[2] * 0.9)
@@ -544,7 +558,7 @@ THINGS: dict[str, Thing] = {
     "floor lamp": Thing(_floor_lamp, 0.1, 0.8),
     "fragment": Thing(_fragment, 0.6, 0.3),
     "floating piece": Thing(_floating, 0.5, 0.3),
-    "mannequin": Thing(_mannequin, 0.3, 0.0, left_out=True),
+    "mannequin": Thing(_mannequin, 0.2, 0.0, left_out=True),
 }
 # what else points may lie on
 STRUCTURES = ("ground", "facade", "wall", "ceiling", "belongings", "own vehicle", "screen")
