@@ -233,7 +233,7 @@ def test_candidates_see_what_the_words_say(scene):
         if candidate.count <= 1000:
             assert candidate.count == len(near)
             # a point on the border of cells may fall to either side
-            assert np.mean(np.abs(fine_reference(near) - inputs["fine"][k]) > 1e-5) < 2e-4
+            assert np.mean(np.abs(fine_reference(near) - inputs["fine"][k]) > 1e-5) < 4e-4
             assert inputs["fine"][k].any()
         context = context_reference(points, heights, candidate.center, candidate.yaw)
         assert np.mean(np.abs(context - inputs["context"][k]) > 0.005) < 0.01

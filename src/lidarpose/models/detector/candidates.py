@@ -453,18 +453,26 @@ def suppress(rows: Sequence[np.ndarray], strength: np.ndarray, *, most_shared: f
     `most_shared` of the points of the one of the two that has fewer, with a stronger one that stays. Two people side by
     side share few points however near they stand. A candidate without points shares none.
     """
+    sizes = np.array([len(own) for own in rows], np.int64)
     order = np.argsort(-np.asarray(strength), kind="stable")
-    owners: dict[int, list[int]] = {}
-    kept = []
-    for k in order.tolist():
-        own = rows[k].tolist()
-        shared: dict[int, int] = {}
-        for row in own:
-            for other in owners.get(row, ()):
-                shared[other] = shared.get(other, 0) + 1
-        if any(count > most_shared * min(len(own), len(rows[other])) for other, count in shared.items()):
-            continue
-        kept.append(k)
-        for row in own:
-            owners.setdefault(row, []).append(k)
-    return np.array(kept, np.int64)
+    rank = np.empty(len(rows), np.int64)
+    rank[order] = np.arange(len(rows))
+    # all pairs of owners of a point, the points' owners lying side by side, the strongest first
+    row = np.concatenate([np.zeros(0, np.int64), *rows])
+    owner = np.repeat(rank, sizes)
+    sorting = np.lexsort((owner, row))
+    row, owner = row[sorting], owner[sorting]
+    pairs, lag = [np.zeros(0, np.int64)], 1
+    while (shared := row[lag:] == row[:-lag]).any():
+        pairs.append(owner[:-lag][shared] * len(rows) + owner[lag:][shared])
+        lag += 1
+    pair, count = np.unique(np.concatenate(pairs), return_counts=True)
+    stronger, weaker = np.divmod(pair, max(len(rows), 1))
+    sizes = sizes[order]
+    is_same = count > most_shared * np.minimum(sizes[stronger], sizes[weaker])
+    stays = np.ones(len(rows), bool)
+    # in the order of the stronger one: whether it stays is known when its pairs come
+    for first, second in zip(stronger[is_same].tolist(), weaker[is_same].tolist(), strict=True):
+        if stays[first]:
+            stays[second] = False
+    return order[stays]

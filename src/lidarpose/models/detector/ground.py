@@ -25,6 +25,12 @@ _SUPPORT, _SUPPORT_ROOM, _SUPPORT_SLOPE = 3, 0.1, 0.15
 _NEAR_PLANE = 0.25
 # slopes of the plane: the steepest, and the width of the bins in which the commonest is looked for
 _STEEPEST, _SLOPE_BIN = 0.9, 0.06
+# cells within so many m count most for the plane, which must lie so far below the sensor, m
+_NEAR, _LEAST_BELOW = 10.0, 0.15
+# a tilt is believed where so many cells and such a share lie on its plane, and no more than this below it
+_TILT_CELLS, _TILT_SHARE, _TILT_BELOW = 20, 0.4, 0.1
+# points so far below the ground, m, lower it where they are so many: fewer may be mirrored ones
+_LEAST_DEPTH, _MOST_DEPTH, _SOLID = 0.15, 1.5, 5
 # how many cells the plane counts for where a hole is filled
 _PLANE_WEIGHT = 0.5
 # there is a ground where at least so many cells, and this share of all cells with points, belong to it
@@ -62,10 +68,11 @@ class Ground:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Floors:
-    """Heights (X, Y) m of the lowest points of cells, NaN where there are none; corner (2,) m."""
+    """Heights (X, Y) m of the lowest points of cells, NaN where there are none; their counts (X, Y); corner (2,) m."""
 
     corner: np.ndarray
     heights: np.ndarray
+    counts: np.ndarray
 
     def positions(self) -> tuple[np.ndarray, np.ndarray]:
         """x (X, 1) and y (1, Y) m of the centers."""
@@ -86,7 +93,7 @@ def estimate_ground(points: np.ndarray, origin: np.ndarray | None = None) -> Gro
     floors = _lowest(points, origin)
     if floors is None:
         return None
-    plane = _common_plane(floors)
+    plane = _common_plane(floors, origin)
     if plane is None:
         return None
     slope, height = plane[:2], plane[2]
@@ -108,7 +115,14 @@ def estimate_ground(points: np.ndarray, origin: np.ndarray | None = None) -> Gro
         is_floor &= ~near | _is_low(np.where(is_floor, rest, np.nan), _OWN_SLOPE)
     if not _is_ground(is_floor, floors.heights):
         return None
-    heights = _fill(np.where(is_floor, rest, np.nan)) + (slope[0] * x + slope[1] * y + height)
+    rest = np.where(is_floor, rest, np.nan)
+    surface = _fill(rest)
+    # nothing stands below the ground: somebody's feet where no ground is seen
+    depth = surface - (floors.heights - height)
+    is_lower = ~is_floor & (depth > _LEAST_DEPTH) & (depth < _MOST_DEPTH) & (floors.counts >= _SOLID)
+    if is_lower.any():
+        surface = _fill(np.where(is_lower, floors.heights - height, rest))
+    heights = surface + (slope[0] * x + slope[1] * y + height)
     return Ground(corner=floors.corner, heights=heights.astype(np.float32))
 
 
@@ -130,20 +144,32 @@ def estimate_up(points: np.ndarray, origin: np.ndarray | None = None) -> np.ndar
     A level cloud on a slope and a tilted one on a plane look alike: a plane that leans less than `TILTED` is a slope.
     points (n, 3) m, z about up. None too where there is no ground to tell by.
     """
-    up = np.array([0.0, 0.0, 1.0])
-    middle = np.zeros(3) if origin is None else np.asarray(origin, float)
+    upright = np.array([0.0, 0.0, 1.0])
+    up, rest = upright, np.zeros(0)
+    if not len(points):
+        return None
+    middle = np.median(points, axis=0) if origin is None else np.asarray(origin, float)
+    center = None if origin is None else np.zeros(3)
     for _ in range(3):
-        leveled = (points - middle) @ rotation_between(up, np.array([0.0, 0.0, 1.0])).T
-        floors = _lowest(leveled, np.zeros(3) if origin is not None else None)
-        plane = None if floors is None else _common_plane(floors)
-        if plane is None:
+        R_level_input = rotation_between(up, upright)
+        floors = _lowest((points - middle) @ R_level_input.T, center)
+        plane = None if floors is None else _common_plane(floors, center)
+        if floors is None or plane is None:
             return None
-        normal = np.array([-plane[0], -plane[1], 1.0]) @ rotation_between(up, np.array([0.0, 0.0, 1.0]))
+        x, y = floors.positions()
+        rest = (floors.heights - (plane[0] * x + plane[1] * y + plane[2]))[np.hypot(x, y) < 2 * _NEAR]
+        normal = np.array([-plane[0], -plane[1], 1.0]) @ R_level_input
         normal /= np.linalg.norm(normal)
         moved, up = np.arccos(np.clip(normal @ up, -1, 1)), normal
+        if np.arccos(np.clip(up[2], -1, 1)) < np.radians(TILTED):
+            return None
         if moved < np.radians(2):
             break
-    return up if np.degrees(np.arccos(np.clip(up[2], -1, 1))) > TILTED else None
+    rest = rest[np.isfinite(rest)]
+    on_it = np.count_nonzero(np.abs(rest) < _NEAR_PLANE)
+    if on_it < max(_TILT_CELLS, _TILT_SHARE * len(rest)) or np.mean(rest < -2 * _NEAR_PLANE) > _TILT_BELOW:
+        return None
+    return up
 
 
 def _lowest(points: np.ndarray, origin: np.ndarray | None, *, least: int = 2) -> _Floors | None:
@@ -182,55 +208,69 @@ def _lowest(points: np.ndarray, origin: np.ndarray | None, *, least: int = 2) ->
     if not len(key):
         return None
     cell, lowest = np.unique(key // levels, return_index=True)
-    heights = np.full(shape, np.nan)
+    heights, counts = np.full(shape, np.nan), np.zeros(shape, np.int64)
     heights.flat[cell] = mean[lowest]
-    return _Floors(corner=corner, heights=heights)
+    counts.flat[cell] = (count + above)[enough][lowest]
+    return _Floors(corner=corner, heights=heights, counts=counts)
 
 
-def _common_plane(floors: _Floors) -> np.ndarray | None:
-    """(a, b, c) of the plane z = a x + b y + c that most floors share; None where floors share none."""
+def _common_plane(floors: _Floors, origin: np.ndarray | None) -> np.ndarray | None:
+    """(a, b, c) of the plane z = a x + b y + c that most floors share, the nearer ones before all.
+
+    None where floors share none. A plane must pass below the sensor at `origin` (3,) m, where that is known.
+    """
     h = floors.heights
-    slopes = []
+    x, y = (np.broadcast_to(values, h.shape) for values in floors.positions())
+    middle = np.array([np.nanmedian(np.where(np.isfinite(h), v, np.nan)) for v in (x, y)]) if origin is None else origin
+    x, y = x - middle[0], y - middle[1]
+    weight = 1 / (1 + (x**2 + y**2) / _NEAR**2)
+    highest = np.inf if origin is None else origin[2] - _LEAST_BELOW
+    planes, weights = [np.zeros((0, 3))], [np.zeros(0)]
     for lag in (2, 4):
-        if min(h.shape) <= lag:
-            continue
         for sign_x, sign_y in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-            part = h[::sign_x, ::sign_y]
-            corner = part[:-lag, :-lag]
-            along = np.stack([sign_x * (part[lag:, :-lag] - corner), sign_y * (part[:-lag, lag:] - corner)], -1)
-            slopes.append(along[np.isfinite(along).all(-1)] / (lag * CELL))
-    slope = np.concatenate(slopes) if slopes else np.zeros((0, 2))
-    slope = slope[(np.abs(slope) < _STEEPEST).all(1)]
-    if len(slope) < 3:
+            z, u, v, w = (values[::sign_x, ::sign_y] for values in (h, x, y, weight))
+            corner = np.s_[:-lag, :-lag]
+            a, b = z[lag:, :-lag] - z[corner], z[:-lag, lag:] - z[corner]
+            a, b = sign_x * a / (lag * CELL), sign_y * b / (lag * CELL)
+            plane = np.stack([a, b, z[corner] - a * u[corner] - b * v[corner]], -1)
+            # false too where a cell is unknown
+            fits = (np.abs(plane[..., :2]) < _STEEPEST).all(-1) & (plane[..., 2] < highest)
+            planes.append(plane[fits])
+            weights.append(w[corner][fits])
+    planes_all, weights_all = np.concatenate(planes), np.concatenate(weights)
+    if len(planes_all) < 3:
         return None
     bins = 2 * round(_STEEPEST / _SLOPE_BIN)
-    row, column = ((slope + _STEEPEST) * (bins / (2 * _STEEPEST))).astype(np.int64).T
-    counts = np.bincount(row * bins + column, minlength=bins * bins).reshape(bins, bins).astype(float)
-    smooth = _box_sum(counts, 1)
-    peak = (np.array(np.unravel_index(smooth.argmax(), smooth.shape)) + 0.5) * (2 * _STEEPEST / bins) - _STEEPEST
-    x, y = (np.broadcast_to(values, h.shape)[np.isfinite(h)] for values in floors.positions())
-    z = h[np.isfinite(h)]
-    plane = np.array([*peak, _lowest_mode(z - peak[0] * x - peak[1] * y)])
+    row, column = ((planes_all[:, :2] + _STEEPEST) * (bins / (2 * _STEEPEST))).astype(np.int64).T
+    counts = np.bincount(row * bins + column, weights_all, minlength=bins * bins).reshape(bins, bins)
+    peak = np.array(np.unravel_index(_box_sum(counts, 1).argmax(), counts.shape))
+    slope = (peak + 0.5) * (2 * _STEEPEST / bins) - _STEEPEST
+    known = np.isfinite(h)
+    x, y, z, weight = x[known], y[known], h[known], weight[known]
+    rest = z - slope[0] * x - slope[1] * y
+    below = rest < highest
+    if not below.any():
+        return None
+    plane = np.array([*slope, _lowest_mode(rest[below], weight[below])])
     basis = np.stack([x, y, np.ones_like(x)], 1)
     for room in (0.6, 0.35, 0.25, 0.25):
-        near = np.abs(z - basis @ plane) < room
-        if near.sum() < 4:
+        rest = z - basis @ plane
+        own = np.where(np.abs(rest) < room, weight, 0.0)
+        if np.count_nonzero(own) < 4:
             return None
         # a weak pull to the plane so far where cells lie on a line
-        middle = basis[near].mean(0) * [1, 1, 0]
-        centered = basis[near] - middle
-        change = np.linalg.solve(
-            centered.T @ centered + np.diag([1.0, 1.0, 1e-6]), centered.T @ (z - basis @ plane)[near]
-        )
-        plane = plane + change - [0, 0, change[:2] @ middle[:2]]
-    return plane
+        pull = np.diag([1.0, 1.0, 1e-6])
+        plane = plane + np.linalg.solve((basis * own[:, None]).T @ basis + pull, basis.T @ (own * rest))
+    if plane[2] > highest:
+        return None
+    return plane - [0, 0, plane[:2] @ middle[:2]]
 
 
-def _lowest_mode(values: np.ndarray) -> float:
+def _lowest_mode(values: np.ndarray, weights: np.ndarray) -> float:
     """The lowest height that is nearly as common as the commonest."""
     step = 0.2
     start = values.min()
-    counts = np.bincount(((values - start) / step).astype(np.int64))
+    counts = np.bincount(((values - start) / step).astype(np.int64), weights)
     smooth = np.convolve(counts, [1, 1], "full")[1:] if len(counts) > 1 else counts
     return float(start + step * (np.flatnonzero(smooth >= 0.6 * smooth.max())[0] + 1))
 

@@ -18,7 +18,7 @@ LOW, HIGH = 0.3, 2.1
 _TILE, _OVERLAP = 64.0, 1.0
 # what a candidate must have: points, the height of its top over the ground, and from its lowest to its highest point
 LEAST_POINTS = 5
-_LEAST_TOP, _LEAST_EXTENT = 0.6, 0.25
+_LEAST_TOP, _LEAST_PART, _LEAST_EXTENT = 0.6, 0.45, 0.25
 # a head or shoulder that looks over something may be as low as this where its top is that high over the ground, m
 _LEAST_HEAD, _HEAD_TOP = 0.08, 1.1
 # cells to each side: of the surroundings that a peak tops, of the mean shift, of a candidate's column, of the grid
@@ -28,7 +28,7 @@ _SHIFTS = 2
 _HEAD = 0.3
 _TALLEST = 2.05
 # a column is dropped this near to a stronger one, and a head this near to any, m
-_APART, _HEADS_APART = 0.5, 0.3
+_APART, _HEADS_APART = 0.3, 0.3
 
 
 def propose(points: np.ndarray, ground: Ground, *, limit: int = 600, heights: np.ndarray | None = None) -> np.ndarray:
@@ -106,6 +106,8 @@ def _peaks(xy: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     is_tall = highest - lowest > _LEAST_EXTENT
     is_tall |= (highest - lowest > _LEAST_HEAD) & (highest > _HEAD_TOP) & (points >= 2 * LEAST_POINTS)
     enough = (points >= LEAST_POINTS) & (highest > _LEAST_TOP) & is_tall
+    # cut off by the field of view
+    enough |= (points >= 6 * LEAST_POINTS) & (highest > _LEAST_PART) & (highest - lowest > _LEAST_HEAD)
     is_body = np.arange(len(centers)) < len(body)
     centers, points, is_body = centers[enough], points[enough], is_body[enough]
     # where two are equally strong, the order of places: not that of the points
