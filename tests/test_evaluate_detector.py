@@ -1,6 +1,7 @@
 """People found in whole scans: matching, recall at so many false people a scan, and the command."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -24,7 +25,7 @@ from lidarpose.eval.detector.detection_scores import (
     score_detector,
     score_scan,
 )
-from lidarpose.eval.detector.labeled_scans import LabeledScan, ScanSet, labeled_scans
+from lidarpose.eval.detector.labeled_scans import LabeledScan, ScanSet, heldout_scans, labeled_scans
 from lidarpose.sample import Box
 
 SIZE = (0.8, 0.8, 1.8)
@@ -113,9 +114,12 @@ def test_the_surer_detection_has_the_person_and_the_other_is_false():
 
 def test_few_points_other_things_and_what_is_far_are_neither_wanted_nor_false():
     own = scan([{"x": 5, "points": 9}, {"x": 10, "is_person": False}, 45, {"x": 15, "mounted": True}, 20])
+    hidden = replace(own, num_points=own.num_points * [0, 1, 1, 1, 1])
     found = [box(x, 0.0) for x in (5, 10, 45, 50, 15, 20, 30)]
     people, detections = score_scan(0, own, found, np.linspace(0.9, 0.3, 7), max_range=40)
     assert detections.status.tolist() == [NEITHER] * 4 + [PERSON, PERSON, FALSE]
+    # whom nobody can see is no excuse
+    assert score_scan(0, hidden, found, np.ones(7), max_range=40)[1].status[0] == FALSE
     assert people.person.tolist() == [3, 4] and people.mounted.tolist() == [True, False]
 
 
@@ -235,6 +239,27 @@ def test_poses_in_found_boxes_are_compared_with_those_in_labeled_boxes():
 def test_nobody_to_find_is_an_error():
     with pytest.raises(InputError, match="made has nobody of 10 points and more within 3 m"):
         score_detector(answers([]), scan_set([scan([5])]), max_range=3.0)
+
+
+# ---- the frozen scenes
+
+
+def test_frozen_scenes_are_labeled_scans_and_said_to_be_changed_where_they_are():
+    scans = heldout_scans(limit=120)
+    first = scans.loaders[2]()
+    wanted = first.num_points >= 10
+    assert scans.name == "heldout" and len(scans.loaders) == 120 and wanted.any() and not first.changed
+    assert len(first.joints) == len(first.boxes) == len(first.activities) == len(first.mounted)
+    of_person = [(first.person == k).sum() for k in range(len(first.boxes))]
+    assert first.num_points.tolist() == of_person and first.thing.max() < len(first.things)
+
+    def perfect(points, origin):
+        return first.boxes, np.where(wanted, 0.9, 0.2)
+
+    other = replace(first, changed=True)
+    result = score_detector(perfect, scan_set([first, other]), max_range=100)
+    # somebody else's detection may be nearer only where two stand in one place
+    assert result.row("recall", "0.3")["value"] == 100 and result.changed == 1 and not result.things
 
 
 # ---- the command

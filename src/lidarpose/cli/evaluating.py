@@ -172,6 +172,8 @@ def _detector_lines(result) -> Iterator[str]:
     recall.columns = [f"at {at} (score {score:.2f})" for at, score in result.thresholds.items()]
     yield f"{result.dataset}: {result.scans:,} scans; recall, %, at so many false people a scan:"
     yield recall.to_string()
+    if result.changed:
+        yield f"  note: {result.changed:,} scenes are not as they were frozen: other figures are not of the same"
     for row in rows[(rows.figure != "recall") & rows["at"].isin(["", "1", "default"])].itertuples():
         words = (row.figure.replace("_", " "), row.at and f"at {row.at}", row.group, row.of if row.of != "all" else "")
         yield f"  {' '.join(filter(None, words))}: {row.cell} {row.unit}"

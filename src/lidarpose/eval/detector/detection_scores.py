@@ -32,6 +32,7 @@ DISTANCE_EDGES = (0.0, 10.0, 20.0, 30.0, np.inf)
 # conditions: another person or a thing so near, m, and people who are less tall, m
 _COMPANY, _TOUCHING, _LOW = 1.0, 0.3, 1.4
 CONDITIONS = ("person within 1 m", "thing within 0.3 m", "under 1.4 m tall", "none of these")
+INDOORS = ("room", "corridor", "hall")
 _REPEATS, _BINS = 1000, 10
 # what a detection is of
 PERSON, FALSE, NEITHER = "person", "false", "neither"
@@ -72,7 +73,9 @@ def score_scan(
     places, centers = (np.array([box.center[:2] for box in some]).reshape(-1, 2) for some in (scan.boxes, boxes))
     distance, far = (np.linalg.norm(at - origin, axis=1) for at in (places, centers))
     wanted = scan.is_person & (scan.num_points >= LEAST_POINTS) & (distance <= max_range)
-    of_person = match(centers, scores, places, wanted)
+    # who has no point at all excuses no detection
+    seen = np.where((scan.num_points > 0)[:, None], places, np.inf)
+    of_person = match(centers, scores, seen, wanted)
     finds = np.append(wanted, False)[of_person]
     detection = np.full(len(places), -1)
     detection[of_person[of_person >= 0]] = np.flatnonzero(of_person >= 0)
@@ -124,13 +127,15 @@ def _things(scan: LabeledScan, boxes: Sequence[Box]) -> list[str]:
 class DetectorResult:
     """A detector on one set of scans.
 
-    people, detections: rows as of `score_scan`, people with pose errors `mpjpe_found` and `mpjpe_given`, mm; boxes: of
-    each scan's detections; rows: the figures; thresholds: operating point -> score; reliability: by bins of the score
-    its mean, the share of people and the number of detections; things: what false people are, at `REFERENCE`.
+    changed: scans that are not as they were frozen; people, detections: rows as of `score_scan`, people with pose
+    errors `mpjpe_found` and `mpjpe_given`, mm; boxes: of each scan's detections; rows: the figures; thresholds:
+    operating point -> score; reliability: by bins of the score its mean, the share of people and the number of
+    detections; things: what false people are, at `REFERENCE`.
     """
 
     dataset: str
     scans: int
+    changed: int
     people: pd.DataFrame
     detections: pd.DataFrame
     boxes: Sequence[Sequence[Box]]
@@ -165,7 +170,7 @@ def score_detector(
         seed: of the intervals.
     """
     tables: list[tuple[pd.DataFrame, pd.DataFrame]] = []
-    about: list[dict[str, str]] = []
+    about: list[dict[str, Any]] = []
     found: list[Sequence[Box]] = []
     progress(0, len(scans.loaders))
     for number, load in enumerate(scans.loaders):
@@ -176,13 +181,14 @@ def score_detector(
             people = people.assign(**_pose_errors(people, scan, boxes, predictor))
         tables.append((people, detections))
         found.append(boxes)
-        about.append({"sensor": scan.sensor, "kind": scan.kind})
+        about.append({"sensor": scan.sensor, "kind": scan.kind, "changed": scan.changed})
         progress(number + 1, len(scans.loaders))
     people, detections = (pd.concat(parts, ignore_index=True) for parts in zip(*tables, strict=True))
     if people.empty:
         raise InputError(f"{scans.name} has nobody of {LEAST_POINTS} points and more within {max_range:g} m")
     rng = np.random.default_rng(seed)
-    rows, thresholds = _figures(people, detections, pd.DataFrame(about), rng, default_score)
+    table = pd.DataFrame(about)
+    rows, thresholds = _figures(people, detections, table, rng, default_score)
     rows += _pose_rows(people, thresholds[f"{REFERENCE:g}"], rng)
     judged = detections[detections.status != NEITHER].assign(people=lambda table: table.status == PERSON)
     error = aggregate.calibration_error(judged.score, judged.people)
@@ -193,6 +199,7 @@ def score_detector(
     return DetectorResult(
         dataset=scans.name,
         scans=len(found),
+        changed=int(table.changed.sum()),
         people=people,
         detections=detections,
         boxes=found,
@@ -224,7 +231,7 @@ def _figures(
     above = {f"{budget:g}": exclusive_thresholds(false, weights, budget) for budget in FALSE_PER_SCAN}
     if default_score is not None:
         above["default"] = np.full(len(weights), np.nextafter(default_score, -1))
-    groups = [group for group in _groups_of_people(people) if group[2].any()]
+    groups = [group for group in _groups_of_people(people) if group[2].any() or group[0] == "all"]
     masks = np.array([mask for _, _, mask in groups], float)
     person_weights = weights[:, people.scan]
     total = person_weights @ masks.T
@@ -291,6 +298,7 @@ def _groups_of_people(people: pd.DataFrame) -> Iterator[tuple[str, str, np.ndarr
         for column in ("sensor", "kind", "activity"):
             for name in sorted(set(people[column]) - {""}):
                 yield f"{column}{least}", name, some & (people[column] == name).to_numpy()
+        yield f"kind{least}", "indoors", some & people.kind.isin(INDOORS).to_numpy()
         for name in CONDITIONS:
             yield f"condition{least}", name, some & people[name].to_numpy(bool)
         for name, rows in aggregate.span_rows(people.distance.to_numpy(), DISTANCE_EDGES).items():

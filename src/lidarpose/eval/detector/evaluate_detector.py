@@ -113,7 +113,7 @@ def write_detector(
     pictures: Path | None = None,
 ) -> list[Path]:
     """Writes detector.json, and pictures of false and missed people into a folder of their own; returns their paths."""
-    names = ("dataset", "scans", "thresholds", "reliability", "things", "rows")
+    names = ("dataset", "scans", "changed", "thresholds", "reliability", "things", "rows")
     entries = [{name: getattr(result, name) for name in names} for result in results]
     text = json.dumps({"schema": SCHEMA, "version": __version__} | about | {"results": entries})
     # a line each row

@@ -35,7 +35,7 @@ class LabeledScan:
     many points each person has; is_person (P,) bool: False where something else is labeled; mounted (P,) bool: riders
     and wheelchairs; activities: P names; sensor, kind of scene: "" where it is not known; thing (n,): the kind of thing
     that a point lies on, an index of `things`, or -1; person (n,): an index of `boxes`, or -1; joints (P, 26, 3) m,
-    body26.
+    body26; changed: the scan is not what it was when its list was frozen.
     """
 
     name: str
@@ -52,6 +52,7 @@ class LabeledScan:
     things: Sequence[str] = ()
     person: np.ndarray | None = None
     joints: np.ndarray | None = None
+    changed: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,23 +66,23 @@ class ScanSet:
 def heldout_scans(limit: int | None = None) -> ScanSet:
     """The frozen scenes with kinds of things, rooms and poses that no detector was trained on."""
     content = json.loads((resources.files("lidarpose.eval") / "assets" / _HELDOUT_FILE).read_text("utf-8"))
-    indices = [content["indices"][k] for k in spread(len(content["indices"]), limit).tolist()]
-    return ScanSet(name=HELDOUT, loaders=[partial(synthetic_scan, content["seed"], index) for index in indices])
+    rows = spread(len(content["indices"]), limit)
+    scenes = [(content["seed"], content["indices"][k], content["family"], content["sha256"][k]) for k in rows]
+    return ScanSet(name=HELDOUT, loaders=[partial(synthetic_scan, *scene) for scene in scenes])
 
 
-def synthetic_scan(seed: int, index: int, family: str = HELDOUT) -> LabeledScan:
-    """A scene of `synth.detection_scene` as a labeled scan."""
+def synthetic_scan(seed: int, index: int, family: str = HELDOUT, digest: str | None = None) -> LabeledScan:
+    """A scene of `synth.detection_scene` as a labeled scan. digest: what its points had when it was frozen."""
     from lidarpose.synth.detection_scene import detection_scene
-    from lidarpose.synth.environment.things import KINDS
 
     scene = detection_scene(seed, index, family=family)
     people = len(scene.boxes)
-    alike = "points origin boxes mounted activities sensor kind thing person joints".split()
+    alike = "points origin boxes mounted activities sensor kind thing things person joints".split()
     return LabeledScan(
         name=f"{family} {index}",
         num_points=np.bincount(scene.person[scene.person >= 0], minlength=people),
         is_person=np.ones(people, bool),
-        things=KINDS,
+        changed=digest not in (None, scene.points_digest()),
         **{name: getattr(scene, name) for name in alike},
     )
 
