@@ -126,12 +126,10 @@ def draw_bodies(
     """The people of a block; a function of (seed, block) and of where poses come from.
 
     Args:
-        bank: captured poses, or None.
-        captured: share of the poses that comes from the bank.
+        bank: captured poses, or None; captured: share of the poses that comes from it.
         count: number of bodies.
         moving: False is faster; then nobody goes anywhere.
-        clothes: see `SceneConfig`.
-        mix: see `sample_rotations`.
+        clothes, mix: see `SceneConfig` and `sample_rotations`.
     """
     rng = np.random.default_rng([seed, RandomStream.BLOCK, block])
     rig = load_rig()

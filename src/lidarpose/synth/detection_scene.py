@@ -5,7 +5,7 @@ its free areas, a fifth of them beside people; then the ground is sloped and wav
 tilted, and points get lost or go astray. What is drawn depends on (seed, index, family) alone. Family "train" never
 draws the things and rooms that are left out for judging; "heldout" draws them most often; "bench" draws all alike.
 
-Letters: P people, n points of a scene, M meshes.
+Letters: P people, n points of a scene.
 """
 
 import hashlib
@@ -24,10 +24,20 @@ from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import Box
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import FRAME_TIME, Bodies, draw_bodies
-from lidarpose.synth.environment import mesh as shapes
-from lidarpose.synth.environment.layouts import LAYOUTS, LEFT_OUT, Item, Layout
-from lidarpose.synth.environment.mesh import Mesh, shape, union
-from lidarpose.synth.environment.things import KINDS, LEAVES, THINGS, draw_thing
+from lidarpose.synth.environment.layouts import LAYOUTS, LEFT_OUT, Layout
+from lidarpose.synth.environment.mesh import Mesh, union
+from lidarpose.synth.environment.site import (
+    HALF_WIDTH,
+    Mount,
+    Relief,
+    Site,
+    add_own_vehicle,
+    add_screens,
+    draw_habits,
+    pick,
+    scatter,
+)  # fmt: skip
+from lidarpose.synth.environment.things import KINDS, LEAVES
 from lidarpose.synth.props import Prop, draw_props
 from lidarpose.synth.props.attachments import MOUNTS
 from lidarpose.synth.scene import Place, RandomStream
@@ -36,26 +46,13 @@ from lidarpose.synth.simulate import ScanConditions, add_sensor_noise, label_box
 FAMILIES = ("train", "heldout", "bench")
 # how often each place is drawn; the left-out ones only where they may be
 _PLACES = {"street": 4.0, "square": 2.0, "path": 2.0, "room": 2.0, "car park": 0.8, "corridor": 1.2, "hall": 1.2}
-# how much more often left-out things are drawn for judging
-_LEFT_OUT_WEIGHT = 3.0
 # sensors by name and how often they are drawn outdoors and indoors; "random": rings at random
 _SENSORS = {
-    "vlp-16": (1.0, 1.0),
-    "vlp-32c": (1.0, 0.3),
-    "hdl-32e": (0.8, 0.3),
-    "hdl-64e": (0.8, 0.0),
-    "os1-64": (1.0, 0.6),
-    "os1-128": (0.5, 0.4),
-    "os0-128": (0.6, 1.0),
-    "pandar64": (1.0, 0.2),
-    "av2": (1.2, 0.0),
-    "waymo-top": (0.5, 0.0),
-    "livox-mid360": (1.3, 1.5),
-    "livox-avia": (1.0, 0.4),
-    "livox-mid100": (0.4, 0.1),
-    "depth-camera": (0.3, 1.5),
+    "vlp-16": (1.0, 1.0), "vlp-32c": (1.0, 0.3), "hdl-32e": (0.8, 0.3), "hdl-64e": (0.8, 0.0), "os1-64": (1.0, 0.6),
+    "os1-128": (0.5, 0.4), "os0-128": (0.6, 1.0), "pandar64": (1.0, 0.2), "av2": (1.2, 0.0), "waymo-top": (0.5, 0.0),
+    "livox-mid360": (1.3, 1.5), "livox-avia": (1.0, 0.4), "livox-mid100": (0.4, 0.1), "depth-camera": (0.3, 1.5),
     "random": (2.5, 1.5),
-}
+}  # fmt: skip
 # beams of a scan at most: what has more sends fewer columns
 _MOST_BEAMS = 140_000
 # people by activity, outdoors and indoors
@@ -68,16 +65,10 @@ _MIX_INDOORS = _MIX_OUTDOORS | {"idle": 0.36, "walk": 0.2, "sit": 0.25, "cycle":
 _SEATS = (("moped", 0.3), ("wheelchair", 0.25), ("chair", 0.45))
 _MOUNTED = ("bicycle", "moped", "wheelchair")
 _PROP_KINDS = {"chair": "chair", "bicycle": "bicycle", "moped": "moped", "pram": "cart", "trolley": "cart"}
-# people and things stand within these distances, m, people at least so far apart
-_NEAREST, _FARTHEST, _APART = 1.5, 40.0, 0.42
+# people stand at least so far apart, and who rides or pushes something needs more, m
+_APART, _MORE = 0.42, 0.4
 # points of a piece of a place at least
 _LEAST_PIECE = 300
-# share of the things beside people among those that are added last, a quarter of all
-_BESIDE = 0.8
-# half of a standing person's width, and what riders and who push something need more, m
-_HALF, _MORE = 0.24, 0.4
-# height of what of a person is to be seen, m
-_CHEST = 1.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,38 +121,30 @@ def detection_scene(seed: int, index: int, *, family: str = "train") -> Detectio
     check_name("family of scenes", family, FAMILIES)
     rng = np.random.default_rng([seed, RandomStream.DETECTION, FAMILIES.index(family), index])
     names = [name for name in _PLACES if family != "train" or name not in LEFT_OUT]
-    place = str(_pick(rng, {name: _PLACES[name] for name in names}))
+    place = str(pick(rng, {name: _PLACES[name] for name in names}))
     layout = LAYOUTS[place](rng)
     device = _draw_sensor(layout.indoors, rng)
     mount = _draw_mount(device, layout, rng)
     duration = device.duration if isinstance(device, RayPattern) else 0.0
-    site = _Site(layout, device, mount)
-    weights = _draw_habits(layout.indoors, family, rng)
+    site = Site(layout, device, mount)
+    weights = draw_habits(layout.indoors, family, rng)
     count = int((rng.integers(3, 16) if layout.indoors else rng.integers(15, 61)) * layout.things)
-    _add_own_vehicle(site, rng)
-    _scatter(site, weights, count - count // 4, np.zeros((0, 2)), rng)
+    add_own_vehicle(site, rng)
+    scatter(site, weights, count - count // 4, np.zeros((0, 2)), rng)
     people = _draw_people(site, duration > 0, rng)
     feet = np.array([person.place.feet[:2] for person in people]).reshape(-1, 2)
-    _scatter(site, weights, count // 4, feet, rng)
-    _add_screens(site, feet, rng)
-    relief = _Relief.draw(layout.indoors, rng)
-    shift = np.array([0, 0, -mount.height - layout.sensor[2]])
-    meshes, owners, kinds = [], [], []
-    for number, person in enumerate(people):
-        person.place = replace(person.place, feet=person.place.feet + [0, 0, relief.at(person.place.feet)] + shift)
-        for name, mesh in person.meshes(duration):
-            meshes.append(mesh)
-            owners.append(number if name is None else -1)
-            kinds.append(-1 if name is None else KINDS.index(name))
-    for name, mesh in site.items:
-        mesh.vertices[:, 2] += relief.at(mesh.vertices.T)
-        meshes.append(Mesh((mesh.vertices + shift).astype(np.float32), mesh.faces, mesh.part))
-        owners.append(-1)
-        kinds.append(KINDS.index(name))
+    scatter(site, weights, count // 4, feet, rng)
+    add_screens(site, feet, rng)
+    _lift(site, people, Relief.draw(layout.indoors, rng), mount.height + layout.sensor[2])
+    meshes = [(number, *item) for number, person in enumerate(people) for item in person.meshes(duration)]
+    meshes += [(-1, *item) for item in site.items]
+    # a person's body and clothes are no thing, things are nobody
+    owners = [number if name is None else -1 for number, name, _ in meshes]
+    kinds = [-1 if name is None else KINDS.index(name) for _, name, _ in meshes]
+    counts = [len(mesh.faces) for _, _, mesh in meshes]
     turn = rotation_about("z", mount.turn).T
-    scene = union(meshes)
+    scene = union([mesh for _, _, mesh in meshes])
     points, face = _scan(device, _turned(scene, turn.astype(np.float32)), mount.R_sensor_level, rng)
-    counts = [len(mesh.faces) for mesh in meshes]
     person_of, thing_of = (np.repeat(np.array(values, np.int16), counts)[face] for values in (owners, kinds))
     if scene.part is not None:
         points = _into_leaves(points, scene.part[face] == LEAVES, rng)
@@ -190,9 +173,15 @@ def detection_scene(seed: int, index: int, *, family: str = "train") -> Detectio
     )
 
 
-def _pick(rng: np.random.Generator, weights: dict[str, float]) -> str:
-    shares = np.cumsum(list(weights.values()))
-    return list(weights)[int(np.searchsorted(shares, rng.random() * shares[-1], side="right"))]
+def _lift(site: Site, people: list["_Person"], relief: Relief, height: float) -> None:
+    """Sets all on the ground's slope and waves, the sensor to z = 0, so high above its flat ground."""
+    down = np.array([0, 0, -height])
+    for person in people:
+        person.place = replace(person.place, feet=person.place.feet + [0, 0, relief.at(person.place.feet)] + down)
+    for row, (name, mesh) in enumerate(site.items):
+        vertices = mesh.vertices.copy()
+        vertices[:, 2] += relief.at(vertices.T)
+        site.items[row] = name, Mesh((vertices + down).astype(np.float32), mesh.faces, mesh.part)
 
 
 def _turned(mesh: Mesh, turn: np.ndarray) -> Mesh:
@@ -202,19 +191,8 @@ def _turned(mesh: Mesh, turn: np.ndarray) -> Mesh:
 # --- the sensor
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Mount:
-    """height m above the ground; R_sensor_level (3, 3); turn rad of the layout about the sensor; view: the middle of a
-    narrow field of view in the layout, rad, and half its width."""
-
-    height: float
-    R_sensor_level: np.ndarray
-    turn: float
-    view: tuple[float, float]
-
-
 def _draw_sensor(indoors: bool, rng: np.random.Generator) -> Sensor | RayPattern:
-    name = _pick(rng, {name: shares[int(indoors)] for name, shares in _SENSORS.items()})
+    name = pick(rng, {name: shares[int(indoors)] for name, shares in _SENSORS.items()})
     device: Sensor | RayPattern
     if name == "random":
         rings = int(rng.choice([16, 24, 32, 40, 48, 64, 80, 128]))
@@ -257,7 +235,7 @@ def _integrated(name: str, frames: int) -> RayPattern:
     return replace(single, rays=rays, frames=4, duration=single.duration * frames)  # type: ignore[arg-type]
 
 
-def _draw_mount(device: Sensor | RayPattern, layout: Layout, rng: np.random.Generator) -> _Mount:
+def _draw_mount(device: Sensor | RayPattern, layout: Layout, rng: np.random.Generator) -> Mount:
     """On a robot, a tripod, a car, a mast or under a ceiling; what is high looks down."""
     where, up, turn = rng.random(3)
     if layout.indoors:
@@ -280,115 +258,12 @@ def _draw_mount(device: Sensor | RayPattern, layout: Layout, rng: np.random.Gene
     yaw = rng.uniform(-pi, pi)
     if narrow:
         yaw = -float(rng.choice(layout.ahead)) + rng.uniform(-0.5, 0.5)
-    return _Mount(
+    return Mount(
         height=float(height),
         R_sensor_level=rotation_about("x", roll) @ rotation_about("y", -pitch),
         turn=yaw,
         view=(-yaw, half if narrow or pitch < np.radians(12) else 1.2),
     )
-
-
-# --- where things and people stand
-
-
-class _Site:
-    """A layout about the sensor: its meshes, and where there is room.
-
-    items: kinds and meshes, the sensor's ground at x = y = 0; low: (M, 5), what each takes of the ground, and its top.
-    """
-
-    def __init__(self, layout: Layout, device: Sensor | RayPattern, mount: _Mount):
-        x, y, _ = layout.sensor
-        self.layout, self.mount = layout, mount
-        self.elevations = device.elevations[0], device.elevations[-1]
-        self.reach = min(_FARTHEST, 0.95 * device.range_max)
-        self.areas = np.array(layout.areas) - [x, x, y, y, 0]
-        self.items: list[Item] = []
-        self.low = np.zeros((0, 5))
-        moved = [(name, mesh.moved((-x, -y, 0))) for name, mesh in layout.items]
-        rows = np.array([_footprint(mesh) for _, mesh in moved])
-        fixed = np.array([name in ("ground", "ceiling", "wall") for name, _ in moved])
-        clear = fixed | (_gap(rows, np.zeros(2)) > 0.5)
-        self.items = [item for item, keep in zip(moved, clear, strict=True) if keep]
-        stands = np.array([name not in ("ground", "ceiling") for name, _ in moved])
-        self.low = rows[clear & stands]
-        self.low = self.low[np.isfinite(self.low[:, 0])]
-
-    def add(self, name: str, mesh: Mesh) -> None:
-        self.items.append((name, mesh))
-        row = _footprint(mesh)
-        if np.isfinite(row[0]):
-            self.low = np.concatenate([self.low, row[None]])
-
-    def level(self, place: np.ndarray) -> float:
-        """z of the flat ground at (2,) m."""
-        inside = (place[0] >= self.areas[:, 0]) & (place[0] <= self.areas[:, 1])
-        inside &= (place[1] >= self.areas[:, 2]) & (place[1] <= self.areas[:, 3])
-        return float(self.areas[np.argmax(inside), 4])
-
-    def is_free(self, place: np.ndarray, room: float) -> bool:
-        return bool(np.hypot(*place) > max(room, 0.3) and (_gap(self.low, place) > room).all())
-
-    def is_hidden(self, places: np.ndarray) -> np.ndarray:
-        """(k,) bool: whether something stands between the sensor and the chest of a person at places (k, 2) m, or the
-        chest is above or below all beams."""
-        up = np.full((len(places), 1), _CHEST - self.mount.height)
-        chest = np.hstack([places, up]) @ rotation_about("z", self.mount.turn).T @ self.mount.R_sensor_level.T
-        elevation = np.arctan2(chest[:, 2], np.hypot(*chest[:, :2].T))
-        outside = (elevation < self.elevations[0]) | (elevation > self.elevations[1])
-        ways = places[:, None, :]
-        ways = np.where(np.abs(ways) < 1e-6, 1e-6, ways)
-        near, far = self.low[:, :2] / ways, self.low[:, 2:4] / ways
-        enter, leave = np.minimum(near, far).max(2), np.maximum(near, far).min(2)
-        beam = self.mount.height + (_CHEST - self.mount.height) * enter
-        return outside | np.any((enter < leave) & (enter > 0) & (enter < 0.97) & (self.low[:, 4] > beam), axis=1)
-
-    def spot(self, distance: float, room: float, rng: np.random.Generator, *, seen: bool = False) -> np.ndarray:
-        """Some free place (2,) m in the areas about so far from the sensor, in view where the view is narrow; where
-        a person is `seen` if there is such a place."""
-        middle, half = self.mount.view
-        u = rng.random((48, 3))
-        angle = middle + half * 0.95 * (2 * u[:24, 0] - 1)
-        polar = distance * np.stack([np.cos(angle), np.sin(angle)], 1)
-        area = self.areas[(u[24:, 0] * len(self.areas)).astype(int)]
-        inside = area[:, [0, 2]] + u[24:, 1:] * (area[:, [1, 3]] - area[:, [0, 2]])
-        places = np.concatenate([polar, inside])
-        far = np.hypot(*places.T)
-        cost = np.abs(far - distance) + 50 * (far > self.reach) + 100 * (far < max(room, _NEAREST))
-        off = np.abs((np.arctan2(places[:, 1], places[:, 0]) - middle + pi) % (2 * pi) - pi)
-        cost += 20 * (off > half)
-        in_area = (places[:, None, :] >= self.areas[:, [0, 2]]) & (places[:, None, :] <= self.areas[:, [1, 3]])
-        cost += 200 * ~np.any(np.all(in_area, axis=2), axis=1)
-        if len(self.low):
-            cost += 200 * (_gap(self.low, places) < room).any(1)
-            cost += 30 * self.is_hidden(places) if seen else 0
-        return places[np.argmin(cost)]
-
-    def beside(self, rng: np.random.Generator, gap: float) -> np.ndarray:
-        """A place (2,) m so near to something that stands there."""
-        near = self.low[np.hypot(*((self.low[:, :2] + self.low[:, 2:4]) / 2).T) < self.reach]
-        if not len(near):
-            return self.spot(rng.uniform(_NEAREST, self.reach), _HALF, rng)
-        low_x, low_y, high_x, high_y, _ = near[rng.integers(len(near))]
-        u = rng.random(2)
-        x, y = low_x + u[0] * (high_x - low_x), low_y + u[0] * (high_y - low_y)
-        sides = [(low_x - gap, y), (high_x + gap, y), (x, low_y - gap), (x, high_y + gap)]
-        return np.array(sides[int(4 * u[1])])
-
-
-def _footprint(mesh: Mesh) -> np.ndarray:
-    """(5,): least x, y, greatest x, y of what is below 1.9 m, inf where nothing is, and the top's z."""
-    low = mesh.vertices[mesh.vertices[:, 2] < 1.9, :2]
-    if not len(low):
-        return np.full(5, np.inf)
-    return np.array([*low.min(0), *low.max(0), mesh.vertices[:, 2].max()])
-
-
-def _gap(low: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Distance of places (..., 2) from footprints (M, 5): (..., M) m, 0 within."""
-    places = places[..., None, :]
-    outside = np.maximum(np.maximum(low[:, :2] - places, places - low[:, 2:4]), 0)
-    return np.hypot(outside[..., 0], outside[..., 1])
 
 
 @dataclass(kw_only=True)
@@ -436,7 +311,7 @@ class _Person:
         return meshes
 
 
-def _draw_people(site: _Site, is_smeared: bool, rng: np.random.Generator) -> list[_Person]:
+def _draw_people(site: Site, is_smeared: bool, rng: np.random.Generator) -> list[_Person]:
     """Groups of one to five, some beside what stands there; who finds no room stays away."""
     indoors = site.layout.indoors
     area = float(np.prod(site.areas[:, [1, 3]] - site.areas[:, [0, 2]], axis=1).max())
@@ -452,9 +327,9 @@ def _draw_people(site: _Site, is_smeared: bool, rng: np.random.Generator) -> lis
         distance = 2 + (site.reach - 2) * rng.random() ** 1.7
         beside = rng.random() < 0.25
         middle = (
-            site.beside(rng, _HALF + 0.4 * rng.random())
+            site.beside(rng, HALF_WIDTH + 0.4 * rng.random())
             if beside
-            else site.spot(distance, _HALF, rng, seen=rng.random() < 0.85)
+            else site.spot(distance, HALF_WIDTH, rng, seen=rng.random() < 0.85)
         )
         style, course = rng.random(), rng.choice([0.0, pi / 2, pi, -pi / 2]) + rng.normal(0, 0.25)
         members: list[np.ndarray] = []
@@ -468,7 +343,7 @@ def _draw_people(site: _Site, is_smeared: bool, rng: np.random.Generator) -> lis
                     near = members[rng.integers(len(members))]
                     place = near + far * np.array([np.cos(angle), np.sin(angle)])
                 apart = [np.hypot(*(person.place.feet[:2] - place)) for person in people]
-                room = 0.9 * _HALF + 0.5 * more
+                room = 0.9 * HALF_WIDTH + 0.5 * more
                 if min(apart, default=9) >= _APART + more and site.is_free(place, room) and np.hypot(*place) > 1.0:
                     to_middle = float(np.arctan2(*(middle - place)[::-1]))
                     yaw = course if style < 0.4 else to_middle if style < 0.7 and members else rng.uniform(-pi, pi)
@@ -486,114 +361,10 @@ def _draw_belongings(bodies: Bodies, row: int, indoors: bool, rng: np.random.Gen
     """What somebody carries, pushes, sits on or rides."""
     kind, joints = bodies.kinds[row], bodies.joints[row]
     if kind == "sit" and not indoors or kind == "sit" and rng.random() < 0.15:
-        mount = MOUNTS[_pick(rng, dict(_SEATS))](joints.tolist(), rng.random(12).tolist())
+        mount = MOUNTS[pick(rng, dict(_SEATS))](joints.tolist(), rng.random(12).tolist())
         if mount is not None:
             return [mount]
     return draw_props(rng, kind=kind, joints=joints)
-
-
-def _draw_habits(indoors: bool, family: str, rng: np.random.Generator) -> dict[str, float]:
-    """How often things stand in a scene: each scene has habits of its own."""
-    weights = {}
-    for name, row in THINGS.items():
-        weights[name] = (row.indoors if indoors else row.outdoors) * (family != "train" or not row.left_out)
-        if row.left_out and family == "heldout":
-            weights[name] *= _LEFT_OUT_WEIGHT
-    return {name: weight * rng.gamma(0.7) for name, weight in weights.items()}
-
-
-def _scatter(site: _Site, weights: dict[str, float], count: int, feet: np.ndarray, rng: np.random.Generator) -> None:
-    """Adds `count` things that are taken for people; where there are people at feet (k, 2) m most stand beside them."""
-    ceiling = site.layout.ceiling
-    for _ in range(count):
-        name = _pick(rng, weights)
-        mesh = draw_thing(name, rng)
-        mesh = mesh.moved((0, 0, 0), rng.choice([0.0, pi / 2, pi, -pi / 2]) + rng.normal(0, 0.15))
-        if mesh.vertices[:, 2].max() > ceiling:
-            mesh = mesh.scaled((1, 1, 0.97 * min(ceiling, 3.0) / mesh.vertices[:, 2].max()))
-        low = _footprint(mesh)
-        for _attempt in range(3):
-            if len(feet) and name != "mannequin" and rng.random() < _BESIDE:
-                angle, near = rng.uniform(-pi, pi), feet[rng.integers(len(feet))]
-                across = np.array([np.cos(angle), np.sin(angle)])
-                place = near + across * (_HALF + 0.05 + 0.45 * rng.random()) - np.where(across > 0, low[:2], low[2:4])
-                place = np.where(np.abs(across) < 0.3, near, place)
-            elif name in ("fragment", "mannequin") and not site.layout.indoors:
-                place = site.spot(rng.uniform(18, 40), 0.3, rng, seen=True)
-            else:
-                place = site.spot(_NEAREST + (site.reach - _NEAREST) * rng.random() ** 1.2, 0.3, rng)
-            row = low + [*place, *place, 0]
-            if _gap(row[None], np.zeros(2)).min() > 0.6 and (not len(feet) or _gap(row[None], feet).min() > 0.2):
-                site.add(name, mesh.moved((*place, site.level(place))))
-                break
-
-
-def _add_screens(site: _Site, feet: np.ndarray, rng: np.random.Generator) -> None:
-    """Plates and leaves close before the sensor, in a quarter of the scenes; none in people at feet (k, 2) m."""
-    for _ in range(rng.integers(1, 7) if rng.random() < 0.25 else 0):
-        far, angle, u = rng.uniform(0.6, 3.0), rng.uniform(-pi, pi), rng.random(3).tolist()
-        wide, low = (0.03 + 0.5 * u[0] ** 2) * far, max(0.0, site.mount.height - u[1] * far)
-        screen = shapes.box((0.03, wide, min(0.1 + 1.2 * u[2], site.layout.ceiling - low)))
-        if rng.random() < 0.3:
-            screen = shapes.foliage((wide, wide, 0.2 + 1.0 * u[2]), 80, 0.08, rng)
-        place = np.array([far * np.cos(angle), far * np.sin(angle)])
-        if not len(feet) or np.hypot(*(feet - place).T).min() > 0.3 + wide / 2:
-            site.add("screen", screen.moved((*place, low + site.level(place)), angle))
-
-
-def _add_own_vehicle(site: _Site, rng: np.random.Generator) -> None:
-    """What carries the sensor, where the sensor sees it."""
-    if rng.random() < 0.4:
-        own = _own_vehicle(site.mount.height, site.layout.by_car, rng)
-        site.items.append(("own vehicle", own.moved((0, 0, site.layout.sensor[2]))))
-        # nobody stands in it, and it hides nothing that is higher than it
-        site.low = np.concatenate([site.low, [[*_footprint(own)[:4], 0]]])
-
-
-def _own_vehicle(height: float, by_car: bool, rng: np.random.Generator) -> Mesh:
-    """A car below its roof sensor, a robot's deck, or the mast or tripod that carries the sensor."""
-    u = rng.random(4)
-    if by_car and height > 1.4:
-        roof = height - 0.1 - 0.25 * u[0]
-        return shape("car" if roof < 1.8 else "van", 4.4 + u[1], 1.85, roof).moved((0.8 * (u[2] - 0.5), 0, 0))
-    if height < 1.4:
-        deck = shapes.box((0.3 + 0.5 * u[0], 0.3 + 0.3 * u[1], 0.8 * height))
-        return deck.moved((-0.2 * u[2], 0, 0), 2 * pi * u[3])
-    legs = [
-        shape("tube", 0.02, 0.02, 0.9 * height).placed(
-            [[1, 0, 0], [0, 1, 0], [np.cos(a) * 0.02, np.sin(a) * 0.02, 1]], (0.15 * np.cos(a), 0.15 * np.sin(a), 0)
-        )
-        for a in (0, 2.1, 4.2)
-    ]
-    return union(legs)
-
-
-@dataclass(frozen=True)
-class _Relief:
-    """Slope (2,) and long waves of the ground: rows of wave vector (2,) rad/m, phase, amplitude m."""
-
-    slope: np.ndarray
-    waves: np.ndarray
-
-    @classmethod
-    def draw(cls, indoors: bool, rng: np.random.Generator) -> "_Relief":
-        if indoors:
-            return cls(np.zeros(2), np.zeros((0, 4)))
-        slope = rng.normal(0, 0.035 if rng.random() < 0.6 else 0.0, 2).clip(-0.12, 0.12)
-        waves = []
-        for _ in range(rng.integers(1, 4) if rng.random() < 0.45 else 0):
-            long, angle, phase = rng.uniform(14, 70), rng.uniform(-pi, pi), rng.uniform(-pi, pi)
-            k = 2 * pi / long
-            waves.append([k * np.cos(angle), k * np.sin(angle), phase, rng.uniform(0, 0.08) / k])
-        return cls(slope, np.array(waves).reshape(-1, 4))
-
-    def at(self, places: np.ndarray) -> np.ndarray:
-        """Height m of the ground at places (2 or 3, ...) m, 0 below the sensor."""
-        x, y = places[0], places[1]
-        z = self.slope[0] * x + self.slope[1] * y
-        for a, b, phase, high in self.waves:
-            z = z + high * (np.sin(a * x + b * y + phase) - np.sin(phase))
-        return z
 
 
 # --- the scan
@@ -668,9 +439,9 @@ class _Frame:
     origin: np.ndarray
 
     @classmethod
-    def draw(cls, mount: _Mount, rng: np.random.Generator) -> "_Frame":
-        """Level within a degree or two; now and then as tilted as the sensor, or as a floor that was taken for level.
-        The sensor is its origin, or it stands above a vehicle's."""
+    def draw(cls, mount: Mount, rng: np.random.Generator) -> "_Frame":
+        """Level within a degree or two, in a tenth tilted by 3 to 15. The sensor is its origin, or stands above a
+        vehicle's."""
         angle, degrees = rng.uniform(-pi, pi), abs(rng.normal(0, 1.2))
         if rng.random() < 0.1:
             degrees = rng.uniform(3, 15)
