@@ -34,8 +34,10 @@ RADIUS, _ROOM = 1.75, 0.2
 _MOST_POINTS, _UNIT = 1000, 5e-4
 # points lie sorted by cells of this size, m, in tables of at most so many cells
 _INDEX_CELL, _MOST_INDEX_CELLS = 0.5, 4_000_000
-# the finest cells of the range image, rad, and how many coarser levels there are, each of twice the size
-_ANGLE, _LEVELS = pi / 1024, 5
+# rows of the range image's finest cells from straight below to above, their size rad, and how many coarser levels
+# there are, each of twice the size
+_ROWS = 1024
+_ANGLE, _LEVELS = pi / _ROWS, 5
 _LEAST_DISTANCE = 0.5
 # heights above the ground: of the slices whose filling is counted, and what is near the ground, m
 _BAND, _BAND_SLICES, _NEAR_GROUND = (0.3, 2.1), 6, 0.2
@@ -135,7 +137,7 @@ class SceneIndex:
         self._shape = tuple(int(n) for n in extent // self._cell + 2)
         cells = ((points[:, :2] - self._corner) * (1 / self._cell)).astype(np.int32)
         flat = cells[:, 0] * self._shape[1] + cells[:, 1]
-        self._order = np.argsort(flat)
+        self._order = _order(flat)
         self._start = np.zeros(self._shape[0] * self._shape[1] + 1, np.int64)
         np.cumsum(np.bincount(flat, minlength=len(self._start) - 1), out=self._start[1:])
         # relative to the corner, float32 holds millimeters of the widest map
@@ -229,6 +231,14 @@ class SceneIndex:
         return np.moveaxis(values, -1, 1).reshape(-1, CONTEXT_CHANNELS, CONTEXT_SIDE, CONTEXT_SIDE).astype(np.uint8)
 
 
+def _order(cells: np.ndarray) -> np.ndarray:
+    """Rows that sort flat cells (n,), those of one cell in their own order: by 16 bits at a time, which is linear."""
+    order = np.argsort((cells & 0xFFFF).astype(np.uint16), kind="stable")
+    if len(cells) and cells.max() > 0xFFFF:
+        order = order[np.argsort((cells >> 16)[order].astype(np.uint16), kind="stable")]
+    return order
+
+
 def _draw_maps(cells: np.ndarray, heights: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """The context's channels (cells, 4) uint8 of points sorted by their flat cells (n,), heights (n,) m."""
     size = shape[0] * shape[1]
@@ -251,8 +261,11 @@ def _draw_maps(cells: np.ndarray, heights: np.ndarray, shape: tuple[int, ...]) -
 
 
 def _log_bytes(count: np.ndarray) -> np.ndarray:
-    """.125 log2(1 + count) as bytes, 255 for 1."""
+    """.125 log2(1 + count) as bytes, 255 for 1 and more."""
     return np.minimum(np.log2(1.0 + count) * (0.125 * 255), 255).astype(np.uint8)
+
+
+_COUNT_BYTES = _log_bytes(np.arange(256))
 
 
 class _RangeImage:
@@ -260,58 +273,61 @@ class _RangeImage:
 
     def __init__(self, points: np.ndarray):
         """points (n, 3) m from the sensor."""
-        x, y, z = np.asarray(points, np.float32).T
-        level = np.hypot(x, y)
-        azimuth = ((np.arctan2(y, x) + np.float32(pi)) * np.float32(1 / _ANGLE)).astype(np.int32)
-        elevation = np.arctan2(z, np.maximum(level, 1e-6))
-        row = ((elevation + np.float32(pi / 2)) * np.float32(1 / _ANGLE)).astype(np.int32)
-        rows, columns = round(pi / _ANGLE), round(2 * pi / _ANGLE)
-        flat = np.minimum(row, rows - 1) * columns + np.minimum(azimuth, columns - 1)
-        order = np.argsort(flat)
-        flat, ranges = flat[order], level[order]
-        near = np.full((rows, columns), np.inf, np.float32)
-        far = np.zeros((rows, columns), np.float32)
-        count = np.bincount(flat, minlength=rows * columns).astype(np.float32).reshape(rows, columns)
-        if len(flat):
-            first = np.flatnonzero(np.concatenate([[True], flat[1:] != flat[:-1]]))
-            near.ravel()[flat[first]] = np.minimum.reduceat(ranges, first)
-            far.ravel()[flat[first]] = np.maximum.reduceat(ranges, first)
-        # each level: (near, far, count)
-        self.levels = [(near, far, count)]
-        for _ in range(_LEVELS):
-            near, far, count = _halved(near, np.minimum), _halved(far, np.maximum), _halved(count, np.add)
-            self.levels.append((near, far, count))
+        x, y, z = np.ascontiguousarray(np.asarray(points, np.float32).T)
+        level = np.sqrt(x * x + y * y)
+        column = ((np.arctan2(y, x) + np.float32(pi)) * np.float32(1 / _ANGLE)).astype(np.int32)
+        row = (np.arctan2(z, level) * np.float32(1 / _ANGLE) + np.float32(_ROWS // 2)).astype(np.int32)
+        # rows that hold nothing above and below are left out, whole cells of the coarsest level
+        coarsest = 2**_LEVELS
+        self._first = int(row.min(initial=_ROWS)) // coarsest * coarsest
+        rows = max(int(row.max(initial=0)) // coarsest * coarsest + coarsest - self._first, coarsest)
+        self._columns = 2 * _ROWS
+        flat = (row - self._first) * self._columns + np.minimum(column, self._columns - 1)
+        near, far = np.full(rows * self._columns, np.inf, np.float32), np.zeros(rows * self._columns, np.float32)
+        np.minimum.at(near, flat, level)
+        np.maximum.at(far, flat, level)
+        count = np.bincount(flat, minlength=len(near)).astype(np.int32)
+        # levels one after the other, and a cell in which nothing came back
+        levels = [(near, far, count)]
+        for number in range(_LEVELS):
+            columns = self._columns >> number
+            near, far, count = (
+                _halved(image.reshape(-1, columns), reduce).ravel()
+                for image, reduce in ((near, np.minimum), (far, np.maximum), (count, np.add))
+            )
+            levels.append((near, far, count))
+        self._rows = rows
+        self._starts = np.cumsum([0, *(len(level[0]) for level in levels)])
+        none = (np.full(1, np.inf, np.float32), np.zeros(1, np.float32), np.zeros(1, np.int32))
+        self._near, self._far, self._count = (np.concatenate(images) for images in zip(*levels, none, strict=True))
 
     def views(self, centers: np.ndarray, yaw: np.ndarray, distance: np.ndarray) -> np.ndarray:
         """Pictures (K, 4, 34, 30) uint8 of centers (K, 3) m from the sensor; see `Candidate`."""
         rows, columns = SLICES + 2 * _MARGIN, SIDE + 2 * _MARGIN
         height = (np.arange(rows) - _MARGIN + 0.5) * CELL + BOTTOM
         lateral = (np.arange(columns) - _MARGIN + 0.5) * CELL - SIDE * CELL / 2
-        azimuth = yaw[:, None] + np.arctan2(lateral, distance[:, None])
-        slant = np.hypot(lateral, distance[:, None])
-        elevation = np.arctan2((centers[:, 2:] + height)[:, :, None], slant[:, None, :])
-        azimuth = np.broadcast_to(azimuth[:, None], elevation.shape)
+        turn = (yaw[:, None] + np.arctan2(lateral, distance[:, None]) + pi) % (2 * pi)
+        column = np.minimum((turn / _ANGLE).astype(np.int64), self._columns - 1)[:, None]
+        slant = np.sqrt(lateral**2 + distance[:, None] ** 2).astype(np.float32)[:, None]
+        tangent = (centers[:, 2:] + height).astype(np.float32)[:, :, None] / slant
+        row = (np.arctan(tangent) * np.float32(1 / _ANGLE) + np.float32(_ROWS // 2)).astype(np.int64) - self._first
         # cells as large as the picture's, or the next smaller ones
-        level = np.clip(np.floor(np.log2(CELL / distance / _ANGLE) + 0.5), 0, _LEVELS - 1).astype(np.int64)
-        views = np.zeros((len(centers), RANGE_CHANNELS, rows, columns), np.uint8)
-        for number in np.unique(level):
-            own = np.flatnonzero(level == number)
-            near, far, count = self._at(number, azimuth[own], elevation[own])
-            around = self._at(number + 1, azimuth[own], elevation[own])[2]
-            middle = slant[own][:, None]
-            views[own, 0] = np.where(count > 0, _range_bytes(near - middle), 0)
-            views[own, 1] = np.where(count > 0, _range_bytes(far - middle), 0)
-            views[own, 2], views[own, 3] = _log_bytes(count), _log_bytes(around)
+        level = np.floor(np.log2(CELL / distance / _ANGLE) + 0.5)
+        level = np.clip(level, 0, _LEVELS - 1).astype(np.int64)[:, None, None]
+        at = self._at(level, row, column)
+        near, far, count = self._near[at], self._far[at], self._count[at]
+        views = np.empty((len(centers), RANGE_CHANNELS, rows, columns), np.uint8)
+        views[:, 0] = _range_bytes(near - slant)
+        views[:, 1] = _range_bytes(far - slant)
+        views[:, 2] = _COUNT_BYTES[np.minimum(count, 255)]
+        views[:, 3] = _COUNT_BYTES[np.minimum(self._count[self._at(level + 1, row, column)], 255)]
+        views[:, :2] *= count[:, None] > 0
         return views
 
-    def _at(self, level: int, azimuth: np.ndarray, elevation: np.ndarray) -> list[np.ndarray]:
-        size = _ANGLE * 2**level
-        images = self.levels[level]
-        rows, columns = images[0].shape
-        i = np.minimum(((elevation + pi / 2) / size).astype(np.int64), rows - 1)
-        j = np.minimum((((azimuth + pi) % (2 * pi)) / size).astype(np.int64), columns - 1)
-        flat = i * columns + j
-        return [image.ravel()[flat] for image in images]
+    def _at(self, level: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        """Flat cells of levels (K, 1, 1) at rows (K, H, 1 or W) and columns (K, 1, W) of the finest."""
+        flat = self._starts[level] + (row >> level) * (self._columns >> level) + (column >> level)
+        return np.where((row >= 0) & (row < self._rows), flat, self._starts[-1])
 
 
 def _halved(image: np.ndarray, reduce: np.ufunc) -> np.ndarray:

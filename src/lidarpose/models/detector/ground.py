@@ -13,6 +13,8 @@ from lidarpose.geometry import rotation_between
 
 # sizes in m: of a cell, of the bins in which its lowest points are looked for
 CELL, _BIN = 1.0, 0.1
+# how often points that lie alone below the others of their cell are left out
+_MOST_ALONE = 4
 # cells an axis; points farther from the middle are left out
 _MOST_CELLS = 1024
 # a floor may rise by so much a meter over the shared plane, and lie so high above its neighbors besides
@@ -173,7 +175,7 @@ def estimate_up(points: np.ndarray, origin: np.ndarray | None = None) -> np.ndar
 
 
 def _lowest(points: np.ndarray, origin: np.ndarray | None, *, least: int = 2) -> _Floors | None:
-    """Of each cell the mean of the lowest bin that, with the next, holds `least` points."""
+    """Of each cell the mean of the lowest 10 cm of points that, with the next 10 cm, are at least `least`."""
     if not len(points):
         return None
     x, y, z = (np.asarray(points)[:, i] for i in range(3))
@@ -188,30 +190,29 @@ def _lowest(points: np.ndarray, origin: np.ndarray | None, *, least: int = 2) ->
     if not len(x):
         return None
     corner = np.floor(np.array([x.min(), y.min()], float) / CELL) * CELL
-    i, j = ((values - start) * (1 / CELL) for values, start in ((x, corner[0]), (y, corner[1])))
-    i, j = i.astype(np.int64), j.astype(np.int64)
+    i, j = (((values - start) * (1 / CELL)).astype(np.int32) for values, start in ((x, corner[0]), (y, corner[1])))
     shape = (int(i.max()) + 1, int(j.max()) + 1)
-    bottom = float(z.min())
-    level = ((z - bottom) * (1 / _BIN)).astype(np.int64)
-    levels = int(level.max()) + 2
-    order_key = (i * shape[1] + j) * levels + level
-    order = np.argsort(order_key)
-    order_key = order_key[order]
-    first = np.flatnonzero(np.concatenate([[True], order_key[1:] != order_key[:-1]]))
-    key, count = order_key[first], np.diff(np.append(first, len(order_key)))
-    total = np.add.reduceat(z[order].astype(float), first)
-    # the next bin of the same cell; the topmost bin of a cell is never filled, so keys of two cells do not touch
-    has_next = np.append(key[1:] == key[:-1] + 1, False)
-    above = np.where(has_next, np.append(count[1:], 0), 0)
-    enough = count + above >= least
-    key, mean = key[enough], (total / count)[enough]
-    if not len(key):
+    cell = i * shape[1] + j
+    heights, counts = np.full(shape[0] * shape[1], np.nan), np.zeros(shape[0] * shape[1], np.int64)
+    for _ in range(_MOST_ALONE):
+        lowest = np.full(heights.size, np.inf)
+        np.minimum.at(lowest, cell, z)
+        above = z - lowest[cell]
+        number = np.bincount(cell[above < 2 * _BIN], minlength=heights.size)
+        has_floor = number >= least
+        first = (above < _BIN) & has_floor[cell]
+        total = np.bincount(cell[first], z[first], minlength=heights.size)
+        in_first = np.bincount(cell[first], minlength=heights.size)
+        heights[has_floor] = (total / np.maximum(in_first, 1))[has_floor]
+        counts[has_floor] = number[has_floor]
+        # what lies alone is left out, and the next higher points of its cell are tried
+        rest = ~has_floor[cell] & (above >= 2 * _BIN)
+        cell, z = cell[rest], z[rest]
+        if not len(z):
+            break
+    if not counts.any():
         return None
-    cell, lowest = np.unique(key // levels, return_index=True)
-    heights, counts = np.full(shape, np.nan), np.zeros(shape, np.int64)
-    heights.flat[cell] = mean[lowest]
-    counts.flat[cell] = (count + above)[enough][lowest]
-    return _Floors(corner=corner, heights=heights, counts=counts)
+    return _Floors(corner=corner, heights=heights.reshape(shape), counts=counts.reshape(shape))
 
 
 def _common_plane(floors: _Floors, origin: np.ndarray | None) -> np.ndarray | None:

@@ -82,21 +82,18 @@ def _peaks(xy: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     width = int(cell[:, 1].max()) + _MARGIN + 1
     size = (int(cell[:, 0].max()) + _MARGIN + 1) * width
     flat = cell[:, 0] * width + cell[:, 1]
-    order = np.argsort(flat)
-    flat, z = flat[order], heights[order]
-    first = np.flatnonzero(np.concatenate([[True], flat[1:] != flat[:-1]]))
-    occupied = flat[first]
-    count, top, bottom = np.zeros(size, np.float32), np.zeros(size, np.float32), np.full(size, HIGH + 1, np.float32)
-    count[occupied] = np.diff(np.append(first, len(flat)))
-    top[occupied] = np.maximum.reduceat(z, first)
-    bottom[occupied] = np.minimum.reduceat(z, first)
+    count = np.bincount(flat, minlength=size).astype(np.float32)
+    top, bottom = np.zeros(size, np.float32), np.full(size, HIGH + 1, np.float32)
+    np.maximum.at(top, flat, heights)
+    np.minimum.at(bottom, flat, heights)
 
     body = _shifted(_maxima(_smoothed(_smoothed(count, width), width), width), count, width)
-    around = occupied[:, None] + _disc(3, width)
-    highest = top[around].max(1)
+    occupied = np.flatnonzero(count)
+    highest = np.zeros(size, np.float32)
+    highest[occupied] = top[occupied[:, None] + _disc(_COLUMN, width)].max(1)
     # nobody's head reaches through the band: a wall
     highest[highest > _TALLEST] = np.inf
-    is_head = z > np.repeat(highest, np.diff(np.append(first, len(flat)))) - _HEAD
+    is_head = heights > highest[flat] - _HEAD
     heads = np.bincount(flat[is_head], minlength=size).astype(np.float32)
     head = _positions(_maxima(_smoothed(heads, width), width), width)
 

@@ -1,0 +1,151 @@
+"""The people of a whole scan: proposals, scored by a network, of which those that share points are one person."""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lidarpose.models.detector.candidates import SceneIndex, render, suppress
+from lidarpose.models.detector.ground import estimate_ground, without_ground
+from lidarpose.models.detector.proposals import heights_above, propose
+
+# candidates that are drawn and scored at a time
+_CHUNK = 128
+# what lies farther than this beyond the range, m, is left out: a candidate at its end still has its surroundings
+_BEYOND = 6.0
+# a detection's own points lie within this of its axis, m
+_OWN_RADIUS = 0.35
+# a box: side, side of somebody mounted, what is added to the height; and bounds of what the network says, m
+_SIDE, _MOUNTED_SIDE, _ROOM = 0.9, 1.1, 0.1
+_MOST_SHIFT, _MOST_FOOT, _HEIGHTS = 0.6, 1.0, (0.5, 2.3)
+
+# the network's inputs by name, see `candidates.render` -> (K, 6): logit of a person; true center minus candidate in the
+# view frame, m; feet above the ground, m; height, m; logit of somebody who rides or sits in a wheelchair
+Scorer = Callable[[dict[str, np.ndarray]], np.ndarray]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Detections:
+    """D people, the surest first, in the level frame, meters.
+
+    centers (D, 3): of their boxes; sizes (D, 3); yaws (D,) rad: 0, the boxes are square; logit (D,); score (D,): the
+    probability that it is a person; mounted (D,): the probability that somebody rides or sits in a wheelchair; rows:
+    of each the rows of the scan's points within 0.35 m of its axis; has_ground: whether a ground was found.
+    """
+
+    centers: np.ndarray
+    sizes: np.ndarray
+    yaws: np.ndarray
+    logit: np.ndarray
+    score: np.ndarray
+    mounted: np.ndarray
+    rows: list[np.ndarray]
+    has_ground: bool
+
+    def __len__(self) -> int:
+        return len(self.centers)
+
+
+class Detector:
+    """Finds people in scans.
+
+    Args:
+        scorer: a network's ONNX file, None for the bundled one; or a function in place of the network.
+        threads: of ONNX Runtime, None for all that may be used.
+
+    Raises:
+        InputError: one line, for a file that is damaged or something else.
+    """
+
+    def __init__(self, scorer: str | os.PathLike | Scorer | None = None, *, threads: int | None = None):
+        self.header: dict[str, Any] = {}
+        if callable(scorer):
+            self._score: Scorer = scorer
+            return
+        from lidarpose.models.detector.detector_file import open_detector  # type: ignore[import-not-found,unused-ignore]
+
+        session, self.header = open_detector(scorer, threads=threads)
+        self._score = lambda arrays: session.run(None, arrays)[0]
+
+    def detect(
+        self,
+        points: np.ndarray,
+        origin: np.ndarray | None,
+        *,
+        max_range: float | None = 40.0,
+        limit: int | None = None,
+        moving: np.ndarray | None = None,
+    ) -> Detections:
+        """The people in a scan.
+
+        Args:
+            points: (n, 3) m, level frame: z up.
+            origin: (3,) m, the sensor; None where it is unknown: then there is no range.
+            max_range: level distance from the sensor, m, up to which people are looked for; None for any.
+            limit: the most that are returned.
+            moving: (n,) bool, where a background is known: points that do not belong to it. People are looked for
+                among these alone, and seen with all points around them.
+
+        Returns:
+            All candidates after suppression, whatever their score.
+        """
+        points = np.asarray(points)
+        rows = np.arange(len(points))
+        if origin is not None and max_range is not None:
+            away = np.hypot(points[:, 0] - origin[0], points[:, 1] - origin[1])
+            rows = np.flatnonzero(away < max_range + _BEYOND)
+            points = points[rows]
+        ground = estimate_ground(points, origin)
+        has_ground = ground is not None
+        ground = ground or without_ground(points, origin)
+        heights = heights_above(points, ground)
+        searched = slice(None) if moving is None else np.asarray(moving, bool)[rows]
+        centers = propose(points[searched], ground, heights=heights[searched])
+        if origin is not None and max_range is not None:
+            centers = centers[np.hypot(centers[:, 0] - origin[0], centers[:, 1] - origin[1]) < max_range]
+        scene = SceneIndex(points, ground, origin, heights=heights)
+        return self._detections(scene, centers, rows, has_ground, limit)
+
+    def _detections(
+        self, scene: SceneIndex, places: np.ndarray, scan_rows: np.ndarray, has_ground: bool, limit: int | None
+    ) -> Detections:
+        scores, yaws = [np.zeros((0, 6))], [np.zeros(0)]
+        for start in range(0, len(places), _CHUNK):
+            candidates = scene.candidates(places[start : start + _CHUNK])
+            scores.append(np.asarray(self._score(render(candidates)), float))
+            yaws.append(np.array([candidate.yaw for candidate in candidates]))
+        logit, x, y, foot, height, mounted_logit = np.concatenate(scores).T
+        yaw = np.concatenate(yaws)
+        x, y = (np.clip(shift, -_MOST_SHIFT, _MOST_SHIFT) for shift in (x, y))
+        foot, height = np.clip(foot, -_MOST_FOOT, _MOST_FOOT), np.clip(height, *_HEIGHTS)
+        centers = places.astype(float)
+        centers[:, 0] += np.cos(yaw) * x - np.sin(yaw) * y
+        centers[:, 1] += np.sin(yaw) * x + np.cos(yaw) * y
+        centers[:, 2] += foot + height / 2
+        rows = scene.rows(centers, _OWN_RADIUS)
+        kept = suppress(rows, logit)[:limit]
+        mounted = _sigmoid(mounted_logit[kept])
+        side = np.where(mounted > 0.5, _MOUNTED_SIDE, _SIDE)
+        return Detections(
+            centers=centers[kept],
+            sizes=np.stack([side, side, height[kept] + _ROOM], 1),
+            yaws=np.zeros(len(kept)),
+            logit=logit[kept],
+            score=self.probability(logit[kept]),
+            mounted=mounted,
+            rows=[scan_rows[rows[k]] for k in kept],
+            has_ground=has_ground,
+        )
+
+    def probability(self, logit: np.ndarray) -> np.ndarray:
+        """Of a person at a logit (D,), by the calibration in the file."""
+        if "calibration" not in self.header:
+            return _sigmoid(logit)
+        logits, probabilities = self.header["calibration"]
+        return np.interp(logit, logits, probabilities)
+
+
+def _sigmoid(logit: np.ndarray) -> np.ndarray:
+    return 0.5 * (1 + np.tanh(np.asarray(logit, float) / 2))

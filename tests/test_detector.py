@@ -1,0 +1,104 @@
+"""The detector's runtime: from a scan to people, with a scorer that reads what the network would."""
+
+import numpy as np
+import pytest
+
+from lidarpose.models.detector.detector import Detector
+from lidarpose.synth.street import street
+from tests.test_proposals import column, nearest, plane
+
+ORIGIN = np.zeros(3)
+
+
+def upright(arrays):
+    """A stand-in for the network: how many slices hold points within 0.4 m of the middle, but for the ground's."""
+    middle = arrays["fine"][:, 6:24, 8:16, 8:16]
+    i, j = np.indices((8, 8)) - 3.5
+    mass = middle.sum(1)
+    total = np.maximum(mass.sum((1, 2)), 1e-6)
+    filled = (middle > 0).any((2, 3)).sum(1)
+    around = (arrays["fine"][:, 10:24] > 0).any(1).sum((1, 2)) - (middle[:, 4:] > 0).any(1).sum((1, 2))
+    scores = np.zeros((len(mass), 6), np.float32)
+    scores[:, 0] = filled - 8 - 0.3 * around
+    scores[:, 1] = (mass * i).sum((1, 2)) / total / 10
+    scores[:, 2] = (mass * j).sum((1, 2)) / total / 10
+    scores[:, 4] = 1.75
+    scores[:, 5] = -3
+    return scores
+
+
+@pytest.fixture(scope="module")
+def points():
+    return np.concatenate([plane(), column(5, 0), column(5, 0.5, seed=3), column(-8, 3, seed=4), column(30, 8, seed=5)])
+
+
+def test_people_are_found_once_each_where_they_stand(points):
+    detections = Detector(upright).detect(points, ORIGIN, max_range=25)
+    sure = detections.logit > 0
+    assert sure.sum() == 3 and detections.has_ground
+    for x, y in ((5, 0), (5, 0.5), (-8, 3)):
+        assert nearest(detections.centers[sure], x, y) < 0.15
+    np.testing.assert_allclose(detections.centers[sure, 2], -1.8 + 1.75 / 2, atol=0.1)
+    np.testing.assert_allclose(detections.sizes[sure], [[0.9, 0.9, 1.85]] * 3, atol=1e-6)
+    assert (np.diff(detections.logit) <= 0).all()
+    np.testing.assert_allclose(detections.score, 1 / (1 + np.exp(-detections.logit)), atol=1e-6)
+    # rows are the scan's, wherever the range cuts it
+    for center, rows in zip(detections.centers, detections.rows, strict=True):
+        assert len(rows) == np.count_nonzero(np.hypot(*(points[:, :2] - center[:2]).T) < 0.35)
+    assert len(Detector(upright).detect(points, ORIGIN, limit=2)) == 2
+
+
+def test_a_scan_that_is_turned_or_unlocated_holds_the_same_people(points):
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    sure = [
+        detections.centers[detections.logit > 0]
+        for detections in (
+            Detector(upright).detect(points, ORIGIN),
+            Detector(upright).detect(points @ turn.T, ORIGIN),
+            Detector(upright).detect(points + [100, 50, 3], None),
+        )
+    ]
+    for other in (sure[1] @ turn, sure[2] - [100, 50, 3]):
+        assert len(other) == len(sure[0]) == 4
+        assert all(nearest(other, *center[:2]) < 0.15 for center in sure[0])
+
+
+def test_moving_points_alone_are_searched_and_the_others_still_seen(points):
+    is_moving = np.hypot(points[:, 0] - 5, points[:, 1]) < 0.3
+    detections = Detector(upright).detect(points, ORIGIN, moving=is_moving)
+    assert nearest(detections.centers, 5, 0) < 0.3
+    assert nearest(detections.centers, -8, 3) > 1
+    everybody = Detector(upright).detect(points, ORIGIN, moving=np.ones(len(points), bool))
+    np.testing.assert_array_equal(everybody.centers, Detector(upright).detect(points, ORIGIN).centers)
+
+
+@pytest.mark.parametrize("cloud", [np.zeros((0, 3)), np.full((3, 3), 2.0), plane()], ids=["none", "few", "bare"])
+def test_scans_without_anybody_are_legal(cloud):
+    detections = Detector(upright).detect(cloud, ORIGIN)
+    assert len(detections) == 0 and detections.centers.shape == (0, 3) and detections.rows == []
+    assert detections.has_ground == (len(cloud) > 3)
+
+
+def test_without_ground_the_search_goes_on():
+    detections = Detector(upright).detect(column(4, 1), ORIGIN)
+    assert not detections.has_ground
+    assert nearest(detections.centers, 4, 1) < 0.3
+
+
+def test_scores_follow_the_calibration_of_the_file(points):
+    detector = Detector(upright)
+    detector.header["calibration"] = [[-2.0, 0.0, 4.0], [0.0, 0.1, 0.9]]
+    assert detector.probability(np.array([-5, -1, 2, 9])).tolist() == pytest.approx([0, 0.05, 0.5, 0.9])
+
+
+def test_candidates_are_scored_in_pieces_of_bounded_size():
+    points = street(3, 2, sensor="hdl-64e").frames[0].points
+    sizes = []
+
+    def count(arrays):
+        sizes.append(len(arrays["fine"]))
+        return upright(arrays)
+
+    together = Detector(count).detect(points, ORIGIN)
+    assert max(sizes) <= 128 and len(sizes) > 1
+    assert len(together) < sum(sizes)
