@@ -264,7 +264,7 @@ def test_a_stopped_step_stops_the_table(tmp_path):
 
 def test_a_training_that_takes_longer_than_its_hours_is_made_shorter(tmp_path):
     words = ("pretrain", "--size", "tiny", "--people", "200000", "--batch", "4", "--workers", "0", "--pictures", "0")
-    step = Step(words, hours=0.001)
+    step = Step(words, hours=0.0005)
     run_steps(step, tmp_path, main, print)
     (option, people) = json.loads((tmp_path / "runs" / f"{step.name}.json").read_text())["length"]
     assert option == "--people" and 8 <= int(people) < 20_000

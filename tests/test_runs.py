@@ -486,6 +486,7 @@ def test_wrong_words_are_one_line_and_leave_no_folder(tmp_path, monkeypatch, cap
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_two_processes_take_the_same_steps_as_one(tmp_path):
     """As torch's and Accelerate's launchers would have it."""
     recipe = replace(RECIPE, people=64, batch=4, seed=3, rate=2e-4, muon_rate=2e-3)

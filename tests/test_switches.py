@@ -7,6 +7,7 @@ import dataset_files
 import motion_files as files
 import numpy as np
 import pytest
+from training_runs import few_to_validate_on  # noqa: F401 - a fixture
 
 from lidarpose.body.mocap import load_motion
 from lidarpose.body.rig import heading
