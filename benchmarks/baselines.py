@@ -44,7 +44,7 @@ def main() -> None:
         config = PRETRAINED[wanted.size][0]
         frames = getattr(config, "frames", 1)
         examples = people if frames == 1 else clips(source, options.people // frames)
-        configs = [config, replace(config, grid=32)] if model == "lpformer" else [config]
+        configs = [config, replace(config, grid=32)] if size == "" and model == "lpformer" else [config]
         for config in configs:
             objective = objective_of(config, wanted)
             network = objective.network()

@@ -70,6 +70,7 @@ def test_points_are_there_once_or_as_published_drawn_again():
     assert again["valid"].sum(1).tolist() == [MOST_POINTS] * 2 and distinct[1][0] == 300 and 650 < distinct[1][1] < 830
     assert not np.array_equal(again["points"], pad_clouds(
         clouds, view, resample_with_replacement=True, seeds=[7, 8])["points"])  # fmt: skip
+    assert pad_clouds(clouds, view, seeds=[5, 6], most_points=128)["valid"].sum(1).tolist() == [128, 128]
 
 
 # ---- what is minimized
@@ -173,12 +174,15 @@ def test_attention_of_the_first_rows_alone_is_that_of_all():
 @pytest.mark.parametrize(
     "make, message",
     [
-        (lambda: LpformerConfig(grid=48), "grid must be 64 or 32 cells, got 48"),
+        (lambda: LpformerConfig(grid=48), "grid must be 64, 32, 16 cells, got 48"),
         (lambda: PrnConfig(joints=("nose", "nose")), "each once"),
         (lambda: PrnConfig(joints=("tail",)), "unknown joint"),
+        (lambda: PrnConfig(width_divisor=3), "width_divisor must be one of 1, 2, 4, 8, got 3"),
+        (lambda: PrnConfig(most_points=0), "most_points must be"),
+        (lambda: LpformerConfig(attention_dropout=1), "attention_dropout must be a share below 1, got 1"),
         (lambda: LpformerConfig(second_softmax=1), "second_softmax must be true or false, got 1"),
         (lambda: _with_options(PRN, ("grid=32",)), "unknown option of prn 'grid'"),
-        (lambda: Pretrain(model="prn", size="tiny"), "the model prn has the size prn, got tiny"),
+        (lambda: Pretrain(model="prn", size="tiny"), "the model prn has the size prn or prn-small, got tiny"),
         (lambda: Pretrain(model="best"), "unknown model 'best'"),
         (lambda: Pretrain(betas=(0.9, 1.0)), "betas must be two numbers"),
     ],
@@ -190,7 +194,10 @@ def test_what_cannot_be_is_refused(make, message):
 
 def test_options_by_name():
     options = ("grid=32", "second_softmax", "sensor_position=true", "resample_with_replacement=false")
-    expected = LpformerConfig(grid=32, second_softmax=True, sensor_position=True)
+    options += ("attention_dropout=0.05", "width_divisor=4")
+    expected = LpformerConfig(
+        grid=32, second_softmax=True, sensor_position=True, attention_dropout=0.05, width_divisor=4
+    )
     assert _with_options(LpformerConfig(), options) == expected
 
 
@@ -208,10 +215,13 @@ def test_all_networks_are_listed(capsys):
     assert not main(["models", "--json"])
     rows = json.loads(capsys.readouterr().out)
     assert rows == networks()
-    counts = {row["name"]: (row["joints"], row["frames"], row["parameters"]) for row in rows}
+    counts = {row["size"]: (row["joints"], row["frames"], row["parameters"]) for row in rows}
     assert counts["prn"] == (15, 1, 1_738_482) and counts["lpformer"] == (15, 1, 4_814_485)
     assert counts["lidarcap"] == (24, 16, 34_925_854) and counts["ne"] == (24, 16, 129_720_766)
-    assert {"ours", "dapt"} < counts.keys() and {"tiny", "paper", "paper-small"} <= {row["size"] for row in rows}
+    # narrower ones for CPUs
+    assert counts["prn-small"][2] == 120_606 and counts["lpformer-small"][2] == 309_493
+    assert counts["lidarcap-small"][2] == 576_798 and counts["ne-small"][2] == 2_072_910
+    assert {"ours", "dapt"} < {row["name"] for row in rows} and {"tiny", "paper", "paper-small"} <= counts.keys()
     assert not main(["models"])
     assert "129,720,766" in capsys.readouterr().out
 
@@ -262,6 +272,9 @@ def test_pretrain_predict_evaluate_and_finetune(tmp_path, capsys, monkeypatch):
     folder = tmp_path / "people"
     assert not main(["synth", "--out", str(folder), "--count", "8", "--scene", "paper"])
     common = [str(folder), "--split", "all", "--epochs", "1", "--batch", "4", *words]
+    narrower = ["--model", "prn", "--init", "run/model.safetensors", "--options", "width_divisor=4", "--out", "no"]
+    assert main(["finetune", *common, *narrower]) == 2
+    assert "--init has weights for width_divisor=1" in capsys.readouterr().err
     assert not main(["finetune", *common, "--model", "prn", "--init", "run/model.safetensors", "--out", "second"])
     assert load_checkpoint("second/model.safetensors")[1].config.joints == BODY26.joints
     assert not main(["finetune", *common, "--model", "prn", "--options", "resample_with_replacement", "--out", "third"])

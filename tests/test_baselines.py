@@ -18,6 +18,7 @@ from lidarpose.models.baselines.point_ops import ball_query, farthest_points, ne
 from lidarpose.models.baselines.prn import Prn, PrnNeck
 from lidarpose.sample import CLIP_FRAMES
 from lidarpose.skeleton import SMPL24, WAYMO14
+from lidarpose.train.setup import PRETRAINED
 
 # numbers of parameters, counted layer by layer from the authors' code
 PARAMETERS = {
@@ -133,16 +134,18 @@ def test_graph_is_normalized_and_splits_by_the_root():
 def _run(name: str, points: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
     """Joints of the network `name` with fixed weights, in evaluation mode; clips show the cloud in every frame."""
     torch.manual_seed(3)
-    if name == "prn":
-        return Prn(PrnConfig()).eval()(points, valid).joints
+    if name.startswith("prn"):
+        return Prn(PRETRAINED[name][0]).eval()(points, valid).joints
     if name == "lpformer":
         return Lpformer(LpformerConfig(grid=32)).eval()(points, valid).joints
+    if name == "lpformer-small":
+        return Lpformer(PRETRAINED[name][0]).eval()(points, valid).joints
     encoder = PointNet2(64).eval()
     return encoder(points, valid)
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("name", ["prn", "lpformer", "pointnet++"])
+@pytest.mark.parametrize("name", ["prn", "prn-small", "lpformer", "lpformer-small", "pointnet++"])
 def test_order_and_padding_change_nothing(name):
     points, valid = _cloud(4, (150, 90, 8))
     expected = _run(name, points, valid)

@@ -84,6 +84,7 @@ def test_all_points_once_and_masked():
     np.testing.assert_allclose(points[0, :5], clouds[0], rtol=1e-6)
     assert (points[1, 0] == 0).all()
     assert len(np.unique(points[2], axis=0)) == FRAME_POINTS
+    assert pad_frames(clouds, seeds=[1, 2, 3], most_points=128)[1].sum(1).tolist() == [5, 1, 128]
     assert (pad_frames(clouds[2:], seeds=[3])[0] == points[2]).all(), "a draw that follows from the seed alone"
     assert pad_frames([np.array([[0.1, 0, 0], [9.0, 0, 0]])], seeds=[0], window=2.0)[1].sum() == 1
 

@@ -75,7 +75,7 @@ def test_a_cell_states_what_it_cost_and_the_mean_pose(finished):
     out, _, _ = finished
     scratch, masked = _content(out)["cells"]
     assert (scratch["people_seen"], masked["people_seen"]) == (64, 128)
-    assert scratch["parameters"] == masked["parameters"] > 1e6
+    assert scratch["parameters"] == masked["parameters"] > 1e6 and scratch["size"] == "paper-small"
     assert scratch["people_scored"] == 16 and scratch["undertrained"] and scratch["mean_pose"] == masked["mean_pose"]
     assert [command.split()[1] for command in masked["commands"]] == [
         "synth",
@@ -188,6 +188,15 @@ def test_the_paper_s_protocol_on_real_sets(data):
     assert reasons["LIPD"] == "" and "--data freemotion=DIR" in reasons["FreeMotion"]
 
 
+@pytest.mark.parametrize("size, suffix", [("paper", ""), ("paper-small", "-small")])
+def test_all_rows_are_at_the_width_that_is_asked_for(size, suffix):
+    sizes = {cell.row: cell.size for cell in cells(TABLES["table1"], Options(size=size)) if cell.evaluation}
+    assert sizes == {
+        "LiDARCap": f"lidarcap{suffix}", "NE": f"ne{suffix}", "LPFormer": f"lpformer{suffix}",
+        "PRN as published": f"prn{suffix}", "PRN": size, "DAPT": size, "ours": "small",
+    }  # fmt: skip
+
+
 def test_other_processes_do_not_make_another_run():
     one, two = (cells(TABLES["table1"], Options(workers=n), ["dapt"])[0].evaluation.name for n in (1, 2))
     assert one == two != cells(TABLES["table1"], Options(hours=1.0), ["dapt"])[0].evaluation.name
@@ -280,7 +289,14 @@ def test_a_training_that_takes_longer_than_its_hours_is_made_shorter(tmp_path):
 def _entry(**changes):
     entry = {"row": "a", "column": "x", "seed": 0, "published": None, "commands": ["lidarpose x"], "state": "done"}
     entry |= {"mpjpe": 100.0, "low": 95.0, "high": 105.0, "pa_mpjpe": 60.0, "pck3": 90.0, "pck5": None}
-    entry |= {"mean_pose": 200.0, "people_seen": 1000, "hours": 0.5, "people_per_second": None, "parameters": 1234}
+    entry |= {
+        "mean_pose": 200.0,
+        "people_seen": 1000,
+        "hours": 0.5,
+        "people_per_second": None,
+        "parameters": 1234,
+        "size": "tiny",
+    }
     return entry | {"undertrained": False} | changes
 
 
@@ -299,8 +315,8 @@ def test_cells_in_words():
         "| c | failed: no such flag |",
         "| d | not run (paper 60.0) |",
         "| e | 100.0 |",
-        "| b | x | 1 | 120.0 | 60.0 | 90.0 | - | 200.0 | 1,000 | 0.50 | - | 1,234 | undertrained |",
-        "| d | x | 0 | - | - | - | - | - | - | - | - | - | not run |",
+        "| b | x | 1 | 120.0 | 60.0 | 90.0 | - | 200.0 | 1,000 | 0.50 | - | tiny | 1,234 | undertrained |",
+        "| d | x | 0 | - | - | - | - | - | - | - | - | - | - | not run |",
     ):
         assert line in page.splitlines()
 

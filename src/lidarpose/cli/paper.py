@@ -37,7 +37,7 @@ def add(commands) -> None:
     budget.add_argument("--hours", type=float, metavar="H", help=words)
     budget.add_argument("--seeds", type=int, default=1, metavar="K", help="seeds 0 ... K-1 of each cell (default 1)")
     budget.add_argument("--workers", type=int, default=1, metavar="N", help="of each command (default 1)")
-    words = "of the paper's network: paper-small (default), or paper as published"
+    words = "widths of all networks: paper-small (default): reduced ones; or paper: as published"
     budget.add_argument("--size", default="paper-small", metavar="NAME", help=words)
     data = paper.add_argument_group("data")
     words = (

@@ -126,9 +126,9 @@ def _models(options: argparse.Namespace) -> None:
     if options.json:
         print(json.dumps(rows, indent=1))
         return
-    print(f"{'name':10}{'size':14}{'joints':>6}{'frames':>8}{'parameters':>14}")
+    print(f"{'name':10}{'size':16}{'joints':>6}{'frames':>8}{'parameters':>14}")
     for row in rows:
-        print(f"{row['name']:10}{row['size']:14}{row['joints']:6}{row['frames']:8}{row['parameters']:14,}")
+        print(f"{row['name']:10}{row['size']:16}{row['joints']:6}{row['frames']:8}{row['parameters']:14,}")
 
 
 def _torch() -> str:

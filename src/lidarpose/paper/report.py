@@ -109,6 +109,7 @@ def _figures(cell: Cell, evaluation: Step, out: Path) -> dict[str, Any]:
         "people_seen": sum(seen),
         "hours": round(sum(hours), 3),
         "people_per_second": round(last["people"] / last["seconds"], 1) if last and last["seconds"] else None,
+        "size": cell.size,
         "parameters": sum(value.numel() for value in network.parameters()),
         "mean_pose": mean_pose,
         "undertrained": row.value is None or row.value > (1 - _UNDERTRAINED) * mean_pose,
@@ -164,7 +165,7 @@ def markdown(content: dict[str, Any]) -> str:
     lines += ["", "## Cells", ""]
     lines += _grid(
         ["row", "column", "seed", "MPJPE", "PA", "PCK-3", "PCK-5", "mean pose", "people seen", "hours"]
-        + ["people/s in training", "parameters", "state"]
+        + ["people/s in training", "size", "parameters", "state"]
     )
     lines += [_line(_cost(entry)) for entry in entries]
     return "\n".join([*lines, "", "## Commands", "", *_commands(entries)]) + "\n"
@@ -214,10 +215,12 @@ def _cell_text(entries: list[dict[str, Any]]) -> str:
 def _cost(entry: dict[str, Any]) -> list[str]:
     where = [entry["row"], entry["column"], str(entry["seed"])]
     if entry["state"] != "done":
-        return [*where, *["-"] * 9, entry["state"]]
+        return [*where, *["-"] * 10, entry["state"]]
     figures = ["-" if entry[name] is None else f"{entry[name]:.1f}" for name in (*COLUMNS, "mean_pose")]
     speed = "-" if entry["people_per_second"] is None else f"{entry['people_per_second']:.1f}"
-    cost = [f"{entry['people_seen']:,}", f"{entry['hours']:.2f}", speed, f"{entry['parameters']:,}"]
+    # tables of before have no sizes
+    cost = [f"{entry['people_seen']:,}", f"{entry['hours']:.2f}", speed, entry.get("size", "-")]
+    cost.append(f"{entry['parameters']:,}")
     return [*where, *figures, *cost, "undertrained" if entry["undertrained"] else "done"]
 
 

@@ -34,8 +34,9 @@ _RECIPE_KEEP = "0.6"
 @dataclass(frozen=True, kw_only=True)
 class Options:
     """What was asked for. people: budget of a stage of training; hours: of a row's training in all; size: of the
-    paper's network; seeds; data: name -> folder, see `REAL`, `CORPORA` and `POSES`; motion: files of captured motion,
-    subjects of the first one to learn from and held_out ones for the target; workers: of each command."""
+    paper's network, and by it the baselines' widths, published or reduced; seeds; data: name -> folder, see `REAL`,
+    `CORPORA` and `POSES`; motion: files of captured motion, subjects of the first one to learn from and held_out ones
+    for the target; workers: of each command."""
 
     people: int = 200_000
     hours: float | None = None
@@ -98,6 +99,12 @@ class Cell:
         """Its training steps, the last one last."""
         steps = self.evaluation.all() if self.evaluation else ()
         return tuple(step for step in steps if step.kind in ("pretrain", "finetune"))
+
+    @property
+    def size(self) -> str:
+        """The named width of its network."""
+        words = self.training[0].words
+        return str(words[words.index("--size") + 1])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -248,22 +255,25 @@ def _published(*values: float | None) -> dict[str, float]:
 def _methods(options: Options) -> list[Row]:
     """Table 1."""
     prn = ("--neck", "prn")
-    # its convolutions over 64^3 cells want a GPU; with 32^3 it has the same weights
-    lpformer = ("--model", "lpformer", *(() if options.size == PAPER else ("--options", "grid=32")))
     return [
-        _of_clips("LiDARCap", 79.31, 101.89),
-        _of_clips("NE", 72.23, 96.80),
-        Row(name="LPFormer", finetune=lpformer, published=_published(61.60, 83.69, 95.72, 49.31)),
-        Row(name="PRN as published", finetune=("--model", "prn")),
+        _of_clips(options, "LiDARCap", 79.31, 101.89),
+        _of_clips(options, "NE", 72.23, 96.80),
+        Row(name="LPFormer", finetune=_baseline(options, "lpformer"), published=_published(61.60, 83.69, 95.72, 49.31)),
+        Row(name="PRN as published", finetune=_baseline(options, "prn")),
         Row(name="PRN", finetune=_random(options, *prn), published=_published(68.48, 70.56, 80.01, 48.76)),
         _dapt(options, _published(51.59, 59.76, 73.47, 28.01)),
         Row(name="ours", finetune=(), pretrain=("--size", "small", "--scene", "paper", *_motion(options))),
     ]
 
 
-def _of_clips(name: str, *published: float) -> Row:
+def _baseline(options: Options, model: str) -> tuple[str, ...]:
+    """Options of a baseline's training, at the width that goes with the size of the paper's network."""
+    return ("--model", model, "--size", model if options.size == PAPER else f"{model}-small")
+
+
+def _of_clips(options: Options, name: str, *published: float) -> Row:
     printed = _published(None, None, *published)
-    return Row(name=name, finetune=("--model", name.lower()), clips=True, published=printed)
+    return Row(name=name, finetune=_baseline(options, name.lower()), clips=True, published=printed)
 
 
 def _dapt(options: Options, published: dict[str, float], name: str = "DAPT") -> Row:

@@ -22,10 +22,8 @@ PAPER, SMALL_PAPER = "paper", "paper-small"
 MODELS: dict[str, tuple[str, ...]] = {
     "ours": ("tiny", "small", "base"),
     "dapt": (PAPER, SMALL_PAPER),
-    "prn": ("prn",),
-    "lpformer": ("lpformer",),
-    "lidarcap": ("lidarcap",),
-    "ne": ("ne",),
+    # as published, and narrower ones for CPUs
+    **{name: (name, f"{name}-small") for name in ("prn", "lpformer", "lidarcap", "ne")},
 }
 # instead of weights: fine-tuning begins with none
 RANDOM = "random"
@@ -137,7 +135,10 @@ class Pretrain(Recipe):
     """Pre-training on synthesized people, made while the network learns, or read from shards."""
 
     model: str = _setting("", f"{_MODEL} (default: the one that --size is of)")
-    size: str = _setting("", "of the network: tiny, small, base (ours; default tiny); paper, paper-small (dapt)")
+    size: str = _setting(
+        "",
+        "of the network: tiny (default), small, base; paper, paper-small; prn, prn-small, ... (lidarpose models)",
+    )
     options: tuple[str, ...] = _setting((), _OPTIONS)
     neck: str = _setting("mde", "of the paper's network: mde, finest or prn (docs/train.md)")
     head: str = _setting(

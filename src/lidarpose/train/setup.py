@@ -4,6 +4,7 @@ To train a further kind of network of `models.NETWORKS`: its sizes in `PRETRAINE
 `objective_of`, its recipes in `recipes.RECIPES`.
 """
 
+import json
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
@@ -62,11 +63,16 @@ PRETRAINED: dict[str, tuple[Any, Skeleton]] = {
     "lpformer": (LpformerConfig(), HUMAN15),
     "lidarcap": (LidarcapConfig(), SMPL24),
     "ne": (NeConfig(), SMPL24),
+    # each sees 200,000 people within an hour or two of one core
+    "prn-small": (PrnConfig(width_divisor=4, most_points=128), HUMAN15),
+    "lpformer-small": (LpformerConfig(width_divisor=4, most_points=128, grid=16, attention_dropout=0.0), HUMAN15),
+    "lidarcap-small": (LidarcapConfig(width_divisor=8, most_points=128), SMPL24),
+    "ne-small": (NeConfig(width_divisor=8, most_points=128), SMPL24),
 }
 
 
 def networks() -> list[dict[str, Any]]:
-    """name, size, joints, frames and parameters of every network, without its weights."""
+    """name, size, joints, frames and parameters of every network, without its weights, a model's by parameters."""
     rows = []
     for name, sizes in MODELS.items():
         for size in sizes:
@@ -76,7 +82,7 @@ def networks() -> list[dict[str, Any]]:
             frames = getattr(config, "frames", 1)
             counts = {"joints": len(config.joints), "frames": frames, "parameters": parameters}
             rows.append({"name": name, "size": size} | counts)
-    return rows
+    return sorted(rows, key=lambda row: (list(MODELS).index(row["name"]), row["parameters"]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,7 +213,8 @@ def _check_no_test(folder: str) -> None:
 
 
 def _with_options(config: Any, options: tuple[str, ...]) -> Any:
-    """A configuration with options NAME=VALUE or NAME for true, of a baseline. Raises InputError for unknown ones."""
+    """A configuration with options NAME=VALUE (JSON or text), or NAME for true, of a baseline. Raises InputError for
+    unknown ones."""
     if not options:
         return config
     if not isinstance(config, BaselineConfig):
@@ -217,7 +224,9 @@ def _with_options(config: Any, options: tuple[str, ...]) -> Any:
     for option in options:
         name, _, value = option.partition("=")
         check_name(f"option of {config.name}", name, known)
-        changes[name] = {"": True, "true": True, "false": False}.get(value, int(value) if value.isdecimal() else value)
+        changes[name] = value or True
+        with suppress(ValueError):
+            changes[name] = json.loads(value)
     return replace(config, **changes)
 
 
@@ -361,6 +370,8 @@ def _finetuned(
     if isinstance(own, BaselineConfig):
         named = own if isinstance(own, LidarcapConfig) else replace(own, joints=joints.joints)
         config = _with_options(named, recipe.options)
+        if trained is not None and config.width_divisor != own.width_divisor:
+            raise InputError(f"--init has weights for width_divisor={own.width_divisor}: leave that option away")
         return config, partial(build, config) if trained is None else partial(with_joints, trained, config)
     own = _with_options(own, recipe.options)
     if isinstance(own, NetworkConfig):

@@ -8,27 +8,34 @@ from typing import ClassVar
 
 import numpy as np
 
-from lidarpose.errors import InputError
+from lidarpose.errors import InputError, check_int
+from lidarpose.models.config import MOST, is_number
 from lidarpose.models.voxelize import WINDOW
 from lidarpose.sample import CLIP_FRAMES
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24
 
 # points of a person that a network reads at most, as published
 MOST_POINTS = 1024
-GRIDS = (64, 32)
+GRIDS = (64, 32, 16)
+# what widths may be divided by: heads and groups of attention stay as many
+DIVISORS = (1, 2, 4, 8)
 
 
 @dataclass(frozen=True, kw_only=True)
 class BaselineConfig:
     """What all baselines have. frames: of a clip, 1 for networks of single frames; layers: a lower bound of its
-    tensors; joints: names, in the order of the outputs. Each option is False for the behavior that its class calls
-    mended. Raises InputError for unknown joints and for options that are neither true nor false."""
+    tensors; joints: names, in the order of the outputs; width_divisor: the channels of hidden layers are as many as
+    published divided by it, for CPUs; most_points: of a cloud, of more a draw is read. Each option is False for the
+    behavior that its class calls mended. Raises InputError for unknown joints, other divisors, and options that are
+    neither true nor false."""
 
     kind: ClassVar[str] = ""
     frames: ClassVar[int] = 1
     layers: ClassVar[int] = 1
 
     joints: tuple[str, ...] = HUMAN15.joints
+    width_divisor: int = 1
+    most_points: int = MOST_POINTS
 
     def __post_init__(self):
         joints = tuple(self.joints) if isinstance(self.joints, list) else self.joints
@@ -37,6 +44,11 @@ class BaselineConfig:
         for joint in joints:
             BODY26.index(joint)
         object.__setattr__(self, "joints", joints)
+        if self.width_divisor not in DIVISORS or type(self.width_divisor) is not int:
+            raise InputError(
+                f"width_divisor must be one of {', '.join(map(str, DIVISORS))}, got {self.width_divisor!r}"
+            )
+        check_int("most_points", self.most_points, least=1, most=MOST)
         for field in fields(self):
             if field.type is bool and not isinstance(getattr(self, field.name), bool):
                 raise InputError(f"{field.name} must be true or false, got {getattr(self, field.name)!r}")
@@ -56,7 +68,7 @@ class BaselineConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class PrnConfig(BaselineConfig):
-    """PRN, the pose network of LiDAR-HMR. resample_with_replacement: `MOST_POINTS` points are drawn, some of them
+    """PRN, the pose network of LiDAR-HMR. resample_with_replacement: `most_points` points are drawn, some of them
     several times, in evaluation too, as published; else each point is there once, and of more that many stay."""
 
     kind: ClassVar[str] = "prn"
@@ -68,33 +80,42 @@ class PrnConfig(BaselineConfig):
 @dataclass(frozen=True, kw_only=True)
 class LpformerConfig(BaselineConfig):
     """LPFormer for crops. resample_with_replacement: as for `PrnConfig`; grid: cells a side of the occupancy grid, 64
-    as published, or 32, an eighth of the work, with weights of the same shapes; second_softmax: the cross entropy of
-    parts is computed of probabilities, as published; sensor_position: a point's token has its place from the sensor
-    beside the local one, as in LiDAR-HMR, else the local one twice, as in the DAPT repository."""
+    as published, or 32 or 16, each an eighth of the work of the one before, with weights of the same shapes;
+    second_softmax: the cross entropy of parts is computed of probabilities, as published; sensor_position: a point's
+    token has its place from the sensor beside the local one, as in LiDAR-HMR, else the local one twice, as in the DAPT
+    repository; attention_dropout: share of the attention's weights dropped."""
 
     kind: ClassVar[str] = "lpformer"
     layers: ClassVar[int] = 50
 
     grid: int = 64
     resample_with_replacement: bool = False
+    attention_dropout: float = 0.1
     second_softmax: bool = False
     sensor_position: bool = False
 
     def __post_init__(self):
         super().__post_init__()
-        if self.grid not in GRIDS or isinstance(self.grid, bool):
-            raise InputError(f"grid must be {' or '.join(map(str, GRIDS))} cells, got {self.grid!r}")
+        if self.grid not in GRIDS or type(self.grid) is not int:
+            raise InputError(f"grid must be {', '.join(map(str, GRIDS))} cells, got {self.grid!r}")
+        if not (is_number(self.attention_dropout) and 0 <= self.attention_dropout < 1):
+            raise InputError(f"attention_dropout must be a share below 1, got {self.attention_dropout!r}")
 
 
 def pad_clouds(
-    clouds: list[np.ndarray], view: np.ndarray, *, resample_with_replacement: bool = False, seeds: list[int]
+    clouds: list[np.ndarray],
+    view: np.ndarray,
+    *,
+    resample_with_replacement: bool = False,
+    seeds: list[int],
+    most_points: int = MOST_POINTS,
 ) -> dict[str, np.ndarray]:
     """Clouds (n, 3) m of people, n = 0 is legal, as a network of single frames reads them.
 
     Args:
         clouds: each in its person's frame; what is beyond `WINDOW` of it is left out.
         view: (B, 5), see `voxelize.view_features`.
-        resample_with_replacement: see `PrnConfig`.
+        resample_with_replacement, most_points: see `PrnConfig`.
         seeds: of what is drawn, a number a person.
 
     Returns:
@@ -108,11 +129,11 @@ def pad_clouds(
         rng = np.random.default_rng(seed)
         middles.append((near.min(0) + near.max(0)) / 2)
         if resample_with_replacement:
-            extra = rng.integers(len(near), size=MOST_POINTS - len(near) * (len(near) <= MOST_POINTS))
-            rows = extra if len(near) > MOST_POINTS else np.concatenate([np.arange(len(near)), extra])
+            extra = rng.integers(len(near), size=most_points - len(near) * (len(near) <= most_points))
+            rows = extra if len(near) > most_points else np.concatenate([np.arange(len(near)), extra])
             near = near[rows]
-        elif len(near) > MOST_POINTS:
-            near = near[rng.choice(len(near), MOST_POINTS, replace=False)]
+        elif len(near) > most_points:
+            near = near[rng.choice(len(near), most_points, replace=False)]
         chosen.append(near - middles[-1])
     middle = np.stack(middles)
     toward, distance, known = view[:, :3], np.exp(view[:, 3:4]), view[:, 4:] > 0
@@ -136,7 +157,7 @@ FRAME_POINTS = 512
 
 @dataclass(frozen=True, kw_only=True)
 class LidarcapConfig(BaselineConfig):
-    """LiDARCap. resample_with_replacement: every cloud has `FRAME_POINTS` points, fewer are repeated whole times and
+    """LiDARCap. resample_with_replacement: every cloud has `most_points` points, fewer are repeated whole times and
     then from the first on, of more some are drawn, perhaps twice, as published; else each point is there once;
     order_dependent_neighbors: neighborhoods depend on the order of the points, as its CUDA kernels'; trans_center: in
     training, frames are centered on SMPL's true trans, as published, so that where the pelvis is need not be learned;
@@ -148,6 +169,7 @@ class LidarcapConfig(BaselineConfig):
     clouds: ClassVar[tuple[str, ...]] = CLOUDS[:1]
 
     joints: tuple[str, ...] = SMPL24.joints
+    most_points: int = FRAME_POINTS
     resample_with_replacement: bool = False
     order_dependent_neighbors: bool = False
     trans_center: bool = False
@@ -170,13 +192,18 @@ class NeConfig(LidarcapConfig):
 
 
 def pad_frames(
-    clouds: list[np.ndarray], *, resample_with_replacement: bool = False, seeds: list[int], window: float = np.inf
+    clouds: list[np.ndarray],
+    *,
+    resample_with_replacement: bool = False,
+    seeds: list[int],
+    window: float = np.inf,
+    most_points: int = FRAME_POINTS,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Clouds (n, 3) m of frames, n = 0 is legal, about their centers, as a network of clips reads them.
 
     Args:
         clouds: of F frames.
-        resample_with_replacement: see `LidarcapConfig`.
+        resample_with_replacement, most_points: see `LidarcapConfig`.
         seeds: of what is drawn, a number a frame.
         window: what is farther from the center along an axis is left out, m.
 
@@ -186,11 +213,11 @@ def pad_frames(
     chosen = []
     for cloud, seed in zip(clouds, seeds, strict=True):
         near = _near(cloud, window)
-        if len(near) > FRAME_POINTS:
+        if len(near) > most_points:
             rng = np.random.default_rng(seed)
-            near = near[rng.choice(len(near), FRAME_POINTS, replace=resample_with_replacement)]
+            near = near[rng.choice(len(near), most_points, replace=resample_with_replacement)]
         # fewer are repeated from the first on
-        chosen.append(np.resize(near, (FRAME_POINTS, 3)) if resample_with_replacement else near)
+        chosen.append(np.resize(near, (most_points, 3)) if resample_with_replacement else near)
     return _padded(chosen)
 
 

@@ -72,11 +72,13 @@ class Lidarcap(nn.Module):
     def __init__(self, config: LidarcapConfig):
         super().__init__()
         self.config = config
-        self.encoder = PointNet2(FEATURES, as_published=config.order_dependent_neighbors)
-        self.embed = nn.Linear(FEATURES, 1024)
-        self.recurrent = nn.GRU(1024, 1024, num_layers=2, batch_first=True, bidirectional=True)
-        self.joints = nn.Linear(2048, 3 * len(SMPL24))
-        self.rotations = StGcn(3 + FEATURES)
+        divisor = config.width_divisor
+        width = FEATURES // divisor
+        self.encoder = PointNet2(width, divisor, as_published=config.order_dependent_neighbors)
+        self.embed = nn.Linear(width, width)
+        self.recurrent = nn.GRU(width, width, num_layers=2, batch_first=True, bidirectional=True)
+        self.joints = nn.Linear(2 * width, 3 * len(SMPL24))
+        self.rotations = StGcn(3 + width, divisor)
 
     def forward(self, clouds: Clouds) -> ClipOutputs:
         """clouds: of B clips of T frames each."""
@@ -102,17 +104,18 @@ def by_frame(encode: Callable[[Clouds], dict[str, Tensor]], clouds: Clouds) -> d
 
 
 class PointNet2(nn.Module):
-    """PointNet++ on coordinates alone: points (B, N, 3), valid (B, N) -> (B, C)."""
+    """PointNet++ on coordinates alone: points (B, N, 3), valid (B, N) -> (B, C); divisor: see `LidarcapConfig`."""
 
-    def __init__(self, channels: int, *, as_published: bool = False):
+    def __init__(self, channels: int, divisor: int = 1, *, as_published: bool = False):
         super().__init__()
+        a, b, c, d = (width // divisor for width in (64, 128, 256, 512))
         self.local = nn.ModuleList(
             [
-                SetAbstraction(256, 0.2, (3, 64, 64, 128), as_published=as_published),
-                SetAbstraction(128, 0.4, (131, 128, 128, 256), as_published=as_published),
+                SetAbstraction(256, 0.2, (3, a, a, b), as_published=as_published),
+                SetAbstraction(128, 0.4, (3 + b, b, b, c), as_published=as_published),
             ]
         )
-        self.all = _perceptron((259, 256, 512, channels))
+        self.all = _perceptron((3 + c, c, d, channels))
 
     def forward(self, points: Tensor, valid: Tensor) -> Tensor:
         features = points[..., :0]
@@ -147,10 +150,10 @@ class SetAbstraction(nn.Module):
 class StGcn(nn.Module):
     """Spatial and temporal graph convolutions over SMPL's tree -> a rotation of each joint in each frame."""
 
-    def __init__(self, channels: int):
+    def __init__(self, channels: int, divisor: int):
         super().__init__()
         self.norm = nn.BatchNorm1d(channels * len(SMPL24))
-        widths = (channels, 256, 128, 64)
+        widths = (channels, 256 // divisor, 128 // divisor, 64 // divisor)
         self.layers = nn.ModuleList(
             GraphLayer(widths[k], widths[k + 1], residual=k > 0) for k in range(len(widths) - 1)
         )

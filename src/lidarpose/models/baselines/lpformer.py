@@ -35,13 +35,16 @@ class Lpformer(nn.Module):
         super().__init__()
         self.config = config
         self.grid = config.grid
-        joints = len(config.joints)
-        self.volume = V2V()
-        self.token = nn.Sequential(nn.Linear(38, 1024), nn.Linear(1024, 512), nn.Linear(512, 256))
-        self.joint = nn.Parameter(torch.randn(joints, 256))
-        self.attention = nn.ModuleList(BareAttention(256, heads=8) for _ in range(4))
-        self.xy, self.z, self.visible = (_joint_head(size) for size in (2, 1, 2))
-        self.parts = nn.Sequential(nn.Linear(256, 256), nn.Linear(256, 16), nn.ReLU(), nn.Linear(16, joints + 1))
+        joints, divisor = len(config.joints), config.width_divisor
+        self.volume = V2V(divisor)
+        widths = [6 + 32 // divisor, 1024 // divisor, 512 // divisor, 256 // divisor]
+        self.token = nn.Sequential(*map(nn.Linear, widths, widths[1:]))
+        width = widths[-1]
+        self.joint = nn.Parameter(torch.randn(joints, width))
+        dropout = config.attention_dropout
+        self.attention = nn.ModuleList(BareAttention(width, heads=8, dropout=dropout) for _ in range(4))
+        self.xy, self.z, self.visible = (_joint_head(width, size) for size in (2, 1, 2))
+        self.parts = nn.Sequential(nn.Linear(width, width), nn.Linear(width, 16), nn.ReLU(), nn.Linear(16, joints + 1))
 
     def forward(self, points: Tensor, valid: Tensor, center: Tensor | None = None) -> LpformerOutputs:
         """points (B, N, 3) m about the middle of their extent, valid (B, N) bool; center (B, 3) m: the middle from the
@@ -77,17 +80,19 @@ class Lpformer(nn.Module):
 
 
 class V2V(nn.Module):
-    """Moon et al. 2018, two levels deep: occupancy (B, 1, G, G, G) -> 32 channels. 3.24 M parameters."""
+    """Moon et al. 2018, two levels deep: occupancy (B, 1, G, G, G) -> 32 channels. 3.24 M parameters. divisor: see
+    `LpformerConfig`."""
 
-    def __init__(self):
+    def __init__(self, divisor: int = 1):
         super().__init__()
-        self.stem = nn.Sequential(_conv(1, 16, 7), Residual(16, 32))
-        self.skips = nn.ModuleList([Residual(32, 32), Residual(64, 64)])
-        self.down = nn.ModuleList([Residual(32, 64), Residual(64, 128)])
-        self.middle = nn.Sequential(Residual(128, 128), Residual(128, 128))
-        self.up = nn.ModuleList([_up(64, 32), _up(128, 64)])
-        self.after = nn.ModuleList([nn.Identity(), Residual(64, 64)])
-        self.last = nn.Conv3d(32, 32, 1)
+        stem, fine, middle, coarse = (width // divisor for width in (16, 32, 64, 128))
+        self.stem = nn.Sequential(_conv(1, stem, 7), Residual(stem, fine))
+        self.skips = nn.ModuleList([Residual(fine, fine), Residual(middle, middle)])
+        self.down = nn.ModuleList([Residual(fine, middle), Residual(middle, coarse)])
+        self.middle = nn.Sequential(Residual(coarse, coarse), Residual(coarse, coarse))
+        self.up = nn.ModuleList([_up(middle, fine), _up(coarse, middle)])
+        self.after = nn.ModuleList([nn.Identity(), Residual(middle, middle)])
+        self.last = nn.Conv3d(fine, fine, 1)
         for module in self.modules():
             if isinstance(module, nn.Conv3d | nn.ConvTranspose3d):
                 nn.init.normal_(module.weight, 0, 0.001)
@@ -129,6 +134,6 @@ def _up(in_channels: int, out_channels: int) -> nn.Sequential:
     return nn.Sequential(conv, nn.BatchNorm3d(out_channels), nn.ReLU())
 
 
-def _joint_head(size: int) -> nn.Sequential:
+def _joint_head(width: int, size: int) -> nn.Sequential:
     # no activation between the last two: as published
-    return nn.Sequential(nn.Linear(256, 16), nn.ReLU(), nn.Linear(16, 8), nn.Linear(8, size))
+    return nn.Sequential(nn.Linear(width, 16), nn.ReLU(), nn.Linear(16, 8), nn.Linear(8, size))

@@ -4,6 +4,8 @@ As LiDARCap, with two further clouds of each frame: the static background behind
 points about it; attention exchanges what the three say.
 """
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -13,7 +15,7 @@ from lidarpose.models.baselines.lidarcap import ClipOutputs, Clouds, PointNet2, 
 from lidarpose.sample import CLIP_FRAMES
 from lidarpose.skeleton import SMPL24
 
-WIDTH, LAYERS = 512, 8
+WIDTH, HIDDEN, LAYERS = 512, 1024, 8
 
 
 class Ne(nn.Module):
@@ -26,17 +28,19 @@ class Ne(nn.Module):
         super().__init__()
         self.config = config
         by_order = config.order_dependent_neighbors
-        self.encoders = nn.ModuleDict({name: PointNet2(WIDTH, as_published=by_order) for name in CLOUDS})
-        self.neighbors = _transformer(WIDTH)
-        self.exchange = Exchange()
-        self.norm = nn.LayerNorm(3 * WIDTH)
-        self.clip = _transformer(3 * WIDTH)
-        self.joints = nn.Linear(3 * WIDTH, 3 * len(SMPL24))
-        self.shrink = nn.Linear(3 * WIDTH, 1024, bias=False)
+        divisor = config.width_divisor
+        width, hidden = WIDTH // divisor, HIDDEN // divisor
+        self.encoders = nn.ModuleDict({name: PointNet2(width, divisor, as_published=by_order) for name in CLOUDS})
+        self.neighbors = _transformer(width, hidden)
+        self.exchange = Exchange(width, hidden)
+        self.norm = nn.LayerNorm(3 * width)
+        self.clip = _transformer(3 * width, hidden)
+        self.joints = nn.Linear(3 * width, 3 * len(SMPL24))
+        self.shrink = nn.Linear(3 * width, hidden, bias=False)
         # frames are its channels: clips have 16
         self.frame_norm = nn.BatchNorm1d(CLIP_FRAMES)
-        self.widen = nn.Linear(1024, 1024)
-        self.rotations = StGcn(3 + 1024)
+        self.widen = nn.Linear(hidden, hidden)
+        self.rotations = StGcn(3 + hidden, divisor)
 
     def forward(self, clouds: Clouds) -> ClipOutputs:
         """clouds: each of `CLOUDS`, of B clips of 16 frames each."""
@@ -61,15 +65,17 @@ class Ne(nn.Module):
 
 
 class Exchange(nn.Module):
-    """Person, background and neighbors (B, T, 512) -> (B, T, 1536): each asks with one, by the keys of another."""
+    """Person, background and neighbors (B, T, C) -> (B, T, 3 C): each asks with one, by the keys of another."""
 
-    def __init__(self):
+    def __init__(self, width: int, hidden: int):
         super().__init__()
         # of each of the three attentions: query, key, value
-        self.norms = nn.ModuleList(nn.ModuleList(nn.LayerNorm(WIDTH, eps=1e-6) for _ in range(3)) for _ in range(3))
-        self.attention = nn.ModuleList(nn.MultiheadAttention(WIDTH, 8, dropout=0.1, batch_first=True) for _ in range(3))
-        self.norm = nn.LayerNorm(3 * WIDTH, eps=1e-6)
-        self.mlp = nn.Sequential(nn.Linear(3 * WIDTH, 1024), nn.GELU(), nn.Linear(1024, 3 * WIDTH))
+        self.norms: Any = nn.ModuleList(
+            nn.ModuleList(nn.LayerNorm(width, eps=1e-6) for _ in range(3)) for _ in range(3)
+        )
+        self.attention = nn.ModuleList(nn.MultiheadAttention(width, 8, dropout=0.1, batch_first=True) for _ in range(3))
+        self.norm = nn.LayerNorm(3 * width, eps=1e-6)
+        self.mlp = nn.Sequential(nn.Linear(3 * width, hidden), nn.GELU(), nn.Linear(hidden, 3 * width))
 
     def forward(self, person: Tensor, background: Tensor, neighbors: Tensor) -> Tensor:
         person = person + self._attend(0, neighbors, background, person)
@@ -91,6 +97,6 @@ def drop_path(branch: Tensor, rate: float, training: bool) -> Tensor:
     return branch * keep / (1 - rate)
 
 
-def _transformer(width: int) -> nn.TransformerEncoder:
-    layer = nn.TransformerEncoderLayer(width, 4, 1024, dropout=0.1, activation="gelu", batch_first=True)
+def _transformer(width: int, hidden: int) -> nn.TransformerEncoder:
+    layer = nn.TransformerEncoderLayer(width, 4, hidden, dropout=0.1, activation="gelu", batch_first=True)
     return nn.TransformerEncoder(layer, LAYERS, enable_nested_tensor=False)

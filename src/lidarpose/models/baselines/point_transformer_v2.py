@@ -4,6 +4,7 @@ Rows of all people lie one after the other: M rows, of which `person` says whose
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -61,24 +62,26 @@ def linear_norm(in_channels: int, out_channels: int, *, bias: bool) -> nn.Sequen
 
 
 class PointTransformerV2(nn.Module):
-    """xyz of each row -> features (M, 48) of each row."""
+    """xyz of each row -> features (M, 48) of each row; divisor: see `PrnConfig`."""
 
-    def __init__(self):
+    def __init__(self, divisor: int = 1):
         super().__init__()
-        self.embedding = linear_norm(3, EMBEDDING, bias=False)
-        self.block = Block(EMBEDDING, EMBEDDING_GROUPS)
-        widths = (EMBEDDING, *ENCODER)
+        embedding, *encoder = (width // divisor for width in (EMBEDDING, *ENCODER))
+        decoder = [width // divisor for width in DECODER]
+        self.embedding = linear_norm(3, embedding, bias=False)
+        self.block = Block(embedding, EMBEDDING_GROUPS)
+        widths = (embedding, *encoder)
         self.down = nn.ModuleList(linear_norm(widths[s], widths[s + 1], bias=False) for s in range(len(GRID)))
-        self.encoder = nn.ModuleList(
+        self.encoder: Any = nn.ModuleList(
             nn.ModuleList(Block(c, g) for _ in range(ENCODER_DEPTH))
-            for c, g in zip(ENCODER, ENCODER_GROUPS, strict=True)
+            for c, g in zip(encoder, ENCODER_GROUPS, strict=True)
         )
-        coarse = (*DECODER[1:], ENCODER[-1])
-        self.up = nn.ModuleList(linear_norm(c, own, bias=True) for c, own in zip(coarse, DECODER, strict=True))
-        self.skip = nn.ModuleList(linear_norm(s, own, bias=True) for s, own in zip(widths, DECODER, strict=False))
-        self.decoder = nn.ModuleList(
+        coarse = (*decoder[1:], encoder[-1])
+        self.up = nn.ModuleList(linear_norm(c, own, bias=True) for c, own in zip(coarse, decoder, strict=True))
+        self.skip = nn.ModuleList(linear_norm(s, own, bias=True) for s, own in zip(widths, decoder, strict=False))
+        self.decoder: Any = nn.ModuleList(
             nn.ModuleList(Block(c, g) for _ in range(DECODER_DEPTH))
-            for c, g in zip(DECODER, DECODER_GROUPS, strict=True)
+            for c, g in zip(decoder, DECODER_GROUPS, strict=True)
         )
 
     def forward(self, rows: Rows) -> Tensor:

@@ -36,16 +36,16 @@ class Prn(nn.Module):
     def __init__(self, config: PrnConfig):
         super().__init__()
         self.config = config
-        joints = len(config.joints)
-        self.backbone = PointTransformerV2()
+        joints, channels = len(config.joints), EMBEDDING // config.width_divisor
+        self.backbone = PointTransformerV2(config.width_divisor)
         # a classifier that the published network has and does not read
         self.unused = nn.Sequential(
-            nn.Linear(EMBEDDING, EMBEDDING), nn.BatchNorm1d(EMBEDDING), nn.ReLU(), nn.Linear(EMBEDDING, joints + 1)
+            nn.Linear(channels, channels), nn.BatchNorm1d(channels), nn.ReLU(), nn.Linear(channels, joints + 1)
         ).requires_grad_(False)
-        self.vote = VoteHead(EMBEDDING, joints, background=joints)
-        width = EMBEDDING + 3
+        self.vote = VoteHead(channels, joints, background=joints)
+        width = channels + 3
         self.joint = nn.Embedding(joints, 32)
-        self.embed = nn.Linear(32 + 3, EMBEDDING)
+        self.embed = nn.Linear(32 + 3, channels)
         self.attention = nn.ModuleList(BareAttention(width, heads=3) for _ in range(2))
         # no activation between the last two: as published
         self.output = nn.Sequential(nn.Linear(width, 16), nn.ReLU(), nn.Linear(16, 8), nn.Linear(8, 3))

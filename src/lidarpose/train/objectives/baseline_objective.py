@@ -37,6 +37,7 @@ class BaselineObjective:
             np.stack([example.view for example in examples]),
             resample_with_replacement=self.config.resample_with_replacement,
             seeds=seeds,
+            most_points=self.config.most_points,
         )
         joints = np.stack([example.joints for example in examples])[:, self.config.columns]
         shift = [np.random.default_rng([seed, 1]).uniform(-self.shift, self.shift) for seed in seeds]

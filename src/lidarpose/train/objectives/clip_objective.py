@@ -43,6 +43,7 @@ class ClipObjective:
                 resample_with_replacement=self.config.resample_with_replacement,
                 seeds=[frame.seed + number for example in examples for frame in example.frames],
                 window=WINDOW if name == "person" else np.inf,
+                most_points=self.config.most_points,
             )
             arrays |= {name: points.reshape(*shape, -1, 3), f"{name}_valid": valid.reshape(*shape, -1)}
         joints = np.stack([frame.joints[_COLUMNS] for example in examples for frame in example.frames])
