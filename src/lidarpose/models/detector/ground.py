@@ -28,15 +28,18 @@ _NEAR_PLANE = 0.25
 # slopes of the plane: the steepest, and the width of the bins in which the commonest is looked for
 _STEEPEST, _SLOPE_BIN = 0.9, 0.06
 # cells within so many m count most for the plane, which must lie so far below the sensor, m
-_NEAR, _LEAST_BELOW = 10.0, 0.15
+_NEAR, _LEAST_BELOW = 10.0, 0.2
+# how many of the commonest slopes are tried, and the slope that is half as likely as none
+_SLOPES, _COMMON_SLOPE = 6, 0.5
 # a tilt is believed where so many cells and such a share lie on its plane, and no more than this below it
 _TILT_CELLS, _TILT_SHARE, _TILT_BELOW = 20, 0.4, 0.1
 # points so far below the ground, m, lower it where they are so many: fewer may be mirrored ones
 _LEAST_DEPTH, _MOST_DEPTH, _SOLID = 0.15, 1.5, 5
 # how many cells the plane counts for where a hole is filled
 _PLANE_WEIGHT = 0.5
-# there is a ground where at least so many cells, and this share of all cells with points, belong to it
-_LEAST_CELLS, _LEAST_SHARE = 6, 0.2
+# there is a ground where at least so many cells belong to it, and this share of all that lie below the sensor, or,
+# where that is unknown, within so many m above
+_LEAST_CELLS, _LEAST_SHARE, _TALL = 6, 0.2, 2.0
 # a cloud whose plane leans more is tilted rather than on a slope, degrees
 TILTED = 10.0
 
@@ -115,7 +118,8 @@ def estimate_ground(points: np.ndarray, origin: np.ndarray | None = None) -> Gro
         # what carries the sensor has a hole around it, in which a steeper cone reaches over hood and roof
         near = np.hypot(x - origin[0], y - origin[1]) < _OWN_REACH
         is_floor &= ~near | _is_low(np.where(is_floor, rest, np.nan), _OWN_SLOPE)
-    if not _is_ground(is_floor, floors.heights):
+    is_seen = np.isfinite(rest) & ((rest < _TALL) if origin is None else (floors.heights < origin[2]))
+    if is_floor.sum() < max(_LEAST_CELLS, _LEAST_SHARE * is_seen.sum()):
         return None
     rest = np.where(is_floor, rest, np.nan)
     surface = _fill(rest)
@@ -225,7 +229,7 @@ def _common_plane(floors: _Floors, origin: np.ndarray | None) -> np.ndarray | No
     middle = np.array([np.nanmedian(np.where(np.isfinite(h), v, np.nan)) for v in (x, y)]) if origin is None else origin
     x, y = x - middle[0], y - middle[1]
     weight = 1 / (1 + (x**2 + y**2) / _NEAR**2)
-    highest = np.inf if origin is None else origin[2] - _LEAST_BELOW
+    highest = np.inf if origin is None else origin[2] - _LEAST_BELOW / 2
     planes, weights = [np.zeros((0, 3))], [np.zeros(0)]
     for lag in (2, 4):
         for sign_x, sign_y in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
@@ -244,16 +248,26 @@ def _common_plane(floors: _Floors, origin: np.ndarray | None) -> np.ndarray | No
     bins = 2 * round(_STEEPEST / _SLOPE_BIN)
     row, column = ((planes_all[:, :2] + _STEEPEST) * (bins / (2 * _STEEPEST))).astype(np.int64).T
     counts = np.bincount(row * bins + column, weights_all, minlength=bins * bins).reshape(bins, bins)
-    peak = np.array(np.unravel_index(_box_sum(counts, 1).argmax(), counts.shape))
-    slope = (peak + 0.5) * (2 * _STEEPEST / bins) - _STEEPEST
+    counts = _box_sum(counts, 1)
+    likeliest = np.argsort(-counts, axis=None)[: _SLOPES * 9 : 9]
+    peaks = np.stack(np.unravel_index(likeliest[counts.flat[likeliest] > 0], counts.shape), 1)
+    slopes = np.concatenate([(peaks + 0.5) * (2 * _STEEPEST / bins) - _STEEPEST, np.zeros((1, 2))])
     known = np.isfinite(h)
     x, y, z, weight = x[known], y[known], h[known], weight[known]
-    rest = z - slope[0] * x - slope[1] * y
-    below = rest < highest
-    if not below.any():
-        return None
-    plane = np.array([*slope, _lowest_mode(rest[below], weight[below])])
     basis = np.stack([x, y, np.ones_like(x)], 1)
+    scores, choices = [], []
+    for slope in slopes:
+        rest = z - basis[:, :2] @ slope
+        below = rest < highest
+        if below.any():
+            choices.append(np.array([*slope, _lowest_mode(rest[below], weight[below])]))
+            rest = rest - choices[-1][2]
+            # much that lies below says that it is no ground
+            scores.append(weight[np.abs(rest) < _NEAR_PLANE].sum() - weight[rest < -2 * _NEAR_PLANE].sum())
+            scores[-1] /= 1 + slope @ slope / _COMMON_SLOPE**2
+    if not scores:
+        return None
+    plane = choices[int(np.argmax(scores))]
     for room in (0.6, 0.35, 0.25, 0.25):
         rest = z - basis @ plane
         own = np.where(np.abs(rest) < room, weight, 0.0)
@@ -262,7 +276,7 @@ def _common_plane(floors: _Floors, origin: np.ndarray | None) -> np.ndarray | No
         # a weak pull to the plane so far where cells lie on a line
         pull = np.diag([1.0, 1.0, 1e-6])
         plane = plane + np.linalg.solve((basis * own[:, None]).T @ basis + pull, basis.T @ (own * rest))
-    if plane[2] > highest:
+    if plane[2] > highest + _LEAST_BELOW:
         return None
     return plane - [0, 0, plane[:2] @ middle[:2]]
 
@@ -315,11 +329,6 @@ def _spread_minimum(heights: np.ndarray, rise: float, reach: int) -> np.ndarray:
         if np.array_equal(lowest, before):
             break
     return lowest
-
-
-def _is_ground(is_floor: np.ndarray, heights: np.ndarray) -> bool:
-    seen = np.count_nonzero(np.isfinite(heights))
-    return bool(is_floor.sum() >= max(_LEAST_CELLS, _LEAST_SHARE * seen))
 
 
 def _fill(heights: np.ndarray) -> np.ndarray:
