@@ -8,14 +8,7 @@ import pytest
 
 from lidarpose.errors import InputError
 from lidarpose.eval import dataset as module
-from lidarpose.eval.dataset import (
-    BENCH_SHA256,
-    bench_path,
-    facing,
-    load_bench,
-    mean_poses,
-    open_eval_dataset,
-)
+from lidarpose.eval.dataset import BENCH_SHA256, bench_path, facing, load_bench, mean_poses, open_eval_dataset
 from lidarpose.geometry import rotation_about
 from lidarpose.sample import Box
 from lidarpose.skeleton import BODY26, HUMAN15

@@ -8,15 +8,7 @@ from shard_files import write_shard
 
 from lidarpose.body.rig import forward_kinematics
 from lidarpose.body.smpl import load_body
-from lidarpose.data.clips import (
-    MARGIN,
-    MOST,
-    consecutive,
-    static_points,
-    window_points,
-    windows,
-    without_person,
-)
+from lidarpose.data.clips import MARGIN, MOST, consecutive, static_points, window_points, windows, without_person
 from lidarpose.data.prepare import reader
 from lidarpose.data.shards import person_row, read_rows, sample_of
 from lidarpose.errors import InputError

@@ -23,12 +23,7 @@ from lidarpose.train import loop, run_dir
 from lidarpose.train.augment import Example
 from lidarpose.train.data_loader import Chunks
 from lidarpose.train.objectives.dapt_losses import DaptTargets, finetuning, log_gaussian, pretraining, prn
-from lidarpose.train.objectives.dapt_objective import (
-    DaptObjective,
-    finetuning_config,
-    pretraining_config,
-    small,
-)
+from lidarpose.train.objectives.dapt_objective import DaptObjective, finetuning_config, pretraining_config, small
 from lidarpose.train.objectives.dapt_transfer import transferred
 from lidarpose.train.objectives.objective import alone, total
 from lidarpose.train.recipes import Pretrain

@@ -3,12 +3,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from raycast_meshes import body, ground, join
-from reference.raycast_reference import (
-    cast_ray_list_reference,
-    merge_echoes_reference,
-    window_ranges,
-    window_rays,
-)
+from reference.raycast_reference import cast_ray_list_reference, merge_echoes_reference, window_ranges, window_rays
 
 from lidarpose.lidar.presets import sensor
 from lidarpose.lidar.raycast import Hits, footprint, scan, scan_divergent

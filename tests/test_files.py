@@ -14,16 +14,7 @@ from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
 from lidarpose.io import files
-from lidarpose.io.files import (
-    LOCK,
-    atomic_path,
-    check_suffix,
-    file_error,
-    is_unused,
-    locked,
-    read_bytes,
-    write_atomic,
-)
+from lidarpose.io.files import LOCK, atomic_path, check_suffix, file_error, is_unused, locked, read_bytes, write_atomic
 from lidarpose.io.npz import read_npz
 
 

@@ -17,12 +17,7 @@ from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about
 from lidarpose.inference import inputs as people_module
 from lidarpose.inference.backend import Raw
 from lidarpose.inference.checks import flat_axis, lies, rows_inside, unit_warning
-from lidarpose.inference.inputs import (
-    MAX_POINTS,
-    as_origin,
-    candidates,
-    clean,
-)
+from lidarpose.inference.inputs import MAX_POINTS, as_origin, candidates, clean
 from lidarpose.inference.predictor import Predictor
 from lidarpose.io.boxes import read_boxes
 from lidarpose.models import bundled_path

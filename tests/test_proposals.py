@@ -6,22 +6,11 @@ import numpy as np
 import pytest
 
 from lidarpose.geometry import rotation_about
-from lidarpose.models.detector.candidates import (
-    Augmentation,
-    SceneIndex,
-    draw_augmentation,
-    render,
-    suppress,
-)
+from lidarpose.models.detector.candidates import Augmentation, SceneIndex, draw_augmentation, render, suppress
 from lidarpose.models.detector.ground import estimate_ground, estimate_up, without_ground
 from lidarpose.models.detector.proposals import heights_above, propose
 from lidarpose.synth.street import street
-from tests.reference.detector_reference import (
-    context_reference,
-    fine_reference,
-    range_reference,
-    suppress_reference,
-)
+from tests.reference.detector_reference import context_reference, fine_reference, range_reference, suppress_reference
 
 ORIGIN = np.zeros(3)
 
