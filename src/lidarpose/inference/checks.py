@@ -50,6 +50,11 @@ _TRUNK = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 _TIGHT, _LONG, _LONG_TO_TALL = 2.0, 0.25, 1.5
 # a sweep's extent leaves out the farthest percents; level, it is so long, m, and so many times what it is upright
 _MOST, _STREET, _FLATTER = (10, 90), 10.0, 3.0
+# a scan that is so long and has so few points a square meter is in other units, and in millimeters from so far on; a
+# whole room is larger than the smallest, m
+_LONGEST_SCAN, _SPARSEST, _LONG_IN_MILLIMETERS, _SMALLEST_SCAN = 500.0, 0.1, 10_000.0, 0.5
+# a sensor is not so far from the nearest point, m; of the points so near, m, some percents lie lower than it by more
+_FAR_OUT, _BELOW_SENSOR, _LOWEST, _LEAST_HEIGHT = 25.0, 15.0, 5, 0.2
 
 
 # ---- one person
@@ -178,9 +183,11 @@ SCAN_CHECKS: tuple[Callable[[Scan, Poses], str | None], ...] = (box_units, empty
 
 def check_scan(scan: Scan, people: Poses) -> list[str]:
     """The warnings of all checks. people: in the level frame, in the order of the scan's clouds."""
-    warnings = {check: check(scan, people) for check in SCAN_CHECKS if scan.boxes}
+    # boxes that were found are nobody's fault, and the axes were looked at before
+    given = scan.found_rows is None
+    warnings = {check: check(scan, people) for check in SCAN_CHECKS if scan.boxes and given}
     # one wrong axis is one warning, and people who are cut short by their boxes only seem to lie
-    axis = flat_along_another_axis(scan)
+    axis = flat_along_another_axis(scan) if given else None
     if not (axis or warnings.get(wide_boxes) or warnings.get(boxes_at_feet)):
         axis = everybody_lies(scan, people)
     return [warning for warning in (*warnings.values(), axis) if warning]
@@ -198,6 +205,31 @@ def origin_warning(scan: Scan) -> str | None:
         f"the sensor at {at} is {distance:,.0f} m from the people, so its place is taken as unknown: "
         "give it in the points' own frame and in meters (sensor_origin)"
     )
+
+
+def scan_unit_warning(points: np.ndarray) -> str | None:
+    """What is likely wrong where the points (n, 3) of a whole scan, z up, are not in meters."""
+    low, high = np.percentile(points, _MOST, axis=0)
+    across = float((high - low)[:2].max())
+    if across < _SMALLEST_SCAN:
+        return f"the points reach over {across:.2g} m: are the units kilometers? multiply all coordinates by 1000"
+    if across > _LONGEST_SCAN and len(points) < _SPARSEST * across**2:
+        unit, factor = ("millimeters", 1000) if across > _LONG_IN_MILLIMETERS else ("centimeters", 100)
+        return f"the points reach over {across:,.0f} m: are the units {unit}? divide all coordinates by {factor}"
+    return unit_warning(high - low, what="the scan")
+
+
+def unlikely_origin(points: np.ndarray, origin: np.ndarray) -> str | None:
+    """A sensor at origin (3,) m cannot have seen the points (n, 3) m of a whole scan, z up."""
+    distance = np.hypot(*(points[:, :2] - origin[:2]).T)
+    near = points[distance < _BELOW_SENSOR, 2]
+    if distance.min() > _FAR_OUT:
+        problem = f"is {distance.min():,.0f} m from the nearest point"
+    elif len(near) and np.percentile(near, _LOWEST) > origin[2] - _LEAST_HEIGHT:
+        problem = "has no ground below it"
+    else:
+        return None
+    return f"the sensor {problem}, so its place is taken as unknown: give it in the points' own frame (sensor origin)"
 
 
 def flat_axis(points: np.ndarray) -> str | None:

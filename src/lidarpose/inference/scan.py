@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,8 +14,11 @@ import numpy as np
 
 from lidarpose.geometry import UP_AXES, rotation_from_up
 from lidarpose.inference.checks import check_scan, origin_warning, rows_inside, unit_warning
+from lidarpose.inference.inputs import only_returns
 from lidarpose.inference.results import PersonPose, Poses
-from lidarpose.sample import Box
+from lidarpose.io.files import file_error
+from lidarpose.io.point_cloud import read_points
+from lidarpose.sample import FARTHEST, Box
 
 if TYPE_CHECKING:
     from lidarpose.inference.predictor import Predictor
@@ -26,7 +30,8 @@ class Scan:
 
     points (n, 3) m; boxes: the people's, None for a crop of one person; origin: the sensor's position (3,) m or None;
     up: the input's up axis or direction, see `rotation_from_up`; warnings: of reading; source: a name for reports.
-    Boxes stand along the input's own axis; where `up` is a direction, along z.
+    Boxes stand along the input's own axis; where `up` is a direction, along z. Where people were searched for,
+    found_rows holds of each box the rows (k,) of the person's points, which a box of a frame that leans cannot tell.
     """
 
     points: np.ndarray
@@ -35,6 +40,7 @@ class Scan:
     up: str = "z"
     warnings: tuple[str, ...] = ()
     source: str | None = None
+    found_rows: list[np.ndarray] | None = None
 
     @cached_property
     def R_level_input(self) -> np.ndarray:
@@ -46,26 +52,38 @@ class Scan:
         return "xyz"[int(np.abs(self.R_level_input[2]).argmax())]
 
     @property
-    def _R_boxes_input(self) -> np.ndarray:
+    def R_boxes_input(self) -> np.ndarray:
         return UP_AXES.get(self.up, UP_AXES["z"])
 
     def level_boxes(self) -> list[Box]:
         """The boxes with z up, in the frame of `box_points`."""
-        return [replace(box, center=self._R_boxes_input @ box.center) for box in self.boxes or []]
+        return [replace(box, center=self.R_boxes_input @ box.center) for box in self.boxes or []]
 
     def box_points(self) -> np.ndarray:
         """The points (n, 3) m in the frame in which boxes stand upright."""
-        return self.points @ self._R_boxes_input.T
+        return self.points @ self.R_boxes_input.T
 
     @cached_property
     def rows(self) -> list[np.ndarray]:
         """Of each box the rows of the points in it."""
+        if self.found_rows is not None:
+            return self.found_rows
         return rows_inside(self.level_boxes(), self.box_points())
 
     def clouds(self) -> list[np.ndarray]:
         """The points of each person in the level frame (z up); of a crop all points."""
         level = self.points @ self.R_level_input.T
         return [level] if self.boxes is None else [level[rows] for rows in self.rows]
+
+
+def read_scan(scan: Scan, path: str | os.PathLike, columns: int | None) -> Scan:
+    """The scan with the returns of a file, its name and notes. Raises InputError where it has none."""
+    cloud = read_points(path, columns=columns)
+    points, notes = only_returns(cloud.points)
+    if not len(points):
+        problem = f"none within {FARTHEST:g} m" if cloud.points.any() else "only 0,0,0, which are no returns"
+        raise file_error(path, f"expected points in meters, got {problem}: export it again")
+    return replace(scan, points=points, warnings=(*cloud.warnings, *notes), source=os.fsdecode(path))
 
 
 def pose_scan(scan: Scan, predictor: Predictor, *, skeleton: str | None = None, progress: bool = False) -> Poses:
@@ -95,6 +113,8 @@ def pose_scan(scan: Scan, predictor: Predictor, *, skeleton: str | None = None, 
         warnings=tuple(warnings),
         timing_ms={"crop": (cropped - started) * 1e3, "predict": predict_ms, "per_person": per_person},
         up=scan.up,
+        scan=None if scan.found_rows is None else scan.points,
+        origin=None if scan.found_rows is None else scan.origin,
     )
 
 

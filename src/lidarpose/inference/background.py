@@ -1,0 +1,146 @@
+"""What stands still about a sensor that stays where it is, learned from a recording, so that it is not searched."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lidarpose.errors import InputError
+from lidarpose.inference.inputs import as_points, only_returns
+from lidarpose.io.files import file_error, listed
+from lidarpose.io.point_cloud import SUFFIXES, read_points
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+# edge of a voxel, m; a point fills the 2 x 2 x 2 voxels nearest to it, since noise moves it into a neighbor
+_VOXEL = 0.15
+# a voxel is static where this share of the scans fill it, in each part of the recording: whoever stood there for a
+# while and left is nothing static
+_SHARE, _PARTS = 0.5, 3
+# more scans of a recording tell nothing new
+_MOST_SCANS = 60
+# voxels are numbered within so many of a middle, on each axis
+_SPAN = 1 << 20
+
+
+def learn_background(
+    scans: "str | os.PathLike | Sequence[str | os.PathLike | ArrayLike]", *, columns: int | None = None
+) -> np.ndarray:
+    """The static points of a recording by a sensor that stays where it is, for `background` of `detect` and `predict`.
+
+    Args:
+        scans: point files or arrays (n, 3) m, in the order of time, or a folder of point files, in that of their
+            names; of more than 60 an even choice is read.
+        columns: values a row of .bin files, see `read_points`.
+
+    Returns:
+        (n, 3) m, in the scans' own frame, where most scans hold points; of one scan, where it does.
+
+    Raises:
+        InputError: no scans, or one that cannot be read.
+    """
+    sources = _sources(scans)
+    chosen = np.unique(np.linspace(0, len(sources) - 1, _MOST_SCANS).round().astype(int))
+    grid: _Grid | None = None
+    static, eighths = None, np.zeros(0, np.int64)
+    for rows in np.array_split(chosen, min(_PARTS, len(chosen))):
+        voxels, counts = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        for row in rows:
+            points = _points(sources[row], columns)
+            grid = grid or _Grid(points)
+            filled = grid.eighths(points)
+            eighths = _ascending(np.concatenate([eighths, filled]))
+            voxels, counts = _counted(voxels, counts, grid.voxels(filled))
+        often = voxels[counts >= _SHARE * len(rows)]
+        static = often if static is None else np.intersect1d(static, often, assume_unique=True)
+    assert grid is not None and static is not None
+    return grid.middles(eighths[np.isin(_packed(_unpacked(eighths) // 2), static)])
+
+
+def read_background(source: Any, *, columns: int | None = None) -> np.ndarray:
+    """Static points (n, 3) m of a file or an array of them, or learned from a folder or several scans."""
+    is_file = isinstance(source, str | os.PathLike) and not os.path.isdir(source)
+    if is_file or hasattr(source, "shape"):
+        return _points(source, columns)
+    return learn_background(source, columns=columns)
+
+
+def is_static(points: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """points (n, 3) m, static points (k, 3) m of one frame -> (n,) bool: which lie where something static does."""
+    grid = _Grid(background)
+    voxels, own = grid.voxels(grid.eighths(background)), _packed(grid.index(points) // 2)
+    if not len(voxels):
+        return np.zeros(len(points), bool)
+    return voxels[np.searchsorted(voxels, own).clip(0, len(voxels) - 1)] == own
+
+
+class _Grid:
+    """Voxels about the middle of points (n, 3) m, by numbers: of a voxel, and of an eighth of one. What lies farther
+    out than numbers reach is at the border."""
+
+    def __init__(self, points: np.ndarray):
+        middle = np.median(points, axis=0) if len(points) else np.zeros(3)
+        self.corner = (np.floor(middle / _VOXEL) - _SPAN // 2) * _VOXEL
+
+    def index(self, points: np.ndarray) -> np.ndarray:
+        """points (n, 3) -> (n, 3) int64: of eighths; halves are voxels."""
+        return np.floor((points - self.corner) / (_VOXEL / 2)).clip(0, 2 * _SPAN - 1).astype(np.int64)
+
+    def eighths(self, points: np.ndarray) -> np.ndarray:
+        """Those that points (n, 3) fill, ascending."""
+        return _ascending(_packed(self.index(points)))
+
+    def voxels(self, eighths: np.ndarray) -> np.ndarray:
+        """Those of which a corner touches an eighth, ascending: 2 x 2 x 2 for each."""
+        low = (_unpacked(eighths) - 1) // 2
+        near = [_packed((low + np.array(offset)).clip(0, _SPAN - 1)) for offset in np.ndindex(2, 2, 2)]
+        return _ascending(np.concatenate(near))
+
+    def middles(self, eighths: np.ndarray) -> np.ndarray:
+        """(n, 3) m."""
+        return (_unpacked(eighths) + 0.5) * (_VOXEL / 2) + self.corner
+
+
+def _counted(numbers: np.ndarray, counts: np.ndarray, more: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ascending numbers with their counts, each of `more` counted once more."""
+    together = _ascending(np.concatenate([numbers, more]))
+    total = np.zeros(len(together), np.int64)
+    total[np.searchsorted(together, numbers)] = counts
+    total[np.searchsorted(together, more)] += 1
+    return together, total
+
+
+def _ascending(numbers: np.ndarray) -> np.ndarray:
+    """Each once. np.unique counts whole numbers by a table of hashes, which takes ten times as long."""
+    numbers = np.sort(numbers)
+    return numbers[np.diff(numbers, prepend=numbers[:1] - 1) > 0]
+
+
+def _packed(index: np.ndarray) -> np.ndarray:
+    x, y, z = index.T
+    return x << 42 | y << 21 | z
+
+
+def _unpacked(number: np.ndarray) -> np.ndarray:
+    return np.stack([number >> 42, number >> 21 & 0x1FFFFF, number & 0x1FFFFF], -1)
+
+
+def _sources(scans: Any) -> list:
+    if isinstance(scans, str | os.PathLike) and os.path.isdir(scans):
+        files = sorted(path for path in Path(scans).iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+        if not files:
+            raise file_error(scans, f"expected scans of one recording ({' '.join(SUFFIXES)}), got a folder without any")
+        return files
+    sources = listed(scans)
+    if not sources:
+        raise InputError("background: expected a file of static points or scans of one recording, got none")
+    return sources
+
+
+def _points(source: Any, columns: int | None) -> np.ndarray:
+    if isinstance(source, str | os.PathLike):
+        return only_returns(read_points(source, columns=columns).points)[0]
+    return only_returns(as_points(source, "background"))[0]

@@ -1,0 +1,356 @@
+"""`detect`: the people in a whole scan. The detector scores places where somebody may stand; the network `tiny` poses
+the best of them, and how sure it is of a pose goes into the score.
+
+Legend: D detections, V those that were posed.
+"""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from numbers import Real
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lidarpose.errors import InputError, check_int
+from lidarpose.geometry import rotation_from_up
+from lidarpose.inference.backend import Backend, OnnxBackend, estimates
+from lidarpose.inference.background import is_static, read_background
+from lidarpose.inference.checks import flat_along_another_axis, scan_unit_warning, unlikely_origin
+from lidarpose.inference.inputs import as_origin, as_points, only_returns
+from lidarpose.inference.scan import Scan, read_scan
+from lidarpose.inference.tta import TTATransform, apply
+from lidarpose.io.boxes import Boxes
+from lidarpose.models import weights_path
+from lidarpose.models.decode import decoder
+from lidarpose.models.detector.detector import Detections, Detector
+from lidarpose.models.detector.ground import estimate_up
+from lidarpose.sample import MIN_POINTS, Box, Pose
+from lidarpose.viz.person_view import facing
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+# how far from the sensor people are searched, m
+MAX_RANGE = 40.0
+# detections that are posed, and how many at once, of like size: a batch costs as much as if all were its largest
+_POSED, _BATCH = 40, 16
+# a scan of more points is thinned: what is farther away than this beyond the range first, m
+_MOST_POINTS, _BEYOND = 1_500_000, 15.0
+_CHUNK = 4_000_000
+# what is posed: a column so wide, and so far below and above the detection's box, m
+_COLUMN, _BELOW, _ABOVE = 0.6, 0.15, 0.25
+# points around a detection that its final box may hold, m to each side
+_AROUND = 2.5
+# a box is so much larger than the joints on each side, m, and so many times their spread, and no more than that
+_ROOM, _ROOM_PER_SPREAD, _MOST_ROOM = 0.1, 2.0, 0.6
+# of two people whose pelvises are nearer than this the less certain one is the same person, m
+_SAME_PERSON = 0.3
+# less of a scan on its background, as a share, and it is the background of something else
+_LEAST_STATIC = 0.2
+# what the final score is made of, by detection: the scorer's logit; means over the joints of confidence and of the log
+# of spread, m; log of 1 + the points of the column; probability that the person is mounted
+FEATURES = ("logit", "confidence", "log_spread", "log_points", "mounted")
+# weights of the features and of products with "mounted", for a detector without its own
+_WEIGHTS = {
+    "bias": -1.5 * np.log(10),
+    "logit": 1.0,
+    "log_spread": -1.5,
+    "mounted": 1.5 * np.log(10),
+    "mounted_log_spread": 1.5,
+}
+# decimals of meters in boxes, as they are written
+_DECIMALS = 4
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Search:
+    """How people are searched for, see `detect`. background (k, 3) m: static points in the scan's frame."""
+
+    max_range: float = MAX_RANGE
+    min_score: float | None = None
+    max_people: int | None = None
+    background: np.ndarray | None = None
+
+    def __post_init__(self):
+        if not _is_number(self.max_range) or not 0 < self.max_range < np.inf:
+            raise InputError(f"range: expected meters, more than 0, got {self.max_range!r}")
+        if self.min_score is not None and not (_is_number(self.min_score) and 0 <= self.min_score <= 1):
+            raise InputError(f"min score: expected a probability from 0 to 1, got {self.min_score!r}")
+        if self.max_people is not None:
+            check_int("max people", self.max_people, least=1)
+
+
+def detect(
+    points: "str | os.PathLike | ArrayLike",
+    *,
+    sensor_origin: "np.ndarray | Sequence[float] | str | None" = None,
+    up: str | Sequence[float] = "z",
+    columns: int | None = None,
+    max_range: float | None = None,
+    min_score: float | None = None,
+    max_people: int | None = None,
+    background: "str | os.PathLike | Sequence | ArrayLike | None" = None,
+) -> Boxes:
+    """The people in a whole scan, surest first, as boxes that `predict` takes.
+
+    Args:
+        points: a point file, or (n, 3+) m in any frame.
+        sensor_origin: (x, y, z) m in that frame, or "unknown"; None means 0, 0, 0.
+        up: what is up there, as in `predict`.
+        columns: values a row of a .bin file.
+        max_range: how far from the sensor people are searched, m, level, None for 40; of an unknown sensor everywhere.
+        min_score: people with a lower score are left out; None for the detector's own, at which about one false person
+            a scan is found.
+        max_people: only so many, the surest.
+        background: what stands still about a sensor that does not move, and is not searched: a file or array (k, 3) m
+            of static points (see `learn_background`), or several scans or a folder of them, of which it is learned.
+
+    Returns:
+        `Boxes` in the frame of the points, each with `score`, the probability that it is a person, and `mounted`,
+        whether the person rides or sits in a wheelchair; `warnings` say what looks wrong about the scan.
+
+    Raises:
+        InputError: a file that cannot be read, or an option of another type.
+    """
+    rotation_from_up(up)
+    search = search_options(min_score, max_range, max_people, background, columns)
+    origin = np.zeros(3) if sensor_origin is None else as_origin(sensor_origin)
+    scan = Scan(points=np.zeros((0, 3)), origin=origin, up=up if isinstance(up, str) else _direction(up))
+    if isinstance(points, str | os.PathLike):
+        scan = read_scan(scan, points, columns)
+    else:
+        cloud, notes = only_returns(as_points(points))
+        scan = replace(scan, points=cloud, warnings=tuple(notes))
+    found = find_people(scan, search)
+    return Boxes(found.boxes or [], source=found.source, warnings=found.warnings, detector=detector_version())
+
+
+def search_options(
+    min_score: float | None, max_range: float | None, max_people: int | None, background: Any, columns: int | None
+) -> Search:
+    """A search with its background read; max_range None: the default. Raises InputError."""
+    max_range = MAX_RANGE if max_range is None else max_range
+    search = Search(max_range=max_range, min_score=min_score, max_people=max_people)
+    return search if background is None else replace(search, background=read_background(background, columns=columns))
+
+
+def find_people(scan: Scan, search: Search) -> Scan:
+    """The scan with the boxes of the people in it, surest first, `found_rows`, and what looks wrong among its warnings;
+    without the place of a sensor that cannot have been there, and with the direction that turned out to be up."""
+    given, notes = _thinned(scan, search)
+    scan, warnings = given, [*scan.warnings, *notes]
+    if len(scan.points) < MIN_POINTS:
+        return replace(scan, boxes=[], found_rows=[], warnings=(*warnings, f"under {MIN_POINTS} points"))
+    level = scan.points @ scan.R_level_input.T
+    warnings += filter(None, (scan_unit_warning(level), flat_along_another_axis(scan)))
+    origin = None if scan.origin is None else scan.R_level_input @ scan.origin
+    up = estimate_up(level, origin)
+    if up is not None:
+        degrees = np.degrees(np.arccos(np.clip(up[2] / np.linalg.norm(up), -1, 1)))
+        warnings.append(f"the ground leans by {degrees:.0f} degrees, which is taken for a tilt of the sensor (up)")
+        scan = replace(scan, up=_direction(up @ scan.R_level_input))
+        level = scan.points @ scan.R_level_input.T
+        origin = None if scan.origin is None else scan.R_level_input @ scan.origin
+    if origin is not None and (warning := unlikely_origin(level, origin)):
+        warnings.append(warning)
+        scan, origin = replace(scan, origin=None), None
+    moving = None
+    if search.background is not None:
+        moving = ~is_static(scan.points, search.background)
+        if (share := 1 - moving.mean()) < _LEAST_STATIC:
+            warnings.append(
+                f"only {share:.0%} of the points lie on the background: is it of this sensor, in this frame?"
+            )
+    detections = _detector().detect(level, origin, max_range=search.max_range, limit=_POSED, moving=moving)
+    if not detections.has_ground:
+        warnings.append("no ground was found, and people are searched without it: is the up axis right?")
+    boxes, rows = _verified(detections, level, origin, search)
+    return replace(
+        scan,
+        boxes=[_in_input(box, scan, given) for box in boxes],
+        found_rows=rows,
+        warnings=tuple(warnings),
+    )
+
+
+def detector_version() -> str:
+    """Of the bundled detector."""
+    return str(_detector().header["version"])
+
+
+@cache
+def _detector() -> Detector:
+    return Detector()
+
+
+@cache
+def _verifier() -> Backend:
+    return OnnxBackend(weights_path("tiny").with_suffix(".onnx"))
+
+
+# ---- the scan
+
+
+def _thinned(scan: Scan, search: Search) -> tuple[Scan, list[str]]:
+    """The scan with at most `_MOST_POINTS` points, those near the sensor where its place is known, and a note."""
+    points, count = scan.points, len(scan.points)
+    if count <= _MOST_POINTS:
+        return scan, []
+    near = np.arange(count)
+    if scan.origin is not None:
+        reach = search.max_range + _BEYOND
+        starts = range(0, count, _CHUNK)
+        parts = [np.linalg.norm(points[start : start + _CHUNK] - scan.origin, axis=1) < reach for start in starts]
+        if (inside := np.concatenate(parts)).any():
+            near = np.flatnonzero(inside)
+    rows, notes = near, []
+    if len(near) > _MOST_POINTS:
+        # drawn in equal shares: a fixed step would keep single beams of organized clouds
+        step = np.random.default_rng(0).random(_MOST_POINTS)
+        rows = near[((np.arange(_MOST_POINTS) + step) * (len(near) / _MOST_POINTS)).astype(np.int64)]
+        notes = [
+            f"thinned from {len(near):,} to {len(rows):,} points to search them: give one scan at a time, or a part"
+        ]
+    return replace(scan, points=points[rows]), notes
+
+
+def _in_input(box: Box, scan: Scan, given: Scan) -> Box:
+    """A level box as a box of the input, along the axis that `given` says is up. In a frame that leans it is larger, so
+    that it still holds the person."""
+    R_boxes_level = given.R_boxes_input @ scan.R_level_input.T
+    center, size = R_boxes_level @ box.center, box.size
+    if not np.allclose(R_boxes_level, np.eye(3)):
+        c, s = np.cos(box.yaw), np.sin(box.yaw)
+        R_level_own = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        size = np.abs(R_level_own.T @ R_boxes_level @ R_level_own) @ box.size
+    center = given.R_boxes_input.T @ center
+    return _rounded(replace(box, center=center, size=size))
+
+
+def _direction(up: Any) -> str:
+    return ",".join(repr(float(value)) for value in up)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+# ---- the final score
+
+
+def verification_features(
+    detections: Detections, points: np.ndarray, origin: np.ndarray | None, backend: Backend | None = None
+) -> tuple[np.ndarray, Pose]:
+    """What the final score of detections in points (n, 3) m, level, from a sensor at origin (3,) or None is made of.
+
+    Args:
+        backend: what poses people; by default the bundled `tiny`.
+
+    Returns:
+        features (D, 5) in the order of `FEATURES`, and the poses, joints (D, 26, 3) m in the frame of the points; of
+        fewer than 5 points they are NaN.
+    """
+    return _posed(detections, [points[rows] for rows in _rows_near(detections, points)], origin, backend or _verifier())
+
+
+def final_score(features: np.ndarray, header: dict) -> np.ndarray:
+    """features (D, 5) -> (D,) in [0, 1]: the probability that a detection is a person, by the detector's header."""
+    verification = header.get("verification") or {}
+    weights = verification if "logit" in verification else _WEIGHTS
+    value = dict(zip(FEATURES, features.T, strict=True))
+    value |= {f"mounted_{name}": value["mounted"] * value[name] for name in ("confidence", "log_spread")}
+    logit = np.full(len(features), float(weights.get("bias", 0.0)))
+    for name, values in value.items():
+        logit += weights.get(name, 0.0) * values
+    logits, probabilities = verification.get("calibration") or header["calibration"]
+    return np.nan_to_num(np.interp(logit, logits, probabilities))
+
+
+def _posed(
+    detections: Detections, clouds: list[np.ndarray], origin: np.ndarray | None, backend: Backend
+) -> tuple[np.ndarray, Pose]:
+    """As `verification_features`, of the points (n, 3) m near each detection."""
+    columns = []
+    for center, size, cloud in zip(detections.centers, detections.sizes, clouds, strict=True):
+        above = cloud[:, 2] - center[2]
+        inside = (above > -size[2] / 2 - _BELOW) & (above < size[2] / 2 + _ABOVE)
+        columns.append(cloud[inside & (np.hypot(*(cloud[:, :2] - center[:2]).T) < _COLUMN)])
+    known = sorted((i for i, column in enumerate(columns) if len(column) >= MIN_POINTS), key=lambda i: len(columns[i]))
+    skeleton = backend.header.skeleton
+    joints = np.full((len(columns), len(skeleton), 3), np.nan)
+    confidence, spread = np.full((2, *joints.shape[:2]), np.nan)
+    for start in range(0, len(known), _BATCH):
+        batch = known[start : start + _BATCH]
+        clouds, view = apply(TTATransform(), [columns[i] for i in batch], detections.centers[batch], origin)
+        pose = estimates(backend.run(clouds, view), decoder("window"), skeleton)
+        joints[batch] = pose.joints + detections.centers[batch][:, None]
+        confidence[batch], spread[batch] = pose.confidence, pose.spread
+    points = np.log1p([len(column) for column in columns])
+    with np.errstate(invalid="ignore"):
+        features = (detections.logit, confidence.mean(1), np.log(spread).mean(1), points, detections.mounted)
+    poses = Pose(joints=joints, skeleton=skeleton, confidence=confidence, spread=spread)
+    return np.stack(features, -1).reshape(-1, len(FEATURES)), poses
+
+
+def _verified(
+    detections: Detections, points: np.ndarray, origin: np.ndarray | None, search: Search
+) -> tuple[list[Box], list[np.ndarray]]:
+    """The people among the detections, surest first: boxes about their poses, and of each the rows of its points."""
+    near = _rows_near(detections, points)
+    clouds = [points[rows] for rows in near]
+    features, poses = _posed(detections, clouds, origin, _verifier())
+    header = _detector().header
+    scores = final_score(features, header)
+    least = float(header["default_score"]) if search.min_score is None else search.min_score
+    pelvis = poses.joints[:, poses.skeleton.index("pelvis")]
+    spread = np.exp(features[:, FEATURES.index("log_spread")])
+    boxes: list[Box] = []
+    rows: list[np.ndarray] = []
+    taken = np.zeros((0, 3))
+    for i in np.argsort(-scores, kind="stable"):
+        if scores[i] < least or len(boxes) == search.max_people or np.isnan(pelvis[i]).any():
+            continue
+        if (np.linalg.norm(taken - pelvis[i], axis=1) < _SAME_PERSON).any():
+            continue
+        box = _box_about(Pose(joints=poses.joints[i], skeleton=poses.skeleton), spread[i])
+        inside = box.contains(clouds[i])
+        if inside.sum() < MIN_POINTS:
+            continue
+        taken = np.concatenate([taken, pelvis[i][None]])
+        mounted = bool(detections.mounted[i] > 0.5)
+        boxes.append(replace(box, id=len(boxes), score=round(float(scores[i]), _DECIMALS), mounted=mounted))
+        rows.append(near[i][inside])
+    return boxes, rows
+
+
+def _box_about(pose: Pose, spread: float) -> Box:
+    """The box of a person by the pose, joints (J, 3) m, larger the less certain it is; spread m: mean of its joints."""
+    forward = facing(pose)
+    yaw = 0.0 if forward is None else float(np.arctan2(forward[1], forward[0]))
+    c, s = np.cos(yaw), np.sin(yaw)
+    R_level_own = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    own = pose.joints @ R_level_own
+    room = min(_ROOM + _ROOM_PER_SPREAD * spread, _MOST_ROOM)
+    # soles are nearer to the lowest joint than the top of the head to the highest
+    low, high = own.min(0) - room * np.array([1, 1, 0.8]), own.max(0) + room * np.array([1, 1, 1.2])
+    return _rounded(Box(center=R_level_own @ ((low + high) / 2), size=high - low, yaw=yaw))
+
+
+def _rounded(box: Box) -> Box:
+    """As it is written: a file of boxes crops the same points."""
+    center, size = box.center.round(_DECIMALS), box.size.round(_DECIMALS)
+    return replace(box, center=center, size=size, yaw=round(box.yaw, _DECIMALS))
+
+
+def _rows_near(detections: Detections, points: np.ndarray) -> list[np.ndarray]:
+    """Of each detection the rows (k,) of the points (n, 3) m about it, ascending."""
+    order = np.argsort(points[:, 0])
+    x = points[order, 0]
+    rows = []
+    for center in detections.centers:
+        first, last = np.searchsorted(x, (center[0] - _AROUND, center[0] + _AROUND))
+        near = np.sort(order[first:last])
+        rows.append(near[np.abs(points[near, 1] - center[1]) < _AROUND])
+    return rows

@@ -1,0 +1,37 @@
+"""What stands still about a fixed sensor is learned; who moves, or waits and leaves, is not."""
+
+import numpy as np
+import pytest
+
+from lidarpose.inference.background import is_static, learn_background
+from lidarpose.synth.street import street
+
+
+@pytest.fixture(scope="module")
+def recording():
+    """Two seconds of a street."""
+    return street(5, 3, sensor="os1-64", people=(4, 6), frames=20).frames
+
+
+def test_what_stands_still_is_learned_and_who_moves_is_kept(recording):
+    background = learn_background([frame.points for frame in recording])
+    moved = [np.linalg.norm(a.center - b.center) for a, b in zip(recording[0].boxes, recording[-1].boxes, strict=True)]
+    movers = [k for k, way in enumerate(moved) if way > 0.5]
+    assert len(movers) >= 3
+    for frame in recording[::5]:
+        static = is_static(frame.points.astype(float), background)
+        assert static[frame.person < 0].mean() > 0.98
+        for k in movers:
+            assert (~static)[frame.person == k].mean() > 0.6, k
+
+
+def test_who_waits_and_leaves_is_not_static():
+    rng = np.random.default_rng(0)
+    wall = rng.uniform((5, -3, 0), (5.01, 3, 3), (4000, 3))
+    person = rng.uniform((3, 0, 0), (3.4, 0.4, 1.7), (400, 3))
+    scans = [np.concatenate([wall + rng.normal(0, 0.02, wall.shape), person]) for _ in range(14)]
+    scans += [wall + rng.normal(0, 0.02, wall.shape) for _ in range(6)]
+    background = learn_background(scans)
+    assert is_static(wall, background).all() and not is_static(person, background).any()
+    assert is_static(person, learn_background(scans[:12])).all()
+    assert not len(learn_background([np.zeros((0, 3)), wall])) and not is_static(wall, np.zeros((0, 3))).any()
