@@ -14,6 +14,8 @@ from lidarpose.body.rig import mean_adult_joints
 from lidarpose.data.clips import windows
 from lidarpose.data.prepare import prepare
 from lidarpose.data.shards import DatasetCard, person_row, shard_path, shard_writer, write_card
+from lidarpose.eval import run
+from lidarpose.eval.protocols import EvalSetup
 from lidarpose.geometry import UP_AXES
 from lidarpose.inference.inputs import Clips
 from lidarpose.inference.predictor import Predictor, load
@@ -29,7 +31,7 @@ from lidarpose.train.augment import clip_example
 from lidarpose.train.objectives.clip_objective import ClipObjective
 from lidarpose.train.objectives.objective import total
 from lidarpose.train.recipes import Finetune, Pretrain, recipe
-from lidarpose.train.setup import make_setup
+from lidarpose.train.setup import PRETRAINED, make_setup
 from lidarpose.train.torch_dataset import InMemoryDataset
 from lidarpose.train.validation import draw_examples
 
@@ -50,14 +52,15 @@ def clips():
     return [[thinned(person.sample) for person in generator.clip(3, k)] for k in range(2)]
 
 
-def write_clips(folder, clips):
+def write_clips(folder, clips, gap=0):
+    """gap: frames that are missing after the 20th."""
     folder.mkdir()
     settings = {"what": "clips", "seed": 3, "scene": "paper"}
     write_card(folder, DatasetCard(settings=settings, count=len(clips), per_shard=10, tables=("people",)))
     with shard_writer(shard_path(folder, "people", 0), "people") as add:
         for index, clip in enumerate(clips):
             for frame, sample in enumerate(clip):
-                add(person_row(sample, index=index, frame=frame))
+                add(person_row(sample, index=index, frame=frame + gap * (frame >= 20)))
     return folder
 
 
@@ -287,3 +290,20 @@ def test_evaluation_shows_true_windows(predictor, folder, clips):
     names = list(result.predictions.skeleton.joints)
     expected = np.concatenate(by_clip)[:, [SMPL24.index(name) for name in names]]
     np.testing.assert_allclose(result.predictions.pred, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("gap", [0, 5])
+def test_evaluation_in_parts_shows_the_same_windows(gap, clips, tmp_path, monkeypatch):
+    """A run of 40 frames, or one of 20 and one of 20 after a gap, then another person, in parts of at least 10."""
+    samples = [*clips[0], *clips[1], *clips[0][:8]]
+    folder = write_clips(tmp_path / "long", [samples, clips[1]], gap=gap)
+    torch.manual_seed(0)
+    config = PRETRAINED["lidarcap-small"][0]
+    predictor = Predictor(ClipBackend(build(config), Header(config=config, card={})), name="small")
+    whole = evaluation.run(predictor, [folder]).evaluations[0].predictions
+    predict, sizes = EvalSetup.predict, []
+    monkeypatch.setattr(EvalSetup, "predict", lambda self, people: sizes.append(len(people)) or predict(self, people))
+    monkeypatch.setattr(run, "_CHUNK", 10)
+    parts = evaluation.run(predictor, [folder]).evaluations[0].predictions
+    assert sizes == ([16, 20, 20] if gap else [16, 16, 24])
+    np.testing.assert_allclose(parts.pred, whole.pred, atol=1e-4)

@@ -18,7 +18,7 @@ from lidarpose.eval.dataset import EvalDataset, EvalSample
 from lidarpose.eval.predictions import Predictions, stack
 from lidarpose.eval.scores import Setting
 from lidarpose.inference.inputs import Clips
-from lidarpose.sample import UNLABELED, Box
+from lidarpose.sample import UNLABELED, Box, LabeledSample
 from lidarpose.skeleton import Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
 
@@ -218,12 +218,27 @@ class EvalSetup:
                 answers[row] = values if np.isfinite(values["pred"]).all() else {}
         yield from (answers[row] for row in range(len(samples)))
 
+    @property
+    def _frames(self) -> int:
+        """Of a clip of the network, 1 for a network of single frames."""
+        return getattr(self.model.backend, "frames", 1)
+
+    def may_part(self, samples: Sequence[EvalSample], person: EvalSample) -> bool:
+        """Whether the clips of these samples are the same without and with the person who comes next."""
+        sequence = person.sample.sequence
+        if self._frames == 1 or samples[-1].sample.sequence != sequence:
+            return True
+        own = [other.sample for other in samples if other.sample.sequence == sequence]
+        # a track's last run may go on
+        last = {own[run[0]].track: len(run) for run in _runs(own)}
+        return all(length % self._frames == 0 for length in last.values())
+
     def _clips(self, samples: Sequence[EvalSample]) -> dict[str, Clips]:
         """What a network of clips reads besides clouds: which people are frames that follow each other."""
-        if getattr(self.model.backend, "frames", 1) == 1:
+        if self._frames == 1:
             return {}
         own = [person.sample for person in samples]
-        runs = consecutive([(sample.sequence, sample.track) for sample in own], [sample.frame for sample in own])
+        runs = _runs(own)
         around = {
             name: [np.zeros((0, 3)) if (cloud := getattr(sample, name)) is None else cloud for sample in own]
             for name in ("background", "neighbors")
@@ -313,3 +328,8 @@ def _subset(of: Skeleton, joints: Sequence[str]) -> Skeleton:
             parent = of.parents[parent]
         parents.append(joints.index(of.joints[parent]) if parent >= 0 else min(len(parents), 1) - 1)
     return Skeleton(name=f"{len(joints)} joints of {of.name}", joints=tuple(joints), parents=tuple(parents))
+
+
+def _runs(samples: Sequence[LabeledSample]) -> list[np.ndarray]:
+    """Rows of each run of one person's frames that follow each other."""
+    return consecutive([(sample.sequence, sample.track) for sample in samples], [sample.frame for sample in samples])

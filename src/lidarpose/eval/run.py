@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,7 @@ from lidarpose.models.checkpoint import runs_of
 from lidarpose.sample import UNLABELED
 from lidarpose.skeleton import BODY26
 
-# people predicted at once: so many clouds are in memory
+# people predicted at once, or more up to the end of a clip: so many clouds are in memory
 _CHUNK = 512
 # the worst people whose points are kept for pictures
 WORST = 24
@@ -60,9 +59,8 @@ def evaluate_dataset(
     parts: list[Predictions] = []
     worst: list[tuple[float, int, EvalSample]] = []
     people = unknown = 0
-    samples = _shown(setup)
     progress(0, dataset.count)
-    while chunk := list(islice(samples, _CHUNK)):
+    for chunk in _chunks(setup):
         predicted = setup.predict(chunk)
         errors = predicted.errors()
         for k in np.flatnonzero(~np.isnan(errors).all(1) & ~predicted.moving).tolist():
@@ -89,6 +87,18 @@ def evaluate_dataset(
     notes = tuple(_notes(setup, setting, predictions))
     result = Result(setting=setting, counts=counts, skipped=skipped, notes=notes, lines=lines)
     return Evaluation(result=result, predictions=predictions, worst=tuple((person, k) for _, k, person in worst))
+
+
+def _chunks(setup: EvalSetup) -> Iterator[list[EvalSample]]:
+    """The people as the protocol shows them, some at a time, whole clips for networks of clips."""
+    chunk: list[EvalSample] = []
+    for person in _shown(setup):
+        if len(chunk) >= _CHUNK and setup.may_part(chunk, person):
+            yield chunk
+            chunk = []
+        chunk.append(person)
+    if chunk:
+        yield chunk
 
 
 def _shown(setup: EvalSetup) -> Iterator[EvalSample]:
