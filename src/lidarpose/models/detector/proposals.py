@@ -21,14 +21,16 @@ LEAST_POINTS = 5
 _LEAST_TOP, _LEAST_PART, _LEAST_EXTENT = 0.6, 0.45, 0.25
 # a head or shoulder that looks over something may be as low as this where its top is that high over the ground, m
 _LEAST_HEAD, _HEAD_TOP = 0.08, 1.1
+# how counts are smoothed along both axes
+_BODY_KERNEL, _HEAD_KERNEL = (1, 2, 3, 2, 1), (1, 1, 1)
 # cells to each side: of the surroundings that a peak tops, of the mean shift, of a candidate's column, of the grid
 _PEAK, _SHIFT, _COLUMN, _MARGIN = 3, 4, 3, 16
 _SHIFTS = 2
 # of heads: points so far below the highest point within 0.3 m belong to it, m
 _HEAD = 0.3
 _TALLEST = 2.05
-# a column is dropped this near to a stronger one, and a head this near to any, m
-_APART, _HEADS_APART = 0.3, 0.3
+# a column is dropped this near to a head or to a stronger column, m
+_APART = 0.3
 
 
 def propose(points: np.ndarray, ground: Ground, *, limit: int = 600, heights: np.ndarray | None = None) -> np.ndarray:
@@ -42,11 +44,13 @@ def propose(points: np.ndarray, ground: Ground, *, limit: int = 600, heights: np
     """
     if heights is None:
         heights = heights_above(points, ground)
-    band = (heights > LOW) & (heights < HIGH)
-    xy, heights = np.asarray(points)[band, :2], heights[band]
+    points = np.asarray(points)
+    band = np.flatnonzero((heights > LOW) & (heights < HIGH))
+    # one after the other: numpy reduces long rows faster than pairs
+    x, y, heights = points[band, 0], points[band, 1], heights[band]
     tile_xy, strengths = [np.zeros((0, 2))], [np.zeros(0)]
-    for corner, inner, rows in _tiles(xy):
-        tile_centers, tile_strength = _peaks(xy[rows] - corner, heights[rows])
+    for corner, inner, rows in _tiles(x, y):
+        tile_centers, tile_strength = _peaks(x[rows] - corner[0], y[rows] - corner[1], heights[rows])
         tile_centers = tile_centers + corner
         own = ((tile_centers >= inner[0]) & (tile_centers < inner[1])).all(1)
         tile_xy.append(tile_centers[own])
@@ -61,41 +65,45 @@ def heights_above(points: np.ndarray, ground: Ground) -> np.ndarray:
     return (points[:, 2] - ground.at(points[:, :2])).astype(np.float32)
 
 
-def _tiles(xy: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray | slice]]:
+def _tiles(x: np.ndarray, y: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray | slice]]:
     """(corner, bounds (2, 2) of what is its own, rows) of tiles with points in them: bounded grids for any extent."""
-    if not len(xy):
+    if not len(x):
         return
-    start = np.floor(xy.min(0) / CELL) * CELL - _OVERLAP
-    if (xy.max(0) - start < 1.5 * _TILE).all():
+    start = np.floor(np.array([x.min(), y.min()], float) / CELL) * CELL - _OVERLAP
+    if max(x.max() - start[0], y.max() - start[1]) < 1.5 * _TILE:
         yield start, np.array([[-np.inf] * 2, [np.inf] * 2]), slice(None)
         return
-    tile = np.floor((xy - start) / _TILE).astype(np.int64)
+    tile = np.floor((np.stack([x, y], 1) - start) / _TILE).astype(np.int64)
     for i, j in np.unique(tile, axis=0):
         low = start + np.array([i, j]) * _TILE
-        inside = ((xy >= low - _OVERLAP) & (xy < low + _TILE + _OVERLAP)).all(1)
-        yield low - _OVERLAP, np.stack([low, low + _TILE]), np.flatnonzero(inside)
+        high = low + _TILE
+        inside = (x >= low[0] - _OVERLAP) & (x < high[0] + _OVERLAP)
+        inside &= (y >= low[1] - _OVERLAP) & (y < high[1] + _OVERLAP)
+        yield low - _OVERLAP, np.stack([low, high]), np.flatnonzero(inside)
 
 
-def _peaks(xy: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centers (K, 2) m and strengths (K,) of a tile's candidates. xy (n, 2) m from its corner, heights (n,) m."""
-    cell = (xy * (1 / CELL)).astype(np.int32) + _MARGIN
-    width = int(cell[:, 1].max()) + _MARGIN + 1
-    size = (int(cell[:, 0].max()) + _MARGIN + 1) * width
-    flat = cell[:, 0] * width + cell[:, 1]
-    count = np.bincount(flat, minlength=size).astype(np.float32)
-    top, bottom = np.zeros(size, np.float32), np.full(size, HIGH + 1, np.float32)
+def _peaks(x: np.ndarray, y: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centers (K, 2) m and strengths (K,) of a tile's candidates. x, y (n,) m from its corner, heights (n,) m."""
+    row, column = ((values * (1 / CELL)).astype(np.int32) + _MARGIN for values in (x, y))
+    width = int(column.max()) + _MARGIN + 1
+    size = (int(row.max()) + _MARGIN + 1) * width
+    flat = row * width + column
+    count, top, bottom = np.zeros(size, np.float32), np.zeros(size, np.float32), np.full(size, HIGH + 1, np.float32)
+    np.add.at(count, flat, np.float32(1))
     np.maximum.at(top, flat, heights)
     np.minimum.at(bottom, flat, heights)
 
-    body = _shifted(_maxima(_smoothed(_smoothed(count, width), width), width), count, width)
-    occupied = np.flatnonzero(count)
-    highest = np.zeros(size, np.float32)
-    highest[occupied] = top[occupied[:, None] + _disc(_COLUMN, width)].max(1)
+    occupied = np.flatnonzero(count > 0)
+    body = _shifted(_maxima(_smoothed(count, occupied, _BODY_KERNEL, width), width), count, width)
+    highest = top[occupied]
+    for step in _disc(_COLUMN, width):
+        np.maximum(highest, top[occupied + step], out=highest)
     # nobody's head reaches through the band: a wall
     highest[highest > _TALLEST] = np.inf
-    is_head = heights > highest[flat] - _HEAD
-    heads = np.bincount(flat[is_head], minlength=size).astype(np.float32)
-    head = _positions(_maxima(_smoothed(heads, width), width), width)
+    head_bottom, heads = np.zeros(size, np.float32), np.zeros(size, np.float32)
+    head_bottom[occupied] = highest - _HEAD
+    np.add.at(heads, flat[heights > head_bottom[flat]], np.float32(1))
+    head = _positions(_maxima(_smoothed(heads, np.flatnonzero(heads > 0), _HEAD_KERNEL, width), width), width)
 
     centers = np.concatenate([body, head])
     column = (centers.astype(np.int32) @ [width, 1])[:, None] + _disc(_COLUMN, width)
@@ -109,18 +117,19 @@ def _peaks(xy: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     centers, points, is_body = centers[enough], points[enough], is_body[enough]
     # where two are equally strong, the order of places: not that of the points
     order = np.lexsort((centers[:, 1], centers[:, 0], -points, is_body))
-    order = order[_apart(centers[order], np.where(is_body, _APART, _HEADS_APART)[order])]
+    order = order[_apart(centers[order])]
     return (centers[order] - _MARGIN) * CELL, points[order]
 
 
-def _smoothed(values: np.ndarray, width: int) -> np.ndarray:
-    """Sums over squares of 3 x 3 cells of a flat grid (size,) with empty margins."""
-    for step in (1, width):
-        total = values.copy()
-        total[step:] += values[:-step]
-        total[:-step] += values[step:]
-        values = total
-    return values
+def _smoothed(values: np.ndarray, cells: np.ndarray, kernel: tuple[int, ...], width: int) -> np.ndarray:
+    """A flat grid (size,) of the values at `cells` (n,) spread by the kernel along both axes."""
+    smooth = np.zeros_like(values)
+    middle = len(kernel) // 2
+    own = values[cells]
+    for i, along in enumerate(kernel):
+        for j, across in enumerate(kernel):
+            smooth[cells + ((i - middle) * width + j - middle)] += own * np.float32(along * across)
+    return smooth
 
 
 def _maxima(values: np.ndarray, width: int) -> np.ndarray:
@@ -136,13 +145,18 @@ def _maxima(values: np.ndarray, width: int) -> np.ndarray:
 
 def _shifted(cells: np.ndarray, count: np.ndarray, width: int) -> np.ndarray:
     """Positions (K, 2) in cells of flat cells after a few steps to the mean of the points around them."""
-    position = _positions(cells, width)
-    offset = _offsets(_SHIFT)
+    position = _positions(cells, width).astype(np.float32)
+    offset = _offsets(_SHIFT).astype(np.float32)
+    steps = _square(_SHIFT, width)
     for _ in range(_SHIFTS):
         start = position.astype(np.int32)
-        away = start[:, None] + 0.5 + offset - position[:, None]
-        weight = count[(start @ [width, 1])[:, None] + offset @ [width, 1]] * ((away**2).sum(-1) < (_SHIFT + 0.5) ** 2)
-        position = position + (weight[..., None] * away).sum(1) / np.maximum(weight.sum(1), 1e-9)[:, None]
+        rest = start + np.float32(0.5) - position
+        x, y = rest[:, :1] + offset[:, 0], rest[:, 1:] + offset[:, 1]
+        weight = count[(start[:, 0] * width + start[:, 1])[:, None] + steps]
+        weight *= x * x + y * y < (_SHIFT + 0.5) ** 2
+        total = np.maximum(weight.sum(1), 1e-9)
+        position[:, 0] += (weight * x).sum(1) / total
+        position[:, 1] += (weight * y).sum(1) / total
     return position
 
 
@@ -167,18 +181,16 @@ def _disc(reach: int, width: int) -> np.ndarray:
     return offset[(offset**2).sum(1) <= (reach + 0.3) ** 2] @ [width, 1]
 
 
-def _apart(centers: np.ndarray, room: np.ndarray) -> np.ndarray:
-    """Rows of positions (K, 2) in cells that have `room` (K,) m to all earlier ones that stay."""
+def _apart(centers: np.ndarray) -> np.ndarray:
+    """Rows of positions (K, 2) in cells, the strongest first, that have `_APART` to all earlier ones that stay."""
     # half a cell is exact enough
+    reach = round(2 * _APART / CELL)
+    disc = (_offsets(reach) ** 2).sum(1).reshape(2 * reach + 1, -1) < reach**2
     cells = (centers * 2).astype(np.int64)
-    reaches = np.rint(room * (2 / CELL)).astype(int)
-    most = int(reaches.max(initial=0))
-    discs = {reach: np.hypot(*np.indices((2 * reach + 1,) * 2) - reach) < reach for reach in set(reaches.tolist())}
-    taken = np.zeros(cells.max(0, initial=0) + 2 * most + 1, bool)
+    taken = np.zeros(cells.max(0, initial=0) + 2 * reach + 1, bool)
     rows = []
-    for row, ((i, j), reach) in enumerate(zip((cells + most).tolist(), reaches.tolist(), strict=True)):
-        around = taken[i - reach : i + reach + 1, j - reach : j + reach + 1]
-        if not (around & discs[reach]).any():
+    for row, (i, j) in enumerate(cells.tolist()):
+        if not taken[i + reach, j + reach]:
             rows.append(row)
-            taken[i, j] = True
+            taken[i : i + 2 * reach + 1, j : j + 2 * reach + 1] |= disc
     return np.array(rows, np.int64)
