@@ -26,6 +26,8 @@ from lidarpose.eval.detector.detection_scores import (
     score_scan,
 )
 from lidarpose.eval.detector.labeled_scans import LabeledScan, ScanSet, heldout_scans, labeled_scans
+from lidarpose.inference import detection
+from lidarpose.models.detector.detector import Detector
 from lidarpose.sample import Box
 
 SIZE = (0.8, 0.8, 1.8)
@@ -260,6 +262,27 @@ def test_frozen_scenes_are_labeled_scans_and_said_to_be_changed_where_they_are()
     result = score_detector(perfect, scan_set([first, other]), max_range=100)
     # somebody else's detection may be nearer only where two stand in one place
     assert result.row("recall", "0.3")["value"] == 100 and result.changed == 1 and not result.things
+
+
+# ---- methods
+
+
+@pytest.mark.parametrize("method", run_module.METHODS)
+def test_every_method_finds_who_stands_alone_on_a_plane(method, monkeypatch):
+    def most_points(arrays):
+        count = arrays["scalars"][:, 2]
+        return np.stack([4 * count, *np.zeros((3, len(count))), 1.7 + 0 * count, -9 + 0 * count], 1).astype(np.float32)
+
+    fake_detector = Detector(most_points)
+    fake_detector.header |= {"version": "0", "default_score": 0.5, "calibration": [[-9.0, 9.0], [0.0, 1.0]]}
+    monkeypatch.setattr(run_module, "_bundled", lambda: fake_detector)
+    monkeypatch.setattr(detection, "_detector", lambda: fake_detector)
+    plane = np.stack(np.meshgrid(np.arange(-3, 12, 0.2), np.arange(-6, 6, 0.2), [-1.7]), -1).reshape(-1, 3)
+    own = scan([5.0])
+    body = np.random.default_rng(2).uniform(-1, 1, (300, 3)) * [0.2, 0.25, 0.85] + [5.0, 0, -0.85]
+    boxes, scores = run_module.detector_of(method, max_range=20.0)(np.concatenate([plane, body]), np.zeros(3))
+    people, _ = score_scan(0, own, boxes, scores, max_range=20)
+    assert people.detection.tolist() == [int(np.argmax(scores))] and (0 <= scores).all() and (scores <= 1).all()
 
 
 # ---- the command

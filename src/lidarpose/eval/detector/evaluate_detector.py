@@ -15,8 +15,13 @@ from lidarpose.errors import check_name
 from lidarpose.eval.detector.detection_pictures import draw_false, draw_missed
 from lidarpose.eval.detector.detection_scores import Detect, DetectorResult, score_detector
 from lidarpose.eval.detector.labeled_scans import ScanSet, heldout_scans, labeled_scans
+from lidarpose.inference.detection import detect as detect_people
 from lidarpose.inference.predictor import Predictor, load
 from lidarpose.io.files import atomic_path
+from lidarpose.models.detector.candidates import SceneIndex, suppress
+from lidarpose.models.detector.detector import Detector
+from lidarpose.models.detector.ground import estimate_ground, without_ground
+from lidarpose.models.detector.proposals import propose
 from lidarpose.sample import Box
 
 SCHEMA = "lidarpose.detector-scores/1"
@@ -31,6 +36,7 @@ _SPREAD = 0.1
 def detector_of(method: str, *, max_range: float) -> Detect:
     """What looks for people: "detector", as `lidarpose.detect`; "scorer", the same without poses; and baselines on its
     candidates, which nothing was trained for: "pose", by the spread of `tiny`'s pose, and "candidates" by their order.
+    The last three take the frame as level.
     """
     if method == "detector":
         return partial(_detect, max_range=max_range)
@@ -39,30 +45,23 @@ def detector_of(method: str, *, max_range: float) -> Detect:
     return partial(_baseline, load("tiny", tta=1) if method == "pose" else None)
 
 
-def _bundled():
-    from lidarpose.models.detector.detector import Detector
-
+def _bundled() -> Detector:
     return Detector()
 
 
 def _detect(points: np.ndarray, origin: np.ndarray | None, *, max_range: float) -> tuple[Sequence[Box], np.ndarray]:
-    from lidarpose.inference.detection import detect
-
-    boxes = detect(points, sensor_origin="unknown" if origin is None else origin, max_range=max_range, min_score=0.0)
+    place = "unknown" if origin is None else origin
+    boxes = detect_people(points, sensor_origin=place, max_range=max_range, min_score=0.0)
     return boxes, np.array([box.score for box in boxes], float)
 
 
-def _scorer(detector, points: np.ndarray, origin: np.ndarray | None, *, max_range: float):
+def _scorer(detector: Detector, points: np.ndarray, origin: np.ndarray | None, *, max_range: float):
     found = detector.detect(points, origin, max_range=max_range, limit=None)
     boxes = zip(found.centers, found.sizes, found.yaws, strict=True)
     return [Box(center=center, size=size, yaw=float(yaw)) for center, size, yaw in boxes], found.score
 
 
 def _baseline(predictor: Predictor | None, points: np.ndarray, origin: np.ndarray | None):
-    from lidarpose.models.detector.candidates import SceneIndex, suppress
-    from lidarpose.models.detector.ground import estimate_ground, without_ground
-    from lidarpose.models.detector.proposals import propose
-
     ground = estimate_ground(points, origin) or without_ground(points, origin)
     centers = propose(points, ground)
     boxes = [Box(center=center + [0, 0, _CANDIDATE[2] / 2], size=_CANDIDATE) for center in centers]
