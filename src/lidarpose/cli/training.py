@@ -1,4 +1,4 @@
-"""`lidarpose pretrain` and `finetune`."""
+"""`lidarpose pretrain`, `finetune` and `train-detector`."""
 
 import argparse
 import os
@@ -10,7 +10,7 @@ from typing import Any
 
 from lidarpose.cli.terminal import add_command, add_keep, names, scene_changes
 from lidarpose.errors import InputError
-from lidarpose.train.recipes import TYPES, Finetune, Pretrain, Recipe
+from lidarpose.train.recipes import TYPES, Finetune, PoseRecipe, Pretrain, Recipe, TrainDetector
 
 _WHAT = (
     "{what} The run's folder holds config.json, log.jsonl, model.safetensors, best.safetensors, pictures, and "
@@ -54,30 +54,36 @@ def add(commands) -> None:
     )
     _add(pretrain, Pretrain)
     _add(finetune, Finetune)
+    detector = add_command(
+        commands,
+        "train-detector",
+        "train the network that finds people in whole scans",
+        "lidarpose train-detector --scenes 20000",
+        "lidarpose train-detector runs/train-detector-001 --resume",
+        description=_WHAT.format(name="train-detector", what="Trains on scans synthesized during training."),
+    )
+    _add(detector, TrainDetector)
 
 
 def _add(parser, kind: type[Recipe]) -> None:
-    name = kind.__name__.lower()
+    name = kind.kind
     parser.set_defaults(run=_train, kind=kind)
     where = f"a new folder for the run (default runs/{name}-001, -002, ...); with --resume that of the run"
-    if kind is Pretrain:
+    if kind is not Finetune:
         parser.add_argument("folder", nargs="?", metavar="RUN", help=where)
     else:
         parser.add_argument("--out", dest="folder", metavar="RUN", help=where)
     parser.add_argument("--resume", action="store_true", help="continue an interrupted run (default: the latest)")
-    parser.add_argument(
-        "--recipe",
-        metavar="NAME",
-        help="default, paper, paper-one-stage; prn, lpformer, lidarcap, ne, as with --model; other options override it",
-    )
+    known = "default, paper, paper-one-stage; prn, lpformer, lidarcap, ne, as with --model; other options override it"
+    parser.add_argument("--recipe", metavar="NAME", help="default" if kind is TrainDetector else known)
     parser.add_argument("--device", metavar="NAME", help="cpu (default: a GPU if there is one)")
     parser.add_argument("--tracker", metavar="NAME", help="also log to tensorboard or wandb, if installed")
-    # first the settings of this kind of training, then those that both have
+    # first the settings of this kind of training, then those that all have
     own = parser.add_argument_group(f"settings of {name}")
     common = parser.add_argument_group("settings of optimizer and run")
     if kind is Pretrain:
         add_keep(own)
-    shared = {field.name for field in fields(Recipe)}
+    shared = {field.name for base in (Recipe, PoseRecipe) for field in fields(base)}
     for field in fields(kind):
         if field.name != "data":
             default = "" if field.default in (None, (), "") else f" ({_said(field.default)})"
@@ -95,8 +101,8 @@ def _train(options: argparse.Namespace) -> None:
     from lidarpose.train.run_dir import latest, read_config
     from lidarpose.train.validation import draw_examples
 
-    kind: type[Pretrain | Finetune] = options.kind
-    name = kind.__name__.lower()
+    kind: type[Recipe] = options.kind
+    name = kind.kind
     changes: dict[str, Any] = {
         field.name: _parsed(field, text)
         for field in fields(kind)

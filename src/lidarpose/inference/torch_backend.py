@@ -44,6 +44,11 @@ def torch_backend(path: str | os.PathLike, *, device: str = "cpu", compile: bool
     return NETWORKS[header.network].part("backend")(network, header, device=device, compile=compile)
 
 
+def no_poses(network: nn.Module, header: Header, **settings: Any) -> Backend:
+    """Raises InputError: what stands for the backend of a network that predicts no joints."""
+    raise InputError(f"the network {header.network} finds people and poses nobody: name weights of a pose network")
+
+
 class TorchBackend:
     """A `PoseNet` that torch runs."""
 

@@ -74,6 +74,13 @@ NETWORKS = {
         objective="lidarpose.train.objectives.clip_objective:ClipObjective",
         backend="lidarpose.inference.torch_backend:ClipBackend",
     ),
+    # finds people and poses nobody
+    "detector": NetworkKind(
+        config="lidarpose.models.detector.detector_config:DetectorConfig",
+        network="lidarpose.models.detector.network:DetectorNet",
+        objective="lidarpose.train.objectives.detector_objective:DetectorObjective",
+        backend="lidarpose.inference.torch_backend:no_poses",
+    ),
 }
 
 BUNDLED = ("tiny", "small")

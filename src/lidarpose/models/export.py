@@ -1,10 +1,11 @@
 """Networks as files that run elsewhere: ONNX, or a program of `torch.export`. Checked before they are written."""
 
 import contextlib
+import copy
 import logging
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -13,7 +14,9 @@ from torch import Tensor, nn
 from lidarpose._version import __version__
 from lidarpose.errors import InputError, LidarPoseError, check_name, missing_extra
 from lidarpose.io.files import atomic_path, check_apart, check_suffix, check_writable, content_digest, write_atomic
-from lidarpose.models.checkpoint import DIGEST, ENTRY, load_checkpoint
+from lidarpose.models.checkpoint import DIGEST, ENTRY, Header, load_checkpoint
+from lidarpose.models.detector.detector_config import INPUTS, OUTPUT
+from lidarpose.models.detector.network import DetectorNet
 from lidarpose.models.onnx import (
     NO_DIGEST,
     OUTPUTS,
@@ -62,6 +65,9 @@ def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = 
     check_apart(out, weights)
     check_suffix(out, FORMATS[format])
     network, header = load_checkpoint(weights)
+    if isinstance(network, DetectorNet) and format == "onnx":
+        export_detector(network, out, card=header.card)
+        return
     if not isinstance(network, PoseNet):
         raise InputError(
             f"{os.fspath(weights)}: a network of the paper ({network.config.name}) is not offered as {format}: "
@@ -88,6 +94,30 @@ def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = 
             torch.export.save(program, file, extra_files=metadata)
 
 
+def export_detector(network: DetectorNet, out: str | os.PathLike, *, card: dict) -> None:
+    """Writes a detector as ONNX, its weights as float16, whole or not at all.
+
+    card: what its header says, see `detector_file`. Raises MissingExtra without onnx, LidarPoseError where the file
+    does not give what the network does.
+    """
+    check_suffix(out, FORMATS["onnx"])
+    check_writable(out)
+    network = copy.deepcopy(network).eval().half().float()
+    shapes = network.config.shapes
+    free = ({0: "candidates"},) * len(INPUTS)
+    traced = tuple(torch.zeros(shape) for shape in shapes(2).values())
+    metadata = {ENTRY: Header(config=network.config, card=card).to_json(), DIGEST: NO_DIGEST}
+    content = with_digest(module_to_onnx(network, traced, free, INPUTS, (OUTPUT,), metadata))
+    session = open_session(content, threads=1)
+    rng = np.random.default_rng(0)
+    for candidates in (1, 7):
+        arrays = {name: rng.normal(size=shape).astype(np.float32) for name, shape in shapes(candidates).items()}
+        with torch.inference_mode():
+            expected = network(*map(torch.as_tensor, arrays.values())).numpy()
+        _check_close(OUTPUT, expected, session.run([OUTPUT], arrays)[0])
+    write_atomic(out, content)
+
+
 def trace(network: PoseNet) -> torch.export.ExportedProgram:
     """The network as a program whose numbers of people and rows are free."""
     arrays = _people(network, _TRACED)
@@ -103,19 +133,34 @@ def trace(network: PoseNet) -> torch.export.ExportedProgram:
 
 def onnx_bytes(network: PoseNet, metadata: dict[str, str]) -> bytes:
     """The network as the content of an ONNX file. Raises MissingExtra without onnx or onnxscript."""
+    arrays = _people(network, _TRACED)
+    names = [input_name(name) for name in arrays]
+    module = ArrayModule(network, tuple(arrays))
+    return module_to_onnx(module, _tensors(arrays), (_axes(arrays),), names, OUTPUTS, metadata)
+
+
+def module_to_onnx(
+    module: nn.Module,
+    tensors: tuple[Tensor, ...],
+    axes: tuple,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    metadata: dict[str, str],
+) -> bytes:
+    """A module of tensors as the content of an ONNX file. axes: of each argument, those of free length and their names.
+    Raises MissingExtra without onnx or onnxscript."""
     try:
         import onnx
         import onnxscript  # noqa: F401
     except ModuleNotFoundError as error:
         raise missing_extra(error, "export to ONNX") from None
-    arrays = _people(network, _TRACED)
     with _silence(), torch.no_grad():
         program = torch.onnx.export(
-            ArrayModule(network, tuple(arrays)).eval(),
-            _tensors(arrays),
-            dynamic_shapes=(_axes(arrays),),
-            input_names=[input_name(name) for name in arrays],
-            output_names=list(OUTPUTS),
+            module.eval(),
+            tensors,
+            dynamic_shapes=axes,
+            input_names=list(inputs),
+            output_names=list(outputs),
             opset_version=_OPSET,
             dynamo=True,
             verbose=False,
@@ -143,12 +188,16 @@ def check(network: PoseNet, run: Callable[[dict[str, np.ndarray]], list[np.ndarr
         with torch.inference_mode():
             expected = ArrayModule(network.eval(), tuple(arrays))(*_tensors(arrays))
         for name, tensor, got in zip(OUTPUTS, expected, run(arrays), strict=True):
-            off = np.abs(got - tensor.numpy()).max(initial=0) if got.shape == tensor.shape else np.inf
-            if not off <= _TOLERANCE:
-                raise LidarPoseError(
-                    f"the exported network's {name} is off by {off:g}, so nothing was written: report this with the "
-                    f"versions that `lidarpose info` prints"
-                )
+            _check_close(name, tensor.numpy(), got)
+
+
+def _check_close(name: str, expected: np.ndarray, got: np.ndarray) -> None:
+    off = np.abs(got - expected).max(initial=0) if got.shape == expected.shape else np.inf
+    if not off <= _TOLERANCE:
+        raise LidarPoseError(
+            f"the exported network's {name} is off by {off:g}, so nothing was written: report this with the "
+            f"versions that `lidarpose info` prints"
+        )
 
 
 def _people(network: PoseNet, sizes: tuple[int, ...]) -> dict[str, np.ndarray]:

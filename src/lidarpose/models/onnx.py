@@ -7,6 +7,7 @@ checkpoint that it was made from, and a digest: the SHA-256 of the file with zer
 
 import hashlib
 import os
+from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
@@ -81,6 +82,18 @@ def open_session(content: bytes, *, threads: int | None = None):
 def open_onnx(path: str | os.PathLike, *, threads: int | None = None) -> tuple[Any, Header, str]:
     """The session of an exported network, its header, and the digest of the checkpoint that it was made from.
 
+    Raises InputError as `open_network` does, and for a file that holds no network of poses.
+    """
+    session, header = open_network(path, threads=threads)
+    if not isinstance(header.config, NetworkConfig):
+        raise file_error(path, f"expected a network of the kind pose, got {header.network}: use its .safetensors")
+    check_names(path, session, expected_inputs(header.config), OUTPUTS)
+    return session, header, session.get_modelmeta().custom_metadata_map.get(SOURCE, "")
+
+
+def open_network(path: str | os.PathLike, *, threads: int | None = None) -> tuple[Any, Header]:
+    """The session of an exported network of any kind, and its header.
+
     Warns of a file without a digest. Raises InputError, one line, for a file that is damaged, cut off, something else,
     another program's ONNX, or one that keeps its weights elsewhere.
     """
@@ -101,21 +114,22 @@ def open_onnx(path: str | os.PathLike, *, threads: int | None = None) -> tuple[A
             f"expected an ONNX file, but its {len(content):,} bytes are damaged, cut off or something else ({reason}): "
             "get it again, or make it anew with `lidarpose export`",
         ) from None
-    metadata = session.get_modelmeta().custom_metadata_map
-    header = parse_header(path, metadata.get(ENTRY))
-    if not isinstance(header.config, NetworkConfig):
-        raise file_error(path, f"expected a network of the kind pose, got {header.network}: use its .safetensors")
+    header = parse_header(path, session.get_modelmeta().custom_metadata_map.get(ENTRY))
+    if not has_digest:
+        warn_without_digest(path)
+    return session, header
+
+
+def check_names(path: str | os.PathLike, session: Any, inputs: Sequence[str], outputs: Sequence[str]) -> None:
+    """Raises InputError unless a session reads and gives arrays of these names."""
     for what, values, expected in (
-        ("input", session.get_inputs(), expected_inputs(header.config)),
-        ("output", session.get_outputs(), OUTPUTS),
+        ("input", session.get_inputs(), inputs),
+        ("output", session.get_outputs(), outputs),
     ):
         if wrong := sorted({value.name for value in values} ^ set(expected)):
             problem = "is missing" if wrong[0] in expected else "is unknown"
             remedy = "make the file anew with `lidarpose export` of this version"
             raise file_error(path, f"{what} {wrong[0]} {problem}: {remedy}")
-    if not has_digest:
-        warn_without_digest(path)
-    return session, header, metadata.get(SOURCE, "")
 
 
 def with_digest(content: bytes) -> bytes:

@@ -38,6 +38,7 @@ class RandomStream(IntEnum):
     INITIAL_WEIGHTS = 9
     TRAINING_STEP = 10
     DETECTION = 11
+    CANDIDATES = 12
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -58,6 +58,11 @@ class Example:
         """Of a clip several, here one."""
         return (self,)
 
+    @property
+    def size(self) -> int:
+        """Cells of 10 cm that hold points: they stand for voxels."""
+        return _cells(self.points)
+
 
 @dataclass(frozen=True, kw_only=True)
 class ClipExample:
@@ -72,6 +77,14 @@ class ClipExample:
     def points(self) -> np.ndarray:
         """(n, 3) m, of all frames."""
         return np.concatenate([frame.points for frame in self.frames])
+
+    @property
+    def size(self) -> int:
+        return _cells(self.points)
+
+
+def _cells(points: np.ndarray) -> int:
+    return len(np.unique(np.floor(points * 10), axis=0))
 
 
 @dataclass(frozen=True, kw_only=True)

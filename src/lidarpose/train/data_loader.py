@@ -2,9 +2,9 @@
 
 A source is a function of an example's number in the run alone, so any process makes any example, in any order. Chunk c
 holds the examples of steps c * BATCHES ... whatever the number of workers and processes, so a run can resume at any
-chunk. A chunk is sorted by voxels before it is cut into batches: padding is what a small network spends its time on. It
-is sorted in lanes, and a process takes whole lanes: no process makes examples for another, and the batches of all of
-them together are the same however many there are.
+chunk. A chunk is sorted by size (voxels) before it is cut into batches: padding is what a small network spends its time
+on. It is sorted in lanes, and a process takes whole lanes: no process makes examples for another, and the batches of
+all of them together are the same however many there are.
 """
 
 import os
@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
 from math import floor, gcd
+from operator import attrgetter
 from typing import Any, Protocol
 
 import numpy as np
@@ -53,7 +54,9 @@ _OF_ONE_DIFFICULTY = ("paper", "reference")
 class Source(Protocol):
     """Examples by their number in a run. May be pickled."""
 
-    def example(self, index: int) -> Example | ClipExample: ...
+    def example(self, index: int) -> Any:
+        """What the run's objective collates; has `size`, by which examples that cost alike share a batch."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,7 +181,7 @@ class MixedSource:
     other: Source
     share: float
 
-    def example(self, index: int) -> Example | ClipExample:
+    def example(self, index: int) -> Any:
         before, after = floor(index * self.share), floor((index + 1) * self.share)
         return self.other.example(before) if after > before else self.main.example(index - before)
 
@@ -221,7 +224,7 @@ class Chunks(IterableDataset):
         mine = []
         for lane in range(self.rank, lanes, self.ranks):
             numbers = range(first + lane, first + batches * self.batch, lanes)
-            mine.append(sorted(map(self.source.example, numbers), key=_voxels))
+            mine.append(sorted(map(self.source.example, numbers), key=attrgetter("size")))
         share = self.batch // lanes
         order = np.random.default_rng([self.seed, RandomStream.BATCH_ORDER, chunk]).permutation(batches)
         return [self.objective.collate([e for lane in mine for e in lane[k * share : (k + 1) * share]]) for k in order]
@@ -240,11 +243,6 @@ def lanes_of(batch: int, ranks: int = 1) -> int:
         fit = ", ".join(str(n) for n in range(1, lanes + 1) if lanes % n == 0)
         raise InputError(f"a batch of {batch} can be shared out among {fit} processes, got {ranks}: change --batch")
     return lanes
-
-
-def _voxels(example: Example | ClipExample) -> int:
-    """Cells of 10 cm stand for voxels: what matters is that examples of like size share a batch."""
-    return len(np.unique(np.floor(example.points * 10), axis=0))
 
 
 def loader(chunks: Chunks, *, workers: int) -> DataLoader:

@@ -17,7 +17,7 @@ from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -30,14 +30,13 @@ from lidarpose.models.checkpoint import save_checkpoint
 from lidarpose.progress import Progress
 from lidarpose.synth.scene import RandomStream
 from lidarpose.train import run_dir
-from lidarpose.train.augment import ClipExample, Example
 from lidarpose.train.data_loader import BATCHES, Chunks, chunks_of, lanes_of, loader
-from lidarpose.train.objectives.objective import total
+from lidarpose.train.objectives.objective import LOGGED, PoseObjective, total
 from lidarpose.train.optim import average, optimizers, set_rates
-from lidarpose.train.recipes import Finetune, Pretrain
+from lidarpose.train.recipes import PoseRecipe, Recipe
 from lidarpose.train.run_dir import BEST, LOG, MODEL, STATE
 from lidarpose.train.setup import TrainSetup, make_setup
-from lidarpose.train.validation import Draw, batch_norms, update_batch_norms, validate
+from lidarpose.train.validation import Draw, batch_norms, update_batch_norms
 
 # of Accelerate's, those that are known to work with a run's folder
 TRACKERS = ("tensorboard", "wandb")
@@ -81,7 +80,7 @@ class StopRequest:
 
 
 def train(
-    recipe: Pretrain | Finetune,
+    recipe: Recipe,
     folder: str | Path | None = None,
     *,
     setup: TrainSetup | None = None,
@@ -145,7 +144,7 @@ def _warn(text: str) -> None:
     print(f"lidarpose: warning: {text}", file=sys.stderr)
 
 
-def _accelerator(recipe: Pretrain | Finetune, on_cpu: bool, tracker: str | None) -> Accelerator:
+def _accelerator(recipe: Recipe, on_cpu: bool, tracker: str | None) -> Accelerator:
     half = recipe.precision == "bf16" or recipe.precision == "auto" and not on_cpu and torch.cuda.is_bf16_supported()
     try:
         return Accelerator(cpu=on_cpu, mixed_precision="bf16" if half else "no", log_with=tracker)
@@ -168,12 +167,12 @@ def _check(device: str | None, tracker: str | None) -> None:
 class _Run:
     """A run that goes on: the network, the mean of its weights, its optimizers, how far it is.
 
-    best, error: of the best and of the last validation, mm; infinite and None before.
+    best, error: of the best and of the last validation, in the setup's unit; infinite and None before.
     """
 
     def __init__(
         self,
-        recipe: Pretrain | Finetune,
+        recipe: Recipe,
         setup: TrainSetup,
         folder: Path,
         accelerator: Accelerator,
@@ -196,7 +195,7 @@ class _Run:
         self.error: float | None = None
 
     @cached_property
-    def _watched(self) -> Sequence[Example | ClipExample]:
+    def _watched(self) -> Sequence[Any]:
         """The samples to validate on."""
         return self.setup.validation()
 
@@ -237,7 +236,9 @@ class _Run:
         seconds_before = self.seconds
         with _dead_worker_named(), ExitStack() as stack:
             log = stack.enter_context(open(self.folder / LOG, "a")) if self.is_main else None
-            bar = stack.enter_context(Progress(people, unit="people", done=min(self.seen, people), shown=self.is_main))
+            bar = stack.enter_context(
+                Progress(people, unit=self.setup.unit, done=min(self.seen, people), shown=self.is_main)
+            )
             chunks = self._chunks(self.accelerator.process_index, self.accelerator.num_processes)
             for batches in loader(chunks, workers=recipe.workers):
                 seen_before = self.seen
@@ -280,9 +281,10 @@ class _Run:
 
     def _note(self, terms: dict[str, float]) -> str:
         """What the progress bar shows."""
-        loss = sum(value for name, value in terms.items() if name not in ("mpjpe", "gradient"))
-        note = f"loss {loss:.3f}, mpjpe {terms['mpjpe'] * 1e3:.0f} mm"
-        return note if self.error is None else f"{note}, validation {self.error:.0f} mm"
+        loss = sum(value for name, value in terms.items() if name not in (*LOGGED, "gradient"))
+        shown = f"mpjpe {terms['mpjpe'] * 1e3:.0f} mm" if "mpjpe" in terms else f"AP {terms['ap']:.3f}"
+        note = f"loss {loss:.3f}, {shown}"
+        return note if self.error is None else f"{note}, validation {self.error:.0f} {self.setup.error_unit}"
 
     def _chunk(self, batches: list, stop: StopRequest) -> tuple[dict[str, float], bool]:
         """Takes the steps of a chunk; returns the mean of each term and of the gradient's norm over them, and whether
@@ -327,7 +329,8 @@ class _Run:
         network = self.setup.objective.network().to(self.accelerator.device)
         network.load_state_dict(self.network.state_dict() | self.mean)
         if batch_norms(network):
-            update_batch_norms(network, self.setup.objective, self._recent_batches())
+            # networks of poses alone have them
+            update_batch_norms(network, cast(PoseObjective, self.setup.objective), self._recent_batches())
         return network.eval()
 
     def _recent_batches(self) -> list:
@@ -342,11 +345,12 @@ class _Run:
         """On the main process; the weights of the best validation are kept."""
         if not self._watched:
             return {}
-        network, pictures = self._averaged(), self.recipe.pictures
-        self.error, joints = validate(
+        network = self._averaged()
+        pictures = self.recipe.pictures if isinstance(self.recipe, PoseRecipe) else 0
+        self.error, joints = self.setup.validate(
             self.setup.objective, network, self._watched, self.recipe.batch // self.setup.frames
         )
-        if pictures and self.draw is not None:
+        if pictures and self.draw is not None and joints is not None and self.setup.joints is not None:
             rows = np.unique(np.linspace(0, len(joints) - 1, min(pictures, len(joints))).astype(int))
             frames = [frame for example in self._watched for frame in example.frames]
             examples = [frames[k] for k in rows]
@@ -355,7 +359,11 @@ class _Run:
         if self.error < self.best:
             self.best = self.error
             self._save_weights(BEST, network)
-        return {"validation_mm": round(self.error, 2)}
+        return self._error_entry(self.error)
+
+    def _error_entry(self, error: float) -> dict[str, float]:
+        """What the log and the card say of a validation."""
+        return {f"validation_{self.setup.error_unit}": round(error, 2)}
 
     def _save(self) -> None:
         # the state last: killed between the two, a run goes on from the older one and writes both again
@@ -373,11 +381,11 @@ class _Run:
         card = {
             "command": self.command or "lidarpose.train.loop.train",
             "recipe": recipe,
-            "people_seen": self.seen,
+            f"{self.setup.unit}_seen": self.seen,
             "hours": round(self.seconds / 3600, 3),
         }
         if self.error is not None:
-            card["validation_mm"] = round(self.error, 2)
+            card |= self._error_entry(self.error)
         save_checkpoint(self.folder / name, network, card=card | self.setup.card)
 
 

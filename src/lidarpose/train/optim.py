@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from lidarpose.models.posenet import PoseNet
-from lidarpose.train.recipes import Recipe
+from lidarpose.train.recipes import PoseRecipe, Recipe
 
 # the released schedule begins at a tenth of its peak and ends at a thousandth
 _FIRST, _LAST = 0.1, 1e-3
@@ -25,7 +25,7 @@ def optimizers(network: nn.Module, recipe: Recipe) -> list[torch.optim.Optimizer
     """AdamW or Adam; with a muon_rate AdamW, and Muon for the hidden matrices of a `PoseNet`."""
     betas: Any = recipe.betas
     settings: dict[str, Any] = {"lr": recipe.rate, "weight_decay": recipe.decay, "fused": True}
-    if not recipe.muon_rate or not isinstance(network, PoseNet):
+    if not (isinstance(network, PoseNet) and isinstance(recipe, PoseRecipe) and recipe.muon_rate):
         kind = torch.optim.Adam if recipe.optimizer == "adam" else torch.optim.AdamW
         # the paper's: torch's own settings
         return [kind(network.parameters(), betas=betas or (0.9, 0.999), **settings)]
@@ -58,7 +58,7 @@ def set_rates(optimizers: list[torch.optim.Optimizer], recipe: Recipe, done: flo
     """Rates of all optimizers when `done` in [0, 1] of the run is over."""
     factor = rate_factor(done, recipe)
     for optimizer in optimizers:
-        rate = recipe.muon_rate if isinstance(optimizer, Muon) else recipe.rate
+        rate = recipe.muon_rate if isinstance(optimizer, Muon) and isinstance(recipe, PoseRecipe) else recipe.rate
         for group in optimizer.param_groups:
             group["lr"] = rate * factor
 

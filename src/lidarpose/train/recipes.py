@@ -6,7 +6,7 @@ A field's help is what the command line says of it; this module stays light for 
 from dataclasses import Field, asdict, dataclass, field, fields
 from operator import index
 from os import fspath
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from lidarpose.errors import InputError, check_finite, check_name
 from lidarpose.io.files import listed
@@ -35,7 +35,7 @@ FREE = ("workers", "validate", "pictures", "precision")
 _BELOW_ONE = ("ema", "mix", "hold_out")
 _MODEL = "ours, dapt, prn, lpformer, lidarcap or ne"
 _OPTIONS = "options of a baseline's network: resample_with_replacement=true, grid=32, ... (docs/train.md)"
-_LEAST = {"batch": 1, "people": 1}
+_LEAST = {"batch": 1, "people": 1, "scenes": 1, "uses": 1}
 
 
 def _to_bool(value: Any) -> bool:
@@ -83,11 +83,15 @@ def _checked(f: Field, value: Any) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """What pre-training and fine-tuning have in common. Raises InputError for a value that cannot be."""
+    """What all training has in common. Raises InputError for a value that cannot be.
+
+    kind: the command.
+    """
+
+    kind: ClassVar[str]
 
     batch: int = _setting(64, "people a step, in all processes together; each frame of a clip counts as one")
     rate: float = _setting(2e-3, "peak learning rate of AdamW", "RATE")
-    muon_rate: float = _setting(0.02, "peak learning rate of Muon for hidden matrices; 0: AdamW for all", "RATE")
     decay: float = _setting(0.01, "weight decay")
     optimizer: str = _setting("adamw", "adamw or adam, where Muon is off")
     betas: tuple[float, ...] = _setting((), "its two betas (default: those of the network)")
@@ -96,11 +100,8 @@ class Recipe:
     cool: float = _setting(0.3, "share of the run in which a plateau's rate falls to nothing", "SHARE")
     ema: float = _setting(0.999, "how much the running mean of the weights keeps each step; 0: no mean", "SHARE")
     clip: float = _setting(1.0, "largest norm of a step's gradient; 0: any")
-    bone: float = _setting(0.0, "weight of the error of bones' lengths")
-    symmetry: float = _setting(0.0, "weight of the difference of left and right bones")
     precision: str = _setting("auto", "auto (bf16 on a GPU), float32 or bf16")
     validate: int = _setting(0, "people between two validations; 0: twenty in the run")
-    pictures: int = _setting(6, "validation people drawn at every validation")
     seed: int = _setting(0, "of all that is random")
     workers: int = _setting(1, "processes that make people, of each process that trains")
 
@@ -113,13 +114,18 @@ class Recipe:
         check_name("schedule", self.schedule, SCHEDULES)
         check_name("precision", self.precision, PRECISIONS)
 
-    @property
-    def kind(self) -> str:
-        """The command, "pretrain" or "finetune"."""
-        return type(self).__name__.lower()
-
     def to_dict(self) -> dict:
         return asdict(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseRecipe(Recipe):
+    """What pre-training and fine-tuning have in common."""
+
+    muon_rate: float = _setting(0.02, "peak learning rate of Muon for hidden matrices; 0: AdamW for all", "RATE")
+    bone: float = _setting(0.0, "weight of the error of bones' lengths")
+    symmetry: float = _setting(0.0, "weight of the difference of left and right bones")
+    pictures: int = _setting(6, "validation people drawn at every validation")
 
 
 def _size_of(model: str, size: str) -> str:
@@ -131,8 +137,10 @@ def _size_of(model: str, size: str) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pretrain(Recipe):
+class Pretrain(PoseRecipe):
     """Pre-training on synthesized people, made while the network learns, or read from shards."""
+
+    kind: ClassVar[str] = "pretrain"
 
     model: str = _setting("", f"{_MODEL} (default: the one that --size is of)")
     size: str = _setting(
@@ -174,8 +182,10 @@ class Pretrain(Recipe):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finetune(Recipe):
+class Finetune(PoseRecipe):
     """Fine-tuning on datasets that `lidarpose prepare` wrote."""
+
+    kind: ClassVar[str] = "finetune"
 
     rate: float = _setting(5e-4, "peak learning rate of AdamW", "RATE")
     muon_rate: float = _setting(5e-3, "peak learning rate of Muon for hidden matrices; 0: AdamW for all", "RATE")
@@ -218,6 +228,20 @@ class Finetune(Recipe):
             raise InputError(
                 "the paper's fine-tuning goes on from a checkpoint of pretrain --recipe paper: name it by --init"
             )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainDetector(Recipe):
+    """Training of the network that finds people, on synthesized scans."""
+
+    kind: ClassVar[str] = "train-detector"
+
+    batch: int = _setting(4, "scans a step, in all processes together")
+    rate: float = _setting(4e-3, "peak learning rate of AdamW", "RATE")
+    validate: int = _setting(0, "scans shown between two validations; 0: twenty in the run")
+    workers: int = _setting(1, "processes that make scans, of each process that trains")
+    scenes: int = _setting(20_000, "scans that are made")
+    uses: int = _setting(4, "how often each scan is shown, each time changed anew")
 
 
 # the released OneCycle schedule, AdamW on everything, neither mean of weights nor clipping
@@ -269,11 +293,12 @@ RECIPES: dict[type[Recipe], dict[str, dict[str, Any]]] = {
         "lidarcap": _CLIPS_DATA | {"model": "lidarcap"},
         "ne": _CLIPS_DATA | {"model": "ne"},
     },
+    TrainDetector: {"default": {}},
 }
 AnyRecipe = TypeVar("AnyRecipe", bound=Recipe)
 
 
 def recipe(kind: type[AnyRecipe], name: str = "default", **changes: Any) -> AnyRecipe:
-    """A named recipe of `Pretrain` or `Finetune`, some of its fields changed."""
+    """A named recipe of a kind of training, some of its fields changed."""
     check_name("recipe", name, RECIPES[kind])
     return kind(**(RECIPES[kind][name] | changes))

@@ -37,8 +37,9 @@ SCHEMA = "lidarpose.run/2"
 # settings that are files or folders, which may have been moved
 PATHS = ("data", "shards", "motion", "init")
 # how a run's length is called: a run may become longer, its schedule follows
-LENGTHS = ("people", "epochs")
-# progress of a run besides tensors: steps taken, seconds, error of the best and of the last validation in mm or None
+LENGTHS = ("people", "epochs", "scenes")
+# progress of a run besides tensors: steps taken, seconds, error of the best and of the last validation in mm (of a
+# detector %) or None
 _ERROR = (int, float, NoneType)
 _PROGRESS = {"steps": (int,), "seconds": (int, float), "best": _ERROR, "validation": _ERROR}
 # entries that an optimizer cannot go on without
@@ -106,7 +107,7 @@ def read_config(folder: Path, kind: type[AnyRecipe]) -> tuple[AnyRecipe, str]:
         if config["schema"] != SCHEMA:
             other = f"is of {config['schema']}, this lidarpose goes on with {SCHEMA}"
             raise InputError(f"{other}: use lidarpose {config['version']}")
-        if config["kind"] != kind.__name__.lower():
+        if config["kind"] != kind.kind:
             raise InputError(f"is of a run of `lidarpose {config['kind']}`: resume it by that command")
         return kind(**config["recipe"]), str(config.get("command", ""))
     except InputError as error:

@@ -30,17 +30,32 @@ from lidarpose.models.baselines.baseline_config import (
 from lidarpose.models.checkpoint import build, load_checkpoint
 from lidarpose.models.config import SIZES, NetworkConfig
 from lidarpose.models.dapt.dapt_config import CONFIGS, DaptConfig
+from lidarpose.models.detector.detector_config import DetectorConfig
 from lidarpose.models.posenet import PoseNet, expand_weights
 from lidarpose.skeleton import HUMAN15, SMPL24, Skeleton, skeleton
 from lidarpose.train.augment import Augmentation, ClipExample, Example, augmentation, augmented
-from lidarpose.train.data_loader import ClipSource, MixedSource, Source, StoredSource, SyntheticSource
+from lidarpose.train.data_loader import BATCHES, ClipSource, MixedSource, Source, StoredSource, SyntheticSource
+from lidarpose.train.detector.candidate_source import CandidateSource
+from lidarpose.train.detector.scan_validation import missed_people, validation_scans
 from lidarpose.train.objectives.baseline_objective import with_joints
 from lidarpose.train.objectives.dapt_objective import finetuning_config, pretraining_config, small
 from lidarpose.train.objectives.dapt_transfer import transferred
+from lidarpose.train.objectives.detector_objective import DetectorObjective
 from lidarpose.train.objectives.objective import Objective
-from lidarpose.train.recipes import MODELS, PAPER, RANDOM, SMALL_PAPER, Finetune, Pretrain, Recipe
+from lidarpose.train.recipes import (
+    MODELS,
+    PAPER,
+    RANDOM,
+    SMALL_PAPER,
+    Finetune,
+    PoseRecipe,
+    Pretrain,
+    Recipe,
+    TrainDetector,
+)
 from lidarpose.train.run_dir import folder_names
 from lidarpose.train.torch_dataset import InMemoryDataset
+from lidarpose.train.validation import validate
 
 # samples to validate on; synthetic ones are of a seed that no run learns from
 VALIDATION = 256
@@ -50,6 +65,8 @@ _NO_VALIDATION = (
 )
 # of fewer sequences none is held out
 _LEAST_SEQUENCES = 3
+# chunks of a run between two times that a scan is shown: divides by the usual numbers of workers
+_LAG = 12
 
 
 Config = NetworkConfig | DaptConfig | BaselineConfig
@@ -88,18 +105,23 @@ def networks() -> list[dict[str, Any]]:
 @dataclass(frozen=True, kw_only=True)
 class TrainSetup:
     """people: how many samples are seen in all; validation: makes those to validate on, once, none for no validation;
-    joints: the skeleton to draw them in; card: what the checkpoint says besides the recipe; warnings: for the user;
-    frames: of an example, each of which counts as one of `people`."""
+    joints: the skeleton to draw them in, None for no pictures; card: what the checkpoint says besides the recipe;
+    warnings: for the user; frames: of an example, each of which counts as one of `people`; unit: what these are;
+    validate: called with (objective, network, examples, batch), the error of a network in evaluation mode, in
+    `error_unit`, and the joints to draw, if any."""
 
     objective: Objective
     source: Source
     people: int
     network: Callable[[], nn.Module]
-    validation: Callable[[], Sequence[Example | ClipExample]]
-    joints: Skeleton
+    validation: Callable[[], Sequence[Any]]
+    joints: Skeleton | None
     card: dict
     warnings: tuple[str, ...] = ()
     frames: int = 1
+    unit: str = "people"
+    validate: Callable[..., tuple[float, np.ndarray | None]] = validate
+    error_unit: str = "mm"
 
     @property
     def task(self) -> Objective:
@@ -112,7 +134,7 @@ def Job(*, task: Objective, **settings: Any) -> TrainSetup:  # noqa: N802
     return TrainSetup(objective=task, **settings)
 
 
-def objective_of(config: Config, recipe: Recipe, layout: str = "ragged") -> Objective:
+def objective_of(config: Config, recipe: PoseRecipe, layout: str = "ragged") -> Objective:
     """What a network of a configuration minimizes: its entry in `models.NETWORKS`, by its settings of a recipe.
     layout: of the paper's tables."""
     lengths = {"bone": recipe.bone, "symmetry": recipe.symmetry}
@@ -130,11 +152,33 @@ def objective_of(config: Config, recipe: Recipe, layout: str = "ragged") -> Obje
     return NETWORKS[config.kind].part("objective")(config=config, **settings)
 
 
-def make_setup(recipe: Pretrain | Finetune, *, on_cpu: bool = True) -> TrainSetup:
+def make_setup(recipe: Recipe, *, on_cpu: bool = True) -> TrainSetup:
     """on_cpu: where the network will run, which decides the layout of the paper's tables. Raises InputError, one line,
     where the recipe names what is not there."""
     layout = "ragged" if on_cpu else "padded"
-    return _pretraining(recipe, layout) if isinstance(recipe, Pretrain) else _finetuning(recipe, layout)
+    if isinstance(recipe, TrainDetector):
+        return _detection(recipe)
+    if isinstance(recipe, Pretrain):
+        return _pretraining(recipe, layout)
+    assert isinstance(recipe, Finetune)
+    return _finetuning(recipe, layout)
+
+
+def _detection(recipe: TrainDetector) -> TrainSetup:
+    objective = DetectorObjective(config=DetectorConfig())
+    return TrainSetup(
+        objective=objective,
+        # a worker shows each scan again that it has made, for all usual numbers of workers
+        source=CandidateSource(seed=recipe.seed, uses=recipe.uses, lag=_LAG * BATCHES * recipe.batch // recipe.uses),
+        people=recipe.scenes * recipe.uses,
+        network=objective.network,
+        validation=partial(validation_scans, _VALIDATION_SEED),
+        joints=None,
+        card={},
+        unit="scans",
+        validate=missed_people,
+        error_unit="missed",
+    )
 
 
 def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
@@ -338,6 +382,8 @@ def _initial(recipe: Finetune) -> tuple[Any, dict]:
         return None, {"init": RANDOM, "init_card": {}}
     path = weights_path(recipe.init)
     trained, header = load_checkpoint(path)
+    if not trained.config.joints:
+        raise file_error(path, f"holds the network {header.network}, which poses nobody: name a checkpoint of another")
     if recipe.model and header.network != PRETRAINED[MODELS[recipe.model][0]][0].kind:
         raise file_error(path, f"holds the network {header.config.name}, not {recipe.model}: name a checkpoint of it")
     return trained, {"init": path.name, "init_card": header.card}

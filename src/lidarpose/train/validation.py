@@ -9,14 +9,14 @@ from torch.nn.modules.batchnorm import _BatchNorm
 from lidarpose.sample import Pose
 from lidarpose.skeleton import BODY26, Skeleton
 from lidarpose.train.augment import ClipExample, Example
-from lidarpose.train.objectives.objective import Objective
+from lidarpose.train.objectives.objective import PoseObjective
 
 # examples in their own frames, predicted joints (N, 26, 3) m of body26, the skeleton to draw, a title -> PNG
 Draw = Callable[[list[Example], np.ndarray, Skeleton, str], bytes]
 
 
 def validate(
-    objective: Objective, network: nn.Module, examples: Sequence[Example | ClipExample], batch: int
+    objective: PoseObjective, network: nn.Module, examples: Sequence[Example | ClipExample], batch: int
 ) -> tuple[float, np.ndarray]:
     """MPJPE in mm of a network in evaluation mode over the labeled joints that it has, and its joints (N, 26, 3) m, of
     all N frames. batch: of examples."""
@@ -33,7 +33,7 @@ def batch_norms(network: nn.Module) -> list[_BatchNorm]:
     return [module for module in network.modules() if isinstance(module, _BatchNorm)]
 
 
-def update_batch_norms(network: nn.Module, objective: Objective, batches: list) -> None:
+def update_batch_norms(network: nn.Module, objective: PoseObjective, batches: list) -> None:
     """Estimates the statistics of a network's batch norms anew, as their means over collated batches. In place.
 
     As `torch.optim.swa_utils.update_bn`, but nothing is dropped, so that they are those of evaluation. Statistics that

@@ -13,6 +13,8 @@ from torch import Tensor, nn
 from lidarpose.skeleton import BODY26
 from lidarpose.train.augment import UNKNOWN_PART
 
+# terms that are logged and not minimized: mean error of decoded joints, m; average precision, 0 to 1
+LOGGED = ("mpjpe", "ap")
 # a sum over this process's people -> that over all processes', divided by their number. Gradients are averaged over
 # processes, so what is divided by it is the mean over all samples of the step, however they are shared out
 Share = Callable[[Tensor], Tensor]
@@ -42,9 +44,13 @@ class Objective(Protocol):
     def terms(
         self, network: Callable, arrays: Any, *, device: torch.device | str = "cpu", share: Share = alone
     ) -> dict[str, Tensor]:
-        """Each weighted loss term by name; their sum is minimized. "mpjpe" (m, of decoded joints, detached) is logged
-        and not part of it. network: called as the network itself, be it wrapped."""
+        """Each weighted loss term by name; their sum is minimized. Those of `LOGGED`, detached, are no part of it.
+        network: called as the network itself, be it wrapped."""
         ...
+
+
+class PoseObjective(Objective, Protocol):
+    """A kind of network that predicts joints."""
 
     def joints(self, network: Callable, arrays: Any, *, device: torch.device | str = "cpu") -> np.ndarray:
         """Decoded joints (B, J, 3) m of body26 in each person's frame, NaN where the network has no such joint."""
@@ -60,7 +66,7 @@ def in_body26(joints: Tensor, columns: Sequence[int] | np.ndarray) -> np.ndarray
 
 def total(terms: dict[str, Tensor]) -> Tensor:
     """The sum of the weighted terms."""
-    return torch.stack([value for name, value in terms.items() if name != "mpjpe"]).sum()
+    return torch.stack([value for name, value in terms.items() if name not in LOGGED]).sum()
 
 
 def at_least_one(count: Tensor) -> Tensor:

@@ -1,0 +1,178 @@
+"""What the detector learns from: candidates of synthesized scans, each scan shown several times.
+
+Scans take longest to make, so a scan's candidates are kept for a while and shown `uses` times, each time drawn anew
+from its points with another augmentation. Everything is a function of an example's number: a process that lacks a scan,
+as after `--resume`, makes it again.
+
+Legend: K candidates, P people of a scan.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from lidarpose.models.detector.candidates import Augmentation, Candidate, SceneIndex, draw_augmentation
+from lidarpose.models.detector.ground import estimate_ground, without_ground
+from lidarpose.models.detector.proposals import heights_above, propose
+from lidarpose.synth.detection_scene import DetectionScene, detection_scene
+from lidarpose.synth.scene import RandomStream
+
+# how far people are looked for, and how far points beyond are taken along, as when people are detected, m
+RANGE, _BEYOND = 40.0, 6.0
+# of a candidate's distance to a person's center in x and y: one up to the first is the person's, and their nearest one
+# up to the second; one beyond the second is nobody's, and what lies between teaches nothing, m
+POSITIVE, IGNORED = 0.35, 0.5
+# who returned fewer points is neither to be found nor to be left alone
+LEAST_POINTS = 5
+# how often a scan's sensor is unknown from the beginning, and how often a candidate is shown without it
+BLIND, DROP_ORIGIN = 0.08, 0.08
+# nobody's candidates of a scan that are shown at a time; the objective learns from the hardest of them
+NEGATIVES = 64
+# `Labels.person` of nobody's candidates and of those that teach nothing
+NOBODY, UNCLEAR = -1, -2
+# what boxes have beyond the body on each side, m
+_MARGIN = 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class Labels:
+    """What is true of K candidates.
+
+    person (K,) int: index into the scene's boxes, `NOBODY` or `UNCLEAR`; of people's candidates also center (K, 3): of
+    the person, x and y in the view frame about the candidate, z the ground, m; foot (K,): lowest point above the ground
+    at the candidate; height (K,) m; mounted (K,) bool. All float32 but for those named.
+    """
+
+    person: np.ndarray
+    center: np.ndarray
+    foot: np.ndarray
+    height: np.ndarray
+    mounted: np.ndarray
+
+    def take(self, rows: np.ndarray) -> "Labels":
+        return Labels(**{name: value[rows] for name, value in vars(self).items()})
+
+
+@dataclass(frozen=True, kw_only=True)
+class DetectorExample:
+    """Candidates of a scan with their labels, as they are (augmentations None) or changed; rows: of the scan's points
+    at each, for suppression."""
+
+    candidates: list[Candidate]
+    labels: Labels
+    augmentations: list[Augmentation] | None = None
+    rows: list[np.ndarray] | None = None
+
+    @property
+    def size(self) -> int:
+        return len(self.candidates)
+
+
+def labels_of(candidates: list[Candidate], scene: DetectionScene) -> Labels:
+    """What is true of the candidates of a scene."""
+    count = len(candidates)
+    center, foot, height = np.zeros((count, 3), np.float32), np.zeros(count, np.float32), np.zeros(count, np.float32)
+    person, mounted = np.full(count, NOBODY), np.zeros(count, bool)
+    if count and scene.boxes:
+        own = np.stack([candidate.center for candidate in candidates])
+        true = np.stack([box.center for box in scene.boxes])
+        half = np.array([box.size[2] / 2 for box in scene.boxes]) - _MARGIN
+        offset = true[None, :, :2] - own[:, None, :2]
+        distance = np.linalg.norm(offset, axis=-1)
+        nearest, rows = distance.argmin(1), np.arange(count)
+        points = np.bincount(scene.person[scene.person >= 0], minlength=len(scene.boxes))
+        least = distance[rows, nearest]
+        person[least <= IGNORED] = UNCLEAR
+        is_near = (least <= POSITIVE) | ((least <= IGNORED) & (distance.argmin(0)[nearest] == rows))
+        is_found = is_near & (points[nearest] >= LEAST_POINTS)
+        person[is_found] = nearest[is_found]
+        yaw = np.array([candidate.yaw for candidate in candidates])
+        x, y = offset[rows, nearest].T
+        center[:, 0] = np.cos(yaw) * x + np.sin(yaw) * y
+        center[:, 1] = np.cos(yaw) * y - np.sin(yaw) * x
+        foot[:] = true[nearest, 2] - half[nearest] - own[:, 2]
+        height[:] = 2 * half[nearest]
+        mounted[:] = scene.mounted[nearest]
+    return Labels(person=person, center=center, foot=foot, height=height, mounted=mounted)
+
+
+def moved(labels: Labels, augmentations: list[Augmentation]) -> Labels:
+    """The labels of candidates that are changed so."""
+    if not augmentations:
+        return labels
+    pairs = zip(augmentations, labels.center, strict=True)
+    center = np.stack([augmentation.apply(place[None])[0] for augmentation, place in pairs]).astype(np.float32)
+    scale = np.array([augmentation.scale for augmentation in augmentations], np.float32)
+    return Labels(
+        person=labels.person,
+        center=center,
+        foot=labels.foot * scale,
+        height=labels.height * scale,
+        mounted=labels.mounted,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CandidateSource:
+    """Each scene of `detection_scene` of a seed `uses` times, `lag` scenes between two times.
+
+    Scene j is example uses * j the first time. Where no scene is old enough yet, a younger one stands in.
+    """
+
+    seed: int
+    uses: int
+    lag: int
+
+    def __getstate__(self) -> dict:
+        return {name: value for name, value in vars(self).items() if name != "_kept"}
+
+    @cached_property
+    def _kept(self) -> dict[int, DetectorExample]:
+        """The scans of this process by their numbers."""
+        return {}
+
+    def example(self, index: int) -> DetectorExample:
+        newest, use = divmod(index, self.uses)
+        number = newest - use * self.lag
+        full = self._scan(newest // (use + 1) if number < 0 else number, newest)
+        rng = np.random.default_rng([self.seed, RandomStream.CANDIDATES, index])
+        person = full.labels.person
+        others = np.flatnonzero(person == NOBODY)
+        others = rng.choice(others, min(NEGATIVES, len(others)), replace=False)
+        rows = np.concatenate([np.flatnonzero(person >= 0), np.sort(others)])
+        augmentations = [draw_augmentation(rng, drop_origin=DROP_ORIGIN) for _ in rows]
+        return DetectorExample(
+            candidates=[full.candidates[row] for row in rows],
+            labels=moved(full.labels.take(rows), augmentations),
+            augmentations=augmentations,
+        )
+
+    def _scan(self, number: int, newest: int) -> DetectorExample:
+        kept = self._kept
+        if number not in kept:
+            for old in [old for old in kept if old < newest - self.uses * self.lag]:
+                del kept[old]
+            kept[number] = scan_example(self.seed, number)
+        return kept[number]
+
+
+def scan_example(seed: int, number: int, *, family: str = "train", with_rows: bool = False) -> DetectorExample:
+    """All candidates of a scene, found as in any scan."""
+    scene = detection_scene(seed, number, family=family)
+    rng = np.random.default_rng([seed, RandomStream.CANDIDATES, number, 0])
+    origin = None if rng.random() < BLIND else scene.origin
+    points = scene.points[_distance(scene.points, scene) < RANGE + _BEYOND]
+    ground = estimate_ground(points, origin) or without_ground(points, origin)
+    heights = heights_above(points, ground)
+    centers = propose(points, ground, heights=heights)
+    centers = centers[_distance(centers, scene) < RANGE]
+    index = SceneIndex(points, ground, origin, heights=heights)
+    candidates, rows = index.candidates(centers), index.rows(centers) if with_rows else None
+    labels = labels_of(candidates, scene)
+    return DetectorExample(candidates=candidates, labels=labels, rows=rows)
+
+
+def _distance(points: np.ndarray, scene: DetectionScene) -> np.ndarray:
+    """Level distances (n,) m of points (n, 3) from the sensor of a scene."""
+    return np.hypot(points[:, 0] - scene.origin[0], points[:, 1] - scene.origin[1])

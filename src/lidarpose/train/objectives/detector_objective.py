@@ -1,0 +1,105 @@
+"""`DetectorObjective`: people's candidates against the hardest of nobody's, and where the people are.
+
+Legend: K candidates of a batch.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from lidarpose.models.detector.candidates import render
+from lidarpose.models.detector.detector_config import INPUTS, DetectorConfig
+from lidarpose.models.detector.network import DetectorNet
+from lidarpose.train.detector.candidate_source import NOBODY, UNCLEAR, DetectorExample
+from lidarpose.train.objectives.objective import Share, alone, at_least_one
+
+# weights; distances are in meters
+PERSON, OFFSET, FOOT, HEIGHT, MOUNTED = 1.0, 2.0, 1.0, 1.0, 0.1
+# nobody's candidates that are learned from: of the largest loss, for each of people's and for each scan; and at random,
+# a share of the rest
+HARD, HARD_OF_SCAN, EASY = 1.5, 4, 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class DetectorObjective:
+    """The `Objective` of a `DetectorNet` with this configuration."""
+
+    config: DetectorConfig
+
+    def network(self) -> DetectorNet:
+        return DetectorNet(self.config)
+
+    def collate(self, examples: list[DetectorExample]) -> dict[str, np.ndarray]:
+        """The network's inputs as float16, which halves what goes between processes; labels (K, ...) of all scans one
+        after the other, and scan (K,), of which each is."""
+        drawn = [render(example.candidates, example.augmentations) for example in examples]
+        # torch rounds ten times as fast as numpy
+        arrays = {
+            name: torch.as_tensor(np.concatenate([each[name] for each in drawn])).half().numpy() for name in INPUTS
+        }
+        for name in vars(examples[0].labels):
+            arrays[name] = np.concatenate([getattr(example.labels, name) for example in examples])
+        return arrays | {"scan": np.repeat(np.arange(len(examples)), [example.size for example in examples])}
+
+    def terms(
+        self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
+    ) -> dict[str, Tensor]:
+        """Cross entropy of people's candidates and of the hard ones of nobody's; distances and height of people's."""
+        tensors = {name: torch.as_tensor(array).to(device) for name, array in arrays.items()}
+        inputs = [tensors[name].float() for name in INPUTS]
+        person = tensors["person"]
+        with torch.no_grad():
+            logit = network(*inputs).float()[:, 0]
+            rows = chosen(logit, person, tensors["scan"])
+            precision = average_precision(logit[person != UNCLEAR], person[person != UNCLEAR] >= 0)
+        out = network(*(values[rows] for values in inputs)).float()
+        is_person = (person[rows] >= 0).float()
+        people = at_least_one(share(is_person.sum()))
+
+        def of_people(error: Tensor) -> Tensor:
+            return (error * is_person).sum() / people
+
+        def l1(column: int, name: str) -> Tensor:
+            return of_people((out[:, column] - tensors[name][rows]).abs())
+
+        binary = F.binary_cross_entropy_with_logits
+        center = tensors["center"][rows, :2]
+        mounted = binary(out[:, 5], tensors["mounted"][rows].float(), reduction="none")
+        count = at_least_one(share(torch.ones_like(is_person).sum()))
+        return {
+            "person": PERSON * binary(out[:, 0], is_person, reduction="sum") / count,
+            "offset": OFFSET * of_people((out[:, 1:3] - center).norm(dim=1)),
+            "foot": FOOT * l1(3, "foot"),
+            "height": HEIGHT * l1(4, "height"),
+            "mounted": MOUNTED * of_people(mounted),
+            "ap": precision,
+        }
+
+    @torch.no_grad()
+    def scores(self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu") -> np.ndarray:
+        """(K, 6), see `detector_config.OUTPUTS`."""
+        inputs = [torch.as_tensor(arrays[name]).to(device).float() for name in INPUTS]
+        return network(*inputs).float().cpu().numpy()
+
+
+def chosen(logit: Tensor, person: Tensor, scan: Tensor) -> Tensor:
+    """Rows to learn from, by logits (K,): all people's, the hardest of nobody's, and some at random, by torch's
+    generator."""
+    theirs, others = (person >= 0).nonzero()[:, 0], (person == NOBODY).nonzero()[:, 0]
+    scans = int(scan.max()) + 1 if len(scan) else 0
+    hard = min(round(HARD * len(theirs)) + HARD_OF_SCAN * scans, len(others))
+    # the loss of somebody who is not there rises with the logit
+    order = others[logit[others].argsort(descending=True)]
+    easy = order[hard:]
+    return torch.cat([theirs, order[:hard], easy[torch.rand(len(easy), device=easy.device) < EASY]])
+
+
+def average_precision(logit: Tensor, is_person: Tensor) -> Tensor:
+    """Mean precision over the ranks of the true ones; 0 where there are none."""
+    hits = is_person[logit.argsort(descending=True)].float()
+    precision = hits.cumsum(0) / torch.arange(1, len(hits) + 1, device=hits.device)
+    return (precision * hits).sum() / hits.sum().clamp(min=1)
