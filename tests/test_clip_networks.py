@@ -11,6 +11,7 @@ from training_runs import few_to_validate_on, refused  # noqa: F401 - a fixture
 
 from lidarpose import evaluation
 from lidarpose.body.rig import mean_adult_joints
+from lidarpose.cli import main
 from lidarpose.data.clips import windows
 from lidarpose.data.prepare import prepare
 from lidarpose.data.shards import DatasetCard, person_row, shard_path, shard_writer, write_card
@@ -172,12 +173,11 @@ def test_losses_vanish_at_the_truth(name, clips):
 # ---- runs
 
 
-@pytest.mark.slow
-def test_a_run_on_clips_is_evaluated_and_predicts(folder, tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", CONFIGS)
+def test_a_run_on_clips_is_evaluated_and_predicts(name, folder, clips, tmp_path, monkeypatch):
     monkeypatch.setattr(setup, "VALIDATION", CLIP_FRAMES)
-    wanted = recipe(
-        Pretrain, "lidarcap", shards=(str(folder),), scene="paper", batch=32, people=40, workers=0, pictures=1
-    )
+    few = {"batch": 32, "workers": 0, "pictures": 1}
+    wanted = recipe(Pretrain, name, size=f"{name}-small", shards=(str(folder),), scene="paper", people=40, **few)
     assert (wanted.optimizer, wanted.rate, wanted.decay, wanted.ema) == ("adam", 1e-4, 1e-4, 0)
     assert recipe(Pretrain, "ne").batch == 8 * CLIP_FRAMES
     path = loop.train(wanted, tmp_path / "run", device="cpu", draw=draw_examples)
@@ -188,12 +188,20 @@ def test_a_run_on_clips_is_evaluated_and_predicts(folder, tmp_path, monkeypatch)
     result = evaluation.evaluate(path, folder)
     assert result.counts["people"] == 2 * CLIP_FRAMES
     assert any(line.figure.startswith("accel") and line.people for line in result.lines)
-    tuned = recipe(
-        Finetune, "lidarcap", data=(str(folder),), init=str(path), split="all", epochs=1.0, batch=32, workers=0
-    )
+    tuned = recipe(Finetune, name, data=(str(folder),), init=str(path), split="all", epochs=1.0, **few)
     assert make_setup(tuned).people == 2 * CLIP_FRAMES
-    went_on = make_setup(tuned).network().state_dict()
-    torch.testing.assert_close(went_on["embed.weight"], load(path).backend.network.state_dict()["embed.weight"])
+    went_on, before = make_setup(tuned).network().state_dict(), load(path).backend.network.state_dict()
+    assert all(torch.equal(value, before[key]) for key, value in went_on.items())
+    # and by command, from random weights
+    monkeypatch.chdir(tmp_path)
+    words = ["--model", name, "--size", f"{name}-small", "--split", "all", "--epochs", "1", "--batch", "32"]
+    assert not main(["finetune", str(folder), *words, "--workers", "0", "--pictures", "0", "--out", "tuned"])
+    assert not main(["evaluate", "tuned/model.safetensors", str(folder), "--out", "scores"])
+    assert json.loads((tmp_path / "scores/scores.json").read_text())["results"][0]["counts"]["people"] == 32
+    np.save("cloud.npy", clips[0][0].points)
+    assert not main(["predict", "cloud.npy", "--weights", "tuned/model.safetensors"])
+    (person,) = json.loads((tmp_path / "cloud.poses.json").read_text())["people"]
+    assert np.isfinite(person["joints"]).all() and len(person["joints"]) == len(SMPL24)
 
 
 def test_settings_that_clips_cannot_have_are_refused(folder, tmp_path):
