@@ -26,7 +26,6 @@ from lidarpose.eval.detector.detection_scores import (
     score_scan,
 )
 from lidarpose.eval.detector.labeled_scans import LabeledScan, ScanSet, heldout_scans, labeled_scans
-from lidarpose.inference import detection
 from lidarpose.models.detector.detector import Detector
 from lidarpose.sample import Box
 
@@ -268,19 +267,19 @@ def test_frozen_scenes_are_labeled_scans_and_said_to_be_changed_where_they_are()
 
 
 @pytest.mark.parametrize("method", run_module.METHODS)
-def test_every_method_finds_who_stands_alone_on_a_plane(method, monkeypatch):
+def test_every_method_finds_who_stands_alone_on_a_plane(method):
     def most_points(arrays):
         count = arrays["scalars"][:, 2]
         return np.stack([4 * count, *np.zeros((3, len(count))), 1.7 + 0 * count, -9 + 0 * count], 1).astype(np.float32)
 
     fake_detector = Detector(most_points)
     fake_detector.header |= {"version": "0", "default_score": 0.5, "calibration": [[-9.0, 9.0], [0.0, 1.0]]}
-    monkeypatch.setattr(run_module, "_bundled", lambda: fake_detector)
-    monkeypatch.setattr(detection, "_detector", lambda: fake_detector)
     plane = np.stack(np.meshgrid(np.arange(-3, 12, 0.2), np.arange(-6, 6, 0.2), [-1.7]), -1).reshape(-1, 3)
     own = scan([5.0])
     body = np.random.default_rng(2).uniform(-1, 1, (300, 3)) * [0.2, 0.25, 0.85] + [5.0, 0, -0.85]
-    boxes, scores = run_module.detector_of(method, max_range=20.0)(np.concatenate([plane, body]), np.zeros(3))
+    boxes, scores = run_module.detector_of(method, fake_detector, max_range=20.0)(
+        np.concatenate([plane, body]), np.zeros(3)
+    )
     people, _ = score_scan(0, own, boxes, scores, max_range=20)
     assert people.detection.tolist() == [int(np.argmax(scores))] and (0 <= scores).all() and (scores <= 1).all()
 
@@ -315,8 +314,8 @@ def fake(points, origin):
 
 def test_the_command_scores_labeled_scans(tmp_path, capsys, monkeypatch):
     write_scans(tmp_path / "labeled")
-    monkeypatch.setattr(run_module, "detector_of", lambda method, max_range: fake)
-    arguments = ["evaluate", "detector", "--method", "scorer", "--scans", str(tmp_path / "labeled"), "--range", "30"]
+    monkeypatch.setattr(run_module, "detector_of", lambda method, detector, max_range: fake)
+    arguments = ["evaluate", "detector", "--method", "pose", "--scans", str(tmp_path / "labeled"), "--range", "30"]
     arguments += ["--out", str(tmp_path / "out"), "--pictures", str(tmp_path / "look")]
     assert main(arguments) == 0
     printed = capsys.readouterr().out
@@ -337,8 +336,10 @@ def test_the_command_scores_labeled_scans(tmp_path, capsys, monkeypatch):
 
 def test_missed_people_are_drawn(tmp_path, monkeypatch):
     write_scans(tmp_path / "labeled")
-    monkeypatch.setattr(run_module, "detector_of", lambda method, max_range: lambda points, origin: ([], np.zeros(0)))
-    arguments = ["evaluate", "detector", "--method", "scorer", "--scans", str(tmp_path / "labeled")]
+    monkeypatch.setattr(
+        run_module, "detector_of", lambda method, detector, max_range: lambda points, origin: ([], np.zeros(0))
+    )
+    arguments = ["evaluate", "detector", "--method", "pose", "--scans", str(tmp_path / "labeled")]
     assert main([*arguments, "--out", str(tmp_path / "out"), "--pictures", str(tmp_path / "look")]) == 0
     assert [path.name for path in (tmp_path / "look").iterdir()] == ["labeled-missed.png"]
     rows = json.loads((tmp_path / "out" / "detector.json").read_text())["results"][0]["rows"]

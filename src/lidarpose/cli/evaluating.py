@@ -42,7 +42,7 @@ _SWITCHES = {
 }
 # in place of a network: what finds people; and its own options
 DETECTOR = "detector"
-_DETECTOR = ("scans", "method", "range", "network", "pictures")
+_DETECTOR = ("scans", "method", "detector", "range", "network", "pictures")
 # groups of rows that the terminal shows; the others are in scores.json
 _SHOWN = ("condition", "plain", "joints", "distance, m", "points", "hidden share")
 # metrics of these groups that it shows, besides those of everybody
@@ -80,6 +80,7 @@ def add(commands) -> None:
     detector.add_argument("--scans", action="append", metavar="DIR", help=words)
     words = "detector (default), scorer: without poses, or baselines: pose, candidates"
     detector.add_argument("--method", metavar="NAME", help=words)
+    detector.add_argument("--detector", metavar="FILE", help="another detector's ONNX file than the bundled one")
     words = "people farther from the sensor do not count (default 40)"
     detector.add_argument("--range", type=float, metavar="M", help=words)
     words = "compare poses in found boxes with those in labeled ones: a checkpoint (default small), or none"
@@ -151,10 +152,11 @@ def _evaluate_detector(options: argparse.Namespace) -> None:
             heldout=bool(options.datasets) or not options.scans,
             folders=options.scans or (),
             network=network,
+            weights=options.detector,
             progress=progress,
             **settings,
         )
-    about = {"command": _command(options), **settings, "network": network}
+    about = {"command": _command(options), **settings, "detector": options.detector, "network": network}
     written = write_detector(results, sets, folder, about, pictures)
     for result in results:
         print("\n".join(_detector_lines(result)))

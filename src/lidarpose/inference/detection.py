@@ -66,12 +66,14 @@ _DECIMALS = 4
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Search:
-    """How people are searched for, see `detect`. background (k, 3) m: static points in the scan's frame."""
+    """How people are searched for, see `detect`. background (k, 3) m: static points in the scan's frame; detector: None
+    for the bundled one."""
 
     max_range: float = MAX_RANGE
     min_score: float | None = None
     max_people: int | None = None
     background: np.ndarray | None = None
+    detector: Detector | None = None
 
     def __post_init__(self):
         if not _is_number(self.max_range) or not 0 < self.max_range < np.inf:
@@ -163,7 +165,8 @@ def find_people(scan: Scan, search: Search) -> Scan:
             warnings.append(
                 f"only {share:.0%} of the points lie on the background: is it of this sensor, in this frame?"
             )
-    detections = _detector().detect(level, origin, max_range=search.max_range, limit=_POSED, moving=moving)
+    detector = search.detector or _detector()
+    detections = detector.detect(level, origin, max_range=search.max_range, limit=_POSED, moving=moving)
     if not detections.has_ground:
         warnings.append("no ground was found, and people are searched without it: is the up axis right?")
     boxes, rows = _verified(detections, level, origin, search)
@@ -301,7 +304,7 @@ def _verified(
     near = _rows_near(detections, points)
     clouds = [points[rows] for rows in near]
     features, poses = _posed(detections, clouds, origin, _verifier())
-    header = _detector().header
+    header = (search.detector or _detector()).header
     scores = final_score(features, header)
     least = float(header["default_score"]) if search.min_score is None else search.min_score
     pelvis = poses.joints[:, poses.skeleton.index("pelvis")]

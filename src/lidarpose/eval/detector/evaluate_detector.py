@@ -15,8 +15,9 @@ from lidarpose.errors import check_name
 from lidarpose.eval.detector.detection_pictures import draw_false, draw_missed
 from lidarpose.eval.detector.detection_scores import Detect, DetectorResult, score_detector
 from lidarpose.eval.detector.labeled_scans import ScanSet, heldout_scans, labeled_scans
-from lidarpose.inference.detection import detect as detect_people
+from lidarpose.inference.detection import Search, find_people
 from lidarpose.inference.predictor import Predictor, load
+from lidarpose.inference.scan import Scan
 from lidarpose.io.files import atomic_path
 from lidarpose.models.detector.candidates import SceneIndex, suppress
 from lidarpose.models.detector.detector import Detector
@@ -33,25 +34,20 @@ _CANDIDATE = np.array([0.9, 0.9, 2.0])
 _SPREAD = 0.1
 
 
-def detector_of(method: str, *, max_range: float) -> Detect:
+def detector_of(method: str, detector: Detector | None, *, max_range: float) -> Detect:
     """What looks for people: "detector", as `lidarpose.detect`; "scorer", the same without poses; and baselines on its
     candidates, which nothing was trained for: "pose", by the spread of `tiny`'s pose, and "candidates" by their order.
-    The last three take the frame as level.
+    The last three take the frame as level. detector: of the first two.
     """
     if method == "detector":
-        return partial(_detect, max_range=max_range)
+        return partial(_detect, Search(max_range=max_range, min_score=0.0, detector=detector))
     if method == "scorer":
-        return partial(_scorer, _bundled(), max_range=max_range)
+        return partial(_scorer, detector or Detector(), max_range=max_range)
     return partial(_baseline, load("tiny", tta=1) if method == "pose" else None)
 
 
-def _bundled() -> Detector:
-    return Detector()
-
-
-def _detect(points: np.ndarray, origin: np.ndarray | None, *, max_range: float) -> tuple[Sequence[Box], np.ndarray]:
-    place = "unknown" if origin is None else origin
-    boxes = detect_people(points, sensor_origin=place, max_range=max_range, min_score=0.0)
+def _detect(search: Search, points: np.ndarray, origin: np.ndarray | None) -> tuple[Sequence[Box], np.ndarray]:
+    boxes = find_people(Scan(points=points, origin=origin), search).boxes or []
     return boxes, np.array([box.score for box in boxes], float)
 
 
@@ -76,6 +72,7 @@ def _baseline(predictor: Predictor | None, points: np.ndarray, origin: np.ndarra
 def run_detector(
     method: str = "detector",
     *,
+    weights: str | os.PathLike | None = None,
     heldout: bool = True,
     folders: Sequence[str | os.PathLike] = (),
     max_range: float = 40.0,
@@ -88,7 +85,8 @@ def run_detector(
     """Scores a detector on the frozen scenes and on folders of labeled scans.
 
     Args:
-        method: see `detector_of`; detect: another detector.
+        method: see `detector_of`; detect: anything else instead.
+        weights: a detector's ONNX file, None for the bundled one.
         folders: see `labeled_scans`.
         max_range: m, people farther away do not count.
         network: whose poses in found boxes are compared with those in labeled boxes; None leaves this out.
@@ -97,8 +95,11 @@ def run_detector(
     check_name("method", method, METHODS)
     sets = [heldout_scans(limit)] if heldout else []
     sets += [labeled_scans(folder, limit) for folder in folders]
-    default = _bundled().header.get("default_score") if method == "detector" and detect is None else None
-    detect = detect or detector_of(method, max_range=max_range)
+    default = None
+    if detect is None:
+        detector = Detector(weights) if method in ("detector", "scorer") else None
+        default = detector.header.get("default_score") if detector and method == "detector" else None
+        detect = detector_of(method, detector, max_range=max_range)
     predictor = None if network is None else load(network, tta=1)
     score = partial(score_detector, detect, max_range=max_range, predictor=predictor, seed=seed, default_score=default)
     return [score(scans, progress=partial(progress, scans.name)) for scans in sets], sets
