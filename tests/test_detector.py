@@ -100,5 +100,5 @@ def test_candidates_are_scored_in_pieces_of_bounded_size():
         return upright(arrays)
 
     together = Detector(count).detect(points, ORIGIN)
-    assert max(sizes) <= 128 and len(sizes) > 1
+    assert max(sizes) <= 64 and len(sizes) > 1
     assert len(together) < sum(sizes)

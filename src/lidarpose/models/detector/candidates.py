@@ -30,6 +30,8 @@ RANGE_CHANNELS, _MARGIN, _FAR = 4, 3, 4.0
 CONTEXT_CHANNELS, CONTEXT_SIDE, CONTEXT_CELL, _TALL = 4, 20, 0.5, 4.0
 # points of a candidate lie within this, and so far above and below the slices, m
 RADIUS, _ROOM = 1.75, 0.2
+# heights above the ground at which points are looked at, m
+_USED = (-1.2, 3.2)
 # the most that are kept, and the unit they are kept in, m
 _MOST_POINTS, _UNIT = 1000, 5e-4
 # points lie sorted by cells of this size, m, in tables of at most so many cells
@@ -135,23 +137,25 @@ class SceneIndex:
         # a wide map has larger cells instead of a larger table
         self._cell = max(_INDEX_CELL, float(np.sqrt(extent.prod() / _MOST_INDEX_CELLS)))
         self._shape = tuple(int(n) for n in extent // self._cell + 2)
-        cells = ((points[:, :2] - self._corner) * (1 / self._cell)).astype(np.int32)
+        place = (points - [*self._corner, 0.0]).astype(np.float32)
+        cells = (place[:, :2] * np.float32(1 / self._cell)).astype(np.int32)
         flat = cells[:, 0] * self._shape[1] + cells[:, 1]
-        self._order = _order(flat)
-        self._start = np.zeros(self._shape[0] * self._shape[1] + 1, np.int64)
-        np.cumsum(np.bincount(flat, minlength=len(self._start) - 1), out=self._start[1:])
+        self._maps = _draw_maps(flat, heights, self._shape)
+        # what lies high above everybody is context alone
+        used = np.flatnonzero((heights > _USED[0]) & (heights < _USED[1]))
+        self._order = used[_order(flat[used])]
         # relative to the corner, float32 holds millimeters of the widest map
-        self._points = (points[self._order] - [*self._corner, 0.0]).astype(np.float32)
-        self._maps = _draw_maps(flat[self._order], heights[self._order], self._shape)
+        self._points = place[self._order]
+        self._start = np.zeros(self._shape[0] * self._shape[1] + 1, np.int64)
+        np.cumsum(np.bincount(flat[used], minlength=len(self._start) - 1), out=self._start[1:])
         self._image = None if self.origin is None else _RangeImage(points - self.origin)
 
     def rows(self, centers: np.ndarray, radius: float = 0.35) -> list[np.ndarray]:
-        """Of each of centers (K, 2 or 3) m the rows of the scan's points within `radius` m of its axis."""
+        """Of each of centers (K, 2 or 3) m the rows of the scan's points at a person's heights within `radius` m."""
         if not len(centers):
             return []
-        owner, near = self._near(np.asarray(centers)[:, :2], radius)
-        rows = self._order[near]
-        return np.split(rows, np.searchsorted(owner, np.arange(1, len(centers))))
+        near, _, count = self._near(np.asarray(centers, float), radius, (-np.inf, np.inf))
+        return np.split(self._order[near], np.cumsum(count)[:-1])
 
     def candidates(self, centers: np.ndarray) -> list[Candidate]:
         """The candidates at centers (K, 3) m: x, y, and z of the ground there."""
@@ -162,23 +166,14 @@ class SceneIndex:
         if self.origin is not None:
             away = centers[:, :2] - self.origin[:2]
             yaw, distance = np.arctan2(away[:, 1], away[:, 0]), np.maximum(np.hypot(*away.T), _LEAST_DISTANCE)
-        owner, near = self._near(centers[:, :2], RADIUS)
-        height = self._points[near, 2] - centers[owner, 2].astype(np.float32)
-        is_near = (height > BOTTOM - _ROOM) & (height < BOTTOM + SLICES * CELL + _ROOM)
-        owner, near = owner[is_near], near[is_near]
-        count = np.bincount(owner, minlength=len(centers))
-        # every so manieth of a place that has too many, in an order that is no pattern of the scan's
-        number = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
-        share = np.minimum(1.0, _MOST_POINTS / np.maximum(count, 1))[owner]
-        chosen = np.floor((number + 1) * share) > np.floor(number * share)
-        owner, near = owner[chosen], near[chosen]
-        middle = centers - [*self._corner, 0.0]
-        local = self._points[near] - middle[owner].astype(np.float32)
-        c, s = np.cos(yaw).astype(np.float32)[owner], np.sin(yaw).astype(np.float32)[owner]
-        x, y = local[:, 0] * c + local[:, 1] * s, local[:, 1] * c - local[:, 0] * s
-        local[:, 0], local[:, 1] = x, y
-        packed = np.rint(local * np.float32(1 / _UNIT)).astype(np.int16)
-        ends = np.cumsum(np.bincount(owner, minlength=len(centers)))
+        _, local, count = self._near(centers, RADIUS, (BOTTOM - _ROOM, BOTTOM + SLICES * CELL + _ROOM))
+        packed, sizes = _thinned(local, count)
+        c, s = (np.repeat(values.astype(np.float32), sizes) for values in (np.cos(yaw), np.sin(yaw)))
+        x, y = packed[:, 0] * c + packed[:, 1] * s, packed[:, 1] * c - packed[:, 0] * s
+        packed[:, 0], packed[:, 1] = x, y
+        packed *= np.float32(1 / _UNIT)
+        packed = np.rint(packed, out=packed).astype(np.int16)
+        ends = np.cumsum(sizes)
         context = self._context(centers, yaw)
         ranges = np.zeros((len(centers), RANGE_CHANNELS, SLICES + 2 * _MARGIN, SIDE + 2 * _MARGIN), np.uint8)
         if self._image is not None and self.origin is not None:
@@ -191,32 +186,42 @@ class SceneIndex:
                 sensor_height=None if self.origin is None else float(self.origin[2] - centers[k, 2]),
                 count=int(count[k]),
                 packed=packed[ends[k - 1] if k else 0 : ends[k]].copy(),
-                range_view=ranges[k],
-                context=context[k],
+                # copies: a candidate that is kept does not hold those of all others
+                range_view=ranges[k].copy(),
+                context=context[k].copy(),
             )
             for k in range(len(centers))
         ]
 
-    def _near(self, xy: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-        """(owner (m,), sorted row (m,)) of all points within `radius` of the places (K, 2) m, by place."""
-        place = xy - self._corner
-        low = np.floor((place - radius) / self._cell).astype(np.int64)
-        high = np.floor((place + radius) / self._cell).astype(np.int64)
+    def _near(
+        self, centers: np.ndarray, radius: float, heights: tuple[float, float]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Points within `radius` and between heights of centers (K, 2 or 3) m, one center's after the other's.
+
+        Returns their sorted rows (m,), where they lie from their center (m, 3) float32 m, and how many each has (K,).
+        """
+        place = centers - [*self._corner, 0.0][: centers.shape[1]]
+        low = np.floor((place[:, :2] - radius) / self._cell).astype(np.int64)
+        high = np.floor((place[:, :2] + radius) / self._cell).astype(np.int64)
         low, high = np.maximum(low, 0), np.minimum(high, np.array(self._shape) - 1)
         # a run of cells for each row of the square: its points lie one after the other
         lines = np.maximum(high[:, 0] - low[:, 0] + 1, 0)
         lines[(high < low).any(1)] = 0
-        owner = np.repeat(np.arange(len(xy)), lines)
+        owner = np.repeat(np.arange(len(place)), lines)
         line = np.arange(len(owner)) - np.repeat(np.cumsum(lines) - lines, lines)
         base = (low[owner, 0] + line) * self._shape[1]
         start, end = self._start[base + low[owner, 1]], self._start[base + high[owner, 1] + 1]
         size = end - start
         row = np.arange(size.sum()) + np.repeat(start - (np.cumsum(size) - size), size)
-        owner = np.repeat(owner, size)
-        place = place.astype(np.float32)
-        away = self._points[row, :2] - place[owner]
-        inside = away[:, 0] ** 2 + away[:, 1] ** 2 < np.float32(radius**2)
-        return owner[inside], row[inside]
+        local = self._points[row]
+        sizes = np.bincount(owner, size, minlength=len(place)).astype(np.int64)
+        for axis in range(place.shape[1]):
+            local[:, axis] -= np.repeat(place[:, axis].astype(np.float32), sizes)
+        inside = local[:, 0] ** 2 + local[:, 1] ** 2 < np.float32(radius**2)
+        if np.isfinite(heights).all():
+            inside &= (local[:, 2] > heights[0]) & (local[:, 2] < heights[1])
+        ends = np.concatenate([[0], np.cumsum(inside)])[np.cumsum(sizes)]
+        return row[inside], local[inside], np.diff(ends, prepend=0)
 
     def _context(self, centers: np.ndarray, yaw: np.ndarray) -> np.ndarray:
         """Contexts (K, 4, 20, 20) uint8, nearest cells of the maps."""
@@ -231,6 +236,20 @@ class SceneIndex:
         return np.moveaxis(values, -1, 1).reshape(-1, CONTEXT_CHANNELS, CONTEXT_SIDE, CONTEXT_SIDE).astype(np.uint8)
 
 
+def _thinned(points: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) of which `count` (K,) belong to each candidate, `_MOST_POINTS` at most; how many each keeps (K,).
+
+    Every so manieth stays of a candidate that has too many.
+    """
+    if count.max(initial=0) <= _MOST_POINTS:
+        return points, count
+    number = np.arange(len(points)) - np.repeat(np.cumsum(count) - count, count)
+    share = np.repeat(np.minimum(1.0, _MOST_POINTS / np.maximum(count, 1)), count)
+    chosen = np.floor((number + 1) * share) > np.floor(number * share)
+    ends = np.concatenate([[0], np.cumsum(chosen)])[np.cumsum(count)]
+    return points[chosen], np.diff(ends, prepend=0)
+
+
 def _order(cells: np.ndarray) -> np.ndarray:
     """Rows that sort flat cells (n,), those of one cell in their own order: by 16 bits at a time, which is linear."""
     order = np.argsort((cells & 0xFFFF).astype(np.uint16), kind="stable")
@@ -240,23 +259,20 @@ def _order(cells: np.ndarray) -> np.ndarray:
 
 
 def _draw_maps(cells: np.ndarray, heights: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """The context's channels (cells, 4) uint8 of points sorted by their flat cells (n,), heights (n,) m."""
+    """The context's channels (cells, 4) uint8 of points in flat cells (n,), heights (n,) m."""
     size = shape[0] * shape[1]
-    maps = np.zeros((size, CONTEXT_CHANNELS), np.uint8)
-    if not len(cells):
-        return maps
-    first = np.flatnonzero(np.concatenate([[True], cells[1:] != cells[:-1]]))
-    occupied = cells[first]
-    highest = np.maximum.reduceat(heights, first)
-    maps[occupied, 0] = np.clip(highest * (255 / _TALL), 0, 255)
-    in_band = (heights > _BAND[0]) & (heights < _BAND[1])
-    level = ((heights[in_band] - _BAND[0]) * (_BAND_SLICES / (_BAND[1] - _BAND[0]))).astype(np.uint8)
-    filled = np.zeros(len(cells), np.uint8)
-    filled[in_band] = np.left_shift(np.uint8(1), np.minimum(level, _BAND_SLICES - 1))
-    bits = np.bitwise_or.reduceat(filled, first)
-    maps[occupied, 1] = np.unpackbits(bits[:, None], axis=1).sum(1) * (255 / _BAND_SLICES)
-    maps[occupied, 2] = _log_bytes(np.diff(np.append(first, len(cells))))
-    maps[occupied, 3] = _log_bytes(np.add.reduceat((np.abs(heights) < _NEAR_GROUND).astype(np.int64), first))
+    highest, count, near = np.zeros(size, np.float32), np.zeros(size, np.float32), np.zeros(size, np.float32)
+    filled = np.zeros(size, np.uint8)
+    np.maximum.at(highest, cells, heights)
+    np.add.at(count, cells, np.float32(1))
+    np.add.at(near, cells[np.abs(heights) < _NEAR_GROUND], np.float32(1))
+    band = np.flatnonzero((heights > _BAND[0]) & (heights < _BAND[1]))
+    level = ((heights[band] - _BAND[0]) * (_BAND_SLICES / (_BAND[1] - _BAND[0]))).astype(np.uint8)
+    np.bitwise_or.at(filled, cells[band], np.left_shift(np.uint8(1), np.minimum(level, _BAND_SLICES - 1)))
+    maps = np.empty((size, CONTEXT_CHANNELS), np.uint8)
+    maps[:, 0] = np.minimum(highest * (255 / _TALL), 255)
+    maps[:, 1] = np.unpackbits(filled[:, None], axis=1).sum(1) * (255 / _BAND_SLICES)
+    maps[:, 2], maps[:, 3] = _log_bytes(count), _log_bytes(near)
     return maps
 
 
@@ -297,7 +313,7 @@ class _RangeImage:
             )
             levels.append((near, far, count))
         self._rows = rows
-        self._starts = np.cumsum([0, *(len(level[0]) for level in levels)])
+        self._starts = np.cumsum([0, *(len(level[0]) for level in levels)], dtype=np.int32)
         none = (np.full(1, np.inf, np.float32), np.zeros(1, np.float32), np.zeros(1, np.int32))
         self._near, self._far, self._count = (np.concatenate(images) for images in zip(*levels, none, strict=True))
 
@@ -307,13 +323,13 @@ class _RangeImage:
         height = (np.arange(rows) - _MARGIN + 0.5) * CELL + BOTTOM
         lateral = (np.arange(columns) - _MARGIN + 0.5) * CELL - SIDE * CELL / 2
         turn = (yaw[:, None] + np.arctan2(lateral, distance[:, None]) + pi) % (2 * pi)
-        column = np.minimum((turn / _ANGLE).astype(np.int64), self._columns - 1)[:, None]
+        column = np.minimum((turn / _ANGLE).astype(np.int32), self._columns - 1)[:, None]
         slant = np.sqrt(lateral**2 + distance[:, None] ** 2).astype(np.float32)[:, None]
         tangent = (centers[:, 2:] + height).astype(np.float32)[:, :, None] / slant
-        row = (np.arctan(tangent) * np.float32(1 / _ANGLE) + np.float32(_ROWS // 2)).astype(np.int64) - self._first
+        row = (np.arctan(tangent) * np.float32(1 / _ANGLE) + np.float32(_ROWS // 2)).astype(np.int32) - self._first
         # cells as large as the picture's, or the next smaller ones
         level = np.floor(np.log2(CELL / distance / _ANGLE) + 0.5)
-        level = np.clip(level, 0, _LEVELS - 1).astype(np.int64)[:, None, None]
+        level = np.clip(level, 0, _LEVELS - 1).astype(np.int32)[:, None, None]
         at = self._at(level, row, column)
         near, far, count = self._near[at], self._far[at], self._count[at]
         views = np.empty((len(centers), RANGE_CHANNELS, rows, columns), np.uint8)
@@ -327,7 +343,8 @@ class _RangeImage:
     def _at(self, level: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
         """Flat cells of levels (K, 1, 1) at rows (K, H, 1 or W) and columns (K, 1, W) of the finest."""
         flat = self._starts[level] + (row >> level) * (self._columns >> level) + (column >> level)
-        return np.where((row >= 0) & (row < self._rows), flat, self._starts[-1])
+        flat[(row < 0) | (row >= self._rows)] = self._starts[-1]
+        return flat
 
 
 def _halved(image: np.ndarray, reduce: np.ufunc) -> np.ndarray:

@@ -12,7 +12,7 @@ from lidarpose.models.detector.ground import estimate_ground, without_ground
 from lidarpose.models.detector.proposals import heights_above, propose
 
 # candidates that are drawn and scored at a time
-_CHUNK = 128
+_CHUNK = 64
 # what lies farther than this beyond the range, m, is left out: a candidate at its end still has its surroundings
 _BEYOND = 6.0
 # a detection's own points lie within this of its axis, m
