@@ -64,7 +64,7 @@ class Detector:
         if callable(scorer):
             self._score: Scorer = scorer
             return
-        from lidarpose.models.detector.detector_file import open_detector  # type: ignore[import-not-found,unused-ignore]
+        from lidarpose.models.detector.detector_file import open_detector
 
         session, self.header = open_detector(scorer, threads=threads)
         self._score = lambda arrays: session.run(None, arrays)[0]
