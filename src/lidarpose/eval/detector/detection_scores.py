@@ -251,7 +251,9 @@ def _figures(
     judged = detections[(detections.status == FALSE) | (detections.status == PERSON) & ~detections.mounted]
     precision = 100 * average_precision(judged, on_foot, weights)
     rows.append(_row("average_precision", **_with_interval(precision, count), unit="%", count=len(on_foot)))
-    return rows, {at: 1.0 if np.isnan(score) else score for at, score in thresholds.items()}
+    # where nothing is above, nothing but certainty is; the default is what it is
+    thresholds = {at: 1.0 if np.isnan(score) else score for at, score in thresholds.items()}
+    return rows, thresholds | ({} if default_score is None else {"default": default_score})
 
 
 def exclusive_thresholds(false: pd.DataFrame, weights: np.ndarray, budget: float) -> np.ndarray:
