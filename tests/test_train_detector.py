@@ -246,6 +246,8 @@ def test_the_command_trains(quick_scans, tmp_path, capsys):
     assert capsys.readouterr().out.strip().endswith("model.safetensors")
     assert main(["train-detector", str(folder), "--resume", "--uses", "3"]) == 2
     assert "a run keeps its recipe" in capsys.readouterr().err
+    assert main(["train-detector", str(tmp_path / "none"), "--calibrate", "5"]) == 2
+    assert "name the folder of a run" in capsys.readouterr().err
     assert main(["pretrain", str(folder), "--resume"]) == 2
     assert "resume it by that command" in capsys.readouterr().err
 

@@ -60,7 +60,15 @@ def add(commands) -> None:
         "train the network that finds people in whole scans",
         "lidarpose train-detector --scenes 20000",
         "lidarpose train-detector runs/train-detector-001 --resume",
+        "lidarpose train-detector runs/train-detector-001 --calibrate 300",
         description=_WHAT.format(name="train-detector", what="Trains on scans synthesized during training."),
+    )
+    detector.add_argument(
+        "--calibrate",
+        type=int,
+        metavar="N",
+        help="train nothing: write RUN/detector.onnx, its scores calibrated on N synthesized scans of what training "
+        "never shows",
     )
     _add(detector, TrainDetector)
 
@@ -103,6 +111,11 @@ def _train(options: argparse.Namespace) -> None:
 
     kind: type[Recipe] = options.kind
     name = kind.kind
+    if getattr(options, "calibrate", None) is not None:
+        from lidarpose.train.detector.calibrate import calibrate
+
+        print(calibrate(options.folder or latest(name), options.calibrate))
+        return
     changes: dict[str, Any] = {
         field.name: _parsed(field, text)
         for field in fields(kind)

@@ -1,0 +1,130 @@
+"""What a trained detector's scores mean: fitted on scans of what training never shows, and written beside the network.
+
+Legend: D detections of all scans, F features.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from lidarpose.errors import InputError, check_int
+from lidarpose.inference.detection import FEATURES, final_score, verification_features
+from lidarpose.models.checkpoint import load_checkpoint
+from lidarpose.models.detector.detector import Detector
+from lidarpose.models.detector.network import DetectorNet
+from lidarpose.models.export import export_detector
+from lidarpose.progress import Progress
+from lidarpose.synth.detection_scene import DetectionScene, detection_scene
+from lidarpose.train.run_dir import MODEL
+
+DETECTOR = "detector.onnx"
+# a seed of which neither a run nor a bench has scans
+_SEED = 2**31 - 11
+# detections of a scan that are posed, the strongest ones
+_VERIFIED = 40
+# a detection within this of a person's center in x and y is theirs, m; people are looked for up to this range, m
+MATCH, _RANGE = 0.5, 40.0
+# false people a scan at the default score
+FALSE = 1.0
+# of the logistic, on standardized features; of the piecewise linear curve, its knots at most
+_RIDGE, _KNOTS = 1e-3, 16
+
+
+def calibrate(folder: str | Path, scans: int) -> Path:
+    """Writes the detector of a run, its scores calibrated on so many scans, and returns its path.
+
+    Raises InputError where the folder holds no detector.
+    """
+    check_int("--calibrate", scans, least=1)
+    path = Path(folder) / MODEL
+    if not path.is_file():
+        raise InputError(f"{path} is not there: name the folder of a run of lidarpose train-detector")
+    network, header = load_checkpoint(path)
+    if not isinstance(network, DetectorNet):
+        raise InputError(f"{path}: expected a detector, got a network of the kind {header.network}")
+    out = Path(folder) / DETECTOR
+    export_detector(network, out, card=header.card)
+    detector = Detector(out)
+    tables: list[tuple[np.ndarray, ...]] = []
+    with Progress(scans, unit="scans") as bar:
+        for number in range(scans):
+            scene = detection_scene(_SEED, number, family="heldout")
+            detections = detector.detect(scene.points, scene.origin, max_range=_RANGE, limit=_VERIFIED)
+            features, _ = verification_features(detections, scene.points, scene.origin)
+            tables.append((features, matched(detections.centers, scene)))
+            bar.update(number + 1)
+    features, is_person = (np.concatenate(column) for column in zip(*tables, strict=True))
+    export_detector(network, out, card=header.card | fit(features, is_person, scans) | {"calibrated_on": scans})
+    return out
+
+
+def matched(centers: np.ndarray, scene: DetectionScene) -> np.ndarray:
+    """Whether each of detections (D, 3), the strongest first, is a person of the scene whom no stronger one is."""
+    seen = np.unique(scene.person[scene.person >= 0])
+    people = np.array([scene.boxes[row].center for row in seen]).reshape(-1, 3)
+    is_free, is_person = np.ones(len(people), bool), np.zeros(len(centers), bool)
+    for row, center in enumerate(centers):
+        distance = np.where(is_free, np.linalg.norm(people[:, :2] - center[:2], axis=1), np.inf)
+        if len(distance) and distance.min() <= MATCH:
+            is_free[distance.argmin()] = False
+            is_person[row] = True
+    return is_person
+
+
+def fit(features: np.ndarray, is_person: np.ndarray, scans: int) -> dict:
+    """The entries "calibration", "verification" and "default_score" of a header.
+
+    features: (D, 5) of detections in so many scans, see `inference.detection.FEATURES`, NaN of those that could not be
+    posed; is_person: (D,). The default score lets `FALSE` false people a scan pass.
+    """
+    posed = np.isfinite(features).all(1)
+    own, labels = features[posed], is_person[posed]
+    # those who ride are posed badly, whatever their pose's spread
+    names = (*FEATURES, "mounted_confidence", "mounted_log_spread")
+    both = np.concatenate([own, own[:, 4:] * own[:, 1:3]], axis=1)
+    bias, weights = logistic(both, labels)
+    verification = {"bias": bias, **dict(zip(names, weights.tolist(), strict=True))}
+    verification["calibration"] = monotone(bias + both @ weights, labels)
+    header = {"calibration": monotone(features[:, 0], is_person), "verification": verification}
+    false = np.sort(final_score(own, header)[~labels])[::-1]
+    last = min(round(FALSE * scans), len(false) - 1)
+    # between the last false one that passes and the first that does not
+    threshold = false[last - 1 : last + 1].mean() if last > 0 else 0.5
+    return header | {"default_score": float(threshold)}
+
+
+def logistic(features: np.ndarray, labels: np.ndarray, *, iterations: int = 30) -> tuple[float, np.ndarray]:
+    """The bias and weights (F,) of a logistic regression of labels (D,), by Newton's method, slightly shrunk."""
+    mean, scale = features.mean(0), features.std(0) + 1e-6
+    x = np.column_stack([np.ones(len(features)), (features - mean) / scale])
+    weights = np.zeros(x.shape[1])
+    shrink = _RIDGE * len(x) * np.eye(len(weights))
+    for _ in range(iterations):
+        probability = 1 / (1 + np.exp(-x @ weights))
+        gradient = x.T @ (probability - labels) + shrink @ weights
+        hessian = (x * (probability * (1 - probability))[:, None]).T @ x + shrink
+        weights -= np.linalg.solve(hessian, gradient)
+    own = weights[1:] / scale
+    return float(weights[0] - own @ mean), own
+
+
+def monotone(logit: np.ndarray, labels: np.ndarray) -> list[list[float]]:
+    """Knots [[logits], [probabilities]] of the share of true labels by logit, rising: groups of like logits, joined
+    until each has a larger share than the one before (pool adjacent violators)."""
+    order = np.argsort(logit, kind="stable")
+    # half of the knots where people are, half where they are not
+    at = np.linspace(0, 1, _KNOTS // 2 + 1)[1:-1]
+    pivots = np.unique(np.concatenate([np.quantile(logit[labels == kind], at) for kind in np.unique(labels)]))
+    groups = np.split(order, np.searchsorted(logit[order], pivots))
+    pools: list[np.ndarray] = []
+    for group in groups:
+        if not len(group):
+            continue
+        pools.append(group)
+        while len(pools) > 1 and labels[pools[-2]].mean() >= labels[pools[-1]].mean():
+            last = pools.pop()
+            pools[-1] = np.concatenate([pools[-1], last])
+    # half a one of each kind more: nothing is certain
+    shares = [(labels[pool].sum() + 0.5) / (len(pool) + 1) for pool in pools]
+    middles = [float(logit[pool].mean()) for pool in pools]
+    return [[round(value, 4) for value in middles], [round(float(value), 5) for value in np.maximum.accumulate(shares)]]

@@ -1,0 +1,49 @@
+"""What a detector's scores mean: fitted on the scans of another family than that of training."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+
+from lidarpose.inference.detection import final_score
+from lidarpose.sample import Box
+from lidarpose.train.detector.calibrate import fit, logistic, matched, monotone
+
+
+def test_a_logistic_regression_finds_its_weights():
+    rng = np.random.default_rng(0)
+    features = rng.normal(size=(20_000, 2)) * [1, 10] + [0, 5]
+    truth = 0.5 + features @ [2.0, -0.1]
+    labels = rng.random(len(features)) < 1 / (1 + np.exp(-truth))
+    bias, weights = logistic(features, labels)
+    np.testing.assert_allclose([bias, *weights], [0.5, 2.0, -0.1], rtol=0.1)
+
+
+def test_probabilities_rise_and_are_shares():
+    rng = np.random.default_rng(0)
+    logit = rng.normal(0, 3, 20_000)
+    probability = 1 / (1 + np.exp(-logit - 1))
+    logits, shares = monotone(logit, rng.random(len(logit)) < probability)
+    assert (np.diff(logits) > 0).all() and (np.diff(shares) >= 0).all() and 0 < shares[0] and shares[-1] < 1
+    np.testing.assert_allclose(np.interp(logit, logits, shares), probability, atol=0.08)
+
+
+def test_a_person_is_found_once():
+    boxes = tuple(Box(center=np.array([x, 0.0, 0.9]), size=np.ones(3), yaw=0.0, id=str(x)) for x in (1.0, 5.0, 9.0))
+    scene = SimpleNamespace(boxes=boxes, person=np.array([0, 0, 1, -1], np.int16))
+    centers = np.array([[1.2, 0.1, 0.9], [1.1, 0.0, 0.9], [5.6, 0.0, 0.9], [5.2, 0.0, 2.0], [9.0, 0.0, 0.9]])
+    # nobody sees the third person
+    assert matched(centers, scene).tolist() == [True, False, False, True, False]
+    assert matched(centers[:0], scene).tolist() == []
+
+
+def test_the_default_score_lets_one_false_person_a_scan_pass():
+    rng = np.random.default_rng(0)
+    scans, labels = 100, rng.random(1500) < 0.3
+    features = np.column_stack([rng.normal(labels * 4.0, 2), rng.normal(size=(1500, 3)), rng.random(1500) < 0.1])
+    features[:5, 2] = np.nan
+    header = fit(features, labels, scans)
+    passing = (final_score(features, header) >= header["default_score"]) & ~labels
+    assert 60 <= passing.sum() <= 100
+    assert set(header) == {"calibration", "verification", "default_score"}
+    assert json.loads(json.dumps(header)) == header
