@@ -329,6 +329,16 @@ def test_no_points_and_no_candidates_are_legal():
     assert outside[0].count == 0 and not render(outside)["context"].any()
 
 
+def test_dense_places_cost_no_more_than_thinned_ones():
+    person = np.concatenate([column(5, 0, count=200_000), plane(reach=8)])
+    scene = SceneIndex(person, estimate_ground(person, ORIGIN), ORIGIN)
+    candidate = scene.candidates(np.array([[5.0, 0, -1.8]]))[0]
+    assert len(candidate.packed) <= 1000 < candidate.count < 100_000
+    # the whole body is still there
+    height = candidate.points[:, 2][np.hypot(*candidate.points[:, :2].T) < 0.3]
+    assert height.max() > 1.7 and np.diff(np.sort(height)).max() < 0.1
+
+
 def test_rows_are_those_of_the_column_and_suppression_is_by_shared_points(scene):
     _, points, ground = scene
     centers = propose(points, ground)

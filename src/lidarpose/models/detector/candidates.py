@@ -36,6 +36,8 @@ _USED = (-1.2, 3.2)
 _MOST_POINTS, _UNIT = 1000, 5e-4
 # points lie sorted by cells of this size, m, in tables of at most so many cells
 _INDEX_CELL, _MOST_INDEX_CELLS = 0.5, 4_000_000
+# of which each keeps at most so many points, and points that are looked at in one go
+_MOST_IN_CELL, _MOST_AT_ONCE = 10_000, 4_000_000
 # rows of the range image's finest cells from straight below to above, their size rad, and how many coarser levels
 # there are, each of twice the size
 _ROWS = 1024
@@ -143,11 +145,13 @@ class SceneIndex:
         self._maps = _draw_maps(flat, heights, self._shape)
         # what lies high above everybody is context alone
         used = np.flatnonzero((heights > _USED[0]) & (heights < _USED[1]))
-        self._order = used[_order(flat[used])]
+        count = np.bincount(flat[used], minlength=self._shape[0] * self._shape[1])
+        # very dense cells are thinned, so that no candidate costs more than so much
+        chosen, count = _thinned(count, _MOST_IN_CELL)
+        self._order = used[_order(flat[used])][chosen]
         # relative to the corner, float32 holds millimeters of the widest map
         self._points = place[self._order]
-        self._start = np.zeros(self._shape[0] * self._shape[1] + 1, np.int64)
-        np.cumsum(np.bincount(flat[used], minlength=len(self._start) - 1), out=self._start[1:])
+        self._start = np.concatenate([[0], np.cumsum(count)])
         self._image = None if self.origin is None else _RangeImage(points - self.origin)
 
     def rows(self, centers: np.ndarray, radius: float = 0.35) -> list[np.ndarray]:
@@ -162,12 +166,16 @@ class SceneIndex:
         centers = np.asarray(centers, float)
         if not len(centers):
             return []
+        if len(centers) > 1 and self._runs(centers[:, :2] - self._corner, RADIUS)[2].sum() > _MOST_AT_ONCE:
+            half = len(centers) // 2
+            return self.candidates(centers[:half]) + self.candidates(centers[half:])
         yaw = distance = np.zeros(len(centers))
         if self.origin is not None:
             away = centers[:, :2] - self.origin[:2]
             yaw, distance = np.arctan2(away[:, 1], away[:, 0]), np.maximum(np.hypot(*away.T), _LEAST_DISTANCE)
         _, local, count = self._near(centers, RADIUS, (BOTTOM - _ROOM, BOTTOM + SLICES * CELL + _ROOM))
-        packed, sizes = _thinned(local, count)
+        chosen, sizes = _thinned(count, _MOST_POINTS)
+        packed = local[chosen]
         c, s = (np.repeat(values.astype(np.float32), sizes) for values in (np.cos(yaw), np.sin(yaw)))
         x, y = packed[:, 0] * c + packed[:, 1] * s, packed[:, 1] * c - packed[:, 0] * s
         packed[:, 0], packed[:, 1] = x, y
@@ -201,17 +209,7 @@ class SceneIndex:
         Returns their sorted rows (m,), where they lie from their center (m, 3) float32 m, and how many each has (K,).
         """
         place = centers - [*self._corner, 0.0][: centers.shape[1]]
-        low = np.floor((place[:, :2] - radius) / self._cell).astype(np.int64)
-        high = np.floor((place[:, :2] + radius) / self._cell).astype(np.int64)
-        low, high = np.maximum(low, 0), np.minimum(high, np.array(self._shape) - 1)
-        # a run of cells for each row of the square: its points lie one after the other
-        lines = np.maximum(high[:, 0] - low[:, 0] + 1, 0)
-        lines[(high < low).any(1)] = 0
-        owner = np.repeat(np.arange(len(place)), lines)
-        line = np.arange(len(owner)) - np.repeat(np.cumsum(lines) - lines, lines)
-        base = (low[owner, 0] + line) * self._shape[1]
-        start, end = self._start[base + low[owner, 1]], self._start[base + high[owner, 1] + 1]
-        size = end - start
+        owner, start, size = self._runs(place[:, :2], radius)
         row = np.arange(size.sum()) + np.repeat(start - (np.cumsum(size) - size), size)
         local = self._points[row]
         sizes = np.bincount(owner, size, minlength=len(place)).astype(np.int64)
@@ -222,6 +220,20 @@ class SceneIndex:
             inside &= (local[:, 2] > heights[0]) & (local[:, 2] < heights[1])
         ends = np.concatenate([[0], np.cumsum(inside)])[np.cumsum(sizes)]
         return row[inside], local[inside], np.diff(ends, prepend=0)
+
+    def _runs(self, place: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Runs of sorted rows in the cells around places (K, 2) m from the corner: (owner, first row, length)."""
+        low = np.floor((place - radius) / self._cell).astype(np.int64)
+        high = np.floor((place + radius) / self._cell).astype(np.int64)
+        low, high = np.maximum(low, 0), np.minimum(high, np.array(self._shape) - 1)
+        # one for each row of the square of cells: its points lie one after the other
+        lines = np.maximum(high[:, 0] - low[:, 0] + 1, 0)
+        lines[(high < low).any(1)] = 0
+        owner = np.repeat(np.arange(len(place)), lines)
+        line = np.arange(len(owner)) - np.repeat(np.cumsum(lines) - lines, lines)
+        base = (low[owner, 0] + line) * self._shape[1]
+        start, end = self._start[base + low[owner, 1]], self._start[base + high[owner, 1] + 1]
+        return owner, start, end - start
 
     def _context(self, centers: np.ndarray, yaw: np.ndarray) -> np.ndarray:
         """Contexts (K, 4, 20, 20) uint8, nearest cells of the maps."""
@@ -236,18 +248,18 @@ class SceneIndex:
         return np.moveaxis(values, -1, 1).reshape(-1, CONTEXT_CHANNELS, CONTEXT_SIDE, CONTEXT_SIDE).astype(np.uint8)
 
 
-def _thinned(points: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) of which `count` (K,) belong to each candidate, `_MOST_POINTS` at most; how many each keeps (K,).
+def _thinned(count: np.ndarray, most: int) -> tuple[slice | np.ndarray, np.ndarray]:
+    """Which rows stay where groups of `count` (K,) rows, one after the other, keep `most` each; how many each keeps.
 
-    Every so manieth stays of a candidate that has too many.
+    Every so manieth row stays of a group that has too many.
     """
-    if count.max(initial=0) <= _MOST_POINTS:
-        return points, count
-    number = np.arange(len(points)) - np.repeat(np.cumsum(count) - count, count)
-    share = np.repeat(np.minimum(1.0, _MOST_POINTS / np.maximum(count, 1)), count)
+    if count.max(initial=0) <= most:
+        return slice(None), count
+    number = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    share = np.repeat(np.minimum(1.0, most / np.maximum(count, 1)), count)
     chosen = np.floor((number + 1) * share) > np.floor(number * share)
     ends = np.concatenate([[0], np.cumsum(chosen)])[np.cumsum(count)]
-    return points[chosen], np.diff(ends, prepend=0)
+    return np.flatnonzero(chosen), np.diff(ends, prepend=0)
 
 
 def _order(cells: np.ndarray) -> np.ndarray:
