@@ -27,7 +27,7 @@ NAMED = sorted(set(re.findall(r"`([\w/]+\.py): ([\w.]+)", (DOCS / "method.md").r
 FLAG = re.compile(r"(?<![\w-])--[a-z][a-z0-9_-]*")
 COMMANDS = (
     "predict", "demo", "synth", "prepare", "sensors", "view", "pretrain", "finetune", "evaluate", "table", "info",
-    "models", "export", "import", "paper",
+    "models", "export", "import", "paper", "train-detector",
 )  # fmt: skip
 LINK = re.compile(r"\[[^]]*\]\((?!https?:)([^)#]*)(#[^)]*)?\)")
 
