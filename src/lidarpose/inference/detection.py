@@ -43,8 +43,9 @@ _CHUNK = 4_000_000
 _COLUMN, _BELOW, _ABOVE = 0.6, 0.15, 0.25
 # points around a detection that its final box may hold, m to each side
 _AROUND = 2.5
-# a box is so much larger than the joints on each side, m, and so many times their spread, and no more than that
-_ROOM, _ROOM_PER_SPREAD, _MOST_ROOM = 0.1, 2.0, 0.6
+# a box is so much larger than the joints on each side, m, and so many times their spread, and no more than that; it
+# ends half way to the next person, less half a body
+_ROOM, _ROOM_PER_SPREAD, _MOST_ROOM, _HALF_BODY = 0.1, 2.0, 0.6, 0.25
 # of two people whose pelvises are nearer than this the less certain one is the same person, m
 _SAME_PERSON = 0.3
 # less of a scan on its background, as a share, and it is the background of something else
@@ -146,7 +147,9 @@ def find_people(scan: Scan, search: Search) -> Scan:
     if len(scan.points) < MIN_POINTS:
         return replace(scan, boxes=[], found_rows=[], warnings=(*warnings, f"under {MIN_POINTS} points"))
     level = scan.points @ scan.R_level_input.T
-    warnings += filter(None, (scan_unit_warning(level), flat_along_another_axis(scan)))
+    # what else looks odd follows from wrong axes or units
+    if wrong := flat_along_another_axis(scan) or scan_unit_warning(level):
+        warnings.append(wrong)
     origin = None if scan.origin is None else scan.R_level_input @ scan.origin
     up = estimate_up(level, origin)
     if up is not None:
@@ -156,7 +159,7 @@ def find_people(scan: Scan, search: Search) -> Scan:
         level = scan.points @ scan.R_level_input.T
         origin = None if scan.origin is None else scan.R_level_input @ scan.origin
     if origin is not None and (warning := unlikely_origin(level, origin)):
-        warnings.append(warning)
+        warnings += [] if wrong else [warning]
         scan, origin = replace(scan, origin=None), None
     moving = None
     if search.background is not None:
@@ -167,7 +170,7 @@ def find_people(scan: Scan, search: Search) -> Scan:
             )
     detector = search.detector or _detector()
     detections = detector.detect(level, origin, max_range=search.max_range, limit=_POSED, moving=moving)
-    if not detections.has_ground:
+    if not (detections.has_ground or wrong):
         warnings.append("no ground was found, and people are searched without it: is the up axis right?")
     boxes, rows = _verified(detections, level, origin, search)
     return replace(
@@ -308,36 +311,38 @@ def _verified(
     scores = final_score(features, header)
     least = float(header["default_score"]) if search.min_score is None else search.min_score
     pelvis = poses.joints[:, poses.skeleton.index("pelvis")]
+    chosen: list[int] = []
+    for i in np.argsort(-scores, kind="stable"):
+        is_new = not (np.linalg.norm(pelvis[chosen] - pelvis[i], axis=1) < _SAME_PERSON).any()
+        if scores[i] >= least and is_new and not np.isnan(pelvis[i]).any():
+            chosen.append(int(i))
     spread = np.exp(features[:, FEATURES.index("log_spread")])
     boxes: list[Box] = []
     rows: list[np.ndarray] = []
-    taken = np.zeros((0, 3))
-    for i in np.argsort(-scores, kind="stable"):
-        if scores[i] < least or len(boxes) == search.max_people or np.isnan(pelvis[i]).any():
-            continue
-        if (np.linalg.norm(taken - pelvis[i], axis=1) < _SAME_PERSON).any():
-            continue
-        box = _box_about(Pose(joints=poses.joints[i], skeleton=poses.skeleton), spread[i])
+    for i in chosen:
+        others = [np.hypot(*(pelvis[k] - pelvis[i])[:2]) for k in chosen if k != i]
+        box = _box_about(Pose(joints=poses.joints[i], skeleton=poses.skeleton), spread[i], min(others, default=np.inf))
         inside = box.contains(clouds[i])
-        if inside.sum() < MIN_POINTS:
+        if inside.sum() < MIN_POINTS or len(boxes) == search.max_people:
             continue
-        taken = np.concatenate([taken, pelvis[i][None]])
         mounted = bool(detections.mounted[i] > 0.5)
         boxes.append(replace(box, id=len(boxes), score=round(float(scores[i]), _DECIMALS), mounted=mounted))
         rows.append(near[i][inside])
     return boxes, rows
 
 
-def _box_about(pose: Pose, spread: float) -> Box:
-    """The box of a person by the pose, joints (J, 3) m, larger the less certain it is; spread m: mean of its joints."""
+def _box_about(pose: Pose, spread: float, alone: float) -> Box:
+    """The box of a person by the pose, joints (J, 3) m, larger the less certain it is; spread m: mean of its joints;
+    alone m: distance to the next person, who is to be kept out."""
     forward = facing(pose)
     yaw = 0.0 if forward is None else float(np.arctan2(forward[1], forward[0]))
     c, s = np.cos(yaw), np.sin(yaw)
     R_level_own = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     own = pose.joints @ R_level_own
     room = min(_ROOM + _ROOM_PER_SPREAD * spread, _MOST_ROOM)
+    beside = max(_ROOM, min(room, alone / 2 - _HALF_BODY))
     # soles are nearer to the lowest joint than the top of the head to the highest
-    low, high = own.min(0) - room * np.array([1, 1, 0.8]), own.max(0) + room * np.array([1, 1, 1.2])
+    low, high = own.min(0) - [beside, beside, 0.8 * room], own.max(0) + [beside, beside, 1.2 * room]
     return _rounded(Box(center=R_level_own @ ((low + high) / 2), size=high - low, yaw=yaw))
 
 

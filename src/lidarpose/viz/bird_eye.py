@@ -28,7 +28,7 @@ class ScanPanel:
 
     Args:
         points: (n, 3).
-        boxes: of people; an id and a score are printed beside the box, the side that a box faces is marked.
+        boxes: of people; an id is printed beside its box, the side that a box faces is marked.
         poses: joints (P, J, 3).
         tracks: positions (F, 2) or (F, 3) of people over time.
         label: printed above.
@@ -154,8 +154,7 @@ def _draw_box(ax, box: Box) -> None:
     nose = box.center[:2] + np.array([np.cos(box.yaw), np.sin(box.yaw)]) * (box.size[0] / 2 + 0.6)
     ax.annotate("", nose, box.center[:2], arrowprops={"arrowstyle": "->", "color": _BOX, "lw": 1.1}, zorder=5)
     if box.id is not None:
-        words = str(box.id) if box.score is None else f"{box.id} ({box.score:.2f})"
         ax.annotate(
-            words, box.center[:2], (9, 9), textcoords="offset points", fontsize=9, weight="bold", color=_BOX,
+            str(box.id), box.center[:2], (9, 9), textcoords="offset points", fontsize=9, weight="bold", color=_BOX,
             zorder=7, parse_math=False, bbox={"fc": "white", "ec": "none", "alpha": 0.7, "pad": 0.8},
         )  # fmt: skip
