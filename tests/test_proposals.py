@@ -8,7 +8,7 @@ import pytest
 from lidarpose.geometry import rotation_about
 from lidarpose.models.detector.candidates import Augmentation, SceneIndex, draw_augmentation, render, suppress
 from lidarpose.models.detector.ground import estimate_ground, estimate_up, without_ground
-from lidarpose.models.detector.proposals import heights_above, propose
+from lidarpose.models.detector.proposals import columns, heights_above, propose
 from lidarpose.synth.street import street
 from tests.reference.detector_reference import context_reference, fine_reference, range_reference, suppress_reference
 
@@ -165,6 +165,16 @@ def test_candidates_stand_where_people_do(points, places):
     assert [nearest(centers, *place) < 0.25 for place in places] == [True] * len(places)
 
 
+def test_most_of_a_wall_is_no_candidate_and_who_stands_before_it_is():
+    wall = box([6, -10, -1.8], [6.2, 10, 2.5], count=30_000)
+    points = np.concatenate([plane(), wall, column(5.5, 3)])
+    ground = estimate_ground(points, ORIGIN)
+    places, _ = columns(points, heights_above(points, ground))
+    centers = propose(points, ground)
+    assert len(centers) < 0.5 * len(places)
+    assert nearest(centers, 5.5, 3) < 0.3
+
+
 def test_bare_ground_and_nothing_have_no_candidates():
     points = plane()
     ground = estimate_ground(points, ORIGIN)
@@ -279,7 +289,7 @@ def test_duplicate_points_only_add_to_counts(scene):
     _, points, ground = scene
     centers = propose(points, ground)
     twice = np.repeat(points, 2, 0)
-    again = propose(twice, ground)
+    again = columns(twice, heights_above(twice, ground))[0]
     assert all(nearest(again, *center[:2]) < 0.35 for center in centers)
     one, two = (render(SceneIndex(p, ground, ORIGIN).candidates(centers[-20:])) for p in (points, twice))
     assert ((one["fine"] > 0) == (two["fine"] > 0)).mean() > 0.999
@@ -341,7 +351,8 @@ def test_dense_places_cost_no_more_than_thinned_ones():
 
 def test_rows_are_those_of_the_column_and_suppression_is_by_shared_points(scene):
     _, points, ground = scene
-    centers = propose(points, ground)
+    places, _ = columns(points, heights_above(points, ground))
+    centers = np.concatenate([places, ground.at(places)[:, None]], 1)
     rows = SceneIndex(points, ground, ORIGIN).rows(centers)
     for center, own in zip(centers[::10], rows[::10], strict=True):
         near = (np.hypot(*(points[:, :2] - center[:2]).T) < 0.35) & (heights_above(points, ground) < 3.2)

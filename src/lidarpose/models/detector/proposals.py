@@ -3,10 +3,13 @@
 Points 0.3-2.1 m above the ground are counted on a grid of 10 cm. Peaks of the smoothed counts, drawn to the mean of
 the points around them, give one kind of candidate; peaks of the finer counts of each column's upper end, where two
 people side by side are still apart, give another. Nothing is clustered, so a person at a wall or a hedge has a
-candidate as good as one in the open.
+candidate as good as one in the open. What is next to never a person is left out in the end, by a look at each column
+and the two rings around it.
 """
 
 from collections.abc import Iterator
+from functools import cache
+from importlib import resources
 
 import numpy as np
 
@@ -23,6 +26,8 @@ _LEAST_TOP, _LEAST_PART, _LEAST_EXTENT = 0.6, 0.45, 0.25
 _LEAST_HEAD, _HEAD_TOP = 0.08, 1.1
 # how counts are smoothed along both axes
 _BODY_KERNEL, _HEAD_KERNEL = (1, 2, 3, 2, 1), (1, 1, 1)
+# radii in cells of the disc and the two rings around it that a column is told by, and how many numbers that gives
+_RINGS, FEATURES = (3, 6, 9), 13
 # cells to each side: of the surroundings that a peak tops, of the mean shift, of a candidate's column, of the grid
 _PEAK, _SHIFT, _COLUMN, _MARGIN = 3, 4, 3, 16
 _SHIFTS = 2
@@ -34,7 +39,7 @@ _APART = 0.3
 
 
 def propose(points: np.ndarray, ground: Ground, *, limit: int = 600, heights: np.ndarray | None = None) -> np.ndarray:
-    """Centers (K, 3) m of columns that may be people: x, y, and z of the ground there; the strongest first.
+    """Centers (K, 3) m of columns that may be people: x, y, and z of the ground there; the likeliest first.
 
     Args:
         points: (n, 3) m, z up.
@@ -42,21 +47,44 @@ def propose(points: np.ndarray, ground: Ground, *, limit: int = 600, heights: np
         limit: the most that are returned.
         heights: (n,) m of the points above the ground, where they are known.
     """
-    if heights is None:
-        heights = heights_above(points, ground)
+    xy, features = columns(points, heights_above(points, ground) if heights is None else heights)
+    logit = _likeness(features)
+    order = np.argsort(-logit, kind="stable")
+    xy = xy[order[logit[order] > 0][:limit]]
+    return np.concatenate([xy, ground.at(xy)[:, None]], 1)
+
+
+def columns(points: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """All columns: places (K, 2) m, and what each and its surroundings are like (K, `FEATURES`).
+
+    points (n, 3) m; heights (n,) m: theirs above the ground.
+    """
     points = np.asarray(points)
     band = np.flatnonzero((heights > LOW) & (heights < HIGH))
     # one after the other: numpy reduces long rows faster than pairs
     x, y, heights = points[band, 0], points[band, 1], heights[band]
-    tile_xy, strengths = [np.zeros((0, 2))], [np.zeros(0)]
+    places, features = [np.zeros((0, 2))], [np.zeros((0, FEATURES), np.float32)]
     for corner, inner, rows in _tiles(x, y):
-        tile_centers, tile_strength = _peaks(x[rows] - corner[0], y[rows] - corner[1], heights[rows])
-        tile_centers = tile_centers + corner
-        own = ((tile_centers >= inner[0]) & (tile_centers < inner[1])).all(1)
-        tile_xy.append(tile_centers[own])
-        strengths.append(tile_strength[own])
-    xy = np.concatenate(tile_xy)[np.argsort(-np.concatenate(strengths), kind="stable")[:limit]]
-    return np.concatenate([xy, ground.at(xy)[:, None]], 1)
+        tile_places, tile_features = _peaks(x[rows] - corner[0], y[rows] - corner[1], heights[rows])
+        tile_places = tile_places + corner
+        own = ((tile_places >= inner[0]) & (tile_places < inner[1])).all(1)
+        places.append(tile_places[own])
+        features.append(tile_features[own])
+    return np.concatenate(places), np.concatenate(features)
+
+
+@cache
+def _weights() -> dict[str, np.ndarray]:
+    """A small perceptron's layers; it is positive where a column may be somebody."""
+    with np.load(str(resources.files("lidarpose.models") / "weights" / "proposals.npz")) as file:
+        return dict(file)
+
+
+def _likeness(features: np.ndarray) -> np.ndarray:
+    """Logits (K,) of features (K, `FEATURES`): negative for what is next to never a person, as most of a wall is."""
+    w = _weights()
+    hidden = np.maximum((features - w["mean"]) / w["deviation"] @ w["hidden_weight"] + w["hidden_bias"], 0)
+    return hidden @ w["weight"] + w["bias"] - w["least"]
 
 
 def heights_above(points: np.ndarray, ground: Ground) -> np.ndarray:
@@ -83,7 +111,7 @@ def _tiles(x: np.ndarray, y: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarra
 
 
 def _peaks(x: np.ndarray, y: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centers (K, 2) m and strengths (K,) of a tile's candidates. x, y (n,) m from its corner, heights (n,) m."""
+    """Places (K, 2) m and features of a tile's columns. x, y (n,) m from its corner, heights (n,) m."""
     row, column = ((values * (1 / CELL)).astype(np.int32) + _MARGIN for values in (x, y))
     width = int(column.max()) + _MARGIN + 1
     size = (int(row.max()) + _MARGIN + 1) * width
@@ -118,7 +146,35 @@ def _peaks(x: np.ndarray, y: np.ndarray, heights: np.ndarray) -> tuple[np.ndarra
     # where two are equally strong, the order of places: not that of the points
     order = np.lexsort((centers[:, 1], centers[:, 0], -points, is_body))
     order = order[_apart(centers[order])]
-    return (centers[order] - _MARGIN) * CELL, points[order]
+    centers = centers[order]
+    return (centers - _MARGIN) * CELL, _features(centers.astype(np.int32) @ [width, 1], count, top, bottom, width)
+
+
+def _features(cells: np.ndarray, count: np.ndarray, top: np.ndarray, bottom: np.ndarray, width: int) -> np.ndarray:
+    """What flat cells (K,) and the rings around them are like, of a grid of counts, highest and lowest heights."""
+    offset = _offsets(_RINGS[-1])
+    squared = (offset**2).sum(1)
+    # the disc first, then ring after ring
+    order = np.argsort(squared, kind="stable")
+    ends = np.searchsorted(squared[order], [(radius + 0.3) ** 2 for radius in _RINGS])
+    offset = offset[order[: ends[-1]]]
+    rings = [slice(start, end) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
+    around = cells[:, None] + offset @ [width, 1]
+    number, highest = count[around], top[around]
+    filled = (number > 0).astype(np.float32)
+    features = [np.log1p(number[:, ring].sum(1)) for ring in rings]
+    features += [filled[:, ring].mean(1) for ring in rings]
+    features += [highest[:, ring].max(1) for ring in rings]
+    features += [bottom[around[:, ring]].min(1) for ring in rings[:2]]
+    # how long and how wide what is filled is, cells
+    total = np.maximum(filled.sum(1), 1)
+    x, y = offset.T.astype(np.float32)
+    mean_x, mean_y = filled @ x / total, filled @ y / total
+    xx, yy = filled @ (x * x) / total - mean_x**2, filled @ (y * y) / total - mean_y**2
+    xy = filled @ (x * y) / total - mean_x * mean_y
+    spread = np.sqrt((xx - yy) ** 2 / 4 + xy**2)
+    features += [np.sqrt(np.maximum((xx + yy) / 2 + sign * spread, 0)) for sign in (1, -1)]
+    return np.stack(features, 1).astype(np.float32)
 
 
 def _smoothed(values: np.ndarray, cells: np.ndarray, kernel: tuple[int, ...], width: int) -> np.ndarray:

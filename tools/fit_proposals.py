@@ -1,0 +1,75 @@
+"""Fits what tells a column that may be a person from one that next to never is: models/weights/proposals.npz.
+
+    python tools/fit_proposals.py SCENES
+
+Columns of so many synthesized scenes (1,500: family "train", seed 9001); a perceptron of 16 hidden units, and the
+logit below which three in a thousand people who have a column lose all of theirs. Needs lidarpose[train].
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from lidarpose.geometry import rotation_between
+from lidarpose.models.detector.ground import estimate_ground, estimate_up, without_ground
+from lidarpose.models.detector.proposals import columns, heights_above
+from lidarpose.synth.detection_scene import detection_scene
+
+OUT = Path(__file__).parent.parent / "src" / "lidarpose" / "models" / "weights" / "proposals.npz"
+SEED, RANGE, HIDDEN, EPOCHS, LOST = 9001, 40.0, 16, 25, 0.003
+
+
+def scene_columns(index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Features (K, F), distance (K,) m to the nearest person with 5 points, and who that is: index and number."""
+    scene = detection_scene(SEED, index)
+    points, origin = scene.points.astype(float), scene.origin
+    up = estimate_up(points, origin)
+    turn = np.eye(3) if up is None else rotation_between(up, np.array([0.0, 0.0, 1.0]))
+    points, origin = points @ turn.T, turn @ origin
+    points = points[np.hypot(*(points - origin)[:, :2].T) < RANGE + 6]
+    ground = estimate_ground(points, origin) or without_ground(points, origin)
+    places, features = columns(points, heights_above(points, ground))
+    near = np.hypot(*(places - origin[:2]).T) < RANGE
+    seen = np.bincount(scene.person[scene.person >= 0], minlength=len(scene.boxes)) >= 5
+    people = np.array([(turn @ box.center)[:2] for box in scene.boxes]).reshape(-1, 2)
+    gaps = np.where(seen, np.hypot(*(places[near][:, None] - people).transpose(2, 0, 1)), 99.0)
+    gaps = np.concatenate([gaps, np.full((len(gaps), 1), 99.0)], 1)
+    return features[near], gaps.min(1), gaps.argmin(1) + 1000 * index
+
+
+def fit(features: np.ndarray, distance: np.ndarray, person: np.ndarray) -> dict[str, np.ndarray]:
+    torch.manual_seed(0)
+    mean, deviation = features.astype(float).mean(0), features.astype(float).std(0) + 1e-6
+    x = torch.tensor((features - mean) / deviation, dtype=torch.float32)
+    is_person = torch.tensor(distance < 0.35)
+    weight = torch.where(is_person, (~is_person).sum() / is_person.sum() / 2, 1.0)
+    used = torch.tensor(np.flatnonzero((distance < 0.35) | (distance > 0.6)))
+    net = torch.nn.Sequential(torch.nn.Linear(x.shape[1], HIDDEN), torch.nn.ReLU(), torch.nn.Linear(HIDDEN, 1))
+    optimizer = torch.optim.Adam(net.parameters(), 3e-3, weight_decay=1e-5)
+    for _ in range(EPOCHS):
+        for rows in used[torch.randperm(len(used))].split(2048):
+            loss = torch.nn.functional.binary_cross_entropy_with_logits(
+                net(x[rows])[:, 0], is_person[rows].float(), weight[rows]
+            )
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+    with torch.no_grad():
+        logit = net(x)[:, 0].numpy()
+    own = distance < 0.5
+    best = np.full(person.max() + 1, -np.inf)
+    np.maximum.at(best, person[own], logit[own])
+    least = np.quantile(best[np.isfinite(best)], LOST)
+    print(f"{np.mean(logit > least):.2f} of {len(logit):,} columns stay, with {1 - LOST:.3f} of the people")
+    arrays = {"mean": mean, "deviation": deviation, "least": least}
+    for name, layer in (("hidden_", net[0]), ("", net[2])):
+        arrays |= {f"{name}weight": layer.weight.detach().numpy().T, f"{name}bias": layer.bias.detach().numpy()}
+    arrays |= {"weight": arrays["weight"][:, 0], "bias": arrays["bias"][0]}
+    return {name: np.asarray(values, np.float32) for name, values in arrays.items()}
+
+
+if __name__ == "__main__":
+    scenes = [scene_columns(index) for index in range(int(sys.argv[1]))]
+    np.savez(OUT, **fit(*(np.concatenate(values) for values in zip(*scenes, strict=True))))
