@@ -1,13 +1,12 @@
 """What a detector's scores mean: fitted on the scans of another family than that of training."""
 
 import json
-from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from lidarpose.inference.detection import final_score
-from lidarpose.sample import Box
-from lidarpose.train.detector.calibrate import fit, logistic, matched, monotone
+from lidarpose.train.detector.calibrate import fit, logistic, matched, monotone, passing_score
 
 
 def test_a_logistic_regression_finds_its_weights():
@@ -29,12 +28,18 @@ def test_probabilities_rise_and_are_shares():
 
 
 def test_a_person_is_found_once():
-    boxes = tuple(Box(center=np.array([x, 0.0, 0.9]), size=np.ones(3), yaw=0.0, id=str(x)) for x in (1.0, 5.0, 9.0))
-    scene = SimpleNamespace(boxes=boxes, person=np.array([0, 0, 1, -1], np.int16))
+    people = np.array([[1.0, 0.0, 0.9], [5.0, 0.0, 0.9]])
     centers = np.array([[1.2, 0.1, 0.9], [1.1, 0.0, 0.9], [5.6, 0.0, 0.9], [5.2, 0.0, 2.0], [9.0, 0.0, 0.9]])
-    # nobody sees the third person
-    assert matched(centers, scene).tolist() == [True, False, False, True, False]
-    assert matched(centers[:0], scene).tolist() == []
+    assert matched(centers, people).tolist() == [True, False, False, True, False]
+    assert matched(centers[:0], people).tolist() == []
+    assert not matched(centers, people[:0]).any()
+
+
+def test_a_score_that_so_many_false_people_pass():
+    assert passing_score(np.array([0.2, 0.9, 0.6, 0.1]), 2) == pytest.approx(0.4)
+    # fewer than one a scan
+    assert passing_score(np.array([0.7, 0.3]), 5) == pytest.approx(0.5)
+    assert passing_score(np.zeros(0), 5) == 0.5
 
 
 def test_the_default_score_lets_one_false_person_a_scan_pass():

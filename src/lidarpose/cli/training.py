@@ -60,7 +60,7 @@ def add(commands) -> None:
         "train the network that finds people in whole scans",
         "lidarpose train-detector --scenes 20000",
         "lidarpose train-detector runs/train-detector-001 --resume",
-        "lidarpose train-detector runs/train-detector-001 --calibrate 300",
+        "lidarpose train-detector runs/train-detector-001 --calibrate 300 --scans labeled",
         description=_WHAT.format(name="train-detector", what="Trains on scans synthesized during training."),
     )
     detector.add_argument(
@@ -69,6 +69,12 @@ def add(commands) -> None:
         metavar="N",
         help="train nothing: write RUN/detector.onnx, its scores calibrated on N synthesized scans of what training "
         "never shows",
+    )
+    detector.add_argument(
+        "--scans",
+        metavar="DIR",
+        help="with --calibrate: labeled real scans, as evaluate detector takes them; the default score lets one false "
+        "person a scan pass there too",
     )
     _add(detector, TrainDetector)
 
@@ -114,7 +120,7 @@ def _train(options: argparse.Namespace) -> None:
     if getattr(options, "calibrate", None) is not None:
         from lidarpose.train.detector.calibrate import calibrate
 
-        print(calibrate(options.folder or latest(name), options.calibrate))
+        print(calibrate(options.folder or latest(name), options.calibrate, labeled=options.scans))
         return
     changes: dict[str, Any] = {
         field.name: _parsed(field, text)

@@ -3,17 +3,20 @@
 Legend: D detections of all scans, F features.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from lidarpose.errors import InputError, check_int
+from lidarpose.eval.detector.labeled_scans import LabeledScan, labeled_scans
 from lidarpose.inference.detection import FEATURES, final_score, verification_features
 from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.detector.detector import Detector
 from lidarpose.models.detector.network import DetectorNet
 from lidarpose.models.export import export_detector
 from lidarpose.progress import Progress
+from lidarpose.sample import Box
 from lidarpose.synth.detection_scene import DetectionScene, detection_scene
 from lidarpose.train.run_dir import MODEL
 
@@ -30,12 +33,14 @@ FALSE = 1.0
 _RIDGE, _KNOTS = 1e-3, 16
 
 
-def calibrate(folder: str | Path, scans: int) -> Path:
+def calibrate(folder: str | Path, scans: int, *, labeled: str | Path | None = None) -> Path:
     """Writes the detector of a run, its scores calibrated on so many scans, and returns its path.
 
-    Raises InputError where the folder holds no detector.
+    labeled: a folder of labeled real scans, see `labeled_scans`; there too the default score lets at most `FALSE` false
+    people a scan pass. Raises InputError where a folder holds no detector or no scans.
     """
     check_int("--calibrate", scans, least=1)
+    real = () if labeled is None else [load() for load in labeled_scans(labeled).loaders]
     path = Path(folder) / MODEL
     if not path.is_file():
         raise InputError(f"{path} is not there: name the folder of a run of lidarpose train-detector")
@@ -45,23 +50,39 @@ def calibrate(folder: str | Path, scans: int) -> Path:
     out = Path(folder) / DETECTOR
     export_detector(network, out, card=header.card)
     detector = Detector(out)
-    tables: list[tuple[np.ndarray, ...]] = []
+
+    def judged(scan: DetectionScene | LabeledScan, people: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        detections = detector.detect(scan.points, scan.origin, max_range=_RANGE, limit=_VERIFIED)
+        features, _ = verification_features(detections, scan.points, scan.origin)
+        return features, matched(detections.centers, people)
+
+    tables = []
     with Progress(scans, unit="scans") as bar:
         for number in range(scans):
             scene = detection_scene(_SEED, number, family="heldout")
-            detections = detector.detect(scene.points, scene.origin, max_range=_RANGE, limit=_VERIFIED)
-            features, _ = verification_features(detections, scene.points, scene.origin)
-            tables.append((features, matched(detections.centers, scene)))
+            seen = np.unique(scene.person[scene.person >= 0])
+            tables.append(judged(scene, _centers([scene.boxes[row] for row in seen])))
             bar.update(number + 1)
-    features, is_person = (np.concatenate(column) for column in zip(*tables, strict=True))
-    export_detector(network, out, card=header.card | fit(features, is_person, scans) | {"calibrated_on": scans})
+    fitted = fit(*_stacked(tables), scans)
+    if real:
+        features, is_person = _stacked([judged(scan, _centers(scan.boxes)) for scan in real])
+        false = final_score(features, fitted)[~is_person & np.isfinite(features).all(1)]
+        fitted["default_score"] = max(fitted["default_score"], passing_score(false, len(real)))
+    export_detector(network, out, card=header.card | fitted | {"calibrated_on": scans, "labeled_scans": len(real)})
     return out
 
 
-def matched(centers: np.ndarray, scene: DetectionScene) -> np.ndarray:
-    """Whether each of detections (D, 3), the strongest first, is a person of the scene whom no stronger one is."""
-    seen = np.unique(scene.person[scene.person >= 0])
-    people = np.array([scene.boxes[row].center for row in seen]).reshape(-1, 3)
+def _centers(boxes: Sequence[Box]) -> np.ndarray:
+    return np.array([box.center for box in boxes]).reshape(-1, 3)
+
+
+def _stacked(tables: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    features, is_person = zip(*tables, strict=True)
+    return np.concatenate(features), np.concatenate(is_person)
+
+
+def matched(centers: np.ndarray, people: np.ndarray) -> np.ndarray:
+    """Whether each of detections (D, 3), the strongest first, is one of people (P, 3) whom no stronger one is."""
     is_free, is_person = np.ones(len(people), bool), np.zeros(len(centers), bool)
     for row, center in enumerate(centers):
         distance = np.where(is_free, np.linalg.norm(people[:, :2] - center[:2], axis=1), np.inf)
@@ -86,11 +107,15 @@ def fit(features: np.ndarray, is_person: np.ndarray, scans: int) -> dict:
     verification = {"bias": bias, **dict(zip(names, weights.tolist(), strict=True))}
     verification["calibration"] = monotone(bias + both @ weights, labels)
     header = {"calibration": monotone(features[:, 0], is_person), "verification": verification}
-    false = np.sort(final_score(own, header)[~labels])[::-1]
+    return header | {"default_score": passing_score(final_score(own, header)[~labels], scans)}
+
+
+def passing_score(false: np.ndarray, scans: int) -> float:
+    """The score that lets `FALSE` false people a scan pass. false (D,): scores of all of them in so many scans."""
+    false = np.sort(false)[::-1]
     last = min(round(FALSE * scans), len(false) - 1)
     # between the last false one that passes and the first that does not
-    threshold = false[last - 1 : last + 1].mean() if last > 0 else 0.5
-    return header | {"default_score": float(threshold)}
+    return float(false[last - 1 : last + 1].mean()) if last > 0 else 0.5
 
 
 def logistic(features: np.ndarray, labels: np.ndarray, *, iterations: int = 30) -> tuple[float, np.ndarray]:
