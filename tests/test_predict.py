@@ -473,9 +473,6 @@ def test_a_sensor_that_cannot_have_seen_the_people_is_unknown(model, sweep, tmp_
 
 def test_the_size_of_a_file_decides_without_flags(model, sweep, tmp_path, points):
     np.save(tmp_path / "crop.npy", points)
-    # in words that hold in Python and on the command line
-    with pytest.raises(InputError, match=r"less than 4 m across, got [^-]*boxes[^-]*crop all the same$"):
-        lidarpose.predict(sweep[0], model=model)
     people = lidarpose.predict(tmp_path / "crop.npy", model=model)
     assert len(people) == 1 and people[0].id == 0 and people[0].box is None
     # unknown is the default for a crop, 0,0,0 for boxes
@@ -487,8 +484,6 @@ def test_the_size_of_a_file_decides_without_flags(model, sweep, tmp_path, points
 
 def test_a_crop_in_other_units_is_told_by_name(model, tmp_path, points):
     np.save(tmp_path / "mm.npy", points * 1000)
-    with pytest.raises(InputError, match="millimeters"):
-        lidarpose.predict(tmp_path / "mm.npy", model=model)
     people = lidarpose.predict(tmp_path / "mm.npy", crop=True, model=model)
     assert any("millimeters" in warning for warning in people[0].warnings)
 

@@ -2,7 +2,7 @@
 
     import lidarpose
     pose = lidarpose.load().predict(points)                       # one person, (n, 3) meters, z up
-    people = lidarpose.predict("sweep.pcd", boxes="boxes.json")   # everybody in a sweep
+    people = lidarpose.predict("sweep.pcd")                       # everybody in a sweep
 
 Names are loaded when first used: importing the package costs no torch and no numba, and predicting needs neither.
 """
@@ -21,11 +21,14 @@ if TYPE_CHECKING:
     from lidarpose.body.pose_prior.sampling import sample_poses as sample_poses
     from lidarpose.errors import InputError as InputError
     from lidarpose.errors import LidarPoseError as LidarPoseError
+    from lidarpose.inference.background import learn_background as learn_background
+    from lidarpose.inference.detection import detect as detect
     from lidarpose.inference.predictor import Predictor as Predictor
     from lidarpose.inference.predictor import load as load
     from lidarpose.inference.predictor import predict as predict
     from lidarpose.inference.results import PersonPose as PersonPose
     from lidarpose.inference.results import Poses as Poses
+    from lidarpose.io.boxes import Boxes as Boxes
     from lidarpose.io.boxes import read_boxes as read_boxes
     from lidarpose.io.point_cloud import read_points as read_points
     from lidarpose.lidar.presets import sensor as sensor
@@ -44,6 +47,8 @@ _HOMES = {
     "load": "lidarpose.inference.predictor",
     "Predictor": "lidarpose.inference.predictor",
     "predict": "lidarpose.inference.predictor",
+    "detect": "lidarpose.inference.detection",
+    "learn_background": "lidarpose.inference.background",
     "export": "lidarpose.models.export",
     "import_dapt": "lidarpose.models.dapt.import_weights",
     "PersonPose": "lidarpose.inference.results",
@@ -55,6 +60,7 @@ _HOMES = {
     "read_points": "lidarpose.io.point_cloud",
     "read_boxes": "lidarpose.io.boxes",
     "Box": "lidarpose.sample",
+    "Boxes": "lidarpose.io.boxes",
     "Pose": "lidarpose.sample",
     "Sample": "lidarpose.sample",
     "Skeleton": "lidarpose.skeleton",

@@ -1,4 +1,4 @@
-"""`lidarpose predict`."""
+"""`lidarpose predict` and `lidarpose detect`."""
 
 import argparse
 import os
@@ -10,36 +10,86 @@ from lidarpose.cli.terminal import add_command, is_watched, tell
 from lidarpose.errors import InputError
 from lidarpose.models import DEFAULT, NAMES
 
+_FILES = ".pcd .ply .bin .npy .npz .csv .xyz .txt"
 # characters of an id in a warning
 _LONGEST_ID = 40
 _BOXES = 'people to pose: {"people": [{"center": [x,y,z], "size": [l,w,h], "yaw": rad}]}, .npy rows, KITTI labels'
 # what a user who names it expects as a file
-_NO_FOLDERS = {".bin", ".html", ".jsonl", ".npy", ".npz", ".parquet", ".pcd", ".pdf", ".pkl", ".ply", ".png", ".txt"}
+_NO_FOLDERS = {
+    ".bin",
+    ".csv",
+    ".html",
+    ".jsonl",
+    ".npy",
+    ".npz",
+    ".parquet",
+    ".pcd",
+    ".pdf",
+    ".pkl",
+    ".ply",
+    ".png",
+    ".txt",
+}
 _NO_FOLDERS |= {".xml", ".yaml", ".yml"}
 
 
 def add(commands) -> None:
-    """Adds the command to the parser's."""
+    """Adds the commands to the parser's."""
+    _add_predict(commands)
+    _add_detect(commands)
+
+
+def _add_predict(commands) -> None:
     predict = add_command(
         commands,
         "predict",
         "estimate the poses of the people in a point file",
-        "lidarpose predict sweep.pcd --boxes people.json --picture",
+        "lidarpose predict sweep.pcd --picture",
+        "lidarpose predict sweep.pcd --boxes people.json",
         "lidarpose predict person.ply --crop --out person.csv",
-        description="Writes STEM.poses.json: every person's joints, in meters and in the file's own frame. Files of "
-        "the same name are replaced.",
+        description="Finds the people in a scan, unless there are boxes or the file holds one person, and writes "
+        "STEM.poses.json: every person's joints, in meters and in the file's own frame. Files of the same name are "
+        "replaced.",
     )
     predict.set_defaults(run=_predict)
-    predict.add_argument("file", metavar="FILE", help=".pcd .ply .bin .npy .npz .csv .xyz .txt")
+    predict.add_argument("file", metavar="FILE", help=_FILES)
     scan = predict.add_argument_group("what is in the file")
     scan.add_argument("--boxes", metavar="FILE", help=_BOXES)
     scan.add_argument("--calib", metavar="FILE", help="KITTI's calibration (default: calib/N.txt beside label_2)")
     scan.add_argument("--crop", action="store_true", help="the file holds one person (assumed under 4 m across)")
-    scan.add_argument(
-        "--sensor-origin",
-        metavar="X,Y,Z",
-        help="sensor position, or unknown (default: 0,0,0 with --boxes, unknown otherwise)",
+    _add_frame(scan, "unknown for one person, else 0,0,0")
+    search = predict.add_argument_group("who is looked for, without boxes")
+    search.add_argument("--find", action="store_true", help="look for people in a file under 4 m across too")
+    _add_search(search)
+    _add_output(predict.add_argument_group("output"))
+    _add_network(predict.add_argument_group("network"))
+
+
+def _add_detect(commands) -> None:
+    detect = add_command(
+        commands,
+        "detect",
+        "find the people in a point file",
+        "lidarpose detect sweep.pcd --out people.json",
+        "lidarpose detect sweep.pcd --min-score 0.3 --background recording/",
+        description="Writes STEM.boxes.json: a box for each person found, surest first, with its score, the "
+        "probability that it is a person. `lidarpose predict --boxes` takes the file.",
     )
+    detect.set_defaults(run=_detect)
+    detect.add_argument("file", metavar="FILE", help=_FILES)
+    _add_frame(detect.add_argument_group("what is in the file"), "0,0,0")
+    _add_search(detect.add_argument_group("who is looked for"))
+    output = detect.add_argument_group("output")
+    output.add_argument(
+        "--out",
+        default=".",
+        metavar="PATH",
+        help="a folder, or a .json file (default: the current folder); - prints it",
+    )
+
+
+def _add_frame(scan, origin: str) -> None:
+    scan.add_argument("--sensor-origin", metavar="X,Y,Z", help=f"sensor position, or unknown (default: {origin})")
     scan.add_argument(
         "--up",
         default="z",
@@ -49,8 +99,23 @@ def add(commands) -> None:
     scan.add_argument(
         "--columns", type=int, metavar="N", help="values per point in a .bin: 4 for KITTI, 5 for nuScenes"
     )
-    _add_output(predict.add_argument_group("output"))
-    _add_network(predict.add_argument_group("network"))
+
+
+def _add_search(search) -> None:
+    search.add_argument(
+        "--min-score",
+        type=float,
+        metavar="P",
+        help="least probability that it is a person, 0 to 1 (default: about one false person a scan)",
+    )
+    search.add_argument("--range", type=float, metavar="M", help="how far from the sensor, m (default 40)")
+    search.add_argument("--max-people", type=int, metavar="N", help="only the N surest")
+    search.add_argument(
+        "--background",
+        nargs="+",
+        metavar="FILE",
+        help="what stands still about a fixed sensor: a file of static points, several scans, or a folder of scans",
+    )
 
 
 def _add_output(output) -> None:
@@ -92,14 +157,12 @@ def _predict(options: argparse.Namespace) -> None:
     from lidarpose.io.files import atomic_path, check_apart, check_writable
 
     file = Path(options.file)
-    result = _result_path(options.out, file)
-    if result is None and sys.stdout is None:
-        raise InputError("--out - prints to the standard output, which is closed: name a file")
+    result = _result_path(options.out, file, "poses", ".json", ".csv")
     picture = None
     if options.picture:
         picture = (result or Path(f"{file.stem}.poses.json")).with_suffix(".png")
     for path in filter(None, (result, picture)):
-        check_apart(path, options.file, options.boxes, options.calib, options.weights)
+        check_apart(path, options.file, options.boxes, options.calib, options.weights, *(options.background or ()))
         # before the work
         check_writable(path)
     choices = {"backend": options.backend, "device": options.device, "decode": options.decode}
@@ -109,6 +172,11 @@ def _predict(options: argparse.Namespace) -> None:
         boxes=options.boxes,
         calib=options.calib,
         crop=options.crop,
+        find=options.find,
+        min_score=options.min_score,
+        max_range=options.range,
+        max_people=options.max_people,
+        background=_background(options),
         sensor_origin=options.sensor_origin,
         skeleton=options.skeleton,
         up=options.up,
@@ -133,21 +201,62 @@ def _predict(options: argparse.Namespace) -> None:
         tell(f"lidarpose: warning: {line}")
     posed = sum(person.has_pose for person in poses)
     where = f" -> {' and '.join(map(str, outputs))}" if outputs else ""
+    if not poses and poses.scan is not None:
+        tell(f"nobody found{where}")
+        return
     tell(f"{posed} of {len(poses)} people, {poses.timing_ms['per_person']:.0f} ms each{where}")
 
 
-def _result_path(out: str, file: Path) -> Path | None:
-    """The file to write, None for the standard output. Raises InputError for a file of another type."""
+def _detect(options: argparse.Namespace) -> None:
+    from lidarpose.inference.detection import detect
+    from lidarpose.io.files import check_apart, check_writable
+
+    result = _result_path(options.out, Path(options.file), "boxes", ".json")
+    if result is not None:
+        check_apart(result, options.file, *(options.background or ()))
+        check_writable(result)
+    boxes = detect(
+        options.file,
+        sensor_origin=options.sensor_origin,
+        up=options.up,
+        columns=options.columns,
+        max_range=options.range,
+        min_score=options.min_score,
+        max_people=options.max_people,
+        background=_background(options),
+    )
+    if result is None:
+        print(boxes.to_json(), end="")
+    else:
+        boxes.save(result)
+    for line in boxes.warnings:
+        tell(f"lidarpose: warning: {line}")
+    found = f"{len(boxes)} {'person' if len(boxes) == 1 else 'people'} found" if boxes else "nobody found"
+    tell(found + (f" -> {result}" if result else ""))
+
+
+def _background(options: argparse.Namespace) -> list[str] | str | None:
+    """One file is of static points, or a folder; several are scans."""
+    given = options.background
+    return given[0] if given and len(given) == 1 else given
+
+
+def _result_path(out: str, file: Path, what: str, *suffixes: str) -> Path | None:
+    """The file to write, with one of the suffixes, None for the standard output. Raises InputError for a file of
+    another type."""
     if out == "-":
+        if sys.stdout is None:
+            raise InputError("--out - prints to the standard output, which is closed: name a file")
         return None
     # os.path says no where a name is too long, which is an error when it is written
     if not out.endswith(("/", os.sep)) and not os.path.isdir(out):
         suffix = Path(out).suffix.lower()
-        if suffix in (".json", ".csv"):
+        if suffix in suffixes:
             return Path(out)
         if suffix in _NO_FOLDERS:
-            raise InputError(f"--out {out}: expected a folder or a file .json or .csv, got {suffix}: name one")
-    return Path(out) / f"{file.stem}.poses.json"
+            files = " or ".join(suffixes)
+            raise InputError(f"--out {out}: expected a folder or a file {files}, got {suffix}: name one")
+    return Path(out) / f"{file.stem}.{what}.json"
 
 
 def _warnings(poses) -> list[str]:

@@ -207,13 +207,13 @@ def origin_warning(scan: Scan) -> str | None:
     )
 
 
-def scan_unit_warning(points: np.ndarray) -> str | None:
-    """What is likely wrong where the points (n, 3) of a whole scan, z up, are not in meters."""
+def scan_unit_warning(points: np.ndarray, count: int) -> str | None:
+    """What is likely wrong where the points (n, 3) of a whole scan of `count` points, z up, are not in meters."""
     low, high = np.percentile(points, _MOST, axis=0)
     across = float((high - low)[:2].max())
     if across < _SMALLEST_SCAN:
         return f"the points reach over {across:.2g} m: are the units kilometers? multiply all coordinates by 1000"
-    if across > _LONGEST_SCAN and len(points) < _SPARSEST * across**2:
+    if across > _LONGEST_SCAN and count < _SPARSEST * across**2:
         unit, factor = ("millimeters", 1000) if across > _LONG_IN_MILLIMETERS else ("centimeters", 100)
         return f"the points reach over {across:,.0f} m: are the units {unit}? divide all coordinates by {factor}"
     return unit_warning(high - low, what="the scan")

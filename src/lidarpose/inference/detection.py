@@ -39,6 +39,8 @@ _POSED, _BATCH = 40, 16
 # a scan of more points is thinned: what is farther away than this beyond the range first, m
 _MOST_POINTS, _BEYOND = 1_500_000, 15.0
 _CHUNK = 4_000_000
+# points that tell how far a scan reaches
+_ENOUGH = 100_000
 # what is posed: a column so wide, and so far below and above the detection's box, m
 _COLUMN, _BELOW, _ABOVE = 0.6, 0.15, 0.25
 # points around a detection that its final box may hold, m to each side
@@ -142,13 +144,16 @@ def search_options(
 def find_people(scan: Scan, search: Search) -> Scan:
     """The scan with the boxes of the people in it, surest first, `found_rows`, and what looks wrong among its warnings;
     without the place of a sensor that cannot have been there, and with the direction that turned out to be up."""
+    count = len(scan.points)
     given, notes = _thinned(scan, search)
     scan, warnings = given, [*scan.warnings, *notes]
     if len(scan.points) < MIN_POINTS:
         return replace(scan, boxes=[], found_rows=[], warnings=(*warnings, f"under {MIN_POINTS} points"))
     level = scan.points @ scan.R_level_input.T
     # what else looks odd follows from wrong axes or units
-    if wrong := flat_along_another_axis(scan) or scan_unit_warning(level):
+    some = slice(None, None, -(-len(level) // _ENOUGH))
+    few = replace(scan, points=scan.points[some])
+    if wrong := flat_along_another_axis(few) or scan_unit_warning(level[some], count):
         warnings.append(wrong)
     origin = None if scan.origin is None else scan.R_level_input @ scan.origin
     up = estimate_up(level, origin)
@@ -359,6 +364,6 @@ def _rows_near(detections: Detections, points: np.ndarray) -> list[np.ndarray]:
     rows = []
     for center in detections.centers:
         first, last = np.searchsorted(x, (center[0] - _AROUND, center[0] + _AROUND))
-        near = np.sort(order[first:last])
-        rows.append(near[np.abs(points[near, 1] - center[1]) < _AROUND])
+        near = order[first:last]
+        rows.append(np.sort(near[np.abs(points[near, 1] - center[1]) < _AROUND]))
     return rows

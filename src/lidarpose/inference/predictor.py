@@ -5,27 +5,26 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 
 from lidarpose.errors import InputError, check_int, check_name, missing_extra
-from lidarpose.geometry import rotation_from_up
+from lidarpose.geometry import UP_AXES, rotation_from_up
 from lidarpose.inference.backend import Backend, OnnxBackend, estimates, exported_beside
 from lidarpose.inference.checks import UPSIDE_DOWN, looks_unsure, oversize_warning, unit_warning, upside_down_warning
 from lidarpose.inference.inputs import Clips, as_origin, as_points, candidates, clean, is_few, only_returns
 from lidarpose.inference.results import PersonPose, Poses, first_names
-from lidarpose.inference.scan import Scan, pose_scan
+from lidarpose.inference.scan import Scan, pose_scan, read_scan
 from lidarpose.inference.tta import TTATransform, apply, average, invert, tta_transforms
 from lidarpose.io.boxes import read_boxes
 from lidarpose.io.files import file_error
-from lidarpose.io.point_cloud import read_points
 from lidarpose.models import BUNDLED, DEFAULT, weights_path
 from lidarpose.models.checkpoint import read_header
 from lidarpose.models.decode import decoder
 from lidarpose.models.voxelize import WINDOW
 from lidarpose.progress import Progress
-from lidarpose.sample import FARTHEST, MIN_POINTS, PER_JOINT, Box, Pose, center_of
+from lidarpose.sample import MIN_POINTS, PER_JOINT, Box, Pose, center_of
 from lidarpose.skeleton import SMPL24, Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
 
@@ -98,6 +97,11 @@ def predict(
     boxes: "str | os.PathLike | dict | Box | list | tuple | np.ndarray | None" = None,
     calib: str | os.PathLike | None = None,
     crop: bool = False,
+    find: bool = False,
+    min_score: float | None = None,
+    max_range: float | None = None,
+    max_people: int | None = None,
+    background: "str | os.PathLike | Sequence | np.ndarray | None" = None,
     sensor_origin: tuple[float, float, float] | str | None = None,
     skeleton: str | None = None,
     up: str | Sequence[float] = "z",
@@ -109,59 +113,59 @@ def predict(
 
     boxes: whatever `read_boxes` takes (a JSON file, a KITTI label, rows, a `Box` or several), their length and width
     level, their height and yaw along and about the up axis (the file's z where `up` is a direction); calib: of a KITTI
-    label, None for `../calib/N.txt` beside it; crop: the file is one person already. With
-    neither, a file of less than 4 m across is taken as a crop and anything else asks for boxes. sensor_origin:
-    (x, y, z) m in the file's frame, or "unknown"; None means 0, 0, 0 with boxes and unknown for a crop. skeleton: a
-    name, or None for smpl24, or for the network's own where it has other joints. up: the file's up axis, "z", "y" or
-    "x", with a minus where it points down ("-y": cameras), or for a sensor mounted askew the direction that is up,
-    (x, y, z) or "x,y,z" in the file's frame. columns: values a row of a .bin; model: a predictor, what `load` takes
-    (with its defaults), or a function that gives the predictor when it is needed. Raises
-    InputError, one line that says what to do.
+    label, None for `../calib/N.txt` beside it; crop: the file is one person already; find: people are searched for,
+    with min_score, max_range (None: 40 m), max_people and background as in `detect`. With neither, a file of less than
+    4 m across is taken as a crop, and in any other people are searched for. sensor_origin: (x, y, z) m in the file's
+    frame, or "unknown"; None means unknown for a crop and 0, 0, 0 else. skeleton: a name, or None for smpl24, or for
+    the network's own where it has other joints. up: the file's up axis, "z", "y" or "x", with a minus where it points
+    down ("-y": cameras), or for a sensor mounted askew the direction that is up, (x, y, z) or "x,y,z" in the file's
+    frame. columns: values a row of a .bin; model: a predictor, what `load` takes (with its defaults), or a function
+    that gives the predictor when it is needed. Raises InputError, one line that says what to do.
     """
-    if boxes is not None and crop:
-        raise InputError("expected boxes or a crop, got both: a crop is one person already, so leave the boxes away")
-    if not isinstance(path, str | os.PathLike):
-        kind = type(path).__name__
-        raise InputError(
-            f"expected the path of a point file, got {kind}: for points use lidarpose.load().predict(points)"
-        )
+    options = (min_score, max_range, max_people, background)
+    _check_choice(path, boxes, crop, find or any(option is not None for option in options))
     started = time.perf_counter()
     rotation_from_up(up)
     scan = Scan(
         points=np.zeros((0, 3)),
         boxes=None if boxes is None else read_boxes(boxes, calib=calib),
-        origin=np.zeros(3) if sensor_origin is None and boxes is not None else as_origin(sensor_origin),
+        origin=as_origin(sensor_origin),
         up=up if isinstance(up, str) else ",".join(repr(float(value)) for value in up),
-        source=os.fsdecode(path),
     )
-    scan = _with_points(scan, path, columns, is_crop=crop)
+    scan = read_scan(scan, path, columns)
+    if boxes is None and not crop and not find:
+        # a map of 10^8 points is not turned for nothing
+        upright = scan.points if scan.up in UP_AXES else scan.clouds()[0]
+        find = bool(np.ptp(upright, axis=0).max() >= CROP_SIZE)
+    if sensor_origin is None and (find or boxes is not None):
+        scan = replace(scan, origin=np.zeros(3))
     read = time.perf_counter()
+    if find:
+        from lidarpose.inference.detection import find_people, search_options
+
+        scan = find_people(scan, search_options(*options, columns))
+    found = time.perf_counter()
     # loaded once the input has proved readable
     predictor = model if isinstance(model, Predictor) else model() if callable(model) else load(model)
     loaded = time.perf_counter()
     poses = pose_scan(scan, predictor, skeleton=skeleton, progress=progress)
-    timing = {"read": (read - started) * 1e3, "load": (loaded - read) * 1e3}
+    times = {"read": read - started, "find": found - read, "load": loaded - found}
+    timing = {name: seconds * 1e3 for name, seconds in times.items() if find or name != "find"}
     return replace(poses, timing_ms=timing | poses.timing_ms)
 
 
-def _with_points(scan: Scan, path: str | os.PathLike, columns: int | None, *, is_crop: bool) -> Scan:
-    """The scan with the returns of a file. Raises InputError where it has none, or is too large for one person."""
-    cloud = read_points(path, columns=columns)
-    points, notes = only_returns(cloud.points)
-    if not len(points):
-        problem = f"none within {FARTHEST:g} m" if cloud.points.any() else "only 0,0,0, which are no returns"
-        raise file_error(path, f"expected points in meters, got {problem}: export it again")
-    scan = replace(scan, points=points, warnings=(*cloud.warnings, *notes))
-    if scan.boxes is None and not is_crop:
-        size = np.ptp(scan.clouds()[0], axis=0)
-        if size.max() >= CROP_SIZE:
-            unit = unit_warning(size, what="it")
-            raise file_error(
-                path,
-                f"expected one person, less than {CROP_SIZE:.0f} m across, got {size.max():,.1f} m: give the people's "
-                "boxes, or say that it is a crop all the same" + (f"; {unit}" if unit else ""),
-            )
-    return scan
+def _check_choice(path: object, boxes: object, crop: bool, searched: bool) -> None:
+    """Raises InputError where it is said in two ways who is in the file, or it is no file."""
+    if boxes is not None and crop:
+        raise InputError("expected boxes or a crop, got both: a crop is one person already, so leave the boxes away")
+    if searched and (boxes is not None or crop):
+        options = "find, min score, range, max people and background"
+        raise InputError(f"{options} are for people who are searched for: leave them away with boxes or a crop")
+    if not isinstance(path, str | os.PathLike):
+        kind = type(path).__name__
+        raise InputError(
+            f"expected the path of a point file, got {kind}: for points use lidarpose.load().predict(points)"
+        )
 
 
 def _torch_backend(path: Path, device: str, compile: bool) -> Backend:
@@ -237,6 +241,17 @@ class Predictor:
         self,
         points: "ArrayLike",
         *,
+        find: Literal[True],
+        sensor_origin: "np.ndarray | Sequence[float] | str | None" = None,
+        skeleton: str | None = None,
+        progress: bool = False,
+    ) -> Poses: ...
+
+    @overload
+    def predict(
+        self,
+        points: "ArrayLike",
+        *,
         boxes: "str | os.PathLike | dict | Box | list | tuple | np.ndarray",
         sensor_origin: "np.ndarray | Sequence[float] | str | None" = None,
         skeleton: str | None = None,
@@ -244,24 +259,33 @@ class Predictor:
     ) -> Poses: ...
 
     def predict(
-        self, points, *, boxes=None, sensor_origin=None, skeleton=None, progress=False, clips=None
+        self, points, *, boxes=None, find=False, sensor_origin=None, skeleton=None, progress=False, clips=None
     ) -> PersonPose | Poses:
-        """One cloud (n, 3+) -> `PersonPose`; a list of clouds, or a cloud with boxes -> `Poses`, in their order.
+        """One cloud (n, 3+) -> `PersonPose`; a list of clouds, or one with boxes or find -> `Poses`, in their order.
 
         points: x, y, z in meters, z up, any frame, each cloud one person, ground and clutter allowed; more columns are
         ignored, those of tables and records are taken by name. boxes: the people of a whole scan, as in
-        `lidarpose.predict`. sensor_origin (3,) m: where the sensor stood in that frame, or "unknown"; None means
-        0, 0, 0 with boxes and unknown without. skeleton: see `in_skeleton`. clips: which of a list's clouds are frames
-        of one person, for networks of clips, by default none: a cloud then fills a clip. A cloud of under 5 different
-        points gets a result without joints and a warning. Raises InputError for arrays of another shape or type.
+        `lidarpose.predict`; find: they are searched for, as by `lidarpose.detect`, whose result is for `boxes` where
+        anything about the search is to be chosen. sensor_origin (3,) m: where the sensor stood in that frame, or
+        "unknown"; None means 0, 0, 0 with boxes and find, and unknown without. skeleton: see `in_skeleton`. clips:
+        which of a list's clouds are frames of one person, for networks of clips, by default none: a cloud then fills a
+        clip. A cloud of under 5 different points gets a result without joints and a warning. Raises InputError for
+        arrays of another shape or type.
         """
         wanted = self.in_skeleton(skeleton)
         if clips is not None and getattr(self.backend, "frames", 1) == 1:
             raise InputError(f"clips are for networks of clips, {self.model['name']} reads single frames")
-        if boxes is not None:
+        if find and boxes is not None:
+            raise InputError("find is for people who are searched for: leave it away with boxes")
+        if boxes is not None or find:
             cloud, notes = only_returns(as_points(points))
             origin = np.zeros(3) if sensor_origin is None else as_origin(sensor_origin)
-            scan = Scan(points=cloud, boxes=read_boxes(boxes), origin=origin, warnings=tuple(notes))
+            given = None if boxes is None else read_boxes(boxes)
+            scan = Scan(points=cloud, boxes=given, origin=origin, warnings=tuple(notes))
+            if find:
+                from lidarpose.inference.detection import Search, find_people
+
+                scan = find_people(scan, Search())
             return pose_scan(scan, self, skeleton=skeleton, progress=progress)
         origin = as_origin(sensor_origin)
         if not _is_many(points):
