@@ -143,7 +143,7 @@ def test_evaluate_and_table_from_the_command_line(tmp_path, monkeypatch, capsys)
         (("evaluate", "nix.safetensors", "bench"), "nix.safetensors"),
         (("evaluate", "tiny", "bench", "--skeleton", "human51"), "did you mean human15"),
         (("evaluate", "tiny", "bench", "--limit", "-1"), "at least 1 person"),
-        (("evaluate", "tiny"), "DATASET"),
+        (("evaluate", "tiny"), "expected a dataset to evaluate on"),
         (("table", "nowhere.json"), "no such file"),
         (("table", "--format", "tex"), "markdown or json, got 'tex'"),
     ],
