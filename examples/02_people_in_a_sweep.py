@@ -1,4 +1,4 @@
-"""Everybody in a whole sweep, given their boxes, from files.
+"""Everybody in a whole sweep, found or given by boxes, from files.
 
 The sweep here is synthesized and written first; the second half is all that your own files need.
 Run: python examples/02_people_in_a_sweep.py    (needs, in the clone: pip install '.[synth]')
@@ -33,7 +33,13 @@ for name, mesh in zip("abc", meshes, strict=True):
 with open("people.json", "w") as file:
     json.dump({"people": people}, file)
 
-# ---- their poses
+# ---- the people, searched for
+
+found = lidarpose.detect("sweep.npy")
+for box in found:
+    print(f"found at {box.center.round(1)} m with a score of {box.score:.2f}")
+
+# ---- their poses, in boxes from elsewhere; without boxes, in those that are found
 
 poses = lidarpose.predict("sweep.npy", boxes="people.json", skeleton="human15")
 for person in poses:
@@ -43,3 +49,5 @@ poses.save("sweep.poses.json")
 poses.picture("sweep.poses.png")
 print("wrote sweep.poses.json and sweep.poses.png; the same by command:")
 print("  lidarpose predict sweep.npy --boxes people.json --skeleton human15 --picture")
+print("and without boxes:")
+print("  lidarpose predict sweep.npy --picture")
