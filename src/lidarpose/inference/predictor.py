@@ -133,10 +133,7 @@ def predict(
         up=up if isinstance(up, str) else ",".join(repr(float(value)) for value in up),
     )
     scan = read_scan(scan, path, columns)
-    if boxes is None and not crop and not find:
-        # a map of 10^8 points is not turned for nothing
-        upright = scan.points if scan.up in UP_AXES else scan.clouds()[0]
-        find = bool(np.ptp(upright, axis=0).max() >= CROP_SIZE)
+    find = find or boxes is None and not crop and _is_wide(scan)
     if sensor_origin is None and (find or boxes is not None):
         scan = replace(scan, origin=np.zeros(3))
     read = time.perf_counter()
@@ -152,6 +149,13 @@ def predict(
     times = {"read": read - started, "find": found - read, "load": loaded - found}
     timing = {name: seconds * 1e3 for name, seconds in times.items() if find or name != "find"}
     return replace(poses, timing_ms=timing | poses.timing_ms)
+
+
+def _is_wide(scan: Scan) -> bool:
+    """Whether the scan is larger than a crop of one person."""
+    # a map of 10^8 points is not turned for nothing
+    upright = scan.points if scan.up in UP_AXES else scan.clouds()[0]
+    return bool(np.ptp(upright, axis=0).max() >= CROP_SIZE)
 
 
 def _check_choice(path: object, boxes: object, crop: bool, searched: bool) -> None:
