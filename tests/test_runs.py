@@ -536,7 +536,10 @@ def test_a_run_s_rates_follow_its_schedule(monkeypatch, tmp_path):
 def test_the_best_validation_is_kept_across_a_resume(monkeypatch, tmp_path):
     errors = [50.0, 40.0, 60.0, 45.0]
 
-    monkeypatch.setattr(loop, "validate", lambda *_: (errors.pop(0), None))
+    def made(recipe, **settings):
+        return replace(setup.make_setup(recipe, **settings), validate=lambda *_: (errors.pop(0), None))
+
+    monkeypatch.setattr(loop, "make_setup", made)
     folder = tmp_path / "run"
 
     def best():
