@@ -3,21 +3,19 @@
 Legend: D detections of all scans, F features.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from lidarpose.errors import InputError, check_int
-from lidarpose.eval.detector.labeled_scans import LabeledScan, labeled_scans
+from lidarpose.eval.detector.evaluate_detector import run_detector
 from lidarpose.inference.detection import FEATURES, final_score, verification_features
 from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.detector.detector import Detector
 from lidarpose.models.detector.network import DetectorNet
 from lidarpose.models.export import export_detector
 from lidarpose.progress import Progress
-from lidarpose.sample import Box
-from lidarpose.synth.detection_scene import DetectionScene, detection_scene
+from lidarpose.synth.detection_scene import detection_scene
 from lidarpose.train.run_dir import MODEL
 
 DETECTOR = "detector.onnx"
@@ -40,7 +38,6 @@ def calibrate(folder: str | Path, scans: int, *, labeled: str | Path | None = No
     people a scan pass. Raises InputError where a folder holds no detector or no scans.
     """
     check_int("--calibrate", scans, least=1)
-    real = () if labeled is None else [load() for load in labeled_scans(labeled).loaders]
     path = Path(folder) / MODEL
     if not path.is_file():
         raise InputError(f"{path} is not there: name the folder of a run of lidarpose train-detector")
@@ -51,34 +48,24 @@ def calibrate(folder: str | Path, scans: int, *, labeled: str | Path | None = No
     export_detector(network, out, card=header.card)
     detector = Detector(out)
 
-    def judged(scan: DetectionScene | LabeledScan, people: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        detections = detector.detect(scan.points, scan.origin, max_range=_RANGE, limit=_VERIFIED)
-        features, _ = verification_features(detections, scan.points, scan.origin)
-        return features, matched(detections.centers, people)
-
-    tables = []
+    tables: list[tuple[np.ndarray, ...]] = []
     with Progress(scans, unit="scans") as bar:
         for number in range(scans):
             scene = detection_scene(_SEED, number, family="heldout")
             seen = np.unique(scene.person[scene.person >= 0])
-            tables.append(judged(scene, _centers([scene.boxes[row] for row in seen])))
+            people = np.array([scene.boxes[row].center for row in seen]).reshape(-1, 3)
+            detections = detector.detect(scene.points, scene.origin, max_range=_RANGE, limit=_VERIFIED)
+            features, _ = verification_features(detections, scene.points, scene.origin)
+            tables.append((features, matched(detections.centers, people)))
             bar.update(number + 1)
-    fitted = fit(*_stacked(tables), scans)
-    if real:
-        features, is_person = _stacked([judged(scan, _centers(scan.boxes)) for scan in real])
-        false = final_score(features, fitted)[~is_person & np.isfinite(features).all(1)]
-        fitted["default_score"] = max(fitted["default_score"], passing_score(false, len(real)))
-    export_detector(network, out, card=header.card | fitted | {"calibrated_on": scans, "labeled_scans": len(real)})
+    features, is_person = (np.concatenate(column) for column in zip(*tables, strict=True))
+    card = header.card | fit(features, is_person, scans) | {"calibrated_on": scans}
+    export_detector(network, out, card=card)
+    if labeled is not None:
+        (result,), _ = run_detector(weights=out, heldout=False, folders=[labeled], max_range=_RANGE)
+        card |= {"default_score": max(card["default_score"], result.thresholds[f"{FALSE:g}"])}
+        export_detector(network, out, card=card | {"labeled_scans": result.scans})
     return out
-
-
-def _centers(boxes: Sequence[Box]) -> np.ndarray:
-    return np.array([box.center for box in boxes]).reshape(-1, 3)
-
-
-def _stacked(tables: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    features, is_person = zip(*tables, strict=True)
-    return np.concatenate(features), np.concatenate(is_person)
 
 
 def matched(centers: np.ndarray, people: np.ndarray) -> np.ndarray:
