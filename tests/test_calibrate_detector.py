@@ -5,8 +5,9 @@ import json
 import numpy as np
 import pytest
 
+from lidarpose.eval.detector.detection_scores import match
 from lidarpose.inference.detection import final_score
-from lidarpose.train.detector.calibrate import fit, logistic, matched, monotone, passing_score
+from lidarpose.train.detector.calibrate import fit, logistic, monotone, passing_score
 
 
 def test_a_logistic_regression_finds_its_weights():
@@ -30,6 +31,11 @@ def test_probabilities_rise_and_are_shares():
 def test_a_person_is_found_once():
     people = np.array([[1.0, 0.0, 0.9], [5.0, 0.0, 0.9]])
     centers = np.array([[1.2, 0.1, 0.9], [1.1, 0.0, 0.9], [5.6, 0.0, 0.9], [5.2, 0.0, 2.0], [9.0, 0.0, 0.9]])
+
+    def matched(centers, people):
+        strongest_first = -np.arange(len(centers), dtype=float)
+        return match(centers[:, :2], strongest_first, people[:, :2], np.ones(len(people), bool)) >= 0
+
     assert matched(centers, people).tolist() == [True, False, False, True, False]
     assert matched(centers[:0], people).tolist() == []
     assert not matched(centers, people[:0]).any()

@@ -5,6 +5,7 @@ import os
 import sys
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 from lidarpose.cli.terminal import add_command, is_watched, tell
 from lidarpose.errors import InputError
@@ -173,14 +174,8 @@ def _predict(options: argparse.Namespace) -> None:
         calib=options.calib,
         crop=options.crop,
         find=options.find,
-        min_score=options.min_score,
-        max_range=options.range,
-        max_people=options.max_people,
-        background=_background(options),
-        sensor_origin=options.sensor_origin,
         skeleton=options.skeleton,
-        up=options.up,
-        columns=options.columns,
+        **_reading(options),
         # loaded once the input has proved readable
         model=lambda: load(options.weights, **choices),
         progress=is_watched(),
@@ -215,30 +210,30 @@ def _detect(options: argparse.Namespace) -> None:
     if result is not None:
         check_apart(result, options.file, *(options.background or ()))
         check_writable(result)
-    boxes = detect(
-        options.file,
-        sensor_origin=options.sensor_origin,
-        up=options.up,
-        columns=options.columns,
-        max_range=options.range,
-        min_score=options.min_score,
-        max_people=options.max_people,
-        background=_background(options),
-    )
+    boxes = detect(options.file, **_reading(options))
     if result is None:
         print(boxes.to_json(), end="")
     else:
         boxes.save(result)
     for line in boxes.warnings:
         tell(f"lidarpose: warning: {line}")
-    found = f"{len(boxes)} {'person' if len(boxes) == 1 else 'people'} found" if boxes else "nobody found"
-    tell(found + (f" -> {result}" if result else ""))
+    outcome = f"{len(boxes)} {'person' if len(boxes) == 1 else 'people'} found" if boxes else "nobody found"
+    tell(outcome + (f" -> {result}" if result else ""))
 
 
-def _background(options: argparse.Namespace) -> list[str] | str | None:
-    """One file is of static points, or a folder; several are scans."""
-    given = options.background
-    return given[0] if given and len(given) == 1 else given
+def _reading(options: argparse.Namespace) -> dict[str, Any]:
+    """How a scan is read and searched, for `predict` and `detect` alike."""
+    background = options.background
+    return {
+        "sensor_origin": options.sensor_origin,
+        "up": options.up,
+        "columns": options.columns,
+        "max_range": options.range,
+        "min_score": options.min_score,
+        "max_people": options.max_people,
+        # one file is of static points, or a folder; several are scans
+        "background": background[0] if background and len(background) == 1 else background,
+    }
 
 
 def _result_path(out: str, file: Path, what: str, *suffixes: str) -> Path | None:

@@ -128,8 +128,8 @@ def detect(
     else:
         cloud, notes = only_returns(as_points(points))
         scan = replace(scan, points=cloud, warnings=tuple(notes))
-    found = find_people(scan, search)
-    return Boxes(found.boxes or [], source=found.source, warnings=found.warnings, detector=detector_version())
+    searched = find_people(scan, search)
+    return Boxes(searched.boxes or [], source=searched.source, warnings=searched.warnings, detector=detector_version())
 
 
 def search_options(

@@ -141,12 +141,12 @@ def predict(
         from lidarpose.inference.detection import find_people, search_options
 
         scan = find_people(scan, search_options(*options, columns))
-    found = time.perf_counter()
+    searched = time.perf_counter()
     # loaded once the input has proved readable
     predictor = model if isinstance(model, Predictor) else model() if callable(model) else load(model)
     loaded = time.perf_counter()
     poses = pose_scan(scan, predictor, skeleton=skeleton, progress=progress)
-    times = {"read": read - started, "find": found - read, "load": loaded - found}
+    times = {"read": read - started, "find": searched - read, "load": loaded - searched}
     timing = {name: seconds * 1e3 for name, seconds in times.items() if find or name != "find"}
     return replace(poses, timing_ms=timing | poses.timing_ms)
 

@@ -93,7 +93,12 @@ NAMES = ", ".join(f"{name} (default)" if name == DEFAULT else name for name in B
 def bundled_path(name: str = DEFAULT, suffix: str = ".safetensors") -> Path:
     """Where the package keeps a bundled checkpoint, or with the suffix .onnx its exported twin."""
     check_name("bundled weights", name, BUNDLED)
-    return Path(str(resources.files("lidarpose.models") / "weights" / f"{name}{suffix}"))
+    return weights_file(f"{name}{suffix}")
+
+
+def weights_file(name: str) -> Path:
+    """Where the package keeps a file of weights."""
+    return Path(str(resources.files("lidarpose.models") / "weights" / name))
 
 
 def weights_path(weights: str | os.PathLike) -> Path:

@@ -171,7 +171,7 @@ def score_detector(
     """
     tables: list[tuple[pd.DataFrame, pd.DataFrame]] = []
     about: list[dict[str, Any]] = []
-    found: list[Sequence[Box]] = []
+    boxes_of_scans: list[Sequence[Box]] = []
     progress(0, len(scans.loaders))
     for number, load in enumerate(scans.loaders):
         scan = load()
@@ -180,7 +180,7 @@ def score_detector(
         if predictor is not None and scan.joints is not None:
             people = people.assign(**_pose_errors(people, scan, boxes, predictor))
         tables.append((people, detections))
-        found.append(boxes)
+        boxes_of_scans.append(boxes)
         about.append({"sensor": scan.sensor, "kind": scan.kind, "changed": scan.changed})
         progress(number + 1, len(scans.loaders))
     people, detections = (pd.concat(parts, ignore_index=True) for parts in zip(*tables, strict=True))
@@ -190,19 +190,19 @@ def score_detector(
     table = pd.DataFrame(about)
     rows, thresholds = _figures(people, detections, table, rng, default_score)
     rows += _pose_rows(people, thresholds[f"{REFERENCE:g}"], rng)
-    judged = detections[detections.status != NEITHER].assign(people=lambda table: table.status == PERSON)
-    error = aggregate.calibration_error(judged.score, judged.people)
-    rows.append(_row("calibration_error", value=100 * error, unit="%", count=len(judged)))
-    bins = judged.groupby(np.minimum((judged.score * _BINS).astype(int), _BINS - 1))
+    counted = detections[detections.status != NEITHER].assign(people=lambda table: table.status == PERSON)
+    error = aggregate.calibration_error(counted.score, counted.people)
+    rows.append(_row("calibration_error", value=100 * error, unit="%", count=len(counted)))
+    bins = counted.groupby(np.minimum((counted.score * _BINS).astype(int), _BINS - 1))
     reliability = bins.agg(score=("score", "mean"), people=("people", "mean"), detections=("people", "size"))
     false = detections[(detections.status == FALSE) & (detections.score >= thresholds[f"{REFERENCE:g}"])]
     return DetectorResult(
         dataset=scans.name,
-        scans=len(found),
+        scans=len(boxes_of_scans),
         changed=int(table.changed.sum()),
         people=people,
         detections=detections,
-        boxes=found,
+        boxes=boxes_of_scans,
         rows=rows,
         thresholds=thresholds,
         reliability=reliability.round(4).to_dict("records"),
@@ -248,8 +248,8 @@ def _figures(
             rows.append(_row("recall", at, group, of, **ends, unit="%", count=int(mask.sum())))
         rows += _false_rows(at, false[false.score > bounds[0]], scans)
     on_foot = people[~people.mounted]
-    judged = detections[(detections.status == FALSE) | (detections.status == PERSON) & ~detections.mounted]
-    precision = 100 * average_precision(judged, on_foot, weights)
+    counted = detections[(detections.status == FALSE) | (detections.status == PERSON) & ~detections.mounted]
+    precision = 100 * average_precision(counted, on_foot, weights)
     rows.append(_row("average_precision", **_with_interval(precision, count), unit="%", count=len(on_foot)))
     # where nothing is above, nothing but certainty is; the default is what it is
     thresholds = {at: 1.0 if np.isnan(score) else score for at, score in thresholds.items()}

@@ -52,9 +52,9 @@ def _detect(search: Search, points: np.ndarray, origin: np.ndarray | None) -> tu
 
 
 def _scorer(detector: Detector, points: np.ndarray, origin: np.ndarray | None, *, max_range: float):
-    found = detector.detect(points, origin, max_range=max_range, limit=None)
-    boxes = zip(found.centers, found.sizes, found.yaws, strict=True)
-    return [Box(center=center, size=size, yaw=float(yaw)) for center, size, yaw in boxes], found.score
+    detections = detector.detect(points, origin, max_range=max_range, limit=None)
+    boxes = zip(detections.centers, detections.sizes, detections.yaws, strict=True)
+    return [Box(center=center, size=size, yaw=float(yaw)) for center, size, yaw in boxes], detections.score
 
 
 def _baseline(predictor: Predictor | None, points: np.ndarray, origin: np.ndarray | None):

@@ -1,18 +1,18 @@
 """The detector's file: opened by ONNX Runtime, with what its header says of scores. No torch."""
 
 import os
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from lidarpose.io.files import file_error
+from lidarpose.models import weights_file
 from lidarpose.models.detector.detector_config import INPUTS, OUTPUT, DetectorConfig
 from lidarpose.models.onnx import check_names, open_network
 
 
 def detector_path() -> Path:
     """Where the package keeps the bundled detector."""
-    return Path(str(resources.files("lidarpose.models") / "weights" / "detector.onnx"))
+    return weights_file("detector.onnx")
 
 
 def open_detector(path: str | os.PathLike | None = None, *, threads: int | None = None) -> tuple[Any, dict]:

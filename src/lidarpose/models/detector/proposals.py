@@ -9,10 +9,10 @@ and the two rings around it.
 
 from collections.abc import Iterator
 from functools import cache
-from importlib import resources
 
 import numpy as np
 
+from lidarpose.models import weights_file
 from lidarpose.models.detector.ground import Ground
 
 # m: of a cell; heights above ground that count; a tile of the grid, and how much tiles overlap
@@ -76,7 +76,7 @@ def columns(points: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, np.nda
 @cache
 def _weights() -> dict[str, np.ndarray]:
     """A small perceptron's layers; it is positive where a column may be somebody."""
-    with np.load(str(resources.files("lidarpose.models") / "weights" / "proposals.npz")) as file:
+    with np.load(weights_file("proposals.npz"), allow_pickle=False) as file:
         return dict(file)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose.errors import InputError, check_int
+from lidarpose.eval.detector.detection_scores import match
 from lidarpose.eval.detector.evaluate_detector import run_detector
 from lidarpose.inference.detection import FEATURES, final_score, verification_features
 from lidarpose.models.checkpoint import load_checkpoint
@@ -23,8 +24,8 @@ DETECTOR = "detector.onnx"
 _SEED = 2**31 - 11
 # detections of a scan that are posed, the strongest ones
 _VERIFIED = 40
-# a detection within this of a person's center in x and y is theirs, m; people are looked for up to this range, m
-MATCH, _RANGE = 0.5, 40.0
+# people are looked for up to this range, m
+_RANGE = 40.0
 # false people a scan at the default score
 FALSE = 1.0
 # of the logistic, on standardized features; of the piecewise linear curve, its knots at most
@@ -56,7 +57,9 @@ def calibrate(folder: str | Path, scans: int, *, labeled: str | Path | None = No
             people = np.array([scene.boxes[row].center for row in seen]).reshape(-1, 3)
             detections = detector.detect(scene.points, scene.origin, max_range=_RANGE, limit=_VERIFIED)
             features, _ = verification_features(detections, scene.points, scene.origin)
-            tables.append((features, matched(detections.centers, people)))
+            # the strongest first
+            own = match(detections.centers[:, :2], detections.logit, people[:, :2], np.ones(len(people), bool))
+            tables.append((features, own >= 0))
             bar.update(number + 1)
     features, is_person = (np.concatenate(column) for column in zip(*tables, strict=True))
     card = header.card | fit(features, is_person, scans) | {"calibrated_on": scans}
@@ -66,17 +69,6 @@ def calibrate(folder: str | Path, scans: int, *, labeled: str | Path | None = No
         card |= {"default_score": max(card["default_score"], result.thresholds[f"{FALSE:g}"])}
         export_detector(network, out, card=card | {"labeled_scans": result.scans})
     return out
-
-
-def matched(centers: np.ndarray, people: np.ndarray) -> np.ndarray:
-    """Whether each of detections (D, 3), the strongest first, is one of people (P, 3) whom no stronger one is."""
-    is_free, is_person = np.ones(len(people), bool), np.zeros(len(centers), bool)
-    for row, center in enumerate(centers):
-        distance = np.where(is_free, np.linalg.norm(people[:, :2] - center[:2], axis=1), np.inf)
-        if len(distance) and distance.min() <= MATCH:
-            is_free[distance.argmin()] = False
-            is_person[row] = True
-    return is_person
 
 
 def fit(features: np.ndarray, is_person: np.ndarray, scans: int) -> dict:
