@@ -86,11 +86,11 @@ def test_files_and_modules_that_pages_name_are_there(page):
         assert there, name
 
 
-def test_there_are_seven_pages_and_each_is_in_the_site():
+def test_there_are_eight_pages_and_each_is_in_the_site():
     site = (ROOT / "mkdocs.yml").read_text("utf-8")
     pages = {path.stem for path in DOCS.glob("*.md")}
     assert pages - {"index", "reference", "log"} == {
-        "use", "data", "synthesis", "train", "evaluate", "method", "results",
+        "use", "recordings", "data", "synthesis", "train", "evaluate", "method", "results",
     }  # fmt: skip
     for path in [*DOCS.glob("*.md"), *DOCS.glob("cards/*.md")]:
         assert f"{path.relative_to(DOCS)}" in site, path.name
