@@ -24,6 +24,7 @@ LAYERS = (
     {"synth"},
     {"models"},
     {"viz"},
+    {"tracking"},
     {"inference"},
     {"eval"},
     {"train"},

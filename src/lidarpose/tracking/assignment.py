@@ -1,0 +1,56 @@
+"""The assignment of rows to columns that costs least in all."""
+
+import numpy as np
+
+
+def assign(costs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of the least sum of costs, of as many rows and columns as pay: who has no pair costs 0.
+
+    costs (N, B): inf for what cannot be a pair. Returns rows (k,) ascending and their columns (k,).
+    """
+    worth = np.minimum(np.asarray(costs, float), 0.0)
+    try:
+        from scipy.optimize import linear_sum_assignment as solve
+    except ImportError:
+        solve = assign_plain
+    rows, columns = solve(worth)
+    pays = worth[rows, columns] < 0
+    return rows[pays], columns[pays]
+
+
+def assign_plain(costs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As scipy's `linear_sum_assignment`, for finite costs (N, B): min(N, B) pairs, rows ascending.
+
+    Source: Jonker and Volgenant 1987: each row in turn takes its place by the shortest augmenting path.
+    """
+    costs = np.asarray(costs, float)
+    if costs.shape[0] > costs.shape[1]:
+        columns, rows = assign_plain(costs.T)
+        order = np.argsort(rows)
+        return rows[order], columns[order]
+    count, width = costs.shape
+    row_price, column_price = np.zeros(count), np.zeros(width)
+    row_of = np.full(width, -1)
+    for start in range(count):
+        # Dijkstra over columns: distance so far, the column before, and whether it is settled
+        distance, before, settled = np.full(width, np.inf), np.full(width, -1), np.zeros(width, bool)
+        row, column, reached = start, -1, 0.0
+        while row >= 0:
+            through = reached + costs[row] - row_price[row] - column_price
+            shorter = ~settled & (through < distance)
+            distance[shorter], before[shorter] = through[shorter], column
+            column = int(np.where(settled, np.inf, distance).argmin())
+            reached = distance[column]
+            settled[column] = True
+            row = int(row_of[column])
+        known = np.flatnonzero(settled & (row_of >= 0))
+        row_price[start] += reached
+        row_price[row_of[known]] += reached - distance[known]
+        column_price[settled] -= reached - distance[settled]
+        while column >= 0:
+            previous = before[column]
+            row_of[column] = start if previous < 0 else row_of[previous]
+            column = int(previous)
+    columns = np.flatnonzero(row_of >= 0)
+    order = np.argsort(row_of[columns])
+    return row_of[columns][order], columns[order]

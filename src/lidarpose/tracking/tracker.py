@@ -1,0 +1,229 @@
+"""`Tracker`: joins the boxes of people over time, so that everybody keeps one number.
+
+A Kalman filter a person holds position and velocity, each axis for itself, all people at once; boxes go to people by
+the assignment that is best for all together. The heading is smoothed apart, since angles wrap.
+
+Letters: N tracks, B boxes.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from lidarpose.errors import InputError, check_finite
+from lidarpose.sample import Box
+from lidarpose.tracking.assignment import assign
+
+# standard deviation of a box's center, m, along x, y and z: what a detector hides or adds moves the height most
+_POSITION_SD = np.array([0.12, 0.12, 0.2])
+# people are first seen with a velocity of this standard deviation, m/s, and change it: m/s in one second, which grows
+# with the square root of time
+_SPEED_SD, _SPEED_CHANGE = np.array([1.5, 1.5, 0.2]), np.array([1.0, 1.0, 0.15])
+# a box farther from where it is expected belongs to nobody: squared Mahalanobis distance, 99.9 % of a chi-square
+# distribution of three degrees of freedom
+_GATE = 16.3
+# nor does a box go to somebody who may be anywhere: bound of -2 log likelihood, less a constant
+_LEAST_LIKELY = 8.0
+# heading and size follow what is seen with this time constant, s
+_SMOOTHING = 0.5
+# who was seen once, with a score below this, is forgotten this soon, s
+_SURE, _UNSURE_GAP = 0.6, 0.35
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrackState:
+    """A person who is expected: track's id; center (3,) and size (3,) m, yaw rad of the box; age: seconds since the
+    person was seen; position_sd: standard deviation of the center on a level axis, m."""
+
+    id: int
+    center: np.ndarray
+    size: np.ndarray
+    yaw: float
+    age: float
+    position_sd: float
+
+
+@dataclass(kw_only=True, eq=False)
+class _Tracks:
+    """Of all tracks: id (N,); state (N, 3, 2): position m and velocity m/s along x, y, z; covariance (N, 3, 2, 2);
+    heading (N, 2): mean of cos and sin of yaw; size (N, 3) m; age (N,) s since seen; sightings (N,); sure (N,) bool."""
+
+    id: np.ndarray
+    state: np.ndarray
+    covariance: np.ndarray
+    heading: np.ndarray
+    size: np.ndarray
+    age: np.ndarray
+    sightings: np.ndarray
+    sure: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    def take(self, rows: np.ndarray) -> "_Tracks":
+        return _Tracks(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
+
+    def joined(self, other: "_Tracks") -> "_Tracks":
+        names = [field.name for field in fields(self)]
+        return _Tracks(**{name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in names})
+
+    def after(self, seconds: float) -> "_Tracks":
+        """Where everybody is expected later: constant velocity, changed by white noise."""
+        move = np.array([[1.0, seconds], [0.0, 1.0]])
+        # integrals of white noise of acceleration
+        noise = np.array([[seconds**3 / 3, seconds**2 / 2], [seconds**2 / 2, seconds]])
+        moved = self.take(np.arange(len(self)))
+        moved.state = self.state @ move.T
+        moved.covariance = move @ self.covariance @ move.T + noise * _SPEED_CHANGE[:, None, None] ** 2
+        moved.age = self.age + seconds
+        return moved
+
+
+class Tracker:
+    """Gives boxes of people in one fixed frame (z up; the world's where it is known) the numbers of their tracks.
+
+    `jumps_back` counts the times that were earlier than the one before.
+
+    Args:
+        max_gap: so long a person may be unseen and keep the number, s.
+
+    Raises:
+        InputError: max_gap is no positive number.
+    """
+
+    def __init__(self, *, max_gap: float = 2.0):
+        check_finite("max_gap", max_gap)
+        if max_gap <= 0:
+            raise InputError(f"max_gap must be seconds, more than 0, got {max_gap!r}")
+        self.max_gap = float(max_gap)
+        self.jumps_back = 0
+        self._time: float | None = None
+        self._next_id = 0
+        self._tracks = _of_boxes([], 0)
+
+    def update(self, time: float, boxes: Sequence[Box]) -> list[int]:
+        """The boxes of a frame.
+
+        Args:
+            time: s, of any beginning. One earlier than the last is counted; by more than `max_gap` it begins anew.
+            boxes: those of all people who are seen.
+
+        Returns:
+            The id of each box's track: a known person's, or the next number, from 0; a number is never used again.
+
+        Raises:
+            InputError: time is no finite number.
+        """
+        tracks = self._elapsed(time)
+        found = _of_boxes(boxes, self._next_id)
+        rows, columns = assign(_costs(tracks, found))
+        _correct(tracks, rows, found, columns)
+        ids = found.id
+        new = np.setdiff1d(np.arange(len(boxes)), columns)
+        ids[new] = self._next_id + np.arange(len(new))
+        ids[columns] = tracks.id[rows]
+        self._next_id += len(new)
+        self._tracks = tracks.joined(found.take(new))
+        return ids.tolist()
+
+    def predicted(self, time: float) -> list[TrackState]:
+        """The people expected at a time, s, not before the last frame's: those who were seen twice or for sure."""
+        check_finite("time", time)
+        tracks = self._tracks.after(0.0 if self._time is None else max(time - self._time, 0.0))
+        tracks = tracks.take((tracks.age <= self.max_gap) & tracks.sure)
+        deviations = np.sqrt(tracks.covariance[:, :2, 0, 0].max(1))
+        return [
+            TrackState(
+                id=int(tracks.id[i]),
+                center=tracks.state[i, :, 0],
+                size=tracks.size[i],
+                yaw=float(np.arctan2(tracks.heading[i, 1], tracks.heading[i, 0])),
+                age=float(tracks.age[i]),
+                position_sd=float(deviations[i]),
+            )
+            for i in range(len(tracks))
+        ]
+
+    def state(self) -> dict[str, Any]:
+        """All that the tracker knows, as JSON holds it."""
+        tracks = {field.name: getattr(self._tracks, field.name).tolist() for field in fields(_Tracks)}
+        names = ("max_gap", "jumps_back")
+        own = {name: getattr(self, name) for name in names}
+        return own | {"time": self._time, "next_id": self._next_id, "tracks": tracks}
+
+    @classmethod
+    def from_state(cls, state: dict[str, Any]) -> "Tracker":
+        """The tracker whose `state()` this is: it goes on as that one would."""
+        tracker = cls(max_gap=state["max_gap"])
+        tracker.jumps_back, tracker._time, tracker._next_id = state["jumps_back"], state["time"], state["next_id"]
+        empty = tracker._tracks
+        tracker._tracks = _Tracks(
+            **{
+                name: np.array(values, getattr(empty, name).dtype).reshape(-1, *getattr(empty, name).shape[1:])
+                for name, values in state["tracks"].items()
+            }
+        )
+        return tracker
+
+    def _elapsed(self, time: float) -> _Tracks:
+        """The tracks at `time`, without those who have been away for too long."""
+        check_finite("time", time)
+        seconds = 0.0 if self._time is None else float(time) - self._time
+        self._time = float(time)
+        if seconds < 0:
+            self.jumps_back += 1
+        tracks = self._tracks.after(max(seconds, 0.0))
+        gap = np.where(tracks.sure, self.max_gap, min(self.max_gap, _UNSURE_GAP))
+        # a jump far back is another recording
+        alive = (tracks.age <= gap) & (seconds >= -self.max_gap)
+        return tracks.take(alive)
+
+
+def _of_boxes(boxes: Sequence[Box], first_id: int) -> _Tracks:
+    """Tracks that begin with boxes."""
+    count = len(boxes)
+    state = np.zeros((count, 3, 2))
+    state[:, :, 0] = np.reshape([box.center for box in boxes], (-1, 3))
+    yaw = np.array([box.yaw for box in boxes], float)
+    scores = np.array([1.0 if box.score is None else box.score for box in boxes])
+    covariance = np.zeros((count, 3, 2, 2))
+    covariance[..., 0, 0] = _POSITION_SD**2
+    covariance[..., 1, 1] = _SPEED_SD**2
+    return _Tracks(
+        id=first_id + np.arange(count),
+        state=state,
+        covariance=covariance,
+        heading=np.stack([np.cos(yaw), np.sin(yaw)], 1),
+        size=np.reshape([box.size for box in boxes], (-1, 3)).astype(float),
+        age=np.zeros(count),
+        sightings=np.ones(count, int),
+        sure=scores >= _SURE,
+    )
+
+
+def _costs(tracks: _Tracks, found: _Tracks) -> np.ndarray:
+    """(N, B): what it costs that a track has a box, below 0 where that is better than neither; inf where it cannot."""
+    off = found.state[None, :, :, 0] - tracks.state[:, None, :, 0]
+    variance = tracks.covariance[:, None, :, 0, 0] + found.covariance[None, :, :, 0, 0]
+    distance = (off**2 / variance).sum(-1)
+    cost = distance + np.log(variance).sum(-1) - _LEAST_LIKELY
+    return np.where((distance < _GATE) & (cost < 0), cost, np.inf)
+
+
+def _correct(tracks: _Tracks, rows: np.ndarray, found: _Tracks, columns: np.ndarray) -> None:
+    """Tracks `rows` saw boxes `columns`: the filter's second half, in place."""
+    covariance = tracks.covariance[rows]
+    variance = covariance[..., 0, 0] + found.covariance[columns][..., 0, 0]
+    gain = covariance[..., 0] / variance[..., None]
+    off = found.state[columns, :, 0] - tracks.state[rows, :, 0]
+    tracks.state[rows] += gain * off[..., None]
+    tracks.covariance[rows] -= gain[..., :, None] * gain[..., None, :] * variance[..., None, None]
+    # after a few sightings their plain mean, then the newest weigh most
+    weight = np.maximum(1 - np.exp(-tracks.age[rows] / _SMOOTHING), 1 / (tracks.sightings[rows] + 1))[:, None]
+    tracks.heading[rows] += weight * (found.heading[columns] - tracks.heading[rows])
+    tracks.size[rows] += weight * (found.size[columns] - tracks.size[rows])
+    tracks.age[rows] = 0
+    tracks.sightings[rows] += 1
+    tracks.sure[rows] = True

@@ -1,0 +1,162 @@
+"""Tracks: who is who from frame to frame."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpose import Box, InputError
+from lidarpose.tracking.assignment import assign, assign_plain
+from lidarpose.tracking.tracker import Tracker
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def person(x, y=0.0, yaw=0.0, score=None):
+    return Box(center=(x, y, 0.9), size=(0.6, 0.6, 1.75), yaw=yaw, score=score)
+
+
+def crowd(rng, people, frames, drop=0.3):
+    """(time, boxes) of people who walk about at 10 Hz and are often missed."""
+    start, velocity = rng.uniform(-8, 8, (people, 2)), rng.normal(0, 1, (people, 2))
+    for frame in range(frames):
+        places = start + velocity * frame / 10 + rng.normal(0, 0.05, (people, 2))
+        yield frame / 10, [person(*place, yaw=rng.uniform(-3, 3)) for place in places if rng.random() > drop]
+
+
+# ---- assignment
+
+
+@given(seed=SEEDS, rows=st.integers(0, 8), columns=st.integers(0, 8), ties=st.booleans())
+@settings(max_examples=150, deadline=None)
+def test_the_plain_assignment_is_scipys(seed, rows, columns, ties):
+    optimize = pytest.importorskip("scipy.optimize")
+    rng = np.random.default_rng(seed)
+    costs = rng.integers(-3, 3, (rows, columns)).astype(float) if ties else rng.normal(0, 5, (rows, columns))
+    own, theirs = assign_plain(costs), optimize.linear_sum_assignment(costs)
+    assert len(own[0]) == min(rows, columns) and len(set(own[1])) == len(own[1]) and (np.diff(own[0]) > 0).all()
+    assert costs[own].sum() == pytest.approx(costs[theirs].sum())
+    if not ties:
+        np.testing.assert_array_equal(own, theirs)
+
+
+def test_only_pairs_that_pay_are_made():
+    costs = np.array([[-1.0, -3.0, np.inf], [np.inf, -2.5, np.inf], [2.0, np.inf, 5.0]])
+    rows, columns = assign(costs)
+    assert list(zip(rows, columns, strict=True)) == [(0, 0), (1, 1)]
+
+
+# ---- numbers
+
+
+@given(seed=SEEDS)
+@settings(max_examples=20, deadline=None)
+def test_numbers_begin_at_0_and_are_never_used_again(seed):
+    tracker, known = Tracker(max_gap=0.3), set()
+    for time, boxes in crowd(np.random.default_rng(seed), 6, 30, drop=0.6):
+        ids = tracker.update(time, boxes)
+        assert len(set(ids)) == len(ids) == len(boxes)
+        new = sorted(set(ids) - known)
+        assert new == list(range(len(known), len(known) + len(new)))
+        known |= set(new)
+
+
+@given(seed=SEEDS)
+@settings(max_examples=20, deadline=None)
+def test_the_order_of_boxes_does_not_matter(seed):
+    rng = np.random.default_rng(seed)
+    tracker, other, names = Tracker(), Tracker(), {}
+    for time, boxes in crowd(rng, 6, 20):
+        order = rng.permutation(len(boxes))
+        ids, theirs = tracker.update(time, boxes), other.update(time, [boxes[i] for i in order])
+        # new people are numbered in the order of their boxes
+        for k, i in enumerate(order):
+            assert names.setdefault(ids[i], theirs[k]) == theirs[k]
+    assert len(set(names.values())) == len(names)
+
+
+@pytest.mark.parametrize("hz", [2, 10, 30])
+def test_people_who_pass_each_other_keep_their_numbers(hz):
+    rng, tracker = np.random.default_rng(0), Tracker()
+    for time in np.arange(0, 6, 1 / hz):
+        places = np.array([[1.3 * (time - 3), 0.25], [-1.3 * (time - 3), -0.25], [0.5, 1.4 * (time - 3)]])
+        places[2, 0] += 2  # crosses both ways
+        assert tracker.update(time, [person(*place) for place in places + rng.normal(0, 0.04, (3, 2))]) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("gap, known", [(1.9, True), (2.5, False)])
+def test_who_is_unseen_for_two_seconds_keeps_the_number(gap, known):
+    tracker, speed = Tracker(), 1.2
+    for time in np.arange(0, 2, 0.1):
+        assert tracker.update(time, [person(speed * time), person(speed * time, 6)]) == [0, 1]
+    for time in np.arange(2, 1.9 + gap - 0.05, 0.1):
+        assert tracker.update(time, [person(speed * time, 6)]) == [1]
+    assert {state.id for state in tracker.predicted(1.9 + gap)} == ({0, 1} if known else {1})
+    ids = tracker.update(1.9 + gap, [person(speed * (1.9 + gap)), person(speed * (1.9 + gap), 6)])
+    assert ids == ([0, 1] if known else [2, 1])
+
+
+def test_somebody_else_far_away_is_somebody_else():
+    tracker = Tracker()
+    for time in np.arange(0, 1, 0.1):
+        tracker.update(time, [person(1.2 * time)])
+    # after a second unseen, faster than anybody runs
+    assert tracker.update(2.0, [person(2.4 - 6.0)]) == [1]
+
+
+# ---- what is expected
+
+
+def test_people_are_expected_where_they_walk_to():
+    rng, tracker = np.random.default_rng(1), Tracker()
+    assert tracker.predicted(0.0) == []
+    for time in np.arange(0, 3, 0.1):
+        yaw = np.pi - 0.1 + rng.normal(0, 0.2)  # wraps
+        tracker.update(time, [person(1.4 * time + rng.normal(0, 0.05), yaw=np.angle(np.exp(1j * yaw)))])
+    soon, later = tracker.predicted(3.0)[0], tracker.predicted(4.0)[0]
+    assert (soon.id, later.id) == (0, 0) and soon.age == pytest.approx(0.1) and later.age == pytest.approx(1.1)
+    np.testing.assert_allclose(soon.center, [4.2, 0, 0.9], atol=0.1)
+    np.testing.assert_allclose(later.center, [5.6, 0, 0.9], atol=0.4)
+    np.testing.assert_allclose(soon.size, [0.6, 0.6, 1.75])
+    assert abs(np.angle(np.exp(1j * (soon.yaw - np.pi + 0.1)))) < 0.15
+    assert 0 < soon.position_sd < 0.15 < later.position_sd
+    assert tracker.predicted(10.0) == []
+
+
+def test_a_doubtful_box_is_expected_again_only_when_seen_twice():
+    tracker = Tracker()
+    assert tracker.update(0.0, [person(0, score=0.3), person(5, score=0.95), person(9)]) == [0, 1, 2]
+    assert [state.id for state in tracker.predicted(0.1)] == [1, 2]
+    assert tracker.update(0.1, [person(0, score=0.3)]) == [0]
+    assert [state.id for state in tracker.predicted(0.2)] == [0, 1, 2]
+
+
+# ---- times and states
+
+
+def test_time_that_jumps_back_is_counted():
+    tracker = Tracker()
+    for time in (0.0, 0.1, 0.2, 0.15, 0.3):
+        assert tracker.update(time, [person(time)]) == [0]
+    assert tracker.jumps_back == 1
+    # a second recording
+    assert tracker.update(-60.0, [person(0.3)]) == [1] and tracker.jumps_back == 2
+    assert tracker.update(-59.9, [person(0.3)]) == [1]
+    with pytest.raises(InputError, match="time must be a finite number"):
+        tracker.update(np.nan, [])
+    with pytest.raises(InputError, match="max_gap must be"):
+        Tracker(max_gap=0)
+
+
+@given(seed=SEEDS, cut=st.integers(0, 14))
+@settings(max_examples=20, deadline=None)
+def test_a_stored_state_goes_on_the_same(seed, cut):
+    tracker, frames = Tracker(max_gap=1.0), list(crowd(np.random.default_rng(seed), 4, 15, drop=0.5))
+    for time, boxes in frames[:cut]:
+        tracker.update(time, boxes)
+    again = Tracker.from_state(json.loads(json.dumps(tracker.state())))
+    for time, boxes in frames[cut:]:
+        assert again.update(time, boxes) == tracker.update(time, boxes)
+    assert again.state() == tracker.state()
