@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from lidarpose.io.boxes import Boxes as Boxes
     from lidarpose.io.boxes import read_boxes as read_boxes
     from lidarpose.io.point_cloud import read_points as read_points
+    from lidarpose.io.sources import open_source as open_source
     from lidarpose.lidar.presets import sensor as sensor
     from lidarpose.lidar.raycast import cast_rays as cast_rays
     from lidarpose.lidar.sensor import Sensor as Sensor
@@ -59,6 +60,7 @@ _HOMES = {
     "sample_poses": "lidarpose.body.pose_prior.sampling",
     "read_points": "lidarpose.io.point_cloud",
     "read_boxes": "lidarpose.io.boxes",
+    "open_source": "lidarpose.io.sources",
     "Box": "lidarpose.sample",
     "Boxes": "lidarpose.io.boxes",
     "Pose": "lidarpose.sample",

@@ -1,0 +1,142 @@
+"""Recordings of every kind as frames: folders of point files, datasets as they lie on disk, bags and packets.
+
+`open_source` finds out what a path holds. The reader of a format makes a `Recording` of it, whose frames are decoded
+one at a time when a `FrameSource` asks for them.
+"""
+
+import glob
+import os
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+
+from lidarpose.errors import check_int
+from lidarpose.io.files import file_error, listed
+from lidarpose.io.sources.folders import natural_key, open_files, scan_files
+from lidarpose.io.sources.frame import (
+    ChainedRecording,
+    DamagedFrame,
+    Frame,
+    FrameSource,
+    IndexedRecording,
+    LazyFrame,
+    Recording,
+    Source,
+    Sweep,
+)
+
+__all__ = [
+    "RECORDINGS",
+    "ChainedRecording",
+    "DamagedFrame",
+    "Frame",
+    "FrameSource",
+    "IndexedRecording",
+    "LazyFrame",
+    "Recording",
+    "Source",
+    "Sweep",
+    "is_single_scan",
+    "open_source",
+]
+
+# suffix of a file that holds many frames -> the module whose `open_recording(path, topic=...)` reads it
+_READERS = {".mcap": "rosbag", ".bag": "rosbag", ".db3": "rosbag", ".pcap": "packets"}
+RECORDINGS = tuple(_READERS)
+# of a folder that is one recording: what is in it, and the module whose `open_recording` reads it
+_LAYOUTS = {"metadata.yaml": "rosbag"}
+
+
+def open_source(
+    paths: str | os.PathLike | Sequence[str | os.PathLike],
+    *,
+    columns: int | None = None,
+    topic: str | None = None,
+    rate: float | None = None,
+    start: float | None = None,
+    end: float | None = None,
+    every: int = 1,
+) -> FrameSource:
+    """Opens files, folders, patterns or recordings as frames in the order of time.
+
+    Point files are a frame each, sorted by the numbers in their names, so that frame_2 is before frame_10; names that
+    end in seconds since 1970, or in milli-, micro- or nanoseconds, tell their times.
+
+    Args:
+        paths: one or many of: point files, folders of them, patterns such as "drive/*.pcd", recordings (.mcap .bag .db3
+            .pcap, folders of ROS 2 bags), folders of KITTI and nuScenes. Several recordings follow each other.
+        columns: values a row of .bin files, see `read_points`.
+        topic: which of a recording's topics is read, where it has several with points; of nuScenes, the scene.
+        rate: frames a second where there are no times, and instead of those that names tell; 10 by default.
+        start, end: s from the first frame.
+        every: only each so many-th frame.
+
+    Returns:
+        A `Source`: its frames, one in memory at a time, as often as wanted.
+
+    Raises:
+        InputError: nothing there, or nothing that holds points.
+        MissingExtra: a format that needs the extra `recordings`.
+    """
+    if columns is not None:
+        columns = check_int("columns", columns, least=3, hint=" (x y z first)")
+    found = [path for given in listed(paths) for path in _matches(given)]
+    if not found:
+        raise file_error("source", "expected files, folders or recordings, got none")
+    name = str(found[0]) if len(found) == 1 else os.path.commonpath([os.path.abspath(path) for path in found])
+    recording = _open_all(name, found, columns=columns, topic=topic, name_times=rate is None)
+    return FrameSource(recording, rate=rate, start=start, end=end, every=every)
+
+
+def is_single_scan(paths: str | os.PathLike | Sequence[str | os.PathLike]) -> bool:
+    """Whether that is one plain point file, or a name of none: one scan, not frames."""
+    given = listed(paths)
+    if len(given) != 1 or os.path.isdir(given[0]):
+        return False
+    is_pattern = glob.has_magic(os.fspath(given[0])) and not os.path.exists(given[0])
+    return not is_pattern and Path(given[0]).suffix.lower() not in RECORDINGS
+
+
+def _matches(given: str | os.PathLike) -> list[Path]:
+    """The paths that a path or pattern names, in natural order."""
+    if os.path.exists(given):
+        return [Path(given)]
+    pattern = os.fspath(given)
+    paths = sorted(map(Path, glob.glob(pattern, recursive=True)), key=natural_key)
+    if not paths:
+        problem = "no file has such a name" if glob.has_magic(pattern) else "no such file or folder"
+        raise file_error(given, f"{problem}; expected point files, a folder of them or a recording: check the path")
+    return paths
+
+
+def _open_all(
+    name: str, paths: Sequence[Path], *, columns: int | None, topic: str | None, name_times: bool
+) -> Recording:
+    """Files of points are one recording together, anything else is one of its own."""
+    files = [path for path in paths if path.is_file() and path.suffix.lower() not in RECORDINGS]
+    others = sorted((path for path in paths if path not in files), key=natural_key)
+    parts: list[Recording] = []
+    if files:
+        parts.append(open_files(name, files, columns=columns, name_times=name_times))
+    for path in others:
+        if path.is_dir():
+            parts.append(_open_folder(path, columns=columns, topic=topic, name_times=name_times))
+        else:
+            parts.append(_reader(_READERS[path.suffix.lower()]).open_recording(path, topic=topic))
+    return parts[0] if len(parts) == 1 else ChainedRecording(name, parts)
+
+
+def _open_folder(folder: Path, *, columns: int | None, topic: str | None, name_times: bool) -> Recording:
+    for content, module in _LAYOUTS.items():
+        if (folder / content).exists():
+            return _reader(module).open_recording(folder, topic=topic)
+    files, warnings = scan_files(folder, RECORDINGS)
+    if files[0].suffix.lower() in RECORDINGS:
+        return _open_all(str(folder), files, columns=columns, topic=topic, name_times=name_times)
+    recording = open_files(str(folder), files, columns=columns, name_times=name_times)
+    recording.warnings += warnings
+    return recording
+
+
+def _reader(module: str):
+    return import_module(f"lidarpose.io.sources.{module}")

@@ -1,0 +1,137 @@
+"""Point files as frames: which of a folder are read, in which order, and which times their names tell."""
+
+import os
+import re
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from lidarpose.errors import LidarPoseError
+from lidarpose.io.files import file_error, shorten
+from lidarpose.io.point_cloud import SUFFIXES, read_points
+from lidarpose.io.sources.frame import IndexedRecording, Sweep
+
+# files of text may be notes, tables or labels: they are points where nothing else is
+_TEXT = (".csv", ".txt", ".xyz")
+# of files without a header the width of a row is taken from the first that can be read, among so many
+_MOST_TRIED = 10
+
+# a name that ends in seconds since 1970, with or without a fraction, or in milli-, micro- or nanoseconds
+_TIME = re.compile(r"(.*\D|)(\d{10}|\d{13}|\d{16}|\d{19})(?:(?<!\d{11})([._])(\d{1,9}))?")
+# 2001 to 2033; 16 digits that are a date are larger
+_FIRST_TIME, _LAST_TIME = 1e9, 2e9
+
+
+def natural_key(path: str | os.PathLike) -> tuple:
+    """To sort names by the numbers in them: frame_2 before frame_10."""
+    name = os.fspath(path)
+    parts = re.split(r"([0-9]+)", name)
+    return [int(part) if i % 2 else part.lower() for i, part in enumerate(parts)], name
+
+
+def list_folder(folder: Path) -> list[Path]:
+    """What is in a folder, but for hidden names, in natural order. Raises InputError."""
+    try:
+        return sorted((path for path in folder.iterdir() if not path.name.startswith(".")), key=natural_key)
+    except OSError as error:
+        raise file_error(folder, f"cannot be listed ({error.strerror or error}); check its rights") from None
+
+
+def scan_files(folder: Path, other: Sequence[str] = ()) -> tuple[list[Path], list[str]]:
+    """The point files of a folder in natural order, and warnings.
+
+    They are those of its commonest suffix, text only where nothing else is. Files of suffixes in `other`, if there are
+    any, come before text.
+
+    Raises InputError, which says what is there, where there is none.
+    """
+    entries = list_folder(folder)
+    files = [path for path in entries if path.is_file() and path.suffix.lower() in (*SUFFIXES, *other)]
+    counts = Counter(path.suffix.lower() for path in files)
+    if not counts:
+        came = describe(entries)
+        raise file_error(folder, f"expected point files ({' '.join((*SUFFIXES, *other))}), got {came}")
+
+    def rank(suffix: str) -> tuple[int, int]:
+        return 2 if suffix in _TEXT else 1 if suffix in other else 0, -counts[suffix]
+
+    suffix, *left_out = sorted(counts, key=rank)
+    warnings = []
+    if left_out and not set(left_out) <= set(_TEXT):
+        names = " and ".join(f"{counts[suffix]} {suffix}" for suffix in left_out)
+        warnings.append(f"only its {counts[suffix]} {suffix} files are read, not {names}: name those by a pattern")
+    return [path for path in files if path.suffix.lower() == suffix], warnings
+
+
+def describe(entries: Sequence[Path]) -> str:
+    """What a folder holds, for an error."""
+    if not entries:
+        return "an empty folder"
+    folders = [path.name for path in entries if path.is_dir()]
+    kinds = Counter(path.suffix.lower() or "without a suffix" for path in entries if path.name not in folders)
+    parts = [f"{count} {kind}" for kind, count in kinds.most_common(5)]
+    if folders:
+        parts.append(f"{len(folders)} folders ({shorten(', '.join(folders), 60)}), of which you may name one")
+    return f"a folder with {', '.join(parts)}"
+
+
+def open_files(name: str, paths: Sequence[Path], *, columns: int | None, name_times: bool) -> IndexedRecording:
+    """Point files, a frame each, in natural order or, where their names are plainly times, in that of time.
+
+    columns: values a row of .bin files; from the first of them where it is None.
+    name_times: whether times are taken from the names.
+    """
+    paths, times = in_order(paths)
+    suffixes = sorted({path.suffix.lower() for path in paths})
+    warnings = [f"mixes {', '.join(suffixes)} files: one sensor is assumed"] if len(suffixes) > 1 else []
+    if columns is None and ".bin" in suffixes:
+        columns, notes = _columns_of([path for path in paths if path.suffix.lower() == ".bin"])
+        warnings += notes
+    ids = [scan_id(path) for path in paths]
+    if len(set(ids)) < len(ids):
+        common = os.path.commonpath([path.parent for path in paths])
+        ids = [os.path.relpath(path, common) for path in paths]
+
+    def read(i: int) -> Sweep:
+        cloud = read_points(paths[i], columns=columns)
+        return Sweep(points=cloud.points, warnings=cloud.warnings)
+
+    return IndexedRecording(name=name, ids=ids, times=times if name_times else None, read=read, warnings=warnings)
+
+
+def scan_id(path: Path) -> str:
+    """A file's name without its suffix, .pcd.bin being one."""
+    return path.stem.removesuffix(".pcd") if path.suffix.lower() == ".bin" else path.stem
+
+
+def in_order(paths: Sequence[Path]) -> tuple[list[Path], list[float] | None]:
+    """Paths in natural order, and None; or in that of times, in s since 1970, where the names are plainly such."""
+    natural = sorted(paths, key=natural_key)
+    matches = [_TIME.fullmatch(scan_id(path)) for path in natural]
+    found = [match.groups() for match in matches if match]
+    # of 1700000000_5 and 1700000000_10 nobody knows whether nanoseconds or tenths follow
+    if len(found) < len(natural) or len({len(part) for *_, mark, part in found if mark == "_"}) > 1:
+        return natural, None
+    seconds = [_seconds(whole, part or "") for _, whole, _, part in found]
+    # 1700000000.5 is later than 1700000000.25, though 5 is before 25
+    rows = sorted(range(len(natural)), key=lambda row: (natural_key(found[row][0]), seconds[row]))
+    times = [seconds[row] for row in rows]
+    rising = all(earlier < later for earlier, later in zip(times, times[1:], strict=False))
+    if not rising or not _FIRST_TIME <= times[0] <= times[-1] <= _LAST_TIME:
+        return natural, None
+    return [natural[row] for row in rows], times
+
+
+def _seconds(whole: str, fraction: str) -> float:
+    return float(f"{whole[:10]}.{whole[10:]}{fraction}")
+
+
+def _columns_of(paths: Sequence[Path]) -> tuple[int | None, list[str]]:
+    """Values a row of raw float32, and what was assumed, by the first file that can be read."""
+    for path in paths[:_MOST_TRIED]:
+        try:
+            cloud = read_points(path)
+        except LidarPoseError:
+            continue
+        return len(cloud.fields), [line for line in cloud.warnings if line.startswith("read as rows")]
+    return None, []

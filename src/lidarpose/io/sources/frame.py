@@ -1,0 +1,275 @@
+"""Frames, and the sources that they come from: what every kind of recording is made into."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+
+from lidarpose.errors import InputError, LidarPoseError, MissingExtra, check_finite, check_int
+from lidarpose.io.files import FormatError, file_error, one_line, shorten
+
+# frames a second where a source has no times
+DEFAULT_RATE = 10.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Frame:
+    """One frame of a source: what a sensor saw in one turn.
+
+    Args:
+        points: (n, 3) float64 m in the sensor's frame, finite; rows 0, 0, 0, which are no returns, are left out.
+        index: its number in the source, from 0; damaged frames count.
+        id: its name in the source, e.g. the stem of its file.
+        time: s; from `index` and the rate where the source has no times.
+        T_world_sensor: (4, 4) m, or None where the sensor's pose is not known; z of the world is up.
+        origin: (3,) m, the sensor's place in the points' frame; None where it is not known.
+        ring: (n,) the beam of each point, or None.
+        warnings: lines about this frame.
+    """
+
+    points: np.ndarray
+    index: int
+    id: str
+    time: float | None = None
+    T_world_sensor: np.ndarray | None = None
+    origin: np.ndarray | None = None
+    ring: np.ndarray | None = None
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class DamagedFrame:
+    """A frame that cannot be read, and why: one line. The frames after it are read."""
+
+    index: int
+    id: str
+    time: float | None = None
+    error: str
+
+
+class Source(Protocol):
+    """Frames in order, one in memory at a time, as often as wanted.
+
+    `name` is that of the file or folder, `count` the number of frames if it is known before they are read, `warnings`
+    are lines about the source as a whole; some are only known after iterating. `frames(first)` begins with the frame
+    of this index, without reading those before; iterating is `frames(0)`.
+    """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def count(self) -> int | None: ...
+
+    @property
+    def warnings(self) -> tuple[str, ...]: ...
+
+    def frames(self, first: int = 0) -> Iterator[Frame | DamagedFrame]: ...
+
+    def __iter__(self) -> Iterator[Frame | DamagedFrame]: ...
+
+
+# ---- what the readers of each format make
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sweep:
+    """A frame as a reader decodes it: `Frame` without its place in the source, rows that are no returns included."""
+
+    points: np.ndarray
+    T_world_sensor: np.ndarray | None = None
+    origin: np.ndarray | None = None
+    ring: np.ndarray | None = None
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class LazyFrame:
+    """A frame that is there but not decoded: its name, its time in s if recorded, and `read`, which decodes it and
+    raises InputError or FormatError where it is damaged."""
+
+    id: str
+    time: float | None
+    read: Callable[[], Sweep]
+
+
+class Recording(Protocol):
+    """What the reader of a format makes of a file or folder: frames not yet decoded, as often as wanted.
+
+    `warnings` may grow while frames are read. An InputError after the first frame ends the recording there, and is
+    told as a damaged frame.
+    """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def count(self) -> int | None: ...
+
+    @property
+    def warnings(self) -> Sequence[str]: ...
+
+    def lazy_frames(self, first: int = 0) -> Iterator[LazyFrame]: ...
+
+
+@dataclass(kw_only=True, eq=False)
+class IndexedRecording:
+    """A recording whose frames can be read in any order.
+
+    ids and, where recorded, times in s of all frames; read(i) decodes frame i.
+    """
+
+    name: str
+    ids: Sequence[str]
+    times: Sequence[float] | None
+    read: Callable[[int], Sweep]
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def count(self) -> int:
+        return len(self.ids)
+
+    def lazy_frames(self, first: int = 0) -> Iterator[LazyFrame]:
+        for i in range(first, len(self.ids)):
+            yield LazyFrame(self.ids[i], None if self.times is None else float(self.times[i]), partial(self.read, i))
+
+
+class ChainedRecording:
+    """Several recordings one after the other. Ids begin with the recording's name; times are dropped unless all have
+    them."""
+
+    def __init__(self, name: str, parts: Sequence[Recording]):
+        self.name = name
+        self.parts = parts
+        firsts = [next(part.lazy_frames(), None) for part in parts]
+        self._has_times = all(first is None or first.time is not None for first in firsts)
+
+    @property
+    def warnings(self) -> list[str]:
+        return [f"{part.name}: {line}" for part in self.parts for line in part.warnings]
+
+    @property
+    def count(self) -> int | None:
+        counts = [part.count for part in self.parts]
+        return None if None in counts else sum(filter(None, counts))
+
+    def lazy_frames(self, first: int = 0) -> Iterator[LazyFrame]:
+        for part in self.parts:
+            if first:
+                length = sum(1 for _ in part.lazy_frames()) if part.count is None else part.count
+                if first >= length:
+                    first -= length
+                    continue
+            for frame in part.lazy_frames(first):
+                yield LazyFrame(f"{part.name}/{frame.id}", frame.time if self._has_times else None, frame.read)
+            first = 0
+
+
+# ---- the source that users see
+
+
+class FrameSource:
+    """The frames of a recording within a span of time, of every so many. A `Source`.
+
+    Args:
+        rate: frames a second, where frames have no times; 10 by default.
+        start, end: s from the first frame. The first frame past `end` ends the source.
+        every: only frames whose index is a multiple of it.
+
+    Raises:
+        InputError: an option that makes no sense, or a recording without frames.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        *,
+        rate: float | None = None,
+        start: float | None = None,
+        end: float | None = None,
+        every: int = 1,
+    ):
+        for name, value in (("rate", rate), ("start", start), ("end", end)):
+            if value is not None:
+                check_finite(name, value)
+        if rate is not None and rate <= 0:
+            raise InputError(f"rate must be positive, frames a second, got {rate!r}")
+        if end is not None and end <= (start or 0):
+            raise InputError(f"end must be later than start, seconds from the first frame, got {start!r} to {end!r}")
+        self.name = recording.name
+        self.recording = recording
+        self.rate = rate or DEFAULT_RATE
+        self.start, self.end = start, end
+        self.every = check_int("every", every, least=1)
+        first = next(recording.lazy_frames(), None)
+        if first is None:
+            raise file_error(recording.name, "has no frames; expected at least one: was it recorded completely?")
+        self._first_time = first.time
+        self._notes: list[str] = []
+        if first.time is None and recording.count != 1 and rate is None:
+            self._notes.append(f"has no times: taken as {DEFAULT_RATE:g} frames a second (give rate for another)")
+        self._num_back = 0
+
+    @property
+    def count(self) -> int | None:
+        """Frames, damaged ones too; None where only reading will tell."""
+        count = self.recording.count
+        return None if count is None or self.start or self.end is not None else -(-count // self.every)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Lines about the source as a whole, as far as it was read."""
+        back = [f"time jumps back {self._num_back} times: the order of the recording is kept"] if self._num_back else []
+        return (*self.recording.warnings, *self._notes, *back)
+
+    def __iter__(self) -> Iterator[Frame | DamagedFrame]:
+        return self.frames()
+
+    def frames(self, first: int = 0) -> Iterator[Frame | DamagedFrame]:
+        """The frames from index `first` on."""
+        self._num_back = 0
+        last_time = -np.inf
+        index = first - 1
+        try:
+            for index, lazy in enumerate(self.recording.lazy_frames(first), first):
+                time = index / self.rate if self._first_time is None else lazy.time
+                if time is not None:
+                    self._num_back += time < last_time
+                    last_time = time
+                    since = time - (self._first_time or 0.0)
+                    if self.end is not None and since > self.end:
+                        return
+                    if self.start is not None and since < self.start:
+                        continue
+                if index % self.every == 0:
+                    yield _read(lazy, index, time)
+        except LidarPoseError as error:
+            if index < 0 or isinstance(error, MissingExtra):
+                raise
+            yield DamagedFrame(index=index + 1, id="", error=f"the recording ends here: {error}")
+
+
+def _read(lazy: LazyFrame, index: int, time: float | None) -> Frame | DamagedFrame:
+    try:
+        sweep = lazy.read()
+    except MissingExtra:
+        raise
+    except (LidarPoseError, FormatError) as error:
+        return DamagedFrame(index=index, id=lazy.id, time=time, error=one_line(str(error)))
+    except Exception as error:
+        reason = shorten(f"{type(error).__name__}: {error}")
+        return DamagedFrame(index=index, id=lazy.id, time=time, error=one_line(f"cannot be read ({reason})"))
+    points = np.asarray(sweep.points, np.float64)
+    is_return = np.isfinite(points).all(1) & points.any(1)
+    return Frame(
+        points=points[is_return],
+        index=index,
+        id=lazy.id,
+        time=time,
+        T_world_sensor=sweep.T_world_sensor,
+        origin=sweep.origin,
+        ring=None if sweep.ring is None else sweep.ring[is_return],
+        warnings=sweep.warnings,
+    )
