@@ -31,6 +31,10 @@ _EXTRA_OF = {
     "pyarrow": "synth",
     "onnx": "export",
     "onnxscript": "export",
+    "rosbags": "recordings",
+    "laspy": "recordings",
+    "lazrs": "recordings",
+    "velodyne_decoder": "recordings",
 }
 
 
