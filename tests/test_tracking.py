@@ -160,3 +160,12 @@ def test_a_stored_state_goes_on_the_same(seed, cut):
     for time, boxes in frames[cut:]:
         assert again.update(time, boxes) == tracker.update(time, boxes)
     assert again.state() == tracker.state()
+
+
+def test_weak_boxes_continue_tracks_and_begin_none():
+    tracker = Tracker()
+    assert tracker.update(0.0, [person(0, score=0.9)], [person(5, score=0.3)]) == [0, -1]
+    assert tracker.update(0.1, [], [person(5, score=0.3), person(0.1, score=0.2)]) == [-1, 0]
+    assert tracker.update(0.2, [person(5, score=0.9)], [person(0.2, score=0.2)]) == [1, 0]
+    # what is sure goes before
+    assert tracker.update(0.3, [person(0.32, score=0.9)], [person(0.3, score=0.2)]) == [0, -1]

@@ -26,6 +26,8 @@ _SPEED_SD, _SPEED_CHANGE = np.array([1.5, 1.5, 0.2]), np.array([1.0, 1.0, 0.15])
 _GATE = 16.3
 # nor does a box go to somebody who may be anywhere: bound of -2 log likelihood, less a constant
 _LEAST_LIKELY = 8.0
+# what more a weak box has to make up for
+_WEAK = 3.0
 # heading and size follow what is seen with this time constant, s
 _SMOOTHING = 0.5
 # who was seen once, with a score below this, is forgotten this soon, s
@@ -101,32 +103,34 @@ class Tracker:
         self.jumps_back = 0
         self._time: float | None = None
         self._next_id = 0
-        self._tracks = _of_boxes([], 0)
+        self._tracks = _of_boxes([])
 
-    def update(self, time: float, boxes: Sequence[Box]) -> list[int]:
+    def update(self, time: float, boxes: Sequence[Box], weak_boxes: Sequence[Box] = ()) -> list[int]:
         """The boxes of a frame.
 
         Args:
             time: s, of any beginning. One earlier than the last is counted; by more than `max_gap` it begins anew.
             boxes: those of all people who are seen.
+            weak_boxes: those that may be people, of low score: they continue tracks and begin none.
 
         Returns:
-            The id of each box's track: a known person's, or the next number, from 0; a number is never used again.
+            The id of the track of each of `boxes`: a known person's, or the next number, from 0; a number is never used
+            again. Then the ids of `weak_boxes`, -1 where they are nobody's.
 
         Raises:
             InputError: time is no finite number.
         """
         tracks = self._elapsed(time)
-        found = _of_boxes(boxes, self._next_id)
-        rows, columns = assign(_costs(tracks, found))
+        found = _of_boxes([*boxes, *weak_boxes])
+        is_weak = np.arange(len(found)) >= len(boxes)
+        rows, columns = assign(_costs(tracks, found, is_weak))
         _correct(tracks, rows, found, columns)
-        ids = found.id
-        new = np.setdiff1d(np.arange(len(boxes)), columns)
-        ids[new] = self._next_id + np.arange(len(new))
-        ids[columns] = tracks.id[rows]
+        found.id[columns] = tracks.id[rows]
+        new = np.setdiff1d(np.flatnonzero(~is_weak), columns)
+        found.id[new] = self._next_id + np.arange(len(new))
         self._next_id += len(new)
         self._tracks = tracks.joined(found.take(new))
-        return ids.tolist()
+        return found.id.tolist()
 
     def predicted(self, time: float) -> list[TrackState]:
         """The people expected at a time, s, not before the last frame's: those who were seen twice or for sure."""
@@ -181,8 +185,8 @@ class Tracker:
         return tracks.take(alive)
 
 
-def _of_boxes(boxes: Sequence[Box], first_id: int) -> _Tracks:
-    """Tracks that begin with boxes."""
+def _of_boxes(boxes: Sequence[Box]) -> _Tracks:
+    """Tracks that begin with boxes, without numbers: -1."""
     count = len(boxes)
     state = np.zeros((count, 3, 2))
     state[:, :, 0] = np.reshape([box.center for box in boxes], (-1, 3))
@@ -192,7 +196,7 @@ def _of_boxes(boxes: Sequence[Box], first_id: int) -> _Tracks:
     covariance[..., 0, 0] = _POSITION_SD**2
     covariance[..., 1, 1] = _SPEED_SD**2
     return _Tracks(
-        id=first_id + np.arange(count),
+        id=np.full(count, -1),
         state=state,
         covariance=covariance,
         heading=np.stack([np.cos(yaw), np.sin(yaw)], 1),
@@ -203,12 +207,12 @@ def _of_boxes(boxes: Sequence[Box], first_id: int) -> _Tracks:
     )
 
 
-def _costs(tracks: _Tracks, found: _Tracks) -> np.ndarray:
+def _costs(tracks: _Tracks, found: _Tracks, is_weak: np.ndarray) -> np.ndarray:
     """(N, B): what it costs that a track has a box, below 0 where that is better than neither; inf where it cannot."""
     off = found.state[None, :, :, 0] - tracks.state[:, None, :, 0]
     variance = tracks.covariance[:, None, :, 0, 0] + found.covariance[None, :, :, 0, 0]
     distance = (off**2 / variance).sum(-1)
-    cost = distance + np.log(variance).sum(-1) - _LEAST_LIKELY
+    cost = distance + np.log(variance).sum(-1) - _LEAST_LIKELY + _WEAK * is_weak
     return np.where((distance < _GATE) & (cost < 0), cost, np.inf)
 
 
