@@ -45,9 +45,9 @@ _ENOUGH = 100_000
 _COLUMN, _BELOW, _ABOVE = 0.6, 0.15, 0.25
 # points around a detection that its final box may hold, m to each side
 _AROUND = 2.5
-# a box is so much larger than the joints on each side, m, and so many times their spread, and no more than that; it
-# ends half way to the next person, less half a body
-_ROOM, _ROOM_PER_SPREAD, _MOST_ROOM, _HALF_BODY = 0.1, 2.0, 0.6, 0.25
+# a box is so much larger than the joints on each side, m, beside another person no more than this; it ends half way to
+# the next person, less half a body
+_ROOM, _LEAST_ROOM, _HALF_BODY = 0.15, 0.1, 0.25
 # of two people whose pelvises are nearer than this the less certain one is the same person, m
 _SAME_PERSON = 0.3
 # less of a scan on its background, as a share, and it is the background of something else
@@ -321,12 +321,11 @@ def _verified(
         is_new = not (np.linalg.norm(pelvis[chosen] - pelvis[i], axis=1) < _SAME_PERSON).any()
         if scores[i] >= least and is_new and not np.isnan(pelvis[i]).any():
             chosen.append(int(i))
-    spread = np.exp(features[:, FEATURES.index("log_spread")])
     boxes: list[Box] = []
     rows: list[np.ndarray] = []
     for i in chosen:
         others = [np.hypot(*(pelvis[k] - pelvis[i])[:2]) for k in chosen if k != i]
-        box = _box_about(Pose(joints=poses.joints[i], skeleton=poses.skeleton), spread[i], min(others, default=np.inf))
+        box = _box_about(Pose(joints=poses.joints[i], skeleton=poses.skeleton), min(others, default=np.inf))
         inside = box.contains(clouds[i])
         if inside.sum() < MIN_POINTS or len(boxes) == search.max_people:
             continue
@@ -336,18 +335,16 @@ def _verified(
     return boxes, rows
 
 
-def _box_about(pose: Pose, spread: float, alone: float) -> Box:
-    """The box of a person by the pose, joints (J, 3) m, larger the less certain it is; spread m: mean of its joints;
-    alone m: distance to the next person, who is to be kept out."""
+def _box_about(pose: Pose, alone: float) -> Box:
+    """The box of a person by the pose, joints (J, 3) m; alone m: distance to the next person, who is to be kept out."""
     forward = facing(pose)
     yaw = 0.0 if forward is None else float(np.arctan2(forward[1], forward[0]))
     c, s = np.cos(yaw), np.sin(yaw)
     R_level_own = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     own = pose.joints @ R_level_own
-    room = min(_ROOM + _ROOM_PER_SPREAD * spread, _MOST_ROOM)
-    beside = max(_ROOM, min(room, alone / 2 - _HALF_BODY))
+    beside = max(_LEAST_ROOM, min(_ROOM, alone / 2 - _HALF_BODY))
     # soles are nearer to the lowest joint than the top of the head to the highest
-    low, high = own.min(0) - [beside, beside, 0.8 * room], own.max(0) + [beside, beside, 1.2 * room]
+    low, high = own.min(0) - [beside, beside, 0.8 * _ROOM], own.max(0) + [beside, beside, 1.2 * _ROOM]
     return _rounded(Box(center=R_level_own @ ((low + high) / 2), size=high - low, yaw=yaw))
 
 
