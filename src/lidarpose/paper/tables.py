@@ -24,8 +24,9 @@ _SEEDS = {"train": 1_000_003, "test": 1_000_033}
 # sensors of the stand-in's target, none of them the pre-training's
 _SENSORS = "waymo-top,os1-128,hdl-64e,vlp-32c"
 _CLIP = 16
-# published rates are those of the full size
+# published rates and schedules are those of the full sizes and of many more steps
 _RATES = {PAPER: (), SMALL_PAPER: ("--rate", "2e-3")}
+_ONE_CYCLE = (*_RATES[SMALL_PAPER], "--schedule", "cosine", "--warmup", "0.04")
 _KEPT = ("0.5", "0.6", "0.7", "0.8", "0.9")
 # r_keep of the recipe, which needs no option
 _RECIPE_KEEP = "0.6"
@@ -267,8 +268,11 @@ def _methods(options: Options) -> list[Row]:
 
 
 def _baseline(options: Options, model: str) -> tuple[str, ...]:
-    """Options of a baseline's training, at the width that goes with the size of the paper's network."""
-    return ("--model", model, "--size", model if options.size == PAPER else f"{model}-small")
+    """Options of a baseline's training, at the width that goes with the size of the paper's network; the reduced ones
+    by the cycle of rates that the paper's network has."""
+    if options.size == PAPER:
+        return ("--model", model, "--size", model)
+    return ("--model", model, "--size", f"{model}-small", *_ONE_CYCLE)
 
 
 def _of_clips(options: Options, name: str, *published: float) -> Row:
