@@ -1,6 +1,7 @@
 """From a user's cloud to one person's points: what an array must be, and where the person may stand."""
 
 import os
+import reprlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -14,6 +15,8 @@ from lidarpose.io.files import FormatError, one_line
 from lidarpose.io.text import is_transposed, pick_xyz
 from lidarpose.sample import CLIP_FRAMES, FARTHEST, MIN_POINTS, center_of, within_reach
 
+# frames a second of a clip without times
+CLIP_RATE = 10.0
 # a person of more points is thinned: no sensor sees so many, and no voxel needs them
 MAX_POINTS = 50_000
 
@@ -126,6 +129,22 @@ def _by_name(points: Any, what: str) -> Any:
     except (FormatError, ValueError) as problem:
         # two columns of one name cannot be told apart
         raise InputError(f"{what}: {problem}") from None
+
+
+def clip_times(times: Any, count: int) -> np.ndarray:
+    """(T,) s of so many frames; None is ten a second. Raises InputError for anything but times that increase."""
+    if times is None:
+        return np.arange(count) / CLIP_RATE
+    try:
+        seconds = np.asarray(times, float)
+    except (TypeError, ValueError):
+        seconds = np.full(0, np.nan)
+    if seconds.shape != (count,) or not (np.isfinite(seconds).all() and (np.diff(seconds) > 0).all()):
+        raise InputError(
+            f"times: expected {count} finite numbers of seconds, one a cloud, each later than the one before, "
+            f"got {reprlib.repr(times)}"
+        )
+    return seconds
 
 
 def as_origin(value: object) -> np.ndarray | None:

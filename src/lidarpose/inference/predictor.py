@@ -13,7 +13,16 @@ from lidarpose.errors import InputError, check_int, check_name, missing_extra
 from lidarpose.geometry import UP_AXES, rotation_from_up
 from lidarpose.inference.backend import Backend, OnnxBackend, estimates, exported_beside
 from lidarpose.inference.checks import UPSIDE_DOWN, looks_unsure, oversize_warning, unit_warning, upside_down_warning
-from lidarpose.inference.inputs import Clips, as_origin, as_points, candidates, clean, is_few, only_returns
+from lidarpose.inference.inputs import (
+    Clips,
+    as_origin,
+    as_points,
+    candidates,
+    clean,
+    clip_times,
+    is_few,
+    only_returns,
+)
 from lidarpose.inference.results import PersonPose, Poses, first_names
 from lidarpose.inference.scan import Scan, pose_scan, read_scan
 from lidarpose.inference.tta import TTATransform, apply, average, invert, tta_transforms
@@ -27,6 +36,9 @@ from lidarpose.progress import Progress
 from lidarpose.sample import MIN_POINTS, PER_JOINT, Box, Pose, center_of
 from lidarpose.skeleton import SMPL24, Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
+from lidarpose.tracking.clip import TrackPoses
+from lidarpose.tracking.live import follow
+from lidarpose.tracking.smoothing import smooth
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -298,6 +310,38 @@ class Predictor:
         people = self._people(clouds, origin, wanted, progress, clips)
         return Poses(people=tuple(people), skeleton=wanted, model=self.model)
 
+    def predict_clip(
+        self,
+        clouds: "Sequence[ArrayLike]",
+        times: "Sequence[float] | np.ndarray | None" = None,
+        sensor_origin: "np.ndarray | Sequence[float] | str | None" = None,
+        skeleton: str | None = None,
+        live: bool = False,
+        progress: bool = False,
+    ) -> Poses:
+        """One person through frames: steady poses, as many as clouds, whose ids are the frames' numbers.
+
+        clouds: (n, 3+) m each, of one person in a frame of coordinates that stays where it is, as in `predict`; one
+        without points is a frame in which the person was not seen, whose joints are filled in within gaps of up to 2 s.
+        times (T,) s, each later than the one before; None: ten frames a second. live: each pose from its own frame and
+        those before only, as it would come from a running sensor. Raises InputError as `predict` does, and for other
+        times.
+        """
+        wanted = self.in_skeleton(skeleton)
+        if not _is_many(clouds):
+            raise InputError("predict_clip: expected a list of clouds, one a frame, got one cloud: use predict")
+        seconds = clip_times(times, len(clouds))
+        clips = Clips.of_run(len(clouds)) if len(clouds) and getattr(self.backend, "frames", 1) > 1 else None
+        each = [as_points(cloud, f"clouds[{i}]") for i, cloud in enumerate(clouds)]
+        people = self._people(each, as_origin(sensor_origin), wanted, progress, clips)
+        track = TrackPoses.of_poses(seconds, [person.pose for person in people], wanted)
+        steady = follow(track) if live else smooth(track).poses()
+        frames = [
+            replace(person, id=i, pose=pose, warnings=_steady_warnings(person, pose))
+            for i, (person, pose) in enumerate(zip(people, steady, strict=True))
+        ]
+        return Poses(people=tuple(frames), skeleton=wanted, model=self.model)
+
     def _people(self, clouds, origin, wanted, progress, clips=None) -> list[PersonPose]:
         cleaned = [clean(cloud) for cloud in clouds]
         usable = {}
@@ -438,6 +482,13 @@ def _range_warning(pose: Pose) -> str | None:
         return None
     names = [name for name, inside in zip(pose.skeleton.joints, pose.in_range, strict=True) if not inside]
     return f"at the end of the heatmap's range, so perhaps farther out than given: {first_names(names)}"
+
+
+def _steady_warnings(person: PersonPose, pose: Pose | None) -> tuple[str, ...]:
+    """What is to be said of a frame of a clip whose pose became another."""
+    if person.pose is not None or pose is None:
+        return person.warnings
+    return ("filled in from other frames: the person was not seen in this one",)
 
 
 def _is_many(points) -> bool:

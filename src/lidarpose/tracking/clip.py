@@ -1,0 +1,82 @@
+"""One person's poses over time, as smoothing takes and gives them."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from lidarpose.errors import InputError
+from lidarpose.sample import Pose
+from lidarpose.skeleton import Skeleton
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrackPoses:
+    """One person through T frames, in a frame of coordinates that stays where it is (z up).
+
+    times (T,) s, increasing; joints (T, J, 3) m, NaN where the person was not seen; spread (T, J) m, the expected
+    distance between joint and truth, or None; visible, confidence (T, J) in [0, 1] or None; filled (T,) bool: frames
+    whose joints were filled in from the frames before and after, none by default.
+    """
+
+    times: np.ndarray
+    joints: np.ndarray
+    skeleton: Skeleton
+    spread: np.ndarray | None = None
+    visible: np.ndarray | None = None
+    confidence: np.ndarray | None = None
+    filled: np.ndarray | None = None
+
+    def __post_init__(self):
+        shape = (len(self.times), len(self.skeleton))
+        if self.joints.shape != (*shape, 3):
+            raise InputError(f"TrackPoses.joints must be {(*shape, 3)}, got {self.joints.shape}")
+        for name in ("spread", "visible", "confidence"):
+            value = getattr(self, name)
+            if value is not None and value.shape != shape:
+                raise InputError(f"TrackPoses.{name} must be {shape}, one a joint, got {value.shape}")
+        if not (np.isfinite(self.times).all() and (np.diff(self.times) > 0).all()):
+            raise InputError("TrackPoses.times must be finite seconds, each later than the one before")
+        if self.filled is None:
+            object.__setattr__(self, "filled", np.zeros(len(self.times), bool))
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @property
+    def seen(self) -> np.ndarray:
+        """(T,) bool: frames with joints."""
+        return np.isfinite(self.joints).all((1, 2))
+
+    @classmethod
+    def of_poses(cls, times: np.ndarray, poses: list[Pose | None], skeleton: Skeleton) -> "TrackPoses":
+        """From a pose a frame, None where the person was not seen."""
+        seen = [pose for pose in poses if pose is not None]
+        values: dict[str, Any] = {}
+        for name, tail in (("joints", (3,)), ("spread", ()), ("visible", ()), ("confidence", ())):
+            if name != "joints" and (not seen or any(getattr(pose, name) is None for pose in seen)):
+                continue
+            values[name] = np.full((len(poses), len(skeleton), *tail), np.nan)
+            for row, pose in enumerate(poses):
+                if pose is not None:
+                    values[name][row] = getattr(pose, name)
+        return cls(times=np.asarray(times, float), skeleton=skeleton, **values)
+
+    def pose(self, row: int) -> Pose | None:
+        """The pose of a frame, None where there is none."""
+        if not np.isfinite(self.joints[row]).all():
+            return None
+        values = {name: getattr(self, name) for name in ("spread", "visible", "confidence")}
+        of_frame: dict[str, Any] = {name: None if value is None else value[row] for name, value in values.items()}
+        return Pose(joints=self.joints[row], skeleton=self.skeleton, **of_frame)
+
+    def poses(self) -> list[Pose | None]:
+        """The pose of each frame."""
+        return [self.pose(row) for row in range(len(self))]
+
+    def rows(self, which: np.ndarray | slice) -> "TrackPoses":
+        """Some of the frames."""
+        names = ("times", "joints", "spread", "visible", "confidence", "filled")
+        values = {name: getattr(self, name) for name in names}
+        picked: dict[str, Any] = {name: None if value is None else value[which] for name, value in values.items()}
+        return replace(self, **picked)

@@ -1,0 +1,155 @@
+"""Poses steady over a track: the smoother, the live filter, and clips of one person."""
+
+import json
+
+import numpy as np
+import pytest
+
+from lidarpose.errors import InputError
+from lidarpose.inference.inputs import clip_times
+from lidarpose.inference.predictor import load
+from lidarpose.skeleton import SKELETONS, SMPL24
+from lidarpose.tracking.clip import TrackPoses
+from lidarpose.tracking.live import LiveFilter, follow
+from lidarpose.tracking.motion_model import smooth_joints
+from lidarpose.tracking.smoothing import smooth
+
+
+def rest_pose(skeleton):
+    """(J, 3) m: a standing person of the skeleton, facing +x."""
+    from lidarpose.body.rig import mean_adult_joints
+
+    joints = mean_adult_joints()
+    head = joints[SMPL24.index("head")]
+    joints = np.concatenate([joints, [head + [0.11, 0, 0.06], head + [0, 0, 0.1]]])
+    return joints[[SKELETONS["body26"].index(name) for name in skeleton.joints]]
+
+
+@pytest.fixture(scope="module")
+def walker():
+    """(skeleton, seed) -> true joints of somebody who walks in a curve, and a track of noisy poses of them."""
+
+    def made(skeleton=SMPL24, frames=40, noise=0.05, seed=0):
+        rng = np.random.default_rng(seed)
+        times = np.arange(frames) / 10
+        angle = 0.3 * times
+        turn = np.stack([np.cos(angle), -np.sin(angle), 0 * angle, np.sin(angle), np.cos(angle), 0 * angle], -1)
+        turn = np.concatenate([turn, np.broadcast_to([0, 0, 1], (frames, 3))], -1).reshape(frames, 3, 3)
+        place = np.stack([4 * np.sin(angle), 4 - 4 * np.cos(angle), 0 * angle], -1) + [10, 3, -1]
+        true = np.einsum("tij,kj->tki", turn, rest_pose(skeleton)) + place[:, None]
+        spread = rng.uniform(0.5, 1.5, true.shape[:2]) * noise
+        joints = true + rng.normal(size=true.shape) * spread[..., None] / 1.6
+        known = {"visible": np.full(spread.shape, 0.9), "confidence": np.full(spread.shape, 0.8)}
+        return true, TrackPoses(times=times, joints=joints, spread=spread, skeleton=skeleton, **known)
+
+    return made
+
+
+def test_paths_are_those_of_one_dense_solve(walker):
+    """The filter forth and back finds the least squares' solution, whatever the steps."""
+    from reference.smoothing_reference import smooth_joints_reference
+
+    rng = np.random.default_rng(1)
+    times = np.cumsum(rng.uniform(0.05, 0.3, 12))
+    joints, precision = rng.normal(size=(12, 3, 3)), rng.uniform(50, 500, (12, 3))
+    precision[4:6] = 0
+    strength = rng.uniform(0.01, 1, (12, 3))
+    for fast, slow in zip(
+        smooth_joints(times, joints, precision, strength),
+        smooth_joints_reference(times, joints, precision, strength),
+        strict=True,
+    ):
+        np.testing.assert_allclose(fast, slow, rtol=1e-6, atol=1e-8)
+
+
+def error(joints, true):
+    """Mean distance, and mean distance of second differences, mm."""
+    off = joints - true
+    return [1e3 * np.linalg.norm(v, axis=-1).mean() for v in (off, np.diff(off, 2, axis=0))]
+
+
+@pytest.mark.parametrize("skeleton", SKELETONS.values(), ids=SKELETONS)
+def test_steady_is_nearer_and_smoother(walker, skeleton):
+    true, track = walker(skeleton)
+    before, steady = error(track.joints, true), error(smooth(track).joints, true)
+    assert steady[0] < 0.7 * before[0] and steady[1] < 0.15 * before[1]
+    live = error(np.stack([pose.joints for pose in follow(track)]), true)
+    assert live[0] < before[0] and live[1] < 0.5 * before[1]
+
+
+def test_unseen_frames_are_filled_and_say_so(walker):
+    true, track = walker(frames=60)
+    joints = track.joints.copy()
+    # 0.8 s, 2.9 s, and the end
+    for gap in (slice(5, 13), slice(20, 49), slice(54, 60)):
+        joints[gap] = np.nan
+    given = TrackPoses(
+        times=track.times, joints=joints, spread=track.spread, visible=track.visible, skeleton=track.skeleton
+    )
+    steady = smooth(given)
+    # the long gap only half a second from its ends
+    far = [25 <= i < 44 or i == 59 for i in range(60)]
+    assert [pose is None for pose in steady.poses()] == far
+    assert steady.filled.tolist() == [bool(np.isnan(joints[i]).any()) and not far[i] for i in range(60)]
+    assert np.linalg.norm(steady.joints[5:13] - true[5:13], axis=-1).mean() < 0.1
+    assert steady.spread[9].mean() > 1.5 * steady.spread[[3, 15]].mean()
+    assert (steady.visible[5:13] == 0).all() and (steady.visible[:5] == 0.9).all()
+    live = follow(given)
+    assert live[12] is not None and live[20] is not None and live[48] is None and live[49] is not None
+    assert live[10].spread.mean() > 2 * live[4].spread.mean()
+
+
+def test_the_past_alone_and_a_state_that_goes_on(walker):
+    _, track = walker()
+    whole, poses = follow(track), track.poses()
+    begun = LiveFilter(track.skeleton)
+    for t in range(20):
+        begun.update(track.times[t], poses[t])
+    again = LiveFilter.from_state(json.loads(json.dumps(begun.state())))
+    for t in range(20, 40):
+        np.testing.assert_array_equal(again.update(track.times[t], poses[t]).joints, whole[t].joints)
+
+
+def test_tracks_without_or_with_one_frame(walker):
+    _, track = walker(frames=1)
+    assert np.abs(smooth(track).joints - track.joints).max() < 1e-3
+    nobody = TrackPoses.of_poses(np.arange(3.0), [None] * 3, SMPL24)
+    assert smooth(nobody).poses() == follow(nobody) == [None] * 3
+
+
+def test_times_must_increase():
+    with pytest.raises(InputError, match="later than the one before"):
+        TrackPoses.of_poses(np.array([0.0, 0.0]), [None, None], SMPL24)
+
+
+# ---- of clouds
+
+
+@pytest.fixture(scope="module")
+def clouds():
+    from lidarpose.synth.generator import Generator
+
+    people = Generator(scene="wild", measure=False).clip(3, 0, frames=8, hard=0.0)
+    return [person.sample.points for person in people]
+
+
+def test_a_clip_of_clouds(clouds):
+    model = load("tiny", tta=1)
+    given = [*clouds[:4], np.zeros((0, 3)), *clouds[5:]]
+    steady = model.predict_clip(given, sensor_origin=(0, 0, 0), skeleton="human15")
+    assert len(steady) == 8 and [person.id for person in steady] == list(range(8))
+    assert steady[4].has_pose and steady[4].num_points == 0 and "filled in" in steady[4].warnings[0]
+    assert steady[0].num_points == len(clouds[0]) and steady.skeleton.name == "human15"
+    each = model.predict(given, sensor_origin=(0, 0, 0), skeleton="human15")
+    assert not np.allclose(steady[3].joints, each[3].joints)
+    first = model.predict_clip(given[:3], sensor_origin=(0, 0, 0), live=True)
+    same = model.predict_clip(given, sensor_origin=(0, 0, 0), live=True)
+    np.testing.assert_array_equal(first.to_numpy(), same.to_numpy()[:3])
+    assert len(model.predict_clip([])) == 0
+
+
+def test_times_that_are_none():
+    assert clip_times(None, 3).tolist() == [0, 0.1, 0.2] and clip_times((0, 0.5, 7), 3).tolist() == [0, 0.5, 7]
+    for times in ([0, 1], [0, 1, 1], [0, 1, np.nan], "abc"):
+        with pytest.raises(InputError, match="3 finite numbers"):
+            clip_times(times, 3)
