@@ -1,5 +1,8 @@
 """The assignment of rows to columns that costs least in all."""
 
+from collections.abc import Callable
+from functools import cache
+
 import numpy as np
 
 
@@ -9,13 +12,18 @@ def assign(costs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     costs (N, B): inf for what cannot be a pair. Returns rows (k,) ascending and their columns (k,).
     """
     worth = np.minimum(np.asarray(costs, float), 0.0)
-    try:
-        from scipy.optimize import linear_sum_assignment as solve
-    except ImportError:
-        solve = assign_plain
-    rows, columns = solve(worth)
+    rows, columns = _solver()(worth)
     pays = worth[rows, columns] < 0
     return rows[pays], columns[pays]
+
+
+@cache
+def _solver() -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    try:
+        from scipy.optimize import linear_sum_assignment
+    except ImportError:
+        return assign_plain
+    return linear_sum_assignment
 
 
 def assign_plain(costs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

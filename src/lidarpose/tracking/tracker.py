@@ -20,7 +20,7 @@ from lidarpose.tracking.assignment import assign
 _POSITION_SD = np.array([0.12, 0.12, 0.2])
 # people are first seen with a velocity of this standard deviation, m/s, and change it: m/s in one second, which grows
 # with the square root of time
-_SPEED_SD, _SPEED_CHANGE = np.array([1.5, 1.5, 0.2]), np.array([1.0, 1.0, 0.15])
+_SPEED_SD, _SPEED_CHANGE = np.array([1.2, 1.2, 0.2]), np.array([0.7, 0.7, 0.15])
 # a box farther from where it is expected belongs to nobody: squared Mahalanobis distance, 99.9 % of a chi-square
 # distribution of three degrees of freedom
 _GATE = 16.3
