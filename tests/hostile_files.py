@@ -9,6 +9,7 @@ import pickle
 import struct
 import zipfile
 
+import laspy
 import numpy as np
 import pytest
 from hypothesis import strategies as st
@@ -86,7 +87,23 @@ def zipped(name, content):
 
 
 _TEXT = "".join(f"{x} {y} {z} {i}\n" for x, y, z, i in POINTS.tolist())
+
+
+def las(points=POINTS, *, version="1.2", kind=0, packed=False, step=1e-3, shift=(0.0, 0.0, 0.0)) -> bytes:
+    """A LAS or LAZ file by laspy."""
+    header = laspy.LasHeader(point_format=kind, version=version)
+    header.scales, header.offsets = np.full(3, step), np.array(shift)
+    cloud = laspy.LasData(header)
+    cloud.xyz = np.asarray(points, float)[:, :3]
+    file = io.BytesIO()
+    cloud.write(file, do_compress=packed, laz_backend=laspy.LazBackend.Lazrs if packed else None)
+    return file.getvalue()
+
+
 POINT_FILES = {
+    "a.las": las(),
+    "b.las": las(version="1.4", kind=6),
+    "a.laz": las(np.tile(POINTS, (99, 1)), kind=1, packed=True),
     "a.pcd": pcd_header() + POINTS.tobytes(),
     "b.pcd": pcd_header(data="ascii") + _TEXT.encode(),
     "c.pcd": pcd_header(data="binary_compressed") + lzf_body(POINTS.T.tobytes()),

@@ -7,14 +7,15 @@ import struct
 import subprocess
 import sys
 
+import laspy
 import numpy as np
 import pytest
-from hostile_files import POINTS, lzf_body, npy, npy_header, npz, pcd_header, ply_header, refusal, zipped
+from hostile_files import POINTS, las, lzf_body, npy, npy_header, npz, pcd_header, ply_header, refusal, zipped
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from lidarpose.errors import InputError
+from lidarpose.errors import InputError, MissingExtra
 from lidarpose.io.files import check_unpacked
 from lidarpose.io.point_cloud import SUFFIXES, Cloud, read_points
 
@@ -104,6 +105,32 @@ def test_ply_of_any_types_and_order(folder, encoding, data, names, count):
     text = "".join(" ".join(map(repr, row)) + "\n" for row in rows.tolist())
     content = text.encode() if encoding == "ascii" else rows.tobytes()
     same(read(folder, f"{encoding}.ply", header + content), np.stack([columns[n] for n in "xyZ"], -1), tuple(names))
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@settings(max_examples=40, deadline=None)
+@given(
+    points=hnp.arrays(np.int32, st.tuples(st.integers(1, 20), st.just(3)), elements=st.integers(-(2**20), 2**20)),
+    kind=st.integers(0, 10),
+    shift=st.tuples(*[st.sampled_from([0.0, 5_414_000.0, -0.5])] * 3),
+)
+def test_las_and_laz_of_all_point_formats(folder, packed, points, kind, shift):
+    version = "1.2" if kind < 4 else "1.4"
+    expected = points * 1e-3 + np.array(shift)
+    content = las(expected, version=version, kind=kind, packed=packed, shift=shift)
+    # the suffix does not say whether points are packed
+    for name in ("a.las", "a.LAZ"):
+        cloud = read(folder, name, content)
+        np.testing.assert_allclose(cloud.points, expected, rtol=0, atol=1e-9)
+    has = set(laspy.PointFormat(kind).dimension_names) & {"classification", "gps_time", "red", "green", "blue"}
+    assert cloud.fields[:4] == ("x", "y", "z", "intensity") and set(cloud.fields[4:]) == has
+
+
+def test_laz_needs_an_extra_and_las_does_not(folder, monkeypatch):
+    monkeypatch.setitem(sys.modules, "lazrs", None)
+    same(read(folder, "a.las", las()))
+    with pytest.raises(MissingExtra, match=r"'.\[recordings\]'"):
+        read(folder, "a.laz", las(packed=True))
 
 
 # what pypcd4 1.5 and trimesh 5.2 write
@@ -411,10 +438,25 @@ PNG = b"\x89PNG\r\n\x1a\n" + bytes(40)
 TEXT = "1 2 3\n4 5 6\n"
 COMPRESSED = pcd_header(data="binary_compressed")
 OBJECTS = npy(np.array([[1, 2, "a"]], dtype=object), allow_pickle=True)
+
+
+def with_bytes(content, place, new):
+    return content[:place] + new + content[place + len(new) :]
+
+
 BAD = {
     "empty": ("a.pcd", b"", ["empty"]),
     "unknown suffix": ("a.las2", ROWS, ["'.las2'", *SUFFIXES]),
     "no suffix": ("cloud", ROWS, ["suffix ''", ".pcd"]),
+    "las as ply": ("a.ply", las(), ["rename it to .las"]),
+    "las cut off": ("a.las", las()[:-1], ["cut off", "expected 60", "got 59"]),
+    "las header alone": ("a.las", las()[:99], ["LAS header", "99"]),
+    "las of 10^9": ("a.las", with_bytes(las(), 107, struct.pack("<I", 10**9)), ["cut off", "1000000000"]),
+    "laz of 10^9": ("a.laz", with_bytes(las(packed=True), 107, struct.pack("<I", 10**9)), ["LIDARPOSE_MAX_UNPACKED"]),
+    "laz cut off": ("a.laz", las(np.tile(POINTS, (99, 1)), packed=True)[:-200], ["damaged or cut off"]),
+    "las format 20": ("a.las", with_bytes(las(), 104, b"\x14"), ["point format 0 to 10", "20"]),
+    "las without points": ("a.las", las(np.zeros((0, 3))), ["has no points"]),
+    "las scale": ("a.las", with_bytes(las(), 131, struct.pack("<d", np.nan)), ["finite scales", "nan"]),
     "gzip as pcd": ("a.pcd", gzip.compress(pcd_header() + ROWS), ["gzip-compressed", "unpack it first"]),
     "gzip by suffix": ("a.pcd.gz", gzip.compress(pcd_header() + ROWS), ["gzip-compressed", "unpack it first"]),
     "zip as ply": ("a.ply", zipped("a.ply", b"ply\n"), ["zip", "unpack it first"]),

@@ -32,7 +32,6 @@ _EXTRA_OF = {
     "onnx": "export",
     "onnxscript": "export",
     "rosbags": "recordings",
-    "laspy": "recordings",
     "lazrs": "recordings",
     "velodyne_decoder": "recordings",
 }

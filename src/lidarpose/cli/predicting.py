@@ -11,7 +11,7 @@ from lidarpose.cli.terminal import add_command, is_watched, tell
 from lidarpose.errors import InputError
 from lidarpose.models import DEFAULT, NAMES
 
-_FILES = ".pcd .ply .bin .npy .npz .csv .xyz .txt"
+_FILES = ".pcd .ply .las .laz .bin .npy .npz .csv .xyz .txt"
 # characters of an id in a warning
 _LONGEST_ID = 40
 _BOXES = 'people to pose: {"people": [{"center": [x,y,z], "size": [l,w,h], "yaw": rad}]}, .npy rows, KITTI labels'

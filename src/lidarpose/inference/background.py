@@ -2,15 +2,15 @@
 
 import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.inference.inputs import as_points, only_returns
-from lidarpose.io.files import file_error, listed
-from lidarpose.io.point_cloud import SUFFIXES, read_points
+from lidarpose.io.files import FormatError, file_error, listed
+from lidarpose.io.point_cloud import read_points
+from lidarpose.io.sources import LazyFrame, is_single_scan, open_source
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -32,8 +32,8 @@ def learn_background(
     """The static points of a recording by a sensor that stays where it is, for `background` of `detect` and `predict`.
 
     Args:
-        scans: point files or arrays (n, 3) m, in the order of time, or a folder of point files, in that of their
-            names; of more than 60 an even choice is read.
+        scans: point files or arrays (n, 3) m, in the order of time, or anything that `open_source` takes; of more than
+            60 an even choice is read.
         columns: values a row of .bin files, see `read_points`.
 
     Returns:
@@ -42,11 +42,10 @@ def learn_background(
     Raises:
         InputError: no scans, or one that cannot be read.
     """
-    sources = _sources(scans)
-    chosen = np.unique(np.linspace(0, len(sources) - 1, _MOST_SCANS).round().astype(int))
+    sources = _sources(scans, columns)
     grid: _Grid | None = None
     static, eighths = None, np.zeros(0, np.int64)
-    for rows in np.array_split(chosen, min(_PARTS, len(chosen))):
+    for rows in np.array_split(np.arange(len(sources)), min(_PARTS, len(sources))):
         voxels, counts = np.zeros(0, np.int64), np.zeros(0, np.int64)
         for row in rows:
             points = _points(sources[row], columns)
@@ -61,9 +60,8 @@ def learn_background(
 
 
 def read_background(source: Any, *, columns: int | None = None) -> np.ndarray:
-    """Static points (n, 3) m of a file or an array of them, or learned from a folder or several scans."""
-    is_file = isinstance(source, str | os.PathLike) and not os.path.isdir(source)
-    if is_file or hasattr(source, "shape"):
+    """Static points (n, 3) m of a file or an array of them, or learned from a recording or several scans."""
+    if hasattr(source, "shape") or isinstance(source, str | os.PathLike) and is_single_scan(source):
         return _points(source, columns)
     return learn_background(source, columns=columns)
 
@@ -128,19 +126,29 @@ def _unpacked(number: np.ndarray) -> np.ndarray:
     return np.stack([number >> 42, number >> 21 & 0x1FFFFF, number & 0x1FFFFF], -1)
 
 
-def _sources(scans: Any) -> list:
-    if isinstance(scans, str | os.PathLike) and os.path.isdir(scans):
-        files = sorted(path for path in Path(scans).iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
-        if not files:
-            raise file_error(scans, f"expected scans of one recording ({' '.join(SUFFIXES)}), got a folder without any")
-        return files
+def _sources(scans: Any, columns: int | None) -> list:
+    """An even choice of scans that `_points` reads."""
     sources = listed(scans)
     if not sources:
         raise InputError("background: expected a file of static points or scans of one recording, got none")
-    return sources
+    if not any(isinstance(source, str | os.PathLike) and not is_single_scan(source) for source in sources):
+        return [sources[row] for row in _chosen(len(sources))]
+    recording = open_source(sources, columns=columns).recording
+    count = sum(1 for _ in recording.lazy_frames()) if recording.count is None else recording.count
+    rows = set(_chosen(count))
+    return [frame for row, frame in enumerate(recording.lazy_frames()) if row in rows]
+
+
+def _chosen(count: int) -> list[int]:
+    return np.unique(np.linspace(0, count - 1, _MOST_SCANS).round().astype(int)).tolist()
 
 
 def _points(source: Any, columns: int | None) -> np.ndarray:
+    if isinstance(source, LazyFrame):
+        try:
+            return only_returns(source.read().points)[0]
+        except FormatError as problem:
+            raise file_error(source.id, problem) from None
     if isinstance(source, str | os.PathLike):
         return only_returns(read_points(source, columns=columns).points)[0]
     return only_returns(as_points(source, "background"))[0]

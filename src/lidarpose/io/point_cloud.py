@@ -1,4 +1,4 @@
-"""Point clouds from files: PCD, PLY, raw float32, NumPy and text.
+"""Point clouds from files: PCD, PLY, LAS, raw float32, NumPy and text.
 
 The suffix, in any case, says the format. Coordinates stay as they are in the file (meters are assumed, nothing is
 turned or scaled), in float64, since float32 rounds map coordinates such as UTM's to half a meter. Columns other than
@@ -16,8 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarpose.errors import check_int
+from lidarpose.errors import MissingExtra, check_int
 from lidarpose.io.files import FormatError, check_unpacked, file_error, read_bytes, shorten
+from lidarpose.io.las import parse_las
 from lidarpose.io.npz import array_header, load_array, open_npz
 from lidarpose.io.pcd_ply import parse_pcd, parse_ply
 from lidarpose.io.text import FEW_ROWS, is_transposed, numbered, parse_text, pick_xyz
@@ -46,7 +47,6 @@ _FOREIGN = {
     rb"\x28\xb5\x2f\xfd": "is zstd-compressed: unpack it first (unzstd)",
     rb"\x89PNG\r\n\x1a\n": "is a PNG picture: expected a point cloud; name the cloud's own file",
     rb"\xff\xd8\xff[\xdb\xe0\xe1\xee]": "is a JPEG picture: expected a point cloud; name the cloud's own file",
-    rb"LASF": "is a LAS or LAZ file: convert it to .ply or .pcd first",
     rb"\x89HDF\r\n\x1a\n": "is an HDF5 file: save the points as .npy first",
     rb"(?i)\s*<(!doctype html|html|\?xml)": "is a web page or XML: expected a point cloud; download it anew",
     rb"version https://git-lfs": "is a Git LFS pointer, not the data: run `git lfs pull`",
@@ -55,6 +55,7 @@ _MAGIC = {
     ".npy": rb"\x93NUMPY",
     ".ply": rb"ply[ \t]*[\r\n]",
     ".pcd": rb"# \.PCD v",
+    ".las": rb"LASF",
     # a zip archive whose first file is an array
     ".npz": rb"(?s)PK\x03\x04.{26}[^/]{1,200}?\.npy",
 }
@@ -78,15 +79,17 @@ class Cloud:
 def read_points(path: str | os.PathLike, *, columns: int | None = None) -> Cloud:
     """Reads a point cloud; the suffix says the format.
 
-    .pcd (ascii, binary, binary_compressed), .ply (the vertices; ascii, binary of either byte order), .npy ((n, 3+) or
-    records with x, y, z), .npz (`points`, else `xyz`, else its only (n, 3+) array), .csv .xyz .txt (with or without a
-    header; commas, semicolons, tabs or blanks; # starts a comment), .bin (rows of `columns` float32).
+    .pcd (ascii, binary, binary_compressed), .ply (the vertices; ascii, binary of either byte order), .las, .laz (all
+    point formats), .npy ((n, 3+) or records with x, y, z), .npz (`points`, else `xyz`, else its only (n, 3+) array),
+    .csv .xyz .txt (with or without a header; commas, semicolons, tabs or blanks; # starts a comment), .bin (rows of
+    `columns` float32).
 
     columns: values a row of a .bin, x y z first; other formats ignore it. Where it is None, rows have 4 (KITTI) or,
     where the size or the values say so, 5 (nuScenes) or 3, which a warning tells; `.pcd.bin`, nuScenes' own suffix,
     means 5.
 
-    Raises InputError of one line that names the file, what was expected, what came and what to do.
+    Raises InputError of one line that names the file, what was expected, what came and what to do; MissingExtra for
+    .laz without the extra `recordings`.
     """
     if columns is not None:
         columns = check_int("columns", columns, least=3, hint=" (x y z first)")
@@ -112,6 +115,8 @@ def read_points(path: str | os.PathLike, *, columns: int | None = None) -> Cloud
             raise FormatError("finite x, y, z", f"NaN or infinity in all {num_dropped} points", "export it again")
     except FormatError as problem:
         raise file_error(path, problem) from None
+    except MissingExtra:
+        raise
     except MemoryError:
         raise file_error(path, "does not fit in memory; split it first") from None
     except Exception as error:
@@ -127,7 +132,7 @@ def _refuse_foreign(data: bytes, suffix: str) -> None:
     """Refuses content that is plainly something else than the suffix says, and suffixes nobody here can read."""
     for other, pattern in _MAGIC.items():
         if re.match(pattern, data):
-            if other != suffix:
+            if other != suffix.replace(".laz", ".las"):
                 raise FormatError(f"a {suffix or 'known'} file", f"a {other} file's content", f"rename it to {other}")
             return
     for pattern, problem in _FOREIGN.items():
@@ -243,6 +248,8 @@ def _points_of(array: np.ndarray, what: str):
 _PARSERS = {
     ".pcd": parse_pcd,
     ".ply": parse_ply,
+    ".las": parse_las,
+    ".laz": parse_las,
     ".npy": _parse_npy,
     ".npz": _parse_npz,
     ".csv": parse_text,

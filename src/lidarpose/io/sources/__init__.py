@@ -24,6 +24,8 @@ from lidarpose.io.sources.frame import (
     Source,
     Sweep,
 )
+from lidarpose.io.sources.kitti import open_kitti
+from lidarpose.io.sources.nuscenes import open_nuscenes
 
 __all__ = [
     "RECORDINGS",
@@ -130,6 +132,9 @@ def _open_folder(folder: Path, *, columns: int | None, topic: str | None, name_t
     for content, module in _LAYOUTS.items():
         if (folder / content).exists():
             return _reader(module).open_recording(folder, topic=topic)
+    dataset = open_kitti(folder) or open_nuscenes(folder, topic)
+    if dataset is not None:
+        return dataset
     files, warnings = scan_files(folder, RECORDINGS)
     if files[0].suffix.lower() in RECORDINGS:
         return _open_all(str(folder), files, columns=columns, topic=topic, name_times=name_times)

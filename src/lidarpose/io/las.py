@@ -1,0 +1,83 @@
+"""LAS and LAZ, the formats of surveyors. Source: ASPRS, LAS Specification 1.4 - R15, 2.4 to 2.6.
+
+Where a point stands is the same in all point formats, so LAS needs no library. LAZ is unpacked by lazrs.
+"""
+
+import io
+import struct
+
+import numpy as np
+
+from lidarpose.errors import missing_extra
+from lidarpose.io.files import FormatError, check_unpacked
+from lidarpose.io.text import check_bytes
+
+# of version 1.2 and older; 1.4 counts its points at the end of a longer one
+_HEADER, _HEADER_1_4 = 227, 375
+_POINT_FORMATS = range(11)
+# set in the number of the point format where points are packed
+_PACKED = 0x80
+# the record that says how: of whom, and which
+_LASZIP = (b"laszip encoded", 22204)
+_WITH_TIME, _WITH_COLOR = (1, 3, 4, 5, 6, 7, 8, 9, 10), (2, 3, 5, 7, 8, 10)
+
+
+def parse_las(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
+    """x y z (n, 3) float64 in the file's unit, the names of the columns, and no warnings; raises FormatError."""
+    if len(data) < _HEADER or data[:4] != b"LASF":
+        raise FormatError("a LAS header", f"another or a damaged one of {len(data)} bytes", "copy it again")
+    version = tuple(data[24:26])
+    start, _, kind, size, num_points = struct.unpack_from("<IIBHI", data, 96)
+    scale, shift = np.split(np.frombuffer(data, "<f8", 6, 131), 2)
+    if version >= (1, 4) and len(data) >= _HEADER_1_4:
+        num_points = struct.unpack_from("<Q", data, 247)[0] or num_points
+    is_packed, kind = bool(kind & _PACKED), kind & 0x3F
+    if kind not in _POINT_FORMATS or size < 20:
+        raise FormatError("point format 0 to 10", f"{kind} of {size} bytes", "export it as LAS 1.4")
+    if not np.isfinite([scale, shift]).all() or not scale.all():
+        raise FormatError("finite scales and offsets", [*scale, *shift], "export it again")
+    if is_packed:
+        check_unpacked(len(data), num_points * size)
+        data, start = _unpack(data, start, size, num_points), 0
+    check_bytes(data, start, num_points * size, num_points)
+    record = np.dtype({"names": ["xyz"], "formats": [("<i4", 3)], "offsets": [0], "itemsize": size})
+    steps = np.frombuffer(data, record, num_points, start)["xyz"]
+    names = ["x", "y", "z", "intensity", "classification"]
+    names += ["gps_time"] * (kind in _WITH_TIME) + ["red", "green", "blue"] * (kind in _WITH_COLOR)
+    return steps * scale + shift, tuple(names), ()
+
+
+class _Unseekable(io.RawIOBase):
+    """Bytes to be read once: lazrs then leaves out the table of chunks, whose announced length it would allocate."""
+
+    def __init__(self, data: bytes):
+        self._file = io.BytesIO(data)
+
+    def readinto(self, buffer) -> int:
+        return self._file.readinto(buffer)
+
+
+def _unpack(data: bytes, start: int, size: int, num_points: int) -> bytes:
+    """The points of a LAZ file as those of a LAS file. lazrs trusts what a file announces, so that is checked here."""
+    try:
+        import lazrs
+    except ModuleNotFoundError as error:
+        raise missing_extra(error, "reading .laz") from None
+    place = struct.unpack_from("<H", data, 94)[0]
+    for _ in range(struct.unpack_from("<I", data, 100)[0]):
+        if place + 54 > min(start, len(data)):
+            break
+        user, record, length = struct.unpack_from("<16sHH", data, place + 2)
+        place += 54 + length
+        if (user.rstrip(b"\0"), record) == _LASZIP:
+            points = bytearray(num_points * size)
+            try:
+                record_data = data[place - length : place]
+                lazrs.LasZipDecompressor(_Unseekable(data[start:]), record_data).decompress_many(points)
+            # a damaged file may stop lazrs in the middle, by an error that is no Exception
+            except BaseException as error:
+                if isinstance(error, KeyboardInterrupt | SystemExit):
+                    raise
+                raise FormatError("is damaged or cut off: copy it again") from None
+            return bytes(points)
+    raise FormatError("is packed but does not say how: was it written completely?")

@@ -1,0 +1,196 @@
+"""KITTI's recordings as they lie on disk: raw drives, and sequences of the odometry benchmark and SemanticKITTI.
+
+Sources: Geiger et al., Vision meets Robotics: The KITTI Dataset, IJRR 2013, and the development kits of both.
+"""
+
+import re
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from lidarpose.errors import LidarPoseError
+from lidarpose.geometry import rotation_about
+from lidarpose.io.files import read_bytes
+from lidarpose.io.point_cloud import KITTI_FIELDS, read_points
+from lidarpose.io.sources.folders import scan_files
+from lidarpose.io.sources.frame import IndexedRecording, Sweep
+
+# m, the Earth's as the development kit of raw data has it
+_EARTH_RADIUS = 6378137.0
+
+
+def open_kitti(folder: Path) -> IndexedRecording | None:
+    """A raw drive or an odometry sequence, or the folder of scans in one; None for any other folder.
+
+    The world is z up: of a drive, east, north and up from where it begins; of a sequence, the sensor's first frame.
+    """
+    folder = folder.absolute()
+    for drive in (folder, *folder.parents[:2]):
+        if drive / "velodyne_points" / "data" in (folder, folder / "velodyne_points" / "data", folder / "data"):
+            if (drive / "velodyne_points" / "data").is_dir():
+                return _open_drive(drive)
+    for sequence in (folder, folder.parent):
+        if sequence / "velodyne" in (folder, folder / "velodyne") and (sequence / "velodyne").is_dir():
+            if any((sequence / name).is_file() for name in ("calib.txt", "times.txt", "poses.txt")):
+                return _open_sequence(sequence)
+    return None
+
+
+def _open_drive(drive: Path) -> IndexedRecording:
+    files, warnings = scan_files(drive / "velodyne_points" / "data")
+    rows = _numbers(files)
+    stamps = _timestamps(drive / "velodyne_points" / "timestamps.txt")
+    times = _chosen(stamps, rows, "velodyne_points/timestamps.txt", warnings)
+    calib = next((path for path in (drive, drive.parent) if (path / "calib_imu_to_velo.txt").is_file()), drive)
+    keys = _calibration(calib / "calib_imu_to_velo.txt")
+    poses = None
+    if [len(keys.get(key, ())) for key in "RT"] == [9, 3]:
+        T_velo_imu = _matrix(np.column_stack([keys["R"].reshape(3, 3), keys["T"]]))
+        poses = _Oxts(drive / "oxts", _inverse(T_velo_imu), stamps)
+    if poses is None or not poses.is_there:
+        poses = None
+        warnings.append("the sensor's poses are not known: oxts or calib_imu_to_velo.txt is missing or damaged")
+    return _recording(drive, files, times, warnings, lambda i: None if poses is None else poses.T_world_velo(rows[i]))
+
+
+def _open_sequence(sequence: Path) -> IndexedRecording:
+    files, warnings = scan_files(sequence / "velodyne")
+    rows = _numbers(files)
+    stamps = _table(sequence / "times.txt", 1)
+    times = _chosen(None if stamps is None else stamps[:, 0], rows, "times.txt", warnings)
+    tables = (sequence / "poses.txt", sequence.parents[1] / "poses" / f"{sequence.name}.txt")
+    poses = _table(next((path for path in tables if path.is_file()), tables[0]), 12)
+    row = _calibration(sequence / "calib.txt").get("Tr", np.zeros(0))
+    if poses is None or len(row) != 12:
+        warnings.append("the sensor's poses are not known: poses.txt, or Tr of calib.txt, is missing or damaged")
+        return _recording(sequence, files, times, warnings, lambda i: None)
+    T_cam_velo = _matrix(row.reshape(3, 4))
+
+    def T_world_velo(i: int) -> np.ndarray | None:
+        if not 0 <= rows[i] < len(poses):
+            return None
+        return _inverse(T_cam_velo) @ _matrix(poses[rows[i]].reshape(3, 4)) @ T_cam_velo
+
+    return _recording(sequence, files, times, warnings, T_world_velo)
+
+
+def _recording(folder: Path, files: Sequence[Path], times, warnings: list[str], T_world_velo) -> IndexedRecording:
+    def read(i: int) -> Sweep:
+        cloud = read_points(files[i], columns=len(KITTI_FIELDS))
+        pose = T_world_velo(i)
+        notes = cloud.warnings if pose is not None else (*cloud.warnings, "the sensor's pose is not known")
+        return Sweep(points=cloud.points, T_world_sensor=pose, origin=np.zeros(3), warnings=notes)
+
+    return IndexedRecording(
+        name=str(folder), ids=[path.stem for path in files], times=times, read=read, warnings=warnings
+    )
+
+
+class _Oxts:
+    """Poses by the drive's GPS and inertial unit: one small file a frame, read when its frame is."""
+
+    def __init__(self, folder: Path, T_imu_velo: np.ndarray, stamps: np.ndarray | None):
+        self.folder = folder
+        self.T_imu_velo = T_imu_velo
+        self.stamps = stamps
+        own = _timestamps(folder / "timestamps.txt")
+        # of drives that are not synchronized, by the nearest time
+        self.own = own if own is not None and stamps is not None and len(own) != len(stamps) else None
+        files = sorted((folder / "data").glob("[0-9]*.txt"))
+        first = _table(files[0], 30) if files else None
+        self.is_there = first is not None
+        if first is not None:
+            self.digits = len(files[0].stem)
+            # Mercator's projection with the scale of the first latitude
+            self.scale = np.cos(np.radians(first[0, 0]))
+            self.start = self._position(first[0])
+
+    def _position(self, values: np.ndarray) -> np.ndarray:
+        latitude, longitude = np.radians(values[:2])
+        north = np.log(np.tan(np.pi / 4 + latitude / 2))
+        return np.array([*(self.scale * _EARTH_RADIUS * np.array([longitude, north])), values[2]])
+
+    def T_world_velo(self, row: int) -> np.ndarray | None:
+        if self.own is not None and self.stamps is not None and row < len(self.stamps):
+            row = int(np.abs(self.own - self.stamps[row]).argmin())
+        values = _table(self.folder / "data" / f"{row:0{self.digits}}.txt", 30)
+        if values is None:
+            return None
+        roll, pitch, yaw = values[0, 3:6]
+        R = rotation_about("z", yaw) @ rotation_about("y", pitch) @ rotation_about("x", roll)
+        return _matrix(np.column_stack([R, self._position(values[0]) - self.start])) @ self.T_imu_velo
+
+
+def _numbers(files: Sequence[Path]) -> list[int]:
+    """The frame's number of each file: scans may be missing, their lines in tables are not."""
+    if all(re.fullmatch("[0-9]+", path.stem) for path in files):
+        return [int(path.stem) for path in files]
+    return list(range(len(files)))
+
+
+def _chosen(stamps: np.ndarray | None, rows: Sequence[int], name: str, warnings: list[str]) -> np.ndarray | None:
+    """The times (n,) s of frames, or None and a warning."""
+    if stamps is not None and max(rows) < len(stamps) and np.isfinite(stamps[rows]).all():
+        return stamps[rows]
+    warnings.append(f"{name} is missing, damaged or too short: the frames' times are not known")
+    return None
+
+
+def _timestamps(path: Path) -> np.ndarray | None:
+    """Lines such as "2011-09-26 13:02:25.594360375" as s since 1970, NaN for others; None without the file."""
+    text = _text(path)
+    if text is None:
+        return None
+    return np.array([_seconds(line.strip()) for line in text.strip("\n").split("\n")])
+
+
+def _seconds(line: str) -> float:
+    day, _, fraction = line.partition(".")
+    try:
+        return datetime.strptime(day, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC).timestamp() + float(f"0.{fraction}")
+    except ValueError:
+        return np.nan
+
+
+def _table(path: Path, columns: int) -> np.ndarray | None:
+    """(n, columns) finite numbers, or None where the file holds something else."""
+    text = _text(path)
+    try:
+        table = np.array([line.split() for line in (text or "").splitlines() if line.strip()], float)
+    except ValueError:
+        return None
+    return table if table.ndim == 2 and table.shape[1] == columns and np.isfinite(table).all() else None
+
+
+def _calibration(path: Path) -> dict[str, np.ndarray]:
+    """Lines "KEY: numbers"."""
+    keys = {}
+    for line in (_text(path) or "").splitlines():
+        key, _, values = line.partition(":")
+        try:
+            numbers = np.array(values.split(), float)
+        except ValueError:
+            continue
+        if np.isfinite(numbers).all():
+            keys[key.strip()] = numbers
+    return keys
+
+
+def _matrix(rows: np.ndarray) -> np.ndarray:
+    """(3, 4) -> (4, 4)."""
+    return np.vstack([rows, [0.0, 0.0, 0.0, 1.0]])
+
+
+def _inverse(T: np.ndarray) -> np.ndarray:
+    """Of a rigid transform (4, 4)."""
+    R = T[:3, :3].T
+    return _matrix(np.column_stack([R, -R @ T[:3, 3]]))
+
+
+def _text(path: Path) -> str | None:
+    try:
+        return read_bytes(path, expected="a file of KITTI").decode("utf-8", "replace")
+    except LidarPoseError:
+        return None
