@@ -43,7 +43,7 @@ __all__ = [
 ]
 
 # suffix of a file that holds many frames -> the module whose `open_recording(path, topic=...)` reads it
-_READERS = {".mcap": "rosbag", ".bag": "rosbag", ".db3": "rosbag", ".pcap": "packets"}
+_READERS = {".mcap": "rosbag", ".bag": "rosbag", ".db3": "rosbag", ".pcap": "ouster", ".pcapng": "ouster"}
 RECORDINGS = tuple(_READERS)
 # of a folder that is one recording: what is in it, and the module whose `open_recording` reads it
 _LAYOUTS = {"metadata.yaml": "rosbag"}

@@ -1,0 +1,314 @@
+"""Packets of Ouster sensors as frames, by the published packet formats and the sensor's metadata.
+
+Formats and geometry: Ouster firmware user manual, "Lidar Data" and "Coordinate Frames and XYZ Calculation". Of dual
+returns the first one of each pixel is taken.
+"""
+
+import json
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidarpose.errors import InputError
+from lidarpose.io.files import FormatError, file_error, read_bytes, shorten
+from lidarpose.io.sources import velodyne
+from lidarpose.io.sources.frame import LazyFrame, Recording, Sweep
+from lidarpose.io.sources.pcap import Capture, Datagram
+
+# bytes of a pixel, by profile. Ranges come first: of RNG15 in 15 bits and steps of 8 mm, of others in 19 (LEGACY 20)
+# bits and mm
+_PIXEL_BYTES = {
+    "LEGACY": 12,
+    "RNG19_RFL8_SIG16_NIR16": 12,
+    "RNG19_RFL8_SIG16_NIR16_DUAL": 16,
+    "RNG19_RFL8_SIG16_NIR16_ZONE16": 12,
+    "RNG19_RFL8_SIG16_ZONE16_DUAL": 16,
+    "RNG19_RFL8_SIG16_NIR16_RGB16": 16,
+    "RNG19_RFL8_SIG16_NIR16_RGB16_DUAL": 20,
+    "RNG15_RFL8_NIR8": 4,
+    "RNG15_RFL8_NIR8_DUAL": 8,
+    "RNG15_RFL8_NIR8_ZONE16": 8,
+    "RNG15_RFL8_WIN8": 4,
+    "FUSA_RNG15_RFL8_NIR8_DUAL": 8,
+}
+_HEADER = _FOOTER = 32
+_MAX_COLUMNS, _MAX_BEAMS, _MAX_PACKET = 4096, 256, 65507
+# of sensors before the metadata told it
+_LIDAR_TO_SENSOR = (-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 36.18, 0, 0, 0, 1)
+_COLUMNS_PER_PACKET = 16
+# datagrams in which the port that the metadata names is looked for
+_NUM_PEEKED = 2000
+
+
+def open_recording(path: Path, *, topic: str | None = None) -> Recording:
+    """Opens a capture of an Ouster sensor, whose metadata is the JSON file of the same stem beside it; without one, of
+    a Velodyne sensor.
+
+    Raises:
+        InputError: No capture, of another sensor, or an Ouster's without its metadata.
+        MissingExtra: A Velodyne's without the library that decodes it.
+    """
+    metadata = path.with_suffix(".json")
+    return OusterRecording(path, metadata) if metadata.exists() else velodyne.open_recording(path)
+
+
+class OusterFormat:
+    """How a sensor's packets are laid out, and where its beams point: what its metadata says.
+
+    columns, columns_per_packet, beams: of a frame, a packet, a column; window: first and last column that is sent;
+    serial: the sensor's number or None; packet: dtype of a packet with `columns`, each with `time` ns, `id`, `status`
+    and `range` (beams,).
+
+    Raises:
+        InputError: No metadata of a sensor.
+    """
+
+    def __init__(self, path: Path):
+        data = read_bytes(path, expected="the sensor's metadata (JSON)", most=2**24)
+        try:
+            metadata = json.loads(data)
+            if not isinstance(metadata, dict):
+                raise FormatError("an object", type(metadata).__name__, "save the sensor's metadata anew")
+            self._parse(_flat(metadata))
+        except FormatError as problem:
+            raise file_error(path, problem) from None
+        except (ValueError, TypeError, OverflowError, RecursionError) as error:
+            reason = shorten(str(error))
+            raise file_error(path, f"cannot be read as an Ouster sensor's metadata ({reason}); save it anew") from None
+
+    def _parse(self, metadata: dict[str, Any]) -> None:
+        altitude, azimuth = (
+            np.deg2rad(_numbers(metadata, f"beam_{name}_angles")).ravel() for name in ("altitude", "azimuth")
+        )
+        self.beams = len(altitude)
+        mode = str(metadata.get("lidar_mode", "")).partition("x")[0]
+        self.columns = _whole(metadata, "columns_per_frame", _MAX_COLUMNS, mode)
+        self.columns_per_packet = _whole(metadata, "columns_per_packet", _MAX_COLUMNS, _COLUMNS_PER_PACKET)
+        pixels = _whole(metadata, "pixels_per_column", _MAX_BEAMS, self.beams)
+        if not len(altitude) == len(azimuth) == pixels:
+            came = f"{len(altitude)} altitudes and {len(azimuth)} azimuths"
+            raise FormatError(f"beam angles of {pixels} beams", came, "save the sensor's metadata anew")
+        window = metadata.get("column_window") or (0, self.columns - 1)
+        self.window = tuple(min(max(int(column), 0), self.columns - 1) for column in window)
+        self.port, self.serial = metadata.get("udp_port_lidar"), metadata.get("prod_sn")
+
+        self.profile = str(metadata.get("udp_profile_lidar", "LEGACY"))
+        if self.profile not in _PIXEL_BYTES:
+            raise FormatError(
+                f"a udp_profile_lidar of {', '.join(_PIXEL_BYTES)}", self.profile, "record it with one of these"
+            )
+        self.is_legacy = self.profile == "LEGACY"
+        self.is_fusa = "FUSA" in (metadata.get("header_type"), self.profile[:4])
+        self.packet = self._packet_type()
+        if self.packet.itemsize > _MAX_PACKET:
+            raise FormatError("packets that fit a datagram", f"{self.packet.itemsize} bytes", "save the metadata anew")
+        self._aim(metadata, altitude, azimuth)
+
+    def _packet_type(self) -> np.dtype:
+        pixel_bytes = _PIXEL_BYTES[self.profile]
+        is_short = "RNG15" in self.profile
+        self.unit = 8 if is_short else 1
+        self.mask = 0x7FFF if is_short else 0xFFFFF if self.is_legacy else 0x7FFFF
+        pixel = np.dtype({"names": ["range"], "formats": ["<u2" if is_short else "<u4"], "itemsize": pixel_bytes})
+        head = 16 if self.is_legacy else 12
+        status = head + self.beams * pixel_bytes
+        column = np.dtype(
+            {
+                "names": ["time", "id", "status", "pixels"],
+                "formats": ["<u8", "<u2", "<u2", (pixel, self.beams)],
+                "offsets": [0, 8, status if self.is_legacy else 10, head],
+                "itemsize": status + 4 * self.is_legacy,
+            }
+        )
+        size = column.itemsize * self.columns_per_packet
+        start = 0 if self.is_legacy else _HEADER
+        return np.dtype(
+            {
+                "names": ["columns"],
+                "formats": [(column, self.columns_per_packet)],
+                "offsets": [start],
+                "itemsize": size if self.is_legacy else size + _HEADER + _FOOTER,
+            }
+        )
+
+    def _aim(self, metadata: dict[str, Any], altitude: np.ndarray, azimuth: np.ndarray) -> None:
+        """Directions (columns, beams, 3) and starts (columns, 3) m of the beams in the sensor's frame; a range counts
+        from `reach` mm in front of its start."""
+        beam_to_lidar = _numbers(metadata, "beam_to_lidar_transform", np.eye(4)).reshape(4, 4)
+        along, up = beam_to_lidar[0, 3], beam_to_lidar[2, 3]
+        if "beam_to_lidar_transform" not in metadata:
+            along = float(_numbers(metadata, "lidar_origin_to_beam_origin_mm", 0.0))
+        self.reach = float(np.hypot(along, up))
+        T_sensor_lidar = _numbers(metadata, "lidar_to_sensor_transform", _LIDAR_TO_SENSOR).reshape(4, 4)
+        R, self.origin = T_sensor_lidar[:3, :3], T_sensor_lidar[:3, 3] / 1000
+        encoder = 2 * np.pi * (1 - np.arange(self.columns) / self.columns)
+        heading = encoder[:, None] - azimuth
+        level = np.cos(altitude)
+        rays = [np.cos(heading) * level, np.sin(heading) * level, np.broadcast_to(np.sin(altitude), heading.shape)]
+        self.directions = np.stack(rays, axis=-1) @ R.T / 1000
+        starts = [along * np.cos(encoder), along * np.sin(encoder), np.full(self.columns, up)]
+        self.starts = np.stack(starts, axis=-1) @ R.T / 1000 + self.origin
+
+    def header(self, packet: bytes) -> tuple[int, int | None]:
+        """A packet's frame id, and the sensor's serial number where it tells it."""
+        if self.is_legacy:
+            return int.from_bytes(packet[10:12], "little"), None
+        if self.is_fusa:
+            return int.from_bytes(packet[4:8], "little"), int.from_bytes(packet[11:16], "little")
+        return int.from_bytes(packet[2:4], "little"), int.from_bytes(packet[7:12], "little")
+
+    def num_packets(self) -> int:
+        """Packets that a whole turn is sent in."""
+        first, last = (column // self.columns_per_packet for column in self.window)
+        most = -(-self.columns // self.columns_per_packet)
+        return last - first + 1 if self.window[0] <= self.window[1] else min(most - first + last + 1, most)
+
+    def num_columns(self) -> int:
+        """Columns that a whole turn holds."""
+        first, last = self.window
+        return last - first + 1 if first <= last else self.columns - first + last + 1
+
+    def decode(self, packets: list[bytes]) -> Sweep:
+        """The sweep that a frame's packets hold; ring is the number of the beam, from the top."""
+        columns = np.frombuffer(b"".join(packets), self.packet)["columns"].reshape(-1)
+        columns = columns[(columns["status"] & 1 == 1) & (columns["id"] < self.columns)]
+        # of packets that came twice, once
+        ids, first = np.unique(columns["id"], return_index=True)
+        ranges = (columns["pixels"]["range"][first] & self.mask).astype(np.int64) * self.unit
+        column, beam = np.nonzero(ranges)
+        points = self.directions[ids[column], beam]
+        points *= (ranges[column, beam] - self.reach)[:, None]
+        points += self.starts[ids[column]]
+        lost = self.num_columns() - len(ids)
+        warnings = (f"{lost} of {self.num_columns()} columns are missing",) if lost > 0 else ()
+        return Sweep(points=points, origin=self.origin, ring=beam, warnings=warnings)
+
+
+class OusterRecording:
+    """A capture of an Ouster sensor's packets, with its metadata. A `Recording`; a frame is one turn of the sensor.
+
+    Args:
+        path: the capture.
+        metadata: the sensor's JSON file.
+    """
+
+    count = None
+
+    def __init__(self, path: Path, metadata: Path):
+        self.name = str(path)
+        self.capture = Capture(path)
+        self.metadata = metadata
+        self.format = OusterFormat(metadata)
+        self._num_lost = self._num_sent = self._num_other = 0
+        self._serial: int | None = None
+        self._flow = self._find_flow()
+
+    def _is_lidar(self, datagram: Datagram) -> bool:
+        return len(datagram.payload) == self.format.packet.itemsize
+
+    def _find_flow(self) -> tuple[bytes, int]:
+        """Whose packets are read: those to the port that the metadata names, else the first."""
+        sizes: dict[int, int] = {}
+        flow = None
+        for k, datagram in enumerate(self.capture):
+            sizes[len(datagram.payload)] = sizes.get(len(datagram.payload), 0) + 1
+            if self._is_lidar(datagram):
+                flow = flow or datagram.flow
+                if datagram.flow[1] == self.format.port:
+                    return datagram.flow
+            if flow and (k >= _NUM_PEEKED or not self.format.port):
+                break
+        if flow is None:
+            size = f"lidar packets of {self.format.packet.itemsize} bytes"
+            expected = f"{size} ({self.format.profile}, {self.format.beams} beams, says {self.metadata})"
+            came = ", ".join(f"{count} of {size}" for size, count in sorted(sizes.items())[:5]) or "no UDP packets"
+            raise file_error(self.name, f"expected {expected}, got {came}: is that the metadata of this recording?")
+        return flow
+
+    @property
+    def warnings(self) -> list[str]:
+        lines = []
+        if self._num_lost:
+            lines.append(f"{self._num_lost} of {self._num_sent} lidar packets were lost")
+        if self.capture.num_cut:
+            lines.append(f"{self.capture.num_cut} packets are captured in part only, and are left out")
+        if self._num_other:
+            lines.append(f"{self._num_other} lidar packets of another sensor are left out")
+        if self._serial and str(self.format.serial or self._serial) != str(self._serial):
+            serial = f"{self._serial}, {self.metadata} is of {self.format.serial}"
+            lines.append(f"the packets are of the sensor {serial}: its beams may point elsewhere")
+        return lines
+
+    def lazy_frames(self, first: int = 0) -> Iterator[LazyFrame]:
+        has_clock = None
+        for index, (captured, packets) in enumerate(self._turns()):
+            if index < first:
+                continue
+            clock = np.frombuffer(packets[0], self.format.packet)["columns"]["time"]
+            clock = clock[clock > 0]
+            has_clock = bool(len(clock)) if has_clock is None else has_clock
+            time = float(clock[0]) / 1e9 if has_clock and len(clock) else captured
+            yield LazyFrame(f"{index:06d}", time, partial(self.format.decode, packets))
+
+    def _turns(self) -> Iterator[tuple[float, list[bytes]]]:
+        """(time of capture, packets) of each turn of the sensor."""
+        self._num_lost = self._num_sent = self._num_other = 0
+        most = self.format.num_packets()
+        packets: list[bytes] = []
+        current = previous = None
+        started, num_turns = 0.0, 0
+        damage = None
+        try:
+            for datagram in self.capture:
+                if not self._is_lidar(datagram) or datagram.flow != self._flow:
+                    self._num_other += self._is_lidar(datagram)
+                    continue
+                frame_id, self._serial = self.format.header(datagram.payload)
+                # late, of the turn before, which counts it as lost
+                if frame_id == previous:
+                    continue
+                if packets and (frame_id != current or len(packets) >= 2 * most):
+                    # the first turn and the last one began or ended outside of the capture
+                    if num_turns:
+                        self._num_sent += most
+                        self._num_lost += max(most - len(packets), 0)
+                    yield started, packets
+                    num_turns += 1
+                    previous = current if frame_id != current else None
+                    packets = []
+                if not packets:
+                    started = datagram.time
+                current = frame_id
+                packets.append(datagram.payload)
+        except InputError as error:
+            damage = error
+        if packets:
+            yield started, packets
+        if damage is not None:
+            raise damage
+
+
+def _flat(metadata: dict[str, Any]) -> dict[str, Any]:
+    """Keys of all sections as one; newer sensors sort into sections what older ones told at the top."""
+    sections = [_flat(value) for value in metadata.values() if isinstance(value, dict)]
+    plain = {key: value for key, value in metadata.items() if not isinstance(value, dict)}
+    return {key: value for section in (*sections, plain) for key, value in section.items()}
+
+
+def _numbers(metadata: dict[str, Any], key: str, default: Any = None) -> np.ndarray:
+    if key not in metadata and default is None:
+        raise FormatError(f"has no {key}: expected an Ouster sensor's metadata; save it from the sensor")
+    values = np.asarray(metadata.get(key, default), dtype=np.float64)
+    if not np.isfinite(values).all():
+        raise FormatError(f"finite numbers in {key}", "others", "save the sensor's metadata anew")
+    return values
+
+
+def _whole(metadata: dict[str, Any], key: str, most: int, default: Any) -> int:
+    value = int(metadata.get(key, default))
+    if not 1 <= value <= most:
+        raise FormatError(f"{key} from 1 to {most}", value, "save the sensor's metadata anew")
+    return value

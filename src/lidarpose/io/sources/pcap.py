@@ -1,0 +1,218 @@
+"""UDP datagrams of packet captures: pcap of either byte order and resolution, and pcapng.
+
+Formats: draft-ietf-opsawg-pcap, draft-ietf-opsawg-pcapng, RFC 791 and 8200 (fragments), RFC 768.
+"""
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+from lidarpose.io.files import FormatError, file_error
+
+# magic of a pcap file: byte order, ticks a second
+_MAGIC = {
+    b"\xd4\xc3\xb2\xa1": ("<", 1e6),
+    b"\xa1\xb2\xc3\xd4": (">", 1e6),
+    b"\x4d\x3c\xb2\xa1": ("<", 1e9),
+    b"\xa1\xb2\x3c\x4d": (">", 1e9),
+}
+_PCAPNG = b"\x0a\x0d\x0d\x0a"
+# bytes; no capture holds larger packets
+_MAX_PACKET = 2**20
+# datagrams whose fragments are waited for, and the bytes of one
+_MAX_PENDING, _MAX_DATAGRAM = 64, 65535
+_VLAN = (0x8100, 0x88A8, 0x9100)
+# link type: where its header tells the EtherType, and its length; raw IP has none
+_ETHERNET = 1
+_LINKS = {_ETHERNET: (12, 14), 113: (14, 16), 276: (0, 20), 0: (None, 4), 108: (None, 4), 101: (None, 0)}
+_LINKS |= {link: (None, 0) for link in (12, 14, 228, 229)}
+_IP = (0x0800, 0x86DD)
+
+
+class Datagram(NamedTuple):
+    """What one UDP datagram carries. time: s, of the capture; flow: source address and destination port."""
+
+    time: float
+    flow: tuple[bytes, int]
+    payload: bytes
+
+
+class Capture:
+    """The UDP datagrams of a capture, as often as wanted.
+
+    num_cut: datagrams of which the capture holds only a part, or not all fragments, since iterating last began.
+
+    Raises:
+        InputError: No capture; while iterating, where the file is cut off.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.num_cut = 0
+        with self._open() as file:
+            magic = file.read(4)
+        if magic not in _MAGIC and magic != _PCAPNG:
+            raise file_error(path, "is no packet capture: expected pcap or pcapng, as tcpdump and Wireshark save it")
+
+    def _open(self) -> BinaryIO:
+        try:
+            return open(self.path, "rb")
+        except OSError as error:
+            raise file_error(self.path, f"cannot be read ({error.strerror}); check the path and its rights") from None
+
+    def __iter__(self) -> Iterator[Datagram]:
+        self.num_cut = 0
+        pending: dict[tuple, dict[int, tuple[bytes, bool]]] = {}
+        with self._open() as file:
+            is_ng = file.read(4) == _PCAPNG
+            file.seek(0)
+            try:
+                for time, link, packet in (_read_pcapng if is_ng else _read_pcap)(file):
+                    datagram = self._datagram(time, _ip_packet(packet, link), pending)
+                    if datagram is not None:
+                        yield datagram
+            except FormatError as problem:
+                raise file_error(self.path, problem) from None
+            except GeneratorExit:
+                # not asked for to the end
+                pending.clear()
+                raise
+            finally:
+                self.num_cut += len(pending)
+
+    def _datagram(self, time: float, ip: memoryview | None, pending: dict) -> Datagram | None:
+        """The datagram that a packet holds, or completes."""
+        part = None if ip is None else _udp_part(ip)
+        if part is None:
+            return None
+        source, key, offset, has_more, data, length = part
+        if len(data) < length:
+            self.num_cut += 1
+            return None
+        if offset or has_more:
+            data = self._reassembled(key, offset, has_more, bytes(data), pending)
+        if len(data) < 8:
+            return None
+        _, port, size = struct.unpack_from(">HHH", data)
+        size = size or len(data)
+        if size > len(data):
+            self.num_cut += 1
+            return None
+        return Datagram(time, (source, port), bytes(data[8:size]))
+
+    def _reassembled(self, key: tuple, offset: int, has_more: bool, data: bytes, pending: dict) -> bytes:
+        """The whole datagram where this fragment is the last one missing, else nothing."""
+        parts = pending.setdefault(key, {})
+        parts[offset] = data, has_more
+        size = sum(len(part) for part, _ in parts.values())
+        if size > _MAX_DATAGRAM or len(pending) > _MAX_PENDING:
+            # the oldest one never comes, or fragments overlap
+            pending.pop(key if size > _MAX_DATAGRAM else next(iter(pending)))
+            self.num_cut += 1
+        last = max(parts)
+        if parts[last][1] or last + len(parts[last][0]) != size:
+            return b""
+        pending.pop(key, None)
+        return b"".join(parts[offset][0] for offset in sorted(parts))
+
+
+def _take(file: BinaryIO, size: int) -> bytes:
+    if not 0 <= size <= _MAX_PACKET:
+        raise FormatError(f"is damaged at byte {file.tell()}: a packet of {size} bytes")
+    data = file.read(size)
+    if len(data) < size:
+        raise FormatError("is cut off: what was captured up to there is read")
+    return data
+
+
+def _read_pcap(file: BinaryIO) -> Iterator[tuple[float, int, bytes]]:
+    """(time, link type, packet) of each record."""
+    order, ticks = _MAGIC[_take(file, 4)]
+    link = struct.unpack(order + "I", _take(file, 20)[16:])[0] & 0xFFFF
+    _check_link(link)
+    while file.peek(1):  # type: ignore[attr-defined]
+        seconds, fraction, size, _ = struct.unpack(order + "4I", _take(file, 16))
+        yield seconds + fraction / ticks, link, _take(file, size)
+
+
+def _read_pcapng(file: BinaryIO) -> Iterator[tuple[float, int, bytes]]:
+    order = "<"
+    # link type and ticks a second of each interface
+    interfaces: list[tuple[int, float]] = []
+    while file.peek(1):  # type: ignore[attr-defined]
+        kind = _take(file, 4)
+        if kind == _PCAPNG:
+            size, magic = _take(file, 4), _take(file, 4)
+            order = "<" if magic == b"\x4d\x3c\x2b\x1a" else ">"
+            interfaces = []
+            _take(file, struct.unpack(order + "I", size)[0] - 12)
+            continue
+        (size,) = struct.unpack(order + "I", _take(file, 4))
+        body = _take(file, size - 8)[:-4]
+        (number,) = struct.unpack(order + "I", kind)
+        if number == 1 and len(body) >= 8:
+            link = struct.unpack_from(order + "H", body)[0]
+            _check_link(link)
+            interfaces.append((link, _ticks(body[8:], order)))
+        elif number == 6 and len(body) >= 20:
+            interface, high, low, size, _ = struct.unpack_from(order + "5I", body)
+            if interface < len(interfaces):
+                link, ticks = interfaces[interface]
+                yield (high * 2**32 + low) / ticks, link, body[20 : 20 + size]
+
+
+def _ticks(options: bytes, order: str) -> float:
+    """Ticks a second of an interface, from its options."""
+    at = 0
+    while at + 5 <= len(options):
+        code, size = struct.unpack_from(order + "HH", options, at)
+        if code == 9:
+            value = options[at + 4]
+            return 2.0 ** (value & 127) if value & 128 else 10.0**value
+        at += 4 + (size + 3) // 4 * 4
+    return 1e6
+
+
+def _check_link(link: int) -> None:
+    if link not in _LINKS:
+        raise FormatError(
+            "a capture of Ethernet, Linux cooked or raw IP packets", f"link type {link}", "capture it anew"
+        )
+
+
+def _ip_packet(packet: bytes, link: int) -> memoryview | None:
+    """The IP packet in one of a link, or None."""
+    type_at, start = _LINKS[link]
+    view = memoryview(packet)
+    if type_at is not None:
+        (kind,) = struct.unpack(">H", bytes(view[type_at : type_at + 2]).rjust(2, b"\0"))
+        while link == _ETHERNET and kind in _VLAN and start + 4 <= len(packet):
+            (kind,) = struct.unpack_from(">H", packet, start + 2)
+            start += 4
+        if kind not in _IP:
+            return None
+    return view[start:]
+
+
+def _udp_part(ip: memoryview):
+    """(source, key, offset, whether more fragments follow, data, its length by the header) of a packet of UDP, or
+    None."""
+    version = ip[0] >> 4 if ip else 0
+    if version == 4 and len(ip) >= 20:
+        start, total, number, flags = (ip[0] & 15) * 4, *struct.unpack_from(">HHH", ip, 2)
+        if ip[9] != 17 or start < 20:
+            return None
+        # cards that cut packets up themselves leave the length open
+        total = total or len(ip)
+        offset, has_more = (flags & 0x1FFF) * 8, bool(flags & 0x2000)
+        return bytes(ip[12:16]), (bytes(ip[12:20]), number), offset, has_more, ip[start:total], total - start
+    if version == 6 and len(ip) >= 40:
+        start, kind, total = 40, ip[6], 40 + struct.unpack_from(">H", ip, 4)[0]
+        offset, has_more, number = 0, False, 0
+        if kind == 44 and len(ip) >= 48:
+            kind, flags, number = ip[40], *struct.unpack_from(">HI", ip, 42)
+            start, offset, has_more = 48, flags & 0xFFF8, bool(flags & 1)
+        if kind == 17:
+            return bytes(ip[8:24]), (bytes(ip[8:40]), number), offset, has_more, ip[start:total], total - start
+    return None

@@ -1,0 +1,337 @@
+"""Point clouds of ROS recordings: sensor_msgs/PointCloud2 in MCAP, ROS 1 bags and rosbag2's SQLite files.
+
+Messages are decoded by the library rosbags. The sensor's pose comes from the recording's transforms (tf), where they
+join the clouds' frame to a world's.
+"""
+
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Callable, Iterator
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidarpose.errors import InputError, missing_extra
+from lidarpose.io.files import FormatError, file_error, shorten
+from lidarpose.io.sources.containers import McapFile, Message, RecordFile, Ros1File, SqliteFile, Topic
+from lidarpose.io.sources.folders import natural_key
+from lidarpose.io.sources.frame import LazyFrame, Sweep
+
+_FILES: dict[str, type[RecordFile] | type[SqliteFile]] = {".mcap": McapFile, ".bag": Ros1File, ".db3": SqliteFile}
+_CLOUD = ("sensor_msgs/msg/PointCloud2", "sensor_msgs/PointCloud2")
+_TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf2_msgs/TFMessage", "tf/tfMessage")
+# of a PointField
+_DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+# names under which drivers publish a point's beam
+_RING = ("ring", "channel", "line", "laser_id")
+# frames that stand still; the first is preferred (REP 105)
+_WORLDS = ("map", "world", "odom")
+# frames of the vehicle or the world, in which the sensor's own place is not the origin
+_NO_SENSORS = (*_WORLDS, "earth", "base_link", "base_footprint", "base")
+
+# a sensor's pose is interpolated between transforms that are at most so far apart, ns
+_MAX_GAP = 10**9
+# clouds wait for transforms that are recorded after them: so many, and so long, ns
+_MAX_WAITING, _MAX_WAIT = 16, 10**9
+# transforms that are kept of each frame
+_MAX_KEPT = 1000
+
+
+def open_recording(path: Path, *, topic: str | None = None) -> "BagRecording":
+    """Opens a .mcap, .bag or .db3 file, or a folder that rosbag2 made.
+
+    Args:
+        topic: of the clouds; by default the only one with clouds, or the one with most.
+
+    Raises:
+        InputError: No such recording, no point clouds in it, or no such topic.
+        MissingExtra: Without the library that decodes messages.
+    """
+    _decoders()
+    files = [path]
+    if path.is_dir():
+        files = sorted((file for file in path.iterdir() if file.suffix.lower() in _FILES), key=natural_key)
+        if not files:
+            packed = next(path.glob("*.zstd"), None)
+            remedy = f"; unpack {packed.name} first (unzstd)" if packed else "; was it copied completely?"
+            raise file_error(path, f"expected a recording's {' or '.join(_FILES)} files in this folder{remedy}")
+    return BagRecording(str(path), [_open_file(file) for file in files], topic)
+
+
+def _open_file(path: Path) -> RecordFile | SqliteFile:
+    try:
+        return _FILES[path.suffix.lower()](path)
+    except FormatError as problem:
+        raise file_error(path, problem) from None
+    except OSError as error:
+        raise file_error(path, f"cannot be read ({error.strerror}); check the path and its rights") from None
+
+
+class BagRecording:
+    """The clouds of a topic. A `Recording`; a frame is one message, and its time the one in its header.
+
+    Args:
+        files: what the recording consists of, in order.
+        topic: None for the one with most clouds.
+    """
+
+    def __init__(self, name: str, files: list[RecordFile | SqliteFile], topic: str | None):
+        self.name = name
+        self.files = files
+        topics: dict[str, Topic] = {}
+        for file in files:
+            for key, entry in file.topics.items():
+                topics.setdefault(key, Topic(entry.type, entry.encoding)).count += entry.count
+        self._notes: list[str] = []
+        self.topics = topics
+        self.topic = self._choose(topic)
+        self._transforms = {
+            key for key, entry in topics.items() if entry.type in _TRANSFORMS and entry.encoding in _decoders()
+        }
+        self._world: str | None = None
+        self._has_stamps = True
+        self._num_frames = self._num_posed = 0
+        self._damage: InputError | None = None
+
+    def _choose(self, topic: str | None) -> str:
+        clouds = {
+            key: entry.count
+            for key, entry in self.topics.items()
+            if entry.type in _CLOUD and entry.encoding in _decoders()
+        }
+        if not clouds:
+            topics = ", ".join(f"{key} ({entry.type}, {entry.encoding})" for key, entry in self.topics.items())
+            problem = f"has no point clouds (expected a topic of {_CLOUD[0]}); its topics are"
+            raise file_error(self.name, f"{problem} {shorten(topics, 1000) or 'none'}")
+        names = ", ".join(f"{key} ({count})" for key, count in clouds.items())
+        if topic is not None and topic not in clouds:
+            raise file_error(self.name, f"has no point clouds in the topic {topic!r}; those with clouds are {names}")
+        if topic is None:
+            topic = max(clouds, key=clouds.__getitem__)
+            if len(clouds) > 1:
+                self._notes.append(f"read the topic {topic}, which has most clouds, of {names}: give topic for another")
+        return topic
+
+    @property
+    def count(self) -> int | None:
+        return self.topics[self.topic].count or None
+
+    @property
+    def warnings(self) -> list[str]:
+        lines = list(self._notes)
+        if not self._has_stamps:
+            lines.append("clouds without a time in their header: the times when they were recorded are taken")
+        if 0 < self._num_posed < self._num_frames:
+            lost = f"{self._num_frames - self._num_posed} of {self._num_frames} clouds"
+            lines.append(f"{lost} have no sensor pose in the frame {self._world}")
+        for file in self.files:
+            if file.num_damaged:
+                lines.append(f"{file.path.name}: {file.num_damaged} chunks are left out: one {file.damage}")
+        return lines
+
+    def lazy_frames(self, first: int = 0) -> Iterator[LazyFrame]:
+        self._num_frames = self._num_posed = 0
+        transforms = TransformTree()
+        # clouds that wait for the pose of their sensor
+        waiting: deque[_Cloud] = deque()
+        index = 0
+        for message in self._messages():
+            if message.topic == self.topic:
+                if index >= first:
+                    waiting.append(_Cloud(index, message, self._decode(message)))
+                index += 1
+            else:
+                transforms.add(self._decode(message), is_static=message.topic.endswith("_static"))
+            while waiting:
+                is_late = len(waiting) > _MAX_WAITING or message.time - waiting[0].recorded > _MAX_WAIT
+                is_last = is_late or not self._transforms
+                T_world_sensor = self._pose(transforms, waiting[0], is_last)
+                if T_world_sensor is None and not is_last:
+                    break
+                yield self._frame(waiting.popleft(), T_world_sensor)
+        for cloud in waiting:
+            yield self._frame(cloud, self._pose(transforms, cloud, True))
+        if self._damage is not None:
+            raise self._damage
+
+    def _decode(self, message: Message) -> Any:
+        """The content of a message, or None where it is damaged."""
+        name = _CLOUD[0] if message.topic == self.topic else _TRANSFORMS[0]
+        try:
+            return _decoders()[self.topics[message.topic].encoding](message.data, name)
+        except Exception:
+            return None
+
+    def _messages(self) -> Iterator[Message]:
+        """Clouds and transforms of all files. Where one of them is damaged, the next one goes on."""
+        self._damage = None
+        for file in self.files:
+            try:
+                yield from file.messages({self.topic, *self._transforms})
+            except FormatError as problem:
+                self._damage = file_error(file.path, problem)
+            except OSError as error:
+                self._damage = file_error(
+                    file.path, f"cannot be read ({error.strerror}); check the path and its rights"
+                )
+
+    def _pose(self, transforms: "TransformTree", cloud: "_Cloud", is_last: bool) -> np.ndarray | None:
+        """T_world_sensor at a cloud's time. The world is chosen once: the first of `_WORLDS`, or, at last, another."""
+        poses = transforms.poses(cloud.frame_id, cloud.stamp)
+        if self._world is None:
+            known = [world for world in _WORLDS if world in poses]
+            if known and (is_last or known[0] == _WORLDS[0]):
+                self._world = known[0]
+        return poses.get(self._world or "")
+
+    def _frame(self, cloud: "_Cloud", T_world_sensor: np.ndarray | None) -> LazyFrame:
+        self._has_stamps &= cloud.has_stamp
+        self._num_frames += 1
+        self._num_posed += T_world_sensor is not None
+        return LazyFrame(f"{cloud.index:06d}", cloud.stamp / 1e9, partial(cloud.decode, T_world_sensor))
+
+
+class _Cloud:
+    """A message with a cloud: recorded and stamp, ns, when it was recorded and when it was measured, as far as its
+    header tells."""
+
+    def __init__(self, index: int, message: Message, content: Any):
+        self.index = index
+        self.recorded = message.time
+        self.content = content
+        header = getattr(content, "header", None)
+        self.frame_id = header.frame_id.lstrip("/") if header else ""
+        stamp = header.stamp.sec * 10**9 + header.stamp.nanosec if header else 0
+        self.has_stamp = stamp > 0 or header is None
+        self.stamp = stamp if stamp > 0 else message.time
+
+    def decode(self, T_world_sensor: np.ndarray | None) -> Sweep:
+        if self.content is None:
+            raise FormatError("cannot be decoded as a PointCloud2: the message is damaged")
+        points, ring = decode_cloud(self.content)
+        origin = None if self.frame_id in _NO_SENSORS else np.zeros(3)
+        return Sweep(points=points, T_world_sensor=T_world_sensor, origin=origin, ring=ring)
+
+
+@cache
+def _decoders() -> dict[str, Callable[[bytes, str], Any]]:
+    """What decodes messages of each encoding."""
+    try:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    except ModuleNotFoundError as error:
+        raise missing_extra(error, "reading a ROS recording") from None
+    ros1, ros2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
+    ros1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", _TRANSFORMS[0]))
+    return {"cdr": ros2.deserialize_cdr, "ros1": ros1.deserialize_ros1}
+
+
+def decode_cloud(cloud: Any) -> tuple[np.ndarray, np.ndarray | None]:
+    """The points (n, 3) of a PointCloud2, float64, and the ring (n,) of each if it is told.
+
+    Fields may lie anywhere in a point, in any number type and either byte order; rows may be padded.
+
+    Raises:
+        FormatError: No x, y, z, or a layout that does not fit the data.
+    """
+    names = {field.name.lower(): field for field in reversed(cloud.fields)}
+    ring = next((name for name in _RING if name in names), None)
+    wanted = ["x", "y", "z", *([ring] if ring else [])]
+    if not {"x", "y", "z"} <= names.keys():
+        came = shorten(", ".join(names)) or "none"
+        raise FormatError("fields x, y, z in a PointCloud2", came, "choose another topic")
+    order = ">" if cloud.is_bigendian else "<"
+    for name in wanted:
+        field = names[name]
+        size = np.dtype(_DATATYPES.get(field.datatype, "f8")).itemsize
+        if field.datatype not in _DATATYPES or field.offset + size > cloud.point_step:
+            where = f"datatype {field.datatype} at byte {field.offset} of {cloud.point_step}"
+            raise FormatError(f"the field {name} within a point", where, "record it anew")
+    formats = [order + _DATATYPES[names[name].datatype] for name in wanted]
+    offsets = [names[name].offset for name in wanted]
+    point = np.dtype({"names": wanted, "formats": formats, "offsets": offsets, "itemsize": cloud.point_step})
+    # of a single row the step is often left out
+    row_step = cloud.row_step if cloud.height > 1 else cloud.width * cloud.point_step
+    needed = row_step * (cloud.height - 1) + cloud.width * cloud.point_step
+    if row_step < cloud.width * cloud.point_step or needed > len(cloud.data):
+        layout = f"{cloud.height} rows of {cloud.width} points of {cloud.point_step} bytes"
+        raise FormatError(layout, f"{len(cloud.data)} bytes", "the cloud is cut off")
+    shape, strides = (cloud.height, cloud.width), (row_step, cloud.point_step)
+    rows = np.ndarray(shape, point, cloud.data, strides=strides) if cloud.width * cloud.height else np.empty(0, point)
+    points = np.stack([rows[name].ravel().astype(np.float64) for name in "xyz"], axis=-1)
+    if ring is None:
+        return points, None
+    with np.errstate(invalid="ignore"):
+        return points, rows[ring].ravel().astype(np.int64)
+
+
+class TransformTree:
+    """The transforms of a recording as far as it was read: which frame is where in which other."""
+
+    def __init__(self):
+        # child -> parent, times ns (empty where it never moves), and (translation m, quaternion x y z w) at each
+        self._edges: dict[str, tuple[str, list[int], list[np.ndarray]]] = {}
+
+    def add(self, message: Any, *, is_static: bool) -> None:
+        """Takes a TFMessage; what is no transform in it is left out."""
+        for stamped in getattr(message, "transforms", ()):
+            child, parent = stamped.child_frame_id.lstrip("/"), stamped.header.frame_id.lstrip("/")
+            t, q = stamped.transform.translation, stamped.transform.rotation
+            placed = np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w])
+            norm = np.linalg.norm(placed[3:])
+            if not np.isfinite(placed).all() or not norm > 0 or child == parent:
+                continue
+            placed[3:] /= norm
+            time = stamped.header.stamp.sec * 10**9 + stamped.header.stamp.nanosec
+            known, times, placements = self._edges.get(child, (parent, [], []))
+            if is_static or known != parent or not times:
+                times, placements = [], []
+            k = bisect_left(times, time)
+            if not is_static:
+                times.insert(k, time)
+            placements.insert(k, placed)
+            self._edges[child] = parent, times[-_MAX_KEPT:], placements[-_MAX_KEPT:]
+
+    def poses(self, frame: str, time: int) -> dict[str, np.ndarray]:
+        """T_parent_frame (4, 4) of the frame in each of those above it, itself included, at a time in ns; those after a
+        transform that is not known then are left out."""
+        poses = {frame: np.eye(4)}
+        T = np.eye(4)
+        while frame in self._edges:
+            parent, times, placements = self._edges[frame]
+            step = _between(times, placements, time) if times else _matrix(placements[0])
+            # a circle has no top
+            if step is None or parent in poses:
+                break
+            T = step @ T
+            poses[parent] = T
+            frame = parent
+        return poses
+
+
+def _between(times: list[int], placements: list[np.ndarray], time: int) -> np.ndarray | None:
+    """The transform at a time between two that are known, or None."""
+    k = bisect_left(times, time)
+    if k < len(times) and times[k] == time:
+        return _matrix(placements[k])
+    if not 0 < k < len(times) or times[k] - times[k - 1] > _MAX_GAP:
+        return None
+    share = (time - times[k - 1]) / (times[k] - times[k - 1])
+    before, after = placements[k - 1], placements[k].copy()
+    # q and -q are the same rotation; over so short a time the chord is the arc
+    after[3:] *= np.sign(before[3:] @ after[3:]) or 1.0
+    return _matrix((1 - share) * before + share * after)
+
+
+def _matrix(placed: np.ndarray) -> np.ndarray:
+    """(4, 4) of a translation and a quaternion x y z w, of any length."""
+    x, y, z, w = placed[3:] / np.linalg.norm(placed[3:])
+    T = np.eye(4)
+    T[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    T[:3, 3] = placed[:3]
+    return T

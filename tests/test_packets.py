@@ -1,0 +1,393 @@
+"""Captures of fabricated packets: every profile of Ouster, every way of capturing, every loss.
+
+The encoder here writes bits and points one by one from the published formats; it shares nothing with the decoder.
+"""
+
+import json
+import struct
+from math import cos, hypot, pi, radians, sin
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidarpose.errors import InputError
+from lidarpose.io.sources import DamagedFrame, open_source
+from lidarpose.io.sources.ouster import OusterFormat
+from lidarpose.io.sources.pcap import Capture
+
+# profile -> bytes of a pixel, bits and unit of the range
+PROFILES = {
+    "LEGACY": (12, 20, 1),
+    "RNG19_RFL8_SIG16_NIR16": (12, 19, 1),
+    "RNG19_RFL8_SIG16_NIR16_DUAL": (16, 19, 1),
+    "RNG15_RFL8_NIR8": (4, 15, 8),
+    "RNG15_RFL8_NIR8_DUAL": (8, 15, 8),
+    "FUSA_RNG15_RFL8_NIR8_DUAL": (8, 15, 8),
+}
+ALTITUDE, AZIMUTH = [20.0, 5.5, -3.0, -17.25], [3.1, -1.2, 4.0, 0.0]
+COLUMNS, PER_PACKET, BEAMS = 32, 8, 4
+TO_SENSOR = [0, 1, 0, 10, -1, 0, 0, 20, 0, 0, 1, 30, 0, 0, 0, 1]
+RECORDINGS = sorted(Path("/work/shared/data/ouster").glob("*.pcap"))
+
+
+def metadata(profile="RNG19_RFL8_SIG16_NIR16", **changes):
+    return {
+        "beam_altitude_angles": ALTITUDE,
+        "beam_azimuth_angles": AZIMUTH,
+        "lidar_origin_to_beam_origin_mm": 15.806,
+        "lidar_to_sensor_transform": TO_SENSOR,
+        "prod_sn": "123456789",
+        "udp_port_lidar": 7502,
+        "data_format": {
+            "columns_per_frame": COLUMNS,
+            "columns_per_packet": PER_PACKET,
+            "pixels_per_column": BEAMS,
+            "column_window": [0, COLUMNS - 1],
+            "udp_profile_lidar": profile,
+        },
+        **changes,
+    }
+
+
+def ranges_of(frame, profile="RNG19_RFL8_SIG16_NIR16"):
+    """(columns, beams) mm, a fifth of them without a return."""
+    random = np.random.default_rng(frame)
+    unit = PROFILES[profile][2]
+    most = 2 ** PROFILES[profile][1] * unit
+    ranges = random.integers(1, most // unit, (COLUMNS, BEAMS)) * unit
+    return np.where(random.random(ranges.shape) < 0.2, 0, ranges)
+
+
+def packet(frame_id, first, ranges, profile="RNG19_RFL8_SIG16_NIR16", time=10**12, serial=123456789, invalid=()):
+    """The packet of columns first, first + 1, ..."""
+    size, bits, unit = PROFILES[profile]
+    body = b""
+    for column in range(first, first + PER_PACKET):
+        stamp = struct.pack("<QH", time + column * 1000, column)
+        pixels = b""
+        for value in ranges[column]:
+            word = (int(value) // unit) | (0xA5A5A5A5 << bits & 0xFFFFFFFF)
+            pixels += struct.pack("<I", word)[: 2 if bits == 15 else 4].ljust(size, b"\x5a")
+        if profile == "LEGACY":
+            status = 0 if column in invalid else 0xFFFFFFFF
+            body += stamp + struct.pack("<HI", frame_id, 77) + pixels + struct.pack("<I", status)
+        else:
+            body += stamp + struct.pack("<H", column not in invalid) + pixels
+    if profile == "LEGACY":
+        return body
+    if profile.startswith("FUSA"):
+        head = struct.pack("<B3sI3s5s", 1, b"\x01\x02\x03", frame_id, b"", serial.to_bytes(5, "little"))
+    else:
+        head = struct.pack("<HH3s5s", 1, frame_id, b"\x01\x02\x03", serial.to_bytes(5, "little"))
+    return head.ljust(32, b"\0") + body + bytes(32)
+
+
+def packets_of(frame_ids, profile="RNG19_RFL8_SIG16_NIR16", **options):
+    return [
+        packet(
+            frame_id % 65536, first, ranges_of(frame_id, profile), profile, time=10**12 + frame_id * 10**8, **options
+        )
+        for frame_id in frame_ids
+        for first in range(0, COLUMNS, PER_PACKET)
+    ]
+
+
+def expected_points(ranges, along=15.806, up=0.0):
+    """Sorted points m in the sensor's frame, one by one as the manual computes them."""
+    points = []
+    for column in range(COLUMNS):
+        for beam in range(BEAMS):
+            value = ranges[column][beam]
+            if value:
+                turn = 2 * pi * (1 - column / COLUMNS)
+                azimuth, altitude = -radians(AZIMUTH[beam]), radians(ALTITUDE[beam])
+                reach = value - hypot(along, up)
+                x = reach * cos(turn + azimuth) * cos(altitude) + along * cos(turn)
+                y = reach * sin(turn + azimuth) * cos(altitude) + along * sin(turn)
+                z = reach * sin(altitude) + up
+                points.append([(y + 10) / 1000, (-x + 20) / 1000, (z + 30) / 1000, beam])
+    return np.array(sorted(points))
+
+
+def decoded(frame):
+    rows = np.column_stack([frame.points, frame.ring])
+    return rows[np.lexsort(rows[:, ::-1].T)]
+
+
+# ---- captures
+
+
+def ip4(payload, port=7502, source=b"\x0a\0\0\x01", mtu=None, number=9):
+    """IPv4 packets of a UDP datagram, in fragments where it is longer than `mtu`."""
+    data = struct.pack(">HHHH", 7502, port, 8 + len(payload), 0) + payload
+    step = len(data) if mtu is None else mtu // 8 * 8
+    parts = []
+    for offset in range(0, len(data), step):
+        part = data[offset : offset + step]
+        flags = (offset + step < len(data)) << 13 | offset // 8
+        head = struct.pack(">BBHHHBBH", 0x46, 0, 24 + len(part), number, flags, 64, 17, 0)
+        parts.append(head + source + b"\x0a\0\0\x02" + b"\x01\x01\x01\0" + part)
+    return parts
+
+
+def ip6(payload, port=7502, mtu=None):
+    data = struct.pack(">HHHH", 7502, port, 8 + len(payload), 0) + payload
+    addresses = bytes(15) + b"\x01" + bytes(15) + b"\x02"
+    if mtu is None:
+        return [struct.pack(">IHBB", 6 << 28, len(data), 17, 64) + addresses + data]
+    parts = []
+    for offset in range(0, len(data), mtu // 8 * 8):
+        part = data[offset : offset + mtu // 8 * 8]
+        fragment = struct.pack(">BBHI", 17, 0, offset | (offset + len(part) < len(data)), 5)
+        parts.append(struct.pack(">IHBB", 6 << 28, 8 + len(part), 44, 64) + addresses + fragment + part)
+    return parts
+
+
+MACS = bytes(12)
+LINKS = {
+    "ethernet": (1, lambda ip: MACS + (b"\x08\0" if ip[:1] < b"\x60" else b"\x86\xdd") + ip.ljust(46, b"\0")),
+    "vlan": (1, lambda ip: MACS + b"\x88\xa8\0\x05\x81\0\0\x07\x08\0" + ip),
+    "linux": (113, lambda ip: bytes(14) + b"\x08\0" + ip),
+    "linux 2": (276, lambda ip: b"\x08\0" + bytes(18) + ip),
+    "raw": (101, lambda ip: ip),
+    "loopback": (0, lambda ip: b"\x02\0\0\0" + ip),
+}
+
+
+def write(path, ips, *, link="ethernet", order="<", nano=False, period=10**6):
+    """A pcap file of packets, the first after 1000.0005 s, the others `period` us apart."""
+    number, wrap = LINKS[link]
+    data = struct.pack(order + "IHHIIII", 0xA1B23C4D if nano else 0xA1B2C3D4, 2, 4, 0, 0, 262144, number)
+    for k, ip in enumerate(ips):
+        frame = wrap(ip)
+        time = 1_000_000_500 + k * period
+        data += (
+            struct.pack(order + "4I", time // 10**6, time % 10**6 * (1000 if nano else 1), *[len(frame)] * 2) + frame
+        )
+    path.write_bytes(data)
+    return path
+
+
+def write_ng(path, ips, order="<"):
+    """pcapng with two interfaces, the second in nanoseconds, and a block that nobody knows."""
+
+    def block(kind, body):
+        body += bytes(-len(body) % 4)
+        return struct.pack(order + "II", kind, len(body) + 12) + body + struct.pack(order + "I", len(body) + 12)
+
+    data = block(0x0A0D0D0A, struct.pack(order + "IHHq", 0x1A2B3C4D, 1, 0, -1))
+    data += block(1, struct.pack(order + "HHI", 1, 0, 0)) + block(0xBAD, b"what is this")
+    options = struct.pack(order + "HH4sHHB3sHH", 1, 3, b"abc\0", 9, 1, 9, b"", 0, 0)
+    data += block(1, struct.pack(order + "HHI", 101, 0, 0) + options)
+    for k, ip in enumerate(ips):
+        frame = LINKS["ethernet"][1](ip) if k % 2 == 0 else ip
+        ticks = (1000 + k) * (10**6 if k % 2 == 0 else 10**9)
+        head = struct.pack(order + "5I", k % 2, ticks >> 32, ticks & 0xFFFFFFFF, len(frame), len(frame))
+        data += block(6, head + frame)
+    path.write_bytes(data)
+    return path
+
+
+def ouster(path, ips, profile="RNG19_RFL8_SIG16_NIR16", **options):
+    path.with_suffix(".json").write_text(json.dumps(metadata(profile)))
+    return open_source(write(path, ips, **options))
+
+
+@pytest.mark.parametrize("order", "<>")
+@pytest.mark.parametrize("link", LINKS)
+def test_datagrams_come_out_of_any_capture(tmp_path, link, order):
+    payloads = [bytes([k]) * (10 + 700 * k) for k in range(6)]
+    ips = [part for k, payload in enumerate(payloads) for part in ip4(payload, mtu=1000, number=k)]
+    other = [ip4(b"tcp")[0][:9] + b"\x06" + ip4(b"tcp")[0][10:], b"", b"\x45", bytes(60)]
+    path = write(tmp_path / "a.pcap", [*other, *ips], link=link, order=order, nano=link == "raw")
+    datagrams = list(Capture(path))
+    assert [datagram.payload for datagram in datagrams] == payloads
+    assert {datagram.flow for datagram in datagrams} == {(b"\x0a\0\0\x01", 7502)}
+    assert abs(datagrams[0].time - 1004.0005) < 1e-6
+
+
+@pytest.mark.parametrize("order", "<>")
+def test_pcapng_and_ipv6_are_read(tmp_path, order):
+    payloads = [bytes([k]) * (10 + 700 * k) for k in range(4)]
+    ips = [part for payload in payloads for part in ip6(payload, mtu=1000 if len(payload) > 1000 else None)]
+    for path in (write_ng(tmp_path / "a.pcapng", ips, order), write(tmp_path / "a.pcap", ips)):
+        datagrams = list(Capture(path))
+        assert [datagram.payload for datagram in datagrams] == payloads and datagrams[0].time < datagrams[1].time < 1010
+
+
+def test_fragments_in_any_order_make_a_datagram_and_missing_ones_are_counted(tmp_path):
+    payload = bytes(range(256)) * 20
+    parts = ip4(payload, mtu=1000)
+    capture = Capture(write(tmp_path / "a.pcap", parts[::-1]))
+    assert [datagram.payload for datagram in capture] == [payload]
+    others = [part for k in range(200) for part in ip4(payload, mtu=1000, number=k + 10)[:-1]]
+    capture = Capture(write(tmp_path / "b.pcap", [*others, *parts]))
+    assert [datagram.payload for datagram in capture] == [payload] and capture.num_cut == 200
+
+
+# ---- Ouster
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_every_profile_decodes_as_the_manual_computes(tmp_path, profile):
+    packets = packets_of(range(3), profile, invalid=(5,) if profile != "RNG15_RFL8_NIR8" else ())
+    source = ouster(tmp_path / "a.pcap", [ip for payload in packets for ip in ip4(payload, mtu=1400)], profile)
+    frames = list(source)
+    assert [frame.index for frame in frames] == [0, 1, 2] and not source.warnings
+    for k, frame in enumerate(frames):
+        ranges = ranges_of(k, profile)
+        if profile != "RNG15_RFL8_NIR8":
+            ranges[5] = 0
+            assert frame.warnings == (f"1 of {COLUMNS} columns are missing",)
+        assert np.allclose(decoded(frame), expected_points(ranges), rtol=0, atol=1e-9)
+        assert abs(frame.time - 1000 - k / 10) < 1e-9 and np.allclose(frame.origin, [0.01, 0.02, 0.03])
+
+
+def test_metadata_of_newer_sensors_is_in_sections(tmp_path):
+    plain = metadata()
+    form = plain.pop("data_format")
+    beams = {key: plain.pop(key) for key in ("beam_altitude_angles", "beam_azimuth_angles")}
+    beams["beam_to_lidar_transform"] = [1, 0, 0, 12.0, 0, 1, 0, 0, 0, 0, 1, 5.0, 0, 0, 0, 1]
+    lidar = {"lidar_to_sensor_transform": plain.pop("lidar_to_sensor_transform")}
+    sections = {"beam_intrinsics": beams, "lidar_intrinsics": lidar, "lidar_data_format": form, "sensor_info": plain}
+    (tmp_path / "a.json").write_text(json.dumps(sections))
+    (frame,) = open_source(write(tmp_path / "a.pcap", [ip4(payload)[0] for payload in packets_of([0])]))
+    assert np.allclose(decoded(frame), expected_points(ranges_of(0), 12.0, 5.0), rtol=0, atol=1e-9)
+
+
+def test_lost_late_and_doubled_packets_are_counted(tmp_path):
+    packets = packets_of([65534, 65535, 65536, 65537])
+    lost = packets.pop(6)
+    packets.insert(9, lost)  # of the second turn, after the third began
+    packets.insert(2, packets[1])
+    packets = [payload for k, payload in enumerate(packets) if k != 13]
+    source = ouster(tmp_path / "a.pcap", [ip4(payload)[0] for payload in packets])
+    frames = list(source)
+    assert [len(frame.warnings) for frame in frames] == [0, 1, 0, 1]
+    assert frames[1].warnings == (f"{PER_PACKET} of {COLUMNS} columns are missing",)
+    for k in (0, 2):
+        assert np.allclose(decoded(frames[k]), expected_points(ranges_of(65534 + k)), rtol=0, atol=1e-9)
+    assert source.warnings == ("1 of 8 lidar packets were lost",)
+
+
+def test_packets_of_other_sensors_are_left_out(tmp_path):
+    mine, other = packets_of([0, 1]), packets_of([5, 6])
+    ips = [ip for a, b in zip(mine, other, strict=True) for ip in (*ip4(b, port=7512), *ip4(a), *ip4(b"imu" * 16))]
+    source = ouster(tmp_path / "a.pcap", ips)
+    assert np.allclose(decoded(list(source)[1]), expected_points(ranges_of(1)), rtol=0, atol=1e-9)
+    assert source.warnings == ("8 lidar packets of another sensor are left out",)
+    source = ouster(tmp_path / "b.pcap", [ip4(payload)[0] for payload in packets_of([0], serial=5)])
+    list(source)
+    assert "of the sensor 5" in source.warnings[0] and "123456789" in source.warnings[0]
+
+
+def test_a_column_window_expects_only_its_columns(tmp_path):
+    for window, firsts in (((8, 20), (8, 16)), ((26, 9), (24, 0, 8))):
+        data = metadata()
+        data["data_format"]["column_window"] = window
+        (tmp_path / "a.json").write_text(json.dumps(data))
+        inside = [c for c in range(COLUMNS) if (window[0] <= c <= window[1]) == (window[0] < window[1]) or c in window]
+        invalid = set(range(COLUMNS)) - set(inside)
+        packets = [packet(k, first, ranges_of(k), invalid=invalid) for k in range(3) for first in firsts]
+        source = open_source(write(tmp_path / "a.pcap", [ip4(payload)[0] for payload in packets]))
+        assert [frame.warnings for frame in source] == [()] * 3 and not source.warnings
+
+
+def test_what_is_missing_or_wrong_is_one_line(tmp_path):
+    ips = [ip4(payload)[0] for payload in packets_of([0])]
+    path = write(tmp_path / "walk.pcap", ips)
+    with pytest.raises(InputError, match="needs its metadata walk.json beside it"):
+        open_source(path)
+    with pytest.raises(InputError, match="no UDP packets"):
+        open_source(write(tmp_path / "empty.pcap", []))
+    (tmp_path / "no.pcap").write_bytes(b"no capture")
+    with pytest.raises(InputError, match="no packet capture"):
+        open_source(tmp_path / "no.pcap")
+    with pytest.raises(InputError, match="link type"):
+        LINKS["usb"] = (189, lambda ip: ip)
+        open_source(write(tmp_path / "usb.pcap", ips, link="usb"))
+    LINKS.pop("usb")
+
+    sizes = metadata("RNG15_RFL8_NIR8")
+    for content, problem in (
+        ("[1]", "expected an object"),
+        ("{", "cannot be read"),
+        ("{}", "beam_altitude_angles"),
+        (json.dumps(sizes), "expected lidar packets of .* got 4 of"),
+        (json.dumps(metadata("RNG99")), "udp_profile_lidar.*RNG99"),
+        (json.dumps(metadata(beam_azimuth_angles=[1.0])), "4 altitudes and 1 azimuths"),
+        (json.dumps(metadata(beam_altitude_angles=[1.0, float("nan"), 1, 1])), "finite"),
+        (json.dumps(metadata(lidar_to_sensor_transform=[1, 2])), "cannot be read"),
+        (json.dumps(metadata(data_format={"columns_per_frame": 10**9})), "columns_per_frame from 1 to"),
+        (json.dumps(metadata(data_format={"columns_per_frame": None})), "cannot be read"),
+        ("[" * 10**5, "cannot be read"),
+    ):
+        (tmp_path / "walk.json").write_text(content)
+        with pytest.raises(InputError, match=problem) as error:
+            open_source(path)
+        assert "\n" not in str(error.value)
+
+
+def test_a_capture_that_is_cut_off_or_damaged_keeps_what_is_whole(tmp_path):
+    source = ouster(tmp_path / "a.pcap", [ip for k in packets_of(range(6)) for ip in ip4(k, mtu=200)])
+    path, data = tmp_path / "a.pcap", (tmp_path / "a.pcap").read_bytes()
+    assert len(list(source)) == 6
+    path.write_bytes(data[: len(data) * 7 // 12])
+    *frames, end = source
+    assert len(frames) == 4 and isinstance(end, DamagedFrame) and "cut off" in end.error
+    for k, frame in enumerate(frames[:3]):
+        assert np.allclose(decoded(frame), expected_points(ranges_of(k)), rtol=0, atol=1e-9)
+    random = np.random.default_rng(7)
+    for _ in range(60):
+        broken = np.frombuffer(data, np.uint8).copy()
+        at = random.integers(0, len(data), random.integers(1, 40))
+        broken[at] = random.integers(0, 256, len(at))
+        path.write_bytes(broken.tobytes())
+        try:
+            assert all(
+                isinstance(frame, DamagedFrame) or np.isfinite(frame.points).all() for frame in open_source(path)
+            )
+        except InputError as error:
+            assert "\n" not in str(error)
+
+
+@pytest.mark.skipif(not RECORDINGS, reason="no Ouster recordings on this machine")
+@pytest.mark.parametrize("path", RECORDINGS, ids=lambda path: path.stem)
+def test_recordings_of_sensors_are_whole_rooms(path):
+    (frame,) = open_source(path)
+    assert len(frame.points) > 20_000 and not frame.warnings
+    assert frame.ring.max() + 1 == OusterFormat(path.with_suffix(".json")).beams
+
+
+# ---- Velodyne
+
+
+def vlp16(first, stamp, distance=5000, model=0x22):
+    """A packet of 12 blocks of a VLP-16 at 0.4 degrees a block; distances in 2 mm."""
+    blocks = b"".join(
+        struct.pack("<HH", 0xEEFF, (first + 40 * k) % 36000) + struct.pack("<HB", distance, 7) * 32 for k in range(12)
+    )
+    return blocks + struct.pack("<IBB", stamp, 0x37, model)
+
+
+def test_velodyne_packets_are_turns(tmp_path):
+    pytest.importorskip("velodyne_decoder", reason="the extra recordings is not installed")
+    ips = [ip4(vlp16(k * 480 % 36000, k * 1330))[0] for k in range(200)]
+    source = open_source(write(tmp_path / "a.pcap", [*ips, *ip4(bytes(512), port=8308)], period=1330))
+    first, second, _ = frames = list(source)
+    assert len(frames) == 3 and not source.warnings and 1000 < first.time < 1000.15 < second.time < 1000.25
+    assert np.allclose(np.linalg.norm(second.points, axis=1), 10, atol=0.1)
+    assert sorted(np.unique(second.ring)) == list(range(16)) and np.array_equal(second.origin, np.zeros(3))
+    elevation = [np.degrees(np.arcsin(second.points[second.ring == k, 2] / 10)).mean() for k in range(16)]
+    assert np.allclose(sorted(elevation), np.arange(-15, 16, 2), atol=0.1)
+    assert [frame.index for frame in source.frames(2)] == [2]
+
+    broken = [*ip4(bytes(1206)), *ips[:5]]
+    source = open_source(write(tmp_path / "b.pcap", broken, period=1330))
+    assert len(list(source)) == 1 and source.warnings == ("1 packets are not of the sensor's model, and are left out",)
+    hdl64 = [ip4(vlp16(0, k, model=k * 11))[0] for k in range(9)]
+    with pytest.raises(InputError, match="HDL-64E whose calibration is not in it"):
+        open_source(write(tmp_path / "d.pcap", hdl64))
+    with pytest.raises(InputError, match="Velodyne model that can be decoded"):
+        open_source(write(tmp_path / "c.pcap", [ip4(bytes(1206))[0]] * 9))

@@ -1,0 +1,363 @@
+"""Point clouds of ROS recordings, written by rosbags' own writers: every layout, container and kind of damage."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidarpose.errors import InputError
+from lidarpose.io.sources import DamagedFrame, open_source
+from lidarpose.io.sources.rosbag import decode_cloud
+
+rosbags = pytest.importorskip("rosbags", reason="the extra recordings is not installed")
+from rosbags.rosbag1 import Writer as Writer1  # noqa: E402
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin  # noqa: E402
+from rosbags.rosbag2 import Writer as Writer2  # noqa: E402
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: E402
+
+ROS2, ROS1 = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC)
+TF = "tf2_msgs/msg/TFMessage"
+ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF))
+CLOUD = "sensor_msgs/msg/PointCloud2"
+START = 1_700_000_000 * 10**9
+CODES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+XYZ = (("x", 0, "f4"), ("y", 4, "f4"), ("z", 8, "f4"))
+
+
+def header(store, stamp, frame):
+    types = store.types
+    time = types["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
+    more = {"seq": 0} if store is ROS1 else {}
+    return types["std_msgs/msg/Header"](stamp=time, frame_id=frame, **more)
+
+
+def cloud(
+    points, *, store=ROS2, stamp=START, frame="lidar", fields=XYZ, step=16, big=False, height=1, pad=0, extra=None
+):
+    """A PointCloud2 of (n, 3) points, written value by value; `extra` fills the other fields."""
+    types = store.types
+    width = len(points) // height
+    data = bytearray((width * step + pad) * height)
+    values = {**dict(zip("xyz", np.asarray(points, dtype=float).T, strict=True)), **(extra or {})}
+    for name, offset, kind in fields:
+        letter = dict(zip(CODES, "bBhHiIfd", strict=True))[kind]
+        for k, value in enumerate(values[name]):
+            at = (k // width) * (width * step + pad) + (k % width) * step + offset
+            struct.pack_into((">" if big else "<") + letter, data, at, value if letter in "fd" else int(value))
+    return types[CLOUD](
+        header=header(store, stamp, frame),
+        height=height,
+        width=width,
+        fields=[
+            types["sensor_msgs/msg/PointField"](name=name, offset=offset, datatype=CODES[kind], count=1)
+            for name, offset, kind in fields
+        ],
+        is_bigendian=big,
+        point_step=step,
+        row_step=width * step + pad,
+        data=np.frombuffer(bytes(data), np.uint8),
+        is_dense=False,
+    )
+
+
+def transform(stamp, parent, child, translation, yaw=0.0, store=ROS2):
+    types = store.types
+    quaternion = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=np.sin(yaw / 2), w=np.cos(yaw / 2))
+    vector = types["geometry_msgs/msg/Vector3"](*(float(value) for value in translation))
+    placed = types["geometry_msgs/msg/Transform"](translation=vector, rotation=quaternion)
+    stamped = types["geometry_msgs/msg/TransformStamped"](
+        header=header(store, stamp, parent), child_frame_id=child, transform=placed
+    )
+    return types[TF](transforms=[stamped])
+
+
+def write(path, messages, *, compression=None):
+    """A recording of (topic, message, ns); the suffix says the container. Returns the path to open."""
+    store = ROS1 if path.suffix == ".bag" else ROS2
+    if path.suffix == ".bag":
+        writer = Writer1(path)
+        if compression:
+            writer.set_compression(getattr(Writer1.CompressionFormat, compression.upper()))
+    else:
+        plugin = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
+        writer = Writer2(path.with_suffix(""), version=9, storage_plugin=plugin)
+        if compression:
+            mode = CompressionMode.STORAGE if path.suffix == ".mcap" else CompressionMode.MESSAGE
+            writer.set_compression(mode, getattr(CompressionFormat, compression.upper()))
+    connections = {}
+    with writer:
+        for topic, message, time in messages:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=store)
+            serialize = store.serialize_ros1 if store is ROS1 else store.serialize_cdr
+            writer.write(connections[topic], time, serialize(message, message.__msgtype__))
+    return path if path.suffix == ".bag" else next(path.with_suffix("").glob(f"*{path.suffix}"))
+
+
+def store_of(suffix):
+    return ROS1 if suffix == ".bag" else ROS2
+
+
+def points_of(k, n=40):
+    """Points of frame k that are float32 numbers."""
+    return np.random.default_rng(k).normal(scale=10, size=(n, 3)).astype(np.float32).astype(float)
+
+
+def clouds(suffix, count=6, n=40):
+    """Clouds at 10 Hz, recorded 20 ms after their stamps."""
+    return [
+        (
+            "/points",
+            cloud(points_of(k, n), store=store_of(suffix), stamp=START + k * 10**8),
+            START + k * 10**8 + 2 * 10**7,
+        )
+        for k in range(count)
+    ]
+
+
+CONTAINERS = [
+    (".mcap", None),
+    (".mcap", "zstd"),
+    (".db3", None),
+    (".db3", "zstd"),
+    (".bag", None),
+    (".bag", "bz2"),
+    (".bag", "lz4"),
+]
+
+
+@pytest.mark.parametrize("suffix, compression", CONTAINERS)
+def test_every_container_yields_its_clouds(tmp_path, suffix, compression):
+    source = open_source(write(tmp_path / f"drive{suffix}", clouds(suffix), compression=compression))
+    for _ in range(2):
+        frames = list(source)
+        assert [frame.id for frame in frames] == [f"{k:06d}" for k in range(6)] and source.count == 6
+        assert np.allclose([frame.time - START / 1e9 for frame in frames], np.arange(6) / 10, atol=1e-6)
+        for k, frame in enumerate(frames):
+            assert np.array_equal(frame.points, points_of(k)) and frame.T_world_sensor is None
+            assert np.array_equal(frame.origin, np.zeros(3)) and frame.ring is None
+    assert [frame.index for frame in source.frames(4)] == [4, 5] and not source.warnings
+
+
+@pytest.mark.parametrize("has_chunk", [True, False])
+def test_an_mcap_without_an_index_is_read(tmp_path, has_chunk):
+    """As streaming recorders write it: lz4 or no chunks at all, no summary, and ROS 1 messages."""
+
+    def record(op, content):
+        return struct.pack("<BQ", op, len(content)) + content
+
+    def text(value):
+        return struct.pack("<I", len(value)) + value.encode()
+
+    records = record(3, struct.pack("<H", 7) + text("sensor_msgs/PointCloud2") + text("ros1msg") + text(""))
+    records += record(4, struct.pack("<HH", 3, 7) + text("/points") + text("ros1") + text(""))
+    for k in range(4):
+        message = ROS1.serialize_ros1(cloud(points_of(k), store=ROS1, stamp=START + k), CLOUD)
+        records += record(5, struct.pack("<HIQQ", 3, k, START + k, START + k) + bytes(message))
+    if has_chunk:
+        lz4 = pytest.importorskip("lz4.frame")
+        packed = lz4.compress(records)
+        head = struct.pack("<QQQI", START, START + 3, len(records), 0) + text("lz4")
+        records = record(6, head + struct.pack("<Q", len(packed)) + packed)
+    magic = b"\x89MCAP0\r\n"
+    data = magic + record(1, text("") + text("by hand")) + records + record(15, bytes(4)) + record(2, bytes(20)) + magic
+    (tmp_path / "a.mcap").write_bytes(data)
+    source = open_source(tmp_path / "a.mcap")
+    assert source.count == 4 and not source.warnings
+    for k, frame in enumerate(source):
+        assert np.array_equal(frame.points, points_of(k))
+
+
+def test_a_ros_2_folder_is_a_recording_of_its_files(tmp_path):
+    file = write(tmp_path / "drive.mcap", clouds(".mcap"))
+    second = write(tmp_path / "next.mcap", clouds(".mcap", 3))
+    second.rename(file.with_name("drive_10.mcap"))
+    file.rename(file.with_name("drive_2.mcap"))
+    source = open_source(tmp_path / "drive")
+    assert source.count == 9 and len(list(source)) == 9
+    (tmp_path / "drive" / "metadata.yaml").unlink()
+    assert len(list(open_source(tmp_path / "drive"))) == 9
+
+
+LAYOUTS = {
+    "plain": {},
+    "doubles": dict(fields=(("x", 0, "f8"), ("y", 8, "f8"), ("z", 16, "f8")), step=24),
+    "big-endian": dict(big=True),
+    "padded rows": dict(height=4, pad=10),
+    "unaligned, any order": dict(
+        fields=(("z", 1, "f4"), ("intensity", 5, "u1"), ("y", 6, "f8"), ("x", 14, "f4")), step=19
+    ),
+    "ring": dict(fields=(*XYZ, ("intensity", 12, "f4"), ("ring", 16, "u2")), step=22),
+    "ring of another name, all odd": dict(
+        fields=(("line", 0, "u1"), ("x", 3, "f8"), ("y", 11, "f4"), ("z", 15, "f4")), step=21, big=True, height=2, pad=3
+    ),
+}
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_any_layout_of_fields_is_read(name):
+    points = points_of(3)
+    points[[2, 5]] = np.nan
+    ring = np.arange(len(points)) % 128
+    message = cloud(points, **LAYOUTS[name], extra={key: ring for key in ("ring", "line", "intensity")})
+    got, got_ring = decode_cloud(ROS2.deserialize_cdr(ROS2.serialize_cdr(message, CLOUD), CLOUD))
+    assert np.array_equal(got, points, equal_nan=True)
+    assert np.array_equal(got_ring, ring) if "ring" in name else got_ring is None
+
+
+def test_returns_that_are_none_are_left_out_with_their_rings(tmp_path):
+    points = points_of(1)
+    points[3], points[7] = np.nan, 0
+    fields = (*XYZ, ("ring", 12, "u2"))
+    message = cloud(points, fields=fields, extra={"ring": np.arange(len(points))}, stamp=0)
+    source = open_source(write(tmp_path / "a.mcap", [("/points", message, START)]))
+    (frame,) = source
+    rest = np.delete(np.arange(len(points)), [3, 7])
+    assert np.array_equal(frame.points, points[rest]) and np.array_equal(frame.ring, rest)
+    # without a stamp, the time when it was recorded
+    assert frame.time == START / 1e9 and "recorded" in source.warnings[0]
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".db3", ".bag"])
+def test_topics_are_chosen_and_named(tmp_path, suffix):
+    store = store_of(suffix)
+    rare = [("/rear/points", cloud(points_of(9), store=store), START)]
+    path = write(tmp_path / f"two{suffix}", rare + clouds(suffix))
+    source = open_source(path)
+    assert len(list(source)) == 6
+    assert "/points (6)" in source.warnings[0] and "/rear/points (1)" in source.warnings[0]
+    source = open_source(path, topic="/rear/points")
+    assert np.array_equal(next(iter(source)).points, points_of(9)) and not source.warnings
+    with pytest.raises(InputError, match=r"'/front'; those with clouds are .*/points \(6\)"):
+        open_source(path, topic="/front")
+
+    text = store.types["std_msgs/msg/String"](data="hello")
+    path = write(tmp_path / f"none{suffix}", [("/chatter", text, START), ("/other", text, START)])
+    with pytest.raises(InputError, match="no point clouds.*/chatter .*String.*/other") as error:
+        open_source(path)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".bag"])
+def test_sensor_poses_come_from_transforms(tmp_path, suffix):
+    """A vehicle that drives along a line and turns; its transforms are recorded after the clouds that they place."""
+    store = store_of(suffix)
+    messages = [("/tf_static", transform(0, "base_link", "lidar", (1, 0, 2), np.pi / 2, store), START - 1)]
+    for k in range(12):
+        time = START + k * 10**8 - 5 * 10**7
+        messages.append(("/tf", transform(time, "odom", "base_link", (k, 0, 0), 0.1 * k, store), time + 15 * 10**7))
+        messages.append(("/tf", transform(time, "map", "odom", (0, 5, 0), 0.0, store), time + 15 * 10**7))
+    messages = sorted(messages + clouds(suffix, 10), key=lambda message: message[2])
+    source = open_source(write(tmp_path / f"drive{suffix}", messages))
+    frames = list(source)
+    assert len(frames) == 10 and source.count == 10
+    for k, frame in enumerate(frames):
+        yaw = 0.1 * (k + 0.5)
+        x, y = k + 0.5 + np.cos(yaw), 5 + np.sin(yaw)
+        assert np.allclose(frame.T_world_sensor[:3, 3], [x, y, 2], atol=2e-3)
+        heading = yaw + np.pi / 2
+        assert np.allclose(frame.T_world_sensor[:2, 0], [np.cos(heading), np.sin(heading)], atol=2e-3)
+        assert np.allclose(frame.T_world_sensor @ np.diag([1, 1, 1, 1])[:, 3], [x, y, 2, 1], atol=2e-3)
+    assert [frame.index for frame in source.frames(7)] == [7, 8, 9]
+
+
+def test_a_pose_is_none_where_no_chain_is_known(tmp_path):
+    gone = ("/tf", transform(START, "map", "base_link", (0, 0, 0)), START)
+    far = [("/tf", transform(START + t, "odom", "lidar", (t / 1e9, 0, 0)), START + t) for t in (0, 10**8, 5 * 10**9)]
+    circle = [
+        ("/tf", transform(START, a, b, (0, 0, 0)), START) for a, b in (("lidar", "a"), ("a", "b"), ("b", "lidar"))
+    ]
+    for k, (transforms, num_posed) in enumerate((([gone], 0), (far, 2), (circle, 0))):
+        path = write(tmp_path / f"{k}.mcap", sorted([*transforms, *clouds(".mcap")], key=lambda message: message[2]))
+        source = open_source(path)
+        poses = [frame.T_world_sensor for frame in source]
+        assert [pose is not None for pose in poses] == [i < num_posed for i in range(6)]
+        assert len(source.warnings) == (num_posed > 0)
+
+    # a cloud that is in the world already; where the sensor was is not known
+    (frame,) = open_source(write(tmp_path / "map.mcap", [("/p", cloud(points_of(1), frame="/map"), START)]))
+    assert np.array_equal(frame.T_world_sensor, np.eye(4)) and frame.origin is None
+
+
+@pytest.mark.parametrize("suffix, compression", CONTAINERS)
+def test_a_recording_that_is_cut_off_keeps_what_is_whole(tmp_path, suffix, compression):
+    path = write(tmp_path / f"drive{suffix}", clouds(suffix, 40, 2000), compression=compression)
+    data = path.read_bytes()
+    most = 0
+    for share in (0.02, 0.3, 0.6, 0.9, 0.999):
+        path.write_bytes(data[: int(share * len(data))])
+        try:
+            frames = list(open_source(path))
+        except InputError as error:
+            # bz2 packs 900 kB at once
+            assert "\n" not in str(error) and share < (0.7 if compression == "bz2" else 0.5)
+            continue
+        whole = [frame for frame in frames if not isinstance(frame, DamagedFrame)]
+        for k, frame in enumerate(whole):
+            assert np.array_equal(frame.points, points_of(k, 2000))
+        assert len(whole) >= most and len(frames) - len(whole) <= 1 and (len(whole) == 40 or len(frames) > len(whole))
+        most = len(whole)
+    assert most >= 35
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".db3", ".bag"])
+def test_damaged_bytes_cost_frames_and_never_more(tmp_path, suffix):
+    path = write(tmp_path / f"drive{suffix}", clouds(suffix, 8))
+    data = path.read_bytes()
+    random = np.random.default_rng(5)
+    for _ in range(60):
+        broken = np.frombuffer(data, np.uint8).copy()
+        at = random.integers(0, len(data), random.integers(1, 20))
+        broken[at] = random.integers(0, 256, len(at))
+        path.write_bytes(broken.tobytes())
+        try:
+            frames = list(open_source(path))
+        except InputError as error:
+            assert "\n" not in str(error)
+        else:
+            assert all(isinstance(frame, DamagedFrame) or np.isfinite(frame.points).all() for frame in frames)
+
+
+def test_clouds_that_do_not_fit_their_layout_are_damaged_frames(tmp_path):
+    good = cloud(points_of(0))
+    broken = []
+    for change in (
+        dict(data=good.data[:-1]),
+        dict(width=2**31),
+        dict(height=3, row_step=1),
+        dict(point_step=6),
+        dict(fields=good.fields[:2]),
+    ):
+        message = cloud(points_of(0))
+        for name, value in change.items():
+            object.__setattr__(message, name, value)
+        broken.append(message)
+    messages = [("/points", message, START + k) for k, message in enumerate([*broken, good])]
+    *damaged, last = open_source(write(tmp_path / "a.db3", messages))
+    assert all(isinstance(frame, DamagedFrame) and "\n" not in frame.error for frame in damaged) and len(damaged) == 5
+    assert np.array_equal(last.points, points_of(0))
+
+
+def test_a_chunk_that_would_unpack_to_more_than_it_may_is_left_out(tmp_path):
+    path = write(tmp_path / "drive.mcap", clouds(".mcap"), compression="zstd")
+    data = bytearray(path.read_bytes())
+    at = data.index(b"\x04\x00\x00\x00zstd") - 12
+    struct.pack_into("<Q", data, at, 2**40)
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="no frames"):
+        open_source(path)
+
+
+def test_what_is_no_recording_is_one_line(tmp_path):
+    for suffix in (".mcap", ".db3", ".bag"):
+        for content in (b"", b"nothing of the kind" * 9):
+            path = Path(tmp_path / f"a{suffix}")
+            path.write_bytes(content)
+            with pytest.raises(InputError) as error:
+                open_source(path)
+            assert "\n" not in str(error.value) and path.name in str(error.value)
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "metadata.yaml").write_text("")
+    with pytest.raises(InputError, match="expected a recording's .mcap"):
+        open_source(tmp_path / "folder")
