@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 from lidarpose.errors import InputError
+from lidarpose.lidar.raycast import scan
+from lidarpose.lidar.sensor import Sensor
 from lidarpose.synth.detection_scene import DetectionScene, detection_scene
 from lidarpose.synth.environment.layouts import LEFT_OUT
 from lidarpose.synth.environment.things import KINDS, THINGS
+from lidarpose.synth.environment.traffic import vehicle
 
 LEFT_OUT_THINGS = {name for name, thing in THINGS.items() if thing.left_out}
 
@@ -71,16 +74,40 @@ def test_training_never_draws_what_is_left_out(train, heldout):
 def test_all_kinds_places_and_sensors_occur(train, heldout):
     present = Counter(name for scene in train for name in scene.negatives)
     assert set(present) | LEFT_OUT_THINGS == set(KINDS)
-    assert {scene.kind for scene in train} == {"street", "square", "path", "room", "car park", "fragment"}
+    assert {scene.kind for scene in train} == set(
+        "street, square, path, room, small room, car park, fragment".split(", ")
+    )
     assert len({scene.sensor for scene in train}) >= 9
     seen = [np.bincount(scene.person[scene.person >= 0], minlength=len(scene.boxes)) for scene in train]
     # most scenes show people, and riders are among them
     assert np.mean([(counts >= 20).any() for counts in seen]) > 0.6
     assert sum(int(scene.mounted.sum()) for scene in train) > 20
     tilt = np.degrees([np.arccos(min(scene.up[2], 1.0)) for scene in train])
-    assert np.median(tilt) < 2 and 3 < tilt.max() < 16
+    assert np.median(tilt) < 2 and 15 < tilt.max() < 31
     assert 0 < np.mean([(scene.origin != 0).any() for scene in train]) < 0.6
     assert min(scene.height for scene in train) < 0.6 and max(scene.height for scene in train) > 3
+
+
+def test_a_third_of_the_people_in_training_do_not_stand(train, heldout):
+    low, of_heldout = (
+        np.mean([kind in ("sit", "crouch", "kneel", "bend") for scene in scenes for kind in scene.activities])
+        for scenes in (train, heldout)
+    )
+    assert 0.26 < low < 0.4 and of_heldout < low - 0.05
+
+
+def test_beams_pass_the_windows_of_some_vehicles_and_end_inside():
+    beam = Sensor(name="beam", elevations=np.zeros(1), azimuth_step=np.pi / 2, range_max=20.0)
+    depths = []
+    for number in range(60):
+        mesh = vehicle(np.random.default_rng(number))
+        low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+        assert low[2] > -0.01 and 1.2 < high[2] < 4.1 and 3.4 < np.ptp(mesh.vertices[:, 0]) < 9.5
+        # from the side, at the height of a car's windows
+        points = scan(mesh.moved((0.0, 6.0, -0.8 * high[2])).vertices, mesh.faces, beam).points
+        depths += (points[:, 1] - (6.0 - high[1])).tolist()
+    # at glass or a wall, and on seats, heads or the far window
+    assert sum(depth < 0.35 for depth in depths) > 20 and sum(depth > 0.4 for depth in depths) > 3
 
 
 @pytest.mark.parametrize("wrong", [{"seed": -1}, {"index": 1.5}, {"family": "test"}])

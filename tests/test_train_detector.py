@@ -10,13 +10,16 @@ import torch
 from training_runs import refused, train_until_killed
 
 from lidarpose.cli import main
+from lidarpose.geometry import axis_angle_to_matrix
 from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.detector.candidates import Augmentation, Candidate
 from lidarpose.models.detector.detector_config import OUTPUT, OUTPUTS, DetectorConfig
 from lidarpose.models.detector.detector_file import open_detector
+from lidarpose.models.detector.ground import estimate_up
 from lidarpose.models.detector.network import DetectorNet
 from lidarpose.models.export import export, export_detector
 from lidarpose.sample import Box
+from lidarpose.synth.detection_scene import detection_scene
 from lidarpose.train import loop, run_dir, setup
 from lidarpose.train.data_loader import BATCHES
 from lidarpose.train.detector import candidate_source, scan_validation
@@ -80,6 +83,37 @@ def quick_scans(monkeypatch):
         monkeypatch.setattr(module, "scan_example", scan)
     monkeypatch.setattr(scan_validation, "SCANS", 3)
     monkeypatch.setattr(setup, "DetectorConfig", lambda: SMALL)
+
+
+# ---- candidates
+
+
+def test_tilted_scans_are_leveled_before_training_as_before_detection(monkeypatch):
+    scene = detection_scene(3, 12)
+    assert estimate_up(scene.points, scene.origin) is None
+    R = axis_angle_to_matrix(np.array([0.25, -0.3, 0.0]))
+    joints = (scene.joints @ R.T).astype(np.float32)
+    # as tight as they were, but upright in the tilted frame
+    grown = np.ptp(joints[..., 2], 1) - np.ptp(scene.joints[..., 2], 1)
+    boxes = tuple(
+        replace(box, center=R @ box.center, size=box.size + [0, 0, more])
+        for box, more in zip(scene.boxes, grown, strict=True)
+    )
+    points = (scene.points @ R.T).astype(np.float32)
+    tilted = replace(scene, points=points, origin=R @ scene.origin, boxes=boxes, joints=joints, up=R @ scene.up)
+    level = candidate_source.leveled(tilted, estimate_up(tilted.points, tilted.origin))
+    assert tilted.up[2] < 0.95 and level.up[2] > 0.995
+    seen = [number for number in range(len(boxes)) if (scene.person == number).sum() > 20]
+    assert len(seen) > 2
+    for number in seen:
+        box, own = level.boxes[number], level.points[level.person == number]
+        assert own[:, 2].min() > box.center[2] - box.size[2] / 2 - 0.1
+        assert own[:, 2].max() < box.center[2] + box.size[2] / 2 + 0.1
+        assert np.hypot(*(np.median(own, 0) - box.center)[:2]) < 0.5
+        assert abs(box.size[2] - scene.boxes[number].size[2]) < 0.1
+    monkeypatch.setattr(candidate_source, "detection_scene", lambda *args, **keywords: tilted)
+    found = {number for number in candidate_source.scan_example(3, 12).labels.person if number >= 0}
+    assert len(found & set(seen)) > 0.6 * len(seen)
 
 
 # ---- the network and its file

@@ -24,8 +24,8 @@ from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import Box
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import FRAME_TIME, Bodies, draw_bodies
-from lidarpose.synth.environment.layouts import LAYOUTS, LEFT_OUT, Layout
-from lidarpose.synth.environment.mesh import Mesh, union
+from lidarpose.synth.environment.layouts import LAYOUTS, Layout
+from lidarpose.synth.environment.mesh import Mesh, shape, union
 from lidarpose.synth.environment.site import (
     HALF_WIDTH,
     Mount,
@@ -38,14 +38,16 @@ from lidarpose.synth.environment.site import (
     scatter,
 )  # fmt: skip
 from lidarpose.synth.environment.things import KINDS, LEAVES
+from lidarpose.synth.environment.traffic import add_surroundings
 from lidarpose.synth.props import Prop, draw_props
-from lidarpose.synth.props.attachments import MOUNTS
+from lidarpose.synth.props.attachments import MOUNTS, PELVIS, rigid_prop, upright
 from lidarpose.synth.scene import Place, RandomStream
 from lidarpose.synth.simulate import ScanConditions, add_sensor_noise, label_box
 
 FAMILIES = ("train", "heldout", "bench")
 # how often each place is drawn; the left-out ones only where they may be
 _PLACES = {"street": 4.0, "square": 2.0, "path": 2.0, "room": 2.0, "car park": 0.8, "corridor": 1.2, "hall": 1.2}
+_TRAINING_PLACES = {"street": 4.0, "square": 2.0, "path": 2.0, "room": 2.4, "small room": 1.8, "car park": 0.8}
 # sensors by name and how often they are drawn outdoors and indoors; "random": rings at random
 _SENSORS = {
     "vlp-16": (1.0, 1.0), "vlp-32c": (1.0, 0.3), "hdl-32e": (0.8, 0.3), "hdl-64e": (0.8, 0.0), "os1-64": (1.0, 0.6),
@@ -53,6 +55,8 @@ _SENSORS = {
     "livox-mid360": (1.3, 1.5), "livox-avia": (1.0, 0.4), "livox-mid100": (0.4, 0.1), "depth-camera": (0.3, 1.5),
     "random": (2.5, 1.5),
 }  # fmt: skip
+# the same in training, where it differs
+_TRAINING_SENSORS = {"depth-camera": (0.3, 1.8)}
 # beams of a scan at most: what has more sends fewer columns
 _MOST_BEAMS = 140_000
 # people by activity, outdoors and indoors
@@ -61,10 +65,24 @@ _MIX_OUTDOORS = {
     **{"kneel": 0.01, "sit": 0.1, "cycle": 0.09, "push": 0.05, "sport": 0.02},
 }
 _MIX_INDOORS = _MIX_OUTDOORS | {"idle": 0.36, "walk": 0.2, "sit": 0.25, "cycle": 0.004, "run": 0.0}
+# in training more of those who do not stand
+_TRAINING_MIX_OUTDOORS = _MIX_OUTDOORS | {"bend": 0.07, "crouch": 0.1, "kneel": 0.08, "sit": 0.16}
+_TRAINING_MIX_INDOORS = _MIX_INDOORS | {"bend": 0.07, "crouch": 0.1, "kneel": 0.08, "sit": 0.3}
 # who sits, outdoors: what on, and how often
 _SEATS = (("moped", 0.3), ("wheelchair", 0.25), ("chair", 0.45))
 _MOUNTED = ("bicycle", "moped", "wheelchair")
-_PROP_KINDS = {"chair": "chair", "bicycle": "bicycle", "moped": "moped", "pram": "cart", "trolley": "cart"}
+_PROP_KINDS = {
+    "chair": "chair",
+    "table": "table",
+    "bicycle": "bicycle",
+    "moped": "moped",
+    "pram": "cart",
+    "trolley": "cart",
+}
+# in training: how many of those who sit do so at a table, who needs half as much more, what stands among people besides
+_AT_TABLES = 0.3
+_LOW = ("bend", "crouch", "kneel", "sit")
+_AMONG_PEOPLE = {"pole": 2.0, "sign": 1.0, "bollard": 0.5, "moped": 0.5, "bicycle": 0.5, "wall end": 0.5, "bush": 0.5}
 # people stand at least so far apart, and who rides or pushes something needs more, m
 _APART, _MORE = 0.42, 0.4
 # points of a piece of a place at least
@@ -120,20 +138,24 @@ def detection_scene(seed: int, index: int, *, family: str = "train") -> Detectio
     seed, index = check_int("seed", seed, least=0), check_int("index", index, least=0)
     check_name("family of scenes", family, FAMILIES)
     rng = np.random.default_rng([seed, RandomStream.DETECTION, FAMILIES.index(family), index])
-    names = [name for name in _PLACES if family != "train" or name not in LEFT_OUT]
-    place = str(pick(rng, {name: _PLACES[name] for name in names}))
+    is_training = family == "train"
+    place = pick(rng, _TRAINING_PLACES if is_training else _PLACES)
     layout = LAYOUTS[place](rng)
-    device = _draw_sensor(layout.indoors, rng)
+    device = _draw_sensor(layout.indoors, _SENSORS | (_TRAINING_SENSORS if is_training else {}), rng)
     mount = _draw_mount(device, layout, rng)
     duration = device.duration if isinstance(device, RayPattern) else 0.0
     site = Site(layout, device, mount)
     weights = draw_habits(layout.indoors, family, rng)
     count = int((rng.integers(3, 16) if layout.indoors else rng.integers(15, 61)) * layout.things)
     add_own_vehicle(site, rng)
+    if is_training and not layout.indoors:
+        add_surroundings(site, place, rng)
     scatter(site, weights, count - count // 4, np.zeros((0, 2)), rng)
-    people = _draw_people(site, duration > 0, rng)
+    people = _draw_people(site, duration > 0, is_training, rng)
     feet = np.array([person.place.feet[:2] for person in people]).reshape(-1, 2)
     scatter(site, weights, count // 4, feet, rng)
+    if is_training and len(feet):
+        scatter(site, _AMONG_PEOPLE, int(rng.integers(0, 5)), feet, rng)
     add_screens(site, feet, rng)
     _lift(site, people, Relief.draw(layout.indoors, rng), mount.height + layout.sensor[2])
     meshes = [(number, *item) for number, person in enumerate(people) for item in person.meshes(duration)]
@@ -151,7 +173,7 @@ def detection_scene(seed: int, index: int, *, family: str = "train") -> Detectio
     points, stray = _go_astray(points, rng)
     person_of[stray], thing_of[stray] = -1, -1
     kept, is_piece = _cut(points, thing_of, rng)
-    frame = _Frame.draw(mount, rng)
+    frame = _Frame.draw(mount, rng, most=30.0 if is_training else 15.0)
     labels = [[frame.of(places @ turn) for places in person.label(duration)] for person in people]
     return DetectionScene(
         points=frame.of(points[kept]).astype(np.float32),
@@ -191,8 +213,10 @@ def _turned(mesh: Mesh, turn: np.ndarray) -> Mesh:
 # --- the sensor
 
 
-def _draw_sensor(indoors: bool, rng: np.random.Generator) -> Sensor | RayPattern:
-    name = pick(rng, {name: shares[int(indoors)] for name, shares in _SENSORS.items()})
+def _draw_sensor(
+    indoors: bool, weights: dict[str, tuple[float, float]], rng: np.random.Generator
+) -> Sensor | RayPattern:
+    name = pick(rng, {name: shares[int(indoors)] for name, shares in weights.items()})
     device: Sensor | RayPattern
     if name == "random":
         rings = int(rng.choice([16, 24, 32, 40, 48, 64, 80, 128]))
@@ -311,15 +335,17 @@ class _Person:
         return meshes
 
 
-def _draw_people(site: Site, is_smeared: bool, rng: np.random.Generator) -> list[_Person]:
+def _draw_people(site: Site, is_smeared: bool, is_training: bool, rng: np.random.Generator) -> list[_Person]:
     """Groups of one to five, some beside what stands there; who finds no room stays away."""
     indoors = site.layout.indoors
     area = float(np.prod(site.areas[:, [1, 3]] - site.areas[:, [0, 2]], axis=1).max())
-    groups = rng.integers(4, 11) if not indoors else rng.integers(1, int(np.clip(area / 12, 2, 7)) + 1)
+    groups = rng.integers(4, 11) if not indoors else rng.integers(1 + is_training, int(np.clip(area / 12, 2, 7)) + 1)
     sizes = rng.choice([1, 2, 3, 4, 5], groups, p=[0.42, 0.27, 0.15, 0.09, 0.07])
+    mix = _MIX_INDOORS if indoors else _MIX_OUTDOORS
+    if is_training:
+        mix = _TRAINING_MIX_INDOORS if indoors else _TRAINING_MIX_OUTDOORS
     bodies = draw_bodies(
-        None, 0.0, int(sizes.sum()), int(rng.integers(2**31)), 0, moving=is_smeared,
-        mix=_MIX_INDOORS if indoors else _MIX_OUTDOORS,
+        None, 0.0, int(sizes.sum()), int(rng.integers(2**31)), 0, moving=is_smeared, mix=mix
     )  # fmt: skip
     people: list[_Person] = []
     row = 0
@@ -335,7 +361,7 @@ def _draw_people(site: Site, is_smeared: bool, rng: np.random.Generator) -> list
         members: list[np.ndarray] = []
         for _ in range(size):
             kind = bodies.kinds[row]
-            more = _MORE if kind in ("cycle", "push") else 0.0
+            more = _MORE if kind in ("cycle", "push") else _MORE / 2 if is_training and kind in _LOW else 0.0
             for _attempt in range(8):
                 place = middle
                 if members:
@@ -350,6 +376,8 @@ def _draw_people(site: Site, is_smeared: bool, rng: np.random.Generator) -> list
                     feet = np.array([*place, site.level(place)])
                     spot = Place(feet=feet, yaw=float(yaw), distance=float(np.hypot(*place)))
                     props = _draw_belongings(bodies, row, indoors, rng)
+                    if is_training and kind == "sit" and rng.random() < _AT_TABLES:
+                        props.append(_draw_table(rng))
                     people.append(_Person(bodies=bodies, row=row, place=spot, props=props))
                     members.append(place)
                     break
@@ -365,6 +393,18 @@ def _draw_belongings(bodies: Bodies, row: int, indoors: bool, rng: np.random.Gen
         if mount is not None:
             return [mount]
     return draw_props(rng, kind=kind, joints=joints)
+
+
+def _draw_table(rng: np.random.Generator) -> Prop:
+    """Before somebody who sits: it hides the legs or the lap."""
+    deep, far = rng.uniform(0.4, 0.9), rng.uniform(0.25, 0.5)
+    mesh = shape("table", deep, rng.uniform(0.6, 1.8), rng.uniform(0.65, 0.78))
+
+    def frame(points: list) -> tuple[list, list]:
+        rows, pelvis = upright(points), points[PELVIS]
+        return rows, [pelvis[axis] + (far + deep / 2) * rows[0][axis] for axis in (0, 1)] + [0.0]
+
+    return rigid_prop("table", mesh, frame)
 
 
 # --- the scan
@@ -439,12 +479,12 @@ class _Frame:
     origin: np.ndarray
 
     @classmethod
-    def draw(cls, mount: Mount, rng: np.random.Generator) -> "_Frame":
-        """Level within a degree or two, in a tenth tilted by 3 to 15. The sensor is its origin, or stands above a
-        vehicle's."""
+    def draw(cls, mount: Mount, rng: np.random.Generator, *, most: float) -> "_Frame":
+        """Level within a degree or two, in a tenth tilted by 3 to `most` degrees. The sensor is its origin, or stands
+        above a vehicle's."""
         angle, degrees = rng.uniform(-pi, pi), abs(rng.normal(0, 1.2))
         if rng.random() < 0.1:
-            degrees = rng.uniform(3, 15)
+            degrees = rng.uniform(3, most)
         R = axis_angle_to_matrix(np.radians(degrees) * np.array([np.cos(angle), np.sin(angle), 0]))
         origin = np.zeros(3)
         if rng.random() < 0.3:

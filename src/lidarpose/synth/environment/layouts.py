@@ -5,7 +5,7 @@ may stand, and where the sensor is. Rooms of `LEFT_OUT` shapes are kept for judg
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import pi
 
 import numpy as np
@@ -228,7 +228,16 @@ def _against_walls(wide: float, long: float, rng: np.random.Generator) -> list[I
 
 def room(rng: np.random.Generator) -> Layout:
     """An office, a class or a living room."""
-    wide, long, high = rng.uniform(3.5, 12), rng.uniform(4, 18), rng.uniform(2.3, 4.0)
+    return _room(rng.uniform(3.5, 12), rng.uniform(4, 18), rng)
+
+
+def small_room(rng: np.random.Generator) -> Layout:
+    """A bedroom, a kitchen, an office for one."""
+    return replace(_room(rng.uniform(2.5, 4.5), rng.uniform(3, 6), rng), things=0.5)
+
+
+def _room(wide: float, long: float, rng: np.random.Generator) -> Layout:
+    high = rng.uniform(2.3, 4.0)
     items = _walls(wide, long, high, rng) + _against_walls(wide, long, rng)
     x, y = (rng.random(2) - 0.5) * [wide - 1, long - 1]
     if rng.random() < 0.5:
@@ -315,6 +324,7 @@ LAYOUTS: dict[str, Callable[[np.random.Generator], Layout]] = {
     "square": square,
     "path": path,
     "room": room,
+    "small room": small_room,
     "car park": car_park,
     "corridor": corridor,
     "hall": hall,

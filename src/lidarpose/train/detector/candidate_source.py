@@ -7,13 +7,14 @@ as after `--resume`, makes it again.
 Legend: K candidates, P people of a scan.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from lidarpose.geometry import rotation_between
 from lidarpose.models.detector.candidates import Augmentation, Candidate, SceneIndex, draw_augmentation
-from lidarpose.models.detector.ground import estimate_ground, without_ground
+from lidarpose.models.detector.ground import estimate_ground, estimate_up, without_ground
 from lidarpose.models.detector.proposals import heights_above, propose
 from lidarpose.synth.detection_scene import DetectionScene, detection_scene
 from lidarpose.synth.scene import RandomStream
@@ -158,10 +159,13 @@ class CandidateSource:
 
 
 def scan_example(seed: int, number: int, *, family: str = "train", with_rows: bool = False) -> DetectorExample:
-    """All candidates of a scene, found as in any scan."""
+    """All candidates of a scene, found as in any scan: leveled first where it is tilted."""
     scene = detection_scene(seed, number, family=family)
     rng = np.random.default_rng([seed, RandomStream.CANDIDATES, number, 0])
-    origin = None if rng.random() < BLIND else scene.origin
+    is_blind = rng.random() < BLIND
+    up = estimate_up(scene.points, None if is_blind else scene.origin)
+    scene = scene if up is None else leveled(scene, up)
+    origin = None if is_blind else scene.origin
     points = scene.points[_distance(scene.points, scene) < RANGE + _BEYOND]
     ground = estimate_ground(points, origin) or without_ground(points, origin)
     heights = heights_above(points, ground)
@@ -171,6 +175,26 @@ def scan_example(seed: int, number: int, *, family: str = "train", with_rows: bo
     candidates, rows = index.candidates(centers), index.rows(centers) if with_rows else None
     labels = labels_of(candidates, scene)
     return DetectorExample(candidates=candidates, labels=labels, rows=rows)
+
+
+def leveled(scene: DetectionScene, up: np.ndarray) -> DetectionScene:
+    """The scene turned so that `up` (3,) points up; boxes exceed the turned joints as they did, below and above."""
+    R_level_scene = rotation_between(up, np.array([0.0, 0.0, 1.0]))
+    joints = scene.joints @ R_level_scene.T.astype(np.float32)
+    boxes = []
+    for box, before, after in zip(scene.boxes, scene.joints[..., 2], joints[..., 2], strict=True):
+        low = after.min() - before.min() + box.center[2] - box.size[2] / 2
+        high = after.max() - before.max() + box.center[2] + box.size[2] / 2
+        center = np.array([*(R_level_scene @ box.center)[:2], (low + high) / 2])
+        boxes.append(replace(box, center=center, size=np.array([*box.size[:2], high - low])))
+    return replace(
+        scene,
+        points=(scene.points @ R_level_scene.T).astype(np.float32),
+        origin=R_level_scene @ scene.origin,
+        boxes=tuple(boxes),
+        joints=joints,
+        up=R_level_scene @ scene.up,
+    )
 
 
 def _distance(points: np.ndarray, scene: DetectionScene) -> np.ndarray:

@@ -1,0 +1,132 @@
+"""What a sensor outdoors sees beyond the free space about it: roads with vehicles, what stands along them, houses.
+
+Drawn for training alone, and only of kinds of `things.THINGS` that training may see.
+"""
+
+from functools import cache
+from math import pi
+
+import numpy as np
+
+from lidarpose.synth.environment import mesh as shapes
+from lidarpose.synth.environment.mesh import Mesh, shape, union
+from lidarpose.synth.environment.site import Site
+from lidarpose.synth.environment.things import car, draw_thing, facade
+
+# half of what is built, how near to the sensor vehicles come, and the gap between vehicles and what stands there, m
+_REACH, _NEAREST, _GAP = 42.0, 3.5, 0.4
+# triangles of the unit car whose middle lies above the first height are windows, but for those all above the second
+_SILL, _ROOF = 0.7, 0.85
+
+
+@cache
+def _is_window() -> np.ndarray:
+    """(F,) bool, of the mesh "car"."""
+    unit = shape("car")
+    heights = unit.vertices[unit.faces][..., 2]
+    return (heights.mean(1) > _SILL) & (heights.min(1) < _ROOF)
+
+
+def vehicle(rng: np.random.Generator) -> Mesh:
+    """Heads along +x. Beams pass some of a car's windows, to the seats and to who sits on them."""
+    u = rng.random(8)
+    body = car(u, rng)
+    if len(body.faces) != len(_is_window()):
+        return body
+    long, wide, high = np.ptp(body.vertices, axis=0)
+    clear = _is_window() & (rng.random(len(body.faces)) < rng.choice([0.0, 0.5, 1.0]))
+    parts = [Mesh(body.vertices, body.faces[~clear])]
+    for x, y in ((0.06, 0.22), (0.06, -0.22), (-0.16, 0.22), (-0.16, -0.22)):
+        x, y, z = x * long, y * wide, 0.62 * high
+        parts.append(shapes.box((0.1, 0.45, 0.24 * high)).moved((x - 0.15, y, z)))
+        if rng.random() < 0.3:
+            parts.append(shapes.box((0.22, 0.42, 0.12 * high)).moved((x, y, z)))
+            parts.append(shape("ball", 0.1, 0.09, 0.12).moved((x, y, 0.82 * high)))
+    return union(parts)
+
+
+def _post(rng: np.random.Generator) -> Mesh:
+    """A post or a mast with plates, boxes and balls: signs, bins, meters, flowers, a traffic light."""
+    u = rng.random(3)
+    radius, high = 0.03 + 0.09 * u[0] ** 2, 1.4 + 3.5 * u[1]
+    parts = [shape("pole", radius, radius, high)]
+    for _ in range(rng.integers(1, 5)):
+        size, z, angle = 0.12 + 0.6 * rng.random(3) ** 1.5, rng.uniform(0.3, min(high, 3.0)), rng.uniform(-pi, pi)
+        if u[2] < 0.4:
+            # plates face one way
+            size[0], angle = 0.02, 0.0
+        part = shapes.box(size) if rng.random() < 0.7 else shape("ball", *size / 2)
+        away = radius + size[0] / 2
+        parts.append(part.moved((away * np.cos(angle), away * np.sin(angle), z), angle))
+    return union(parts)
+
+
+def _clump(rng: np.random.Generator) -> Mesh:
+    """Bushes that touch each other."""
+    where = np.cumsum(rng.normal(0, 0.55, (rng.integers(2, 5), 2)), axis=0)
+    return union([draw_thing("bush", rng).moved((*place, 0)) for place in where])
+
+
+def _corner(rng: np.random.Generator) -> Mesh:
+    """A house's corner or a yard's: two walls, one with ledges or piers that stand out from it."""
+    u, (long, other) = rng.random(4), rng.uniform(0.8, 6.0, 2)
+    high, thick = 1.0 + 3.5 * u[0], 0.2 + 0.3 * u[1]
+    middle, size = [(0, long / 2, 0), (-other / 2, 0, 0)], [(thick, long, high), (other, thick, high)]
+    for y in np.arange(0.3, long, rng.uniform(0.8, 2.5)) if u[2] < 0.5 else ():
+        middle.append((thick / 2, y, 0))
+        size.append((0.15 + 0.5 * u[3], 0.25 + 0.3 * u[3], high * rng.uniform(0.7, 1.0)))
+    return shapes.boxes(np.array(middle), np.array(size))
+
+
+# what stands along roads: names of `things.KINDS`, how often, and builders
+_ROADSIDE = (("pole", 0.5, _post), ("bush", 0.15, _clump), ("wall end", 0.2, _corner), ("car", 0.15, vehicle))
+
+
+def _put(site: Site, name: str, mesh: Mesh, place: tuple[float, float], nearest: float) -> None:
+    """Adds a mesh there where nothing stands within `_GAP`, nor the sensor within `nearest` m."""
+    mesh = mesh.moved((*place, site.level(np.array(place))))
+    low, high = mesh.vertices[:, :2].min(0) - _GAP, mesh.vertices[:, :2].max(0) + _GAP
+    overlaps = np.all((low < site.low[:, 2:4]) & (site.low[:, :2] < high), axis=1)
+    if not overlaps.any() and np.hypot(*np.maximum(np.maximum(low, -high), 0)) >= nearest:
+        site.add(name, mesh)
+
+
+def _add_road(site: Site, offset: float, turn: int, rng: np.random.Generator) -> None:
+    """Vehicles one after the other on a line along x, or y if `turn` is odd, `offset` m beside the sensor."""
+    at, apart = -_REACH + 12 * rng.random(), rng.choice([2.0, 8.0, 25.0])
+    heading = pi * rng.integers(2) + turn * pi / 2
+    while at < _REACH:
+        mesh = vehicle(rng).moved((0, 0, 0), heading + rng.normal(0, 0.05))
+        _put(site, "car", mesh, (offset, at) if turn % 2 else (at, offset), _NEAREST)
+        at += 5.0 + rng.exponential(apart)
+
+
+def _add_houses(site: Site, turn: int, rng: np.random.Generator) -> None:
+    """A row of fronts that faces the sensor from one of four sides."""
+    far, at = rng.uniform(14, _REACH), -_REACH
+    while at < _REACH:
+        long = rng.uniform(6, 16)
+        if rng.random() < 0.75:
+            for name, mesh in facade(long, rng.uniform(2.8, 9), rng):
+                mesh = mesh.moved((0, 0, 0), pi).moved((far + rng.exponential(0.5), at + long / 2, 0))
+                site.add(name, mesh.moved((0, 0, 0), turn * pi / 2))
+        at += long
+
+
+def add_surroundings(site: Site, place: str, rng: np.random.Generator) -> None:
+    """Roads, what stands along them, and houses about a place outdoors, a name of `layouts.LAYOUTS`."""
+    turn = int(rng.integers(4))
+    if place == "street":
+        low, high = site.areas[-1, 2:4]
+        for offset in rng.uniform(low, high, rng.integers(0, 3)):
+            _add_road(site, offset, 0, rng)
+    else:
+        for side in range(rng.integers(0, 3)):
+            _add_houses(site, turn + side, rng)
+        for side in range(rng.integers(0, 3)):
+            _add_road(site, rng.choice([-1, 1]) * rng.uniform(6, 36), turn + side, rng)
+    for row in rng.choice(len(_ROADSIDE), rng.integers(2, 14), p=[share for _, share, _ in _ROADSIDE]):
+        name, _, build = _ROADSIDE[row]
+        mesh = build(rng).moved((0, 0, 0), rng.uniform(-pi, pi))
+        spot = site.spot(rng.uniform(6, 40), 0.4, rng, seen=True)
+        _put(site, name, mesh, (spot[0], spot[1]), 1.0)
