@@ -13,7 +13,7 @@ of an unknown sensor, x and y are the level frame's. Inputs, K candidates first:
         points, 1 where the sensor is known; without a sensor, range_view and the first two are 0
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import pi
 
@@ -38,6 +38,8 @@ _MOST_POINTS, _UNIT = 1000, 5e-4
 _INDEX_CELL, _MOST_INDEX_CELLS = 0.5, 4_000_000
 # of which each keeps at most so many points, and points that are looked at in one go
 _MOST_IN_CELL, _MOST_AT_ONCE = 10_000, 4_000_000
+# candidates that are drawn at a time
+_CHUNK = 64
 # rows of the range image's finest cells from straight below to above, their size rad, and how many coarser levels
 # there are, each of twice the size
 _ROWS = 1024
@@ -117,6 +119,20 @@ def draw_augmentation(rng: np.random.Generator, *, drop_origin: float = 0.15) ->
     )
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Cuts:
+    """K candidates as arrays, see `Candidate`: `distance` is 0 where the sensor is unknown, xyz (3, n) int16 holds the
+    points of all, `sizes` (K,) of each, and the range views have as many cells of a margin as they were cut with."""
+
+    distance: np.ndarray
+    sensor_height: np.ndarray
+    count: np.ndarray
+    sizes: np.ndarray
+    xyz: np.ndarray
+    range_views: np.ndarray
+    contexts: np.ndarray
+
+
 class SceneIndex:
     """A scan prepared once, from which candidates are cut.
 
@@ -134,92 +150,128 @@ class SceneIndex:
         if heights is None:
             heights = heights_above(points, ground)
         self.origin = None if origin is None else np.asarray(origin, float)
-        self._corner = np.floor(points[:, :2].min(0)) if len(points) else np.zeros(2)
-        extent = np.floor(points[:, :2].max(0)) - self._corner + 1 if len(points) else np.ones(2)
+        columns = points.T
+        self._corner = np.array(
+            [np.floor(values.min(initial=np.inf)) if len(points) else 0.0 for values in columns[:2]]
+        )
+        extent = (
+            [np.floor(values.max(initial=0)) for values in columns[:2]] - self._corner + 1
+            if len(points)
+            else np.ones(2)
+        )
         # a wide map has larger cells instead of a larger table
         self._cell = max(_INDEX_CELL, float(np.sqrt(extent.prod() / _MOST_INDEX_CELLS)))
         self._shape = tuple(int(n) for n in extent // self._cell + 2)
-        place = (points - [*self._corner, 0.0]).astype(np.float32)
-        cells = (place[:, :2] * np.float32(1 / self._cell)).astype(np.int32)
-        flat = cells[:, 0] * self._shape[1] + cells[:, 1]
+        # relative to the corner, float32 holds millimeters of the widest map
+        x, y = ((columns[i] - self._corner[i]).astype(np.float32) for i in (0, 1))
+        row, column = ((values * np.float32(1 / self._cell)).astype(np.int32) for values in (x, y))
+        flat = row * self._shape[1] + column
         self._maps = _draw_maps(flat, heights, self._shape)
         # what lies high above everybody is context alone
         used = np.flatnonzero((heights > _USED[0]) & (heights < _USED[1]))
-        count = np.bincount(flat[used], minlength=self._shape[0] * self._shape[1])
+        cells = flat[used]
         # very dense cells are thinned, so that no candidate costs more than so much
-        chosen, count = _thinned(count, _MOST_IN_CELL)
-        self._order = used[_order(flat[used])][chosen]
-        # relative to the corner, float32 holds millimeters of the widest map
-        self._points = place[self._order]
+        chosen, count = _thinned(np.bincount(cells, minlength=self._shape[0] * self._shape[1]), _MOST_IN_CELL)
+        self._order = used[_order(cells)][chosen]
+        self._x, self._y, self._z = x[self._order], y[self._order], columns[2][self._order].astype(np.float32)
         self._start = np.concatenate([[0], np.cumsum(count)])
-        self._image = None if self.origin is None else _RangeImage(points - self.origin)
+        self._image = None if self.origin is None else _RangeImage(points, self.origin)
 
     def rows(self, centers: np.ndarray, radius: float = 0.35) -> list[np.ndarray]:
         """Of each of centers (K, 2 or 3) m the rows of the scan's points at a person's heights within `radius` m."""
         if not len(centers):
             return []
-        near, _, count = self._near(np.asarray(centers, float), radius, (-np.inf, np.inf))
+        near, _, count = self._near(np.asarray(centers, float), radius)
         return np.split(self._order[near], np.cumsum(count)[:-1])
 
     def candidates(self, centers: np.ndarray) -> list[Candidate]:
         """The candidates at centers (K, 3) m: x, y, and z of the ground there."""
+        return [candidate for piece in self._pieces(centers) for candidate in self._candidates(piece)]
+
+    def inputs(self, centers: np.ndarray) -> Iterator[dict[str, np.ndarray]]:
+        """What `render` makes of the candidates at centers (K, 3) m, some at a time, until the next are asked for."""
+        # in memory that each piece uses again: to get as much anew takes longer than all else
+        fine = np.empty((min(len(centers), _CHUNK), SLICES, SIDE, SIDE), np.float32)
+        return (_rendered(self._cuts(piece, 0), None, fine[: len(piece)]) for piece in self._pieces(centers))
+
+    def yaws(self, centers: np.ndarray) -> np.ndarray:
+        """Of the view frames' x at centers (K, 2 or 3) m, (K,) rad."""
+        if self.origin is None:
+            return np.zeros(len(centers))
+        return np.arctan2(centers[:, 1] - self.origin[1], centers[:, 0] - self.origin[0])
+
+    def _pieces(self, centers: np.ndarray) -> Iterator[np.ndarray]:
+        """Centers (K, 3) m, some at a time: together they have no more than so many points to look at."""
         centers = np.asarray(centers, float)
-        if not len(centers):
-            return []
-        if len(centers) > 1 and self._runs(centers[:, :2] - self._corner, RADIUS)[2].sum() > _MOST_AT_ONCE:
-            half = len(centers) // 2
-            return self.candidates(centers[:half]) + self.candidates(centers[half:])
-        yaw = distance = np.zeros(len(centers))
-        if self.origin is not None:
-            away = centers[:, :2] - self.origin[:2]
-            yaw, distance = np.arctan2(away[:, 1], away[:, 0]), np.maximum(np.hypot(*away.T), _LEAST_DISTANCE)
-        _, local, count = self._near(centers, RADIUS, (BOTTOM - _ROOM, BOTTOM + SLICES * CELL + _ROOM))
-        chosen, sizes = _thinned(count, _MOST_POINTS)
-        packed = local[chosen]
-        c, s = (np.repeat(values.astype(np.float32), sizes) for values in (np.cos(yaw), np.sin(yaw)))
-        x, y = packed[:, 0] * c + packed[:, 1] * s, packed[:, 1] * c - packed[:, 0] * s
-        packed[:, 0], packed[:, 1] = x, y
-        packed *= np.float32(1 / _UNIT)
-        packed = np.rint(packed, out=packed).astype(np.int16)
-        ends = np.cumsum(sizes)
-        context = self._context(centers, yaw)
-        ranges = np.zeros((len(centers), RANGE_CHANNELS, SLICES + 2 * _MARGIN, SIDE + 2 * _MARGIN), np.uint8)
-        if self._image is not None and self.origin is not None:
-            ranges = self._image.views(centers - self.origin, yaw, distance)
+        for start in range(0, len(centers), _CHUNK):
+            piece = centers[start : start + _CHUNK]
+            number = self._runs(piece[:, :2] - self._corner, RADIUS)[2].sum()
+            yield from np.array_split(piece, min(len(piece), 1 + 2 * number // _MOST_AT_ONCE))
+
+    def _candidates(self, centers: np.ndarray) -> list[Candidate]:
+        cuts, yaw = self._cuts(centers, _MARGIN), self.yaws(centers)
+        packed, ends = np.ascontiguousarray(cuts.xyz.T), np.cumsum(cuts.sizes)
+        is_known = self.origin is not None
         return [
             Candidate(
                 center=centers[k],
                 yaw=float(yaw[k]),
-                distance=None if self.origin is None else float(distance[k]),
-                sensor_height=None if self.origin is None else float(self.origin[2] - centers[k, 2]),
-                count=int(count[k]),
-                packed=packed[ends[k - 1] if k else 0 : ends[k]].copy(),
+                distance=float(cuts.distance[k]) if is_known else None,
+                sensor_height=float(cuts.sensor_height[k]) if is_known else None,
+                count=int(cuts.count[k]),
+                packed=packed[ends[k] - cuts.sizes[k] : ends[k]].copy(),
                 # copies: a candidate that is kept does not hold those of all others
-                range_view=ranges[k].copy(),
-                context=context[k].copy(),
+                range_view=cuts.range_views[k].copy(),
+                context=cuts.contexts[k].copy(),
             )
             for k in range(len(centers))
         ]
 
+    def _cuts(self, centers: np.ndarray, margin: int) -> _Cuts:
+        """Candidates at centers (K, 3) m, their range views with so many cells of a margin."""
+        yaw, distance, sensor_height = self.yaws(centers), np.zeros(len(centers)), np.zeros(len(centers))
+        ranges = np.zeros((len(centers), RANGE_CHANNELS, SLICES + 2 * margin, SIDE + 2 * margin), np.uint8)
+        if self._image is not None and self.origin is not None:
+            away = centers - self.origin
+            distance, sensor_height = np.maximum(np.hypot(away[:, 0], away[:, 1]), _LEAST_DISTANCE), -away[:, 2]
+            ranges = self._image.views(away, yaw, distance, margin)
+        _, (x, y, z), count = self._near(centers, RADIUS, (BOTTOM - _ROOM, BOTTOM + SLICES * CELL + _ROOM))
+        chosen, sizes = _thinned(count, _MOST_POINTS)
+        x, y, z = x[chosen], y[chosen], z[chosen]
+        c, s = (np.repeat(values.astype(np.float32), sizes) for values in (np.cos(yaw), np.sin(yaw)))
+        xyz = np.stack([x * c + y * s, y * c - x * s, z])
+        xyz *= np.float32(1 / _UNIT)
+        return _Cuts(
+            distance=distance,
+            sensor_height=sensor_height,
+            count=count,
+            sizes=sizes,
+            xyz=np.rint(xyz, out=xyz).astype(np.int16),
+            range_views=ranges,
+            contexts=self._context(centers, yaw),
+        )
+
     def _near(
-        self, centers: np.ndarray, radius: float, heights: tuple[float, float]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        self, centers: np.ndarray, radius: float, heights: tuple[float, float] | None = None
+    ) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
         """Points within `radius` and between heights of centers (K, 2 or 3) m, one center's after the other's.
 
-        Returns their sorted rows (m,), where they lie from their center (m, 3) float32 m, and how many each has (K,).
+        Returns their sorted rows (m,), where they lie from their center, x, y and with heights z (m,) float32 m, and
+        how many each has (K,).
         """
-        place = centers - [*self._corner, 0.0][: centers.shape[1]]
-        owner, start, size = self._runs(place[:, :2], radius)
+        owner, start, size = self._runs(centers[:, :2] - self._corner, radius)
         row = np.arange(size.sum()) + np.repeat(start - (np.cumsum(size) - size), size)
-        local = self._points[row]
-        sizes = np.bincount(owner, size, minlength=len(place)).astype(np.int64)
-        for axis in range(place.shape[1]):
-            local[:, axis] -= np.repeat(place[:, axis].astype(np.float32), sizes)
-        inside = local[:, 0] ** 2 + local[:, 1] ** 2 < np.float32(radius**2)
-        if np.isfinite(heights).all():
-            inside &= (local[:, 2] > heights[0]) & (local[:, 2] < heights[1])
-        ends = np.concatenate([[0], np.cumsum(inside)])[np.cumsum(sizes)]
-        return row[inside], local[inside], np.diff(ends, prepend=0)
+        sizes = np.bincount(owner, size, minlength=len(centers)).astype(np.int64)
+        middle = (centers - [*self._corner, 0.0][: centers.shape[1]]).astype(np.float32).T
+        x, y = (values[row] - np.repeat(own, sizes) for values, own in zip((self._x, self._y), middle, strict=False))
+        inside = np.flatnonzero(x * x + y * y < np.float32(radius**2))
+        local = [x, y]
+        if heights is not None:
+            z = self._z[row[inside]] - np.repeat(middle[2], sizes)[inside]
+            between = (z > heights[0]) & (z < heights[1])
+            inside, local = inside[between], [x, y, z[between]]
+        local[:2] = x[inside], y[inside]
+        return row[inside], local, np.diff(np.searchsorted(inside, np.cumsum(sizes)), prepend=0)
 
     def _runs(self, place: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Runs of sorted rows in the cells around places (K, 2) m from the corner: (owner, first row, length)."""
@@ -244,8 +296,10 @@ class SceneIndex:
         i = np.floor((place[:, :1] + c * x - s * y) / self._cell).astype(np.int64)
         j = np.floor((place[:, 1:] + s * x + c * y) / self._cell).astype(np.int64)
         inside = (i >= 0) & (j >= 0) & (i < self._shape[0]) & (j < self._shape[1])
-        values = self._maps[np.where(inside, i * self._shape[1] + j, 0)] * inside[..., None]
-        return np.moveaxis(values, -1, 1).reshape(-1, CONTEXT_CHANNELS, CONTEXT_SIDE, CONTEXT_SIDE).astype(np.uint8)
+        # outside is the cell after the last, which is empty
+        cells = self._maps[np.where(inside, i * self._shape[1] + j, len(self._maps) - 1)]
+        values = np.moveaxis(cells.view(np.uint8).reshape(*inside.shape, CONTEXT_CHANNELS), -1, 1)
+        return np.ascontiguousarray(values).reshape(-1, CONTEXT_CHANNELS, CONTEXT_SIDE, CONTEXT_SIDE)
 
 
 def _thinned(count: np.ndarray, most: int) -> tuple[slice | np.ndarray, np.ndarray]:
@@ -271,21 +325,21 @@ def _order(cells: np.ndarray) -> np.ndarray:
 
 
 def _draw_maps(cells: np.ndarray, heights: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """The context's channels (cells, 4) uint8 of points in flat cells (n,), heights (n,) m."""
+    """The context's channels of points in flat cells (n,), heights (n,) m: four bytes (cells + 1,) each, the last 0."""
     size = shape[0] * shape[1]
-    highest, count, near = np.zeros(size, np.float32), np.zeros(size, np.float32), np.zeros(size, np.float32)
-    filled = np.zeros(size, np.uint8)
+    highest, count, near = np.zeros((3, size + 1), np.float32)
+    filled = np.zeros(size + 1, np.uint8)
     np.maximum.at(highest, cells, heights)
     np.add.at(count, cells, np.float32(1))
     np.add.at(near, cells[np.abs(heights) < _NEAR_GROUND], np.float32(1))
     band = np.flatnonzero((heights > _BAND[0]) & (heights < _BAND[1]))
     level = ((heights[band] - _BAND[0]) * (_BAND_SLICES / (_BAND[1] - _BAND[0]))).astype(np.uint8)
     np.bitwise_or.at(filled, cells[band], np.left_shift(np.uint8(1), np.minimum(level, _BAND_SLICES - 1)))
-    maps = np.empty((size, CONTEXT_CHANNELS), np.uint8)
+    maps = np.empty((size + 1, CONTEXT_CHANNELS), np.uint8)
     maps[:, 0] = np.minimum(highest * (255 / _TALL), 255)
-    maps[:, 1] = np.unpackbits(filled[:, None], axis=1).sum(1) * (255 / _BAND_SLICES)
+    maps[:, 1] = np.bitwise_count(filled) * (255 / _BAND_SLICES)
     maps[:, 2], maps[:, 3] = _log_bytes(count), _log_bytes(near)
-    return maps
+    return maps.view(np.uint32).ravel()
 
 
 def _log_bytes(count: np.ndarray) -> np.ndarray:
@@ -299,41 +353,44 @@ _COUNT_BYTES = _log_bytes(np.arange(256))
 class _RangeImage:
     """Nearest and farthest range and number of returns by direction, in levels of ever coarser cells."""
 
-    def __init__(self, points: np.ndarray):
-        """points (n, 3) m from the sensor."""
-        x, y, z = np.ascontiguousarray(np.asarray(points, np.float32).T)
+    def __init__(self, points: np.ndarray, origin: np.ndarray):
+        """points (n, 3) m, origin (3,) m: the sensor."""
+        x, y, z = ((points[:, i] - origin[i]).astype(np.float32) for i in range(3))
         level = np.sqrt(x * x + y * y)
         column = ((np.arctan2(y, x) + np.float32(pi)) * np.float32(1 / _ANGLE)).astype(np.int32)
         row = (np.arctan2(z, level) * np.float32(1 / _ANGLE) + np.float32(_ROWS // 2)).astype(np.int32)
         # rows that hold nothing above and below are left out, whole cells of the coarsest level
         coarsest = 2**_LEVELS
         self._first = int(row.min(initial=_ROWS)) // coarsest * coarsest
-        rows = max(int(row.max(initial=0)) // coarsest * coarsest + coarsest - self._first, coarsest)
+        self._rows = max(int(row.max(initial=0)) // coarsest * coarsest + coarsest - self._first, coarsest)
         self._columns = 2 * _ROWS
         flat = (row - self._first) * self._columns + np.minimum(column, self._columns - 1)
-        near, far = np.full(rows * self._columns, np.inf, np.float32), np.zeros(rows * self._columns, np.float32)
-        np.minimum.at(near, flat, level)
-        np.maximum.at(far, flat, level)
-        count = np.bincount(flat, minlength=len(near)).astype(np.int32)
         # levels one after the other, and a cell in which nothing came back
-        levels = [(near, far, count)]
-        for number in range(_LEVELS):
-            columns = self._columns >> number
-            near, far, count = (
-                _halved(image.reshape(-1, columns), reduce).ravel()
-                for image, reduce in ((near, np.minimum), (far, np.maximum), (count, np.add))
-            )
-            levels.append((near, far, count))
-        self._rows = rows
-        self._starts = np.cumsum([0, *(len(level[0]) for level in levels)], dtype=np.int32)
-        none = (np.full(1, np.inf, np.float32), np.zeros(1, np.float32), np.zeros(1, np.int32))
-        self._near, self._far, self._count = (np.concatenate(images) for images in zip(*levels, none, strict=True))
+        sizes = [self._rows * self._columns >> 2 * number for number in range(_LEVELS + 1)]
+        self._starts = np.cumsum([0, *sizes], dtype=np.int32)
+        size = self._starts[-1] + 1
+        self._near, self._far, count = (
+            np.full(size, np.inf, np.float32),
+            np.zeros(size, np.float32),
+            np.zeros(size, np.int32),
+        )
+        np.minimum.at(self._near, flat, level)
+        np.maximum.at(self._far, flat, level)
+        np.add.at(count, flat, np.int32(1))
+        for image, reduce in ((self._near, np.minimum), (self._far, np.maximum), (count, np.add)):
+            levels = np.split(image, self._starts[1:])
+            for number, (fine, coarse) in enumerate(zip(levels[:-2], levels[1:-1], strict=True)):
+                lines = fine.reshape(-1, 2, self._columns >> number)
+                lines = reduce(lines[:, 0], lines[:, 1])
+                reduce(lines[:, ::2], lines[:, 1::2], out=coarse.reshape(len(lines), -1))
+        # more than 255 look like 255
+        self._count = np.minimum(count, 255).astype(np.uint8)
 
-    def views(self, centers: np.ndarray, yaw: np.ndarray, distance: np.ndarray) -> np.ndarray:
-        """Pictures (K, 4, 34, 30) uint8 of centers (K, 3) m from the sensor; see `Candidate`."""
-        rows, columns = SLICES + 2 * _MARGIN, SIDE + 2 * _MARGIN
-        height = (np.arange(rows) - _MARGIN + 0.5) * CELL + BOTTOM
-        lateral = (np.arange(columns) - _MARGIN + 0.5) * CELL - SIDE * CELL / 2
+    def views(self, centers: np.ndarray, yaw: np.ndarray, distance: np.ndarray, margin: int) -> np.ndarray:
+        """Pictures (K, 4, 28 + 2 margin, 24 + 2 margin) uint8 of centers (K, 3) m from the sensor; see `Candidate`."""
+        rows, columns = SLICES + 2 * margin, SIDE + 2 * margin
+        height = (np.arange(rows) - margin + 0.5) * CELL + BOTTOM
+        lateral = (np.arange(columns) - margin + 0.5) * CELL - SIDE * CELL / 2
         turn = (yaw[:, None] + np.arctan2(lateral, distance[:, None]) + pi) % (2 * pi)
         column = np.minimum((turn / _ANGLE).astype(np.int32), self._columns - 1)[:, None]
         slant = np.sqrt(lateral**2 + distance[:, None] ** 2).astype(np.float32)[:, None]
@@ -343,12 +400,12 @@ class _RangeImage:
         level = np.floor(np.log2(CELL / distance / _ANGLE) + 0.5)
         level = np.clip(level, 0, _LEVELS - 1).astype(np.int32)[:, None, None]
         at = self._at(level, row, column)
-        near, far, count = self._near[at], self._far[at], self._count[at]
+        count = self._count[at]
         views = np.empty((len(centers), RANGE_CHANNELS, rows, columns), np.uint8)
-        views[:, 0] = _range_bytes(near - slant)
-        views[:, 1] = _range_bytes(far - slant)
-        views[:, 2] = _COUNT_BYTES[np.minimum(count, 255)]
-        views[:, 3] = _COUNT_BYTES[np.minimum(self._count[self._at(level + 1, row, column)], 255)]
+        views[:, 0] = _range_bytes(self._near[at] - slant)
+        views[:, 1] = _range_bytes(self._far[at] - slant)
+        views[:, 2] = _COUNT_BYTES[count]
+        views[:, 3] = _COUNT_BYTES[self._count[self._at(level + 1, row, column)]]
         views[:, :2] *= count[:, None] > 0
         return views
 
@@ -357,12 +414,6 @@ class _RangeImage:
         flat = self._starts[level] + (row >> level) * (self._columns >> level) + (column >> level)
         flat[(row < 0) | (row >= self._rows)] = self._starts[-1]
         return flat
-
-
-def _halved(image: np.ndarray, reduce: np.ufunc) -> np.ndarray:
-    """An image of half the size: four cells become one."""
-    image = reduce(image[::2], image[1::2])
-    return reduce(image[:, ::2], image[:, 1::2])
 
 
 def _range_bytes(meters: np.ndarray) -> np.ndarray:
@@ -374,77 +425,90 @@ def render(
     candidates: Sequence[Candidate], augmentations: Sequence[Augmentation] | None = None
 ) -> dict[str, np.ndarray]:
     """The network's inputs, float32: see the module. augmentations: one for each candidate, or None for none."""
-    known = np.array([c.distance is not None for c in candidates], bool)
-    if augmentations is not None:
-        known &= ~np.array([a.drop_origin for a in augmentations], bool)
-    points, owner, count = _moved_points(candidates, augmentations)
-    with_origin = known.astype(np.float32)
-    scalars = np.zeros((len(candidates), 4), np.float32)
-    scalars[:, 0] = with_origin * np.log([1.0 if c.distance is None else c.distance for c in candidates])
-    scalars[:, 1] = with_origin * [(c.sensor_height or 0.0) / 4 for c in candidates]
+    side = (SLICES + 2 * _MARGIN, SIDE + 2 * _MARGIN)
+    empty = np.zeros((0, RANGE_CHANNELS, *side), np.uint8), np.zeros((0, 4, CONTEXT_SIDE, CONTEXT_SIDE), np.uint8)
+    cuts = _Cuts(
+        distance=np.array([c.distance or 0.0 for c in candidates]),
+        sensor_height=np.array([c.sensor_height or 0.0 for c in candidates]),
+        count=np.array([c.count for c in candidates], np.int64),
+        sizes=np.array([len(c.packed) for c in candidates], np.int64),
+        xyz=np.concatenate([np.zeros((0, 3), np.int16), *(c.packed for c in candidates)]).T,
+        range_views=np.stack([c.range_view for c in candidates]) if candidates else empty[0],
+        contexts=np.stack([c.context for c in candidates]) if candidates else empty[1],
+    )
+    return _rendered(cuts, augmentations)
+
+
+def _rendered(
+    cuts: _Cuts, changes: Sequence[Augmentation] | None, fine: np.ndarray | None = None
+) -> dict[str, np.ndarray]:
+    """fine: memory (K, 28, 24, 24) float32 for that input."""
+    known = cuts.distance > 0
+    if changes is not None:
+        known &= ~np.array([a.drop_origin for a in changes], bool)
+    points, owner, count = _moved_points(cuts, changes)
+    scalars = np.zeros((len(known), 4), np.float32)
+    scalars[:, 0] = np.log(np.where(known, cuts.distance, 1.0))
+    scalars[:, 1] = known * cuts.sensor_height / 4
     scalars[:, 2] = np.log1p(count)
-    scalars[:, 3] = with_origin
+    scalars[:, 3] = known
+    # of a place with more points than are kept, those stand for all
+    weight = cuts.count / np.maximum(cuts.sizes, 1)
     return {
-        "fine": _fine(points, owner, candidates),
-        "range_view": _range_views(candidates, known, augmentations),
-        "context": _contexts(candidates, augmentations),
+        "fine": _fine(points, owner, weight, fine),
+        "range_view": _range_views(cuts.range_views, known, changes),
+        "context": _contexts(cuts.contexts, changes),
         "scalars": scalars,
     }
 
 
-def _moved_points(
-    candidates: Sequence[Candidate], changes: Sequence[Augmentation] | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(points (n, 3) float32 m, owner (n,), counts (K,) of all points within `RADIUS`)."""
-    sizes = np.array([len(c.packed) for c in candidates], np.int64)
-    count = np.array([c.count for c in candidates], float)
-    points = np.concatenate([np.zeros((0, 3), np.int16), *(c.packed for c in candidates)]) * np.float32(_UNIT)
-    owner = np.repeat(np.arange(len(candidates)), sizes)
+def _moved_points(cuts: _Cuts, changes: Sequence[Augmentation] | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(points (3, n) float32 m, owner (n,), counts (K,) of all points within `RADIUS`)."""
+    points = cuts.xyz * np.float32(_UNIT)
+    owner = np.repeat(np.arange(len(cuts.sizes)), cuts.sizes)
     if changes is None:
-        return points, owner, count
+        return points, owner, cuts.count
     draws = []
-    for size, change in zip(sizes.tolist(), changes, strict=True):
+    for size, change in zip(cuts.sizes.tolist(), changes, strict=True):
         rng = np.random.default_rng(change.seed)
         draws.append(np.stack([rng.random(size, np.float32), rng.standard_normal(size, np.float32) * change.noise]))
     chance, noise = np.concatenate([np.zeros((2, 0), np.float32), *draws], axis=1)
     kept = chance < np.array([a.keep for a in changes], np.float32)[owner]
-    points, owner, noise = points[kept], owner[kept], noise[kept]
-    points[:, 0] += noise
+    points, owner, noise = points[:, kept], owner[kept], noise[kept]
+    points[0] += noise
     matrix = np.array([a._matrix() for a in changes], np.float32).reshape(-1, 2, 2)[owner]
     shift = np.array([a.shift for a in changes], np.float32).reshape(-1, 2)[owner]
-    x, y = (matrix[:, i, 0] * points[:, 0] + matrix[:, i, 1] * points[:, 1] + shift[:, i] for i in (0, 1))
-    z = points[:, 2] * np.array([a.scale for a in changes], np.float32)[owner]
-    return np.stack([x, y, z], 1), owner, count * [a.keep for a in changes]
+    x, y = (matrix[:, i, 0] * points[0] + matrix[:, i, 1] * points[1] + shift[:, i] for i in (0, 1))
+    z = points[2] * np.array([a.scale for a in changes], np.float32)[owner]
+    return np.stack([x, y, z]), owner, cuts.count * np.array([a.keep for a in changes])
 
 
-def _fine(points: np.ndarray, owner: np.ndarray, candidates: Sequence[Candidate]) -> np.ndarray:
-    scaled = points * np.float32(1 / CELL)
-    i = np.floor(scaled[:, 2] - BOTTOM / CELL).astype(np.int64)
-    j, k = (np.floor(scaled[:, axis]).astype(np.int64) + SIDE // 2 for axis in (0, 1))
-    inside = (i >= 0) & (i < SLICES) & (j >= 0) & (j < SIDE) & (k >= 0) & (k < SIDE)
+def _fine(points: np.ndarray, owner: np.ndarray, weight: np.ndarray, fine: np.ndarray | None) -> np.ndarray:
+    """(K, 28, 24, 24) of points (3, n) m, of whose owners (n,) each stands for `weight` (K,) points."""
+    shape = (len(weight), SLICES, SIDE, SIDE)
+    first = np.array([[SIDE // 2], [SIDE // 2], [-BOTTOM / CELL]], np.float32)
+    j, k, i = np.floor(points * np.float32(1 / CELL) + first).astype(np.int64)
+    # as unsigned numbers, what is below 0 is large
+    inside = np.logical_and.reduce([at.view(np.uint64) < n for at, n in zip((i, j, k), shape[1:], strict=True)])
     flat = (((owner * SLICES + i) * SIDE + j) * SIDE + k)[inside]
-    cells, number = np.unique(flat, return_counts=True)
-    # of a place with more points than are kept, those stand for all
-    weight = np.array([c.count / max(len(c.packed), 1) for c in candidates])
-    fine = np.zeros((len(candidates), SLICES, SIDE, SIDE), np.float32)
-    owner_of_cell = cells // (SLICES * SIDE * SIDE)
-    fine.ravel()[cells] = 0.5 + 0.125 * np.log2(1 + number * weight[owner_of_cell])
+    fine = np.empty(shape, np.float32) if fine is None else fine
+    fine[:] = 0
+    cells = fine.reshape(-1)
+    np.add.at(cells, flat, np.float32(1))
+    cells[flat] = 0.5 + 0.125 * np.log2(1 + cells[flat] * weight[owner[inside]])
     return fine
 
 
-def _range_views(
-    candidates: Sequence[Candidate], known: np.ndarray, changes: Sequence[Augmentation] | None
-) -> np.ndarray:
-    views = np.zeros((len(candidates), RANGE_CHANNELS, SLICES, SIDE), np.float32)
+def _range_views(stored: np.ndarray, known: np.ndarray, changes: Sequence[Augmentation] | None) -> np.ndarray:
+    views = np.zeros((len(known), RANGE_CHANNELS, SLICES, SIDE), np.float32)
     if not known.any():
         return views
-    rows = np.flatnonzero(known).tolist()
-    stored = np.stack([candidates[k].range_view for k in rows])
-    inner = np.s_[_MARGIN:-_MARGIN]
+    stored = stored[known]
     if changes is None:
-        stored = stored[:, :, inner, inner]
+        margin = (stored.shape[3] - SIDE) // 2
+        stored = stored[:, :, margin : margin + SLICES, margin : margin + SIDE]
     else:
-        chosen = [changes[k] for k in rows]
+        chosen = [change for change, is_known in zip(changes, known, strict=True) if is_known]
         scale = np.array([a.scale for a in chosen])[:, None]
         sign = np.array([-1.0 if a.mirror else 1.0 for a in chosen])[:, None]
         shift = np.array([a.shift[1] for a in chosen])[:, None]
@@ -456,11 +520,9 @@ def _range_views(
         stored = stored[np.arange(len(stored))[:, None, None], :, i[:, :, None], j[:, None, :]]
         stored = np.moveaxis(stored, -1, 1)
         stored = _lost(stored, chosen)
-    tables = np.arange(256, dtype=np.float32)
-    ranges, logs = np.where(tables > 0, (tables - 128) / 127, 0), tables / 255
-    drawn = np.empty(stored.shape, np.float32)
-    drawn[:, :2], drawn[:, 2:] = ranges[stored[:, :2]], logs[stored[:, 2:]]
-    views[known] = drawn
+    ranges = (stored[:, :2] - np.float32(128)) / np.float32(127)
+    ranges[stored[:, :2] == 0] = 0
+    views[known, :2], views[known, 2:] = ranges, stored[:, 2:] / np.float32(255)
     return views
 
 
@@ -476,8 +538,7 @@ def _lost(stored: np.ndarray, changes: Sequence[Augmentation]) -> np.ndarray:
     return stored
 
 
-def _contexts(candidates: Sequence[Candidate], changes: Sequence[Augmentation] | None) -> np.ndarray:
-    stored = np.stack([c.context for c in candidates]) if candidates else np.zeros((0, 4, 20, 20), np.uint8)
+def _contexts(stored: np.ndarray, changes: Sequence[Augmentation] | None) -> np.ndarray:
     if changes is not None and len(stored):
         side = (np.arange(CONTEXT_SIDE) - (CONTEXT_SIDE - 1) / 2) * CONTEXT_CELL
         to = np.stack(np.meshgrid(side, side, indexing="ij"), -1).reshape(-1, 2)

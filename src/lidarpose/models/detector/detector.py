@@ -7,12 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.models.detector.candidates import SceneIndex, render, suppress
+from lidarpose.models.detector.candidates import SceneIndex, suppress
 from lidarpose.models.detector.ground import estimate_ground, without_ground
 from lidarpose.models.detector.proposals import heights_above, propose
 
-# candidates that are drawn and scored at a time
-_CHUNK = 64
 # what lies farther than this beyond the range, m, is left out: a candidate at its end still has its surroundings
 _BEYOND = 6.0
 # a detection's own points lie within this of its axis, m
@@ -91,12 +89,14 @@ class Detector:
         Returns:
             All candidates after suppression, whatever their score.
         """
-        points = np.asarray(points)
-        rows = np.arange(len(points))
+        columns = np.asarray(points).T
+        rows = np.arange(columns.shape[1])
         if origin is not None and max_range is not None:
-            away = np.hypot(points[:, 0] - origin[0], points[:, 1] - origin[1])
-            rows = np.flatnonzero(away < max_range + _BEYOND)
-            points = points[rows]
+            squared = (columns[0] - origin[0]) ** 2 + (columns[1] - origin[1]) ** 2
+            rows = np.flatnonzero(squared < (max_range + _BEYOND) ** 2)
+            columns = [values[rows] for values in columns]
+        # x after x in memory: every step reads one axis at a time
+        points = np.ascontiguousarray(columns).T
         ground = estimate_ground(points, origin)
         has_ground = ground is not None
         ground = ground or without_ground(points, origin)
@@ -111,13 +111,9 @@ class Detector:
     def _detections(
         self, scene: SceneIndex, places: np.ndarray, scan_rows: np.ndarray, has_ground: bool, limit: int | None
     ) -> Detections:
-        scores, yaws = [np.zeros((0, 6))], [np.zeros(0)]
-        for start in range(0, len(places), _CHUNK):
-            candidates = scene.candidates(places[start : start + _CHUNK])
-            scores.append(np.asarray(self._score(render(candidates)), float))
-            yaws.append(np.array([candidate.yaw for candidate in candidates]))
-        logit, x, y, foot, height, mounted_logit = np.concatenate(scores).T
-        yaw = np.concatenate(yaws)
+        scores = [np.asarray(self._score(inputs), float) for inputs in scene.inputs(places)]
+        logit, x, y, foot, height, mounted_logit = np.concatenate([np.zeros((0, 6)), *scores]).T
+        yaw = scene.yaws(places)
         x, y = (np.clip(shift, -_MOST_SHIFT, _MOST_SHIFT) for shift in (x, y))
         foot, height = np.clip(foot, -_MOST_FOOT, _MOST_FOOT), np.clip(height, *_HEIGHTS)
         centers = places.astype(float)

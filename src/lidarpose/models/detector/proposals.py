@@ -7,6 +7,7 @@ candidate as good as one in the open. What is next to never a person is left out
 and the two rings around it.
 """
 
+import threading
 from collections.abc import Iterator
 from functools import cache
 
@@ -34,8 +35,12 @@ _SHIFTS = 2
 # of heads: points so far below the highest point within 0.3 m belong to it, m
 _HEAD = 0.3
 _TALLEST = 2.05
+# the lowest height of a cell that holds nothing, m
+_EMPTY = np.float32(HIGH + 1)
 # a column is dropped this near to a head or to a stronger column, m
 _APART = 0.3
+
+_kept = threading.local()
 
 
 def propose(points: np.ndarray, ground: Ground, *, limit: int = 600, heights: np.ndarray | None = None) -> np.ndarray:
@@ -114,28 +119,34 @@ def _peaks(x: np.ndarray, y: np.ndarray, heights: np.ndarray) -> tuple[np.ndarra
     """Places (K, 2) m and features of a tile's columns. x, y (n,) m from its corner, heights (n,) m."""
     row, column = ((values * (1 / CELL)).astype(np.int32) + _MARGIN for values in (x, y))
     width = int(column.max()) + _MARGIN + 1
-    size = (int(row.max()) + _MARGIN + 1) * width
     flat = row * width + column
-    count, top, bottom = np.zeros(size, np.float32), np.zeros(size, np.float32), np.full(size, HIGH + 1, np.float32)
+    # of each cell: points; the highest, and how far the lowest is below `_EMPTY`, m; what is looked at in turn
+    count, top, depth, grid = _grids(4, (int(row.max()) + _MARGIN + 1) * width)
     np.add.at(count, flat, np.float32(1))
     np.maximum.at(top, flat, heights)
-    np.minimum.at(bottom, flat, heights)
+    np.maximum.at(depth, flat, _EMPTY - heights)
 
     occupied = np.flatnonzero(count > 0)
-    body = _shifted(_maxima(_smoothed(count, occupied, _BODY_KERNEL, width), width), count, width)
+    _smooth(grid, occupied, count[occupied], _BODY_KERNEL, width)
+    body = _shifted(_maxima(grid, width), count, width)
     highest = top[occupied]
     for step in _disc(_COLUMN, width):
         np.maximum(highest, top[occupied + step], out=highest)
     # nobody's head reaches through the band: a wall
     highest[highest > _TALLEST] = np.inf
-    head_bottom, heads = np.zeros(size, np.float32), np.zeros(size, np.float32)
-    head_bottom[occupied] = highest - _HEAD
-    np.add.at(heads, flat[heights > head_bottom[flat]], np.float32(1))
-    head = _positions(_maxima(_smoothed(heads, np.flatnonzero(heads > 0), _HEAD_KERNEL, width), width), width)
+    grid[occupied] = highest - _HEAD
+    is_head = heights > grid[flat]
+    grid[:] = 0
+    np.add.at(grid, flat[is_head], np.float32(1))
+    occupied = occupied[grid[occupied] > 0]
+    heads = grid[occupied]
+    grid[occupied] = 0
+    _smooth(grid, occupied, heads, _HEAD_KERNEL, width)
+    head = _positions(_maxima(grid, width), width)
 
     centers = np.concatenate([body, head])
-    column = (centers.astype(np.int32) @ [width, 1])[:, None] + _disc(_COLUMN, width)
-    points, highest, lowest = count[column].sum(1), top[column].max(1), bottom[column].min(1)
+    column = _disc(_COLUMN, width)[:, None] + centers.astype(np.int32) @ [width, 1]
+    points, highest, lowest = count[column].sum(0), top[column].max(0), _EMPTY - depth[column].max(0)
     is_tall = highest - lowest > _LEAST_EXTENT
     is_tall |= (highest - lowest > _LEAST_HEAD) & (highest > _HEAD_TOP) & (points >= 2 * LEAST_POINTS)
     enough = (points >= LEAST_POINTS) & (highest > _LEAST_TOP) & is_tall
@@ -145,13 +156,23 @@ def _peaks(x: np.ndarray, y: np.ndarray, heights: np.ndarray) -> tuple[np.ndarra
     centers, points, is_body = centers[enough], points[enough], is_body[enough]
     # where two are equally strong, the order of places: not that of the points
     order = np.lexsort((centers[:, 1], centers[:, 0], -points, is_body))
-    order = order[_apart(centers[order])]
+    grid[:] = 0
+    order = order[_apart(centers[order], grid.view(bool).reshape(-1, 2 * width))]
     centers = centers[order]
-    return (centers - _MARGIN) * CELL, _features(centers.astype(np.int32) @ [width, 1], count, top, bottom, width)
+    return (centers - _MARGIN) * CELL, _features(centers.astype(np.int32) @ [width, 1], count, top, depth, width)
 
 
-def _features(cells: np.ndarray, count: np.ndarray, top: np.ndarray, bottom: np.ndarray, width: int) -> np.ndarray:
-    """What flat cells (K,) and the rings around them are like, of a grid of counts, highest and lowest heights."""
+def _grids(number: int, size: int) -> np.ndarray:
+    """Zeros (number, size) float32 in memory that the thread keeps: to get as much anew takes longer than all else."""
+    if number * size > len(getattr(_kept, "memory", ())):
+        _kept.memory = np.empty(number * size, np.float32)
+    grids = _kept.memory[: number * size].reshape(number, size)
+    grids[:] = 0
+    return grids
+
+
+def _features(cells: np.ndarray, count: np.ndarray, top: np.ndarray, depth: np.ndarray, width: int) -> np.ndarray:
+    """What flat cells (K,) and the rings around them are like, of grids of counts, heights and depths."""
     offset = _offsets(_RINGS[-1])
     squared = (offset**2).sum(1)
     # the disc first, then ring after ring
@@ -159,60 +180,54 @@ def _features(cells: np.ndarray, count: np.ndarray, top: np.ndarray, bottom: np.
     ends = np.searchsorted(squared[order], [(radius + 0.3) ** 2 for radius in _RINGS])
     offset = offset[order[: ends[-1]]]
     rings = [slice(start, end) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
-    around = cells[:, None] + offset @ [width, 1]
+    around = (offset @ [width, 1])[:, None] + cells
     number, highest = count[around], top[around]
     filled = (number > 0).astype(np.float32)
-    features = [np.log1p(number[:, ring].sum(1)) for ring in rings]
-    features += [filled[:, ring].mean(1) for ring in rings]
-    features += [highest[:, ring].max(1) for ring in rings]
-    features += [bottom[around[:, ring]].min(1) for ring in rings[:2]]
+    features = [np.log1p(number[ring].sum(0)) for ring in rings]
+    features += [filled[ring].mean(0) for ring in rings]
+    features += [highest[ring].max(0) for ring in rings]
+    features += [_EMPTY - depth[around[ring]].max(0) for ring in rings[:2]]
     # how long and how wide what is filled is, cells
-    total = np.maximum(filled.sum(1), 1)
+    total = np.maximum(filled.sum(0), 1)
     x, y = offset.T.astype(np.float32)
-    mean_x, mean_y = filled @ x / total, filled @ y / total
-    xx, yy = filled @ (x * x) / total - mean_x**2, filled @ (y * y) / total - mean_y**2
-    xy = filled @ (x * y) / total - mean_x * mean_y
+    mean_x, mean_y = x @ filled / total, y @ filled / total
+    xx, yy = (x * x) @ filled / total - mean_x**2, (y * y) @ filled / total - mean_y**2
+    xy = (x * y) @ filled / total - mean_x * mean_y
     spread = np.sqrt((xx - yy) ** 2 / 4 + xy**2)
     features += [np.sqrt(np.maximum((xx + yy) / 2 + sign * spread, 0)) for sign in (1, -1)]
     return np.stack(features, 1).astype(np.float32)
 
 
-def _smoothed(values: np.ndarray, cells: np.ndarray, kernel: tuple[int, ...], width: int) -> np.ndarray:
-    """A flat grid (size,) of the values at `cells` (n,) spread by the kernel along both axes."""
-    smooth = np.zeros_like(values)
+def _smooth(grid: np.ndarray, cells: np.ndarray, values: np.ndarray, kernel: tuple[int, ...], width: int) -> None:
+    """Adds values (n,) at flat cells (n,), all different, spread by the kernel along both axes, to a grid (size,)."""
     middle = len(kernel) // 2
-    own = values[cells]
     for i, along in enumerate(kernel):
         for j, across in enumerate(kernel):
-            smooth[cells + ((i - middle) * width + j - middle)] += own * np.float32(along * across)
-    return smooth
+            grid[cells + ((i - middle) * width + j - middle)] += values * np.float32(along * across)
 
 
-def _maxima(values: np.ndarray, width: int) -> np.ndarray:
+def _maxima(grid: np.ndarray, width: int) -> np.ndarray:
     """Flat cells that hold something and are the maximum of the square around them."""
-    inner = values[width:-width]
-    highest = (
-        (inner > 0) & (inner >= values[width - 1 : -width - 1]) & (inner >= values[width + 1 : -width + 1 or None])
-    )
-    highest &= (inner >= values[: -2 * width]) & (inner >= values[2 * width :])
-    cells = np.flatnonzero(highest) + width
-    return cells[values[cells] >= values[cells[:, None] + _square(_PEAK, width)].max(1)]
+    cells = np.flatnonzero(grid > 0)
+    for step in (-1, 1, -width, width):
+        cells = cells[grid[cells] >= grid[cells + step]]
+    return cells[grid[cells] >= grid[_square(_PEAK, width)[:, None] + cells].max(0)]
 
 
 def _shifted(cells: np.ndarray, count: np.ndarray, width: int) -> np.ndarray:
     """Positions (K, 2) in cells of flat cells after a few steps to the mean of the points around them."""
     position = _positions(cells, width).astype(np.float32)
-    offset = _offsets(_SHIFT).astype(np.float32)
-    steps = _square(_SHIFT, width)
+    offset = _offsets(_SHIFT).astype(np.float32).T[..., None]
+    steps = _square(_SHIFT, width)[:, None]
     for _ in range(_SHIFTS):
         start = position.astype(np.int32)
         rest = start + np.float32(0.5) - position
-        x, y = rest[:, :1] + offset[:, 0], rest[:, 1:] + offset[:, 1]
-        weight = count[(start[:, 0] * width + start[:, 1])[:, None] + steps]
+        x, y = offset[0] + rest[:, 0], offset[1] + rest[:, 1]
+        weight = count[steps + (start[:, 0] * width + start[:, 1])]
         weight *= x * x + y * y < (_SHIFT + 0.5) ** 2
-        total = np.maximum(weight.sum(1), 1e-9)
-        position[:, 0] += (weight * x).sum(1) / total
-        position[:, 1] += (weight * y).sum(1) / total
+        total = np.maximum(weight.sum(0), 1e-9)
+        position[:, 0] += (weight * x).sum(0) / total
+        position[:, 1] += (weight * y).sum(0) / total
     return position
 
 
@@ -237,16 +252,14 @@ def _disc(reach: int, width: int) -> np.ndarray:
     return offset[(offset**2).sum(1) <= (reach + 0.3) ** 2] @ [width, 1]
 
 
-def _apart(centers: np.ndarray) -> np.ndarray:
-    """Rows of positions (K, 2) in cells, the strongest first, that have `_APART` to all earlier ones that stay."""
-    # half a cell is exact enough
+def _apart(centers: np.ndarray, taken: np.ndarray) -> np.ndarray:
+    """Rows of positions (K, 2) in cells, the strongest first, that have `_APART` to all earlier ones that stay; taken:
+    False for each half cell, which is exact enough."""
     reach = round(2 * _APART / CELL)
     disc = (_offsets(reach) ** 2).sum(1).reshape(2 * reach + 1, -1) < reach**2
-    cells = (centers * 2).astype(np.int64)
-    taken = np.zeros(cells.max(0, initial=0) + 2 * reach + 1, bool)
     rows = []
-    for row, (i, j) in enumerate(cells.tolist()):
-        if not taken[i + reach, j + reach]:
+    for row, (i, j) in enumerate((centers * 2).astype(np.int64).tolist()):
+        if not taken[i, j]:
             rows.append(row)
-            taken[i : i + 2 * reach + 1, j : j + 2 * reach + 1] |= disc
+            taken[i - reach : i + reach + 1, j - reach : j + reach + 1] |= disc
     return np.array(rows, np.int64)
