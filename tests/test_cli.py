@@ -122,7 +122,7 @@ def test_every_format_gives_the_same_pose(tmp_path, out, crop, points):
         ("--out -", [], True),
         ("--out - --picture", ["crop.poses.png"], True),
         ("--out a/one.JSON --picture", ["a/one.JSON", "a/one.png"], False),
-        ("--out a.CSV --picture", ["a.CSV", "a.png"], False),
+        ("--out a.CSV --picture --html", ["a.CSV", "a.html", "a.png"], False),
         # a folder is a folder whatever its name
         ("--out b.json", ["b.json/crop.poses.json"], False),
         ("--out c.csv/", ["c.csv/crop.poses.json"], False),
@@ -143,6 +143,8 @@ def test_results_go_where_they_are_to_go(crop, tmp_path, monkeypatch, capsys, wo
     for name, content in files.items():
         if name.endswith("png"):
             assert content.startswith(b"\x89PNG")
+        elif name.endswith("html"):
+            assert content.startswith(b"<!doctype html>") and b'data-person="0"' in content
         elif name.endswith("CSV"):
             table = pandas.read_csv(io.BytesIO(content))
             assert len(table) == 24 and {"id", "joint", "x", "y", "z", "confidence"} <= set(table.columns)

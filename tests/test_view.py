@@ -16,6 +16,7 @@ from lidarpose.geometry import rotation_about
 from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14, Skeleton
 from lidarpose.viz import draw
+from lidarpose.viz.bird_eye import ScanPanel
 from lidarpose.viz.draw import draw_people, shortened
 from lidarpose.viz.html import MAX_POINTS, render_report, write_report
 from lidarpose.viz.person_view import Panel, bone_sides, describe, facing, project, side, thinned, view_directions
@@ -327,6 +328,29 @@ def test_report_holds_the_data():
     assert tuple(skeleton["joints"]) == BODY26.joints
     assert [tuple(b[:2]) for b in skeleton["bones"]] == list(BODY26.bones)
     assert {s for *_, s in skeleton["bones"]} == set(skeleton["sides"]) == set("lrc")
+
+
+def test_report_shows_a_scan_about_its_people():
+    """All points near people, a choice of the others, none far away; everybody's joints where they are."""
+    rng = np.random.default_rng(2)
+    joints = np.stack([person().pose.joints + at for at in ([5.0, 0, 0], [9.0, 3, 0])])
+    joints[1, 4] = np.nan
+    boxes = [Box(center=np.nanmean(body, 0), size=np.array([1.0, 1, 2])) for body in joints]
+    near = boxes[0].center + rng.uniform(-0.5, 0.5, (500, 3))
+    wide, far = rng.uniform((-5, -8, -1), (20, 12, 2), (60_000, 3)), rng.uniform(50, 60, (1000, 3))
+    points = np.concatenate([wide, near, far, [[np.nan, 0, 0]]])
+    scan = ScanPanel(points=points, boxes=boxes, poses=Pose(joints=joints, skeleton=BODY26), label=EVIL)
+    page = Reader(text := render_report([], title="", summary=[], scan=scan))
+    assert EVIL in page.texts["strong"] and len(text) < 500_000
+    shown = json.loads(page.texts["script"][0])["scan"]
+    center = np.median([box.center for box in boxes], axis=0)
+    drawn = np.reshape(shown["points"], (-1, 3)) / 1000 + center
+    assert 20_000 <= len(drawn) <= 40_000 and drawn.max() < 40
+    assert all(np.linalg.norm(drawn - row, axis=1).min() < 1e-3 for row in near)
+    assert shown["poses"][1]["joints"][4] is None
+    np.testing.assert_allclose(np.array(shown["poses"][0]["joints"]) / 1000 + center, joints[0], atol=6e-4)
+    nobody = replace(scan, boxes=(), poses=None)
+    assert "canvas" in Reader(render_report([], title="", summary=[], scan=nobody)).tags
 
 
 def test_report_is_small_and_thins_what_is_too_much():

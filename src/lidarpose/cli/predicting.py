@@ -127,6 +127,7 @@ def _add_output(output) -> None:
         help="a folder, a .json or .csv file (default: the current folder); - prints the JSON",
     )
     output.add_argument("--picture", action="store_true", help="also draw STEM.poses.png, or FILE.png")
+    output.add_argument("--html", action="store_true", help="also write STEM.poses.html: everybody in 3D, the scan too")
     output.add_argument(
         "--skeleton", metavar="NAME", help="smpl24, human15, waymo14 or body26 (default smpl24, else the network's own)"
     )
@@ -159,10 +160,10 @@ def _predict(options: argparse.Namespace) -> None:
 
     file = Path(options.file)
     result = _result_path(options.out, file, "poses", ".json", ".csv")
-    picture = None
-    if options.picture:
-        picture = (result or Path(f"{file.stem}.poses.json")).with_suffix(".png")
-    for path in filter(None, (result, picture)):
+    beside = result or Path(f"{file.stem}.poses.json")
+    picture = beside.with_suffix(".png") if options.picture else None
+    page = beside.with_suffix(".html") if options.html else None
+    for path in filter(None, (result, picture, page)):
         check_apart(path, options.file, options.boxes, options.calib, options.weights, *(options.background or ()))
         # before the work
         check_writable(path)
@@ -186,6 +187,8 @@ def _predict(options: argparse.Namespace) -> None:
         outputs[result] = (poses.to_dataframe().to_csv(index=False) if as_csv else poses.to_json()).encode()
     if picture is not None:
         outputs[picture] = poses.picture(title=file.name)
+    if page is not None:
+        outputs[page] = poses.html(title=file.name).encode("utf-8", "replace")
     # all of them or none
     with ExitStack() as stack:
         for path, content in outputs.items():

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import pandas
 
     from lidarpose.viz.bird_eye import ScanPanel
+    from lidarpose.viz.person_view import Panel
 
 SCHEMA = "lidarpose.poses/1"
 
@@ -263,18 +264,36 @@ class Poses(Sequence):
         Where people were searched for, the scan from above is over them.
         """
         from lidarpose.viz.bird_eye import draw_scans
-        from lidarpose.viz.draw import Panel, draw_people, stack_pictures
+        from lidarpose.viz.draw import draw_people, stack_pictures
 
         title = title or (self.source or "")
+        panels, scan = self._panels()
+        if scan is None:
+            return Picture(draw_people(panels, path, title=title))
+        above = draw_scans([scan], title=title)
+        return Picture(stack_pictures([above, draw_people(panels)] if panels else [above], path))
+
+    def html(self, path: str | Path | None = None, *, title: str = "") -> str:
+        """A page on which everybody is turned in 3D, under the scan where people were searched for; also written to
+        `path` where given."""
+        from lidarpose.viz.html import render_report, write_report
+
+        title = title or (self.source or "lidarpose")
+        panels, scan = self._panels()
+        if path is not None:
+            write_report(path, panels, title=title, summary=[], scan=scan)
+        return render_report(panels, title=title, summary=[], scan=scan)
+
+    def _panels(self) -> "tuple[list[Panel], ScanPanel | None]":
+        """What is drawn: everybody, and the scan where people were searched for."""
+        from lidarpose.viz.person_view import Panel
+
         upright = [_upright(person, self.up) for person in self.people]
         panels = [
             Panel(points=p.points, pose=p.pose, label=_label(given), box=p.box, distance=self._distance(given))
             for p, given in zip(upright, self.people, strict=True)
         ]
-        if self.scan is None:
-            return Picture(draw_people(panels, path, title=title))
-        above = draw_scans([self._from_above(self.scan, upright)], title=title)
-        return Picture(stack_pictures([above, draw_people(panels)] if panels else [above], path))
+        return panels, None if self.scan is None else self._from_above(self.scan, upright)
 
     def _distance(self, person: PersonPose) -> float | None:
         """From the sensor, m, where people were searched for; NaN where its place is unknown."""

@@ -14,6 +14,7 @@ from lidarpose._version import __version__
 from lidarpose.io.files import check_suffix, write_atomic
 from lidarpose.sample import Pose, within_reach
 from lidarpose.skeleton import SMPL24, Skeleton
+from lidarpose.viz.bird_eye import ScanPanel
 from lidarpose.viz.person_view import (
     Panel,
     bone_sides,
@@ -29,10 +30,14 @@ from lidarpose.viz.person_view import (
 
 MAX_POINTS = 60_000  # of all people together: about 0.9 MB of text
 _FEWEST_POINTS = 150  # a person keeps these, however many people there are
+# of a scan: most points, half of them so many m about its people; and how far about all of them the scan is shown, m
+_SCAN_POINTS, _NEAR, _SCAN_REACH = 40_000, 1.0, 15.0
 _SCHEMA = 1
 
 
-def write_report(path: str | Path, people: list[Panel], *, title: str, summary: list[dict]) -> None:
+def write_report(
+    path: str | Path, people: list[Panel], *, title: str, summary: list[dict], scan: ScanPanel | None = None
+) -> None:
     """Writes the report to `path`, whole or not at all.
 
     Args:
@@ -41,18 +46,21 @@ def write_report(path: str | Path, people: list[Panel], *, title: str, summary: 
         title: above all.
         summary: rows of the table on top: the columns are the rows' keys in order of appearance, a column of numbers is
             aligned to the right.
+        scan: all of it with everybody in it, shown first.
 
     Raises:
         InputError: a path of another suffix, or one that cannot be written.
     """
     check_suffix(path, ".html", ".htm")
-    write_atomic(path, render_report(people, title=title, summary=summary).encode("utf-8", "replace"))
+    write_atomic(path, render_report(people, title=title, summary=summary, scan=scan).encode("utf-8", "replace"))
 
 
-def render_report(people: list[Panel], *, title: str, summary: list[dict]) -> str:
+def render_report(people: list[Panel], *, title: str, summary: list[dict], scan: ScanPanel | None = None) -> str:
     """The text of `write_report`'s file; the same input gives the same text."""
     people = list(people)
     skeletons = {pose.skeleton.name: pose.skeleton for p in people for pose in (p.pose, p.truth) if pose is not None}
+    if scan is not None and scan.poses is not None:
+        skeletons[scan.poses.skeleton.name] = scan.poses.skeleton
     limit = max(_FEWEST_POINTS, MAX_POINTS // max(len(people), 1))
     drawn = [_person_data(p, limit) for p in people]
     data = {
@@ -60,10 +68,13 @@ def render_report(people: list[Panel], *, title: str, summary: list[dict]) -> st
         "unit": "mm",
         "skeletons": {name: _skeleton_data(s) for name, s in skeletons.items()},
         "people": drawn,
+        "scan": None if scan is None else _scan_data(scan),
     }
     # inside a script element only "<" could end the element early
     blob = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     cards = [_card(i, p, len(d["points"]) // 3) for i, (p, d) in enumerate(zip(people, drawn, strict=True))]
+    if scan is not None:
+        cards.insert(0, _scan_card(scan))
     fields = {
         "TITLE": escape(title),
         "VERSION": escape(__version__),
@@ -106,6 +117,29 @@ def _person_data(person: Panel, limit: int) -> dict:
     return data
 
 
+def _scan_data(scan: ScanPanel) -> dict:
+    """As of a person, but with everybody's pose, about the middle of all."""
+    points = scan.points[within_reach(scan.points)]
+    centers = np.array([box.center for box in scan.boxes])
+    if len(centers):
+        low, high = centers.min(0) - _SCAN_REACH, centers.max(0) + _SCAN_REACH
+        points = points[((points[:, :2] > low[:2]) & (points[:, :2] < high[:2])).all(1)]
+    near = np.zeros(len(points), bool)
+    for box in scan.boxes:
+        near |= box.contains(points, margin=_NEAR)
+    rows = [np.flatnonzero(near), np.flatnonzero(~near)]
+    rows = [own[thinned(len(own), _SCAN_POINTS // 2)] for own in rows]
+    points = points[np.sort(np.concatenate(rows))]
+    if not len(centers):
+        centers = points if len(points) else np.zeros((1, 3))
+    center = np.median(centers, axis=0)
+    poses = []
+    if scan.poses is not None:
+        poses = [Pose(joints=joints, skeleton=scan.poses.skeleton) for joints in scan.poses.joints]
+    drawn = [data for pose in poses if (data := _pose_data(pose, center)) is not None]
+    return {"points": _millimeters(points, center), "facing": None, "pose": None, "truth": None, "poses": drawn}
+
+
 # a letter a part: n = not body, else the body side's
 _PART_SIDES = np.array(["n"] + [side(joint)[0] for joint in SMPL24.joints])
 
@@ -129,12 +163,19 @@ def _card(i: int, person: Panel, drawn: int) -> str:
     notes = [missing_pose(person)]
     if drawn < len(person.points):
         notes.append(f"{drawn:,} of {len(person.points):,} points drawn")
-    note = "".join(f'<p class="note">{escape(n)}</p>' for n in notes if n)
-    label = escape(person.label)
+    return _figure(str(i), "card", person.label, describe(person), [note for note in notes if note])
+
+
+def _scan_card(scan: ScanPanel) -> str:
+    return _figure("scan", "card scan", scan.label, f"{len(scan.points):,} points, not all are drawn", [])
+
+
+def _figure(key: str, kind: str, label: str, caption: str, notes: list[str]) -> str:
+    note = "".join(f'<p class="note">{escape(n)}</p>' for n in notes)
     return (
-        f'<figure class="card"><canvas data-person="{i}" tabindex="0" role="img" aria-label="3D view of {label}">'
-        f"</canvas>{note}<figcaption><strong>{label}</strong>"
-        f"<span>{escape(describe(person))}</span></figcaption></figure>"
+        f'<figure class="{kind}"><canvas data-person="{key}" tabindex="0" role="img" '
+        f'aria-label="3D view of {escape(label)}"></canvas>{note}<figcaption><strong>{escape(label)}</strong>'
+        f"<span>{escape(caption)}</span></figcaption></figure>"
     )
 
 

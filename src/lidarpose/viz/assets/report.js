@@ -7,10 +7,10 @@
   const calm = matchMedia("(prefers-reduced-motion: reduce)");
   const toggles = Object.fromEntries(["points", "pose", "truth", "spin"].map((id) => [id, document.getElementById(id)]));
   const SHADES = 7, SHADE_SPAN = 350;   // steps of the points' gray, mm about the middle over which it runs
-  const EYE = 6500;                     // mm from the person to the eye: a mild perspective
+  const EYE = 6500, FAR = 1.5;          // mm from the person to the eye, of a scan its width: a mild perspective
   const GRID = 500, REACH = 1000;       // mm: a square of the ground, how far it runs at least
   const SPIN = 0.00035;                 // rad per millisecond
-  const START = {turn: 0.5, tilt: 0.16, zoom: 1};
+  const START = {turn: 0.5, tilt: 0.16, zoom: 1}, ABOVE = {turn: 3.6, tilt: 0.7, zoom: 1};
   let color = {};
 
   function readColors() {
@@ -39,20 +39,28 @@
       if (joint) for (let k = 0; k < 3; k++) { low[k] = Math.min(low[k], joint[k]); high[k] = Math.max(high[k], joint[k]); }
     }
     if (!isFinite(low[0])) return null;
+    if (person.poses) {   // of a scan the people, all of it where there are none
+      const joints = person.poses.flatMap((pose) => pose.joints.filter((joint) => joint));
+      const end = (of, k) => of(...joints.map((joint) => joint[k]));
+      const a = joints.length ? low.map((_, k) => end(Math.min, k)) : low;
+      const b = joints.length ? high.map((_, k) => end(Math.max, k)) : high;
+      const wide = Math.max(Math.hypot(b[0] - a[0], b[1] - a[1]) + 2000, 6000);
+      return {center: a.map((v, k) => (v + b[k]) / 2), ground: a[2], tall: wide * 0.6, wide};
+    }
     const center = low.map((v, k) => (v + high[k]) / 2);
     const tall = Math.max(high[2] - low[2], 1500), wide = Math.max(Math.hypot(high[0] - low[0], high[1] - low[1]), 800);
     return {center, ground: low[2], tall: Math.min(tall, 5000), wide: Math.min(wide, 5000)};
   }
 
   function makeView(canvas) {
-    const person = data.people[+canvas.dataset.person];
-    const span = bounds(person), front = person.facing === null ? 0 : person.facing;
-    const view = {canvas, person, span, ...START, turn: front + START.turn, touched: false, visible: true, hover: null};
+    const scan = canvas.dataset.person === "scan", person = scan ? data.scan : data.people[+canvas.dataset.person];
+    const start = scan ? ABOVE : {...START, turn: START.turn + (person.facing || 0)};
+    const view = {canvas, person, span: bounds(person), ...start, touched: scan, visible: true, hover: null};
     const fingers = new Map();
     let pinch = 0;
-    view.reset = () => Object.assign(view, START, {turn: front + START.turn, touched: false, hover: null});
+    view.reset = () => Object.assign(view, start, {touched: scan, hover: null});
     const touch = () => { view.touched = true; ask(view); };
-    const zoom = (factor) => { view.zoom = Math.min(6, Math.max(0.4, view.zoom * factor)); touch(); };
+    const zoom = (factor) => { view.zoom = Math.min(scan ? 40 : 6, Math.max(0.3, view.zoom * factor)); touch(); };
     const gap = () => { const [a, b] = [...fingers.values()]; return Math.hypot(a.x - b.x, a.y - b.y); };
 
     canvas.addEventListener("pointerdown", (e) => {
@@ -115,17 +123,17 @@
     }
     const ct = Math.cos(view.turn), st = Math.sin(view.turn), ce = Math.cos(view.tilt), se = Math.sin(view.tilt);
     const scale = view.zoom * Math.min(height * 0.8 / span.tall, width * 0.86 / span.wide);
-    const [mx, my, mz] = span.center;
+    const [mx, my, mz] = span.center, eye = person.poses ? FAR * span.wide : EYE;
     // (x, y, z) mm -> [pixels right, pixels down, mm towards the viewer]
     const place = (x, y, z) => {
       const dx = x - mx, dy = y - my, dz = z - mz;
       const toward = ct * dx + st * dy, depth = ce * toward + se * dz;
-      const size = scale * EYE / Math.max(EYE - depth, 300);
+      const size = scale * eye / Math.max(eye - depth, 300);
       return [width / 2 + (ct * dy - st * dx) * size, height * 0.475 - (ce * dz - se * toward) * size, depth];
     };
     const line = (a, b) => { pen.beginPath(); pen.moveTo(a[0], a[1]); pen.lineTo(b[0], b[1]); pen.stroke(); };
     pen.lineCap = "round";
-    drawGround(view, pen, place, line);
+    if (!person.poses) drawGround(view, pen, place, line);
     if (toggles.points.checked) drawPoints(view, pen, place);
     if (toggles.truth.checked && person.truth) {
       const at = person.truth.joints.map((j) => j && place(...j));
@@ -135,7 +143,8 @@
       for (const [a, b] of data.skeletons[person.truth.skeleton].bones) if (at[a] && at[b]) line(at[a], at[b]);
       pen.setLineDash([]);
     }
-    if (toggles.pose.checked && person.pose) drawPose(view, pen, place, line);
+    const poses = person.poses || (person.pose ? [person.pose] : []);
+    if (toggles.pose.checked) for (const pose of poses) drawPose(view, pose, pen, place, line);
   }
 
   function drawGround(view, pen, place, line) {
@@ -161,10 +170,11 @@
   }
 
   function drawPoints(view, pen, place) {
-    const {points: p, sides} = view.person, shades = Array.from({length: SHADES}, () => []);
+    const {points: p, sides, poses} = view.person, reach = poses ? view.span.wide / 2 : SHADE_SPAN;
+    const shades = Array.from({length: SHADES}, () => []);
     for (let i = 0; i < p.length; i += 3) {
       const at = place(p[i], p[i + 1], p[i + 2]);
-      const shade = Math.floor((at[2] / SHADE_SPAN + 1) / 2 * SHADES);
+      const shade = Math.floor((at[2] / reach + 1) / 2 * SHADES);
       if (sides) at[2] = sides[i / 3];
       shades[Math.min(SHADES - 1, Math.max(0, shade))].push(at);
     }
@@ -180,8 +190,8 @@
     pen.globalAlpha = 1;
   }
 
-  function drawPose(view, pen, place, line) {
-    const {pose, truth} = view.person, skeleton = data.skeletons[pose.skeleton];
+  function drawPose(view, pose, pen, place, line) {
+    const {truth} = view.person, skeleton = data.skeletons[pose.skeleton];
     const at = pose.joints.map((j) => j && place(...j));
     const sure = pose.confidence || pose.joints.map(() => 1);
     const ink = (c) => 0.2 + 0.8 * c;
