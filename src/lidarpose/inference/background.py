@@ -10,7 +10,8 @@ from lidarpose.errors import InputError
 from lidarpose.inference.inputs import as_points, only_returns
 from lidarpose.io.files import FormatError, file_error, listed
 from lidarpose.io.point_cloud import read_points
-from lidarpose.io.sources import LazyFrame, is_single_scan, open_source
+from lidarpose.io.sources import is_single_scan, open_source
+from lidarpose.io.sources.frame import LazyFrame
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

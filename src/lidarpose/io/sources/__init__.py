@@ -13,34 +13,11 @@ from pathlib import Path
 from lidarpose.errors import check_int
 from lidarpose.io.files import file_error, listed
 from lidarpose.io.sources.folders import natural_key, open_files, scan_files
-from lidarpose.io.sources.frame import (
-    ChainedRecording,
-    DamagedFrame,
-    Frame,
-    FrameSource,
-    IndexedRecording,
-    LazyFrame,
-    Recording,
-    Source,
-    Sweep,
-)
+from lidarpose.io.sources.frame import ChainedRecording, DamagedFrame, Frame, FrameSource, Recording, Source
 from lidarpose.io.sources.kitti import open_kitti
 from lidarpose.io.sources.nuscenes import open_nuscenes
 
-__all__ = [
-    "RECORDINGS",
-    "ChainedRecording",
-    "DamagedFrame",
-    "Frame",
-    "FrameSource",
-    "IndexedRecording",
-    "LazyFrame",
-    "Recording",
-    "Source",
-    "Sweep",
-    "is_single_scan",
-    "open_source",
-]
+__all__ = ["RECORDINGS", "DamagedFrame", "Frame", "FrameSource", "Source", "is_single_scan", "open_source"]
 
 # suffix of a file that holds many frames -> the module whose `open_recording(path, topic=...)` reads it
 _READERS = {".mcap": "rosbag", ".bag": "rosbag", ".db3": "rosbag", ".pcap": "ouster", ".pcapng": "ouster"}
@@ -86,7 +63,7 @@ def open_source(
     if not found:
         raise file_error("source", "expected files, folders or recordings, got none")
     name = str(found[0]) if len(found) == 1 else os.path.commonpath([os.path.abspath(path) for path in found])
-    recording = _open_all(name, found, columns=columns, topic=topic, name_times=rate is None)
+    recording = _open_all(name, found, topic, columns=columns, name_times=rate is None)
     return FrameSource(recording, rate=rate, start=start, end=end, every=every)
 
 
@@ -111,24 +88,19 @@ def _matches(given: str | os.PathLike) -> list[Path]:
     return paths
 
 
-def _open_all(
-    name: str, paths: Sequence[Path], *, columns: int | None, topic: str | None, name_times: bool
-) -> Recording:
-    """Files of points are one recording together, anything else is one of its own."""
+def _open_all(name: str, paths: Sequence[Path], topic: str | None, **reading) -> Recording:
+    """Files of points are one recording together, anything else is one of its own. reading: as of `open_files`."""
     files = [path for path in paths if path.is_file() and path.suffix.lower() not in RECORDINGS]
-    others = sorted((path for path in paths if path not in files), key=natural_key)
-    parts: list[Recording] = []
-    if files:
-        parts.append(open_files(name, files, columns=columns, name_times=name_times))
-    for path in others:
+    parts: list[Recording] = [open_files(name, files, **reading)] if files else []
+    for path in sorted(set(paths) - set(files), key=natural_key):
         if path.is_dir():
-            parts.append(_open_folder(path, columns=columns, topic=topic, name_times=name_times))
+            parts.append(_open_folder(path, topic, **reading))
         else:
             parts.append(_reader(_READERS[path.suffix.lower()]).open_recording(path, topic=topic))
     return parts[0] if len(parts) == 1 else ChainedRecording(name, parts)
 
 
-def _open_folder(folder: Path, *, columns: int | None, topic: str | None, name_times: bool) -> Recording:
+def _open_folder(folder: Path, topic: str | None, **reading) -> Recording:
     for content, module in _LAYOUTS.items():
         if (folder / content).exists():
             return _reader(module).open_recording(folder, topic=topic)
@@ -137,8 +109,8 @@ def _open_folder(folder: Path, *, columns: int | None, topic: str | None, name_t
         return dataset
     files, warnings = scan_files(folder, RECORDINGS)
     if files[0].suffix.lower() in RECORDINGS:
-        return _open_all(str(folder), files, columns=columns, topic=topic, name_times=name_times)
-    recording = open_files(str(folder), files, columns=columns, name_times=name_times)
+        return _open_all(str(folder), files, topic, **reading)
+    recording = open_files(str(folder), files, **reading)
     recording.warnings += warnings
     return recording
 

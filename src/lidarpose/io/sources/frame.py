@@ -1,8 +1,10 @@
 """Frames, and the sources that they come from: what every kind of recording is made into."""
 
+import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -137,8 +139,8 @@ class IndexedRecording:
 
 
 class ChainedRecording:
-    """Several recordings one after the other. Ids begin with the recording's name; times are dropped unless all have
-    them."""
+    """Several recordings one after the other. Ids begin with that of the recording, a path in the folder `name`; times
+    are dropped unless all have them."""
 
     def __init__(self, name: str, parts: Sequence[Recording]):
         self.name = name
@@ -162,8 +164,9 @@ class ChainedRecording:
                 if first >= length:
                     first -= length
                     continue
+            prefix = Path(os.path.relpath(part.name, self.name)).as_posix()
             for frame in part.lazy_frames(first):
-                yield LazyFrame(f"{part.name}/{frame.id}", frame.time if self._has_times else None, frame.read)
+                yield LazyFrame(f"{prefix}/{frame.id}", frame.time if self._has_times else None, frame.read)
             first = 0
 
 
@@ -262,7 +265,9 @@ def _read(lazy: LazyFrame, index: int, time: float | None) -> Frame | DamagedFra
         reason = shorten(f"{type(error).__name__}: {error}")
         return DamagedFrame(index=index, id=lazy.id, time=time, error=one_line(f"cannot be read ({reason})"))
     points = np.asarray(sweep.points, np.float64)
-    is_return = np.isfinite(points).all(1) & points.any(1)
+    # finite, and not 0, 0, 0
+    reach = np.abs(points) @ np.ones(3)
+    is_return = (reach > 0) & (reach < np.inf)
     return Frame(
         points=points[is_return],
         index=index,

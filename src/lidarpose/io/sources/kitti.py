@@ -5,7 +5,6 @@ Sources: Geiger et al., Vision meets Robotics: The KITTI Dataset, IJRR 2013, and
 
 import re
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -139,19 +138,14 @@ def _chosen(stamps: np.ndarray | None, rows: Sequence[int], name: str, warnings:
 
 
 def _timestamps(path: Path) -> np.ndarray | None:
-    """Lines such as "2011-09-26 13:02:25.594360375" as s since 1970, NaN for others; None without the file."""
-    text = _text(path)
-    if text is None:
-        return None
-    return np.array([_seconds(line.strip()) for line in text.strip("\n").split("\n")])
-
-
-def _seconds(line: str) -> float:
-    day, _, fraction = line.partition(".")
+    """Lines such as "2011-09-26 13:02:25.594360375" as s since 1970; NaN for empty ones; None for a damaged file."""
     try:
-        return datetime.strptime(day, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC).timestamp() + float(f"0.{fraction}")
+        moments = np.array(
+            [line.strip() or "NaT" for line in (_text(path) or "?").strip().split("\n")], "datetime64[ns]"
+        )
     except ValueError:
-        return np.nan
+        return None
+    return (moments - np.datetime64(0, "ns")) / np.timedelta64(1, "s")
 
 
 def _table(path: Path, columns: int) -> np.ndarray | None:
