@@ -10,7 +10,7 @@ from lidarpose.skeleton import Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
 from lidarpose.tracking.clip import TrackPoses
 from lidarpose.tracking.motion_model import SCALES, Belief, odds_after, shared, strengths
-from lidarpose.tracking.smoothing import MAX_GAP, frame_weights, likely_hit, precisions
+from lidarpose.tracking.smoothing import MAX_GAP, frame_weights, known_spread, likely_hit, precisions, steady_spread
 
 _BELIEF = ("position", "velocity", "variance", "covariance", "velocity_variance")
 
@@ -28,6 +28,7 @@ class LiveFilter:
         self._seen: float | None = None
         self._origin = np.zeros(3)
         self._belief = Belief.unknown((len(SCALES), len(skeleton)))
+        self._certainty, self._frames = np.zeros(len(skeleton)), 0
         self._odds = np.full((len(SCALES), len(skeleton)), 1 / len(SCALES))
 
     def update(self, time: float, pose: Pose | None) -> Pose | None:
@@ -55,8 +56,9 @@ class LiveFilter:
                 visible=np.zeros(len(spread)),
             )
         joints = pose.joints - self._origin
-        spread = None if pose.spread is None else pose.spread[None]
-        precision = precisions(spread, np.ones(1, bool), len(self._usual))[0]
+        given = None if pose.spread is None else pose.spread[None]
+        spread = known_spread(given, np.ones(1, bool), len(self._usual))[0]
+        precision = precisions(spread)
         if self._seen is not None:
             mean = (self._odds[..., None] * forecast.position).sum(0)
             variance = (self._odds * forecast.variance).sum(0)
@@ -64,14 +66,16 @@ class LiveFilter:
         self._belief, likelihood = forecast.updated(joints, precision)
         self._odds = odds_after(self._odds, step, shared(likelihood))
         self._seen = time
-        joints, steady_spread = self._estimate()
-        return replace(pose, joints=joints, spread=steady_spread)
+        self._certainty = self._certainty + spread**-2
+        self._frames += 1
+        joints, spread = self._estimate()
+        return replace(pose, joints=joints, spread=spread)
 
     def _estimate(self) -> tuple[np.ndarray, np.ndarray]:
         """Joints (J, 3) m and their spread (J,) m."""
         mean = (self._odds[..., None] * self._belief.position).sum(0)
         variance = (self._odds * self._belief.variance).sum(0)
-        return mean + self._origin, 1.6 * np.sqrt(variance)
+        return mean + self._origin, steady_spread(variance, self._certainty / self._frames)
 
     def state(self) -> dict[str, Any]:
         """All it knows as JSON holds it; `from_state` goes on from there."""
@@ -81,6 +85,8 @@ class LiveFilter:
             "seen": self._seen,
             "origin": self._origin.tolist(),
             "odds": self._odds.tolist(),
+            "certainty": self._certainty.tolist(),
+            "frames": self._frames,
             **{name: getattr(self._belief, name).tolist() for name in _BELIEF},
         }
 
@@ -90,6 +96,7 @@ class LiveFilter:
         live = cls(skeleton_of(state["skeleton"]) if skeleton is None else skeleton)
         live._time, live._seen = state["time"], state["seen"]
         live._origin, live._odds = np.array(state["origin"]), np.array(state["odds"])
+        live._certainty, live._frames = np.array(state["certainty"]), state["frames"]
         live._belief = Belief(**{name: np.array(state[name]) for name in _BELIEF})
         return live
 

@@ -18,9 +18,9 @@ _STRENGTHS = {"hand": 0.4, "wrist": 0.25, "elbow": 0.07, "foot": 0.06, "ankle": 
 _TRUNK = 0.035
 SCALES = 10.0 ** np.arange(-2.0, 2.1, 0.5)
 # how long a scale holds, s
-_SCALE_TIME = 4.0
+_SCALE_TIME = 20.0
 # how far a joint's scale is that of the whole body: the weight of the other joints' evidence
-_SHARED = 0.1
+_SHARED = 0.05
 # before the first frame a velocity may be anything a person's is, standard deviation m/s
 _VELOCITY = 1.5
 # a position that is not known, variance m^2

@@ -5,30 +5,44 @@ from dataclasses import replace
 import numpy as np
 
 from lidarpose.sample import CONFIDENCE_RADIUS
+from lidarpose.tracking.bones import bone_lengths, keep_lengths, rigid_bones
 from lidarpose.tracking.clip import TrackPoses
+from lidarpose.tracking.facing import exchanged
 from lidarpose.tracking.motion_model import learn_strength, smooth_joints, strengths
 
 # frames are trusted by Student's t of so many degrees of freedom: a frame that is off as a whole hardly counts
-_FREEDOM = 1.0
+_FREEDOM = 0.5
 # rounds of weighing frames; the strength of motion is learned before each of the last
 _ROUNDS, _LEARNED = 6, 3
 _FIRST_SCALE = 3.0
 # spread where the network does not say, and the least that is believed, m
 _SPREAD, _LEAST_SPREAD = 0.08, 0.005
+# a joint counts by its spread to the power of -3, which is better than -2: at this spread, m, both are the same
+_USUAL_SPREAD = 0.06
+# so much of the deviation along a path, and of the frames' spread, is the spread of a steady joint
+_PATH, _COMMON = 2.5, 0.8
+# bones are not measured in fewer frames
+_LEAST_FRAMES = 3
 # longer gaps, and what is before and after a track, are filled in next to seen frames only, s
 MAX_GAP, _MAX_BEYOND = 2.0, 0.5
 
 
 def smooth(track: TrackPoses) -> TrackPoses:
-    """The same track made steady. Frames that were not seen are filled in within gaps of up to `MAX_GAP` s, and
-    within half a second of a frame that was, with a spread that says so, `visible` 0 and `filled` true."""
+    """The same track made steady: its facing settled, joints on smooth paths, bones of one length.
+
+    Frames that were not seen are filled in within gaps of up to `MAX_GAP` s, and within half a second of a frame that
+    was, with a spread that says so, `visible` 0 and `filled` true.
+    """
     seen = track.seen
     if not seen.any():
         return track
-    times, joints, usual = track.times, track.joints, strengths(track.skeleton)
-    origin = joints[seen][0].mean(0)
-    joints = np.where(seen[:, None, None], joints - origin, 0.0)
-    precision = precisions(track.spread, seen, len(usual))
+    track = settled(track)
+    times, usual = track.times, strengths(track.skeleton)
+    spread = known_spread(track.spread, seen, len(usual))
+    precision = precisions(spread)
+    # numbers stay small about the first place
+    origin = track.joints[seen][0].mean(0)
+    joints = np.where(seen[:, None, None], track.joints - origin, 0.0)
     weight = np.ones((len(times), 1))
     strength = np.broadcast_to(_FIRST_SCALE * usual, precision.shape)
     for k in range(_ROUNDS):
@@ -36,13 +50,46 @@ def smooth(track: TrackPoses) -> TrackPoses:
             strength = learn_strength(times, joints, precision * weight, usual)
         path, variance = smooth_joints(times, joints, precision * weight, strength)
         weight = frame_weights(path - joints, precision)
-    return filled_in(track, path + origin, 1.6 * np.sqrt(variance))
+    bones = rigid_bones(track.skeleton)
+    if seen.sum() >= _LEAST_FRAMES and len(bones):
+        lengths = bone_lengths(joints[seen], 1 / precision[seen], bones, np.array(track.skeleton.flip))
+        path = keep_lengths(path, variance, bones, lengths)
+    return filled_in(track, path + origin, steady_spread(variance, (spread**-2).sum(0) / seen.sum()))
 
 
-def precisions(spread: np.ndarray | None, seen: np.ndarray, count: int) -> np.ndarray:
-    """(T, J) 1/m^2 of spreads (T, J) m, or None; 0 where not seen (T,)."""
+def known_spread(spread: np.ndarray | None, seen: np.ndarray, count: int) -> np.ndarray:
+    """(T, J) m: spread (T, J) or None of frames seen (T,) bool; infinite where nothing was."""
     spread = np.full((len(seen), count), _SPREAD) if spread is None else spread
-    return np.where(seen[:, None], np.maximum(np.where(seen[:, None], spread, 1.0), _LEAST_SPREAD) ** -2, 0.0)
+    return np.where(seen[:, None], np.maximum(spread, _LEAST_SPREAD), np.inf)
+
+
+def precisions(spread: np.ndarray) -> np.ndarray:
+    """1/m^2 of spreads m."""
+    return _USUAL_SPREAD * spread**-3
+
+
+def steady_spread(variance: np.ndarray, certainty: np.ndarray) -> np.ndarray:
+    """(..., J) m: the expected distance from the truth of joints of that variance m^2 on an axis along their paths.
+
+    What all frames of a person have in common no smoothing takes away: certainty (J,) 1/m^2, mean inverse square of the
+    frames' spread.
+    """
+    return np.sqrt(_PATH**2 * variance + _COMMON**2 / certainty)
+
+
+def settled(track: TrackPoses) -> TrackPoses:
+    """A track whose facing is settled: left and right are exchanged in the frames that were turned round."""
+    rows = np.flatnonzero(track.seen)
+    variance = known_spread(track.spread, track.seen, len(track.skeleton))[rows] ** 2
+    confidence = None if track.confidence is None else track.confidence[rows]
+    turned = rows[exchanged(track.times[rows], track.joints[rows], variance, confidence, track.skeleton)]
+    flip = np.array(track.skeleton.flip)
+    values = {name: getattr(track, name) for name in ("joints", "spread", "visible", "confidence")}
+    for name, value in values.items():
+        if value is not None:
+            values[name] = value.copy()
+            values[name][turned] = value[turned][:, flip]
+    return replace(track, **values)
 
 
 def frame_weights(offset: np.ndarray, precision: np.ndarray) -> np.ndarray:
