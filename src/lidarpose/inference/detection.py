@@ -40,7 +40,7 @@ _POSED, _BATCH = 40, 16
 _MOST_POINTS, _BEYOND = 1_500_000, 15.0
 _CHUNK = 4_000_000
 # points that tell how far a scan reaches
-_ENOUGH = 100_000
+_ENOUGH = 25_000
 # what is posed: a column so wide, and so far below and above the detection's box, m
 _COLUMN, _BELOW, _ABOVE = 0.6, 0.15, 0.25
 # points around a detection that its final box may hold, m to each side
@@ -149,19 +149,19 @@ def find_people(scan: Scan, search: Search) -> Scan:
     scan, warnings = given, [*scan.warnings, *notes]
     if len(scan.points) < MIN_POINTS:
         return replace(scan, boxes=[], found_rows=[], warnings=(*warnings, f"under {MIN_POINTS} points"))
-    level = scan.points @ scan.R_level_input.T
+    level = _leveled(scan)
     # what else looks odd follows from wrong axes or units
     some = slice(None, None, -(-len(level) // _ENOUGH))
     few = replace(scan, points=scan.points[some])
     if wrong := flat_along_another_axis(few) or scan_unit_warning(level[some], count):
         warnings.append(wrong)
     origin = None if scan.origin is None else scan.R_level_input @ scan.origin
-    up = estimate_up(level, origin)
+    up = estimate_up(_near(level, origin, search), origin)
     if up is not None:
         degrees = np.degrees(np.arccos(np.clip(up[2] / np.linalg.norm(up), -1, 1)))
         warnings.append(f"the ground leans by {degrees:.0f} degrees, which is taken for a tilt of the sensor (up)")
         scan = replace(scan, up=_direction(up @ scan.R_level_input))
-        level = scan.points @ scan.R_level_input.T
+        level = _leveled(scan)
         origin = None if scan.origin is None else scan.R_level_input @ scan.origin
     if origin is not None and (warning := unlikely_origin(level, origin)):
         warnings += [] if wrong else [warning]
@@ -225,6 +225,21 @@ def _thinned(scan: Scan, search: Search) -> tuple[Scan, list[str]]:
             f"thinned from {len(near):,} to {len(rows):,} points to search them: give one scan at a time, or a part"
         ]
     return replace(scan, points=points[rows]), notes
+
+
+def _leveled(scan: Scan) -> np.ndarray:
+    """The scan's points (n, 3) m in the level frame, one axis after the other in memory."""
+    R_level_input = scan.R_level_input
+    columns = np.ascontiguousarray(scan.points.T)
+    return (columns if np.array_equal(R_level_input, np.eye(3)) else R_level_input @ columns).T
+
+
+def _near(points: np.ndarray, origin: np.ndarray | None, search: Search) -> np.ndarray:
+    """Those of the points (n, 3) m that may lie under the people searched for."""
+    if origin is None:
+        return points
+    near = (points[:, 0] - origin[0]) ** 2 + (points[:, 1] - origin[1]) ** 2 < (search.max_range + _BEYOND) ** 2
+    return points.T[:, near].T if near.any() else points
 
 
 def _in_input(box: Box, scan: Scan, given: Scan) -> Box:
@@ -356,11 +371,15 @@ def _rounded(box: Box) -> Box:
 
 def _rows_near(detections: Detections, points: np.ndarray) -> list[np.ndarray]:
     """Of each detection the rows (k,) of the points (n, 3) m about it, ascending."""
-    order = np.argsort(points[:, 0])
-    x = points[order, 0]
+    # sorted by strips along x; of maps of more strips the last one holds the rest
+    start = points[:, 0].min(initial=0)
+    strip = np.minimum((points[:, 0] - start) / _AROUND, 65_535).astype(np.uint16)
+    order = np.argsort(strip, kind="stable")
+    ends = np.concatenate([[0], np.cumsum(np.bincount(strip, minlength=65_536))])
     rows = []
-    for center in detections.centers:
-        first, last = np.searchsorted(x, (center[0] - _AROUND, center[0] + _AROUND))
-        near = order[first:last]
-        rows.append(np.sort(near[np.abs(points[near, 1] - center[1]) < _AROUND]))
+    for x, y in detections.centers[:, :2]:
+        first, last = np.clip([(x - _AROUND - start) / _AROUND, (x + _AROUND - start) / _AROUND], 0, 65_535).astype(int)
+        near = order[ends[first] : ends[last + 1]]
+        near = near[np.abs(points[near, 1] - y) < _AROUND]
+        rows.append(np.sort(near[np.abs(points[near, 0] - x) < _AROUND]))
     return rows

@@ -151,14 +151,15 @@ def estimate_up(points: np.ndarray, origin: np.ndarray | None = None) -> np.ndar
     points (n, 3) m, z about up. None too where there is no ground to tell by.
     """
     upright = np.array([0.0, 0.0, 1.0])
-    up, rest = upright, np.zeros(0)
+    up, rest, R_level_input = upright, np.zeros(0), np.eye(3)
     if not len(points):
         return None
     middle = np.median(points, axis=0) if origin is None else np.asarray(origin, float)
     center = None if origin is None else np.zeros(3)
+    own = np.stack([points[:, i] - middle[i] for i in range(3)])
+    leveled = own
     for _ in range(3):
-        R_level_input = rotation_between(up, upright)
-        floors = _lowest((points - middle) @ R_level_input.T, center)
+        floors = _lowest(leveled.T, center)
         plane = None if floors is None else _common_plane(floors, center)
         if floors is None or plane is None:
             return None
@@ -171,6 +172,8 @@ def estimate_up(points: np.ndarray, origin: np.ndarray | None = None) -> np.ndar
             return None
         if moved < np.radians(2):
             break
+        R_level_input = rotation_between(up, upright)
+        leveled = R_level_input @ own
     rest = rest[np.isfinite(rest)]
     on_it = np.count_nonzero(np.abs(rest) < _NEAR_PLANE)
     if on_it < max(_TILT_CELLS, _TILT_SHARE * len(rest)) or np.mean(rest < -2 * _NEAR_PLANE) > _TILT_BELOW:
