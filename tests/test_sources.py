@@ -131,19 +131,27 @@ def test_a_damaged_file_costs_its_frame(tmp_path):
     assert "2.npy: is empty" in frames[2].error and "4.npy" in frames[4].error
 
 
-def test_of_a_folder_of_many_kinds_the_commonest_points_are_read(tmp_path):
-    saved(tmp_path, "1.npy", "2.npy", "3.NPY")
-    for name in ("4.pcd", "poses.txt", "times.txt", "a.csv", "b.csv", "c.csv", "d.csv", "picture.png"):
+def test_which_files_of_a_folder_of_many_kinds_are_read(tmp_path):
+    saved(tmp_path, "1.npy", "2.npy", "10.NPY")
+    for name in ("4.xyz", "poses.txt", "times.txt", "a.csv", "b.csv", "c.csv", "d.csv", "picture.png", "a.mcap"):
         (tmp_path / name).write_text("1 2 3\n")
-    source = open_source(tmp_path)
-    assert ids(source) == ["1", "2", "3"]
-    assert "only its 3 .npy files are read" in source.warnings[0] and "1 .pcd" in source.warnings[0]
+    source = open_source(tmp_path, rate=10)
+    assert ids(source) == ["1", "2", "10"] and source.warnings == ()
     # what is named is read, whatever it is
     named = open_source([tmp_path / "1.npy", tmp_path / "poses.txt"])
     assert ids(named) == ["1", "poses"] and "mixes .npy, .txt files" in named.warnings[0]
-    for path in tmp_path.glob("*.[nNp][pPc]*"):
+    np.savez(tmp_path / "3.npz", POINTS)
+    source = open_source(tmp_path, rate=10)
+    assert (
+        ids(source) == ["1", "2", "3", "10"] and len(source.warnings) == 1 and "mixes .npy, .npz" in source.warnings[0]
+    )
+    np.savez(tmp_path / "2.npz", POINTS)
+    source = open_source(tmp_path, rate=10)
+    assert ids(source) == ["1", "2", "10"] and "only its 3 .npy files are read, not 2 .npz" in source.warnings[0]
+    for path in (*tmp_path.glob("*.[nN][pP]?"), tmp_path / "a.mcap"):
         path.unlink()
-    assert len(ids(open_source(tmp_path))) == 4
+    source = open_source(tmp_path, rate=10)
+    assert ids(source) == ["a", "b", "c", "d"] and "4 .csv" in source.warnings[0]
 
 
 def test_rows_of_raw_floats_are_as_wide_as_those_of_the_first_file(tmp_path):

@@ -40,27 +40,24 @@ def list_folder(folder: Path) -> list[Path]:
 def scan_files(folder: Path, other: Sequence[str] = ()) -> tuple[list[Path], list[str]]:
     """The point files of a folder in natural order, and warnings.
 
-    They are those of its commonest suffix, text only where nothing else is. Files of suffixes in `other`, if there are
-    any, come before text.
+    Files of suffixes in `other` count where there are no points but in text, text where nothing else is. Of text, and
+    of scans that are there in several formats, those of the commonest suffix are taken.
 
     Raises InputError, which says what is there, where there is none.
     """
     entries = list_folder(folder)
-    files = [path for path in entries if path.is_file() and path.suffix.lower() in (*SUFFIXES, *other)]
-    counts = Counter(path.suffix.lower() for path in files)
-    if not counts:
-        came = describe(entries)
-        raise file_error(folder, f"expected point files ({' '.join((*SUFFIXES, *other))}), got {came}")
-
-    def rank(suffix: str) -> tuple[int, int]:
-        return 2 if suffix in _TEXT else 1 if suffix in other else 0, -counts[suffix]
-
-    suffix, *left_out = sorted(counts, key=rank)
-    warnings = []
-    if left_out and not set(left_out) <= set(_TEXT):
-        names = " and ".join(f"{counts[suffix]} {suffix}" for suffix in left_out)
-        warnings.append(f"only its {counts[suffix]} {suffix} files are read, not {names}: name those by a pattern")
-    return [path for path in files if path.suffix.lower() == suffix], warnings
+    suffixes = {path: path.suffix.lower() for path in entries if path.is_file()}
+    kinds = ([s for s in SUFFIXES if s not in _TEXT], other, _TEXT)
+    groups = [[path for path, suffix in suffixes.items() if suffix in kind] for kind in kinds]
+    files = next(filter(None, groups), [])
+    if not files:
+        raise file_error(folder, f"expected point files ({' '.join((*SUFFIXES, *other))}), got {describe(entries)}")
+    if files is not groups[2] and len({scan_id(path) for path in files}) == len(files):
+        return files, []
+    (suffix, count), *left_out = Counter(suffixes[path] for path in files).most_common()
+    names = " and ".join(f"{count} {suffix}" for suffix, count in left_out)
+    warning = f"only its {count} {suffix} files are read, not {names}: name those by a pattern"
+    return [path for path in files if suffixes[path] == suffix], [warning] if left_out else []
 
 
 def describe(entries: Sequence[Path]) -> str:
