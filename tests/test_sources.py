@@ -268,6 +268,32 @@ def test_a_chain_is_its_parts_one_after_the_other(lengths, first, counted):
     assert chain.count == (sum(lengths) if counted else None)
 
 
+def test_recordings_that_are_damaged_cost_no_other(tmp_path):
+    saved(tmp_path / "a", "0.npy", "1.npy")
+    (tmp_path / "b").mkdir()
+    saved(tmp_path / "c", "0.npy")
+    source = open_source([tmp_path / name for name in "abc"], rate=10)
+    assert ids(source) == ["a/0", "a/1", "c/0"]
+    assert len(source.warnings) == 1 and "left out: " in source.warnings[0] and "an empty folder" in source.warnings[0]
+
+    def read(i):
+        return Sweep(points=POINTS)
+
+    class Cut(IndexedRecording):
+        count = None
+
+        def lazy_frames(self, first=0):
+            yield from super().lazy_frames(first)
+            raise InputError("a.bag: is cut off")
+
+    made = [
+        kind(name=name, ids=["0", "1"], times=None, read=read) for kind, name in ((Cut, "a"), (IndexedRecording, "b"))
+    ]
+    chain = FrameSource(ChainedRecording(os.curdir, made))
+    assert [isinstance(frame, DamagedFrame) for frame in chain] == [False, False, True, False, False]
+    assert [frame.index for frame in chain.frames(3)] == [3, 4]
+
+
 def test_background_is_learned_of_any_source(tmp_path):
     rng = np.random.default_rng(0)
     wall = rng.uniform((5, -3, 0), (5.01, 3, 3), (4000, 3))

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 
-from lidarpose.errors import check_int
+from lidarpose.errors import InputError, check_int
 from lidarpose.io.files import file_error, listed
 from lidarpose.io.sources.folders import natural_key, open_files, scan_files
 from lidarpose.io.sources.frame import ChainedRecording, DamagedFrame, Frame, FrameSource, Recording, Source
@@ -92,12 +92,20 @@ def _open_all(name: str, paths: Sequence[Path], topic: str | None, **reading) ->
     """Files of points are one recording together, anything else is one of its own. reading: as of `open_files`."""
     files = [path for path in paths if path.is_file() and path.suffix.lower() not in RECORDINGS]
     parts: list[Recording] = [open_files(name, files, **reading)] if files else []
+    problems: list[InputError] = []
     for path in sorted(set(paths) - set(files), key=natural_key):
-        if path.is_dir():
-            parts.append(_open_folder(path, topic, **reading))
-        else:
-            parts.append(_reader(_READERS[path.suffix.lower()]).open_recording(path, topic=topic))
-    return parts[0] if len(parts) == 1 else ChainedRecording(name, parts)
+        try:
+            if path.is_dir():
+                parts.append(_open_folder(path, topic, **reading))
+            else:
+                parts.append(_reader(_READERS[path.suffix.lower()]).open_recording(path, topic=topic))
+        except InputError as problem:
+            problems.append(problem)
+    if not parts:
+        raise problems[0]
+    if len(parts) == 1 and not problems:
+        return parts[0]
+    return ChainedRecording(name, parts, [f"left out: {problem}" for problem in problems])
 
 
 def _open_folder(folder: Path, topic: str | None, **reading) -> Recording:

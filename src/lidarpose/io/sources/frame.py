@@ -140,17 +140,18 @@ class IndexedRecording:
 
 class ChainedRecording:
     """Several recordings one after the other. Ids begin with that of the recording, a path in the folder `name`; times
-    are dropped unless all have them."""
+    are dropped unless all have them. One that breaks off ends with a damaged frame, and the next follows."""
 
-    def __init__(self, name: str, parts: Sequence[Recording]):
+    def __init__(self, name: str, parts: Sequence[Recording], warnings: Sequence[str] = ()):
         self.name = name
         self.parts = parts
-        firsts = [next(part.lazy_frames(), None) for part in parts]
+        self._warnings = warnings
+        firsts = [next(self._frames(part), None) for part in parts]
         self._has_times = all(first is None or first.time is not None for first in firsts)
 
     @property
     def warnings(self) -> list[str]:
-        return [f"{part.name}: {line}" for part in self.parts for line in part.warnings]
+        return [*self._warnings, *(f"{part.name}: {line}" for part in self.parts for line in part.warnings)]
 
     @property
     def count(self) -> int | None:
@@ -160,14 +161,24 @@ class ChainedRecording:
     def lazy_frames(self, first: int = 0) -> Iterator[LazyFrame]:
         for part in self.parts:
             if first:
-                length = sum(1 for _ in part.lazy_frames()) if part.count is None else part.count
+                length = sum(1 for _ in self._frames(part)) if part.count is None else part.count
                 if first >= length:
                     first -= length
                     continue
             prefix = Path(os.path.relpath(part.name, self.name)).as_posix()
-            for frame in part.lazy_frames(first):
+            for frame in self._frames(part, first):
                 yield LazyFrame(f"{prefix}/{frame.id}", frame.time if self._has_times else None, frame.read)
             first = 0
+
+    def _frames(self, part: Recording, first: int = 0) -> Iterator[LazyFrame]:
+        try:
+            yield from part.lazy_frames(first)
+        except InputError as error:
+            yield LazyFrame("end", None, partial(_refuse, error))
+
+
+def _refuse(error: InputError) -> Sweep:
+    raise error
 
 
 # ---- the source that users see
