@@ -4,6 +4,7 @@ Sources: Geiger et al., Vision meets Robotics: The KITTI Dataset, IJRR 2013, and
 """
 
 import re
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -38,10 +39,10 @@ def open_kitti(folder: Path) -> IndexedRecording | None:
 
 
 def _open_drive(drive: Path) -> IndexedRecording:
-    files, warnings = scan_files(drive / "velodyne_points" / "data")
+    files, notes = scan_files(drive / "velodyne_points" / "data")
     rows = _numbers(files)
     stamps = _timestamps(drive / "velodyne_points" / "timestamps.txt")
-    times = _chosen(stamps, rows, "velodyne_points/timestamps.txt", warnings)
+    times = _chosen(stamps, rows, "velodyne_points/timestamps.txt", notes)
     calib = next((path for path in (drive, drive.parent) if (path / "calib_imu_to_velo.txt").is_file()), drive)
     keys = _calibration(calib / "calib_imu_to_velo.txt")
     poses = None
@@ -50,21 +51,21 @@ def _open_drive(drive: Path) -> IndexedRecording:
         poses = _Oxts(drive / "oxts", _inverse(T_velo_imu), stamps)
     if poses is None or not poses.is_there:
         poses = None
-        warnings.append("the sensor's poses are not known: oxts or calib_imu_to_velo.txt is missing or damaged")
-    return _recording(drive, files, times, warnings, lambda i: None if poses is None else poses.T_world_velo(rows[i]))
+        notes.append("the sensor's poses are not known: oxts or calib_imu_to_velo.txt is missing or damaged")
+    return _recording(drive, files, times, notes, lambda i: None if poses is None else poses.T_world_velo(rows[i]))
 
 
 def _open_sequence(sequence: Path) -> IndexedRecording:
-    files, warnings = scan_files(sequence / "velodyne")
+    files, notes = scan_files(sequence / "velodyne")
     rows = _numbers(files)
     stamps = _table(sequence / "times.txt", 1)
-    times = _chosen(None if stamps is None else stamps[:, 0], rows, "times.txt", warnings)
+    times = _chosen(None if stamps is None else stamps[:, 0], rows, "times.txt", notes)
     tables = (sequence / "poses.txt", sequence.parents[1] / "poses" / f"{sequence.name}.txt")
     poses = _table(next((path for path in tables if path.is_file()), tables[0]), 12)
     row = _calibration(sequence / "calib.txt").get("Tr", np.zeros(0))
     if poses is None or len(row) != 12:
-        warnings.append("the sensor's poses are not known: poses.txt, or Tr of calib.txt, is missing or damaged")
-        return _recording(sequence, files, times, warnings, lambda i: None)
+        notes.append("the sensor's poses are not known: poses.txt, or Tr of calib.txt, is missing or damaged")
+        return _recording(sequence, files, times, notes, lambda i: None)
     T_cam_velo = _matrix(row.reshape(3, 4))
 
     def T_world_velo(i: int) -> np.ndarray | None:
@@ -72,19 +73,18 @@ def _open_sequence(sequence: Path) -> IndexedRecording:
             return None
         return _inverse(T_cam_velo) @ _matrix(poses[rows[i]].reshape(3, 4)) @ T_cam_velo
 
-    return _recording(sequence, files, times, warnings, T_world_velo)
+    return _recording(sequence, files, times, notes, T_world_velo)
 
 
-def _recording(folder: Path, files: Sequence[Path], times, warnings: list[str], T_world_velo) -> IndexedRecording:
+def _recording(folder: Path, files: Sequence[Path], times, notes: list[str], T_world_velo) -> IndexedRecording:
     def read(i: int) -> Sweep:
         cloud = read_points(files[i], columns=len(KITTI_FIELDS))
         pose = T_world_velo(i)
-        notes = cloud.warnings if pose is not None else (*cloud.warnings, "the sensor's pose is not known")
-        return Sweep(points=cloud.points, T_world_sensor=pose, origin=np.zeros(3), warnings=notes)
+        pose = pose if pose is not None and np.isfinite(pose).all() else None
+        lines = cloud.warnings if pose is not None else (*cloud.warnings, "the sensor's pose is not known")
+        return Sweep(points=cloud.points, T_world_sensor=pose, origin=np.zeros(3), warnings=lines)
 
-    return IndexedRecording(
-        name=str(folder), ids=[path.stem for path in files], times=times, read=read, warnings=warnings
-    )
+    return IndexedRecording(name=str(folder), ids=[path.stem for path in files], times=times, read=read, warnings=notes)
 
 
 class _Oxts:
@@ -108,11 +108,15 @@ class _Oxts:
 
     def _position(self, values: np.ndarray) -> np.ndarray:
         latitude, longitude = np.radians(values[:2])
-        north = np.log(np.tan(np.pi / 4 + latitude / 2))
+        # damaged values are no place
+        with np.errstate(all="ignore"):
+            north = np.log(np.tan(np.pi / 4 + latitude / 2))
         return np.array([*(self.scale * _EARTH_RADIUS * np.array([longitude, north])), values[2]])
 
     def T_world_velo(self, row: int) -> np.ndarray | None:
-        if self.own is not None and self.stamps is not None and row < len(self.stamps):
+        if self.own is not None and self.stamps is not None:
+            if row >= len(self.stamps) or not np.isfinite([self.stamps[row], self.own.sum()]).all():
+                return None
             row = int(np.abs(self.own - self.stamps[row]).argmin())
         values = _table(self.folder / "data" / f"{row:0{self.digits}}.txt", 30)
         if values is None:
@@ -129,21 +133,22 @@ def _numbers(files: Sequence[Path]) -> list[int]:
     return list(range(len(files)))
 
 
-def _chosen(stamps: np.ndarray | None, rows: Sequence[int], name: str, warnings: list[str]) -> np.ndarray | None:
+def _chosen(stamps: np.ndarray | None, rows: Sequence[int], name: str, notes: list[str]) -> np.ndarray | None:
     """The times (n,) s of frames, or None and a warning."""
     if stamps is not None and max(rows) < len(stamps) and np.isfinite(stamps[rows]).all():
         return stamps[rows]
-    warnings.append(f"{name} is missing, damaged or too short: the frames' times are not known")
+    notes.append(f"{name} is missing, damaged or too short: the frames' times are not known")
     return None
 
 
 def _timestamps(path: Path) -> np.ndarray | None:
     """Lines such as "2011-09-26 13:02:25.594360375" as s since 1970; NaN for empty ones; None for a damaged file."""
+    lines = [line.strip() or "NaT" for line in (_text(path) or "?").strip().split("\n")]
     try:
-        moments = np.array(
-            [line.strip() or "NaT" for line in (_text(path) or "?").strip().split("\n")], "datetime64[ns]"
-        )
-    except ValueError:
+        # numpy warns of what looks like a time zone
+        with warnings.catch_warnings(action="error"):
+            moments = np.array(lines, "datetime64[ns]")
+    except (ValueError, Warning):
         return None
     return (moments - np.datetime64(0, "ns")) / np.timedelta64(1, "s")
 

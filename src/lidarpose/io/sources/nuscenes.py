@@ -37,10 +37,10 @@ def open_nuscenes(folder: Path, scene: str | None = None) -> IndexedRecording | 
         sweeps = _sweeps(versions[0], scene)
     except InputError:
         raise
-    except (KeyError, TypeError, ValueError, AttributeError, np.linalg.LinAlgError) as error:
+    except (LookupError, TypeError, ValueError, ArithmeticError, RecursionError) as error:
         raise file_error(versions[0], f"its tables are not nuScenes' ({shorten(str(error))}): download again") from None
     there = {f"{part}/{_CHANNEL}": _names(root / part / _CHANNEL) for part in ("samples", "sweeps")}
-    kept = [sweep for sweep in sweeps if Path(sweep["file"]).name in there.get(str(Path(sweep["file"]).parent), ())]
+    kept = [sweep for sweep in sweeps if sweep["file"].name in there.get(sweep["file"].parent.as_posix(), ())]
     if not kept:
         raise file_error(root, f"holds none of the {len(sweeps)} sweeps in {versions[0].name}: unpack its files there")
     warnings = []
@@ -82,7 +82,7 @@ def _sweeps(version: Path, scene: str | None) -> list[dict[str, Any]]:
             continue
         name = by_token["scene"][by_token["sample"][row["sample_token"]]["scene_token"]]["name"]
         if scene in (None, name):
-            sweep = {"scene": name, "id": f"{name}/{row['timestamp']}", "file": row["filename"]}
+            sweep = {"scene": name, "id": f"{name}/{row['timestamp']}", "file": Path(row["filename"])}
             poses = {"T_world_ego": _pose(by_token["ego_pose"][row["ego_pose_token"]]), "T_ego_sensor": _pose(mount)}
             sweeps.append(sweep | poses | {"time": row["timestamp"] / 1e6})
     if not sweeps:
@@ -96,14 +96,16 @@ def _sweeps(version: Path, scene: str | None) -> list[dict[str, Any]]:
 
 def _pose(row: dict[str, Any]) -> np.ndarray:
     """(4, 4) of a translation in m and a quaternion w, x, y, z."""
-    w, *axis = np.array(row["rotation"], float) / np.linalg.norm(row["rotation"])
-    x, y, z = axis
+    quaternion = np.array(row["rotation"], float)
+    if not 0.5 < np.linalg.norm(quaternion) < 2:
+        raise ValueError("a rotation that is none")
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     T = np.eye(4)
     T[:3, :3] += 2 * (w * cross + cross @ cross)
     T[:3, 3] = row["translation"]
     if not np.isfinite(T).all():
-        raise ValueError("a pose that is not finite")
+        raise ValueError("a place that is none")
     return T
 
 
