@@ -26,6 +26,7 @@ LAYERS = (
     {"viz"},
     {"tracking"},
     {"inference"},
+    {"recording"},
     {"eval"},
     {"train"},
     {"paper"},

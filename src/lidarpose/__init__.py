@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from lidarpose.lidar.sensor import Sensor as Sensor
     from lidarpose.models.dapt.import_weights import import_dapt as import_dapt
     from lidarpose.models.export import export as export
+    from lidarpose.recording.predict_recording import FramePoses as FramePoses
+    from lidarpose.recording.predict_recording import predict_recording as predict_recording
     from lidarpose.sample import Box as Box
     from lidarpose.sample import Pose as Pose
     from lidarpose.sample import Sample as Sample
@@ -48,6 +50,8 @@ _HOMES = {
     "load": "lidarpose.inference.predictor",
     "Predictor": "lidarpose.inference.predictor",
     "predict": "lidarpose.inference.predictor",
+    "predict_recording": "lidarpose.recording.predict_recording",
+    "FramePoses": "lidarpose.recording.predict_recording",
     "detect": "lidarpose.inference.detection",
     "learn_background": "lidarpose.inference.background",
     "export": "lidarpose.models.export",

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from lidarpose.cli import recordings
 from lidarpose.cli.terminal import add_command, is_watched, tell
 from lidarpose.errors import InputError
 from lidarpose.models import DEFAULT, NAMES
@@ -20,6 +21,7 @@ _NO_FOLDERS = {
     ".bin",
     ".csv",
     ".html",
+    ".json",
     ".jsonl",
     ".npy",
     ".npz",
@@ -44,16 +46,21 @@ def _add_predict(commands) -> None:
     predict = add_command(
         commands,
         "predict",
-        "estimate the poses of the people in a point file",
+        "estimate the poses of the people in a point file, a folder of them or a recording",
         "lidarpose predict sweep.pcd --picture",
         "lidarpose predict sweep.pcd --boxes people.json",
         "lidarpose predict person.ply --crop --out person.csv",
+        "lidarpose predict drive/ --track",
+        "lidarpose predict street.mcap --every 2 --format parquet",
         description="Finds the people in a scan, unless there are boxes or the file holds one person, and writes "
-        "STEM.poses.json: every person's joints, in meters and in the file's own frame. Files of the same name are "
+        "STEM.poses.json: every person's joints, in meters and in the file's own frame. Of a folder or a recording it "
+        "writes NAME.poses.jsonl, a line a frame; stopped, the same command goes on. Files of the same name are "
         "replaced.",
     )
     predict.set_defaults(run=_predict)
-    predict.add_argument("file", metavar="FILE", help=_FILES)
+    predict.add_argument(
+        "source", metavar="FILE", nargs="+", help=f"{_FILES}; a folder, a pattern, several files, or a recording"
+    )
     scan = predict.add_argument_group("what is in the file")
     scan.add_argument("--boxes", metavar="FILE", help=_BOXES)
     scan.add_argument("--calib", metavar="FILE", help="KITTI's calibration (default: calib/N.txt beside label_2)")
@@ -62,6 +69,7 @@ def _add_predict(commands) -> None:
     search = predict.add_argument_group("who is looked for, without boxes")
     search.add_argument("--find", action="store_true", help="look for people in a file under 4 m across too")
     _add_search(search)
+    recordings.add_options(predict)
     _add_output(predict.add_argument_group("output"))
     _add_network(predict.add_argument_group("network"))
 
@@ -158,19 +166,28 @@ def _predict(options: argparse.Namespace) -> None:
     from lidarpose.inference.predictor import TTA, load, predict
     from lidarpose.io.files import atomic_path, check_apart, check_writable
 
-    file = Path(options.file)
-    result = _result_path(options.out, file, "poses", ".json", ".csv")
-    beside = result or Path(f"{file.stem}.poses.json")
+    many = recordings.is_recording(options)
+    name = recordings.name_of(options.source) if many else Path(options.source[0]).stem
+    formats = (options.format,) if options.format else ("jsonl", "csv", "parquet") if many else ("json", "csv")
+    result = _result_path(options.out, name, "poses", *(f".{suffix}" for suffix in formats))
+    beside = result or Path(f"{name}.poses.json")
     picture = beside.with_suffix(".png") if options.picture else None
     page = beside.with_suffix(".html") if options.html else None
     for path in filter(None, (result, picture, page)):
-        check_apart(path, options.file, options.boxes, options.calib, options.weights, *(options.background or ()))
+        inputs = (options.boxes, options.calib, options.weights, *(options.background or ()))
+        check_apart(path, *options.source, *inputs)
         # before the work
         check_writable(path)
     choices = {"backend": options.backend, "device": options.device, "decode": options.decode}
     choices["tta"] = TTA if options.tta is None else options.tta
+    if many:
+        recordings.predict_recording(
+            options, result, picture, reading=_reading(options), model=lambda: load(options.weights, **choices)
+        )
+        return
+    file = Path(options.source[0])
     poses = predict(
-        options.file,
+        options.source[0],
         boxes=options.boxes,
         calib=options.calib,
         crop=options.crop,
@@ -209,7 +226,7 @@ def _detect(options: argparse.Namespace) -> None:
     from lidarpose.inference.detection import detect
     from lidarpose.io.files import check_apart, check_writable
 
-    result = _result_path(options.out, Path(options.file), "boxes", ".json")
+    result = _result_path(options.out, Path(options.file).stem, "boxes", ".json")
     if result is not None:
         check_apart(result, options.file, *(options.background or ()))
         check_writable(result)
@@ -239,9 +256,9 @@ def _reading(options: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def _result_path(out: str, file: Path, what: str, *suffixes: str) -> Path | None:
-    """The file to write, with one of the suffixes, None for the standard output. Raises InputError for a file of
-    another type."""
+def _result_path(out: str, name: str, what: str, *suffixes: str) -> Path | None:
+    """The file to write, with one of the suffixes, in a folder the first; None for the standard output. Raises
+    InputError for a file of another type."""
     if out == "-":
         if sys.stdout is None:
             raise InputError("--out - prints to the standard output, which is closed: name a file")
@@ -254,7 +271,7 @@ def _result_path(out: str, file: Path, what: str, *suffixes: str) -> Path | None
         if suffix in _NO_FOLDERS:
             files = " or ".join(suffixes)
             raise InputError(f"--out {out}: expected a folder or a file {files}, got {suffix}: name one")
-    return Path(out) / f"{file.stem}.{what}.json"
+    return Path(out) / f"{name}.{what}{suffixes[0]}"
 
 
 def _warnings(poses) -> list[str]:

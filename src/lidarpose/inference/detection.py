@@ -8,6 +8,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import product
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
@@ -63,6 +64,18 @@ _WEIGHTS = {
     "mounted": 1.5 * np.log(10),
     "mounted_log_spread": 1.5,
 }
+# what joints can be at best, and the fewest and most points, between which a score is bounded before anybody is posed:
+# the least mean spread of a person's joints seen is 0.022 m
+_CONFIDENCES, _LOG_SPREADS, _LOG_POINTS = (0.0, 1.0), (np.log(0.012), 0.0), (np.log1p(MIN_POINTS), np.log1p(1e5))
+# a detection so near to where somebody is expected is that person, m, if no other is expected within the second
+# distance
+_EXPECTED, _ALONE = 0.5, 1.0
+# who is expected may have moved by so much out of the box, m
+_MOVED = 0.15
+# a place that held nobody is not looked at again for a while: a score below this share of the least, and a distance, m
+_NOBODY, _SAME_PLACE = 1 / 3, 0.3
+# the least score where a track is expected
+WEAK_SCORE = 0.1
 # decimals of meters in boxes, as they are written
 _DECIMALS = 4
 
@@ -85,6 +98,23 @@ class Search:
             raise InputError(f"min score: expected a probability from 0 to 1, got {self.min_score!r}")
         if self.max_people is not None:
             check_int("max people", self.max_people, least=1)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class KnownPlaces:
+    """What the frames before say of a scan, in its frame.
+
+    boxes: of the K people who need no verification, where they are expected, with the scores they had when they were
+    verified; pelvises (K, 3) m; tracks (M, 3) m: where anybody is expected, the K first, within reach (M,) m: who is
+    not found there is searched for among detections of `WEAK_SCORE` or more; rejected (R, 3) m: places of detections
+    that were nobody.
+    """
+
+    boxes: Sequence[Box]
+    pelvises: np.ndarray
+    tracks: np.ndarray
+    reach: np.ndarray
+    rejected: np.ndarray
 
 
 def detect(
@@ -141,9 +171,12 @@ def search_options(
     return search if background is None else replace(search, background=read_background(background, columns=columns))
 
 
-def find_people(scan: Scan, search: Search) -> Scan:
+def find_people(scan: Scan, search: Search, known: KnownPlaces | None = None) -> Scan:
     """The scan with the boxes of the people in it, surest first, `found_rows`, and what looks wrong among its warnings;
-    without the place of a sensor that cannot have been there, and with the direction that turned out to be up."""
+    without the place of a sensor that cannot have been there, and with the direction that turned out to be up.
+
+    known: of a recording's frames before; with it the scan has `pelvises`, `verified` and `rejected`, too.
+    """
     count = len(scan.points)
     given, notes = _thinned(scan, search)
     scan, warnings = given, [*scan.warnings, *notes]
@@ -177,13 +210,30 @@ def find_people(scan: Scan, search: Search) -> Scan:
     detections = detector.detect(level, origin, max_range=search.max_range, limit=_POSED, moving=moving)
     if not (detections.has_ground or wrong):
         warnings.append("no ground was found, and people are searched without it: is the up axis right?")
-    boxes, rows = _verified(detections, level, origin, search)
-    return replace(
+    # the boxes of a frame that leans are larger than their people: these are looked for anew
+    leans = not np.allclose(given.R_boxes_input, scan.R_level_input)
+    people = _verified(detections, level, origin, search, None if known is None or leans else _level(known, scan))
+    searched = replace(
         scan,
-        boxes=[_in_input(box, scan, given) for box in boxes],
-        found_rows=rows,
+        boxes=[_in_input(box, scan, given) for box in people.boxes],
+        found_rows=people.rows,
         warnings=tuple(warnings),
     )
+    if known is None:
+        return searched
+    return replace(
+        searched,
+        pelvises=people.pelvises @ scan.R_level_input,
+        verified=people.verified,
+        rejected=people.rejected @ scan.R_level_input,
+    )
+
+
+def least_score(search: Search) -> float:
+    """The score below which detections are left out."""
+    if search.min_score is not None:
+        return search.min_score
+    return float((search.detector or _detector()).header["default_score"])
 
 
 def detector_version() -> str:
@@ -278,7 +328,9 @@ def verification_features(
         features (D, 5) in the order of `FEATURES`, and the poses, joints (D, 26, 3) m in the frame of the points; of
         fewer than 5 points they are NaN.
     """
-    return _posed(detections, [points[rows] for rows in _rows_near(detections, points)], origin, backend or _verifier())
+    every = np.arange(len(detections))
+    clouds = [points[rows] for rows in _rows_near(detections.centers, points)]
+    return _posed(detections, every, clouds, origin, backend or _verifier())
 
 
 def final_score(features: np.ndarray, header: dict) -> np.ndarray:
@@ -295,14 +347,16 @@ def final_score(features: np.ndarray, header: dict) -> np.ndarray:
 
 
 def _posed(
-    detections: Detections, clouds: list[np.ndarray], origin: np.ndarray | None, backend: Backend
+    detections: Detections, chosen: np.ndarray, clouds: list[np.ndarray], origin: np.ndarray | None, backend: Backend
 ) -> tuple[np.ndarray, Pose]:
-    """As `verification_features`, of the points (n, 3) m near each detection."""
-    columns = []
-    for center, size, cloud in zip(detections.centers, detections.sizes, clouds, strict=True):
+    """As `verification_features`, of the chosen detections (C,) and the points (n, 3) m near each of these; of the
+    others what comes from points is NaN."""
+    columns = [np.zeros((0, 3))] * len(detections)
+    for i, cloud in zip(chosen.tolist(), clouds, strict=True):
+        center, size = detections.centers[i], detections.sizes[i]
         above = cloud[:, 2] - center[2]
         inside = (above > -size[2] / 2 - _BELOW) & (above < size[2] / 2 + _ABOVE)
-        columns.append(cloud[inside & (np.hypot(*(cloud[:, :2] - center[:2]).T) < _COLUMN)])
+        columns[i] = cloud[inside & (np.hypot(*(cloud[:, :2] - center[:2]).T) < _COLUMN)]
     known = sorted((i for i, column in enumerate(columns) if len(column) >= MIN_POINTS), key=lambda i: len(columns[i]))
     skeleton = backend.header.skeleton
     joints = np.full((len(columns), len(skeleton), 3), np.nan)
@@ -320,34 +374,113 @@ def _posed(
     return np.stack(features, -1).reshape(-1, len(FEATURES)), poses
 
 
+def _highest_score(detections: Detections, header: dict) -> np.ndarray:
+    """(D,): what `final_score` can be at most, whatever the pose. The score's logit is linear in what is unknown."""
+    highest = np.zeros(len(detections))
+    for unknown in product(_CONFIDENCES, _LOG_SPREADS, _LOG_POINTS):
+        columns = [detections.logit, *(np.full(len(detections), value) for value in unknown), detections.mounted]
+        highest = np.maximum(highest, final_score(np.stack(columns, -1), header))
+    return highest
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _People:
+    """N people, level, surest first: boxes, rows of their points, pelvises (N, 3) m, verified (N,) bool; rejected
+    (R, 3) m: detections that were nobody."""
+
+    boxes: list[Box]
+    rows: list[np.ndarray]
+    pelvises: np.ndarray
+    verified: np.ndarray
+    rejected: np.ndarray
+
+
 def _verified(
-    detections: Detections, points: np.ndarray, origin: np.ndarray | None, search: Search
-) -> tuple[list[Box], list[np.ndarray]]:
-    """The people among the detections, surest first: boxes about their poses, and of each the rows of its points."""
-    near = _rows_near(detections, points)
-    clouds = [points[rows] for rows in near]
-    features, poses = _posed(detections, clouds, origin, _verifier())
+    detections: Detections,
+    points: np.ndarray,
+    origin: np.ndarray | None,
+    search: Search,
+    known: KnownPlaces | None = None,
+) -> _People:
+    """The people among the detections, surest first, in boxes about their poses; of known people about where they are
+    expected."""
     header = (search.detector or _detector()).header
+    usual = least_score(search)
+    least = np.full(len(detections), usual)
+    highest = _highest_score(detections, header)
+    expected = np.full(len(detections), -1)
+    if known is not None:
+        expected = _expected(detections, highest >= usual, known)
+        is_missed = ~np.isin(np.arange(len(known.tracks)), expected)
+        is_near = (_apart(detections.centers, known.tracks[is_missed]) < known.reach[is_missed]).any(1)
+        least[is_near] = min(usual, WEAK_SCORE)
+        is_nobody = (_apart(detections.centers, known.rejected) < _SAME_PLACE).any(1)
+        least[is_nobody & ~is_near & (expected < 0)] = np.inf
+    possible = np.flatnonzero(highest >= least)
+    near = dict(zip(possible.tolist(), _rows_near(detections.centers[possible], points), strict=True))
+    posed = possible[expected[possible] < 0]
+    features, poses = _posed(detections, posed, [points[near[i]] for i in posed.tolist()], origin, _verifier())
     scores = final_score(features, header)
-    least = float(header["default_score"]) if search.min_score is None else search.min_score
-    pelvis = poses.joints[:, poses.skeleton.index("pelvis")]
+    pelvis = poses.joints[:, poses.skeleton.index("pelvis")].copy()
+    rejected = detections.centers[posed][scores[posed] < _NOBODY * usual]
+    if known is not None:
+        spared = np.flatnonzero(expected >= 0)
+        scores[spared] = [known.boxes[k].score for k in expected[spared].tolist()]
+        pelvis[spared] = known.pelvises[expected[spared]]
     chosen: list[int] = []
     for i in np.argsort(-scores, kind="stable"):
         is_new = not (np.linalg.norm(pelvis[chosen] - pelvis[i], axis=1) < _SAME_PERSON).any()
-        if scores[i] >= least and is_new and not np.isnan(pelvis[i]).any():
+        if scores[i] >= least[i] and is_new and not np.isnan(pelvis[i]).any():
             chosen.append(int(i))
     boxes: list[Box] = []
     rows: list[np.ndarray] = []
+    shown: list[int] = []
     for i in chosen:
-        others = [np.hypot(*(pelvis[k] - pelvis[i])[:2]) for k in chosen if k != i]
-        box = _box_about(Pose(joints=poses.joints[i], skeleton=poses.skeleton), min(others, default=np.inf))
-        inside = box.contains(clouds[i])
+        if known is not None and expected[i] >= 0:
+            box = known.boxes[expected[i]]
+            cropped, mounted = replace(box, size=box.size + 2 * _MOVED), box.mounted
+        else:
+            others = [np.hypot(*(pelvis[k] - pelvis[i])[:2]) for k in chosen if k != i and scores[k] >= usual]
+            alone = min(others, default=np.inf)
+            box = cropped = _box_about(Pose(joints=poses.joints[i], skeleton=poses.skeleton), alone)
+            mounted = bool(detections.mounted[i] > 0.5)
+        inside = cropped.contains(points[near[i]])
         if inside.sum() < MIN_POINTS or len(boxes) == search.max_people:
             continue
-        mounted = bool(detections.mounted[i] > 0.5)
         boxes.append(replace(box, id=len(boxes), score=round(float(scores[i]), _DECIMALS), mounted=mounted))
         rows.append(near[i][inside])
-    return boxes, rows
+        shown.append(i)
+    return _People(boxes=boxes, rows=rows, pelvises=pelvis[shown], verified=expected[shown] < 0, rejected=rejected)
+
+
+def _expected(detections: Detections, is_sure: np.ndarray, known: KnownPlaces) -> np.ndarray:
+    """Of each detection, those that are sure enough, which known person it is: (D,) int, -1: none."""
+    expected = np.full(len(detections), -1)
+    sure = np.flatnonzero(is_sure)
+    if len(sure) and known.boxes:
+        away = _apart(detections.centers[sure], known.tracks[: len(known.boxes)])
+        is_alone = (_apart(known.tracks, known.tracks) < _ALONE).sum(0)[: len(known.boxes)] == 1
+        nearest = away.argmin(0)
+        for k in np.flatnonzero(is_alone & (away.min(0) < _EXPECTED)):
+            expected[sure[nearest[k]]] = k
+    return expected
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Level distances of a (A, 2+) from b (B, 2+): (A, B) m."""
+    return np.linalg.norm(a[:, None, :2] - b[None, :, :2], axis=-1)
+
+
+def _level(known: KnownPlaces, scan: Scan) -> KnownPlaces:
+    """In the scan's level frame."""
+    R_level_input = scan.R_level_input
+    return replace(
+        known,
+        boxes=[replace(box, center=R_level_input @ box.center) for box in known.boxes],
+        pelvises=known.pelvises @ R_level_input.T,
+        tracks=known.tracks @ R_level_input.T,
+        rejected=known.rejected @ R_level_input.T,
+    )
 
 
 def _box_about(pose: Pose, alone: float) -> Box:
@@ -369,15 +502,15 @@ def _rounded(box: Box) -> Box:
     return replace(box, center=center, size=size, yaw=round(box.yaw, _DECIMALS))
 
 
-def _rows_near(detections: Detections, points: np.ndarray) -> list[np.ndarray]:
-    """Of each detection the rows (k,) of the points (n, 3) m about it, ascending."""
+def _rows_near(centers: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
+    """Of each center the rows (k,) of the points (n, 3) m about it, ascending."""
     # sorted by strips along x; of maps of more strips the last one holds the rest
     start = points[:, 0].min(initial=0)
     strip = np.minimum((points[:, 0] - start) / _AROUND, 65_535).astype(np.uint16)
     order = np.argsort(strip, kind="stable")
     ends = np.concatenate([[0], np.cumsum(np.bincount(strip, minlength=65_536))])
     rows = []
-    for x, y in detections.centers[:, :2]:
+    for x, y in centers[:, :2]:
         first, last = np.clip([(x - _AROUND - start) / _AROUND, (x + _AROUND - start) / _AROUND], 0, 65_535).astype(int)
         near = order[ends[first] : ends[last + 1]]
         near = near[np.abs(points[near, 1] - y) < _AROUND]

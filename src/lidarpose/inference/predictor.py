@@ -43,6 +43,8 @@ from lidarpose.tracking.smoothing import smooth
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
+    from lidarpose.inference.detection import KnownPlaces, Search
+
 BACKENDS = ("onnx", "torch")
 # default number of test-time augmentation passes
 TTA = 4
@@ -52,7 +54,8 @@ PASSES = 2
 CROP_SIZE = 4.0
 # to which the center of the second pass is rounded, m: backends differ by less than a micrometer, which must not move a
 # point to another voxel
-_CENTER_STEP = 0.01
+_CENTER_DECIMALS = 2
+_CENTER_STEP = 10**-_CENTER_DECIMALS
 
 
 def load(
@@ -135,7 +138,8 @@ def predict(
     that gives the predictor when it is needed. Raises InputError, one line that says what to do.
     """
     options = (min_score, max_range, max_people, background)
-    _check_choice(path, boxes, crop, find or any(option is not None for option in options))
+    check_choice(boxes, crop, find or any(option is not None for option in options))
+    _check_path(path)
     started = time.perf_counter()
     rotation_from_up(up)
     scan = Scan(
@@ -145,38 +149,75 @@ def predict(
         up=up if isinstance(up, str) else ",".join(repr(float(value)) for value in up),
     )
     scan = read_scan(scan, path, columns)
-    find = find or boxes is None and not crop and _is_wide(scan)
+    find = find or boxes is None and not crop and is_wide(scan)
     if sensor_origin is None and (find or boxes is not None):
         scan = replace(scan, origin=np.zeros(3))
     read = time.perf_counter()
+    search = None
     if find:
-        from lidarpose.inference.detection import find_people, search_options
+        from lidarpose.inference.detection import search_options
 
-        scan = find_people(scan, search_options(*options, columns))
-    searched = time.perf_counter()
+        search = search_options(*options, columns)
     # loaded once the input has proved readable
-    predictor = model if isinstance(model, Predictor) else model() if callable(model) else load(model)
-    loaded = time.perf_counter()
+    _, poses = predict_scan(scan, lambda: predictor_of(model), search=search, skeleton=skeleton, progress=progress)
+    return replace(poses, timing_ms={"read": (read - started) * 1e3} | poses.timing_ms)
+
+
+def predictor_of(model: "Predictor | str | os.PathLike | Callable[[], Predictor]") -> "Predictor":
+    """What `predict` takes as its model, ready to use."""
+    return model if isinstance(model, Predictor) else model() if callable(model) else load(model)
+
+
+def predict_scan(
+    scan: Scan,
+    model: "Callable[[], Predictor]",
+    *,
+    search: "Search | None" = None,
+    known: "KnownPlaces | None" = None,
+    skeleton: str | None = None,
+    progress: bool = False,
+) -> tuple[Scan, Poses]:
+    """The steps of one scan: people are searched for where `search` is given, else they are the scan's boxes or its
+    crop; then everybody is posed.
+
+    Args:
+        model: loads the network, once people were searched for.
+        known: as of `find_people`.
+
+    Returns:
+        The scan as it was searched, and the poses, whose `timing_ms` has "find", "load", "crop" and "predict".
+    """
+    started = time.perf_counter()
+    times = {}
+    if search is not None:
+        from lidarpose.inference.detection import find_people
+
+        scan = find_people(scan, search, known)
+        times["find"] = time.perf_counter() - started
+    searched = time.perf_counter()
+    predictor = model()
+    times["load"] = time.perf_counter() - searched
     poses = pose_scan(scan, predictor, skeleton=skeleton, progress=progress)
-    times = {"read": read - started, "find": searched - read, "load": loaded - searched}
-    timing = {name: seconds * 1e3 for name, seconds in times.items() if find or name != "find"}
-    return replace(poses, timing_ms=timing | poses.timing_ms)
+    return scan, replace(poses, timing_ms={name: seconds * 1e3 for name, seconds in times.items()} | poses.timing_ms)
 
 
-def _is_wide(scan: Scan) -> bool:
+def is_wide(scan: Scan) -> bool:
     """Whether the scan is larger than a crop of one person."""
     # a map of 10^8 points is not turned for nothing
     upright = scan.points if scan.up in UP_AXES else scan.clouds()[0]
     return bool(np.ptp(upright, axis=0).max() >= CROP_SIZE)
 
 
-def _check_choice(path: object, boxes: object, crop: bool, searched: bool) -> None:
-    """Raises InputError where it is said in two ways who is in the file, or it is no file."""
+def check_choice(boxes: object, crop: bool, searched: bool) -> None:
+    """Raises InputError where it is said in two ways who is in the file."""
     if boxes is not None and crop:
         raise InputError("expected boxes or a crop, got both: a crop is one person already, so leave the boxes away")
     if searched and (boxes is not None or crop):
         options = "find, min score, range, max people and background"
         raise InputError(f"{options} are for people who are searched for: leave them away with boxes or a crop")
+
+
+def _check_path(path: object) -> None:
     if not isinstance(path, str | os.PathLike):
         kind = type(path).__name__
         raise InputError(
@@ -342,7 +383,16 @@ class Predictor:
         ]
         return Poses(people=tuple(frames), skeleton=wanted, model=self.model)
 
-    def _people(self, clouds, origin, wanted, progress, clips=None) -> list[PersonPose]:
+    def predict_about(
+        self, clouds: Sequence[np.ndarray], centers: np.ndarray, origin: np.ndarray | None, skeleton: str | None = None
+    ) -> Poses:
+        """As `predict` of clouds (n, 3) m, each of one person alone whose pelvis is nearly known, centers (N, 3) m: the
+        pass that would find it is spared."""
+        wanted = self.in_skeleton(skeleton)
+        people = self._people(list(clouds), origin, wanted, False, centers=centers)
+        return Poses(people=tuple(people), skeleton=wanted, model=self.model)
+
+    def _people(self, clouds, origin, wanted, progress, clips=None, centers=None) -> list[PersonPose]:
         cleaned = [clean(cloud) for cloud in clouds]
         usable = {}
         for i, (points, notes) in enumerate(cleaned):
@@ -351,7 +401,11 @@ class Predictor:
                 notes.append(f"no pose: under {MIN_POINTS} {points_of}")
             else:
                 usable[i] = points
-        if clips is None:
+        if centers is not None:
+            rows = list(usable)
+            about = self._all_poses(list(usable.values()), origin, progress, np.round(centers[rows], _CENTER_DECIMALS))
+            best = {i: (pose, usable[i]) for i, pose in zip(rows, about, strict=True) if pose is not None}
+        elif clips is None:
             best = self._best_poses(usable, origin, progress)
         else:
             best = self._clip_poses(usable, origin, clips.usable(np.isin(np.arange(len(clouds)), list(usable))))
@@ -408,25 +462,36 @@ class Predictor:
             }
         return best
 
-    def _all_poses(self, clouds: list[np.ndarray], origin: np.ndarray | None, progress: bool) -> list[Pose | None]:
-        """The pose of each cloud (n, 3) m in batches. People of like size go together: a batch costs as much as if all
-        were its largest."""
+    def _all_poses(
+        self, clouds: list[np.ndarray], origin: np.ndarray | None, progress: bool, centers: np.ndarray | None = None
+    ) -> list[Pose | None]:
+        """The pose of each cloud (n, 3) m in batches; centers (N, 3) m: as of `_poses`. People of like size go
+        together: a batch costs as much as if all were its largest."""
         poses: list[Pose | None] = [None] * len(clouds)
         order = sorted(range(len(clouds)), key=lambda k: len(clouds[k]))
         with Progress(len(clouds), unit="clouds", shown=progress) as shown:
             for start in range(0, len(clouds), self.backend.batch):
                 batch = order[start : start + self.backend.batch]
-                for k, pose in zip(batch, self._poses([clouds[k] for k in batch], origin), strict=True):
+                about = None if centers is None else centers[batch]
+                answers = self._poses([clouds[k] for k in batch], origin, centers=about)
+                for k, pose in zip(batch, answers, strict=True):
                     poses[k] = pose
                 shown.update(start + len(batch))
         return poses
 
     def _poses(
-        self, clouds: list[np.ndarray], origin: np.ndarray | None, clip: Clips | None = None
+        self,
+        clouds: list[np.ndarray],
+        origin: np.ndarray | None,
+        clip: Clips | None = None,
+        centers: np.ndarray | None = None,
     ) -> list[Pose | None]:
-        """The pose of each cloud (n, 3) m, None where too little of it is near its middle. clip: of frames of clips."""
-        centers = np.stack([center_of(points) for points in clouds])
-        for _ in range(self._passes - 1):
+        """The pose of each cloud (n, 3) m, None where too little of it is near its middle. clip: of frames of clips;
+        centers (N, 3) m: of the pelvises, where they need not be found."""
+        passes = self._passes if centers is None else 1
+        if centers is None:
+            centers = np.stack([center_of(points) for points in clouds])
+        for _ in range(passes - 1):
             root = self.outputs(clouds, centers, origin, clip).joints[:, self._root].mean(1)
             # an answer that is no number stays one
             centers = centers + np.round(np.clip(root, -WINDOW / 2, WINDOW / 2) / _CENTER_STEP) * _CENTER_STEP

@@ -31,7 +31,9 @@ class Scan:
     points (n, 3) m; boxes: the people's, None for a crop of one person; origin: the sensor's position (3,) m or None;
     up: the input's up axis or direction, see `rotation_from_up`; warnings: of reading; source: a name for reports.
     Boxes stand along the input's own axis; where `up` is a direction, along z. Where people were searched for,
-    found_rows holds of each box the rows (k,) of the person's points, which a box of a frame that leans cannot tell.
+    found_rows holds of each box the rows (k,) of the person's points, which a box of a frame that leans cannot tell. In
+    recordings, pelvises (N, 3) m: where those of the boxes' people are about; verified (N,) bool: whose score is of
+    this scan; rejected (R, 3) m: places that turned out to hold nobody.
     """
 
     points: np.ndarray
@@ -41,6 +43,9 @@ class Scan:
     warnings: tuple[str, ...] = ()
     source: str | None = None
     found_rows: list[np.ndarray] | None = None
+    pelvises: np.ndarray | None = None
+    verified: np.ndarray | None = None
+    rejected: np.ndarray | None = None
 
     @cached_property
     def R_level_input(self) -> np.ndarray:
@@ -96,7 +101,10 @@ def pose_scan(scan: Scan, predictor: Predictor, *, skeleton: str | None = None, 
         warnings.append(warning)
         scan = replace(scan, origin=None)
     origin = None if scan.origin is None else scan.R_level_input @ scan.origin
-    level = predictor.predict(clouds, sensor_origin=origin, skeleton=skeleton, progress=progress)
+    if scan.pelvises is not None and clouds:
+        level = predictor.predict_about(clouds, scan.pelvises @ scan.R_level_input.T, origin, skeleton)
+    else:
+        level = predictor.predict(clouds, sensor_origin=origin, skeleton=skeleton, progress=progress)
     predict_ms = (time.perf_counter() - cropped) * 1e3
     level = replace(level, people=_named(level, scan.boxes))
     warnings += check_scan(scan, level)

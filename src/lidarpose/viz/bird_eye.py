@@ -31,6 +31,7 @@ class ScanPanel:
         boxes: of people; an id is printed beside its box, the side that a box faces is marked.
         poses: joints (P, J, 3).
         tracks: positions (F, 2) or (F, 3) of people over time.
+        places: (K, 2) or (K, 3), of people whom nobody knows apart.
         label: printed above.
         sensor: x, y of the sensor, None where nobody knows it.
     """
@@ -39,6 +40,7 @@ class ScanPanel:
     boxes: Sequence[Box] = ()
     poses: Pose | None = None
     tracks: Sequence[np.ndarray] = ()
+    places: np.ndarray | None = None
     label: str = ""
     sensor: tuple[float, float] | None = (0.0, 0.0)
 
@@ -104,6 +106,8 @@ def _draw_panel(ax, panel: ScanPanel) -> None:
     for track in panel.tracks:
         ax.plot(track[:, 0], track[:, 1], color=_BOX, lw=1.2, ls=":", zorder=4)
         ax.plot(*track[-1, :2], ls="", marker="o", ms=2.5, color=_BOX, zorder=4)
+    if panel.places is not None and len(panel.places):
+        ax.plot(panel.places[:, 0], panel.places[:, 1], ls="", marker="o", ms=2.5, color=_BOX, alpha=0.5, zorder=4)
     for box in panel.boxes:
         _draw_box(ax, box)
     if is_known(panel.poses):
@@ -119,6 +123,8 @@ def _window(panel: ScanPanel, points: np.ndarray) -> tuple[np.ndarray, float]:
     """The lower left corner and the side of a square that holds the people, their tracks and the sensor, else most
     points."""
     shown = [box.center[None, :2] for box in panel.boxes] + [np.asarray(track)[:, :2] for track in panel.tracks]
+    if panel.places is not None and len(panel.places):
+        shown.append(np.asarray(panel.places)[:, :2])
     if shown and panel.sensor is not None:
         shown.append(np.array([panel.sensor]))
     if not shown:

@@ -1,0 +1,129 @@
+"""`lidarpose predict` of folders and recordings: many frames, a line each."""
+
+import argparse
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from lidarpose._version import __version__
+from lidarpose.cli.terminal import tell
+from lidarpose.errors import InputError
+
+# options that only frames have, by their names in the namespace
+_ONLY = ("track", "live", "world", "format", "topic", "rate", "start", "end", "every")
+# what a user reads of warnings that many frames have
+_MOST_WARNINGS = 8
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options of many frames."""
+    frames = parser.add_argument_group("folders and recordings")
+    frames.add_argument("--track", action="store_true", help="join people over time, and make their poses steady")
+    frames.add_argument("--live", action="store_true", help="tracks made steady by the past alone, as they come")
+    frames.add_argument("--world", action="store_true", help="joints in the world's frame, where it is known")
+    frames.add_argument("--format", choices=("jsonl", "csv", "parquet"), help="of NAME.poses.FORMAT (default jsonl)")
+    frames.add_argument("--topic", metavar="NAME", help="which points of a bag")
+    frames.add_argument("--rate", type=float, metavar="HZ", help="frames a second where times are unknown (default 10)")
+    frames.add_argument("--start", type=float, metavar="S", help="seconds from the first frame")
+    frames.add_argument("--end", type=float, metavar="S", help="seconds from the first frame")
+    frames.add_argument("--every", type=int, metavar="N", help="only every N-th frame")
+
+
+def is_recording(options: argparse.Namespace) -> bool:
+    """Whether the command is about many frames rather than one plain file."""
+    from lidarpose.io.sources import is_single_scan
+
+    if any(getattr(options, name) not in (None, False) for name in _ONLY):
+        return True
+    return not is_single_scan(options.source)
+
+
+def name_of(paths: Sequence[str]) -> str:
+    """What results are named after: the file's or folder's stem, of several files their folder's."""
+    path = paths[0] if len(paths) == 1 else os.path.commonpath([os.path.abspath(path) for path in paths])
+    if any(letter in path for letter in "*?[") and not os.path.exists(path):
+        path = os.path.dirname(path.split("**")[0]) or "."
+    path = os.path.realpath(path)
+    name = os.path.basename(path)
+    return (name if os.path.isdir(path) else Path(name).stem) or "recording"
+
+
+def predict_recording(
+    options: argparse.Namespace, result: Path | None, picture: Path | None, *, reading: dict[str, Any], model
+) -> None:
+    """Poses all frames, and says what was found. reading: options of reading and searching a scan, as of `predict`."""
+    from lidarpose.io.files import write_atomic
+    from lidarpose.io.sources import open_source
+    from lidarpose.recording.output import write_recording
+    from lidarpose.recording.picture import WaysPicture
+    from lidarpose.recording.predict_recording import FramePredictor
+
+    if options.html:
+        raise InputError("--html is of one scan: name one file, or draw a recording with --picture")
+    if len(options.source) > 1 and any(map(os.path.isdir, options.source)):
+        raise InputError(f"expected one folder, or files, got {len(options.source)}: run the command for each folder")
+    frames = {name: getattr(options, name) for name in ("topic", "rate", "start", "end")}
+    source = open_source(
+        options.source, columns=options.columns, every=1 if options.every is None else options.every, **frames
+    )
+    search = tuple(reading.pop(name) for name in ("min_score", "max_range", "max_people", "background"))
+    steps = FramePredictor(
+        boxes=options.boxes,
+        calib=options.calib,
+        crop=options.crop,
+        find=options.find,
+        search=search,
+        skeleton=options.skeleton,
+        track=options.track,
+        live=options.live,
+        model=model,
+        name=source.name,
+        **reading,
+    )
+    if result is None:
+        _print_lines(options, source, steps)
+        return
+    ways = None if picture is None else WaysPicture(steps.up)
+    summary = write_recording(
+        source,
+        steps,
+        result,
+        command=_command(options),
+        world=options.world,
+        on_line=None if ways is None else ways.add,
+        tell=lambda text: tell(f"lidarpose: {text}"),
+    )
+    if ways is not None and picture is not None:
+        write_atomic(picture, ways.draw(source, title=Path(source.name).name))
+    for line in [*source.warnings, *summary.warning_lines(_MOST_WARNINGS)]:
+        tell(f"lidarpose: warning: {line}")
+    tell(f"{summary.text(steps.is_tracked)} -> {' and '.join(str(path) for path in (result, picture) if path)}")
+
+
+def _print_lines(options: argparse.Namespace, source, steps) -> None:
+    """Frames as they come, on the standard output."""
+    from lidarpose.recording.output import Summary, in_world
+    from lidarpose.recording.predict_recording import read_ahead
+
+    if steps.is_tracked and not steps.live:
+        raise InputError("--out - prints frames as they come: say --live, which needs no later frames, or name a file")
+    summary = Summary()
+    for frame in read_ahead(source.frames()):
+        line = steps.predict(frame).to_dict()
+        line = in_world(line) if options.world else line
+        summary.add(line)
+        print(json.dumps(line), flush=True)
+    for line in [*source.warnings, *summary.warning_lines(_MOST_WARNINGS)]:
+        tell(f"lidarpose: warning: {line}")
+    tell(summary.text(steps.is_tracked))
+
+
+def _command(options: argparse.Namespace) -> dict[str, Any]:
+    """All that the poses of frames depend on."""
+    ignored = ("run", "command", "quiet", "out", "format", "picture", "world", "source")
+    command = {name: value for name, value in vars(options).items() if name not in ignored}
+    weights = os.stat(options.weights).st_mtime_ns if os.path.isfile(options.weights) else None
+    sources = [os.path.abspath(path) for path in options.source]
+    return command | {"source": sources, "weights changed": weights, "version": __version__}

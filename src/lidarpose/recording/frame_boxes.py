@@ -1,0 +1,97 @@
+"""People's boxes of many frames: a folder with a file a frame, or one JSON or JSONL file that names its frames."""
+
+import json
+import os
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from lidarpose.errors import InputError
+from lidarpose.io.boxes import read_boxes
+from lidarpose.io.files import file_error, read_bytes, shorten
+from lidarpose.io.sources import DamagedFrame, Frame
+from lidarpose.sample import Box
+
+_FORM = '{"frame": 0, "people": [{"center": [x, y, z], "size": [l, w, h]}]}'
+_SUFFIXES = (".json", ".npy", ".txt")
+
+
+class FrameBoxes:
+    """The boxes of a recording's people by frame.
+
+    Args:
+        given: a folder, whose files are named as the frames are (`ID.json`, `ID.npy`, KITTI's `ID.txt`, or
+            `ID.boxes.json`, as `lidarpose detect` names them); or a file: JSON lines or a list of
+            `{"frame": 0, "people": [...]}`, the frame by number or by id; or a mapping from either to whatever
+            `read_boxes` takes.
+        calib: KITTI's calibration, as in `read_boxes`.
+
+    Raises:
+        InputError: one line that names the file and what was expected.
+    """
+
+    def __init__(self, given: "str | os.PathLike | Mapping[Any, Any]", *, calib: str | os.PathLike | None = None):
+        self._name: object = "boxes" if isinstance(given, Mapping) else given
+        self._read = partial(read_boxes, calib=calib)
+        self._by_frame: dict[str, Any] = {}
+        self.was_used = False
+        if isinstance(given, Mapping):
+            self._by_frame = {str(frame): boxes for frame, boxes in given.items()}
+        elif not isinstance(given, str | os.PathLike):
+            came = type(given).__name__
+            raise InputError(f"boxes of a recording: expected a folder, a file or a dict by frame, got {came}")
+        elif os.path.isdir(given):
+            for path in sorted(Path(given).iterdir()):
+                if path.suffix.lower() in _SUFFIXES:
+                    self._by_frame[path.stem.removesuffix(".boxes")] = path
+        else:
+            self._by_frame = _by_frame(given)
+        if not self._by_frame:
+            raise file_error(self._name, f"expected boxes a frame, files named as the frames are or {_FORM}, got none")
+
+    def of(self, frame: Frame | DamagedFrame) -> list[Box] | None:
+        """The boxes of a frame; None where none are given. Raises InputError for those that cannot be read."""
+        key = frame.id if frame.id in self._by_frame else str(frame.index)
+        if key not in self._by_frame:
+            return None
+        self.was_used = True
+        try:
+            return self._read(self._by_frame[key])
+        except InputError as error:
+            given = self._by_frame[key]
+            raise error if isinstance(given, str | os.PathLike) else file_error(f"frame {key}", error) from None
+
+    def check_used(self, frame: Frame | DamagedFrame) -> None:
+        """Raises InputError where no frame up to this last one has boxes, so that they are of something else."""
+        if not self.was_used:
+            ids = shorten(", ".join(list(self._by_frame)[:3]))
+            raise file_error(
+                self._name, f"has boxes of frames {ids}, none of which is here: the last one is {frame.id}"
+            )
+
+
+def _by_frame(path: str | os.PathLike) -> dict[str, Any]:
+    """Entries of a file by number or id of the frame."""
+    data = read_bytes(path, expected="a folder or a file of boxes")
+    try:
+        text = data.decode("utf-8-sig")
+        try:
+            content = json.loads(text)
+        except json.JSONDecodeError:
+            content = [json.loads(line) for line in text.splitlines() if line.strip()]
+    except (UnicodeDecodeError, ValueError, RecursionError) as error:
+        raise file_error(path, f"expected JSON or JSON lines, {_FORM} each, got something else ({error})") from None
+    entries = content.get("frames", [content]) if isinstance(content, dict) else content
+    by_frame: dict[str, Any] = {}
+    for i, entry in enumerate(entries if isinstance(entries, list) else [entries]):
+        frame = entry.get("frame") if isinstance(entry, dict) else None
+        if isinstance(frame, bool) or not isinstance(frame, str | int) or "people" not in entry:
+            came = shorten(json.dumps(entry), 60)
+            raise file_error(
+                path, f"expected an entry a frame, {_FORM}, got {came} as entry {i}: one box file is one scan"
+            )
+        if str(frame) in by_frame:
+            raise file_error(path, f"expected a frame once, got {frame!r} twice: put its people into one entry")
+        by_frame[str(frame)] = entry
+    return by_frame

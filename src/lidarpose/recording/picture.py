@@ -1,0 +1,76 @@
+"""The picture of a recording: the ways of its people from above, over some of its frames."""
+
+from typing import Any
+
+import numpy as np
+
+from lidarpose.io.sources import Frame, Source
+from lidarpose.recording.predict_recording import fixed_from_sensor
+from lidarpose.sample import Box
+from lidarpose.viz.bird_eye import ScanPanel, draw_scans
+
+# frames whose points are drawn where the sensor moves
+_FRAMES = 8
+
+
+class WaysPicture:
+    """Collects where people are, line by line of the result, in the frame that stays where it is."""
+
+    def __init__(self, up: str):
+        self._up = up
+        self._frames: list[int] = []
+        self._to_fixed: list[np.ndarray] = []
+        self._world: np.ndarray | None = None
+        self._ways: dict[int | None, list[np.ndarray]] = {}
+        self._yaws: dict[int | None, float] = {}
+
+    def add(self, line: dict[str, Any]) -> None:
+        if line["error"] is not None:
+            return
+        if line["T_world_sensor"] is not None:
+            self._world = np.array(line["T_world_sensor"])
+        T_fixed_sensor = fixed_from_sensor(self._world, self._up)
+        self._frames.append(line["frame"])
+        self._to_fixed.append(T_fixed_sensor)
+        # lines may hold people in the world's frame already
+        T = np.eye(4) if line.get("coordinates") == "world" else T_fixed_sensor
+        for person in line["people"]:
+            if person["joints"] is not None:
+                joints = np.array(person["joints"]) @ T[:3, :3].T + T[:3, 3]
+                self._ways.setdefault(person["track"], []).append((joints.min(0) + joints.max(0)) / 2)
+                if person["box"] is not None:
+                    yaw = person["box"]["yaw"]
+                    x, y, _ = T[:3, :3] @ fixed_from_sensor(None, self._up)[:3, :3].T @ [np.cos(yaw), np.sin(yaw), 0]
+                    self._yaws[person["track"]] = float(np.arctan2(y, x))
+
+    def draw(self, source: Source, *, title: str) -> bytes:
+        """The PNG; the source is read again for the points of some frames."""
+        ways = {id: np.array(places) for id, places in self._ways.items()}
+        boxes = [
+            Box(center=way[-1], size=np.array([0.8, 0.8, 1.8]), yaw=self._yaws.get(id, 0.0), id=id)
+            for id, way in ways.items()
+            if id is not None
+        ]
+        people = f"{len(boxes)} tracks" if boxes or None not in ways else f"{len(ways[None]):,} people"
+        panel = ScanPanel(
+            points=self._points(source),
+            boxes=boxes,
+            tracks=[way for id, way in ways.items() if id is not None],
+            places=ways.get(None),
+            label=f"{people} in {len(self._frames):,} frames",
+            sensor=self._to_fixed[-1][:2, 3].tolist() if self._to_fixed else None,
+        )
+        return draw_scans([panel], title=title)
+
+    def _points(self, source: Source) -> np.ndarray:
+        """(n, 3) m of frames from the beginning to the end; of one where the sensor stays."""
+        if not self._frames:
+            return np.zeros((0, 3))
+        count = 1 if self._world is None else min(_FRAMES, len(self._frames))
+        clouds = []
+        for row in np.linspace(len(self._frames) - 1, 0, count).astype(int).tolist():
+            frame = next(source.frames(self._frames[row]), None)
+            if isinstance(frame, Frame):
+                T = self._to_fixed[row]
+                clouds.append(frame.points @ T[:3, :3].T + T[:3, 3])
+        return np.concatenate(clouds) if clouds else np.zeros((0, 3))

@@ -1,0 +1,354 @@
+"""Folders and recordings: people of every frame, their tracks, and files that grow and go on after a kill."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pandas
+import pytest
+
+import lidarpose
+from lidarpose import Box, InputError
+from lidarpose.cli import main
+from lidarpose.geometry import rotation_about
+from lidarpose.inference import predictor
+from lidarpose.io.sources.frame import Frame, FrameSource, IndexedRecording, Sweep
+from lidarpose.lidar.raycast import scan
+from lidarpose.recording import output
+from lidarpose.recording.frame_boxes import FrameBoxes
+from lidarpose.recording.predict_recording import FramePredictor
+from lidarpose.synth.bodies import draw_bodies
+from lidarpose.synth.environment.mesh import Mesh, quad, union
+
+FRAMES, DAMAGED = 7, 4
+# where two people stand in the first frame, and how far they go in each, m
+PLACES, STEPS = np.array([[4.0, 1.5], [3.0, -3.0]]), np.array([[0.1, 0.0], [0.0, 0.08]])
+
+
+@pytest.fixture(scope="module")
+def clouds():
+    """Points (n, 3) m of each frame: two people on flat ground about a VLP-32C."""
+    sensor = lidarpose.sensor("vlp-32c")
+    bodies = draw_bodies(None, captured=0.0, count=12, seed=1, block=0, moving=False)
+    standing = [i for i, kind in enumerate(bodies.kinds) if kind in ("stand", "idle", "walk")][:2]
+    floor = quad(30.0, np.zeros(2)).moved((0.0, 0.0, -sensor.height))
+    frames = []
+    for k in range(FRAMES):
+        feet = np.column_stack([PLACES + k * STEPS, [-sensor.height] * 2])
+        people = [Mesh(bodies.vertices[i], bodies.faces).moved(at) for i, at in zip(standing, feet, strict=True)]
+        everything = union([*people, floor])
+        frames.append(scan(everything.vertices, everything.faces, sensor).points)
+    return frames
+
+
+@pytest.fixture(scope="module")
+def drive(clouds, tmp_path_factory):
+    """A folder of the frames, of which one is damaged."""
+    folder = tmp_path_factory.mktemp("recordings") / "drive"
+    folder.mkdir()
+    for k, points in enumerate(clouds):
+        np.save(folder / f"frame_{k + 5}.npy", points)
+    (folder / f"frame_{DAMAGED + 5}.npy").write_bytes(b"not an array")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def model():
+    return lidarpose.load("tiny", tta=1)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_model(model):
+    """The same loaded network for every command."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(predictor, "load", lambda *_, **__: model)
+        yield
+
+
+@pytest.fixture(scope="module")
+def folder(drive):
+    return drive.parent
+
+
+@pytest.fixture(scope="module")
+def tracked(drive, folder):
+    """The lines of the folder with tracks, made in one go, and the file."""
+    return run(drive, "--track", "--out", folder / "whole.jsonl"), folder / "whole.jsonl"
+
+
+def run(*words, status=0):
+    """Runs `lidarpose predict` and returns the lines of the file after --out."""
+    words = [str(word) for word in ("predict", *words)]
+    assert main([*words, "--quiet"]) == status
+    path = words[words.index("--out") + 1]
+    return [json.loads(line) for line in open(path, "rb")] if status == 0 else None
+
+
+def places(line):
+    """By track where people are: the mean of their joints, (3,) m."""
+    return {person["track"]: np.mean(person["joints"], 0) for person in line["people"] if person["joints"]}
+
+
+def test_a_line_a_frame_in_the_order_of_numbers(tracked):
+    lines, _ = tracked
+    assert [line["frame"] for line in lines] == list(range(FRAMES))
+    assert [line["id"] for line in lines] == [f"frame_{k + 5}" for k in range(FRAMES)]
+    assert [line["time"] for line in lines] == pytest.approx(np.arange(FRAMES) / 10)
+    own = {"frame", "id", "time", "T_world_sensor", "error", "people", "skeleton", "model", "source", "unit"}
+    assert all(own <= set(line) and "timing_ms" not in line for line in lines)
+    assert lines[DAMAGED]["people"] == [] and ".npy" in lines[DAMAGED]["error"]
+
+
+def test_people_keep_their_tracks_and_go_their_ways(tracked):
+    lines = [line for k, line in enumerate(tracked[0]) if k != DAMAGED]
+    assert [set(places(line)) for line in lines] == [{0, 1}] * len(lines)
+    first, last = places(lines[0]), places(lines[-1])
+    for at, step in zip(PLACES, STEPS, strict=True):
+        track = min(first, key=lambda id: np.hypot(*(first[id][:2] - at)))
+        moved = (last[track] - first[track])[:2]
+        assert np.hypot(*(first[track][:2] - at)) < 0.25 and np.hypot(*(moved - step * (FRAMES - 1))) < 0.1
+    for person in (person for line in lines for person in line["people"]):
+        assert person["id"] == person["track"] and person["filled"] is False
+        assert len(person["joints"]) == len(person["spread"]) == 24 and person["num_points"] > 50
+
+
+def test_without_tracks_a_frame_is_what_its_file_alone_is(drive, folder, clouds, model):
+    lines = run(drive, "--every", 3, "--end", 0.4, "--out", folder / "plain.jsonl")
+    assert [line["frame"] for line in lines] == [0, 3]
+    alone = lidarpose.predict(drive / "frame_8.npy", model=model).to_dict()
+    assert [person | {"track": None, "filled": False} for person in alone["people"]] == lines[1]["people"]
+    assert lines[1]["people"][0]["score"] > 0.8
+
+
+@pytest.mark.parametrize("flag", ["--track", "--live"])
+def test_a_killed_command_goes_on_and_ends_the_same(flag, drive, folder, tracked, monkeypatch, capsys):
+    words, path = (drive, flag, "--out", folder / f"killed{flag}.jsonl"), folder / f"killed{flag}.jsonl.part"
+    whole = tracked[1] if flag == "--track" else folder / "live.jsonl"
+    if flag == "--live":
+        run(drive, flag, "--out", whole)
+    predict, posed = FramePredictor.predict, []
+
+    def killed(self, frame):
+        if len(posed) == 3:
+            raise KeyboardInterrupt
+        posed.append(frame.index)
+        return predict(self, frame)
+
+    monkeypatch.setattr(FramePredictor, "predict", killed)
+    run(*words, status=130)
+    # a torn line, and one that is whole but that the predictor's state does not know
+    with open(path, "ab") as file:
+        file.write(path.read_bytes().splitlines()[0] + b'\n{"schema": "lidar')
+    assert not (folder / f"killed{flag}.jsonl").exists()
+    monkeypatch.setattr(
+        FramePredictor, "predict", lambda self, frame: posed.append(frame.index) or predict(self, frame)
+    )
+    run(*words)
+    assert posed == list(range(FRAMES))
+    assert (folder / f"killed{flag}.jsonl").read_bytes() == whole.read_bytes()
+    assert not list(folder.glob("killed*.part*"))
+
+
+def test_lines_of_another_command_are_not_gone_on_with(drive, folder, monkeypatch, capsys):
+    def stop(self, frame):
+        raise KeyboardInterrupt
+
+    out = folder / "other.jsonl"
+    with monkeypatch.context() as patch:
+        predict = FramePredictor.predict
+        patch.setattr(FramePredictor, "predict", lambda self, f: stop(self, f) if f.index else predict(self, f))
+        run(drive, "--end", 0.2, "--out", out, status=130)
+    assert main(["predict", str(drive), "--end", "0.2", "--max-people", "1", "--out", str(out)]) == 0
+    assert "of another command (max_people): beginning anew" in capsys.readouterr().err
+    assert [len(json.loads(line)["people"]) for line in open(out)] == [1, 1, 1]
+
+
+def test_finished_lines_of_other_frames_are_an_error(drive, folder, monkeypatch, tmp_path, capsys):
+    part = output.PartFile(tmp_path / "a.jsonl", {})
+    steps = FramePredictor(crop=True, model=lidarpose.load("tiny", tta=1))
+    frame = Frame(points=np.ones((9, 3)), index=0, id="gone", time=0.0)
+    part.append(steps.predict(frame), steps.state())
+    recording = IndexedRecording(name="made", ids=["here"], times=None, read=lambda i: Sweep(points=np.ones((9, 3))))
+    with pytest.raises(InputError, match=r"a.jsonl.part: was made of other frames, the last one gone: remove it"):
+        output.write_recording(FrameSource(recording), steps, tmp_path / "a.jsonl", command={})
+
+
+def test_csv_and_parquet_have_a_row_a_person_and_joint(tracked, tmp_path):
+    pytest.importorskip("pyarrow")
+    lines, _ = tracked
+    tables = []
+    for name, read in (("a.csv", pandas.read_csv), ("a.parquet", pandas.read_parquet)):
+        output.write_result(tmp_path / name, lines)
+        tables.append(read(tmp_path / name))
+    csv, parquet = tables
+    people = [(line, person) for line in lines for person in line["people"]]
+    assert len(csv) == len(parquet) == 24 * len(people)
+    line, person = people[-1]
+    row = parquet.iloc[-24]
+    assert (row.frame, row.frame_id, row.track, row.joint) == (line["frame"], line["id"], person["track"], "pelvis")
+    assert [row.x, row.y, row.z] == person["joints"][0] and row.spread == person["spread"][0]
+    np.testing.assert_allclose(csv[["x", "y", "z", "confidence"]], parquet[["x", "y", "z", "confidence"]])
+    # nobody in all frames: the columns are there
+    output.write_result(tmp_path / "none.parquet", [line | {"people": []} for line in lines])
+    none = pandas.read_parquet(tmp_path / "none.parquet")
+    assert len(none) == 0 and list(none.columns) == list(parquet.columns) and none.dtypes.equals(parquet.dtypes)
+
+
+# ---- in Python
+
+
+def moving_source(clouds, boxes=None):
+    """The frames as of a sensor that goes and turns, whose pose is known."""
+    poses = []
+    for k in range(len(clouds)):
+        T_world_sensor = np.eye(4)
+        T_world_sensor[:3, :3] = rotation_about("z", 0.3 * k)
+        T_world_sensor[:3, 3] = [100 + k, -50.0, 2.0]
+        poses.append(T_world_sensor)
+
+    def read(i):
+        T = np.linalg.inv(poses[i])
+        points = (clouds[i] + [100.0, -50.0, 2.0]) @ T[:3, :3].T + T[:3, 3]
+        return Sweep(
+            points=points, T_world_sensor=poses[i], origin=(np.array([100.0, -50, 2]) @ T[:3, :3].T + T[:3, 3])
+        )
+
+    ids = [str(k) for k in range(len(clouds))]
+    return FrameSource(IndexedRecording(name="moving", ids=ids, times=np.arange(len(clouds)) / 10, read=read))
+
+
+def test_tracks_of_a_moving_sensor_live_in_the_world(clouds, model):
+    frames = list(lidarpose.predict_recording(moving_source(clouds), track=True, model=model))
+    assert [{person.id for person in frame.poses} for frame in frames] == [{0, 1}] * FRAMES
+    first = {person.id: person.joints.mean(0) for person in frames[0].poses}
+    for frame in frames:
+        line = output.in_world(frame.to_dict())
+        assert line["coordinates"] == "world"
+        for track, at in places(line).items():
+            start = first[track] @ frames[0].T_world_sensor[:3, :3].T + frames[0].T_world_sensor[:3, 3]
+            assert np.hypot(*(at - start)[:2]) < 0.1 * FRAMES + 0.2
+
+
+def test_known_people_are_not_verified_again_and_keep_their_score(clouds, model, monkeypatch):
+    from lidarpose.inference import detection
+
+    posed = []
+    verify = detection._posed
+    monkeypatch.setattr(
+        detection, "_posed", lambda d, chosen, *rest: posed.append(len(chosen)) or verify(d, chosen, *rest)
+    )
+    frames = list(lidarpose.predict_recording(moving_source(clouds), track=True, model=model))
+    # a place beside them once
+    assert posed[0] >= 2 and sum(posed[2:]) <= 1
+    scores = [{person.id: person.score for person in frame.poses} for frame in frames]
+    assert all(line == scores[-1] for line in scores[2:])
+
+
+def test_a_folder_of_crops_is_one_person(clouds, folder, model):
+    crops = folder / "crops"
+    crops.mkdir()
+    for k, points in enumerate(clouds):
+        feet = PLACES[0] + k * STEPS[0]
+        np.save(crops / f"{k}.npy", points[(np.abs(points[:, :2] - feet) < 0.7).all(1)])
+    lines = run(crops, "--crop", "--track", "--out", folder / "crops.jsonl")
+    assert [[person["track"] for person in line["people"]] for line in lines] == [[0]] * FRAMES
+    way = np.array([places(line)[0] for line in lines])
+    assert np.linalg.norm(np.diff(way, axis=0) - [*STEPS[0], 0], axis=1).max() < 0.05
+    # without --crop the first frame tells
+    frame = next(lidarpose.predict_recording(crops, model=model))
+    assert [person.box for person in frame.poses] == [None]
+
+
+def test_people_hidden_for_a_while_are_filled_in(clouds, folder, model, monkeypatch):
+    boxes = {}
+    for k in range(FRAMES):
+        at = PLACES + k * STEPS
+        people = [{"center": [*place, -0.9], "size": [1, 1, 2.1]} for place in at]
+        boxes[k] = people[:1] if 2 <= k < 5 else people
+    source = moving_source(clouds)
+    still = FrameSource(replace(source.recording, read=lambda i: Sweep(points=clouds[i])))
+    steps = FramePredictor(boxes=boxes, track=True, model=model)
+    output.write_recording(still, steps, folder / "filled.jsonl", command={})
+    lines = [json.loads(line) for line in open(folder / "filled.jsonl")]
+    assert [[person["filled"] for person in line["people"]] for line in lines[1:6]] == [
+        [False, False], [False, True], [False, True], [False, True], [False, False]
+    ]  # fmt: skip
+    hidden = lines[3]["people"][1]
+    assert hidden["box"] is None and hidden["num_points"] == 0
+    assert np.hypot(*(np.mean(hidden["joints"], 0)[:2] - PLACES[1] - 3 * STEPS[1])) < 0.25
+    assert len(hidden["spread"]) == 24 and np.mean(hidden["visible"]) == 0
+
+
+# ---- boxes of many frames
+
+
+@pytest.mark.parametrize("form", ["folder", "list", "lines"])
+def test_boxes_of_frames_are_read_by_name_or_number(form, tmp_path):
+    people = [{"center": [1, 2, 3], "size": [1, 1, 2]}]
+    entries = [{"frame": 0, "people": []}, {"frame": "b", "people": people}]
+    path = tmp_path / "boxes.json"
+    if form == "folder":
+        path = tmp_path / "boxes"
+        path.mkdir()
+        (path / "0.json").write_text(json.dumps({"people": []}))
+        (path / "b.boxes.json").write_text(json.dumps({"people": people}))
+    else:
+        path.write_text("\n".join(map(json.dumps, entries)) if form == "lines" else json.dumps(entries))
+    boxes = FrameBoxes(path)
+    frames = [Frame(points=np.zeros((0, 3)), index=k, id=id) for k, id in enumerate("abc")]
+    assert boxes.of(frames[0]) == [] and boxes.of(frames[2]) is None
+    (box,) = boxes.of(frames[1])
+    assert isinstance(box, Box) and box.center.tolist() == [1, 2, 3]
+    boxes.check_used(frames[2])
+
+
+@pytest.mark.parametrize(
+    "content, problem",
+    [
+        ('{"people": []}', 'expected an entry a frame, {"frame": 0'),
+        ('[{"frame": 1, "people": []}, {"frame": 1, "people": []}]', "got 1 twice"),
+        ("x", "expected JSON or JSON lines"),
+        ("[]", "expected boxes a frame"),
+    ],
+)
+def test_boxes_that_are_not_of_frames(content, problem, drive, tmp_path, capsys):
+    (tmp_path / "b.json").write_text(content)
+    assert main(["predict", str(drive), "--boxes", str(tmp_path / "b.json"), "--out", str(tmp_path / "o.jsonl")]) == 2
+    error = capsys.readouterr().err
+    assert problem in error and "b.json" in error and error.count("\n") == 1
+    assert not list(tmp_path.glob("o.jsonl*"))
+
+
+# ---- the command line
+
+
+def test_the_command_line(drive, folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["predict", f"{drive}/frame_*.npy", "--start", "0.3", "--format", "csv", "--picture", "--track"]) == 0
+    said = capsys.readouterr().err
+    assert "4 frames, 6 people, 2 tracks, 1 damaged -> drive.poses.csv and drive.poses.png" in said
+    assert "warning: 1 damaged, first frame 4 (frame_9): " in said
+    assert {path.name for path in tmp_path.iterdir()} == {"drive.poses.csv", "drive.poses.png"}
+    assert (tmp_path / "drive.poses.png").read_bytes().startswith(b"\x89PNG")
+    assert main(["predict", str(drive), "--end", "0.1", "--live", "--out", "-"]) == 0
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [line["frame"] for line in lines] == [0, 1] and lines[1]["people"][0]["track"] == 0
+
+
+@pytest.mark.parametrize(
+    "words, problem",
+    [
+        (["DRIVE", "DRIVE/.."], "run the command for each folder"),
+        (["DRIVE", "--track", "--out", "-"], "say --live"),
+        (["DRIVE", "--out", "a.json"], "expected a folder or a file .jsonl or .csv or .parquet, got .json"),
+        (["DRIVE", "--crop", "--boxes", "b.json"], "got both"),
+        (["DRIVE", "--every", "0"], "every must be"),
+        (["no*.pcd"], "no file has such a name"),
+    ],
+)
+def test_wrong_commands_are_one_line(words, problem, drive, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["predict", *(word.replace("DRIVE", str(drive)) for word in words)]) == 2
+    error = capsys.readouterr().err
+    assert problem in error and error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
