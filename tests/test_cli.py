@@ -377,7 +377,7 @@ BAD_COMMANDS = {
     "unknown command": ("predikt CROP", "predikt"),
     "no file": ("predict", "FILE"),
     "missing file": ("predict DIR/crob.npy", "did you mean crop.npy"),
-    "a folder": ("predict DIR", "an empty folder"),
+    "a folder": ("detect DIR", "got a folder"),
     "boxes missing": ("predict CROP --boxes DIR/no.json", "no.json: no such file"),
     "boxes a folder": ("predict CROP --boxes DIR", "got a folder"),
     "both": ("predict CROP --crop --boxes BOXES", "got both"),
