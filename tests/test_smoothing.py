@@ -1,6 +1,7 @@
 """Poses steady over a track: the smoother, the live filter, and clips of one person."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from lidarpose.errors import InputError
 from lidarpose.inference.inputs import clip_times
 from lidarpose.inference.predictor import load
 from lidarpose.skeleton import SKELETONS, SMPL24
+from lidarpose.tracking.bones import rigid_bones
 from lidarpose.tracking.clip import TrackPoses
 from lidarpose.tracking.live import LiveFilter, follow
 from lidarpose.tracking.motion_model import smooth_joints
@@ -75,6 +77,41 @@ def test_steady_is_nearer_and_smoother(walker, skeleton):
     assert steady[0] < 0.7 * before[0] and steady[1] < 0.15 * before[1]
     live = error(np.stack([pose.joints for pose in follow(track)]), true)
     assert live[0] < before[0] and live[1] < 0.5 * before[1]
+
+
+@pytest.mark.parametrize("speed", [10.0, -25.0])
+def test_a_sensor_that_moves(walker, speed):
+    """In coordinates that drive along and brake, steady poses are still where the person is."""
+    true, track = walker()
+    way = np.outer(speed * track.times - 0.5 * np.sign(speed) * 2.5 * track.times**2, [1, 0, 0])[:, None]
+    moved = replace(track, joints=track.joints + way)
+    before = error(moved.joints, true + way)
+    steady = error(smooth(moved).joints, true + way)
+    assert steady[0] < 0.8 * before[0] and steady[1] < 0.2 * before[1]
+    live = error(np.stack([pose.joints for pose in follow(moved)]), true + way)
+    assert live[0] < 1.1 * before[0] and live[1] < 0.75 * before[1]
+
+
+@pytest.mark.parametrize("skeleton", SKELETONS.values(), ids=SKELETONS)
+def test_frames_turned_round_are_turned_back(walker, skeleton):
+    true, track = walker(skeleton)
+    joints, spread, confidence = track.joints.copy(), track.spread.copy(), track.confidence.copy()
+    turned = [3, 4, 5, 12, 20, 21, 22, 23, 24, 39]
+    for values in (joints, spread):
+        values[turned] = values[turned][:, list(skeleton.flip)]
+    confidence[turned] = 0.6
+    steady = smooth(replace(track, joints=joints, spread=spread, confidence=confidence))
+    np.testing.assert_allclose(steady.joints, smooth(track).joints, atol=1e-9)
+
+
+@pytest.mark.parametrize("skeleton", SKELETONS.values(), ids=SKELETONS)
+def test_bones_keep_their_length(walker, skeleton):
+    true, track = walker(skeleton)
+    bones = rigid_bones(skeleton)
+    assert len(bones) > 7
+    steady = smooth(track).joints
+    lengths, exact = (np.linalg.norm(j[:, bones[:, 0]] - j[:, bones[:, 1]], axis=-1) for j in (steady, true))
+    assert np.abs(lengths - lengths.mean(0)).max() < 0.005 and np.abs(lengths - exact).mean() < 0.02
 
 
 def test_unseen_frames_are_filled_and_say_so(walker):

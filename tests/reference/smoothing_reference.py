@@ -2,7 +2,7 @@
 
 import numpy as np
 
-ANYWHERE, VELOCITY = 1e4, 1.5
+ANYWHERE, VELOCITY = 1e4, 5.0
 
 
 def smooth_joints_reference(

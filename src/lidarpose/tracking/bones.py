@@ -7,13 +7,13 @@ import numpy as np
 
 from lidarpose.skeleton import BODY26, Skeleton
 
-# rounds over all bones
-_ROUNDS = 10
-# a joint's expected place is pulled towards where it may be elsewhere, which shortens bones: share of the ends' variance
-# that a squared length is short of
+# rounds over all bones, of a track and of a single frame
+_ROUNDS, _LIVE_ROUNDS = 15, 3
+# a joint's expected place is pulled towards where it may be elsewhere, which shortens bones: a squared length lacks so
+# much of the ends' variance
 _SHORT = 0.1
 # frames count by the inverse variance to this power
-_POWER = 1.5
+_POWER = 2.0
 
 
 def rigid_bones(skeleton: Skeleton) -> np.ndarray:
@@ -25,24 +25,29 @@ def rigid_bones(skeleton: Skeleton) -> np.ndarray:
     return np.array([(at[a], at[b]) for a, b in pairs if a in at and b in at], int).reshape(-1, 2)
 
 
-def bone_lengths(joints: np.ndarray, variance: np.ndarray, bones: np.ndarray, flip: np.ndarray) -> np.ndarray:
-    """(E,) m: lengths of bones (E, 2) over frames of joints (T, J, 3) m with variance (T, J) m^2, the same left and
-    right. flip: as in `Skeleton`."""
-    squared = ((joints[:, bones[:, 0]] - joints[:, bones[:, 1]]) ** 2).sum(-1)
-    ends = variance[:, bones[:, 0]] + variance[:, bones[:, 1]]
+def measured(joints: np.ndarray, variance: np.ndarray, bones: np.ndarray) -> np.ndarray:
+    """(..., E, 2) of joints (..., J, 3) m with variance (..., J) m^2: what a frame says of the squared length of each
+    bone (E, 2), times its weight, and the weight. Sums over frames are what `lengths_of` takes."""
+    squared = ((joints[..., bones[:, 0], :] - joints[..., bones[:, 1], :]) ** 2).sum(-1)
+    ends = variance[..., bones[:, 0]] + variance[..., bones[:, 1]]
     weight = ends**-_POWER
-    total = weight.sum(0)
-    lengths = np.sqrt((weight * (squared + _SHORT * ends)).sum(0) / total)
-    sorted_bones = [tuple(sorted(bone)) for bone in bones.tolist()]
-    across = [sorted_bones.index(tuple(sorted(pair))) for pair in flip[bones].tolist()]
-    return (total * lengths + total[across] * lengths[across]) / (total + total[across])
+    return np.stack([weight * (squared + _SHORT * ends), weight], -1)
+
+
+def lengths_of(total: np.ndarray, bones: np.ndarray, flip: tuple[int, ...]) -> np.ndarray:
+    """(E,) m: lengths of bones (E, 2), the same left and right, from a sum (E, 2) of `measured`. flip: as in
+    `Skeleton`."""
+    number = {frozenset(bone): i for i, bone in enumerate(bones.tolist())}
+    across = [number[frozenset((flip[a], flip[b]))] for a, b in bones.tolist()]
+    squared, weight = (total + total[across]).T
+    return np.sqrt(squared / weight)
 
 
 def keep_lengths(joints: np.ndarray, variance: np.ndarray, bones: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     """Joints (..., J, 3) m moved so that bones (E, 2) have lengths (E,) m; those of large variance (..., J) move most
     (position-based dynamics: Mueller et al. 2007)."""
     joints = joints.copy()
-    for _ in range(_ROUNDS):
+    for _ in range(_ROUNDS if joints.ndim > 2 else _LIVE_ROUNDS):
         for (a, b), length in zip(bones.tolist(), lengths, strict=True):
             bone = joints[..., b, :] - joints[..., a, :]
             now = np.maximum(np.linalg.norm(bone, axis=-1), 1e-6)

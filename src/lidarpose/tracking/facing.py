@@ -10,12 +10,14 @@ import numpy as np
 
 from lidarpose.skeleton import Skeleton
 
-# log odds that a frame is the right way round, by the mean confidence of its joints: of none, and of full confidence
-_UNSURE, _SURE = 0.0, 6.0
+# log odds that a frame is the right way round, times the mean confidence of its joints
+_SURE = 6.0
 # what confidence is taken for where the network does not say
 _CONFIDENCE = 0.6
 # cost of a frame turned round against the one before
 _TURN = 10.0
+# what is across the body
+_ACROSS = ("hip", "shoulder")
 # log odds for walking forwards rather than backwards, at most, and the speed of half as much, m/s
 _FORWARD, _WALK = 0.3, 0.7
 
@@ -28,21 +30,18 @@ def exchanged(
     times (T,) s; joints (T, J, 3) m, all seen; variance (T, J) m^2; confidence (T, J) or None.
     """
     flip = np.array(skeleton.flip)
-    paired = np.flatnonzero(flip != np.arange(len(flip)))
-    if not len(paired):
-        return np.zeros(len(times), bool)
     sure = np.full(len(times), _CONFIDENCE) if confidence is None else confidence.mean(1)
-    cost = np.zeros((len(times), 2))
-    cost[:, 1] = _UNSURE + (_SURE - _UNSURE) * sure + forward_odds(times, joints, skeleton)
-    alike = _alike((joints - joints[:, flip])[:, paired], (variance + variance[:, flip])[:, paired])
-    best, came = cost[0], np.zeros((len(times), 2), int)
+    odds = _SURE * sure + _forward_odds(times, joints, skeleton)
+    # joints in the middle are their own mirror: nothing is across
+    alike = _alike(joints - joints[:, flip], variance + variance[:, flip])
+    costs, came = np.array([0.0, odds[0]]), np.zeros((len(times), 2), int)
     for row in range(1, len(times)):
         # [before, now]
-        total = best[:, None] + _TURN * alike[row - 1] * (1 - np.eye(2))
+        total = costs[:, None] + _TURN * alike[row - 1] * (1 - np.eye(2))
         came[row] = total.argmin(0)
-        best = total.min(0) + cost[row]
-    chosen = np.empty(len(times), bool)
-    state = int(best.argmin())
+        costs = total.min(0) + [0, odds[row]]
+    chosen = np.zeros(len(times), bool)
+    state = int(costs.argmin())
     for row in range(len(times))[::-1]:
         chosen[row] = state
         state = came[row, state]
@@ -50,25 +49,19 @@ def exchanged(
 
 
 def _alike(across: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """(T - 1,) in [-1, 1]: how far the ways from right to left joints (T, P, 3) are those of the frame before."""
+    """(T - 1,) in [-1, 1]: how far the ways from right to left joints (T, J, 3) m are those of the frame before."""
     weight = 1 / np.sqrt(variance[1:] * variance[:-1])
     product = (weight * (across[1:] * across[:-1]).sum(-1)).sum(-1)
     before, now = ((weight * (part**2).sum(-1)).sum(-1) for part in (across[:-1], across[1:]))
     return product / np.maximum(np.sqrt(before * now), 1e-12)
 
 
-def forward_odds(times: np.ndarray, joints: np.ndarray, skeleton: Skeleton) -> np.ndarray:
+def _forward_odds(times: np.ndarray, joints: np.ndarray, skeleton: Skeleton) -> np.ndarray:
     """(T,) log odds that a frame is the right way round, from where the person goes."""
-    pairs = [
-        (skeleton.index(f"left_{name}"), skeleton.index(f"right_{name}"))
-        for name in ("hip", "shoulder")
-        if f"left_{name}" in skeleton.joints and f"right_{name}" in skeleton.joints
-    ]
+    pairs = [(name, f"right_{part}") for name in skeleton.joints if (part := name.removeprefix("left_")) in _ACROSS]
     if not pairs or len(times) < 2:
         return np.zeros(len(times))
-    left = sum(joints[:, a, :2] - joints[:, b, :2] for a, b in pairs)
-    ahead = np.stack([left[:, 1], -left[:, 0]], 1)
-    ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-6)
+    x, y = sum(joints[:, skeleton.index(a), :2] - joints[:, skeleton.index(b), :2] for a, b in pairs).T
     velocity = np.gradient(np.median(joints[..., :2], 1), times, axis=0)
-    speed = (velocity * ahead).sum(1)
+    speed = (velocity[:, 0] * y - velocity[:, 1] * x) / np.maximum(np.hypot(x, y), 1e-6)
     return _FORWARD * speed / np.hypot(speed, _WALK)

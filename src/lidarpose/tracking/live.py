@@ -8,74 +8,94 @@ import numpy as np
 from lidarpose.sample import Pose
 from lidarpose.skeleton import Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
+from lidarpose.tracking.bones import keep_lengths, lengths_of, measured, rigid_bones
 from lidarpose.tracking.clip import TrackPoses
 from lidarpose.tracking.motion_model import SCALES, Belief, odds_after, shared, strengths
-from lidarpose.tracking.smoothing import MAX_GAP, frame_weights, known_spread, likely_hit, precisions, steady_spread
+from lidarpose.tracking.smoothing import (
+    LEAST_FRAMES,
+    MAX_GAP,
+    frame_weights,
+    known_spread,
+    likely_hit,
+    precisions,
+    steady_spread,
+)
 
-_BELIEF = ("position", "velocity", "variance", "covariance", "velocity_variance")
+# how fast joints are expected to move at first, standard deviation m/s, which steadies the first frames
+_SPEED = 1.0
+# degrees of freedom by which frames are trusted: what is new may be true
+_FREEDOM = 2.0
 
 
 class LiveFilter:
     """One person's poses, made steady frame by frame: `update` takes a frame's pose and gives the steady one.
 
-    The model is that of `smooth`, of which this is the half that looks back. skeleton: of all the poses.
+    The model is that of `smooth`, of which this is the half that looks back; only a frame that is turned round is not
+    turned back, but hardly counts. skeleton: of all the poses.
     """
 
     def __init__(self, skeleton: Skeleton):
         self.skeleton = skeleton
-        self._usual = strengths(skeleton)
+        self._usual, self._bones = strengths(skeleton), rigid_bones(skeleton)
         self._time: float | None = None
         self._seen: float | None = None
-        self._origin = np.zeros(3)
-        self._belief = Belief.unknown((len(SCALES), len(skeleton)))
-        self._certainty, self._frames = np.zeros(len(skeleton)), 0
-        self._odds = np.full((len(SCALES), len(skeleton)), 1 / len(SCALES))
+        self._frames = 0
+        self._arrays = {
+            "origin": np.zeros(3),
+            "odds": np.full((len(SCALES), len(skeleton)), 1 / len(SCALES)),
+            "certainty": np.zeros(len(skeleton)),
+            "bones": np.zeros((len(self._bones), 2)),
+        }
+        self._belief = Belief.unknown((len(SCALES), len(skeleton)), _SPEED)
 
     def update(self, time: float, pose: Pose | None) -> Pose | None:
         """The steady pose at `time` s, later than the last one's; pose: as predicted, None where the person was not
         seen. None before the first pose, and once nothing was seen for `MAX_GAP` s."""
         step = 0.0 if self._time is None else time - self._time
-        self._time = time
-        if self._seen is None:
-            if pose is None:
-                return None
-            self._origin = pose.joints.mean(0)
-        elif time - self._seen > MAX_GAP:
+        if self._seen is not None and time - self._seen > MAX_GAP:
             # whoever comes back may be anywhere
             self.__init__(self.skeleton)  # type: ignore[misc]
-            return self.update(time, pose)
-        forecast = self._belief.predicted(step, SCALES[:, None] * self._usual)
+            step = 0.0
+        self._time = time
         if pose is None:
-            self._belief = forecast
+            if self._seen is None:
+                return None
+            self._belief = self._belief.predicted(step, SCALES[:, None] * self._usual)
             joints, spread = self._estimate()
-            return Pose(
-                joints=joints,
-                skeleton=self.skeleton,
-                spread=spread,
-                confidence=likely_hit(spread),
-                visible=np.zeros(len(spread)),
-            )
-        joints = pose.joints - self._origin
+            unseen = {"confidence": likely_hit(spread), "visible": np.zeros(len(spread))}
+            return Pose(joints=joints, skeleton=self.skeleton, spread=spread, **unseen)
+        if self._seen is None:
+            self._arrays["origin"] = pose.joints.mean(0)
         given = None if pose.spread is None else pose.spread[None]
         spread = known_spread(given, np.ones(1, bool), len(self._usual))[0]
-        precision = precisions(spread)
-        if self._seen is not None:
-            mean = (self._odds[..., None] * forecast.position).sum(0)
-            variance = (self._odds * forecast.variance).sum(0)
-            precision = precision * frame_weights(joints - mean, 1 / (1 / precision + variance))
-        self._belief, likelihood = forecast.updated(joints, precision)
-        self._odds = odds_after(self._odds, step, shared(likelihood))
+        self._add(step, pose.joints - self._arrays["origin"], spread)
         self._seen = time
-        self._certainty = self._certainty + spread**-2
-        self._frames += 1
         joints, spread = self._estimate()
         return replace(pose, joints=joints, spread=spread)
 
+    def _add(self, step: float, joints: np.ndarray, spread: np.ndarray) -> None:
+        """Learns from a frame's joints (J, 3) m about the origin and their spread (J,) m."""
+        arrays, precision = self._arrays, precisions(spread)
+        forecast = self._belief.predicted(step, SCALES[:, None] * self._usual)
+        if self._frames >= LEAST_FRAMES:
+            mean = (arrays["odds"][..., None] * forecast.position).sum(0)
+            variance = (arrays["odds"] * forecast.variance).sum(0)
+            precision = precision * frame_weights(joints - mean, 1 / (1 / precision + variance), _FREEDOM)
+        self._belief, likelihood = forecast.updated(joints, precision)
+        arrays["odds"] = odds_after(arrays["odds"], step, shared(likelihood))
+        arrays["certainty"] = arrays["certainty"] + spread**-2
+        arrays["bones"] = arrays["bones"] + measured(joints, spread**2, self._bones)
+        self._frames += 1
+
     def _estimate(self) -> tuple[np.ndarray, np.ndarray]:
         """Joints (J, 3) m and their spread (J,) m."""
-        mean = (self._odds[..., None] * self._belief.position).sum(0)
-        variance = (self._odds * self._belief.variance).sum(0)
-        return mean + self._origin, steady_spread(variance, self._certainty / self._frames)
+        odds = self._arrays["odds"]
+        mean = (odds[..., None] * self._belief.position).sum(0)
+        variance = (odds * self._belief.variance).sum(0)
+        if self._frames >= LEAST_FRAMES and len(self._bones):
+            lengths = lengths_of(self._arrays["bones"], self._bones, self.skeleton.flip)
+            mean = keep_lengths(mean, variance, self._bones, lengths)
+        return mean + self._arrays["origin"], steady_spread(variance, self._arrays["certainty"] / self._frames)
 
     def state(self) -> dict[str, Any]:
         """All it knows as JSON holds it; `from_state` goes on from there."""
@@ -83,21 +103,18 @@ class LiveFilter:
             "skeleton": self.skeleton.name,
             "time": self._time,
             "seen": self._seen,
-            "origin": self._origin.tolist(),
-            "odds": self._odds.tolist(),
-            "certainty": self._certainty.tolist(),
             "frames": self._frames,
-            **{name: getattr(self._belief, name).tolist() for name in _BELIEF},
+            "arrays": {name: value.tolist() for name, value in self._arrays.items()},
+            "belief": {name: value.tolist() for name, value in vars(self._belief).items()},
         }
 
     @classmethod
     def from_state(cls, state: dict[str, Any], skeleton: Skeleton | None = None) -> "LiveFilter":
         """The filter of a `state`; skeleton: only where it is none of lidarpose's own."""
         live = cls(skeleton_of(state["skeleton"]) if skeleton is None else skeleton)
-        live._time, live._seen = state["time"], state["seen"]
-        live._origin, live._odds = np.array(state["origin"]), np.array(state["odds"])
-        live._certainty, live._frames = np.array(state["certainty"]), state["frames"]
-        live._belief = Belief(**{name: np.array(state[name]) for name in _BELIEF})
+        live._time, live._seen, live._frames = state["time"], state["seen"], state["frames"]
+        live._arrays = {name: np.array(value) for name, value in state["arrays"].items()}
+        live._belief = Belief(**{name: np.array(value) for name, value in state["belief"].items()})
         return live
 
 

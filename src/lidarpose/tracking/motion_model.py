@@ -21,8 +21,8 @@ SCALES = 10.0 ** np.arange(-2.0, 2.1, 0.5)
 _SCALE_TIME = 20.0
 # how far a joint's scale is that of the whole body: the weight of the other joints' evidence
 _SHARED = 0.05
-# before the first frame a velocity may be anything a person's is, standard deviation m/s
-_VELOCITY = 1.5
+# standard deviation of velocities before the first frame, m/s: anything, where the frames to come will tell
+_ANY_SPEED = 5.0
 # a position that is not known, variance m^2
 _ANYWHERE = 1e4
 
@@ -45,10 +45,11 @@ class Belief:
     velocity_variance: np.ndarray
 
     @classmethod
-    def unknown(cls, shape: tuple[int, ...]) -> "Belief":
+    def unknown(cls, shape: tuple[int, ...], speed: float = _ANY_SPEED) -> "Belief":
+        """Of joints that may be anywhere, moving about that fast, m/s."""
         zeros = np.zeros(shape)
         vector = np.zeros((*shape, 3))
-        return cls(vector, vector, zeros + _ANYWHERE, zeros, zeros + _VELOCITY**2)
+        return cls(vector, vector, zeros + _ANYWHERE, zeros, zeros + speed**2)
 
     def predicted(self, step: float, strength: np.ndarray) -> "Belief":
         """`step` s later."""

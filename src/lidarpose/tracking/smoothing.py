@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from lidarpose.sample import CONFIDENCE_RADIUS
-from lidarpose.tracking.bones import bone_lengths, keep_lengths, rigid_bones
+from lidarpose.tracking.bones import keep_lengths, lengths_of, measured, rigid_bones
 from lidarpose.tracking.clip import TrackPoses
 from lidarpose.tracking.facing import exchanged
 from lidarpose.tracking.motion_model import learn_strength, smooth_joints, strengths
@@ -22,7 +22,7 @@ _USUAL_SPREAD = 0.06
 # so much of the deviation along a path, and of the frames' spread, is the spread of a steady joint
 _PATH, _COMMON = 2.5, 0.8
 # bones are not measured in fewer frames
-_LEAST_FRAMES = 3
+LEAST_FRAMES = 3
 # longer gaps, and what is before and after a track, are filled in next to seen frames only, s
 MAX_GAP, _MAX_BEYOND = 2.0, 0.5
 
@@ -51,8 +51,8 @@ def smooth(track: TrackPoses) -> TrackPoses:
         path, variance = smooth_joints(times, joints, precision * weight, strength)
         weight = frame_weights(path - joints, precision)
     bones = rigid_bones(track.skeleton)
-    if seen.sum() >= _LEAST_FRAMES and len(bones):
-        lengths = bone_lengths(joints[seen], 1 / precision[seen], bones, np.array(track.skeleton.flip))
+    if seen.sum() >= LEAST_FRAMES and len(bones):
+        lengths = lengths_of(measured(joints[seen], spread[seen] ** 2, bones).sum(0), bones, track.skeleton.flip)
         path = keep_lengths(path, variance, bones, lengths)
     return filled_in(track, path + origin, steady_spread(variance, (spread**-2).sum(0) / seen.sum()))
 
@@ -92,10 +92,10 @@ def settled(track: TrackPoses) -> TrackPoses:
     return replace(track, **values)
 
 
-def frame_weights(offset: np.ndarray, precision: np.ndarray) -> np.ndarray:
+def frame_weights(offset: np.ndarray, precision: np.ndarray, freedom: float = _FREEDOM) -> np.ndarray:
     """(..., 1): how far a frame is trusted whose joints are off by (..., J, 3) m with precision (..., J) 1/m^2."""
     off = ((offset**2).sum(-1) * precision).mean(-1, keepdims=True)
-    return (_FREEDOM + 3) / (_FREEDOM + off)
+    return (freedom + 3) / (freedom + off)
 
 
 def likely_hit(spread: np.ndarray) -> np.ndarray:
