@@ -5,7 +5,9 @@ returns the first one of each pixel is taken.
 """
 
 import json
+from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -178,9 +180,10 @@ class OusterFormat:
         # of packets that came twice, once
         ids, first = np.unique(columns["id"], return_index=True)
         ranges = (columns["pixels"]["range"][first] & self.mask).astype(np.int64) * self.unit
-        column, beam = np.nonzero(ranges)
+        (returns,) = np.nonzero(ranges.ravel())
+        column, beam = np.divmod(returns, self.beams)
         points = self.directions[ids[column], beam]
-        points *= (ranges[column, beam] - self.reach)[:, None]
+        points *= (ranges.ravel()[returns] - self.reach)[:, None]
         points += self.starts[ids[column]]
         lost = self.num_columns() - len(ids)
         warnings = (f"{lost} of {self.num_columns()} columns are missing",) if lost > 0 else ()
@@ -211,16 +214,18 @@ class OusterRecording:
 
     def _find_flow(self) -> tuple[bytes, int]:
         """Whose packets are read: those to the port that the metadata names, else the first."""
-        sizes: dict[int, int] = {}
+        sizes: Counter[int] = Counter()
         flow = None
-        for k, datagram in enumerate(self.capture):
-            sizes[len(datagram.payload)] = sizes.get(len(datagram.payload), 0) + 1
-            if self._is_lidar(datagram):
-                flow = flow or datagram.flow
-                if datagram.flow[1] == self.format.port:
-                    return datagram.flow
-            if flow and (k >= _NUM_PEEKED or not self.format.port):
-                break
+        # a capture that is cut off tells so at its end
+        with suppress(InputError):
+            for k, datagram in enumerate(self.capture):
+                sizes[len(datagram.payload)] += 1
+                if self._is_lidar(datagram):
+                    flow = flow or datagram.flow
+                    if datagram.flow[1] == self.format.port:
+                        return datagram.flow
+                if flow and (k >= _NUM_PEEKED or not self.format.port):
+                    break
         if flow is None:
             size = f"lidar packets of {self.format.packet.itemsize} bytes"
             expected = f"{size} ({self.format.profile}, {self.format.beams} beams, says {self.metadata})"

@@ -35,6 +35,10 @@ _NO_SENSORS = (*_WORLDS, "earth", "base_link", "base_footprint", "base")
 _MAX_GAP = 10**9
 # clouds wait for transforms that are recorded after them: so many, and so long, ns
 _MAX_WAITING, _MAX_WAIT = 16, 10**9
+# m; no sensor is farther from the origin of its world
+_MAX_PLAUSIBLE = 1e9
+# of a quaternion that is a rotation
+_MIN_NORM = 1e-3
 # transforms that are kept of each frame
 _MAX_KEPT = 1000
 
@@ -279,10 +283,11 @@ class TransformTree:
             child, parent = stamped.child_frame_id.lstrip("/"), stamped.header.frame_id.lstrip("/")
             t, q = stamped.transform.translation, stamped.transform.rotation
             placed = np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w])
-            norm = np.linalg.norm(placed[3:])
-            if not np.isfinite(placed).all() or not norm > 0 or child == parent:
+            # NaN is not below
+            is_plausible = np.abs(placed).max() < _MAX_PLAUSIBLE and np.linalg.norm(placed[3:]) > _MIN_NORM
+            if not is_plausible or child == parent:
                 continue
-            placed[3:] /= norm
+            placed[3:] /= np.linalg.norm(placed[3:])
             time = stamped.header.stamp.sec * 10**9 + stamped.header.stamp.nanosec
             known, times, placements = self._edges.get(child, (parent, [], []))
             if is_static or known != parent or not times:
