@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from lidarpose import Box, InputError
 from lidarpose.tracking.assignment import assign, assign_plain
-from lidarpose.tracking.tracker import Tracker
+from lidarpose.tracking.tracker import POSITION_SD, SPEED_CHANGE, SPEED_SD, Tracker
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -169,3 +169,45 @@ def test_weak_boxes_continue_tracks_and_begin_none():
     assert tracker.update(0.2, [person(5, score=0.9)], [person(0.2, score=0.2)]) == [1, 0]
     # what is sure goes before
     assert tracker.update(0.3, [person(0.32, score=0.9)], [person(0.3, score=0.2)]) == [0, -1]
+
+
+def test_places_are_those_of_a_textbook_kalman_filter():
+    rng, tracker = np.random.default_rng(2), Tracker()
+    sd, speed, change = np.diag(POSITION_SD**2), SPEED_SD**2, SPEED_CHANGE**2
+    mean, covariance = None, np.diag([*POSITION_SD**2, *speed])
+    last = 0.0
+    for time in np.cumsum(rng.uniform(0.02, 0.6, 20)):
+        place = np.array([1.2 * time, -0.4 * time, 0.9]) + rng.normal(0, 0.1, 3)
+        assert tracker.update(time, [Box(center=place, size=(1, 1, 2))]) == [0]
+        if mean is None:
+            mean = np.array([*place, 0, 0, 0])
+        else:
+            dt = time - last
+            move = np.eye(6) + dt * np.eye(6, k=3)
+            noise = np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], np.diag(change))
+            mean, covariance = move @ mean, move @ covariance @ move.T + noise
+            gain = covariance[:, :3] @ np.linalg.inv(covariance[:3, :3] + sd)
+            mean, covariance = mean + gain @ (place - mean[:3]), covariance - gain @ covariance[:3]
+        last = time
+        expected = tracker.predicted(time)[0]
+        np.testing.assert_allclose(expected.center, mean[:3], atol=1e-9)
+        assert expected.position_sd == pytest.approx(np.sqrt(covariance[0, 0]))
+
+
+def test_a_weak_box_on_somebody_who_is_seen_is_nobody_else():
+    tracker = Tracker()
+    for time in (0.0, 0.1, 0.2):
+        assert tracker.update(time, [person(0, score=0.9), person(0.7, score=0.9)]) == [0, 1]
+    assert tracker.update(0.3, [person(0, score=0.9)], [person(0.35, score=0.4)]) == [0, -1]
+    assert tracker.update(0.4, [person(0, score=0.9)], [person(0.75, score=0.4)]) == [0, 1]
+
+
+def test_a_doubtful_box_moves_its_person_less():
+    moved = []
+    for score in (1.0, 0.2):
+        tracker = Tracker()
+        for time in (0.0, 0.1, 0.2):
+            tracker.update(time, [person(0)])
+        tracker.update(0.3, [person(0.3, score=score)])
+        moved.append(tracker.predicted(0.3)[0].center[0])
+    assert 0.15 < moved[0] < 0.3 and moved[1] < 0.5 * moved[0]

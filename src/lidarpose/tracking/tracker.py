@@ -16,18 +16,19 @@ from lidarpose.errors import InputError, check_finite
 from lidarpose.sample import Box
 from lidarpose.tracking.assignment import assign
 
-# standard deviation of a box's center, m, along x, y and z: what a detector hides or adds moves the height most
-_POSITION_SD = np.array([0.12, 0.12, 0.2])
+# standard deviation of a sure box's center, m, along x, y and z; its square grows as the score falls, no further than
+# at the least: measured on boxes that are found
+POSITION_SD, _LEAST_SCORE = np.array([0.12, 0.12, 0.2]), 0.05
 # people are first seen with a velocity of this standard deviation, m/s, and change it: m/s in one second, which grows
 # with the square root of time
-_SPEED_SD, _SPEED_CHANGE = np.array([1.2, 1.2, 0.2]), np.array([0.7, 0.7, 0.15])
+SPEED_SD, SPEED_CHANGE = np.array([1.2, 1.2, 0.2]), np.array([0.7, 0.7, 0.15])
 # a box farther from where it is expected belongs to nobody: squared Mahalanobis distance, 99.9 % of a chi-square
 # distribution of three degrees of freedom
 _GATE = 16.3
 # nor does a box go to somebody who may be anywhere: bound of -2 log likelihood, less a constant
 _LEAST_LIKELY = 8.0
-# what more a weak box has to make up for
-_WEAK = 3.0
+# a weak box so near to a sure one is the same person again, m
+_AGAIN = 0.55
 # heading and size follow what is seen with this time constant, s
 _SMOOTHING = 0.5
 # who was seen once, with a score below this, is forgotten this soon, s
@@ -78,7 +79,7 @@ class _Tracks:
         noise = np.array([[seconds**3 / 3, seconds**2 / 2], [seconds**2 / 2, seconds]])
         moved = self.take(np.arange(len(self)))
         moved.state = self.state @ move.T
-        moved.covariance = move @ self.covariance @ move.T + noise * _SPEED_CHANGE[:, None, None] ** 2
+        moved.covariance = move @ self.covariance @ move.T + noise * SPEED_CHANGE[:, None, None] ** 2
         moved.age = self.age + seconds
         return moved
 
@@ -193,8 +194,8 @@ def _of_boxes(boxes: Sequence[Box]) -> _Tracks:
     yaw = np.array([box.yaw for box in boxes], float)
     scores = np.array([1.0 if box.score is None else box.score for box in boxes])
     covariance = np.zeros((count, 3, 2, 2))
-    covariance[..., 0, 0] = _POSITION_SD**2
-    covariance[..., 1, 1] = _SPEED_SD**2
+    covariance[..., 0, 0] = POSITION_SD**2 / np.maximum(scores, _LEAST_SCORE)[:, None]
+    covariance[..., 1, 1] = SPEED_SD**2
     return _Tracks(
         id=np.full(count, -1),
         state=state,
@@ -212,7 +213,10 @@ def _costs(tracks: _Tracks, found: _Tracks, is_weak: np.ndarray) -> np.ndarray:
     off = found.state[None, :, :, 0] - tracks.state[:, None, :, 0]
     variance = tracks.covariance[:, None, :, 0, 0] + found.covariance[None, :, :, 0, 0]
     distance = (off**2 / variance).sum(-1)
-    cost = distance + np.log(variance).sum(-1) - _LEAST_LIKELY + _WEAK * is_weak
+    # a weak box beside a sure one is the same person again
+    apart = np.linalg.norm(found.state[:, None, :2, 0] - found.state[~is_weak][None, :, :2, 0], axis=-1)
+    distance[:, is_weak & (apart < _AGAIN).any(1)] = np.inf
+    cost = distance + np.log(variance).sum(-1) - _LEAST_LIKELY
     return np.where((distance < _GATE) & (cost < 0), cost, np.inf)
 
 
