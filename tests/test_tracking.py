@@ -131,6 +131,10 @@ def test_a_doubtful_box_is_expected_again_only_when_seen_twice():
     assert [state.id for state in tracker.predicted(0.1)] == [1, 2]
     assert tracker.update(0.1, [person(0, score=0.3)]) == [0]
     assert [state.id for state in tracker.predicted(0.2)] == [0, 1, 2]
+    # once more: after a second, at one frame a second or with frames between
+    assert tracker.update(1.1, [person(-6, score=0.3)]) == [3]
+    assert tracker.update(2.1, [person(-6, score=0.3), person(-12, score=0.3)]) == [3, 4]
+    assert tracker.update(2.6, []) == [] and tracker.update(3.1, [person(-12, score=0.3)]) == [5]
 
 
 # ---- times and states
@@ -144,6 +148,9 @@ def test_time_that_jumps_back_is_counted():
     # a second recording
     assert tracker.update(-60.0, [person(0.3)]) == [1] and tracker.jumps_back == 2
     assert tracker.update(-59.9, [person(0.3)]) == [1]
+    # as far as numbers go
+    assert tracker.update(1e308, [person(0.3)]) == [2] and tracker.predicted(-1e308)[0].id == 2
+    assert tracker.update(-1e308, [person(0.3)]) == [3] and tracker.predicted(1e308) == []
     with pytest.raises(InputError, match="time must be a finite number"):
         tracker.update(np.nan, [])
     with pytest.raises(InputError, match="max_gap must be"):

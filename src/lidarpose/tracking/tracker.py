@@ -136,7 +136,10 @@ class Tracker:
     def predicted(self, time: float) -> list[TrackState]:
         """The people expected at a time, s, not before the last frame's: those who were seen twice or for sure."""
         check_finite("time", time)
-        tracks = self._tracks.after(0.0 if self._time is None else max(time - self._time, 0.0))
+        seconds = 0.0 if self._time is None else max(time - self._time, 0.0)
+        if seconds > self.max_gap:
+            return []
+        tracks = self._tracks.after(seconds)
         tracks = tracks.take((tracks.age <= self.max_gap) & tracks.sure)
         deviations = np.sqrt(tracks.covariance[:, :2, 0, 0].max(1))
         return [
@@ -179,11 +182,13 @@ class Tracker:
         self._time = float(time)
         if seconds < 0:
             self.jumps_back += 1
-        tracks = self._tracks.after(max(seconds, 0.0))
-        gap = np.where(tracks.sure, self.max_gap, min(self.max_gap, _UNSURE_GAP))
         # a jump far back is another recording
-        alive = (tracks.age <= gap) & (seconds >= -self.max_gap)
-        return tracks.take(alive)
+        if abs(seconds) > self.max_gap:
+            return _of_boxes([])
+        tracks = self._tracks.after(max(seconds, 0.0))
+        # whoever was in the frame before may be seen again
+        gap = np.where(tracks.sure, self.max_gap, min(self.max_gap, max(_UNSURE_GAP, seconds)))
+        return tracks.take(tracks.age <= gap)
 
 
 def _of_boxes(boxes: Sequence[Box]) -> _Tracks:
