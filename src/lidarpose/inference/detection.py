@@ -42,6 +42,8 @@ _MOST_POINTS, _BEYOND = 1_500_000, 15.0
 _CHUNK = 4_000_000
 # points that tell how far a scan reaches
 _ENOUGH = 25_000
+# and which way is up
+_ENOUGH_FOR_UP = 250_000
 # what is posed: a column so wide, and so far below and above the detection's box, m
 _COLUMN, _BELOW, _ABOVE = 0.6, 0.15, 0.25
 # points around a detection that its final box may hold, m to each side
@@ -259,21 +261,31 @@ def _thinned(scan: Scan, search: Search) -> tuple[Scan, list[str]]:
     points, count = scan.points, len(scan.points)
     if count <= _MOST_POINTS:
         return scan, []
-    near = np.arange(count)
+    # masks, not rows: of 10^8 points these alone would take a gigabyte
+    inside, starts = np.ones(count, bool), range(0, count, _CHUNK)
     if scan.origin is not None:
         reach = search.max_range + _BEYOND
-        starts = range(0, count, _CHUNK)
-        parts = [np.linalg.norm(points[start : start + _CHUNK] - scan.origin, axis=1) < reach for start in starts]
-        if (inside := np.concatenate(parts)).any():
-            near = np.flatnonzero(inside)
-    rows, notes = near, []
-    if len(near) > _MOST_POINTS:
+        for start in starts:
+            piece = slice(start, start + _CHUNK)
+            inside[piece] = np.linalg.norm(points[piece] - scan.origin, axis=1) < reach
+        if not inside.any():
+            inside[:] = True
+    number, notes = np.count_nonzero(inside), []
+    if number <= _MOST_POINTS:
+        rows = np.flatnonzero(inside)
+    else:
         # drawn in equal shares: a fixed step would keep single beams of organized clouds
         step = np.random.default_rng(0).random(_MOST_POINTS)
-        rows = near[((np.arange(_MOST_POINTS) + step) * (len(near) / _MOST_POINTS)).astype(np.int64)]
-        notes = [
-            f"thinned from {len(near):,} to {len(rows):,} points to search them: give one scan at a time, or a part"
-        ]
+        drawn = ((np.arange(_MOST_POINTS) + step) * (number / _MOST_POINTS)).astype(np.int64)
+        ends = np.cumsum([0, *(np.count_nonzero(inside[start : start + _CHUNK]) for start in starts)])
+        pieces = np.split(drawn, np.searchsorted(drawn, ends[1:-1]))
+        rows = np.concatenate(
+            [
+                start + np.flatnonzero(inside[start : start + _CHUNK])[own - end]
+                for start, own, end in zip(starts, pieces, ends[:-1], strict=True)
+            ]
+        )
+        notes = [f"thinned from {number:,} to {len(rows):,} points to search them: give one scan at a time, or a part"]
     return replace(scan, points=points[rows]), notes
 
 
@@ -285,11 +297,14 @@ def _leveled(scan: Scan) -> np.ndarray:
 
 
 def _near(points: np.ndarray, origin: np.ndarray | None, search: Search) -> np.ndarray:
-    """Those of the points (n, 3) m that may lie under the people searched for."""
-    if origin is None:
-        return points
-    near = (points[:, 0] - origin[0]) ** 2 + (points[:, 1] - origin[1]) ** 2 < (search.max_range + _BEYOND) ** 2
-    return points.T[:, near].T if near.any() else points
+    """Enough of the points (n, 3) m that may lie under the people searched for."""
+    rows = np.arange(len(points))
+    if origin is not None:
+        squared = (points[:, 0] - origin[0]) ** 2 + (points[:, 1] - origin[1]) ** 2
+        near = np.flatnonzero(squared < (search.max_range + _BEYOND) ** 2)
+        rows = near if len(near) else rows
+    rows = rows[:: -(-len(rows) // _ENOUGH_FOR_UP)]
+    return np.stack([values[rows] for values in points.T]).T
 
 
 def _in_input(box: Box, scan: Scan, given: Scan) -> Box:
