@@ -13,7 +13,7 @@ from test_smpl import synthetic
 
 from lidarpose.body.smpl import load_body
 from lidarpose.geometry import axis_angle_to_matrix, rotation_vector
-from lidarpose.skeleton import HUMAN15, SMPL24
+from lidarpose.skeleton import HUMAN15, ITOP14, SMPL24
 
 TO_HUMAN15 = SMPL24.map_to(HUMAN15)
 
@@ -231,4 +231,59 @@ def write_freemotion(root, smpl, *, name="fm_test2.pkl", frames=2, noise=False):
             truth[f"{name}/m1", f, str(view)] = one.joints[here] + shift
         entries.append(entry)
     (root / name).write_bytes(pickle.dumps(entries, protocol=4))
+    return truth
+
+
+# --- ITOP
+
+
+# of the file's 15 joints: the torso is none of SMPL's, the head's middle is put above SMPL's head
+ITOP_JOINTS = (*ITOP14.joints[:8], "torso", *ITOP14.joints[8:])
+
+
+def itop_joints(joints):
+    """SMPL's joints (F, 24, 3), z up -> ITOP's (F, 15, 3)."""
+    of = {name: joints[:, SMPL24.index(name)] for name in SMPL24.joints}
+    of |= {"head_center": of["head"] + [0, 0, 0.09], "torso": (of["neck"] + of["pelvis"]) / 2}
+    return np.stack([of[name] for name in ITOP_JOINTS], 1)
+
+
+def write_itop(root, smpl, *, parts=("side/test", "side/train"), frames=3, invalid=(), mirrored=False):
+    """A person on the floor of a room, a wall and a chair behind; frames in `invalid` were not checked. mirrored: x is
+    left. The camera is 1.2 m above the floor, of the top view 2.9 m."""
+    import h5py
+
+    root.mkdir(parents=True, exist_ok=True)
+    truth, sign = {}, 1 if mirrored else -1
+    for k, part in enumerate(parts):
+        view, rng = part.split("/")[0], np.random.default_rng(k)
+        # the side view's camera looks along x; the top view's down, with x up in its image
+        at, floor, camera_of = (
+            ((2.6, 0.0), -1.2, lambda p: np.stack([sign * p[..., 1], p[..., 2], p[..., 0]], -1))
+            if view == "side"
+            else ((0.2, 0.1), -2.9, lambda p: np.stack([sign * p[..., 1], p[..., 0], -p[..., 2]], -1))
+        )
+        one = person(smpl, frames, seed=k)
+        clouds, joints = np.zeros((frames, 76800, 3), np.float16), np.zeros((frames, 15, 3), np.float32)
+        visible, names = np.ones((frames, 15), np.int16), [f"{4 * k:02d}_{7 + f:05d}" for f in range(frames)]
+        visible[:, ITOP_JOINTS.index("left_hand")] = 0
+        for f in range(frames):
+            shift = np.array([*at, floor]) - [*one.joints[f, 0, :2], one.vertices[f, :, 2].min()]
+            body = one.vertices[f][rng.integers(0, len(one.vertices[f]), 3000)] + shift
+            ground = rng.uniform([1.5, -1.5, floor], [3.5, 1.5, floor + 0.01], (20000, 3))
+            wall = rng.uniform([3.9, -2, floor], [3.91, 2, 1.2], (5000, 3))
+            chair = rng.uniform([3.1, -0.8, floor + 0.1], [3.3, -0.7, floor + 0.7], (400, 3))
+            room = np.concatenate([body, *([ground, wall, chair] if view == "side" else [])])
+            clouds[f, : len(room)] = camera_of(room)
+            own = itop_joints(one.joints[f : f + 1])[0] + shift
+            joints[f] = camera_of(own)
+            if f not in invalid:
+                truth[f"{view}/{4 * k:02d}", 7 + f, "0"] = np.delete(own, ITOP_JOINTS.index("torso"), 0)
+        valid = np.array([f not in invalid for f in range(frames)], np.uint8)
+        labels = {"is_valid": valid, "real_world_coordinates": joints, "visible_joints": visible}
+        for kind, content in (("labels", labels), ("point_cloud", {"data": clouds})):
+            with h5py.File(root / f"ITOP_{part.replace('/', '_')}_{kind}.h5", "w") as file:
+                file["id"] = np.array(names, "S8")
+                for name, values in content.items():
+                    file[name] = values
     return truth

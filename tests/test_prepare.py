@@ -332,7 +332,7 @@ def test_published_splits_are_apart_and_name_their_source(tmp_path):
         assert (
             sum(rule.usual for rule in rules)
             == bool(rules)
-            == (name in ("humanm3", "lidarhuman26m", "sloper4d", "waymo"))
+            == (name in ("humanm3", "lidarhuman26m", "sloper4d", "waymo", "itop"))
         )
         rule = split_rule(name, tmp_path)
         assert (rule is None) == (not rules)

@@ -19,6 +19,7 @@ WRITERS = {
     "humanm3": files.write_humanm3,
     "lidarhuman26m": files.write_lidarhuman26m,
     "sloper4d": files.write_sloper4d,
+    "itop": files.write_itop,
     "lipd": files.write_lipd,
     "freemotion": files.write_freemotion,
     "noisemotion": lambda root, smpl: files.write_freemotion(root, smpl, name="FreeMotion_train.pkl", noise=True),

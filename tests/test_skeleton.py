@@ -32,8 +32,8 @@ def test_the_published_orders():
     assert BODY26.parents == (*SMPL_PARENTS, 15, 15)
     assert list(HUMAN15.joints) == HUMAN
     assert list(WAYMO14.joints) == WAYMO
-    assert list(SKELETONS) == ["smpl24", "human15", "waymo14", "body26"]
-    assert [len(s) for s in SKELETONS.values()] == [24, 15, 14, 26]
+    assert list(SKELETONS) == ["smpl24", "human15", "waymo14", "itop14", "body26"]
+    assert [len(s) for s in SKELETONS.values()] == [24, 15, 14, 14, 26]
 
 
 @named

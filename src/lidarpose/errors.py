@@ -34,6 +34,7 @@ _EXTRA_OF = {
     "rosbags": "recordings",
     "lazrs": "recordings",
     "velodyne_decoder": "recordings",
+    "h5py": "itop",
 }
 
 

@@ -135,10 +135,19 @@ WAYMO14 = _tree(
     extra="right_shoulder<left_shoulder right_hip<left_hip",
 )
 
-SKELETONS = {s.name: s for s in (SMPL24, HUMAN15, WAYMO14, BODY26)}
+# ITOP's 15 joints in its order, without the torso, for which SMPL has no joint; hands and feet are SMPL's by name, some
+# centimeters from where ITOP's sensor and annotators put them
+ITOP14 = _tree(
+    "itop14",
+    """head_center neck<head_center right_shoulder<neck left_shoulder<neck right_elbow<right_shoulder
+    left_elbow<left_shoulder right_hand<right_elbow left_hand<left_elbow right_hip<neck left_hip<neck
+    right_knee<right_hip left_knee<left_hip right_foot<right_knee left_foot<left_knee""",
+)
+
+SKELETONS = {s.name: s for s in (SMPL24, HUMAN15, WAYMO14, ITOP14, BODY26)}
 
 
 def skeleton(name: str) -> Skeleton:
-    """A named skeleton: smpl24, human15, waymo14 or body26."""
+    """A named skeleton: smpl24, human15, waymo14, itop14 or body26."""
     check_name("skeleton", name, SKELETONS)
     return SKELETONS[name]

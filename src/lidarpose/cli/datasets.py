@@ -88,7 +88,7 @@ def _add_prepare(commands) -> None:
     )
     prepare.set_defaults(run=_prepare)
     prepare.add_argument(
-        "dataset", metavar="NAME", help="humanm3, lidarhuman26m, sloper4d, waymo, lipd, freemotion or noisemotion"
+        "dataset", metavar="NAME", help="humanm3, lidarhuman26m, sloper4d, waymo, itop, lipd, freemotion or noisemotion"
     )
     prepare.add_argument("root", metavar="RAW", help="folder of the dataset's raw files")
     prepare.add_argument("out", metavar="OUT", help="a new folder, or the one of an interrupted run")

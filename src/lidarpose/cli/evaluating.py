@@ -44,12 +44,13 @@ _SWITCHES = {
 DETECTOR = "detector"
 _DETECTOR = ("scans", "method", "detector", "range", "network", "pictures")
 # groups of rows that the terminal shows; the others are in scores.json
-_SHOWN = ("condition", "plain", "joints", "distance, m", "points", "hidden share")
+_SHOWN = ("condition", "plain", "joints", "body", "joint", "distance, m", "points", "hidden share")
 # metrics of these groups that it shows, besides those of everybody
-_GROUP_METRICS = ("mpjpe", "turned_round")
+_GROUP_METRICS = ("mpjpe", "turned_round", "pck_10cm")
 _TITLES = {
     **{"mpjpe": "MPJPE", "pa_mpjpe": "PA-MPJPE", "pck3": "PCK-3", "pck5": "PCK-5"},
     **{"turned_round": "facing flipped (> 90 deg)", "pem": "PEM", "oks_ap": "OKS-AP", "auroc": "AUROC"},
+    "pck_10cm": "within 10 cm",
 }
 
 

@@ -137,7 +137,9 @@ def _add_output(output) -> None:
     output.add_argument("--picture", action="store_true", help="also draw STEM.poses.png, or FILE.png")
     output.add_argument("--html", action="store_true", help="also write STEM.poses.html: everybody in 3D, the scan too")
     output.add_argument(
-        "--skeleton", metavar="NAME", help="smpl24, human15, waymo14 or body26 (default smpl24, else the network's own)"
+        "--skeleton",
+        metavar="NAME",
+        help="smpl24, human15, waymo14, itop14 or body26 (default smpl24, else the network's own)",
     )
 
 

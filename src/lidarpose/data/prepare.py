@@ -41,6 +41,7 @@ READERS: dict[str, tuple[str, str, bool]] = {
     "lidarhuman26m": ("lidarhuman26m", "LidarHuman26M", True),
     "sloper4d": ("sloper4d", "Sloper4D", True),
     "waymo": ("waymo", "Waymo", False),
+    "itop": ("itop", "Itop", False),
     "lipd": ("corpora", "Lipd", False),
     "freemotion": ("corpora", "FreeMotion", True),
     "noisemotion": ("corpora", "NoiseMotion", True),

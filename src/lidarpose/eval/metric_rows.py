@@ -29,6 +29,11 @@ PLENTY = 100
 _REPEATS = 1000
 # frames count as evenly apart where two steps differ by less than this share
 _EVEN = 0.2
+# joints of each half of the body, without their sides. Source: Haque et al. 2016, whose torso is in neither
+ITOP_HALVES = {
+    "upper": ("head_center", "neck", "shoulder", "elbow", "hand"),
+    "lower": ("hip", "knee", "foot"),
+}
 
 
 # ---- what is computed
@@ -53,6 +58,10 @@ def facing_flipped(predictions: Predictions) -> np.ndarray:
 
 def _pck(p: Predictions, threshold: float) -> np.ndarray:
     return joint_hits(p.filled, p.true, p.labeled, threshold=threshold)
+
+
+def _within_10cm(p: Predictions) -> np.ndarray:
+    return joint_hits(p.filled, p.true, p.labeled, threshold=CONFIDENCE_RADIUS, torso=1.0)
 
 
 def _pck_box(p: Predictions, threshold: float) -> np.ndarray:
@@ -91,6 +100,7 @@ METRICS = {
         for threshold in keypoints.PCK_THRESHOLDS
     },
     "oks_ap": Metric(_oks_precision, "%", ("boxes",)),
+    "pck_10cm": Metric(_within_10cm, "%", ("itop",), "joint"),
 }
 
 
@@ -158,6 +168,14 @@ def _groups(section: str, p: Predictions, setting: Setting) -> Iterator[tuple[st
         for title, (values, edges) in (spans | {"hidden share": (hidden, aggregate.OCCLUSION_EDGES)}).items():
             for of, rows in aggregate.span_rows(values, edges).items():
                 yield title, of, rows, None
+    elif section == "itop" and setting.kind == "itop":
+        yield "all", "all", everybody, None
+        for half, words in ITOP_HALVES.items():
+            names = [name for name in p.skeleton.joints if name.removeprefix("left_").removeprefix("right_") in words]
+            if names:
+                yield "body", half, everybody, np.array([p.skeleton.index(name) for name in names])
+        for j, name in enumerate(p.skeleton.joints):
+            yield "joint", name, everybody, np.array([j])
     elif section == "boxes" and _has_waymo_boxes(p, setting) and (p.boxed & p.posed).any():
         yield "all", "all", p.boxed, None
 
@@ -186,7 +204,7 @@ def hidden_share(labels: np.ndarray) -> np.ndarray:
 def metric_rows(predictions: Predictions, setting: Setting, *, dapt_compat: bool = False) -> tuple[MetricRow, ...]:
     """The rows of a dataset's people; dapt_compat: also with the released code's arithmetic."""
     alone = predictions.select(~predictions.moving)
-    rows = [*_mean_rows(alone, setting, ("all", "dense", "joints", "conditions", "spans", "boxes"))]
+    rows = [*_mean_rows(alone, setting, ("all", "dense", "joints", "conditions", "spans", "boxes", "itop"))]
     for name, (summary, unit) in SUMMARIES.items():
         if (score := summary(alone, setting)) is not None:
             rows.append(_row(score, setting, name, unit=unit, no_pose=int((~alone.posed).sum())))

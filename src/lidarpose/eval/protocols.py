@@ -59,6 +59,7 @@ DAPT = {
 _CLEAN_CROPS = {
     "waymo": "labelled box with a detector's errors",
     "humanm3": "box about the true joints with a detector's errors",
+    "itop": "side view: cut out without labels; top view: box about the true joints with a detector's errors",
     "bench": "the set's own detector's box",
     "synth": "the set's own detector's box",
 }

@@ -25,10 +25,14 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix, rotation_vector
 from lidarpose.io.files import content_digest, file_error, read_bytes
 from lidarpose.io.point_cloud import read_points
-from lidarpose.sample import FARTHEST, SEEN, UNLABELED, LabeledSample, Pose, center_of, within_reach
+from lidarpose.sample import FARTHEST, SEEN, UNLABELED, Box, LabeledSample, Pose, center_of, within_reach
 from lidarpose.skeleton import SMPL24, Skeleton
 
 _NUMBER = re.compile("[0-9]{1,12}")
+# of people without a labeled box, it is that of their joints, this much larger on each side, m
+_BOX_MARGIN = 0.2
+# and their points are those in a box this much larger still, m: what a detector's box lets in
+POINT_MARGIN = 0.3
 # what the published files are called: SMPL_MALE.pkl, basicmodel_m_lbs_10_207_0_v1.1.0.pkl, basicModel_f_lbs_...
 _NAMES = {
     "neutral": r"smpl_neutral|basicmodel_neutral_lbs.*",
@@ -279,6 +283,12 @@ class SceneClouds:
         origin = np.zeros(3) if origin is None else origin
         person, others, static = ((x - origin) @ R_sensor_scan.T for x in (self._people(frame), others, self._static))
         return {"background": window_points(static, person), "neighbors": window_points(others, person)}
+
+
+def box_of_joints(joints: np.ndarray, id: str) -> Box:
+    """The box of a person's labeled joints (n, 3) m, n >= 1. Raises InputError where they are out of reach."""
+    low, high = joints.min(0), joints.max(0)
+    return Box(center=(low + high) / 2, size=high - low + 2 * _BOX_MARGIN, id=id)
 
 
 def labeled_sample(

@@ -22,15 +22,11 @@ from lidarpose.data.readers.base import Reader, Skipped
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
 from lidarpose.io.pickles import load_pickle
-from lidarpose.sample import Box, LabeledSample
+from lidarpose.sample import LabeledSample
 from lidarpose.skeleton import HUMAN15
 
 # frames a second of the fused clouds
 _FPS = 10.0
-# the box of a person: that of the joints, this much larger on each side, m
-_BOX_MARGIN = 0.2
-# and the points are those in a box this much larger still, m: what a detector's box lets in
-_POINT_MARGIN = 0.3
 # what lies at the root
 _SPLITS = ("train", "test")
 # how many folders below the root a sequence may lie
@@ -153,13 +149,12 @@ def _people(
         if not len(labeled):
             yield Skipped("no joint is labelled", where)
             continue
-        low, high = labeled.min(0), labeled.max(0)
         try:
-            box = Box(center=(low + high) / 2, size=high - low + 2 * _BOX_MARGIN, id=track)
+            box = base.box_of_joints(labeled, track)
         except InputError as error:
             yield Skipped("joints out of reach", f"{where}: {error}")
             continue
-        points = cloud[box.contains(cloud, _POINT_MARGIN)]
+        points = cloud[box.contains(cloud, base.POINT_MARGIN)]
         if not len(points):
             yield Skipped("no points in the box", where)
             continue

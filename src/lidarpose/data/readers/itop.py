@@ -1,0 +1,245 @@
+"""ITOP (Haque et al. 2016): one person in a room, seen by a depth camera from the side or from the ceiling.
+
+    ROOT/ITOP_{side,top}_{train,test}_labels.h5
+        id (n,)                             b"PP_FFFFF": person, frame
+        is_valid (n,)                       1 where a human checked the labels
+        real_world_coordinates (n, 15, 3)   joints, m
+        visible_joints (n, 15)              1 where the camera sees the joint
+    ROOT/ITOP_{side,top}_{train,test}_point_cloud.h5
+        id (n,); data (n, 76800, 3)         everything the camera sees, m
+
+The axes are the camera's: x right, y up, z away from it. The side view's person is cut out of the room without labels
+(`person_of_room`); of the top view no such rule is published, so a box about the labeled joints crops the points.
+Sources: iballester/spike const/skeleton_joints.py and utils/preprocess_itop.py.
+"""
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidarpose.data.readers import base
+from lidarpose.data.readers.base import Reader, Skipped
+from lidarpose.errors import InputError, missing_extra
+from lidarpose.io.files import file_error, one_line
+from lidarpose.sample import HIDDEN, SEEN, UNLABELED, LabeledSample
+from lidarpose.skeleton import ITOP14
+
+PARTS = ("side/test", "side/train", "top/test", "top/train")
+# a file's datasets, and their shape after the number of frames
+_DATASETS: dict[str, dict[str, tuple[int, ...]]] = {
+    "labels": {"id": (), "is_valid": (), "real_world_coordinates": (15, 3), "visible_joints": (15,)},
+    "point_cloud": {"id": (), "data": (76800, 3)},
+}
+# the largest file has 39,795; more would be a damaged header
+_MOST_FRAMES = 1_000_000
+# which of the 15 joints is the torso
+_TORSO = 8
+# from the camera's axes to the level frame's: a reflection, since x right, y up, z away is left-handed
+_R_LEVEL_CAMERA = {
+    "side": np.array([[0.0, 0, 1], [-1, 0, 0], [0, 1, 0]]),
+    "top": np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, -1]]),
+}
+# fewer frames than this do not tell whether x is right or left
+_LEAST_FRAMES = 100
+# where the side view's people stand: low and high x, y, z in the camera's axes, m. Source: SPiKE, as the next ones
+_REGION = np.array([[-0.85, -1.7, 1.85], [0.95, 1.0, 3.7]])
+# the floor is among the lowest so many of so many equal steps of height
+_FLOOR_STEPS, _STEPS = 10, 100
+# points of neighboring cells belong together, m (SPiKE: 0.15 m by DBSCAN, whose cells' diagonals are about twice that)
+_CELL = 0.075
+# a smaller cluster is noise
+_LEAST_POINTS = 10
+# other clusters count within so much of the largest one, m
+_NEAR = 0.2
+
+
+class Itop(Reader):
+    """Reads ITOP's HDF5 files. A part is a pair of them: "side/test", "top/train"."""
+
+    name = "itop"
+    skeleton = ITOP14.name
+
+    def parts(self, root: Path) -> list[str]:
+        """The parts of which a file is there. Raises InputError where there is none, where one of a pair is missing or
+        damaged, and where the two are of different frames; MissingExtra without h5py."""
+        parts = [part for part in PARTS if any(_path(root, part, kind).is_file() for kind in _DATASETS)]
+        if not parts:
+            raise self.wrong_root(root)
+        for part in parts:
+            with _opened(root, part):
+                pass
+        return parts
+
+    def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
+        """The person of each frame that was checked, in the order of the file."""
+        view = part.split("/")[0]
+        with _opened(root, part) as (labels, clouds):
+            path = labels.filename
+            joints = base.numbers(path, labels["real_world_coordinates"][:], (-1, 15, 3), "joints", finite=False)
+            is_valid, is_visible = labels["is_valid"][:] > 0, labels["visible_joints"][:] > 0
+            R_level_camera, source = _R_LEVEL_CAMERA[view], f"itop/{view}"
+            if is_mirrored(np.delete(joints[is_valid] @ R_level_camera.T, _TORSO, 1)):
+                R_level_camera, source = R_level_camera * np.array([-1.0, 1, 1]), f"{source}, x left"
+            for k, name in enumerate(_ids(labels)):
+                where = f"{part}/{name}"
+                person, _, frame = name.partition("_")
+                if not is_valid[k]:
+                    yield Skipped("labels that no human checked", where)
+                elif not (person.isdecimal() and frame.isdecimal()):
+                    yield Skipped("id of another form", where)
+                else:
+                    try:
+                        cloud = base.as_cloud(clouds.filename, clouds["data"][k])
+                    except (InputError, OSError) as error:
+                        yield Skipped("cloud cannot be read", one_line(f"{where}: {error}"))
+                        continue
+                    yield _sample(
+                        cloud,
+                        np.delete(joints[k], _TORSO, 0),
+                        np.delete(is_visible[k], _TORSO),
+                        R_level_camera,
+                        source=source,
+                        sequence=f"{view}/{person}",
+                        frame=int(frame),
+                        frame_id=where,
+                    )
+
+
+def _sample(
+    cloud: np.ndarray, joints: np.ndarray, is_visible: np.ndarray, R_level_camera: np.ndarray, **where: Any
+) -> LabeledSample | Skipped:
+    """The person in a cloud (n, 3) m with joints (14, 3) m, both in the camera's axes; where: fields of the sample."""
+    is_labeled, frame_id = np.isfinite(joints).all(-1), where["frame_id"]
+    if not is_labeled.any():
+        return Skipped("no joint is labelled", frame_id)
+    joints = np.where(is_labeled[:, None], joints, np.nan) @ R_level_camera.T
+    if where["sequence"].startswith("side"):
+        points = person_of_room(cloud) @ R_level_camera.T
+        if not len(points):
+            return Skipped("nobody stands out of the room", frame_id)
+    else:
+        try:
+            box = base.box_of_joints(joints[is_labeled], "0")
+        except InputError as error:
+            return Skipped("joints out of reach", f"{frame_id}: {error}")
+        points = cloud @ R_level_camera.T
+        points = points[box.contains(points, base.POINT_MARGIN)]
+        if not len(points):
+            return Skipped("no points in the box", frame_id)
+        where |= {"box": box, "centers": {"joints_box": box.center}}
+    joint_labels = np.where(is_labeled, np.where(is_visible, SEEN, HIDDEN), UNLABELED).astype(np.uint8)
+    return base.labeled_sample(points, joints, ITOP14, joint_labels=joint_labels, track="0", **where)
+
+
+def is_mirrored(joints: np.ndarray) -> bool:
+    """joints (n, 14, 3) m of itop14 -> whether people are their own mirror images: their forearms point backwards on
+    average, by which side is called left. False for under 100 people with all the joints that tell."""
+    joints = joints[np.isfinite(joints).all((1, 2))]
+    if len(joints) < _LEAST_FRAMES:
+        return False
+    left, right = (
+        {name: joints[:, ITOP14.index(f"{side}_{name}")] for name in ("shoulder", "hip", "elbow", "hand")}
+        for side in ("left", "right")
+    )
+    middle = {name: (left[name] + right[name]) / 2 for name in left}
+    # a person's left times their up is forwards
+    forward = np.cross(left["shoulder"] - right["shoulder"], middle["shoulder"] - middle["hip"])
+    return bool(((middle["hand"] - middle["elbow"]) * forward).sum(-1).mean() < 0)
+
+
+# ---- files
+
+
+def _path(root: Path, part: str, kind: str) -> Path:
+    return root / f"ITOP_{part.replace('/', '_')}_{kind}.h5"
+
+
+def _ids(file: Any) -> list[str]:
+    return [name.decode("ascii", "replace") if isinstance(name, bytes) else str(name) for name in file["id"][:]]
+
+
+@contextmanager
+def _opened(root: Path, part: str) -> Iterator[tuple[Any, Any]]:
+    """Labels and clouds of a part, checked but for their values. Raises InputError, MissingExtra without h5py."""
+    try:
+        import h5py
+    except ModuleNotFoundError as error:
+        raise missing_extra(error, "reading ITOP") from None
+    paths = [_path(root, part, kind) for kind in _DATASETS]
+    with ExitStack() as stack:
+        files, ids = [], []
+        for path, shapes in zip(paths, _DATASETS.values(), strict=True):
+            if not path.is_file():
+                raise file_error(path, "is missing: get it from zenodo.org/records/3932973 and unpack it by gunzip")
+            try:
+                files.append(stack.enter_context(h5py.File(path, "r")))
+                found = {name: getattr(files[-1].get(name), "shape", None) for name in shapes}
+                ids.append(_ids(files[-1]) if found["id"] is not None and found["id"] <= (_MOST_FRAMES,) else [])
+            # what h5py raises for damaged files
+            except (OSError, KeyError, RuntimeError, TypeError, ValueError) as error:
+                problem = f"cannot be read as HDF5 ({one_line(str(error))}); was it downloaded and unpacked completely?"
+                raise file_error(path, problem) from None
+            for name, shape in shapes.items():
+                if found[name] != (wanted := (len(ids[-1]), *shape)):
+                    raise file_error(path, f"expected {name} of shape {wanted}, got {found[name]}")
+        if ids[0] != ids[1]:
+            raise file_error(paths[1], f"is of other frames than {paths[0].name}: get both again")
+        yield files[0], files[1]
+
+
+# ---- the person in the side view's room
+
+
+def person_of_room(points: np.ndarray) -> np.ndarray:
+    """points (n, 3) m in the camera's axes, y up -> those of the person (k, 3), k = 0 where nobody is found.
+
+    Without labels, after SPiKE's preprocessing: a fixed region of the room, the floor taken off, the largest cluster,
+    and the clusters about it and in front of it. Clusters are of neighboring cells, where SPiKE's are DBSCAN's.
+    """
+    points = points[((points >= _REGION[0]) & (points <= _REGION[1])).all(1)]
+    points = points[points[:, 1] >= _floor(points[:, 1])]
+    if not len(points):
+        return points
+    cluster = _clusters(points)
+    counts = np.bincount(cluster)
+    largest = points[cluster == counts.argmax()]
+    low, high = largest.min(0) - _NEAR, largest.max(0) + _NEAR
+    # arms are raised and stretched towards the camera
+    low[2], high[1] = _REGION[0, 2], high[1] + _NEAR
+    is_outside = ((points < low) | (points > high)).any(1)
+    is_person = (np.bincount(cluster, is_outside) == 0) & (counts >= _LEAST_POINTS)
+    return points[is_person[cluster]]
+
+
+def _floor(heights: np.ndarray) -> float:
+    """The height m below which all is floor, -inf where none is seen: the lowest tenth of the heights then has no more
+    points than others have."""
+    counts, edges = np.histogram(heights, bins=_STEPS)
+    lowest = counts[:_FLOOR_STEPS]
+    if lowest.sum() <= _FLOOR_STEPS * counts.mean():
+        return -np.inf
+    above = lowest[lowest.argmax() :]
+    return float(edges[lowest.argmax() + (above < above.mean()).argmax()])
+
+
+def _clusters(points: np.ndarray) -> np.ndarray:
+    """points (n, 3) m, n >= 1 -> (n,) int, the same number for points whose cells are connected, also by a corner."""
+    cells = np.floor((points - points.min(0)) / _CELL).astype(int) + 1
+    shape = tuple(cells.max(0) + 2)
+    code, cell = np.unique(np.ravel_multi_index(tuple(cells.T), shape), return_inverse=True)
+    grid = np.full(np.prod(shape), -1)
+    grid[code] = np.arange(len(code))
+    steps = np.array(list(product((-1, 0, 1), repeat=3))) @ [shape[1] * shape[2], shape[2], 1]
+    neighbors = grid[code + steps[:, None]]
+    number = np.arange(len(code))
+    while True:
+        # the least number of a neighbor, then the least that this one knows of
+        least = np.where(neighbors >= 0, number[neighbors], len(code)).min(0)
+        least = least[least]
+        if (least == number).all():
+            return number[cell]
+        number = least

@@ -1,0 +1,219 @@
+"""ITOP: people come out of its HDF5 files where they went in, without the room, and joints within 10 cm are counted."""
+
+import re
+import sys
+
+import dataset_files as files
+import h5py
+import motion_files
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_evaluate import Fake
+
+from lidarpose.cli import main
+from lidarpose.data.prepare import prepare, reader
+from lidarpose.data.readers import itop
+from lidarpose.data.readers.base import Skipped
+from lidarpose.data.shards import open_dataset
+from lidarpose.errors import MissingExtra
+from lidarpose.eval.dataset import open_eval_dataset
+from lidarpose.eval.protocols import eval_setup
+from lidarpose.eval.run import evaluate_dataset
+from lidarpose.sample import HIDDEN, SEEN, LabeledSample
+from lidarpose.skeleton import BODY26, ITOP14
+
+LABELS, CLOUDS = "ITOP_side_test_labels.h5", "ITOP_side_test_point_cloud.h5"
+
+
+@pytest.fixture(scope="module")
+def smpl(tmp_path_factory):
+    return files.write_smpl(tmp_path_factory.mktemp("smpl") / "SMPL_NEUTRAL.npz")
+
+
+@pytest.fixture(scope="module")
+def raw(tmp_path_factory, smpl):
+    """Both views, their second frames unchecked, and what must come out."""
+    root = tmp_path_factory.mktemp("itop")
+    return root, files.write_itop(root, smpl, parts=itop.PARTS, frames=3, invalid=(1,))
+
+
+@pytest.fixture(scope="module")
+def prepared(raw, tmp_path_factory):
+    out = tmp_path_factory.mktemp("prepared") / "itop"
+    return out, prepare("itop", raw[0], out)
+
+
+def everything(root):
+    source = reader("itop")
+    records = [record for part in source.parts(root) for record in source.read(root, part)]
+    return [record for record in records if isinstance(record, LabeledSample)], records
+
+
+def test_a_known_pose_comes_back_in_the_level_frame_and_unchecked_frames_do_not(raw):
+    root, truth = raw
+    people, records = everything(root)
+    assert {(person.sequence, person.frame, person.track) for person in people} == truth.keys()
+    assert len(people) == len(truth) == 8
+    for person in people:
+        joints = truth[person.sequence, person.frame, person.track]
+        assert np.abs(person.joints - joints).max() < 1e-4
+        at = {name: person.joints[ITOP14.index(name)] for name in ITOP14.joints}
+        assert at["head_center"][2] > at["neck"][2] > max(at["left_hip"][2], at["right_hip"][2])
+        labels = {name: label for name, label in zip(ITOP14.joints, person.joint_labels, strict=True)}
+        assert labels.pop("left_hand") == HIDDEN and set(labels.values()) == {SEEN}
+        assert person.sensor_known and person.source == f"itop/{person.sequence[:-3]}"
+    skipped = [record for record in records if isinstance(record, Skipped)]
+    assert [record.reason for record in skipped] == ["labels that no human checked"] * 4
+    assert skipped[0].where == "side/test/00_00008"
+
+
+def test_the_side_view_s_room_is_cut_away_without_labels(raw):
+    people, _ = everything(raw[0])
+    for person in people:
+        if person.sequence.startswith("side"):
+            distance = np.linalg.norm(person.points[:, None] - person.joints, axis=-1).min(1)
+            # the floor goes, and with it the soles; half the skin is nearer than 15 cm to a joint
+            assert distance.max() < 0.4 and np.median(distance) < 0.15 and 2400 < len(person.points) < 3100
+            assert person.box is None and not person.centers
+        else:
+            assert person.box.contains(person.points, 0.3001).all() and len(person.points) >= 3000
+            np.testing.assert_array_equal(person.centers["joints_box"], person.box.center)
+
+
+def test_a_file_whose_x_is_left_is_told_by_its_forearms(tmp_path, smpl, monkeypatch):
+    joints = files.itop_joints(motion_files.joints_of(motion_files.a_clip(300)[0]))
+    joints = np.delete(joints, files.ITOP_JOINTS.index("torso"), 1)
+    assert not itop.is_mirrored(joints) and itop.is_mirrored(joints * [1, -1, 1])
+    # too few to tell; unlabeled joints tell nothing
+    assert not itop.is_mirrored(joints[:99] * [1, -1, 1])
+    joints[99:, 3] = np.nan
+    assert not itop.is_mirrored(joints * [1, -1, 1])
+    monkeypatch.setattr(itop, "_LEAST_FRAMES", 6)
+    truth = files.write_itop(tmp_path, smpl, parts=("side/test", "top/test"), frames=6, mirrored=True)
+    people, _ = everything(tmp_path)
+    for person in people:
+        assert np.abs(person.joints - truth[person.sequence, person.frame, person.track]).max() < 1e-4
+        assert person.source.endswith(", x left")
+
+
+def test_views_are_not_mixed(raw, prepared, tmp_path):
+    out, summary = prepared
+    assert summary["splits"] == {"none": 4, "test": 2, "train": 2}
+    assert {sample.sequence for sample in open_dataset(out).samples("test")} == {"side/00"}
+    summary = prepare("itop", raw[0], tmp_path / "top", split_by="top", split="test")
+    assert summary["splits"] == {"test": 2} and summary["sources"] == {"itop/top": 2}
+
+
+def scored(out, shift=0.0, joints=ITOP14.joints):
+    """The result of a network that knows the truth, but that `joints` are off by `shift` m."""
+    dataset = open_eval_dataset(out)
+    people = {tuple(person.points[0]): person for person in dataset}
+    moved = shift * np.isin(ITOP14.joints, joints)[:, None] * [0.6, 0.0, 0.8]
+
+    def answer(cloud):
+        pose = np.zeros((len(BODY26), 3))
+        pose[BODY26.map_to(ITOP14)] = people[tuple(cloud[0].astype(np.float32))].sample.joints + moved
+        return pose
+
+    return evaluate_dataset(eval_setup(Fake(answer), dataset)).result
+
+
+def test_joints_within_10_cm_are_counted_by_half_and_joint(prepared):
+    for shift, value in ((0.0, 100.0), (0.09, 100.0), (0.11, 0.0)):
+        rows = [row for row in scored(prepared[0], shift).lines if row.figure == "pck_10cm"]
+        assert len(rows) == 1 + 2 + 14 and {row.value for row in rows} == {value}
+    result = scored(prepared[0], 0.11, ("left_hand", "left_foot"))
+    assert result.line("pck_10cm").value == pytest.approx(100 * 12 / 14)
+    assert result.line("pck_10cm", "body", "upper").value == pytest.approx(100 * 7 / 8)
+    assert result.line("pck_10cm", "body", "lower").value == pytest.approx(100 * 5 / 6)
+    assert result.line("pck_10cm", "joint", "left_hand").value == 0
+    assert result.line("pck_10cm", "joint", "right_hand").value == 100
+    assert "cut out without labels" in result.setting.crop and result.setting.centring == "points alone"
+
+
+# ---- damaged files
+
+
+def cut_off(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def without(path, name):
+    with h5py.File(path, "a") as file:
+        del file[name]
+
+
+def replaced(path, name, values):
+    without(path, name)
+    with h5py.File(path, "a") as file:
+        file[name] = values
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda root: cut_off(root / LABELS), f"{LABELS}: cannot be read as HDF5"),
+        (lambda root: cut_off(root / CLOUDS), f"{CLOUDS}: cannot be read as HDF5"),
+        (lambda root: (root / CLOUDS).write_bytes(b"\x1f\x8b"), f"{CLOUDS}: cannot be read as HDF5"),
+        (lambda root: (root / CLOUDS).unlink(), f"{CLOUDS}: is missing: get it .* unpack it by gunzip"),
+        (lambda root: without(root / LABELS, "is_valid"), r"expected is_valid of shape \(1,\), got None"),
+        (lambda root: replaced(root / CLOUDS, "data", np.zeros((1, 9, 3))), r"expected data of shape \(1, 76800, 3\)"),
+        (lambda root: replaced(root / CLOUDS, "id", np.array(["00_00009"], "S8")), "is of other frames than"),
+        (lambda root: replaced(root / LABELS, "id", 5), "cannot be read as HDF5"),
+        (lambda root: (root / LABELS).unlink() or (root / CLOUDS).unlink(), "is not the root of ITOP"),
+    ],
+)
+def test_a_damaged_file_is_one_line_and_nothing_is_written(tmp_path, smpl, capsys, change, message):
+    files.write_itop(tmp_path / "raw", smpl, parts=("side/test",), frames=1)
+    change(tmp_path / "raw")
+    assert main(["prepare", "itop", str(tmp_path / "raw"), str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err.strip()
+    assert "\n" not in error and re.search(message, error)
+    assert not (tmp_path / "out").exists()
+
+
+def test_frames_that_cannot_be_used_are_counted(tmp_path, smpl):
+    files.write_itop(tmp_path, smpl, parts=("side/test", "top/test"), frames=4)
+    names = np.array(["00_00007", "nobody", "00_00009", "00_00010"], "S8")
+    for path in sorted(tmp_path.iterdir()):
+        replaced(path, "id", names)
+        with h5py.File(path, "a") as file:
+            if "data" in file:
+                file["data"][0] = np.zeros((76800, 3))
+            else:
+                file["real_world_coordinates"][2] = np.nan
+    people, records = everything(tmp_path)
+    assert [person.frame for person in people] == [10, 10]
+    assert [record.reason for record in records if isinstance(record, Skipped)] == [
+        "nobody stands out of the room", "id of another form", "no joint is labelled",
+        "no points in the box", "id of another form", "no joint is labelled",
+    ]  # fmt: skip
+
+
+def test_without_h5py_the_extra_is_named(raw, monkeypatch):
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(MissingExtra, match=r"'.\[itop\]'"):
+        reader("itop").parts(raw[0])
+
+
+def clusters_reference(points):
+    """`itop._clusters` by flooding from point to point."""
+    cells = np.floor((points - points.min(0)) / 0.075).astype(int)
+    cluster = np.full(len(points), -1)
+    for k in range(len(points)):
+        queue = [k] if cluster[k] < 0 else []
+        while queue:
+            j = queue.pop()
+            cluster[j] = k
+            queue += np.flatnonzero((np.abs(cells - cells[j]) <= 1).all(1) & (cluster < 0)).tolist()
+    return cluster
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 120), st.sampled_from([0.2, 0.6, 1.5]))
+def test_clusters_are_those_of_the_reference(seed, count, wide):
+    points = np.random.default_rng(seed).uniform(0, wide, (count, 3))
+    ours, theirs = itop._clusters(points), clusters_reference(points)
+    np.testing.assert_array_equal(ours[:, None] == ours, theirs[:, None] == theirs)
