@@ -321,6 +321,8 @@ def test_what_is_missing_or_wrong_is_one_line(tmp_path):
         (json.dumps(metadata(lidar_to_sensor_transform=[1, 2])), "cannot be read"),
         (json.dumps(metadata(data_format={"columns_per_frame": 10**9})), "columns_per_frame from 1 to"),
         (json.dumps(metadata(data_format={"columns_per_frame": None})), "cannot be read"),
+        (json.dumps(metadata(data_format={"columns_per_frame": COLUMNS, "column_window": [1]})), "cannot be read"),
+        (json.dumps(metadata(lidar_to_sensor_transform=[1e308] * 16)), "finite numbers in lidar_to_sensor"),
         ("[" * 10**5, "cannot be read"),
     ):
         (tmp_path / "walk.json").write_text(content)

@@ -88,7 +88,7 @@ class _Bytes:
         return struct.unpack("<" + kind, self.take(struct.calcsize("<" + kind)))[0]
 
     def text(self) -> str:
-        return self.take(self.number("I")).decode("utf-8", "replace")
+        return _text(self.take(self.number("I")))
 
 
 class RecordFile:
@@ -106,16 +106,22 @@ class RecordFile:
         self.path = path
         self.topics: dict[str, Topic] = {}
         self.num_damaged, self.damage = 0, ""
+        # of MCAP: names of types
+        self._schemas: dict[int, str] = {}
         with open(path, "rb") as file:
             if file.read(len(self.MAGIC)) != self.MAGIC:
                 raise FormatError(f"is no {path.suffix} file, though its name says so; convert or rename it")
-            with suppress(FormatError, struct.error):
-                if self._read_index(file, path.stat().st_size):
-                    return
-            self.topics.clear()
             try:
-                for topic, *_ in self._walk(self._stream(file)):
-                    self.topics[topic].count += 1
+                start = self._index_start(file)
+                for kind, topic, count, *_ in self._learned(file, start) if start else ():
+                    self.topics[topic].count += count if kind == "count" else 0
+            except (FormatError, struct.error):
+                self.topics.clear()
+            if any(topic.count for topic in self.topics.values()):
+                return
+            try:
+                for kind, topic, *_ in self._learned(file):
+                    self.topics[topic].count += kind == "message"
             except FormatError:
                 # told where the messages end
                 if not self.topics:
@@ -125,16 +131,23 @@ class RecordFile:
         """Those of some topics. Raises FormatError where the file is damaged; what is before it has come."""
         self.num_damaged = 0
         with open(self.path, "rb") as file:
-            for topic, time, size, stream in self._walk(self._stream(file)):
-                if topic in topics:
+            for kind, topic, *content in self._learned(file):
+                if kind == "message" and topic in topics:
+                    time, size, stream = content
                     yield Message(topic, time, stream.take(size))
 
-    def _stream(self, file: BinaryIO, start: int = 0) -> _Bytes:
-        """The file from the first record on, or from another one."""
+    def _learned(self, file: BinaryIO, start: int = 0) -> Iterator[tuple]:
+        """Messages and counts as of `_records` from a place on, with the topic for the id. Fills `topics`."""
+        channels: dict[Any, str] = {}
         start = start or len(self.MAGIC)
         size = file.seek(0, 2)
         file.seek(start)
-        return _Bytes(file, max(size - start, 0))
+        for kind, channel, *content in self._records(_Bytes(file, max(size - start, 0))):
+            if kind == "channel":
+                channels[channel], *types = content
+                self.topics.setdefault(channels[channel], Topic(*types))
+            elif channel in channels:
+                yield kind, channels[channel], *content
 
     def _unpacked(self, stream: _Bytes, compression: str, size: int, unpacked: int) -> Iterator[tuple]:
         """The records of a compressed chunk. One that cannot be unpacked costs itself."""
@@ -150,17 +163,13 @@ class RecordFile:
         if is_cut:
             raise FormatError(_CUT_OFF)
 
-    def _read_index(self, file: BinaryIO, size: int) -> bool:
-        """Fills `topics` from the index at the end; False if there is none."""
+    def _index_start(self, file: BinaryIO) -> int:
+        """Where the index begins, 0 if there is none."""
         raise NotImplementedError
 
     def _records(self, stream: _Bytes, is_chunk: bool = False) -> Iterator[tuple]:
-        """(kind, what its header says, size, stream) of each record, those of chunks too. What of the `size` bytes is
-        not taken from the stream is skipped."""
-        raise NotImplementedError
-
-    def _walk(self, stream: _Bytes) -> Iterator[tuple[str, int, int, _Bytes]]:
-        """(topic, time, size, stream) of each message, whose data may be taken from the stream."""
+        """What is told, in chunks too: ("channel", id, topic, type, encoding), ("count", id, messages), and
+        ("message", id, time ns, size, stream); what is not taken from the stream is skipped."""
         raise NotImplementedError
 
 
@@ -168,118 +177,79 @@ class McapFile(RecordFile):
     MAGIC = b"\x89MCAP0\r\n"
     _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _STATISTICS, _DATA_END = 2, 3, 4, 5, 6, 11, 15
 
-    def _read_index(self, file, size):
+    def _index_start(self, file):
         # the footer, and the magic after it
-        file.seek(max(size - 37, 0))
+        file.seek(max(file.seek(0, 2) - 37, 0))
         footer = file.read()
-        if not footer.endswith(self.MAGIC) or footer[0] != self._FOOTER:
-            return False
-        start = struct.unpack_from("<Q", footer, 9)[0]
-        schemas: dict[int, str] = {}
-        channels: dict[int, str] = {}
-        for op, _, stream in self._records(self._stream(file, start)) if 0 < start < size else ():
-            self._learn(op, stream, schemas, channels)
-            if op == self._STATISTICS:
-                stream.take(42)
-                for channel, count in struct.iter_unpack("<HQ", stream.take(stream.number("I"))):
-                    if channel in channels:
-                        self.topics[channels[channel]].count += count
-                return True
-        return False
+        is_whole = footer.endswith(self.MAGIC) and footer[0] == self._FOOTER
+        return struct.unpack_from("<Q", footer, 9)[0] if is_whole else 0
 
     def _records(self, stream, is_chunk=False):
         while stream.left:
             op, size = stream.number("B"), stream.number("Q")
+            left = stream.left - size
             if op in (self._FOOTER, self._DATA_END):
                 return
             if op == self._CHUNK and not is_chunk:
-                stream.take(16)
-                unpacked, _, compression, size = (
-                    stream.number("Q"),
-                    stream.number("I"),
-                    stream.text(),
-                    stream.number("Q"),
-                )
+                *_, unpacked, _ = struct.unpack("<QQQI", stream.take(28))
+                compression, size = stream.text(), stream.number("Q")
                 # records of a chunk that is not compressed follow as others do
                 if compression:
                     yield from self._unpacked(stream, compression, size, unpacked)
                 continue
-            left = stream.left - size
-            yield op, size, stream
+            if op == self._SCHEMA:
+                number = stream.number("H")
+                self._schemas[number] = stream.text()
+            elif op == self._CHANNEL:
+                channel, schema = stream.number("H"), stream.number("H")
+                yield "channel", channel, stream.text(), self._schemas.get(schema, "no type"), stream.text()
+            elif op == self._STATISTICS:
+                stream.take(42)
+                for channel, count in struct.iter_unpack("<HQ", stream.take(stream.number("I"))):
+                    yield "count", channel, count
+            elif op == self._MESSAGE:
+                channel, _, time, _ = struct.unpack("<HIQQ", stream.take(22))
+                yield "message", channel, time, size - 22, stream
             stream.skip(stream.left - left)
         if not is_chunk:
             raise FormatError(_CUT_OFF)
-
-    def _learn(self, op: int, stream: _Bytes, schemas: dict[int, str], channels: dict[int, str]) -> None:
-        """Takes a schema or a channel."""
-        if op == self._SCHEMA:
-            number = stream.number("H")
-            schemas[number] = stream.text()
-        elif op == self._CHANNEL:
-            number, schema, topic, encoding = stream.number("H"), stream.number("H"), stream.text(), stream.text()
-            channels[number] = topic
-            self.topics.setdefault(topic, Topic(schemas.get(schema, "no type"), encoding))
-
-    def _walk(self, stream):
-        schemas: dict[int, str] = {}
-        channels: dict[int, str] = {}
-        for op, size, inner in self._records(stream):
-            self._learn(op, inner, schemas, channels)
-            if op == self._MESSAGE:
-                channel, _, time, _ = struct.unpack("<HIQQ", inner.take(22))
-                if channel in channels:
-                    yield channels[channel], time, size - 22, inner
 
 
 class Ros1File(RecordFile):
     MAGIC = b"#ROSBAG V2.0\n"
     _MESSAGE, _BAG, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 5, 6, 7
 
-    def _read_index(self, file, size):
-        _, header, *_ = next(self._records(self._stream(file)), (0, {}))
-        start = int.from_bytes(header.get(b"index_pos", b""), "little")
-        if not 0 < start < size:
-            return False
-        connections: dict[bytes, str] = {}
-        for op, header, size, stream in self._records(self._stream(file, start)):
-            self._learn(op, header, size, stream, connections)
-            if op == self._CHUNK_INFO:
-                for connection, count in struct.iter_unpack("<4sI", stream.take(size)):
-                    if connection in connections:
-                        self.topics[connections[connection]].count += count
-        return True
+    def _index_start(self, file):
+        stream = _Bytes(file, file.seek(0, 2))
+        file.seek(len(self.MAGIC))
+        return int.from_bytes(_fields(stream.take(stream.number("I"))).get(b"index_pos", b""), "little")
 
     def _records(self, stream, is_chunk=False):
         while stream.left:
             header, size = _fields(stream.take(stream.number("I"))), stream.number("I")
-            op = header.get(b"op", b"\0")[0]
+            left = stream.left - size
+            op, channel = header.get(b"op", b"\0")[0], header.get(b"conn")
             if op == self._CHUNK and not is_chunk:
                 # records of a chunk that is not compressed follow as others do
-                compression = header.get(b"compression", b"none").decode("latin-1")
+                compression = _text(header.get(b"compression", b"none"))
                 if compression != "none":
                     unpacked = int.from_bytes(header.get(b"size", b""), "little")
                     yield from self._unpacked(stream, compression, size, unpacked)
                 continue
-            left = stream.left - size
-            yield op, header, size, stream
+            if op == self._CONNECTION:
+                type_ = _fields(stream.take(size)).get(b"type", b"no type")
+                yield "channel", channel, _text(header.get(b"topic", b"")), _text(type_), "ros1"
+            elif op == self._CHUNK_INFO:
+                for channel, count in struct.iter_unpack("<4sI", stream.take(size)):
+                    yield "count", channel, count
+            elif op == self._MESSAGE:
+                seconds, nanoseconds = struct.unpack("<II", header.get(b"time", b"")[:8].ljust(8, b"\0"))
+                yield "message", channel, seconds * 10**9 + nanoseconds, size, stream
             stream.skip(stream.left - left)
 
-    def _learn(self, op: int, header: dict, size: int, stream: _Bytes, connections: dict[bytes, str]) -> None:
-        """Takes a connection."""
-        if op == self._CONNECTION:
-            topic = header.get(b"topic", b"").decode("utf-8", "replace")
-            type_ = _fields(stream.take(size)).get(b"type", b"no type").decode("utf-8", "replace")
-            connections[header.get(b"conn", b"")] = topic
-            self.topics.setdefault(topic, Topic(type_, "ros1"))
 
-    def _walk(self, stream):
-        connections: dict[bytes, str] = {}
-        for op, header, size, inner in self._records(stream):
-            self._learn(op, header, size, inner, connections)
-            topic = connections.get(header.get(b"conn", b""))
-            if op == self._MESSAGE and topic is not None:
-                seconds, nanoseconds = struct.unpack("<II", header.get(b"time", b"").ljust(8, b"\0")[:8])
-                yield topic, seconds * 10**9 + nanoseconds, size, inner
+def _text(data: bytes) -> str:
+    return data.decode("utf-8", "replace")
 
 
 def _fields(data: bytes) -> dict[bytes, bytes]:
@@ -323,7 +293,7 @@ class SqliteFile:
         # a file that is shorter than its header says is refused otherwise
         connection.execute("PRAGMA writable_schema=ON")
         connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MAX_MESSAGE)
-        connection.text_factory = lambda text: text.decode("utf-8", "replace")
+        connection.text_factory = _text
         return connection
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:

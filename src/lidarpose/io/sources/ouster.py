@@ -36,8 +36,7 @@ _PIXEL_BYTES = {
     "RNG15_RFL8_WIN8": 4,
     "FUSA_RNG15_RFL8_NIR8_DUAL": 8,
 }
-_HEADER = _FOOTER = 32
-_MAX_COLUMNS, _MAX_BEAMS, _MAX_PACKET = 4096, 256, 65507
+_MAX_COLUMNS, _MAX_BEAMS, _MAX_PACKET, _MAX_NUMBER = 4096, 256, 65507, 1e9
 # of sensors before the metadata told it
 _LIDAR_TO_SENSOR = (-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 36.18, 0, 0, 0, 1)
 _COLUMNS_PER_PACKET = 16
@@ -93,8 +92,8 @@ class OusterFormat:
         if not len(altitude) == len(azimuth) == pixels:
             came = f"{len(altitude)} altitudes and {len(azimuth)} azimuths"
             raise FormatError(f"beam angles of {pixels} beams", came, "save the sensor's metadata anew")
-        window = metadata.get("column_window") or (0, self.columns - 1)
-        self.window = tuple(min(max(int(column), 0), self.columns - 1) for column in window)
+        first, last = metadata.get("column_window") or (0, self.columns - 1)
+        self.window = min(max(int(first), 0), self.columns - 1), min(max(int(last), 0), self.columns - 1)
         self.port, self.serial = metadata.get("udp_port_lidar"), metadata.get("prod_sn")
 
         self.profile = str(metadata.get("udp_profile_lidar", "LEGACY"))
@@ -110,31 +109,16 @@ class OusterFormat:
         self._aim(metadata, altitude, azimuth)
 
     def _packet_type(self) -> np.dtype:
-        pixel_bytes = _PIXEL_BYTES[self.profile]
         is_short = "RNG15" in self.profile
         self.unit = 8 if is_short else 1
         self.mask = 0x7FFF if is_short else 0xFFFFF if self.is_legacy else 0x7FFFF
-        pixel = np.dtype({"names": ["range"], "formats": ["<u2" if is_short else "<u4"], "itemsize": pixel_bytes})
-        head = 16 if self.is_legacy else 12
-        status = head + self.beams * pixel_bytes
-        column = np.dtype(
-            {
-                "names": ["time", "id", "status", "pixels"],
-                "formats": ["<u8", "<u2", "<u2", (pixel, self.beams)],
-                "offsets": [0, 8, status if self.is_legacy else 10, head],
-                "itemsize": status + 4 * self.is_legacy,
-            }
-        )
-        size = column.itemsize * self.columns_per_packet
-        start = 0 if self.is_legacy else _HEADER
-        return np.dtype(
-            {
-                "names": ["columns"],
-                "formats": [(column, self.columns_per_packet)],
-                "offsets": [start],
-                "itemsize": size if self.is_legacy else size + _HEADER + _FOOTER,
-            }
-        )
+        number = "<u2" if is_short else "<u4"
+        pixel = np.dtype({"names": ["range"], "formats": [number], "itemsize": _PIXEL_BYTES[self.profile]})
+        column: list[tuple] = [("time", "<u8"), ("id", "<u2"), ("status", "<u2"), ("pixels", pixel, self.beams)]
+        if self.is_legacy:
+            column[2:] = [("frame", "<u2"), ("encoder", "<u4"), ("pixels", pixel, self.beams), ("status", "<u4")]
+        columns = ("columns", column, self.columns_per_packet)
+        return np.dtype([columns] if self.is_legacy else [("header", "V32"), columns, ("footer", "V32")])
 
     def _aim(self, metadata: dict[str, Any], altitude: np.ndarray, azimuth: np.ndarray) -> None:
         """Directions (columns, beams, 3) and starts (columns, 3) m of the beams in the sensor's frame; a range counts
@@ -156,22 +140,15 @@ class OusterFormat:
 
     def header(self, packet: bytes) -> tuple[int, int | None]:
         """A packet's frame id, and the sensor's serial number where it tells it."""
-        if self.is_legacy:
-            return int.from_bytes(packet[10:12], "little"), None
-        if self.is_fusa:
-            return int.from_bytes(packet[4:8], "little"), int.from_bytes(packet[11:16], "little")
-        return int.from_bytes(packet[2:4], "little"), int.from_bytes(packet[7:12], "little")
+        at, size, serial = (10, 2, None) if self.is_legacy else (4, 4, 11) if self.is_fusa else (2, 2, 7)
+        frame_id = int.from_bytes(packet[at : at + size], "little")
+        return frame_id, None if serial is None else int.from_bytes(packet[serial : serial + 5], "little")
 
-    def num_packets(self) -> int:
-        """Packets that a whole turn is sent in."""
-        first, last = (column // self.columns_per_packet for column in self.window)
-        most = -(-self.columns // self.columns_per_packet)
-        return last - first + 1 if self.window[0] <= self.window[1] else min(most - first + last + 1, most)
-
-    def num_columns(self) -> int:
-        """Columns that a whole turn holds."""
-        first, last = self.window
-        return last - first + 1 if first <= last else self.columns - first + last + 1
+    def num_sent(self, step: int = 1) -> int:
+        """Columns that a whole turn is sent in, or groups of `step` of them."""
+        first, last = (column // step for column in self.window)
+        total = -(-self.columns // step)
+        return last - first + 1 if self.window[0] <= self.window[1] else min(total - first + last + 1, total)
 
     def decode(self, packets: list[bytes]) -> Sweep:
         """The sweep that a frame's packets hold; ring is the number of the beam, from the top."""
@@ -185,8 +162,8 @@ class OusterFormat:
         points = self.directions[ids[column], beam]
         points *= (ranges.ravel()[returns] - self.reach)[:, None]
         points += self.starts[ids[column]]
-        lost = self.num_columns() - len(ids)
-        warnings = (f"{lost} of {self.num_columns()} columns are missing",) if lost > 0 else ()
+        lost = self.num_sent() - len(ids)
+        warnings = (f"{lost} of {self.num_sent()} columns are missing",) if lost > 0 else ()
         return Sweep(points=points, origin=self.origin, ring=beam, warnings=warnings)
 
 
@@ -261,7 +238,7 @@ class OusterRecording:
     def _turns(self) -> Iterator[tuple[float, list[bytes]]]:
         """(time of capture, packets) of each turn of the sensor."""
         self._num_lost = self._num_sent = self._num_other = 0
-        most = self.format.num_packets()
+        most = self.format.num_sent(self.format.columns_per_packet)
         packets: list[bytes] = []
         current = previous = None
         started, num_turns = 0.0, 0
@@ -307,7 +284,7 @@ def _numbers(metadata: dict[str, Any], key: str, default: Any = None) -> np.ndar
     if key not in metadata and default is None:
         raise FormatError(f"has no {key}: expected an Ouster sensor's metadata; save it from the sensor")
     values = np.asarray(metadata.get(key, default), dtype=np.float64)
-    if not np.isfinite(values).all():
+    if not (np.abs(values) < _MAX_NUMBER).all():
         raise FormatError(f"finite numbers in {key}", "others", "save the sensor's metadata anew")
     return values
 
