@@ -105,13 +105,12 @@ def predict_recording(
 def _print_lines(options: argparse.Namespace, source, steps) -> None:
     """Frames as they come, on the standard output."""
     from lidarpose.recording.output import Summary, in_world
-    from lidarpose.recording.predict_recording import read_ahead
 
     if steps.is_tracked and not steps.live:
         raise InputError("--out - prints frames as they come: say --live, which needs no later frames, or name a file")
     summary = Summary()
-    for frame in read_ahead(source.frames()):
-        line = steps.predict(frame).to_dict()
+    for frame in steps.predict_all(source.frames()):
+        line = frame.to_dict()
         line = in_world(line) if options.world else line
         summary.add(line)
         print(json.dumps(line), flush=True)

@@ -179,11 +179,28 @@ def find_people(scan: Scan, search: Search, known: KnownPlaces | None = None) ->
 
     known: of a recording's frames before; with it the scan has `pelvises`, `verified` and `rejected`, too.
     """
+    return verify_people(detect_places(scan, search), search, known)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Places:
+    """A scan in which people were detected, but not verified: as given, and as it is searched; its points in the level
+    frame (n, 3) m; the detections there, None of a scan without points."""
+
+    given: Scan
+    scan: Scan
+    level: np.ndarray
+    detections: Detections | None
+
+
+def detect_places(scan: Scan, search: Search) -> Places:
+    """The first half of `find_people`, which depends on no other frame."""
     count = len(scan.points)
     given, notes = _thinned(scan, search)
     scan, warnings = given, [*scan.warnings, *notes]
     if len(scan.points) < MIN_POINTS:
-        return replace(scan, boxes=[], found_rows=[], warnings=(*warnings, f"under {MIN_POINTS} points"))
+        scan = replace(scan, warnings=(*warnings, f"under {MIN_POINTS} points"))
+        return Places(given=given, scan=scan, level=scan.points, detections=None)
     level = _leveled(scan)
     # what else looks odd follows from wrong axes or units
     some = slice(None, None, -(-len(level) // _ENOUGH))
@@ -212,15 +229,22 @@ def find_people(scan: Scan, search: Search, known: KnownPlaces | None = None) ->
     detections = detector.detect(level, origin, max_range=search.max_range, limit=_POSED, moving=moving)
     if not (detections.has_ground or wrong):
         warnings.append("no ground was found, and people are searched without it: is the up axis right?")
+    scan = replace(scan, warnings=tuple(warnings))
+    return Places(given=given, scan=scan, level=level, detections=detections)
+
+
+def verify_people(places: Places, search: Search, known: KnownPlaces | None = None) -> Scan:
+    """The second half of `find_people`."""
+    scan, given = places.scan, places.given
+    if places.detections is None:
+        return replace(scan, boxes=[], found_rows=[])
     # the boxes of a frame that leans are larger than their people: these are looked for anew
     leans = not np.allclose(given.R_boxes_input, scan.R_level_input)
-    people = _verified(detections, level, origin, search, None if known is None or leans else _level(known, scan))
-    searched = replace(
-        scan,
-        boxes=[_in_input(box, scan, given) for box in people.boxes],
-        found_rows=people.rows,
-        warnings=tuple(warnings),
-    )
+    origin = None if scan.origin is None else scan.R_level_input @ scan.origin
+    here = None if known is None or leans else _level(known, scan)
+    people = _verified(places.detections, places.level, origin, search, here)
+    boxes = [_in_input(box, scan, given) for box in people.boxes]
+    searched = replace(scan, boxes=boxes, found_rows=people.rows)
     if known is None:
         return searched
     return replace(

@@ -43,7 +43,7 @@ from lidarpose.tracking.smoothing import smooth
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from lidarpose.inference.detection import KnownPlaces, Search
+    from lidarpose.inference.detection import KnownPlaces, Places, Search
 
 BACKENDS = ("onnx", "torch")
 # default number of test-time augmentation passes
@@ -169,7 +169,7 @@ def predictor_of(model: "Predictor | str | os.PathLike | Callable[[], Predictor]
 
 
 def predict_scan(
-    scan: Scan,
+    scan: "Scan | Places",
     model: "Callable[[], Predictor]",
     *,
     search: "Search | None" = None,
@@ -181,6 +181,7 @@ def predict_scan(
     crop; then everybody is posed.
 
     Args:
+        scan: or one in which people were detected already.
         model: loads the network, once people were searched for.
         known: as of `find_people`.
 
@@ -190,10 +191,12 @@ def predict_scan(
     started = time.perf_counter()
     times = {}
     if search is not None:
-        from lidarpose.inference.detection import find_people
+        from lidarpose.inference.detection import detect_places, verify_people
 
-        scan = find_people(scan, search, known)
+        places = detect_places(scan, search) if isinstance(scan, Scan) else scan
+        scan = verify_people(places, search, known)
         times["find"] = time.perf_counter() - started
+    assert isinstance(scan, Scan)
     searched = time.perf_counter()
     predictor = model()
     times["load"] = time.perf_counter() - searched
@@ -427,7 +430,8 @@ class Predictor:
                 notes.append(warning)
             elif looks_unsure(pose, part):
                 doubtful.append(i)
-        # a second look at the few whose pose looks unsure
+        # a second look at the few whose pose looks unsure; where pelvises are known people were seen upright before
+        doubtful = doubtful if centers is None else []
         flipped = [best[i][1] * UPSIDE_DOWN for i in doubtful]
         flipped_poses = self._all_poses(flipped, None if origin is None else origin * UPSIDE_DOWN, False)
         for i, turned in zip(doubtful, flipped_poses, strict=True):

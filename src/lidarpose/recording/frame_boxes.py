@@ -62,13 +62,11 @@ class FrameBoxes:
             given = self._by_frame[key]
             raise error if isinstance(given, str | os.PathLike) else file_error(f"frame {key}", error) from None
 
-    def check_used(self, frame: Frame | DamagedFrame) -> None:
-        """Raises InputError where no frame up to this last one has boxes, so that they are of something else."""
+    def check_used(self, last: str) -> None:
+        """Raises InputError where no frame up to the last one's id has boxes, so that they are of something else."""
         if not self.was_used:
             ids = shorten(", ".join(list(self._by_frame)[:3]))
-            raise file_error(
-                self._name, f"has boxes of frames {ids}, none of which is here: the last one is {frame.id}"
-            )
+            raise file_error(self._name, f"has boxes of frames {ids}, none of which is here: the last one is {last}")
 
 
 def _by_frame(path: str | os.PathLike) -> dict[str, Any]:

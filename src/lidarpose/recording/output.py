@@ -21,7 +21,7 @@ from lidarpose.errors import missing_extra
 from lidarpose.io.files import atomic_path, check_writable, file_error
 from lidarpose.io.sources import Source
 from lidarpose.progress import Progress
-from lidarpose.recording.predict_recording import FramePoses, FramePredictor, fixed_from_sensor, read_ahead
+from lidarpose.recording.predict_recording import FramePoses, FramePredictor, fixed_from_sensor
 from lidarpose.sample import PER_JOINT
 from lidarpose.skeleton import Skeleton
 from lidarpose.tracking.clip import TrackPoses
@@ -214,10 +214,10 @@ def _add_frames(source: Source, steps: FramePredictor, part: PartFile) -> None:
         if frame is None or (frame.index, frame.id) != (index, id):
             raise file_error(part.path, f"was made of other frames, the last one {id}: remove it to begin anew")
     with Progress(source.count, unit="frames", done=part.frames) as shown:
-        for frame in read_ahead(frames):
-            part.append(steps.predict(frame), steps.state())
+        for done in steps.predict_all(frames):
+            part.append(done, steps.state())
             shown.update(part.frames)
-    steps.check_boxes(frame)
+    steps.check_boxes(part.last)
 
 
 def write_result(path: Path, lines: Iterable[dict[str, Any]]) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, rotation_from_up
-from lidarpose.inference.detection import KnownPlaces, Search, least_score, search_options
+from lidarpose.inference.detection import KnownPlaces, Places, Search, detect_places, least_score, search_options
 from lidarpose.inference.inputs import as_origin, only_returns
 from lidarpose.inference.predictor import Predictor, check_choice, is_wide, predict_scan, predictor_of
 from lidarpose.inference.results import PersonPose, Poses
@@ -32,7 +32,7 @@ from lidarpose.tracking.tracker import Tracker, TrackState
 SCHEMA = "lidarpose.recording/1"
 # a known person is verified anew after so many seconds, and a place that held nobody looked at: between the two, so
 # that not all are due in one frame
-_TRUSTED = (0.8, 1.2)
+_TRUSTED = (1.6, 2.4)
 # who was not seen for longer, s, or may be farther off than this, m, is searched for like anybody else
 _RECENT, _MOST_DEVIATION = 0.5, 0.35
 # a detection within so many m, and standard deviations more, of where a track is expected may continue it
@@ -130,16 +130,7 @@ def predict_recording(
         model=model,
         name=source.name,
     )
-    return (steps.predict(frame) for frame in read_ahead(source.frames()))
-
-
-def read_ahead(frames: Iterator[Frame | DamagedFrame]) -> Iterator[Frame | DamagedFrame]:
-    """The same frames, the next being read while one is worked on."""
-    with ThreadPoolExecutor(1) as pool:
-        pending = pool.submit(next, frames, None)
-        while (frame := pending.result()) is not None:
-            pending = pool.submit(next, frames, None)
-            yield frame
+    return steps.predict_all(source.frames())
 
 
 class FramePredictor:
@@ -200,24 +191,53 @@ class FramePredictor:
         """The skeleton of the poses."""
         return self.predictor.in_skeleton(self.skeleton)
 
-    def check_boxes(self, last: Frame | DamagedFrame | None) -> None:
-        """Raises InputError where no frame up to the last one had boxes, though some were given."""
+    def check_boxes(self, last: tuple[int, str] | None) -> None:
+        """Raises InputError where no frame up to the last one, index and id, had boxes, though some were given."""
         if self.boxes is not None and last is not None:
-            self.boxes.check_used(last)
+            self.boxes.check_used(last[1])
+
+    def predict_all(self, frames: Iterator[Frame | DamagedFrame]) -> Iterator[FramePoses]:
+        """The people of the next frames; while one is posed the one after is read and searched."""
+
+        def prepare() -> tuple[Frame | DamagedFrame, Scan | Places | InputError] | None:
+            frame = next(frames, None)
+            return None if frame is None else (frame, self._prepared(frame))
+
+        with ThreadPoolExecutor(1) as pool:
+            pending = pool.submit(prepare)
+            while (ready := pending.result()) is not None:
+                pending = pool.submit(prepare)
+                yield self._predicted(*ready)
 
     def predict(self, frame: Frame | DamagedFrame) -> FramePoses:
         """The people of the next frame."""
+        return self._predicted(frame, self._prepared(frame))
+
+    def _prepared(self, frame: Frame | DamagedFrame) -> Scan | Places | InputError:
+        """What depends on no other frame: the scan, searched where people are searched for; or what is wrong."""
+        if isinstance(frame, DamagedFrame):
+            return InputError(frame.error)
+        try:
+            scan = self._scan(frame)
+            return scan if self.boxes is not None or self._is_crop else detect_places(scan, self._search)
+        except InputError as error:
+            return error
+
+    def _predicted(self, frame: Frame | DamagedFrame, prepared: Scan | Places | InputError) -> FramePoses:
         nobody = Poses(people=(), skeleton=self.wanted, model=self.predictor.model, source=self.name)
         of_frame = partial(FramePoses, index=frame.index, id=frame.id, time=frame.time, is_tracked=self.is_tracked)
         if isinstance(frame, DamagedFrame):
             return of_frame(poses=nobody, error=frame.error)
+        T_fixed_sensor = self._to_fixed(frame.T_world_sensor)
+        time = frame.index / DEFAULT_RATE if frame.time is None else frame.time
         try:
-            scan = self._scan(frame)
-            search = self._search if self.boxes is None and not self._is_crop else None
-            T_fixed_sensor = self._to_fixed(frame.T_world_sensor)
-            time = frame.index / DEFAULT_RATE if frame.time is None else frame.time
+            if isinstance(prepared, InputError):
+                raise prepared
+            search = self._search if isinstance(prepared, Places) else None
             known = self._known(time, T_fixed_sensor) if self.is_tracked and search is not None else None
-            scan, poses = predict_scan(scan, lambda: self.predictor, search=search, known=known, skeleton=self.skeleton)
+            scan, poses = predict_scan(
+                prepared, lambda: self.predictor, search=search, known=known, skeleton=self.skeleton
+            )
         except InputError as error:
             return of_frame(poses=nobody, T_world_sensor=frame.T_world_sensor, error=str(error))
         if self.is_tracked:
