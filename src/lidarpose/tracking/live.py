@@ -62,7 +62,7 @@ class LiveFilter:
                 return None
             self._belief = self._belief.predicted(step, SCALES[:, None] * self._usual)
             joints, spread = self._estimate()
-            unseen = {"confidence": likely_hit(spread), "visible": np.zeros(len(spread))}
+            unseen: dict[str, Any] = {"confidence": likely_hit(spread), "visible": np.zeros(len(spread))}
             return Pose(joints=joints, skeleton=self.skeleton, spread=spread, **unseen)
         if self._seen is None:
             self._arrays["origin"] = pose.joints.mean(0)

@@ -1,0 +1,194 @@
+"""How steady and near poses over clips are: frame by frame, by a plain solve, and as `model.predict_clip` gives them.
+
+    python benchmarks/clips.py --motion cmu_motion.npz:006,007 --store clips.npz --json docs/scores/clips.json
+
+Clips of 16 frames at 10 Hz of the scene preset `wild` (full difficulty, 14 sensors, 2.5 to 25 m), of people and motion
+that nothing was trained on: --motion FILE[:SUBJECTS], which may stand more than once and takes turns; without it
+activities of the prior. Sensors stand still. Poses are predicted once and kept in --store.
+
+MPJPE on the 15 joints of human15. Acceleration error: distance of second differences, mm a frame squared. Turned round:
+the way from right to left hips and shoulders is over 90 degrees off. Bone lengths: standard deviation over a clip, mean
+of the bones of both limbs and the hips. Frames in which the person was not seen count too: frame by frame they repeat
+the nearest frame that was seen. The plain solve: for each joint, squared second differences plus distances weighted by
+1/spread^2, one linear system.
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+
+from lidarpose.inference.predictor import load
+from lidarpose.io.files import write_atomic
+from lidarpose.metrics import acceleration_errors, aligned_errors, interval, joint_errors, paired_interval
+from lidarpose.models import DEFAULT
+from lidarpose.skeleton import BODY26, HUMAN15
+from lidarpose.synth.bodies import CLIP_HZ, PoseBank
+from lidarpose.synth.generator import Generator
+from lidarpose.tracking.bones import rigid_bones
+from lidarpose.tracking.clip import TrackPoses
+from lidarpose.tracking.live import follow
+from lidarpose.tracking.smoothing import smooth
+
+# never a seed of a training run, nor of the clips that the smoother was tuned on, 71001
+SEED = 77_001
+# weight of squared second differences in the plain solve: the best of 100, 300, 1000, 3000 on the clips for tuning
+STIFFNESS = 300.0
+_VALUES = ("joints", "spread", "visible", "confidence")
+_PICKED = BODY26.map_to(HUMAN15)
+
+
+def make_clips(motion: list[str], count: int, seed: int, weights: str) -> dict[str, np.ndarray]:
+    """Truth (C, T, 26, 3) m and what the network says frame by frame, NaN where the person was not seen."""
+    banks = []
+    for spec in motion:
+        path, _, subjects = spec.partition(":")
+        banks.append(PoseBank.from_clips(path, tuple(subjects.split(",")) if subjects else None))
+    scenes = [Generator(scene="wild", bank=bank, captured=1.0, measure=False) for bank in banks]
+    scenes = scenes or [Generator(scene="wild", measure=False)]
+    model, clips = load(weights), []
+    for index in range(count):
+        people = scenes[index % len(scenes)].clip(seed, index)
+        clouds = [np.asarray(person.sample.points, float) for person in people]
+        poses = [person.pose for person in model.predict(clouds, sensor_origin=(0, 0, 0), skeleton="body26")]
+        track = TrackPoses.of_poses(np.arange(len(poses)), poses, BODY26)
+        true = np.stack([person.sample.pose.joints for person in people])
+        clips.append({"true": true} | {name: getattr(track, name) for name in _VALUES})
+        print(f"\r{index + 1} of {count} clips", end="", flush=True)
+    print()
+    return {name: np.stack([clip[name] for clip in clips]) for name in clips[0]}
+
+
+def nearest_seen(joints: np.ndarray) -> np.ndarray:
+    """Frames (T, J, 3) without joints repeat the nearest that has some."""
+    frames = np.arange(len(joints))
+    seen = np.flatnonzero(np.isfinite(joints).all((1, 2)))
+    return joints[seen[np.abs(frames[:, None] - seen).argmin(1)]]
+
+
+def plain_solve(track: TrackPoses) -> np.ndarray:
+    """(T, J, 3) m."""
+    frames = len(track)
+    bends = np.diff(np.eye(frames), 2, axis=0)
+    weight = np.where(track.seen[:, None], track.spread**-2, 0.0)
+    seen = np.where(track.seen[:, None, None], track.joints, 0.0)
+    system = STIFFNESS * bends.T @ bends + np.eye(frames) * weight.T[:, :, None]
+    return np.linalg.solve(system, (weight[..., None] * seen).swapaxes(0, 1)).swapaxes(0, 1)
+
+
+def live_joints(track: TrackPoses) -> np.ndarray:
+    """(T, J, 3) m, NaN where there are none."""
+    return TrackPoses.of_poses(track.times, follow(track), BODY26).joints
+
+
+WAYS = {
+    "frame by frame": lambda track: track.joints,
+    "plain solve": plain_solve,
+    "smoothed": lambda track: smooth(track).joints,
+    "live": live_joints,
+}
+
+
+def across(joints: np.ndarray) -> np.ndarray:
+    """(..., 3): from right to left."""
+    at = BODY26.index
+    return sum(joints[..., at(f"left_{name}"), :] - joints[..., at(f"right_{name}"), :] for name in ("hip", "shoulder"))
+
+
+def figures(joints: np.ndarray, base: np.ndarray, true: np.ndarray) -> dict:
+    """Of clips (C, T, 26, 3) m, with intervals over clips; base: those of frame by frame."""
+    rng = np.random.default_rng(0)
+    count = len(true)
+
+    def errors(pred):
+        picked, truth = (a[:, :, _PICKED] for a in (pred, true))
+        return joint_errors(picked, truth).reshape(count, -1), acceleration_errors(picked, truth, 1.0)
+
+    bones = rigid_bones(HUMAN15)
+    ends = joints[:, :, _PICKED][:, :, bones]
+    lengths = 1e3 * np.linalg.norm(ends[..., 0, :] - ends[..., 1, :], axis=-1)
+    turned, turned_before = ((across(a) * across(true)).sum(-1) < 0 for a in (joints, base))
+    mostly_right = turned_before.mean(1) < 0.5
+    values = {}
+    for name, own, before in zip(("mpjpe", "acceleration"), errors(joints), errors(base), strict=True):
+        mean, less = interval(own, rng), paired_interval(before, own, rng)
+        values[name] = {"value": float(own.mean()), "low": mean.low, "high": mean.high}
+        saved = (before.mean() - own.mean(), less.low, less.high)
+        values[f"{name}_less"] = [100 * float(value / before.mean()) for value in saved]
+    return values | {
+        "pa_mpjpe": float(aligned_errors(joints[:, :, _PICKED], true[:, :, _PICKED]).mean()),
+        "p95": float(np.percentile(errors(joints)[0], 95)),
+        "turned_percent": float(100 * turned.mean()),
+        "clips_mostly_right": int(mostly_right.sum()),
+        "turned_clips_of_these": int(turned[mostly_right].any(1).sum()),
+        "turned_frames_of_these": int(turned[mostly_right].sum()),
+        "bone_deviation": float(lengths.std(1).mean()),
+    }
+
+
+def run(clips: dict[str, np.ndarray]) -> dict:
+    """The figures of each way."""
+    tracks = [
+        TrackPoses(
+            times=np.arange(clips["true"].shape[1]) / CLIP_HZ,
+            skeleton=BODY26,
+            **{name: clips[name][i] for name in _VALUES},
+        )
+        for i in range(len(clips["true"]))
+    ]
+    seen = np.array([track.seen.any() for track in tracks])
+    tracks, true = [track for track in tracks if track.seen.any()], clips["true"][seen]
+    report, base = {"clips": len(tracks), "unseen_clips": int((~seen).sum()), "ways": {}}, None
+    for name, way in WAYS.items():
+        started = time.perf_counter()
+        found = [way(track) for track in tracks]
+        spent = time.perf_counter() - started
+        joints = np.stack([nearest_seen(each) for each in found])
+        base = joints if base is None else base
+        report["ways"][name] = figures(joints, base, true) | {"ms_a_frame": 1e3 * spent / true[..., 0, 0].size}
+    steady = [smooth(track) for track in tracks]
+    ok = np.stack([track.seen for track in steady])
+    spread = np.stack([track.spread for track in steady])[ok]
+    error = np.linalg.norm(np.stack([track.joints for track in steady])[ok] - true[ok], axis=-1)
+    report["spread_over_error"] = float(spread.mean() / error.mean())
+    tenths = np.array_split(np.argsort(spread.ravel()), 10)
+    report["spread_tenths_mm"] = [[1e3 * float(v.ravel()[i].mean()) for v in (spread, error)] for i in tenths]
+    return report
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--motion", action="append", default=[], metavar="FILE[:SUBJECTS]")
+    parser.add_argument("--weights", default=DEFAULT)
+    parser.add_argument("--clips", type=int, default=120)
+    parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--store", help="npz of predicted clips: read where it is there, else written")
+    parser.add_argument("--json", help="also write the figures to this file")
+    options = parser.parse_args()
+
+    if options.store and Path(options.store).exists():
+        with np.load(options.store) as stored:
+            clips = dict(stored)
+    else:
+        clips = make_clips(options.motion, options.clips, options.seed, options.weights)
+        if options.store:
+            np.savez_compressed(options.store, **clips)
+    report = run(clips)
+    for name, way in report["ways"].items():
+        mpjpe, bent = way["mpjpe_less"], way["acceleration_less"]
+        print(
+            f"{name:15s} MPJPE {way['mpjpe']['value']:5.1f} mm, less {mpjpe[0]:4.1f} % [{mpjpe[1]:.1f}, {mpjpe[2]:.1f}]"
+            f"  acceleration {way['acceleration']['value']:5.1f}, less {bent[0]:4.1f} % [{bent[1]:.1f}, {bent[2]:.1f}]"
+            f"  PA {way['pa_mpjpe']:4.1f}  p95 {way['p95']:5.1f}  turned {way['turned_percent']:.2f} %"
+            f" ({way['turned_clips_of_these']} of {way['clips_mostly_right']} clips)"
+            f"  bones {way['bone_deviation']:4.1f} mm  {way['ms_a_frame']:.2f} ms"
+        )
+    print(f"spread / error {report['spread_over_error']:.2f}")
+    if options.json:
+        write_atomic(Path(options.json), json.dumps(report, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
