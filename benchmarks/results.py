@@ -36,7 +36,7 @@ DOCS = ROOT / "docs"
 SCORES = DOCS / "scores"
 PAGES = (
     ROOT / "README.md",
-    *(DOCS / f"{page}.md" for page in ("results", "evaluate", "method")),
+    *(DOCS / f"{page}.md" for page in ("results", "evaluate", "method", "recordings")),
     *(DOCS / "cards" / f"{name}.md" for name in BUNDLED),
 )
 RUNS = "ablations"
@@ -239,6 +239,20 @@ def real() -> str:
     return table((*header, "points within 15 cm of a bone", "trunk lean", "confidence"), rows)
 
 
+def clips() -> str:
+    """Poses over clips made steady; see clips.py."""
+    rows = []
+    for name, way in _read("clips")["ways"].items():
+        cells = [name]
+        for figure in ("mpjpe", "acceleration"):
+            less, low, high = way[f"{figure}_less"]
+            cells.append(f"{way[figure]['value']:.1f}" + (f" (-{less:.0f} % [{low:.0f}, {high:.0f}])" if less else ""))
+        turned = f"{way['turned_clips_of_these']} of {way['clips_mostly_right']}"
+        rows.append((*cells, f"{way['pa_mpjpe']:.1f}", turned, f"{way['bone_deviation']:.1f}"))
+    header = ("", "MPJPE mm", "acceleration error, mm a frame squared", "PA-MPJPE mm")
+    return table((*header, "clips with a frame turned round", "bone lengths, deviation mm"), rows)
+
+
 def moved() -> str:
     """How far real people's joints went between two sweeps; see real.py."""
     rows = [(one["person"], f"{one['mm']:.0f}") for one in _read("real")["tracks"]]
@@ -307,7 +321,7 @@ def tables() -> dict[str, Callable[[], str]]:
     made["against the paper"] = lambda: table(*changed.against_paper(runs))
     made["speed"] = lambda: table(*timed.medians(_read("speed")))
     made["speed ratios"] = lambda: table(*timed.ratios(_read("speed")["targets"]))
-    made |= {"calibration": calibration, "spread": spread, "real moved": moved}
+    made |= {"calibration": calibration, "spread": spread, "real moved": moved, "clips": clips}
     for group in ("points", "kind", "sensor", "activity", "condition", "distance, m"):
         own = ("all", "points", "mounted, all") if group == "points" else (group, f"{group}, 50 points and more")
         made |= {f"detector {name} by {group}": partial(detector, name, *own) for name in ("heldout", "real")}

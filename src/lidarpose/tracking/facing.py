@@ -14,8 +14,8 @@ from lidarpose.skeleton import Skeleton
 _SURE = 6.0
 # what confidence is taken for where the network does not say
 _CONFIDENCE = 0.6
-# cost of a frame turned round against the one before
-_TURN = 10.0
+# cost of a frame turned round against the one before: nobody turns about in a tenth of a second
+_TURN = 40.0
 # what is across the body
 _ACROSS = ("hip", "shoulder")
 # log odds for walking forwards rather than backwards, at most, and the speed of half as much, m/s
