@@ -11,7 +11,7 @@ from lidarpose.tracking.facing import exchanged
 from lidarpose.tracking.motion_model import learn_strength, smooth_joints, strengths
 
 # frames are trusted by Student's t of so many degrees of freedom: a frame that is off as a whole hardly counts
-_FREEDOM = 0.5
+_FREEDOM = 1.0
 # rounds of weighing frames; the strength of motion is learned before each of the last
 _ROUNDS, _LEARNED = 6, 3
 _FIRST_SCALE = 3.0
