@@ -1,4 +1,4 @@
-"""What a sensor sees by direction: nearest and farthest return and their number, of which pictures of places are cut."""
+"""What a sensor sees by direction: nearest and farthest return and their number. Pictures of places are made of it."""
 
 from math import pi
 
