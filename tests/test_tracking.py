@@ -209,6 +209,16 @@ def test_a_weak_box_on_somebody_who_is_seen_is_nobody_else():
     assert tracker.update(0.4, [person(0, score=0.9)], [person(0.75, score=0.4)]) == [0, 1]
 
 
+def test_a_weak_box_of_somebody_unnumbered_goes_to_nobody_else():
+    tracker = Tracker()
+    for time in (0.0, 0.1, 0.2, 0.3):
+        assert tracker.update(time, [person(0, score=0.9)], [person(0.8, score=0.5)]) == [0, -1]
+    # the first is hidden
+    assert tracker.update(0.4, [], [person(0.8, score=0.5)]) == [-1]
+    assert [state.id for state in tracker.predicted(0.5)] == [0]
+    assert tracker.update(0.5, [person(0.8, score=0.9)]) == [1]
+
+
 def test_a_doubtful_box_moves_its_person_less():
     moved = []
     for score in (1.0, 0.2):

@@ -27,12 +27,12 @@ SPEED_SD, SPEED_CHANGE = np.array([1.2, 1.2, 0.2]), np.array([0.7, 0.7, 0.15])
 _GATE = 16.3
 # nor does a box go to somebody who may be anywhere: bound of -2 log likelihood, less a constant
 _LEAST_LIKELY = 8.0
-# a weak box so near to a sure one is the same person again, m
-_AGAIN = 0.55
+# a weak box so near to another one is the same person again, m
+_REPEATED = 0.5
 # heading and size follow what is seen with this time constant, s
 _SMOOTHING = 0.5
 # who was seen once, with a score below this, is forgotten this soon, s
-_SURE, _UNSURE_GAP = 0.6, 0.35
+_SURE, _UNSURE_GAP = 0.6, 0.6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,8 +50,9 @@ class TrackState:
 
 @dataclass(kw_only=True, eq=False)
 class _Tracks:
-    """Of all tracks: id (N,); state (N, 3, 2): position m and velocity m/s along x, y, z; covariance (N, 3, 2, 2);
-    heading (N, 2): mean of cos and sin of yaw; size (N, 3) m; age (N,) s since seen; sightings (N,); sure (N,) bool."""
+    """Of all tracks: id (N,), -1 for those without a number yet; state (N, 3, 2): position m and velocity m/s along x, y,
+    z; covariance (N, 3, 2, 2); heading (N, 2): mean of cos and sin of yaw; size (N, 3) m; age (N,) s since seen;
+    sightings (N,); sure (N,) bool: seen twice, or by a box of high score."""
 
     id: np.ndarray
     state: np.ndarray
@@ -64,6 +65,11 @@ class _Tracks:
 
     def __len__(self) -> int:
         return len(self.id)
+
+    @property
+    def is_expected(self) -> np.ndarray:
+        """(N,) bool: those with a number that were seen twice or for sure."""
+        return self.sure & (self.id >= 0)
 
     def take(self, rows: np.ndarray) -> "_Tracks":
         return _Tracks(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
@@ -124,14 +130,22 @@ class Tracker:
         tracks = self._elapsed(time)
         found = _of_boxes([*boxes, *weak_boxes])
         is_weak = np.arange(len(found)) >= len(boxes)
-        rows, columns = assign(_costs(tracks, found, is_weak))
+        ids = np.full(len(found), -1)
+        others = np.flatnonzero(~_repeats(found, is_weak))
+        found, is_weak = found.take(others), is_weak[others]
+        rows, columns = assign(_costs(tracks, found))
         _correct(tracks, rows, found, columns)
-        found.id[columns] = tracks.id[rows]
-        new = np.setdiff1d(np.flatnonzero(~is_weak), columns)
-        found.id[new] = self._next_id + np.arange(len(new))
-        self._next_id += len(new)
-        self._tracks = tracks.joined(found.take(new))
-        return found.id.tolist()
+        begins = np.setdiff1d(np.arange(len(found)), columns)
+        track = np.empty(len(found), int)
+        track[columns], track[begins] = rows, len(tracks) + np.arange(len(begins))
+        tracks = tracks.joined(found.take(begins))
+        # whom only weak boxes showed so far is nobody yet, but keeps them from going to others
+        numbered = track[~is_weak & (tracks.id[track] < 0)]
+        tracks.id[numbered] = self._next_id + np.arange(len(numbered))
+        self._next_id += len(numbered)
+        self._tracks = tracks
+        ids[others] = tracks.id[track]
+        return ids.tolist()
 
     def predicted(self, time: float) -> list[TrackState]:
         """The people expected at a time, s, not before the last frame's: those who were seen twice or for sure."""
@@ -140,7 +154,7 @@ class Tracker:
         if seconds > self.max_gap:
             return []
         tracks = self._tracks.after(seconds)
-        tracks = tracks.take((tracks.age <= self.max_gap) & tracks.sure)
+        tracks = tracks.take((tracks.age <= self.max_gap) & tracks.is_expected)
         deviations = np.sqrt(tracks.covariance[:, :2, 0, 0].max(1))
         return [
             TrackState(
@@ -187,7 +201,7 @@ class Tracker:
             return _of_boxes([])
         tracks = self._tracks.after(max(seconds, 0.0))
         # whoever was in the frame before may be seen again
-        gap = np.where(tracks.sure, self.max_gap, min(self.max_gap, max(_UNSURE_GAP, seconds)))
+        gap = np.where(tracks.is_expected, self.max_gap, min(self.max_gap, max(_UNSURE_GAP, seconds)))
         return tracks.take(tracks.age <= gap)
 
 
@@ -213,14 +227,18 @@ def _of_boxes(boxes: Sequence[Box]) -> _Tracks:
     )
 
 
-def _costs(tracks: _Tracks, found: _Tracks, is_weak: np.ndarray) -> np.ndarray:
+def _repeats(found: _Tracks, is_weak: np.ndarray) -> np.ndarray:
+    """(B,) bool: weak boxes beside one that is not: the same person again."""
+    places = found.state[:, :2, 0]
+    apart = np.linalg.norm(places[:, None] - places[~is_weak], axis=-1)
+    return is_weak & (apart < _REPEATED).any(1)
+
+
+def _costs(tracks: _Tracks, found: _Tracks) -> np.ndarray:
     """(N, B): what it costs that a track has a box, below 0 where that is better than neither; inf where it cannot."""
     off = found.state[None, :, :, 0] - tracks.state[:, None, :, 0]
     variance = tracks.covariance[:, None, :, 0, 0] + found.covariance[None, :, :, 0, 0]
     distance = (off**2 / variance).sum(-1)
-    # a weak box beside a sure one is the same person again
-    apart = np.linalg.norm(found.state[:, None, :2, 0] - found.state[~is_weak][None, :, :2, 0], axis=-1)
-    distance[:, is_weak & (apart < _AGAIN).any(1)] = np.inf
     cost = distance + np.log(variance).sum(-1) - _LEAST_LIKELY
     return np.where((distance < _GATE) & (cost < 0), cost, np.inf)
 
