@@ -341,6 +341,7 @@ def test_the_command_line(drive, folder, tmp_path, monkeypatch, capsys):
         (["DRIVE", "--out", "a.json"], "expected a folder or a file .jsonl or .csv or .parquet, got .json"),
         (["DRIVE", "--crop", "--boxes", "b.json"], "got both"),
         (["DRIVE", "--every", "0"], "every must be"),
+        (["DRIVE", "--start", "9"], "has no frames between start and end"),
         (["no*.pcd"], "no file has such a name"),
     ],
 )

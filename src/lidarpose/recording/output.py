@@ -28,6 +28,8 @@ from lidarpose.tracking.clip import TrackPoses
 from lidarpose.tracking.smoothing import smooth
 
 FORMATS = ("jsonl", "csv", "parquet")
+# what is made steady besides the joints, and its decimals
+_SMOOTHED = {"spread": 4, "visible": 3, "confidence": 3}
 # frames whose rows are written at a time
 _ROWS_OF = 200
 _COLUMNS = ("frame", "frame_id", "time", "person", "id", "track", "filled", "joint", "x", "y", "z", *PER_JOINT, "score")
@@ -187,6 +189,9 @@ def write_recording(
         elif part.frames:
             tell(f"{part.frames:,} frames are in {part.path}: going on")
         _add_frames(source, steps, part)
+        if not part.frames:
+            part.remove()
+            raise file_error(source.name, "has no frames between start and end: choose others")
         lines = steadied(part, steps) if steps.is_tracked and not steps.live else part.lines()
 
         def final() -> Iterator[dict[str, Any]]:
@@ -349,18 +354,27 @@ def steadied(part: PartFile, steps: FramePredictor) -> Iterator[dict[str, Any]]:
                 joints = np.array(person["joints"]) @ to_fixed[-1][:3, :3].T + to_fixed[-1][:3, 3]
                 others = {name: np.array(person[name], np.float32) for name in _SMOOTHED if person[name]}
                 tracks.setdefault(person["track"], _Sightings()).add(row, {"joints": joints} | others)
+    # as arrays: lists of numbers would take five times the memory
     steady: list[dict[int, dict[str, Any]]] = [{} for _ in times]
-    for id, sightings in tracks.items():
-        for row, entry in _steady(sightings, np.array(times), steps.wanted):
+    for id in list(tracks):
+        for row, entry in _steady(tracks.pop(id), np.array(times), steps.wanted):
             if not is_damaged[row]:
-                T_sensor_fixed = np.linalg.inv(to_fixed[row])
-                steady[row][id] = entry | {"joints": _applied(T_sensor_fixed, entry["joints"])}
-    for line, entries in zip(part.lines(), steady, strict=True):
-        yield line | {"people": list(_with_steady(line["people"], entries))}
+                steady[row][id] = entry
+    for line, entries, T_fixed_sensor in zip(part.lines(), steady, to_fixed, strict=True):
+        T_sensor_fixed = np.linalg.inv(T_fixed_sensor)
+        written = {id: _written(entry, T_sensor_fixed) for id, entry in entries.items()}
+        entries.clear()
+        yield line | {"people": list(_with_steady(line["people"], written))}
 
 
-_SMOOTHED = ("spread", "visible", "confidence")
-_DECIMALS = {"spread": 4, "visible": 3, "confidence": 3}
+def _written(entry: dict[str, Any], T_sensor_fixed: np.ndarray) -> dict[str, Any]:
+    """What is steady of a person as a line holds it."""
+    rounded = {
+        name: np.round(entry[name].astype(float), digits).tolist()
+        for name, digits in _SMOOTHED.items()
+        if name in entry
+    }
+    return rounded | {"joints": _applied(T_sensor_fixed, entry["joints"]), "filled": entry["filled"]}
 
 
 def _steady(sightings: _Sightings, times: np.ndarray, own: Skeleton) -> Iterator[tuple[int, dict[str, Any]]]:
@@ -380,14 +394,14 @@ def _steady(sightings: _Sightings, times: np.ndarray, own: Skeleton) -> Iterator
     for i, row in enumerate(rows.tolist()):
         if np.isfinite(track.joints[i]).all():
             named = ((name, getattr(track, name)) for name in _SMOOTHED)
-            entry = {name: value[i].round(_DECIMALS[name]).tolist() for name, value in named if value is not None}
-            yield row, entry | {"joints": track.joints[i], "filled": track.filled is not None and bool(track.filled[i])}
+            entry = {name: value[i].astype(np.float32) for name, value in named if value is not None}
+            filled = track.filled is not None and bool(track.filled[i])
+            yield row, entry | {"joints": track.joints[i].copy(), "filled": filled}
 
 
 def _with_steady(people: list[dict[str, Any]], entries: dict[int, dict[str, Any]]) -> Iterator[dict[str, Any]]:
     for person in people:
-        entry = entries.pop(person["track"], None) if person["joints"] is not None else None
-        yield person | (entry or {})
+        yield person | entries.pop(person["track"], {})
     for id, entry in sorted(entries.items()):
         nobody = {"id": id, "box": None, "score": None, "mounted": None, "num_points": 0, "joints": None}
         empty: dict[str, list] = {"confidence": [], "spread": [], "visible": [], "out_of_range": [], "warnings": []}
