@@ -1,6 +1,7 @@
 """Finding people: the ground under a scan, places where somebody may stand, and what the network sees there."""
 
 import pickle
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -195,6 +196,15 @@ def test_candidates_do_not_depend_on_the_order_of_points_and_move_with_them(scen
     np.testing.assert_array_equal(propose(points, ground, limit=7), centers[:7])
 
 
+def test_threads_do_not_share_their_memory(scene):
+    _, points, ground = scene
+    clouds = [points, points[::2], points[::3], points[::5]] * 3
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda cloud: propose(cloud, ground), clouds))
+    for cloud, centers in zip(clouds, together, strict=True):
+        np.testing.assert_array_equal(centers, propose(cloud, ground))
+
+
 def test_a_map_wider_than_a_tile_has_the_candidates_of_its_parts():
     near = np.concatenate([plane(), column(5, 0)])
     # at a border of tiles, and far away
@@ -244,6 +254,18 @@ def test_candidates_see_what_the_words_say(scene):
         assert np.mean(grown[drawn]) > 0.97
         assert drawn.sum() > 0.3 * seen.sum()
         assert len(pickle.dumps(candidate)) < 12_500
+
+
+@pytest.mark.parametrize("origin", [ORIGIN, None], ids=["known", "unknown"])
+def test_inputs_of_places_are_those_of_their_candidates(scene, origin):
+    _, points, ground = scene
+    centers = np.tile(propose(points, ground), (3, 1))[:100]
+    index = SceneIndex(points, ground, origin)
+    pieces = [{name: array.copy() for name, array in inputs.items()} for inputs in index.inputs(centers)]
+    assert len(pieces) == 2
+    for name, expected in render(index.candidates(centers)).items():
+        np.testing.assert_array_equal(np.concatenate([piece[name] for piece in pieces]), expected)
+    np.testing.assert_array_equal(index.yaws(centers), [c.yaw for c in index.candidates(centers)])
 
 
 def test_a_wall_before_the_candidate_hides_and_one_behind_it_is_seen_past():
