@@ -66,7 +66,7 @@ class Scan:
 
     def box_points(self) -> np.ndarray:
         """The points (n, 3) m in the frame in which boxes stand upright."""
-        return self.points @ self.R_boxes_input.T
+        return _turned(self.points, self.R_boxes_input)
 
     @cached_property
     def rows(self) -> list[np.ndarray]:
@@ -77,8 +77,13 @@ class Scan:
 
     def clouds(self) -> list[np.ndarray]:
         """The points of each person in the level frame (z up); of a crop all points."""
-        level = self.points @ self.R_level_input.T
+        level = _turned(self.points, self.R_level_input)
         return [level] if self.boxes is None else [level[rows] for rows in self.rows]
+
+
+def _turned(points: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """points (n, 3) turned by R; themselves where nothing is turned, which of a whole scan saves much time."""
+    return points if np.array_equal(R, np.eye(3)) else points @ R.T
 
 
 def read_scan(scan: Scan, path: str | os.PathLike, columns: int | None) -> Scan:

@@ -1,6 +1,6 @@
 """One person's poses over time, as smoothing takes and gives them."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -73,10 +73,3 @@ class TrackPoses:
     def poses(self) -> list[Pose | None]:
         """The pose of each frame."""
         return [self.pose(row) for row in range(len(self))]
-
-    def rows(self, which: np.ndarray | slice) -> "TrackPoses":
-        """Some of the frames."""
-        names = ("times", "joints", "spread", "visible", "confidence", "filled")
-        values = {name: getattr(self, name) for name in names}
-        picked: dict[str, Any] = {name: None if value is None else value[which] for name, value in values.items()}
-        return replace(self, **picked)

@@ -50,7 +50,7 @@ class TrackState:
 
 @dataclass(kw_only=True, eq=False)
 class _Tracks:
-    """Of all tracks: id (N,), -1 for those without a number yet; state (N, 3, 2): position m and velocity m/s along x, y,
+    """Of all tracks: id (N,), -1: no number yet; state (N, 3, 2): position m and velocity m/s along x, y,
     z; covariance (N, 3, 2, 2); heading (N, 2): mean of cos and sin of yaw; size (N, 3) m; age (N,) s since seen;
     sightings (N,); sure (N,) bool: seen twice, or by a box of high score."""
 

@@ -16,7 +16,7 @@ from lidarpose.viz.person_view import bone_pairs, bone_sides, box_edges, finite,
 
 MAX_SCANS = 12
 _MAX_POINTS = 120_000  # a scan; more only cover each other at this size
-_DPI, _PANEL, _TITLE = 110, 7.6, 0.45  # inches
+_DPI, _PANEL, _TITLE = 110, 7.6, 0.6  # inches
 _MARGIN, _LEAST_SPAN = 3.0, 16.0  # m about the people, and of a view's side at least
 _BELOW, _ABOVE = 0.25, 2.5  # heights above the lowest points over which the colors run, m
 _GROUND, _HIGH, _INK, _FAINT, _BOX = "#d5d9de", "#eceff2", "#1f2328", "#7a828c", "#b3261e"
@@ -79,7 +79,7 @@ def draw_scans(panels: Sequence[ScanPanel], path: str | Path | None = None, *, t
     )
     tracks = "dotted: the way over the frames; " if any(panel.tracks for panel in panels) else ""
     note = f"arrow: facing; {tracks}left limbs blue, right ones orange"
-    figure.text(1 - 0.15 / width, 1 - 0.2 / height, note, fontsize=8, color=_FAINT, va="top", ha="right")
+    figure.text(0.15 / width, 1 - 0.42 / height, note, fontsize=8, color=_FAINT, va="top")
     for number, panel in enumerate(panels):
         row, column = divmod(number, columns)
         place = ((column * _PANEL + 0.55) / width, (height - _TITLE - (row + 1) * _PANEL + 0.45) / height)

@@ -21,11 +21,10 @@ import numpy as np
 
 from lidarpose.models.detector.ground import Ground
 from lidarpose.models.detector.proposals import heights_above
+from lidarpose.models.detector.range_image import BOTTOM, CELL, RANGE_CHANNELS, SIDE, SLICES, RangeImage, log_bytes
 
-# fine: slices and cells of a side, their size m, the lowest slice's bottom m
-SLICES, SIDE, CELL, BOTTOM = 28, 24, 0.1, -0.5
-# range view: channels; as stored cells of a margin to each side, so that it can be moved and scaled
-RANGE_CHANNELS, _MARGIN, _FAR = 4, 3, 4.0
+# cells of a margin to each side of a stored range view, so that it can be moved and scaled
+_MARGIN = 3
 # context: channels, cells of a side, their size m, what height is 1
 CONTEXT_CHANNELS, CONTEXT_SIDE, CONTEXT_CELL, _TALL = 4, 20, 0.5, 4.0
 # points of a candidate lie within this, and so far above and below the slices, m
@@ -40,10 +39,6 @@ _INDEX_CELL, _MOST_INDEX_CELLS = 0.5, 4_000_000
 _MOST_IN_CELL, _MOST_AT_ONCE = 10_000, 4_000_000
 # candidates that are drawn at a time
 _CHUNK = 64
-# rows of the range image's finest cells from straight below to above, their size rad, and how many coarser levels
-# there are, each of twice the size
-_ROWS = 1024
-_ANGLE, _LEVELS = pi / _ROWS, 5
 _LEAST_DISTANCE = 0.5
 # heights above the ground: of the slices whose filling is counted, and what is near the ground, m
 _BAND, _BAND_SLICES, _NEAR_GROUND = (0.3, 2.1), 6, 0.2
@@ -175,7 +170,7 @@ class SceneIndex:
         self._order = used[_order(cells)][chosen]
         self._x, self._y, self._z = x[self._order], y[self._order], columns[2][self._order].astype(np.float32)
         self._start = np.concatenate([[0], np.cumsum(count)])
-        self._image = None if self.origin is None else _RangeImage(points, self.origin)
+        self._image = None if self.origin is None else RangeImage(points, self.origin)
 
     def rows(self, centers: np.ndarray, radius: float = 0.35) -> list[np.ndarray]:
         """Of each of centers (K, 2 or 3) m the rows of the scan's points at a person's heights within `radius` m."""
@@ -338,87 +333,8 @@ def _draw_maps(cells: np.ndarray, heights: np.ndarray, shape: tuple[int, ...]) -
     maps = np.empty((size + 1, CONTEXT_CHANNELS), np.uint8)
     maps[:, 0] = np.minimum(highest * (255 / _TALL), 255)
     maps[:, 1] = np.bitwise_count(filled) * (255 / _BAND_SLICES)
-    maps[:, 2], maps[:, 3] = _log_bytes(count), _log_bytes(near)
+    maps[:, 2], maps[:, 3] = log_bytes(count), log_bytes(near)
     return maps.view(np.uint32).ravel()
-
-
-def _log_bytes(count: np.ndarray) -> np.ndarray:
-    """.125 log2(1 + count) as bytes, 255 for 1 and more."""
-    return np.minimum(np.log2(1.0 + count) * (0.125 * 255), 255).astype(np.uint8)
-
-
-_COUNT_BYTES = _log_bytes(np.arange(256))
-
-
-class _RangeImage:
-    """Nearest and farthest range and number of returns by direction, in levels of ever coarser cells."""
-
-    def __init__(self, points: np.ndarray, origin: np.ndarray):
-        """points (n, 3) m, origin (3,) m: the sensor."""
-        x, y, z = ((points[:, i] - origin[i]).astype(np.float32) for i in range(3))
-        level = np.sqrt(x * x + y * y)
-        column = ((np.arctan2(y, x) + np.float32(pi)) * np.float32(1 / _ANGLE)).astype(np.int32)
-        row = (np.arctan2(z, level) * np.float32(1 / _ANGLE) + np.float32(_ROWS // 2)).astype(np.int32)
-        # rows that hold nothing above and below are left out, whole cells of the coarsest level
-        coarsest = 2**_LEVELS
-        self._first = int(row.min(initial=_ROWS)) // coarsest * coarsest
-        self._rows = max(int(row.max(initial=0)) // coarsest * coarsest + coarsest - self._first, coarsest)
-        self._columns = 2 * _ROWS
-        flat = (row - self._first) * self._columns + np.minimum(column, self._columns - 1)
-        # levels one after the other, and a cell in which nothing came back
-        sizes = [self._rows * self._columns >> 2 * number for number in range(_LEVELS + 1)]
-        self._starts = np.cumsum([0, *sizes], dtype=np.int32)
-        size = self._starts[-1] + 1
-        self._near, self._far, count = (
-            np.full(size, np.inf, np.float32),
-            np.zeros(size, np.float32),
-            np.zeros(size, np.int32),
-        )
-        np.minimum.at(self._near, flat, level)
-        np.maximum.at(self._far, flat, level)
-        np.add.at(count, flat, np.int32(1))
-        for image, reduce in ((self._near, np.minimum), (self._far, np.maximum), (count, np.add)):
-            levels = np.split(image, self._starts[1:])
-            for number, (fine, coarse) in enumerate(zip(levels[:-2], levels[1:-1], strict=True)):
-                lines = fine.reshape(-1, 2, self._columns >> number)
-                lines = reduce(lines[:, 0], lines[:, 1])
-                reduce(lines[:, ::2], lines[:, 1::2], out=coarse.reshape(len(lines), -1))
-        # more than 255 look like 255
-        self._count = np.minimum(count, 255).astype(np.uint8)
-
-    def views(self, centers: np.ndarray, yaw: np.ndarray, distance: np.ndarray, margin: int) -> np.ndarray:
-        """Pictures (K, 4, 28 + 2 margin, 24 + 2 margin) uint8 of centers (K, 3) m from the sensor; see `Candidate`."""
-        rows, columns = SLICES + 2 * margin, SIDE + 2 * margin
-        height = (np.arange(rows) - margin + 0.5) * CELL + BOTTOM
-        lateral = (np.arange(columns) - margin + 0.5) * CELL - SIDE * CELL / 2
-        turn = (yaw[:, None] + np.arctan2(lateral, distance[:, None]) + pi) % (2 * pi)
-        column = np.minimum((turn / _ANGLE).astype(np.int32), self._columns - 1)[:, None]
-        slant = np.sqrt(lateral**2 + distance[:, None] ** 2).astype(np.float32)[:, None]
-        tangent = (centers[:, 2:] + height).astype(np.float32)[:, :, None] / slant
-        row = (np.arctan(tangent) * np.float32(1 / _ANGLE) + np.float32(_ROWS // 2)).astype(np.int32) - self._first
-        # cells as large as the picture's, or the next smaller ones
-        level = np.floor(np.log2(CELL / distance / _ANGLE) + 0.5)
-        level = np.clip(level, 0, _LEVELS - 1).astype(np.int32)[:, None, None]
-        at = self._at(level, row, column)
-        count = self._count[at]
-        views = np.empty((len(centers), RANGE_CHANNELS, rows, columns), np.uint8)
-        views[:, 0] = _range_bytes(self._near[at] - slant)
-        views[:, 1] = _range_bytes(self._far[at] - slant)
-        views[:, 2] = _COUNT_BYTES[count]
-        views[:, 3] = _COUNT_BYTES[self._count[self._at(level + 1, row, column)]]
-        views[:, :2] *= count[:, None] > 0
-        return views
-
-    def _at(self, level: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-        """Flat cells of levels (K, 1, 1) at rows (K, H, 1 or W) and columns (K, 1, W) of the finest."""
-        flat = self._starts[level] + (row >> level) * (self._columns >> level) + (column >> level)
-        flat[(row < 0) | (row >= self._rows)] = self._starts[-1]
-        return flat
-
-
-def _range_bytes(meters: np.ndarray) -> np.ndarray:
-    """-4 to 4 m as 1 to 255; 0 is nothing."""
-    return np.clip(meters * (127 / _FAR) + 128, 1, 255).astype(np.uint8)
 
 
 def render(

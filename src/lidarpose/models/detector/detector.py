@@ -89,8 +89,8 @@ class Detector:
         Returns:
             All candidates after suppression, whatever their score.
         """
-        columns = np.asarray(points).T
-        rows = np.arange(columns.shape[1])
+        columns = list(np.asarray(points).T)
+        rows = np.arange(len(points))
         if origin is not None and max_range is not None:
             squared = (columns[0] - origin[0]) ** 2 + (columns[1] - origin[1]) ** 2
             rows = np.flatnonzero(squared < (max_range + _BEYOND) ** 2)

@@ -152,8 +152,8 @@ def _peaks(x: np.ndarray, y: np.ndarray, heights: np.ndarray) -> tuple[np.ndarra
     head = _positions(_maxima(grid, width), width)
 
     centers = np.concatenate([body, head])
-    column = _disc(_COLUMN, width)[:, None] + centers.astype(np.int32) @ [width, 1]
-    points, highest, lowest = count[column].sum(0), top[column].max(0), _EMPTY - depth[column].max(0)
+    around = _disc(_COLUMN, width)[:, None] + centers.astype(np.int32) @ [width, 1]
+    points, highest, lowest = count[around].sum(0), top[around].max(0), _EMPTY - depth[around].max(0)
     is_tall = highest - lowest > _LEAST_EXTENT
     is_tall |= (highest - lowest > _LEAST_HEAD) & (highest > _HEAD_TOP) & (points >= 2 * LEAST_POINTS)
     enough = (points >= LEAST_POINTS) & (highest > _LEAST_TOP) & is_tall
