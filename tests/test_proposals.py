@@ -268,6 +268,20 @@ def test_inputs_of_places_are_those_of_their_candidates(scene, origin):
     np.testing.assert_array_equal(index.yaws(centers), [c.yaw for c in index.candidates(centers)])
 
 
+def test_a_crowded_candidate_is_the_same_in_any_order_of_points():
+    """Of more than 1,000 points some stay: beam after beam, as drivers order them, these would be of some beams only."""
+    rng = np.random.default_rng(3)
+    cloud = np.concatenate([plane(), column(6, 0, count=8000)]).astype(np.float32)
+    ground, center = estimate_ground(cloud, ORIGIN), np.array([[6.0, 0, -1.8]])
+    drawn = []
+    for order in (np.arange(len(cloud)), np.argsort(cloud[:, 2], kind="stable"), rng.permutation(len(cloud))):
+        (candidate,) = SceneIndex(cloud[order], ground, ORIGIN).candidates(center)
+        assert len(candidate.points) <= 1000
+        drawn.append({tuple(point) for point in np.asarray(candidate.points).tolist()})
+    # but for points whose scrambled coordinates are equal
+    assert min(len(drawn[0] & other) for other in drawn[1:]) > 0.95 * len(drawn[0])
+
+
 def test_a_wall_before_the_candidate_hides_and_one_behind_it_is_seen_past():
     wall = np.stack(np.meshgrid(np.linspace(-3, 3, 400), np.linspace(-1.8, 2, 300)), -1).reshape(-1, 2)
     person = column(8, 0, count=400)

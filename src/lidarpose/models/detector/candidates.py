@@ -164,11 +164,14 @@ class SceneIndex:
         self._maps = _draw_maps(flat, heights, self._shape)
         # what lies high above everybody is context alone
         used = np.flatnonzero((heights > _USED[0]) & (heights < _USED[1]))
+        z = columns[2].astype(np.float32)
+        # in an order of their own: thinned in the file's, beam after beam, whole beams would go
+        used = used[np.argsort(_scrambled(x[used], y[used], z[used]), kind="stable")]
         cells = flat[used]
         # very dense cells are thinned, so that no candidate costs more than so much
         chosen, count = _thinned(np.bincount(cells, minlength=self._shape[0] * self._shape[1]), _MOST_IN_CELL)
         self._order = used[_order(cells)][chosen]
-        self._x, self._y, self._z = x[self._order], y[self._order], columns[2][self._order].astype(np.float32)
+        self._x, self._y, self._z = x[self._order], y[self._order], z[self._order]
         self._start = np.concatenate([[0], np.cumsum(count)])
         self._image = None if self.origin is None else RangeImage(points, self.origin)
 
@@ -309,6 +312,13 @@ def _thinned(count: np.ndarray, most: int) -> tuple[slice | np.ndarray, np.ndarr
     chosen = np.floor((number + 1) * share) > np.floor(number * share)
     ends = np.concatenate([[0], np.cumsum(chosen)])[np.cumsum(count)]
     return np.flatnonzero(chosen), np.diff(ends, prepend=0)
+
+
+def _scrambled(*columns: np.ndarray) -> np.ndarray:
+    """(n,) uint16 without pattern, of each row of columns (n,) float32 the same wherever it stands."""
+    factors = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D)
+    mixed = sum(values.view(np.uint32) * np.uint32(factor) for values, factor in zip(columns, factors, strict=True))
+    return (np.asarray(mixed) >> 16).astype(np.uint16)
 
 
 def _order(cells: np.ndarray) -> np.ndarray:
