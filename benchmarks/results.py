@@ -304,6 +304,16 @@ def _labels(variant: str) -> dict[str, str]:
     return {"study": VARIANTS[variant].study, "what": VARIANTS[variant].what}
 
 
+def tracks() -> str:
+    """Who is who on streets of ten people; see tracks.py."""
+    names = ("idf1", "hota", "mota", "recall", "precision")
+    rows = [
+        (row["boxes"], row["by"], *(f"{row[name]:.3f}" for name in names), str(row["switches"]))
+        for row in _read("tracks")["rows"]
+    ]
+    return table(("boxes", "numbered by", "IDF1", "HOTA", "MOTA", "recall", "precision", "switches"), rows)
+
+
 def tables() -> dict[str, Callable[[], str]]:
     """What makes each table, by name."""
     every = [run | _labels(run["variant"]) for run in _read(RUNS)]
@@ -325,7 +335,7 @@ def tables() -> dict[str, Callable[[], str]]:
     for group in ("points", "kind", "sensor", "activity", "condition", "distance, m"):
         own = ("all", "points", "mounted, all") if group == "points" else (group, f"{group}, 50 points and more")
         made |= {f"detector {name} by {group}": partial(detector, name, *own) for name in ("heldout", "real")}
-    made |= {"visibility": visibility, "real": real}
+    made |= {"visibility": visibility, "real": real, "tracks": tracks}
     made["headline"] = partial(headline, *BUNDLED)
     made |= {"readme": readme, "conditions": conditions}
     made["stability"] = lambda: table(("", "undisturbed", *5 * ("",)), disturbed.curves(DEFAULT))

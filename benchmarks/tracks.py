@@ -1,0 +1,285 @@
+"""Whether people keep their numbers: streets of ten people for ten seconds, seen at 10 Hz by a sensor that moves.
+
+    pip install trackeval                                      # by its authors: HOTA, IDF1, MOTA
+    python benchmarks/tracks.py --streets 10 --seed 2 --cache runs/tracks --json docs/scores/tracks.json
+
+People walk, stop for a while, cross each other's ways and hide each other; scans are cast rays, so they are hidden as
+they would be. Boxes are the true ones with noise, of those who are seen, and what the detector finds. A person counts
+where at least ten points are on them; a box belongs to a person within 0.5 m. Beside the tracker stand a plain one,
+which takes the nearest box to where somebody was, and the most that the boxes allow: each has its person's number.
+"""
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import trackeval
+
+from lidarpose.eval.detector.detection_scores import LEAST_POINTS, MATCH_RADIUS
+from lidarpose.geometry import rotation_about
+from lidarpose.inference.detection import detect
+from lidarpose.io.files import write_atomic
+from lidarpose.lidar.presets import sensor as named_sensor
+from lidarpose.models.detector.detector import Detector
+from lidarpose.sample import Box
+from lidarpose.synth import street as streets
+from lidarpose.synth.environment.mesh import union
+from lidarpose.synth.scene import Place
+from lidarpose.tracking.assignment import assign
+from lidarpose.tracking.tracker import Tracker
+
+PEOPLE, FRAMES, HZ = 10, 100, 10.0
+# people keep so far from each other and from the sensor, and start within this of it, m
+APART, CLEAR, NEAR = 0.5, 1.2, 18.0
+SENSORS = ("os1-128", "os1-64", "vlp-32c", "hdl-64e", "os0-128")
+# the least score of boxes that are stored, and of those that may continue a track
+LEAST_SCORE, WEAK_SCORE = 0.02, 0.1
+# who counts is so near, m
+RANGE = 40.0
+
+
+def sensor_path(plan, rng):
+    """(F, 3): x, y m and yaw rad of the sensor: along the street, a little to and fro."""
+    time = np.arange(FRAMES) / HZ
+    speed, sway, phase = rng.uniform(0.3, 2.0) * rng.choice([-1, 1]), rng.uniform(0, 0.3), rng.uniform(0, 6)
+    x, y = speed * time, 0.1 * (np.sin(time + phase) - np.sin(phase))
+    yaw = sway * (np.sin(0.8 * time + phase) - np.sin(phase))
+    c, s = np.cos(plan.turn), np.sin(plan.turn)
+    return np.stack([c * x - s * y, s * x + c * y, yaw], 1)
+
+
+def with_stop(bodies, rng):
+    """Half of the people stand still for one to three seconds."""
+    frames = np.arange(FRAMES)
+    if rng.random() < 0.5:
+        start, pause = rng.integers(10, 60), rng.integers(10, 30)
+        frames = np.where(frames < start, frames, np.maximum(start, frames - pause))
+    rows = {name: getattr(bodies, name)[frames] for name in ("vertices", "joints")}
+    heading = tuple(np.array(bodies.heading)[frames].tolist())
+    return replace(bodies, **rows, heading=heading, moved=lambda frame: bodies.moved(int(frames[frame])))
+
+
+def walkers_of(plan, path, rng):
+    """People whose ways cross: of the starts that keep them apart, the one that brings them nearest to the others."""
+    walkers, ways = [], []
+    while len(walkers) < PEOPLE:
+        bodies = streets._draw_pedestrian(FRAMES, rng)
+        if bodies.kinds[0] == "idle" and rng.random() < 0.7:
+            continue
+        bodies, best, nearest = with_stop(bodies, rng), None, np.inf
+        for _ in range(60):
+            place, _ = streets._draw_start(plan, bodies, rng)
+            way = streets._path((bodies, place))
+            apart = min((np.linalg.norm(way - other, axis=1).min() for other in ways), default=0.6)
+            clear = np.linalg.norm(way - path[:, :2], axis=1).min() > CLEAR and np.linalg.norm(way[0]) < NEAR
+            if clear and APART < apart < nearest:
+                best, nearest = (bodies, place), apart
+        if best:
+            walkers.append(best)
+            ways.append(streets._path(best))
+    return walkers
+
+
+def recording(seed, index):
+    """The frames of a street: points (n, 3) m and people in the sensor's frame, and the sensor's x, y, yaw."""
+    rng = np.random.default_rng([seed, index])
+    device = named_sensor(SENSORS[index % len(SENSORS)])
+    plan = streets._draw_plan(device, rng)
+    still = union(streets._scenery(plan, rng)).moved((0, 0, 0), plan.turn)
+    path = sensor_path(plan, rng)
+    walkers = walkers_of(plan, path, rng)
+    normals = rng.standard_normal(256, np.float32)
+    for frame, (x, y, yaw) in enumerate(path):
+        R_sensor_world = rotation_about("z", -yaw)
+        here = np.array([x, y, 0.0])
+        seen = [
+            (b, Place(feet=R_sensor_world @ (p.feet - here), yaw=p.yaw - yaw, distance=p.distance)) for b, p in walkers
+        ]
+        scene = still.moved(-R_sensor_world @ here, -yaw)
+        yield streets._scan_turn(device, scene, seen, frame, normals, rng), (x, y, yaw)
+
+
+def to_world(boxes, pose):
+    """Boxes in the sensor's frame -> in the world's."""
+    x, y, yaw = pose
+    R_world_sensor = rotation_about("z", yaw)
+    return [replace(b, center=R_world_sensor @ b.center + [x, y, 0], yaw=b.yaw + yaw) for b in boxes]
+
+
+def to_sensor(boxes, pose):
+    x, y, yaw = pose
+    R_sensor_world = rotation_about("z", -yaw)
+    return [replace(b, center=R_sensor_world @ (b.center - [x, y, 0]), yaw=b.yaw - yaw) for b in boxes]
+
+
+def stored(seed, index, cache):
+    """Frames of a street in the world's frame: the people, how many points each has, and the boxes found."""
+    path = cache / f"{seed}-{index}.json"
+    if not path.exists():
+        frames = []
+        for frame, pose in recording(seed, index):
+            found = detect(frame.points, min_score=LEAST_SCORE)
+            points = np.bincount(frame.person[frame.person >= 0], minlength=PEOPLE).tolist()
+            people, boxes = (
+                [b.to_dict() | {"score": b.score} for b in to_world(some, pose)] for some in (frame.boxes, found)
+            )
+            frames.append({"people": people, "points": points, "boxes": boxes, "sensor": list(map(float, pose))})
+        write_atomic(path, json.dumps(frames))
+    return json.loads(path.read_text())
+
+
+def noisy(frame, rng):
+    """The true boxes of who is seen, with a detector's errors; the fewer points, the more are missed."""
+    boxes = []
+    for person, points in zip(frame["people"], frame["points"], strict=True):
+        shift, turn, drop = rng.normal(0, [0.08, 0.08, 0.05]), rng.normal(0, 0.2), rng.random()
+        if points >= 5 and drop < points / (points + 5):
+            boxes.append(Box(center=person["center"] + shift, size=person["size"], yaw=person["yaw"] + turn))
+    return boxes
+
+
+def found(frame, least, below=1.1):
+    return [Box(**box) for box in frame["boxes"] if least <= box["score"] < below]
+
+
+def distances(frame, boxes):
+    """(P, B) m, level, of people and boxes."""
+    people, centers = (
+        np.reshape(places, (-1, 3))[:, None, :2]
+        for places in ([p["center"] for p in frame["people"]], [b.center for b in boxes])
+    )
+    return np.linalg.norm(people - centers[:, 0], axis=-1)
+
+
+class Nearest:
+    """The plain tracker: each box in turn takes the nearest track's last place within 1 m, for 2 s."""
+
+    def __init__(self):
+        self.tracks, self.next_id = {}, 0
+
+    def update(self, time, boxes, weak_boxes):
+        ids = []
+        for number, box in enumerate([*boxes, *weak_boxes]):
+            near = {
+                i: np.linalg.norm(box.center[:2] - place)
+                for i, (seen, place) in self.tracks.items()
+                if i not in ids and time - seen <= 2
+            }
+            best = min(near, key=near.get, default=-1)
+            if best < 0 or near[best] > 1:
+                is_weak = number >= len(boxes)
+                best, self.next_id = (-1 if is_weak else self.next_id), self.next_id + (not is_weak)
+            ids.append(best)
+            if best >= 0:
+                self.tracks[best] = (time, box.center[:2])
+        return ids
+
+
+def evaluated(frames, boxes, ids):
+    """What trackeval needs of a street: boxes within 0.5 m of people who do not count are left out."""
+    numbers = {name: k for k, name in enumerate(sorted({i for some in ids for i in some}))}
+    gt_ids, own_ids, similarities = [], [], []
+    for frame, some, own in zip(frames, boxes, ids, strict=True):
+        places = np.array([p["center"][:2] for p in frame["people"]])
+        near = np.linalg.norm(places - frame["sensor"][:2], axis=1) < RANGE
+        counts = near & (np.array(frame["points"]) >= LEAST_POINTS)
+        distance = distances(frame, some)
+        # people who count first
+        person, box = assign(
+            np.where(distance < MATCH_RADIUS, distance - MATCH_RADIUS - 10.0 * counts[:, None], np.inf)
+        )
+        kept = np.setdiff1d(np.arange(len(some)), box[~counts[person]])
+        gt_ids.append(np.flatnonzero(counts))
+        own_ids.append(np.array([numbers[own[k]] for k in kept], int))
+        similarities.append(np.maximum(1 - distance[counts][:, kept] / (2 * MATCH_RADIUS), 0))
+    return {
+        "num_timesteps": len(frames), "num_gt_ids": PEOPLE, "num_tracker_ids": len(numbers),
+        "num_gt_dets": sum(map(len, gt_ids)), "num_tracker_dets": sum(map(len, own_ids)),
+        "gt_ids": gt_ids, "tracker_ids": own_ids, "similarity_scores": similarities,
+    }  # fmt: skip
+
+
+def scored(sequences):
+    """Figures over all streets."""
+    figures = {}
+    for name in ("Identity", "HOTA", "CLEAR"):
+        metric = getattr(trackeval.metrics, name)({"PRINT_CONFIG": False})
+        by_street = {str(k): metric.eval_sequence(sequence) for k, sequence in enumerate(sequences)}
+        figures |= metric.combine_sequences(by_street)
+    return {
+        "idf1": figures["IDF1"], "hota": float(figures["HOTA"].mean()), "mota": figures["MOTA"],
+        "recall": figures["CLR_Re"], "precision": figures["CLR_Pr"], "switches": int(figures["IDSW"]),
+    }  # fmt: skip
+
+
+def true_ids(frames, boxes):
+    """Each box has its person's number, and false ones their own."""
+    ids, false = [], PEOPLE
+    for frame, some in zip(frames, boxes, strict=True):
+        distance = distances(frame, some)
+        person, box = assign(np.where(distance < MATCH_RADIUS, distance - MATCH_RADIUS, np.inf))
+        own = false + np.arange(len(some))
+        own[box] = person
+        false += len(some)
+        ids.append(own.tolist())
+    return ids
+
+
+def tracked(frames, boxes, weak, tracker, poses_known=True):
+    """The boxes that are somebody's, and whose; without poses the tracker sees them in the sensor's frame."""
+    written, ids = [], []
+    for number, (some, doubtful) in enumerate(zip(boxes, weak, strict=True)):
+        given = [some, doubtful] if poses_known else [to_sensor(b, frames[number]["sensor"]) for b in (some, doubtful)]
+        own = tracker.update(number / HZ, *given)
+        kept = [(box, k) for box, k in zip(some + doubtful, own, strict=True) if k >= 0]
+        written.append([box for box, _ in kept])
+        ids.append([k for _, k in kept])
+    return evaluated(frames, written, ids)
+
+
+def figures(recordings):
+    """Rows: boxes, who numbers them, and the figures over all streets."""
+    least = round(float(Detector().header["default_score"]), 2)
+    rng = np.random.default_rng(0)
+    none = [[[] for _ in frames] for frames in recordings]
+    given = [[noisy(frame, rng) for frame in frames] for frames in recordings]
+    sure = [[found(frame, least) for frame in frames] for frames in recordings]
+    weak = [[found(frame, WEAK_SCORE, least) for frame in frames] for frames in recordings]
+    rows = []
+    for name, boxes, doubtful in (
+        ("true, with noise and drop-outs", given, none),
+        (f"found, score {least:g} and more", sure, none),
+        (f"found, and down to {WEAK_SCORE:g} where a track goes on", sure, weak),
+    ):
+        every = list(zip(recordings, boxes, doubtful, strict=True))
+        for by, tracker in (("nearest place", Nearest), ("tracker", Tracker)):
+            rows.append({"boxes": name, "by": by, **scored([tracked(*street, tracker()) for street in every])})
+        if doubtful is none:
+            true = [evaluated(frames, some, true_ids(frames, some)) for frames, some, _ in every]
+            rows.append({"boxes": name, "by": "the truth", **scored(true)})
+        else:
+            local = [tracked(*street, Tracker(), poses_known=False) for street in every]
+            rows.append({"boxes": name, "by": "tracker, the sensor's poses unknown", **scored(local)})
+    return rows
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--streets", type=int, default=10)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--cache", type=Path, required=True, metavar="DIR", help="where found boxes are kept")
+    parser.add_argument("--json", type=Path, help="where the figures go")
+    options = parser.parse_args()
+    options.cache.mkdir(parents=True, exist_ok=True)
+    recordings = [stored(options.seed, index, options.cache) for index in range(options.streets)]
+    rows = figures(recordings)
+    for row in rows:
+        print(*(f"{value:.3f}" if isinstance(value, float) else value for value in row.values()), sep=" | ")
+    if options.json:
+        write_atomic(options.json, json.dumps({"streets": options.streets, "rows": rows}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
