@@ -77,8 +77,9 @@ class Scan:
 
     def clouds(self) -> list[np.ndarray]:
         """The points of each person in the level frame (z up); of a crop all points."""
-        level = _turned(self.points, self.R_level_input)
-        return [level] if self.boxes is None else [level[rows] for rows in self.rows]
+        # only who is posed is turned, not the whole scan
+        clouds = [self.points] if self.boxes is None else [self.points[rows] for rows in self.rows]
+        return [_turned(cloud, self.R_level_input) for cloud in clouds]
 
 
 def _turned(points: np.ndarray, R: np.ndarray) -> np.ndarray:

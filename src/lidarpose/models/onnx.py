@@ -74,6 +74,8 @@ def open_session(content: bytes, *, threads: int | None = None):
     # set in any case: left alone it would pin threads to processors, which a container may forbid
     settings.intra_op_num_threads = usable_threads() if threads is None else threads
     settings.inter_op_num_threads = 1
+    # threads that wait for the next call would take the processors from what is done between calls
+    settings.add_session_config_entry("session.force_spinning_stop", "1")
     # what is wrong is raised; the log would add lines of its own
     settings.log_severity_level = 4
     return runtime.InferenceSession(content, settings, providers=["CPUExecutionProvider"])
