@@ -24,7 +24,7 @@ from lidarpose.skeleton import BODY26, HUMAN15
 MATCH_RADIUS = 0.5
 # people of fewer points are neither wanted nor false
 LEAST_POINTS = 10
-# operating points: false people a scan; the middle one decides what is missed, and poses
+# operating points: false people a scan; the middle one decides what is missed
 FALSE_PER_SCAN = (0.3, 1.0, 3.0, 10.0)
 REFERENCE = 1.0
 POINT_EDGES = (LEAST_POINTS, 20, 50, np.inf)
@@ -189,7 +189,8 @@ def score_detector(
     rng = np.random.default_rng(seed)
     table = pd.DataFrame(about)
     rows, thresholds = _figures(people, detections, table, rng, default_score)
-    rows += _pose_rows(people, thresholds[f"{REFERENCE:g}"], rng)
+    for at in (f"{REFERENCE:g}", "default"):
+        rows += _pose_rows(people, at, thresholds[at], rng) if at in thresholds else []
     counted = detections[detections.status != NEITHER].assign(people=lambda table: table.status == PERSON)
     error = aggregate.calibration_error(counted.score, counted.people)
     rows.append(_row("calibration_error", value=100 * error, unit="%", count=len(counted)))
@@ -344,12 +345,12 @@ def _pose_errors(
     return errors
 
 
-def _pose_rows(people: pd.DataFrame, threshold: float, rng: np.random.Generator) -> Iterator[dict[str, Any]]:
-    """MPJPE of people found at the reference point who have a pose in both boxes, and the mean difference."""
+def _pose_rows(people: pd.DataFrame, at: str, threshold: float, rng: np.random.Generator) -> Iterator[dict[str, Any]]:
+    """MPJPE of people found at an operating point who have a pose in both boxes, and the mean difference."""
     if "mpjpe_found" not in people:
         return
     both = people[(people.score >= threshold) & people.mpjpe_found.notna() & people.mpjpe_given.notna()]
     for name in ("mpjpe_found", "mpjpe_given", "mpjpe_difference") if len(both) else ():
         values = both.mpjpe_found - both.mpjpe_given if name == "mpjpe_difference" else both[name]
         low, high = aggregate.interval(values, rng, clusters=both.scan.to_numpy()).stated
-        yield _row(name, f"{REFERENCE:g}", value=values.mean(), low=low, high=high, unit="mm", count=len(both))
+        yield _row(name, at, value=values.mean(), low=low, high=high, unit="mm", count=len(both))
