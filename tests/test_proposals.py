@@ -269,7 +269,7 @@ def test_inputs_of_places_are_those_of_their_candidates(scene, origin):
 
 
 def test_a_crowded_candidate_is_the_same_in_any_order_of_points():
-    """Of more than 1,000 points some stay: beam after beam, as drivers order them, these would be of some beams only."""
+    """Of more than 1,000 points some stay: in drivers' order, beam after beam, these would be of some beams only."""
     rng = np.random.default_rng(3)
     cloud = np.concatenate([plane(), column(6, 0, count=8000)]).astype(np.float32)
     ground, center = estimate_ground(cloud, ORIGIN), np.array([[6.0, 0, -1.8]])

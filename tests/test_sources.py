@@ -75,7 +75,7 @@ def test_the_frames_chosen_are_those_of_a_plain_filter(first, rate, damaged, eve
     chosen = [
         i
         for i in range(first, 25)
-        if (start is None or since[i] >= start) and (end is None or since[i] <= end) and i % every == 0
+        if (start is None or since[i] >= start - 1e-6) and (end is None or since[i] <= end + 1e-6) and i % every == 0
     ]
     frames = list(source.frames(first))
     assert [frame.index for frame in frames] == chosen
@@ -83,6 +83,11 @@ def test_the_frames_chosen_are_those_of_a_plain_filter(first, rate, damaged, eve
     assert [frame.time for frame in frames] == list(times[chosen])
     if source.count is not None:
         assert source.count == len(list(source))
+
+
+def test_ends_of_an_epoch_time_are_not_lost_to_rounding():
+    source = FrameSource(numbered(5, times=list(1_700_000_000 + np.arange(5) / 10)), start=0.1, end=0.2)
+    assert [frame.index for frame in source] == [1, 2]
 
 
 # ---- names

@@ -51,13 +51,15 @@ class WaysPicture:
             for id, way in ways.items()
             if id is not None
         ]
-        people = f"{len(boxes)} tracks" if boxes or None not in ways else f"{len(ways[None]):,} people"
+        people = _counted(len(boxes), "track", "tracks")
+        if not boxes and None in ways:
+            people = _counted(len(ways[None]), "person", "people")
         panel = ScanPanel(
             points=self._points(source),
             boxes=boxes,
             tracks=[way for id, way in ways.items() if id is not None],
             places=ways.get(None),
-            label=f"{people} in {len(self._frames):,} frames",
+            label=f"{people} in {_counted(len(self._frames), 'frame', 'frames')}",
             sensor=self._to_fixed[-1][:2, 3].tolist() if self._to_fixed else None,
         )
         return draw_scans([panel], title=title)
@@ -74,3 +76,7 @@ class WaysPicture:
                 T = self._to_fixed[row]
                 clouds.append(frame.points @ T[:3, :3].T + T[:3, 3])
         return np.concatenate(clouds) if clouds else np.zeros((0, 3))
+
+
+def _counted(count: int, one: str, many: str) -> str:
+    return f"{count:,} {one if count == 1 else many}"

@@ -14,6 +14,8 @@ from lidarpose.io.files import FormatError, file_error, one_line, shorten
 
 # frames a second where a source has no times
 DEFAULT_RATE = 10.0
+# seconds since 1970 are known to 0.2 microseconds
+_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -253,9 +255,9 @@ class FrameSource:
                     self._num_back += time < last_time
                     last_time = time
                     since = time - (self._first_time or 0.0)
-                    if self.end is not None and since > self.end:
+                    if self.end is not None and since > self.end + _ROUNDING:
                         return
-                    if self.start is not None and since < self.start:
+                    if self.start is not None and since < self.start - _ROUNDING:
                         continue
                 if index % self.every == 0:
                     yield _read(lazy, index, time)
