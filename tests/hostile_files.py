@@ -35,6 +35,15 @@ def refusal(call, *args, words=(), **options) -> str:
 # ---- points
 
 
+def with_changed_bytes(data: bytes, random: np.random.Generator, most: int, count: int = 60):
+    """Copies of a file with up to `most` bytes less one replaced by random ones."""
+    for _ in range(count):
+        broken = np.frombuffer(data, np.uint8).copy()
+        at = random.integers(0, len(data), random.integers(1, most))
+        broken[at] = random.integers(0, 256, len(at))
+        yield broken.tobytes()
+
+
 def pcd_header(fields="x y z i", size="4 4 4 4", kind="F F F F", count="1 1 1 1", points=3, data="binary"):
     return (
         f"# .PCD v0.7\nVERSION 0.7\nFIELDS {fields}\nSIZE {size}\nTYPE {kind}\nCOUNT {count}\nWIDTH {points}\n"

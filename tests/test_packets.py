@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hostile_files import with_changed_bytes
 
 from lidarpose.errors import InputError
 from lidarpose.io.sources import DamagedFrame, open_source
@@ -28,7 +29,7 @@ PROFILES = {
 ALTITUDE, AZIMUTH = [20.0, 5.5, -3.0, -17.25], [3.1, -1.2, 4.0, 0.0]
 COLUMNS, PER_PACKET, BEAMS = 32, 8, 4
 TO_SENSOR = [0, 1, 0, 10, -1, 0, 0, 20, 0, 0, 1, 30, 0, 0, 0, 1]
-RECORDINGS = sorted(Path("/work/shared/data/ouster").glob("*.pcap"))
+RECORDINGS = sorted((Path(__file__).parents[2] / "shared" / "data" / "ouster").glob("*.pcap"))
 
 
 def metadata(profile="RNG19_RFL8_SIG16_NIR16", **changes):
@@ -341,11 +342,8 @@ def test_a_capture_that_is_cut_off_or_damaged_keeps_what_is_whole(tmp_path):
     for k, frame in enumerate(frames[:3]):
         assert np.allclose(decoded(frame), expected_points(ranges_of(k)), rtol=0, atol=1e-9)
     random = np.random.default_rng(7)
-    for _ in range(60):
-        broken = np.frombuffer(data, np.uint8).copy()
-        at = random.integers(0, len(data), random.integers(1, 40))
-        broken[at] = random.integers(0, 256, len(at))
-        path.write_bytes(broken.tobytes())
+    for broken in with_changed_bytes(data, random, 40):
+        path.write_bytes(broken)
         try:
             assert all(
                 isinstance(frame, DamagedFrame) or np.isfinite(frame.points).all() for frame in open_source(path)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hostile_files import with_changed_bytes
 
 from lidarpose.errors import InputError
 from lidarpose.io.sources import DamagedFrame, open_source
@@ -309,11 +310,8 @@ def test_damaged_bytes_cost_frames_and_never_more(tmp_path, suffix):
     path = write(tmp_path / f"drive{suffix}", clouds(suffix, 8))
     data = path.read_bytes()
     random = np.random.default_rng(5)
-    for _ in range(60):
-        broken = np.frombuffer(data, np.uint8).copy()
-        at = random.integers(0, len(data), random.integers(1, 20))
-        broken[at] = random.integers(0, 256, len(at))
-        path.write_bytes(broken.tobytes())
+    for broken in with_changed_bytes(data, random, 20):
+        path.write_bytes(broken)
         try:
             frames = list(open_source(path))
         except InputError as error:

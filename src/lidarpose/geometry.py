@@ -66,6 +66,11 @@ def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return axis_angle_to_matrix(axis * np.arctan2(s, c)[..., None])
 
 
+def transform_points(T: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """points (..., 3) m moved by a rigid transform T (4, 4)."""
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
 def unit(vector: np.ndarray) -> np.ndarray:
     """vector (..., 3) scaled to length 1; a zero vector stays zero."""
     vector = np.asarray(vector, float)

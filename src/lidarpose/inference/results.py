@@ -281,7 +281,7 @@ class Poses(Sequence):
         title = title or (self.source or "lidarpose")
         panels, scan = self._panels()
         if path is not None:
-            write_report(path, panels, title=title, summary=[], scan=scan)
+            return write_report(path, panels, title=title, summary=[], scan=scan)
         return render_report(panels, title=title, summary=[], scan=scan)
 
     def _panels(self) -> "tuple[list[Panel], ScanPanel | None]":

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.errors import missing_extra
+from lidarpose.geometry import transform_points
 from lidarpose.io.files import atomic_path, check_writable, file_error
 from lidarpose.io.sources import Source
 from lidarpose.progress import Progress
@@ -145,12 +146,13 @@ class Summary:
 
     def text(self, is_tracked: bool) -> str:
         """The counts."""
-        parts = [_counted(self.frames, "frame"), _counted(self.people, "person", "people")]
-        parts += [_counted(len(self.tracks), "track")] if is_tracked else []
+        parts = [counted(self.frames, "frame"), counted(self.people, "person", "people")]
+        parts += [counted(len(self.tracks), "track")] if is_tracked else []
         return ", ".join(parts + ([f"{self.damaged:,} damaged"] if self.damaged else []))
 
 
-def _counted(number: int, one: str, many: str | None = None) -> str:
+def counted(number: int, one: str, many: str | None = None) -> str:
+    """ "1 frame", "2 frames"."""
     return f"{number:,} {one if number == 1 else many or one + 's'}"
 
 
@@ -308,17 +310,17 @@ def in_world(line: dict[str, Any]) -> dict[str, Any]:
     for person in line["people"]:
         moved: dict[str, Any] = {}
         if person["joints"] is not None:
-            moved["joints"] = _applied(T, person["joints"])
+            moved["joints"] = _transformed(T, person["joints"])
         if person["box"] is not None:
             x, y = T[:2, :2] @ [np.cos(person["box"]["yaw"]), np.sin(person["box"]["yaw"])]
-            center = _applied(T, person["box"]["center"])
+            center = _transformed(T, person["box"]["center"])
             moved["box"] = person["box"] | {"center": center, "yaw": float(np.arctan2(y, x))}
         people.append(person | moved)
     return line | {"people": people, "coordinates": "world"}
 
 
-def _applied(T: np.ndarray, points: Any) -> list:
-    return (np.asarray(points) @ T[:3, :3].T + T[:3, 3]).round(4).tolist()
+def _transformed(T: np.ndarray, points: Any) -> list:
+    return transform_points(T, np.asarray(points)).round(4).tolist()
 
 
 # ---- steady tracks
@@ -351,7 +353,7 @@ def steadied(part: PartFile, steps: FramePredictor) -> Iterator[dict[str, Any]]:
         is_damaged.append(line["error"] is not None)
         for person in line["people"]:
             if person["joints"] is not None:
-                joints = np.array(person["joints"]) @ to_fixed[-1][:3, :3].T + to_fixed[-1][:3, 3]
+                joints = transform_points(to_fixed[-1], np.array(person["joints"]))
                 others = {name: np.array(person[name], np.float32) for name in _SMOOTHED if person[name]}
                 tracks.setdefault(person["track"], _Sightings()).add(row, {"joints": joints} | others)
     # as arrays: lists of numbers would take five times the memory
@@ -374,7 +376,7 @@ def _written(entry: dict[str, Any], T_sensor_fixed: np.ndarray) -> dict[str, Any
         for name, digits in _SMOOTHED.items()
         if name in entry
     }
-    return rounded | {"joints": _applied(T_sensor_fixed, entry["joints"]), "filled": entry["filled"]}
+    return rounded | {"joints": _transformed(T_sensor_fixed, entry["joints"]), "filled": entry["filled"]}
 
 
 def _steady(sightings: _Sightings, times: np.ndarray, own: Skeleton) -> Iterator[tuple[int, dict[str, Any]]]:

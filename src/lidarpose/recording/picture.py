@@ -4,7 +4,9 @@ from typing import Any
 
 import numpy as np
 
+from lidarpose.geometry import transform_points
 from lidarpose.io.sources import Frame, Source
+from lidarpose.recording.output import counted
 from lidarpose.recording.predict_recording import fixed_from_sensor
 from lidarpose.sample import Box
 from lidarpose.viz.bird_eye import ScanPanel, draw_scans
@@ -36,7 +38,7 @@ class WaysPicture:
         T = np.eye(4) if line.get("coordinates") == "world" else T_fixed_sensor
         for person in line["people"]:
             if person["joints"] is not None:
-                joints = np.array(person["joints"]) @ T[:3, :3].T + T[:3, 3]
+                joints = transform_points(T, np.array(person["joints"]))
                 self._ways.setdefault(person["track"], []).append((joints.min(0) + joints.max(0)) / 2)
                 if person["box"] is not None:
                     yaw = person["box"]["yaw"]
@@ -51,15 +53,15 @@ class WaysPicture:
             for id, way in ways.items()
             if id is not None
         ]
-        people = _counted(len(boxes), "track", "tracks")
+        people = counted(len(boxes), "track")
         if not boxes and None in ways:
-            people = _counted(len(ways[None]), "person", "people")
+            people = counted(len(ways[None]), "person", "people")
         panel = ScanPanel(
             points=self._points(source),
             boxes=boxes,
             tracks=[way for id, way in ways.items() if id is not None],
             places=ways.get(None),
-            label=f"{people} in {_counted(len(self._frames), 'frame', 'frames')}",
+            label=f"{people} in {counted(len(self._frames), 'frame')}",
             sensor=self._to_fixed[-1][:2, 3].tolist() if self._to_fixed else None,
         )
         return draw_scans([panel], title=title)
@@ -73,10 +75,5 @@ class WaysPicture:
         for row in np.linspace(len(self._frames) - 1, 0, count).astype(int).tolist():
             frame = next(source.frames(self._frames[row]), None)
             if isinstance(frame, Frame):
-                T = self._to_fixed[row]
-                clouds.append(frame.points @ T[:3, :3].T + T[:3, 3])
+                clouds.append(transform_points(self._to_fixed[row], frame.points))
         return np.concatenate(clouds) if clouds else np.zeros((0, 3))
-
-
-def _counted(count: int, one: str, many: str) -> str:
-    return f"{count:,} {one if count == 1 else many}"

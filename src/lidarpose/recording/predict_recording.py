@@ -14,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 
 from lidarpose.errors import InputError
-from lidarpose.geometry import UP_AXES, rotation_from_up
+from lidarpose.geometry import UP_AXES, rotation_from_up, transform_points
 from lidarpose.inference.detection import KnownPlaces, Places, Search, detect_places, least_score, search_options
 from lidarpose.inference.inputs import as_origin, only_returns
 from lidarpose.inference.predictor import Predictor, check_choice, is_wide, predict_scan, predictor_of
@@ -282,16 +282,16 @@ class FramePredictor:
             center, size = state.center, np.maximum(state.size, 0.1)
             box = Box(center=center, size=size, yaw=state.yaw, score=person.score, mounted=person.mounted)
             boxes.append(_moved(box, T_sensor_fixed, np.eye(3), R_boxes_input))
-            pelvises.append(_applied(T_sensor_fixed, center + person.offset))
+            pelvises.append(transform_points(T_sensor_fixed, center + person.offset))
         states += others
         since = time - self._rejected[:, 3]
         self._rejected = self._rejected[(since >= 0) & (since < _trusted(np.arange(len(self._rejected))))]
         return KnownPlaces(
             boxes=boxes,
             pelvises=np.reshape(pelvises, (-1, 3)),
-            tracks=_applied(T_sensor_fixed, np.reshape([state.center for state in states], (-1, 3))),
+            tracks=transform_points(T_sensor_fixed, np.reshape([state.center for state in states], (-1, 3))),
             reach=np.array([_NEAR + _NEAR_DEVIATIONS * state.position_sd for state in states]),
-            rejected=_applied(T_sensor_fixed, self._rejected[:, :3]),
+            rejected=transform_points(T_sensor_fixed, self._rejected[:, :3]),
         )
 
     def _is_trusted(self, state: TrackState, person: "_Person", time: float) -> bool:
@@ -305,7 +305,7 @@ class FramePredictor:
             people = tuple(replace(person, id=0) for person in poses)
             return replace(poses, people=self._steadied(time, people, T_fixed_sensor) if self.live else people)
         if scan.rejected is not None:
-            places = _applied(T_fixed_sensor, scan.rejected)
+            places = transform_points(T_fixed_sensor, scan.rejected)
             self._rejected = np.concatenate([self._rejected, np.insert(places, 3, time, axis=1)])
         R_boxes_input = UP_AXES.get(self.up, UP_AXES["z"])
         # whoever is searched for, or was given, has a box
@@ -324,7 +324,7 @@ class FramePredictor:
         for i, (id, box, pelvis) in enumerate(zip(ids, boxes, pelvises, strict=True)):
             is_verified = scan.verified is not None and scan.verified[i]
             if is_verified and id >= 0 and pelvis is not None and box.score is not None:
-                offset = _applied(T_fixed_sensor, pelvis) - box.center
+                offset = transform_points(T_fixed_sensor, pelvis) - box.center
                 self._people[id] = _Person(verified=time, score=box.score, mounted=box.mounted, offset=offset)
         self._people = {id: person for id, person in self._people.items() if time - person.verified < _FORGOTTEN}
         named = tuple(
@@ -345,8 +345,8 @@ class FramePredictor:
                 steady.append(person)
                 continue
             _, own = self._filters.get(person.id) or (time, LiveFilter(person.skeleton))
-            pose = own.update(time, replace(person.pose, joints=_applied(T_fixed_sensor, person.pose.joints)))
-            pose = pose and replace(pose, joints=_applied(T_sensor_fixed, pose.joints))
+            pose = own.update(time, replace(person.pose, joints=transform_points(T_fixed_sensor, person.pose.joints)))
+            pose = pose and replace(pose, joints=transform_points(T_sensor_fixed, pose.joints))
             self._filters[person.id] = time, own
             steady.append(replace(person, pose=pose or person.pose))
         return tuple(steady)
@@ -416,16 +416,11 @@ def _trusted(number: Any) -> Any:
     return first + (last - first) * (number % 5) / 4
 
 
-def _applied(T: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """T (4, 4), points (..., 3) m."""
-    return points @ T[:3, :3].T + T[:3, 3]
-
-
 def _moved(box: Box, T: np.ndarray, R_upright_from: np.ndarray, R_upright_to: np.ndarray) -> Box:
     """The box in another frame. R_upright (3, 3): of each frame to the one in which its boxes stand along z."""
     heading = R_upright_from.T @ [np.cos(box.yaw), np.sin(box.yaw), 0.0]
     x, y, _ = R_upright_to @ T[:3, :3] @ heading
-    return replace(box, center=_applied(T, box.center), yaw=float(np.arctan2(y, x)))
+    return replace(box, center=transform_points(T, box.center), yaw=float(np.arctan2(y, x)))
 
 
 def _pelvis(pose: Pose | None) -> np.ndarray | None:

@@ -37,8 +37,8 @@ _SCHEMA = 1
 
 def write_report(
     path: str | Path, people: list[Panel], *, title: str, summary: list[dict], scan: ScanPanel | None = None
-) -> None:
-    """Writes the report to `path`, whole or not at all.
+) -> str:
+    """Writes the report to `path`, whole or not at all, and returns its text.
 
     Args:
         path: ends in .html or .htm.
@@ -52,7 +52,9 @@ def write_report(
         InputError: a path of another suffix, or one that cannot be written.
     """
     check_suffix(path, ".html", ".htm")
-    write_atomic(path, render_report(people, title=title, summary=summary, scan=scan).encode("utf-8", "replace"))
+    text = render_report(people, title=title, summary=summary, scan=scan)
+    write_atomic(path, text.encode("utf-8", "replace"))
+    return text
 
 
 def render_report(people: list[Panel], *, title: str, summary: list[dict], scan: ScanPanel | None = None) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 
 from lidarpose.data.readers.base import Skipped, labeled_sample
 from lidarpose.errors import InputError
-from lidarpose.geometry import from_spherical
+from lidarpose.geometry import from_spherical, transform_points
 from lidarpose.sample import HIDDEN, SEEN, UNLABELED, Box, LabeledSample, within_reach
 from lidarpose.skeleton import WAYMO14
 
@@ -108,7 +108,7 @@ def points_of_image(
     # columns divide the turn of the vehicle's axes, not of the laser's own
     azimuth = ((width - column - 0.5) / width * 2 - 1) * np.pi - np.arctan2(T[1, 0], T[0, 0])
     points = from_spherical(image[row, column].astype(float), azimuth, calibration.rows(height)[row])
-    points = points @ T[:3, :3].T + T[:3, 3]
+    points = transform_points(T, points)
     if pixel_poses is None:
         return points, row
     if T_world_vehicle is None:
