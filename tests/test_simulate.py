@@ -242,7 +242,7 @@ def test_clutter_is_what_stands_above_the_ground_and_is_not_the_body(monkeypatch
 def test_every_try_is_nearer_and_easier_and_the_best_counts(monkeypatch):
     seen, counts = [], iter([3, 9, 5, 0, 2, 8, 1, 4])
 
-    def draw_scene(config, bodies, first, block, row, nearer, rng):
+    def draw_scene(config, bodies, first, block, row, nearer, rng, acquisition):
         seen.append((config.hard, nearer))
         return len(seen) - 1
 

@@ -158,6 +158,13 @@ class Sample:
     background: np.ndarray | None = None
     neighbors: np.ndarray | None = None
 
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """Of a synthetic sample that is not one scan of an upright sensor around one person, what it is instead, as its
+        source says after scene and sensor: merged, accumulated, integrated, inverted, sparse, crowded."""
+        words = self.source.split("/")
+        return tuple(words[3].split("+")) if words[0] == "synth" and len(words) > 3 else ()
+
     def __post_init__(self):
         _as_arrays(self, "points", "center", "part", "ring", "rotations", "translation", "background", "neighbors")
         if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.dtype != np.float32:

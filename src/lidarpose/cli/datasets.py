@@ -47,7 +47,7 @@ def _add_synth(commands) -> None:
     synth.add_argument("--out", required=True, metavar="DIR", help="a new folder, or the one of an interrupted run")
     synth.add_argument("-n", "--count", type=int, required=True, metavar="N", help="number of people, clips or streets")
     scene = synth.add_argument_group("scene")
-    scene.add_argument("--scene", default="wild", metavar="NAME", help="wild (default), paper or reference")
+    scene.add_argument("--scene", default="wild", metavar="NAME", help="wild (default), wide, paper or reference")
     scene.add_argument(
         "--sensor", metavar="A,B", help="names of sensors or sensor files (default: the scene's); see lidarpose sensors"
     )

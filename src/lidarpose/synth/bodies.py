@@ -111,6 +111,18 @@ class Bodies:
     moved: Callable[[int], tuple[np.ndarray, np.ndarray]]
     places: np.ndarray | None = None
 
+    def between(self, row: int, share: float) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices (V, 3) and joints (26, 3) m of a body after a `share` of `FRAME_TIME`, moving evenly; below 0:
+        before, above 1: after."""
+        moved = self.moved(row)
+        if share == 1:
+            return moved
+        vertices, joints = (
+            now + np.float32(share) * (later - now)
+            for now, later in zip((self.vertices[row], self.joints[row]), moved, strict=True)
+        )
+        return vertices, joints
+
 
 def draw_bodies(
     bank: PoseBank | None,
@@ -177,25 +189,63 @@ def draw_bodies(
 def draw_moving_body(
     bank: PoseBank | None, captured: float, frames: int, rng: np.random.Generator, *, clothes: float = 1.0
 ) -> Bodies:
-    """The frames of a person who moves, at `CLIP_HZ`.
+    """The frames of a person who moves, at `CLIP_HZ`: one of `draw_moving_bodies`."""
+    return draw_moving_bodies(bank, captured, 1, frames, rng, clothes=clothes)[0]
+
+
+def draw_moving_bodies(
+    bank: PoseBank | None,
+    captured: float,
+    count: int,
+    frames: int,
+    rng: np.random.Generator,
+    *,
+    clothes: float = 1.0,
+    to_last: bool = False,
+) -> list[Bodies]:
+    """The frames of `count` people who move, at `CLIP_HZ`.
 
     Args:
         bank: captured poses, or None.
         captured: chance of a clip of the bank instead of the prior's.
         clothes: see `SceneConfig`.
+        to_last: the last frame is on the origin and faces +x, instead of the first.
     """
-    rig = load_rig()
-    clip = bank.clip(frames + 1, rng) if bank is not None and rng.random() < captured else None
-    if clip is not None:
-        (rotations, translation), kind, clearance = clip, "captured", None
-    else:
-        drawn = sample_clips(rng, 1, frames=frames + 1, hz=CLIP_HZ)
-        rotations, translation = drawn.rotations[0], drawn.translation[0] * np.array([1, 1, 0], np.float32)
-        kind, clearance = KINDS[drawn.kind[0]], drawn.clearance[0]
-    person = rig.rest(sample_people(rng, 1).coefficients)
+    clips = [bank.clip(frames + 1, rng) if bank is not None and rng.random() < captured else None for _ in range(count)]
+    motion: list[tuple[np.ndarray, np.ndarray, str, np.ndarray | None]]
+    motion = [(*clip, "captured", None) for clip in clips if clip is not None]
+    if drawn_count := clips.count(None):
+        drawn = sample_clips(rng, drawn_count, frames=frames + 1, hz=CLIP_HZ)
+        flat = drawn.translation * np.array([1, 1, 0], np.float32)
+        motion += zip(drawn.rotations, flat, [KINDS[kind] for kind in drawn.kind], drawn.clearance, strict=True)
+    people = load_rig().rest(sample_people(rng, count).coefficients)
+    worn = clothing(rng, count) * np.float32(clothes)
+    return [
+        _moving_body(
+            RestBody(vertices=people.vertices[k : k + 1], joints=people.joints[k : k + 1]), worn[k : k + 1], *moves,
+            to_last=to_last,
+        )
+        for k, moves in enumerate(motion)
+    ]  # fmt: skip
+
+
+def _moving_body(
+    person: RestBody, worn: np.ndarray, rotations: np.ndarray, translation: np.ndarray, kind: str,
+    clearance: np.ndarray | None, *, to_last: bool,
+) -> Bodies:  # fmt: skip
+    """One person's F frames, of one more: rotations (F + 1, 24, 3, 3), translation (F + 1, 3) m; clearance (F + 1,) m,
+    see `sampling.DrawnClips`, None of captured motion."""
+    rig, frames = load_rig(), len(rotations) - 1
+    # where the pelvis's x axis points
+    yaw = np.arctan2(rotations[:, 0, 1, 0], rotations[:, 0, 0, 0])
+    if to_last:
+        turn = rotation_about("z", -yaw[frames - 1]).astype(np.float32)
+        rotations = np.concatenate([(turn @ rotations[:, 0])[:, None], rotations[:, 1:]], 1)
+        translation = (translation - translation[frames - 1] * [1, 1, 0]) @ turn.T
+        yaw = yaw - yaw[frames - 1]
     translation = translation * [*_stride_ratio(person, [kind]).repeat(2), 1]
     rest = RestBody(vertices=np.repeat(person.vertices, frames + 1, 0), joints=np.repeat(person.joints, frames + 1, 0))
-    worn = np.repeat(clothing(rng, 1) * np.float32(clothes), frames + 1, 0)
+    worn = np.repeat(worn, frames + 1, 0)
     vertices, joints, low, _ = _dressed(rest, worn, rotations, translation)
     lowest = low[:, 2]
     if clearance is None:
@@ -203,15 +253,13 @@ def draw_moving_body(
         clearance = np.maximum(lowest - lowest.min() - _JUMP, 0)
     rise = ground_offset(lowest, clearance)[:, None, None] * np.array([0, 0, 1], np.float32)
     vertices, joints = vertices + rise, joints + rise
-    # where the pelvis's x axis points
-    heading = np.arctan2(rotations[:frames, 0, 1, 0], rotations[:frames, 0, 0, 0])
-    turned = vertices[:frames] @ rotation_about("z", heading).astype(np.float32)
+    turned = vertices[:frames] @ rotation_about("z", yaw[:frames]).astype(np.float32)
     return Bodies(
         vertices=vertices[:frames],
         joints=joints[:frames],
         rotations=rotations[:frames],
         kinds=(kind,) * frames,
-        heading=tuple(heading.tolist()),
+        heading=tuple(yaw[:frames].tolist()),
         extent=_extents(turned.min(1), turned.max(1)),
         faces=rig.faces,
         face_part=rig.face_part,

@@ -20,12 +20,33 @@ from lidarpose.lidar.ray_pattern import RayPattern
 from lidarpose.sample import CLIP_FRAMES, Box, PersonInfo, Pose, Sample, center_of
 from lidarpose.skeleton import BODY26
 from lidarpose.synth import noise
-from lidarpose.synth.bodies import Bodies, PoseBank, draw_bodies, draw_moving_body
+from lidarpose.synth.bodies import CLIP_HZ, Bodies, PoseBank, draw_bodies, draw_moving_bodies, draw_moving_body
 from lidarpose.synth.environment.mesh import Mesh
 from lidarpose.synth.environment.surroundings import ground, occluder, surroundings
 from lidarpose.synth.props import draw_props
-from lidarpose.synth.scene import Place, RandomStream, SceneConfig, draw_place, recorded_place, scene_config
-from lidarpose.synth.simulate import Scan, Scene, count_alone, draw_conditions, scan_background, simulate_scan
+from lidarpose.synth.scene import (
+    ACQUISITION_DRAWS,
+    MOST_FRAMES,
+    SINGLE_SCAN,
+    Acquisition,
+    Place,
+    RandomStream,
+    SceneConfig,
+    draw_acquisition,
+    draw_place,
+    recorded_place,
+    scene_config,
+)
+from lidarpose.synth.simulate import (
+    Scan,
+    Scene,
+    View,
+    count_alone,
+    draw_conditions,
+    scan_background,
+    simulate,
+    simulate_scan,
+)
 
 # people whose poses and shapes are drawn together
 BLOCK = 256
@@ -74,8 +95,8 @@ class Generator:
         self._bodies  # noqa: B018
 
     def __getstate__(self) -> dict:
-        # the cache of blocks stays in its process
-        return {name: value for name, value in vars(self).items() if name != "_bodies"}
+        # the caches of blocks stay in their process
+        return {name: value for name, value in vars(self).items() if name not in ("_bodies", "_acquisitions")}
 
     @property
     def config(self) -> SceneConfig:
@@ -85,17 +106,41 @@ class Generator:
     @cached_property
     def _bodies(self) -> Callable[[int, int], Bodies]:
         """(seed, block) -> its bodies."""
-        moving = any(isinstance(sensor(name), RayPattern) for name in self.config.sensors)
+        moving = bool(self.config.merged) or any(isinstance(sensor(name), RayPattern) for name in self.config.sensors)
         # neighbors share a block; two suffice for a reader that crosses from one to the next
         draw_block = partial(draw_bodies, self.bank, self.captured, BLOCK, moving=moving, clothes=self.config.clothes)
         return lru_cache(maxsize=2)(draw_block)
+
+    @cached_property
+    def _acquisitions(self) -> Callable[[int, int], tuple[np.ndarray, dict[int, Bodies]]]:
+        """(seed, block) -> what decides on its people's acquisitions, (BLOCK, ACQUISITION_DRAWS) in [0, 1), and by row
+        the frames of those of whom several may be added up."""
+
+        def draw(seed: int, block: int) -> tuple[np.ndarray, dict[int, Bodies]]:
+            draws = np.random.default_rng([seed, RandomStream.ACQUISITION, block]).random((BLOCK, ACQUISITION_DRAWS))
+            # whoever has several frames at some difficulty has them here
+            full = replace(self.config, hard=1.0, merged=0.0, sparse=0.0)
+            rows = [row for row in range(BLOCK) if draw_acquisition(full, draws[row]).frames > 1]
+            rng = np.random.default_rng([seed, RandomStream.MOTION, block])
+            moving = draw_moving_bodies(
+                self.bank, self.captured, len(rows), MOST_FRAMES, rng, clothes=self.config.clothes, to_last=True
+            )
+            return draws, dict(zip(rows, moving, strict=True))
+
+        return lru_cache(maxsize=2)(draw)
 
     def person(self, seed: int, index: int, *, hard: float | None = None) -> SyntheticPerson:
         """Person `index` of `seed`, at the scene's difficulty or at `hard` in [0, 1]."""
         seed, index = check_int("seed", seed, least=0), check_int("index", index, least=0)
         rng = np.random.default_rng([seed, RandomStream.PERSON, index])
         block, row = self._bodies(seed, index // BLOCK), index % BLOCK
-        return self._observe(block, [row], block, row, rng, hard)[0]
+        bodies, shown, acquisition = block, row, SINGLE_SCAN
+        if self.config.varied:
+            draws, moving = self._acquisitions(seed, index // BLOCK)
+            acquisition = draw_acquisition(self.config if hard is None else self.config.eased(hard), draws[row])
+            if acquisition.frames > 1:
+                bodies, shown = moving[row], MOST_FRAMES - 1
+        return self._observe(bodies, [shown], block, row, rng, hard, acquisition=acquisition)[0]
 
     def clip(
         self, seed: int, index: int, *, frames: int = CLIP_FRAMES, hard: float | None = None
@@ -120,6 +165,7 @@ class Generator:
         hard: float | None,
         *,
         in_clip: bool = False,
+        acquisition: Acquisition = SINGLE_SCAN,
     ) -> list[SyntheticPerson]:
         """A person's frames, `rows` of `bodies`. While hardly anything of them is seen, the scene is drawn again,
         easier each time; after the last try the best one counts, if it has any points at all. A second person is
@@ -129,7 +175,7 @@ class Generator:
         draw = _draw_clip_frame if in_clip else _draw_sample
         for attempt in range(_TRIES if self.redraw else 1):
             eased = config.eased(config.hard * (1 - attempt / (_TRIES - 1))) if attempt else config
-            scene = _draw_scene(eased, bodies, rows[0], block, row, 0.8**attempt, rng)
+            scene = _draw_scene(eased, bodies, rows[0], block, row, 0.8**attempt, rng, acquisition)
             samples = [draw(scene, bodies, k, frame, rng) for frame, k in enumerate(rows)]
             # of the middle frame: half of a clip's frames have more
             points = float(np.median([np.count_nonzero(_truth(sample)[0]) for sample in samples]))
@@ -151,26 +197,31 @@ class Generator:
 
 
 def _draw_scene(
-    config: SceneConfig, bodies: Bodies, first: int, block: Bodies, row: int, nearer: float, rng: np.random.Generator
-) -> Scene:
+    config: SceneConfig, bodies: Bodies, first: int, block: Bodies, row: int, nearer: float, rng: np.random.Generator,
+    acquisition: Acquisition = SINGLE_SCAN,
+) -> Scene:  # fmt: skip
     """Paper: section "Scene sampling". A person too far to be seen comes nearer with every attempt."""
-    device = sensor(config.sensors[rng.integers(len(config.sensors))])
+    sensors = acquisition.sensors[:1] or (config.sensors[rng.integers(len(config.sensors))],)
+    device = sensor(sensors[0])
     low, high = bodies.extent[first]
     height, reach = high[2], max(-low[0], -low[1], high[0], high[1])
-    place = draw_place(config, device, height, reach, nearer, rng)
+    placing = config
+    if acquisition.distance:
+        placing = replace(config, distance=acquisition.distance, median_points=0)
+    place = draw_place(placing, device, height, reach, nearer, rng, acquisition.inverted)
     if config.recorded and bodies.places is not None and np.isfinite(bodies.places[first]).all():
         place = recorded_place(place, bodies.places[first])
     background = [ground(config, place.feet, rng), *surroundings(config, place.feet, reach, rng)]
     if (front := occluder(config, place.feet, height, rng)) is not None:
         background.append(front)
     still = len(background)
-    if rng.random() < config.company * config.hard:
-        background.append(_second_person(block, row, place, rng))
+    if (rng.random() < config.company * config.hard) or acquisition.crowded:
+        background.append(_second_person(block, row, place, rng, close=acquisition.crowded))
     props = []
     if rng.random() < config.carry * config.hard:
         props = draw_props(rng, kind=bodies.kinds[first], joints=bodies.joints[first])
     conditions = draw_conditions(config, device, rng)
-    return Scene(
+    scene = Scene(
         config=config,
         sensor=device,
         place=place,
@@ -178,32 +229,80 @@ def _draw_scene(
         background=background,
         props=props,
         still=still,
+        acquisition=acquisition,
     )
+    if len(acquisition.sensors) > 1:
+        return replace(scene, views=_merged_views(scene, placing, height, reach, nearer, rng))
+    return replace(scene, views=_earlier_views(scene)) if acquisition.frames > 1 else scene
+
+
+# sensors that are merged stand so far off equal angles around the person, rad
+_OFF_ANGLE = 0.4
+# a sensor that drives does not come nearer than this to the person, m
+_BESIDE_LANE = 1.5
+
+
+def _merged_views(
+    scene: Scene, placing: SceneConfig, height: float, reach: float, nearer: float, rng: np.random.Generator
+) -> tuple[View, ...]:
+    """The other sensors around a person, each turned, mounted and disturbed on its own, up to a tenth of a second
+    before or after the first one. Arguments: as of `draw_place`."""
+    names, feet, views = scene.acquisition.sensors, scene.place.feet, []
+    for k, name in enumerate(names[1:], 1):
+        device = sensor(name)
+        own = draw_place(placing, device, height, reach, nearer, rng, scene.acquisition.inverted)
+        angle, lag = rng.uniform(-1, 1, 2).tolist()
+        # from there the person is seen in this direction of the first sensor's frame
+        heading = np.arctan2(feet[1], feet[0]) + 2 * np.pi * k / len(names) + _OFF_ANGLE * angle
+        turn = rotation_about("z", heading - np.arctan2(own.feet[1], own.feet[0]))
+        mount = turn.T if own.R_sensor_level is None else own.R_sensor_level @ turn.T
+        seen = scene.seen_from(
+            feet - turn @ own.feet,
+            place=replace(scene.place, R_sensor_level=mount),
+            sensor=device,
+            conditions=draw_conditions(scene.config, device, rng),
+        )
+        views.append(View(scene=seen, at=feet - turn @ own.feet, lag=lag))
+    return tuple(views)
+
+
+def _earlier_views(scene: Scene) -> tuple[View, ...]:
+    """The frames before the last, seen from where the sensor was."""
+    feet, views = scene.place.feet, []
+    # it does not drive through the person
+    forward = -1 if feet[0] < 0 and abs(feet[1]) < _BESIDE_LANE else 1
+    for earlier in range(1, scene.acquisition.frames):
+        at = np.array([-forward * scene.acquisition.speed * earlier / CLIP_HZ, 0, 0])
+        views.append(View(scene=scene.seen_from(at), at=at, earlier=earlier))
+    return tuple(views)
 
 
 # a second person: how often before the first one, as seen by the sensor; else beside
 _BEFORE = 0.3
 _BESIDE, _NEARER = (0.4, 1.0), (0.4, 2.5)
+# how far apart two people in one crop are, m
+_CLOSE = (0.35, 0.8)
 
 
-def _second_person(block: Bodies, row: int, place: Place, rng: np.random.Generator) -> Mesh:
-    """Another body of the block, an arm's length away or between the sensor and the person."""
+def _second_person(block: Bodies, row: int, place: Place, rng: np.random.Generator, *, close: bool) -> Mesh:
+    """Another body of the block, an arm's length away or between the sensor and the person; `close`: always beside."""
     other = (row + rng.integers(1, len(block.vertices))) % len(block.vertices)
     before, gap, angle, aside, yaw = rng.random(5)
     ahead = place.feet[:2] / max(np.hypot(*place.feet[:2]), 1e-6)
-    if before < _BEFORE:
+    if before < _BEFORE and not close:
         # not nearer to the sensor than a third of the way
         near = min(_NEARER[0] + gap * (_NEARER[1] - _NEARER[0]), 0.67 * place.distance)
         shift = -near * ahead + (aside - 0.5) * np.array([-ahead[1], ahead[0]])
     else:
-        reach = _BESIDE[0] + gap * (_BESIDE[1] - _BESIDE[0])
+        least, most = _CLOSE if close else _BESIDE
+        reach = least + gap * (most - least)
         shift = reach * np.array([np.cos(2 * np.pi * angle), np.sin(2 * np.pi * angle)])
     there = Place(feet=place.feet + [*shift, 0], yaw=2 * np.pi * yaw, distance=place.distance)
     return Mesh(there.of_body(block.vertices[other]), block.faces)
 
 
 def _draw_sample(scene: Scene, bodies: Bodies, row: int, frame: int, rng: np.random.Generator) -> Sample:
-    return _crop(scene, bodies, row, simulate_scan(scene, scene.meshes(bodies, row), rng, frame=frame), rng)
+    return _crop(scene, bodies, row, simulate(scene, bodies, row, rng, frame=frame), rng)
 
 
 def _draw_clip_frame(scene: Scene, bodies: Bodies, row: int, frame: int, rng: np.random.Generator) -> Sample:
@@ -229,8 +328,11 @@ def _smpl_pose(place: Place, bodies: Bodies, row: int) -> np.ndarray:
 
 def _crop(scene: Scene, bodies: Bodies, row: int, scan: Scan, rng: np.random.Generator) -> Sample:
     """The points in a box as a detector draws it."""
-    config, place = scene.config, scene.body_place
-    box = noise.draw_box(config.crop, config.hard, bodies.extent[row], place, rng, heading=bodies.heading[row])
+    config, place, acquisition = scene.config, scene.body_place, scene.acquisition
+    box = noise.draw_box(config.crop, config.hard, _extent(scene, bodies, row, rng), place, rng, bodies.heading[row])
+    if acquisition.crowded:
+        body = place.of_body(bodies.vertices[row])
+        box = noise.box_of_two(box, body, scene.background[-1].vertices, rng)
     points, ring, part = scan.points, scan.ring, scan.part
     clutter, missing_part = rng.random(2)
     if clutter < config.noise.clutter * config.hard:
@@ -249,13 +351,23 @@ def _crop(scene: Scene, bodies: Bodies, row: int, scan: Scan, rng: np.random.Gen
         points, ring, part = points[left], ring[left], part[left]
     return Sample(
         points=points,
-        center=center_of(points) if len(points) else box.center,
+        # of two people the box says who is meant
+        center=center_of(points) if len(points) and not acquisition.crowded else box.center,
         part=part,
         ring=ring,
         pose=Pose(joints=place.of_body(bodies.joints[row]), skeleton=BODY26, frame="sensor"),
         box=box,
-        source=f"synth/{config.name}/{scene.sensor.name}",
+        source="/".join(("synth", config.name, scene.sensor.name, *filter(None, ["+".join(acquisition.conditions)]))),
     )
+
+
+def _extent(scene: Scene, bodies: Bodies, row: int, rng: np.random.Generator) -> tuple[list[float], list[float]]:
+    """What a box is drawn about, as in `Bodies.extent`: the body; of several frames half of the time all bodies."""
+    if scene.acquisition.frames == 1 or rng.random() < 0.5:
+        return bodies.extent[row]
+    vertices = bodies.vertices[row + 1 - scene.acquisition.frames : row + 1].reshape(-1, 3)
+    vertices = vertices @ rotation_about("z", bodies.heading[row])
+    return vertices.min(0).tolist(), vertices.max(0).tolist()
 
 
 # points this close to the soles count as ground, not as clutter, m
@@ -270,7 +382,7 @@ def _truth(sample: Sample) -> tuple[np.ndarray, Pose]:
 def _measure(sample: Sample, scene: Scene, bodies: Bodies, row: int, frame: int) -> PersonInfo:
     """What is known of a sample: see `PersonInfo`."""
     low, high = bodies.extent[row]
-    visible_alone = count_alone(scene, scene.meshes(bodies, row)[0], frame)
+    visible_alone = sum(count_alone(seen, meshes[0], k) for seen, meshes, k, _ in scene.scans(bodies, row, frame))
     part, pose = _truth(sample)
     seen = sample.points[part > 0]
     clutter = (part == 0) & (sample.points[:, 2] > float(scene.place.feet[2]) + _GROUND)

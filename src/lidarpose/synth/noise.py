@@ -8,6 +8,7 @@ from math import cos, sin
 
 import numpy as np
 
+from lidarpose.geometry import rotation_about
 from lidarpose.sample import Box
 from lidarpose.synth.scene import CropErrors, Place
 
@@ -149,6 +150,8 @@ _SUNK, _SUNK_BY = 0.3, (0.03, 0.25)
 _LEAST_SIZE = 0.4
 # what a crop without errors adds on each side, m
 _ALL = 2.5
+# the center of a box that holds two people is at most this share of the way from the one meant to the other
+_TOWARDS = 0.4
 
 
 def draw_box(
@@ -191,6 +194,30 @@ def draw_box(
     center = place.feet + np.array([c * x - s * y, s * x + c * y, z])
     box = Box(center=center, size=np.maximum(high - low, _LEAST_SIZE), yaw=yaw)
     return cut_box(box, rng=rng) if cut < errors.cut * difficulty else box
+
+
+def box_of_two(box: Box, body: np.ndarray, other: np.ndarray, rng: np.random.Generator) -> Box:
+    """A box about a body, grown to hold another one too; its center stays nearer to the first.
+
+    Args:
+        box: about the body, with a detector's errors.
+        body, other: (V, 3) m, vertices; who is nearer is a matter of the middles of their extents from above.
+    """
+    middles = [(vertices[:, :2].min(0) + vertices[:, :2].max(0)) / 2 for vertices in (body, other)]
+    way = middles[1] - middles[0]
+    # the share of the way to the other's middle at which the center lies: the box's own errors, and a shift
+    apart = float(way @ way)
+    own = float((box.center[:2] - middles[0]) @ way) / max(apart, 1e-9)
+    center = box.center.copy()
+    center[:2] += (min(own + _TOWARDS * rng.random(), _TOWARDS) - own) * way
+    R_level_box = rotation_about("z", box.yaw)
+    local = np.concatenate([body, other]) @ R_level_box - center @ R_level_box
+    low, high = local.min(0), local.max(0)
+    # heights are not shared about the middle
+    half = np.maximum(np.maximum(-low, high), box.size / 2)
+    shift = (min(low[2], -box.size[2] / 2) + max(high[2], box.size[2] / 2)) / 2
+    half[2] = max(high[2], box.size[2] / 2) - shift
+    return replace(box, center=center + [0, 0, shift], size=2 * half + _ROOM)
 
 
 def cut_box(box: Box, *, most: float = 0.3, rng: np.random.Generator) -> Box:

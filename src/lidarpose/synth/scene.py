@@ -8,13 +8,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from functools import lru_cache
-from math import atan2, cos, inf, sin, tan
+from math import atan2, cos, inf, pi, sin, tan
 from typing import Any
 
 import numpy as np
 
 from lidarpose.errors import InputError, check_name
 from lidarpose.geometry import rotation_about
+from lidarpose.lidar.presets import sensor
 from lidarpose.lidar.ray_pattern import RayPattern
 from lidarpose.lidar.sensor import Sensor
 
@@ -39,6 +40,8 @@ class RandomStream(IntEnum):
     TRAINING_STEP = 10
     DETECTION = 11
     CANDIDATES = 12
+    ACQUISITION = 13
+    MOTION = 14
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,6 +100,13 @@ class SceneConfig:
         occluder: something in front.
         company: a second person in or before the crop.
         carry: how often something is carried or used, relative to the street's habit.
+        merged: the cloud of 2 to 4 sensors around the person, see `Acquisition`; this and the next five hold for single
+            people only, clips have none of them.
+        accumulated: 2 to 5 frames of somebody who moves in one cloud.
+        inverted: sensors mounted upside down, 2 to 5 m above the ground.
+        integration: rosettes that collect 0.1, 0.2 or 0.5 s, each as often.
+        sparse: sensors of 16 and 32 rings at a uniform distance of up to 25 m.
+        crowded: crops that hold a second person besides the one whom the box's center is nearer to.
         noise: what goes wrong with returns.
         crop: errors of the crop's box.
         recorded: 1: captured people stay where they were recorded, as without the paper's scene sampling; 0: they are
@@ -118,6 +128,12 @@ class SceneConfig:
     occluder: float = 0.0
     company: float = 0.0
     carry: float = 0.0
+    merged: float = 0.0
+    accumulated: float = 0.0
+    inverted: float = 0.0
+    integration: float = 0.0
+    sparse: float = 0.0
+    crowded: float = 0.0
     noise: NoiseConfig
     crop: CropErrors = CropErrors()
     recorded: float = 0.0
@@ -129,6 +145,11 @@ class SceneConfig:
             raise InputError(f"SceneConfig.hard must be between 0 (easy) and 1 (full), got {self.hard}")
         if not self.sensors:
             raise InputError("SceneConfig.sensors must name at least one sensor, got none")
+
+    @property
+    def varied(self) -> bool:
+        """Whether people may be seen otherwise than in one scan of an upright sensor."""
+        return any((self.merged, self.accumulated, self.inverted, self.integration, self.sparse, self.crowded))
 
     def eased(self, hard: float) -> "SceneConfig":
         """The same scenes at a difficulty of `hard` in [0, 1]."""
@@ -147,8 +168,8 @@ class SceneConfig:
 
 # fields that are between 0 and 1
 _SHARES = frozenset(
-    "clutter occluder company recorded hard mask mask_keep missing_part intensity_dropout beam_divergence dapt_compat "
-    "loose cut".split()
+    "clutter occluder company merged accumulated inverted integration sparse crowded recorded hard mask mask_keep "
+    "missing_part intensity_dropout beam_divergence dapt_compat loose cut".split()
 )
 
 
@@ -179,6 +200,85 @@ def _changed(scene: SceneConfig, name: str, text: str) -> SceneConfig:
     if not group:
         return replace(scene, **changes)
     return replace(scene, **{group: replace(groups[group], **changes)})
+
+
+# --- how a cloud is acquired
+
+# sensors of few rings, and how far away people are who are seen by them, m
+_SPARSE, _SPARSE_FAR = ("vlp-16", "hdl-32e", "vlp-32c"), 25.0
+# sensors that are merged: how many, how far from the person, m, and how often they are of one model
+_MERGED, _MERGED_AWAY, _ONE_MODEL = (2, 4), (3.0, 15.0), 0.5
+# frames added up: how many, and the sensor's speed, m/s, in the half of cases in which it drives
+_FRAMES, _FASTEST = (2, 5), 15.0
+_INTEGRATED = (1, 2, 5)
+# height of a sensor that hangs, m
+_HANGS = (2.0, 5.0)
+# numbers in [0, 1) that decide on an acquisition
+ACQUISITION_DRAWS = 13
+
+
+@dataclass(frozen=True, kw_only=True)
+class Acquisition:
+    """How a person's cloud is acquired, by default in one scan of an upright sensor.
+
+    Args:
+        sensors: names; those after the first stand around the person too, and all scans are merged. None: one of the
+            scene's sensors, drawn with the scene.
+        frames: scans at 10 Hz that are added up in the frame of the last one, which the pose is of.
+        speed: of the sensor along its x axis meanwhile, m/s; what stands still agrees all the same.
+        inverted, crowded: as in `SceneConfig`.
+        distance: nearest and farthest, m, uniform; None: by the scene.
+        conditions: names of what holds: merged, accumulated, integrated, inverted, sparse, crowded.
+    """
+
+    sensors: tuple[str, ...] = ()
+    frames: int = 1
+    speed: float = 0.0
+    inverted: bool = False
+    crowded: bool = False
+    distance: tuple[float, float] | None = None
+    conditions: tuple[str, ...] = ()
+
+
+SINGLE_SCAN = Acquisition()
+# a person's frames that may be added up: the last one is that of the pose
+MOST_FRAMES = _FRAMES[1]
+
+
+def draw_acquisition(config: SceneConfig, draws: np.ndarray) -> Acquisition:
+    """The acquisition that `draws` (ACQUISITION_DRAWS,), uniform in [0, 1), decide on; merged ones have one frame."""
+    merged, accumulated, integration, inverted, sparse, crowded, several, drives, speed, *devices = draws.tolist()
+    hard = config.hard
+    names, distance, frames, moving, conditions = config.sensors, None, 1, 0.0, []
+    if sparse < config.sparse * hard:
+        names, distance = _SPARSE, (config.distance[0], min(config.distance[1], _SPARSE_FAR))
+        conditions.append("sparse")
+    drawn = [names[int(device * len(names))] for device in devices]
+    sensors = drawn[:1]
+    if merged < config.merged * hard:
+        count = _between(_MERGED, several)
+        sensors = sensors * count if drives < _ONE_MODEL else drawn[:count]
+        distance = _MERGED_AWAY
+        conditions.append("merged")
+    elif accumulated < config.accumulated * hard:
+        frames, moving = _between(_FRAMES, several), speed * _FASTEST if drives < 0.5 else 0.0
+        conditions.append("accumulated")
+    elif integration < config.integration * hard and getattr(sensor(sensors[0]), "duration", 0):
+        frames = _INTEGRATED[int(several * len(_INTEGRATED))]
+        conditions += ["integrated"] * (frames > 1)
+    conditions += ["inverted"] * (hangs := inverted < config.inverted * hard)
+    conditions += ["crowded"] * (two := crowded < config.crowded * hard)
+    if not conditions:
+        return SINGLE_SCAN
+    return Acquisition(
+        sensors=tuple(sensors), frames=frames, speed=moving, inverted=hangs, crowded=two, distance=distance,
+        conditions=tuple(conditions),
+    )  # fmt: skip
+
+
+def _between(ends: tuple[int, int], share: float) -> int:
+    """The whole number at a share in [0, 1) of those from the one to the other."""
+    return ends[0] + int(share * (ends[1] - ends[0] + 1))
 
 
 # Paper: section "Scene sampling": r in [4, 20] m, a tilted square of ground, the effective window without a margin,
@@ -237,8 +337,21 @@ SCENES = {
 }
 
 
+# clouds of several scans, hung sensors, few rings and two people in one crop besides
+SCENES["wide"] = replace(
+    SCENES["wild"],
+    name="wide",
+    merged=0.06,
+    accumulated=0.06,
+    inverted=0.08,
+    integration=0.5,
+    sparse=0.12,
+    crowded=0.05,
+)
+
+
 def scene_config(name: str) -> SceneConfig:
-    """The named scene preset: paper, reference or wild."""
+    """The named scene preset: paper, reference, wild or wide."""
     check_name("scene", name, SCENES)
     return SCENES[name]
 
@@ -287,21 +400,27 @@ class Place:
 
 
 def draw_place(
-    config: SceneConfig, device: Sensor | RayPattern, tall: float, wide: float, nearer: float, rng: np.random.Generator
-) -> Place:
+    config: SceneConfig, device: Sensor | RayPattern, tall: float, wide: float, nearer: float, rng: np.random.Generator,
+    inverted: bool = False,
+) -> Place:  # fmt: skip
     """Somebody `tall` m, who reaches `wide` m to the sides, before a sensor. Paper: section "Scene sampling".
 
-    `nearer` scales the distance, for another try at somebody of whom too little was seen.
+    `nearer` scales the distance, for another try at somebody of whom too little was seen; `inverted`: the sensor hangs
+    upside down.
     """
     distance = max(draw_distance(config, device, rng) * nearer, config.distance[0])
     ahead, yaw, escape = rng.random(3).tolist()
     azimuth = _azimuth(device, atan2(wide, distance), ahead, escape < _CUT or not config.mount)
-    pitch, roll = device.tilt, 0.0
+    pitch, roll = 0.0 if inverted else device.tilt, 0.0
     if config.mount:
         pitch, roll = pitch + _MOUNT_TILT * rng.standard_normal(), _MOUNT_TILT * rng.standard_normal()
     mount = rotation_about("x", roll) @ rotation_about("y", -pitch) if pitch or roll else None
     height = device.height
-    if config.mount:
+    if inverted:
+        height = float(rng.uniform(*_HANGS))
+        level = np.eye(3) if mount is None else mount
+        mount = rotation_about("x", pi) @ level @ _aim_inverted(device, distance, tall, height, azimuth)
+    elif config.mount:
         height = draw_height(device, distance, tall, config.mount, pitch, azimuth, rng)
     return Place(
         feet=np.array([distance * cos(azimuth), distance * sin(azimuth), -height]),
@@ -354,6 +473,19 @@ def _beam(device: Sensor | RayPattern) -> float:
         return device.azimuth_step * float(gap)
     width = device.azimuths[1] - device.azimuths[0]
     return float(width * np.diff(np.sin(device.elevations))[0] / len(device.frame(0).directions))
+
+
+def _aim_inverted(
+    device: Sensor | RayPattern, distance: float, tall: float, height: float, azimuth: float
+) -> np.ndarray:
+    """(3, 3) turn of a sensor before it is mounted upside down, `height` m above the ground: none where its fan, which
+    is mirrored, holds the whole person; else its middle is tilted to theirs."""
+    low, high = -device.elevations[-1], -device.elevations[0]
+    feet, head = atan2(-height, distance), atan2(tall - height, distance)
+    if low <= feet and head <= high:
+        return np.eye(3)
+    down = (low + high - feet - head) / 2
+    return rotation_about("z", azimuth) @ rotation_about("y", -down) @ rotation_about("z", -azimuth)
 
 
 def draw_height(

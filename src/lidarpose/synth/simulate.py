@@ -1,8 +1,9 @@
 """What a sensor returns of a person's scene: its triangles, the cast, and the sensor's noise."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import pi
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from lidarpose.synth.environment.mesh import Mesh, union
 from lidarpose.synth.noise import direction_mask, laser_mask
 from lidarpose.synth.noise_kernels import lose_returns
 from lidarpose.synth.props import Prop
-from lidarpose.synth.scene import Place, SceneConfig
+from lidarpose.synth.scene import SINGLE_SCAN, Acquisition, Place, SceneConfig
 
 # makers' range limits hold for targets that reflect about 80 percent; clothes at 20 percent are seen half as far
 REACH = 0.5
@@ -64,6 +65,8 @@ class Scene:
         background: meshes in the level frame at the sensor: ground, things, another person.
         props: what the person wears and uses.
         still: how many of `background` stand still: all but the other person, who is the last one.
+        acquisition: how the cloud is acquired.
+        views: the scans that are added to the scene's own.
     """
 
     config: SceneConfig
@@ -73,6 +76,8 @@ class Scene:
     background: list[Mesh]
     props: list[Prop]
     still: int = 0
+    acquisition: Acquisition = SINGLE_SCAN
+    views: tuple["View", ...] = ()
 
     @property
     def body_place(self) -> Place:
@@ -85,17 +90,52 @@ class Scene:
         """Whether the sensor takes so long for a frame that people move meanwhile."""
         return isinstance(self.sensor, RayPattern) and self.sensor.duration > 0
 
-    def meshes(self, bodies: Bodies, row: int) -> list[Mesh]:
-        """All triangles, level frame: body `row` first, then its props, then the background."""
-        place, joints = self.body_place, bodies.joints[row]
-        moved = bodies.moved(row) if self.is_smeared else None
+    def meshes(self, bodies: Bodies, row: int, lag: float = 0.0) -> list[Mesh]:
+        """All triangles, level frame: body `row` first, then its props, then the background. lag: by how much of the
+        way that it goes within a frame the body has moved on."""
+        place, vertices, joints = self.body_place, bodies.vertices[row], bodies.joints[row]
+        if lag:
+            vertices, joints = bodies.between(row, lag)
+        moved = bodies.between(row, 1 + lag) if self.is_smeared else None
         later = None if moved is None else place.of_body(moved[0])
-        meshes = [Mesh(place.of_body(bodies.vertices[row]), bodies.faces, bodies.face_part, later)]
+        meshes = [Mesh(place.of_body(vertices), bodies.faces, bodies.face_part, later)]
         for prop in self.props:
             later = None if moved is None else place.of_body(prop.place(moved[1]).vertices)
             mesh = prop.place(joints)
             meshes.append(Mesh(place.of_body(mesh.vertices), mesh.faces, prop.face_part, later))
         return meshes + self.background
+
+    def seen_from(self, at: np.ndarray, **changes: Any) -> "Scene":
+        """The scene in a level frame at (3,) m of this one, its axes parallel; changes: of the sensor there."""
+        place = changes.pop("place", self.place)
+        feet = self.place.feet - at
+        place = replace(place, feet=feet, yaw=self.place.yaw, distance=float(np.hypot(feet[0], feet[1])))
+        return replace(self, place=place, background=[mesh.moved(-at) for mesh in self.background], views=(), **changes)
+
+    def scans(self, bodies: Bodies, row: int, frame: int) -> Iterator[tuple["Scene", list[Mesh], int, np.ndarray]]:
+        """The scans that make up the cloud of body `row`, the scene's own first: the scene as it is seen from there,
+        its meshes, the frame's number, and where (3,) m that is in the level frame."""
+        yield self, self.meshes(bodies, row), frame, np.zeros(3)
+        for view in self.views:
+            meshes = view.scene.meshes(bodies, row - view.earlier, view.lag)
+            yield view.scene, meshes, frame - view.earlier, view.at
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """A scan that is added to another.
+
+    Args:
+        scene: as it is seen from there, see `Scene.seen_from`.
+        at: (3,) m, the sensor in the other scan's level frame.
+        earlier: by how many frames.
+        lag: see `Scene.meshes`.
+    """
+
+    scene: Scene
+    at: np.ndarray
+    earlier: int = 0
+    lag: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,6 +172,18 @@ def draw_conditions(config: SceneConfig, sensor: Sensor | RayPattern, rng: np.ra
 
 def _between(ends: tuple[float, float], share: float) -> float:
     return ends[0] + share * (ends[1] - ends[0])
+
+
+def simulate(scene: Scene, bodies: Bodies, row: int, rng: np.random.Generator, *, frame: int = 0) -> Scan:
+    """The cloud of body `row`: what the scene's sensor returns, and all that is added to it."""
+    scans: list[Scan] = []
+    for seen, meshes, number, at in scene.scans(bodies, row, frame):
+        scan = simulate_scan(seen, meshes, rng, frame=number)
+        scans.append(replace(scan, points=scan.points + at.astype(np.float32)) if scans else scan)
+    if len(scans) == 1:
+        return scans[0]
+    joined = {name: np.concatenate([getattr(scan, name) for scan in scans]) for name in ("points", "ring", "part")}
+    return Scan(**joined)
 
 
 def simulate_scan(scene: Scene, meshes: list[Mesh], rng: np.random.Generator, *, frame: int = 0) -> Scan:

@@ -211,7 +211,8 @@ def disturbed(sample: _Sample, *, strays: float, noise: float, rng: np.random.Ge
     """A synthetic sample whose points are worse than a sensor's: with probability `strays` clusters of clutter points,
     which no box has cut, and with probability `noise` normal steps of 0.5 to 8 cm on every coordinate.
 
-    Paper: the disturbances of its stability study, of any size. The center is that of what is there now.
+    Paper: the disturbances of its stability study, of any size. The center is that of what is there now, except
+    where it says which of two people is meant.
     """
     points, part = sample.points, sample.part
     assert part is not None
@@ -225,8 +226,9 @@ def disturbed(sample: _Sample, *, strays: float, noise: float, rng: np.random.Ge
         points = jitter(points, sigma=sigma, clip=2 * sigma, rng=rng).astype(np.float32)
     if points is sample.points:
         return sample
+    center = sample.center if "crowded" in sample.conditions else center_of(points)
     # clutter comes from no ring
-    return replace(sample, points=points, part=part, ring=None, center=center_of(points))
+    return replace(sample, points=points, part=part, ring=None, center=center)
 
 
 def _with_clutter(

@@ -154,7 +154,7 @@ class Pretrain(PoseRecipe):
     )
     drop_path: float | None = _setting(None, "of the paper's network: share of the last block's branches dropped")
     init: str = _setting("", "weights to begin with, of this size or smaller: bundled, or a checkpoint", "NAME|FILE")
-    scene: str = _setting("wild", "wild, paper or reference")
+    scene: str = _setting("wild", "wild, wide, paper or reference")
     set: tuple[str, ...] = _setting(
         (), "changes of the scene: its numbers, keep=R (laser mask), recorded=1 (places of the motion)", "A=X,B=Y"
     )
@@ -200,7 +200,7 @@ class Finetune(PoseRecipe):
     interval: int = _setting(1, "only every so many frames, as published recipes thin out")
     augment: str = _setting("default", "what happens to people: default, paper, lidarhmr or none")
     mix: float = _setting(0.25, "share of synthesized people, below 1", "SHARE")
-    scene: str = _setting("wild", "of the synthesized people: wild, paper or reference")
+    scene: str = _setting("wild", "of the synthesized people: wild, wide, paper or reference")
     hold_out: float = _setting(
         0.1, "share of sequences kept for validation where the dataset has no split val", "SHARE"
     )

@@ -109,7 +109,7 @@ def _panel(index: int, sample: LabeledSample, dataset: DatasetReader) -> Panel:
     if "frames" in dataset.card.tables:
         words.append(f"track {sample.track}")
     words.append((sample.info and sample.info.sensor) or sample.source.rpartition("/")[2])
-    label = " ".join(words)
+    label = " ".join((*words, *sample.conditions))
     return Panel(points=sample.points, truth=sample.pose, part=sample.part, label=label, distance=sample.distance)
 
 

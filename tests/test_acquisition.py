@@ -1,0 +1,307 @@
+"""Clouds that are not one scan of an upright sensor around one person: merged, accumulated, hung, sparse, crowded."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lidarpose.errors import InputError
+from lidarpose.geometry import rotation_about
+from lidarpose.lidar.presets import sensor
+from lidarpose.sample import Box
+from lidarpose.skeleton import BODY26
+from lidarpose.synth import generator
+from lidarpose.synth.bodies import draw_bodies, draw_moving_bodies
+from lidarpose.synth.generator import BLOCK, Generator
+from lidarpose.synth.noise import box_of_two
+from lidarpose.synth.scene import MOST_FRAMES, SCENES, Acquisition, draw_acquisition, draw_place
+from lidarpose.synth.simulate import simulate
+from lidarpose.train.augment import disturbed
+
+SEED = 11
+WILD, WIDE = SCENES["wild"], SCENES["wide"]
+# a flat ground, all that a sensor sees, no errors
+CLEAN = replace(
+    SCENES["paper"],
+    sensors=("os1-64",),
+    noise=replace(SCENES["paper"].noise, mask=0.0),
+    slope=0.0,
+    clothes=0.0,
+    distance=(4.0, 8.0),
+)
+SHARES = ("merged", "accumulated", "inverted", "integration", "sparse", "crowded")
+
+
+def drawn(config, acquisition, bodies, row, block=None, seed=0):
+    """A scene, drawn without errors of the sensor."""
+    scene = generator._draw_scene(
+        config, bodies, row, block or bodies, row, 1.0, np.random.default_rng(seed), acquisition
+    )
+    exact = {"conditions": replace(scene.conditions, sigma=0.0, bias=0.0, intensity_dropout=0.0)}
+    views = tuple(replace(view, scene=replace(view.scene, **exact)) for view in scene.views)
+    return replace(scene, **exact, views=views)
+
+
+def walkers(count, last=MOST_FRAMES - 1):
+    """People who walk on, their last frame on the origin."""
+    everybody = draw_moving_bodies(None, 0.0, 40, MOST_FRAMES, np.random.default_rng(3), to_last=True)
+    return [one for one in everybody if one.kinds[0] == "walk" and one.joints[0, 0, 0] < -0.3][:count]
+
+
+# --- which conditions hold
+
+
+def test_people_without_conditions_are_those_of_the_same_scene_without_shares():
+    wide, wild = Generator(scene=WIDE), Generator(scene=WILD)
+    held = 0
+    for index in range(64):
+        person, same = wide.person(SEED, index), wild.person(SEED, index)
+        if person.sample.conditions:
+            held += 1
+        else:
+            np.testing.assert_array_equal(person.sample.points, same.sample.points)
+            assert repr(person.facts) == repr(same.facts)
+        assert not same.sample.conditions
+        # nothing of it holds where nothing hides people
+        assert not wide.person(SEED, index, hard=0.0).sample.conditions
+    assert 8 < held < 35
+    again = pickle.loads(pickle.dumps(wide))
+    for index in (BLOCK + 1, 5):
+        np.testing.assert_array_equal(again.person(SEED, index).sample.points, wide.person(SEED, index).sample.points)
+
+
+def test_every_share_is_as_often_as_it_says():
+    draws = np.random.default_rng(0).random((4000, generator.ACQUISITION_DRAWS))
+    for hard in (1.0, 0.5):
+        found = [name for one in draws for name in draw_acquisition(WIDE.eased(hard), one).conditions]
+        shares = {name: found.count(name) / len(draws) for name in set(found)}
+        # accumulated and integrated are drawn of who is not merged; a fifth of the sensors are rosettes, a third of the
+        # times 0.1 s
+        expected = {"merged": 0.06, "accumulated": 0.056, "inverted": 0.08, "sparse": 0.12, "crowded": 0.05}
+        expected["integrated"] = 0.5 * 0.2 * 2 / 3 * 0.94 * 0.94 * (1 - 0.12 * hard)
+        assert shares == pytest.approx({name: hard * share for name, share in expected.items()}, abs=0.012)
+    counts = [len(draw_acquisition(replace(WILD, merged=1.0), one).sensors) for one in draws]
+    assert set(counts) == {2, 3, 4}
+    frames = [draw_acquisition(replace(WILD, accumulated=1.0), one) for one in draws]
+    assert {one.frames for one in frames} == {2, 3, 4, 5} and max(one.speed for one in frames) < 15
+    assert np.mean([one.speed > 0 for one in frames]) == pytest.approx(0.5, abs=0.03)
+
+
+@pytest.mark.parametrize("name", SHARES)
+def test_a_share_of_one_holds_for_everybody_and_their_source_says_so(name):
+    config = WILD.changed((f"{name}=1",))
+    if name == "integration":
+        config = replace(config, sensors=("livox-mid360",))
+    people = [Generator(scene=config).person(SEED, index) for index in range(12)]
+    word = "integrated" if name == "integration" else name
+    held = [word in person.sample.conditions for person in people]
+    # a frame of a rosette is one of three lengths
+    assert all(held) if name != "integration" else 3 < sum(held) < 12
+    for person in people:
+        sample, facts = person.sample, person.facts
+        assert sample.source.split("/")[2] == facts.sensor and 0 < facts.visible <= 1
+        assert sample.box.contains(sample.points, margin=1e-4).all()
+        if name == "sparse":
+            assert sensor(facts.sensor).rows <= 32 and facts.distance < 25.5
+        if name == "merged":
+            assert 2.5 < facts.distance < 15.5
+    with pytest.raises(InputError, match=f"{name} must be between 0 and 1"):
+        WILD.changed((f"{name}=1.5",))
+
+
+# --- several sensors
+
+
+def test_merged_clouds_have_the_far_side_of_the_body():
+    def far_side(config):
+        """The share of the trunk's points that lie behind its middle as the first sensor sees it."""
+        shares = []
+        for index in range(30):
+            sample = Generator(scene=config, measure=False).person(SEED, index).sample
+            joints = sample.pose.joints
+            middle = (joints[0] + joints[BODY26.index("neck")]) / 2
+            trunk = sample.points[np.isin(sample.part, [1 + BODY26.index(f"spine{k}") for k in (1, 2, 3)])]
+            away = middle[:2] / np.linalg.norm(middle[:2])
+            shares.append(((trunk - middle)[:, :2] @ away > 0.06).mean())
+        return np.mean(shares)
+
+    single, merged = far_side(CLEAN), far_side(replace(CLEAN, merged=1.0))
+    assert single < 0.08 and merged > 0.25
+
+
+def test_merged_sensors_stand_around_and_see_the_same_body():
+    block = draw_bodies(None, 0.0, 8, SEED, 0)
+    scene = drawn(CLEAN, Acquisition(sensors=("os1-64", "vlp-32c", "os1-64"), distance=(3.0, 15.0)), block, 2)
+    angles = []
+    for view in (*scene.views,):
+        assert -1 <= view.lag <= 1 and 3 <= view.scene.place.distance <= 15
+        # its frame's axes are the first one's
+        np.testing.assert_allclose(view.scene.place.feet + view.at, scene.place.feet, atol=1e-9)
+        angles.append(np.arctan2(*-view.scene.place.feet[1::-1]))
+    toward = np.arctan2(*-scene.place.feet[1::-1])
+    assert np.sort(np.mod(np.array(angles) - toward, 2 * np.pi)) == pytest.approx([2.09, 4.19], abs=0.45)
+    # who stands still: all points lie on one body, on the ground, or nowhere
+    still = replace(block, moved=lambda row: (block.vertices[row], block.joints[row]))
+    scan = simulate(scene, still, 2, np.random.default_rng(0))
+    body = scene.body_place.of_body(block.vertices[2])
+    sight = [simulate(replace(scene, views=scene.views[:k]), still, 2, np.random.default_rng(0)) for k in range(3)]
+    assert len(sight[0].points) < len(sight[1].points) < len(sight[2].points) == len(scan.points)
+    on_body = scan.points[scan.part > 0]
+    gap = np.linalg.norm(on_body[:, None] - body[None], axis=-1).min(1)
+    # vertices are up to 5 cm apart
+    assert gap.max() < 0.06
+    np.testing.assert_allclose(scan.points[scan.part == 0, 2], scene.place.feet[2], atol=1e-3)
+
+
+def test_a_sensor_that_lags_sees_the_person_move():
+    block = draw_bodies(None, 0.0, 64, SEED, 0)
+    row = block.kinds.index("walk")
+    scene = drawn(CLEAN, Acquisition(), block, row)
+    now, half, before = (scene.meshes(block, row, lag)[0].vertices for lag in (0.0, 0.5, -1.0))
+    then = scene.body_place.of_body(block.moved(row)[0])
+    np.testing.assert_allclose(half, (now + then) / 2, atol=1e-5)
+    np.testing.assert_allclose(before, 2 * now - then, atol=1e-5)
+    assert np.abs(half - now).max() > 0.02
+
+
+# --- several frames
+
+
+@pytest.mark.parametrize("speed", [0.0, 10.0])
+def test_accumulated_frames_smear_who_walks_and_nothing_else(speed):
+    wider = []
+    for bodies in walkers(4):
+        scene = drawn(CLEAN, Acquisition(sensors=("os1-64",), frames=5, speed=speed), bodies, MOST_FRAMES - 1)
+        assert [view.earlier for view in scene.views] == [1, 2, 3, 4]
+        np.testing.assert_allclose([view.at[0] for view in scene.views], -speed / 10 * np.arange(1, 5), atol=1e-9)
+        one = simulate(replace(scene, views=()), bodies, MOST_FRAMES - 1, np.random.default_rng(0))
+        scan = simulate(scene, bodies, MOST_FRAMES - 1, np.random.default_rng(0))
+        # the last frame is the single scan
+        np.testing.assert_array_equal(scan.points[: len(one.points)], one.points)
+        np.testing.assert_allclose(scan.points[scan.part == 0, 2], scene.place.feet[2], atol=1e-3)
+        ahead = rotation_about("z", scene.place.yaw)[:, 0]
+        wide = [np.ptp(found.points[found.part > 0] @ ahead) for found in (one, scan)]
+        way = bodies.joints[-1, 0, 0] - bodies.joints[0, 0, 0]
+        wider.append((wide[1] - wide[0]) / way)
+    assert np.mean(wider) > 0.4
+
+
+def test_a_sensor_that_drives_does_not_come_through_the_person():
+    (bodies,) = walkers(1)
+    scene = drawn(CLEAN, Acquisition(sensors=("os1-64",), frames=5, speed=15.0), bodies, MOST_FRAMES - 1)
+    for feet in ([-3.0, 0.2, -1.0], [3.0, 0.2, -1.0], [-3.0, 2.0, -1.0]):
+        views = generator._earlier_views(replace(scene, place=replace(scene.place, feet=np.array(feet))))
+        assert min(view.scene.place.distance for view in views) > 1.5
+
+
+def test_moving_bodies_end_where_they_are_told_to():
+    first, last = (
+        draw_moving_bodies(None, 0.0, 6, 4, np.random.default_rng(4), to_last=to_last) for to_last in (False, True)
+    )
+    for a, b in zip(first, last, strict=True):
+        assert b.heading[-1] == 0 and a.heading[0] == pytest.approx(0, abs=0.2)
+        np.testing.assert_allclose(b.joints[-1, 0, :2], 0, atol=1e-5)
+        # the same motion, turned and moved
+        turn = rotation_about("z", a.heading[-1])
+        way = (a.joints - a.joints[-1, 0] * [1, 1, 0]) @ turn
+        np.testing.assert_allclose(b.joints, way, atol=1e-4)
+
+
+@pytest.mark.parametrize("frames", [2, 5])
+def test_integration_gives_as_many_times_the_points(frames):
+    block = draw_bodies(None, 0.0, 16, SEED, 0)
+    still = replace(
+        block,
+        vertices=block.vertices[:1].repeat(MOST_FRAMES, 0),
+        joints=block.joints[:1].repeat(MOST_FRAMES, 0),
+        moved=lambda row: (block.vertices[0], block.joints[0]),
+    )
+    counts = np.zeros(2)
+    for seed in range(6):
+        config = replace(CLEAN, sensors=("livox-mid360",), distance=(2.0, 5.0))
+        acquisition = Acquisition(sensors=config.sensors, frames=frames)
+        scene = drawn(config, acquisition, still, MOST_FRAMES - 1, block, seed)
+        for k, one in enumerate((replace(scene, views=()), scene)):
+            scan = simulate(one, still, MOST_FRAMES - 1, np.random.default_rng(0))
+            counts[k] += np.count_nonzero(scan.part)
+    assert counts[1] / counts[0] == pytest.approx(frames, rel=0.1)
+
+
+# --- mounts
+
+
+@pytest.mark.parametrize("name", ["vlp-32c", "hdl-64e", "livox-mid360", "livox-avia"])
+def test_an_inverted_sensor_sees_its_rings_mirrored(name):
+    device = sensor(name)
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        place = draw_place(replace(CLEAN, distance=(3.0, 12.0)), device, 1.7, 0.3, 1.0, rng, inverted=True)
+        assert 2 <= -place.feet[2] <= 5
+        # its up is the ground's down, or, tilted to the person, leans to it
+        R = place.R_sensor_level
+        assert np.linalg.det(R) == pytest.approx(1) and R[2, 2] < 0
+        azimuth = np.arctan2(place.feet[1], place.feet[0])
+        elevation = []
+        for height in (0.0, 0.85, 1.7):
+            x, y, z = place.to_sensor((place.feet + [0, 0, height])[None])[0]
+            elevation.append(np.arctan2(z, np.hypot(x, y)))
+        # what is above is seen by lower rings
+        assert elevation[0] > elevation[1] > elevation[2]
+        middle = (device.elevations[0] + device.elevations[-1]) / 2
+        fits = device.elevations[0] - 1e-9 <= elevation[2] and elevation[0] <= device.elevations[-1] + 1e-9
+        # bent by what a slope about one point is not
+        assert fits or elevation[1] == pytest.approx(middle, abs=0.12)
+        if np.allclose(R[2], [0, 0, -1]):
+            mirrored = [np.cos(azimuth), -np.sin(azimuth), 0]
+            np.testing.assert_allclose(R @ [np.cos(azimuth), np.sin(azimuth), 0], mirrored, atol=1e-9)
+
+
+def test_points_of_an_inverted_sensor_lie_on_its_rings_and_stand_upright():
+    device = sensor("vlp-32c")
+    block = draw_bodies(None, 0.0, 8, SEED, 0)
+    scene = drawn(replace(CLEAN, sensors=("vlp-32c",)), Acquisition(inverted=True), block, 3)
+    scan = simulate(scene, block, 3, np.random.default_rng(0))
+    x, y, z = scene.place.to_sensor(scan.points.astype(float)).T
+    np.testing.assert_allclose(np.arctan2(z, np.hypot(x, y)), device.elevations[scan.ring], atol=1e-5)
+    body = scan.points[scan.part > 0]
+    head, foot = (body[np.isin(scan.part[scan.part > 0], parts), 2] for parts in ([16], [8, 9, 11, 12]))
+    assert head.min() > foot.max()
+    # the lowest ring sees highest
+    ring = scan.ring[scan.part > 0]
+    assert np.corrcoef(ring, body[:, 2])[0, 1] < -0.9
+
+
+# --- two people in one crop
+
+
+def test_crowded_crops_hold_two_and_the_center_says_who_is_meant():
+    others = []
+    for index in range(40):
+        sample = Generator(scene=replace(WILD, crowded=1.0), measure=False).person(SEED, index).sample
+        np.testing.assert_array_equal(sample.center, sample.box.center)
+        others.append(np.count_nonzero(sample.part == 0))
+        worse = disturbed(sample, strays=1.0, noise=1.0, rng=np.random.default_rng(index))
+        assert worse is not sample
+        np.testing.assert_array_equal(worse.center, sample.center)
+    assert np.median(others) > 40
+
+
+def test_a_box_of_two_holds_both_and_its_center_is_nearer_to_the_first():
+    rng, shares = np.random.default_rng(0), []
+    for _ in range(300):
+        body, other = (rng.uniform(-1, 1, (50, 3)) * [0.3, 0.4, 0.9] + [9, 3, 0] for _ in range(2))
+        angle, apart = rng.uniform(-np.pi, np.pi), rng.uniform(0.35, 0.8)
+        other += apart * np.array([np.cos(angle), np.sin(angle), 0])
+        size = np.ptp(body, axis=0) + 0.1
+        errors = rng.normal(0, 0.1, 3)
+        box = Box(center=np.array([9, 3, 0]) + errors, size=size, yaw=rng.uniform(-3, 3))
+        grown = box_of_two(box, body, other, rng)
+        assert grown.contains(np.concatenate([body, other])).all() and grown.yaw == box.yaw
+        middles = [(one.min(0) + one.max(0))[:2] / 2 for one in (body, other)]
+        near, far = (np.linalg.norm(grown.center[:2] - middle) for middle in middles)
+        assert near < far
+        way = middles[1] - middles[0]
+        shares.append((grown.center[:2] - middles[0]) @ way / (way @ way))
+        assert (grown.size >= box.size).all()
+    assert max(shares) <= 0.4 + 1e-9 and np.std(shares) > 0.05
