@@ -295,6 +295,19 @@ def test_a_column_window_expects_only_its_columns(tmp_path):
         assert [frame.warnings for frame in source] == [()] * 3 and not source.warnings
 
 
+def test_metadata_of_another_name_is_named(tmp_path):
+    path = tmp_path / "walk.pcap"
+    beside = [frame.points for frame in ouster(path, [ip for payload in packets_of([0]) for ip in ip4(payload)])]
+    path.with_suffix(".json").rename(tmp_path / "sensor.json")
+    for (named,) in (
+        open_source(path, meta=tmp_path / "sensor.json"),
+        open_source([path], meta=str(tmp_path / "sensor.json")),
+    ):
+        assert np.array_equal(named.points, beside[0])
+    with pytest.raises(InputError, match="other.json: no such file"):
+        open_source(path, meta=tmp_path / "other.json")
+
+
 def test_what_is_missing_or_wrong_is_one_line(tmp_path):
     ips = [ip4(payload)[0] for payload in packets_of([0])]
     path = write(tmp_path / "walk.pcap", ips)

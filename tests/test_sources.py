@@ -81,8 +81,7 @@ def test_the_frames_chosen_are_those_of_a_plain_filter(first, rate, damaged, eve
     assert [frame.index for frame in frames] == chosen
     assert [isinstance(frame, DamagedFrame) for frame in frames] == [i in damaged for i in chosen]
     assert [frame.time for frame in frames] == list(times[chosen])
-    if source.count is not None:
-        assert source.count == len(list(source))
+    assert source.count == len(list(source))
 
 
 def test_ends_of_an_epoch_time_are_not_lost_to_rounding():
@@ -499,6 +498,19 @@ def test_nuscenes_is_read_scene_by_scene_with_poses(tmp_path):
     one = open_source(root, topic="scene-0061")
     assert one.count == 5 and frames[5].id == next(iter(one)).id
     refusal(open_source, root, topic="scene-0062", words=["unknown scene", "scene-0061"])
+
+
+@pytest.mark.parametrize("damage", [None, {}, {"rotation": [0, 0, 0, 0]}, {"translation": [1, float("nan"), 0]}])
+def test_a_damaged_pose_of_nuscenes_costs_its_frame(tmp_path, damage):
+    root = write_nuscenes(tmp_path)
+    path = root / "v1.0-mini" / "ego_pose.json"
+    rows = json.loads(path.read_text())
+    first = min(range(len(rows)), key=lambda i: rows[i]["timestamp"])
+    rows[first] = rows[first] | damage if damage else {"token": rows[first]["token"] if damage == {} else "another"}
+    path.write_text(json.dumps(rows))
+    frames = list(open_source(root))
+    assert [isinstance(frame, DamagedFrame) for frame in frames] == [i == 0 for i in range(10)]
+    assert "pose in the tables is damaged" in frames[0].error
 
 
 def test_of_nuscenes_what_is_on_the_disk_is_read(tmp_path):

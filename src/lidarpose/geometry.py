@@ -71,6 +71,30 @@ def transform_points(T: np.ndarray, points: np.ndarray) -> np.ndarray:
     return points @ T[:3, :3].T + T[:3, 3]
 
 
+def rigid_transform(R: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """T (4, 4) of a rotation R (3, 3) and a translation t (3,) m."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t
+    return T
+
+
+def inverse_transform(T: np.ndarray) -> np.ndarray:
+    """The inverse of a rigid transform T (4, 4)."""
+    return rigid_transform(T[:3, :3].T, -T[:3, :3].T @ T[:3, 3])
+
+
+def quaternion_to_matrix(quaternion: np.ndarray) -> np.ndarray:
+    """(3, 3) of a quaternion (4,) w, x, y, z of any length > 0."""
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
 def unit(vector: np.ndarray) -> np.ndarray:
     """vector (..., 3) scaled to length 1; a zero vector stays zero."""
     vector = np.asarray(vector, float)

@@ -68,6 +68,11 @@ def file_error(path: object, problem: object) -> InputError:
     return InputError(one_line(f"{path or repr(path)}: {problem}"))
 
 
+def unreadable(path: object, error: OSError) -> InputError:
+    """The error for a file that the system does not let us read."""
+    return file_error(path, f"cannot be read ({error.strerror or error}); check the path and its rights")
+
+
 def listed(paths: str | os.PathLike | Iterable[str | os.PathLike]) -> list[str | os.PathLike]:
     """Paths or names as a list; one alone is one, not a list of letters."""
     return [paths] if isinstance(paths, str | os.PathLike) else list(paths)
@@ -114,7 +119,7 @@ def read_bytes(path: str | os.PathLike, *, expected: str, most: int | None = Non
     except FileNotFoundError:
         raise file_error(path, f"no such file; expected {expected}{_nearest(path)}") from None
     except OSError as error:
-        raise file_error(path, f"cannot be read ({error.strerror or error}); check the path and its rights") from None
+        raise unreadable(path, error) from None
     except MemoryError:
         raise file_error(path, "does not fit in memory; split it first") from None
     except (TypeError, ValueError) as error:

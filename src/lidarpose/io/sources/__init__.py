@@ -13,17 +13,23 @@ from pathlib import Path
 from lidarpose.errors import InputError, check_int
 from lidarpose.io.files import file_error, listed
 from lidarpose.io.sources.folders import natural_key, open_files, scan_files
-from lidarpose.io.sources.frame import ChainedRecording, DamagedFrame, Frame, FrameSource, Recording, Source
+from lidarpose.io.sources.frame import (
+    ChainedRecording,
+    DamagedFrame,
+    Frame,
+    FrameSource,
+    ReadingOptions,
+    Recording,
+    Source,
+)
 from lidarpose.io.sources.kitti import open_kitti
 from lidarpose.io.sources.nuscenes import open_nuscenes
 
 __all__ = ["RECORDINGS", "DamagedFrame", "Frame", "FrameSource", "Source", "is_single_scan", "open_source"]
 
-# suffix of a file that holds many frames -> the module whose `open_recording(path, topic=...)` reads it
+# suffix of a file that holds many frames -> the module whose `open_recording(path, how)` reads it
 _READERS = {".mcap": "rosbag", ".bag": "rosbag", ".db3": "rosbag", ".pcap": "ouster", ".pcapng": "ouster"}
 RECORDINGS = tuple(_READERS)
-# of a folder that is one recording: what is in it, and the module whose `open_recording` reads it
-_LAYOUTS = {"metadata.yaml": "rosbag"}
 
 
 def open_source(
@@ -31,6 +37,7 @@ def open_source(
     *,
     columns: int | None = None,
     topic: str | None = None,
+    meta: str | os.PathLike | None = None,
     rate: float | None = None,
     start: float | None = None,
     end: float | None = None,
@@ -46,6 +53,7 @@ def open_source(
             .pcap, folders of ROS 2 bags), folders of KITTI and nuScenes. Several recordings follow each other.
         columns: values a row of .bin files, see `read_points`.
         topic: which of a recording's topics is read, where it has several with points; of nuScenes, the scene.
+        meta: the JSON file of an Ouster sensor; None for the one of the recording's name beside it.
         rate: frames a second where there are no times, and instead of those that names tell; 10 by default.
         start, end: s from the first frame.
         every: only each so many-th frame.
@@ -59,12 +67,13 @@ def open_source(
     """
     if columns is not None:
         columns = check_int("columns", columns, least=3, hint=" (x y z first)")
-    found = [path for given in listed(paths) for path in _matches(given)]
-    if not found:
+    named = [path for given in listed(paths) for path in _matches(given)]
+    if not named:
         raise file_error("source", "expected files, folders or recordings, got none")
-    name = str(found[0]) if len(found) == 1 else os.path.commonpath([os.path.abspath(path) for path in found])
-    recording = _open_all(name, found, topic, columns=columns, name_times=rate is None)
-    return FrameSource(recording, rate=rate, start=start, end=end, every=every)
+    name = str(named[0]) if len(named) == 1 else os.path.commonpath([os.path.abspath(path) for path in named])
+    where = None if meta is None else Path(meta)
+    how = ReadingOptions(columns=columns, topic=topic, meta=where, name_times=rate is None)
+    return FrameSource(_open_all(name, named, how), rate=rate, start=start, end=end, every=every)
 
 
 def is_single_scan(paths: str | os.PathLike | Sequence[str | os.PathLike]) -> bool:
@@ -88,17 +97,14 @@ def _matches(given: str | os.PathLike) -> list[Path]:
     return paths
 
 
-def _open_all(name: str, paths: Sequence[Path], topic: str | None, **reading) -> Recording:
-    """Files of points are one recording together, anything else is one of its own. reading: as of `open_files`."""
+def _open_all(name: str, paths: Sequence[Path], how: ReadingOptions) -> Recording:
+    """Files of points are one recording together, anything else is one of its own."""
     files = [path for path in paths if path.is_file() and path.suffix.lower() not in RECORDINGS]
-    parts: list[Recording] = [open_files(name, files, **reading)] if files else []
+    parts: list[Recording] = [open_files(name, files, how)] if files else []
     problems: list[InputError] = []
     for path in sorted(set(paths) - set(files), key=natural_key):
         try:
-            if path.is_dir():
-                parts.append(_open_folder(path, topic, **reading))
-            else:
-                parts.append(_reader(_READERS[path.suffix.lower()]).open_recording(path, topic=topic))
+            parts.append(_open_folder(path, how) if path.is_dir() else _open_recording(path, how))
         except InputError as problem:
             problems.append(problem)
     if not parts:
@@ -108,20 +114,21 @@ def _open_all(name: str, paths: Sequence[Path], topic: str | None, **reading) ->
     return ChainedRecording(name, parts, [f"left out: {problem}" for problem in problems])
 
 
-def _open_folder(folder: Path, topic: str | None, **reading) -> Recording:
-    for content, module in _LAYOUTS.items():
-        if (folder / content).exists():
-            return _reader(module).open_recording(folder, topic=topic)
-    dataset = open_kitti(folder) or open_nuscenes(folder, topic)
+def _open_folder(folder: Path, how: ReadingOptions) -> Recording:
+    # what rosbag2 writes
+    if (folder / "metadata.yaml").exists():
+        return _open_recording(folder, how, "rosbag")
+    dataset = open_kitti(folder) or open_nuscenes(folder, how)
     if dataset is not None:
         return dataset
     files, warnings = scan_files(folder, RECORDINGS)
     if files[0].suffix.lower() in RECORDINGS:
-        return _open_all(str(folder), files, topic, **reading)
-    recording = open_files(str(folder), files, **reading)
+        return _open_all(str(folder), files, how)
+    recording = open_files(str(folder), files, how)
     recording.warnings += warnings
     return recording
 
 
-def _reader(module: str):
-    return import_module(f"lidarpose.io.sources.{module}")
+def _open_recording(path: Path, how: ReadingOptions, reader: str | None = None) -> Recording:
+    module = import_module(f"lidarpose.io.sources.{reader or _READERS[path.suffix.lower()]}")
+    return module.open_recording(path, how)

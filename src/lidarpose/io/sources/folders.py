@@ -9,7 +9,7 @@ from pathlib import Path
 from lidarpose.errors import LidarPoseError
 from lidarpose.io.files import file_error, shorten
 from lidarpose.io.point_cloud import SUFFIXES, read_points
-from lidarpose.io.sources.frame import IndexedRecording, Sweep
+from lidarpose.io.sources.frame import IndexedRecording, ReadingOptions, Sweep
 
 # files of text may be notes, tables or labels: they are points where nothing else is
 _TEXT = (".csv", ".txt", ".xyz")
@@ -72,15 +72,13 @@ def describe(entries: Sequence[Path]) -> str:
     return f"a folder with {', '.join(parts)}"
 
 
-def open_files(name: str, paths: Sequence[Path], *, columns: int | None, name_times: bool) -> IndexedRecording:
-    """Point files, a frame each, in natural order or, where their names are plainly times, in that of time.
-
-    columns: values a row of .bin files; from the first of them where it is None.
-    name_times: whether times are taken from the names.
-    """
+def open_files(name: str, paths: Sequence[Path], how: ReadingOptions) -> IndexedRecording:
+    """Point files, a frame each, in natural order or, where their names are plainly times, in that of time. Where
+    columns are not known they are those of the first .bin file."""
     paths, times = in_order(paths)
     suffixes = sorted({path.suffix.lower() for path in paths})
     warnings = [f"mixes {', '.join(suffixes)} files: one sensor is assumed"] if len(suffixes) > 1 else []
+    columns = how.columns
     if columns is None and ".bin" in suffixes:
         columns, notes = _columns_of([path for path in paths if path.suffix.lower() == ".bin"])
         warnings += notes
@@ -93,7 +91,7 @@ def open_files(name: str, paths: Sequence[Path], *, columns: int | None, name_ti
         cloud = read_points(paths[i], columns=columns)
         return Sweep(points=cloud.points, warnings=cloud.warnings)
 
-    return IndexedRecording(name=name, ids=ids, times=times if name_times else None, read=read, warnings=warnings)
+    return IndexedRecording(name=name, ids=ids, times=times if how.name_times else None, read=read, warnings=warnings)
 
 
 def scan_id(path: Path) -> str:

@@ -19,14 +19,11 @@ _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Frame:
-    """One frame of a source: what a sensor saw in one turn.
+class Sweep:
+    """What a sensor saw in one turn, as the reader of a format decodes it.
 
     Args:
-        points: (n, 3) float64 m in the sensor's frame, finite; rows 0, 0, 0, which are no returns, are left out.
-        index: its number in the source, from 0; damaged frames count.
-        id: its name in the source, e.g. the stem of its file.
-        time: s; from `index` and the rate where the source has no times.
+        points: (n, 3) m in the sensor's frame; rows that are NaN or 0, 0, 0 are no returns.
         T_world_sensor: (4, 4) m, or None where the sensor's pose is not known; z of the world is up.
         origin: (3,) m, the sensor's place in the points' frame; None where it is not known.
         ring: (n,) the beam of each point, or None.
@@ -34,13 +31,26 @@ class Frame:
     """
 
     points: np.ndarray
-    index: int
-    id: str
-    time: float | None = None
     T_world_sensor: np.ndarray | None = None
     origin: np.ndarray | None = None
     ring: np.ndarray | None = None
     warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Frame(Sweep):
+    """One frame of a source: a `Sweep` without the rows that are no returns, and its place in the source.
+
+    Args:
+        points: (n, 3) float64 m, finite.
+        index: its number in the source, from 0; damaged frames count.
+        id: its name in the source, e.g. the stem of its file.
+        time: s; from `index` and the rate where the source has no times.
+    """
+
+    index: int
+    id: str
+    time: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,15 +88,14 @@ class Source(Protocol):
 # ---- what the readers of each format make
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Sweep:
-    """A frame as a reader decodes it: `Frame` without its place in the source, rows that are no returns included."""
+@dataclass(frozen=True, kw_only=True)
+class ReadingOptions:
+    """How recordings are read: columns, topic and meta as of `open_source`; name_times: whether names tell times."""
 
-    points: np.ndarray
-    T_world_sensor: np.ndarray | None = None
-    origin: np.ndarray | None = None
-    ring: np.ndarray | None = None
-    warnings: tuple[str, ...] = ()
+    columns: int | None = None
+    topic: str | None = None
+    meta: Path | None = None
+    name_times: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +241,15 @@ class FrameSource:
     def count(self) -> int | None:
         """Frames, damaged ones too; None where only reading will tell."""
         count = self.recording.count
-        return None if count is None or self.start or self.end is not None else -(-count // self.every)
+        if count is None or self.start is None and self.end is None:
+            return None if count is None else -(-count // self.every)
+        times = np.arange(count) / self.rate if self._first_time is None else getattr(self.recording, "times", None)
+        if times is None:
+            return None
+        chosen = [self._place(time) for time in times]
+        # the first frame past the end ends the source
+        chosen = chosen[: chosen.index(1) if 1 in chosen else None]
+        return chosen[:: self.every].count(0)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -242,6 +259,13 @@ class FrameSource:
 
     def __iter__(self) -> Iterator[Frame | DamagedFrame]:
         return self.frames()
+
+    def _place(self, time: float) -> int:
+        """-1 before the span of time that is read, 0 in it, 1 after it."""
+        since = time - (self._first_time or 0.0)
+        if self.end is not None and since > self.end + _ROUNDING:
+            return 1
+        return -1 if self.start is not None and since < self.start - _ROUNDING else 0
 
     def frames(self, first: int = 0) -> Iterator[Frame | DamagedFrame]:
         """The frames from index `first` on."""
@@ -254,10 +278,9 @@ class FrameSource:
                 if time is not None:
                     self._num_back += time < last_time
                     last_time = time
-                    since = time - (self._first_time or 0.0)
-                    if self.end is not None and since > self.end + _ROUNDING:
+                    if (place := self._place(time)) > 0:
                         return
-                    if self.start is not None and since < self.start - _ROUNDING:
+                    if place < 0:
                         continue
                 if index % self.every == 0:
                     yield _read(lazy, index, time)
@@ -272,22 +295,14 @@ def _read(lazy: LazyFrame, index: int, time: float | None) -> Frame | DamagedFra
         sweep = lazy.read()
     except MissingExtra:
         raise
-    except (LidarPoseError, FormatError) as error:
-        return DamagedFrame(index=index, id=lazy.id, time=time, error=one_line(str(error)))
     except Exception as error:
-        reason = shorten(f"{type(error).__name__}: {error}")
-        return DamagedFrame(index=index, id=lazy.id, time=time, error=one_line(f"cannot be read ({reason})"))
+        is_explained = isinstance(error, LidarPoseError | FormatError)
+        reason = str(error) if is_explained else f"cannot be read ({shorten(f'{type(error).__name__}: {error}')})"
+        return DamagedFrame(index=index, id=lazy.id, time=time, error=one_line(reason))
     points = np.asarray(sweep.points, np.float64)
     # finite, and not 0, 0, 0
     reach = np.abs(points) @ np.ones(3)
     is_return = (reach > 0) & (reach < np.inf)
-    return Frame(
-        points=points[is_return],
-        index=index,
-        id=lazy.id,
-        time=time,
-        T_world_sensor=sweep.T_world_sensor,
-        origin=sweep.origin,
-        ring=None if sweep.ring is None else sweep.ring[is_return],
-        warnings=sweep.warnings,
-    )
+    ring = None if sweep.ring is None else sweep.ring[is_return]
+    returns = vars(sweep) | {"points": points[is_return], "ring": ring}
+    return Frame(**returns, index=index, id=lazy.id, time=time)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose.errors import LidarPoseError
-from lidarpose.geometry import rotation_about
+from lidarpose.geometry import inverse_transform, rigid_transform, rotation_about
 from lidarpose.io.files import read_bytes
 from lidarpose.io.point_cloud import KITTI_FIELDS, read_points
 from lidarpose.io.sources.folders import scan_files
@@ -47,8 +47,8 @@ def _open_drive(drive: Path) -> IndexedRecording:
     keys = _calibration(calib / "calib_imu_to_velo.txt")
     poses = None
     if [len(keys.get(key, ())) for key in "RT"] == [9, 3]:
-        T_velo_imu = _matrix(np.column_stack([keys["R"].reshape(3, 3), keys["T"]]))
-        poses = _Oxts(drive / "oxts", _inverse(T_velo_imu), stamps)
+        T_velo_imu = rigid_transform(keys["R"].reshape(3, 3), keys["T"])
+        poses = _Oxts(drive / "oxts", inverse_transform(T_velo_imu), stamps)
     if poses is None or not poses.is_there:
         poses = None
         notes.append("the sensor's poses are not known: oxts or calib_imu_to_velo.txt is missing or damaged")
@@ -66,12 +66,12 @@ def _open_sequence(sequence: Path) -> IndexedRecording:
     if poses is None or len(row) != 12:
         notes.append("the sensor's poses are not known: poses.txt, or Tr of calib.txt, is missing or damaged")
         return _recording(sequence, files, times, notes, lambda i: None)
-    T_cam_velo = _matrix(row.reshape(3, 4))
+    T_cam_velo = _transform(row)
 
     def T_world_velo(i: int) -> np.ndarray | None:
         if not 0 <= rows[i] < len(poses):
             return None
-        return _inverse(T_cam_velo) @ _matrix(poses[rows[i]].reshape(3, 4)) @ T_cam_velo
+        return inverse_transform(T_cam_velo) @ _transform(poses[rows[i]]) @ T_cam_velo
 
     return _recording(sequence, files, times, notes, T_world_velo)
 
@@ -123,7 +123,7 @@ class _Oxts:
             return None
         roll, pitch, yaw = values[0, 3:6]
         R = rotation_about("z", yaw) @ rotation_about("y", pitch) @ rotation_about("x", roll)
-        return _matrix(np.column_stack([R, self._position(values[0]) - self.start])) @ self.T_imu_velo
+        return rigid_transform(R, self._position(values[0]) - self.start) @ self.T_imu_velo
 
 
 def _numbers(files: Sequence[Path]) -> list[int]:
@@ -177,15 +177,9 @@ def _calibration(path: Path) -> dict[str, np.ndarray]:
     return keys
 
 
-def _matrix(rows: np.ndarray) -> np.ndarray:
-    """(3, 4) -> (4, 4)."""
-    return np.vstack([rows, [0.0, 0.0, 0.0, 1.0]])
-
-
-def _inverse(T: np.ndarray) -> np.ndarray:
-    """Of a rigid transform (4, 4)."""
-    R = T[:3, :3].T
-    return _matrix(np.column_stack([R, -R @ T[:3, 3]]))
+def _transform(values: np.ndarray) -> np.ndarray:
+    """(4, 4) of the first three rows (12,)."""
+    return rigid_transform(values.reshape(3, 4)[:, :3], values.reshape(3, 4)[:, 3])
 
 
 def _text(path: Path) -> str | None:

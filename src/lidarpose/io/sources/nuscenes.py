@@ -11,16 +11,17 @@ from typing import Any
 import numpy as np
 
 from lidarpose.errors import InputError, check_name
+from lidarpose.geometry import quaternion_to_matrix, rigid_transform
 from lidarpose.io.files import file_error, read_bytes, shorten
 from lidarpose.io.point_cloud import NUSCENES_FIELDS
-from lidarpose.io.sources.frame import IndexedRecording, Sweep
+from lidarpose.io.sources.frame import IndexedRecording, ReadingOptions, Sweep
 
 _CHANNEL = "LIDAR_TOP"
 _TABLES = ("sample_data", "sample", "scene", "ego_pose", "calibrated_sensor", "sensor")
 
 
-def open_nuscenes(folder: Path, scene: str | None = None) -> IndexedRecording | None:
-    """The sweeps of one scene, or of all in the order of time; None for a folder that is not nuScenes'.
+def open_nuscenes(folder: Path, how: ReadingOptions) -> IndexedRecording | None:
+    """The sweeps of one scene (topic), or of all in the order of time; None for a folder that is not nuScenes'.
 
     folder: the data's, or that of its tables (v1.0-mini, ...) where it has several.
     """
@@ -34,7 +35,7 @@ def open_nuscenes(folder: Path, scene: str | None = None) -> IndexedRecording | 
         names = ", ".join(path.name for path in versions)
         raise file_error(folder, f"expected one version of nuScenes, got {names}: name the folder of one")
     try:
-        sweeps = _sweeps(versions[0], scene)
+        sweeps = _sweeps(versions[0], how.topic)
     except InputError:
         raise
     except (LookupError, TypeError, ValueError, ArithmeticError, RecursionError) as error:
@@ -43,31 +44,22 @@ def open_nuscenes(folder: Path, scene: str | None = None) -> IndexedRecording | 
     kept = [sweep for sweep in sweeps if sweep["file"].name in there.get(sweep["file"].parent.as_posix(), ())]
     if not kept:
         raise file_error(root, f"holds none of the {len(sweeps)} sweeps in {versions[0].name}: unpack its files there")
-    warnings = []
-    if len(kept) < len(sweeps):
-        warnings.append(f"{len(sweeps) - len(kept)} of {len(sweeps)} sweeps in its tables are not on the disk")
+    lost = len(sweeps) - len(kept)
+    notes = [f"{lost} of {len(sweeps)} sweeps in its tables are not on the disk"] if lost else []
 
     def read(i: int) -> Sweep:
-        path = root / kept[i]["file"]
-        rows = _rows(path)
-        return Sweep(
-            points=rows[:, :3],
-            ring=rows[:, 4].astype(int) if np.isfinite(rows[:, 4]).all() else None,
-            T_world_sensor=kept[i]["T_world_ego"] @ kept[i]["T_ego_sensor"],
-            origin=np.zeros(3),
-        )
+        if kept[i]["T_world_sensor"] is None:
+            raise file_error(kept[i]["file"], "its pose in the tables is damaged: download them again")
+        rows = _rows(root / kept[i]["file"])
+        ring = rows[:, 4].astype(int) if np.isfinite(rows[:, 4]).all() else None
+        return Sweep(points=rows[:, :3], ring=ring, T_world_sensor=kept[i]["T_world_sensor"], origin=np.zeros(3))
 
-    return IndexedRecording(
-        name=str(root),
-        ids=[sweep["id"] for sweep in kept],
-        times=[sweep["time"] for sweep in kept],
-        read=read,
-        warnings=warnings,
-    )
+    ids, times = ([sweep[name] for sweep in kept] for name in ("id", "time"))
+    return IndexedRecording(name=str(root), ids=ids, times=times, read=read, warnings=notes)
 
 
 def _sweeps(version: Path, scene: str | None) -> list[dict[str, Any]]:
-    """Of each sweep its id, file, time in s and poses, in order."""
+    """Of each sweep its id, file, time in s and pose, None for a damaged one, in order."""
     tables = {
         name: json.loads(read_bytes(version / f"{name}.json", expected="a table of nuScenes")) for name in _TABLES
     }
@@ -83,8 +75,8 @@ def _sweeps(version: Path, scene: str | None) -> list[dict[str, Any]]:
         name = by_token["scene"][by_token["sample"][row["sample_token"]]["scene_token"]]["name"]
         if scene in (None, name):
             sweep = {"scene": name, "id": f"{name}/{row['timestamp']}", "file": Path(row["filename"])}
-            poses = {"T_world_ego": _pose(by_token["ego_pose"][row["ego_pose_token"]]), "T_ego_sensor": _pose(mount)}
-            sweeps.append(sweep | poses | {"time": row["timestamp"] / 1e6})
+            sweep["T_world_sensor"] = _pose(by_token["ego_pose"].get(row["ego_pose_token"]), mount)
+            sweeps.append(sweep | {"time": row["timestamp"] / 1e6})
     if not sweeps:
         raise file_error(version, f"expected sweeps of {_CHANNEL} in sample_data.json, got none: download it again")
     # scenes may overlap where two cars drove at once
@@ -94,19 +86,19 @@ def _sweeps(version: Path, scene: str | None) -> list[dict[str, Any]]:
     return sorted(sweeps, key=lambda sweep: (begin[sweep["scene"]], sweep["scene"], sweep["time"]))
 
 
-def _pose(row: dict[str, Any]) -> np.ndarray:
-    """(4, 4) of a translation in m and a quaternion w, x, y, z."""
-    quaternion = np.array(row["rotation"], float)
-    if not 0.5 < np.linalg.norm(quaternion) < 2:
-        raise ValueError("a rotation that is none")
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    T = np.eye(4)
-    T[:3, :3] += 2 * (w * cross + cross @ cross)
-    T[:3, 3] = row["translation"]
-    if not np.isfinite(T).all():
-        raise ValueError("a place that is none")
-    return T
+def _pose(*rows: Any) -> np.ndarray | None:
+    """(4, 4) of transforms one in the other, each a translation in m and a quaternion w, x, y, z; None where a row is
+    missing or damaged."""
+    pose = np.eye(4)
+    for row in rows:
+        try:
+            quaternion, translation = np.array(row["rotation"], float), np.array(row["translation"], float)
+            if not 0.5 < np.linalg.norm(quaternion) < 2 or not np.isfinite(translation).all():
+                return None
+            pose = pose @ rigid_transform(quaternion_to_matrix(quaternion), translation)
+        except (LookupError, TypeError, ValueError):
+            return None
+    return pose
 
 
 def _rows(path: Path) -> np.ndarray:

@@ -6,7 +6,7 @@ returns the first one of each pixel is taken.
 
 import json
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -17,8 +17,8 @@ import numpy as np
 from lidarpose.errors import InputError
 from lidarpose.io.files import FormatError, file_error, read_bytes, shorten
 from lidarpose.io.sources import velodyne
-from lidarpose.io.sources.frame import LazyFrame, Recording, Sweep
-from lidarpose.io.sources.pcap import Capture, Datagram
+from lidarpose.io.sources.frame import ReadingOptions, Recording, Sweep
+from lidarpose.io.sources.pcap import PacketRecording
 
 # bytes of a pixel, by profile. Ranges come first: of RNG15 in 15 bits and steps of 8 mm, of others in 19 (LEGACY 20)
 # bits and mm
@@ -44,16 +44,18 @@ _COLUMNS_PER_PACKET = 16
 _NUM_PEEKED = 2000
 
 
-def open_recording(path: Path, *, topic: str | None = None) -> Recording:
-    """Opens a capture of an Ouster sensor, whose metadata is the JSON file of the same stem beside it; without one, of
-    a Velodyne sensor.
+def open_recording(path: Path, how: ReadingOptions) -> Recording:
+    """Opens a capture of an Ouster sensor, whose metadata is a JSON file: the one that is named (meta), else the one of
+    the same stem beside it; without one, of a Velodyne sensor.
 
     Raises:
         InputError: No capture, of another sensor, or an Ouster's without its metadata.
         MissingExtra: A Velodyne's without the library that decodes it.
     """
-    metadata = path.with_suffix(".json")
-    return OusterRecording(path, metadata) if metadata.exists() else velodyne.open_recording(path)
+    metadata = how.meta or path.with_suffix(".json")
+    if how.meta is None and not metadata.exists():
+        return velodyne.open_recording(path, how)
+    return OusterRecording(path, metadata)
 
 
 class OusterFormat:
@@ -167,27 +169,21 @@ class OusterFormat:
         return Sweep(points=points, origin=self.origin, ring=beam, warnings=warnings)
 
 
-class OusterRecording:
-    """A capture of an Ouster sensor's packets, with its metadata. A `Recording`; a frame is one turn of the sensor.
+class OusterRecording(PacketRecording):
+    """A capture of an Ouster sensor's packets, with its metadata.
 
     Args:
         path: the capture.
         metadata: the sensor's JSON file.
     """
 
-    count = None
-
     def __init__(self, path: Path, metadata: Path):
-        self.name = str(path)
-        self.capture = Capture(path)
         self.metadata = metadata
         self.format = OusterFormat(metadata)
-        self._num_lost = self._num_sent = self._num_other = 0
+        super().__init__(path, self.format.packet.itemsize)
+        self.flow = self._find_flow()
+        self._num_lost = self._num_sent = 0
         self._serial: int | None = None
-        self._flow = self._find_flow()
-
-    def _is_lidar(self, datagram: Datagram) -> bool:
-        return len(datagram.payload) == self.format.packet.itemsize
 
     def _find_flow(self) -> tuple[bytes, int]:
         """Whose packets are read: those to the port that the metadata names, else the first."""
@@ -197,14 +193,14 @@ class OusterRecording:
         with suppress(InputError):
             for k, datagram in enumerate(self.capture):
                 sizes[len(datagram.payload)] += 1
-                if self._is_lidar(datagram):
+                if len(datagram.payload) == self.packet_bytes:
                     flow = flow or datagram.flow
                     if datagram.flow[1] == self.format.port:
                         return datagram.flow
                 if flow and (k >= _NUM_PEEKED or not self.format.port):
                     break
         if flow is None:
-            size = f"lidar packets of {self.format.packet.itemsize} bytes"
+            size = f"lidar packets of {self.packet_bytes} bytes"
             expected = f"{size} ({self.format.profile}, {self.format.beams} beams, says {self.metadata})"
             came = ", ".join(f"{count} of {size}" for size, count in sorted(sizes.items())[:5]) or "no UDP packets"
             raise file_error(self.name, f"expected {expected}, got {came}: is that the metadata of this recording?")
@@ -215,62 +211,48 @@ class OusterRecording:
         lines = []
         if self._num_lost:
             lines.append(f"{self._num_lost} of {self._num_sent} lidar packets were lost")
-        if self.capture.num_cut:
-            lines.append(f"{self.capture.num_cut} packets are captured in part only, and are left out")
-        if self._num_other:
-            lines.append(f"{self._num_other} lidar packets of another sensor are left out")
+        lines += super().warnings
         if self._serial and str(self.format.serial or self._serial) != str(self._serial):
             serial = f"{self._serial}, {self.metadata} is of {self.format.serial}"
             lines.append(f"the packets are of the sensor {serial}: its beams may point elsewhere")
         return lines
 
-    def lazy_frames(self, first: int = 0) -> Iterator[LazyFrame]:
+    def turns(self) -> Iterator[tuple[float, Callable[[], Sweep]]]:
         has_clock = None
-        for index, (captured, packets) in enumerate(self._turns()):
-            if index < first:
-                continue
+        for captured, packets in self._packets_of_turns():
             clock = np.frombuffer(packets[0], self.format.packet)["columns"]["time"]
             clock = clock[clock > 0]
             has_clock = bool(len(clock)) if has_clock is None else has_clock
             time = float(clock[0]) / 1e9 if has_clock and len(clock) else captured
-            yield LazyFrame(f"{index:06d}", time, partial(self.format.decode, packets))
+            yield time, partial(self.format.decode, packets)
 
-    def _turns(self) -> Iterator[tuple[float, list[bytes]]]:
+    def _packets_of_turns(self) -> Iterator[tuple[float, list[bytes]]]:
         """(time of capture, packets) of each turn of the sensor."""
-        self._num_lost = self._num_sent = self._num_other = 0
+        self._num_lost = self._num_sent = 0
         most = self.format.num_sent(self.format.columns_per_packet)
         packets: list[bytes] = []
         current = previous = None
         started, num_turns = 0.0, 0
-        damage = None
-        try:
-            for datagram in self.capture:
-                if not self._is_lidar(datagram) or datagram.flow != self._flow:
-                    self._num_other += self._is_lidar(datagram)
-                    continue
-                frame_id, self._serial = self.format.header(datagram.payload)
-                # late, of the turn before, which counts it as lost
-                if frame_id == previous:
-                    continue
-                if packets and (frame_id != current or len(packets) >= 2 * most):
-                    # the first turn and the last one began or ended outside of the capture
-                    if num_turns:
-                        self._num_sent += most
-                        self._num_lost += max(most - len(packets), 0)
-                    yield started, packets
-                    num_turns += 1
-                    previous = current if frame_id != current else None
-                    packets = []
-                if not packets:
-                    started = datagram.time
-                current = frame_id
-                packets.append(datagram.payload)
-        except InputError as error:
-            damage = error
+        for datagram in self.packets():
+            frame_id, self._serial = self.format.header(datagram.payload)
+            # late, of the turn before, which counts it as lost
+            if frame_id == previous:
+                continue
+            if packets and (frame_id != current or len(packets) >= 2 * most):
+                # the first turn and the last one began or ended outside of the capture
+                if num_turns:
+                    self._num_sent += most
+                    self._num_lost += max(most - len(packets), 0)
+                yield started, packets
+                num_turns += 1
+                previous = current if frame_id != current else None
+                packets = []
+            if not packets:
+                started = datagram.time
+            current = frame_id
+            packets.append(datagram.payload)
         if packets:
             yield started, packets
-        if damage is not None:
-            raise damage
 
 
 def _flat(metadata: dict[str, Any]) -> dict[str, Any]:

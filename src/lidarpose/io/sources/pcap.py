@@ -4,11 +4,14 @@ Formats: draft-ietf-opsawg-pcap, draft-ietf-opsawg-pcapng, RFC 791 and 8200 (fra
 """
 
 import struct
-from collections.abc import Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from lidarpose.io.files import FormatError, file_error
+from lidarpose.errors import InputError
+from lidarpose.io.files import FormatError, file_error, unreadable
+from lidarpose.io.sources.frame import LazyFrame, Sweep
 
 # magic of a pcap file: byte order, ticks a second
 _MAGIC = {
@@ -54,52 +57,47 @@ class Capture:
             magic = file.read(4)
         if magic not in _MAGIC and magic != _PCAPNG:
             raise file_error(path, "is no packet capture: expected pcap or pcapng, as tcpdump and Wireshark save it")
+        self._read = _read_pcapng if magic == _PCAPNG else _read_pcap
 
     def _open(self) -> BinaryIO:
         try:
             return open(self.path, "rb")
         except OSError as error:
-            raise file_error(self.path, f"cannot be read ({error.strerror}); check the path and its rights") from None
+            raise unreadable(self.path, error) from None
 
     def __iter__(self) -> Iterator[Datagram]:
         self.num_cut = 0
         pending: dict[tuple, dict[int, tuple[bytes, bool]]] = {}
+        damage = None
         with self._open() as file:
-            is_ng = file.read(4) == _PCAPNG
-            file.seek(0)
             try:
-                for time, link, packet in (_read_pcapng if is_ng else _read_pcap)(file):
+                for time, link, packet in self._read(file):
                     datagram = self._datagram(time, _ip_packet(packet, link), pending)
                     if datagram is not None:
                         yield datagram
             except FormatError as problem:
-                raise file_error(self.path, problem) from None
-            except GeneratorExit:
-                # not asked for to the end
-                pending.clear()
-                raise
-            finally:
-                self.num_cut += len(pending)
+                damage = file_error(self.path, problem)
+        self.num_cut += len(pending)
+        if damage is not None:
+            raise damage
 
-    def _datagram(self, time: float, ip: memoryview | None, pending: dict) -> Datagram | None:
+    def _datagram(self, time: float, ip: memoryview, pending: dict) -> Datagram | None:
         """The datagram that a packet holds, or completes."""
-        part = None if ip is None else _udp_part(ip)
+        part = _udp_part(ip)
         if part is None:
             return None
         source, key, offset, has_more, data, length = part
-        if len(data) < length:
-            self.num_cut += 1
-            return None
-        if offset or has_more:
+        is_whole = len(data) >= length
+        if is_whole and (offset or has_more):
             data = self._reassembled(key, offset, has_more, bytes(data), pending)
-        if len(data) < 8:
+        if is_whole and len(data) < 8:
             return None
-        _, port, size = struct.unpack_from(">HHH", data)
-        size = size or len(data)
-        if size > len(data):
-            self.num_cut += 1
-            return None
-        return Datagram(time, (source, port), bytes(data[8:size]))
+        if is_whole:
+            _, port, size = struct.unpack_from(">HHH", data)
+            if size <= len(data):
+                return Datagram(time, (source, port), bytes(data[8 : size or len(data)]))
+        self.num_cut += 1
+        return None
 
     def _reassembled(self, key: tuple, offset: int, has_more: bool, data: bytes, pending: dict) -> bytes:
         """The whole datagram where this fragment is the last one missing, else nothing."""
@@ -115,6 +113,58 @@ class Capture:
             return b""
         pending.pop(key, None)
         return b"".join(parts[offset][0] for offset in sorted(parts))
+
+
+class PacketRecording(ABC):
+    """A capture of one sensor's packets. A `Recording`; a frame is one turn of the sensor.
+
+    Args:
+        path: the capture.
+        packet_bytes: the size of the sensor's packets.
+        flow: whose packets are read; None for those that come first.
+    """
+
+    count = None
+
+    def __init__(self, path: Path, packet_bytes: int, flow: tuple[bytes, int] | None = None):
+        self.name = str(path)
+        self.capture = Capture(path)
+        self.packet_bytes, self.flow = packet_bytes, flow
+        self.num_other = 0
+        self._damage: InputError | None = None
+
+    @abstractmethod
+    def turns(self) -> Iterator[tuple[float, Callable[[], Sweep]]]:
+        """Of each turn its time, s, and what decodes it."""
+
+    def packets(self) -> Iterator[Datagram]:
+        """The sensor's, as far as the capture can be read."""
+        self.num_other, self._damage, flow = 0, None, self.flow
+        try:
+            for datagram in self.capture:
+                if len(datagram.payload) == self.packet_bytes:
+                    flow = flow or datagram.flow
+                    if datagram.flow == flow:
+                        yield datagram
+                    else:
+                        self.num_other += 1
+        except InputError as error:
+            self._damage = error
+
+    @property
+    def warnings(self) -> list[str]:
+        counts = {
+            "packets are captured in part only, and are left out": self.capture.num_cut,
+            "lidar packets of another sensor are left out": self.num_other,
+        }
+        return [f"{count} {what}" for what, count in counts.items() if count]
+
+    def lazy_frames(self, first: int = 0) -> Iterator[LazyFrame]:
+        for index, (time, read) in enumerate(self.turns()):
+            if index >= first:
+                yield LazyFrame(f"{index:06d}", time, read)
+        if self._damage is not None:
+            raise self._damage
 
 
 def _take(file: BinaryIO, size: int) -> bytes:
@@ -181,17 +231,17 @@ def _check_link(link: int) -> None:
         )
 
 
-def _ip_packet(packet: bytes, link: int) -> memoryview | None:
-    """The IP packet in one of a link, or None."""
+def _ip_packet(packet: bytes, link: int) -> memoryview:
+    """The IP packet in one of a link; empty where it holds something else."""
     type_at, start = _LINKS[link]
     view = memoryview(packet)
     if type_at is not None:
-        (kind,) = struct.unpack(">H", bytes(view[type_at : type_at + 2]).rjust(2, b"\0"))
-        while link == _ETHERNET and kind in _VLAN and start + 4 <= len(packet):
-            (kind,) = struct.unpack_from(">H", packet, start + 2)
+        kind = int.from_bytes(view[type_at : type_at + 2])
+        while link == _ETHERNET and kind in _VLAN:
+            kind = int.from_bytes(view[start + 2 : start + 4])
             start += 4
         if kind not in _IP:
-            return None
+            return view[:0]
     return view[start:]
 
 
@@ -200,19 +250,20 @@ def _udp_part(ip: memoryview):
     None."""
     version = ip[0] >> 4 if ip else 0
     if version == 4 and len(ip) >= 20:
-        start, total, number, flags = (ip[0] & 15) * 4, *struct.unpack_from(">HHH", ip, 2)
-        if ip[9] != 17 or start < 20:
-            return None
+        start, kind, addresses = (ip[0] & 15) * 4, ip[9], bytes(ip[12:20])
+        total, number, flags = struct.unpack_from(">HHH", ip, 2)
         # cards that cut packets up themselves leave the length open
         total = total or len(ip)
         offset, has_more = (flags & 0x1FFF) * 8, bool(flags & 0x2000)
-        return bytes(ip[12:16]), (bytes(ip[12:20]), number), offset, has_more, ip[start:total], total - start
-    if version == 6 and len(ip) >= 40:
-        start, kind, total = 40, ip[6], 40 + struct.unpack_from(">H", ip, 4)[0]
+    elif version == 6 and len(ip) >= 40:
+        start, kind, addresses = 40, ip[6], bytes(ip[8:40])
+        total = 40 + int.from_bytes(ip[4:6])
         offset, has_more, number = 0, False, 0
         if kind == 44 and len(ip) >= 48:
             kind, flags, number = ip[40], *struct.unpack_from(">HI", ip, 42)
             start, offset, has_more = 48, flags & 0xFFF8, bool(flags & 1)
-        if kind == 17:
-            return bytes(ip[8:24]), (bytes(ip[8:40]), number), offset, has_more, ip[start:total], total - start
-    return None
+    else:
+        return None
+    if kind != 17 or start < 20:
+        return None
+    return addresses[: len(addresses) // 2], (addresses, number), offset, has_more, ip[start:total], total - start

@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 
 from lidarpose.errors import InputError, missing_extra
-from lidarpose.io.files import FormatError, file_error, shorten
+from lidarpose.geometry import quaternion_to_matrix, rigid_transform
+from lidarpose.io.files import FormatError, file_error, shorten, unreadable
 from lidarpose.io.sources.containers import McapFile, Message, RecordFile, Ros1File, SqliteFile, Topic
 from lidarpose.io.sources.folders import natural_key
-from lidarpose.io.sources.frame import LazyFrame, Sweep
+from lidarpose.io.sources.frame import LazyFrame, ReadingOptions, Sweep
 
 _FILES: dict[str, type[RecordFile] | type[SqliteFile]] = {".mcap": McapFile, ".bag": Ros1File, ".db3": SqliteFile}
 _CLOUD = ("sensor_msgs/msg/PointCloud2", "sensor_msgs/PointCloud2")
@@ -43,11 +44,10 @@ _MIN_NORM = 1e-3
 _MAX_KEPT = 1000
 
 
-def open_recording(path: Path, *, topic: str | None = None) -> "BagRecording":
+def open_recording(path: Path, how: ReadingOptions) -> "BagRecording":
     """Opens a .mcap, .bag or .db3 file, or a folder that rosbag2 made.
 
-    Args:
-        topic: of the clouds; by default the only one with clouds, or the one with most.
+    The topic of the clouds is by default the only one with clouds, or the one with most.
 
     Raises:
         InputError: No such recording, no point clouds in it, or no such topic.
@@ -61,7 +61,7 @@ def open_recording(path: Path, *, topic: str | None = None) -> "BagRecording":
             packed = next(path.glob("*.zstd"), None)
             remedy = f"; unpack {packed.name} first (unzstd)" if packed else "; was it copied completely?"
             raise file_error(path, f"expected a recording's {' or '.join(_FILES)} files in this folder{remedy}")
-    return BagRecording(str(path), [_open_file(file) for file in files], topic)
+    return BagRecording(str(path), [_open_file(file) for file in files], how.topic)
 
 
 def _open_file(path: Path) -> RecordFile | SqliteFile:
@@ -70,7 +70,7 @@ def _open_file(path: Path) -> RecordFile | SqliteFile:
     except FormatError as problem:
         raise file_error(path, problem) from None
     except OSError as error:
-        raise file_error(path, f"cannot be read ({error.strerror}); check the path and its rights") from None
+        raise unreadable(path, error) from None
 
 
 class BagRecording:
@@ -177,9 +177,7 @@ class BagRecording:
             except FormatError as problem:
                 self._damage = file_error(file.path, problem)
             except OSError as error:
-                self._damage = file_error(
-                    file.path, f"cannot be read ({error.strerror}); check the path and its rights"
-                )
+                self._damage = unreadable(file.path, error)
 
     def _pose(self, transforms: "TransformTree", cloud: "_Cloud", is_last: bool) -> np.ndarray | None:
         """T_world_sensor at a cloud's time. The world is chosen once: the first of `_WORLDS`, or, at last, another."""
@@ -331,12 +329,4 @@ def _between(times: list[int], placements: list[np.ndarray], time: int) -> np.nd
 
 def _matrix(placed: np.ndarray) -> np.ndarray:
     """(4, 4) of a translation and a quaternion x y z w, of any length."""
-    x, y, z, w = placed[3:] / np.linalg.norm(placed[3:])
-    T = np.eye(4)
-    T[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    T[:3, 3] = placed[:3]
-    return T
+    return rigid_transform(quaternion_to_matrix(np.roll(placed[3:], 1)), placed[:3])
