@@ -2,11 +2,48 @@
 
 import argparse
 
-from lidarpose.cli.terminal import add_command, add_keep, names, scene_changes, tell
+from lidarpose.cli.terminal import KEEP, add_command, add_options, names, scene_changes, tell
 from lidarpose.models import DEFAULT, NAMES
 from lidarpose.progress import Progress
 
-_WORKERS = "number of processes, at most one a shard (default 1)"
+_WORKERS = "--workers N = 1  number of processes, at most one a shard (default 1)"
+_DEMO = f"""
+--out DIR = lidarpose-demo  folder (default lidarpose-demo)
+--seed N = 7  random seed (default 7)
+--weights NAME|FILE = {DEFAULT}  {NAMES}, or a checkpoint
+"""
+_SCENE = f"""
+--scene NAME = wild  wild (default), wide, paper or reference
+--sensor A,B  names of sensors or sensor files (default: the scene's); see lidarpose sensors
+--seed N = 0  random seed (default 0)
+--hard H = 1  difficulty from 0 (easy) to 1 (default)
+{KEEP}
+"""
+_SEVERAL = """
+--clips  write clips of 16 frames at 10 Hz instead of single people
+--scenes  write whole streets with several walking people
+"""
+_MOTION = """
+--motion FILE  take poses from captured motion: a file or a folder
+--subjects A,B  subjects to use: the first part of a clip's name
+--captured SHARE  share of poses taken from the clips (default 0.5)
+"""
+_WORK = f"""
+{_WORKERS}
+--per-shard N  people (2000), clips (125) or streets (2) per file
+"""
+_PREPARE = f"""
+--split NAME  write only the people of train, val or test
+--split-by NAME  a published split (default: RAW/train.txt, val.txt and test.txt if present, else the usual one)
+--smpl FILE|DIR  your SMPL model, for lidarhuman26m, sloper4d, freemotion, noisemotion
+--no-level  lidarhuman26m: keep the release's frame, as the LiDAR was mounted
+{_WORKERS}
+"""
+_VIEW = """
+-n,--count N = 24  people, or at most 12 streets, evenly spread (default 24)
+--html  write an interactive 3D page instead of a picture
+--out FILE  default DIR.png or DIR.html, in the current folder
+"""
 
 
 def add(commands) -> None:
@@ -28,9 +65,7 @@ def _add_demo(commands) -> None:
         description="Synthesizes people, predicts their poses and writes an interactive 3D report.",
     )
     demo.set_defaults(run=_demo)
-    demo.add_argument("--out", default="lidarpose-demo", metavar="DIR", help="folder (default lidarpose-demo)")
-    demo.add_argument("--seed", type=int, default=7, metavar="N", help="random seed (default 7)")
-    demo.add_argument("--weights", default=DEFAULT, metavar="NAME|FILE", help=f"{NAMES}, or a checkpoint")
+    add_options(demo, _DEMO)
 
 
 def _add_synth(commands) -> None:
@@ -47,33 +82,12 @@ def _add_synth(commands) -> None:
     synth.add_argument("--out", required=True, metavar="DIR", help="a new folder, or the one of an interrupted run")
     synth.add_argument("-n", "--count", type=int, required=True, metavar="N", help="number of people, clips or streets")
     scene = synth.add_argument_group("scene")
-    scene.add_argument("--scene", default="wild", metavar="NAME", help="wild (default), wide, paper or reference")
-    scene.add_argument(
-        "--sensor", metavar="A,B", help="names of sensors or sensor files (default: the scene's); see lidarpose sensors"
-    )
-    scene.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
-    scene.add_argument("--hard", type=float, default=1.0, metavar="H", help="difficulty from 0 (easy) to 1 (default)")
-    add_keep(scene)
-    scene.add_argument(
-        "--set",
-        dest="set_set",
-        metavar="A=X,B=Y",
-        help="changes of the scene: its numbers (docs/synthesis.md), recorded=1 keeps the places of --motion",
-    )
-    several = scene.add_mutually_exclusive_group()
-    several.add_argument(
-        "--clips", action="store_true", help="write clips of 16 frames at 10 Hz instead of single people"
-    )
-    several.add_argument("--scenes", action="store_true", help="write whole streets with several walking people")
-    poses = synth.add_argument_group("captured motion")
-    poses.add_argument("--motion", metavar="FILE", help="take poses from captured motion: a file or a folder")
-    poses.add_argument("--subjects", metavar="A,B", help="subjects to use: the first part of a clip's name")
-    poses.add_argument(
-        "--captured", type=float, metavar="SHARE", help="share of poses taken from the clips (default 0.5)"
-    )
-    work = synth.add_argument_group("work")
-    work.add_argument("--workers", type=int, default=1, metavar="N", help=_WORKERS)
-    work.add_argument("--per-shard", type=int, metavar="N", help="people (2000), clips (125) or streets (2) per file")
+    add_options(scene, _SCENE)
+    words = "changes of the scene: its numbers (docs/synthesis.md), recorded=1 keeps the places of --motion"
+    scene.add_argument("--set", dest="set_set", metavar="A=X,B=Y", help=words)
+    add_options(scene.add_mutually_exclusive_group(), _SEVERAL)
+    add_options(synth.add_argument_group("captured motion"), _MOTION)
+    add_options(synth.add_argument_group("work"), _WORK)
 
 
 def _add_prepare(commands) -> None:
@@ -87,24 +101,11 @@ def _add_prepare(commands) -> None:
         "interruption the same command continues.",
     )
     prepare.set_defaults(run=_prepare)
-    prepare.add_argument(
-        "dataset", metavar="NAME", help="humanm3, lidarhuman26m, sloper4d, waymo, itop, lipd, freemotion or noisemotion"
-    )
+    known = "humanm3, lidarhuman26m, sloper4d, waymo, itop, lipd, freemotion or noisemotion"
+    prepare.add_argument("dataset", metavar="NAME", help=known)
     prepare.add_argument("root", metavar="RAW", help="folder of the dataset's raw files")
     prepare.add_argument("out", metavar="OUT", help="a new folder, or the one of an interrupted run")
-    prepare.add_argument("--split", metavar="NAME", help="write only the people of train, val or test")
-    prepare.add_argument(
-        "--split-by",
-        metavar="NAME",
-        help="a published split (default: RAW/train.txt, val.txt and test.txt if present, else the usual one)",
-    )
-    prepare.add_argument(
-        "--smpl", metavar="FILE|DIR", help="your SMPL model, for lidarhuman26m, sloper4d, freemotion, noisemotion"
-    )
-    prepare.add_argument(
-        "--no-level", action="store_true", help="lidarhuman26m: keep the release's frame, as the LiDAR was mounted"
-    )
-    prepare.add_argument("--workers", type=int, default=1, metavar="N", help=_WORKERS)
+    add_options(prepare, _PREPARE)
 
 
 def _add_view(commands) -> None:
@@ -119,16 +120,7 @@ def _add_view(commands) -> None:
     )
     view.set_defaults(run=_view)
     view.add_argument("folder", metavar="DIR", help="a dataset's folder")
-    view.add_argument(
-        "-n",
-        "--count",
-        type=int,
-        default=24,
-        metavar="N",
-        help="people, or at most 12 streets, evenly spread (default 24)",
-    )
-    view.add_argument("--html", action="store_true", help="write an interactive 3D page instead of a picture")
-    view.add_argument("--out", metavar="FILE", help="default DIR.png or DIR.html, in the current folder")
+    add_options(view, _VIEW)
 
 
 def _demo(options: argparse.Namespace) -> None:

@@ -5,44 +5,40 @@ import shlex
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from types import SimpleNamespace
-from typing import Any
 
-from lidarpose.cli.terminal import add_command, tell
+from lidarpose.cli.terminal import add_command, add_options, tell
 from lidarpose.errors import InputError
 from lidarpose.models import BUNDLED, DEFAULT
 from lidarpose.progress import Progress
 
-# options of `evaluation.run`: type, default, metavar, help
-_OPTIONS: dict[str, tuple[Any, Any, str, str]] = {
-    "protocol": (
-        str,
-        "clean",
-        "NAME",
-        "clean (default), or dapt: crops and centers from labels, as in the released code",
-    ),
-    "split": (str, None, "NAME", "split to score, or all (default: test, else val, else all)"),
-    "skeleton": (str, None, "NAME", "score the joints of this skeleton (default: the dataset's)"),
-    "limit": (int, None, "N", "score only N people (of detector: scans), evenly spread"),
-    "seed": (int, 0, "N", "random seed for displaced boxes and intervals (default 0)"),
-    "device": (str, "cpu", "NAME", "cpu (default), or cuda (backend torch)"),
-    "backend": (str, None, "NAME", "onnx or torch, as in lidarpose predict"),
-    "decode": (str, "window", "NAME", "as in lidarpose predict; the released code uses dark"),
-    "tta": (
-        int,
-        1,
-        "N",
-        "test-time augmentation: average N predictions of each person, 1 (default) to 8; protocol clean only",
-    ),
-}
-# those that are on or off
-_SWITCHES = {
-    "stability": "also perturb the points and draw the curves",
-    "legacy": "also score with the released code's arithmetic",
-    "sensor_unknown": "hide the sensor's position from the network",
-}
-# in place of a network: what finds people; and its own options
+# options of `evaluation.run`
+_OPTIONS = """
+--protocol NAME = clean  clean (default), or dapt: crops and centers from labels, as in the released code
+--split NAME  split to score, or all (default: test, else val, else all)
+--skeleton NAME  score the joints of this skeleton (default: the dataset's)
+--limit N  score only N people (of detector: scans), evenly spread
+--seed N = 0  random seed for displaced boxes and intervals (default 0)
+--device NAME = cpu  cpu (default), or cuda (backend torch)
+--backend NAME  onnx or torch, as in lidarpose predict
+--decode NAME = window  as in lidarpose predict; the released code uses dark
+--tta N = 1  test-time augmentation: average N predictions of each person, 1 (default) to 8; protocol clean only
+--stability  also perturb the points and draw the curves
+--legacy  also score with the released code's arithmetic
+--sensor-unknown  hide the sensor's position from the network
+"""
+# in place of a network: what finds people; and its own options, besides the folders of scans
 DETECTOR = "detector"
-_DETECTOR = ("scans", "method", "detector", "range", "network", "pictures")
+_DETECTOR = """
+--method NAME  detector (default), scorer: without poses, or baselines: pose, candidates
+--detector FILE  another detector's ONNX file than the bundled one
+--range M  people farther from the sensor do not count (default 40)
+--network NAME  compare poses in found boxes with those in labeled ones: a checkpoint (default small), or none
+--pictures DIR  draw the strongest false people and those who are missed into DIR
+"""
+_TABLE = """
+--format NAME = markdown  markdown (default) or json
+--out FILE  write to FILE (default: print)
+"""
 # groups of rows that the terminal shows; the others are in scores.json
 _SHOWN = ("condition", "plain", "joints", "body", "joint", "distance, m", "points", "hidden share")
 # metrics of these groups that it shows, besides those of everybody
@@ -70,24 +66,12 @@ def add(commands) -> None:
     evaluate.add_argument("weights", metavar="CHECKPOINT", help=words)
     words = "a folder written by prepare or synth, or bench; of detector heldout (default without --scans)"
     evaluate.add_argument("datasets", nargs="*", metavar="DATASET", help=words)
-    for name, (kind, default, metavar, words) in _OPTIONS.items():
-        evaluate.add_argument(f"--{name}", type=kind, default=default, metavar=metavar, help=words)
-    for name, words in _SWITCHES.items():
-        evaluate.add_argument(_flag(name), action="store_true", help=words)
+    settings = add_options(evaluate, _OPTIONS)
     evaluate.add_argument("--out", metavar="DIR", help="a new or empty folder (default evaluation/NAME, numbered)")
-
     detector = evaluate.add_argument_group("evaluate detector")
     words = "a folder of SCAN.json of labeled people beside SCAN.pcd, .bin, .ply, .npy or another; may be repeated"
     detector.add_argument("--scans", action="append", metavar="DIR", help=words)
-    words = "detector (default), scorer: without poses, or baselines: pose, candidates"
-    detector.add_argument("--method", metavar="NAME", help=words)
-    detector.add_argument("--detector", metavar="FILE", help="another detector's ONNX file than the bundled one")
-    words = "people farther from the sensor do not count (default 40)"
-    detector.add_argument("--range", type=float, metavar="M", help=words)
-    words = "compare poses in found boxes with those in labeled ones: a checkpoint (default small), or none"
-    detector.add_argument("--network", metavar="NAME", help=words)
-    words = "draw the strongest false people and those who are missed into DIR"
-    detector.add_argument("--pictures", metavar="DIR", help=words)
+    evaluate.set_defaults(settings=settings, of_detector=("scans", *add_options(detector, _DETECTOR)))
 
     table = add_command(
         commands,
@@ -98,8 +82,7 @@ def add(commands) -> None:
     )
     table.set_defaults(run=_table)
     table.add_argument("scores", nargs="*", metavar="FILE|DIR", help="scores.json files, or folders that contain one")
-    table.add_argument("--format", default="markdown", metavar="NAME", help="markdown (default) or json")
-    table.add_argument("--out", metavar="FILE", help="write to FILE (default: print)")
+    add_options(table, _TABLE)
 
 
 def _flag(name: str) -> str:
@@ -111,12 +94,12 @@ def _evaluate(options: argparse.Namespace) -> None:
 
     if options.weights == DETECTOR:
         return _evaluate_detector(options)
-    if wrong := [f"--{name}" for name in _DETECTOR if getattr(options, name) is not None]:
+    if wrong := [f"--{name}" for name in options.of_detector if getattr(options, name) is not None]:
         raise InputError(
             f"{wrong[0]} is of lidarpose evaluate detector, got the network {options.weights}: leave it out"
         )
     folder = evaluation.new_folder(options.weights) if options.out is None else evaluation.check_folder(options.out)
-    settings = {name: getattr(options, name) for name in (*_OPTIONS, *_SWITCHES)}
+    settings = {name: getattr(options, name) for name in options.settings}
     with ExitStack() as stack:
         progress = _progress(stack)
         run = evaluation.run(
@@ -135,7 +118,7 @@ def _evaluate_detector(options: argparse.Namespace) -> None:
     from lidarpose.eval.detector.evaluate_detector import run_detector, write_detector
     from lidarpose.eval.detector.labeled_scans import HELDOUT
 
-    for name, (_, default, _, _) in (_OPTIONS | dict.fromkeys(_SWITCHES, (bool, False, "", ""))).items():
+    for name, default in options.settings.items():
         if name not in ("limit", "seed") and getattr(options, name) != default:
             raise InputError(f"{_flag(name)} is of networks, got the detector: leave it out")
     if set(options.datasets) - {HELDOUT}:
@@ -201,14 +184,17 @@ def _table(options: argparse.Namespace) -> None:
 def _command(options: argparse.Namespace) -> str:
     """What was asked for, as it would be typed."""
     words = ["lidarpose", "evaluate", options.weights, *options.datasets]
-    for name, (_, default, _, _) in _OPTIONS.items():
-        if (value := getattr(options, name)) != default:
-            words += [_flag(name), str(value)]
-    for name in _DETECTOR:
+    changed = {
+        name: value for name, default in options.settings.items() if (value := getattr(options, name)) != default
+    }
+    for name in options.of_detector:
         value = getattr(options, name)
-        for part in value if isinstance(value, list) else [value] * (value is not None):
+        changed |= {} if value is None else {name: value}
+    switches = [_flag(name) for name, value in changed.items() if value is True]
+    for name, value in changed.items():
+        for part in () if value is True else value if isinstance(value, list) else (value,):
             words += [_flag(name), str(part)]
-    return shlex.join([*words, *(_flag(name) for name in _SWITCHES if getattr(options, name))])
+    return shlex.join([*words, *switches])
 
 
 def _progress(stack: ExitStack, unit: str = "people") -> Callable[[str, int, int], None]:

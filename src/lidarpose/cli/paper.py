@@ -5,10 +5,31 @@ import io
 from contextlib import redirect_stderr
 from pathlib import Path
 
-from lidarpose.cli.terminal import add_command, names, tell
+from lidarpose.cli.terminal import add_command, add_options, names, tell
 from lidarpose.errors import InputError, check_name
 
 _NAMES = ("table1", "table2", "table3", "table4", "fig5", "fig6", "fig7", "fig8")
+_OPTIONS = """
+--out DIR = paper  folder of all tables (default paper)
+--rows A,B  only these rows, named as --dry-run names them
+--dry-run  print the commands of every cell, run nothing
+--table-only  write the table of what is there, run nothing
+"""
+_BUDGET = """
+--people N = 200000  people that a stage of training sees: pre-training, and fine-tuning on the stand-in
+ (default 200000)
+--hours H  of a row's training in all: longer ones are made shorter, their schedule too
+--seeds K = 1  seeds 0 ... K-1 of each cell (default 1)
+--workers N = 1  of each command (default 1)
+--size NAME = paper-small  widths of all networks: paper-small (default): reduced ones; or paper: as published
+"""
+_DATA = """
+--data NAME=DIR,...  prepared real sets to learn from and to score on: waymo, humanm3, lidarhuman26m, sloper4d; to
+ pre-train on: lipd, freemotion, noisemotion; raw poses: freemotion-poses, lidarhuman26m-poses
+--motion FILE,FILE  captured motion for synthesis; each is a row of table2, the first one is everywhere else
+--subjects A,B  subjects of the first file to learn from
+--held-out A,B  its subjects whom the stand-in's target shows
+"""
 
 
 def add(commands) -> None:
@@ -26,29 +47,9 @@ def add(commands) -> None:
     )
     paper.set_defaults(run=_paper)
     paper.add_argument("name", metavar="NAME", help="table1 to table4, or fig5 to fig8")
-    paper.add_argument("--out", default="paper", metavar="DIR", help="folder of all tables (default paper)")
-    paper.add_argument("--rows", metavar="A,B", help="only these rows, named as --dry-run names them")
-    paper.add_argument("--dry-run", action="store_true", help="print the commands of every cell, run nothing")
-    paper.add_argument("--table-only", action="store_true", help="write the table of what is there, run nothing")
-    budget = paper.add_argument_group("budget")
-    words = "people that a stage of training sees: pre-training, and fine-tuning on the stand-in (default 200000)"
-    budget.add_argument("--people", type=int, default=200_000, metavar="N", help=words)
-    words = "of a row's training in all: longer ones are made shorter, their schedule too"
-    budget.add_argument("--hours", type=float, metavar="H", help=words)
-    budget.add_argument("--seeds", type=int, default=1, metavar="K", help="seeds 0 ... K-1 of each cell (default 1)")
-    budget.add_argument("--workers", type=int, default=1, metavar="N", help="of each command (default 1)")
-    words = "widths of all networks: paper-small (default): reduced ones; or paper: as published"
-    budget.add_argument("--size", default="paper-small", metavar="NAME", help=words)
-    data = paper.add_argument_group("data")
-    words = (
-        "prepared real sets to learn from and to score on: waymo, humanm3, lidarhuman26m, sloper4d; to pre-train on: "
-        "lipd, freemotion, noisemotion; raw poses: freemotion-poses, lidarhuman26m-poses"
-    )
-    data.add_argument("--data", metavar="NAME=DIR,...", help=words)
-    words = "captured motion for synthesis; each is a row of table2, the first one is everywhere else"
-    data.add_argument("--motion", metavar="FILE,FILE", help=words)
-    data.add_argument("--subjects", metavar="A,B", help="subjects of the first file to learn from")
-    data.add_argument("--held-out", metavar="A,B", help="its subjects whom the stand-in's target shows")
+    add_options(paper, _OPTIONS)
+    add_options(paper.add_argument_group("budget"), _BUDGET)
+    add_options(paper.add_argument_group("data"), _DATA)
 
 
 def _paper(options: argparse.Namespace) -> None:

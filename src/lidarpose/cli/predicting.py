@@ -4,36 +4,49 @@ import argparse
 import os
 import sys
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from lidarpose.cli import recordings
-from lidarpose.cli.terminal import add_command, is_watched, tell
+from lidarpose.cli.terminal import add_command, add_options, is_watched, tell
 from lidarpose.errors import InputError
 from lidarpose.models import DEFAULT, NAMES
 
 _FILES = ".pcd .ply .las .laz .bin .npy .npz .csv .xyz .txt"
 # characters of an id in a warning
 _LONGEST_ID = 40
-_BOXES = 'people to pose: {"people": [{"center": [x,y,z], "size": [l,w,h], "yaw": rad}]}, .npy rows, KITTI labels'
 # what a user who names it expects as a file
-_NO_FOLDERS = {
-    ".bin",
-    ".csv",
-    ".html",
-    ".json",
-    ".jsonl",
-    ".npy",
-    ".npz",
-    ".parquet",
-    ".pcd",
-    ".pdf",
-    ".pkl",
-    ".ply",
-    ".png",
-    ".txt",
-}
-_NO_FOLDERS |= {".xml", ".yaml", ".yml"}
+_NO_FOLDERS = "bin csv html json jsonl npy npz parquet pcd pdf pkl ply png txt xml yaml yml"
+
+_INPUT = """
+--boxes FILE  people to pose: {"people": [{"center": [x,y,z], "size": [l,w,h], "yaw": rad}]}, .npy rows, KITTI labels
+--calib FILE  KITTI's calibration (default: calib/N.txt beside label_2)
+--crop  the file holds one person (assumed under 4 m across)
+"""
+_FRAME = """
+--sensor-origin X,Y,Z  sensor position, or unknown (default: ORIGIN)
+--up AXIS = z  what is up: z (default), y or x, -y where y points down (cameras), or a direction x,y,z
+--columns N  values per point in a .bin: 4 for KITTI, 5 for nuScenes
+"""
+_SEARCH = """
+--min-score P  least probability that it is a person, 0 to 1 (default: about one false person a scan)
+--range M  how far from the sensor, m (default 40)
+--max-people N  only the N surest
+"""
+_OUTPUT = """
+--out PATH = .  a folder, a .json or .csv file (default: the current folder); - prints the JSON
+--picture  also draw STEM.poses.png, or FILE.png
+--html  also write STEM.poses.html: everybody in 3D, the scan too
+--skeleton NAME  smpl24, human15, waymo14, itop14 or body26 (default smpl24, else the network's own)
+"""
+_NETWORK = f"""
+--weights NAME|FILE = {DEFAULT}  {NAMES}, a checkpoint, or an exported .onnx
+--backend NAME  onnx or torch (default onnx for bundled weights and .onnx, torch for .safetensors and other devices)
+--device NAME = cpu  cpu (default), or cuda (backend torch)
+--decode NAME = window  how heatmaps are decoded: window (default), argmax or dark
+--tta N = 4  test-time augmentation: average N predictions of each person, 1 to 8 (default 4)
+"""
 
 
 def add(commands) -> None:
@@ -61,17 +74,14 @@ def _add_predict(commands) -> None:
     predict.add_argument(
         "source", metavar="FILE", nargs="+", help=f"{_FILES}; a folder, a pattern, several files, or a recording"
     )
-    scan = predict.add_argument_group("what is in the file")
-    scan.add_argument("--boxes", metavar="FILE", help=_BOXES)
-    scan.add_argument("--calib", metavar="FILE", help="KITTI's calibration (default: calib/N.txt beside label_2)")
-    scan.add_argument("--crop", action="store_true", help="the file holds one person (assumed under 4 m across)")
-    _add_frame(scan, "unknown for one person, else 0,0,0")
+    add_options(
+        predict.add_argument_group("what is in the file"), _INPUT + _frame("unknown for one person, else 0,0,0")
+    )
     search = predict.add_argument_group("who is looked for, without boxes")
-    search.add_argument("--find", action="store_true", help="look for people in a file under 4 m across too")
-    _add_search(search)
-    recordings.add_options(predict)
-    _add_output(predict.add_argument_group("output"))
-    _add_network(predict.add_argument_group("network"))
+    _add_search(search, "--find  look for people in a file under 4 m across too")
+    recordings.add_frame_options(predict)
+    add_options(predict.add_argument_group("output"), _OUTPUT)
+    add_options(predict.add_argument_group("network"), _NETWORK)
 
 
 def _add_detect(commands) -> None:
@@ -86,86 +96,24 @@ def _add_detect(commands) -> None:
     )
     detect.set_defaults(run=_detect)
     detect.add_argument("file", metavar="FILE", help=_FILES)
-    _add_frame(detect.add_argument_group("what is in the file"), "0,0,0")
+    add_options(detect.add_argument_group("what is in the file"), _frame("0,0,0"))
     _add_search(detect.add_argument_group("who is looked for"))
-    output = detect.add_argument_group("output")
-    output.add_argument(
-        "--out",
-        default=".",
-        metavar="PATH",
-        help="a folder, or a .json file (default: the current folder); - prints it",
-    )
+    out = "--out PATH = .  a folder, or a .json file (default: the current folder); - prints it"
+    add_options(detect.add_argument_group("output"), out)
 
 
-def _add_frame(scan, origin: str) -> None:
-    scan.add_argument("--sensor-origin", metavar="X,Y,Z", help=f"sensor position, or unknown (default: {origin})")
-    scan.add_argument(
-        "--up",
-        default="z",
-        metavar="AXIS",
-        help="what is up: z (default), y or x, -y where y points down (cameras), or a direction x,y,z",
-    )
-    scan.add_argument(
-        "--columns", type=int, metavar="N", help="values per point in a .bin: 4 for KITTI, 5 for nuScenes"
-    )
+def _frame(origin: str) -> str:
+    return _FRAME.replace("ORIGIN", origin)
 
 
-def _add_search(search) -> None:
-    search.add_argument(
-        "--min-score",
-        type=float,
-        metavar="P",
-        help="least probability that it is a person, 0 to 1 (default: about one false person a scan)",
-    )
-    search.add_argument("--range", type=float, metavar="M", help="how far from the sensor, m (default 40)")
-    search.add_argument("--max-people", type=int, metavar="N", help="only the N surest")
-    search.add_argument(
-        "--background",
-        nargs="+",
-        metavar="FILE",
-        help="what stands still about a fixed sensor: a file of static points, several scans, or a folder of scans",
-    )
-
-
-def _add_output(output) -> None:
-    output.add_argument(
-        "--out",
-        default=".",
-        metavar="PATH",
-        help="a folder, a .json or .csv file (default: the current folder); - prints the JSON",
-    )
-    output.add_argument("--picture", action="store_true", help="also draw STEM.poses.png, or FILE.png")
-    output.add_argument("--html", action="store_true", help="also write STEM.poses.html: everybody in 3D, the scan too")
-    output.add_argument(
-        "--skeleton",
-        metavar="NAME",
-        help="smpl24, human15, waymo14, itop14 or body26 (default smpl24, else the network's own)",
-    )
-
-
-def _add_network(network) -> None:
-    network.add_argument(
-        "--weights", default=DEFAULT, metavar="NAME|FILE", help=f"{NAMES}, a checkpoint, or an exported .onnx"
-    )
-    network.add_argument(
-        "--backend",
-        metavar="NAME",
-        help="onnx or torch (default onnx for bundled weights and .onnx, torch for .safetensors and other devices)",
-    )
-    network.add_argument("--device", default="cpu", metavar="NAME", help="cpu (default), or cuda (backend torch)")
-    network.add_argument(
-        "--decode", default="window", metavar="NAME", help="how heatmaps are decoded: window (default), argmax or dark"
-    )
-    network.add_argument(
-        "--tta",
-        type=int,
-        metavar="N",
-        help="test-time augmentation: average N predictions of each person, 1 to 8 (default 4)",
-    )
+def _add_search(search, first: str = "") -> None:
+    add_options(search, first + _SEARCH)
+    words = "what stands still about a fixed sensor: a file of static points, several scans, or a folder of scans"
+    search.add_argument("--background", nargs="+", metavar="FILE", help=words)
 
 
 def _predict(options: argparse.Namespace) -> None:
-    from lidarpose.inference.predictor import TTA, load, predict
+    from lidarpose.inference.predictor import load, predict
     from lidarpose.io.files import atomic_path, check_apart, check_writable
 
     many = recordings.is_recording(options)
@@ -180,26 +128,17 @@ def _predict(options: argparse.Namespace) -> None:
         check_apart(path, *options.source, *inputs)
         # before the work
         check_writable(path)
-    choices = {"backend": options.backend, "device": options.device, "decode": options.decode}
-    choices["tta"] = TTA if options.tta is None else options.tta
+    choices = {name: getattr(options, name) for name in ("backend", "device", "decode", "tta")}
+    asked = {name: getattr(options, name) for name in ("boxes", "calib", "crop", "find", "skeleton")} | _reading(
+        options
+    )
+    # loaded once the input has proved readable
+    asked["model"] = partial(load, options.weights, **choices)
     if many:
-        recordings.predict_recording(
-            options, result, picture, reading=_reading(options), model=lambda: load(options.weights, **choices)
-        )
+        recordings.predict_recording(options, result, picture, asked)
         return
     file = Path(options.source[0])
-    poses = predict(
-        options.source[0],
-        boxes=options.boxes,
-        calib=options.calib,
-        crop=options.crop,
-        find=options.find,
-        skeleton=options.skeleton,
-        **_reading(options),
-        # loaded once the input has proved readable
-        model=lambda: load(options.weights, **choices),
-        progress=is_watched(),
-    )
+    poses = predict(options.source[0], **asked, progress=is_watched())
     outputs: dict[Path, bytes] = {}
     if result is not None:
         as_csv = result.suffix.lower() == ".csv"
@@ -245,17 +184,12 @@ def _detect(options: argparse.Namespace) -> None:
 
 def _reading(options: argparse.Namespace) -> dict[str, Any]:
     """How a scan is read and searched, for `predict` and `detect` alike."""
+    names = ("sensor_origin", "up", "columns", "min_score", "max_people")
     background = options.background
-    return {
-        "sensor_origin": options.sensor_origin,
-        "up": options.up,
-        "columns": options.columns,
-        "max_range": options.range,
-        "min_score": options.min_score,
-        "max_people": options.max_people,
-        # one file is of static points, or a folder; several are scans
-        "background": background[0] if background and len(background) == 1 else background,
-    }
+    # one file is of static points, or a folder; several are scans
+    background = background[0] if background and len(background) == 1 else background
+    reading = {name: getattr(options, name) for name in names}
+    return reading | {"max_range": options.range, "background": background}
 
 
 def _result_path(out: str, name: str, what: str, *suffixes: str) -> Path | None:
@@ -270,7 +204,7 @@ def _result_path(out: str, name: str, what: str, *suffixes: str) -> Path | None:
         suffix = Path(out).suffix.lower()
         if suffix in suffixes:
             return Path(out)
-        if suffix in _NO_FOLDERS:
+        if suffix[1:] in _NO_FOLDERS.split():
             files = " or ".join(suffixes)
             raise InputError(f"--out {out}: expected a folder or a file {files}, got {suffix}: name one")
     return Path(out) / f"{name}.{what}{suffixes[0]}"

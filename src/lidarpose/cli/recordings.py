@@ -8,34 +8,37 @@ from pathlib import Path
 from typing import Any
 
 from lidarpose._version import __version__
-from lidarpose.cli.terminal import tell
+from lidarpose.cli.terminal import add_options, tell
 from lidarpose.errors import InputError
 
-# options that only frames have, by their names in the namespace
-_ONLY = ("track", "live", "world", "format", "topic", "rate", "start", "end", "every")
+_FRAMES = """
+--track  join people over time, and make their poses steady
+--live  tracks made steady by the past alone, as they come
+--world  joints in the world's frame, where it is known
+--topic NAME  which points of a bag
+--meta FILE  an Ouster sensor's JSON file (default: the recording's name beside it)
+--rate HZ  frames a second where times are unknown (default 10)
+--start S  seconds from the first frame
+--end S  seconds from the first frame
+--every N  only every N-th frame
+"""
 # what a user reads of warnings that many frames have
 _MOST_WARNINGS = 8
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
+def add_frame_options(parser: argparse.ArgumentParser) -> None:
     """The options of many frames."""
     frames = parser.add_argument_group("folders and recordings")
-    frames.add_argument("--track", action="store_true", help="join people over time, and make their poses steady")
-    frames.add_argument("--live", action="store_true", help="tracks made steady by the past alone, as they come")
-    frames.add_argument("--world", action="store_true", help="joints in the world's frame, where it is known")
+    only = add_options(frames, _FRAMES)
     frames.add_argument("--format", choices=("jsonl", "csv", "parquet"), help="of NAME.poses.FORMAT (default jsonl)")
-    frames.add_argument("--topic", metavar="NAME", help="which points of a bag")
-    frames.add_argument("--rate", type=float, metavar="HZ", help="frames a second where times are unknown (default 10)")
-    frames.add_argument("--start", type=float, metavar="S", help="seconds from the first frame")
-    frames.add_argument("--end", type=float, metavar="S", help="seconds from the first frame")
-    frames.add_argument("--every", type=int, metavar="N", help="only every N-th frame")
+    parser.set_defaults(of_frames=("format", *only))
 
 
 def is_recording(options: argparse.Namespace) -> bool:
     """Whether the command is about many frames rather than one plain file."""
     from lidarpose.io.sources import is_single_scan
 
-    if any(getattr(options, name) not in (None, False) for name in _ONLY):
+    if any(getattr(options, name) not in (None, False) for name in options.of_frames):
         return True
     return not is_single_scan(options.source)
 
@@ -51,9 +54,9 @@ def name_of(paths: Sequence[str]) -> str:
 
 
 def predict_recording(
-    options: argparse.Namespace, result: Path | None, picture: Path | None, *, reading: dict[str, Any], model
+    options: argparse.Namespace, result: Path | None, picture: Path | None, asked: dict[str, Any]
 ) -> None:
-    """Poses all frames, and says what was found. reading: options of reading and searching a scan, as of `predict`."""
+    """Poses all frames, and says what came of it. asked: as of `FramePredictor`."""
     from lidarpose.io.files import write_atomic
     from lidarpose.io.sources import open_source
     from lidarpose.recording.output import write_recording
@@ -64,24 +67,9 @@ def predict_recording(
         raise InputError("--html is of one scan: name one file, or draw a recording with --picture")
     if len(options.source) > 1 and any(map(os.path.isdir, options.source)):
         raise InputError(f"expected one folder, or files, got {len(options.source)}: run the command for each folder")
-    frames = {name: getattr(options, name) for name in ("topic", "rate", "start", "end")}
-    source = open_source(
-        options.source, columns=options.columns, every=1 if options.every is None else options.every, **frames
-    )
-    search = tuple(reading.pop(name) for name in ("min_score", "max_range", "max_people", "background"))
-    steps = FramePredictor(
-        boxes=options.boxes,
-        calib=options.calib,
-        crop=options.crop,
-        find=options.find,
-        search=search,
-        skeleton=options.skeleton,
-        track=options.track,
-        live=options.live,
-        model=model,
-        name=source.name,
-        **reading,
-    )
+    frames = {name: getattr(options, name) for name in ("columns", "topic", "meta", "rate", "start", "end")}
+    source = open_source(options.source, every=1 if options.every is None else options.every, **frames)
+    steps = FramePredictor(name=source.name, track=options.track, live=options.live, **asked)
     if result is None:
         _print_lines(options, source, steps)
         return
@@ -111,7 +99,7 @@ def _print_lines(options: argparse.Namespace, source, steps) -> None:
     summary = Summary()
     for frame in steps.predict_all(source.frames()):
         line = frame.to_dict()
-        line = in_world(line) if options.world else line
+        line = in_world(line, steps.up) if options.world else line
         summary.add(line)
         print(json.dumps(line), flush=True)
     for line in [*source.warnings, *summary.warning_lines(_MOST_WARNINGS)]:
@@ -121,7 +109,7 @@ def _print_lines(options: argparse.Namespace, source, steps) -> None:
 
 def _command(options: argparse.Namespace) -> dict[str, Any]:
     """All that the poses of frames depend on."""
-    ignored = ("run", "command", "quiet", "out", "format", "picture", "world", "source")
+    ignored = ("run", "command", "quiet", "out", "format", "picture", "world", "source", "of_frames")
     command = {name: value for name, value in vars(options).items() if name not in ignored}
     weights = os.stat(options.weights).st_mtime_ns if os.path.isfile(options.weights) else None
     sources = [os.path.abspath(path) for path in options.source]

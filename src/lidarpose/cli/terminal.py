@@ -1,7 +1,9 @@
 """How options are written, and how the command line speaks."""
 
 import argparse
+import re
 import sys
+from typing import Any
 
 from lidarpose.io.files import one_line
 from lidarpose.progress import is_quiet
@@ -26,6 +28,32 @@ def add_command(
     return parser
 
 
+# the metavar of an option tells its type; others are text
+_TYPES = {"N": int, "K": int} | dict.fromkeys(("P", "M", "S", "HZ", "H", "SHARE"), float)
+# stands for a change of the scene
+KEEP = "--keep R  laser mask: every sample keeps a share R of its patches, the paper's r_keep; as --set keep=R"
+
+
+def add_options(parser, table: str) -> dict[str, Any]:
+    """Adds options to a parser or a group, and returns their defaults by name.
+
+    table: a line each, `--name METAVAR = DEFAULT  help`, which lines that begin with a blank continue; an option
+    without a metavar is on or off, one without a default is None.
+    """
+    defaults: dict[str, Any] = {}
+    for line in filter(None, re.sub(r"\n +", " ", table).splitlines()):
+        spec, words = line.split("  ", 1)
+        option, _, default = spec.partition(" = ")
+        flags, *metavar = option.split(" ")
+        style: dict[str, Any] = {"action": "store_true"}
+        if metavar:
+            kind = _TYPES.get(metavar[0], str)
+            style = {"type": kind, "metavar": metavar[0], "default": kind(default) if default else None}
+        action = parser.add_argument(*flags.split(","), help=words.strip(), **style)
+        defaults[action.dest] = action.default
+    return defaults
+
+
 def names(text: str) -> tuple[str, ...]:
     """The names in a list that commas part."""
     return tuple(name.strip() for name in text.split(",") if name.strip())
@@ -35,12 +63,6 @@ def scene_changes(options: argparse.Namespace) -> tuple[str, ...] | None:
     """The changes of the scene that `--keep` and `--set` ask for; None for none."""
     keep = () if options.keep is None else (f"keep={options.keep}",)
     return keep + (() if options.set_set is None else names(options.set_set)) or None
-
-
-def add_keep(parser) -> None:
-    """The option --keep, which stands for a change of the scene."""
-    words = "laser mask: every sample keeps a share R of its patches, the paper's r_keep; as --set keep=R"
-    parser.add_argument("--keep", metavar="R", help=words)
 
 
 def tell(text: str, *, error: bool = False) -> None:

@@ -8,7 +8,7 @@ from dataclasses import Field, fields
 from pathlib import Path
 from typing import Any
 
-from lidarpose.cli.terminal import add_command, add_keep, names, scene_changes
+from lidarpose.cli.terminal import KEEP, add_command, add_options, names, scene_changes
 from lidarpose.errors import InputError
 from lidarpose.train.recipes import TYPES, Finetune, PoseRecipe, Pretrain, Recipe, TrainDetector
 
@@ -17,6 +17,12 @@ _WHAT = (
     "state.safetensors to resume from. After an interruption, --resume continues with the same losses. Several "
     "processes: `torchrun --nproc_per_node N -m lidarpose {name} ...`, with the run's folder named."
 )
+_CALIBRATE = """
+--calibrate N  train nothing: write RUN/detector.onnx, its scores calibrated on N synthesized scans of what training
+ never shows
+--scans DIR  with --calibrate: labeled real scans, as evaluate detector takes them; the default score lets one false
+ person a scan pass there too
+"""
 # a value of a setting from its text, by type; others are texts
 _BOOLS = {"true": True, "false": False}
 _PARSERS: dict[Any, Callable] = {
@@ -63,19 +69,7 @@ def add(commands) -> None:
         "lidarpose train-detector runs/train-detector-001 --calibrate 300 --scans labeled",
         description=_WHAT.format(name="train-detector", what="Trains on scans synthesized during training."),
     )
-    detector.add_argument(
-        "--calibrate",
-        type=int,
-        metavar="N",
-        help="train nothing: write RUN/detector.onnx, its scores calibrated on N synthesized scans of what training "
-        "never shows",
-    )
-    detector.add_argument(
-        "--scans",
-        metavar="DIR",
-        help="with --calibrate: labeled real scans, as evaluate detector takes them; the default score lets one false "
-        "person a scan pass there too",
-    )
+    add_options(detector, _CALIBRATE)
     _add(detector, TrainDetector)
 
 
@@ -96,7 +90,7 @@ def _add(parser, kind: type[Recipe]) -> None:
     own = parser.add_argument_group(f"settings of {name}")
     common = parser.add_argument_group("settings of optimizer and run")
     if kind is Pretrain:
-        add_keep(own)
+        add_options(own, KEEP)
     shared = {field.name for base in (Recipe, PoseRecipe) for field in fields(base)}
     for field in fields(kind):
         if field.name != "data":

@@ -10,20 +10,25 @@ from pathlib import Path
 from typing import Any, cast
 
 from lidarpose._version import __version__
-from lidarpose.cli.terminal import add_command, tell
+from lidarpose.cli.terminal import add_command, add_options, tell
 from lidarpose.models import BUNDLED, DEFAULT, bundled_path
+
+_EXPORT = """
+--format NAME = onnx  onnx (default) or torch (a .pt2 program)
+--out FILE  default STEM.onnx or STEM.pt2, in the current folder
+"""
 
 
 def add(commands) -> None:
     """Adds the commands to the parser's."""
     info = add_command(commands, "info", "show versions, device, bundled weights and their scores", "lidarpose info")
     info.set_defaults(run=_info)
-    info.add_argument("-v", "--verbose", action="store_true", help="also how the weights were trained, and all scores")
-    info.add_argument("--json", action="store_true", help="print everything as JSON")
+    words = "-v,--verbose  also how the weights were trained, and all scores\n--json  print everything as JSON"
+    add_options(info, words)
 
     models = add_command(commands, "models", "list the networks: joints, frames, parameters", "lidarpose models --json")
     models.set_defaults(run=_models)
-    models.add_argument("--json", action="store_true", help="print them as JSON")
+    add_options(models, "--json  print them as JSON")
 
     export = add_command(
         commands,
@@ -35,8 +40,7 @@ def add(commands) -> None:
     )
     export.set_defaults(run=_export)
     export.add_argument("weights", nargs="?", default=DEFAULT, metavar="NAME|FILE", help=f"default {DEFAULT}")
-    export.add_argument("--format", default="onnx", metavar="NAME", help="onnx (default) or torch (a .pt2 program)")
-    export.add_argument("--out", metavar="FILE", help="default STEM.onnx or STEM.pt2, in the current folder")
+    add_options(export, _EXPORT)
 
     take = add_command(
         commands,
@@ -48,11 +52,8 @@ def add(commands) -> None:
     take.set_defaults(run=_import)
     take.add_argument("file", help="the released weights, as .safetensors")
     take.add_argument("out", metavar="OUT", help="the checkpoint to write (.safetensors)")
-    take.add_argument(
-        "--config",
-        metavar="NAME",
-        help="waymo, humanm3, lidarhuman26m, sloper4d, pretrain or paper (default: as the file says)",
-    )
+    known = "waymo, humanm3, lidarhuman26m, sloper4d, pretrain or paper (default: as the file says)"
+    add_options(take, f"--config NAME  {known}")
 
 
 def _info(options: argparse.Namespace) -> None:

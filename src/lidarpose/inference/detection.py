@@ -20,7 +20,7 @@ from lidarpose.inference.backend import Backend, OnnxBackend, estimates
 from lidarpose.inference.background import is_static, read_background
 from lidarpose.inference.checks import flat_along_another_axis, scan_unit_warning, unlikely_origin
 from lidarpose.inference.inputs import as_origin, as_points, only_returns
-from lidarpose.inference.scan import Scan, read_scan
+from lidarpose.inference.scan import Scan, read_scan, up_text
 from lidarpose.inference.tta import TTATransform, apply
 from lidarpose.io.boxes import Boxes
 from lidarpose.models import weights_path
@@ -154,7 +154,7 @@ def detect(
     rotation_from_up(up)
     search = search_options(min_score, max_range, max_people, background, columns)
     origin = np.zeros(3) if sensor_origin is None else as_origin(sensor_origin)
-    scan = Scan(points=np.zeros((0, 3)), origin=origin, up=up if isinstance(up, str) else _direction(up))
+    scan = Scan(points=np.zeros((0, 3)), origin=origin, up=up_text(up))
     if isinstance(points, str | os.PathLike):
         scan = read_scan(scan, points, columns)
     else:
@@ -212,7 +212,7 @@ def detect_places(scan: Scan, search: Search) -> Places:
     if up is not None:
         degrees = np.degrees(np.arccos(np.clip(up[2] / np.linalg.norm(up), -1, 1)))
         warnings.append(f"the ground leans by {degrees:.0f} degrees, which is taken for a tilt of the sensor (up)")
-        scan = replace(scan, up=_direction(up @ scan.R_level_input))
+        scan = replace(scan, up=up_text(up @ scan.R_level_input))
         level = _leveled(scan)
         origin = None if scan.origin is None else scan.R_level_input @ scan.origin
     if origin is not None and (warning := unlikely_origin(level, origin)):
@@ -342,10 +342,6 @@ def _in_input(box: Box, scan: Scan, given: Scan) -> Box:
         size = np.abs(R_level_own.T @ R_boxes_level @ R_level_own) @ box.size
     center = given.R_boxes_input.T @ center
     return _rounded(replace(box, center=center, size=size))
-
-
-def _direction(up: Any) -> str:
-    return ",".join(repr(float(value)) for value in up)
 
 
 def _is_number(value: object) -> bool:

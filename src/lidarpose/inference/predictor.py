@@ -24,7 +24,7 @@ from lidarpose.inference.inputs import (
     only_returns,
 )
 from lidarpose.inference.results import PersonPose, Poses, first_names
-from lidarpose.inference.scan import Scan, pose_scan, read_scan
+from lidarpose.inference.scan import Scan, pose_scan, read_scan, up_text
 from lidarpose.inference.tta import TTATransform, apply, average, invert, tta_transforms
 from lidarpose.io.boxes import read_boxes
 from lidarpose.io.files import file_error
@@ -146,7 +146,7 @@ def predict(
         points=np.zeros((0, 3)),
         boxes=None if boxes is None else read_boxes(boxes, calib=calib),
         origin=as_origin(sensor_origin),
-        up=up if isinstance(up, str) else ",".join(repr(float(value)) for value in up),
+        up=up_text(up),
     )
     scan = read_scan(scan, path, columns)
     find = find or boxes is None and not crop and is_wide(scan)

@@ -22,9 +22,9 @@ from lidarpose.geometry import transform_points
 from lidarpose.io.files import atomic_path, check_writable, file_error
 from lidarpose.io.sources import Source
 from lidarpose.progress import Progress
-from lidarpose.recording.predict_recording import FramePoses, FramePredictor, fixed_from_sensor
-from lidarpose.sample import PER_JOINT
-from lidarpose.skeleton import Skeleton
+from lidarpose.recording.coordinates import FixedFrame, moved_yaw, upright
+from lidarpose.recording.predict_recording import FramePoses, FramePredictor
+from lidarpose.sample import PER_JOINT, Pose
 from lidarpose.tracking.clip import TrackPoses
 from lidarpose.tracking.smoothing import smooth
 
@@ -198,7 +198,7 @@ def write_recording(
 
         def final() -> Iterator[dict[str, Any]]:
             for line in lines:
-                line = in_world(line) if world else line
+                line = in_world(line, steps.up) if world else line
                 summary.add(line)
                 if on_line is not None:
                     on_line(line)
@@ -301,8 +301,8 @@ def _rows(line: dict[str, Any]) -> Iterator[tuple]:
             yield line["frame"], line["id"], line["time"], *of_person, name, *person["joints"][j], *values
 
 
-def in_world(line: dict[str, Any]) -> dict[str, Any]:
-    """The line with joints and boxes in the world's frame, where the sensor's pose is known."""
+def in_world(line: dict[str, Any], up: str = "z") -> dict[str, Any]:
+    """The line with joints and boxes in the world's frame, where the sensor's pose is known. up: of the sensor's."""
     if line["T_world_sensor"] is None:
         return line
     T = np.array(line["T_world_sensor"])
@@ -311,10 +311,9 @@ def in_world(line: dict[str, Any]) -> dict[str, Any]:
         moved: dict[str, Any] = {}
         if person["joints"] is not None:
             moved["joints"] = _transformed(T, person["joints"])
-        if person["box"] is not None:
-            x, y = T[:2, :2] @ [np.cos(person["box"]["yaw"]), np.sin(person["box"]["yaw"])]
-            center = _transformed(T, person["box"]["center"])
-            moved["box"] = person["box"] | {"center": center, "yaw": float(np.arctan2(y, x))}
+        if (box := person["box"]) is not None:
+            yaw = moved_yaw(box["yaw"], T, upright(up))
+            moved["box"] = box | {"center": _transformed(T, box["center"]), "yaw": yaw}
         people.append(person | moved)
     return line | {"people": people, "coordinates": "world"}
 
@@ -326,82 +325,64 @@ def _transformed(T: np.ndarray, points: Any) -> list:
 # ---- steady tracks
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Sightings:
-    """Of a track, growing: rows of frames, and what was seen there, joints in the fixed frame."""
-
-    rows: list[int] = field(default_factory=list)
-    values: dict[str, list[np.ndarray]] = field(default_factory=dict)
-
-    def add(self, row: int, values: dict[str, np.ndarray]) -> None:
-        self.rows.append(row)
-        for name, value in values.items():
-            self.values.setdefault(name, []).append(value)
-
-
 def steadied(part: PartFile, steps: FramePredictor) -> Iterator[dict[str, Any]]:
     """The lines with every track made steady, and people added where they were hidden."""
     times: list[float] = []
     to_fixed: list[np.ndarray] = []
     is_damaged: list[bool] = []
-    tracks: dict[int, _Sightings] = {}
-    last_world = None
+    # by track and row of the lines, in the fixed frame
+    tracks: dict[int, dict[int, Pose]] = {}
+    fixed = FixedFrame(steps.up)
     for row, line in enumerate(part.lines()):
-        last_world = last_world if line["T_world_sensor"] is None else np.array(line["T_world_sensor"])
-        to_fixed.append(fixed_from_sensor(last_world, steps.up))
+        to_fixed.append(fixed.from_sensor(line["T_world_sensor"]))
         times.append(np.nan if line["time"] is None else line["time"])
         is_damaged.append(line["error"] is not None)
         for person in line["people"]:
             if person["joints"] is not None:
                 joints = transform_points(to_fixed[-1], np.array(person["joints"]))
-                others = {name: np.array(person[name], np.float32) for name in _SMOOTHED if person[name]}
-                tracks.setdefault(person["track"], _Sightings()).add(row, {"joints": joints} | others)
-    # as arrays: lists of numbers would take five times the memory
-    steady: list[dict[int, dict[str, Any]]] = [{} for _ in times]
+                others: dict[str, Any] = {
+                    name: np.array(person[name], np.float32) for name in _SMOOTHED if person[name]
+                }
+                pose = Pose(joints=joints, skeleton=steps.wanted, **others)
+                tracks.setdefault(person["track"], {})[row] = pose
+    steady: list[dict[int, tuple[Pose, bool]]] = [{} for _ in times]
     for id in list(tracks):
-        for row, entry in _steady(tracks.pop(id), np.array(times), steps.wanted):
+        for row, pose, is_filled in _steady(tracks.pop(id), np.array(times)):
             if not is_damaged[row]:
-                steady[row][id] = entry
-    for line, entries, T_fixed_sensor in zip(part.lines(), steady, to_fixed, strict=True):
+                steady[row][id] = pose, is_filled
+    for line, people, T_fixed_sensor in zip(part.lines(), steady, to_fixed, strict=True):
         T_sensor_fixed = np.linalg.inv(T_fixed_sensor)
-        written = {id: _written(entry, T_sensor_fixed) for id, entry in entries.items()}
-        entries.clear()
-        yield line | {"people": list(_with_steady(line["people"], written))}
+        entries = {id: _entry(pose, T_sensor_fixed) | {"filled": filled} for id, (pose, filled) in people.items()}
+        people.clear()
+        yield line | {"people": list(_with_steady(line["people"], entries))}
 
 
-def _written(entry: dict[str, Any], T_sensor_fixed: np.ndarray) -> dict[str, Any]:
-    """What is steady of a person as a line holds it."""
-    rounded = {
-        name: np.round(entry[name].astype(float), digits).tolist()
-        for name, digits in _SMOOTHED.items()
-        if name in entry
-    }
-    return rounded | {"joints": _transformed(T_sensor_fixed, entry["joints"]), "filled": entry["filled"]}
-
-
-def _steady(sightings: _Sightings, times: np.ndarray, own: Skeleton) -> Iterator[tuple[int, dict[str, Any]]]:
-    """A track's frames, from first to last, with what they say of the person's joints."""
-    rows = np.arange(sightings.rows[0], sightings.rows[-1] + 1)
+def _steady(poses: dict[int, Pose], times: np.ndarray) -> Iterator[tuple[int, Pose, bool]]:
+    """The smoothed poses of a track by row, first to last, and whether each was filled in. times: s, of all rows."""
+    rows = np.arange(min(poses), max(poses) + 1)
     # time that stands still or jumps back cannot be smoothed over: such frames stay as they are
     highest = np.maximum.accumulate(np.concatenate([[-np.inf], np.nan_to_num(times[rows], nan=-np.inf)]))[:-1]
     rows = rows[times[rows] > highest]
-    seen = np.isin(sightings.rows, rows)
-    places = np.searchsorted(rows, np.array(sightings.rows)[seen])
-    values = {}
-    for name, given in sightings.values.items():
-        if len(given) == len(sightings.rows):
-            values[name] = np.full((len(rows), *given[0].shape), np.nan)
-            values[name][places] = np.array(given)[seen]
-    track = smooth(TrackPoses(times=times[rows], skeleton=own, **values))
+    skeleton = next(iter(poses.values())).skeleton
+    track = smooth(TrackPoses.of_poses(times[rows], [poses.get(row) for row in rows.tolist()], skeleton))
     for i, row in enumerate(rows.tolist()):
-        if np.isfinite(track.joints[i]).all():
-            named = ((name, getattr(track, name)) for name in _SMOOTHED)
-            entry = {name: value[i].astype(np.float32) for name, value in named if value is not None}
-            filled = track.filled is not None and bool(track.filled[i])
-            yield row, entry | {"joints": track.joints[i].copy(), "filled": filled}
+        if (pose := track.pose(i)) is not None:
+            yield row, pose, row not in poses
+
+
+def _entry(pose: Pose, T_sensor_fixed: np.ndarray) -> dict[str, Any]:
+    """What a line holds of a smoothed pose."""
+    known = {name: (getattr(pose, name), digits) for name, digits in _SMOOTHED.items()}
+    values = {
+        name: value.astype(np.float32).astype(float).round(digits).tolist()
+        for name, (value, digits) in known.items()
+        if value is not None
+    }
+    return values | {"joints": _transformed(T_sensor_fixed, pose.joints)}
 
 
 def _with_steady(people: list[dict[str, Any]], entries: dict[int, dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """People of a line, with what is smoothed of them, then those who were hidden."""
     for person in people:
         yield person | entries.pop(person["track"], {})
     for id, entry in sorted(entries.items()):

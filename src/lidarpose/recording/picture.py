@@ -6,8 +6,8 @@ import numpy as np
 
 from lidarpose.geometry import transform_points
 from lidarpose.io.sources import Frame, Source
+from lidarpose.recording.coordinates import FixedFrame, moved_yaw
 from lidarpose.recording.output import counted
-from lidarpose.recording.predict_recording import fixed_from_sensor
 from lidarpose.sample import Box
 from lidarpose.viz.bird_eye import ScanPanel, draw_scans
 
@@ -19,31 +19,27 @@ class WaysPicture:
     """Collects where people are, line by line of the result, in the frame that stays where it is."""
 
     def __init__(self, up: str):
-        self._up = up
+        self._fixed = FixedFrame(up)
         self._frames: list[int] = []
         self._to_fixed: list[np.ndarray] = []
-        self._world: np.ndarray | None = None
         self._ways: dict[int | None, list[np.ndarray]] = {}
         self._yaws: dict[int | None, float] = {}
 
     def add(self, line: dict[str, Any]) -> None:
         if line["error"] is not None:
             return
-        if line["T_world_sensor"] is not None:
-            self._world = np.array(line["T_world_sensor"])
-        T_fixed_sensor = fixed_from_sensor(self._world, self._up)
+        T_fixed_sensor = self._fixed.from_sensor(line["T_world_sensor"])
         self._frames.append(line["frame"])
         self._to_fixed.append(T_fixed_sensor)
         # lines may hold people in the world's frame already
-        T = np.eye(4) if line.get("coordinates") == "world" else T_fixed_sensor
+        is_moved = line.get("coordinates") == "world"
+        T, R_upright = (np.eye(4), None) if is_moved else (T_fixed_sensor, self._fixed.R_upright)
         for person in line["people"]:
             if person["joints"] is not None:
                 joints = transform_points(T, np.array(person["joints"]))
                 self._ways.setdefault(person["track"], []).append((joints.min(0) + joints.max(0)) / 2)
                 if person["box"] is not None:
-                    yaw = person["box"]["yaw"]
-                    x, y, _ = T[:3, :3] @ fixed_from_sensor(None, self._up)[:3, :3].T @ [np.cos(yaw), np.sin(yaw), 0]
-                    self._yaws[person["track"]] = float(np.arctan2(y, x))
+                    self._yaws[person["track"]] = moved_yaw(person["box"]["yaw"], T, R_upright)
 
     def draw(self, source: Source, *, title: str) -> bytes:
         """The PNG; the source is read again for the points of some frames."""
@@ -70,7 +66,7 @@ class WaysPicture:
         """(n, 3) m of frames from the beginning to the end; of one where the sensor stays."""
         if not self._frames:
             return np.zeros((0, 3))
-        count = 1 if self._world is None else min(_FRAMES, len(self._frames))
+        count = 1 if self._fixed.T_world_sensor is None else min(_FRAMES, len(self._frames))
         clouds = []
         for row in np.linspace(len(self._frames) - 1, 0, count).astype(int).tolist():
             frame = next(source.frames(self._frames[row]), None)

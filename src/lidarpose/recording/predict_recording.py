@@ -1,44 +1,29 @@
-"""`predict_recording`: the people of every frame of a folder or recording, posed and, if asked, joined over time.
-
-Coordinates: the sensor's frame is that of a frame's points; the fixed frame is the world's where the sensor's poses are
-known, else the sensor's with z up. Tracks live in the fixed frame.
-"""
+"""`predict_recording`: the people of every frame of a folder or recording, posed and, if asked, joined over time."""
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, cast
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 
 from lidarpose.errors import InputError
-from lidarpose.geometry import UP_AXES, rotation_from_up, transform_points
-from lidarpose.inference.detection import KnownPlaces, Places, Search, detect_places, least_score, search_options
+from lidarpose.geometry import rotation_from_up
+from lidarpose.inference.detection import Places, detect_places, least_score, search_options
 from lidarpose.inference.inputs import as_origin, only_returns
 from lidarpose.inference.predictor import Predictor, check_choice, is_wide, predict_scan, predictor_of
-from lidarpose.inference.results import PersonPose, Poses
-from lidarpose.inference.scan import Scan
+from lidarpose.inference.results import Poses
+from lidarpose.inference.scan import Scan, up_text
 from lidarpose.io.sources import DamagedFrame, Frame, Source, open_source
 from lidarpose.io.sources.frame import DEFAULT_RATE
 from lidarpose.models import DEFAULT
 from lidarpose.recording.frame_boxes import FrameBoxes
-from lidarpose.sample import Box, Pose
+from lidarpose.recording.known_people import KnownPeople
 from lidarpose.skeleton import Skeleton
-from lidarpose.tracking.live import LiveFilter
-from lidarpose.tracking.tracker import Tracker, TrackState
 
 SCHEMA = "lidarpose.recording/1"
-# a known person is verified anew after so many seconds, and a place that held nobody looked at: between the two, so
-# that not all are due in one frame
-_TRUSTED = (1.6, 2.4)
-# who was not seen for longer, s, or may be farther off than this, m, is searched for like anybody else
-_RECENT, _MOST_DEVIATION = 0.5, 0.35
-# a detection within so many m, and standard deviations more, of where a track is expected may continue it
-_NEAR, _NEAR_DEVIATIONS = 0.4, 3.0
-# what is remembered of a person whom nobody sees, s
-_FORGOTTEN = 10.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,35 +57,42 @@ class FramePoses:
         return document | own | {"people": people, "error": self.error}
 
 
+class PosingOptions(TypedDict, total=False):
+    """How the frames of a recording are posed, see `FramePredictor`."""
+
+    boxes: "str | os.PathLike | Mapping[Any, Any] | None"
+    calib: str | os.PathLike | None
+    crop: bool
+    find: bool
+    min_score: float | None
+    max_range: float | None
+    max_people: int | None
+    background: "str | os.PathLike | Sequence | np.ndarray | None"
+    sensor_origin: tuple[float, float, float] | str | None
+    skeleton: str | None
+    up: str | Sequence[float]
+    track: bool
+    live: bool
+    model: "Predictor | str | os.PathLike | Callable[[], Predictor]"
+
+
 def predict_recording(
     source: "str | os.PathLike | Sequence[str | os.PathLike] | Source",
     *,
-    boxes: "str | os.PathLike | Mapping[Any, Any] | None" = None,
-    calib: str | os.PathLike | None = None,
-    crop: bool = False,
-    find: bool = False,
-    min_score: float | None = None,
-    max_range: float | None = None,
-    max_people: int | None = None,
-    background: "str | os.PathLike | Sequence | np.ndarray | None" = None,
-    sensor_origin: tuple[float, float, float] | str | None = None,
-    skeleton: str | None = None,
-    up: str | Sequence[float] = "z",
     columns: int | None = None,
     topic: str | None = None,
+    meta: str | os.PathLike | None = None,
     rate: float | None = None,
     start: float | None = None,
     end: float | None = None,
     every: int = 1,
-    track: bool = False,
-    live: bool = False,
-    model: "Predictor | str | os.PathLike | Callable[[], Predictor]" = DEFAULT,
+    **posing: Unpack[PosingOptions],
 ) -> Iterator[FramePoses]:
     """Poses of the people of each frame of a recording, one frame after the other.
 
     Args:
-        source: files, folders or recordings as `open_source` takes them, with columns, topic, rate, start, end and
-            every; or a source.
+        source: files, folders or recordings as `open_source` takes them, with columns, topic, meta, rate, start, end
+            and every; or a source.
         boxes: see `FrameBoxes`; with calib as in `predict`.
         crop, find, min_score, max_range, max_people, background, sensor_origin, skeleton, up, model: as in `predict`.
             Whether the frames are crops of one person is decided by the first one.
@@ -113,31 +105,16 @@ def predict_recording(
     Raises:
         InputError: options that contradict each other, or a source that cannot be read at all.
     """
-    if isinstance(source, str | os.PathLike) or isinstance(source, Sequence):
-        source = open_source(source, columns=columns, topic=topic, rate=rate, start=start, end=end, every=every)
-    steps = FramePredictor(
-        boxes=boxes,
-        calib=calib,
-        crop=crop,
-        find=find,
-        search=(min_score, max_range, max_people, background),
-        sensor_origin=sensor_origin,
-        skeleton=skeleton,
-        up=up,
-        columns=columns,
-        track=track,
-        live=live,
-        model=model,
-        name=source.name,
-    )
-    return steps.predict_all(source.frames())
+    if isinstance(source, str | os.PathLike | Sequence):
+        chosen: dict[str, Any] = {"topic": topic, "meta": meta, "rate": rate, "start": start, "end": end}
+        source = open_source(source, columns=columns, every=every, **chosen)
+    return FramePredictor(columns=columns, name=source.name, **posing).predict_all(source.frames())
 
 
 class FramePredictor:
     """Poses the frames of a recording in their order, and knows what the frames before said of people.
 
     Args:
-        search: (min_score, max_range, max_people, background) as in `predict`.
         name: of the recording, for reports.
         others: as of `predict_recording`.
     """
@@ -149,7 +126,10 @@ class FramePredictor:
         calib: str | os.PathLike | None = None,
         crop: bool = False,
         find: bool = False,
-        search: tuple[Any, Any, Any, Any] = (None, None, None, None),
+        min_score: float | None = None,
+        max_range: float | None = None,
+        max_people: int | None = None,
+        background: "str | os.PathLike | Sequence | np.ndarray | None" = None,
         sensor_origin: tuple[float, float, float] | str | None = None,
         skeleton: str | None = None,
         up: str | Sequence[float] = "z",
@@ -159,26 +139,27 @@ class FramePredictor:
         model: "Predictor | str | os.PathLike | Callable[[], Predictor]" = DEFAULT,
         name: str | None = None,
     ):
+        search = (min_score, max_range, max_people, background)
         is_searched = find or any(option is not None for option in search)
         check_choice(boxes, crop, is_searched)
         rotation_from_up(up)
-        self.up = up if isinstance(up, str) else ",".join(repr(float(value)) for value in up)
-        self.name, self.skeleton, self.is_tracked, self.live = name, skeleton, track or live, live
+        self.up, self.name, self.skeleton = up_text(up), name, skeleton
         self.boxes = None if boxes is None else FrameBoxes(boxes, calib=calib)
         self._origin = sensor_origin if sensor_origin is None else (as_origin(sensor_origin),)
         # whether the frames are crops: None until the first one tells
         self._is_crop = True if crop else False if is_searched or boxes is not None else None
-        self._search: Search = search_options(*search, columns)
-        # boxes that are given are all people
-        self._least_score = 0.0 if boxes is not None else least_score(self._search)
+        self._search = search_options(*search, columns)
         self._model = model
         self._loaded: Predictor | None = None
-        # what the frames before said
-        self._tracker = Tracker()
-        self._T_world_sensor: np.ndarray | None = None
-        self._people: dict[int, _Person] = {}
-        self._rejected = np.zeros((0, 4))
-        self._filters: dict[int, tuple[float, LiveFilter]] = {}
+        self.live, self.people = live, None
+        if track or live:
+            # boxes that are given are all people
+            least = 0.0 if boxes is not None else least_score(self._search)
+            self.people = KnownPeople(up=self.up, least_score=least, live=live)
+
+    @property
+    def is_tracked(self) -> bool:
+        return self.people is not None
 
     @property
     def predictor(self) -> Predictor:
@@ -228,21 +209,24 @@ class FramePredictor:
         of_frame = partial(FramePoses, index=frame.index, id=frame.id, time=frame.time, is_tracked=self.is_tracked)
         if isinstance(frame, DamagedFrame):
             return of_frame(poses=nobody, error=frame.error)
-        T_fixed_sensor = self._to_fixed(frame.T_world_sensor)
+        of_frame.keywords["T_world_sensor"] = frame.T_world_sensor
+        people, known = self.people, None
+        T_fixed_sensor = np.eye(4) if people is None else people.fixed.from_sensor(frame.T_world_sensor)
         time = frame.index / DEFAULT_RATE if frame.time is None else frame.time
         try:
             if isinstance(prepared, InputError):
                 raise prepared
             search = self._search if isinstance(prepared, Places) else None
-            known = self._known(time, T_fixed_sensor) if self.is_tracked and search is not None else None
+            if people is not None and search is not None:
+                known = people.expected(time, T_fixed_sensor)
             scan, poses = predict_scan(
                 prepared, lambda: self.predictor, search=search, known=known, skeleton=self.skeleton
             )
         except InputError as error:
-            return of_frame(poses=nobody, T_world_sensor=frame.T_world_sensor, error=str(error))
-        if self.is_tracked:
-            poses = self._tracked(time, scan, poses, T_fixed_sensor)
-        return of_frame(poses=replace(poses, source=self.name), T_world_sensor=frame.T_world_sensor)
+            return of_frame(poses=nobody, error=str(error))
+        if people is not None:
+            poses = people.update(time, scan, poses, T_fixed_sensor)
+        return of_frame(poses=replace(poses, source=self.name))
 
     def _scan(self, frame: Frame) -> Scan:
         points, notes = only_returns(frame.points)
@@ -259,173 +243,16 @@ class FramePredictor:
             origin = np.zeros(3) if frame.origin is None and not self._is_crop else frame.origin
         return replace(scan, origin=origin, warnings=(*frame.warnings, *notes))
 
-    # ---- tracks
-
-    def _to_fixed(self, T_world_sensor: np.ndarray | None) -> np.ndarray:
-        """T_fixed_sensor (4, 4); of a frame without the sensor's pose, where others have it, the last one."""
-        if T_world_sensor is not None:
-            self._T_world_sensor = np.asarray(T_world_sensor, float)
-        return fixed_from_sensor(self._T_world_sensor, self.up)
-
-    def _known(self, time: float, T_fixed_sensor: np.ndarray) -> KnownPlaces:
-        """Who is expected in this frame and was verified not long ago, in the sensor's frame."""
-        T_sensor_fixed = np.linalg.inv(T_fixed_sensor)
-        R_boxes_input = UP_AXES.get(self.up, UP_AXES["z"])
-        boxes, pelvises, others = [], [], []
-        states = []
-        for state in self._tracker.predicted(time):
-            person = self._people.get(state.id)
-            if person is None or not self._is_trusted(state, person, time):
-                others.append(state)
-                continue
-            states.append(state)
-            center, size = state.center, np.maximum(state.size, 0.1)
-            box = Box(center=center, size=size, yaw=state.yaw, score=person.score, mounted=person.mounted)
-            boxes.append(_moved(box, T_sensor_fixed, np.eye(3), R_boxes_input))
-            pelvises.append(transform_points(T_sensor_fixed, center + person.offset))
-        states += others
-        since = time - self._rejected[:, 3]
-        self._rejected = self._rejected[(since >= 0) & (since < _trusted(np.arange(len(self._rejected))))]
-        return KnownPlaces(
-            boxes=boxes,
-            pelvises=np.reshape(pelvises, (-1, 3)),
-            tracks=transform_points(T_sensor_fixed, np.reshape([state.center for state in states], (-1, 3))),
-            reach=np.array([_NEAR + _NEAR_DEVIATIONS * state.position_sd for state in states]),
-            rejected=transform_points(T_sensor_fixed, self._rejected[:, :3]),
-        )
-
-    def _is_trusted(self, state: TrackState, person: "_Person", time: float) -> bool:
-        """Whether somebody needs no verification."""
-        is_recent = state.age <= _RECENT and state.position_sd <= _MOST_DEVIATION
-        return is_recent and person.score >= self._least_score and 0 <= time - person.verified < _trusted(state.id)
-
-    def _tracked(self, time: float, scan: Scan, poses: Poses, T_fixed_sensor: np.ndarray) -> Poses:
-        """The people with the ids of their tracks, and what is remembered of them."""
-        if self._is_crop:
-            people = tuple(replace(person, id=0) for person in poses)
-            return replace(poses, people=self._steadied(time, people, T_fixed_sensor) if self.live else people)
-        if scan.rejected is not None:
-            places = transform_points(T_fixed_sensor, scan.rejected)
-            self._rejected = np.concatenate([self._rejected, np.insert(places, 3, time, axis=1)])
-        R_boxes_input = UP_AXES.get(self.up, UP_AXES["z"])
-        # whoever is searched for, or was given, has a box
-        own = [cast(Box, person.box) for person in poses]
-        pelvises = [_pelvis(person.pose) for person in poses]
-        if scan.verified is not None and scan.pelvises is not None:
-            # the box of somebody known goes with the pelvis
-            for i in np.flatnonzero(~scan.verified).tolist():
-                pelvis = scan.pelvises[i] if pelvises[i] is None else pelvises[i]
-                own[i] = replace(own[i], center=(own[i].center + pelvis - scan.pelvises[i]).round(4))
-        boxes = [_moved(box, T_fixed_sensor, R_boxes_input, np.eye(3)) for box in own]
-        is_weak = [box.score is not None and box.score < self._least_score for box in boxes]
-        # the surest are first
-        strong = len(boxes) - sum(is_weak)
-        ids = self._tracker.update(time, boxes[:strong], boxes[strong:])
-        for i, (id, box, pelvis) in enumerate(zip(ids, boxes, pelvises, strict=True)):
-            is_verified = scan.verified is not None and scan.verified[i]
-            if is_verified and id >= 0 and pelvis is not None and box.score is not None:
-                offset = transform_points(T_fixed_sensor, pelvis) - box.center
-                self._people[id] = _Person(verified=time, score=box.score, mounted=box.mounted, offset=offset)
-        self._people = {id: person for id, person in self._people.items() if time - person.verified < _FORGOTTEN}
-        named = tuple(
-            replace(person, id=id, box=replace(box, id=id))
-            for id, person, box in zip(ids, poses, own, strict=True)
-            if id >= 0
-        )
-        return replace(poses, people=self._steadied(time, named, T_fixed_sensor) if self.live else named)
-
-    def _steadied(self, time: float, people: tuple[PersonPose, ...], T_fixed_sensor: np.ndarray) -> tuple:
-        """Poses by the past of their tracks."""
-        T_sensor_fixed = np.linalg.inv(T_fixed_sensor)
-        gap = self._tracker.max_gap
-        self._filters = {id: own for id, own in self._filters.items() if 0 <= time - own[0] <= gap}
-        steady = []
-        for person in people:
-            if person.pose is None or not isinstance(person.id, int):
-                steady.append(person)
-                continue
-            _, own = self._filters.get(person.id) or (time, LiveFilter(person.skeleton))
-            pose = own.update(time, replace(person.pose, joints=transform_points(T_fixed_sensor, person.pose.joints)))
-            pose = pose and replace(pose, joints=transform_points(T_sensor_fixed, pose.joints))
-            self._filters[person.id] = time, own
-            steady.append(replace(person, pose=pose or person.pose))
-        return tuple(steady)
-
-    # ---- going on
-
     def state(self) -> dict[str, Any]:
         """What the frames so far said, as JSON holds it."""
-        own = {"is_crop": self._is_crop, "boxes_used": self.boxes is not None and self.boxes.was_used}
-        if not self.is_tracked:
-            return own
-        world = None if self._T_world_sensor is None else self._T_world_sensor.tolist()
-        return own | {
-            "tracker": self._tracker.state(),
-            "T_world_sensor": world,
-            "people": {id: person.state() for id, person in self._people.items()},
-            "rejected": self._rejected.tolist(),
-            "filters": {id: [time, own.state()] for id, (time, own) in self._filters.items()},
-        }
+        people = None if self.people is None else self.people.state()
+        boxes_used = self.boxes is not None and self.boxes.was_used
+        return {"is_crop": self._is_crop, "boxes_used": boxes_used, "people": people}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Goes on where the predictor whose `state()` this is would."""
         self._is_crop = state["is_crop"]
         if self.boxes is not None:
             self.boxes.was_used = state["boxes_used"]
-        if not self.is_tracked:
-            return
-        self._tracker = Tracker.from_state(state["tracker"])
-        world = state["T_world_sensor"]
-        self._T_world_sensor = None if world is None else np.array(world)
-        self._people = {int(id): _Person.from_state(own) for id, own in state["people"].items()}
-        self._rejected = np.array(state["rejected"], float).reshape(-1, 4)
-        self._filters = {int(id): (time, LiveFilter.from_state(own)) for id, (time, own) in state["filters"].items()}
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Person:
-    """Of a track: time s of the last verification, the score and mounted that it gave; offset (3,) m of the pelvis from
-    the box's center, in the fixed frame."""
-
-    verified: float
-    score: float
-    mounted: bool | None
-    offset: np.ndarray
-
-    def state(self) -> list:
-        return [self.verified, self.score, self.mounted, self.offset.tolist()]
-
-    @classmethod
-    def from_state(cls, state: list) -> "_Person":
-        verified, score, mounted, offset = state
-        return cls(verified=verified, score=score, mounted=mounted, offset=np.array(offset))
-
-
-def fixed_from_sensor(T_world_sensor: np.ndarray | None, up: str) -> np.ndarray:
-    """T_fixed_sensor (4, 4): to the world where the sensor's pose is known, else the sensor's frame with z up."""
-    if T_world_sensor is not None:
-        return T_world_sensor
-    level = np.eye(4)
-    level[:3, :3] = UP_AXES.get(up, UP_AXES["z"])
-    return level
-
-
-def _trusted(number: Any) -> Any:
-    """For how long what was verified holds, s."""
-    first, last = _TRUSTED
-    return first + (last - first) * (number % 5) / 4
-
-
-def _moved(box: Box, T: np.ndarray, R_upright_from: np.ndarray, R_upright_to: np.ndarray) -> Box:
-    """The box in another frame. R_upright (3, 3): of each frame to the one in which its boxes stand along z."""
-    heading = R_upright_from.T @ [np.cos(box.yaw), np.sin(box.yaw), 0.0]
-    x, y, _ = R_upright_to @ T[:3, :3] @ heading
-    return replace(box, center=transform_points(T, box.center), yaw=float(np.arctan2(y, x)))
-
-
-def _pelvis(pose: Pose | None) -> np.ndarray | None:
-    """(3,) m, or half way between the hips where the skeleton has none."""
-    if pose is None:
-        return None
-    names = ("pelvis",) if "pelvis" in pose.skeleton.joints else ("left_hip", "right_hip")
-    return pose.joints[[pose.skeleton.index(name) for name in names]].mean(0)
+        if self.people is not None:
+            self.people.restore(state["people"])

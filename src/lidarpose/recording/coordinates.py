@@ -1,0 +1,34 @@
+"""Coordinates of a recording: those of the sensor, in which points are, and of the fixed frame, in which tracks live:
+the world's where the sensor's poses are known, else the sensor's with z up."""
+
+import numpy as np
+
+from lidarpose.geometry import UP_AXES, rigid_transform
+
+
+class FixedFrame:
+    """The fixed frame as frames come. up: of the points, as in `predict`."""
+
+    def __init__(self, up: str):
+        self.R_upright = upright(up)
+        self.T_world_sensor: np.ndarray | None = None
+
+    def from_sensor(self, T_world_sensor: np.ndarray | list | None) -> np.ndarray:
+        """T_fixed_sensor (4, 4) of the next frame; without the sensor's pose, where others have it, the last one."""
+        if T_world_sensor is not None:
+            self.T_world_sensor = np.asarray(T_world_sensor, float)
+        return rigid_transform(self.R_upright, np.zeros(3)) if self.T_world_sensor is None else self.T_world_sensor
+
+
+def upright(up: str) -> np.ndarray:
+    """(3, 3): turns a frame with that axis up into the one in which its boxes stand along z."""
+    return UP_AXES.get(up, UP_AXES["z"])
+
+
+def moved_yaw(yaw: float, T: np.ndarray, R_from: np.ndarray | None = None, R_to: np.ndarray | None = None) -> float:
+    """The yaw of a box moved by T (4, 4), rad. R_from, R_to (3, 3): as of `upright`, of both frames; None where z is
+    up."""
+    heading = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    heading = T[:3, :3] @ (heading if R_from is None else R_from.T @ heading)
+    x, y, _ = heading if R_to is None else R_to @ heading
+    return float(np.arctan2(y, x))

@@ -1,0 +1,173 @@
+"""What the frames before say of people: their tracks, whose scores still hold, and which places held nobody."""
+
+from dataclasses import replace
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+
+from lidarpose.geometry import transform_points
+from lidarpose.inference.detection import KnownPlaces
+from lidarpose.inference.results import PersonPose, Poses
+from lidarpose.inference.scan import Scan
+from lidarpose.recording.coordinates import FixedFrame, moved_yaw
+from lidarpose.sample import Box, Pose
+from lidarpose.tracking.live import LiveFilter
+from lidarpose.tracking.tracker import Tracker, TrackState
+
+# a known person is verified anew after so many seconds, and a place that held nobody looked at: between the two, so
+# that not all are due in one frame
+_TRUSTED = (1.6, 2.4)
+# who was not seen for longer, s, or may be farther off than this, m, is searched for like anybody else
+_RECENT, _MOST_DEVIATION = 0.5, 0.35
+# a detection within so many m, and standard deviations more, of where a track is expected may continue it
+_NEAR, _NEAR_DEVIATIONS = 0.4, 3.0
+# what is remembered of a person whom nobody sees, s
+_FORGOTTEN = 10.0
+
+
+class _Verified(NamedTuple):
+    """Of a track: time s of the last verification, the score and mounted that it gave; offset (3,) m of the pelvis from
+    the box's center, in the fixed frame."""
+
+    time: float
+    score: float
+    mounted: bool | None
+    offset: list[float]
+
+
+class KnownPeople:
+    """The people of a recording as frames come, each with the number of a track.
+
+    Args:
+        up: of the points, as in `predict`.
+        least_score: people of a lower one continue tracks and begin none.
+        live: poses are made steady by the past.
+    """
+
+    def __init__(self, *, up: str, least_score: float, live: bool):
+        self.fixed = FixedFrame(up)
+        self.live = live
+        self._least_score = least_score
+        self._tracker = Tracker()
+        self._verified: dict[int, _Verified] = {}
+        # x, y, z m in the fixed frame, and time s
+        self._rejected = np.zeros((0, 4))
+        self._filters: dict[int, tuple[float, LiveFilter]] = {}
+
+    def expected(self, time: float, T_fixed_sensor: np.ndarray) -> KnownPlaces:
+        """Where people are expected in the next frame, those first who need no verification, in the sensor's frame."""
+        T_sensor_fixed = np.linalg.inv(T_fixed_sensor)
+        states = sorted(self._tracker.predicted(time), key=lambda state: not self._is_trusted(state, time))
+        boxes, pelvises = [], []
+        for state in states:
+            if self._is_trusted(state, time):
+                last, size = self._verified[state.id], np.maximum(state.size, 0.1)
+                center = transform_points(T_sensor_fixed, state.center)
+                yaw = moved_yaw(state.yaw, T_sensor_fixed, None, self.fixed.R_upright)
+                boxes.append(Box(center=center, size=size, yaw=yaw, score=last.score, mounted=last.mounted))
+                pelvises.append(transform_points(T_sensor_fixed, state.center + last.offset))
+        since = time - self._rejected[:, 3]
+        self._rejected = self._rejected[(since >= 0) & (since < _trusted(np.arange(len(self._rejected))))]
+        return KnownPlaces(
+            boxes=boxes,
+            pelvises=np.reshape(pelvises, (-1, 3)),
+            tracks=transform_points(T_sensor_fixed, np.reshape([state.center for state in states], (-1, 3))),
+            reach=np.array([_NEAR + _NEAR_DEVIATIONS * state.position_sd for state in states]),
+            rejected=transform_points(T_sensor_fixed, self._rejected[:, :3]),
+        )
+
+    def _is_trusted(self, state: TrackState, time: float) -> bool:
+        """Whether somebody needs no verification."""
+        last = self._verified.get(state.id)
+        if last is None or last.score < self._least_score or not 0 <= time - last.time < _trusted(state.id):
+            return False
+        return state.age <= _RECENT and state.position_sd <= _MOST_DEVIATION
+
+    def update(self, time: float, scan: Scan, poses: Poses, T_fixed_sensor: np.ndarray) -> Poses:
+        """The people of a frame with the numbers of their tracks; of a crop the one person is number 0."""
+        if scan.boxes is None:
+            people = tuple(replace(person, id=0) for person in poses)
+        else:
+            people = self._tracked(time, scan, poses, T_fixed_sensor)
+        return replace(poses, people=self._steadied(time, people, T_fixed_sensor) if self.live else people)
+
+    def _tracked(self, time: float, scan: Scan, poses: Poses, T_fixed_sensor: np.ndarray) -> tuple[PersonPose, ...]:
+        if scan.rejected is not None:
+            places = transform_points(T_fixed_sensor, scan.rejected)
+            self._rejected = np.concatenate([self._rejected, np.insert(places, 3, time, axis=1)])
+        # whoever is searched for, or was given, has a box
+        own = [cast(Box, person.box) for person in poses]
+        pelvises = [_pelvis(person.pose) for person in poses]
+        is_verified = np.zeros(len(own), bool) if scan.verified is None else scan.verified
+        if scan.verified is not None and scan.pelvises is not None:
+            # the box of somebody known goes with the pelvis
+            for i in np.flatnonzero(~scan.verified).tolist():
+                pelvis = scan.pelvises[i] if pelvises[i] is None else pelvises[i]
+                own[i] = replace(own[i], center=(own[i].center + pelvis - scan.pelvises[i]).round(4))
+        boxes = [
+            replace(
+                box,
+                center=transform_points(T_fixed_sensor, box.center),
+                yaw=moved_yaw(box.yaw, T_fixed_sensor, self.fixed.R_upright),
+            )
+            for box in own
+        ]
+        # the surest are first
+        strong = sum(box.score is None or box.score >= self._least_score for box in boxes)
+        ids = self._tracker.update(time, boxes[:strong], boxes[strong:])
+        for id, box, pelvis, is_new in zip(ids, boxes, pelvises, is_verified, strict=True):
+            if is_new and id >= 0 and pelvis is not None and box.score is not None:
+                offset = transform_points(T_fixed_sensor, pelvis) - box.center
+                self._verified[id] = _Verified(time, box.score, box.mounted, offset.tolist())
+        self._verified = {id: last for id, last in self._verified.items() if time - last.time < _FORGOTTEN}
+        people = zip(ids, poses, own, strict=True)
+        return tuple(replace(person, id=id, box=replace(box, id=id)) for id, person, box in people if id >= 0)
+
+    def _steadied(self, time: float, people: tuple[PersonPose, ...], T_fixed_sensor: np.ndarray) -> tuple:
+        """Poses by the past of their tracks."""
+        T_sensor_fixed = np.linalg.inv(T_fixed_sensor)
+        gap = self._tracker.max_gap
+        self._filters = {id: own for id, own in self._filters.items() if 0 <= time - own[0] <= gap}
+        steady = []
+        for person in people:
+            if person.pose is not None and isinstance(person.id, int):
+                _, own = self._filters.get(person.id) or (time, LiveFilter(person.skeleton))
+                joints = transform_points(T_fixed_sensor, person.pose.joints)
+                pose = cast(Pose, own.update(time, replace(person.pose, joints=joints)))
+                self._filters[person.id] = time, own
+                person = replace(person, pose=replace(pose, joints=transform_points(T_sensor_fixed, pose.joints)))
+            steady.append(person)
+        return tuple(steady)
+
+    def state(self) -> dict[str, Any]:
+        """What the frames so far said, as JSON holds it."""
+        world = self.fixed.T_world_sensor
+        return {
+            "tracker": self._tracker.state(),
+            "T_world_sensor": None if world is None else world.tolist(),
+            "verified": self._verified,
+            "rejected": self._rejected.tolist(),
+            "filters": {id: [time, own.state()] for id, (time, own) in self._filters.items()},
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes on where those whose `state()` this is would."""
+        self._tracker = Tracker.from_state(state["tracker"])
+        self.fixed.from_sensor(state["T_world_sensor"])
+        self._verified = {int(id): _Verified(*own) for id, own in state["verified"].items()}
+        self._rejected = np.array(state["rejected"], float).reshape(-1, 4)
+        self._filters = {int(id): (time, LiveFilter.from_state(own)) for id, (time, own) in state["filters"].items()}
+
+
+def _trusted(number: Any) -> Any:
+    """For how long what was verified holds, s."""
+    first, last = _TRUSTED
+    return first + (last - first) * (number % 5) / 4
+
+
+def _pelvis(pose: Pose | None) -> np.ndarray | None:
+    """(3,) m, or half way between the hips where the skeleton has none."""
+    if pose is None:
+        return None
+    names = ("pelvis",) if "pelvis" in pose.skeleton.joints else ("left_hip", "right_hip")
+    return pose.joints[[pose.skeleton.index(name) for name in names]].mean(0)
