@@ -22,19 +22,21 @@ from lidarpose.models.checkpoint import DAMAGED, DIGEST, load_checkpoint, read_h
 from lidarpose.models.config import NetworkConfig
 from lidarpose.models.export import ArrayModule, check, export
 from lidarpose.models.onnx import (
-    OUTPUTS,
     check_digest,
     expected_inputs,
     input_name,
     open_onnx,
     open_session,
+    output_names,
     voxelize_people,
 )
 from lidarpose.models.posenet import PoseNet
 
 CARD = {"command": "none", "note": "random"}
 # every kind of layer, few of each: what is traced takes as long as there are layers
-SMALL = NetworkConfig(size="small", channels=(16, 32, 32), head_channels=16, blocks=(0, 1, 0), convolution=8)
+SMALL = NetworkConfig(
+    size="small", channels=(16, 32, 32), head_channels=16, blocks=(0, 1, 0), convolution=8, person=True
+)
 
 
 def stored_network(path, config, seed=0):
@@ -90,7 +92,7 @@ def test_onnx_and_a_program_of_torch_give_what_torch_gives(folder, program, size
     network, header = load_checkpoint(folder / "net.safetensors")
     ours = OnnxBackend(folder / "net.onnx", threads=1).run(clouds, view)
     due = TorchBackend(network, header).run(clouds, view)
-    for name in ("vote", "confidence", "log_spread", "visible", "low", "step"):
+    for name in ("vote", "confidence", "log_spread", "visible", "person", "low", "step"):
         np.testing.assert_allclose(getattr(ours, name), getattr(due, name), rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(ours.heatmaps, due.heatmaps, rtol=1e-4, atol=1e-4)
     assert np.ptp(due.heatmaps[0]) > 0.1
@@ -150,7 +152,7 @@ def test_the_files_tell_what_they_are(folder, program):
     assert source == content_digest(folder / "net.safetensors", expected="a checkpoint")
     assert [value.name for value in session.get_inputs()] == expected_inputs(SMALL)
     assert "in_mid_neighbours" in expected_inputs(SMALL)
-    assert [value.name for value in session.get_outputs()] == list(OUTPUTS)
+    assert [value.name for value in session.get_outputs()] == list(output_names(SMALL))
     shapes = {value.name: value.shape for value in [*session.get_inputs(), *session.get_outputs()]}
     assert shapes["in_fine_position"] == ["people", "fine_rows", 3] and shapes["in_view"] == ["people", 5]
     assert shapes["in_mid_neighbours"] == ["people", "mid_rows", 27] and shapes["part"] == ["people", "fine_rows", 25]
@@ -276,7 +278,7 @@ def test_another_program_s_onnx_and_another_version_s(folder, tmp_path):
             with_entry("lidarpose", json.dumps(entry | {"config": entry["config"] | {"convolution": 0}})),
             "input in_coarse_neighbours is unknown",
         ),
-        (lambda model: model.graph.output.remove(model.graph.output[-1]), "output visible is missing"),
+        (lambda model: model.graph.output.remove(model.graph.output[-1]), "output person is missing"),
     ):
         assert_one_line(changed(folder, tmp_path / "x.onnx", change), words)
 

@@ -71,7 +71,8 @@ def random_network(config):
 
 def random_targets(people, part):
     known = torch.ones(people, 26, dtype=torch.bool)
-    return Targets(joints=torch.randn(people, 26, 3) * 0.3, known=known, visible=known, part=part)
+    somebody = torch.tensor([[1.0, torch.nan]]).expand(people, 2)
+    return Targets(joints=torch.randn(people, 26, 3) * 0.3, known=known, visible=known, part=part, person=somebody)
 
 
 @torch.inference_mode()
@@ -160,6 +161,7 @@ SMALL_ONE = {"size": "x", "channels": [4, 8, 8], "head_channels": 8, "blocks": [
         ({"convolution": -1}, "convolution must be a whole number from 0 to 16384, got -1"),
         ({"convolution": True}, "convolution must be a whole number from 0 to 16384, got True"),
         ({"skeleton": "cat"}, "unknown skeleton 'cat'"),
+        ({"person": 1}, "person must be true or false, got 1"),
     ],
 )
 def test_configurations_that_cannot_be(change, message):
@@ -410,3 +412,21 @@ def test_eight_people_can_be_learned_by_heart():
         for optimizer in made:
             optimizer.step()
     assert terms["mpjpe"] < 0.01
+
+
+def test_whether_somebody_is_there_is_learned_and_costs_the_joints_nothing():
+    """The head's own loss reaches nothing but the head, and what is not known teaches nothing."""
+    model = random_network(replace(TINY, person=True))
+    batch = batch_of([person(40), person(90, seed=1)])
+    part = torch.where(batch.fine.valid, torch.tensor(3), torch.tensor(-1))
+    targets = random_targets(2, part)
+    terms = losses(model(batch), replace(targets, person=torch.tensor([[1.0, torch.nan], [0.0, 1.0]])))
+    terms["person"].backward()
+    learned = {name for name, value in model.named_parameters() if value.grad is not None and value.grad.any()}
+    assert learned == {name for name, _ in model.named_parameters() if name.startswith("person.")}
+    unknown = losses(model(batch), replace(targets, person=torch.full((2, 2), torch.nan)))
+    assert unknown["person"] == 0 and terms["person"] > 0
+    without = random_network(TINY)
+    assert set(terms) - set(losses(without(batch), targets)) == {"person"}
+    without.load_state_dict({k: v for k, v in model.state_dict().items() if not k.startswith("person.")})
+    torch.testing.assert_close(model(batch).joints(), without(batch).joints(), atol=0, rtol=0)

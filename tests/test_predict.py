@@ -576,7 +576,7 @@ def test_results_follow_the_schema(model, points, tmp_path, name):
     assert all(0 <= i < len(joints) and 0 <= j < len(joints) for i, j in document["skeleton"]["bones"])
     assert set(document["model"]) == {"name", "version", "backend", "decode"}
     (person,) = document["people"]
-    keys = "id box score mounted num_points joints confidence spread visible out_of_range warnings"
+    keys = "id box score mounted num_points person second_person joints confidence spread visible out_of_range warnings"
     assert list(person) == keys.split()
     np.testing.assert_allclose(person["joints"], pose.joints, atol=1e-4)
     assert len(person["confidence"]) == len(person["spread"]) == len(person["visible"]) == len(joints)

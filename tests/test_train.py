@@ -71,7 +71,9 @@ def outputs(vote, **more):
 def targets(joints, **more):
     known = torch.ones(joints.shape[:2], dtype=torch.bool)
     part = torch.tensor([[1, 2, 0, -1]] * len(joints))
-    return Targets(**({"joints": joints, "known": known, "visible": known.float(), "part": part} | more))
+    nobody_says = torch.full((len(joints), 2), torch.nan)
+    own = {"joints": joints, "known": known, "visible": known.float(), "part": part, "person": nobody_says}
+    return Targets(**(own | more))
 
 
 def gradient(name, value, vote=ASTRAY, aims=None):

@@ -23,6 +23,8 @@ MIN_POINTS = 5
 CLIP_FRAMES = 16
 # what a pose may say of each joint
 PER_JOINT = ("confidence", "spread", "visible", "in_range")
+# and once a person
+PER_PERSON = ("person", "second_person")
 # the label of a joint: not labeled (its position is NaN), labeled though hidden or uncertain, labeled and seen
 UNLABELED, HIDDEN, SEEN = 0, 1, 2
 
@@ -39,7 +41,8 @@ class Pose:
     joints (..., J, 3) m; confidence (..., J) in [0, 1], the probability that the joint is within 10 cm;
     spread (..., J) m, the expected distance between the joint and the truth; visible (..., J) in [0, 1], the
     probability that the sensor sees the joint; in_range (..., J) bool, False where the joint may lie farther out than
-    it says, since it was found at the end of what the network can tell; frame names the frame of the joints.
+    it says, since it was found at the end of what the network can tell; person, second_person (...) in [0, 1], the
+    probabilities that the cloud shows a person, and a second one besides; frame names the frame of the joints.
     """
 
     joints: np.ndarray
@@ -48,11 +51,13 @@ class Pose:
     spread: np.ndarray | None = None
     visible: np.ndarray | None = None
     in_range: np.ndarray | None = None
+    person: np.ndarray | None = None
+    second_person: np.ndarray | None = None
     frame: str = "input"
 
     def __post_init__(self):
         count = len(self.skeleton)
-        _as_arrays(self, "joints", *PER_JOINT)
+        _as_arrays(self, "joints", *PER_JOINT, *PER_PERSON)
         if self.joints.ndim < 2 or self.joints.shape[-2:] != (count, 3):
             raise InputError(
                 f"Pose.joints of {self.skeleton.name} must be (..., {count}, 3), got {tuple(self.joints.shape)}"
@@ -61,6 +66,10 @@ class Pose:
             value = getattr(self, name)
             if value is not None and value.shape != self.joints.shape[:-1]:
                 raise InputError(f"Pose.{name} must be {self.joints.shape[:-1]}, one a joint, got {value.shape}")
+        for name in PER_PERSON:
+            value = getattr(self, name)
+            if value is not None and value.shape != self.joints.shape[:-2]:
+                raise InputError(f"Pose.{name} must be {self.joints.shape[:-2]}, one a person, got {value.shape}")
         if self.in_range is not None and self.in_range.dtype != bool:
             raise InputError(f"Pose.in_range must be true or false for each joint, got {self.in_range.dtype}")
 
@@ -137,7 +146,8 @@ class Sample:
 
     points (n, 3) float32 m in the sensor's frame, n = 0 is legal; center (3,) m, the origin of the person's own
     frame, which has the sensor's axes; part (n,) uint8, 0 = not body, 1 + j = the bone of SMPL-24's joint j;
-    ring (n,) int, the beam; pose in the sensor's frame; source tells where the sample came from.
+    ring (n,) int, the beam; pose in the sensor's frame; source tells where the sample came from; second_person_points:
+    how many points are somebody else's, None where that is not known.
 
     What networks of clips need besides: rotations (24, 3) rad, axis-angles of SMPL's joints, each relative to its
     parent, the pelvis' from SMPL's rest frame (y up, facing +z) to the sensor's; translation (3,) m, SMPL's trans as a
@@ -153,6 +163,7 @@ class Sample:
     box: Box | None = None
     source: str = ""
     frame_id: str = ""
+    second_person_points: int | None = None
     rotations: np.ndarray | None = None
     translation: np.ndarray | None = None
     background: np.ndarray | None = None

@@ -19,8 +19,8 @@ from lidarpose.io.files import content_digest, file_error
 from lidarpose.models.checkpoint import Header, read_header
 from lidarpose.models.config import BIN, NetworkConfig
 from lidarpose.models.decode import Decoder, out_of_range
-from lidarpose.models.onnx import OUTPUTS, input_name, open_onnx, voxelize_people
-from lidarpose.sample import CONFIDENCE_RADIUS, Pose
+from lidarpose.models.onnx import input_name, open_onnx, output_names, voxelize_people
+from lidarpose.sample import CONFIDENCE_RADIUS, PER_PERSON, Pose
 from lidarpose.skeleton import Skeleton
 
 # people a call; more fill the memory without being faster
@@ -36,7 +36,7 @@ class Raw:
     vote (B, J, 3) m: where the heatmaps' origin lies; heatmaps: logits (B, J, W) of x, y and z, None for a network
     without; low, step (3,) m: where bin 0 of each axis lies about the vote and how far apart bins are. Of networks that
     say so: confidence (B, J) logit of an error under `CONFIDENCE_RADIUS`, log_spread (B, J) log of the expected error
-    in m, visible (B, J) logit of being seen.
+    in m, visible (B, J) logit of being seen, person (B, 2) logits of a person and of a second one in the cloud.
     """
 
     vote: np.ndarray
@@ -46,6 +46,7 @@ class Raw:
     confidence: np.ndarray | None = None
     log_spread: np.ndarray | None = None
     visible: np.ndarray | None = None
+    person: np.ndarray | None = None
 
     @classmethod
     def from_joints(cls, joints: np.ndarray) -> "Raw":
@@ -66,6 +67,7 @@ class Raw:
             confidence=outputs["confidence"],
             log_spread=outputs["log_spread"],
             visible=outputs["visible"],
+            person=outputs.get("person"),
         )
 
 
@@ -91,7 +93,7 @@ class OnnxBackend:
         self.session, self.header, self.source = open_onnx(path, threads=threads)
         self._config = cast(NetworkConfig, self.header.config)
         # body parts are not used: outputs that are not requested are not computed
-        self._outputs = [name for name in OUTPUTS if name != "part"]
+        self._outputs = [name for name in output_names(self._config) if name != "part"]
 
     def __reduce__(self) -> tuple:
         # a session cannot go to another process, which opens the file anew
@@ -140,6 +142,7 @@ def estimates(raw: Raw, decoder: Decoder, skeleton: Skeleton) -> Pose:
     spread = None if raw.log_spread is None else np.exp(np.minimum(raw.log_spread.astype(float), _LARGEST_LOG_SPREAD))
     if confidence is None and raw.heatmaps is not None:
         confidence, spread = _from_heatmaps(raw, raw.heatmaps, joints - raw.vote)
+    of_person = {} if raw.person is None else dict(zip(PER_PERSON, _probability(raw.person).T, strict=True))
     return Pose(
         joints=joints,
         skeleton=skeleton,
@@ -147,6 +150,7 @@ def estimates(raw: Raw, decoder: Decoder, skeleton: Skeleton) -> Pose:
         spread=spread,
         visible=None if raw.visible is None else _probability(raw.visible),
         in_range=in_range,
+        **of_person,
     )
 
 

@@ -41,6 +41,8 @@ _TALLEST, _GIANT, _TRIMMED = 2.2, 3.0, (3, 97)
 _CLEARLY_SURER = 0.6
 # a crop that is so far across is no crop of one person, m
 _WIDEST_CROP = 20.0
+# a crop shows nobody below, and two people above this probability
+_NOBODY, _TWO = 0.05, 0.8
 # a half turn about x
 UPSIDE_DOWN = np.array([1.0, -1.0, -1.0])
 # joints that every skeleton has
@@ -93,6 +95,15 @@ def oversize_warning(points: np.ndarray, pose: Pose) -> str | None:
         f"the points are {high - low:.1f} m tall, taller than a person: expected meters, perhaps they are in feet or "
         "another unit, or the crop holds more than a person"
     )
+
+
+def company_warning(pose: Pose) -> str | None:
+    """The points show nobody, or more people than the one whose pose it is."""
+    if pose.person is not None and pose.person < _NOBODY:
+        return f"the points look unlike a person (person {float(pose.person):.2f}): is somebody in this crop?"
+    if pose.second_person is not None and pose.second_person > _TWO:
+        return "the points look like two people: the pose is of the one nearer to their middle"
+    return None
 
 
 def looks_unsure(pose: Pose, points: np.ndarray) -> bool:

@@ -12,7 +12,14 @@ import numpy as np
 from lidarpose.errors import InputError, check_int, check_name, missing_extra
 from lidarpose.geometry import UP_AXES, rotation_from_up
 from lidarpose.inference.backend import Backend, OnnxBackend, estimates, exported_beside
-from lidarpose.inference.checks import UPSIDE_DOWN, looks_unsure, oversize_warning, unit_warning, upside_down_warning
+from lidarpose.inference.checks import (
+    UPSIDE_DOWN,
+    company_warning,
+    looks_unsure,
+    oversize_warning,
+    unit_warning,
+    upside_down_warning,
+)
 from lidarpose.inference.inputs import (
     Clips,
     as_origin,
@@ -33,7 +40,7 @@ from lidarpose.models.checkpoint import read_header
 from lidarpose.models.decode import decoder
 from lidarpose.models.voxelize import WINDOW
 from lidarpose.progress import Progress
-from lidarpose.sample import MIN_POINTS, PER_JOINT, Box, Pose, center_of
+from lidarpose.sample import MIN_POINTS, PER_JOINT, PER_PERSON, Box, Pose, center_of
 from lidarpose.skeleton import SMPL24, Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
 from lidarpose.tracking.clip import TrackPoses
@@ -423,7 +430,7 @@ class Predictor:
                 continue
             pose, part = best[i]
             poses[i] = wanted_pose = pose.to(wanted)
-            notes += filter(None, (unit, _range_warning(wanted_pose)))
+            notes += filter(None, (unit, company_warning(pose), _range_warning(wanted_pose)))
             if unit:
                 continue
             if warning := oversize_warning(points, pose):
@@ -506,7 +513,7 @@ class Predictor:
             if near < MIN_POINTS or not np.isfinite(estimated.joints[k]).all():
                 poses.append(None)
                 continue
-            values = {name: getattr(estimated, name) for name in PER_JOINT}
+            values = {name: getattr(estimated, name) for name in (*PER_JOINT, *PER_PERSON)}
             of_person: dict[str, Any] = {name: value[k] for name, value in values.items() if value is not None}
             poses.append(replace(estimated, joints=estimated.joints[k] + centers[k], **of_person))
         return poses

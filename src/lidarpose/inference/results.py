@@ -81,6 +81,20 @@ class PersonPose:
         """(J,) bool: False where the joint may lie farther out than it says; None where the network does not say."""
         return self._of_pose("in_range")
 
+    @property
+    def person(self) -> float | None:
+        """The probability that the points show a person; None where the network does not say."""
+        return self._number("person")
+
+    @property
+    def second_person(self) -> float | None:
+        """The probability that they show a second person besides; None where the network does not say."""
+        return self._number("second_person")
+
+    def _number(self, name: str) -> float | None:
+        value = self._of_pose(name)
+        return None if value is None else float(value)
+
     def _of_pose(self, name: str) -> np.ndarray:
         return cast(np.ndarray, None if self.pose is None else getattr(self.pose, name))
 
@@ -108,6 +122,8 @@ class PersonPose:
             "score": None if self.score is None else round(self.score, 4),
             "mounted": self.box and self.box.mounted,
             "num_points": self.num_points,
+            "person": None if self.person is None else round(self.person, 4),
+            "second_person": None if self.second_person is None else round(self.second_person, 4),
             "joints": None if self.pose is None else _rounded(self.joints, 4),
             "confidence": _rounded(self.confidence, 3),
             "spread": _rounded(self.spread, 4),

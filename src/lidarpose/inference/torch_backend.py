@@ -15,7 +15,7 @@ from lidarpose.models import NETWORKS
 from lidarpose.models.baselines.baseline_config import pad_clouds, pad_frames
 from lidarpose.models.checkpoint import Header, load_checkpoint
 from lidarpose.models.export import ArrayModule
-from lidarpose.models.onnx import OUTPUTS, voxelize_people
+from lidarpose.models.onnx import output_names, voxelize_people
 from lidarpose.models.posenet import PoseNet
 from lidarpose.models.voxelize import WINDOW
 from lidarpose.sample import CLIP_FRAMES
@@ -78,7 +78,8 @@ class TorchBackend:
         except torch._dynamo.exc.TorchDynamoException as error:
             reason = " ".join(str(error).split())[:160]
             raise InputError(f"torch.compile failed ({reason}): leave compile away") from None
-        return Raw.from_pose({name: value.cpu().numpy() for name, value in zip(OUTPUTS, values, strict=True)})
+        names = output_names(self.network.config)
+        return Raw.from_pose({name: value.cpu().numpy() for name, value in zip(names, values, strict=True)})
 
 
 class _PaperBackend:

@@ -13,7 +13,7 @@ import numpy as np
 
 from lidarpose.errors import check_int
 from lidarpose.models.voxelize import view_features
-from lidarpose.sample import PER_JOINT, Pose
+from lidarpose.sample import PER_JOINT, PER_PERSON, Pose
 
 # a transform's answer counts by its mean confidence to this power: one flipped facing of four is outvoted
 _POWER = 8
@@ -80,7 +80,8 @@ def average(poses: list[Pose]) -> Pose:
     it."""
     if len(poses) == 1:
         return poses[0]
-    stacks = {name: np.stack([getattr(each, name) for each in poses]).astype(float) for name in _values(poses[0])}
+    names = [*_values(poses[0]), *(name for name in PER_PERSON if getattr(poses[0], name) is not None)]
+    stacks = {name: np.stack([getattr(each, name) for each in poses]).astype(float) for name in names}
     weight = np.ones(stacks["joints"].shape[:2])
     if "confidence" in stacks:
         weight = stacks["confidence"].mean(-1) ** _POWER

@@ -41,7 +41,8 @@ class NetworkConfig:
     channels: of the fine, mid and coarse level; head_channels: a head of attention; blocks: attention blocks (mid
     encoder, coarse, mid decoder); grid: edge of a fine voxel in meters (mid and coarse: 2 and 4 times); max_voxels:
     fine voxels a person at the most; parts: body parts and 0; heatmap: one of `HEATMAPS`; convolution: channels
-    of the submanifold convolutions before the blocks of the mid and coarse level, 0 for none.
+    of the submanifold convolutions before the blocks of the mid and coarse level, 0 for none; person: whether it says
+    if a crop shows a person, and a second one.
     """
 
     kind: ClassVar[str] = "pose"
@@ -56,6 +57,7 @@ class NetworkConfig:
     parts: int = 25
     heatmap: str = "window"
     convolution: int = 0
+    person: bool = False
 
     def __post_init__(self):
         # false in files of before it was a number
@@ -74,6 +76,8 @@ class NetworkConfig:
                 f"channels of the mid and coarse level must divide by head_channels, got {self.channels} "
                 f"and {self.head_channels}"
             )
+        if not isinstance(self.person, bool):
+            raise InputError(f"person must be true or false, got {self.person!r}")
         check_grid(self.grid)
         check_name("heatmap", self.heatmap, HEATMAPS)
         skeleton(self.skeleton)

@@ -19,10 +19,10 @@ from lidarpose.models.detector.detector_config import INPUTS, OUTPUT
 from lidarpose.models.detector.network import DetectorNet
 from lidarpose.models.onnx import (
     NO_DIGEST,
-    OUTPUTS,
     SOURCE,
     input_name,
     open_session,
+    output_names,
     voxelize_people,
     with_digest,
 )
@@ -40,16 +40,18 @@ _WORTH = 64
 
 
 class ArrayModule(nn.Module):
-    """A network as a function of a pyramid's arrays, named `names`, one after the other, giving `OUTPUTS` in order."""
+    """A network as a function of a pyramid's arrays, named `names`, one after the other, giving its
+    `output_names` in order."""
 
     def __init__(self, network: PoseNet, names: tuple[str, ...]):
         super().__init__()
         self.network = network
         self.names = names
+        self.outputs = output_names(network.config)
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
         out = self.network(Batch.from_arrays(dict(zip(self.names, tensors, strict=True)), tensors[0].device))
-        return tuple(getattr(out, name) for name in OUTPUTS)
+        return tuple(getattr(out, name) for name in self.outputs)
 
 
 def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = "onnx") -> None:
@@ -81,7 +83,9 @@ def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = 
         session = open_session(content, threads=1)
 
         def run(arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
-            return session.run(list(OUTPUTS), {input_name(name): array for name, array in arrays.items()})
+            return session.run(
+                list(output_names(network.config)), {input_name(name): array for name, array in arrays.items()}
+            )
 
         check(network, run)
         write_atomic(out, content)
@@ -136,7 +140,7 @@ def onnx_bytes(network: PoseNet, metadata: dict[str, str]) -> bytes:
     arrays = _people(network, _TRACED)
     names = [input_name(name) for name in arrays]
     module = ArrayModule(network, tuple(arrays))
-    return module_to_onnx(module, _tensors(arrays), (_axes(arrays),), names, OUTPUTS, metadata)
+    return module_to_onnx(module, _tensors(arrays), (_axes(arrays),), names, module.outputs, metadata)
 
 
 def module_to_onnx(
@@ -187,7 +191,7 @@ def check(network: PoseNet, run: Callable[[dict[str, np.ndarray]], list[np.ndarr
         arrays = _people(network, sizes)
         with torch.inference_mode():
             expected = ArrayModule(network.eval(), tuple(arrays))(*_tensors(arrays))
-        for name, tensor, got in zip(OUTPUTS, expected, run(arrays), strict=True):
+        for name, tensor, got in zip(output_names(network.config), expected, run(arrays), strict=True):
             _check_close(name, tensor.numpy(), got)
 
 

@@ -4,6 +4,8 @@ Legend: B people, N rows (padded), K keys (padded), C channels, H heads, D chann
 joints, W heatmap bins.
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -304,3 +306,22 @@ class JointHead(nn.Module):
         if self.heatmap is None:
             return hidden[..., None, :0], *certainty
         return self.heatmap(hidden).unflatten(-1, (3, self.bins)), *certainty
+
+
+class PersonHead(nn.Module):
+    """Whether a crop shows a person, and a second one: from the means of anchors and voxels and what the joints' head
+    says of every joint. It learns nothing of its inputs, which are the joints' alone."""
+
+    def __init__(self, channels: int, voxel_channels: int, joints: int):
+        super().__init__()
+        self.norm = nn.LayerNorm(channels + voxel_channels)
+        self.hidden = nn.Sequential(nn.Linear(channels + voxel_channels + 3 * joints, 64), nn.SiLU())
+        self.out = nn.Linear(64, 2)
+
+    def forward(self, anchors: Tensor, voxels: Tensor, valid: Tensor, certainty: Sequence[Tensor]) -> Tensor:
+        """anchors (B, J, C), voxels (B, N, F), valid (B, N), certainty: confidence, log_spread, visible (B, J) ->
+        (B, 2) logits."""
+        weight = valid.to(voxels.dtype)[..., None]
+        mean = (voxels * weight).sum(1) / weight.sum(1).clamp(min=1)
+        features = self.norm(torch.cat([anchors.mean(1), mean], -1).detach())
+        return self.out(self.hidden(torch.cat([features, *(value.detach() for value in certainty)], -1)))

@@ -24,7 +24,7 @@ SOURCE = "lidarpose.source"
 NO_DIGEST = "0" * 64
 # a tensor in a file of its own: the key of where that lies, as protocol buffers write it
 _EXTERNAL = b"\n\x08location\x12"
-# what a network gives, in this order
+# what every network gives, in this order
 OUTPUTS = ("vote", "heatmap", "part", "confidence", "log_spread", "visible")
 # a network this small only waits for more threads than that
 _MOST_THREADS = 8
@@ -89,7 +89,7 @@ def open_onnx(path: str | os.PathLike, *, threads: int | None = None) -> tuple[A
     session, header = open_network(path, threads=threads)
     if not isinstance(header.config, NetworkConfig):
         raise file_error(path, f"expected a network of the kind pose, got {header.network}: use its .safetensors")
-    check_names(path, session, expected_inputs(header.config), OUTPUTS)
+    check_names(path, session, expected_inputs(header.config), output_names(header.config))
     return session, header, session.get_modelmeta().custom_metadata_map.get(SOURCE, "")
 
 
@@ -160,6 +160,11 @@ def _digest(content: bytes, start: int) -> bytes:
     digest.update(NO_DIGEST.encode())
     digest.update(memoryview(content)[start + len(NO_DIGEST) :])
     return digest.hexdigest().encode()
+
+
+def output_names(config: NetworkConfig) -> tuple[str, ...]:
+    """What an exported network gives, in this order."""
+    return (*OUTPUTS, "person") if config.person else OUTPUTS
 
 
 def expected_inputs(config: NetworkConfig) -> list[str]:

@@ -22,6 +22,7 @@ from lidarpose.models.layers import (
     Exchange,
     FeedForward,
     JointHead,
+    PersonHead,
     RotaryEmbedding,
     VoteHead,
     decode,
@@ -68,13 +69,15 @@ class Targets:
     joints (B, J, 3) m in the person's frame; known (B, J) bool: false where the truth is not known, for a dataset that
     labels some of the skeleton's joints; visible (B, J): 1 where some point lies near the joint, 0 where none does, NaN
     where that is not known, see `train.augment.seen`; part (B, F) int64, the majority part of each fine voxel's points,
-    -1 where padded or unknown.
+    -1 where padded or unknown; person (B, 2): 1 where the crop shows a person, and a second one, 0 where it does not,
+    NaN where that is not known.
     """
 
     joints: Tensor
     known: Tensor
     visible: Tensor
     part: Tensor
+    person: Tensor
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray], device: torch.device | str = "cpu") -> "Targets":
@@ -89,7 +92,8 @@ class Outputs:
     (vote is then zero), W = 0 where it has no heatmaps; part (B, N, P) logits of each fine voxel, 0 = not body;
     confidence (B, J) logit of an error under 10 cm; log_spread (B, J) log of the expected error in m; visible (B, J)
     logit of the joint being seen; level_joints: one (B, J, 3) m a coarser level, read off its anchors; has_votes:
-    whether the network votes at all.
+    whether the network votes at all; person (B, 2) logits of a person and of a second one in the crop, where the
+    network has them.
     """
 
     vote: Tensor
@@ -100,6 +104,7 @@ class Outputs:
     visible: Tensor
     level_joints: tuple[Tensor, ...]
     has_votes: bool = True
+    person: Tensor | None = None
 
     def joints(self) -> Tensor:
         """(B, J, 3) m: the vote plus the heatmap's offset."""
@@ -135,6 +140,7 @@ class PoseNet(nn.Module):
         bins = round(2 * REACH[config.heatmap] / BIN) if config.heatmap in REACH else 0
         self.joint = JointHead(width, fine if self.vote is not None else 0, bins)
         self.part = nn.Linear(fine, config.parts)
+        self.person = PersonHead(width, fine, joints) if config.person else None
 
     def forward(self, batch: Batch) -> Outputs:
         fine, mid, coarse = batch.fine, batch.mid, batch.coarse
@@ -169,7 +175,9 @@ class PoseNet(nn.Module):
         vote, voter_features = torch.zeros_like(mid_joints), anchors[..., :0]
         if self.vote is not None:
             vote, voter_features = self.vote(anchors, fine_rows, fine.position, fine_bias)
-        heatmap, confidence, log_spread, visible = self.joint(anchors, voter_features, vote)
+        heatmap, *certainty = self.joint(anchors, voter_features, vote)
+        confidence, log_spread, visible = certainty
+        person = None if self.person is None else self.person(anchors, fine_rows, fine.valid, certainty)
         return Outputs(
             vote=vote,
             heatmap=heatmap,
@@ -179,6 +187,7 @@ class PoseNet(nn.Module):
             visible=visible,
             level_joints=(coarse_joints, mid_joints),
             has_votes=self.vote is not None,
+            person=person,
         )
 
     def _features(self, batch: Batch, places: RotaryEmbedding, mid_of_fine: Tensor, coarse_of_mid: Tensor) -> Tensor:
@@ -275,6 +284,9 @@ def expand_weights(network: PoseNet, config: NetworkConfig) -> PoseNet:
             )
     larger = PoseNet(config)
     learned = network.state_dict()
+    if small.channels != config.channels:
+        # small, soon learned, and of streams that mean something else now
+        learned = {name: value for name, value in learned.items() if not name.startswith("person.")}
     state = larger.state_dict()
     for name, value in state.items():
         if name in learned:

@@ -277,6 +277,8 @@ def _earlier_views(scene: Scene) -> tuple[View, ...]:
     return tuple(views)
 
 
+# part of a second person's points until they are counted
+_OTHER = 255
 # a second person: how often before the first one, as seen by the sensor; else beside
 _BEFORE = 0.3
 _BESIDE, _NEARER = (0.4, 1.0), (0.4, 2.5)
@@ -298,7 +300,7 @@ def _second_person(block: Bodies, row: int, place: Place, rng: np.random.Generat
         reach = least + gap * (most - least)
         shift = reach * np.array([np.cos(2 * np.pi * angle), np.sin(2 * np.pi * angle)])
     there = Place(feet=place.feet + [*shift, 0], yaw=2 * np.pi * yaw, distance=place.distance)
-    return Mesh(there.of_body(block.vertices[other]), block.faces)
+    return Mesh(there.of_body(block.vertices[other]), block.faces, np.full(len(block.faces), _OTHER, np.uint8))
 
 
 def _draw_sample(scene: Scene, bodies: Bodies, row: int, frame: int, rng: np.random.Generator) -> Sample:
@@ -346,6 +348,8 @@ def _crop(scene: Scene, bodies: Bodies, row: int, scan: Scan, rng: np.random.Gen
         part = np.concatenate([part, np.zeros(len(clusters), np.uint8)])
     inside = box.contains(points)
     points, ring, part = points[inside], ring[inside], part[inside]
+    others = int(np.count_nonzero(part == _OTHER))
+    part = np.where(part == _OTHER, np.uint8(0), part)
     if missing_part < config.noise.missing_part * config.hard:
         left = noise.part_removal(part, rng=rng)
         points, ring, part = points[left], ring[left], part[left]
@@ -357,6 +361,7 @@ def _crop(scene: Scene, bodies: Bodies, row: int, scan: Scan, rng: np.random.Gen
         ring=ring,
         pose=Pose(joints=place.of_body(bodies.joints[row]), skeleton=BODY26, frame="sensor"),
         box=box,
+        second_person_points=others,
         source="/".join(("synth", config.name, scene.sensor.name, *filter(None, ["+".join(acquisition.conditions)]))),
     )
 

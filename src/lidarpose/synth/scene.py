@@ -42,6 +42,7 @@ class RandomStream(IntEnum):
     CANDIDATES = 12
     ACQUISITION = 13
     MOTION = 14
+    OBJECT = 15
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -248,7 +249,7 @@ MOST_FRAMES = _FRAMES[1]
 def draw_acquisition(config: SceneConfig, draws: np.ndarray) -> Acquisition:
     """The acquisition that `draws` (ACQUISITION_DRAWS,), uniform in [0, 1), decide on; merged ones have one frame."""
     merged, accumulated, integration, inverted, sparse, crowded, several, drives, speed, *devices = draws.tolist()
-    hard = config.hard
+    hard = float(config.hard)
     names, distance, frames, moving, conditions = config.sensors, None, 1, 0.0, []
     if sparse < config.sparse * hard:
         names, distance = _SPARSE, (config.distance[0], min(config.distance[1], _SPARSE_FAR))

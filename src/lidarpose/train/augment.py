@@ -4,7 +4,7 @@ All happens in the person's own frame but for the crop. Legend: n points.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
@@ -19,6 +19,10 @@ from lidarpose.synth.noise import half_space_keep, jitter, noise_clusters, rando
 
 # half of the samples are centered as a user's cloud is, half about a guess of the pelvis, as in a second pass
 REFINED, PELVIS_ERROR = 0.5, 0.06
+# the same of a pelvis where nobody is, m
+_OBJECT_ERROR = 0.15
+# points of a second person from which on a crop is said to show two
+_FEWEST_OF_SECOND = 15
 # how often the sensor's position is kept from the network
 BLIND = 0.3
 # a joint of which the body's surface is seen within this distance is visible, m: hips lie 12 cm deep
@@ -43,7 +47,8 @@ class Example:
 
     points (n, 3) float32 m; part (n,) int: 0 = not body, 1 + j = the bone of SMPL-24's joint j, -1 = not known; joints
     (26, 3) float32 m of body26, NaN where there is no label; visible (26,) float32: 1 seen, 0 not, NaN not known;
-    view (5,): `voxelize.view_features`; seed: of what is drawn when the example is collated.
+    view (5,): `voxelize.view_features`; seed: of what is drawn when the example is collated; person (2,) float32:
+    whether somebody is there, and a second one besides, 1, 0 or NaN as of joints.
     """
 
     points: np.ndarray
@@ -52,6 +57,7 @@ class Example:
     visible: np.ndarray
     view: np.ndarray
     seed: int
+    person: np.ndarray = field(default_factory=lambda: np.full(2, np.nan, np.float32))
 
     @property
     def frames(self) -> tuple["Example", ...]:
@@ -143,6 +149,31 @@ def example(sample: Sample, rng: np.random.Generator, *, refined: float = REFINE
     points, joints = sample.points - center, sample.pose.joints - center
     visible = seen(joints, points[sample.part > 0]).astype(np.float32)
     return _example(rng, points, joints, part=sample.part, visible=visible, view=view_features(center, origin))
+
+
+def people_in(sample: Sample) -> np.ndarray:
+    """`Example.person` of a synthetic sample. A second person of a few points is neither there nor not."""
+    others = sample.second_person_points or 0
+    known = not 0 < others < max(_FEWEST_OF_SECOND, 0.1 * len(sample.points))
+    return np.array([1, float(others > 0) if known else np.nan], np.float32)
+
+
+def object_example(sample: Sample, rng: np.random.Generator, *, refined: float = REFINED) -> Example:
+    """A crop in which nobody is, as a training step shows it: about the points' center or about one that a pelvis was
+    taken to be at (refined: how often)."""
+    center = sample.center
+    if rng.random() < refined:
+        center = center + rng.normal(0, _OBJECT_ERROR, 3)
+    origin = None if rng.random() < BLIND else np.zeros(3)
+    return _example(
+        rng,
+        sample.points - center,
+        np.full((len(BODY26), 3), np.nan),
+        part=np.full(len(sample.points), UNKNOWN_PART),
+        visible=np.full(len(BODY26), np.nan, np.float32),
+        view=view_features(center, origin),
+        person=np.zeros(2, np.float32),
+    )
 
 
 def augmented(sample: LabeledSample, kind: Augmentation, rng: np.random.Generator) -> Example:

@@ -13,7 +13,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
 from math import floor, gcd
 from operator import attrgetter
@@ -27,6 +27,7 @@ from lidarpose.errors import InputError
 from lidarpose.sample import Sample
 from lidarpose.synth.bodies import PoseBank
 from lidarpose.synth.generator import Generator
+from lidarpose.synth.objects import draw_object
 from lidarpose.synth.scene import RandomStream, scene_config
 from lidarpose.train.augment import (
     REFINED,
@@ -37,6 +38,8 @@ from lidarpose.train.augment import (
     clip_example,
     disturbed,
     example,
+    object_example,
+    people_in,
 )
 from lidarpose.train.objectives.objective import Objective
 from lidarpose.train.torch_dataset import InMemoryDataset
@@ -65,8 +68,8 @@ class SyntheticSource:
 
     easy: how many samples it takes to rise from nothing to full; below the ceiling every difficulty is still sampled,
     harder ones more often, except in the paper's scenes, which have one difficulty; motion, subjects, captured,
-    strays, noise, set: see `recipes.Pretrain`; refined: see `example`. Raises InputError, at once, for an unknown scene
-    and for clips that cannot be read.
+    strays, noise, objects, set: see `recipes.Pretrain`; refined: see `example`. Raises InputError, at once, for an
+    unknown scene and for clips that cannot be read.
     """
 
     scene: str
@@ -77,6 +80,7 @@ class SyntheticSource:
     captured: float = 0.0
     strays: float = 0.0
     noise: float = 0.0
+    objects: float = 0.0
     set: tuple[str, ...] = ()
     refined: float = REFINED
 
@@ -97,11 +101,15 @@ class SyntheticSource:
 
     def example(self, index: int) -> Example:
         rng = np.random.default_rng([self.seed, RandomStream.SYNTHETIC_AUGMENTATION, index])
+        if self.objects and rng.random() < self.objects:
+            thing, _ = draw_object(self._generator.config, self.seed, index)
+            return object_example(thing, rng, refined=self.refined)
         hard = min(index / self.easy, 1.0) if self.easy else 1.0
         if self.scene not in _OF_ONE_DIFFICULTY:
             hard *= np.sqrt(rng.random())
         sample = self._generator.person(self.seed, index, hard=hard).sample
-        return example(disturbed(sample, strays=self.strays, noise=self.noise, rng=rng), rng, refined=self.refined)
+        shown = example(disturbed(sample, strays=self.strays, noise=self.noise, rng=rng), rng, refined=self.refined)
+        return replace(shown, person=people_in(sample)) if self.objects else shown
 
     def clip(self, index: int, *, trans_center: bool) -> ClipExample:
         """A clip of somebody as difficult as the scene is."""

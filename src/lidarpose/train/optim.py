@@ -15,7 +15,7 @@ _FIRST, _LAST = 0.1, 1e-3
 # vectors, embeddings and the layers of a `PoseNet` that end in meters or logits
 _ENDS = (
     *("anchors", "stem.voxel", "stem.view", "place", "anchor_view", "level_joints", "vote.residual", "part"),
-    *("joint.heatmap", "joint.certainty"),
+    *("joint.heatmap", "joint.certainty", "person"),
 )
 # Newton-Schulz iteration of Muon
 _COEFFICIENTS, _ITERATIONS, _EPS = (3.4445, -4.775, 2.0315), 5, 1e-7

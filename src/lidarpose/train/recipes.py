@@ -32,7 +32,7 @@ HEADS = ("coordinates", "heatmaps")
 # what changes no sample: a resumed run may have others
 FREE = ("workers", "validate", "pictures", "precision")
 # shares of a whole that cannot be all of it
-_BELOW_ONE = ("ema", "mix", "hold_out")
+_BELOW_ONE = ("ema", "mix", "hold_out", "objects")
 _MODEL = "ours, dapt, prn, lpformer, lidarcap or ne"
 _OPTIONS = "options of a baseline's network: resample_with_replacement=true, grid=32, ... (docs/train.md)"
 _LEAST = {"batch": 1, "people": 1, "scenes": 1, "uses": 1}
@@ -167,6 +167,9 @@ class Pretrain(PoseRecipe):
     subjects: tuple[str, ...] = _setting((), "those of its clips to learn from, by the first part of names")
     strays: float = _setting(0.2, "how often stray points are about a person", "SHARE")
     noise: float = _setting(0.15, "how often all points are blurred, by 0.5 to 8 cm", "SHARE")
+    objects: float = _setting(
+        0.0, "share of crops in which nobody is; the network then says whether somebody is there", "SHARE"
+    )
     shards: tuple[str, ...] = _setting(
         (),
         "folders that `lidarpose synth` wrote, to learn from; scene and motion then choose validation people",

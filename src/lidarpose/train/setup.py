@@ -67,6 +67,8 @@ _NO_VALIDATION = (
 _LEAST_SEQUENCES = 3
 # chunks of a run between two times that a scan is shown: divides by the usual numbers of workers
 _LAG = 12
+# share of objects among the synthesized people of fine-tuning, for a network that says whether somebody is there
+_OBJECTS = 0.2
 
 
 Config = NetworkConfig | DaptConfig | BaselineConfig
@@ -185,6 +187,14 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
     check_name("network size", recipe.size, PRETRAINED)
     config, joints = PRETRAINED[recipe.size]
     config = _with_options(config, recipe.options)
+    if recipe.objects:
+        if not isinstance(config, NetworkConfig):
+            raise InputError(
+                f"objects are for the package's own networks, of which {recipe.size} is none: leave them away"
+            )
+        config = replace(config, person=True)
+        if recipe.shards:
+            raise InputError("objects are made during training, shards have none: leave either away")
     if (recipe.neck, recipe.head, recipe.drop_path) != ("mde", "coordinates", None):
         config = _switched(recipe, config)
     objective = objective_of(config, recipe, layout)
@@ -192,12 +202,12 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
     card: dict = {"motion": None if recipe.motion is None else Path(recipe.motion).name}
     if recipe.init:
         network, card["init_card"] = _expanded(recipe.init, config)
-    names = ("scene", "set", "motion", "subjects", "captured", "strays", "noise")
+    names = ("scene", "set", "motion", "subjects", "captured", "strays", "noise", "objects")
     synthetic: dict[str, Any] = {name: getattr(recipe, name) for name in names}
 
     def validation() -> Sequence[Example | ClipExample]:
         # as a user's cloud: centered on its points
-        held_out = SyntheticSource(seed=_VALIDATION_SEED, refined=0.0, **synthetic)
+        held_out = SyntheticSource(seed=_VALIDATION_SEED, refined=0.0, **(synthetic | {"objects": 0.0}))
         if isinstance(config, LidarcapConfig):
             clips = range(VALIDATION // config.frames)
             return [held_out.clip(index, trans_center=config.trans_center) for index in clips]
@@ -313,7 +323,9 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
     config, network = _finetuned(recipe, trained, joints, dataset.dataset)
     source: Source = StoredSource(dataset=dataset, seed=recipe.seed, augmentation=kind)
     if recipe.mix:
-        synthetic = SyntheticSource(scene=recipe.scene, seed=recipe.seed)
+        synthetic = SyntheticSource(
+            scene=recipe.scene, seed=recipe.seed, objects=_OBJECTS if getattr(config, "person", False) else 0.0
+        )
         source = MixedSource(main=source, other=synthetic, share=recipe.mix)
 
     def validation() -> list[Example]:

@@ -24,6 +24,8 @@ from lidarpose.train.objectives.objective import Share, alone, at_least_one, maj
 MAX_VOXELS = 224
 # weights; distances are in meters, so a weight of 10 brings 10 cm to order one
 VOTE, JOINTS, LEVEL, HEATMAP, PART, CONFIDENCE, SPREAD, VISIBLE = 10.0, 5.0, 2.0, 0.25, 0.25, 0.1, 0.05, 0.05
+# of what learns apart from all else
+PERSON = 1.0
 # width of the heatmap's target: 1.2 bins
 SIGMA = 0.036
 # bones as pairs (parent, child), and pairs of bones that mirror each other
@@ -68,6 +70,7 @@ class PoseNetObjective:
             "known": ~np.isnan(joints).any(-1),
             "visible": np.stack([e.visible for e in examples]),
             "part": part.reshape(valid.shape),
+            "person": np.stack([e.person for e in examples]),
         }
 
     def terms(
@@ -122,6 +125,10 @@ def losses(
     }
     if outputs.has_votes:
         terms["vote"] = VOTE * mean((outputs.vote.float() - true).norm(dim=-1))
+    if outputs.person is not None:
+        known_person = (~targets.person.isnan()).float()
+        missed_person = _binary(outputs.person, targets.person.nan_to_num(0.0)) * known_person
+        terms["person"] = PERSON * over(missed_person.sum(), known_person.sum())
     bins = outputs.heatmap.shape[-1]
     if bins:
         offset = true - outputs.vote.detach().float()

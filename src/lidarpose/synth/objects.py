@@ -1,0 +1,104 @@
+"""(seed, i) -> a crop in which nobody is: a thing that stands where a person might, cut out as if it were one.
+
+What a network learns from, and is judged by, that says whether a crop shows a person.
+"""
+
+import numpy as np
+
+from lidarpose.errors import InputError, check_int
+from lidarpose.lidar.presets import sensor
+from lidarpose.sample import Box, Sample, center_of
+from lidarpose.synth import noise
+from lidarpose.synth.environment.mesh import Mesh
+from lidarpose.synth.environment.surroundings import ground, surroundings
+from lidarpose.synth.environment.things import THINGS, draw_thing
+from lidarpose.synth.scene import RandomStream, SceneConfig, draw_place
+from lidarpose.synth.simulate import Scene, draw_conditions, simulate_scan
+
+# fewest points of an object's crop, and how often it is drawn again, each time nearer to the sensor
+LEAST_POINTS = 15
+_TRIES = 16
+# boxes: length and width, height, and how far their middle is off the thing, m
+_WIDE, _TALL, _OFF = (0.5, 1.2), (1.0, 2.2), 0.2
+# how often a box does not stand on the ground: part of something larger or higher
+_RAISED = 0.3
+# how often clusters of points stand alone, without a thing, and their largest number
+_CLUTTER, _MOST_CLUTTER = 0.05, 200
+# a thing wider than this is not looked at as a whole, m
+_REACH = 1.0
+
+
+def draw_object(config: SceneConfig, seed: int, index: int, *, left_out: bool = False) -> tuple[Sample, str]:
+    """Object `index` of `seed`, seen as the scene's people are.
+
+    Args:
+        config: scenes: sensors, distances, surroundings, noise.
+        left_out: a thing of the kinds that training never sees, or else of the others.
+
+    Returns:
+        The sample (level frame at the sensor, parts 0, no pose) and the kind of thing, a name of `THINGS` or "clutter".
+
+    Raises:
+        InputError: no draw left enough points, as where people stand out of the sensors' range.
+    """
+    seed, index = check_int("seed", seed, least=0), check_int("index", index, least=0)
+    rng = np.random.default_rng([seed, RandomStream.OBJECT, index])
+    weights = {name: thing.outdoors + thing.indoors for name, thing in THINGS.items() if thing.left_out is left_out}
+    share = np.array(list(weights.values())) / sum(weights.values())
+    for attempt in range(_TRIES):
+        alone = rng.random() < _CLUTTER and not attempt
+        name = "clutter" if alone else str(rng.choice(list(weights), p=share))
+        sample = _draw_sample(config, name, 0.85**attempt, rng)
+        if len(sample.points) >= LEAST_POINTS:
+            return sample, name
+    raise InputError(
+        f"scene {config.name}: no draw of {_TRIES} left {LEAST_POINTS} points on an object; does the range of its "
+        f"sensors hold {config.distance[0]:g} to {config.distance[1]:g} m?"
+    )
+
+
+def _draw_sample(config: SceneConfig, name: str, nearer: float, rng: np.random.Generator) -> Sample:
+    """A crop about a thing, perhaps without points."""
+    device = sensor(config.sensors[rng.integers(len(config.sensors))])
+    thing = draw_thing(name, rng) if name in THINGS else Mesh(np.zeros((3, 3), np.float32), np.zeros((0, 3), np.int32))
+    low, high = thing.vertices.min(0), thing.vertices.max(0)
+    reach = float(min(max(-low[0], -low[1], high[0], high[1], 0.2), _REACH))
+    place = draw_place(config, device, float(np.clip(high[2], 0.5, 2.0)), reach, nearer, rng)
+    own = Mesh(place.of_body(thing.vertices), thing.faces, np.ones(len(thing.faces), np.uint8))
+    background = [ground(config, place.feet, rng), *surroundings(config, place.feet, reach, rng)]
+    scene = Scene(
+        config=config, sensor=device, place=place, conditions=draw_conditions(config, device, rng),
+        background=background, props=[],
+    )  # fmt: skip
+    scan = simulate_scan(scene, [own, *background], rng)
+    points, ring = scan.points, scan.ring
+    middle = place.feet + [0, 0, 1.0]
+    returned = scan.points[scan.part > 0]
+    if not len(returned) and name in THINGS:
+        points, ring = points[:0], ring[:0]
+    elif name not in THINGS or rng.random() < config.noise.clutter:
+        clusters = noise.noise_clusters(middle, most=_MOST_CLUTTER, rng=rng).astype(np.float32)
+        points, ring = np.concatenate([points, clusters]), np.concatenate([ring, np.zeros(len(clusters), ring.dtype)])
+    if len(returned):
+        middle = returned[rng.integers(len(returned))].astype(float)
+    box = _draw_box(middle, float(place.feet[2]), rng)
+    inside = box.contains(points)
+    points, ring = points[inside], ring[inside]
+    return Sample(
+        points=points,
+        center=center_of(points) if len(points) else box.center,
+        part=np.zeros(len(points), np.uint8),
+        ring=ring,
+        box=box,
+        source=f"synth/{config.name}/{device.name}",
+    )
+
+
+def _draw_box(middle: np.ndarray, floor: float, rng: np.random.Generator) -> Box:
+    """A box of a person's size about `middle` (3,) m, as a detector that is wrong draws it; floor: z of the ground."""
+    size = np.array([*rng.uniform(*_WIDE, 2), rng.uniform(*_TALL)])
+    center = middle + [*(_OFF * rng.standard_normal(2)), 0]
+    raised, below = rng.random(2)
+    bottom = middle[2] - below * size[2] if raised < _RAISED else floor + 0.05 * rng.standard_normal()
+    center[2] = bottom + size[2] / 2
+    return Box(center=center, size=size, yaw=float(rng.uniform(-np.pi, np.pi)))
