@@ -26,7 +26,7 @@ from lidarpose.models.detector.detector import Detector
 from lidarpose.sample import Box
 from lidarpose.synth import street as streets
 from lidarpose.synth.environment.mesh import union
-from lidarpose.synth.scene import Place
+from lidarpose.synth.place import Place
 from lidarpose.tracking.assignment import assign
 from lidarpose.tracking.tracker import Tracker
 

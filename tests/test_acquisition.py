@@ -12,10 +12,12 @@ from lidarpose.lidar.presets import sensor
 from lidarpose.sample import Box
 from lidarpose.skeleton import BODY26
 from lidarpose.synth import generator
+from lidarpose.synth.acquisition import MOST_FRAMES, Acquisition, draw_acquisition
 from lidarpose.synth.bodies import draw_bodies, draw_moving_bodies
 from lidarpose.synth.generator import BLOCK, Generator
 from lidarpose.synth.noise import box_of_two
-from lidarpose.synth.scene import MOST_FRAMES, SCENES, Acquisition, draw_acquisition, draw_place
+from lidarpose.synth.place import draw_place
+from lidarpose.synth.scene import SCENES
 from lidarpose.synth.simulate import simulate
 from lidarpose.train.augment import disturbed
 

@@ -16,7 +16,8 @@ from lidarpose.synth import noise
 from lidarpose.synth.environment.mesh import Mesh
 from lidarpose.synth.noise import draw_box, laser_mask
 from lidarpose.synth.noise_kernels import lose_returns
-from lidarpose.synth.scene import SCENES, Place
+from lidarpose.synth.place import Place
+from lidarpose.synth.scene import SCENES
 from lidarpose.synth.simulate import REACH, ScanConditions, add_sensor_noise
 
 RNG = np.random.default_rng

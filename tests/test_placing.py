@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from lidarpose.lidar.presets import SENSORS, sensor
 from lidarpose.lidar.sensor import Sensor
-from lidarpose.synth.scene import SCENES, draw_distance, draw_height, draw_place
+from lidarpose.synth.place import draw_distance, draw_height, draw_place
+from lidarpose.synth.scene import SCENES
 
 WILD = SCENES["wild"]
 

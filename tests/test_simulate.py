@@ -14,8 +14,9 @@ from lidarpose.skeleton import BODY26
 from lidarpose.synth import generator, noise
 from lidarpose.synth.environment.mesh import Mesh, box, quad
 from lidarpose.synth.generator import Generator
+from lidarpose.synth.place import Place
 from lidarpose.synth.props.attachments import rigid_prop
-from lidarpose.synth.scene import SCENES, Place, scene_config
+from lidarpose.synth.scene import SCENES, scene_config
 from lidarpose.synth.simulate import Scan, ScanConditions, Scene, count_alone, draw_conditions, simulate_scan
 
 SEED = 11

@@ -13,7 +13,7 @@ from lidarpose.sample import Box
 from lidarpose.skeleton import BODY26
 from lidarpose.synth import street as module
 from lidarpose.synth.environment.mesh import quad
-from lidarpose.synth.scene import Place
+from lidarpose.synth.place import Place
 from lidarpose.synth.street import Street, StreetFrame, samples, street
 
 FRAMES = 4

@@ -39,9 +39,10 @@ from lidarpose.synth.environment.site import (
 )  # fmt: skip
 from lidarpose.synth.environment.things import KINDS, LEAVES
 from lidarpose.synth.environment.traffic import add_surroundings
+from lidarpose.synth.place import Place
 from lidarpose.synth.props import Prop, draw_props
 from lidarpose.synth.props.attachments import MOUNTS, PELVIS, rigid_prop, upright
-from lidarpose.synth.scene import Place, RandomStream
+from lidarpose.synth.scene import RandomStream
 from lidarpose.synth.simulate import ScanConditions, add_sensor_noise, label_box
 
 FAMILIES = ("train", "heldout", "bench")

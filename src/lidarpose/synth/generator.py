@@ -20,23 +20,13 @@ from lidarpose.lidar.ray_pattern import RayPattern
 from lidarpose.sample import CLIP_FRAMES, Box, PersonInfo, Pose, Sample, center_of
 from lidarpose.skeleton import BODY26
 from lidarpose.synth import noise
+from lidarpose.synth.acquisition import ACQUISITION_DRAWS, MOST_FRAMES, SINGLE_SCAN, Acquisition, draw_acquisition
 from lidarpose.synth.bodies import CLIP_HZ, Bodies, PoseBank, draw_bodies, draw_moving_bodies, draw_moving_body
 from lidarpose.synth.environment.mesh import Mesh
 from lidarpose.synth.environment.surroundings import ground, occluder, surroundings
+from lidarpose.synth.place import Place, draw_place, recorded_place
 from lidarpose.synth.props import draw_props
-from lidarpose.synth.scene import (
-    ACQUISITION_DRAWS,
-    MOST_FRAMES,
-    SINGLE_SCAN,
-    Acquisition,
-    Place,
-    RandomStream,
-    SceneConfig,
-    draw_acquisition,
-    draw_place,
-    recorded_place,
-    scene_config,
-)
+from lidarpose.synth.scene import RandomStream, SceneConfig, scene_config
 from lidarpose.synth.simulate import (
     Scan,
     Scene,

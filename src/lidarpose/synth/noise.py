@@ -10,7 +10,8 @@ import numpy as np
 
 from lidarpose.geometry import rotation_about
 from lidarpose.sample import Box
-from lidarpose.synth.scene import CropErrors, Place
+from lidarpose.synth.place import Place
+from lidarpose.synth.scene import CropErrors
 
 # --- the paper's laser-level mask: patches of the laser grid go missing, as behind something in the foreground
 

@@ -12,7 +12,8 @@ from lidarpose.synth import noise
 from lidarpose.synth.environment.mesh import Mesh
 from lidarpose.synth.environment.surroundings import ground, surroundings
 from lidarpose.synth.environment.things import THINGS, draw_thing
-from lidarpose.synth.scene import RandomStream, SceneConfig, draw_place
+from lidarpose.synth.place import draw_place
+from lidarpose.synth.scene import RandomStream, SceneConfig
 from lidarpose.synth.simulate import Scene, draw_conditions, simulate_scan
 
 # fewest points of an object's crop, and how often it is drawn again, each time nearer to the sensor

@@ -13,12 +13,14 @@ from lidarpose.lidar.ray_pattern import RayPattern
 from lidarpose.lidar.raycast import Hits, scan_divergent, scan_pattern
 from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import Box
+from lidarpose.synth.acquisition import SINGLE_SCAN, Acquisition
 from lidarpose.synth.bodies import Bodies
 from lidarpose.synth.environment.mesh import Mesh, union
 from lidarpose.synth.noise import direction_mask, laser_mask
 from lidarpose.synth.noise_kernels import lose_returns
+from lidarpose.synth.place import Place
 from lidarpose.synth.props import Prop
-from lidarpose.synth.scene import SINGLE_SCAN, Acquisition, Place, SceneConfig
+from lidarpose.synth.scene import SceneConfig
 
 # makers' range limits hold for targets that reflect about 80 percent; clothes at 20 percent are seen half as far
 REACH = 0.5

@@ -23,7 +23,8 @@ from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import Bodies, draw_moving_body
 from lidarpose.synth.environment import mesh as shapes
 from lidarpose.synth.environment.mesh import Mesh, shape, union
-from lidarpose.synth.scene import Place, RandomStream
+from lidarpose.synth.place import Place
+from lidarpose.synth.scene import RandomStream
 from lidarpose.synth.simulate import ScanConditions, add_sensor_noise, label_box
 
 # furniture stands so far behind the kerb, and half of the street's length that is built, m

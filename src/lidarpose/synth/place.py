@@ -1,0 +1,170 @@
+"""Where a person stands before a sensor, and how the sensor is mounted.
+
+Frames: the level frame at the sensor, z up, the ground under the person at -height, and the sensor's own.
+"""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from math import atan2, cos, pi, sin, tan
+
+import numpy as np
+
+from lidarpose.geometry import rotation_about
+from lidarpose.lidar.ray_pattern import RayPattern
+from lidarpose.lidar.sensor import Sensor
+from lidarpose.synth.scene import SceneConfig
+
+# a standing adult fills about this much of a sphere seen from one meter (silhouette, m2)
+_SILHOUETTE = 0.55
+# log-normal spread of point counts about the median: 5 to 95 percent are a factor of about 5
+_COUNT_SPREAD = 0.95
+# height of a sensor that hangs, m
+_HANGS = (2.0, 5.0)
+# share of people whom the edge of the sensor's field of view may cut
+_CUT = 0.05
+# standard deviation of a mount's pitch and roll, rad, in scenes whose mounts vary
+_MOUNT_TILT = np.radians(1.5)
+# a sensor tilted by more than this looks at people ahead of it, within this azimuth, rad
+_TILTED, _AHEAD = np.radians(10.0), np.radians(50.0)
+# lasers nearer than this share one elevation, rad
+_SAME_ELEVATION = 1e-9
+# edges of a field of view steeper than this leave room for anybody, rad
+_STEEPEST = np.radians(80.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """Where somebody stands, in the level frame at the sensor: feet (3,) m, yaw rad, distance m (horizontal);
+    R_sensor_level (3, 3): the mount, None where the sensor is level."""
+
+    feet: np.ndarray
+    yaw: float
+    distance: float
+    R_sensor_level: np.ndarray | None = None
+
+    def of_body(self, points: np.ndarray) -> np.ndarray:
+        """Points (n, 3) of a body that faces +x on the origin, where it stands: in the level frame."""
+        c, s = cos(self.yaw), sin(self.yaw)
+        turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], points.dtype)
+        return points @ turn + self.feet.astype(points.dtype)
+
+    def to_sensor(self, points: np.ndarray) -> np.ndarray:
+        """Points (n, 3) of the level frame in the sensor's."""
+        return points if self.R_sensor_level is None else points @ self.R_sensor_level.T.astype(points.dtype)
+
+    def to_level(self, points: np.ndarray) -> np.ndarray:
+        """Points (n, 3) of the sensor's frame in the level one."""
+        return points if self.R_sensor_level is None else points @ self.R_sensor_level.astype(points.dtype)
+
+
+def draw_place(
+    config: SceneConfig, device: Sensor | RayPattern, tall: float, wide: float, nearer: float, rng: np.random.Generator,
+    inverted: bool = False,
+) -> Place:  # fmt: skip
+    """Somebody `tall` m, who reaches `wide` m to the sides, before a sensor. Paper: section "Scene sampling".
+
+    `nearer` scales the distance, for another try at somebody of whom too little was seen; `inverted`: the sensor hangs
+    upside down.
+    """
+    distance = max(draw_distance(config, device, rng) * nearer, config.distance[0])
+    ahead, yaw, escape = rng.random(3).tolist()
+    azimuth = _azimuth(device, atan2(wide, distance), ahead, escape < _CUT or not config.mount)
+    pitch, roll = 0.0 if inverted else device.tilt, 0.0
+    if config.mount:
+        pitch, roll = pitch + _MOUNT_TILT * rng.standard_normal(), _MOUNT_TILT * rng.standard_normal()
+    mount = rotation_about("x", roll) @ rotation_about("y", -pitch) if pitch or roll else None
+    height = device.height
+    if inverted:
+        height = float(rng.uniform(*_HANGS))
+        level = np.eye(3) if mount is None else mount
+        mount = rotation_about("x", pi) @ level @ _aim_inverted(device, distance, tall, height, azimuth)
+    elif config.mount:
+        height = draw_height(device, distance, tall, config.mount, pitch, azimuth, rng)
+    return Place(
+        feet=np.array([distance * cos(azimuth), distance * sin(azimuth), -height]),
+        yaw=float(2 * np.pi * yaw - np.pi),
+        distance=float(distance),
+        R_sensor_level=mount,
+    )
+
+
+def recorded_place(place: Place, recorded: np.ndarray) -> Place:
+    """`place` with x, y m and heading rad of a recording (3,) instead of random ones."""
+    x, y, yaw = recorded.astype(float)
+    return replace(place, feet=np.array([x, y, place.feet[2]]), yaw=float(yaw), distance=float(np.hypot(x, y)))
+
+
+def _azimuth(device: Sensor | RayPattern, half_width: float, share: float, cut: bool) -> float:
+    """Uniform over the sensor's field of view, with the whole person inside it unless it may `cut` them."""
+    low, high = (-np.pi, np.pi) if isinstance(device, Sensor) else device.azimuths
+    if abs(device.tilt) > _TILTED:
+        low, high = max(low, -_AHEAD), min(high, _AHEAD)
+    if high - low < 2 * np.pi - 1e-6 and not cut:
+        half_width = min(half_width, (high - low) / 2)
+        low, high = low + half_width, high - half_width
+    return float(low + share * (high - low))
+
+
+def draw_distance(config: SceneConfig, device: Sensor | RayPattern, rng: np.random.Generator) -> float:
+    """Horizontal distance to the person in meters.
+
+    Paper: uniform. Else the distance at which this sensor returns a log-normal number of points.
+    """
+    near, far = config.distance
+    if config.median_points == 0:
+        return float(rng.uniform(near, far))
+    count = config.median_points * np.exp(rng.normal(0, _COUNT_SPREAD))
+    return float(min(max(np.sqrt(_SILHOUETTE / (count * _beam(device))), near), far))
+
+
+@lru_cache(maxsize=64)
+def _beam(device: Sensor | RayPattern) -> float:
+    """Solid angle that a beam of the sensor stands for (where its rings lie closest), sr. Where most lasers share their
+    elevations, those of one elevation share the gap to the next."""
+    if isinstance(device, Sensor):
+        gaps = np.diff(device.elevations)
+        gap = np.median(gaps) if len(gaps) else 0.0
+        if gap < _SAME_ELEVATION:
+            gaps = gaps[gaps > _SAME_ELEVATION]
+            gap = np.median(gaps) if len(gaps) else np.radians(1.0)
+            gap *= (len(gaps) + 1) / len(device.elevations)
+        return device.azimuth_step * float(gap)
+    width = device.azimuths[1] - device.azimuths[0]
+    return float(width * np.diff(np.sin(device.elevations))[0] / len(device.frame(0).directions))
+
+
+def _aim_inverted(
+    device: Sensor | RayPattern, distance: float, tall: float, height: float, azimuth: float
+) -> np.ndarray:
+    """(3, 3) turn of a sensor before it is mounted upside down, `height` m above the ground: none where its fan, which
+    is mirrored, holds the whole person; else its middle is tilted to theirs."""
+    low, high = -device.elevations[-1], -device.elevations[0]
+    feet, head = atan2(-height, distance), atan2(tall - height, distance)
+    if low <= feet and head <= high:
+        return np.eye(3)
+    down = (low + high - feet - head) / 2
+    return rotation_about("z", azimuth) @ rotation_about("y", -down) @ rotation_about("z", -azimuth)
+
+
+def draw_height(
+    device: Sensor | RayPattern, distance: float, tall: float, spread: float, pitch: float, azimuth: float,
+    rng: np.random.Generator, cut: float = _CUT,
+) -> float:  # fmt: skip
+    """Height of the sensor above the person's ground in meters, jittered for mounts and slopes.
+
+    Where the person of `tall` m would reach out of the sensor's fan although there is room for them, the height is
+    moved until they fit, but for a share `cut` of people. `spread` m is the height's standard
+    deviation, `pitch` rad tilts the fan down at azimuth 0, `azimuth` rad is the person's.
+    """
+    mount, slope = rng.standard_normal(2).tolist()
+    height = device.height + spread * mount + 0.02 * slope * distance
+    down = pitch * cos(azimuth)
+    edges = [min(max(device.elevations[end] - down, -_STEEPEST), _STEEPEST) for end in (0, -1)]
+    low, high = distance * tan(edges[0]), distance * tan(edges[1])
+    if rng.random() < cut:
+        return float(height)
+    if high - low <= tall:
+        # taller than the fan: the middle of the fan looks at the middle of the person
+        return float(tall / 2 - (low + high) / 2)
+    # feet, at -height, not below the fan; head, at tall - height, not above it
+    return float(min(max(height, tall - high), -low))
