@@ -43,15 +43,15 @@ def street(times: int) -> np.ndarray:
 def worker(file: str) -> None:
     """Times a step of the package that Python finds, for each line that comes in."""
     import lidarpose
-    from lidarpose.inference import detection
+    from lidarpose.inference import detection, verification
     from lidarpose.models import weights_path
     from lidarpose.models.detector.detector import Detector
 
     points = np.load(file)
     detector, predictor = Detector(threads=1), lidarpose.load("small", threads=1, tta=1)
-    verifier = detection.OnnxBackend(weights_path("tiny").with_suffix(".onnx"), threads=1)
+    verifier = verification.OnnxBackend(weights_path("tiny").with_suffix(".onnx"), threads=1)
     # those of the package take all processors
-    detection._detector, detection._verifier = lambda: detector, lambda: verifier
+    detection._detector, verification._verifier = lambda: detector, lambda: verifier
     origin = np.zeros(3)
 
     def predict():

@@ -18,7 +18,8 @@ from ablation_tables import figures
 
 from lidarpose import evaluation
 from lidarpose.inference.backend import Raw, estimates
-from lidarpose.inference.predictor import PASSES, Predictor, load
+from lidarpose.inference.estimator import PASSES
+from lidarpose.inference.predictor import Predictor, load
 from lidarpose.inference.tta import TRANSFORMS, TTATransform, apply
 from lidarpose.io.files import write_atomic
 from lidarpose.sample import Pose
@@ -60,10 +61,10 @@ class Averaging(Predictor):
         super().__init__(predictor.backend, name=predictor.model["name"], decode=predictor.model["decode"])
         self._passes, self._tta, self.heatmaps = way.passes, way.transforms, way.heatmaps
 
-    def _augmented(self, clouds, centers, origin, clip=None) -> Pose:
+    def outputs(self, clouds, centers, origin, clip=None, *, transforms=TRANSFORMS[:1]) -> Pose:
         if not self.heatmaps:
-            return super()._augmented(clouds, centers, origin, clip)
-        raws = [self._raw(transform, clouds, centers, origin) for transform in self._tta]
+            return super().outputs(clouds, centers, origin, clip, transforms=transforms)
+        raws = [self._raw(transform, clouds, centers, origin) for transform in transforms]
         return estimates(_fused(raws), self._decoder, self.skeleton)
 
     def _raw(

@@ -356,13 +356,13 @@ def test_a_released_networks_joints_are_brought_in_order(dapt):
 
 
 def test_a_released_network_is_centered_on_the_hips(dapt, monkeypatch):
-    transformed, calls = dapt._transformed, []
+    outputs, calls = dapt.outputs, []
 
-    def recorded(transform, clouds, centers, *rest):
-        calls.append((centers, transformed(transform, clouds, centers, *rest)))
+    def recorded(clouds, centers, *rest, **more):
+        calls.append((centers, outputs(clouds, centers, *rest, **more)))
         return calls[-1][1]
 
-    monkeypatch.setattr(dapt, "_transformed", recorded)
+    monkeypatch.setattr(dapt, "outputs", recorded)
     dapt.predict(blob(200))
     (first, estimated), (second, _) = calls[:2]
     hips = estimated.joints[:, [WAYMO14.index("left_hip"), WAYMO14.index("right_hip")]].mean(1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarpose.eval.detector.detection_scores import match
-from lidarpose.inference.detection import final_score
+from lidarpose.inference.verification import final_score
 from lidarpose.train.detector.calibrate import fit, logistic, monotone, passing_score
 
 

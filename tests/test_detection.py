@@ -13,7 +13,7 @@ import lidarpose
 from lidarpose.cli import main
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
-from lidarpose.inference import detection
+from lidarpose.inference import detection, verification
 from lidarpose.lidar.raycast import scan
 from lidarpose.models.detector.detector import Detector
 from lidarpose.synth.bodies import draw_bodies
@@ -213,13 +213,13 @@ def test_the_final_score_is_what_the_header_says():
     weights |= {"mounted_confidence": -1.0, "mounted_log_spread": 0.4}
     logit = 0.5 + 3.0 + 1.6 + 3.0 + 0.5 + 0.175 - 0.2 - 0.3
     header = {"verification": weights | {"calibration": [[0.0, 10.0], [0.0, 1.0]]}}
-    np.testing.assert_allclose(detection.final_score(features, header), [logit / 10, 0])
+    np.testing.assert_allclose(verification.final_score(features, header), [logit / 10, 0])
     # without weights: the scorer's logit, less where the pose is unsure of somebody who stands
     header = {"calibration": [[-10.0, 10.0], [0.0, 1.0]]}
     spread = np.log([0.1, 0.3, 0.3])
     rows = np.column_stack([np.zeros(3), np.ones(3), spread, np.ones(3), [0, 0, 1]])
     np.testing.assert_allclose(
-        detection.final_score(rows, header), 0.5 - np.array([0, 0.075 * np.log(3), 0]), atol=1e-12
+        verification.final_score(rows, header), 0.5 - np.array([0, 0.075 * np.log(3), 0]), atol=1e-12
     )
 
 

@@ -11,7 +11,6 @@ import lidarpose
 from lidarpose import Box, InputError
 from lidarpose.cli import main
 from lidarpose.geometry import rotation_about
-from lidarpose.inference import predictor
 from lidarpose.io.sources.frame import Frame, FrameSource, IndexedRecording, Sweep
 from lidarpose.lidar.raycast import scan
 from lidarpose.recording import output
@@ -61,7 +60,7 @@ def model():
 def one_model(model):
     """The same loaded network for every command."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(predictor, "load", lambda *_, **__: model)
+        patch.setattr("lidarpose.inference.predictor.load", lambda *_, **__: model)
         yield
 
 
@@ -228,12 +227,12 @@ def test_tracks_of_a_moving_sensor_live_in_the_world(clouds, model):
 
 
 def test_known_people_are_not_verified_again_and_keep_their_score(clouds, model, monkeypatch):
-    from lidarpose.inference import detection
+    from lidarpose.inference import verification
 
     posed = []
-    verify = detection._posed
+    verify = verification._posed
     monkeypatch.setattr(
-        detection, "_posed", lambda d, chosen, *rest: posed.append(len(chosen)) or verify(d, chosen, *rest)
+        verification, "_posed", lambda d, chosen, *rest: posed.append(len(chosen)) or verify(d, chosen, *rest)
     )
     frames = list(lidarpose.predict_recording(moving_source(clouds), track=True, model=model))
     # a place beside them once

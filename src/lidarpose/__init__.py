@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from lidarpose.errors import LidarPoseError as LidarPoseError
     from lidarpose.inference.background import learn_background as learn_background
     from lidarpose.inference.detection import detect as detect
+    from lidarpose.inference.predict_scan import predict as predict
     from lidarpose.inference.predictor import Predictor as Predictor
     from lidarpose.inference.predictor import load as load
-    from lidarpose.inference.predictor import predict as predict
     from lidarpose.inference.results import PersonPose as PersonPose
     from lidarpose.inference.results import Poses as Poses
     from lidarpose.io.boxes import Boxes as Boxes
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "load": "lidarpose.inference.predictor",
     "Predictor": "lidarpose.inference.predictor",
-    "predict": "lidarpose.inference.predictor",
+    "predict": "lidarpose.inference.predict_scan",
     "predict_recording": "lidarpose.recording.predict_recording",
     "FramePoses": "lidarpose.recording.predict_recording",
     "detect": "lidarpose.inference.detection",

@@ -17,7 +17,7 @@ RENAMED = {
     "evaluate": "eval",
     "evaluate.metrics": "metrics",
     "infer": "inference",
-    "infer.files": "inference.predictor",
+    "infer.files": "inference.predict_scan",
     "infer.predictor": "inference.predictor",
     "infer.results": "inference.results",
     "io.formats": "io.point_cloud",

@@ -113,7 +113,8 @@ def _add_search(search, first: str = "") -> None:
 
 
 def _predict(options: argparse.Namespace) -> None:
-    from lidarpose.inference.predictor import load, predict
+    from lidarpose.inference.predict_scan import predict
+    from lidarpose.inference.predictor import load
     from lidarpose.io.files import atomic_path, check_apart, check_writable
 
     many = recordings.is_recording(options)

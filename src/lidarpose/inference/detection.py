@@ -8,7 +8,6 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import product
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
@@ -16,27 +15,23 @@ import numpy as np
 
 from lidarpose.errors import InputError, check_int
 from lidarpose.geometry import rotation_from_up
-from lidarpose.inference.backend import Backend, OnnxBackend, estimates
 from lidarpose.inference.background import is_static, read_background
 from lidarpose.inference.checks import flat_along_another_axis, scan_unit_warning, unlikely_origin
 from lidarpose.inference.inputs import as_origin, as_points, only_returns
 from lidarpose.inference.scan import Scan, read_scan, up_text
-from lidarpose.inference.tta import TTATransform, apply
+from lidarpose.inference.verification import KnownPlaces, rounded, verified
 from lidarpose.io.boxes import Boxes
-from lidarpose.models import weights_path
-from lidarpose.models.decode import decoder
 from lidarpose.models.detector.detector import Detections, Detector
 from lidarpose.models.detector.ground import estimate_up
-from lidarpose.sample import MIN_POINTS, Box, Pose
-from lidarpose.viz.person_view import facing
+from lidarpose.sample import MIN_POINTS, Box
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 # how far from the sensor people are searched, m
 MAX_RANGE = 40.0
-# detections that are posed, and how many at once, of like size: a batch costs as much as if all were its largest
-_POSED, _BATCH = 40, 16
+# detections that may be posed
+_POSED = 40
 # a scan of more points is thinned: what is farther away than this beyond the range first, m
 _MOST_POINTS, _BEYOND = 1_500_000, 15.0
 _CHUNK = 4_000_000
@@ -44,42 +39,8 @@ _CHUNK = 4_000_000
 _ENOUGH = 25_000
 # and which way is up
 _ENOUGH_FOR_UP = 250_000
-# what is posed: a column so wide, and so far below and above the detection's box, m
-_COLUMN, _BELOW, _ABOVE = 0.6, 0.15, 0.25
-# points around a detection that its final box may hold, m to each side
-_AROUND = 2.5
-# a box is so much larger than the joints on each side, m, beside another person no more than this; it ends half way to
-# the next person, less half a body
-_ROOM, _LEAST_ROOM, _HALF_BODY = 0.15, 0.1, 0.25
-# of two people whose pelvises are nearer than this the less certain one is the same person, m
-_SAME_PERSON = 0.3
 # less of a scan on its background, as a share, and it is the background of something else
 _LEAST_STATIC = 0.2
-# what the final score is made of, by detection: the scorer's logit; means over the joints of confidence and of the log
-# of spread, m; log of 1 + the points of the column; probability that the person is mounted
-FEATURES = ("logit", "confidence", "log_spread", "log_points", "mounted")
-# weights of the features and of products with "mounted", for a detector without its own
-_WEIGHTS = {
-    "bias": -1.5 * np.log(10),
-    "logit": 1.0,
-    "log_spread": -1.5,
-    "mounted": 1.5 * np.log(10),
-    "mounted_log_spread": 1.5,
-}
-# what joints can be at best, and the fewest and most points, between which a score is bounded before anybody is posed:
-# the least mean spread of a person's joints seen is 0.022 m
-_CONFIDENCES, _LOG_SPREADS, _LOG_POINTS = (0.0, 1.0), (np.log(0.012), 0.0), (np.log1p(MIN_POINTS), np.log1p(1e5))
-# a detection so near to where somebody is expected is that person, m, if no other is expected within the second
-# distance
-_EXPECTED, _ALONE = 0.5, 1.0
-# who is expected may have moved by so much out of the box, m
-_MOVED = 0.15
-# a place that held nobody is not looked at again for a while: a score below this share of the least, and a distance, m
-_NOBODY, _SAME_PLACE = 1 / 3, 0.3
-# the least score where a track is expected
-WEAK_SCORE = 0.1
-# decimals of meters in boxes, as they are written
-_DECIMALS = 4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -100,23 +61,6 @@ class Search:
             raise InputError(f"min score: expected a probability from 0 to 1, got {self.min_score!r}")
         if self.max_people is not None:
             check_int("max people", self.max_people, least=1)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class KnownPlaces:
-    """What the frames before say of a scan, in its frame.
-
-    boxes: of the K people who need no verification, where they are expected, with the scores they had when they were
-    verified; pelvises (K, 3) m; tracks (M, 3) m: where anybody is expected, the K first, within reach (M,) m: who is
-    not found there is searched for among detections of `WEAK_SCORE` or more; rejected (R, 3) m: places of detections
-    that were nobody.
-    """
-
-    boxes: Sequence[Box]
-    pelvises: np.ndarray
-    tracks: np.ndarray
-    reach: np.ndarray
-    rejected: np.ndarray
 
 
 def detect(
@@ -241,8 +185,9 @@ def verify_people(places: Places, search: Search, known: KnownPlaces | None = No
     # the boxes of a frame that leans are larger than their people: these are looked for anew
     leans = not np.allclose(given.R_boxes_input, scan.R_level_input)
     origin = None if scan.origin is None else scan.R_level_input @ scan.origin
-    here = None if known is None or leans else _level(known, scan)
-    people = _verified(places.detections, places.level, origin, search, here)
+    here = None if known is None or leans else known.level(scan.R_level_input)
+    header = (search.detector or _detector()).header
+    people = verified(places.detections, places.level, origin, header, least_score(search), search.max_people, here)
     boxes = [_in_input(box, scan, given) for box in people.boxes]
     searched = replace(scan, boxes=boxes, found_rows=people.rows)
     if known is None:
@@ -270,11 +215,6 @@ def detector_version() -> str:
 @cache
 def _detector() -> Detector:
     return Detector()
-
-
-@cache
-def _verifier() -> Backend:
-    return OnnxBackend(weights_path("tiny").with_suffix(".onnx"))
 
 
 # ---- the scan
@@ -341,213 +281,8 @@ def _in_input(box: Box, scan: Scan, given: Scan) -> Box:
         R_level_own = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
         size = np.abs(R_level_own.T @ R_boxes_level @ R_level_own) @ box.size
     center = given.R_boxes_input.T @ center
-    return _rounded(replace(box, center=center, size=size))
+    return rounded(replace(box, center=center, size=size))
 
 
 def _is_number(value: object) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool)
-
-
-# ---- the final score
-
-
-def verification_features(
-    detections: Detections, points: np.ndarray, origin: np.ndarray | None, backend: Backend | None = None
-) -> tuple[np.ndarray, Pose]:
-    """What the final score of detections in points (n, 3) m, level, from a sensor at origin (3,) or None is made of.
-
-    Args:
-        backend: what poses people; by default the bundled `tiny`.
-
-    Returns:
-        features (D, 5) in the order of `FEATURES`, and the poses, joints (D, 26, 3) m in the frame of the points; of
-        fewer than 5 points they are NaN.
-    """
-    every = np.arange(len(detections))
-    clouds = [points[rows] for rows in _rows_near(detections.centers, points)]
-    return _posed(detections, every, clouds, origin, backend or _verifier())
-
-
-def final_score(features: np.ndarray, header: dict) -> np.ndarray:
-    """features (D, 5) -> (D,) in [0, 1]: the probability that a detection is a person, by the detector's header."""
-    verification = header.get("verification") or {}
-    weights = verification if "logit" in verification else _WEIGHTS
-    value = dict(zip(FEATURES, features.T, strict=True))
-    value |= {f"mounted_{name}": value["mounted"] * value[name] for name in ("confidence", "log_spread")}
-    logit = np.full(len(features), float(weights.get("bias", 0.0)))
-    for name, values in value.items():
-        logit += weights.get(name, 0.0) * values
-    logits, probabilities = verification.get("calibration") or header["calibration"]
-    return np.nan_to_num(np.interp(logit, logits, probabilities))
-
-
-def _posed(
-    detections: Detections, chosen: np.ndarray, clouds: list[np.ndarray], origin: np.ndarray | None, backend: Backend
-) -> tuple[np.ndarray, Pose]:
-    """As `verification_features`, of the chosen detections (C,) and the points (n, 3) m near each of these; of the
-    others what comes from points is NaN."""
-    columns = [np.zeros((0, 3))] * len(detections)
-    for i, cloud in zip(chosen.tolist(), clouds, strict=True):
-        center, size = detections.centers[i], detections.sizes[i]
-        above = cloud[:, 2] - center[2]
-        inside = (above > -size[2] / 2 - _BELOW) & (above < size[2] / 2 + _ABOVE)
-        columns[i] = cloud[inside & (np.hypot(*(cloud[:, :2] - center[:2]).T) < _COLUMN)]
-    known = sorted((i for i, column in enumerate(columns) if len(column) >= MIN_POINTS), key=lambda i: len(columns[i]))
-    skeleton = backend.header.skeleton
-    joints = np.full((len(columns), len(skeleton), 3), np.nan)
-    confidence, spread = np.full((2, *joints.shape[:2]), np.nan)
-    for start in range(0, len(known), _BATCH):
-        batch = known[start : start + _BATCH]
-        clouds, view = apply(TTATransform(), [columns[i] for i in batch], detections.centers[batch], origin)
-        pose = estimates(backend.run(clouds, view), decoder("window"), skeleton)
-        joints[batch] = pose.joints + detections.centers[batch][:, None]
-        confidence[batch], spread[batch] = pose.confidence, pose.spread
-    points = np.log1p([len(column) for column in columns])
-    with np.errstate(invalid="ignore"):
-        features = (detections.logit, confidence.mean(1), np.log(spread).mean(1), points, detections.mounted)
-    poses = Pose(joints=joints, skeleton=skeleton, confidence=confidence, spread=spread)
-    return np.stack(features, -1).reshape(-1, len(FEATURES)), poses
-
-
-def _highest_score(detections: Detections, header: dict) -> np.ndarray:
-    """(D,): what `final_score` can be at most, whatever the pose. The score's logit is linear in what is unknown."""
-    highest = np.zeros(len(detections))
-    for unknown in product(_CONFIDENCES, _LOG_SPREADS, _LOG_POINTS):
-        columns = [detections.logit, *(np.full(len(detections), value) for value in unknown), detections.mounted]
-        highest = np.maximum(highest, final_score(np.stack(columns, -1), header))
-    return highest
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _People:
-    """N people, level, surest first: boxes, rows of their points, pelvises (N, 3) m, verified (N,) bool; rejected
-    (R, 3) m: detections that were nobody."""
-
-    boxes: list[Box]
-    rows: list[np.ndarray]
-    pelvises: np.ndarray
-    verified: np.ndarray
-    rejected: np.ndarray
-
-
-def _verified(
-    detections: Detections,
-    points: np.ndarray,
-    origin: np.ndarray | None,
-    search: Search,
-    known: KnownPlaces | None = None,
-) -> _People:
-    """The people among the detections, surest first, in boxes about their poses; of known people about where they are
-    expected."""
-    header = (search.detector or _detector()).header
-    usual = least_score(search)
-    least = np.full(len(detections), usual)
-    highest = _highest_score(detections, header)
-    expected = np.full(len(detections), -1)
-    if known is not None:
-        expected = _expected(detections, highest >= usual, known)
-        is_missed = ~np.isin(np.arange(len(known.tracks)), expected)
-        is_near = (_apart(detections.centers, known.tracks[is_missed]) < known.reach[is_missed]).any(1)
-        least[is_near] = min(usual, WEAK_SCORE)
-        is_nobody = (_apart(detections.centers, known.rejected) < _SAME_PLACE).any(1)
-        least[is_nobody & ~is_near & (expected < 0)] = np.inf
-    possible = np.flatnonzero(highest >= least)
-    near = dict(zip(possible.tolist(), _rows_near(detections.centers[possible], points), strict=True))
-    posed = possible[expected[possible] < 0]
-    features, poses = _posed(detections, posed, [points[near[i]] for i in posed.tolist()], origin, _verifier())
-    scores = final_score(features, header)
-    pelvis = poses.joints[:, poses.skeleton.index("pelvis")].copy()
-    rejected = detections.centers[posed][scores[posed] < _NOBODY * usual]
-    if known is not None:
-        spared = np.flatnonzero(expected >= 0)
-        scores[spared] = [known.boxes[k].score for k in expected[spared].tolist()]
-        pelvis[spared] = known.pelvises[expected[spared]]
-    chosen: list[int] = []
-    for i in np.argsort(-scores, kind="stable"):
-        is_new = not (np.linalg.norm(pelvis[chosen] - pelvis[i], axis=1) < _SAME_PERSON).any()
-        if scores[i] >= least[i] and is_new and not np.isnan(pelvis[i]).any():
-            chosen.append(int(i))
-    boxes: list[Box] = []
-    rows: list[np.ndarray] = []
-    shown: list[int] = []
-    for i in chosen:
-        if known is not None and expected[i] >= 0:
-            box = known.boxes[expected[i]]
-            cropped, mounted = replace(box, size=box.size + 2 * _MOVED), box.mounted
-        else:
-            others = [np.hypot(*(pelvis[k] - pelvis[i])[:2]) for k in chosen if k != i and scores[k] >= usual]
-            alone = min(others, default=np.inf)
-            box = cropped = _box_about(Pose(joints=poses.joints[i], skeleton=poses.skeleton), alone)
-            mounted = bool(detections.mounted[i] > 0.5)
-        inside = cropped.contains(points[near[i]])
-        if inside.sum() < MIN_POINTS or len(boxes) == search.max_people:
-            continue
-        boxes.append(replace(box, id=len(boxes), score=round(float(scores[i]), _DECIMALS), mounted=mounted))
-        rows.append(near[i][inside])
-        shown.append(i)
-    return _People(boxes=boxes, rows=rows, pelvises=pelvis[shown], verified=expected[shown] < 0, rejected=rejected)
-
-
-def _expected(detections: Detections, is_sure: np.ndarray, known: KnownPlaces) -> np.ndarray:
-    """Of each detection, those that are sure enough, which known person it is: (D,) int, -1: none."""
-    expected = np.full(len(detections), -1)
-    sure = np.flatnonzero(is_sure)
-    if len(sure) and known.boxes:
-        away = _apart(detections.centers[sure], known.tracks[: len(known.boxes)])
-        is_alone = (_apart(known.tracks, known.tracks) < _ALONE).sum(0)[: len(known.boxes)] == 1
-        nearest = away.argmin(0)
-        for k in np.flatnonzero(is_alone & (away.min(0) < _EXPECTED)):
-            expected[sure[nearest[k]]] = k
-    return expected
-
-
-def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Level distances of a (A, 2+) from b (B, 2+): (A, B) m."""
-    return np.linalg.norm(a[:, None, :2] - b[None, :, :2], axis=-1)
-
-
-def _level(known: KnownPlaces, scan: Scan) -> KnownPlaces:
-    """In the scan's level frame."""
-    R_level_input = scan.R_level_input
-    return replace(
-        known,
-        boxes=[replace(box, center=R_level_input @ box.center) for box in known.boxes],
-        pelvises=known.pelvises @ R_level_input.T,
-        tracks=known.tracks @ R_level_input.T,
-        rejected=known.rejected @ R_level_input.T,
-    )
-
-
-def _box_about(pose: Pose, alone: float) -> Box:
-    """The box of a person by the pose, joints (J, 3) m; alone m: distance to the next person, who is to be kept out."""
-    forward = facing(pose)
-    yaw = 0.0 if forward is None else float(np.arctan2(forward[1], forward[0]))
-    c, s = np.cos(yaw), np.sin(yaw)
-    R_level_own = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    own = pose.joints @ R_level_own
-    beside = max(_LEAST_ROOM, min(_ROOM, alone / 2 - _HALF_BODY))
-    # soles are nearer to the lowest joint than the top of the head to the highest
-    low, high = own.min(0) - [beside, beside, 0.8 * _ROOM], own.max(0) + [beside, beside, 1.2 * _ROOM]
-    return _rounded(Box(center=R_level_own @ ((low + high) / 2), size=high - low, yaw=yaw))
-
-
-def _rounded(box: Box) -> Box:
-    """As it is written: a file of boxes crops the same points."""
-    center, size = box.center.round(_DECIMALS), box.size.round(_DECIMALS)
-    return replace(box, center=center, size=size, yaw=round(box.yaw, _DECIMALS))
-
-
-def _rows_near(centers: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
-    """Of each center the rows (k,) of the points (n, 3) m about it, ascending."""
-    # sorted by strips along x; of maps of more strips the last one holds the rest
-    start = points[:, 0].min(initial=0)
-    strip = np.minimum((points[:, 0] - start) / _AROUND, 65_535).astype(np.uint16)
-    order = np.argsort(strip, kind="stable")
-    ends = np.concatenate([[0], np.cumsum(np.bincount(strip, minlength=65_536))])
-    rows = []
-    for x, y in centers[:, :2]:
-        first, last = np.clip([(x - _AROUND - start) / _AROUND, (x + _AROUND - start) / _AROUND], 0, 65_535).astype(int)
-        near = order[ends[first] : ends[last + 1]]
-        near = near[np.abs(points[near, 1] - y) < _AROUND]
-        rows.append(np.sort(near[np.abs(points[near, 0] - x) < _AROUND]))
-    return rows

@@ -13,7 +13,8 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_from_up
 from lidarpose.inference.detection import Places, detect_places, least_score, search_options
 from lidarpose.inference.inputs import as_origin, only_returns
-from lidarpose.inference.predictor import Predictor, check_choice, is_wide, predict_scan, predictor_of
+from lidarpose.inference.predict_scan import check_choice, is_wide, predict_scan, predictor_of
+from lidarpose.inference.predictor import Predictor
 from lidarpose.inference.results import Poses
 from lidarpose.inference.scan import Scan, up_text
 from lidarpose.io.sources import DamagedFrame, Frame, Source, open_source

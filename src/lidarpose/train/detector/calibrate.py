@@ -10,7 +10,7 @@ import numpy as np
 from lidarpose.errors import InputError, check_int
 from lidarpose.eval.detector.detection_scores import match
 from lidarpose.eval.detector.evaluate_detector import run_detector
-from lidarpose.inference.detection import FEATURES, final_score, verification_features
+from lidarpose.inference.verification import FEATURES, final_score, verification_features
 from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.detector.detector import Detector
 from lidarpose.models.detector.network import DetectorNet
@@ -74,8 +74,8 @@ def calibrate(folder: str | Path, scans: int, *, labeled: str | Path | None = No
 def fit(features: np.ndarray, is_person: np.ndarray, scans: int) -> dict:
     """The entries "calibration", "verification" and "default_score" of a header.
 
-    features: (D, 5) of detections in so many scans, see `inference.detection.FEATURES`, NaN of those that could not be
-    posed; is_person: (D,). The default score lets `FALSE` false people a scan pass.
+    features: (D, 5) of detections in so many scans, see `inference.verification.FEATURES`, NaN of those that could not
+    be posed; is_person: (D,). The default score lets `FALSE` false people a scan pass.
     """
     posed = np.isfinite(features).all(1)
     own, labels = features[posed], is_person[posed]

@@ -1,0 +1,114 @@
+"""`PoseEstimator`: from people's points to poses: batches, the pass that finds the pelvis, test-time augmentation.
+
+Legend: N clouds, B those of a batch.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from lidarpose.inference.backend import Backend, estimates
+from lidarpose.inference.inputs import Clips
+from lidarpose.inference.tta import TTATransform, apply, average, invert, tta_transforms
+from lidarpose.models.decode import decoder
+from lidarpose.models.voxelize import WINDOW
+from lidarpose.progress import Progress
+from lidarpose.sample import MIN_POINTS, PER_JOINT, PER_PERSON, Pose, center_of
+
+# passes: the second is centered on the pelvis that the first estimated
+PASSES = 2
+# to which the center of the second pass is rounded, m: backends differ by less than a micrometer, which must not move a
+# point to another voxel
+_CENTER_DECIMALS = 2
+_CENTER_STEP = 10**-_CENTER_DECIMALS
+
+
+class PoseEstimator:
+    """A network, and how its answers become poses. decode, tta: as of `load`."""
+
+    def __init__(self, backend: Backend, *, decode: str = "window", tta: int = 1):
+        self.backend, self.header, self.skeleton = backend, backend.header, backend.header.skeleton
+        self._decoder, self._tta, self._passes = decoder(decode), tta_transforms(tta), PASSES
+        # the middle of a person: the pelvis, or half way between the hips where the skeleton has none
+        root = ("pelvis",) if "pelvis" in self.skeleton.joints else ("left_hip", "right_hip")
+        self._root = [self.skeleton.index(joint) for joint in root]
+
+    def outputs(
+        self,
+        clouds: list[np.ndarray],
+        centers: np.ndarray,
+        origin: np.ndarray | None,
+        clip: Clips | None = None,
+        *,
+        transforms: Sequence[TTATransform] = (TTATransform(),),
+    ) -> Pose:
+        """What the network says of clouds (n, 3) m seen about centers (B, 3), from a sensor at origin (3,) or None;
+        clip: of networks of clips, which of the clouds are frames of one person; the mean under all transforms."""
+        return average([self._transformed(transform, clouds, centers, origin, clip) for transform in transforms])
+
+    def _transformed(self, transform: TTATransform, clouds, centers, origin, clip) -> Pose:
+        about, view = apply(transform, clouds, centers, origin)
+        seen: dict[str, Any] = {}
+        if clip is not None:
+            seen["clip"] = clip.mapped(lambda around: apply(transform, around, centers, origin)[0])
+        return invert(estimates(self.backend.run(about, view, **seen), self._decoder, self.skeleton), transform)
+
+    def poses(
+        self,
+        clouds: Sequence[np.ndarray],
+        origin: np.ndarray | None,
+        *,
+        clips: Clips | None = None,
+        centers: np.ndarray | None = None,
+        progress: bool = False,
+    ) -> list[Pose | None]:
+        """The pose of each cloud (n, 3) m, None where too little of it is near its middle, and, of clips, where it is
+        in none; centers (N, 3) m: about where the pelvises are, where they need not be found."""
+        poses: list[Pose | None] = [None] * len(clouds)
+        centers = None if centers is None else np.round(centers, _CENTER_DECIMALS)
+        done = 0
+        with Progress(len(clouds), unit="clouds", shown=progress) as shown:
+            for rows, clip in self._batches(clouds, clips):
+                about = None if centers is None else centers[rows]
+                answers = self._batch([clouds[row] for row in rows], origin, clip, about)
+                for row, pose in zip(rows, answers, strict=True):
+                    poses[row] = pose
+                done += len(rows)
+                shown.update(done)
+        return poses
+
+    def _batches(
+        self, clouds: Sequence[np.ndarray], clips: Clips | None
+    ) -> Iterator[tuple[Sequence[int], Clips | None]]:
+        """Rows of clouds, and which of those are frames of one person. People of like size go together: a batch costs
+        as much as if all were its largest."""
+        count = self.backend.batch
+        if clips is not None:
+            yield from ((rows.tolist(), clip) for rows, clip in clips.batches(count))
+            return
+        order = sorted(range(len(clouds)), key=lambda row: len(clouds[row]))
+        yield from ((order[start : start + count], None) for start in range(0, len(order), count))
+
+    def _batch(
+        self, clouds: list[np.ndarray], origin: np.ndarray | None, clip: Clips | None, centers: np.ndarray | None
+    ) -> list[Pose | None]:
+        passes = self._passes if centers is None else 1
+        if centers is None:
+            centers = np.stack([center_of(points) for points in clouds])
+        for _ in range(passes - 1):
+            root = self.outputs(clouds, centers, origin, clip).joints[:, self._root].mean(1)
+            # an answer that is no number stays one
+            centers = centers + np.round(np.clip(root, -WINDOW / 2, WINDOW / 2) / _CENTER_STEP) * _CENTER_STEP
+        estimated = self.outputs(clouds, centers, origin, clip, transforms=self._tta)
+        poses: list[Pose | None] = []
+        for k, points in enumerate(clouds):
+            near = (np.abs(points - centers[k]) < WINDOW).all(1).sum()
+            if near < MIN_POINTS or not np.isfinite(estimated.joints[k]).all():
+                poses.append(None)
+                continue
+            values = {name: getattr(estimated, name) for name in (*PER_JOINT, *PER_PERSON)}
+            of_person: dict[str, Any] = {name: value[k] for name, value in values.items() if value is not None}
+            poses.append(replace(estimated, joints=estimated.joints[k] + centers[k], **of_person))
+        return poses

@@ -1,0 +1,139 @@
+"""`predict`: the people of a file. The steps of one scan: read, search, load, pose."""
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from lidarpose.errors import InputError
+from lidarpose.geometry import UP_AXES, rotation_from_up
+from lidarpose.inference.detection import Places, Search, detect_places, search_options, verify_people
+from lidarpose.inference.inputs import as_origin
+from lidarpose.inference.predictor import Predictor, load
+from lidarpose.inference.results import Poses
+from lidarpose.inference.scan import Scan, pose_scan, read_scan, up_text
+from lidarpose.inference.verification import KnownPlaces
+from lidarpose.io.boxes import read_boxes
+from lidarpose.models import DEFAULT
+from lidarpose.sample import Box
+
+# a file of less than this across is taken for a crop, m
+CROP_SIZE = 4.0
+
+
+def predict(
+    path: str | os.PathLike,
+    *,
+    boxes: "str | os.PathLike | dict | Box | list | tuple | np.ndarray | None" = None,
+    calib: str | os.PathLike | None = None,
+    crop: bool = False,
+    find: bool = False,
+    min_score: float | None = None,
+    max_range: float | None = None,
+    max_people: int | None = None,
+    background: "str | os.PathLike | Sequence | np.ndarray | None" = None,
+    sensor_origin: tuple[float, float, float] | str | None = None,
+    skeleton: str | None = None,
+    up: str | Sequence[float] = "z",
+    columns: int | None = None,
+    model: "Predictor | str | os.PathLike | Callable[[], Predictor]" = DEFAULT,
+    progress: bool = False,
+) -> Poses:
+    """Poses of the people in a point file, in the file's own frame.
+
+    boxes: whatever `read_boxes` takes (a JSON file, a KITTI label, rows, a `Box` or several), their length and width
+    level, their height and yaw along and about the up axis (the file's z where `up` is a direction); calib: of a KITTI
+    label, None for `../calib/N.txt` beside it; crop: the file is one person already; find: people are searched for,
+    with min_score, max_range (None: 40 m), max_people and background as in `detect`. With neither, a file of less than
+    4 m across is taken as a crop, and in any other people are searched for. sensor_origin: (x, y, z) m in the file's
+    frame, or "unknown"; None means unknown for a crop and 0, 0, 0 else. skeleton: a name, or None for smpl24, or for
+    the network's own where it has other joints. up: the file's up axis, "z", "y" or "x", with a minus where it points
+    down ("-y": cameras), or for a sensor mounted askew the direction that is up, (x, y, z) or "x,y,z" in the file's
+    frame. columns: values a row of a .bin; model: a predictor, what `load` takes (with its defaults), or a function
+    that gives the predictor when it is needed. Raises InputError, one line that says what to do.
+    """
+    options = (min_score, max_range, max_people, background)
+    check_choice(boxes, crop, find or any(option is not None for option in options))
+    _check_path(path)
+    started = time.perf_counter()
+    rotation_from_up(up)
+    scan = Scan(
+        points=np.zeros((0, 3)),
+        boxes=None if boxes is None else read_boxes(boxes, calib=calib),
+        origin=as_origin(sensor_origin),
+        up=up_text(up),
+    )
+    scan = read_scan(scan, path, columns)
+    find = find or boxes is None and not crop and is_wide(scan)
+    if sensor_origin is None and (find or boxes is not None):
+        scan = replace(scan, origin=np.zeros(3))
+    read = time.perf_counter()
+    search = search_options(*options, columns) if find else None
+    # loaded once the input has proved readable
+    _, poses = predict_scan(scan, lambda: predictor_of(model), search=search, skeleton=skeleton, progress=progress)
+    return replace(poses, timing_ms={"read": (read - started) * 1e3} | poses.timing_ms)
+
+
+def predictor_of(model: "Predictor | str | os.PathLike | Callable[[], Predictor]") -> "Predictor":
+    """What `predict` takes as its model, ready to use."""
+    return model if isinstance(model, Predictor) else model() if callable(model) else load(model)
+
+
+def predict_scan(
+    scan: "Scan | Places",
+    model: "Callable[[], Predictor]",
+    *,
+    search: "Search | None" = None,
+    known: "KnownPlaces | None" = None,
+    skeleton: str | None = None,
+    progress: bool = False,
+) -> tuple[Scan, Poses]:
+    """The steps of one scan: people are searched for where `search` is given, else they are the scan's boxes or its
+    crop; then everybody is posed.
+
+    Args:
+        scan: or one in which people were detected already.
+        model: loads the network, once people were searched for.
+        known: as of `find_people`.
+
+    Returns:
+        The scan as it was searched, and the poses, whose `timing_ms` has "find", "load", "crop" and "predict".
+    """
+    started = time.perf_counter()
+    times = {}
+    if search is not None:
+        places = detect_places(scan, search) if isinstance(scan, Scan) else scan
+        scan = verify_people(places, search, known)
+        times["find"] = time.perf_counter() - started
+    assert isinstance(scan, Scan)
+    searched = time.perf_counter()
+    predictor = model()
+    times["load"] = time.perf_counter() - searched
+    poses = pose_scan(scan, predictor, skeleton=skeleton, progress=progress)
+    return scan, replace(poses, timing_ms={name: seconds * 1e3 for name, seconds in times.items()} | poses.timing_ms)
+
+
+def is_wide(scan: Scan) -> bool:
+    """Whether the scan is larger than a crop of one person."""
+    # a map of 10^8 points is not turned for nothing
+    upright = scan.points if scan.up in UP_AXES else scan.clouds()[0]
+    return bool(np.ptp(upright, axis=0).max() >= CROP_SIZE)
+
+
+def check_choice(boxes: object, crop: bool, searched: bool) -> None:
+    """Raises InputError where it is said in two ways who is in the file."""
+    if boxes is not None and crop:
+        raise InputError("expected boxes or a crop, got both: a crop is one person already, so leave the boxes away")
+    if searched and (boxes is not None or crop):
+        options = "find, min score, range, max people and background"
+        raise InputError(f"{options} are for people who are searched for: leave them away with boxes or a crop")
+
+
+def _check_path(path: object) -> None:
+    if not isinstance(path, str | os.PathLike):
+        kind = type(path).__name__
+        raise InputError(
+            f"expected the path of a point file, got {kind}: for points use lidarpose.load().predict(points)"
+        )

@@ -1,0 +1,279 @@
+"""Which detections are people: each is posed by the network `tiny`, and how sure it is of the pose goes into the score.
+
+Legend: D detections.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import product
+
+import numpy as np
+
+from lidarpose.geometry import rotation_about
+from lidarpose.inference.backend import Backend, OnnxBackend, estimates
+from lidarpose.inference.tta import TTATransform, apply
+from lidarpose.models import weights_path
+from lidarpose.models.decode import decoder
+from lidarpose.models.detector.detector import Detections
+from lidarpose.sample import MIN_POINTS, Box, Pose
+from lidarpose.viz.person_view import facing
+
+# detections that are posed at once, of like size: a batch costs as much as if all were its largest
+_BATCH = 16
+# what is posed: a column so wide, and so far below and above the detection's box, m
+_COLUMN, _BELOW, _ABOVE = 0.6, 0.15, 0.25
+# points around a detection that its final box may hold, m to each side
+_AROUND = 2.5
+# a box is so much larger than the joints on each side, m, beside another person no more than this; it ends half way to
+# the next person, less half a body
+_ROOM, _LEAST_ROOM, _HALF_BODY = 0.15, 0.1, 0.25
+# of two people whose pelvises are nearer than this the less certain one is the same person, m
+_SAME_PERSON = 0.3
+# what the final score is made of, by detection: the scorer's logit; means over the joints of confidence and of the log
+# of spread, m; log of 1 + the points of the column; probability that the person is mounted
+FEATURES = ("logit", "confidence", "log_spread", "log_points", "mounted")
+# weights of the features and of products with "mounted", for a detector without its own
+_WEIGHTS = {
+    "bias": -1.5 * np.log(10),
+    "logit": 1.0,
+    "log_spread": -1.5,
+    "mounted": 1.5 * np.log(10),
+    "mounted_log_spread": 1.5,
+}
+# what joints can be at best, and the fewest and most points, between which a score is bounded before anybody is posed:
+# the least mean spread of a person's joints seen is 0.022 m
+_CONFIDENCES, _LOG_SPREADS, _LOG_POINTS = (0.0, 1.0), (np.log(0.012), 0.0), (np.log1p(MIN_POINTS), np.log1p(1e5))
+# a detection so near to where somebody is expected is that person, m, if no other is expected within the second
+# distance
+_EXPECTED, _ALONE = 0.5, 1.0
+# who is expected may have moved by so much out of the box, m
+_MOVED = 0.15
+# a place that held nobody is not looked at again for a while: a score below this share of the least, and a distance, m
+_NOBODY, _SAME_PLACE = 1 / 3, 0.3
+# the least score where a track is expected
+WEAK_SCORE = 0.1
+# decimals of meters in boxes, as they are written
+_DECIMALS = 4
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class KnownPlaces:
+    """What the frames before say of a scan, in its frame.
+
+    boxes: of the K people who need no verification, where they are expected, with the scores they had when they were
+    verified; pelvises (K, 3) m; tracks (M, 3) m: where anybody is expected, the K first, within reach (M,) m: who is
+    not found there is searched for among detections of `WEAK_SCORE` or more; rejected (R, 3) m: places of detections
+    that were nobody.
+    """
+
+    boxes: Sequence[Box]
+    pelvises: np.ndarray
+    tracks: np.ndarray
+    reach: np.ndarray
+    rejected: np.ndarray
+
+    def level(self, R_level_input: np.ndarray) -> "KnownPlaces":
+        """In the scan's level frame."""
+        turned = {name: getattr(self, name) @ R_level_input.T for name in ("pelvises", "tracks", "rejected")}
+        return replace(self, boxes=[replace(box, center=R_level_input @ box.center) for box in self.boxes], **turned)
+
+
+@cache
+def _verifier() -> Backend:
+    return OnnxBackend(weights_path("tiny").with_suffix(".onnx"))
+
+
+def verification_features(
+    detections: Detections, points: np.ndarray, origin: np.ndarray | None, backend: Backend | None = None
+) -> tuple[np.ndarray, Pose]:
+    """What the final score of detections in points (n, 3) m, level, from a sensor at origin (3,) or None is made of.
+
+    Args:
+        backend: what poses people; by default the bundled `tiny`.
+
+    Returns:
+        features (D, 5) in the order of `FEATURES`, and the poses, joints (D, 26, 3) m in the frame of the points; of
+        fewer than 5 points they are NaN.
+    """
+    every = np.arange(len(detections))
+    clouds = [points[rows] for rows in _rows_near(detections.centers, points)]
+    return _posed(detections, every, clouds, origin, backend or _verifier())
+
+
+def final_score(features: np.ndarray, header: dict) -> np.ndarray:
+    """features (D, 5) -> (D,) in [0, 1]: the probability that a detection is a person, by the detector's header."""
+    verification = header.get("verification") or {}
+    weights = verification if "logit" in verification else _WEIGHTS
+    value = dict(zip(FEATURES, features.T, strict=True))
+    value |= {f"mounted_{name}": value["mounted"] * value[name] for name in ("confidence", "log_spread")}
+    logit = np.full(len(features), float(weights.get("bias", 0.0)))
+    for name, values in value.items():
+        logit += weights.get(name, 0.0) * values
+    logits, probabilities = verification.get("calibration") or header["calibration"]
+    return np.nan_to_num(np.interp(logit, logits, probabilities))
+
+
+def _posed(
+    detections: Detections, chosen: np.ndarray, clouds: list[np.ndarray], origin: np.ndarray | None, backend: Backend
+) -> tuple[np.ndarray, Pose]:
+    """As `verification_features`, of the chosen detections (C,) and the points (n, 3) m near each of these; of the
+    others what comes from points is NaN."""
+    columns = [np.zeros((0, 3))] * len(detections)
+    for i, cloud in zip(chosen.tolist(), clouds, strict=True):
+        center, size = detections.centers[i], detections.sizes[i]
+        above = cloud[:, 2] - center[2]
+        inside = (above > -size[2] / 2 - _BELOW) & (above < size[2] / 2 + _ABOVE)
+        columns[i] = cloud[inside & (np.hypot(*(cloud[:, :2] - center[:2]).T) < _COLUMN)]
+    known = sorted((i for i, column in enumerate(columns) if len(column) >= MIN_POINTS), key=lambda i: len(columns[i]))
+    skeleton = backend.header.skeleton
+    joints = np.full((len(columns), len(skeleton), 3), np.nan)
+    confidence, spread = np.full((2, *joints.shape[:2]), np.nan)
+    for start in range(0, len(known), _BATCH):
+        batch = known[start : start + _BATCH]
+        clouds, view = apply(TTATransform(), [columns[i] for i in batch], detections.centers[batch], origin)
+        pose = estimates(backend.run(clouds, view), decoder("window"), skeleton)
+        joints[batch] = pose.joints + detections.centers[batch][:, None]
+        confidence[batch], spread[batch] = pose.confidence, pose.spread
+    points = np.log1p([len(column) for column in columns])
+    with np.errstate(invalid="ignore"):
+        features = (detections.logit, confidence.mean(1), np.log(spread).mean(1), points, detections.mounted)
+    poses = Pose(joints=joints, skeleton=skeleton, confidence=confidence, spread=spread)
+    return np.stack(features, -1).reshape(-1, len(FEATURES)), poses
+
+
+def _highest_score(detections: Detections, header: dict) -> np.ndarray:
+    """(D,): what `final_score` can be at most, whatever the pose. The score's logit is linear in what is unknown."""
+    highest = np.zeros(len(detections))
+    for unknown in product(_CONFIDENCES, _LOG_SPREADS, _LOG_POINTS):
+        columns = [detections.logit, *(np.full(len(detections), value) for value in unknown), detections.mounted]
+        highest = np.maximum(highest, final_score(np.stack(columns, -1), header))
+    return highest
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class People:
+    """N people, level, surest first: boxes, rows of their points, pelvises (N, 3) m, verified (N,) bool; rejected
+    (R, 3) m: detections that were nobody."""
+
+    boxes: list[Box]
+    rows: list[np.ndarray]
+    pelvises: np.ndarray
+    verified: np.ndarray
+    rejected: np.ndarray
+
+
+def verified(
+    detections: Detections,
+    points: np.ndarray,
+    origin: np.ndarray | None,
+    header: dict,
+    least_score: float,
+    max_people: int | None = None,
+    known: KnownPlaces | None = None,
+) -> People:
+    """The people among the detections, surest first, in boxes about their poses; of known people about where they are
+    expected.
+
+    Args:
+        points: (n, 3) m, level, from a sensor at origin (3,) or None.
+        header: the detector's.
+        least_score: people of a lower score are left out; near where tracks are expected, `WEAK_SCORE` is enough.
+    """
+    least = np.full(len(detections), least_score)
+    highest = _highest_score(detections, header)
+    expected = np.full(len(detections), -1)
+    if known is not None:
+        expected = _expected(detections, highest >= least_score, known)
+        is_missed = ~np.isin(np.arange(len(known.tracks)), expected)
+        is_near = (_apart(detections.centers, known.tracks[is_missed]) < known.reach[is_missed]).any(1)
+        least[is_near] = min(least_score, WEAK_SCORE)
+        is_nobody = (_apart(detections.centers, known.rejected) < _SAME_PLACE).any(1)
+        least[is_nobody & ~is_near & (expected < 0)] = np.inf
+    possible = np.flatnonzero(highest >= least)
+    near = dict(zip(possible.tolist(), _rows_near(detections.centers[possible], points), strict=True))
+    posed = possible[expected[possible] < 0]
+    features, poses = _posed(detections, posed, [points[near[i]] for i in posed.tolist()], origin, _verifier())
+    scores = final_score(features, header)
+    pelvis = poses.joints[:, poses.skeleton.index("pelvis")].copy()
+    rejected = detections.centers[posed][scores[posed] < _NOBODY * least_score]
+    if known is not None:
+        spared = np.flatnonzero(expected >= 0)
+        scores[spared] = [known.boxes[k].score for k in expected[spared].tolist()]
+        pelvis[spared] = known.pelvises[expected[spared]]
+    chosen: list[int] = []
+    for i in np.argsort(-scores, kind="stable").tolist():
+        is_new = not (np.linalg.norm(pelvis[chosen] - pelvis[i], axis=1) < _SAME_PERSON).any()
+        if scores[i] >= least[i] and is_new and not np.isnan(pelvis[i]).any():
+            chosen.append(i)
+    boxes: list[Box] = []
+    rows: list[np.ndarray] = []
+    shown: list[int] = []
+    for i in chosen:
+        if known is not None and expected[i] >= 0:
+            box = known.boxes[expected[i]]
+            cropped, mounted = replace(box, size=box.size + 2 * _MOVED), box.mounted
+        else:
+            others = [np.hypot(*(pelvis[k] - pelvis[i])[:2]) for k in chosen if k != i and scores[k] >= least_score]
+            alone = min(others, default=np.inf)
+            box = cropped = _box_about(Pose(joints=poses.joints[i], skeleton=poses.skeleton), alone)
+            mounted = bool(detections.mounted[i] > 0.5)
+        inside = cropped.contains(points[near[i]])
+        if inside.sum() < MIN_POINTS or len(boxes) == max_people:
+            continue
+        boxes.append(replace(box, id=len(boxes), score=round(float(scores[i]), _DECIMALS), mounted=mounted))
+        rows.append(near[i][inside])
+        shown.append(i)
+    return People(boxes=boxes, rows=rows, pelvises=pelvis[shown], verified=expected[shown] < 0, rejected=rejected)
+
+
+def _expected(detections: Detections, is_sure: np.ndarray, known: KnownPlaces) -> np.ndarray:
+    """Of each detection, those that are sure enough, which known person it is: (D,) int, -1: none."""
+    expected = np.full(len(detections), -1)
+    sure = np.flatnonzero(is_sure)
+    if len(sure) and known.boxes:
+        away = _apart(detections.centers[sure], known.tracks[: len(known.boxes)])
+        is_alone = (_apart(known.tracks, known.tracks) < _ALONE).sum(0)[: len(known.boxes)] == 1
+        nearest = away.argmin(0)
+        for k in np.flatnonzero(is_alone & (away.min(0) < _EXPECTED)):
+            expected[sure[nearest[k]]] = k
+    return expected
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Level distances of a (A, 2+) from b (B, 2+): (A, B) m."""
+    return np.linalg.norm(a[:, None, :2] - b[None, :, :2], axis=-1)
+
+
+def _box_about(pose: Pose, alone: float) -> Box:
+    """The box of a person by the pose, joints (J, 3) m; alone m: distance to the next person, who is to be kept out."""
+    forward = facing(pose)
+    yaw = 0.0 if forward is None else float(np.arctan2(forward[1], forward[0]))
+    R_level_own = rotation_about("z", yaw)
+    own = pose.joints @ R_level_own
+    beside = max(_LEAST_ROOM, min(_ROOM, alone / 2 - _HALF_BODY))
+    # soles are nearer to the lowest joint than the top of the head to the highest
+    low, high = own.min(0) - [beside, beside, 0.8 * _ROOM], own.max(0) + [beside, beside, 1.2 * _ROOM]
+    return rounded(Box(center=R_level_own @ ((low + high) / 2), size=high - low, yaw=yaw))
+
+
+def rounded(box: Box) -> Box:
+    """As it is written: a file of boxes crops the same points."""
+    center, size = box.center.round(_DECIMALS), box.size.round(_DECIMALS)
+    return replace(box, center=center, size=size, yaw=round(box.yaw, _DECIMALS))
+
+
+def _rows_near(centers: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
+    """Of each center the rows (k,) of the points (n, 3) m about it, ascending."""
+    # sorted by strips along x; of maps of more strips the last one holds the rest
+    start = points[:, 0].min(initial=0)
+    strip = np.minimum((points[:, 0] - start) / _AROUND, 65_535).astype(np.uint16)
+    order = np.argsort(strip, kind="stable")
+    ends = np.concatenate([[0], np.cumsum(np.bincount(strip, minlength=65_536))])
+    rows = []
+    for x, y in centers[:, :2]:
+        first, last = np.clip([(x - _AROUND - start) / _AROUND, (x + _AROUND - start) / _AROUND], 0, 65_535).astype(int)
+        near = order[ends[first] : ends[last + 1]]
+        near = near[np.abs(points[near, 1] - y) < _AROUND]
+        rows.append(np.sort(near[np.abs(points[near, 0] - x) < _AROUND]))
+    return rows
