@@ -386,6 +386,7 @@ def _with_steady(people: list[dict[str, Any]], entries: dict[int, dict[str, Any]
     for person in people:
         yield person | entries.pop(person["track"], {})
     for id, entry in sorted(entries.items()):
-        nobody = {"id": id, "box": None, "score": None, "mounted": None, "num_points": 0, "joints": None}
+        nobody: dict[str, Any] = {"id": id, "num_points": 0}
+        nobody |= dict.fromkeys(("box", "score", "mounted", "person", "second_person", "joints"))
         empty: dict[str, list] = {"confidence": [], "spread": [], "visible": [], "out_of_range": [], "warnings": []}
         yield nobody | empty | {"track": id} | entry
