@@ -119,5 +119,5 @@ def test_people_without_clothes_wear_none(monkeypatch):
     bare, dressed = (Generator(scene=replace(SCENES["paper"], clothes=share))._bodies(SEED, 0) for share in (0.0, 1.0))
     assert np.abs(dressed.vertices - bare.vertices).max() > 0.01
     np.testing.assert_array_equal(bare.joints[..., :2], dressed.joints[..., :2])
-    monkeypatch.setattr(bodies, "clothing", lambda rng, count: clothing(rng, count) * 0)
+    monkeypatch.setattr(bodies, "clothing", lambda rng, count, rig: clothing(rng, count) * 0)
     np.testing.assert_array_equal(Generator(scene=SCENES["paper"])._bodies(SEED, 0).vertices, bare.vertices)

@@ -1,5 +1,6 @@
 """SMPL files: the published equations on a synthetic model file, frames, part labels, and what is refused."""
 
+import json
 import pickle
 
 import numpy as np
@@ -7,11 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpose.body.rig import load_rig
+from lidarpose.body.mocap.smpl_poses import load_betas
+from lidarpose.body.rig import load_rig, pose_bodies
 from lidarpose.body.smpl import load_body
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about
 from lidarpose.skeleton import BODY26, SMPL24
+from lidarpose.synth.bodies import smpl_rig
+from lidarpose.synth.shard_job import Job
 
 J = BODY26.index
 R_LEVEL_SMPL = UP_AXES["y"]
@@ -253,3 +257,55 @@ def test_wrong_calls(body, betas, rotations, translation, message):
     if isinstance(rotations, np.ndarray) and rotations.ndim == 4:
         with pytest.raises(InputError, match=message):
             body.pose_house(betas, rotations, np.zeros((2, 3)) if translation is None else translation)
+
+
+# ---- as the body of synthesis
+
+
+@pytest.mark.parametrize("joints", [24, 52])
+def test_a_rig_poses_as_the_model_does_but_for_shapes_that_follow_the_pose(tmp_path, joints):
+    model = synthetic(joints)
+    model["posedirs"] *= 0
+    # no vertex of the published files has more
+    assert (np.count_nonzero(model["weights"][:, :22], axis=1) <= 4).all()
+    np.savez(tmp_path / "body.npz", **model)
+    body, rng = load_body(tmp_path / "body.npz"), np.random.default_rng(5)
+    betas = rng.normal(size=(3, 10))
+    rotations = axis_angle_to_matrix(rng.normal(0, 0.4, (3, 24, 3)))
+    place = rng.normal(size=(3, 3))
+    rig = body.rig(betas)
+    vertices, found = pose_bodies(rig, rig.rest(betas), rotations, place)
+    due, expected = body.pose_level(betas, rotations, place)
+    np.testing.assert_allclose(vertices, due, atol=2e-5)
+    np.testing.assert_allclose(found, expected, atol=2e-5)
+    assert set(np.unique(rig.face_part)) == set(range(1, 25)) or joints == 52
+
+
+def test_people_are_synthesized_of_a_file_of_the_user_with_the_shapes_of_the_motion(tmp_path):
+    np.savez(tmp_path / "body.npz", **synthetic())
+    poses = tmp_path / "pose" / "7"
+    poses.mkdir(parents=True)
+    shapes = np.round(np.random.default_rng(2).normal(size=(2, 10)), 3)
+    for k in range(30):
+        frame = {"pose": [np.pi / 2, 0, 0] + [0.0] * 69, "trans": [0, 8 + 0.01 * k, 0], "beta": shapes[k % 2].tolist()}
+        (poses / f"{k:06d}.json").write_text(json.dumps(frame))
+    np.testing.assert_array_equal(load_betas(tmp_path / "pose"), np.unique(shapes, axis=0))
+    made, shipped = (
+        Job(what="people", count=4, scene="paper", motion=str(poses), captured=1.0, body=body).generator()
+        for body in (str(tmp_path / "body.npz"), None)
+    )
+    np.testing.assert_allclose(np.unique(made.rig.coefficients, axis=0), np.unique(shapes, axis=0), atol=1e-6)
+    bones = [np.linalg.norm(np.diff(g.person(1, 0).sample.pose.joints[[1, 4]], axis=0)) for g in (made, shipped)]
+    due = made.rig.rest(made.rig.coefficients).joints
+    lengths = np.linalg.norm(due[:, 1] - due[:, 4], axis=1)
+    assert np.abs(lengths - bones[0]).min() < 1e-4 and np.abs(lengths - bones[1]).min() > 1e-4
+
+
+def test_motion_without_shapes_leaves_them_to_chance(tmp_path):
+    np.savez(tmp_path / "body.npz", **synthetic())
+    np.savez(tmp_path / "motion.npz", poses=np.zeros((4, 72)), trans=np.zeros((4, 3)), betas=["a"])
+    assert load_betas(tmp_path / "motion.npz").shape == (0, 10)
+    rig = smpl_rig(tmp_path / "body.npz", tmp_path / "motion.npz")
+    assert rig.coefficients.shape == (256, 10) and 0.7 < rig.coefficients.std() < 1.1
+    with pytest.raises(InputError, match="expected a body of the SMPL family, .npz or .pkl"):
+        Job(what="people", count=4, body=str(tmp_path / "body.txt")).generator()

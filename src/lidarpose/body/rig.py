@@ -44,15 +44,17 @@ MAX_CLOTHING = 0.04
 FOLD_GAIN = np.float32(0.18)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Rig:
-    """The body as stored. Arrays are read-only, C-contiguous.
+    """A body that can be posed: the shipped one, or one of the user's SMPL file (`body.smpl`). Arrays are read-only,
+    C-contiguous.
 
     faces (F, 3) int32, counter-clockwise seen from outside; face_part (F,) uint8 = 1 + SMPL joint (0 is "not body");
     weight_index, weight (V, 4) int32, float32: the joints that move a vertex, strongest first, unused ones 0;
     parents (24,) int32; template (V, 3) and morphs (S, V, 3) m, m a unit of coefficient; joint_template (26, 3) and
     joint_morphs (S, 26, 3) likewise, in BODY26's order. The table of N sampled people: coefficients (N, S),
-    sex (N,) "female" or "male", age (N,) years, height (N,) m, bmi (N,) kg/m2.
+    sex (N,) "female" or "male", age (N,) years, height (N,) m, bmi (N,) kg/m2; of another body than the shipped one
+    these four are empty.
     """
 
     faces: np.ndarray
@@ -91,6 +93,12 @@ class Rig:
         return RestBody(
             vertices=shaped(self.template, self.morphs), joints=shaped(self.joint_template, self.joint_morphs)
         )
+
+    def draw_people(self, rng: np.random.Generator, n: int) -> "RestBody":
+        """n people at rest: of the shipped body as `sample_people` draws them, else of the table's rows alike."""
+        if len(self.sex):
+            return self.rest(sample_people(rng, n).coefficients)
+        return self.rest(self.coefficients[rng.integers(len(self.coefficients), size=n)])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -249,11 +257,14 @@ def _density_ratio(value: np.ndarray, mean: float, spread: float) -> np.ndarray:
     return np.exp((fitted**2 - target**2) / 2)
 
 
-def clothing(rng: np.random.Generator, n: int) -> np.ndarray:
+def clothing(rng: np.random.Generator, n: int, rig: Rig | None = None) -> np.ndarray:
     """Draws clothes: how far clothes, hair and shoes stand off the skin along its normals, smooth over the body.
 
     A torso's mean is about 1.5 cm; a tenth of the people wear next to nothing, a tenth bulky coats; hands and faces
     stay bare but for a few gloves.
+
+    Args:
+        rig: whose vertices; None: the shipped body's.
 
     Returns:
         (n, V) float32 m in [0, `MAX_CLOTHING`].
@@ -263,7 +274,7 @@ def clothing(rng: np.random.Generator, n: int) -> np.ndarray:
     """
     from lidarpose.body.rig_kernels import fold_clothing
 
-    dense, scalp, template = _regions()
+    dense, scalp, template = _regions(load_rig() if rig is None else rig)
     offset = _outfit(rng, n) @ dense.T
     hair = rng.uniform(0.0, 0.03, (n, 1)) + rng.choice([0.0, 0.012], (n, 1), p=[0.8, 0.2])
     offset += hair.astype(np.float32) * scalp
@@ -277,9 +288,8 @@ def clothing(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 @cache
-def _regions() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _regions(rig: Rig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Dense weights (V, 24), hair's share of each vertex (V,), and the mean body's vertices (V, 3)."""
-    rig = load_rig()
     dense = rig.dense_weight
     from_center = rig.template - rig.joint_template[BODY26.index("head_center")]
     # hair: above and behind a plane that rises forwards from below the ears to the brow, 4 cm of transition

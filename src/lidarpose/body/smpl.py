@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.body.rig import forward_kinematics
+from lidarpose.body.rig import Rig, forward_kinematics
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_vector
 from lidarpose.io.files import file_error
@@ -144,6 +144,43 @@ class SmplBody:
 
     # its name before 0.3
     pose_house = pose_level
+
+    def rig(self, betas: np.ndarray) -> Rig:
+        """The body as synthesis poses it, its people those of betas (n, <= S): four bones a vertex, and no shapes that
+        follow the pose."""
+        betas = np.asarray(betas, float)
+        # raises for betas that cannot be
+        self.rest(betas[:1])
+        count = betas.shape[1]
+        owned = on_smpl(self.weights, self.parents)
+        index = np.argsort(-owned, 1, kind="stable")[:, :4]
+        weight = np.take_along_axis(owned, index, 1)
+        level = [self._level_rest(shape) for shape in (self.template, *np.moveaxis(self.shapes[..., :count], -1, 0))]
+        # a unit of a coefficient moves vertices and joints alike
+        vertices, joints = (np.ascontiguousarray(np.stack(part), np.float32) for part in zip(*level, strict=True))
+        return Rig(
+            faces=self.faces.copy(),
+            face_part=self.face_part.copy(),
+            weight_index=np.ascontiguousarray(np.where(weight > 0, index, 0), np.int32),
+            weight=np.ascontiguousarray(weight / weight.sum(1, keepdims=True), np.float32),
+            parents=np.array(SMPL24.parents, np.int32),
+            template=vertices[0].copy(),
+            morphs=vertices[1:].copy(),
+            joint_template=joints[0].copy(),
+            joint_morphs=joints[1:].copy(),
+            coefficients=betas.astype(np.float32),
+            **{name: np.zeros(0) for name in ("sex", "age", "height", "bmi")},
+        )
+
+    def _level_rest(self, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices (V, 3) at rest, or what a shape adds to them, and the joints of BODY26 (26, 3), level frame about
+        the pelvis; linear in the vertices."""
+        joints = self.regressor @ vertices
+        nose, ears = self._head_vertices
+        fingers = [self._fingers(wrist) for wrist in _HANDS]
+        hands = [joints[bases[:-1] if len(bases) > 1 else bases].mean(0) for bases in fingers]
+        body26 = np.concatenate([joints[:_SHARED], np.stack(hands), vertices[nose, None], vertices[ears].mean(0)[None]])
+        return (vertices - joints[0]) @ _R_LEVEL_SMPL.T, (body26 - joints[0]) @ _R_LEVEL_SMPL.T
 
     def _posed(
         self, vertices: np.ndarray, joints: np.ndarray, rotations: np.ndarray, root: np.ndarray

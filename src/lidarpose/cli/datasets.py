@@ -27,6 +27,7 @@ _MOTION = """
 --motion FILE  take poses from captured motion: a file or a folder
 --subjects A,B  subjects to use: the first part of a clip's name
 --captured SHARE  share of poses taken from the clips (default 0.5)
+--body FILE  your SMPL, SMPL+H or SMPL-X file instead of the shipped body, with the shapes of --motion where it has any
 """
 _WORK = f"""
 {_WORKERS}
@@ -86,7 +87,7 @@ def _add_synth(commands) -> None:
     words = "changes of the scene: its numbers (docs/synthesis.md), recorded=1 keeps the places of --motion"
     scene.add_argument("--set", dest="set_set", metavar="A=X,B=Y", help=words)
     add_options(scene.add_mutually_exclusive_group(), _SEVERAL)
-    add_options(synth.add_argument_group("captured motion"), _MOTION)
+    add_options(synth.add_argument_group("poses and bodies"), _MOTION)
     add_options(synth.add_argument_group("work"), _WORK)
 
 
@@ -133,7 +134,7 @@ def _synth(options: argparse.Namespace) -> None:
     from lidarpose.data.shards import counted
     from lidarpose.synth.shard_job import Job, write_dataset
 
-    fields = ("count", "scene", "seed", "hard", "motion", "captured", "per_shard")
+    fields = ("count", "scene", "seed", "hard", "motion", "captured", "body", "per_shard")
     job = Job(
         what="clips" if options.clips else "streets" if options.scenes else "people",
         sensors=None if options.sensor is None else names(options.sensor),

@@ -8,10 +8,12 @@ import numpy as np
 
 from lidarpose.body.mocap import load_motion
 from lidarpose.body.mocap.motion import Motion, facing_x
+from lidarpose.body.mocap.smpl_poses import load_betas
 from lidarpose.body.pose_prior.activities import KINDS
 from lidarpose.body.pose_prior.constraints import ground_offset
 from lidarpose.body.pose_prior.sampling import sample_clips, sample_rotations
-from lidarpose.body.rig import RestBody, clothing, load_rig, mean_adult_joints, pose_bodies, sample_people
+from lidarpose.body.rig import RestBody, Rig, clothing, load_rig, mean_adult_joints, pose_bodies
+from lidarpose.body.smpl import load_body
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.geometry import axis_angle_to_matrix, rotation_about
 from lidarpose.skeleton import SMPL24
@@ -30,11 +32,28 @@ _MOST_HZ = 30.0
 # spread of the small turns that make two draws of one captured pose differ, rad
 _VARIATION = 0.06
 _MIRROR = np.diag([1.0, -1.0, 1.0])
+# shapes that are drawn of a user's body where motion has none
+_SHAPES = 256
 # how high a captured foot may be above its clip's lowest and still stand on the ground, m
 _JUMP = 0.06
 # a recording whose median distance from its origin is between these was made by a LiDAR that stands there, as
 # LiDARHuman26M; others are of rooms or walks, and their middle is set so far ahead of the sensor, m
 _SENSED, _AHEAD = (4.0, 40.0), 12.0
+
+
+def smpl_rig(body: str | Path, motion: str | Path | None = None) -> Rig:
+    """The user's SMPL, SMPL+H or SMPL-X file as the body of synthesis.
+
+    Args:
+        body: the file.
+        motion: a file or folder of motion whose people's shapes are taken, see `load_betas`; where it has none, shapes
+            are `_SHAPES` normal ones.
+    """
+    betas = np.zeros((0, 1)) if motion is None else load_betas(motion)
+    if not len(betas):
+        betas = np.clip(np.random.default_rng(0).normal(size=(_SHAPES, 10)), -2, 2)
+    model = load_body(body)
+    return model.rig(betas[:, : model.shape_count])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,6 +153,7 @@ def draw_bodies(
     moving: bool = True,
     clothes: float = 1.0,
     mix: dict[str, float] | None = None,
+    rig: Rig | None = None,
 ) -> Bodies:
     """The people of a block; a function of (seed, block) and of where poses come from.
 
@@ -142,9 +162,10 @@ def draw_bodies(
         count: number of bodies.
         moving: False is faster; then nobody goes anywhere.
         clothes, mix: see `SceneConfig` and `sample_rotations`.
+        rig: the body, None: the shipped one.
     """
     rng = np.random.default_rng([seed, RandomStream.BLOCK, block])
-    rig = load_rig()
+    rig = load_rig() if rig is None else rig
     prior = sample_rotations(rng, count, mix=mix, dt=FRAME_TIME if moving else 0.0)
     poses, step, kinds = np.stack([prior.rotations, prior.moved], 1), prior.step, np.array(KINDS)[prior.kind]
     places = None
@@ -156,9 +177,9 @@ def draw_bodies(
         step = np.where(chosen[:, None], way[:, 0] if moving else 0, step)
         kinds = np.where(chosen, "captured", kinds)
         places = np.where(chosen[:, None], bank.places[picked], np.nan)
-    rest = rig.rest(sample_people(rng, count).coefficients)
-    worn = clothing(rng, count) * np.float32(clothes)
-    vertices, joints, low, high = _dressed(rest, worn, poses[:, 0], np.zeros((count, 3), np.float32))
+    rest = rig.draw_people(rng, count)
+    worn = clothing(rng, count, rig) * np.float32(clothes)
+    vertices, joints, low, high = _dressed(rig, rest, worn, poses[:, 0], np.zeros((count, 3), np.float32))
     lift = low[:, 2].copy()
     for heights in (vertices[..., 2], joints[..., 2]):
         heights -= lift[:, None]
@@ -168,7 +189,7 @@ def draw_bodies(
     def moved(row: int) -> tuple[np.ndarray, np.ndarray]:
         rows = slice(row, row + 1)
         person = RestBody(vertices=rest.vertices[rows], joints=rest.joints[rows])
-        vertices, joints, _, _ = _dressed(person, worn[rows], poses[rows, 1], step[rows])
+        vertices, joints, _, _ = _dressed(rig, person, worn[rows], poses[rows, 1], step[rows])
         down = np.array([0, 0, lift[row]], np.float32)
         return vertices[0] - down, joints[0] - down
 
@@ -187,10 +208,11 @@ def draw_bodies(
 
 
 def draw_moving_body(
-    bank: PoseBank | None, captured: float, frames: int, rng: np.random.Generator, *, clothes: float = 1.0
-) -> Bodies:
+    bank: PoseBank | None, captured: float, frames: int, rng: np.random.Generator, *, clothes: float = 1.0,
+    rig: Rig | None = None,
+) -> Bodies:  # fmt: skip
     """The frames of a person who moves, at `CLIP_HZ`: one of `draw_moving_bodies`."""
-    return draw_moving_bodies(bank, captured, 1, frames, rng, clothes=clothes)[0]
+    return draw_moving_bodies(bank, captured, 1, frames, rng, clothes=clothes, rig=rig)[0]
 
 
 def draw_moving_bodies(
@@ -202,6 +224,7 @@ def draw_moving_bodies(
     *,
     clothes: float = 1.0,
     to_last: bool = False,
+    rig: Rig | None = None,
 ) -> list[Bodies]:
     """The frames of `count` people who move, at `CLIP_HZ`.
 
@@ -210,7 +233,9 @@ def draw_moving_bodies(
         captured: chance of a clip of the bank instead of the prior's.
         clothes: see `SceneConfig`.
         to_last: the last frame is on the origin and faces +x, instead of the first.
+        rig: the body, None: the shipped one.
     """
+    rig = load_rig() if rig is None else rig
     clips = [bank.clip(frames + 1, rng) if bank is not None and rng.random() < captured else None for _ in range(count)]
     motion: list[tuple[np.ndarray, np.ndarray, str, np.ndarray | None]]
     motion = [(*clip, "captured", None) for clip in clips if clip is not None]
@@ -218,24 +243,27 @@ def draw_moving_bodies(
         drawn = sample_clips(rng, drawn_count, frames=frames + 1, hz=CLIP_HZ)
         flat = drawn.translation * np.array([1, 1, 0], np.float32)
         motion += zip(drawn.rotations, flat, [KINDS[kind] for kind in drawn.kind], drawn.clearance, strict=True)
-    people = load_rig().rest(sample_people(rng, count).coefficients)
-    worn = clothing(rng, count) * np.float32(clothes)
+    people = rig.draw_people(rng, count)
+    worn = clothing(rng, count, rig) * np.float32(clothes)
     return [
         _moving_body(
-            RestBody(vertices=people.vertices[k : k + 1], joints=people.joints[k : k + 1]), worn[k : k + 1], *moves,
+            rig,
+            RestBody(vertices=people.vertices[k : k + 1], joints=people.joints[k : k + 1]),
+            worn[k : k + 1],
+            *moves,
             to_last=to_last,
         )
         for k, moves in enumerate(motion)
-    ]  # fmt: skip
+    ]
 
 
 def _moving_body(
-    person: RestBody, worn: np.ndarray, rotations: np.ndarray, translation: np.ndarray, kind: str,
+    rig: Rig, person: RestBody, worn: np.ndarray, rotations: np.ndarray, translation: np.ndarray, kind: str,
     clearance: np.ndarray | None, *, to_last: bool,
 ) -> Bodies:  # fmt: skip
     """One person's F frames, of one more: rotations (F + 1, 24, 3, 3), translation (F + 1, 3) m; clearance (F + 1,) m,
     see `sampling.DrawnClips`, None of captured motion."""
-    rig, frames = load_rig(), len(rotations) - 1
+    frames = len(rotations) - 1
     # where the pelvis's x axis points
     yaw = np.arctan2(rotations[:, 0, 1, 0], rotations[:, 0, 0, 0])
     if to_last:
@@ -246,7 +274,7 @@ def _moving_body(
     translation = translation * [*_stride_ratio(person, [kind]).repeat(2), 1]
     rest = RestBody(vertices=np.repeat(person.vertices, frames + 1, 0), joints=np.repeat(person.joints, frames + 1, 0))
     worn = np.repeat(worn, frames + 1, 0)
-    vertices, joints, low, _ = _dressed(rest, worn, rotations, translation)
+    vertices, joints, low, _ = _dressed(rig, rest, worn, rotations, translation)
     lowest = low[:, 2]
     if clearance is None:
         # the body is not as tall as who was captured: what is little above the lowest frame stands on the ground
@@ -282,11 +310,10 @@ def _leg_length(joints: np.ndarray) -> np.ndarray:
 
 
 def _dressed(
-    rest: RestBody, clothes: np.ndarray, rotations: np.ndarray, translation: np.ndarray
+    rig: Rig, rest: RestBody, clothes: np.ndarray, rotations: np.ndarray, translation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Vertices (n, V, 3) and joints (n, 26, 3) m of posed bodies whose clothes stand off (n, V) m; the vertices' least
     and greatest x, y, z (n, 3)."""
-    rig = load_rig()
     vertices, joints = pose_bodies(rig, rest, rotations, translation)
     low, high = np.empty((len(vertices), 3), np.float32), np.empty((len(vertices), 3), np.float32)
     dress_people(rig.faces, vertices, clothes, low, high)

@@ -11,6 +11,7 @@ from typing import cast
 
 import numpy as np
 
+from lidarpose.body.rig import Rig
 from lidarpose.body.smpl import smpl_axis_angles
 from lidarpose.data.clips import window_points
 from lidarpose.errors import InputError, check_int
@@ -61,6 +62,7 @@ class Generator:
         scene: a configuration, or the name of a preset.
         bank: captured poses.
         captured: share of poses from `bank`, the rest from the prior.
+        rig: the body, None: the shipped one.
         measure: also find the facts, which costs a second cast: the sample is the same either way.
         redraw: somebody of whom hardly anything is seen is drawn again, each time easier to see; else they stay as
             they are, without points too.
@@ -69,6 +71,7 @@ class Generator:
     scene: SceneConfig | str
     bank: PoseBank | None = None
     captured: float = 0.0
+    rig: Rig | None = None
     measure: bool = True
     redraw: bool = True
 
@@ -98,7 +101,9 @@ class Generator:
         """(seed, block) -> its bodies."""
         moving = bool(self.config.merged) or any(isinstance(sensor(name), RayPattern) for name in self.config.sensors)
         # neighbors share a block; two suffice for a reader that crosses from one to the next
-        draw_block = partial(draw_bodies, self.bank, self.captured, BLOCK, moving=moving, clothes=self.config.clothes)
+        draw_block = partial(
+            draw_bodies, self.bank, self.captured, BLOCK, moving=moving, clothes=self.config.clothes, rig=self.rig
+        )
         return lru_cache(maxsize=2)(draw_block)
 
     @cached_property
@@ -113,8 +118,9 @@ class Generator:
             rows = [row for row in range(BLOCK) if draw_acquisition(full, draws[row]).frames > 1]
             rng = np.random.default_rng([seed, RandomStream.MOTION, block])
             moving = draw_moving_bodies(
-                self.bank, self.captured, len(rows), MOST_FRAMES, rng, clothes=self.config.clothes, to_last=True
-            )
+                self.bank, self.captured, len(rows), MOST_FRAMES, rng, clothes=self.config.clothes, to_last=True,
+                rig=self.rig,
+            )  # fmt: skip
             return draws, dict(zip(rows, moving, strict=True))
 
         return lru_cache(maxsize=2)(draw)
@@ -141,7 +147,7 @@ class Generator:
         frames = check_int("a clip's frames", frames, least=1)
         seed, index = check_int("seed", seed, least=0), check_int("index", index, least=0)
         rng = np.random.default_rng([seed, RandomStream.CLIP, index])
-        bodies = draw_moving_body(self.bank, self.captured, frames, rng, clothes=self.config.clothes)
+        bodies = draw_moving_body(self.bank, self.captured, frames, rng, clothes=self.config.clothes, rig=self.rig)
         block, row = self._bodies(seed, index // BLOCK), index % BLOCK
         return self._observe(bodies, range(frames), block, row, rng, hard, in_clip=True)
 

@@ -36,8 +36,8 @@ _MOST_SHARDS = 100_000
 class Job:
     """What to make. what: people, clips or streets; count of them; scene: a preset's name; sensors: names or files of
     tables, None: the scene's; hard in [0, 1]; motion: a file of captured clips whose poses make up a share `captured`
-    of all (None: half), subjects: which of them; set: changes of the scene, see
-    `SceneConfig.changed`; per_shard: persons, clips or streets a file, None: as `PER_SHARD`."""
+    of all (None: half), subjects: which of them; body: the user's SMPL file instead of the shipped body; set: changes
+    of the scene, see `SceneConfig.changed`; per_shard: persons, clips or streets a file, None: as `PER_SHARD`."""
 
     what: str
     count: int
@@ -48,6 +48,7 @@ class Job:
     motion: str | None = None
     subjects: tuple[str, ...] | None = None
     captured: float | None = None
+    body: str | None = None
     per_shard: int | None = None
     set: tuple[str, ...] = ()
 
@@ -56,7 +57,7 @@ class Job:
         check_int(f"the number of {self.what}", self.count, least=1)
         check_int("--per-shard", self.shard_size, least=1)
         check_int("the seed", self.seed, least=0)
-        if self.what == "streets" and (self.scene != "wild" or self.hard != 1 or self.motion is not None or self.set):
+        if self.what == "streets" and (self.scene != "wild" or self.hard != 1 or self.motion or self.body or self.set):
             raise InputError("streets have scene, difficulty and walkers of their own: leave these options out")
         if -(-self.count // self.shard_size) > _MOST_SHARDS:
             raise InputError(
@@ -88,7 +89,7 @@ class Job:
 
     def generator(self) -> "Generator":
         """What makes the people. Raises InputError where motion cannot be read, MissingExtra without numba."""
-        from lidarpose.synth.bodies import CLIP_HZ, PoseBank
+        from lidarpose.synth.bodies import CLIP_HZ, PoseBank, smpl_rig
         from lidarpose.synth.generator import Generator
 
         scene = scene_config(self.scene).eased(self.hard).changed(self.set)
@@ -99,7 +100,8 @@ class Job:
             raise file_error(
                 self.motion, f"no clip lasts {CLIP_FRAMES / CLIP_HZ:g} s: give longer motion, or leave --clips away"
             )
-        return Generator(scene=scene, bank=bank, captured=self.share)
+        rig = None if self.body is None else smpl_rig(self.body, self.motion)
+        return Generator(scene=scene, bank=bank, captured=self.share, rig=rig)
 
     def card(self) -> DatasetCard:
         """The dataset's card: all that decides its content."""
@@ -119,6 +121,8 @@ class Job:
             settings["motion"] = motion_digest(self.motion)
             settings["captured"] = self.share
             settings["subjects"] = list(self.subjects) if self.subjects else None
+        if self.body is not None:
+            settings["body"] = content_digest(self.body, expected="a body of the SMPL family")[:16]
         return DatasetCard(settings=settings, count=self.count, per_shard=self.shard_size, tables=_TABLES[self.what])
 
 

@@ -25,7 +25,7 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from lidarpose.errors import InputError
 from lidarpose.sample import Sample
-from lidarpose.synth.bodies import PoseBank
+from lidarpose.synth.bodies import PoseBank, smpl_rig
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.objects import draw_object
 from lidarpose.synth.scene import RandomStream, scene_config
@@ -68,8 +68,8 @@ class SyntheticSource:
 
     easy: how many samples it takes to rise from nothing to full; below the ceiling every difficulty is still sampled,
     harder ones more often, except in the paper's scenes, which have one difficulty; motion, subjects, captured,
-    strays, noise, objects, set: see `recipes.Pretrain`; refined: see `example`. Raises InputError, at once, for an
-    unknown scene and for clips that cannot be read.
+    body, strays, noise, objects, set: see `recipes.Pretrain`; refined: see `example`. Raises InputError, at once, for
+    an unknown scene and for clips that cannot be read.
     """
 
     scene: str
@@ -78,6 +78,7 @@ class SyntheticSource:
     motion: str | None = None
     subjects: tuple[str, ...] = ()
     captured: float = 0.0
+    body: str | None = None
     strays: float = 0.0
     noise: float = 0.0
     objects: float = 0.0
@@ -97,7 +98,8 @@ class SyntheticSource:
         bank = PoseBank.from_clips(self.motion, self.subjects) if self.motion else None
         captured = self.captured if bank is not None else 0.0
         scene = scene_config(self.scene).changed(self.set)
-        return Generator(scene=scene, bank=bank, captured=captured, measure=False)
+        rig = None if self.body is None else smpl_rig(self.body, self.motion)
+        return Generator(scene=scene, bank=bank, captured=captured, rig=rig, measure=False)
 
     def example(self, index: int) -> Example:
         rng = np.random.default_rng([self.seed, RandomStream.SYNTHETIC_AUGMENTATION, index])

@@ -165,6 +165,9 @@ class Pretrain(PoseRecipe):
     captured: float = _setting(0.5, "share of poses from captured motion, where clips are given", "SHARE")
     motion: str | None = _setting(None, "captured motion to take poses from: a file or a folder")
     subjects: tuple[str, ...] = _setting((), "those of its clips to learn from, by the first part of names")
+    body: str | None = _setting(
+        None, "your SMPL, SMPL+H or SMPL-X file instead of the shipped body, with the shapes of motion where it has any"
+    )
     strays: float = _setting(0.2, "how often stray points are about a person", "SHARE")
     noise: float = _setting(0.15, "how often all points are blurred, by 0.5 to 8 cm", "SHARE")
     objects: float = _setting(

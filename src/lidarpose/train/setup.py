@@ -202,7 +202,7 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
     card: dict = {"motion": None if recipe.motion is None else Path(recipe.motion).name}
     if recipe.init:
         network, card["init_card"] = _expanded(recipe.init, config)
-    names = ("scene", "set", "motion", "subjects", "captured", "strays", "noise", "objects")
+    names = ("scene", "set", "motion", "subjects", "captured", "body", "strays", "noise", "objects")
     synthetic: dict[str, Any] = {name: getattr(recipe, name) for name in names}
 
     def validation() -> Sequence[Example | ClipExample]:

@@ -49,6 +49,8 @@ _RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
 _BODY = 66  # the root and SMPL's 21 joints of the body, 3 numbers each; SMPL has two hands more, the others fingers
 _SMPL = 72
 _PEOPLE = ("first_person", "second_person")
+# shape coefficients of the files
+_BETAS = 10
 # frames a second of the LiDAR that LiDARHuman26M's labels belong to
 LIDARHUMAN26M_FPS = 10.0
 _FRAME = re.compile("[0-9]{1,12}")
@@ -194,6 +196,33 @@ def _load_corpus(path: str | os.PathLike, entries: list, up: str | None, fps: fl
     return join(motions, source=f"corpus: {path}")
 
 
+def load_betas(path: str | os.PathLike) -> np.ndarray:
+    """The shapes (n, 10) of the people of motion, each once: `beta` of LiDARHuman26M's files and SLOPER4D's labels,
+    `betas` of AMASS's. Of a folder all that are in it and its folders; none of motion without shapes."""
+    path = Path(path)
+    files = sorted(path.rglob("*")) if path.is_dir() else [path]
+    rows: list[np.ndarray] = []
+    for file in files:
+        if file.suffix.lower() == ".json" and _FRAME.fullmatch(file.stem):
+            content = _json(file)
+            rows.append(_first_betas(content.get("beta") if isinstance(content, dict) else None))
+        elif file.suffix.lower() == ".npz":
+            rows.append(_first_betas(read_npz(file, ("betas",), expected="an npz file of motion")[0].get("betas")))
+        elif file.suffix.lower() == ".pkl" and isinstance(labels := load_pickle(file), dict):
+            people = (labels.get(person) for person in _PEOPLE)
+            rows += [_first_betas(person.get("beta")) for person in people if isinstance(person, dict)]
+    return np.unique(np.concatenate([np.zeros((0, _BETAS)), *rows]), axis=0)
+
+
+def _first_betas(value: object) -> np.ndarray:
+    """(1, 10) of anything with ten numbers or more, (0, 10) of anything else."""
+    try:
+        betas = np.asarray(value, float).ravel()[:_BETAS]
+    except (TypeError, ValueError):
+        betas = np.zeros(0)
+    return betas[None] if len(betas) == _BETAS and np.isfinite(betas).all() else np.zeros((0, _BETAS))
+
+
 def _frame_rate(path: object, rate: object, key: str) -> float:
     try:
         return float(np.asarray(rate).item())
@@ -218,11 +247,7 @@ def load_lidarhuman26m(path: str | os.PathLike, *, up: str | None = None, fps: f
 
 
 def _read_pose_file(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    data = read_bytes(path, expected="a JSON file with pose and trans")
-    try:
-        content = json.loads(data.decode("utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise file_error(path, f"is not JSON ({error}); was it copied completely?") from None
+    content = _json(path)
     try:
         pose, trans = (np.asarray(content[key], float).ravel() for key in ("pose", "trans"))
     except (TypeError, KeyError, IndexError, ValueError, OverflowError):
@@ -230,3 +255,11 @@ def _read_pose_file(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if len(pose) != _SMPL or len(trans) != 3:
         raise file_error(path, f"expected pose (72 numbers) and trans (3 numbers), got {reprlib.repr(content)}")
     return pose, trans
+
+
+def _json(path: Path) -> Any:
+    data = read_bytes(path, expected="a JSON file with pose and trans")
+    try:
+        return json.loads(data.decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise file_error(path, f"is not JSON ({error}); was it copied completely?") from None
