@@ -4,7 +4,8 @@
     python benchmarks/results.py                              # docs/scores -> the tables of the pages
     python benchmarks/results.py --check                      # exit code 1 where they differ
 
-docs/scores/NAME.json is what `lidarpose evaluate NAME bench` wrote, NAME-unknown.json with `--sensor-unknown`,
+docs/scores/NAME.json is what `lidarpose evaluate NAME bench` wrote, NAME-2.json of bench-2, NAME-unknown.json with
+`--sensor-unknown`,
 stability/NAME.json what it writes besides with `--stability`; the others are what the benchmarks of their names wrote.
 
 A table stands between `<!-- table NAME -->` and `<!-- end -->`; the words around it are left as they are.
@@ -150,6 +151,20 @@ def conditions() -> str:
         lines = _mpjpe(*source)
         rows.append((name, *(f"{lines[group].value:.1f}" for group in wanted)))
     return table(("MPJPE, mm", *(changed.WORDS.get(of, of) for _, of in wanted)), rows)
+
+
+def second_bench(group: str) -> str:
+    """MPJPE of the bundled models on lidarpose-bench-2 by a group of people, the default's worst last."""
+    scores = {model: _mpjpe(f"{model}-2", model) for model in BUNDLED}
+    lines = [line for key, line in scores[DEFAULT].items() if key[0] in ("all", group)]
+    lines.sort(key=lambda line: (line.group != "all", line.value))
+    rows = []
+    for line in lines:
+        cells = [
+            f"{(own := scores[model][line.group, line.of]).value:.1f} {_interval(own)}".rstrip() for model in BUNDLED
+        ]
+        rows.append((changed.WORDS.get(line.of, line.of), *cells, f"{line.people:,}"))
+    return table((group, *(f"`{model}`, mm" for model in BUNDLED), "people"), rows)
 
 
 def card(model: str) -> str:
@@ -338,6 +353,9 @@ def tables() -> dict[str, Callable[[], str]]:
     made |= {"visibility": visibility, "real": real, "tracks": tracks}
     made["headline"] = partial(headline, *BUNDLED)
     made |= {"readme": readme, "conditions": conditions}
+    made |= {
+        f"bench-2 by {group}": partial(second_bench, group) for group in ("condition", "poses", "family", "sensor")
+    }
     made["stability"] = lambda: table(("", "undisturbed", *5 * ("",)), disturbed.curves(DEFAULT))
     made["stability sensors"] = lambda: table(("sensor", "points", "MPJPE mm"), disturbed.sensors(DEFAULT))
     made["stability ends"] = lambda: table(("", "mean, mm", "deviation"), disturbed.ends(DEFAULT))

@@ -9,7 +9,7 @@ import pytest
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.lidar.presets import sensor
-from lidarpose.sample import Box
+from lidarpose.sample import SEEN, Box, LabeledSample
 from lidarpose.skeleton import BODY26
 from lidarpose.synth import generator
 from lidarpose.synth.acquisition import MOST_FRAMES, Acquisition, draw_acquisition
@@ -19,7 +19,7 @@ from lidarpose.synth.noise import box_of_two
 from lidarpose.synth.place import draw_place
 from lidarpose.synth.scene import SCENES
 from lidarpose.synth.simulate import simulate
-from lidarpose.train.augment import disturbed
+from lidarpose.train.augment import Augmentation, augmented, disturbed
 
 SEED = 11
 WILD, WIDE = SCENES["wild"], SCENES["wide"]
@@ -286,6 +286,14 @@ def test_crowded_crops_hold_two_and_the_center_says_who_is_meant():
         worse = disturbed(sample, strays=1.0, noise=1.0, rng=np.random.default_rng(index))
         assert worse is not sample
         np.testing.assert_array_equal(worse.center, sample.center)
+        stored = LabeledSample(
+            **{name: getattr(sample, name) for name in ("points", "center", "box", "source")},
+            part=sample.part.astype(np.int16),
+            pose=replace(sample.pose, visible=np.ones(26, np.float32)),
+            joint_labels=np.full(26, SEEN, np.uint8),
+        )
+        shown = augmented(stored, Augmentation(refined=0.0), np.random.default_rng(index))
+        np.testing.assert_allclose(shown.joints, sample.pose.joints - sample.center, atol=1e-5)
     assert np.median(others) > 40
 
 

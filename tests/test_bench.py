@@ -1,33 +1,48 @@
-"""The frozen benchmark: nothing may ever change it, and what it says of itself is so."""
+"""The frozen benchmarks: nothing may ever change them, and what they say of themselves is so."""
 
 import hashlib
+import json
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 
+from lidarpose import evaluation
+from lidarpose.cli import main
 from lidarpose.errors import InputError
 from lidarpose.eval import dataset as module
-from lidarpose.eval.dataset import BENCH_SHA256, bench_path, facing, load_bench, mean_poses, open_eval_dataset
+from lidarpose.eval.dataset import (
+    BENCH_SHA256,
+    BENCHES,
+    bench_path,
+    facing,
+    load_bench,
+    mean_poses,
+    open_eval_dataset,
+)
 from lidarpose.geometry import rotation_about
-from lidarpose.sample import Box
+from lidarpose.inference.results import PersonPose, Poses
+from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import BODY26, HUMAN15
 
 
 @cache
-def bench():
-    return load_bench()
+def bench(which="bench"):
+    return load_bench(which)
 
 
-def test_the_file_is_the_frozen_one_and_a_damaged_one_is_named(monkeypatch, tmp_path):
-    data = bench_path().read_bytes()
-    assert hashlib.sha256(data).hexdigest() == BENCH_SHA256
-    assert BENCH_SHA256.startswith("8abcafc6628c") and len(data) < 12e6
+@pytest.mark.parametrize("which, digest", [("bench", "8abcafc6628c"), ("bench-2", "872355263c4f")])
+def test_the_file_is_the_frozen_one_and_a_damaged_one_is_named(which, digest, monkeypatch, tmp_path):
+    data, (name, sha256) = bench_path(which).read_bytes(), BENCHES[which]
+    assert hashlib.sha256(data).hexdigest() == sha256
+    assert sha256.startswith(digest) and len(data) < 6.3e6 and BENCHES["bench"].sha256 == BENCH_SHA256
     damaged = tmp_path / "b.parquet"
     damaged.write_bytes(data[:-1])
-    monkeypatch.setattr(module, "bench_path", lambda: damaged)
-    with pytest.raises(InputError, match="is not lidarpose-bench-1 as it was frozen"):
-        load_bench()
+    monkeypatch.setattr(module, "bench_path", lambda which: damaged)
+    with pytest.raises(InputError, match=f"is not {name} as it was frozen"):
+        load_bench(which)
 
 
 def test_parts_are_equal():
@@ -41,6 +56,91 @@ def test_parts_are_equal():
     assert columns["distance"][people].min() >= 1.9 and columns["distance"][people].max() <= 40.1
     for rows in bench().clips:
         assert (columns["frame"][rows] == np.arange(16)).all() and len(set(columns["sensor"][rows])) == 1
+
+
+def test_parts_of_the_second_are_equal():
+    people, columns = bench("bench-2").people, bench("bench-2").columns
+    assert len(people) == 3000 and len(columns["clip"]) == 3500 and not bench("bench-2").clips
+    rows = pd.DataFrame({name: columns[name][people] for name in ("condition", "poses", "family", "sensor")})
+    count = rows.groupby("condition").size()
+    assert count.pop("sparse") == count.pop("integrated") == 150 and len(count) == 9 and (count == 300).all()
+    assert rows.groupby("poses").size().to_dict() == {"prior": 1000, "hdm05": 1000, "cmu": 600, "idle": 400}
+    families = rows[rows.poses == "hdm05"].groupby("family").size()
+    assert len(families) == 11 and families.min() > 85
+    assert set(rows[rows.poses == "idle"].family) == {"idle"} and len(set(rows.sensor)) == 12
+    # of two people there are two, of one alone none
+    two = columns["others"][people] >= 15
+    assert two[rows.condition == "crowded"].mean() > 0.8 and not two[rows.condition == "clean"].any()
+    box, joints = columns["box"][people], bench("bench-2").joints[people]
+    assert (np.linalg.norm(box[:, :2] - joints[:, 0, :2], axis=1)[rows.condition == "crowded"] < 0.8).mean() > 0.95
+    points = columns["num_points"]
+    assert points.min() >= 20 and points.max() <= 1200
+
+
+def test_objects_are_no_people():
+    objects, columns = bench("bench-2").objects, bench("bench-2").columns
+    assert len(objects) == 500 and not set(objects) & set(bench("bench-2").people) and not len(bench().objects)
+    assert set(columns["condition"][objects]) == {"object"} and len(set(columns["family"][objects])) > 30
+    assert (
+        np.isnan(bench("bench-2").joints[objects]).all()
+        and not np.isnan(bench("bench-2").joints[bench("bench-2").people]).any()
+    )
+
+
+class Knowing:
+    """A model that says where somebody's pelvis is about, and whether somebody is there, by the number of points."""
+
+    skeleton, backend = BODY26, SimpleNamespace(batch=64)
+    model = {"name": "knowing"}
+
+    def __init__(self, person=None):
+        self.person, self.shown = person, 0
+
+    def predict(self, points, *, sensor_origin=None, skeleton=None, progress=False):
+        self.shown += len(points)
+        people = []
+        for cloud in points:
+            said = {} if self.person is None else dict.fromkeys(("person", "second_person"), self.person(cloud))
+            pose = Pose(joints=np.repeat(cloud.mean(0)[None], 26, 0), skeleton=BODY26, **said)
+            people.append(PersonPose(pose=pose, skeleton=BODY26, points=cloud))
+        return Poses(people=tuple(people), skeleton=BODY26)
+
+
+def test_the_second_is_scored_by_condition_family_and_sensor():
+    model = Knowing()
+    result = evaluation.evaluate(model, "bench-2", limit=600)
+    # objects are shown to who has something to say of them
+    assert model.shown == result.counts["people"] == 600
+    rows = open_eval_dataset("bench-2", limit=600)
+    for group, of in (("condition", "merged"), ("family", "kick"), ("sensor", "vlp-16"), ("poses", "hdm05")):
+        line = result.line("mpjpe", group, of)
+        assert line.people == sum(getattr(one, group, one.info.sensor) == of for one in rows) > 10
+    assert not any("auroc" in line.figure for line in result.lines)
+
+
+def test_people_are_told_from_objects_by_who_says_so(tmp_path):
+    run = evaluation.run(Knowing(lambda cloud: np.exp(-len(cloud) / 100)), ["bench-2"], limit=300)
+    result = run.scores.results[0]
+    assert run.evaluations[0].predictions.person.max() <= 1
+    points, objects = bench("bench-2").columns["num_points"], bench("bench-2").objects
+    people = points[[one.row for one in open_eval_dataset("bench-2", limit=300)]]
+    less = (people[:, None] < points[objects]).mean() + 0.5 * (people[:, None] == points[objects]).mean()
+    assert result.line("person_auroc").value == pytest.approx(100 * less)
+    assert result.line("second_person_auroc").value < 50
+    evaluation.write(run, tmp_path / "out")
+    again = evaluation.read_poses(tmp_path / "out" / "poses.parquet")["lidarpose-bench-2"]
+    np.testing.assert_array_equal(again.person, run.evaluations[0].predictions.person)
+    assert set(again.family) == set(run.evaluations[0].predictions.family) != {""}
+
+
+def test_the_command_prints_slices_of_the_second(capsys, tmp_path):
+    assert not main(["evaluate", "tiny", "bench-2", "--limit", "60", "--out", str(tmp_path / "out")])
+    text = capsys.readouterr().out
+    assert "lidarpose-bench-2: MPJPE" in text and "60 of 3,000 people" in text
+    for words in ("condition accumulated", "family walk", "sensor os1-64"):
+        assert f"MPJPE, {words}, mm" in text
+    (result,) = json.loads((tmp_path / "out" / "scores.json").read_text())["results"]
+    assert result["setting"]["dataset"] == "lidarpose-bench-2"
 
 
 def test_points_lie_in_their_box_and_bodies_about_their_joints():

@@ -40,13 +40,14 @@ _TABLE = """
 --out FILE  write to FILE (default: print)
 """
 # groups of rows that the terminal shows; the others are in scores.json
-_SHOWN = ("condition", "plain", "joints", "body", "joint", "distance, m", "points", "hidden share")
+_SHOWN = ("condition", "family", "sensor", "plain", "joints", "body", "joint", "distance, m", "points", "hidden share")
 # metrics of these groups that it shows, besides those of everybody
 _GROUP_METRICS = ("mpjpe", "turned_round", "pck_10cm")
 _TITLES = {
     **{"mpjpe": "MPJPE", "pa_mpjpe": "PA-MPJPE", "pck3": "PCK-3", "pck5": "PCK-5"},
     **{"turned_round": "facing flipped (> 90 deg)", "pem": "PEM", "oks_ap": "OKS-AP", "auroc": "AUROC"},
     "pck_10cm": "within 10 cm",
+    **{"person_auroc": "AUROC of person", "second_person_auroc": "AUROC of a second person"},
 }
 
 
@@ -64,7 +65,7 @@ def add(commands) -> None:
     evaluate.set_defaults(run=_evaluate)
     words = f"{', '.join(BUNDLED)}, a checkpoint, an exported .onnx, or detector: what finds people in whole scans"
     evaluate.add_argument("weights", metavar="CHECKPOINT", help=words)
-    words = "a folder written by prepare or synth, or bench; of detector heldout (default without --scans)"
+    words = "a folder written by prepare or synth, bench or bench-2; of detector heldout (default without --scans)"
     evaluate.add_argument("datasets", nargs="*", metavar="DATASET", help=words)
     settings = add_options(evaluate, _OPTIONS)
     evaluate.add_argument("--out", metavar="DIR", help="a new or empty folder (default evaluation/NAME, numbered)")

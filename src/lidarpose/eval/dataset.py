@@ -1,12 +1,16 @@
 """Datasets to evaluate on: folders that `lidarpose prepare` or `synth` wrote, and lidarpose-bench.
 
-lidarpose-bench is a frozen set of synthetic people and clips on which weights are scored: one Parquet file that ships
-with the package and that no later version of the generator touches (`tools/make_bench.py` made it once). A row is one
-person in one frame:
+lidarpose-bench 1 and 2 are frozen sets of synthetic people on which weights are scored, 1 with clips of them: one
+Parquet file each that ships with the package and that no later version of the generator touches (`tools/make_bench.py`
+made them once). A row is one person in one frame:
 
     clip, frame         number of the clip and frame of it; clip -1: a person alone
-    condition           clean, occluded, cluttered, crop (a poor detector's box) or company (a second person)
-    poses               prior (procedural) or captured (subjects kept out of all training)
+    person              of 2: False of 500 crops without a person: joints NaN, condition object, family the thing
+    others              of 2: how many points are a second person's
+    condition           clean, occluded, cluttered, crop (a poor detector's box) or company (a second person); of 2 also
+                        the `conditions` of a sample
+    poses               prior (procedural) or captured (subjects kept out of all training); of 2 prior, cmu, hdm05, idle
+    family              of 2: what is done, in one word for all sources
     sensor, kind, distance, visible, clutter, upright      as in `sample.PersonInfo`
     origin              (3,) m in the level frame at the sensor; points_mm: x, y, z of all points from it, millimeters
     part                one a point: 0 = not body, 1 + j = the bone of SMPL-24's joint j
@@ -20,7 +24,7 @@ from dataclasses import dataclass, field
 from importlib import resources
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -32,9 +36,21 @@ from lidarpose.io.files import file_error, read_bytes
 from lidarpose.sample import SEEN, Box, LabeledSample, PersonInfo, Pose, center_of, is_plain
 from lidarpose.skeleton import BODY26, HUMAN15, Skeleton, skeleton
 
-# the word for the set that ships with the package, and its name
-BENCH, BENCH_NAME = "bench", "lidarpose-bench-1"
-BENCH_SHA256 = "8abcafc6628c7580b8bdf91f9c05992c7c6e4098d6922973c7cfc39d8fe0e0d2"
+
+class BenchFile(NamedTuple):
+    """A set that ships with the package: its name, and the hash of its file."""
+
+    name: str
+    sha256: str
+
+
+# by the word for it; the first one's is also the kind of both
+BENCH = "bench"
+BENCHES = {
+    BENCH: BenchFile("lidarpose-bench-1", "8abcafc6628c7580b8bdf91f9c05992c7c6e4098d6922973c7cfc39d8fe0e0d2"),
+    "bench-2": BenchFile("lidarpose-bench-2", "872355263c4fc6de96e158c177ebb8694753ab5de5110013eb029a6152caf69d"),
+}
+BENCH_NAME, BENCH_SHA256 = BENCHES[BENCH]
 # the word for everybody, whatever split
 EVERYBODY = "all"
 # splits that are scored where none is named, the first that there is. Waymo's papers report on its validation folder
@@ -53,8 +69,8 @@ class EvalSample:
     """A sample and its place in the dataset.
 
     points: (n, 3) m, what the network is shown, at first all that the dataset holds, as precise as it holds them;
-    shard, row: where in the dataset; condition, poses: as in lidarpose-bench, "" elsewhere; moving: a frame of a clip
-    that is scored for motion alone.
+    shard, row: where in the dataset; condition, poses, family: as in lidarpose-bench, "" elsewhere; moving: a frame of
+    a clip that is scored for motion alone.
     """
 
     sample: LabeledSample
@@ -63,6 +79,7 @@ class EvalSample:
     row: int
     condition: str = ""
     poses: str = ""
+    family: str = ""
     moving: bool = False
 
     @property
@@ -121,8 +138,8 @@ def open_eval_dataset(dataset: str | PathLike, *, split: str | None = None, limi
         limit = check_int("limit", limit, least=1, hint=" person")
     if not isinstance(dataset, str | PathLike):
         raise InputError(f"expected a dataset to evaluate on, {BENCH} or the path of a folder, got {dataset!r}")
-    if str(dataset) == BENCH:
-        return _open_bench(split, limit)
+    if str(dataset) in BENCHES:
+        return _open_bench(str(dataset), split, limit)
     return _open_folder(Path(dataset), split, limit)
 
 
@@ -239,7 +256,12 @@ class Bench:
     @property
     def people(self) -> np.ndarray:
         """Rows of people alone."""
-        return np.flatnonzero(self.columns["clip"] < 0)
+        return np.flatnonzero(self.columns["person"] & (self.columns["clip"] < 0))
+
+    @property
+    def objects(self) -> np.ndarray:
+        """Rows of crops without a person."""
+        return np.flatnonzero(~self.columns["person"])
 
     @property
     def clips(self) -> list[np.ndarray]:
@@ -248,40 +270,49 @@ class Bench:
         return [np.flatnonzero(clip == k) for k in range(int(clip.max(initial=-1)) + 1)]
 
 
-def bench_path() -> Path:
-    """Where the package keeps the file."""
-    return Path(str(resources.files("lidarpose.eval") / "assets" / f"{BENCH_NAME}.parquet"))
+def bench_path(which: str = BENCH) -> Path:
+    """Where the package keeps the file of a name of `BENCHES`."""
+    return Path(str(resources.files("lidarpose.eval") / "assets" / f"{BENCHES[which].name}.parquet"))
 
 
-def load_bench() -> Bench:
-    """The set. Raises InputError where the file is not the one that was frozen, MissingExtra without pyarrow."""
+def load_bench(which: str = BENCH) -> Bench:
+    """The set of a name of `BENCHES`. Raises InputError where the file is not the one that was frozen, MissingExtra
+    without pyarrow."""
     pa, parquet = pyarrow()
-    path = bench_path()
-    data = read_bytes(path, expected=f"{BENCH_NAME}, a Parquet file")
-    if hashlib.sha256(data).hexdigest() != BENCH_SHA256:
-        raise file_error(path, f"is not {BENCH_NAME} as it was frozen: install lidarpose again")
+    path, (name, sha256) = bench_path(which), BENCHES[which]
+    data = read_bytes(path, expected=f"{name}, a Parquet file")
+    if hashlib.sha256(data).hexdigest() != sha256:
+        raise file_error(path, f"is not {name} as it was frozen: install lidarpose again")
     table = parquet.read_table(pa.BufferReader(data)).to_pandas()
     columns: dict[str, Any] = {name: values.to_numpy() for name, values in table.items()}
     columns |= {name: np.stack(columns[name]) for name in ("origin", "joints", "box")}
     shifts = zip(columns["origin"], columns.pop("points_mm"), strict=True)
     points = tuple(origin + millimeters.reshape(-1, 3) / 1e3 for origin, millimeters in shifts)
     columns["num_points"] = np.array([len(cloud) for cloud in points])
+    # of bench 1 all are people, of no family
+    own = {
+        "person": np.ones(len(points), bool),
+        "others": np.zeros(len(points), int),
+        "family": np.full(len(points), ""),
+    }
+    columns = own | columns
     joints = columns.pop("joints").reshape(-1, len(BODY26), 3)
     return Bench(points=points, joints=joints, columns=columns)
 
 
-def _open_bench(split: str | None, limit: int | None) -> EvalDataset:
+def _open_bench(which: str, split: str | None, limit: int | None) -> EvalDataset:
     """lidarpose-bench: its people alone, and without a limit the frames of its clips for motion."""
+    name = BENCHES[which].name
     if split not in (None, EVERYBODY):
-        raise InputError(f"{BENCH_NAME} is one test set without splits, got {split!r}: leave --split out")
-    bench = load_bench()
+        raise InputError(f"{name} is one test set without splits, got {split!r}: leave --split out")
+    bench = load_bench(which)
     total = len(bench.people)
     limit = limit if limit is not None and limit < total else None
     rows = bench.people[spread(total, limit)]
     if limit is None:
         rows = np.concatenate([rows, *bench.clips])
     return EvalDataset(
-        name=BENCH_NAME,
+        name=name,
         kind=BENCH,
         skeleton=BODY26,
         scored=_SYNTHETIC,
@@ -309,7 +340,7 @@ def _bench_sample(bench: Bench, row: int) -> EvalSample:
         time=frame / 10 if clip >= 0 else np.nan,
         info=PersonInfo(**{name: columns[name] for name in known}),
     )
-    words = {name: str(columns[name]) for name in ("condition", "poses")}
+    words = {name: str(columns[name]) for name in ("condition", "poses", "family")}
     return EvalSample(sample=sample, points=bench.points[row], shard=0, row=row, moving=clip >= 0, **words)
 
 

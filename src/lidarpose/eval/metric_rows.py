@@ -27,6 +27,8 @@ from lidarpose.sample import CONFIDENCE_RADIUS, HIDDEN, SEEN, UNLABELED
 # people of fewer points do not tell where they face
 PLENTY = 100
 _REPEATS = 1000
+# points from which on a second person is said to be in a crop
+FEWEST_OF_SECOND = 15
 # frames count as evenly apart where two steps differ by less than this share
 _EVEN = 0.2
 # joints of each half of the body, without their sides. Source: Haque et al. 2016, whose torso is in neither
@@ -157,7 +159,7 @@ def _groups(section: str, p: Predictions, setting: Setting) -> Iterator[tuple[st
             if name != "all":
                 yield "joints", name, everybody, joints
     elif section == "conditions":
-        for title in ("condition", "poses", "sensor"):
+        for title in ("condition", "poses", "family", "sensor"):
             values = getattr(p, title)
             for of in np.unique(values[values != ""]).tolist():
                 yield title, of, values == of, None
@@ -272,6 +274,33 @@ def _dapt_compat_rows(p: Predictions, setting: Setting) -> Iterator[MetricRow]:
                 group = "all" if name == "all" else "joints"
                 options: dict[str, Any] = {"unit": unit, "no_pose": len(p) - len(posed), "arithmetic": RELEASED}
                 yield _row(score, setting, metric, group=group, of=name, **options)
+
+
+# ---- persons
+
+
+def person_rows(p: Predictions, objects: np.ndarray, others: np.ndarray, setting: Setting) -> Iterator[MetricRow]:
+    """How well a network that says so tells crops of people from those of objects, and of two people from those of one.
+
+    Args:
+        p: people.
+        objects: (K,) what it says of the objects, the probability of a person.
+        others: (N,) how many points are a second person's; with a few it is neither there nor not.
+    """
+    clear = (others == 0) | (others >= FEWEST_OF_SECOND)
+    ranked = {
+        # who has no pose is not taken for a person
+        "person_auroc": (
+            np.append(np.where(p.posed, p.person, 0), objects).astype(np.float32),
+            np.arange(len(p) + len(objects)) < len(p),
+        ),
+        "second_person_auroc": (p.second_person[clear], others[clear] > 0),
+    }
+    for figure, (probability, is_true) in ranked.items():
+        stated = ~np.isnan(probability)
+        if len(np.unique(is_true[stated])) == 2:
+            value = 100 * aggregate.auroc(probability[stated].astype(float), is_true[stated])
+            yield _row(Score(value, people=int(stated.sum())), setting, figure, unit="%")
 
 
 # ---- motion

@@ -6,7 +6,7 @@ A row is one person in one frame; columns:
     dataset             name, as in scores.json
     shard, row          where in the dataset
     sequence, frame, track, time        s, NaN where unknown
-    sensor, condition, poses, plain     what synthetic sets tell; "" where nothing is known
+    sensor, condition, poses, family, plain     what synthetic sets tell; "" where nothing is known
     moving              a frame of a clip that counts for acceleration alone
     points              how many points the network was given
     distance            m from the sensor, NaN where unknown
@@ -16,6 +16,7 @@ A row is one person in one frame; columns:
                         without a pose, true NaN without a label
     labels              one a joint: 0 not labeled, 1 hidden or uncertain, 2 seen
     confidence, spread, visible         one a joint, null where the network does not tell; spread in m
+    person, second_person               probabilities that the cloud shows one, NaN where the network does not tell
     error_mm            one a joint, NaN where there is nothing to score
 """
 
@@ -58,6 +59,7 @@ class Predictions:
     sensor: np.ndarray = _column(str)
     condition: np.ndarray = _column(str)
     poses: np.ndarray = _column(str)
+    family: np.ndarray = _column(str)
     plain: np.ndarray = _column(bool)
     moving: np.ndarray = _column(bool)
     points: np.ndarray = _column(np.int32)
@@ -70,6 +72,8 @@ class Predictions:
     confidence: np.ndarray = _column(np.float32, -1, null=True)
     spread: np.ndarray = _column(np.float32, -1, null=True)
     visible: np.ndarray = _column(np.float32, -1, null=True)
+    person: np.ndarray = _column(np.float32, null=True)
+    second_person: np.ndarray = _column(np.float32, null=True)
 
     def __len__(self) -> int:
         return len(self.pred)
@@ -122,7 +126,8 @@ def stack(skeleton: Skeleton, rows: Sequence[dict[str, Any]]) -> Predictions:
         if column.metadata["null"]:
             values = [np.full(shape, np.nan) if row.get(name) is None else np.reshape(row[name], shape) for row in rows]
         else:
-            values = [row[name] for row in rows]
+            # files of before 0.3 have no families
+            values = [row.get(name, "") if name == "family" else row[name] for row in rows]
         columns[name] = np.array(values, kind).reshape(len(rows), *shape)
     return Predictions(skeleton=skeleton, **columns)
 

@@ -18,7 +18,7 @@ from lidarpose.eval.dataset import EvalDataset, EvalSample
 from lidarpose.eval.predictions import Predictions, stack
 from lidarpose.eval.scores import Setting
 from lidarpose.inference.inputs import Clips
-from lidarpose.sample import UNLABELED, Box, LabeledSample
+from lidarpose.sample import PER_PERSON, UNLABELED, Box, LabeledSample
 from lidarpose.skeleton import Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
 
@@ -251,13 +251,17 @@ class EvalSetup:
         pick = self.model.skeleton.map_to(self.joints)
         stated = {name: getattr(estimates, name) for name in ("confidence", "spread", "visible")}
         stated = {name: value[index][..., pick] for name, value in stated.items() if value is not None}
-        return stated | {"pred": estimates.joints[index][..., pick, :]}
+        whole = {name: value[index] for name in PER_PERSON if (value := getattr(estimates, name)) is not None}
+        return stated | whole | {"pred": estimates.joints[index][..., pick, :]}
 
     def _known(self, person: EvalSample) -> dict[str, Any]:
         sample, box = person.sample, person.sample.box
         pick = self.dataset.skeleton.map_to(self.joints)
         return {
-            **{name: getattr(person, name) for name in ("shard", "row", "condition", "poses", "plain", "moving")},
+            **{
+                name: getattr(person, name)
+                for name in ("shard", "row", "condition", "poses", "family", "plain", "moving")
+            },
             **{name: getattr(sample, name) for name in ("sequence", "frame", "track", "time", "distance")},
             "sensor": str(person.info.sensor),
             "hidden": 1 - person.info.visible,

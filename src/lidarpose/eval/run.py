@@ -17,7 +17,7 @@ from lidarpose._version import __version__
 from lidarpose.data.shards import pyarrow
 from lidarpose.errors import InputError
 from lidarpose.eval.dataset import BENCH, Bench, EvalDataset, EvalSample, count_skipped, mean_poses, open_eval_dataset
-from lidarpose.eval.metric_rows import baseline_rows, metric_rows
+from lidarpose.eval.metric_rows import baseline_rows, metric_rows, person_rows
 from lidarpose.eval.metrics import aggregate
 from lidarpose.eval.predictions import Predictions, concatenate, write_poses
 from lidarpose.eval.protocols import EvalSetup, Model, eval_setup
@@ -80,6 +80,7 @@ def evaluate_dataset(
     lines = metric_rows(predictions, setting, dapt_compat=dapt_compat)
     if dataset.bench is not None:
         lines += _baselines(dataset.bench, predictions, setting)
+        lines += _person_rows(setup, dataset.bench, predictions, setting)
     alone = ~predictions.moving
     counts = {"people": int(alone.sum()), "frames of clips": int((~alone).sum())}
     counts["without a pose"] = int((~predictions.posed & alone).sum())
@@ -122,6 +123,19 @@ def _baselines(bench: Bench, predictions: Predictions, setting: Setting) -> tupl
         baseline = replace(predictions, pred=pred, confidence=unstated, spread=unstated, visible=unstated)
         rows += baseline_rows(baseline, replace(setting, method=f"{BASELINE}{name}"))
     return rows
+
+
+def _person_rows(setup: EvalSetup, bench: Bench, predictions: Predictions, setting: Setting) -> tuple[MetricRow, ...]:
+    """Of a network that says whether a crop shows a person, where the set has objects too."""
+    alone = predictions.select(~predictions.moving)
+    if not len(bench.objects) or np.isnan(alone.person).all():
+        return ()
+    model, origin = setup.model, np.zeros(3) if setting.sensor == "known" else None
+    clouds = [bench.points[row] for row in bench.objects]
+    answers = model.predict(clouds, sensor_origin=origin, skeleton=model.skeleton.name)
+    # what no pose is found in is no person
+    objects = np.array([0.0 if answer.person is None else answer.person for answer in answers])
+    return tuple(person_rows(alone, objects, bench.columns["others"][alone.row], setting))
 
 
 def _notes(setup: EvalSetup, setting: Setting, predictions: Predictions) -> Iterator[str]:

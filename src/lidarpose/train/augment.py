@@ -257,9 +257,13 @@ def disturbed(sample: _Sample, *, strays: float, noise: float, rng: np.random.Ge
         points = jitter(points, sigma=sigma, clip=2 * sigma, rng=rng).astype(np.float32)
     if points is sample.points:
         return sample
-    center = sample.center if "crowded" in sample.conditions else center_of(points)
     # clutter comes from no ring
-    return replace(sample, points=points, part=part, ring=None, center=center)
+    return replace(sample, points=points, part=part, ring=None, center=_own_center(sample, points))
+
+
+def _own_center(sample: Sample, points: np.ndarray) -> np.ndarray:
+    """The center (3,) m of points of a sample; of two people the one that says who is meant."""
+    return sample.center if "crowded" in sample.conditions else center_of(points)
 
 
 def _with_clutter(
@@ -288,7 +292,7 @@ def _view(sample: LabeledSample, kind: Augmentation, rng: np.random.Generator) -
     if rng.random() < kind.cut:
         keep &= half_space_keep(sample.points, most=0.4, rng=rng)
     sample = _cropped(sample, keep)
-    center = center_of(sample.points)
+    center = _own_center(sample, sample.points)
     # where the pelvis is not labeled, half way between the hips: what a second pass centers on
     pelvis = sample.joints[_PELVIS]
     root = sample.joints[_HIPS].mean(0) if np.isnan(pelvis).any() else pelvis
