@@ -13,11 +13,12 @@ from lidarpose.cli import main
 from lidarpose.geometry import rotation_about
 from lidarpose.io.sources.frame import Frame, FrameSource, IndexedRecording, Sweep
 from lidarpose.lidar.raycast import scan
-from lidarpose.recording import output
+from lidarpose.recording import output, picture
 from lidarpose.recording.frame_boxes import FrameBoxes
 from lidarpose.recording.predict_recording import FramePredictor
 from lidarpose.synth.bodies import draw_bodies
 from lidarpose.synth.environment.mesh import Mesh, quad, union
+from lidarpose.viz.draw import draw_people
 
 FRAMES, DAMAGED = 7, 4
 # where two people stand in the first frame, and how far they go in each, m
@@ -330,6 +331,20 @@ def test_the_command_line(drive, folder, tmp_path, monkeypatch, capsys):
     assert main(["predict", str(drive), "--end", "0.1", "--live", "--out", "-"]) == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [line["frame"] for line in lines] == [0, 1] and lines[1]["people"][0]["track"] == 0
+
+
+def test_of_a_recording_of_one_frame_the_people_are_drawn(drive, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(picture, "draw_people", lambda panels: drawn.extend(panels) or draw_people(panels))
+    command = ["predict", str(drive), "--track", "--picture", "--out", str(tmp_path / "a.jsonl")]
+    assert main([*command, "--end", "0.1"]) == 0 and not drawn
+    assert main([*command, "--end", "0.05"]) == 0
+    (line,) = (json.loads(text) for text in open(tmp_path / "a.jsonl"))
+    assert len(drawn) == len(line["people"]) == 2
+    for panel, person in zip(drawn, line["people"], strict=True):
+        assert panel.label == f"{person['id']} · score {person['score']:.2f}"
+        np.testing.assert_allclose(panel.pose.joints, person["joints"], atol=1e-9)
+        assert abs(len(panel.points) - person["num_points"]) <= 2 and panel.box.contains(panel.points).all()
 
 
 @pytest.mark.parametrize(

@@ -84,7 +84,7 @@ def predict_recording(
         tell=lambda text: tell(f"lidarpose: {text}"),
     )
     if ways is not None and picture is not None:
-        write_atomic(picture, ways.draw(source, title=Path(source.name).name))
+        write_atomic(picture, ways.draw(source, steps.wanted, title=Path(source.name).name))
     for line in [*source.warnings, *summary.warning_lines(_MOST_WARNINGS)]:
         tell(f"lidarpose: warning: {line}")
     tell(f"{summary.text(steps.is_tracked)} -> {' and '.join(str(path) for path in (result, picture) if path)}")

@@ -1,5 +1,6 @@
-"""The picture of a recording: the ways of its people from above, over some of its frames."""
+"""The picture of a recording: the ways of its people from above, over some of its frames; of one frame, people too."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -8,15 +9,18 @@ from lidarpose.geometry import transform_points
 from lidarpose.io.sources import Frame, Source
 from lidarpose.recording.coordinates import FixedFrame, moved_yaw
 from lidarpose.recording.output import counted
-from lidarpose.sample import Box
+from lidarpose.sample import Box, Pose
+from lidarpose.skeleton import Skeleton
 from lidarpose.viz.bird_eye import ScanPanel, draw_scans
+from lidarpose.viz.draw import draw_people, stack_pictures
+from lidarpose.viz.person_view import Panel
 
 # frames whose points are drawn where the sensor moves
 _FRAMES = 8
 
 
 class WaysPicture:
-    """Collects where people are, line by line of the result, in the frame that stays where it is."""
+    """Collects where people are, line by line of the result, in the fixed frame."""
 
     def __init__(self, up: str):
         self._fixed = FixedFrame(up)
@@ -24,6 +28,8 @@ class WaysPicture:
         self._to_fixed: list[np.ndarray] = []
         self._ways: dict[int | None, list[np.ndarray]] = {}
         self._yaws: dict[int | None, float] = {}
+        # of the frame that came last
+        self._people: list[dict[str, Any]] = []
 
     def add(self, line: dict[str, Any]) -> None:
         if line["error"] is not None:
@@ -34,14 +40,20 @@ class WaysPicture:
         # lines may hold people in the world's frame already
         is_moved = line.get("coordinates") == "world"
         T, R_upright = (np.eye(4), None) if is_moved else (T_fixed_sensor, self._fixed.R_upright)
+        self._people = []
         for person in line["people"]:
-            if person["joints"] is not None:
-                joints = transform_points(T, np.array(person["joints"]))
+            joints, box = person["joints"], person["box"]
+            if box is not None:
+                center, yaw = transform_points(T, np.array(box["center"])), moved_yaw(box["yaw"], T, R_upright)
+                box = Box(center=center, size=np.array(box["size"]), yaw=yaw, id=person["id"])
+            if joints is not None:
+                joints = transform_points(T, np.array(joints))
                 self._ways.setdefault(person["track"], []).append((joints.min(0) + joints.max(0)) / 2)
-                if person["box"] is not None:
-                    self._yaws[person["track"]] = moved_yaw(person["box"]["yaw"], T, R_upright)
+                if box is not None:
+                    self._yaws[person["track"]] = box.yaw
+            self._people.append(person | {"joints": joints, "box": box})
 
-    def draw(self, source: Source, *, title: str) -> bytes:
+    def draw(self, source: Source, skeleton: Skeleton, *, title: str) -> bytes:
         """The PNG; the source is read again for the points of some frames."""
         ways = {id: np.array(places) for id, places in self._ways.items()}
         boxes = [
@@ -52,15 +64,30 @@ class WaysPicture:
         people = counted(len(boxes), "track")
         if not boxes and None in ways:
             people = counted(len(ways[None]), "person", "people")
+        points = self._points(source)
         panel = ScanPanel(
-            points=self._points(source),
+            points=points,
             boxes=boxes,
             tracks=[way for id, way in ways.items() if id is not None],
             places=ways.get(None),
             label=f"{people} in {counted(len(self._frames), 'frame')}",
             sensor=self._to_fixed[-1][:2, 3].tolist() if self._to_fixed else None,
         )
-        return draw_scans([panel], title=title)
+        above = draw_scans([panel], title=title)
+        cards = list(self._cards(points, skeleton)) if len(self._frames) == 1 else []
+        return stack_pictures([above, draw_people(cards)]) if cards else above
+
+    def _cards(self, points: np.ndarray, skeleton: Skeleton) -> Iterator[Panel]:
+        """Everybody in a recording of one frame of points (n, 3) m."""
+        for person in self._people:
+            joints, box, score = person["joints"], person["box"], person["score"]
+            own = points if box is None else points[box.contains(points)]
+            pose = None
+            if joints is not None:
+                pose = Pose(joints=joints, skeleton=skeleton, confidence=person["confidence"] or None)
+            label = f"{person['id']}" if score is None else f"{person['id']} · score {score:.2f}"
+            away = np.linalg.norm(np.median(own, 0) - self._to_fixed[0][:3, 3]) if len(own) else np.nan
+            yield Panel(points=own, pose=pose, label=label, box=box, distance=float(away))
 
     def _points(self, source: Source) -> np.ndarray:
         """(n, 3) m of frames from the beginning to the end; of one where the sensor stays."""
