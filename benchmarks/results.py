@@ -58,8 +58,8 @@ def table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
 
 def _longest() -> dict[int, dict[str, float]]:
     """The figures of `tiny` as it ships, by the number of people that it has seen in all its runs."""
-    found = {name: figure["value"] for name, figure in figures(_scored("tiny").results[0]).items()}
-    return {sum(one["people_seen"] for one in runs_of(read_header(bundled_path("tiny")).card)): found}
+    scores = {name: figure["value"] for name, figure in figures(_scored("tiny").results[0]).items()}
+    return {sum(one["people_seen"] for one in runs_of(read_header(bundled_path("tiny")).card)): scores}
 
 
 def strays(**networks: str) -> str:
@@ -170,24 +170,24 @@ def second_bench(group: str) -> str:
 def card(model: str) -> str:
     """How a bundled model was made, as its file says."""
     path = bundled_path(model)
-    told = read_header(path).card
-    runs = runs_of(told)
+    card = read_header(path).card
+    runs = runs_of(card)
     if _scored(model).weights["digest"] != content_digest(path, expected="a checkpoint"):
         raise SystemExit(f"docs/scores/{model}.json is of other weights: run lidarpose evaluate {model} bench")
     rows = [
         ("file", f"`{path.name}`, {path.stat().st_size / 1e6:.1f} MB in float16"),
         ("as ONNX", f"`{model}.onnx`, {bundled_path(model, '.onnx').stat().st_size / 1e6:.1f} MB"),
-        ("command", f"`{told['command']}`"),
-        ("seed", str(told["recipe"]["seed"])),
+        ("command", f"`{card['command']}`"),
+        ("seed", str(card["recipe"]["seed"])),
         ("people seen", _in_all(runs, "people_seen", ",")),
         ("hours", _in_all(runs, "hours", ".2f")),
-        ("captured motion", f"{told['motion']}, subjects {', '.join(told['recipe']['subjects'])}"),
+        ("captured motion", f"{card['motion']}, subjects {', '.join(card['recipe']['subjects'])}"),
     ]
     stages = [f"{run['recipe']['init']} ({before['people_seen']:,} people)" for run, before in pairwise(runs)]
     if stages:
         rows.append(("started from", ", itself from ".join(stages)))
-    if "note" in told:
-        rows.append(("note", told["note"]))
+    if "note" in card:
+        rows.append(("note", card["note"]))
     return table(("", ""), rows)
 
 
@@ -213,9 +213,9 @@ def _in_all(runs: list[dict], name: str, form: str) -> str:
 def extras(model: str) -> str:
     """What test-time extras bring; see test_time.py."""
     rows = []
-    found = _read("test_time")[model]
-    usual = next(one for one in found["ways"] if one["usual"])
-    for one in found["ways"]:
+    report = _read("test_time")[model]
+    usual = next(one for one in report["ways"] if one["usual"])
+    for one in report["ways"]:
         cost = one["seconds"] / usual["seconds"]
         figures = [f"{one['figures'][name]['value']:.1f}" for name in ("all", "plain", "cluttered", "occluded")]
         rows.append((one["what"], *figures, f"{one['figures']['turned round']['value']:.1f} %", f"{cost:.1f}"))
@@ -225,8 +225,8 @@ def extras(model: str) -> str:
 def visibility() -> str:
     """Conditions against clean people of whom as much is hidden; see visibility.py."""
     rows = []
-    for model, found in _read("visibility").items():
-        for one in found:
+    for model, rows_of_model in _read("visibility").items():
+        for one in rows_of_model:
             ratio = f"{one['ratio']:.2f} [{one['low']:.2f}, {one['high']:.2f}]"
             mm, clean = f"{one['mm']:.1f}", f"{one['clean']:.1f}"
             condition = changed.WORDS.get(one["condition"], one["condition"])
@@ -296,17 +296,17 @@ def calibration() -> str:
 
 def spread() -> str:
     """What `spread` predicts beside the truth; see calibration.py."""
-    found = _read("calibration")
+    report = _read("calibration")
     rows = [
-        (one["of"], f"{one['share']:.1f} %", f"{one['stated']:.1f}", f"{one['true']:.1f}") for one in found["spread"]
+        (one["of"], f"{one['share']:.1f} %", f"{one['stated']:.1f}", f"{one['true']:.1f}") for one in report["spread"]
     ]
-    rows.append(("rank correlation of the two", "", "", f"{found['rank']:.2f}"))
+    rows.append(("rank correlation of the two", "", "", f"{report['rank']:.2f}"))
     return table(("`spread`", "joints", "predicted, mm", "true, mm"), rows)
 
 
 def rejection(model: str) -> str:
-    found = _read("test_time")[model]["rejection"]
-    rows = [(f"{one['kept']:.0f} %", f"{one['people']:.1f}", f"{one['joints']:.1f}") for one in found]
+    report = _read("test_time")[model]["rejection"]
+    rows = [(f"{one['kept']:.0f} %", f"{one['people']:.1f}", f"{one['joints']:.1f}") for one in report]
     return table(
         ("kept", "people with the highest mean confidence: mm", "joints with the highest confidence: mm"), rows
     )
@@ -377,7 +377,7 @@ def tables() -> dict[str, Callable[[], str]]:
 def written(page: str) -> str:
     """The page, its tables made anew. Raises KeyError for a table that nothing makes."""
     made = tables()
-    return _MARKED.sub(lambda found: found[1] + "\n" + made[found[2]]() + "\n" + found[3], page)
+    return _MARKED.sub(lambda match: match[1] + "\n" + made[match[2]]() + "\n" + match[3], page)
 
 
 def main() -> None:

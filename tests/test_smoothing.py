@@ -47,6 +47,22 @@ def walker():
     return made
 
 
+@pytest.fixture(scope="module")
+def people_in_motion():
+    """True joints and noisy tracks of 40 synthesized clips, half of whose error all frames of a clip have in common."""
+    from lidarpose.synth.generator import Generator
+
+    generator, rng, clips = Generator(scene="wild", measure=False), np.random.default_rng(3), []
+    for index in range(40):
+        true = np.stack([person.sample.pose.to(SMPL24).joints for person in generator.clip(31, index)])
+        spread = rng.uniform(0.03, 0.09, true.shape[1:2]) * rng.uniform(0.8, 1.2, true.shape[:2])
+        noise = (rng.normal(size=true.shape[1:]) + rng.normal(size=true.shape)) / np.sqrt(2)
+        joints = true + noise * spread[..., None] / 1.6
+        times = np.arange(len(true)) / 10
+        clips.append((true, TrackPoses(times=times, joints=joints, spread=spread, skeleton=SMPL24)))
+    return clips
+
+
 def test_paths_are_those_of_one_dense_solve(walker):
     """The filter forth and back finds the least squares' solution, whatever the steps."""
     from reference.smoothing_reference import smooth_joints_reference
@@ -135,6 +151,26 @@ def test_unseen_frames_are_filled_and_say_so(walker):
     live = follow(given)
     assert live[12] is not None and live[20] is not None and live[48] is None and live[49] is not None
     assert live[10].spread.mean() > 2 * live[4].spread.mean()
+
+
+@pytest.mark.parametrize("gap", [4, 8, 12])
+def test_filled_joints_are_as_far_off_as_their_spread_says(people_in_motion, gap):
+    """By the number of frames to the nearest one that was seen; a hand that moves fast must not be said to be near."""
+    first = (16 - gap) // 2
+    spread, error = ([[] for _ in range(gap // 2)] for _ in range(2))
+    for true, track in people_in_motion:
+        joints = track.joints.copy()
+        joints[first : first + gap] = np.nan
+        steady = smooth(replace(track, joints=joints))
+        off = np.linalg.norm(steady.joints - true, axis=-1)
+        for k in range(gap):
+            assert steady.filled[first + k]
+            spread[min(k, gap - 1 - k)].append(steady.spread[first + k])
+            error[min(k, gap - 1 - k)].append(off[first + k])
+    for stated, actual in zip(spread, error, strict=True):
+        assert 0.95 < np.mean(stated) / np.mean(actual) < 1.4
+        # not on the mean alone
+        assert 0.5 < (np.array(actual) < np.array(stated)).mean() < 0.9
 
 
 def test_the_past_alone_and_a_state_that_goes_on(walker):

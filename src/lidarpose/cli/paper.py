@@ -101,10 +101,10 @@ def _problem(words: list[str]) -> str:
     """What the command line's parser says against a command, "" for nothing."""
     from lidarpose.cli import _parser
 
-    said = io.StringIO()
+    errors = io.StringIO()
     try:
-        with redirect_stderr(said):
+        with redirect_stderr(errors):
             _parser().parse_args(words)
     except SystemExit:
-        return said.getvalue().strip().removeprefix("lidarpose: error: ")
+        return errors.getvalue().strip().removeprefix("lidarpose: error: ")
     return ""

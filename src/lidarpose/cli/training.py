@@ -94,7 +94,7 @@ def _add(parser, kind: type[Recipe]) -> None:
     shared = {field.name for base in (Recipe, PoseRecipe) for field in fields(base)}
     for field in fields(kind):
         if field.name != "data":
-            default = "" if field.default in (None, (), "") else f" ({_said(field.default)})"
+            default = "" if field.default in (None, (), "") else f" ({_as_typed(field.default)})"
             (common if field.name in shared else own).add_argument(
                 f"--{field.name.replace('_', '-')}",
                 dest=f"set_{field.name}",
@@ -136,7 +136,7 @@ def _train(options: argparse.Namespace) -> None:
         # a baseline is trained as published
         model = changes.get("model")
         wanted = recipe(kind, options.recipe or (model if model in RECIPES[kind] else "default"), **changes)
-    words = [f"--{key.replace('_', '-')} {_said(value)}" for key, value in changes.items() if key != "data"]
+    words = [f"--{key.replace('_', '-')} {_as_typed(value)}" for key, value in changes.items() if key != "data"]
     words += [f"--recipe {options.recipe}"] * (options.recipe not in (None, "default"))
     words += ["--resume"] * options.resume
     sets = [shlex.quote(Path(data).name) for data in changes.get("data", ())]
@@ -155,7 +155,7 @@ def _parsed(field: Field, text: str) -> object:
         return text
 
 
-def _said(value: Any) -> str:
+def _as_typed(value: Any) -> str:
     """A value as it is written after an option, of paths the name alone."""
     if isinstance(value, bool):
         return str(value).lower()

@@ -99,14 +99,14 @@ def _by_processes(make: Make, shards: list[int], workers: int) -> Iterator[tuple
     done, stop = context.Value("q", 0), context.Event()
     with ProcessPoolExecutor(workers, mp_context=context, initializer=_start, initargs=(make, done, stop)) as pool:
         try:
-            told, waiting = 0, {pool.submit(_shard, shard) for shard in shards}
+            reported, waiting = 0, {pool.submit(_shard, shard) for shard in shards}
             while waiting:
                 ready, waiting = wait(waiting, timeout=_TICK, return_when=FIRST_COMPLETED)
                 for future in ready:
                     future.result()
                 now = done.value
-                yield len(ready), now - told
-                told = now
+                yield len(ready), now - reported
+                reported = now
         except BrokenProcessPool:
             raise InputError(
                 f"a worker process died, of {workers}: give fewer --workers if memory ran out; "

@@ -195,7 +195,7 @@ SCAN_CHECKS: tuple[Callable[[Scan, Poses], str | None], ...] = (box_units, empty
 def check_scan(scan: Scan, people: Poses) -> list[str]:
     """The warnings of all checks. people: in the level frame, in the order of the scan's clouds."""
     # boxes that were found are nobody's fault, and the axes were looked at before
-    given = scan.found_rows is None
+    given = scan.detected_rows is None
     warnings = {check: check(scan, people) for check in SCAN_CHECKS if scan.boxes and given}
     # one wrong axis is one warning, and people who are cut short by their boxes only seem to lie
     axis = flat_along_another_axis(scan) if given else None

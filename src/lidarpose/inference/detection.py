@@ -118,8 +118,8 @@ def search_options(
 
 
 def find_people(scan: Scan, search: Search, known: KnownPlaces | None = None) -> Scan:
-    """The scan with the boxes of the people in it, surest first, `found_rows`, and what looks wrong among its warnings;
-    without the place of a sensor that cannot have been there, and with the direction that turned out to be up.
+    """The scan with the boxes of the people in it, surest first, `detected_rows`, and what looks wrong among its
+    warnings; without the place of a sensor that cannot have been there, and with the direction that is up after all.
 
     known: of a recording's frames before; with it the scan has `pelvises`, `verified` and `rejected`, too.
     """
@@ -181,7 +181,7 @@ def verify_people(places: Places, search: Search, known: KnownPlaces | None = No
     """The second half of `find_people`."""
     scan, given = places.scan, places.given
     if places.detections is None:
-        return replace(scan, boxes=[], found_rows=[])
+        return replace(scan, boxes=[], detected_rows=[])
     # the boxes of a frame that leans are larger than their people: these are looked for anew
     leans = not np.allclose(given.R_boxes_input, scan.R_level_input)
     origin = None if scan.origin is None else scan.R_level_input @ scan.origin
@@ -189,7 +189,7 @@ def verify_people(places: Places, search: Search, known: KnownPlaces | None = No
     header = (search.detector or _detector()).header
     people = verified(places.detections, places.level, origin, header, least_score(search), search.max_people, here)
     boxes = [_in_input(box, scan, given) for box in people.boxes]
-    searched = replace(scan, boxes=boxes, found_rows=people.rows)
+    searched = replace(scan, boxes=boxes, detected_rows=people.rows)
     if known is None:
         return searched
     return replace(

@@ -323,12 +323,12 @@ class Poses(Sequence):
 
         R_level_input = rotation_from_up(self.up)
         posed = [person.pose.joints for person in upright if person.pose is not None]
-        found = f"{len(upright)} {'person' if len(upright) == 1 else 'people'} found"
+        label = f"{len(upright)} {'person' if len(upright) == 1 else 'people'} found" if upright else "nobody found"
         return ScanPanel(
             points=points @ R_level_input.T,
             boxes=[box for person in upright if (box := person.box or _box_around(person))],
             poses=Pose(joints=np.stack(posed), skeleton=self.skeleton) if posed else None,
-            label=found if upright else "nobody found",
+            label=label,
             sensor=None if self.origin is None else tuple((R_level_input @ self.origin)[:2].tolist()),
         )
 

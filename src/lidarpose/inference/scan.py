@@ -31,8 +31,8 @@ class Scan:
     points (n, 3) m; boxes: the people's, None for a crop of one person; origin: the sensor's position (3,) m or None;
     up: the input's up axis or direction, see `rotation_from_up`; warnings: of reading; source: a name for reports.
     Boxes stand along the input's own axis; where `up` is a direction, along z. Where people were searched for,
-    found_rows holds of each box the rows (k,) of the person's points, which a box of a frame that leans cannot tell. In
-    recordings, pelvises (N, 3) m: where those of the boxes' people are about; verified (N,) bool: whose score is of
+    detected_rows holds of each box the rows (k,) of the person's points, which a box of a frame that leans cannot tell.
+    In recordings, pelvises (N, 3) m: where those of the boxes' people are about; verified (N,) bool: whose score is of
     this scan; rejected (R, 3) m: places that turned out to hold nobody.
     """
 
@@ -42,7 +42,7 @@ class Scan:
     up: str = "z"
     warnings: tuple[str, ...] = ()
     source: str | None = None
-    found_rows: list[np.ndarray] | None = None
+    detected_rows: list[np.ndarray] | None = None
     pelvises: np.ndarray | None = None
     verified: np.ndarray | None = None
     rejected: np.ndarray | None = None
@@ -71,8 +71,8 @@ class Scan:
     @cached_property
     def rows(self) -> list[np.ndarray]:
         """Of each box the rows of the points in it."""
-        if self.found_rows is not None:
-            return self.found_rows
+        if self.detected_rows is not None:
+            return self.detected_rows
         return rows_inside(self.level_boxes(), self.box_points())
 
     def clouds(self) -> list[np.ndarray]:
@@ -132,8 +132,8 @@ def pose_scan(scan: Scan, predictor: Predictor, *, skeleton: str | None = None, 
         warnings=tuple(warnings),
         timing_ms={"crop": (cropped - started) * 1e3, "predict": predict_ms, "per_person": per_person},
         up=scan.up,
-        scan=None if scan.found_rows is None else scan.points,
-        origin=None if scan.found_rows is None else scan.origin,
+        scan=None if scan.detected_rows is None else scan.points,
+        origin=None if scan.detected_rows is None else scan.origin,
     )
 
 

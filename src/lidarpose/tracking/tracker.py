@@ -17,7 +17,7 @@ from lidarpose.sample import Box
 from lidarpose.tracking.assignment import assign
 
 # standard deviation of a sure box's center, m, along x, y and z; its square grows as the score falls, no further than
-# at the least: measured on boxes that are found
+# at the least: measured on boxes that were detected
 POSITION_SD, _LEAST_SCORE = np.array([0.12, 0.12, 0.2]), 0.05
 # people are first seen with a velocity of this standard deviation, m/s, and change it: m/s in one second, which grows
 # with the square root of time
@@ -128,17 +128,17 @@ class Tracker:
             InputError: time is no finite number.
         """
         tracks = self._elapsed(time)
-        found = _of_boxes([*boxes, *weak_boxes])
-        is_weak = np.arange(len(found)) >= len(boxes)
-        ids = np.full(len(found), -1)
-        others = np.flatnonzero(~_repeats(found, is_weak))
-        found, is_weak = found.take(others), is_weak[others]
-        rows, columns = assign(_costs(tracks, found))
-        _correct(tracks, rows, found, columns)
-        begins = np.setdiff1d(np.arange(len(found)), columns)
-        track = np.empty(len(found), int)
+        detections = _of_boxes([*boxes, *weak_boxes])
+        is_weak = np.arange(len(detections)) >= len(boxes)
+        ids = np.full(len(detections), -1)
+        others = np.flatnonzero(~_repeats(detections, is_weak))
+        detections, is_weak = detections.take(others), is_weak[others]
+        rows, columns = assign(_costs(tracks, detections))
+        _correct(tracks, rows, detections, columns)
+        begins = np.setdiff1d(np.arange(len(detections)), columns)
+        track = np.empty(len(detections), int)
         track[columns], track[begins] = rows, len(tracks) + np.arange(len(begins))
-        tracks = tracks.joined(found.take(begins))
+        tracks = tracks.joined(detections.take(begins))
         # whom only weak boxes showed so far is nobody yet, but keeps them from going to others
         numbered = track[~is_weak & (tracks.id[track] < 0)]
         tracks.id[numbered] = self._next_id + np.arange(len(numbered))
@@ -227,34 +227,34 @@ def _of_boxes(boxes: Sequence[Box]) -> _Tracks:
     )
 
 
-def _repeats(found: _Tracks, is_weak: np.ndarray) -> np.ndarray:
+def _repeats(detections: _Tracks, is_weak: np.ndarray) -> np.ndarray:
     """(B,) bool: weak boxes beside one that is not: the same person again."""
-    places = found.state[:, :2, 0]
+    places = detections.state[:, :2, 0]
     apart = np.linalg.norm(places[:, None] - places[~is_weak], axis=-1)
     return is_weak & (apart < _REPEATED).any(1)
 
 
-def _costs(tracks: _Tracks, found: _Tracks) -> np.ndarray:
+def _costs(tracks: _Tracks, detections: _Tracks) -> np.ndarray:
     """(N, B): what it costs that a track has a box, below 0 where that is better than neither; inf where it cannot."""
-    off = found.state[None, :, :, 0] - tracks.state[:, None, :, 0]
-    variance = tracks.covariance[:, None, :, 0, 0] + found.covariance[None, :, :, 0, 0]
+    off = detections.state[None, :, :, 0] - tracks.state[:, None, :, 0]
+    variance = tracks.covariance[:, None, :, 0, 0] + detections.covariance[None, :, :, 0, 0]
     distance = (off**2 / variance).sum(-1)
     cost = distance + np.log(variance).sum(-1) - _LEAST_LIKELY
     return np.where((distance < _GATE) & (cost < 0), cost, np.inf)
 
 
-def _correct(tracks: _Tracks, rows: np.ndarray, found: _Tracks, columns: np.ndarray) -> None:
+def _correct(tracks: _Tracks, rows: np.ndarray, detections: _Tracks, columns: np.ndarray) -> None:
     """Tracks `rows` saw boxes `columns`: the filter's second half, in place."""
     covariance = tracks.covariance[rows]
-    variance = covariance[..., 0, 0] + found.covariance[columns][..., 0, 0]
+    variance = covariance[..., 0, 0] + detections.covariance[columns][..., 0, 0]
     gain = covariance[..., 0] / variance[..., None]
-    off = found.state[columns, :, 0] - tracks.state[rows, :, 0]
+    off = detections.state[columns, :, 0] - tracks.state[rows, :, 0]
     tracks.state[rows] += gain * off[..., None]
     tracks.covariance[rows] -= gain[..., :, None] * gain[..., None, :] * variance[..., None, None]
     # after a few sightings their plain mean, then the newest weigh most
     weight = np.maximum(1 - np.exp(-tracks.age[rows] / _SMOOTHING), 1 / (tracks.sightings[rows] + 1))[:, None]
-    tracks.heading[rows] += weight * (found.heading[columns] - tracks.heading[rows])
-    tracks.size[rows] += weight * (found.size[columns] - tracks.size[rows])
+    tracks.heading[rows] += weight * (detections.heading[columns] - tracks.heading[rows])
+    tracks.size[rows] += weight * (detections.size[columns] - tracks.size[rows])
     tracks.age[rows] = 0
     tracks.sightings[rows] += 1
     tracks.sure[rows] = True

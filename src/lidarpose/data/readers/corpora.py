@@ -85,10 +85,10 @@ class _Corpus(Reader):
 
     def parts(self, root: Path) -> list[str]:
         """The pickles of the root. Raises InputError where there are none."""
-        found = sorted(path.name for path in root.glob("*.pkl"))
-        if not found:
+        names = sorted(path.name for path in root.glob("*.pkl"))
+        if not names:
             raise self.wrong_root(root)
-        return found
+        return names
 
     def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         """Everybody in a file, in its order."""

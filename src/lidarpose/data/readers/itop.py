@@ -177,15 +177,15 @@ def _opened(root: Path, part: str) -> Iterator[tuple[Any, Any]]:
                 raise file_error(path, "is missing: get it from zenodo.org/records/3932973 and unpack it by gunzip")
             try:
                 files.append(stack.enter_context(h5py.File(path, "r")))
-                found = {name: getattr(files[-1].get(name), "shape", None) for name in shapes}
-                ids.append(_ids(files[-1]) if found["id"] is not None and found["id"] <= (_MOST_FRAMES,) else [])
+                came = {name: getattr(files[-1].get(name), "shape", None) for name in shapes}
+                ids.append(_ids(files[-1]) if came["id"] is not None and came["id"] <= (_MOST_FRAMES,) else [])
             # what h5py raises for damaged files
             except (OSError, KeyError, RuntimeError, TypeError, ValueError) as error:
                 problem = f"cannot be read as HDF5 ({one_line(str(error))}); was it downloaded and unpacked completely?"
                 raise file_error(path, problem) from None
             for name, shape in shapes.items():
-                if found[name] != (wanted := (len(ids[-1]), *shape)):
-                    raise file_error(path, f"expected {name} of shape {wanted}, got {found[name]}")
+                if came[name] != (wanted := (len(ids[-1]), *shape)):
+                    raise file_error(path, f"expected {name} of shape {wanted}, got {came[name]}")
         if ids[0] != ids[1]:
             raise file_error(paths[1], f"is of other frames than {paths[0].name}: get both again")
         yield files[0], files[1]

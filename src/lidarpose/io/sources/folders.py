@@ -103,13 +103,13 @@ def in_order(paths: Sequence[Path]) -> tuple[list[Path], list[float] | None]:
     """Paths in natural order, and None; or in that of times, in s since 1970, where the names are plainly such."""
     natural = sorted(paths, key=natural_key)
     matches = [_TIME.fullmatch(scan_id(path)) for path in natural]
-    found = [match.groups() for match in matches if match]
+    parts = [match.groups() for match in matches if match]
     # of 1700000000_5 and 1700000000_10 nobody knows whether nanoseconds or tenths follow
-    if len(found) < len(natural) or len({len(part) for *_, mark, part in found if mark == "_"}) > 1:
+    if len(parts) < len(natural) or len({len(part) for *_, mark, part in parts if mark == "_"}) > 1:
         return natural, None
-    seconds = [_seconds(whole, part or "") for _, whole, _, part in found]
+    seconds = [_seconds(whole, part or "") for _, whole, _, part in parts]
     # 1700000000.5 is later than 1700000000.25, though 5 is before 25
-    rows = sorted(range(len(natural)), key=lambda row: (natural_key(found[row][0]), seconds[row]))
+    rows = sorted(range(len(natural)), key=lambda row: (natural_key(parts[row][0]), seconds[row]))
     times = [seconds[row] for row in rows]
     rising = all(earlier < later for earlier, later in zip(times, times[1:], strict=False))
     if not rising or not _FIRST_TIME <= times[0] <= times[-1] <= _LAST_TIME:
