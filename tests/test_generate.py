@@ -14,7 +14,6 @@ from lidarpose.lidar.presets import sensor
 from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import center_of
 from lidarpose.skeleton import BODY26, SMPL24
-from lidarpose.synth import bodies
 from lidarpose.synth.bodies import draw_bodies, draw_moving_body
 from lidarpose.synth.generator import BLOCK, LEAST_POINTS, Generator
 from lidarpose.synth.scene import SCENES
@@ -232,7 +231,7 @@ def test_a_clip_is_one_person_who_moves_before_things_that_do_not():
 def test_feet_stay_where_they_stand_however_long_the_legs(which, monkeypatch):
     crowd = sample_people(np.random.default_rng(0), 200)
     one = crowd.coefficients[which(crowd.height)][None]
-    monkeypatch.setattr(bodies, "sample_people", lambda rng, n: SimpleNamespace(coefficients=one))
+    monkeypatch.setattr("lidarpose.body.rig.sample_people", lambda rng, n: SimpleNamespace(coefficients=one))
     slides, walks = [], 0
     for seed in range(60):
         somebody = draw_moving_body(None, 0.0, 8, np.random.default_rng(seed))
