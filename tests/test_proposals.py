@@ -2,14 +2,16 @@
 
 import pickle
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from lidarpose.geometry import rotation_about
-from lidarpose.models.detector.candidates import Augmentation, SceneIndex, draw_augmentation, render, suppress
+from lidarpose.models.detector.candidates import SceneIndex, suppress
 from lidarpose.models.detector.ground import estimate_ground, estimate_up, without_ground
 from lidarpose.models.detector.proposals import columns, heights_above, propose
+from lidarpose.models.detector.render import Augmentation, draw_augmentation, render
 from lidarpose.synth.street import street
 from tests.reference.detector_reference import context_reference, fine_reference, range_reference, suppress_reference
 
@@ -232,28 +234,28 @@ def test_candidates_see_what_the_words_say(scene):
         "scalars": (4,),
     }
     assert all(array.dtype == np.float32 for array in inputs.values())
-    for k, candidate in enumerate(chosen):
-        away = candidate.center - origin
-        assert candidate.distance == pytest.approx(np.hypot(*away[:2]))
-        R = rotation_about("z", -candidate.yaw)
-        np.testing.assert_allclose(R @ [away[0], away[1], 0], [candidate.distance, 0, 0], atol=1e-9)
-        local = (points - candidate.center) @ R.T
+    for k, center in enumerate(chosen.centers):
+        away = center - origin
+        assert chosen.distance[k] == pytest.approx(np.hypot(*away[:2]))
+        R = rotation_about("z", -chosen.yaw[k])
+        np.testing.assert_allclose(R @ [away[0], away[1], 0], [chosen.distance[k], 0, 0], atol=1e-9)
+        local = (points - center) @ R.T
         near = local[(np.hypot(*local[:, :2].T) < 1.75) & (np.abs(local[:, 2] - 0.9) < 1.6)]
-        if candidate.count <= 1000:
-            assert candidate.count == len(near)
+        if chosen.count[k] <= 1000:
+            assert chosen.count[k] == len(near)
             # a point on the border of cells may fall to either side
             assert np.mean(np.abs(fine_reference(near) - inputs["fine"][k]) > 1e-5) < 4e-4
             assert inputs["fine"][k].any()
-        context = context_reference(points, heights, candidate.center, candidate.yaw)
+        context = context_reference(points, heights, center, chosen.yaw[k])
         assert np.mean(np.abs(context - inputs["context"][k]) > 0.005) < 0.01
-        seen = range_reference(points, origin, candidate)
+        seen = range_reference(points, origin, chosen, k)
         drawn = inputs["range_view"][k, 2] > 0
         # the tables' cells are up to 1.4 times smaller or larger than the picture's
         grown = np.pad(seen, 1)
         grown = np.stack([grown[i : i + 28, j : j + 24] for i in range(3) for j in range(3)]).any(0)
         assert np.mean(grown[drawn]) > 0.97
         assert drawn.sum() > 0.3 * seen.sum()
-        assert len(pickle.dumps(candidate)) < 12_500
+    assert len(pickle.dumps(chosen)) < 12_500 * len(chosen)
 
 
 @pytest.mark.parametrize("origin", [ORIGIN, None], ids=["known", "unknown"])
@@ -261,11 +263,11 @@ def test_inputs_of_places_are_those_of_their_candidates(scene, origin):
     _, points, ground = scene
     centers = np.tile(propose(points, ground), (3, 1))[:100]
     index = SceneIndex(points, ground, origin)
-    pieces = [{name: array.copy() for name, array in inputs.items()} for inputs in index.inputs(centers)]
+    pieces = [render(piece) for piece in index.pieces(centers)]
     assert len(pieces) == 2
     for name, expected in render(index.candidates(centers)).items():
         np.testing.assert_array_equal(np.concatenate([piece[name] for piece in pieces]), expected)
-    np.testing.assert_array_equal(index.yaws(centers), [c.yaw for c in index.candidates(centers)])
+    np.testing.assert_array_equal(index.yaws(centers), index.candidates(centers).yaw)
 
 
 def test_a_crowded_candidate_is_the_same_in_any_order_of_points():
@@ -275,9 +277,9 @@ def test_a_crowded_candidate_is_the_same_in_any_order_of_points():
     ground, center = estimate_ground(cloud, ORIGIN), np.array([[6.0, 0, -1.8]])
     drawn = []
     for order in (np.arange(len(cloud)), np.argsort(cloud[:, 2], kind="stable"), rng.permutation(len(cloud))):
-        (candidate,) = SceneIndex(cloud[order], ground, ORIGIN).candidates(center)
-        assert len(candidate.points) <= 1000
-        drawn.append({tuple(point) for point in np.asarray(candidate.points).tolist()})
+        chosen = SceneIndex(cloud[order], ground, ORIGIN).candidates(center)
+        assert chosen.sizes[0] == chosen.xyz.shape[1] <= 1000
+        drawn.append({tuple(point) for point in chosen.xyz.T.tolist()})
     # but for points whose scrambled coordinates are equal
     assert min(len(drawn[0] & other) for other in drawn[1:]) > 0.95 * len(drawn[0])
 
@@ -301,10 +303,10 @@ def test_without_a_sensor_candidates_keep_the_level_frame(scene):
     chosen = SceneIndex(points, ground, None).candidates(centers)
     inputs = render(chosen)
     assert not inputs["range_view"].any() and not inputs["scalars"][:, [0, 1, 3]].any()
-    assert all(c.yaw == 0 and c.distance is None for c in chosen)
+    assert not chosen.yaw.any() and not chosen.distance.any()
     # as with a sensor that is dropped
     seen = SceneIndex(points, ground, ORIGIN).candidates(centers)
-    dropped = render(seen, [Augmentation(drop_origin=True, turn=c.yaw) for c in seen])
+    dropped = render(seen, Augmentation(drop_origin=True, turn=seen.yaw))
     assert not dropped["range_view"].any() and not dropped["scalars"][:, [0, 1, 3]].any()
     assert np.mean(np.abs(dropped["fine"] - inputs["fine"]) > 1e-5) < 1e-3
 
@@ -337,7 +339,7 @@ def test_augmentation_moves_points_and_labels_alike():
     ball = rng.normal(0, 0.03, (300, 3)) + [0.4, 0.3, 1.0]
     points = np.concatenate([plane(), ball + [6, 0, -1.8]])
     chosen = SceneIndex(points, estimate_ground(points, ORIGIN), ORIGIN).candidates(np.array([[6.0, 0, -1.8]]))
-    fine = render(chosen, [change])["fine"][0]
+    fine = render(chosen, change)["fine"][0]
     high = fine[10:]
     middle = (np.argwhere(high > 0) * high[high > 0][:, None]).sum(0) / high.sum()
     expected = change.apply(np.array([[0.4, 0.3, 1.0]]))[0]
@@ -352,36 +354,39 @@ def test_augmentation_moves_points_and_labels_alike():
 def test_augmented_candidates_depend_on_their_own_augmentation_alone(scene):
     _, points, ground = scene
     chosen = SceneIndex(points, ground, ORIGIN).candidates(propose(points, ground)[:6])
-    changes = [draw_augmentation(np.random.default_rng([1, k])) for k in range(6)]
+    changes = draw_augmentation(np.random.default_rng(1), 6)
     together = render(chosen, changes)
-    alone = render(chosen[3:4], changes[3:4])
+    alone = render(chosen.take([3]), replace(changes, **{name: values[3:4] for name, values in vars(changes).items()}))
     for name, values in together.items():
         np.testing.assert_allclose(values[3], alone[name][0], atol=1e-6)
-    unchanged = render(chosen, [Augmentation()] * 6)
+    unchanged = render(chosen, Augmentation())
     for name, values in render(chosen).items():
         np.testing.assert_allclose(unchanged[name], values, atol=0.005)
-    half = render(chosen, [Augmentation(keep=0.5, seed=k) for k in range(6)])
+    half = render(chosen, Augmentation(keep=0.5, seed=np.arange(6)))
     assert 0.3 < (half["fine"] > 0).sum() / (unchanged["fine"] > 0).sum() < 0.9
 
 
 def test_no_points_and_no_candidates_are_legal():
     ground = estimate_ground(plane(), ORIGIN)
     empty = SceneIndex(np.zeros((0, 3)), ground, ORIGIN)
-    assert empty.candidates(np.zeros((0, 3))) == [] and empty.rows(np.zeros((0, 2))) == []
-    assert render([])["fine"].shape == (0, 28, 24, 24)
+    nobody = empty.candidates(np.zeros((0, 3)))
+    assert len(nobody) == 0 and empty.rows(np.zeros((0, 2))) == []
+    for augmentation in (None, Augmentation(), draw_augmentation(np.random.default_rng(0), 0)):
+        assert render(nobody, augmentation)["fine"].shape == (0, 28, 24, 24)
     alone = empty.candidates(np.array([[4.0, 1, -1.8]]))
-    assert alone[0].count == 0 and not render(alone)["fine"].any()
+    assert alone.count[0] == 0 and not render(alone)["fine"].any()
     outside = SceneIndex(plane(), ground, ORIGIN).candidates(np.array([[400.0, 100, -1.8]]))
-    assert outside[0].count == 0 and not render(outside)["context"].any()
+    assert outside.count[0] == 0 and not render(outside)["context"].any()
 
 
 def test_dense_places_cost_no_more_than_thinned_ones():
     person = np.concatenate([column(5, 0, count=200_000), plane(reach=8)])
     scene = SceneIndex(person, estimate_ground(person, ORIGIN), ORIGIN)
-    candidate = scene.candidates(np.array([[5.0, 0, -1.8]]))[0]
-    assert len(candidate.packed) <= 1000 < candidate.count < 100_000
+    chosen = scene.candidates(np.array([[5.0, 0, -1.8]]))
+    assert chosen.sizes[0] <= 1000 < chosen.count[0] < 100_000
     # the whole body is still there
-    height = candidate.points[:, 2][np.hypot(*candidate.points[:, :2].T) < 0.3]
+    x, y, z = chosen.xyz * 5e-4
+    height = z[np.hypot(x, y) < 0.3]
     assert height.max() > 1.7 and np.diff(np.sort(height)).max() < 0.1
 
 

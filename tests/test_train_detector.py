@@ -12,11 +12,12 @@ from training_runs import refused, train_until_killed
 from lidarpose.cli import main
 from lidarpose.geometry import axis_angle_to_matrix
 from lidarpose.models.checkpoint import load_checkpoint
-from lidarpose.models.detector.candidates import Augmentation, Candidate
+from lidarpose.models.detector.candidates import Candidates
+from lidarpose.models.detector.detector import open_detector
 from lidarpose.models.detector.detector_config import OUTPUT, OUTPUTS, DetectorConfig
-from lidarpose.models.detector.detector_file import open_detector
 from lidarpose.models.detector.ground import estimate_up
 from lidarpose.models.detector.network import DetectorNet
+from lidarpose.models.detector.render import Augmentation
 from lidarpose.models.export import export, export_detector
 from lidarpose.sample import Box
 from lidarpose.synth.detection_scene import detection_scene
@@ -41,19 +42,22 @@ SMALL = DetectorConfig(channels=(8, 8, 16), coarse_channels=(4, 8), hidden=16)
 RECIPE = TrainDetector(scenes=BATCHES * 2, uses=2, batch=2, workers=0, seed=3, validate=1000)
 
 
-def a_candidate(rng, *, is_person=True, center=(0.0, 0.0, 0.0), yaw=0.0):
-    """Points of a person's height, or of a low box."""
-    points = rng.normal(0, (0.15, 0.2, 0.0), (60, 3))
-    points[:, 2] = rng.uniform(0, 1.75 if is_person else 0.7, 60)
-    return Candidate(
-        center=np.array(center),
-        yaw=yaw,
-        distance=8.0,
-        sensor_height=1.8,
-        count=60,
-        packed=np.rint(points / 5e-4).astype(np.int16),
-        range_view=np.full((4, 34, 30), 100, np.uint8),
-        context=np.zeros((4, 20, 20), np.uint8),
+def some_candidates(rng, is_person, *, centers=None, yaw=0.0):
+    """Points of a person's height, or of a low box, 60 for each entry of is_person."""
+    count = len(is_person)
+    points = [rng.normal(0, (0.15, 0.2, 0.0), (60, 3)) for _ in is_person]
+    for own, tall in zip(points, is_person, strict=True):
+        own[:, 2] = rng.uniform(0, 1.75 if tall else 0.7, 60)
+    return Candidates(
+        centers=np.zeros((count, 3)) if centers is None else np.array(centers),
+        yaw=np.full(count, yaw),
+        distance=np.full(count, 8.0),
+        sensor_height=np.full(count, 1.8),
+        count=np.full(count, 60),
+        sizes=np.full(count, 60),
+        xyz=np.rint(np.concatenate(points).T / 5e-4).astype(np.int16),
+        range_views=np.full((count, 4, 34, 30), 100, np.uint8),
+        contexts=np.zeros((count, 4, 20, 20), np.uint8),
     )
 
 
@@ -69,7 +73,7 @@ def an_example(number, *, with_rows=False, count=10):
         mounted=np.zeros(count, bool),
     )
     rows = [np.arange(5) + 5 * k for k in range(count)] if with_rows else None
-    return DetectorExample(candidates=[a_candidate(rng, is_person=p) for p in is_person], labels=labels, rows=rows)
+    return DetectorExample(candidates=some_candidates(rng, is_person), labels=labels, rows=rows)
 
 
 @pytest.fixture
@@ -184,7 +188,7 @@ def test_who_is_whose_candidate():
     # the person's; between; nobody's; of somebody of whom 3 points are seen; the nearest of somebody's, if far away
     places = [(5.2, 0.2), (5.0, -0.45), (5.0, 0.6), (20.0, 0.1), (10.4, 0.0)]
     rng = np.random.default_rng(0)
-    candidates = [a_candidate(rng, center=(x, y, -0.1), yaw=np.pi / 2) for x, y in places]
+    candidates = some_candidates(rng, [True] * 5, centers=[(x, y, -0.1) for x, y in places], yaw=np.pi / 2)
     labels = labels_of(candidates, scene)
     assert labels.person.tolist() == [0, UNCLEAR, NOBODY, UNCLEAR, 1]
     # the view frame's x is the level frame's y
@@ -196,7 +200,7 @@ def test_who_is_whose_candidate():
 def test_labels_move_with_the_points():
     labels = replace(an_example(0, count=1).labels, center=np.array([[0.3, 0.1, 0.0]], np.float32))
     change = Augmentation(turn=np.pi / 2, mirror=True, scale=1.05, shift=(0.02, -0.04))
-    after = moved(labels, [change])
+    after = moved(labels, change)
     np.testing.assert_allclose(after.center[0, :2], [0.1 * 1.05 + 0.02, 0.3 * 1.05 - 0.04], atol=1e-6)
     np.testing.assert_allclose(after.center[0], change.apply(labels.center)[0], atol=1e-6)
     assert after.height[0] == pytest.approx(1.75 * 1.05)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from lidarpose.models.detector import candidates as c
+from lidarpose.models.detector.candidates import Candidates
 
 
 def fine_reference(points: np.ndarray) -> np.ndarray:
@@ -45,16 +45,16 @@ def suppress_reference(rows: list[np.ndarray], strength: np.ndarray) -> list[int
     return kept
 
 
-def range_reference(points: np.ndarray, origin: np.ndarray, candidate: c.Candidate) -> np.ndarray:
-    """Whether (28, 24) a return lies in each direction of a picture, by angles instead of tables."""
+def range_reference(points: np.ndarray, origin: np.ndarray, chosen: Candidates, k: int) -> np.ndarray:
+    """Whether (28, 24) a return lies in each direction of candidate k's picture, by angles instead of tables."""
     seen = np.zeros((28, 24), bool)
-    away = points - origin
+    away, distance = points - origin, chosen.distance[k]
     for x, y, z in away:
-        turn = (math.atan2(y, x) - candidate.yaw + math.pi) % (2 * math.pi) - math.pi
+        turn = (math.atan2(y, x) - chosen.yaw[k] + math.pi) % (2 * math.pi) - math.pi
         if abs(turn) < 1.5:
-            lateral = candidate.distance * math.tan(turn)
-            slant = math.hypot(candidate.distance, lateral)
-            height = z / math.hypot(x, y) * slant - (candidate.center[2] - origin[2])
+            lateral = distance * math.tan(turn)
+            slant = math.hypot(distance, lateral)
+            height = z / math.hypot(x, y) * slant - (chosen.centers[k, 2] - origin[2])
             i, j = math.floor(10 * height + 5), math.floor(10 * lateral) + 12
             if 0 <= i < 28 and 0 <= j < 24:
                 seen[i, j] = True

@@ -101,8 +101,8 @@ def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = 
 def export_detector(network: DetectorNet, out: str | os.PathLike, *, card: dict) -> None:
     """Writes a detector as ONNX, its weights as float16, whole or not at all.
 
-    card: what its header says, see `detector_file`. Raises MissingExtra without onnx, LidarPoseError where the file
-    does not give what the network does.
+    card: what its header says, see `detector.open_detector`. Raises MissingExtra without onnx, LidarPoseError where the
+    file does not give what the network does.
     """
     check_suffix(out, FORMATS["onnx"])
     check_writable(out)

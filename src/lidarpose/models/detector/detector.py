@@ -3,13 +3,20 @@
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lidarpose.models.detector.candidates import SceneIndex, suppress
+from lidarpose.io.files import file_error
+from lidarpose.models import weights_file
+from lidarpose.models.detector.candidates import CHUNK, SceneIndex, suppress
+from lidarpose.models.detector.detector_config import INPUTS, OUTPUT, DetectorConfig
 from lidarpose.models.detector.ground import estimate_ground, without_ground
 from lidarpose.models.detector.proposals import heights_above, propose
+from lidarpose.models.detector.range_image import SIDE, SLICES
+from lidarpose.models.detector.render import render
+from lidarpose.models.onnx import check_names, open_network
 
 # what lies farther than this beyond the range, m, is left out: a candidate at its end still has its surroundings
 _BEYOND = 6.0
@@ -19,7 +26,7 @@ _OWN_RADIUS = 0.35
 _SIDE, _MOUNTED_SIDE, _ROOM = 0.9, 1.1, 0.1
 _MOST_SHIFT, _MOST_FOOT, _HEIGHTS = 0.6, 1.0, (0.5, 2.3)
 
-# the network's inputs by name, see `candidates.render` -> (K, 6): logit of a person; true center minus candidate in the
+# the network's inputs by name, see `render.render` -> (K, 6): logit of a person; true center minus candidate in the
 # view frame, m; feet above the ground, m; height, m; logit of somebody who rides or sits in a wheelchair
 Scorer = Callable[[dict[str, np.ndarray]], np.ndarray]
 
@@ -62,8 +69,6 @@ class Detector:
         if callable(scorer):
             self._score: Scorer = scorer
             return
-        from lidarpose.models.detector.detector_file import open_detector
-
         session, self.header = open_detector(scorer, threads=threads)
         self._score = lambda arrays: session.run(None, arrays)[0]
 
@@ -111,7 +116,10 @@ class Detector:
     def _detections(
         self, scene: SceneIndex, places: np.ndarray, scan_rows: np.ndarray, has_ground: bool, limit: int | None
     ) -> Detections:
-        scores = [np.asarray(self._score(inputs), float) for inputs in scene.inputs(places)]
+        # memory that each piece uses again: to get as much anew takes longer than all else
+        fine = np.empty((min(len(places), CHUNK), SLICES, SIDE, SIDE), np.float32)
+        pieces = (render(piece, fine=fine[: len(piece)]) for piece in scene.pieces(places))
+        scores = [np.asarray(self._score(inputs), float) for inputs in pieces]
         logit, x, y, foot, height, mounted_logit = np.concatenate([np.zeros((0, 6)), *scores]).T
         yaw = scene.yaws(places)
         x, y = (np.clip(shift, -_MOST_SHIFT, _MOST_SHIFT) for shift in (x, y))
@@ -145,3 +153,22 @@ class Detector:
 
 def _sigmoid(logit: np.ndarray) -> np.ndarray:
     return 0.5 * (1 + np.tanh(np.asarray(logit, float) / 2))
+
+
+def detector_path() -> Path:
+    """Where the package keeps the bundled detector."""
+    return weights_file("detector.onnx")
+
+
+def open_detector(path: str | os.PathLike | None = None, *, threads: int | None = None) -> tuple[Any, dict]:
+    """The session of a detector (None: the bundled one), and its header: "version", and the card of its training, with
+    "calibration" ([logits], [probabilities]), "default_score" and "verification" once it is calibrated.
+
+    Raises InputError, one line, for a file that is damaged, something else, or another network's.
+    """
+    path = detector_path() if path is None else path
+    session, header = open_network(path, threads=threads)
+    if not isinstance(header.config, DetectorConfig):
+        raise file_error(path, f"expected a detector, got a network of the kind {header.network}: leave it away")
+    check_names(path, session, INPUTS, (OUTPUT,))
+    return session, {"version": header.version, **header.card}

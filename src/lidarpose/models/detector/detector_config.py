@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 from lidarpose.errors import check_int
 from lidarpose.models.config import MOST, check_counts
 
-# inputs of the network in their order, see `candidates.render`
+# inputs of the network in their order, see `render.render`
 INPUTS = ("fine", "range_view", "context", "scalars")
 # the name of what it gives (K, 6), and its columns: logit of a person; true center minus candidate in the view frame,
 # m; feet above the estimated ground, m; height, m; logit of somebody who rides or sits in a wheelchair

@@ -13,9 +13,10 @@ from functools import cached_property
 import numpy as np
 
 from lidarpose.geometry import rotation_between
-from lidarpose.models.detector.candidates import Augmentation, Candidate, SceneIndex, draw_augmentation
+from lidarpose.models.detector.candidates import Candidates, SceneIndex
 from lidarpose.models.detector.ground import estimate_ground, estimate_up, without_ground
 from lidarpose.models.detector.proposals import heights_above, propose
+from lidarpose.models.detector.render import Augmentation, draw_augmentation
 from lidarpose.synth.detection_scene import DetectionScene, detection_scene
 from lidarpose.synth.scene import RandomStream
 
@@ -57,12 +58,12 @@ class Labels:
 
 @dataclass(frozen=True, kw_only=True)
 class DetectorExample:
-    """Candidates of a scan with their labels, as they are (augmentations None) or changed; rows: of the scan's points
-    at each, for suppression."""
+    """Candidates of a scan with their labels, as they are or as an augmentation changes them; rows: of the scan's
+    points at each, for suppression."""
 
-    candidates: list[Candidate]
+    candidates: Candidates
     labels: Labels
-    augmentations: list[Augmentation] | None = None
+    augmentation: Augmentation | None = None
     rows: list[np.ndarray] | None = None
 
     @property
@@ -70,13 +71,12 @@ class DetectorExample:
         return len(self.candidates)
 
 
-def labels_of(candidates: list[Candidate], scene: DetectionScene) -> Labels:
+def labels_of(candidates: Candidates, scene: DetectionScene) -> Labels:
     """What is true of the candidates of a scene."""
-    count = len(candidates)
+    count, own, yaw = len(candidates), candidates.centers, candidates.yaw
     center, foot, height = np.zeros((count, 3), np.float32), np.zeros(count, np.float32), np.zeros(count, np.float32)
     person, mounted = np.full(count, NOBODY), np.zeros(count, bool)
     if count and scene.boxes:
-        own = np.stack([candidate.center for candidate in candidates])
         true = np.stack([box.center for box in scene.boxes])
         half = np.array([box.size[2] / 2 for box in scene.boxes]) - _MARGIN
         offset = true[None, :, :2] - own[:, None, :2]
@@ -88,7 +88,6 @@ def labels_of(candidates: list[Candidate], scene: DetectionScene) -> Labels:
         is_near = (least <= POSITIVE) | ((least <= IGNORED) & (distance.argmin(0)[nearest] == rows))
         is_found = is_near & (points[nearest] >= LEAST_POINTS)
         person[is_found] = nearest[is_found]
-        yaw = np.array([candidate.yaw for candidate in candidates])
         x, y = offset[rows, nearest].T
         center[:, 0] = np.cos(yaw) * x + np.sin(yaw) * y
         center[:, 1] = np.cos(yaw) * y - np.sin(yaw) * x
@@ -98,20 +97,11 @@ def labels_of(candidates: list[Candidate], scene: DetectionScene) -> Labels:
     return Labels(person=person, center=center, foot=foot, height=height, mounted=mounted)
 
 
-def moved(labels: Labels, augmentations: list[Augmentation]) -> Labels:
+def moved(labels: Labels, augmentation: Augmentation) -> Labels:
     """The labels of candidates that are changed so."""
-    if not augmentations:
-        return labels
-    pairs = zip(augmentations, labels.center, strict=True)
-    center = np.stack([augmentation.apply(place[None])[0] for augmentation, place in pairs]).astype(np.float32)
-    scale = np.array([augmentation.scale for augmentation in augmentations], np.float32)
-    return Labels(
-        person=labels.person,
-        center=center,
-        foot=labels.foot * scale,
-        height=labels.height * scale,
-        mounted=labels.mounted,
-    )
+    scale = np.asarray(augmentation.scale, np.float32)
+    center = augmentation.apply(labels.center).astype(np.float32)
+    return replace(labels, center=center, foot=labels.foot * scale, height=labels.height * scale)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,12 +132,9 @@ class CandidateSource:
         others = np.flatnonzero(person == NOBODY)
         others = rng.choice(others, min(NEGATIVES, len(others)), replace=False)
         rows = np.concatenate([np.flatnonzero(person >= 0), np.sort(others)])
-        augmentations = [draw_augmentation(rng, drop_origin=DROP_ORIGIN) for _ in rows]
-        return DetectorExample(
-            candidates=[full.candidates[row] for row in rows],
-            labels=moved(full.labels.take(rows), augmentations),
-            augmentations=augmentations,
-        )
+        augmentation = draw_augmentation(rng, len(rows), drop_origin=DROP_ORIGIN)
+        labels = moved(full.labels.take(rows), augmentation)
+        return DetectorExample(candidates=full.candidates.take(rows), labels=labels, augmentation=augmentation)
 
     def _scan(self, number: int, newest: int) -> DetectorExample:
         kept = self._kept

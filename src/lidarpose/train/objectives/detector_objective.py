@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from lidarpose.models.detector.candidates import render
 from lidarpose.models.detector.detector_config import INPUTS, DetectorConfig
 from lidarpose.models.detector.network import DetectorNet
+from lidarpose.models.detector.render import render
 from lidarpose.train.detector.candidate_source import NOBODY, UNCLEAR, DetectorExample
 from lidarpose.train.objectives.objective import Share, alone, at_least_one
 
@@ -36,7 +36,7 @@ class DetectorObjective:
     def collate(self, examples: list[DetectorExample]) -> dict[str, np.ndarray]:
         """The network's inputs as float16, which halves what goes between processes; labels (K, ...) of all scans one
         after the other, and scan (K,), of which each is."""
-        drawn = [render(example.candidates, example.augmentations) for example in examples]
+        drawn = [render(example.candidates, example.augmentation) for example in examples]
         # torch rounds ten times as fast as numpy
         arrays = {
             name: torch.as_tensor(np.concatenate([each[name] for each in drawn])).half().numpy() for name in INPUTS

@@ -1,0 +1,185 @@
+"""What the detector's network sees of a candidate: the points there, what the sensor sees past it, and what is around.
+
+The view frame of a candidate: x away from the sensor, level, y left, z up from the ground at the candidate's center;
+of an unknown sensor, x and y are the level frame's. Inputs, K candidates first:
+
+    fine (K, 28, 24, 24): slices of 10 cm from -0.5 to 2.3 m, cells of 10 cm: .5 + .125 log2(1 + points), 0 if empty
+    range_view (K, 4, 28, 24): directions, as a picture of 2.4 x 2.8 m at the candidate's distance, rows from below,
+        columns from the right to the left: nearest and farthest return beyond the candidate (m / 4, to +-1), how many
+        returns there are, and how many around, .125 log2(1 + returns)
+    context (K, 4, 20, 20): 10 x 10 m from above, x first: highest point above the ground (m / 4, to 1), share of the
+        heights 0.3-2.1 m that hold points, .125 log2(1 + points), the same of points near the ground
+    scalars (K, 4): log of the distance, height of the sensor above the ground there (m / 4), log of the number of
+        points, 1 where the sensor is known; without a sensor, range_view and the first two are 0
+"""
+
+from dataclasses import dataclass, fields
+from math import pi
+from typing import Any
+
+import numpy as np
+
+from lidarpose.models.detector.candidates import CONTEXT_CELL, CONTEXT_SIDE, MARGIN, UNIT, Candidates
+from lidarpose.models.detector.range_image import BOTTOM, CELL, RANGE_CHANNELS, SIDE, SLICES
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Augmentation:
+    """How candidates are changed in training. Of points in the view frame, in this order: mirror, turn, scale, shift.
+
+    Each field is an array with an entry for each of K candidates, or one value for all. turn rad about z; mirror: y to
+    -y; scale; shift (K, 2) m; keep: share of points; noise m: standard deviation along x, away from the sensor;
+    drop_origin: as if the sensor was unknown; seed of what is drawn for each point.
+    """
+
+    turn: Any = 0.0
+    mirror: Any = False
+    scale: Any = 1.0
+    shift: Any = (0.0, 0.0)
+    keep: Any = 1.0
+    noise: Any = 0.0
+    drop_origin: Any = False
+    seed: Any = 0
+
+    def over(self, count: int) -> "Augmentation":
+        """The same, with an entry for each of so many candidates."""
+        shapes = {"shift": (count, 2)}
+        values = {f.name: np.broadcast_to(getattr(self, f.name), shapes.get(f.name, (count,))) for f in fields(self)}
+        return Augmentation(**values)
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """(K, 2, 2) of x and y."""
+        c, s = self.scale * np.cos(self.turn), self.scale * np.sin(self.turn)
+        sign = np.where(self.mirror, -1, 1)
+        return np.stack([np.stack([c, -s * sign], -1), np.stack([s, c * sign], -1)], -2)
+
+    def apply(self, places: np.ndarray) -> np.ndarray:
+        """places (K, 3) m, one a candidate, mirrored, turned, scaled and shifted."""
+        own = self.over(len(places))
+        xy = (own.matrix @ places[:, :2, None])[..., 0] + own.shift
+        return np.column_stack([xy, places[:, 2] * own.scale])
+
+
+def draw_augmentation(rng: np.random.Generator, count: int, *, drop_origin: float = 0.15) -> Augmentation:
+    """A random one for each of `count` candidates; in a share `drop_origin` the sensor is dropped, and the turn is any
+    instead of small."""
+    rows = []
+    for _ in range(count):
+        is_dropped = rng.random() < drop_origin
+        rows.append(
+            {
+                "turn": rng.uniform(-pi, pi) if is_dropped else rng.normal(0, 0.1),
+                "mirror": rng.random() < 0.5,
+                "scale": rng.uniform(0.92, 1.08),
+                "shift": rng.uniform(-0.1, 0.1, 2),
+                "keep": rng.uniform(0.25, 1.0) if rng.random() < 0.6 else 1.0,
+                "noise": rng.uniform(0, 0.025),
+                "drop_origin": is_dropped,
+                "seed": rng.integers(2**63),
+            }
+        )
+    return Augmentation(**{name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())})
+
+
+def render(
+    candidates: Candidates, augmentation: Augmentation | None = None, *, fine: np.ndarray | None = None
+) -> dict[str, np.ndarray]:
+    """The network's inputs, float32: see the module. fine: memory (K, 28, 24, 24) float32 for that input."""
+    own, known, count = candidates, candidates.distance > 0, candidates.count
+    points, owner = own.xyz * np.float32(UNIT), np.repeat(np.arange(len(own)), own.sizes)
+    contexts, change = own.contexts, None
+    if augmentation is not None:
+        change = augmentation.over(len(own))
+        known, count = known & ~change.drop_origin, count * change.keep
+        points, owner = _moved_points(points, owner, own.sizes, change)
+        contexts = _moved_contexts(contexts, change)
+    scalars = np.zeros((len(own), 4), np.float32)
+    scalars[:, 0] = np.log(np.where(known, own.distance, 1.0))
+    scalars[:, 1] = known * own.sensor_height / 4
+    scalars[:, 2] = np.log1p(count)
+    scalars[:, 3] = known
+    return {
+        # of a place with more points than are kept, those stand for all
+        "fine": _fine(points, owner, own.count / np.maximum(own.sizes, 1), fine),
+        "range_view": _range_views(own.range_views, known, change),
+        "context": contexts * np.float32(1 / 255),
+        "scalars": scalars,
+    }
+
+
+def _moved_points(
+    points: np.ndarray, owner: np.ndarray, sizes: np.ndarray, change: Augmentation
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (3, n) float32 m of owners (n,), `sizes` (K,) of each, as they are changed, and the owners of those that
+    are kept."""
+    draws = [np.zeros((2, 0), np.float32)]
+    for size, seed, deviation in zip(sizes.tolist(), change.seed.tolist(), change.noise.tolist(), strict=True):
+        rng = np.random.default_rng(seed)
+        draws.append(np.stack([rng.random(size, np.float32), rng.standard_normal(size, np.float32) * deviation]))
+    chance, noise = np.concatenate(draws, axis=1)
+    kept = chance < change.keep.astype(np.float32)[owner]
+    points, owner, noise = points[:, kept], owner[kept], noise[kept]
+    points[0] += noise
+    matrix, shift = change.matrix.astype(np.float32)[owner], change.shift.astype(np.float32)[owner]
+    x, y = (matrix[:, i, 0] * points[0] + matrix[:, i, 1] * points[1] + shift[:, i] for i in (0, 1))
+    return np.stack([x, y, points[2] * change.scale.astype(np.float32)[owner]]), owner
+
+
+def _fine(points: np.ndarray, owner: np.ndarray, weight: np.ndarray, fine: np.ndarray | None) -> np.ndarray:
+    """(K, 28, 24, 24) of points (3, n) m, of whose owners (n,) each stands for `weight` (K,) points."""
+    shape = (len(weight), SLICES, SIDE, SIDE)
+    first = np.array([[SIDE // 2], [SIDE // 2], [-BOTTOM / CELL]], np.float32)
+    j, k, i = np.floor(points * np.float32(1 / CELL) + first).astype(np.int64)
+    # as unsigned numbers, what is below 0 is large
+    inside = np.logical_and.reduce([at.view(np.uint64) < n for at, n in zip((i, j, k), shape[1:], strict=True)])
+    flat = (((owner * SLICES + i) * SIDE + j) * SIDE + k)[inside]
+    fine = np.empty(shape, np.float32) if fine is None else fine
+    fine[:] = 0
+    cells = fine.reshape(-1)
+    np.add.at(cells, flat, np.float32(1))
+    cells[flat] = 0.5 + 0.125 * np.log2(1 + cells[flat] * weight[owner[inside]])
+    return fine
+
+
+def _range_views(stored: np.ndarray, known: np.ndarray, change: Augmentation | None) -> np.ndarray:
+    views = np.zeros((len(known), RANGE_CHANNELS, SLICES, SIDE), np.float32)
+    stored = stored[known]
+    if change is None:
+        margin = (stored.shape[3] - SIDE) // 2
+        stored = stored[:, :, margin : margin + SLICES, margin : margin + SIDE]
+    else:
+        scale, sign = change.scale[known, None], np.where(change.mirror, -1.0, 1.0)[known, None]
+        height = ((np.arange(SLICES) + 0.5) * CELL + BOTTOM) / scale
+        lateral = (np.arange(SIDE) + 0.5) * CELL - SIDE * CELL / 2
+        lateral = sign * (lateral - change.shift[known, 1:]) / scale
+        i = np.floor((height - BOTTOM) / CELL).astype(np.int64) + MARGIN
+        j = np.floor((lateral + SIDE * CELL / 2) / CELL).astype(np.int64) + MARGIN
+        i, j = np.clip(i, 0, stored.shape[2] - 1), np.clip(j, 0, stored.shape[3] - 1)
+        stored = np.moveaxis(stored[np.arange(len(stored))[:, None, None], :, i[:, :, None], j[:, None, :]], -1, 1)
+        _lose_returns(stored, change.keep[known], change.seed[known].tolist())
+    ranges = (stored[:, :2] - np.float32(128)) / np.float32(127)
+    ranges[stored[:, :2] == 0] = 0
+    views[known, :2], views[known, 2:] = ranges, stored[:, 2:] / np.float32(255)
+    return views
+
+
+def _lose_returns(views: np.ndarray, keep: np.ndarray, seeds: list[int]) -> None:
+    """Keeps a share (K,) of the returns of range views (K, 4, H, W), in place: a cell is empty where all are lost."""
+    keep = keep[:, None, None]
+    count = np.exp2(views[:, 2] / (0.125 * 255)) - 1
+    chance = np.empty(count.shape, np.float32)
+    for k, seed in enumerate(seeds):
+        chance[k] = np.random.default_rng([seed, 1]).random(count.shape[1:], np.float32)
+    views[:, :3] *= (chance >= (1 - keep) ** count)[:, None]
+    fewer = np.log2(keep) * (0.125 * 255)
+    views[:, 2:] = np.where(views[:, 2:] > 0, np.maximum(views[:, 2:] + fewer[:, None], 1), 0)
+
+
+def _moved_contexts(stored: np.ndarray, change: Augmentation) -> np.ndarray:
+    side = (np.arange(CONTEXT_SIDE) - (CONTEXT_SIDE - 1) / 2) * CONTEXT_CELL
+    to = np.stack(np.meshgrid(side, side, indexing="ij"), -1).reshape(-1, 2)
+    source = (to - change.shift[:, None]) @ np.swapaxes(np.linalg.inv(change.matrix), 1, 2)
+    i, j = np.moveaxis(np.floor(source / CONTEXT_CELL).astype(np.int64) + CONTEXT_SIDE // 2, -1, 0)
+    i, j = np.clip(i, 0, CONTEXT_SIDE - 1), np.clip(j, 0, CONTEXT_SIDE - 1)
+    return np.moveaxis(stored[np.arange(len(stored))[:, None], :, i, j], -1, 1).reshape(stored.shape)
