@@ -19,8 +19,7 @@ from lidarpose.models.voxelize import view_features
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14
 from lidarpose.train.augment import Example
 from lidarpose.train.data_loader import SyntheticSource
-from lidarpose.train.objectives.baseline_losses import point_labels
-from lidarpose.train.objectives.baseline_objective import BaselineObjective, with_joints
+from lidarpose.train.objectives.baseline_objective import BaselineObjective, point_labels, with_joints
 from lidarpose.train.objectives.objective import total
 from lidarpose.train.recipes import Finetune, Pretrain, recipe
 from lidarpose.train.setup import PRETRAINED, _with_options, networks
@@ -179,7 +178,7 @@ def test_attention_of_the_first_rows_alone_is_that_of_all():
         (lambda: PrnConfig(joints=("tail",)), "unknown joint"),
         (lambda: PrnConfig(width_divisor=3), "width_divisor must be one of 1, 2, 4, 8, got 3"),
         (lambda: PrnConfig(most_points=0), "most_points must be"),
-        (lambda: LpformerConfig(attention_dropout=1), "attention_dropout must be a share below 1, got 1"),
+        (lambda: LpformerConfig(attention_dropout=1), "attention_dropout must be a probability below 1, got 1"),
         (lambda: LpformerConfig(second_softmax=1), "second_softmax must be true or false, got 1"),
         (lambda: _with_options(PRN, ("grid=32",)), "unknown option of prn 'grid'"),
         (lambda: Pretrain(model="prn", size="tiny"), "the model prn has the size prn or prn-small, got tiny"),

@@ -29,7 +29,7 @@ from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth.generator import Generator
 from lidarpose.train import loop, setup
 from lidarpose.train.augment import clip_example
-from lidarpose.train.objectives.clip_objective import ClipObjective
+from lidarpose.train.objectives.baseline_objective import ClipObjective
 from lidarpose.train.objectives.objective import total
 from lidarpose.train.recipes import Finetune, Pretrain, recipe
 from lidarpose.train.setup import PRETRAINED, make_setup

@@ -23,7 +23,7 @@ from lidarpose.sample import Box
 from lidarpose.synth.detection_scene import detection_scene
 from lidarpose.train import loop, run_dir, setup
 from lidarpose.train.data_loader import BATCHES
-from lidarpose.train.detector import candidate_source, scan_validation
+from lidarpose.train.detector import candidate_source
 from lidarpose.train.detector.candidate_source import (
     NOBODY,
     UNCLEAR,
@@ -33,7 +33,7 @@ from lidarpose.train.detector.candidate_source import (
     labels_of,
     moved,
 )
-from lidarpose.train.objectives.detector_objective import DetectorObjective, average_precision, chosen
+from lidarpose.train.objectives.detector_objective import DetectorObjective, average_precision, chosen, missed_people
 from lidarpose.train.objectives.objective import total
 from lidarpose.train.recipes import TrainDetector
 
@@ -83,9 +83,8 @@ def quick_scans(monkeypatch):
     def scan(seed, number, *, family="train", with_rows=False):
         return an_example(number + 1000 * (family == "heldout"), with_rows=with_rows)
 
-    for module in (candidate_source, scan_validation):
-        monkeypatch.setattr(module, "scan_example", scan)
-    monkeypatch.setattr(scan_validation, "SCANS", 3)
+    monkeypatch.setattr(candidate_source, "scan_example", scan)
+    monkeypatch.setattr(candidate_source, "VALIDATION", 3)
     monkeypatch.setattr(setup, "DetectorConfig", lambda: SMALL)
 
 
@@ -291,11 +290,11 @@ def test_the_command_trains(quick_scans, tmp_path, capsys):
 
 
 def test_people_missed_at_one_false_person_a_scan(quick_scans):
-    examples = scan_validation.validation_scans(0)
+    examples = candidate_source.validation_scans(0)
     logits = iter([np.array(values) for values in ([9.0, 8, 7, 6, 5, 4, 3, 2, 1, 0],) * 3])
     objective = SimpleNamespace(
         collate=lambda examples: None, scores=lambda *args, **kwargs: np.repeat(next(logits)[:, None], 6, 1)
     )
     # of people 9, 7, 5, 3, 1 and others 8, 6, ... in each of 3 scans the fourth false one, 6, lets 9 and 7 pass
-    missed, joints = scan_validation.missed_people(objective, torch.nn.Linear(1, 1), examples, 1)
+    missed, joints = missed_people(objective, torch.nn.Linear(1, 1), examples, 1)
     assert missed == pytest.approx(60) and joints is None

@@ -13,13 +13,13 @@ from typing import Any
 from lidarpose.errors import InputError, check_name
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class NetworkKind:
     """Where the parts of a kind of network are defined, as "module:name": they are imported when first needed.
 
-    config: a frozen dataclass of plain values with `kind` (its key in `NETWORKS`), `name` (for messages), `joints`
-    (names, in the order of the outputs), `layers` (a lower bound of its tensors) and `to_dict`, which raises InputError
-    for what cannot be; network: a module made from the config alone, which it keeps as `config`; objective: a
+    config: a `models.config.Config` with `kind` (its key in `NETWORKS`), `name` (for messages), `joints` (names, in the
+    order of the outputs) and `layers` (a lower bound of its tensors), which raises InputError for what cannot be;
+    network: a module made from the config alone, which it keeps as `config`; objective: a
     `train.objectives.objective.Objective`; backend: called with (network, header, device=, compile=), an
     `inference.backend.Backend`.
     """
@@ -31,55 +31,37 @@ class NetworkKind:
 
     def part(self, name: str) -> Any:
         """The class that `config`, `network`, `objective` or `backend` names."""
+        folder = {"objective": "train.objectives", "backend": "inference"}.get(name, "models")
         module, _, attribute = getattr(self, name).partition(":")
-        return getattr(import_module(module), attribute)
+        return getattr(import_module(f"lidarpose.{folder}.{module}"), attribute)
 
 
-# by the name that checkpoints give: this package's own, the paper's, and its baselines
+def _baseline(name: str, objective: str, backend: str) -> NetworkKind:
+    config = f"baselines.baseline_config:{name}Config"
+    return NetworkKind(config, f"baselines.{name.lower()}:{name}", objective, f"torch_backend:{backend}")
+
+
+_FRAMES = ("baseline_objective:BaselineObjective", "BaselineBackend")
+_CLIPS = ("baseline_objective:ClipObjective", "ClipBackend")
+# by the name that checkpoints give, modules of `models`, `train.objectives` and `inference`: this package's own, the
+# paper's, those that the paper compares with, and one that finds people and poses nobody
 NETWORKS = {
     "pose": NetworkKind(
-        config="lidarpose.models.config:NetworkConfig",
-        network="lidarpose.models.posenet:PoseNet",
-        objective="lidarpose.train.objectives.posenet_objective:PoseNetObjective",
-        backend="lidarpose.inference.torch_backend:TorchBackend",
+        "config:NetworkConfig", "posenet:PoseNet", "posenet_objective:PoseNetObjective", "torch_backend:TorchBackend"
     ),
     "dapt": NetworkKind(
-        config="lidarpose.models.dapt.dapt_config:DaptConfig",
-        network="lidarpose.models.dapt.dapt_net:DaptNet",
-        objective="lidarpose.train.objectives.dapt_objective:DaptObjective",
-        backend="lidarpose.inference.torch_backend:DaptBackend",
+        "dapt.dapt_config:DaptConfig",
+        "dapt.dapt_net:DaptNet",
+        "dapt_objective:DaptObjective",
+        "torch_backend:DaptBackend",
     ),
-    # those that the paper compares with
-    "prn": NetworkKind(
-        config="lidarpose.models.baselines.baseline_config:PrnConfig",
-        network="lidarpose.models.baselines.prn:Prn",
-        objective="lidarpose.train.objectives.baseline_objective:BaselineObjective",
-        backend="lidarpose.inference.torch_backend:BaselineBackend",
-    ),
-    "lpformer": NetworkKind(
-        config="lidarpose.models.baselines.baseline_config:LpformerConfig",
-        network="lidarpose.models.baselines.lpformer:Lpformer",
-        objective="lidarpose.train.objectives.baseline_objective:BaselineObjective",
-        backend="lidarpose.inference.torch_backend:BaselineBackend",
-    ),
-    "lidarcap": NetworkKind(
-        config="lidarpose.models.baselines.baseline_config:LidarcapConfig",
-        network="lidarpose.models.baselines.lidarcap:Lidarcap",
-        objective="lidarpose.train.objectives.clip_objective:ClipObjective",
-        backend="lidarpose.inference.torch_backend:ClipBackend",
-    ),
-    "ne": NetworkKind(
-        config="lidarpose.models.baselines.baseline_config:NeConfig",
-        network="lidarpose.models.baselines.ne:Ne",
-        objective="lidarpose.train.objectives.clip_objective:ClipObjective",
-        backend="lidarpose.inference.torch_backend:ClipBackend",
-    ),
-    # finds people and poses nobody
+    **{name.lower(): _baseline(name, *_FRAMES) for name in ("Prn", "Lpformer")},
+    **{name.lower(): _baseline(name, *_CLIPS) for name in ("Lidarcap", "Ne")},
     "detector": NetworkKind(
-        config="lidarpose.models.detector.detector_config:DetectorConfig",
-        network="lidarpose.models.detector.network:DetectorNet",
-        objective="lidarpose.train.objectives.detector_objective:DetectorObjective",
-        backend="lidarpose.inference.torch_backend:no_poses",
+        "detector.detector_config:DetectorConfig",
+        "detector.network:DetectorNet",
+        "detector_objective:DetectorObjective",
+        "torch_backend:no_poses",
     ),
 }
 

@@ -1,11 +1,12 @@
-"""The sizes of the network: one dial, the rest derived."""
+"""What configurations of networks have in common, and the sizes of the package's own: one dial, the rest derived."""
 
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass
-from typing import Any, ClassVar
+from dataclasses import MISSING, Field, asdict, dataclass, field, fields
+from typing import Any, ClassVar, get_args
 
 from lidarpose.errors import InputError, check_int, check_name
-from lidarpose.skeleton import skeleton
+from lidarpose.skeleton import BODY26, skeleton
 
 # heatmaps in a window about each joint's vote; over the whole person, as the paper's; or votes alone
 HEATMAPS = ("window", "full", "none")
@@ -28,14 +29,65 @@ def is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def check_grid(grid: Any) -> None:
-    """Raises InputError unless `grid` is an edge of a voxel."""
-    if not (is_number(grid) and grid > 0):
-        raise InputError(f"grid must be a positive number of meters, got {grid!r}")
+def at_least(least: int, default: Any = MISSING, *, levels: str = "") -> Any:
+    """A field of whole numbers from `least` on; levels: what those of a tuple are of."""
+    return field(default=default, metadata={"least": least, "levels": levels})
+
+
+def probability(default: float) -> Any:
+    """A field of a number from 0 to below 1."""
+    return field(default=default, metadata={"probability": True})
 
 
 @dataclass(frozen=True, kw_only=True)
-class NetworkConfig:
+class Config:
+    """The configuration of a network, checked as its fields declare: whole numbers from 1 (see `at_least`) to `MOST`,
+    numbers above 0 (see `probability`), true or false; lists become tuples. Raises InputError for anything else."""
+
+    kind: ClassVar[str] = ""
+
+    def __post_init__(self):
+        for f in fields(self):
+            object.__setattr__(self, f.name, _checked(f, _as_tuple(getattr(self, f.name))))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for a file's header: the constructor reads them back, from JSON too."""
+        return asdict(self)
+
+
+def _as_tuple(value: Any) -> Any:
+    return tuple(map(_as_tuple, value)) if isinstance(value, list | tuple) else value
+
+
+def _checked(f: Field, value: Any) -> Any:
+    """A setting as its field declares it; tuples of free length are for the configuration itself to check."""
+    least, parts = f.metadata.get("least", 1), get_args(f.type)
+    if f.type is int:
+        return check_int(f.name, value, least=least, most=MOST)
+    if parts and set(parts) == {int}:
+        return check_counts(f.name, value, len(parts), least=least, levels=f.metadata.get("levels", ""))
+    of_type: dict[Any, tuple[Callable[[Any], bool], str]] = {
+        bool: (lambda flag: isinstance(flag, bool), "true or false"),
+        float: (lambda number: is_number(number) and number > 0, "a positive number of meters"),
+    }
+    if f.metadata.get("probability"):
+        of_type[float] = (lambda number: is_number(number) and 0 <= number < 1, "a probability below 1")
+    is_good, expected = of_type.get(f.type, (lambda _: True, ""))
+    if not is_good(value):
+        raise InputError(f"{f.name} must be {expected}, got {value!r}")
+    return value
+
+
+def check_joints(joints: Any) -> None:
+    """Raises InputError unless these are names of body26's joints, each once."""
+    if not isinstance(joints, tuple) or not joints or len(set(joints)) != len(joints):
+        raise InputError(f"joints must be joint names, each once, got {joints!r}")
+    for joint in joints:
+        BODY26.index(joint)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkConfig(Config):
     """Widths and depths of a `PoseNet`.
 
     channels: of the fine, mid and coarse level; head_channels: a head of attention; blocks: attention blocks (mid
@@ -48,37 +100,25 @@ class NetworkConfig:
     kind: ClassVar[str] = "pose"
 
     size: str
-    channels: tuple[int, int, int]
+    channels: tuple[int, int, int] = at_least(1, levels=" (fine, mid, coarse)")
     head_channels: int
-    blocks: tuple[int, int, int]
+    blocks: tuple[int, int, int] = at_least(0, levels=" (mid encoder, coarse, mid decoder)")
     grid: float = 0.06
     max_voxels: int = 384
     skeleton: str = "body26"
     parts: int = 25
     heatmap: str = "window"
-    convolution: int = 0
+    convolution: int = at_least(0, 0)
     person: bool = False
 
     def __post_init__(self):
         # false in files of before it was a number
         if self.convolution is False:
             object.__setattr__(self, "convolution", 0)
-        for name, least in (("head_channels", 1), ("max_voxels", 1), ("parts", 1), ("convolution", 0)):
-            object.__setattr__(self, name, check_int(name, getattr(self, name), least=least, most=MOST))
-        for name, least, levels in (
-            ("channels", 1, "fine, mid, coarse"),
-            ("blocks", 0, "mid encoder, coarse, mid decoder"),
-        ):
-            counts = check_counts(name, getattr(self, name), 3, least=least, levels=f" ({levels})")
-            object.__setattr__(self, name, counts)
+        super().__post_init__()
         if any(width % self.head_channels for width in self.channels[1:]):
-            raise InputError(
-                f"channels of the mid and coarse level must divide by head_channels, got {self.channels} "
-                f"and {self.head_channels}"
-            )
-        if not isinstance(self.person, bool):
-            raise InputError(f"person must be true or false, got {self.person!r}")
-        check_grid(self.grid)
+            divide = "channels of the mid and coarse level must divide by head_channels"
+            raise InputError(f"{divide}, got {self.channels} and {self.head_channels}")
         check_name("heatmap", self.heatmap, HEATMAPS)
         skeleton(self.skeleton)
 
@@ -94,9 +134,6 @@ class NetworkConfig:
     def layers(self) -> int:
         """Blocks of all levels."""
         return sum(self.blocks)
-
-    def to_dict(self) -> dict:
-        return asdict(self)
 
 
 SIZES = {

@@ -61,25 +61,15 @@ _TRAINING_SENSORS = {"depth-camera": (0.3, 1.8)}
 # beams of a scan at most: what has more sends fewer columns
 _MOST_BEAMS = 140_000
 # people by activity, outdoors and indoors
-_MIX_OUTDOORS = {
-    **{"idle": 0.31, "walk": 0.34, "captured": 0.07, "run": 0.03, "step": 0.02, "bend": 0.035, "crouch": 0.035},
-    **{"kneel": 0.01, "sit": 0.1, "cycle": 0.09, "push": 0.05, "sport": 0.02},
-}
+_MIX_OUTDOORS = {"idle": 0.31, "walk": 0.34, "captured": 0.07, "run": 0.03, "step": 0.02, "bend": 0.035}
+_MIX_OUTDOORS |= {"crouch": 0.035, "kneel": 0.01, "sit": 0.1, "cycle": 0.09, "push": 0.05, "sport": 0.02}
 _MIX_INDOORS = _MIX_OUTDOORS | {"idle": 0.36, "walk": 0.2, "sit": 0.25, "cycle": 0.004, "run": 0.0}
 # in training more of those who do not stand
-_TRAINING_MIX_OUTDOORS = _MIX_OUTDOORS | {"bend": 0.07, "crouch": 0.1, "kneel": 0.08, "sit": 0.16}
-_TRAINING_MIX_INDOORS = _MIX_INDOORS | {"bend": 0.07, "crouch": 0.1, "kneel": 0.08, "sit": 0.3}
+_TRAINING_LOW = {is_in: {"bend": 0.07, "crouch": 0.1, "kneel": 0.08, "sit": 0.3 if is_in else 0.16} for is_in in (0, 1)}
 # who sits, outdoors: what on, and how often
 _SEATS = (("moped", 0.3), ("wheelchair", 0.25), ("chair", 0.45))
 _MOUNTED = ("bicycle", "moped", "wheelchair")
-_PROP_KINDS = {
-    "chair": "chair",
-    "table": "table",
-    "bicycle": "bicycle",
-    "moped": "moped",
-    "pram": "cart",
-    "trolley": "cart",
-}
+_PROP_KINDS = {name: name for name in ("chair", "table", "bicycle", "moped")} | {"pram": "cart", "trolley": "cart"}
 # in training: how many of those who sit do so at a table, who needs half as much more, what stands among people besides
 _AT_TABLES = 0.3
 _LOW = ("bend", "crouch", "kneel", "sit")
@@ -342,22 +332,16 @@ def _draw_people(site: Site, is_smeared: bool, is_training: bool, rng: np.random
     area = float(np.prod(site.areas[:, [1, 3]] - site.areas[:, [0, 2]], axis=1).max())
     groups = rng.integers(4, 11) if not indoors else rng.integers(1 + is_training, int(np.clip(area / 12, 2, 7)) + 1)
     sizes = rng.choice([1, 2, 3, 4, 5], groups, p=[0.42, 0.27, 0.15, 0.09, 0.07])
-    mix = _MIX_INDOORS if indoors else _MIX_OUTDOORS
-    if is_training:
-        mix = _TRAINING_MIX_INDOORS if indoors else _TRAINING_MIX_OUTDOORS
-    bodies = draw_bodies(
-        None, 0.0, int(sizes.sum()), int(rng.integers(2**31)), 0, moving=is_smeared, mix=mix
-    )  # fmt: skip
+    mix = (_MIX_INDOORS if indoors else _MIX_OUTDOORS) | (_TRAINING_LOW[indoors] if is_training else {})
+    bodies = draw_bodies(None, 0.0, int(sizes.sum()), int(rng.integers(2**31)), 0, moving=is_smeared, mix=mix)
     people: list[_Person] = []
     row = 0
     for size in sizes:
         distance = 2 + (site.reach - 2) * rng.random() ** 1.7
-        beside = rng.random() < 0.25
-        middle = (
-            site.beside(rng, HALF_WIDTH + 0.4 * rng.random())
-            if beside
-            else site.spot(distance, HALF_WIDTH, rng, seen=rng.random() < 0.85)
-        )
+        if rng.random() < 0.25:
+            middle = site.beside(rng, HALF_WIDTH + 0.4 * rng.random())
+        else:
+            middle = site.spot(distance, HALF_WIDTH, rng, seen=rng.random() < 0.85)
         style, course = rng.random(), rng.choice([0.0, pi / 2, pi, -pi / 2]) + rng.normal(0, 0.25)
         members: list[np.ndarray] = []
         for _ in range(size):

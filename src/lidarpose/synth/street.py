@@ -70,11 +70,8 @@ def street(
     seed: int, index: int, *, sensor: str = "os1-128", people: tuple[int, int] = (3, 8), frames: int = 1
 ) -> Street:
     """Street `index` of `seed` with `people` (least, most) in it, `frames` turns at 10 Hz. Raises InputError."""
-    seed, index, frames = (
-        check_int("seed", seed, least=0),
-        check_int("index", index, least=0),
-        check_int("frames", frames, least=1),
-    )
+    seed, index = check_int("seed", seed, least=0), check_int("index", index, least=0)
+    frames = check_int("frames", frames, least=1)
     try:
         least, most = map(as_index, people)
     except (TypeError, ValueError):
@@ -206,10 +203,8 @@ def _kerb_row(plan: StreetPlan, side: int, rng: np.random.Generator) -> list[Mes
         elif a < 0.5:
             # a tree: trunk and crown
             crown = shapes.foliage((2.2 + b, 2.2 + b, 2.0), 120, 0.28, rng)
-            meshes += [
-                shape("pole", 0.10 + 0.10 * c, 0.10 + 0.10 * c, 2.6).moved(place),
-                crown.moved((x, place[1], plan.kerb + 2.2)),
-            ]
+            meshes.append(shape("pole", 0.10 + 0.10 * c, 0.10 + 0.10 * c, 2.6).moved(place))
+            meshes.append(crown.moved((x, place[1], plan.kerb + 2.2)))
         elif a < 0.62:
             meshes.append(shapes.sign(2.0 + 0.6 * b, 0.5).moved(place, inwards))
         elif a < 0.75:
@@ -249,9 +244,8 @@ def _draw_walkers(plan: StreetPlan, count: int, frames: int, rng: np.random.Gene
             path = _path((bodies, place))
             if np.linalg.norm(path, axis=1).min() < _NEAREST - 1:
                 continue
-            if (stays or 2 * attempt > _PLACE_TRIES) and all(
-                np.linalg.norm(path - other, axis=1).min() > _APART for other in paths
-            ):
+            apart = [np.linalg.norm(path - other, axis=1).min() for other in paths]
+            if (stays or 2 * attempt > _PLACE_TRIES) and min(apart, default=np.inf) > _APART:
                 walkers.append((bodies, place))
                 paths.append(path)
                 break
@@ -322,7 +316,7 @@ def _scan_turn(
         hits = scan(mesh.vertices, mesh.faces, device)
     conditions = ScanConditions(sigma=device.range_sigma, bias=_RING_BIAS, intensity_dropout=_INTENSITY_DROPOUT)
     points, returned = add_sensor_noise(hits, mesh, device, conditions, rng, ring_normals=ring_normals)
-    face = hits.face[returned]
+    face, joints = hits.face[returned], [place.of_body(bodies.joints[frame]) for bodies, place in walkers]
     # the people's faces come first, one person after the other
     owner = np.repeat(np.arange(len(people) + 1), [len(m.faces) for m in (*people, still)]).astype(np.int16)
     owner[owner == len(people)] = -1
@@ -332,9 +326,7 @@ def _scan_turn(
         person=owner[face],
         part=np.zeros(len(face), np.uint8) if scene.part is None else scene.part[face],
         boxes=tuple(_label(walker, frame, track) for track, walker in enumerate(walkers)),
-        joints=np.array([place.of_body(bodies.joints[frame]) for bodies, place in walkers], np.float32).reshape(
-            -1, len(BODY26), 3
-        ),
+        joints=np.array(joints, np.float32).reshape(-1, len(BODY26), 3),
     )
 
 

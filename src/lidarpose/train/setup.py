@@ -35,12 +35,11 @@ from lidarpose.models.posenet import PoseNet, expand_weights
 from lidarpose.skeleton import HUMAN15, SMPL24, Skeleton, skeleton
 from lidarpose.train.augment import Augmentation, ClipExample, Example, augmentation, augmented
 from lidarpose.train.data_loader import BATCHES, ClipSource, MixedSource, Source, StoredSource, SyntheticSource
-from lidarpose.train.detector.candidate_source import CandidateSource
-from lidarpose.train.detector.scan_validation import missed_people, validation_scans
+from lidarpose.train.detector.candidate_source import CandidateSource, validation_scans
 from lidarpose.train.objectives.baseline_objective import with_joints
 from lidarpose.train.objectives.dapt_objective import finetuning_config, pretraining_config, small
 from lidarpose.train.objectives.dapt_transfer import transferred
-from lidarpose.train.objectives.detector_objective import DetectorObjective
+from lidarpose.train.objectives.detector_objective import DetectorObjective, missed_people
 from lidarpose.train.objectives.objective import Objective
 from lidarpose.train.recipes import (
     MODELS,

@@ -3,13 +3,13 @@
 Legend: B people, N points of the largest.
 """
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from lidarpose.errors import InputError, check_int
-from lidarpose.models.config import MOST, is_number
+from lidarpose.errors import InputError
+from lidarpose.models.config import Config, check_joints, probability
 from lidarpose.models.voxelize import WINDOW
 from lidarpose.sample import CLIP_FRAMES
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24
@@ -22,14 +22,13 @@ DIVISORS = (1, 2, 4, 8)
 
 
 @dataclass(frozen=True, kw_only=True)
-class BaselineConfig:
+class BaselineConfig(Config):
     """What all baselines have. frames: of a clip, 1 for networks of single frames; layers: a lower bound of its
     tensors; joints: names, in the order of the outputs; width_divisor: the channels of hidden layers are as many as
     published divided by it, for CPUs; most_points: of a cloud, of more a draw is read. Each option is False for the
     behavior that its class calls mended. Raises InputError for unknown joints, other divisors, and options that are
     neither true nor false."""
 
-    kind: ClassVar[str] = ""
     frames: ClassVar[int] = 1
     layers: ClassVar[int] = 1
 
@@ -38,20 +37,11 @@ class BaselineConfig:
     most_points: int = MOST_POINTS
 
     def __post_init__(self):
-        joints = tuple(self.joints) if isinstance(self.joints, list) else self.joints
-        if not isinstance(joints, tuple) or not joints or len(set(joints)) != len(joints):
-            raise InputError(f"joints must be joint names, each once, got {joints!r}")
-        for joint in joints:
-            BODY26.index(joint)
-        object.__setattr__(self, "joints", joints)
-        if self.width_divisor not in DIVISORS or type(self.width_divisor) is not int:
-            raise InputError(
-                f"width_divisor must be one of {', '.join(map(str, DIVISORS))}, got {self.width_divisor!r}"
-            )
-        check_int("most_points", self.most_points, least=1, most=MOST)
-        for field in fields(self):
-            if field.type is bool and not isinstance(getattr(self, field.name), bool):
-                raise InputError(f"{field.name} must be true or false, got {getattr(self, field.name)!r}")
+        super().__post_init__()
+        check_joints(self.joints)
+        if self.width_divisor not in DIVISORS:
+            known = ", ".join(map(str, DIVISORS))
+            raise InputError(f"width_divisor must be one of {known}, got {self.width_divisor!r}")
 
     @property
     def name(self) -> str:
@@ -61,9 +51,6 @@ class BaselineConfig:
     def columns(self) -> list[int]:
         """Columns of body26 that the network's joints are."""
         return [BODY26.index(joint) for joint in self.joints]
-
-    def to_dict(self) -> dict:
-        return asdict(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,16 +77,14 @@ class LpformerConfig(BaselineConfig):
 
     grid: int = 64
     resample_with_replacement: bool = False
-    attention_dropout: float = 0.1
+    attention_dropout: float = probability(0.1)
     second_softmax: bool = False
     sensor_position: bool = False
 
     def __post_init__(self):
         super().__post_init__()
-        if self.grid not in GRIDS or type(self.grid) is not int:
+        if self.grid not in GRIDS:
             raise InputError(f"grid must be {', '.join(map(str, GRIDS))} cells, got {self.grid!r}")
-        if not (is_number(self.attention_dropout) and 0 <= self.attention_dropout < 1):
-            raise InputError(f"attention_dropout must be a share below 1, got {self.attention_dropout!r}")
 
 
 def pad_clouds(

@@ -3,13 +3,13 @@
 Legend: L levels (0 = the finest), J joints, W heatmap bins an axis.
 """
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import ClassVar
 
 import numpy as np
 
-from lidarpose.errors import InputError, check_int, check_name
-from lidarpose.models.config import MOST, check_counts, check_grid, is_number
+from lidarpose.errors import InputError, check_name
+from lidarpose.models.config import MOST, Config, at_least, check_counts, check_joints, is_number, probability
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, Skeleton
 
 # the order in which the released Waymo network knows its joints: Waymo's own numbers, limb after limb
@@ -30,7 +30,7 @@ Range = tuple[float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
-class DaptConfig:
+class DaptConfig(Config):
     """The network: a Point Transformer V3 U-Net, joint anchors that read every level of its decoder, heads.
 
     name: of the configuration; joints: names in the network's own order; bins, ranges: heatmap bins (W) and (low, high)
@@ -60,25 +60,21 @@ class DaptConfig:
     decoder_heads: tuple[int, ...] = (8, 8, 8, 16)
     anchor_channels: tuple[int, ...] = (128, 128, 128, 256, 256)
     anchor_heads: int = 4
-    anchor_dropout: float = 0.1
+    anchor_dropout: float = probability(0.1)
     neck: str = "mde"
     mlp_ratio: int = 4
     patch: int = 1024
     grid: float = 0.01
     strides: tuple[int, ...] = (2, 2, 2, 2)
     orders: tuple[str, ...] = CURVES
-    drop_path: float = 0.3
-    parts: int = 0
+    drop_path: float = probability(0.3)
+    parts: int = at_least(0, 0)
     coordinates: bool = False
     auxiliary: bool = False
     legacy: bool = False
 
     def __post_init__(self):
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, list):
-                value = tuple(tuple(x) if isinstance(x, list) else x for x in value)
-                object.__setattr__(self, field.name, value)
+        super().__post_init__()
         levels = len(self.encoder_depths) if isinstance(self.encoder_depths, tuple) else 0
         lengths = {"encoder_depths": max(levels, 2)}
         lengths |= dict.fromkeys(("encoder_channels", "encoder_heads", "anchor_channels"), levels)
@@ -86,50 +82,32 @@ class DaptConfig:
         for name, length in lengths.items():
             counts = check_counts(name, getattr(self, name), length, levels=f" (encoder_depths has {levels})")
             object.__setattr__(self, name, counts)
-        for name in ("anchor_heads", "mlp_ratio", "patch"):
-            object.__setattr__(self, name, check_int(name, getattr(self, name), least=1, most=MOST))
         if not set(self.strides) <= {2, 4, 8} or np.prod(self.strides, dtype=float) > 1 << CELL_BITS:
             raise InputError(f"strides must be 2, 4 or 8 each and {1 << CELL_BITS} in all at most, got {self.strides}")
-        anchor_heads = (self.anchor_heads,) * len(self.decoder_channels)
-        for widths, heads, of, by in (
-            (self.encoder_channels, self.encoder_heads, "encoder_channels", "encoder_heads"),
-            (self.decoder_channels, self.decoder_heads, "decoder_channels", "decoder_heads"),
-            (self.decoder_channels, anchor_heads, "decoder_channels", "anchor_heads"),
-        ):
-            if any(width % number for width, number in zip(widths, heads, strict=True)):
-                raise InputError(f"{of} must divide by {by}, got {widths} and {getattr(self, by)}")
-        check_grid(self.grid)
-        for name in ("drop_path", "anchor_dropout"):
-            if not (is_number(getattr(self, name)) and 0 <= getattr(self, name) < 1):
-                raise InputError(f"{name} must be a probability below 1, got {getattr(self, name)!r}")
+        for widths, heads in (("encoder", "encoder"), ("decoder", "decoder"), ("decoder", "anchor")):
+            of, by = f"{widths}_channels", f"{heads}_heads"
+            if np.any(np.array(getattr(self, of)) % getattr(self, by)):
+                raise InputError(f"{of} must divide by {by}, got {getattr(self, of)} and {getattr(self, by)}")
         if not self.orders:
             raise InputError(f"orders must name at least one curve of {', '.join(CURVES)}, got none")
         for order in self.orders:
             check_name("curve", order, CURVES)
+        check_joints(self.joints)
+        check_name("neck", self.neck, NECKS)
         self._check_heads()
 
     def _check_heads(self) -> None:
-        if not isinstance(self.joints, tuple) or not self.joints or len(set(self.joints)) != len(self.joints):
-            raise InputError(f"joints must be joint names, each once, got {self.joints!r}")
-        for joint in self.joints:
-            BODY26.index(joint)
         if self.bins or self.ranges:
             check_counts("bins", self.bins, 3, levels=" (x, y, z)")
             if not isinstance(self.ranges, tuple) or len(self.ranges) != 3 or not all(map(_is_range, self.ranges)):
                 raise InputError(f"ranges must be three pairs (low, high) of meters, or none, got {self.ranges!r}")
         elif not self.coordinates:
             raise InputError("a network needs heatmaps (bins and ranges) or coordinates=True: it would predict nothing")
-        if check_int("parts", self.parts, least=0, most=MOST) == 1:
+        if self.parts == 1:
             raise InputError(f"parts must be 0 (no part head) or from 2 to {MOST}, got 1")
-        check_name("neck", self.neck, NECKS)
         if self.neck == "prn" and (self.bins or self.parts or not self.coordinates):
-            raise InputError(
-                "the neck prn has joints and parts of its own: leave bins, ranges and parts empty and set "
-                "coordinates=True"
-            )
-        for name in ("coordinates", "auxiliary", "legacy"):
-            if not isinstance(getattr(self, name), bool):
-                raise InputError(f"{name} must be true or false, got {getattr(self, name)!r}")
+            own = "the neck prn has joints and parts of its own"
+            raise InputError(f"{own}: leave bins, ranges and parts empty and set coordinates=True")
 
     @property
     def layers(self) -> int:
@@ -165,10 +143,6 @@ class DaptConfig:
             )
         return np.array([self.joints.index(joint) for joint in skeleton.joints])
 
-    def to_dict(self) -> dict:
-        """Plain values, for a file's header: `DaptConfig(**entries)` reads them back, from JSON too."""
-        return asdict(self)
-
     @classmethod
     def from_dict(cls, entries: dict) -> "DaptConfig":
         """From `to_dict`'s entries, or from the constructor arguments of the authors' backbone.
@@ -194,32 +168,15 @@ def _is_range(value: object) -> bool:
 
 
 # the authors' names of what this package names otherwise
-_REFERENCE = {
-    "enc_depths": "encoder_depths",
-    "enc_channels": "encoder_channels",
-    "enc_num_head": "encoder_heads",
-    "dec_depths": "decoder_depths",
-    "dec_channels": "decoder_channels",
-    "dec_num_head": "decoder_heads",
-    "dec_kp_channels": "anchor_channels",
-    "mlp_ratio": "mlp_ratio",
-    "stride": "strides",
-    "order": "orders",
-    "drop_path": "drop_path",
-    "grid_size": "grid",
-}
+_REFERENCE = dict(
+    pair.split(":")
+    for pair in """enc_depths:encoder_depths enc_channels:encoder_channels enc_num_head:encoder_heads
+    dec_depths:decoder_depths dec_channels:decoder_channels dec_num_head:decoder_heads dec_kp_channels:anchor_channels
+    mlp_ratio:mlp_ratio stride:strides order:orders drop_path:drop_path grid_size:grid""".split()
+)
 # what the authors' arguments must be for this network to be theirs
-_FIXED = {
-    "in_channels": 3,
-    "pre_norm": True,
-    "enable_rpe": False,
-    "dec_kp_mixer": "attn",
-    "num_extra": 0,
-    "qkv_bias": True,
-    "cls_mode": False,
-    "pdnorm_bn": False,
-    "pdnorm_ln": False,
-}
+_FIXED = {"in_channels": 3, "dec_kp_mixer": "attn", "num_extra": 0, "pre_norm": True, "qkv_bias": True}
+_FIXED |= dict.fromkeys(("enable_rpe", "cls_mode", "pdnorm_bn", "pdnorm_ln"), False)
 _JOINTS = (WAYMO_JOINTS, HUMAN15.joints, SMPL24.joints)
 
 
@@ -254,14 +211,8 @@ def _from_reference(entries: dict) -> dict:
 def _released(name: str, joints: tuple[str, ...], bins: tuple[int, int], reach: Range) -> DaptConfig:
     """bins and half widths in meters of (x and y, z)."""
     across, up = ((-r, r) for r in reach)
-    return DaptConfig(
-        name=name,
-        joints=joints,
-        bins=(bins[0], *bins),
-        ranges=(across, across, up),
-        auxiliary=True,
-        legacy=True,
-    )
+    ranges = (across, across, up)
+    return DaptConfig(name=name, joints=joints, bins=(bins[0], *bins), ranges=ranges, auxiliary=True, legacy=True)
 
 
 # `paper`: the paper's network for the superset skeleton, every head of both stages, so that none is thrown away between

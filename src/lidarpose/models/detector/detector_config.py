@@ -1,10 +1,9 @@
 """The shape of the detector's network, and of what it reads. No torch, no numpy here."""
 
-from dataclasses import asdict, dataclass
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import ClassVar
 
-from lidarpose.errors import check_int
-from lidarpose.models.config import MOST, check_counts
+from lidarpose.models.config import Config
 
 # inputs of the network in their order, see `render.render`
 INPUTS = ("fine", "range_view", "context", "scalars")
@@ -15,7 +14,7 @@ OUTPUTS = ("logit", "dx", "dy", "foot", "height", "mounted")
 
 
 @dataclass(frozen=True, kw_only=True)
-class DetectorConfig:
+class DetectorConfig(Config):
     """Inputs and widths of a `DetectorNet`.
 
     fine, range_view, context: channels, rows and columns of what it reads; scalars: numbers beside; channels: of the
@@ -34,13 +33,6 @@ class DetectorConfig:
     coarse_channels: tuple[int, int] = (24, 48)
     hidden: int = 128
 
-    def __post_init__(self):
-        for name in ("fine", "range_view", "context", "channels"):
-            object.__setattr__(self, name, check_counts(name, getattr(self, name), 3))
-        object.__setattr__(self, "coarse_channels", check_counts("coarse_channels", self.coarse_channels, 2))
-        for name in ("scalars", "hidden"):
-            object.__setattr__(self, name, check_int(name, getattr(self, name), least=1, most=MOST))
-
     @property
     def layers(self) -> int:
         """A lower bound of the tensors."""
@@ -48,13 +40,5 @@ class DetectorConfig:
 
     def shapes(self, candidates: int) -> dict[str, tuple[int, ...]]:
         """The shape of each of `INPUTS` for so many candidates."""
-        own: dict[str, tuple[int, ...]] = {
-            "fine": self.fine,
-            "range_view": self.range_view,
-            "context": self.context,
-            "scalars": (self.scalars,),
-        }
-        return {name: (candidates, *own[name]) for name in INPUTS}
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
+        own = (self.fine, self.range_view, self.context, (self.scalars,))
+        return {name: (candidates, *shape) for name, shape in zip(INPUTS, own, strict=True)}

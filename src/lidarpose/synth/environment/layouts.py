@@ -7,6 +7,7 @@ may stand, and where the sensor is. Rooms of `LEFT_OUT` shapes are kept for judg
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import pi
+from typing import Any
 
 import numpy as np
 
@@ -77,8 +78,7 @@ def street(rng: np.random.Generator) -> Layout:
     for side in (-1, 1):
         items += _fronts(side, front, kerb, rng)
         items += _parked(side, road, kerb, rng)
-    areas = [(-40.0, 40.0, side * road + side * 0.3, side * front - side * 0.2, kerb) for side in (-1, 1)]
-    areas = [(a, b, min(c, d), max(c, d), z) for a, b, c, d, z in areas]
+    areas = [(-40.0, 40.0, 0.2 - front, -road - 0.3, kerb), (-40.0, 40.0, road + 0.3, front - 0.2, kerb)]
     areas.append((-40.0, 40.0, -road + 2.0, road - 2.0, 0.0))
     on_road = rng.random() < 0.6
     y = rng.uniform(-1, 1) * (road - 2.0) if on_road else rng.choice([-1, 1]) * rng.uniform(road + 0.5, front - 0.5)
@@ -200,20 +200,12 @@ def _walls(wide: float, long: float, high: float, rng: np.random.Generator, *, w
 def _against_walls(wide: float, long: float, rng: np.random.Generator) -> list[Item]:
     """Shelves, cupboards, tables and doors along the walls, tables with chairs within."""
     items: list[Item] = []
-    for name in rng.choice(
-        ["shelf", "cupboard", "table", "door", "chair"], int(rng.integers(2, int(5 + (wide + long) / 3)))
-    ):
-        mesh, turn = draw_thing(str(name), rng), int(rng.integers(4))
-        deep = -float(mesh.vertices[:, 0].min())
+    count = int(rng.integers(2, int(5 + (wide + long) / 3)))
+    for name in map(str, rng.choice(["shelf", "cupboard", "table", "door", "chair"], count)):
+        mesh, turn = draw_thing(name, rng), int(rng.integers(4))
         far, along = (wide / 2, long) if turn % 2 == 0 else (long / 2, wide)
-        items.append(
-            (
-                str(name),
-                mesh.moved((-far + deep + 0.03, (rng.random() - 0.5) * along * 0.85, 0)).moved(
-                    (0, 0, 0), turn * pi / 2
-                ),
-            )
-        )
+        place = (-far - float(mesh.vertices[:, 0].min()) + 0.03, (rng.random() - 0.5) * along * 0.85, 0)
+        items.append((name, mesh.moved(place).moved((0, 0, 0), turn * pi / 2)))
     for _ in range(int(rng.integers(0, int(2 + wide * long / 12)))):
         x, y, turn = (rng.random() - 0.5) * (wide - 2), (rng.random() - 0.5) * (long - 2), rng.choice([0.0, pi / 2])
         deep, size = rng.uniform(0.6, 1.0), rng.uniform(0.8, 2.2)
@@ -242,10 +234,22 @@ def _room(wide: float, long: float, rng: np.random.Generator) -> Layout:
     x, y = (rng.random(2) - 0.5) * [wide - 1, long - 1]
     if rng.random() < 0.5:
         y = -long / 2 + 0.4
-    free = (-wide / 2 + 0.3, wide / 2 - 0.3, -long / 2 + 0.3, long / 2 - 0.3, 0.0)
-    return Layout(
-        items=items, areas=[free], sensor=(x, y, 0), ahead=(float(np.arctan2(-y, -x)),), indoors=True, ceiling=high
-    )
+    return _indoors(items, (wide, long, high), (0.3, 0.3), (x, y), float(np.arctan2(-y, -x)))
+
+
+def _indoors(
+    items: list[Item],
+    size: tuple[float, float, float],
+    margin: tuple[float, float],
+    sensor: tuple[float, float],
+    ahead: float,
+    **more: Any,
+) -> Layout:
+    """A room of size (wide, long, high) about the origin, free but for a margin at its walls."""
+    wide, long, high = size
+    free = (margin[0] - wide / 2, wide / 2 - margin[0], margin[1] - long / 2, long / 2 - margin[1], 0.0)
+    room = Layout(items=items, areas=[free], sensor=(*sensor, 0), ahead=(ahead,), indoors=True, ceiling=high)
+    return replace(room, **more)
 
 
 def car_park(rng: np.random.Generator) -> Layout:
@@ -263,12 +267,9 @@ def car_park(rng: np.random.Generator) -> Layout:
                 vehicle = shape("car", *rng.uniform([3.6, 1.65, 1.4], [4.9, 1.9, 1.75]))
                 items.append(("car", vehicle.moved((x + rng.normal(0, 0.15), y, 0), rng.choice([0.0, pi]))))
     lanes = [lane for lane in lanes if lane[1] - lane[0] > 1.0]
-    free = (-wide / 2 + 0.5, wide / 2 - 0.5, -long / 2 + 0.5, long / 2 - 0.5, 0.0)
     x, y = (lanes[0][0] + lanes[0][1]) / 2, rng.uniform(-0.5, 0.5) * long
-    return Layout(
-        items=items, areas=[*lanes, free], sensor=(x, y * 0.8, 0), ahead=(pi / 2 if y < 0 else -pi / 2,), indoors=True,
-        ceiling=high, things=0.5,
-    )  # fmt: skip
+    hall = _indoors(items, (wide, long, high), (0.5, 0.5), (x, y * 0.8), pi / 2 if y < 0 else -pi / 2, things=0.5)
+    return replace(hall, areas=[*lanes, *hall.areas])
 
 
 def corridor(rng: np.random.Generator) -> Layout:
@@ -278,9 +279,8 @@ def corridor(rng: np.random.Generator) -> Layout:
     items.append(("ceiling", ground(np.array([-9.0, 9.0]), np.array([-long, long]), high)))
     for side in (-1, 1):
         for name, mesh in facade(long, high, rng, bars=0.0, niches=0.5):
-            items.append(
-                ("wall" if name == "facade" else name, mesh.moved((side * wide / 2, 0, 0), 0 if side < 0 else pi))
-            )
+            name = "wall" if name == "facade" else name
+            items.append((name, mesh.moved((side * wide / 2, 0, 0), 0 if side < 0 else pi)))
         end = shapes.wall(wide, high, opening=(-0.4, 0.4, 0, 2.05) if rng.random() < 0.5 else None)
         items.append(("wall", end.moved((0, side * long / 2, 0), pi / 2)))
     for y in rng.uniform(-0.45, 0.45, rng.integers(0, 8)) * long:
@@ -288,11 +288,8 @@ def corridor(rng: np.random.Generator) -> Layout:
         side = rng.choice([-1, 1])
         items.append((name, draw_thing(name, rng).moved((side * (wide / 2 - 0.35), y, 0), 0 if side < 0 else pi)))
     y = rng.uniform(-0.48, 0.48) * long
-    free = (-wide / 2 + 0.3, wide / 2 - 0.3, -long / 2 + 0.4, long / 2 - 0.4, 0.0)
-    return Layout(
-        items=items, areas=[free], sensor=(0.3 * wide * (rng.random() - 0.5), y, 0),
-        ahead=(pi / 2 if y < 0 else -pi / 2,), indoors=True, ceiling=high, things=0.5,
-    )  # fmt: skip
+    sensor = (0.3 * wide * (rng.random() - 0.5), y)
+    return _indoors(items, (wide, long, high), (0.3, 0.4), sensor, pi / 2 if y < 0 else -pi / 2, things=0.5)
 
 
 def hall(rng: np.random.Generator) -> Layout:
@@ -312,21 +309,11 @@ def hall(rng: np.random.Generator) -> Layout:
                 place = np.array([np.cos(turn + pi / 2), np.sin(turn + pi / 2)]) * 1.1 * k + [x, y]
                 if (np.abs(place) < [wide / 2 - 0.5, long / 2 - 0.5]).all():
                     items.append(("shelf", draw_thing("shelf", rng).moved((*place, 0), turn)))
-    free = (-wide / 2 + 0.4, wide / 2 - 0.4, -long / 2 + 0.4, long / 2 - 0.4, 0.0)
     x, y = -wide / 2 + rng.uniform(0.5, wide / 2), -long / 2 + rng.uniform(0.5, long / 2)
-    return Layout(
-        items=items, areas=[free], sensor=(x, y, 0), ahead=(float(np.arctan2(-y, -x)),), indoors=True, ceiling=high
-    )
+    return _indoors(items, (wide, long, high), (0.4, 0.4), (x, y), float(np.arctan2(-y, -x)))
 
 
 LAYOUTS: dict[str, Callable[[np.random.Generator], Layout]] = {
-    "street": street,
-    "square": square,
-    "path": path,
-    "room": room,
-    "small room": small_room,
-    "car park": car_park,
-    "corridor": corridor,
-    "hall": hall,
+    kind.__name__.replace("_", " "): kind for kind in (street, square, path, room, small_room, car_park, corridor, hall)
 }
 LEFT_OUT = ("corridor", "hall")

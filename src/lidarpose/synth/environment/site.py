@@ -169,10 +169,8 @@ def scatter(site: Site, weights: dict[str, float], count: int, feet: np.ndarray,
             if len(feet) and name != "mannequin" and rng.random() < _BESIDE:
                 angle, near = rng.uniform(-pi, pi), feet[rng.integers(len(feet))]
                 across = np.array([np.cos(angle), np.sin(angle)])
-                place = (
-                    near + across * (HALF_WIDTH + 0.05 + 0.45 * rng.random()) - np.where(across > 0, low[:2], low[2:4])
-                )
-                place = np.where(np.abs(across) < 0.3, near, place)
+                place = near + across * (HALF_WIDTH + 0.05 + 0.45 * rng.random())
+                place = np.where(np.abs(across) < 0.3, near, place - np.where(across > 0, low[:2], low[2:4]))
             elif name in ("fragment", "mannequin") and not site.layout.indoors:
                 place = site.spot(rng.uniform(18, 40), 0.3, rng, seen=True)
             else:
@@ -214,13 +212,9 @@ def _own_vehicle(height: float, by_car: bool, rng: np.random.Generator) -> Mesh:
     if height < 1.4:
         deck = shapes.box((0.3 + 0.5 * u[0], 0.3 + 0.3 * u[1], 0.8 * height))
         return deck.moved((-0.2 * u[2], 0, 0), 2 * pi * u[3])
-    legs = [
-        shape("tube", 0.02, 0.02, 0.9 * height).placed(
-            [[1, 0, 0], [0, 1, 0], [np.cos(a) * 0.02, np.sin(a) * 0.02, 1]], (0.15 * np.cos(a), 0.15 * np.sin(a), 0)
-        )
-        for a in (0, 2.1, 4.2)
-    ]
-    return union(legs)
+    leg = shape("tube", 0.02, 0.02, 0.9 * height)
+    ways = [np.array([np.cos(angle), np.sin(angle)]) for angle in (0, 2.1, 4.2)]
+    return union([leg.placed([[1, 0, 0], [0, 1, 0], [*(0.02 * way), 1]], (*(0.15 * way), 0)) for way in ways])
 
 
 @dataclass(frozen=True)

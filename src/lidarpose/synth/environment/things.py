@@ -4,7 +4,7 @@ Each stands on the origin, its front along +x, its length along y; sizes in mete
 they stand outdoors and indoors, and which of them are kept for judging. Builders take uniforms (8,) and a generator.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import cos, pi, sin
@@ -33,13 +33,17 @@ def _at(mesh: Mesh, x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float =
     return mesh.moved((x, y, z), yaw)
 
 
-def _post(radius: float, height: float) -> Mesh:
-    return shape("pole", radius, radius, height)
+def _box(size: Sequence[float] | np.ndarray, *at: float) -> Mesh:
+    return _at(shapes.box(size), *at)
 
 
-def _disc(radius: float, wide: float) -> Mesh:
-    """A wheel in the x-z plane that stands on the origin."""
-    return _at(shape("ball", radius, wide, radius), z=radius)
+def _post(radius: float, height: float, *at: float) -> Mesh:
+    return _at(shape("pole", radius, radius, height), *at)
+
+
+def _union(*parts: Mesh | bool) -> Mesh:
+    """Those of the parts that are there."""
+    return union([part for part in parts if isinstance(part, Mesh)])
 
 
 # --- buildings
@@ -66,7 +70,7 @@ def facade(
         if kind < 0.3 or height < 2.8:
             block(center, wide, 0, height, 0, thick)
             if u < 0.25:
-                rods.append(_at(_post(0.04 + 0.03 * v, height), 0.07, center))
+                rods.append(_post(0.04 + 0.03 * v, height, 0.07, center))
         elif kind < 0.3 + niches:
             # a doorway or a niche
             back = 0.15 + 1.0 * deep * deep
@@ -119,33 +123,30 @@ def _bars(u: Uniforms, rng: np.random.Generator) -> Mesh:
 def _wall_end(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A short wall seen on its end, or a corner of two."""
     high, long = 1.2 + 1.8 * u[0], 0.5 + 2.5 * u[1]
-    wall = shapes.box((long, 0.15 + 0.3 * u[2], high))
-    wall = _at(wall, -long / 2)
+    wall = _box((long, 0.15 + 0.3 * u[2], high), -long / 2)
     if u[3] < 0.4:
         side = 1 if u[4] < 0.5 else -1
-        return union([wall, _at(shapes.box((0.2, 0.4 + u[5], high)), 0, side * (0.2 + u[5] / 2))])
+        return union([wall, _box((0.2, 0.4 + u[5], high), 0, side * (0.2 + u[5] / 2))])
     # a post at the end, with a cap
-    return union([wall, shapes.box((0.3, 0.3, high + 0.1))]) if u[3] < 0.7 else wall
+    return _union(wall, u[3] < 0.7 and _box((0.3, 0.3, high + 0.1)))
 
 
 def _cabinet(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """Of a street's power or telephone: a plinth, a body, a roof."""
     deep, wide, high = 0.25 + 0.3 * u[0], 0.4 + 0.9 * u[1] ** 2, 0.9 + 0.9 * u[2]
-    parts = [shapes.box((deep, wide, 0.15)), _at(shapes.box((0.94 * deep, 0.96 * wide, high - 0.15)), z=0.15)]
-    if u[3] < 0.6:
-        parts.append(_at(shapes.box((deep + 0.06, wide + 0.06, 0.05)), z=high))
-    if u[4] < 0.3:
-        parts.append(_at(shapes.box((deep, 0.5 * wide + 0.2, 0.7 * high)), 0, 0.75 * wide + 0.15))
-    return union(parts)
+    return _union(
+        _box((deep, wide, 0.15)),
+        _box((0.94 * deep, 0.96 * wide, high - 0.15), 0, 0, 0.15),
+        u[3] < 0.6 and _box((deep + 0.06, wide + 0.06, 0.05), 0, 0, high),
+        u[4] < 0.3 and _box((deep, 0.5 * wide + 0.2, 0.7 * high), 0, 0.75 * wide + 0.15),
+    )
 
 
 def _pillar(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """Round or square, up to a ceiling or with a base and a cap."""
     half, high = 0.1 + 0.22 * u[0], 1.6 + 2.4 * u[1]
-    mesh = _post(half, high) if u[2] < 0.5 else shapes.box((2 * half, 2 * half * (0.6 + 0.8 * u[5]), high))
-    if u[3] < 0.4:
-        return union([mesh, shapes.box((2.6 * half, 2.6 * half, 0.15 + 0.6 * u[4] ** 2))])
-    return mesh
+    mesh = _post(half, high) if u[2] < 0.5 else _box((2 * half, 2 * half * (0.6 + 0.8 * u[5]), high))
+    return _union(mesh, u[3] < 0.4 and _box((2.6 * half, 2.6 * half, 0.15 + 0.6 * u[4] ** 2)))
 
 
 # --- plants
@@ -189,7 +190,7 @@ def _clipped(size: tuple[float, float, float], rng: np.random.Generator) -> Mesh
     where += rng.normal(0, 0.04, where.shape)
     leaves = where[:, None] + rng.normal(0, leaf, (count, 3, 3))
     leaves[..., 2] = np.maximum(leaves[..., 2], 0)
-    inside = shapes.box((max(deep - 0.25, 0.05), max(long - 0.2, 0.05), max(high - 0.15, 0.1)))
+    inside = _box((max(deep - 0.25, 0.05), max(long - 0.2, 0.05), max(high - 0.15, 0.1)))
     outside = Mesh(leaves.reshape(-1, 3).astype(np.float32), shapes.repeated(count, 3, "triangle"))
     return union([_leaves(outside), inside])
 
@@ -198,15 +199,11 @@ def _hedge(u: Uniforms, rng: np.random.Generator) -> Mesh:
     size = (0.35 + 0.6 * u[0], 0.5 + 4.5 * u[1] ** 2, 0.6 + 1.5 * u[2])
     if u[3] < 0.8:
         return _clipped(size, rng)
-    count = max(1, int(size[1] / 0.8))
-    return union(
-        [
-            _at(
-                _leaves(shapes.foliage((size[0] + 0.3, 1.2, size[2] * rng.uniform(0.7, 1.1)), 110, 0.1, rng)), y=0.8 * k
-            )
-            for k in range(count)
-        ]
-    )
+    plants = []
+    for k in range(max(1, int(size[1] / 0.8))):
+        plant = shapes.foliage((size[0] + 0.3, 1.2, size[2] * rng.uniform(0.7, 1.1)), 110, 0.1, rng)
+        plants.append(_at(_leaves(plant), 0, 0.8 * k))
+    return union(plants)
 
 
 def _hedge_at_wall(u: Uniforms, rng: np.random.Generator) -> Mesh:
@@ -214,7 +211,7 @@ def _hedge_at_wall(u: Uniforms, rng: np.random.Generator) -> Mesh:
     long = 1.0 + 3.5 * u[4]
     plant = _hedge(u, rng) if u[5] < 0.6 else crown((0.4 + 0.3 * u[0], 0.4 + 0.5 * u[1], 1.0 + 0.9 * u[2]), rng)
     low, high = plant.vertices.min(0), plant.vertices.max(0)
-    wall = shapes.box((0.2, long, 0.8 + 2.2 * u[6]))
+    wall = _box((0.2, long, 0.8 + 2.2 * u[6]))
     return union([_at(plant, y=-(low[1] + high[1]) / 2), _at(wall, low[0] - 0.12)])
 
 
@@ -227,20 +224,17 @@ def _tree(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A trunk and a crown above heads."""
     clear, wide = 2.0 + 1.2 * u[0], 2.0 + 3.0 * u[1]
     radius = 0.08 + 0.25 * u[2] ** 2
-    parts = [_post(radius, clear + 0.8), _at(crown((wide, wide, 2 + 2.5 * u[3]), rng), z=clear)]
-    if u[4] < 0.3:
-        # suckers at the foot
-        parts.append(shapes.foliage((0.6, 0.6, 0.3 + 0.7 * u[5]), 70, 0.06, rng))
-    return union(parts)
+    top = _at(crown((wide, wide, 2 + 2.5 * u[3]), rng), z=clear)
+    # suckers at the foot
+    low = u[4] < 0.3 and shapes.foliage((0.6, 0.6, 0.3 + 0.7 * u[5]), 70, 0.06, rng)
+    return _union(_post(radius, clear + 0.8), top, low)
 
 
 def _young_tree(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A thin trunk and a small crown that begins low."""
-    clear, wide = 0.7 + 1.3 * u[0], 0.4 + 1.0 * u[1]
-    height = 1.0 + 1.8 * u[3]
-    return union(
-        [_post(0.012 + 0.035 * u[2], clear + height * 0.6), _at(crown((wide, wide, height), rng, dense=0.3), z=clear)]
-    )
+    clear, wide, high = 0.7 + 1.3 * u[0], 0.4 + 1.0 * u[1], 1.0 + 1.8 * u[3]
+    top = _at(crown((wide, wide, high), rng, dense=0.3), z=clear)
+    return union([_post(0.012 + 0.035 * u[2], clear + high * 0.6), top])
 
 
 def _low_crown(u: Uniforms, rng: np.random.Generator) -> Mesh:
@@ -255,13 +249,11 @@ def _staked_tree(u: Uniforms, rng: np.random.Generator) -> Mesh:
     away = 0.12 + 0.25 * u[6]
     for k in range(count):
         angle = 2 * pi * (k / count + u[7])
-        parts.append(_at(_post(0.025 + 0.02 * u[6], tall), away * cos(angle), away * sin(angle)))
+        parts.append(_post(0.025 + 0.02 * u[6], tall, away * cos(angle), away * sin(angle)))
         if count > 1:
-            bar = _at(shapes.box((0.04, 1.6 * away, 0.07)), away * cos(angle) / 2, away * sin(angle) / 2, 0.92 * tall)
+            bar = _box((0.04, 1.6 * away, 0.07), away * cos(angle) / 2, away * sin(angle) / 2, 0.92 * tall)
             parts.append(bar)
-    if u[0] < 0.3:
-        parts.append(_post(0.08 + 0.06 * u[1], 0.9 + 0.5 * u[2]))
-    return union(parts)
+    return _union(*parts, u[0] < 0.3 and _post(0.08 + 0.06 * u[1], 0.9 + 0.5 * u[2]))
 
 
 # --- street furniture and what stands about
@@ -269,20 +261,17 @@ def _staked_tree(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 def _bollard(u: Uniforms, rng: np.random.Generator) -> Mesh:
     half, high = 0.05 + 0.12 * u[0], 0.5 + 0.8 * u[1]
-    mesh = _post(half, high) if u[2] < 0.7 else shapes.box((2 * half, 2 * half, high))
-    return union([mesh, _at(shape("ball", 1.15 * half, 1.15 * half, 1.1 * half), z=high)]) if u[3] < 0.4 else mesh
+    mesh = _post(half, high) if u[2] < 0.7 else _box((2 * half, 2 * half, high))
+    return _union(mesh, u[3] < 0.4 and _at(shape("ball", 1.15 * half, 1.15 * half, 1.1 * half), z=high))
 
 
 def _pole(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A lamp post, a flagpole, a post with a box on it."""
     radius, high = 0.025 + 0.1 * u[0] ** 2, 1.5 + 6 * u[1]
-    parts = [_post(radius, high)]
-    if u[2] < 0.3:
-        parts.append(_post(1.7 * radius, 0.8 + 0.5 * u[3]))
-    if u[4] < 0.35:
-        # a box, a bin or a parking meter at the height of a chest
-        parts.append(_at(shapes.box((0.2 + 0.2 * u[5], 0.25 + 0.2 * u[6], 0.3 + 0.5 * u[7])), 0.1, 0, 0.6 + 0.7 * u[3]))
-    return union(parts)
+    foot = u[2] < 0.3 and _post(1.7 * radius, 0.8 + 0.5 * u[3])
+    # a box, a bin or a parking meter at the height of a chest
+    box = u[4] < 0.35 and _box((0.2 + 0.2 * u[5], 0.25 + 0.2 * u[6], 0.3 + 0.5 * u[7]), 0.1, 0, 0.6 + 0.7 * u[3])
+    return _union(_post(radius, high), foot, box)
 
 
 def _sign(u: Uniforms, rng: np.random.Generator) -> Mesh:
@@ -291,10 +280,10 @@ def _sign(u: Uniforms, rng: np.random.Generator) -> Mesh:
     if u[0] < 0.8:
         # a board on two feet
         wide, high = 0.5 + 0.8 * u[1], 1.0 + 1.0 * u[2]
-        board = _at(shapes.box((0.04, wide, 0.75 * high)), z=0.25 * high)
-        return union([board, _at(_post(0.03, high), y=wide / 2), _at(_post(0.03, high), y=-wide / 2)])
+        board = _box((0.04, wide, 0.75 * high), 0, 0, 0.25 * high)
+        return union([board, _post(0.03, high, 0, wide / 2), _post(0.03, high, 0, -wide / 2)])
     # an advertising column or a stele
-    return shapes.box((0.12 + 0.3 * u[1] ** 2, 0.5 + 0.6 * u[2], 1.3 + 1.1 * u[3]))
+    return _box((0.12 + 0.3 * u[1] ** 2, 0.5 + 0.6 * u[2], 1.3 + 1.1 * u[3]))
 
 
 def _bin(u: Uniforms, rng: np.random.Generator) -> Mesh:
@@ -302,7 +291,7 @@ def _bin(u: Uniforms, rng: np.random.Generator) -> Mesh:
         return shape("wheeled bin", 0.5 + 0.3 * u[1], 0.45 + 0.35 * u[2], 0.9 + 0.4 * u[3])
     if u[0] < 0.85:
         return _post(0.18 + 0.12 * u[1], 0.7 + 0.4 * u[2])
-    return shapes.box((0.8 + 0.5 * u[1], 1.2 + 0.8 * u[2], 1.1 + 0.4 * u[3]))
+    return _box((0.8 + 0.5 * u[1], 1.2 + 0.8 * u[2], 1.1 + 0.4 * u[3]))
 
 
 def _bench(u: Uniforms, rng: np.random.Generator) -> Mesh:
@@ -314,18 +303,14 @@ def _chair(u: Uniforms, rng: np.random.Generator) -> Mesh:
     chair = shape("chair", 0.9 + 0.3 * u[0], 0.42 + 0.15 * u[1], 0.43 + 0.06 * u[2])
     if u[3] < 0.15:
         return union([_at(chair, z=0.09 * k) for k in range(2 + int(4 * u[4]))])
-    return union([chair, _at(shapes.box((0.08, 0.45, 0.4)), -0.2, 0, 0.8)]) if u[3] < 0.35 else chair
+    return _union(chair, u[3] < 0.35 and _box((0.08, 0.45, 0.4), -0.2, 0, 0.8))
 
 
 def _table(u: Uniforms, rng: np.random.Generator) -> Mesh:
     long, deep, high = 0.6 + 1.4 * u[0], 0.5 + 0.5 * u[1], 0.7 + 0.4 * u[2] ** 3
-    parts = [shape("table", deep, long, high)]
-    if u[3] < 0.4:
-        # a screen, a case or a pile on it
-        parts.append(
-            _at(shapes.box((0.05 + 0.3 * u[4], 0.3 + 0.3 * u[5], 0.2 + 0.4 * u[6])), 0, long * (u[7] - 0.5) / 2, high)
-        )
-    return union(parts)
+    # a screen, a case or a pile on it
+    size = (0.05 + 0.3 * u[4], 0.3 + 0.3 * u[5], 0.2 + 0.4 * u[6])
+    return _union(shape("table", deep, long, high), u[3] < 0.4 and _box(size, 0, long * (u[7] - 0.5) / 2, high))
 
 
 def _cart(u: Uniforms, rng: np.random.Generator) -> Mesh:
@@ -335,43 +320,39 @@ def _cart(u: Uniforms, rng: np.random.Generator) -> Mesh:
         return _at(shape("pram"), -0.5)
     # a cage or a luggage cart
     deep, wide, high = 0.6 + 0.3 * u[1], 0.5 + 0.3 * u[2], 0.9 + 0.8 * u[3]
-    parts = [_at(shapes.box((deep, wide, 0.06)), z=0.15), _at(shapes.box((deep, wide, 0.5 * high * u[4])), z=0.2)]
-    parts += [_at(shapes.lattice_fence(wide, high, 0.12, 0.02), side * deep / 2) for side in (-1, 1)]
-    return union(parts)
+    sides = [_at(shapes.lattice_fence(wide, high, 0.12, 0.02), side * deep / 2) for side in (-1, 1)]
+    return union([_box((deep, wide, 0.06), 0, 0, 0.15), _box((deep, wide, 0.5 * high * u[4]), 0, 0, 0.2), *sides])
 
 
 def _bicycle(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """Parked, one or a few side by side."""
     size = 0.9 + 0.2 * u[0]
-    single = union([shape("bicycle"), _at(shapes.box((0.04, 0.56, 0.035)), 0.52, 0, 1.02)]).scaled((size,) * 3)
-    if u[1] < 0.3:
-        single = union([single, _at(shapes.box((0.3, 0.35, 0.25)), -0.4 if u[2] < 0.5 else 0.7, 0, 0.75)])
+    single = union([shape("bicycle"), _box((0.04, 0.56, 0.035), 0.52, 0, 1.02)]).scaled((size,) * 3)
+    single = _union(single, u[1] < 0.3 and _box((0.3, 0.35, 0.25), -0.4 if u[2] < 0.5 else 0.7, 0, 0.75))
     count = 1 + int(4 * max(0.0, u[3] - 0.5))
     return union([_at(single, 0.05 * k, 0.45 * k + 0.05 * u[4], yaw=0.1 * (u[5] - 0.5)) for k in range(count)])
 
 
 def moped() -> Mesh:
     """A scooter that faces +x, its seat's middle above the origin at 0.75 m, the foot board at 0.28 m."""
-    parts = [_at(_disc(0.23, 0.06), 0.85), _at(_disc(0.23, 0.07), -0.35)]
-    parts += [
-        _at(shapes.box((0.5, 0.3, 0.08)), 0.42, 0, 0.2),
-        _at(shapes.box((0.75, 0.3, 0.38)), -0.15, 0, 0.3),
-        _at(shapes.box((0.7, 0.26, 0.07)), -0.1, 0, 0.68),
-        shapes.box((0.08, 0.42, 0.55)).placed([[1, 0, 0], [0, 1, 0], [-0.2, 0, 1]], (0.76, 0, 0.3)),
-        _at(shapes.box((0.14, 0.16, 0.2)), 0.64, 0, 0.85),
-        _at(shapes.box((0.04, 0.62, 0.04)), 0.58, 0, 1.0),
-        _at(shapes.box((0.16, 0.1, 0.5)), 0.85, 0, 0.15),
-    ]
-    return union(parts)
+    return _union(
+        _at(shape("ball", 0.23, 0.06, 0.23), 0.85, 0, 0.23),
+        _at(shape("ball", 0.23, 0.07, 0.23), -0.35, 0, 0.23),
+        _box((0.5, 0.3, 0.08), 0.42, 0, 0.2),
+        _box((0.75, 0.3, 0.38), -0.15, 0, 0.3),
+        _box((0.7, 0.26, 0.07), -0.1, 0, 0.68),
+        _box((0.08, 0.42, 0.55)).placed([[1, 0, 0], [0, 1, 0], [-0.2, 0, 1]], (0.76, 0, 0.3)),
+        _box((0.14, 0.16, 0.2), 0.64, 0, 0.85),
+        _box((0.04, 0.62, 0.04), 0.58, 0, 1.0),
+        _box((0.16, 0.1, 0.5), 0.85, 0, 0.15),
+    )
 
 
 def _moped(u: Uniforms, rng: np.random.Generator) -> Mesh:
     mesh = moped().scaled((0.9 + 0.2 * u[0], 1.0, 0.9 + 0.2 * u[1]))
-    if u[2] < 0.35:
-        # a top box or a wind screen
-        box = _at(shapes.box((0.35, 0.38, 0.35)), -0.6, 0, 0.75)
-        mesh = union([mesh, box if u[3] < 0.6 else _at(shapes.box((0.04, 0.45, 0.5)), 0.66, 0, 0.95)])
-    return mesh
+    # a top box or a wind screen
+    more = _box((0.35, 0.38, 0.35), -0.6, 0, 0.75) if u[3] < 0.6 else _box((0.04, 0.45, 0.5), 0.66, 0, 0.95)
+    return _union(mesh, u[2] < 0.35 and more)
 
 
 def _cone(u: Uniforms, rng: np.random.Generator) -> Mesh:
@@ -388,7 +369,7 @@ def _sacks(u: Uniforms, rng: np.random.Generator) -> Mesh:
         up = high if u[1] < 0.5 else 0.0
         where = {"x": 0.4 * (d - 0.5), "y": (0.3 if u[1] < 0.5 else 1.0) * (e - 0.5), "z": up, "yaw": pi * d}
         half = np.array(size) / 2
-        part = shapes.box(size) if u[2] < 0.5 else _at(shape("ball", *half), z=half[2] * 0.9)
+        part = _box(size) if u[2] < 0.5 else _at(shape("ball", *half), z=half[2] * 0.9)
         parts.append(_at(part, **where))
         high = min(high + 0.85 * size[2], 1.5)
     return union(parts)
@@ -401,7 +382,7 @@ def _fence(u: Uniforms, rng: np.random.Generator) -> Mesh:
     if u[2] < 0.8:
         return shapes.lattice_fence(long, high, 0.08 + 0.14 * u[3], 0.015 + 0.06 * u[4])
     # boards between posts
-    return union([_at(shapes.box((0.04, long, high - 0.1)), z=0.1), shapes.rail_fence(long, high + 0.05, 1)])
+    return union([_box((0.04, long, high - 0.1), 0, 0, 0.1), shapes.rail_fence(long, high + 0.05, 1)])
 
 
 def car(u: Uniforms, rng: np.random.Generator) -> Mesh:
@@ -410,16 +391,17 @@ def car(u: Uniforms, rng: np.random.Generator) -> Mesh:
         return shape("car", 3.6 + 1.3 * u[1], 1.65 + 0.25 * u[2], 1.38 + 0.35 * u[3])
     if u[0] < 0.95:
         return shape("van", 4.4 + 1.6 * u[1], 1.85 + 0.25 * u[2], 1.8 + 0.9 * u[3])
-    return union([_at(shapes.box((6 + 3 * u[1], 2.4, 2.2 + u[2])), z=0.8), _at(shapes.box((5, 2.2, 0.5)), z=0.3)])
+    return union([_box((6 + 3 * u[1], 2.4, 2.2 + u[2]), 0, 0, 0.8), _box((5, 2.2, 0.5), 0, 0, 0.3)])
 
 
 def _car_corner(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A car's corner beside what hides the rest: only a strip of it is seen."""
-    vehicle, hides = car(u * [0.9] + [0.0] * 8, rng), shapes.box((0.15, 2.0 + 2 * u[4], 1.6 + 0.8 * u[5]))
+    vehicle, hides = car(u * [0.9] + [0.0] * 8, rng), _box((0.15, 2.0 + 2 * u[4], 1.6 + 0.8 * u[5]))
     gap = 0.25 + 0.5 * u[6]
     low, high = vehicle.vertices.min(0), vehicle.vertices.max(0)
-    front = union([_at(hides, 0.8, gap + (2.0 + 2 * u[4]) / 2), _at(hides, 0.8, -(2.0 + 2 * u[4]) / 2)])
-    return union([_at(vehicle, -(high[0] if u[7] < 0.5 else -low[0]), (u[3] - 0.5) * high[1] * 2), front])
+    aside = (2.0 + 2 * u[4]) / 2
+    vehicle = _at(vehicle, -(high[0] if u[7] < 0.5 else -low[0]), (u[3] - 0.5) * high[1] * 2)
+    return union([vehicle, _at(hides, 0.8, gap + aside), _at(hides, 0.8, -aside)])
 
 
 # --- indoors
@@ -446,37 +428,29 @@ def _shelf(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 def _cupboard(u: Uniforms, rng: np.random.Generator) -> Mesh:
     deep, wide, high = 0.35 + 0.3 * u[0], 0.5 + 1.2 * u[1], 0.8 + 1.4 * u[2]
-    parts = [shapes.box((deep, wide, high))]
-    if u[3] < 0.35:
-        # an open door
-        parts.append(_at(shapes.box((0.5, 0.02, high)), deep / 2 + 0.25, wide / 2))
-    if u[4] < 0.3:
-        parts.append(_at(shapes.box((0.3, 0.4, 0.3)), 0, wide * (u[5] - 0.5) / 2, high))
-    return union(parts)
+    door = u[3] < 0.35 and _box((0.5, 0.02, high), deep / 2 + 0.25, wide / 2)
+    case = u[4] < 0.3 and _box((0.3, 0.4, 0.3), 0, wide * (u[5] - 0.5) / 2, high)
+    return _union(_box((deep, wide, high)), door, case)
 
 
 def _door(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A door leaf that stands open, with a piece of its frame."""
-    leaf = _at(shapes.box((0.04, 0.85, 2.0)), 0, 0.42).moved((0, 0, 0), 1.5 * u[0])
-    return union([leaf, _at(shapes.box((0.12, 0.08, 2.1)), y=-0.05)])
+    leaf = _box((0.04, 0.85, 2.0), 0, 0.42).moved((0, 0, 0), 1.5 * u[0])
+    return union([leaf, _box((0.12, 0.08, 2.1), 0, -0.05)])
 
 
 def _plant(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A pot plant."""
-    pot = 0.25 + 0.35 * u[0]
-    wide = 0.3 + 0.6 * u[1]
+    pot, wide = 0.25 + 0.35 * u[0], 0.3 + 0.6 * u[1]
     return union([_post(0.5 * pot, pot), _at(crown((wide, wide, 0.4 + 1.1 * u[2]), rng, dense=0.5), z=pot)])
 
 
 def _floor_lamp(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A floor lamp, a coat stand, a music stand, a screen on a stand."""
     high = 1.2 + 0.7 * u[0]
-    parts = [_post(0.015 + 0.01 * u[1], high), _post(0.14, 0.03)]
-    if u[2] < 0.4:
-        parts.append(_at(_post(0.12 + 0.12 * u[3], 0.25), z=high - 0.1))
-    elif u[2] < 0.7:
-        parts.append(_at(shapes.box((0.05, 0.5 + 0.5 * u[3], 0.35 + 0.3 * u[4])), z=high - 0.3))
-    return union(parts)
+    shade = u[2] < 0.4 and _post(0.12 + 0.12 * u[3], 0.25, 0, 0, high - 0.1)
+    screen = 0.4 <= u[2] < 0.7 and _box((0.05, 0.5 + 0.5 * u[3], 0.35 + 0.3 * u[4]), 0, 0, high - 0.3)
+    return _union(_post(0.015 + 0.01 * u[1], high), _post(0.14, 0.03), shade, screen)
 
 
 # --- pieces
@@ -486,18 +460,16 @@ def _fragment(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A piece as large as a person or smaller, of no particular thing: a plate, a clump, a corner, some posts."""
     high, wide = 0.5 + 1.4 * u[0], 0.15 + 0.6 * u[1]
     if u[2] < 0.3:
-        piece = shapes.box((0.05, wide, high))
+        piece = _box((0.05, wide, high))
     elif u[2] < 0.5:
         piece = shapes.foliage((wide, wide, high), 40 + int(70 * u[3]), 0.1, rng)
     elif u[2] < 0.7:
-        half = _at(shapes.box((0.05, wide, high)), 0, wide / 2)
+        half = _box((0.05, wide, high), 0, wide / 2)
         piece = union([half, half.moved((0, 0, 0), 1.2 + 0.6 * u[3])])
     elif u[2] < 0.85:
-        piece = union([_at(_post(0.05, high * (0.4 + 0.6 * rng.random())), y=wide * rng.random()) for _ in range(4)])
+        piece = union([_post(0.05, high * (0.4 + 0.6 * rng.random()), 0, wide * rng.random()) for _ in range(4)])
     else:
-        piece = union(
-            [_at(shapes.box(0.15 + 0.35 * rng.random(3)), *(rng.random(3) * [wide, wide, high])) for _ in "abc"]
-        )
+        piece = union([_box(0.15 + 0.35 * rng.random(3), *(rng.random(3) * [wide, wide, high])) for _ in "abc"])
     return _at(piece, z=0.7 * max(0.0, u[4] - 0.6))
 
 
@@ -505,7 +477,7 @@ def _floating(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """What hangs, or stands on legs too thin to be seen: a sign, a lamp, a banner, a branch, a machine."""
     z, high, wide = 0.35 + 1.1 * u[0], 0.3 + 0.9 * u[1], 0.2 + 0.7 * u[2]
     if u[3] < 0.5:
-        return _at(shapes.box((0.04 + 0.3 * u[4] ** 2, wide, high)), z=z)
+        return _box((0.04 + 0.3 * u[4] ** 2, wide, high), 0, 0, z)
     return _at(shapes.foliage((wide, wide, high), 60, 0.1, rng), z=z)
 
 
@@ -513,15 +485,14 @@ def _mannequin(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """As tall and as wide as a person, of a few rough parts: a column, a wrapped pile, a dummy without limbs."""
     tall, wide = 1.3 + 0.6 * u[0], 0.3 + 0.3 * u[1]
     if u[2] < 0.4:
-        cuts = np.sort(rng.uniform(0.1, 0.9, 2)) * tall
-        edges = [0.0, *cuts, tall]
-        sizes = [
-            (wide * (0.5 + 0.5 * rng.random()), wide * (0.6 + 0.4 * rng.random()), b - a) for a, b in pairwise(edges)
-        ]
-        return union([_at(shapes.box(size), z=low) for size, low in zip(sizes, edges[:-1], strict=True)])
+        edges, parts = [0.0, *np.sort(rng.uniform(0.1, 0.9, 2)) * tall, tall], []
+        for low, high in pairwise(edges):
+            size = (wide * (0.5 + 0.5 * rng.random()), wide * (0.6 + 0.4 * rng.random()), high - low)
+            parts.append(_box(size, 0, 0, low))
+        return union(parts)
     if u[2] < 0.7:
         return _at(shape("ball", wide / 2, wide / 2, tall / 2), z=tall / 2)
-    return union([_post(wide / 2 * (0.7 + 0.3 * u[3]), tall * (0.6 + 0.3 * u[4])), shapes.box((0.1, wide, tall))])
+    return union([_post(wide / 2 * (0.7 + 0.3 * u[3]), tall * (0.6 + 0.3 * u[4])), _box((0.1, wide, tall))])
 
 
 THINGS: dict[str, Thing] = {

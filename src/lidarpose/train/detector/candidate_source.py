@@ -31,6 +31,8 @@ LEAST_POINTS = 5
 BLIND, DROP_ORIGIN = 0.08, 0.08
 # nobody's candidates of a scan that are shown at a time; the objective learns from the hardest of them
 NEGATIVES = 64
+# scans to validate on
+VALIDATION = 30
 # `Labels.person` of nobody's candidates and of those that teach nothing
 NOBODY, UNCLEAR = -1, -2
 # what boxes have beyond the body on each side, m
@@ -162,6 +164,11 @@ def scan_example(seed: int, number: int, *, family: str = "train", with_rows: bo
     candidates, rows = index.candidates(centers), index.rows(centers) if with_rows else None
     labels = labels_of(candidates, scene)
     return DetectorExample(candidates=candidates, labels=labels, rows=rows)
+
+
+def validation_scans(seed: int) -> list[DetectorExample]:
+    """All candidates of `VALIDATION` scans of the family "heldout"."""
+    return [scan_example(seed, number, family="heldout", with_rows=True) for number in range(VALIDATION)]
 
 
 def leveled(scene: DetectionScene, up: np.ndarray) -> DetectionScene:

@@ -1,6 +1,7 @@
-"""`BaselineObjective`: what the loop must know of the baselines of single frames, PRN and LPFormer.
+"""What the loop must know of the baselines, and what they minimize, as their authors' code does; all weights are 1.
 
-Legend: B people, J joints of the network.
+`BaselineObjective`: those of single frames, PRN and LPFormer; `ClipObjective`: those of clips, LiDARCap and NE.
+Legend: B people or clips, N points, J joints of the network, T frames of a clip.
 """
 
 from collections.abc import Callable
@@ -10,12 +11,22 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
-from lidarpose.models.baselines.baseline_config import LpformerConfig, PrnConfig, pad_clouds
+from lidarpose.geometry import axis_angle_to_matrix
+from lidarpose.models.baselines.baseline_config import LidarcapConfig, LpformerConfig, PrnConfig, pad_clouds, pad_frames
+from lidarpose.models.baselines.lidarcap import ClipOutputs, Clouds, forward_kinematics, rest_offsets
+from lidarpose.models.baselines.lpformer import LpformerOutputs
+from lidarpose.models.baselines.prn import PrnOutputs
 from lidarpose.models.checkpoint import build
-from lidarpose.train.augment import Example
-from lidarpose.train.objectives.baseline_losses import lpformer_losses, mean_distance, prn_losses
-from lidarpose.train.objectives.objective import Share, alone, in_body26
+from lidarpose.models.voxelize import WINDOW
+from lidarpose.skeleton import BODY26, SMPL24
+from lidarpose.train.augment import ClipExample, Example
+from lidarpose.train.objectives.objective import Share, alone, at_least_one, in_body26, on_device
+
+# a point is labelled with the nearest joint within this distance, m
+LABEL_RADIUS = 0.25
+_COLUMNS = BODY26.map_to(SMPL24)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,9 +57,9 @@ class BaselineObjective:
     def terms(
         self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
     ) -> dict[str, Tensor]:
-        """`baseline_losses.prn_losses` or `lpformer_losses`, people moved by their shift; joints without a label teach
+        """`prn_losses` or `lpformer_losses`, people moved by their shift; joints without a label teach
         nothing."""
-        read = {name: torch.as_tensor(array).to(device) for name, array in arrays.items()}
+        read = on_device(arrays, device)
         shift, valid = read["shift"][:, None, None], read["valid"]
         points = (read["points"] + shift).masked_fill(~valid[..., None], 0)
         known = read["joints"].isfinite().all(-1)
@@ -66,6 +77,134 @@ class BaselineObjective:
         points, valid, center = (torch.as_tensor(arrays[name]).to(device) for name in ("points", "valid", "center"))
         own = in_body26(network(points, valid, center).joints, self.config.columns)
         return own + arrays["middle"][:, None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClipObjective:
+    """The `Objective` of a `Lidarcap` or `Ne` with this configuration."""
+
+    config: LidarcapConfig
+
+    def network(self) -> nn.Module:
+        return build(self.config)
+
+    def collate(self, examples: list[ClipExample]) -> dict[str, np.ndarray]:
+        """Of each cloud NAME points (B, T, N, 3) m about the frames' centers and NAME_valid (B, T, N); joints
+        (B, T, 24, 3) m about them, NaN without a label; rotations (B, T, 24, 3, 3), SMPL's."""
+        shape = len(examples), len(examples[0].frames)
+        arrays: dict[str, np.ndarray] = {}
+        for number, name in enumerate(self.config.clouds):
+            points, valid = pad_frames(
+                [cloud for example in examples for cloud in example.clouds[name]],
+                resample_with_replacement=self.config.resample_with_replacement,
+                seeds=[frame.seed + number for example in examples for frame in example.frames],
+                window=WINDOW if name == "person" else np.inf,
+                most_points=self.config.most_points,
+            )
+            arrays |= {name: points.reshape(*shape, -1, 3), f"{name}_valid": valid.reshape(*shape, -1)}
+        joints = np.stack([frame.joints[_COLUMNS] for example in examples for frame in example.frames])
+        rotations = axis_angle_to_matrix(np.stack([example.rotations for example in examples])).astype(np.float32)
+        return arrays | {"joints": joints.reshape(*shape, -1, 3), "rotations": rotations}
+
+    def _clouds(self, arrays: dict, device: torch.device | str) -> Clouds:
+        tensors = on_device(arrays, device)
+        return {name: (tensors[name], tensors[f"{name}_valid"]) for name in self.config.clouds}
+
+    def terms(
+        self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
+    ) -> dict[str, Tensor]:
+        """`clip_losses`; clips all have as many frames and joints, so means of processes are means of
+        all."""
+        outputs = network(self._clouds(arrays, device))
+        joints, rotations = (torch.as_tensor(arrays[name]).to(device) for name in ("joints", "rotations"))
+        known = joints.isfinite().all(-1)
+        terms = clip_losses(outputs, rotations, joints[:, :, :1], rest_offsets().to(device))
+        return terms | {"mpjpe": mean_distance(outputs.posed().detach(), joints, known)}
+
+    @torch.no_grad()
+    def joints(self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu") -> np.ndarray:
+        return in_body26(network(self._clouds(arrays, device)).posed().flatten(0, 1), _COLUMNS)
+
+
+# ---- losses
+
+
+def point_labels(points: Tensor, valid: Tensor, joints: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+    """Labels (B, N): the number of the nearest joint with a label, J for background, -1 for padding; and the offsets
+    (B, N, 3) m from the points to those joints.
+
+    joints (B, J, 3) m, known (B, J).
+    """
+    distance = torch.cdist(points, joints).masked_fill(~known[:, None], torch.inf)
+    nearest, joint = distance.min(-1)
+    offsets = joints.gather(1, joint[..., None].expand(-1, -1, 3)) - points
+    label = torch.where(nearest < LABEL_RADIUS, joint, joints.shape[1])
+    return label.masked_fill(~valid, -1), offsets
+
+
+def prn_losses(
+    outputs: PrnOutputs, points: Tensor, valid: Tensor, joints: Tensor, known: Tensor, *, share: Share = alone
+) -> dict[str, Tensor]:
+    """Distances of refined and of voted joints, cross entropy of parts, distances of the points' offsets."""
+    label, offset = point_labels(points, valid, joints, known)
+    label, is_body = label[valid], label[valid] < joints.shape[1]
+    missed = (outputs.offsets - offset[valid]).norm(dim=-1)[is_body]
+    return {
+        "joints": mean_distance(outputs.joints, joints, known, share),
+        "vote": mean_distance(outputs.voted, joints, known, share),
+        "part": _cross_entropy(outputs.parts, label, share),
+        "offset": missed.sum() / at_least_one(share(is_body.sum())),
+    }
+
+
+def lpformer_losses(
+    outputs: LpformerOutputs,
+    points: Tensor,
+    valid: Tensor,
+    joints: Tensor,
+    known: Tensor,
+    *,
+    second_softmax: bool = False,
+    share: Share = alone,
+) -> dict[str, Tensor]:
+    """Distances of joints and cross entropy of parts. second_softmax: of probabilities instead of logits, as
+    published."""
+    label, _ = point_labels(points, valid, joints, known)
+    parts = outputs.parts.softmax(-1) if second_softmax else outputs.parts
+    return {
+        # zero, of the head without a loss: processes that average gradients wait for all heads
+        "joints": mean_distance(outputs.joints, joints, known, share) + 0 * outputs.visible.sum(),
+        "part": _cross_entropy(parts[valid], label[valid], share),
+    }
+
+
+def clip_losses(outputs: ClipOutputs, rotations: Tensor, pelvis: Tensor, offsets: Tensor) -> dict[str, Tensor]:
+    """LiDARCap's and NE's: mean square errors of rotations, of the joints that they lead to, and of the first stage's.
+
+    rotations (B, T, 24, 3, 3), SMPL's; pelvis (B, T, 1, 3) m about the frame's center; offsets (24, 3) m: the skeleton
+    at rest. Joints are of this one skeleton, prediction and truth alike, where the published code regresses them from
+    posed vertices. The first stage's are about the frame's center, those of the rotations about the pelvis.
+    """
+    true = forward_kinematics(rotations, offsets, SMPL24.parents)
+    posed = forward_kinematics(outputs.rotations, offsets, SMPL24.parents)
+    return {
+        "rotation": F.mse_loss(outputs.rotations, rotations),
+        "joints": F.mse_loss(posed, true),
+        "first": F.mse_loss(outputs.joints, pelvis + true),
+    }
+
+
+def mean_distance(joints: Tensor, true: Tensor, known: Tensor, share: Share = alone) -> Tensor:
+    """m, over joints with a label."""
+    distance = (joints - torch.where(known[..., None], true, 0.0)).norm(dim=-1)
+    return (distance * known).sum() / at_least_one(share(known.sum()))
+
+
+def _cross_entropy(logits: Tensor, label: Tensor, share: Share) -> Tensor:
+    return F.cross_entropy(logits.float(), label, reduction="sum") / at_least_one(share(label.new_tensor(len(label))))
+
+
+# ---- weights to go on from
 
 
 @torch.no_grad()

@@ -17,6 +17,8 @@ from lidarpose.train.objectives.objective import Share, alone, at_least_one
 
 # width of a heatmap's target, bins
 SIGMA = 2.0
+# lambda_reg and lambda_seg of the paper
+REGRESSION, SEGMENTATION = 0.5, 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,14 +34,7 @@ class DaptTargets:
     part: Tensor | None = None
 
 
-def pretraining(
-    outputs: DaptOutputs,
-    targets: DaptTargets,
-    *,
-    regression: float = 0.5,
-    segmentation: float = 1.0,
-    share: Share = alone,
-) -> dict[str, Tensor]:
+def pretraining(outputs: DaptOutputs, targets: DaptTargets, *, share: Share = alone) -> dict[str, Tensor]:
     """Paper: Eq. 9, L_pre = lambda_reg L_reg + lambda_seg L_seg, of the coordinate head and the part head.
 
     Terms "regression" and "segmentation", and "mpjpe" of the coordinates for the log; share: see `objective`.
@@ -48,20 +43,16 @@ def pretraining(
     assert coordinates is not None and parts is not None and part is not None
     people, labels, voxels = _divisors(targets, share, (part >= 0).sum())
     return {
-        "regression": regression * distance_loss(coordinates, targets, people),
-        "segmentation": segmentation * segmentation_loss(parts.float(), part, voxels),
+        "regression": REGRESSION * distance_loss(coordinates, targets, people),
+        "segmentation": SEGMENTATION * segmentation_loss(parts.float(), part, voxels),
         "mpjpe": _mpjpe(coordinates.float(), targets, labels),
     }
 
 
-def finetuning(
-    outputs: DaptOutputs, targets: DaptTargets, *, auxiliary: float = 0.0, share: Share = alone
-) -> dict[str, Tensor]:
-    """Paper: Eq. 10, L_ft = L_hm, of the heatmaps alone.
+def finetuning(outputs: DaptOutputs, targets: DaptTargets, *, share: Share = alone) -> dict[str, Tensor]:
+    """Paper: Eq. 10, L_ft = L_hm, of the heatmaps alone, where the released code adds a term of the auxiliary head.
 
-    The released code adds 0.2 times a term of the auxiliary head, of which the paper has no word: `auxiliary`. Terms
-    "heatmap" or "regression", with an `auxiliary` weight above 0 "auxiliary", and "mpjpe" of the joints for the log;
-    share: see `objective`.
+    Terms "heatmap" or "regression", and "mpjpe" of the joints for the log; share: see `objective`.
     """
     people, labels = _divisors(targets, share)
     joints = outputs.joints()
@@ -69,11 +60,7 @@ def finetuning(
         terms = {"regression": distance_loss(joints, targets, people)}
     else:
         terms = {"heatmap": heatmap_loss(outputs, targets, people)}
-    terms["mpjpe"] = _mpjpe(joints.float(), targets, labels)
-    if auxiliary:
-        assert outputs.inter is not None
-        terms["auxiliary"] = auxiliary * distance_loss(outputs.inter, targets, people, squared=True)
-    return terms
+    return terms | {"mpjpe": _mpjpe(joints.float(), targets, labels)}
 
 
 def prn(outputs: DaptOutputs, targets: DaptTargets, *, share: Share = alone) -> dict[str, Tensor]:
@@ -90,15 +77,10 @@ def prn(outputs: DaptOutputs, targets: DaptTargets, *, share: Share = alone) -> 
     }
 
 
-def distance_loss(joints: Tensor, targets: DaptTargets, people: Tensor, *, squared: bool = False) -> Tensor:
-    """Paper: Eq. 7, sum_i ||J_i - J^_i||_2 v_i / sum_i v_i, its mean over `people`, those with a label.
-
-    joints (B, J, 3) m. squared: the distance squared, as the released code has it, here and in the term of the
-    auxiliary head, which is not in the paper.
-    """
-    offset = joints.float() - targets.joints
-    distance = offset.square().sum(-1) if squared else offset.norm(dim=-1)
-    weight = targets.weight
+def distance_loss(joints: Tensor, targets: DaptTargets, people: Tensor) -> Tensor:
+    """Paper: Eq. 7, sum_i ||J_i - J^_i||_2 v_i / sum_i v_i, its mean over `people`, those with a label. The released
+    code has the square of the distance. joints (B, J, 3) m."""
+    distance, weight = (joints.float() - targets.joints).norm(dim=-1), targets.weight
     return ((distance * weight).sum(1) / at_least_one(weight.sum(1))).sum() / people
 
 

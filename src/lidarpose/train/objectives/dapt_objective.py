@@ -14,7 +14,7 @@ from lidarpose.errors import InputError, check_name
 from lidarpose.models.dapt.dapt_config import PARTS, DaptConfig, named_config
 from lidarpose.models.dapt.dapt_net import DaptNet, to_tensors
 from lidarpose.models.dapt.voxel_tables import LAYOUTS, Tables, build_tables
-from lidarpose.skeleton import BODY26, HUMAN15
+from lidarpose.skeleton import BODY26
 from lidarpose.train.augment import UNKNOWN_PART, Example
 from lidarpose.train.objectives.dapt_losses import DaptTargets, finetuning, pretraining, prn
 from lidarpose.train.objectives.objective import Share, alone, in_body26, majority_part
@@ -53,34 +53,23 @@ class DaptObjective:
     """The `Objective` of a `DaptNet` with this configuration.
 
     stage: "pretrain", which needs coordinates and parts, or "finetune", which learns heatmaps, or coordinates where
-    there are none; the neck prn learns the same in both; layout: of the tables,
-    "ragged" for CPUs and "padded" for accelerators; regression, segmentation, auxiliary: weights, see `dapt_losses`.
-    Heads that a stage does not use get a gradient of zero. Raises InputError where the configuration lacks a head.
+    there are none; the neck prn learns the same in both; layout: of the tables, "ragged" for CPUs and "padded" for
+    accelerators. Heads that a stage does not use get a gradient of zero. Raises InputError where the configuration
+    lacks a head.
     """
 
     config: DaptConfig
     stage: str
     layout: str = "ragged"
-    regression: float = 0.5
-    segmentation: float = 1.0
-    auxiliary: float = 0.0
 
     def __post_init__(self):
         config = self.config
         check_name("stage of training", self.stage, STAGES)
         check_name("layout", self.layout, LAYOUTS)
-        for name in ("regression", "segmentation", "auxiliary"):
-            if not 0 <= getattr(self, name) < float("inf"):
-                raise InputError(f"{name} must be a weight of at least 0, got {getattr(self, name)}")
         if self.stage == "pretrain" and config.neck != "prn" and not (config.coordinates and config.parts == PARTS):
             raise InputError(
                 f"pre-training needs coordinates and {PARTS} parts, {config.name} has coordinates={config.coordinates} "
                 f"and parts={config.parts}: see pretraining_config"
-            )
-        if self.stage == "finetune" and self.auxiliary and not config.auxiliary:
-            raise InputError(
-                f"auxiliary={self.auxiliary} needs the auxiliary head, which {config.name} lacks: set auxiliary=True "
-                "in its configuration"
             )
 
     @property
@@ -121,19 +110,12 @@ class DaptObjective:
         """`dapt_losses.pretraining`, `finetuning` or `prn`. A joint's weight is 1 where it is labelled, seen or not, as
         in the released code."""
         outputs, targets = network(to_tensors(arrays.tables, device)), arrays.targets(device)
-        if self.config.neck == "prn":
-            terms, asked = prn(outputs, targets, share=share), {"coordinates", "parts"}
-        elif self.stage == "pretrain":
-            weights = {"regression": self.regression, "segmentation": self.segmentation}
-            terms, asked = pretraining(outputs, targets, share=share, **weights), {"coordinates", "parts"}
-        else:
-            terms = finetuning(outputs, targets, share=share, auxiliary=self.auxiliary)
-            asked = {"logits_x", "logits_y", "logits_z"} if self.config.bins else {"coordinates"}
-            asked |= {"inter"} if self.auxiliary else set()
-        # zero, of the heads that the stage does not use: processes that average gradients wait for all of them
+        losses = prn if self.config.neck == "prn" else pretraining if self.stage == "pretrain" else finetuning
+        terms = losses(outputs, targets, share=share)
+        # zero, of all heads, used or not: processes that average gradients wait for all of them
         first = next(iter(terms))
-        idle = [value for name in _HEADS if name not in asked and (value := getattr(outputs, name)) is not None]
-        terms[first] = sum((value.float().sum() * 0 for value in idle), terms[first])
+        heads = [value for name in _HEADS if (value := getattr(outputs, name)) is not None]
+        terms[first] = sum((value.float().sum() * 0 for value in heads), terms[first])
         return terms
 
     @torch.no_grad()
@@ -144,17 +126,15 @@ class DaptObjective:
         return in_body26(own, self._columns)
 
 
-def pretraining_config(joints: tuple[str, ...] = HUMAN15.joints) -> DaptConfig:
-    """The paper's network before fine-tuning, with the corrected data flow; joints: its 15, or any of body26."""
-    return replace(named_config("pretrain"), joints=joints, legacy=False)
+def pretraining_config() -> DaptConfig:
+    """The paper's network before fine-tuning, with the corrected data flow."""
+    return replace(named_config("pretrain"), legacy=False)
 
 
-def finetuning_config(dataset: str, *, auxiliary: bool = False) -> DaptConfig:
-    """The paper's network for a dataset, with the corrected data flow: waymo, humanm3, lidarhuman26m or sloper4d.
-
-    auxiliary: with the head of the released code's other term. Raises InputError for another name.
-    """
-    return replace(named_config(dataset), auxiliary=auxiliary, legacy=False)
+def finetuning_config(dataset: str) -> DaptConfig:
+    """The paper's network for a dataset, with the corrected data flow and no auxiliary head: waymo, humanm3,
+    lidarhuman26m or sloper4d. Raises InputError for another name."""
+    return replace(named_config(dataset), auxiliary=False, legacy=False)
 
 
 def small(config: DaptConfig) -> DaptConfig:

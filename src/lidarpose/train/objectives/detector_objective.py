@@ -1,27 +1,31 @@
-"""`DetectorObjective`: people's candidates against the hardest of nobody's, and where the people are.
+"""`DetectorObjective`: people's candidates against the hardest of nobody's, and where the people are; and the share of
+people who are missed on whole scans that training never shows.
 
 Legend: K candidates of a batch.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
+from lidarpose.models.detector.candidates import suppress
 from lidarpose.models.detector.detector_config import INPUTS, DetectorConfig
 from lidarpose.models.detector.network import DetectorNet
 from lidarpose.models.detector.render import render
 from lidarpose.train.detector.candidate_source import NOBODY, UNCLEAR, DetectorExample
-from lidarpose.train.objectives.objective import Share, alone, at_least_one
+from lidarpose.train.objectives.objective import Share, alone, at_least_one, on_device
 
 # weights; distances are in meters
 PERSON, OFFSET, FOOT, HEIGHT, MOUNTED = 1.0, 2.0, 1.0, 1.0, 0.1
 # nobody's candidates that are learned from: of the largest loss, for each of people's and for each scan; and at random,
 # a share of the rest
 HARD, HARD_OF_SCAN, EASY = 1.5, 4, 0.1
+# in validation, the false people a scan at which people are counted
+FALSE = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +53,7 @@ class DetectorObjective:
         self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
     ) -> dict[str, Tensor]:
         """Cross entropy of people's candidates and of the hard ones of nobody's; distances and height of people's."""
-        tensors = {name: torch.as_tensor(array).to(device) for name, array in arrays.items()}
+        tensors = on_device(arrays, device)
         inputs = [tensors[name].float() for name in INPUTS]
         person = tensors["person"]
         with torch.no_grad():
@@ -103,3 +107,23 @@ def average_precision(logit: Tensor, is_person: Tensor) -> Tensor:
     hits = is_person[logit.argsort(descending=True)].float()
     precision = hits.cumsum(0) / torch.arange(1, len(hits) + 1, device=hits.device)
     return (precision * hits).sum() / hits.sum().clamp(min=1)
+
+
+def missed_people(
+    objective: DetectorObjective, network: nn.Module, examples: Sequence[DetectorExample], batch: int
+) -> tuple[float, None]:
+    """Per cent of the people that candidates have who are missed at `FALSE` false people a scan. batch: is not used."""
+    device = next(network.parameters()).device
+    false: list[np.ndarray] = []
+    best: list[np.ndarray] = []
+    for example in examples:
+        logit = objective.scores(network, objective.collate([example]), device=device)[:, 0]
+        person = example.labels.person
+        rows = suppress(example.rows or [], logit)
+        false.append(logit[rows][person[rows] == NOBODY])
+        people = np.unique(person[person >= 0])
+        best.append(np.array([logit[rows][person[rows] == number].max(initial=-np.inf) for number in people]))
+    ranked = np.sort(np.concatenate([*false, [-np.inf]]))[::-1]
+    threshold = ranked[min(round(FALSE * len(examples)), len(ranked) - 1)]
+    people = np.concatenate(best)
+    return float((people <= threshold).mean() * 100) if len(people) else 0.0, None

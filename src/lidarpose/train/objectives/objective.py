@@ -57,6 +57,11 @@ class PoseObjective(Objective, Protocol):
         ...
 
 
+def on_device(arrays: dict[str, np.ndarray], device: torch.device | str) -> dict[str, Tensor]:
+    """Arrays as tensors there."""
+    return {name: torch.as_tensor(array).to(device) for name, array in arrays.items()}
+
+
 def in_body26(joints: Tensor, columns: Sequence[int] | np.ndarray) -> np.ndarray:
     """Joints (B, J, 3) that are these columns of body26 -> (B, 26, 3) float32, NaN in all others."""
     out = np.full((len(joints), len(BODY26), 3), np.nan, np.float32)
