@@ -9,7 +9,7 @@ import numpy as np
 
 from lidarpose.eval.charts import compare_ends, compare_stability
 from lidarpose.eval.dataset import open_eval_dataset
-from lidarpose.eval.predictions import Predictions, read_poses
+from lidarpose.eval.predictions import read_poses
 from lidarpose.io.files import write_atomic
 from lidarpose.paper.steps import Step, is_done
 from lidarpose.paper.tables import Cell
@@ -30,10 +30,8 @@ _STANDS, _TRIED = 1.5, 100
 
 def draw(name: str, cells: Sequence[Cell], out: Path) -> Path | None:
     """Draws fig5, fig7 or fig8 of the cells that are done, of the first seed and column; None where there are none."""
-    done = {}
-    for cell in cells:
-        if cell.seed == 0 and cell.column == cells[0].column and cell.evaluation and is_done(cell.evaluation, out):
-            done[cell.row] = cell
+    firsts = [cell for cell in cells if cell.seed == 0 and cell.column == cells[0].column]
+    done = {cell.row: cell for cell in firsts if cell.evaluation and is_done(cell.evaluation, out)}
     if not done:
         return None
     if name == "fig5":
@@ -48,15 +46,12 @@ def draw(name: str, cells: Sequence[Cell], out: Path) -> Path | None:
 
 def _side_by_side(done: dict[str, Cell], out: Path) -> bytes:
     """The hardest people, a row a person, a column a method."""
-    predictions: dict[str, Predictions] = {}
-    for row, cell in done.items():
-        if cell.evaluation:
-            predictions[row] = next(iter(read_poses(cell.evaluation.product(out) / "poses.parquet").values()))
+    paths = {row: cell.evaluation.product(out) / "poses.parquet" for row, cell in done.items() if cell.evaluation}
+    predictions = {row: next(iter(read_poses(path).values())) for row, path in paths.items()}
     places = [{(s, r): k for k, (s, r) in enumerate(zip(p.shard, p.row, strict=True))} for p in predictions.values()]
     everywhere = sorted(set.intersection(*map(set, places)))
-    errors = np.array(
-        [[p.errors()[at[key]] for key in everywhere] for p, at in zip(predictions.values(), places, strict=True)]
-    )
+    tables = zip((p.errors() for p in predictions.values()), places, strict=True)
+    errors = np.array([[table[at[key]] for key in everywhere] for table, at in tables])
     # without labels there is no error
     mean = np.nan_to_num(np.where(np.isnan(errors), 0, errors).sum(-1) / np.maximum((~np.isnan(errors)).sum(-1), 1))
     hardest = [everywhere[k] for k in np.argsort(-mean.mean(0), kind="stable")[:HARDEST]]

@@ -12,7 +12,7 @@ from lidarpose.errors import LidarPoseError
 from lidarpose.eval.dataset import EvalSample, open_eval_dataset
 from lidarpose.eval.scores import COLUMNS, FILE, Result, read_scores
 from lidarpose.io.files import write_atomic
-from lidarpose.models.checkpoint import load_checkpoint, read_header, runs_of
+from lidarpose.models.checkpoint import load_checkpoint, runs_of
 from lidarpose.paper.steps import Execute, Step, StepFailed, check_out, is_done, last_entry, run_steps
 from lidarpose.paper.tables import Cell, Options, Table, Target, cells, row_key
 from lidarpose.sample import center_of
@@ -91,12 +91,8 @@ def _entry(table: Table, cell: Cell, out: Path, failure: str) -> dict[str, Any]:
 def _figures(cell: Cell, evaluation: Step, out: Path) -> dict[str, Any]:
     """An evaluation's figures, what the training cost, and the mean pose's error on the same people."""
     result = read_scores(evaluation.product(out) / FILE).results[0]
-    weights = cell.training[-1].product(out)
-    runs = runs_of(read_header(weights).card)
-    network = load_checkpoint(weights)[0]
-    hours = [run.get("hours", 0.0) for run in runs]
-    seen = [run.get("people_seen", 0) for run in runs]
-    last = last_entry(cell.training[-1].folder(out))
+    network, header = load_checkpoint(cell.training[-1].product(out))
+    runs, last = runs_of(header.card), last_entry(cell.training[-1].folder(out))
     row = result.line("mpjpe")
     mean_pose = mean_pose_error(cell.target, result, out)
     return {
@@ -106,8 +102,8 @@ def _figures(cell: Cell, evaluation: Step, out: Path) -> dict[str, Any]:
         "people_scored": row.people,
         "joints": list(result.setting.joints),
         "protocol": result.setting.summary,
-        "people_seen": sum(seen),
-        "hours": round(sum(hours), 3),
+        "people_seen": sum(run.get("people_seen", 0) for run in runs),
+        "hours": round(sum(run.get("hours", 0.0) for run in runs), 3),
         "people_per_second": round(last["people"] / last["seconds"], 1) if last and last["seconds"] else None,
         "size": cell.size,
         "parameters": sum(value.numel() for value in network.parameters()),
@@ -163,10 +159,8 @@ def markdown(content: dict[str, Any]) -> str:
         own = [[e for e in entries if (e["row"], e["column"]) == (row, column)] for column in columns]
         lines.append(_line([row, *map(_cell_text, own)]))
     lines += ["", "## Cells", ""]
-    lines += _grid(
-        ["row", "column", "seed", "MPJPE", "PA", "PCK-3", "PCK-5", "mean pose", "people seen", "hours"]
-        + ["people/s in training", "size", "parameters", "state"]
-    )
+    heads = "row, column, seed, MPJPE, PA, PCK-3, PCK-5, mean pose, people seen, hours, people/s in training, size"
+    lines += _grid([*heads.split(", "), "parameters", "state"])
     lines += [_line(_cost(entry)) for entry in entries]
     return "\n".join([*lines, "", "## Commands", "", *_commands(entries)]) + "\n"
 
@@ -174,16 +168,14 @@ def markdown(content: dict[str, Any]) -> str:
 def plan(table: Table, selected: Sequence[Cell], out: Path, problem: Any) -> str:
     """The commands of each cell as a page, each in full where it comes first. problem(words): what the parser says
     against a command, "" for nothing."""
-    entries = []
-    known: set[str] = set()
+    entries, known = [], set[str]()
     for cell in selected:
         steps = list(cell.evaluation.all()) if cell.evaluation else []
-        wrong = next(filter(None, (problem(step.command(out)) for step in steps)), "")
-        where = {"row": cell.row, "column": cell.column, "seed": cell.seed}
-        commands = [f"{step.name}, as above" if step.name in known else step.line(out) for step in steps]
+        reason = cell.why or next(filter(None, (problem(step.command(out)) for step in steps)), "")
+        entry = {"row": cell.row, "column": cell.column, "seed": cell.seed, "reason": reason}
+        entry["commands"] = [f"{step.name}, as above" if step.name in known else step.line(out) for step in steps]
         known.update(step.name for step in steps)
-        state = {"commands": commands, "reason": cell.why or wrong}
-        entries.append(where | state | {"state": "not possible" if cell.why or wrong else "done"})
+        entries.append(entry | {"state": "not possible" if reason else "done"})
     rows = ", ".join(dict.fromkeys(row_key(cell.row) for cell in selected))
     return "\n".join([f"# {table.title}", "", f"Rows for --rows: {rows}.", "", *_commands(entries)]) + "\n"
 

@@ -7,6 +7,7 @@ method learns the same people and is scored on the same others.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 
 from lidarpose.data.shards import CARD
@@ -90,7 +91,7 @@ class Cell:
     row: str
     column: str
     seed: int
-    evaluation: Step | None
+    evaluation: Step | None = None
     why: str = ""
     published: float | None = None
     target: Target
@@ -108,9 +109,10 @@ class Cell:
         return str(words[words.index("--size") + 1])
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Table:
-    """name; title; columns: real sets that it is of; rows: (options) -> each row."""
+    """name; title; columns: real sets that it is of; rows: (options) -> each row; score: options of evaluate; single:
+    the stand-in has no clips."""
 
     name: str
     title: str
@@ -150,20 +152,16 @@ def cells(table: Table, options: Options, chosen: Sequence[str] = ()) -> list[Ce
         check_name(f"row of {table.name}", key, [row_key(row.name) for row in rows])
     rows = [row for row in rows if not chosen or row_key(row.name) in chosen]
     targets = _targets(table, options)
-    return [
-        _cell(row, target, seed, table.score, options)
-        for row in rows
-        for target in targets
-        for seed in range(options.seeds)
-    ]
+    places = product(rows, targets, range(options.seeds))
+    return [_cell(row, target, seed, table.score, options) for row, target, seed in places]
 
 
 def _cell(row: Row, target: Target, seed: int, score: tuple[str, ...], options: Options) -> Cell:
-    common = {"row": row.name, "column": target.name, "seed": seed, "target": target}
-    published = row.published.get(target.name)
     why = row.why or ("needs clips of consecutive frames with rotations" if row.clips and not target.clips else "")
+    published = row.published.get(target.name)
+    cell = Cell(row=row.name, column=target.name, seed=seed, target=target, why=why, published=published)
     if why:
-        return Cell(evaluation=None, why=why, published=published, **common)  # type: ignore[arg-type]
+        return cell
     stages = 1 + (row.pretrain is not None)
     hours = None if options.hours is None else options.hours / stages
     run = ("--seed", str(seed), "--workers", str(options.workers))
@@ -175,7 +173,7 @@ def _cell(row: Row, target: Target, seed: int, score: tuple[str, ...], options: 
     # as the released code decodes heatmaps
     dark = ("--decode", "dark") if options.real and row.heatmaps else ()
     words = ("evaluate", tuned, target.test, *target.score, *dark, *score)
-    return Cell(evaluation=Step(words), published=published, **common)  # type: ignore[arg-type]
+    return replace(cell, evaluation=Step(words))
 
 
 # ---- columns
@@ -290,32 +288,26 @@ def _corpora(options: Options) -> list[Row]:
     def poses(source: str, *subjects: str) -> tuple[str, ...]:
         return _pretrained(options, motion=("--motion", source, *subjects, "--captured", "1"))
 
-    def waymo(value: float, other: float) -> dict[str, float]:
-        return {"waymo": value, "lidarhuman26m": other}
-
     tuned = _tuned(options)
-    rows = [Row(name="w/o", finetune=_random(options), published=waymo(59.2, 76.5))]
+    rows = [Row(name="w/o", finetune=_random(options), published=_published(59.2, None, 76.5))]
     if not options.real:
         rows.append(Row(name="procedural prior", finetune=tuned, pretrain=_pretrained(options, motion=())))
         for k, source in enumerate(options.motion):
             subjects = ("--subjects", options.subjects) if options.subjects and k == 0 else ()
             rows.append(Row(name=f"poses of {Path(source).stem}", finetune=tuned, pretrain=poses(source, *subjects)))
         return rows
-    for name, title, printed in (
-        ("lipd", "LIPD", waymo(58.7, 75.6)),
-        ("freemotion", "FreeMotion", waymo(57.9, 74.3)),
-        ("noisemotion", "NoiseMotion", waymo(59.0, 76.3)),
+    for name, title, *printed in (
+        ("lipd", "LIPD", 58.7, None, 75.6),
+        ("freemotion", "FreeMotion", 57.9, None, 74.3),
+        ("noisemotion", "NoiseMotion", 59.0, None, 76.3),
+        ("freemotion-poses", "FreeMotion†", 54.6, None, 73.2),
+        ("lidarhuman26m-poses", "LiDARH26M†", 51.6, None, 73.4),
     ):
-        own = _pretrained(options, "--shards", options.data.get(name, ""), motion=())
-        why = "" if name in options.data else f"needs --data {name}=DIR, prepared with --split train"
-        rows.append(Row(name=title, finetune=tuned, pretrain=own, why=why, published=printed))
-    for name, title, printed in (
-        ("freemotion-poses", "FreeMotion†", waymo(54.6, 73.2)),
-        ("lidarhuman26m-poses", "LiDARH26M†", waymo(51.6, 73.4)),
-    ):
-        why = "" if name in options.data else f"needs --data {name}=DIR, the raw files of its poses"
-        own = poses(options.data.get(name, ""))
-        rows.append(Row(name=title, finetune=tuned, pretrain=own, why=why, published=printed))
+        folder, has_points = options.data.get(name, ""), name in CORPORA
+        own = _pretrained(options, "--shards", folder, motion=()) if has_points else poses(folder)
+        what = "prepared with --split train" if has_points else "the raw files of its poses"
+        why = "" if folder else f"needs --data {name}=DIR, {what}"
+        rows.append(Row(name=title, finetune=tuned, pretrain=own, why=why, published=_published(*printed)))
     return rows
 
 
@@ -336,17 +328,11 @@ def _components(options: Options) -> list[Row]:
 def _augmentations(options: Options) -> list[Row]:
     """Table 4a, and Table 4b, whose r_keep of 0.6 is the last row of 4a."""
     tuned, motion = _tuned(options), _motion(options)
-    recorded = Row(
-        name="+ pre-training",
-        finetune=tuned,
-        pretrain=_pretrained(options, "--set", "recorded=1,keep=1"),
-        why="" if motion else "places as recorded need captured motion: --motion FILE",
-        published={"waymo": 52.9},
-    )
-    sampled = _pretrained(options, "--keep", "1")
+    recorded, sampled = (_pretrained(options, *way) for way in (("--set", "recorded=1,keep=1"), ("--keep", "1")))
+    why = "" if motion else "places as recorded need captured motion: --motion FILE"
     rows = [
         Row(name="scratch", finetune=_random(options), published={"waymo": 59.2}),
-        recorded,
+        Row(name="+ pre-training", finetune=tuned, pretrain=recorded, why=why, published={"waymo": 52.9}),
         Row(name="+ scene sampling", finetune=tuned, pretrain=sampled, published={"waymo": 52.4}),
         _dapt(options, {"waymo": 51.7}, "+ laser masking"),
     ]
@@ -373,16 +359,12 @@ _ONE = ("waymo",)
 TABLES = {
     table.name: table
     for table in (
-        Table(name="table1", title="Table 1: comparison with other methods", columns=REAL, rows=_methods),
-        Table(name="table2", title="Table 2: pre-training corpora", columns=("waymo", "lidarhuman26m"), rows=_corpora),
-        Table(name="table3", title="Table 3: components", columns=_ONE, rows=_components),
-        Table(name="table4", title="Table 4: synthesis, and r_keep", columns=_ONE, rows=_augmentations),
-        Table(name="fig5", title="Figure 5: the hardest people", columns=REAL, rows=_side_by_side, single=True),
-        Table(
-            name="fig7", title="Figure 7: stability", columns=_ONE, rows=_compared, score=("--stability",), single=True
-        ),
-        Table(
-            name="fig8", title="Figure 8: end joints", columns=_ONE, rows=_compared, score=("--stability",), single=True
-        ),
+        Table("table1", "Table 1: comparison with other methods", REAL, _methods),
+        Table("table2", "Table 2: pre-training corpora", ("waymo", "lidarhuman26m"), _corpora),
+        Table("table3", "Table 3: components", _ONE, _components),
+        Table("table4", "Table 4: synthesis, and r_keep", _ONE, _augmentations),
+        Table("fig5", "Figure 5: the hardest people", REAL, _side_by_side, single=True),
+        Table("fig7", "Figure 7: stability", _ONE, _compared, ("--stability",), single=True),
+        Table("fig8", "Figure 8: end joints", _ONE, _compared, ("--stability",), single=True),
     )
 }
