@@ -112,12 +112,8 @@ def person_row(
     sample: Sample, *, index: int, frame: int = 0, track: int = 0, facts: PersonInfo | None = None
 ) -> dict[str, Any]:
     """A row of the people table. The sample needs pose (body26), part, ring and box."""
-    info = {} if facts is None else asdict(facts)
-    return {**_sample_columns(sample, "people"), **dict.fromkeys(_INFO), **info} | {
-        "index": index,
-        "frame": frame,
-        "track": track,
-    }
+    info: dict[str, Any] = dict.fromkeys(_INFO) if facts is None else asdict(facts)
+    return _sample_columns(sample, "people") | info | {"index": index, "frame": frame, "track": track}
 
 
 def labeled_row(sample: LabeledSample, *, index: int) -> dict[str, Any]:

@@ -57,11 +57,8 @@ def check_settings(folder: str | Path, present: DatasetCard, wanted: DatasetCard
     old, new = (
         {"count": c.count, "per_shard": c.per_shard, "version": c.version, **c.settings} for c in (present, wanted)
     )
-    differ = [
-        f"{name} {json.dumps(old.get(name))} there, {json.dumps(new.get(name))} asked for"
-        for name in sorted(old | new)
-        if old.get(name) != new.get(name)
-    ]
+    pairs = {name: (json.dumps(old.get(name)), json.dumps(new.get(name))) for name in sorted(old | new)}
+    differ = [f"{name} {there} there, {asked} asked for" for name, (there, asked) in pairs.items() if there != asked]
     if differ:
         problem = f"{folder} holds a dataset of other settings: {'; '.join(differ)}"
         raise InputError(f"{problem}; give another folder or the same settings")

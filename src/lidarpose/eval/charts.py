@@ -149,15 +149,10 @@ def draw_worst(p: Predictions, setting: Setting, worst: Sequence[tuple[EvalSampl
         if p.sensor[k]:
             where = f"#{p.row[k]} {p.condition[k] or p.sensor[k]}"
         confidence = None if np.isnan(p.confidence[k]).any() else p.confidence[k].astype(float)
-        panels.append(
-            Panel(
-                points=person.points,
-                label=f"{np.nanmean(errors[k]):.0f} mm · {where}",
-                distance=float(p.distance[k]),
-                pose=Pose(joints=p.pred[k].astype(float), skeleton=p.skeleton, confidence=confidence),
-                truth=Pose(joints=p.true[k].astype(float), skeleton=p.skeleton),
-            )
-        )
+        pose = Pose(joints=p.pred[k].astype(float), skeleton=p.skeleton, confidence=confidence)
+        truth = Pose(joints=p.true[k].astype(float), skeleton=p.skeleton)
+        label, distance = f"{np.nanmean(errors[k]):.0f} mm · {where}", float(p.distance[k])
+        panels.append(Panel(points=person.points, label=label, distance=distance, pose=pose, truth=truth))
     title = f"{setting.dataset}: the {len(panels)} largest mean errors of {setting.method} · {setting.summary}"
     return draw_people(panels, title=title)
 
@@ -168,11 +163,8 @@ def draw_worst(p: Predictions, setting: Setting, worst: Sequence[tuple[EvalSampl
 def _bars(axes, values: np.ndarray, low, high, names: list[str], texts: list[str], *, level: bool = False) -> None:
     """A bar a value with its interval and a text at its end, upright or `level`."""
     at = np.arange(len(values))
-    bar, lines, set_names = (
-        (axes.barh, axes.hlines, axes.set_yticks) if level else (axes.bar, axes.vlines, axes.set_xticks)
-    )
-    bar(at, values, 0.7, color=_BAR, zorder=1)
-    lines(at, low, high, color=_BLUE, lw=1.6, zorder=4)
+    (axes.barh if level else axes.bar)(at, values, 0.7, color=_BAR, zorder=1)
+    (axes.hlines if level else axes.vlines)(at, low, high, color=_BLUE, lw=1.6, zorder=4)
     axes.plot(*((values, at) if level else (at, values)), "o", ms=4, color=_BLUE, zorder=5)
     ends = np.maximum(values, high)
     for k, end, text in zip(at, ends, texts, strict=True):

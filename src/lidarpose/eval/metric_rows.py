@@ -19,7 +19,7 @@ import numpy as np
 from lidarpose.errors import InputError
 from lidarpose.eval.metrics import aggregate, keypoints
 from lidarpose.eval.metrics.aggregate import Score, joint_groups, mean
-from lidarpose.eval.metrics.joint_errors import PCK3, PCK5, acceleration_errors, aligned_errors, joint_hits
+from lidarpose.eval.metrics.joint_errors import PCK3, PCK5, TORSO, acceleration_errors, aligned_errors, joint_hits
 from lidarpose.eval.predictions import Predictions
 from lidarpose.eval.scores import RELEASED, MetricRow, Setting, number
 from lidarpose.sample import CONFIDENCE_RADIUS, HIDDEN, SEEN, UNLABELED
@@ -58,12 +58,8 @@ def facing_flipped(predictions: Predictions) -> np.ndarray:
     return np.where(labeled, 100.0 * ((predicted * true).sum(1) < 0), np.nan)
 
 
-def _pck(p: Predictions, threshold: float) -> np.ndarray:
-    return joint_hits(p.filled, p.true, p.labeled, threshold=threshold)
-
-
-def _within_10cm(p: Predictions) -> np.ndarray:
-    return joint_hits(p.filled, p.true, p.labeled, threshold=CONFIDENCE_RADIUS, torso=1.0)
+def _pck(p: Predictions, threshold: float, torso: float = TORSO) -> np.ndarray:
+    return joint_hits(p.filled, p.true, p.labeled, threshold=threshold, torso=torso)
 
 
 def _pck_box(p: Predictions, threshold: float) -> np.ndarray:
@@ -102,7 +98,7 @@ METRICS = {
         for threshold in keypoints.PCK_THRESHOLDS
     },
     "oks_ap": Metric(_oks_precision, "%", ("boxes",)),
-    "pck_10cm": Metric(_within_10cm, "%", ("itop",), "joint"),
+    "pck_10cm": Metric(partial(_pck, threshold=CONFIDENCE_RADIUS, torso=1.0), "%", ("itop",), "joint"),
 }
 
 
@@ -330,9 +326,6 @@ def _acceleration(p: Predictions, setting: Setting) -> Iterator[MetricRow]:
     # people evenly picked out of sequences do not follow each other
     rows = triples(p) if setting.limit is None else np.empty((0, 3), int)
     if len(rows):
-        table, clusters = (
-            acceleration_errors(p.filled[rows], p.true[rows], 1.0, p.labeled[rows]),
-            p.sequence[rows[:, 0]],
-        )
-        metric = Metric(lambda _: table, "mm/frame²", ("all",))
+        table = acceleration_errors(p.filled[rows], p.true[rows], 1.0, p.labeled[rows])
+        metric, clusters = Metric(lambda _: table, "mm/frame²", ("all",)), p.sequence[rows[:, 0]]
         yield _mean_row(table, setting, "acceleration", metric, "all", "frames in a row", clusters=clusters)

@@ -239,12 +239,9 @@ class EvalSetup:
         if self._frames == 1:
             return {}
         own = [person.sample for person in samples]
-        runs = _runs(own)
-        around = {
-            name: [np.zeros((0, 3)) if (cloud := getattr(sample, name)) is None else cloud for sample in own]
-            for name in ("background", "neighbors")
-        }
-        return {"clips": Clips(windows=np.concatenate([windows(run) for run in runs]), **around)}
+        around = {name: [getattr(sample, name) for sample in own] for name in ("background", "neighbors")}
+        around = {name: [np.zeros((0, 3)) if own is None else own for own in clouds] for name, clouds in around.items()}
+        return {"clips": Clips(windows=np.concatenate([windows(run) for run in _runs(own)]), **around)}
 
     def _picked(self, estimates, index) -> dict:
         """Of a pose, or of person `index` of many: the scored joints."""

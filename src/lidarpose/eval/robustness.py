@@ -369,19 +369,11 @@ def _sensor_curve(setup: EvalSetup, advance: Callable[[int], None]) -> Curve:
     from lidarpose.synth.generator import Generator
     from lidarpose.synth.scene import scene_config
 
-    scene = scene_config("wild")
-    scene = replace(
-        scene,
-        distance=_DISTANCE,
-        # uniform: the law of counts would bring people nearer to coarser sensors
-        median_points=0,
-        clutter=0.0,
-        occluder=0.0,
-        company=0.0,
-        noise=replace(scene.noise, mask=0.0, clutter=0.0, missing_part=0.0),
-        crop=replace(scene.crop, jitter=0.03, loose=0.0, cut=0.0),
-    )
-    points = []
+    scene, points = scene_config("wild"), []
+    noise, crop = replace(scene.noise, mask=0.0, clutter=0.0, missing_part=0.0), replace(scene.crop, loose=0.0, cut=0.0)
+    # uniform: the law of counts would bring people nearer to coarser sensors
+    scene = replace(scene, distance=_DISTANCE, median_points=0, clutter=0.0, occluder=0.0, company=0.0)
+    scene = replace(scene, noise=noise, crop=replace(crop, jitter=0.03))
     for k, name in enumerate(SENSORS):
         generator = Generator(scene=replace(scene, sensors=(name,)), measure=False, redraw=False)
         samples = [generator.person(_SEED, index).sample for index in range(CAST)]
@@ -391,13 +383,9 @@ def _sensor_curve(setup: EvalSetup, advance: Callable[[int], None]) -> Curve:
         point = _point(predictions, predictions.errors(), float(k), name, setting)
         points.append(replace(point, increase=None, increase_low=None, increase_high=None))
         advance(len(samples))
-    return Curve(
-        name="sensors",
-        title="other sensors",
-        says=f"{CAST} people of the procedural prior, {_DISTANCE[0]:g} to {_DISTANCE[1]:g} m away, cast anew for each "
-        "sensor: the same bodies, poses and places, nothing around them",
-        points=tuple(points),
-    )
+    says = f"{CAST} people of the procedural prior, {_DISTANCE[0]:g} to {_DISTANCE[1]:g} m away, cast anew for each "
+    says += "sensor: the same bodies, poses and places, nothing around them"
+    return Curve(name="sensors", title="other sensors", says=says, points=tuple(points))
 
 
 def _simulated(sample, setup: EvalSetup, shard: int, row: int) -> EvalSample:

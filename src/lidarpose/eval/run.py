@@ -140,7 +140,8 @@ def _person_rows(setup: EvalSetup, bench: Bench, predictions: Predictions, setti
 
 def _notes(setup: EvalSetup, setting: Setting, predictions: Predictions) -> Iterator[str]:
     """What the reader must know; setting: the setup's, as it turned out."""
-    yield from _training_notes(setup)
+    runs = runs_of(getattr(getattr(setup.model, "header", None), "card", {}))
+    yield from dict.fromkeys(note for run in runs for note in _notes_of_run(run, setup.dataset))
     if setting.not_judged:
         yield f"scored joints: {', '.join(setting.joints)}; {setting.not_judged}"
     if setting.leaks:
@@ -151,23 +152,16 @@ def _notes(setup: EvalSetup, setting: Setting, predictions: Predictions) -> Iter
             yield "sequences out of level were turned; for the released code's frame, prepare with --no-level"
     if setting.kind == "waymo" and not (predictions.labels == UNLABELED).all():
         yield "joints that are labeled as hidden count, but in PEM; people are predicted in their labeled boxes"
-    if (
-        setting.clusters
-        and (sequences := len(np.unique(predictions.sequence[~predictions.moving]))) < aggregate.LEAST_UNITS
-    ):
+    sequences = len(np.unique(predictions.sequence[~predictions.moving]))
+    if setting.clusters and sequences < aggregate.LEAST_UNITS:
         few = "one sequence alone" if sequences == 1 else f"{sequences} sequences alone"
         yield f"{few}: no intervals, which take {aggregate.LEAST_UNITS}, since frames of a sequence are not independent"
     if setting.kind == BENCH:
         yield "baselines use no points: the mean skeleton about the points' center, with the true facing or one for all"
 
 
-def _training_notes(setup: EvalSetup) -> Iterator[str]:
-    """Whether the network was trained on these people, by what its checkpoint tells of the runs that made it."""
-    runs = runs_of(getattr(getattr(setup.model, "header", None), "card", {}))
-    yield from dict.fromkeys(note for run in runs for note in _notes_of_run(run, setup.dataset))
-
-
 def _notes_of_run(run: dict, dataset: EvalDataset) -> Iterator[str]:
+    """Whether the network was trained on these people, by what its checkpoint tells of a run that made it."""
     recipe = run.get("recipe")
     if not isinstance(recipe, dict):
         return
@@ -182,10 +176,8 @@ def _notes_of_run(run: dict, dataset: EvalDataset) -> Iterator[str]:
     synthesized = recipe["mix"] if "mix" in recipe else not recipe.get("shards")
     alike = made.get("what") == "people" and all(made.get(name) == recipe.get(name) for name in ("seed", "scene"))
     if synthesized and alike:
-        yield (
-            f"the network was trained on synthesized people of seed {made['seed']}, as these are: they may be the "
-            "very same; make others by lidarpose synth --seed"
-        )
+        who = f"synthesized people of seed {made['seed']}, as these are: they may be the very same"
+        yield f"the network was trained on {who}; make others by lidarpose synth --seed"
 
 
 # ---- all of one call
@@ -331,9 +323,8 @@ def write(run: Run, folder: str | os.PathLike) -> list[Path]:
         name = evaluation.result.setting.dataset
         files[f"{name}-errors.png"] = charts.draw_errors(evaluation.result)
         files[f"{name}-reliability.png"] = charts.draw_reliability(evaluation.predictions, evaluation.result)
-        files[f"{name}-worst.png"] = evaluation.worst and charts.draw_worst(
-            evaluation.predictions, evaluation.result.setting, evaluation.worst
-        )
+        shown = (evaluation.predictions, evaluation.result.setting, evaluation.worst)
+        files[f"{name}-worst.png"] = evaluation.worst and charts.draw_worst(*shown)
     for stability in run.studies:
         files[f"{stability.setting.dataset}-stability.png"] = charts.draw_stability(stability)
     if run.studies:

@@ -171,13 +171,7 @@ class _Run:
     """
 
     def __init__(
-        self,
-        recipe: Recipe,
-        setup: TrainSetup,
-        folder: Path,
-        accelerator: Accelerator,
-        command: str,
-        draw: Draw | None,
+        self, recipe: Recipe, setup: TrainSetup, folder: Path, accelerator: Accelerator, command: str, draw: Draw | None
     ):
         self.recipe, self.setup, self.folder, self.command, self.draw = recipe, setup, folder, command, draw
         self.accelerator, self.is_main = accelerator, accelerator.is_main_process
@@ -347,9 +341,8 @@ class _Run:
             return {}
         network = self._averaged()
         pictures = self.recipe.pictures if isinstance(self.recipe, PoseRecipe) else 0
-        self.error, joints = self.setup.validate(
-            self.setup.objective, network, self._watched, self.recipe.batch // self.setup.frames
-        )
+        batch = self.recipe.batch // self.setup.frames
+        self.error, joints = self.setup.validate(self.setup.objective, network, self._watched, batch)
         if pictures and self.draw is not None and joints is not None and self.setup.joints is not None:
             rows = np.unique(np.linspace(0, len(joints) - 1, min(pictures, len(joints))).astype(int))
             frames = [frame for example in self._watched for frame in example.frames]
@@ -378,12 +371,8 @@ class _Run:
             if value := recipe.get(field):
                 # names of files, not where they lie
                 recipe[field] = Path(value).name if isinstance(value, str) else run_dir.folder_names(value)
-        card = {
-            "command": self.command or "lidarpose.train.loop.train",
-            "recipe": recipe,
-            f"{self.setup.unit}_seen": self.seen,
-            "hours": round(self.seconds / 3600, 3),
-        }
+        card = {"command": self.command or "lidarpose.train.loop.train", "recipe": recipe}
+        card |= {f"{self.setup.unit}_seen": self.seen, "hours": round(self.seconds / 3600, 3)}
         if self.error is not None:
             card |= self._error_entry(self.error)
         save_checkpoint(self.folder / name, network, card=card | self.setup.card)

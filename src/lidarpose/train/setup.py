@@ -320,6 +320,7 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
     dataset = full.without(held_out)
     joints = skeleton(dataset.skeleton)
     config, network = _finetuned(recipe, trained, joints, dataset.dataset)
+    card |= {"data": folder_names(recipe.data), "held_out_sequences": list(held_out)}
     source: Source = StoredSource(dataset=dataset, seed=recipe.seed, augmentation=kind)
     if recipe.mix:
         synthetic = SyntheticSource(
@@ -343,12 +344,7 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
         network=network,
         validation=validation,
         joints=joints,
-        card={
-            **card,
-            "data": folder_names(recipe.data),
-            "held_out_sequences": list(held_out),
-            "damaged": list(dataset.damaged),
-        },
+        card=card | {"damaged": list(dataset.damaged)},
         warnings=_damage(dataset) + ((_NO_VALIDATION,) if watched is None else ()),
     )
     if not isinstance(config, LidarcapConfig):
@@ -357,11 +353,9 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
         raise InputError(f"{config.name} learns from clips as they are: leave --mix at 0 and --augment at none")
     own = _clips(dataset, config, recipe)
     seen = None if watched is None else _clips(watched, config, recipe)
-    return replace(
-        _of_clips(setup, own),
-        people=max(round(recipe.epochs * len(own.clips)), 1) * config.frames,
-        validation=lambda: [] if seen is None else seen.some(VALIDATION // config.frames),
-    )
+    people = max(round(recipe.epochs * len(own.clips)), 1) * config.frames
+    watch = partial(seen.some, VALIDATION // config.frames) if seen is not None else list
+    return replace(_of_clips(setup, own), people=people, validation=watch)
 
 
 def _clips(dataset: InMemoryDataset, config: LidarcapConfig, recipe: Pretrain | Finetune) -> ClipSource:

@@ -129,13 +129,8 @@ class InMemoryDataset:
         names = np.array(self.sequences)
         left = ~np.isin(names, sequences)
         rows = left[self.sequence]
-        number = left.cumsum() - 1
-        return replace(
-            self,
-            place=self.place[rows],
-            sequence=number[self.sequence[rows]],
-            sequences=tuple(names[left].tolist()),
-        )
+        sequence = (left.cumsum() - 1)[self.sequence[rows]]
+        return replace(self, place=self.place[rows], sequence=sequence, sequences=tuple(names[left].tolist()))
 
 
 def _value(cell: Any) -> Any:

@@ -48,9 +48,8 @@ def draw_missed(result: DetectorResult, scans: ScanSet) -> bytes | None:
         scan, score = scans.loaders[row.scan](), f"{row.score:.2f}" if row.detection >= 0 else "no score"
         words = (score, f"{row.points} points", f"{row.distance:.0f} m", "mounted" * row.mounted)
         crops.append(_crop(scan, scan.boxes[row.person], words))
-    return _sheet(
-        crops, f"{result.dataset}: {len(missed)} people missed above {threshold:.2f}, the most points first (red)"
-    )
+    title = f"{result.dataset}: {len(missed)} people missed above {threshold:.2f}, the most points first (red)"
+    return _sheet(crops, title)
 
 
 def _crop(scan: LabeledScan, box: Box, words: Sequence[str]) -> _Crop:
@@ -58,10 +57,8 @@ def _crop(scan: LabeledScan, box: Box, words: Sequence[str]) -> _Crop:
     own = int(box.contains(near).sum())
     people = [person for person in scan.boxes if np.hypot(*(person.center - box.center)[:2]) < _REACH]
     towards = (np.zeros(3) if scan.origin is None else scan.origin)[:2] - box.center[:2]
-    label = (
-        " · ".join(filter(None, words))
-        + f"\n{shorten(' '.join((scan.name, scan.sensor, scan.kind)), 36)} · {own} inside"
-    )
+    where = shorten(" ".join((scan.name, scan.sensor, scan.kind)), 36)
+    label = " · ".join(filter(None, words)) + f"\n{where} · {own} inside"
     return _Crop(
         points=near[thinned(len(near), _MAX_POINTS)],
         box=box,

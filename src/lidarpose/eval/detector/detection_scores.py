@@ -169,9 +169,7 @@ def score_detector(
         predictor: poses matched people in found and in labeled boxes, where joints are known.
         seed: of the intervals.
     """
-    tables: list[tuple[pd.DataFrame, pd.DataFrame]] = []
-    about: list[dict[str, Any]] = []
-    boxes_of_scans: list[Sequence[Box]] = []
+    scored: list[tuple] = []
     progress(0, len(scans.loaders))
     for number, load in enumerate(scans.loaders):
         scan = load()
@@ -179,15 +177,15 @@ def score_detector(
         people, detections = score_scan(number, scan, boxes, np.asarray(scores, float), max_range=max_range)
         if predictor is not None and scan.joints is not None:
             people = people.assign(**_pose_errors(people, scan, boxes, predictor))
-        tables.append((people, detections))
-        boxes_of_scans.append(boxes)
-        about.append({"sensor": scan.sensor, "kind": scan.kind, "changed": scan.changed})
+        about = {"sensor": scan.sensor, "kind": scan.kind, "changed": scan.changed}
+        scored.append((people, detections, boxes, about))
         progress(number + 1, len(scans.loaders))
-    people, detections = (pd.concat(parts, ignore_index=True) for parts in zip(*tables, strict=True))
+    *tables, all_boxes, rows_about = zip(*scored, strict=True)
+    people, detections = (pd.concat(parts, ignore_index=True) for parts in tables)
     if people.empty:
         raise InputError(f"{scans.name} has nobody of {LEAST_POINTS} points and more within {max_range:g} m")
     rng = np.random.default_rng(seed)
-    table = pd.DataFrame(about)
+    table = pd.DataFrame(rows_about)
     rows, thresholds = _figures(people, detections, table, rng, default_score)
     for at in (f"{REFERENCE:g}", "default"):
         rows += _pose_rows(people, at, thresholds[at], rng) if at in thresholds else []
@@ -199,11 +197,11 @@ def score_detector(
     false = detections[(detections.status == FALSE) & (detections.score >= thresholds[f"{REFERENCE:g}"])]
     return DetectorResult(
         dataset=scans.name,
-        scans=len(boxes_of_scans),
+        scans=len(table),
         changed=int(table.changed.sum()),
         people=people,
         detections=detections,
-        boxes=boxes_of_scans,
+        boxes=all_boxes,
         rows=rows,
         thresholds=thresholds,
         reliability=reliability.round(4).to_dict("records"),

@@ -25,9 +25,7 @@ _LIMB_JOINTS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 # the groups that the paper and Waymo report (head to ankles), and groups for the joints that only SMPL has
 GROUPS = {
     "head": ("head", "nose", "head_center"),
-    **{
-        f"{name}s": (f"left_{name}", f"right_{name}") for name in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
-    },
+    **{f"{name}s": (f"left_{name}", f"right_{name}") for name in _LIMB_JOINTS},
     "trunk": ("pelvis", "spine1", "spine2", "spine3", "neck", "left_collar", "right_collar"),
     "hands": ("left_hand", "right_hand"),
     "feet": ("left_foot", "right_foot"),

@@ -17,16 +17,8 @@ from lidarpose.eval.metrics.joint_errors import checked_poses, joint_errors
 from lidarpose.skeleton import WAYMO14, Skeleton
 
 # spread of each joint in units of the box's scale; twice COCO's sigmas, the head's center by the same method
-SIGMAS = {
-    "nose": 0.052,
-    "head_center": 0.158,
-    "shoulder": 0.158,
-    "elbow": 0.144,
-    "wrist": 0.124,
-    "hip": 0.214,
-    "knee": 0.174,
-    "ankle": 0.178,
-}
+SIGMAS = {"nose": 0.052, "head_center": 0.158, "shoulder": 0.158, "elbow": 0.144, "wrist": 0.124}
+SIGMAS |= {"hip": 0.214, "knee": 0.174, "ankle": 0.178}
 OKS_THRESHOLDS = (0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95)
 PCK_THRESHOLDS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
 # cost of a keypoint that is missed or made up, and farthest distance of a match, m

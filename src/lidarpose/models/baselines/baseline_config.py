@@ -124,12 +124,8 @@ def pad_clouds(
     toward, distance, known = view[:, :3], np.exp(view[:, 3:4]), view[:, 4:] > 0
     points, valid = _padded(chosen)
     center = np.where(known, middle - toward * distance, 0)
-    return {
-        "points": points,
-        "valid": valid,
-        "middle": middle.astype(np.float32),
-        "center": center.astype(np.float32),
-    }
+    places = {"middle": middle.astype(np.float32), "center": center.astype(np.float32)}
+    return {"points": points, "valid": valid, **places}
 
 
 # ---- networks of clips

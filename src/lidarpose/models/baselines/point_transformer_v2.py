@@ -72,17 +72,11 @@ class PointTransformerV2(nn.Module):
         self.block = Block(embedding, EMBEDDING_GROUPS)
         widths = (embedding, *encoder)
         self.down = nn.ModuleList(linear_norm(widths[s], widths[s + 1], bias=False) for s in range(len(GRID)))
-        self.encoder: Any = nn.ModuleList(
-            nn.ModuleList(Block(c, g) for _ in range(ENCODER_DEPTH))
-            for c, g in zip(encoder, ENCODER_GROUPS, strict=True)
-        )
+        self.encoder = _stages(encoder, ENCODER_GROUPS, ENCODER_DEPTH)
         coarse = (*decoder[1:], encoder[-1])
         self.up = nn.ModuleList(linear_norm(c, own, bias=True) for c, own in zip(coarse, decoder, strict=True))
         self.skip = nn.ModuleList(linear_norm(s, own, bias=True) for s, own in zip(widths, decoder, strict=False))
-        self.decoder: Any = nn.ModuleList(
-            nn.ModuleList(Block(c, g) for _ in range(DECODER_DEPTH))
-            for c, g in zip(decoder, DECODER_GROUPS, strict=True)
-        )
+        self.decoder = _stages(decoder, DECODER_GROUPS, DECODER_DEPTH)
 
     def forward(self, rows: Rows) -> Tensor:
         # nearest first, so fewer are the first ones
@@ -103,6 +97,12 @@ class PointTransformerV2(nn.Module):
             for block in self.decoder[stage]:
                 x = block(x, levels[stage].xyz, tables[stage])
         return x
+
+
+def _stages(channels: list[int], groups: tuple[int, ...], depth: int) -> Any:
+    """A list of blocks a level."""
+    levels = zip(channels, groups, strict=True)
+    return nn.ModuleList(nn.ModuleList(Block(c, g) for _ in range(depth)) for c, g in levels)
 
 
 class Block(nn.Module):

@@ -4,7 +4,7 @@ Legend: L levels (0 = the finest), J joints, W heatmap bins an axis.
 """
 
 from dataclasses import dataclass, fields
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -215,18 +215,11 @@ def _released(name: str, joints: tuple[str, ...], bins: tuple[int, int], reach: 
     return DaptConfig(name=name, joints=joints, bins=(bins[0], *bins), ranges=ranges, auxiliary=True, legacy=True)
 
 
+_ALL_HEADS: dict[str, Any] = {"parts": PARTS, "coordinates": True, "auxiliary": True}
 # `paper`: the paper's network for the superset skeleton, every head of both stages, so that none is thrown away between
 # pre-training and fine-tuning; the others: what the authors' own files hold
 CONFIGS = {
-    "paper": DaptConfig(
-        name="paper",
-        joints=BODY26.joints,
-        bins=(220, 220, 220),
-        ranges=((-1.1, 1.1),) * 3,
-        parts=PARTS,
-        coordinates=True,
-        auxiliary=True,
-    ),
+    "paper": DaptConfig(name="paper", joints=BODY26.joints, bins=(220,) * 3, ranges=((-1.1, 1.1),) * 3, **_ALL_HEADS),
     "waymo": _released("waymo", WAYMO_JOINTS, (72, 120), (0.9, 1.5)),
     "humanm3": _released("humanm3", HUMAN15.joints, (140, 220), (0.7, 1.1)),
     "lidarhuman26m": _released("lidarhuman26m", SMPL24.joints, (220, 220), (1.1, 1.1)),

@@ -54,11 +54,9 @@ class Ground:
 
     def at(self, xy: np.ndarray) -> np.ndarray:
         """Height (n,) float32 m of the ground at xy (n, 2) m: bilinear, outside as at the border."""
-        rows, columns = self.heights.shape
+        (rows, columns), xy = self.heights.shape, np.asarray(xy)
         at_x, at_y = (
-            np.clip((np.asarray(xy)[:, i] - (self.corner[i] + self.cell / 2)) / self.cell, 0, count - 1).astype(
-                np.float32
-            )
+            np.clip((xy[:, i] - (self.corner[i] + self.cell / 2)) / self.cell, 0, count - 1).astype(np.float32)
             for i, count in enumerate((rows, columns))
         )
         i, j = (np.minimum(at.astype(np.int32), max(n - 2, 0)) for at, n in ((at_x, rows), (at_y, columns)))

@@ -41,11 +41,8 @@ class RangeImage:
         sizes = [self._rows * self._columns >> 2 * number for number in range(_LEVELS + 1)]
         self._starts = np.cumsum([0, *sizes], dtype=np.int32)
         size = self._starts[-1] + 1
-        self._near, self._far, count = (
-            np.full(size, np.inf, np.float32),
-            np.zeros(size, np.float32),
-            np.zeros(size, np.int32),
-        )
+        self._near, self._far = np.full(size, np.inf, np.float32), np.zeros(size, np.float32)
+        count = np.zeros(size, np.int32)
         np.minimum.at(self._near, flat, level)
         np.maximum.at(self._far, flat, level)
         np.add.at(count, flat, np.int32(1))
