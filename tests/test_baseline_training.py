@@ -47,7 +47,7 @@ def test_clouds_are_about_the_middle_of_their_extent_and_know_the_sensor():
     clouds[1] = np.concatenate([clouds[1], [[9.0, 0, 0]]])
     origin = np.array([4.0, -3.0, 1.0])
     view = np.stack([view_features(np.zeros(3), origin), *np.zeros((2, 5))])
-    arrays = pad_clouds(clouds, view, seeds=[1, 2, 3])
+    arrays = pad_clouds(clouds, view, PrnConfig(), [1, 2, 3])
     assert arrays["valid"].sum(1).tolist() == [50, 7, 1]
     for row, cloud in enumerate((clouds[0], clouds[1][:7])):
         points = arrays["points"][row][arrays["valid"][row]]
@@ -60,16 +60,17 @@ def test_clouds_are_about_the_middle_of_their_extent_and_know_the_sensor():
 def test_points_are_there_once_or_as_published_drawn_again():
     rng = np.random.default_rng(0)
     clouds, view = [rng.normal(0, 0.3, (n, 3)) for n in (300, 1500)], np.zeros((2, 5))
-    once = pad_clouds(clouds, view, seeds=[5, 6])
-    again = pad_clouds(clouds, view, resample_with_replacement=True, seeds=[5, 6])
+    once = pad_clouds(clouds, view, PrnConfig(), [5, 6])
+    published = PrnConfig(resample_with_replacement=True)
+    again = pad_clouds(clouds, view, published, [5, 6])
     distinct = [[len(np.unique(points[valid], axis=0)) for points, valid in zip(a["points"], a["valid"], strict=True)]
                 for a in (once, again)]  # fmt: skip
     assert once["valid"].sum(1).tolist() == [300, MOST_POINTS] and distinct[0] == [300, MOST_POINTS]
     # every point of a small cloud; of a large one about 1 - exp(-1024 / 1500) of its points
     assert again["valid"].sum(1).tolist() == [MOST_POINTS] * 2 and distinct[1][0] == 300 and 650 < distinct[1][1] < 830
-    assert not np.array_equal(again["points"], pad_clouds(
-        clouds, view, resample_with_replacement=True, seeds=[7, 8])["points"])  # fmt: skip
-    assert pad_clouds(clouds, view, seeds=[5, 6], most_points=128)["valid"].sum(1).tolist() == [128, 128]
+    assert not np.array_equal(again["points"], pad_clouds(clouds, view, published, [7, 8])["points"])
+    fewer = pad_clouds(clouds, view, PrnConfig(most_points=128), [5, 6])
+    assert fewer["valid"].sum(1).tolist() == [128, 128]
 
 
 # ---- what is minimized

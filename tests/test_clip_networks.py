@@ -83,23 +83,27 @@ def predictor(request):
 def test_all_points_once_and_masked():
     rng = np.random.default_rng(0)
     clouds = [rng.normal(0, 0.5, (n, 3)) for n in (5, 0, 700)]
-    points, valid = pad_frames(clouds, seeds=[1, 2, 3])
+    points, valid = pad_frames(clouds, LidarcapConfig(), [1, 2, 3])
     assert points.shape == (3, FRAME_POINTS, 3) and valid.sum(1).tolist() == [5, 1, FRAME_POINTS]
     np.testing.assert_allclose(points[0, :5], clouds[0], rtol=1e-6)
     assert (points[1, 0] == 0).all()
     assert len(np.unique(points[2], axis=0)) == FRAME_POINTS
-    assert pad_frames(clouds, seeds=[1, 2, 3], most_points=128)[1].sum(1).tolist() == [5, 1, 128]
-    assert (pad_frames(clouds[2:], seeds=[3])[0] == points[2]).all(), "a draw that follows from the seed alone"
-    assert pad_frames([np.array([[0.1, 0, 0], [9.0, 0, 0]])], seeds=[0], window=2.0)[1].sum() == 1
+    assert pad_frames(clouds, LidarcapConfig(most_points=128), [1, 2, 3])[1].sum(1).tolist() == [5, 1, 128]
+    assert (pad_frames(clouds[2:], LidarcapConfig(), [3])[0] == points[2]).all(), (
+        "a draw that follows from the seed alone"
+    )
+    far = np.array([[0.1, 0, 0], [9.0, 0, 0]])
+    assert pad_frames([far], LidarcapConfig(), [0], window=2.0)[1].sum() == 1
 
 
 def test_512_points_as_published():
     rng = np.random.default_rng(0)
     cloud = rng.normal(size=(200, 3)).astype(np.float32)
-    points, valid = pad_frames([cloud], resample_with_replacement=True, seeds=[0])
+    published = LidarcapConfig(resample_with_replacement=True)
+    points, valid = pad_frames([cloud], published, [0])
     assert valid.all() and (points[0] == np.concatenate([cloud, cloud, cloud[:112]])).all()
     many = rng.normal(size=(700, 3)).astype(np.float32)
-    drawn = pad_frames([many], resample_with_replacement=True, seeds=[0])[0][0]
+    drawn = pad_frames([many], published, [0])[0][0]
     assert drawn.shape == (FRAME_POINTS, 3) and len(np.unique(drawn, axis=0)) < 450
     assert {tuple(p) for p in drawn.tolist()} <= {tuple(p) for p in many.tolist()}
 

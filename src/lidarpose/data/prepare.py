@@ -147,7 +147,7 @@ def _parts_of(name: str, parts: list[str], rule: SplitRule | None, split: str | 
 
 def _card(source: Reader, parts: list[str], rule: SplitRule | None, split: str | None) -> DatasetCard:
     # the names themselves would fill the line that says what differs
-    settings = {"what": "parts", "dataset": source.name, "parts": _digest("\n".join(parts))}
+    settings: dict[str, Any] = {"what": "parts", "dataset": source.name, "parts": _digest("\n".join(parts))}
     settings |= {"split": split, "split_by": rule and rule.name}
     about = {key: value for key, value in source.about.items() if key not in ("frame", "settings")}
     if rule is not None:

@@ -124,8 +124,7 @@ class BaselineBackend(_PaperBackend):
     @torch.inference_mode()
     def run(self, clouds: list[np.ndarray], view: np.ndarray) -> Raw:
         config = self.network.config
-        drawn = {"resample_with_replacement": config.resample_with_replacement, "most_points": config.most_points}
-        arrays = pad_clouds(clouds, view, seeds=[0] * len(clouds), **drawn)
+        arrays = pad_clouds(clouds, view, config, [0] * len(clouds))
         inputs = (torch.as_tensor(arrays[name]).to(self.device) for name in ("points", "valid", "center"))
         joints = self.network(*inputs).joints.float().cpu().numpy() + arrays["middle"][:, None]
         order = [config.joints.index(joint) for joint in self.header.skeleton.joints]
@@ -146,8 +145,7 @@ class ClipBackend(_PaperBackend):
         inputs = {}
         for name in config.clouds:
             reach = WINDOW if name == "person" else np.inf
-            drawn = {"resample_with_replacement": config.resample_with_replacement, "most_points": config.most_points}
-            points, valid = pad_frames(given[name], seeds=[0] * len(rows), window=reach, **drawn)
+            points, valid = pad_frames(given[name], config, [0] * len(rows), window=reach)
             inputs[name] = torch.as_tensor(points).to(self.device), torch.as_tensor(valid).to(self.device)
         index = torch.as_tensor(clip.windows, device=self.device)
         # each frame once, however often it is in a clip

@@ -371,7 +371,7 @@ class _Run:
             if value := recipe.get(field):
                 # names of files, not where they lie
                 recipe[field] = Path(value).name if isinstance(value, str) else run_dir.folder_names(value)
-        card = {"command": self.command or "lidarpose.train.loop.train", "recipe": recipe}
+        card: dict[str, Any] = {"command": self.command or "lidarpose.train.loop.train", "recipe": recipe}
         card |= {f"{self.setup.unit}_seen": self.seen, "hours": round(self.seconds / 3600, 3)}
         if self.error is not None:
             card |= self._error_entry(self.error)

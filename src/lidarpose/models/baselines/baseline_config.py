@@ -88,19 +88,14 @@ class LpformerConfig(BaselineConfig):
 
 
 def pad_clouds(
-    clouds: list[np.ndarray],
-    view: np.ndarray,
-    *,
-    resample_with_replacement: bool = False,
-    seeds: list[int],
-    most_points: int = MOST_POINTS,
+    clouds: list[np.ndarray], view: np.ndarray, config: PrnConfig | LpformerConfig, seeds: list[int]
 ) -> dict[str, np.ndarray]:
     """Clouds (n, 3) m of people, n = 0 is legal, as a network of single frames reads them.
 
     Args:
         clouds: each in its person's frame; what is beyond `WINDOW` of it is left out.
         view: (B, 5), see `voxelize.view_features`.
-        resample_with_replacement, most_points: see `PrnConfig`.
+        config: the network's, which says how many points are read and how they are drawn.
         seeds: of what is drawn, a number a person.
 
     Returns:
@@ -108,12 +103,12 @@ def pad_clouds(
         middle (B, 3) float32 m in the person's frame; center (B, 3) float32 m: the middle from the sensor, 0 where its
         place is not known.
     """
-    chosen, middles = [], []
+    chosen, middles, most_points = [], [], config.most_points
     for cloud, seed in zip(clouds, seeds, strict=True):
         near = _near(cloud, WINDOW)
         rng = np.random.default_rng(seed)
         middles.append((near.min(0) + near.max(0)) / 2)
-        if resample_with_replacement:
+        if config.resample_with_replacement:
             extra = rng.integers(len(near), size=most_points - len(near) * (len(near) <= most_points))
             rows = extra if len(near) > most_points else np.concatenate([np.arange(len(near)), extra])
             near = near[rows]
@@ -173,32 +168,26 @@ class NeConfig(LidarcapConfig):
 
 
 def pad_frames(
-    clouds: list[np.ndarray],
-    *,
-    resample_with_replacement: bool = False,
-    seeds: list[int],
-    window: float = np.inf,
-    most_points: int = FRAME_POINTS,
+    clouds: list[np.ndarray], config: LidarcapConfig, seeds: list[int], *, window: float = np.inf
 ) -> tuple[np.ndarray, np.ndarray]:
     """Clouds (n, 3) m of frames, n = 0 is legal, about their centers, as a network of clips reads them.
 
     Args:
         clouds: of F frames.
-        resample_with_replacement, most_points: see `LidarcapConfig`.
+        config: the network's, which says how many points are read and how they are drawn.
         seeds: of what is drawn, a number a frame.
         window: what is farther from the center along an axis is left out, m.
 
     Returns:
         Points (F, N, 3) float32 m and valid (F, N) bool, False for padding.
     """
-    chosen = []
+    chosen, most, again = [], config.most_points, config.resample_with_replacement
     for cloud, seed in zip(clouds, seeds, strict=True):
         near = _near(cloud, window)
-        if len(near) > most_points:
-            rng = np.random.default_rng(seed)
-            near = near[rng.choice(len(near), most_points, replace=resample_with_replacement)]
+        if len(near) > most:
+            near = near[np.random.default_rng(seed).choice(len(near), most, replace=again)]
         # fewer are repeated from the first on
-        chosen.append(np.resize(near, (most_points, 3)) if resample_with_replacement else near)
+        chosen.append(np.resize(near, (most, 3)) if again else near)
     return _padded(chosen)
 
 

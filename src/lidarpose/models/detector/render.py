@@ -67,7 +67,10 @@ def draw_augmentation(rng: np.random.Generator, count: int, *, drop_origin: floa
     rows = []
     for _ in range(count):
         is_dropped = rng.random() < drop_origin
-        row = {"turn": rng.uniform(-pi, pi) if is_dropped else rng.normal(0, 0.1), "mirror": rng.random() < 0.5}
+        row: dict[str, Any] = {
+            "turn": rng.uniform(-pi, pi) if is_dropped else rng.normal(0, 0.1),
+            "mirror": rng.random() < 0.5,
+        }
         row |= {"scale": rng.uniform(0.92, 1.08), "shift": rng.uniform(-0.1, 0.1, 2)}
         row |= {"keep": rng.uniform(0.25, 1.0) if rng.random() < 0.6 else 1.0, "noise": rng.uniform(0, 0.025)}
         rows.append(row | {"drop_origin": is_dropped, "seed": rng.integers(2**63)})

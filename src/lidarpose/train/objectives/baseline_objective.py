@@ -43,13 +43,8 @@ class BaselineObjective:
     def collate(self, examples: list[Example]) -> dict[str, np.ndarray]:
         """The arrays of `pad_clouds`; joints (B, J, 3) float32 m about the middle, NaN without a label; shift (B,)."""
         seeds = [example.seed for example in examples]
-        arrays = pad_clouds(
-            [example.points for example in examples],
-            np.stack([example.view for example in examples]),
-            resample_with_replacement=self.config.resample_with_replacement,
-            seeds=seeds,
-            most_points=self.config.most_points,
-        )
+        view = np.stack([example.view for example in examples])
+        arrays = pad_clouds([example.points for example in examples], view, self.config, seeds)
         joints = np.stack([example.joints for example in examples])[:, self.config.columns]
         shift = [np.random.default_rng([seed, 1]).uniform(-self.shift, self.shift) for seed in seeds]
         return arrays | {"joints": joints - arrays["middle"][:, None], "shift": np.array(shift, np.float32)}
@@ -57,19 +52,14 @@ class BaselineObjective:
     def terms(
         self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
     ) -> dict[str, Tensor]:
-        """`prn_losses` or `lpformer_losses`, people moved by their shift; joints without a label teach
-        nothing."""
+        """`frame_losses`, people moved by their shift; joints without a label teach nothing."""
         read = on_device(arrays, device)
         shift, valid = read["shift"][:, None, None], read["valid"]
         points = (read["points"] + shift).masked_fill(~valid[..., None], 0)
         known = read["joints"].isfinite().all(-1)
         joints = torch.where(known[..., None], read["joints"] + shift, 0)
         outputs = network(points, valid, read["center"])
-        truth: tuple[Any, ...] = (points, valid, joints, known)
-        if isinstance(self.config, PrnConfig):
-            terms = prn_losses(outputs, *truth, share=share)
-        else:
-            terms = lpformer_losses(outputs, *truth, second_softmax=self.config.second_softmax, share=share)
+        terms = frame_losses(self.config, outputs, points, valid, joints, known, share)
         return terms | {"mpjpe": mean_distance(outputs.joints.detach(), joints, known, share)}
 
     @torch.no_grad()
@@ -94,13 +84,10 @@ class ClipObjective:
         shape = len(examples), len(examples[0].frames)
         arrays: dict[str, np.ndarray] = {}
         for number, name in enumerate(self.config.clouds):
-            points, valid = pad_frames(
-                [cloud for example in examples for cloud in example.clouds[name]],
-                resample_with_replacement=self.config.resample_with_replacement,
-                seeds=[frame.seed + number for example in examples for frame in example.frames],
-                window=WINDOW if name == "person" else np.inf,
-                most_points=self.config.most_points,
-            )
+            clouds = [cloud for example in examples for cloud in example.clouds[name]]
+            seeds = [frame.seed + number for example in examples for frame in example.frames]
+            reach = WINDOW if name == "person" else np.inf
+            points, valid = pad_frames(clouds, self.config, seeds, window=reach)
             arrays |= {name: points.reshape(*shape, -1, 3), f"{name}_valid": valid.reshape(*shape, -1)}
         joints = np.stack([frame.joints[_COLUMNS] for example in examples for frame in example.frames])
         rotations = axis_angle_to_matrix(np.stack([example.rotations for example in examples])).astype(np.float32)
@@ -142,39 +129,31 @@ def point_labels(points: Tensor, valid: Tensor, joints: Tensor, known: Tensor) -
     return label.masked_fill(~valid, -1), offsets
 
 
-def prn_losses(
-    outputs: PrnOutputs, points: Tensor, valid: Tensor, joints: Tensor, known: Tensor, *, share: Share = alone
-) -> dict[str, Tensor]:
-    """Distances of refined and of voted joints, cross entropy of parts, distances of the points' offsets."""
-    label, offset = point_labels(points, valid, joints, known)
-    label, is_body = label[valid], label[valid] < joints.shape[1]
-    missed = (outputs.offsets - offset[valid]).norm(dim=-1)[is_body]
-    return {
-        "joints": mean_distance(outputs.joints, joints, known, share),
-        "vote": mean_distance(outputs.voted, joints, known, share),
-        "part": _cross_entropy(outputs.parts, label, share),
-        "offset": missed.sum() / at_least_one(share(is_body.sum())),
-    }
-
-
-def lpformer_losses(
-    outputs: LpformerOutputs,
+def frame_losses(
+    config: PrnConfig | LpformerConfig,
+    outputs: PrnOutputs | LpformerOutputs,
     points: Tensor,
     valid: Tensor,
     joints: Tensor,
     known: Tensor,
-    *,
-    second_softmax: bool = False,
-    share: Share = alone,
+    share: Share,
 ) -> dict[str, Tensor]:
-    """Distances of joints and cross entropy of parts. second_softmax: of probabilities instead of logits, as
-    published."""
-    label, _ = point_labels(points, valid, joints, known)
-    parts = outputs.parts.softmax(-1) if second_softmax else outputs.parts
-    return {
+    """Distances of joints and cross entropy of parts; of PRN also distances of voted joints and of points' offsets."""
+    label, offset = point_labels(points, valid, joints, known)
+    label, distance = label[valid], mean_distance(outputs.joints, joints, known, share)
+    if isinstance(outputs, LpformerOutputs):
+        # of probabilities instead of logits, as published
+        is_softmax = isinstance(config, LpformerConfig) and config.second_softmax
+        parts = (outputs.parts.softmax(-1) if is_softmax else outputs.parts)[valid]
         # zero, of the head without a loss: processes that average gradients wait for all heads
-        "joints": mean_distance(outputs.joints, joints, known, share) + 0 * outputs.visible.sum(),
-        "part": _cross_entropy(parts[valid], label[valid], share),
+        return {"joints": distance + 0 * outputs.visible.sum(), "part": _cross_entropy(parts, label, share)}
+    is_body = label < joints.shape[1]
+    missed = (outputs.offsets - offset[valid]).norm(dim=-1)[is_body]
+    return {
+        "joints": distance,
+        "vote": mean_distance(outputs.voted, joints, known, share),
+        "part": _cross_entropy(outputs.parts, label, share),
+        "offset": missed.sum() / at_least_one(share(is_body.sum())),
     }
 
 
