@@ -1,5 +1,6 @@
 """The command line: what it writes, and one line with exit code 2 for whatever is wrong."""
 
+import argparse
 import functools
 import io
 import json
@@ -523,6 +524,42 @@ def test_the_notebook_runs_and_holds_no_output(tmp_path, monkeypatch, capsys):
 
 
 # ---- help and quiet
+
+
+def test_a_command_is_what_its_text_says():
+    from lidarpose.cli.terminal import add_command, option_names
+
+    text = """
+do a thing
+Does a thing,
+ really.
+$ thing a
+$ thing b
+<file> FILE+  files
+-n,--count N = 3  how many
+--far M  how far
+--fast  at once
+--kind:which {a,b}  one of them
+[more]
+--data A=B,...  as it is
+--scans DIR&  again
+ and again
+--out FILE = REQUIRED  where
+"""
+    parser = argparse.ArgumentParser()
+    command = add_command(parser.add_subparsers(), "thing", print, text)
+    options = vars(parser.parse_args("thing x y --far 2 --scans p --scans q --out o --kind b --data 1,2".split()))
+    assert options == {
+        **{"file": ["x", "y"], "count": 3, "far": 2.0, "fast": False, "which": "b", "data": "1,2", "scans": ["p", "q"]},
+        **{"out": "o", "quiet": False, "run": print},
+    }
+    help = command.format_help()
+    assert "Does a thing, really." in help and "examples:\n  thing a\n  thing b" in help
+    assert "more:\n  --data A=B,...  as it is" in help and "again and again" in help
+    assert option_names(text) == ["far", "fast", "kind", "data", "scans", "out"]
+    for wrong in ("thing x", "thing --out o", "thing x --out o --kind c", "thing x --out o -n 1.5"):
+        with pytest.raises(SystemExit):
+            parser.parse_args(wrong.split())
 
 
 def test_help_and_version(capsys):

@@ -165,7 +165,7 @@ BAD = {
     "motion": (["-n", "5", "--motion", "none.npz"], "none.npz"),
     "subjects": (["-n", "5", "--subjects", "a"], "--motion"),
     "no subject": (["-n", "5", "--motion", "none.npz", "--subjects", ","], "leave --subjects away"),
-    "both": (["-n", "5", "--clips", "--scenes"], "not allowed with"),
+    "both": (["-n", "5", "--clips", "--scenes"], "are different datasets"),
     "shard": (["-n", "5", "--per-shard", "0"], "--per-shard must be a whole number of at least 1, got 0"),
     "captured": (["-n", "5", "--captured", "0.3"], "--motion"),
     "share": (["-n", "5", "--motion", "none.npz", "--captured", "1.5"], "between 0 and 1, got 1.5"),

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from types import SimpleNamespace
 
-from lidarpose.cli.terminal import add_command, add_options, tell
+from lidarpose.cli.terminal import add_command, option_names, tell
 from lidarpose.errors import InputError
 from lidarpose.models import BUNDLED, DEFAULT
 from lidarpose.progress import Progress
@@ -26,16 +26,36 @@ _OPTIONS = """
 --legacy  also score with the released code's arithmetic
 --sensor-unknown  hide the sensor's position from the network
 """
-# in place of a network: what finds people; and its own options, besides the folders of scans
+# in place of a network: what finds people; and its own options
 DETECTOR = "detector"
 _DETECTOR = """
+--scans DIR&  a folder of SCAN.json of labeled people beside SCAN.pcd, .bin, .ply, .npy or another; may be repeated
 --method NAME  detector (default), scorer: without poses, or baselines: pose, candidates
 --detector FILE  another detector's ONNX file than the bundled one
 --range M  people farther from the sensor do not count (default 40)
 --network NAME  compare poses in found boxes with those in labeled ones: a checkpoint (default small), or none
 --pictures DIR  draw the strongest false people and those who are missed into DIR
 """
+_EVALUATE = f"""
+score a checkpoint on datasets
+Prints metrics and writes scores.json, poses.parquet and pictures into a folder.
+$ lidarpose evaluate small bench
+$ lidarpose evaluate small prepared/waymo --out scores/waymo
+$ lidarpose evaluate detector --scans labeled --pictures look
+<weights> CHECKPOINT  {", ".join(BUNDLED)}, a checkpoint, an exported .onnx, or detector: what finds people in whole
+ scans
+<datasets> DATASET*  a folder written by prepare or synth, bench or bench-2; of detector heldout (default without
+ --scans)
+{_OPTIONS}
+--out DIR  a new or empty folder (default evaluation/NAME, numbered)
+[evaluate detector]
+{_DETECTOR}
+"""
 _TABLE = """
+show scores beside the paper's Table 1
+Sets scores.json files beside the figures printed in the paper, by protocol.
+$ lidarpose table evaluation/small
+<scores> FILE|DIR*  scores.json files, or folders that contain one
 --format NAME = markdown  markdown (default) or json
 --out FILE  write to FILE (default: print)
 """
@@ -53,37 +73,9 @@ _TITLES = {
 
 def add(commands) -> None:
     """Adds the commands to the parser's."""
-    evaluate = add_command(
-        commands,
-        "evaluate",
-        "score a checkpoint on datasets",
-        "lidarpose evaluate small bench",
-        "lidarpose evaluate small prepared/waymo --out scores/waymo",
-        "lidarpose evaluate detector --scans labeled --pictures look",
-        description="Prints metrics and writes scores.json, poses.parquet and pictures into a folder.",
-    )
-    evaluate.set_defaults(run=_evaluate)
-    words = f"{', '.join(BUNDLED)}, a checkpoint, an exported .onnx, or detector: what finds people in whole scans"
-    evaluate.add_argument("weights", metavar="CHECKPOINT", help=words)
-    words = "a folder written by prepare or synth, bench or bench-2; of detector heldout (default without --scans)"
-    evaluate.add_argument("datasets", nargs="*", metavar="DATASET", help=words)
-    settings = add_options(evaluate, _OPTIONS)
-    evaluate.add_argument("--out", metavar="DIR", help="a new or empty folder (default evaluation/NAME, numbered)")
-    detector = evaluate.add_argument_group("evaluate detector")
-    words = "a folder of SCAN.json of labeled people beside SCAN.pcd, .bin, .ply, .npy or another; may be repeated"
-    detector.add_argument("--scans", action="append", metavar="DIR", help=words)
-    evaluate.set_defaults(settings=settings, of_detector=("scans", *add_options(detector, _DETECTOR)))
-
-    table = add_command(
-        commands,
-        "table",
-        "show scores beside the paper's Table 1",
-        "lidarpose table evaluation/small",
-        description="Sets scores.json files beside the figures printed in the paper, by protocol.",
-    )
-    table.set_defaults(run=_table)
-    table.add_argument("scores", nargs="*", metavar="FILE|DIR", help="scores.json files, or folders that contain one")
-    add_options(table, _TABLE)
+    evaluate = add_command(commands, "evaluate", _evaluate, _EVALUATE)
+    evaluate.set_defaults(defaults={name: evaluate.get_default(name) for name in option_names(_OPTIONS)})
+    add_command(commands, "table", _table, _TABLE)
 
 
 def _flag(name: str) -> str:
@@ -95,12 +87,12 @@ def _evaluate(options: argparse.Namespace) -> None:
 
     if options.weights == DETECTOR:
         return _evaluate_detector(options)
-    if wrong := [f"--{name}" for name in options.of_detector if getattr(options, name) is not None]:
+    if wrong := [f"--{name}" for name in option_names(_DETECTOR) if getattr(options, name) is not None]:
         raise InputError(
             f"{wrong[0]} is of lidarpose evaluate detector, got the network {options.weights}: leave it out"
         )
     folder = evaluation.new_folder(options.weights) if options.out is None else evaluation.check_folder(options.out)
-    settings = {name: getattr(options, name) for name in options.settings}
+    settings = {name: getattr(options, name) for name in options.defaults}
     with ExitStack() as stack:
         progress = _progress(stack)
         run = evaluation.run(
@@ -119,7 +111,7 @@ def _evaluate_detector(options: argparse.Namespace) -> None:
     from lidarpose.eval.detector.evaluate_detector import run_detector, write_detector
     from lidarpose.eval.detector.labeled_scans import HELDOUT
 
-    for name, default in options.settings.items():
+    for name, default in options.defaults.items():
         if name not in ("limit", "seed") and getattr(options, name) != default:
             raise InputError(f"{_flag(name)} is of networks, got the detector: leave it out")
     if set(options.datasets) - {HELDOUT}:
@@ -186,9 +178,9 @@ def _command(options: argparse.Namespace) -> str:
     """What was asked for, as it would be typed."""
     words = ["lidarpose", "evaluate", options.weights, *options.datasets]
     changed = {
-        name: value for name, default in options.settings.items() if (value := getattr(options, name)) != default
+        name: value for name, default in options.defaults.items() if (value := getattr(options, name)) != default
     }
-    for name in options.of_detector:
+    for name in option_names(_DETECTOR):
         value = getattr(options, name)
         changed |= {} if value is None else {name: value}
     switches = [_flag(name) for name, value in changed.items() if value is True]

@@ -5,25 +5,31 @@ import io
 from contextlib import redirect_stderr
 from pathlib import Path
 
-from lidarpose.cli.terminal import add_command, add_options, names, tell
+from lidarpose.cli.terminal import add_command, names, tell
 from lidarpose.errors import InputError, check_name
 
 _NAMES = ("table1", "table2", "table3", "table4", "fig5", "fig6", "fig7", "fig8")
-_OPTIONS = """
+_PAPER = """
+run a table or figure of the paper
+Runs the commands behind a table, cell by cell, and writes NAME.md and NAME.json with what each cell cost; figures as
+ NAME.png. What is done is not done again, and the same command continues after an interruption. Without --data
+ synthesized people stand in for the real sets.
+$ lidarpose paper table1 --dry-run
+$ lidarpose paper table1 --people 200000 --workers 2
+$ lidarpose paper table3 --data waymo=prepared/waymo --size paper
+<name> NAME  table1 to table4, or fig5 to fig8
 --out DIR = paper  folder of all tables (default paper)
 --rows A,B  only these rows, named as --dry-run names them
 --dry-run  print the commands of every cell, run nothing
 --table-only  write the table of what is there, run nothing
-"""
-_BUDGET = """
+[budget]
 --people N = 200000  people that a stage of training sees: pre-training, and fine-tuning on the stand-in
  (default 200000)
 --hours H  of a row's training in all: longer ones are made shorter, their schedule too
 --seeds K = 1  seeds 0 ... K-1 of each cell (default 1)
 --workers N = 1  of each command (default 1)
 --size NAME = paper-small  widths of all networks: paper-small (default): reduced ones; or paper: as published
-"""
-_DATA = """
+[data]
 --data NAME=DIR,...  prepared real sets to learn from and to score on: waymo, humanm3, lidarhuman26m, sloper4d; to
  pre-train on: lipd, freemotion, noisemotion; raw poses: freemotion-poses, lidarhuman26m-poses
 --motion FILE,FILE  captured motion for synthesis; each is a row of table2, the first one is everywhere else
@@ -34,22 +40,7 @@ _DATA = """
 
 def add(commands) -> None:
     """Adds the command to the parser's."""
-    paper = add_command(
-        commands,
-        "paper",
-        "run a table or figure of the paper",
-        "lidarpose paper table1 --dry-run",
-        "lidarpose paper table1 --people 200000 --workers 2",
-        "lidarpose paper table3 --data waymo=prepared/waymo --size paper",
-        description="Runs the commands behind a table, cell by cell, and writes NAME.md and NAME.json with what each "
-        "cell cost; figures as NAME.png. What is done is not done again, and the same command continues after an "
-        "interruption. Without --data synthesized people stand in for the real sets.",
-    )
-    paper.set_defaults(run=_paper)
-    paper.add_argument("name", metavar="NAME", help="table1 to table4, or fig5 to fig8")
-    add_options(paper, _OPTIONS)
-    add_options(paper.add_argument_group("budget"), _BUDGET)
-    add_options(paper.add_argument_group("data"), _DATA)
+    add_command(commands, "paper", _paper, _PAPER)
 
 
 def _paper(options: argparse.Namespace) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lidarpose.cli import recordings
-from lidarpose.cli.terminal import add_command, add_options, is_watched, tell
+from lidarpose.cli.terminal import add_command, is_watched, tell
 from lidarpose.errors import InputError
 from lidarpose.models import DEFAULT, NAMES
 
@@ -19,11 +19,6 @@ _LONGEST_ID = 40
 # what a user who names it expects as a file
 _NO_FOLDERS = "bin csv html json jsonl npy npz parquet pcd pdf pkl ply png txt xml yaml yml"
 
-_INPUT = """
---boxes FILE  people to pose: {"people": [{"center": [x,y,z], "size": [l,w,h], "yaw": rad}]}, .npy rows, KITTI labels
---calib FILE  KITTI's calibration (default: calib/N.txt beside label_2)
---crop  the file holds one person (assumed under 4 m across)
-"""
 _FRAME = """
 --sensor-origin X,Y,Z  sensor position, or unknown (default: ORIGIN)
 --up AXIS = z  what is up: z (default), y or x, -y where y points down (cameras), or a direction x,y,z
@@ -33,83 +28,62 @@ _SEARCH = """
 --min-score P  least probability that it is a person, 0 to 1 (default: about one false person a scan)
 --range M  how far from the sensor, m (default 40)
 --max-people N  only the N surest
+--background FILE+  what stands still about a fixed sensor: a file of static points, several scans, or a folder of scans
 """
-_OUTPUT = """
+_PREDICT = f"""
+estimate the poses of the people in a point file, a folder of them or a recording
+Finds the people in a scan, unless there are boxes or the file holds one person, and writes STEM.poses.json: every
+ person's joints, in meters and in the file's own frame. Of a folder or a recording it writes NAME.poses.jsonl, a line
+ a frame; stopped, the same command goes on. Files of the same name are replaced.
+$ lidarpose predict sweep.pcd --picture
+$ lidarpose predict sweep.pcd --boxes people.json
+$ lidarpose predict person.ply --crop --out person.csv
+$ lidarpose predict drive/ --track
+$ lidarpose predict street.mcap --every 2 --format parquet
+<source> FILE+  {_FILES}; a folder, a pattern, several files, or a recording
+[what is in the file]
+--boxes FILE  people to pose: {{"people": [{{"center": [x,y,z], "size": [l,w,h], "yaw": rad}}]}}, .npy rows, KITTI
+ labels
+--calib FILE  KITTI's calibration (default: calib/N.txt beside label_2)
+--crop  the file holds one person (assumed under 4 m across)
+{_FRAME.replace("ORIGIN", "unknown for one person, else 0,0,0")}
+[who is looked for, without boxes]
+--find  look for people in a file under 4 m across too
+{_SEARCH}
+[folders and recordings]
+{recordings.FRAMES}
+[output]
 --out PATH = .  a folder, a .json or .csv file (default: the current folder); - prints the JSON
 --picture  also draw STEM.poses.png, or FILE.png
 --html  also write STEM.poses.html: everybody in 3D, the scan too
 --skeleton NAME  smpl24, human15, waymo14, itop14 or body26 (default smpl24, else the network's own)
-"""
-_NETWORK = f"""
+[network]
 --weights NAME|FILE = {DEFAULT}  {NAMES}, a checkpoint, or an exported .onnx
 --backend NAME  onnx or torch (default onnx for bundled weights and .onnx, torch for .safetensors and other devices)
 --device NAME = cpu  cpu (default), or cuda (backend torch)
 --decode NAME = window  how heatmaps are decoded: window (default), argmax or dark
 --tta N = 4  test-time augmentation: average N predictions of each person, 1 to 8 (default 4)
 """
+_DETECT = f"""
+find the people in a point file
+Writes STEM.boxes.json: a box for each person found, surest first, with its score, the probability that it is a person.
+ `lidarpose predict --boxes` takes the file.
+$ lidarpose detect sweep.pcd --out people.json
+$ lidarpose detect sweep.pcd --min-score 0.3 --background recording/
+<file> FILE  {_FILES}
+[what is in the file]
+{_FRAME.replace("ORIGIN", "0,0,0")}
+[who is looked for]
+{_SEARCH}
+[output]
+--out PATH = .  a folder, or a .json file (default: the current folder); - prints it
+"""
 
 
 def add(commands) -> None:
     """Adds the commands to the parser's."""
-    _add_predict(commands)
-    _add_detect(commands)
-
-
-def _add_predict(commands) -> None:
-    predict = add_command(
-        commands,
-        "predict",
-        "estimate the poses of the people in a point file, a folder of them or a recording",
-        "lidarpose predict sweep.pcd --picture",
-        "lidarpose predict sweep.pcd --boxes people.json",
-        "lidarpose predict person.ply --crop --out person.csv",
-        "lidarpose predict drive/ --track",
-        "lidarpose predict street.mcap --every 2 --format parquet",
-        description="Finds the people in a scan, unless there are boxes or the file holds one person, and writes "
-        "STEM.poses.json: every person's joints, in meters and in the file's own frame. Of a folder or a recording it "
-        "writes NAME.poses.jsonl, a line a frame; stopped, the same command goes on. Files of the same name are "
-        "replaced.",
-    )
-    predict.set_defaults(run=_predict)
-    predict.add_argument(
-        "source", metavar="FILE", nargs="+", help=f"{_FILES}; a folder, a pattern, several files, or a recording"
-    )
-    add_options(
-        predict.add_argument_group("what is in the file"), _INPUT + _frame("unknown for one person, else 0,0,0")
-    )
-    search = predict.add_argument_group("who is looked for, without boxes")
-    _add_search(search, "--find  look for people in a file under 4 m across too")
-    recordings.add_frame_options(predict)
-    add_options(predict.add_argument_group("output"), _OUTPUT)
-    add_options(predict.add_argument_group("network"), _NETWORK)
-
-
-def _add_detect(commands) -> None:
-    detect = add_command(
-        commands,
-        "detect",
-        "find the people in a point file",
-        "lidarpose detect sweep.pcd --out people.json",
-        "lidarpose detect sweep.pcd --min-score 0.3 --background recording/",
-        description="Writes STEM.boxes.json: a box for each person found, surest first, with its score, the "
-        "probability that it is a person. `lidarpose predict --boxes` takes the file.",
-    )
-    detect.set_defaults(run=_detect)
-    detect.add_argument("file", metavar="FILE", help=_FILES)
-    add_options(detect.add_argument_group("what is in the file"), _frame("0,0,0"))
-    _add_search(detect.add_argument_group("who is looked for"))
-    out = "--out PATH = .  a folder, or a .json file (default: the current folder); - prints it"
-    add_options(detect.add_argument_group("output"), out)
-
-
-def _frame(origin: str) -> str:
-    return _FRAME.replace("ORIGIN", origin)
-
-
-def _add_search(search, first: str = "") -> None:
-    add_options(search, first + _SEARCH)
-    words = "what stands still about a fixed sensor: a file of static points, several scans, or a folder of scans"
-    search.add_argument("--background", nargs="+", metavar="FILE", help=words)
+    add_command(commands, "predict", _predict, _PREDICT)
+    add_command(commands, "detect", _detect, _DETECT)
 
 
 def _predict(options: argparse.Namespace) -> None:

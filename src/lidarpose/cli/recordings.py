@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from lidarpose._version import __version__
-from lidarpose.cli.terminal import add_options, tell
+from lidarpose.cli.terminal import option_names, tell
 from lidarpose.errors import InputError
 
-_FRAMES = """
+# options of folders and recordings
+FRAMES = """
 --track  join people over time, and make their poses steady
 --live  tracks made steady by the past alone, as they come
 --world  joints in the world's frame, where it is known
@@ -21,24 +22,17 @@ _FRAMES = """
 --start S  seconds from the first frame
 --end S  seconds from the first frame
 --every N  only every N-th frame
+--format {jsonl,csv,parquet}  of NAME.poses.FORMAT (default jsonl)
 """
 # what a user reads of warnings that many frames have
 _MOST_WARNINGS = 8
-
-
-def add_frame_options(parser: argparse.ArgumentParser) -> None:
-    """The options of many frames."""
-    frames = parser.add_argument_group("folders and recordings")
-    only = add_options(frames, _FRAMES)
-    frames.add_argument("--format", choices=("jsonl", "csv", "parquet"), help="of NAME.poses.FORMAT (default jsonl)")
-    parser.set_defaults(of_frames=("format", *only))
 
 
 def is_recording(options: argparse.Namespace) -> bool:
     """Whether the command is about many frames rather than one plain file."""
     from lidarpose.io.sources import is_single_scan
 
-    if any(getattr(options, name) not in (None, False) for name in options.of_frames):
+    if any(getattr(options, name) not in (None, False) for name in option_names(FRAMES)):
         return True
     return not is_single_scan(options.source)
 
@@ -109,7 +103,7 @@ def _print_lines(options: argparse.Namespace, source, steps) -> None:
 
 def _command(options: argparse.Namespace) -> dict[str, Any]:
     """All that the poses of frames depend on."""
-    ignored = ("run", "command", "quiet", "out", "format", "picture", "world", "source", "of_frames")
+    ignored = ("run", "command", "quiet", "out", "format", "picture", "world", "source")
     command = {name: value for name, value in vars(options).items() if name not in ignored}
     weights = os.stat(options.weights).st_mtime_ns if os.path.isfile(options.weights) else None
     sources = [os.path.abspath(path) for path in options.source]

@@ -3,6 +3,7 @@
 import argparse
 import re
 import sys
+from collections.abc import Callable
 from typing import Any
 
 from lidarpose.io.files import one_line
@@ -16,42 +17,67 @@ class _Help(argparse.HelpFormatter):
         return text if text.startswith("example") else super()._fill_text(text, width, indent)
 
 
-def add_command(
-    commands, name: str, help: str, *examples: str, description: str | None = None
-) -> argparse.ArgumentParser:
-    """A command's parser. help: in the list of commands; examples: command lines, shown under its options."""
-    lines = "\n".join(f"  {line}" for line in examples)
-    epilog = f"example{'s' * (len(examples) > 1)}:\n{lines}"
-    description = description or f"{help[0].upper()}{help[1:]}."
-    parser = commands.add_parser(name, help=help, description=description, epilog=epilog, formatter_class=_Help)
-    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only, no notes and no progress")
-    return parser
-
-
 # the metavar of an option tells its type; others are text
 _TYPES = {"N": int, "K": int} | dict.fromkeys(("P", "M", "S", "HZ", "H", "SHARE"), float)
 # stands for a change of the scene
 KEEP = "--keep R  laser mask: every sample keeps a share R of its patches, the paper's r_keep; as --set keep=R"
 
 
-def add_options(parser, table: str) -> dict[str, Any]:
-    """Adds options to a parser or a group, and returns their defaults by name.
+def add_command(commands, name: str, run: Callable[[argparse.Namespace], None], text: str) -> argparse.ArgumentParser:
+    """Adds a command that is written as its help reads.
 
-    table: a line each, `--name METAVAR = DEFAULT  help`, which lines that begin with a blank continue; an option
-    without a metavar is on or off, one without a default is None.
+    text: what the list of commands says; the description, by default the same; examples, `$ lidarpose ...`; arguments
+    and options, see `add_options`. Lines that begin with a blank continue.
     """
-    defaults: dict[str, Any] = {}
-    for line in filter(None, re.sub(r"\n +", " ", table).splitlines()):
+    help, *lines = _lines(text)
+    examples = [line[2:] for line in lines if line.startswith("$ ")]
+    epilog = "\n  ".join([f"example{'s' * (len(examples) > 1)}:", *examples])
+    description = " ".join(line for line in lines if line[0] not in "$<-[") or f"{help[0].upper()}{help[1:]}."
+    parser = commands.add_parser(name, help=help, description=description, epilog=epilog, formatter_class=_Help)
+    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only, no notes and no progress")
+    parser.set_defaults(run=run)
+    add_options(parser, "\n".join(line for line in lines if line[0] in "<-["))
+    return parser
+
+
+def add_options(parser, table: str) -> None:
+    """Adds arguments and options to a parser or a group, a line each.
+
+    `--name METAVAR = DEFAULT  help` is an option, None without a default; without a metavar it is on or off, `REQUIRED`
+    says that it is; `--name:key` has another key in the namespace. `<name> METAVAR  help` is an argument. Behind a
+    metavar argparse's `?`, `*` or `+` says how many values there are, `&` that the option may be repeated; `{a,b}` are
+    choices. `[title]` begins a group.
+    """
+    target = parser
+    for line in _lines(table):
+        if line.startswith("["):
+            target = parser.add_argument_group(line[1:-1])
+            continue
         spec, words = line.split("  ", 1)
-        option, _, default = spec.partition(" = ")
-        flags, *metavar = option.split(" ")
-        style: dict[str, Any] = {"action": "store_true"}
-        if metavar:
-            kind = _TYPES.get(metavar[0], str)
-            style = {"type": kind, "metavar": metavar[0], "default": kind(default) if default else None}
-        action = parser.add_argument(*flags.split(","), help=words.strip(), **style)
-        defaults[action.dest] = action.default
-    return defaults
+        spec, _, default = spec.partition(" = ")
+        flags, *metavars = spec.split(" ")
+        flags, _, key = flags.strip("<>").partition(":")
+        style: dict[str, Any] = {"dest": key} if key else {}
+        if not metavars:
+            style["action"] = "store_true"
+        elif metavars[0].startswith("{"):
+            style["choices"] = metavars[0][1:-1].split(",")
+        else:
+            (metavar, count) = re.fullmatch(r"(.*?)([?*+&]?)", metavars[0]).groups()  # type: ignore[union-attr]
+            style |= {"metavar": metavar, "type": _TYPES.get(metavar, str)}
+            style |= {"action": "append"} if count == "&" else {"nargs": count} if count else {}
+        if default:
+            style |= {"required": True} if default == "REQUIRED" else {"default": style["type"](default)}
+        target.add_argument(*flags.split(","), help=words.strip(), **style)
+
+
+def option_names(table: str) -> list[str]:
+    """The options of a table by their keys in the namespace."""
+    return [name.replace("-", "_") for name in re.findall(r"^--([\w-]+)", table, re.M)]
+
+
+def _lines(text: str) -> list[str]:
+    return [line for line in re.sub(r"\n +", " ", text).splitlines() if line]
 
 
 def names(text: str) -> tuple[str, ...]:

@@ -12,12 +12,29 @@ from lidarpose.cli.terminal import KEEP, add_command, add_options, names, scene_
 from lidarpose.errors import InputError
 from lidarpose.train.recipes import TYPES, Finetune, PoseRecipe, Pretrain, Recipe, TrainDetector
 
-_WHAT = (
-    "{what} The run's folder holds config.json, log.jsonl, model.safetensors, best.safetensors, pictures, and "
-    "state.safetensors to resume from. After an interruption, --resume continues with the same losses. Several "
-    "processes: `torchrun --nproc_per_node N -m lidarpose {name} ...`, with the run's folder named."
-)
-_CALIBRATE = """
+_RUN = """
+ The run's folder holds config.json, log.jsonl, model.safetensors, best.safetensors, pictures, and state.safetensors to
+ resume from. After an interruption, --resume continues with the same losses. Several processes: `torchrun
+ --nproc_per_node N -m lidarpose COMMAND ...`, with the run's folder named."""
+_PRETRAIN = f"""
+train a network on synthesized people
+Trains on people synthesized during training, or on shards.{_RUN.replace("COMMAND", "pretrain")}
+$ lidarpose pretrain --people 300000
+$ lidarpose pretrain runs/pretrain-001 --resume
+"""
+_FINETUNE = f"""
+fine-tune a network on datasets that prepare wrote
+Trains on labeled people; each dataset supervises the joints that it labels.{_RUN.replace("COMMAND", "finetune")}
+$ lidarpose finetune humanm3 --epochs 20
+$ lidarpose finetune --out runs/finetune-001 --resume
+<data> DATASET*  folders written by lidarpose prepare; with --resume the run's own
+"""
+_DETECTOR = f"""
+train the network that finds people in whole scans
+Trains on scans synthesized during training.{_RUN.replace("COMMAND", "train-detector")}
+$ lidarpose train-detector --scenes 20000
+$ lidarpose train-detector runs/train-detector-001 --resume
+$ lidarpose train-detector runs/train-detector-001 --calibrate 300 --scans labeled
 --calibrate N  train nothing: write RUN/detector.onnx, its scores calibrated on N synthesized scans of what training
  never shows
 --scans DIR  with --calibrate: labeled real scans, as evaluate detector takes them; the default score lets one false
@@ -37,57 +54,24 @@ _PARSERS: dict[Any, Callable] = {
 
 def add(commands) -> None:
     """Adds the commands to the parser's."""
-    pretrain = add_command(
-        commands,
-        "pretrain",
-        "train a network on synthesized people",
-        "lidarpose pretrain --people 300000",
-        "lidarpose pretrain runs/pretrain-001 --resume",
-        description=_WHAT.format(name="pretrain", what="Trains on people synthesized during training, or on shards."),
-    )
-    finetune = add_command(
-        commands,
-        "finetune",
-        "fine-tune a network on datasets that prepare wrote",
-        "lidarpose finetune humanm3 --epochs 20",
-        "lidarpose finetune --out runs/finetune-001 --resume",
-        description=_WHAT.format(
-            name="finetune", what="Trains on labeled people; each dataset supervises the joints that it labels."
-        ),
-    )
-    finetune.add_argument(
-        "data", nargs="*", metavar="DATASET", help="folders written by lidarpose prepare; with --resume the run's own"
-    )
-    _add(pretrain, Pretrain)
-    _add(finetune, Finetune)
-    detector = add_command(
-        commands,
-        "train-detector",
-        "train the network that finds people in whole scans",
-        "lidarpose train-detector --scenes 20000",
-        "lidarpose train-detector runs/train-detector-001 --resume",
-        "lidarpose train-detector runs/train-detector-001 --calibrate 300 --scans labeled",
-        description=_WHAT.format(name="train-detector", what="Trains on scans synthesized during training."),
-    )
-    add_options(detector, _CALIBRATE)
-    _add(detector, TrainDetector)
+    for kind, text in ((Pretrain, _PRETRAIN), (Finetune, _FINETUNE), (TrainDetector, _DETECTOR)):
+        _add(add_command(commands, kind.kind, _train, text), kind)
 
 
 def _add(parser, kind: type[Recipe]) -> None:
-    name = kind.kind
-    parser.set_defaults(run=_train, kind=kind)
-    where = f"a new folder for the run (default runs/{name}-001, -002, ...); with --resume that of the run"
-    if kind is not Finetune:
-        parser.add_argument("folder", nargs="?", metavar="RUN", help=where)
-    else:
-        parser.add_argument("--out", dest="folder", metavar="RUN", help=where)
-    parser.add_argument("--resume", action="store_true", help="continue an interrupted run (default: the latest)")
+    parser.set_defaults(kind=kind)
+    run = "--out:folder RUN" if kind is Finetune else "<folder> RUN?"
     known = "default, paper, paper-one-stage; prn, lpformer, lidarcap, ne, as with --model; other options override it"
-    parser.add_argument("--recipe", metavar="NAME", help="default" if kind is TrainDetector else known)
-    parser.add_argument("--device", metavar="NAME", help="cpu (default: a GPU if there is one)")
-    parser.add_argument("--tracker", metavar="NAME", help="also log to tensorboard or wandb, if installed")
+    options = f"""
+{run}  a new folder for the run (default runs/{kind.kind}-001, -002, ...); with --resume that of the run
+--resume  continue an interrupted run (default: the latest)
+--recipe NAME  {"default" if kind is TrainDetector else known}
+--device NAME  cpu (default: a GPU if there is one)
+--tracker NAME  also log to tensorboard or wandb, if installed
+"""
+    add_options(parser, options)
     # first the settings of this kind of training, then those that all have
-    own = parser.add_argument_group(f"settings of {name}")
+    own = parser.add_argument_group(f"settings of {kind.kind}")
     common = parser.add_argument_group("settings of optimizer and run")
     if kind is Pretrain:
         add_options(own, KEEP)

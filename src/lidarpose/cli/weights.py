@@ -10,50 +10,45 @@ from pathlib import Path
 from typing import Any, cast
 
 from lidarpose._version import __version__
-from lidarpose.cli.terminal import add_command, add_options, tell
+from lidarpose.cli.terminal import add_command, tell
 from lidarpose.models import BUNDLED, DEFAULT, bundled_path
 
-_EXPORT = """
+_INFO = """
+show versions, device, bundled weights and their scores
+$ lidarpose info
+-v,--verbose  also how the weights were trained, and all scores
+--json  print everything as JSON
+"""
+_MODELS = """
+list the networks: joints, frames, parameters
+$ lidarpose models --json
+--json  print them as JSON
+"""
+_EXPORT = f"""
+write weights as ONNX or as a torch.export program
+Converts a checkpoint to one file of another format, for any number of people and points. A file of the same name is
+ replaced.
+$ lidarpose export mine.safetensors
+<weights> NAME|FILE? = {DEFAULT}  default {DEFAULT}
 --format NAME = onnx  onnx (default) or torch (a .pt2 program)
 --out FILE  default STEM.onnx or STEM.pt2, in the current folder
+"""
+_IMPORT = """
+convert released DAPT weights to a checkpoint
+Converts weights that DAPT's authors released, saved as safetensors, to a checkpoint for predict.
+$ lidarpose import dapt_waymo.safetensors waymo.safetensors --config waymo
+<file> file  the released weights, as .safetensors
+<out> OUT  the checkpoint to write (.safetensors)
+--config NAME  waymo, humanm3, lidarhuman26m, sloper4d, pretrain or paper (default: as the file says)
 """
 
 
 def add(commands) -> None:
     """Adds the commands to the parser's."""
-    info = add_command(commands, "info", "show versions, device, bundled weights and their scores", "lidarpose info")
-    info.set_defaults(run=_info)
-    words = "-v,--verbose  also how the weights were trained, and all scores\n--json  print everything as JSON"
-    add_options(info, words)
-
-    models = add_command(commands, "models", "list the networks: joints, frames, parameters", "lidarpose models --json")
-    models.set_defaults(run=_models)
-    add_options(models, "--json  print them as JSON")
-
-    export = add_command(
-        commands,
-        "export",
-        "write weights as ONNX or as a torch.export program",
-        "lidarpose export mine.safetensors",
-        description="Converts a checkpoint to one file of another format, for any number of people and points. A file "
-        "of the same name is replaced.",
-    )
-    export.set_defaults(run=_export)
-    export.add_argument("weights", nargs="?", default=DEFAULT, metavar="NAME|FILE", help=f"default {DEFAULT}")
-    add_options(export, _EXPORT)
-
-    take = add_command(
-        commands,
-        "import",
-        "convert released DAPT weights to a checkpoint",
-        "lidarpose import dapt_waymo.safetensors waymo.safetensors --config waymo",
-        description="Converts weights that DAPT's authors released, saved as safetensors, to a checkpoint for predict.",
-    )
-    take.set_defaults(run=_import)
-    take.add_argument("file", help="the released weights, as .safetensors")
-    take.add_argument("out", metavar="OUT", help="the checkpoint to write (.safetensors)")
-    known = "waymo, humanm3, lidarhuman26m, sloper4d, pretrain or paper (default: as the file says)"
-    add_options(take, f"--config NAME  {known}")
+    add_command(commands, "info", _info, _INFO)
+    add_command(commands, "models", _models, _MODELS)
+    add_command(commands, "export", _export, _EXPORT)
+    add_command(commands, "import", _import, _IMPORT)
 
 
 def _info(options: argparse.Namespace) -> None:
