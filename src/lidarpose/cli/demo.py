@@ -23,6 +23,8 @@ def run(folder: str | Path, *, seed: int, weights: str = DEFAULT) -> None:
 
     Raises MissingExtra without numba; InputError for a negative seed or a folder that cannot be written.
     """
+    import pandas
+
     from lidarpose.synth.generator import Generator
     from lidarpose.synth.scene import scene_config
 
@@ -44,7 +46,7 @@ def run(folder: str | Path, *, seed: int, weights: str = DEFAULT) -> None:
     with ExitStack() as stack:
         for name, content in contents.items():
             stack.enter_context(atomic_path(folder / name)).write_bytes(content)
-    print(_table(rows))
+    print(pandas.DataFrame(rows).to_string(index=False))
     print(f"open {folder / 'index.html'} to turn the people in 3D; pictures: {folder}/*.png")
 
 
@@ -86,16 +88,3 @@ def _report(model: Predictor, people: list) -> tuple[list[dict], dict[str, bytes
     title = "lidarpose demo: synthesized people, predicted and true"
     contents["index.html"] = render_report(panels, title=title, summary=rows).encode()
     return rows, contents
-
-
-def _table(rows: list[dict]) -> str:
-    """Rows of the same keys as text, numbers to the right."""
-    names = list(rows[0])
-    cells = [names] + [[str(row[name]) for name in names] for row in rows]
-    widths = [max(len(line[k]) for line in cells) for k in range(len(names))]
-    return "\n".join(
-        "  ".join(
-            f"{cell:<{w}}" if k == 0 else f"{cell:>{w}}" for k, (cell, w) in enumerate(zip(line, widths, strict=True))
-        )
-        for line in cells
-    )

@@ -79,9 +79,7 @@ def predict_recording(
     )
     if ways is not None and picture is not None:
         write_atomic(picture, ways.draw(source, steps.wanted, title=Path(source.name).name))
-    for line in [*source.warnings, *summary.warning_lines(_MOST_WARNINGS)]:
-        tell(f"lidarpose: warning: {line}")
-    tell(f"{summary.text(steps.is_tracked)} -> {' and '.join(str(path) for path in (result, picture) if path)}")
+    _report(source, steps, summary, f" -> {' and '.join(str(path) for path in (result, picture) if path)}")
 
 
 def _print_lines(options: argparse.Namespace, source, steps) -> None:
@@ -96,9 +94,13 @@ def _print_lines(options: argparse.Namespace, source, steps) -> None:
         line = in_world(line, steps.up) if options.world else line
         summary.add(line)
         print(json.dumps(line), flush=True)
+    _report(source, steps, summary)
+
+
+def _report(source, steps, summary, outputs: str = "") -> None:
     for line in [*source.warnings, *summary.warning_lines(_MOST_WARNINGS)]:
         tell(f"lidarpose: warning: {line}")
-    tell(summary.text(steps.is_tracked))
+    tell(summary.text(steps.is_tracked) + outputs)
 
 
 def _command(options: argparse.Namespace) -> dict[str, Any]:

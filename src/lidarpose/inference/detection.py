@@ -241,14 +241,13 @@ def _thinned(scan: Scan, search: Search) -> tuple[Scan, list[str]]:
         # drawn in equal shares: a fixed step would keep single beams of organized clouds
         step = np.random.default_rng(0).random(_MOST_POINTS)
         drawn = ((np.arange(_MOST_POINTS) + step) * (number / _MOST_POINTS)).astype(np.int64)
-        ends = np.cumsum([0, *(np.count_nonzero(inside[start : start + _CHUNK]) for start in starts)])
-        pieces = np.split(drawn, np.searchsorted(drawn, ends[1:-1]))
-        rows = np.concatenate(
-            [
-                start + np.flatnonzero(inside[start : start + _CHUNK])[own - end]
-                for start, own, end in zip(starts, pieces, ends[:-1], strict=True)
-            ]
-        )
+        chosen, before = [], 0
+        for start in starts:
+            own = start + np.flatnonzero(inside[start : start + _CHUNK])
+            first, last = np.searchsorted(drawn, (before, before + len(own)))
+            chosen.append(own[drawn[first:last] - before])
+            before += len(own)
+        rows = np.concatenate(chosen)
         notes = [f"thinned from {number:,} to {len(rows):,} points to search them: give one scan at a time, or a part"]
     return replace(scan, points=points[rows]), notes
 

@@ -8,6 +8,7 @@ import bz2
 import sqlite3
 import struct
 import sys
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass
@@ -91,7 +92,7 @@ class _Bytes:
         return _text(self.take(self.number("I")))
 
 
-class RecordFile:
+class RecordFile(ABC):
     """A file of records, some of which are chunks of records.
 
     topics: by name; num_damaged, damage: chunks that could not be unpacked since reading last began, and why.
@@ -111,32 +112,36 @@ class RecordFile:
         with open(path, "rb") as file:
             if file.read(len(self.MAGIC)) != self.MAGIC:
                 raise FormatError(f"is no {path.suffix} file, though its name says so; convert or rename it")
-            try:
-                start = self._index_start(file)
-                for kind, topic, count, *_ in self._learned(file, start) if start else ():
-                    self.topics[topic].count += count if kind == "count" else 0
-            except (FormatError, struct.error):
-                self.topics.clear()
-            if any(topic.count for topic in self.topics.values()):
+            if self._has_index(file):
                 return
             try:
-                for kind, topic, *_ in self._learned(file):
+                for kind, topic, *_ in self._by_topic(file):
                     self.topics[topic].count += kind == "message"
             except FormatError:
-                # told where the messages end
+                # `messages` raises it where the file ends
                 if not self.topics:
                     raise FormatError("is cut off or damaged before its first message; record it anew") from None
+
+    def _has_index(self, file: BinaryIO) -> bool:
+        """Whether the file ends with an index of its topics, which is read."""
+        try:
+            start = self._index_start(file)
+            for kind, topic, count, *_ in self._by_topic(file, start) if start else ():
+                self.topics[topic].count += count if kind == "count" else 0
+        except (FormatError, struct.error):
+            self.topics.clear()
+        return any(topic.count for topic in self.topics.values())
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
         """Those of some topics. Raises FormatError where the file is damaged; what is before it has come."""
         self.num_damaged = 0
         with open(self.path, "rb") as file:
-            for kind, topic, *content in self._learned(file):
+            for kind, topic, *content in self._by_topic(file):
                 if kind == "message" and topic in topics:
                     time, size, stream = content
                     yield Message(topic, time, stream.take(size))
 
-    def _learned(self, file: BinaryIO, start: int = 0) -> Iterator[tuple]:
+    def _by_topic(self, file: BinaryIO, start: int = 0) -> Iterator[tuple]:
         """Messages and counts as of `_records` from a place on, with the topic for the id. Fills `topics`."""
         channels: dict[Any, str] = {}
         start = start or len(self.MAGIC)
@@ -163,14 +168,14 @@ class RecordFile:
         if is_cut:
             raise FormatError(_CUT_OFF)
 
+    @abstractmethod
     def _index_start(self, file: BinaryIO) -> int:
         """Where the index begins, 0 if there is none."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _records(self, stream: _Bytes, is_chunk: bool = False) -> Iterator[tuple]:
-        """What is told, in chunks too: ("channel", id, topic, type, encoding), ("count", id, messages), and
+        """Records, those in chunks too: ("channel", id, topic, type, encoding), ("count", id, messages), and
         ("message", id, time ns, size, stream); what is not taken from the stream is skipped."""
-        raise NotImplementedError
 
 
 class McapFile(RecordFile):
