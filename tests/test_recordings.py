@@ -13,7 +13,8 @@ from lidarpose.cli import main
 from lidarpose.geometry import rotation_about
 from lidarpose.io.sources.frame import Frame, FrameSource, IndexedRecording, Sweep
 from lidarpose.lidar.raycast import scan
-from lidarpose.recording import output, picture
+from lidarpose.recording import output, picture, tables
+from lidarpose.recording.coordinates import in_world
 from lidarpose.recording.frame_boxes import FrameBoxes
 from lidarpose.recording.predict_recording import FramePredictor
 from lidarpose.synth.bodies import draw_bodies
@@ -174,11 +175,11 @@ def test_finished_lines_of_other_frames_are_an_error(drive, folder, monkeypatch,
 def test_csv_and_parquet_have_a_row_a_person_and_joint(tracked, tmp_path):
     pytest.importorskip("pyarrow")
     lines, _ = tracked
-    tables = []
+    made = []
     for name, read in (("a.csv", pandas.read_csv), ("a.parquet", pandas.read_parquet)):
-        output.write_result(tmp_path / name, lines)
-        tables.append(read(tmp_path / name))
-    csv, parquet = tables
+        tables.write_result(tmp_path / name, lines)
+        made.append(read(tmp_path / name))
+    csv, parquet = made
     people = [(line, person) for line in lines for person in line["people"]]
     assert len(csv) == len(parquet) == 24 * len(people)
     line, person = people[-1]
@@ -187,7 +188,7 @@ def test_csv_and_parquet_have_a_row_a_person_and_joint(tracked, tmp_path):
     assert [row.x, row.y, row.z] == person["joints"][0] and row.spread == person["spread"][0]
     np.testing.assert_allclose(csv[["x", "y", "z", "confidence"]], parquet[["x", "y", "z", "confidence"]])
     # nobody in all frames: the columns are there
-    output.write_result(tmp_path / "none.parquet", [line | {"people": []} for line in lines])
+    tables.write_result(tmp_path / "none.parquet", [line | {"people": []} for line in lines])
     none = pandas.read_parquet(tmp_path / "none.parquet")
     assert len(none) == 0 and list(none.columns) == list(parquet.columns) and none.dtypes.equals(parquet.dtypes)
 
@@ -220,7 +221,7 @@ def test_tracks_of_a_moving_sensor_live_in_the_world(clouds, model):
     assert [{person.id for person in frame.poses} for frame in frames] == [{0, 1}] * FRAMES
     first = {person.id: person.joints.mean(0) for person in frames[0].poses}
     for frame in frames:
-        line = output.in_world(frame.to_dict())
+        line = in_world(frame.to_dict())
         assert line["coordinates"] == "world"
         for track, at in places(line).items():
             start = first[track] @ frames[0].T_world_sensor[:3, :3].T + frames[0].T_world_sensor[:3, 3]

@@ -84,7 +84,8 @@ def predict_recording(
 
 def _print_lines(options: argparse.Namespace, source, steps) -> None:
     """Frames as they come, on the standard output."""
-    from lidarpose.recording.output import Summary, in_world
+    from lidarpose.recording.coordinates import in_world
+    from lidarpose.recording.output import Summary
 
     if steps.is_tracked and not steps.live:
         raise InputError("--out - prints frames as they come: say --live, which needs no later frames, or name a file")

@@ -1,9 +1,11 @@
 """Coordinates of a recording: those of the sensor, in which points are, and of the fixed frame, in which tracks live:
 the world's where the sensor's poses are known, else the sensor's with z up."""
 
+from typing import Any
+
 import numpy as np
 
-from lidarpose.geometry import UP_AXES, rigid_transform
+from lidarpose.geometry import UP_AXES, rigid_transform, transform_points
 
 
 class FixedFrame:
@@ -32,3 +34,25 @@ def moved_yaw(yaw: float, T: np.ndarray, R_from: np.ndarray | None = None, R_to:
     heading = T[:3, :3] @ (heading if R_from is None else R_from.T @ heading)
     x, y, _ = heading if R_to is None else R_to @ heading
     return float(np.arctan2(y, x))
+
+
+def in_world(line: dict[str, Any], up: str = "z") -> dict[str, Any]:
+    """The line with joints and boxes in the world's frame, where the sensor's pose is known. up: of the sensor's."""
+    if line["T_world_sensor"] is None:
+        return line
+    T = np.array(line["T_world_sensor"])
+    people = []
+    for person in line["people"]:
+        moved: dict[str, Any] = {}
+        if person["joints"] is not None:
+            moved["joints"] = moved_points(T, person["joints"])
+        if (box := person["box"]) is not None:
+            yaw = moved_yaw(box["yaw"], T, upright(up))
+            moved["box"] = box | {"center": moved_points(T, box["center"]), "yaw": yaw}
+        people.append(person | moved)
+    return line | {"people": people, "coordinates": "world"}
+
+
+def moved_points(T: np.ndarray, points: Any) -> list:
+    """Points (..., 3) m moved by T (4, 4), as lines hold them."""
+    return transform_points(T, np.asarray(points)).round(4).tolist()

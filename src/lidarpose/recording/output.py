@@ -1,4 +1,4 @@
-"""NAME.poses.jsonl, .csv and .parquet: results of recordings that grow as they are made and go on after a kill.
+"""Results of recordings that grow as they are made and go on after a kill.
 
 While frames come, RESULT.part holds a finished line each, and RESULT.part.json beside it how it is made and what the
 frames so far said of the next ones. At the end the lines become the result, whole.
@@ -8,32 +8,19 @@ import json
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from lidarpose.errors import missing_extra
-from lidarpose.geometry import transform_points
-from lidarpose.io.files import atomic_path, check_writable, file_error
+from lidarpose.io.files import check_writable, file_error
 from lidarpose.io.sources import Source
 from lidarpose.progress import Progress
-from lidarpose.recording.coordinates import FixedFrame, moved_yaw, upright
+from lidarpose.recording.coordinates import in_world
 from lidarpose.recording.predict_recording import FramePoses, FramePredictor
-from lidarpose.sample import PER_JOINT, Pose
-from lidarpose.tracking.clip import TrackPoses
-from lidarpose.tracking.smoothing import smooth
-
-FORMATS = ("jsonl", "csv", "parquet")
-# what is made steady besides the joints, and its decimals
-_SMOOTHED = {"spread": 4, "visible": 3, "confidence": 3}
-# frames whose rows are written at a time
-_ROWS_OF = 200
-_COLUMNS = ("frame", "frame_id", "time", "person", "id", "track", "filled", "joint", "x", "y", "z", *PER_JOINT, "score")
+from lidarpose.recording.steady_tracks import steadied
+from lidarpose.recording.tables import check_format, write_result
 
 
 class PartFile:
@@ -156,9 +143,6 @@ def counted(number: int, one: str, many: str | None = None) -> str:
     return f"{number:,} {one if number == 1 else many or one + 's'}"
 
 
-# ---- the whole result
-
-
 def write_recording(
     source: Source,
     steps: FramePredictor,
@@ -194,7 +178,8 @@ def write_recording(
         if not part.frames:
             part.remove()
             raise file_error(source.name, "has no frames between start and end: choose others")
-        lines = steadied(part, steps) if steps.is_tracked and not steps.live else part.lines()
+        is_smoothed = steps.is_tracked and not steps.live
+        lines = steadied(part.lines, steps.up, steps.wanted) if is_smoothed else part.lines()
 
         def final() -> Iterator[dict[str, Any]]:
             for line in lines:
@@ -225,168 +210,3 @@ def _add_frames(source: Source, steps: FramePredictor, part: PartFile) -> None:
             part.append(done, steps.state())
             shown.update(part.frames)
     steps.check_boxes(part.last)
-
-
-def write_result(path: Path, lines: Iterable[dict[str, Any]]) -> None:
-    """Writes lines as the format that the file's name says, whole or not at all.
-
-    Raises InputError where it cannot be written, MissingExtra for Parquet without pyarrow.
-    """
-    suffix = path.suffix.lower()
-    with atomic_path(path) as temporary:
-        if suffix == ".jsonl":
-            with open(temporary, "w", encoding="utf-8") as file:
-                file.writelines(json.dumps(line) + "\n" for line in lines)
-        elif suffix == ".csv":
-            for number, table in enumerate(_tables(lines)):
-                table.to_csv(temporary, index=False, mode="a" if number else "w", header=not number)
-        elif suffix == ".parquet":
-            _write_parquet(temporary, lines)
-        else:
-            raise file_error(path, f"expected a name that ends in .{' .'.join(FORMATS)}, got {suffix or 'none'}")
-
-
-def check_format(path: Path) -> None:
-    """Raises MissingExtra where a format cannot be written, before the work."""
-    if path.suffix.lower() == ".parquet":
-        try:
-            import pyarrow.parquet  # noqa: F401
-        except ModuleNotFoundError as error:
-            raise missing_extra(error, "writing Parquet", "synth") from None
-
-
-def _write_parquet(path: Path, lines: Iterable[dict[str, Any]]) -> None:
-    import pyarrow
-    import pyarrow.parquet
-
-    writer = None
-    for table in _tables(lines):
-        rows = pyarrow.Table.from_pandas(table, preserve_index=False)
-        writer = writer or pyarrow.parquet.ParquetWriter(path, rows.schema)
-        writer.write_table(rows)
-    if writer is not None:
-        writer.close()
-
-
-def _tables(lines: Iterable[dict[str, Any]]) -> Iterator[Any]:
-    """Data frames of a row a frame, person and joint, of some frames at a time; of the same types all, one at least."""
-    import pandas
-
-    remaining = iter(lines)
-    for first in chain(islice(remaining, 1), [None]):
-        # the first table, or an empty one
-        some = [] if first is None else [first, *islice(remaining, _ROWS_OF - 1)]
-        while some or first is None:
-            table = pandas.DataFrame([row for line in some for row in _rows(line)], columns=list(_COLUMNS))
-            table["id"] = table["id"].map(lambda id: None if id is None else str(id)).astype("string")
-            for name in ("frame_id", "joint"):
-                table[name] = table[name].astype("string")
-            types = {"frame": "int64", "person": "int64", "track": "Int64", "filled": "bool", "in_range": "boolean"}
-            others = set(_COLUMNS) - set(types) - {"id", "frame_id", "joint"}
-            yield table.astype(types | dict.fromkeys(others, "float64"))
-            some = list(islice(remaining, _ROWS_OF))
-            if not some:
-                return
-
-
-def _rows(line: dict[str, Any]) -> Iterator[tuple]:
-    joints = line["skeleton"]["joints"]
-    for number, person in enumerate(line["people"]):
-        if person["joints"] is None:
-            continue
-        of_person = (number, person["id"], person["track"], person["filled"])
-        known = [person[name] or [None] * len(joints) for name in ("confidence", "spread", "visible")]
-        for j, name in enumerate(joints):
-            values = (*(value[j] for value in known), name not in person["out_of_range"], person["score"])
-            yield line["frame"], line["id"], line["time"], *of_person, name, *person["joints"][j], *values
-
-
-def in_world(line: dict[str, Any], up: str = "z") -> dict[str, Any]:
-    """The line with joints and boxes in the world's frame, where the sensor's pose is known. up: of the sensor's."""
-    if line["T_world_sensor"] is None:
-        return line
-    T = np.array(line["T_world_sensor"])
-    people = []
-    for person in line["people"]:
-        moved: dict[str, Any] = {}
-        if person["joints"] is not None:
-            moved["joints"] = _transformed(T, person["joints"])
-        if (box := person["box"]) is not None:
-            yaw = moved_yaw(box["yaw"], T, upright(up))
-            moved["box"] = box | {"center": _transformed(T, box["center"]), "yaw": yaw}
-        people.append(person | moved)
-    return line | {"people": people, "coordinates": "world"}
-
-
-def _transformed(T: np.ndarray, points: Any) -> list:
-    return transform_points(T, np.asarray(points)).round(4).tolist()
-
-
-# ---- steady tracks
-
-
-def steadied(part: PartFile, steps: FramePredictor) -> Iterator[dict[str, Any]]:
-    """The lines with every track made steady, and people added where they were hidden."""
-    times: list[float] = []
-    to_fixed: list[np.ndarray] = []
-    is_damaged: list[bool] = []
-    # by track and row of the lines, in the fixed frame
-    tracks: dict[int, dict[int, Pose]] = {}
-    fixed = FixedFrame(steps.up)
-    for row, line in enumerate(part.lines()):
-        to_fixed.append(fixed.from_sensor(line["T_world_sensor"]))
-        times.append(np.nan if line["time"] is None else line["time"])
-        is_damaged.append(line["error"] is not None)
-        for person in line["people"]:
-            if person["joints"] is not None:
-                joints = transform_points(to_fixed[-1], np.array(person["joints"]))
-                others: dict[str, Any] = {
-                    name: np.array(person[name], np.float32) for name in _SMOOTHED if person[name]
-                }
-                pose = Pose(joints=joints, skeleton=steps.wanted, **others)
-                tracks.setdefault(person["track"], {})[row] = pose
-    steady: list[dict[int, tuple[Pose, bool]]] = [{} for _ in times]
-    for id in list(tracks):
-        for row, pose, is_filled in _steady(tracks.pop(id), np.array(times)):
-            if not is_damaged[row]:
-                steady[row][id] = pose, is_filled
-    for line, people, T_fixed_sensor in zip(part.lines(), steady, to_fixed, strict=True):
-        T_sensor_fixed = np.linalg.inv(T_fixed_sensor)
-        entries = {id: _entry(pose, T_sensor_fixed) | {"filled": filled} for id, (pose, filled) in people.items()}
-        people.clear()
-        yield line | {"people": list(_with_steady(line["people"], entries))}
-
-
-def _steady(poses: dict[int, Pose], times: np.ndarray) -> Iterator[tuple[int, Pose, bool]]:
-    """The smoothed poses of a track by row, first to last, and whether each was filled in. times: s, of all rows."""
-    rows = np.arange(min(poses), max(poses) + 1)
-    # time that stands still or jumps back cannot be smoothed over: such frames stay as they are
-    highest = np.maximum.accumulate(np.concatenate([[-np.inf], np.nan_to_num(times[rows], nan=-np.inf)]))[:-1]
-    rows = rows[times[rows] > highest]
-    skeleton = next(iter(poses.values())).skeleton
-    track = smooth(TrackPoses.of_poses(times[rows], [poses.get(row) for row in rows.tolist()], skeleton))
-    for i, row in enumerate(rows.tolist()):
-        if (pose := track.pose(i)) is not None:
-            yield row, pose, row not in poses
-
-
-def _entry(pose: Pose, T_sensor_fixed: np.ndarray) -> dict[str, Any]:
-    """What a line holds of a smoothed pose."""
-    known = {name: (getattr(pose, name), digits) for name, digits in _SMOOTHED.items()}
-    values = {
-        name: value.astype(np.float32).astype(float).round(digits).tolist()
-        for name, (value, digits) in known.items()
-        if value is not None
-    }
-    return values | {"joints": _transformed(T_sensor_fixed, pose.joints)}
-
-
-def _with_steady(people: list[dict[str, Any]], entries: dict[int, dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """People of a line, with what is smoothed of them, then those who were hidden."""
-    for person in people:
-        yield person | entries.pop(person["track"], {})
-    for id, entry in sorted(entries.items()):
-        nobody: dict[str, Any] = {"id": id, "num_points": 0}
-        nobody |= dict.fromkeys(("box", "score", "mounted", "person", "second_person", "joints"))
-        empty: dict[str, list] = {"confidence": [], "spread": [], "visible": [], "out_of_range": [], "warnings": []}
-        yield nobody | empty | {"track": id} | entry

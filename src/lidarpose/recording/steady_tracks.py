@@ -1,0 +1,89 @@
+"""The lines of a recording with the poses of every track smoothed."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from lidarpose.geometry import transform_points
+from lidarpose.recording.coordinates import FixedFrame, moved_points
+from lidarpose.sample import Pose
+from lidarpose.skeleton import Skeleton
+from lidarpose.tracking.clip import TrackPoses
+from lidarpose.tracking.smoothing import smooth
+
+# what is smoothed besides the joints, and its decimals
+_SMOOTHED = {"spread": 4, "visible": 3, "confidence": 3}
+
+
+def steadied(lines: Callable[[], Iterator[dict[str, Any]]], up: str, skeleton: Skeleton) -> Iterator[dict[str, Any]]:
+    """The lines with every track made steady, and people added where they were hidden.
+
+    Args:
+        lines: reads them, from the first.
+        up: of the points, as in `predict`.
+        skeleton: of the poses.
+    """
+    times: list[float] = []
+    to_fixed: list[np.ndarray] = []
+    is_damaged: list[bool] = []
+    # by track and row of the lines, in the fixed frame
+    tracks: dict[int, dict[int, Pose]] = {}
+    fixed = FixedFrame(up)
+    for row, line in enumerate(lines()):
+        to_fixed.append(fixed.from_sensor(line["T_world_sensor"]))
+        times.append(np.nan if line["time"] is None else line["time"])
+        is_damaged.append(line["error"] is not None)
+        for person in line["people"]:
+            if person["joints"] is not None:
+                joints = transform_points(to_fixed[-1], np.array(person["joints"]))
+                others: dict[str, Any] = {
+                    name: np.array(person[name], np.float32) for name in _SMOOTHED if person[name]
+                }
+                pose = Pose(joints=joints, skeleton=skeleton, **others)
+                tracks.setdefault(person["track"], {})[row] = pose
+    steady: list[dict[int, tuple[Pose, bool]]] = [{} for _ in times]
+    for id in list(tracks):
+        for row, pose, is_filled in _steady(tracks.pop(id), np.array(times)):
+            if not is_damaged[row]:
+                steady[row][id] = pose, is_filled
+    for line, people, T_fixed_sensor in zip(lines(), steady, to_fixed, strict=True):
+        T_sensor_fixed = np.linalg.inv(T_fixed_sensor)
+        entries = {id: _entry(pose, T_sensor_fixed) | {"filled": filled} for id, (pose, filled) in people.items()}
+        people.clear()
+        yield line | {"people": list(_with_steady(line["people"], entries))}
+
+
+def _steady(poses: dict[int, Pose], times: np.ndarray) -> Iterator[tuple[int, Pose, bool]]:
+    """The smoothed poses of a track by row, first to last, and whether each was filled in. times: s, of all rows."""
+    rows = np.arange(min(poses), max(poses) + 1)
+    # time that stands still or jumps back cannot be smoothed over: such frames stay as they are
+    highest = np.maximum.accumulate(np.concatenate([[-np.inf], np.nan_to_num(times[rows], nan=-np.inf)]))[:-1]
+    rows = rows[times[rows] > highest]
+    skeleton = next(iter(poses.values())).skeleton
+    track = smooth(TrackPoses.of_poses(times[rows], [poses.get(row) for row in rows.tolist()], skeleton))
+    for i, row in enumerate(rows.tolist()):
+        if (pose := track.pose(i)) is not None:
+            yield row, pose, row not in poses
+
+
+def _entry(pose: Pose, T_sensor_fixed: np.ndarray) -> dict[str, Any]:
+    """What a line holds of a smoothed pose."""
+    known = {name: (getattr(pose, name), digits) for name, digits in _SMOOTHED.items()}
+    values = {
+        name: value.astype(np.float32).astype(float).round(digits).tolist()
+        for name, (value, digits) in known.items()
+        if value is not None
+    }
+    return values | {"joints": moved_points(T_sensor_fixed, pose.joints)}
+
+
+def _with_steady(people: list[dict[str, Any]], entries: dict[int, dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """People of a line, with what is smoothed of them, then those who were hidden."""
+    for person in people:
+        yield person | entries.pop(person["track"], {})
+    for id, entry in sorted(entries.items()):
+        nobody: dict[str, Any] = {"id": id, "num_points": 0}
+        nobody |= dict.fromkeys(("box", "score", "mounted", "person", "second_person", "joints"))
+        empty: dict[str, list] = {"confidence": [], "spread": [], "visible": [], "out_of_range": [], "warnings": []}
+        yield nobody | empty | {"track": id} | entry

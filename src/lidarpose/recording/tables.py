@@ -1,0 +1,90 @@
+"""NAME.poses.jsonl, .csv and .parquet: the lines of a recording, written whole."""
+
+import json
+from collections.abc import Iterable, Iterator
+from itertools import chain, islice
+from pathlib import Path
+from typing import Any
+
+from lidarpose.errors import missing_extra
+from lidarpose.io.files import atomic_path, file_error
+from lidarpose.sample import PER_JOINT
+
+FORMATS = ("jsonl", "csv", "parquet")
+# frames whose rows are written at a time
+_ROWS_OF = 200
+_COLUMNS = ("frame", "frame_id", "time", "person", "id", "track", "filled", "joint", "x", "y", "z", *PER_JOINT, "score")
+
+
+def write_result(path: Path, lines: Iterable[dict[str, Any]]) -> None:
+    """Writes lines as the format that the file's name says, whole or not at all.
+
+    Raises InputError where it cannot be written, MissingExtra for Parquet without pyarrow.
+    """
+    suffix = path.suffix.lower()
+    with atomic_path(path) as temporary:
+        if suffix == ".jsonl":
+            with open(temporary, "w", encoding="utf-8") as file:
+                file.writelines(json.dumps(line) + "\n" for line in lines)
+        elif suffix == ".csv":
+            for number, table in enumerate(_tables(lines)):
+                table.to_csv(temporary, index=False, mode="a" if number else "w", header=not number)
+        elif suffix == ".parquet":
+            _write_parquet(temporary, lines)
+        else:
+            raise file_error(path, f"expected a name that ends in .{' .'.join(FORMATS)}, got {suffix or 'none'}")
+
+
+def check_format(path: Path) -> None:
+    """Raises MissingExtra where a format cannot be written, before the work."""
+    if path.suffix.lower() == ".parquet":
+        try:
+            import pyarrow.parquet  # noqa: F401
+        except ModuleNotFoundError as error:
+            raise missing_extra(error, "writing Parquet", "synth") from None
+
+
+def _write_parquet(path: Path, lines: Iterable[dict[str, Any]]) -> None:
+    import pyarrow
+    import pyarrow.parquet
+
+    writer = None
+    for table in _tables(lines):
+        rows = pyarrow.Table.from_pandas(table, preserve_index=False)
+        writer = writer or pyarrow.parquet.ParquetWriter(path, rows.schema)
+        writer.write_table(rows)
+    if writer is not None:
+        writer.close()
+
+
+def _tables(lines: Iterable[dict[str, Any]]) -> Iterator[Any]:
+    """Data frames of a row a frame, person and joint, of some frames at a time; of the same types all, one at least."""
+    import pandas
+
+    remaining = iter(lines)
+    for first in chain(islice(remaining, 1), [None]):
+        # the first table, or an empty one
+        some = [] if first is None else [first, *islice(remaining, _ROWS_OF - 1)]
+        while some or first is None:
+            table = pandas.DataFrame([row for line in some for row in _rows(line)], columns=list(_COLUMNS))
+            table["id"] = table["id"].map(lambda id: None if id is None else str(id)).astype("string")
+            for name in ("frame_id", "joint"):
+                table[name] = table[name].astype("string")
+            types = {"frame": "int64", "person": "int64", "track": "Int64", "filled": "bool", "in_range": "boolean"}
+            others = set(_COLUMNS) - set(types) - {"id", "frame_id", "joint"}
+            yield table.astype(types | dict.fromkeys(others, "float64"))
+            some = list(islice(remaining, _ROWS_OF))
+            if not some:
+                return
+
+
+def _rows(line: dict[str, Any]) -> Iterator[tuple]:
+    joints = line["skeleton"]["joints"]
+    for number, person in enumerate(line["people"]):
+        if person["joints"] is None:
+            continue
+        of_person = (number, person["id"], person["track"], person["filled"])
+        known = [person[name] or [None] * len(joints) for name in ("confidence", "spread", "visible")]
+        for j, name in enumerate(joints):
+            values = (*(value[j] for value in known), name not in person["out_of_range"], person["score"])
+            yield line["frame"], line["id"], line["time"], *of_person, name, *person["joints"][j], *values
