@@ -159,6 +159,23 @@ def run(clips: dict[str, np.ndarray]) -> dict:
     return report
 
 
+def hidden(clips: dict[str, np.ndarray], gap: int) -> list[list[float]]:
+    """Of frames hidden in the middle of clips, by frames to the nearest one that is seen: mean spread and error, mm."""
+    count, frames = clips["true"].shape[:2]
+    rows = np.arange((frames - gap) // 2, (frames - gap) // 2 + gap)
+    to_seen = np.minimum(rows - rows[0], rows[-1] - rows)
+    means = []
+    for i in range(count):
+        values = {name: clips[name][i].copy() for name in _VALUES}
+        values["joints"][rows] = np.nan
+        track = smooth(TrackPoses(times=np.arange(frames) / CLIP_HZ, skeleton=BODY26, **values))
+        error = np.linalg.norm(track.joints - clips["true"][i], axis=-1)
+        if track.filled[rows].all():
+            means.append(1e3 * np.stack([track.spread[rows], error[rows]]))
+    means = np.stack(means)
+    return [means[:, :, to_seen == k].mean((0, 2, 3)).tolist() for k in range(to_seen.max() + 1)]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--motion", action="append", default=[], metavar="FILE[:SUBJECTS]")
@@ -166,6 +183,7 @@ def main() -> None:
     parser.add_argument("--clips", type=int, default=120)
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--store", help="npz of predicted clips: read where it is there, else written")
+    parser.add_argument("--hide", type=int, nargs="+", default=[], metavar="N", help="also hide N frames in the middle")
     parser.add_argument("--json", help="also write the figures to this file")
     options = parser.parse_args()
 
@@ -187,6 +205,10 @@ def main() -> None:
             f"  bones {way['bone_deviation']:4.1f} mm  {way['ms_a_frame']:.2f} ms"
         )
     print(f"spread / error {report['spread_over_error']:.2f}")
+    for gap in options.hide:
+        print(
+            f"{gap} frames hidden, spread and error in mm:", [[round(v) for v in pair] for pair in hidden(clips, gap)]
+        )
     if options.json:
         write_atomic(Path(options.json), json.dumps(report, indent=1) + "\n")
 
