@@ -363,7 +363,7 @@ def test_wrong_calls_are_one_line_and_write_nothing(raw, tmp_path, smpl):
     mine.write_text("x")
     for arguments, options, message in (
         (("humanm3", tmp_path / "none", out), {}, "none: is no folder; expected the raw files of humanm3"),
-        (("humanm3", raw[0], out), {"workers": 0}, "at least 1 worker"),
+        (("humanm3", raw[0], out), {"workers": 0}, "workers must be a whole number of at least 1, got 0"),
         (("human3m", raw[0], out), {}, "unknown dataset 'human3m': did you mean humanm3"),
         (("lidarhuman26m", raw[0], out), {"smpl": smpl}, "is not the root of LiDARHuman26M"),
         (("lidarhuman26m", raw[0], out), {}, "register at smpl.is.tue.mpg.de"),

@@ -29,7 +29,7 @@ from lidarpose.data.shards import (
 )
 from lidarpose.data.splits import SplitRule, split_rule
 from lidarpose.data.writer import Counts, lock_dataset, make_shards, open_folder
-from lidarpose.errors import InputError, check_name
+from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.io.files import file_error, one_line
 from lidarpose.progress import Progress
 from lidarpose.sample import HIDDEN, SEEN, UNLABELED, LabeledSample
@@ -104,8 +104,7 @@ def prepare(
     parts, and warnings. Raises InputError, one line, for a wrong root, name, split or SMPL model and for a folder that
     holds something else; MissingExtra without pyarrow.
     """
-    if workers < 1:
-        raise InputError(f"expected at least 1 worker, got {workers}")
+    check_int("workers", workers, least=1)
     root, out = Path(root), Path(out)
     source = reader(name, smpl, level=level)
     if not root.is_dir():

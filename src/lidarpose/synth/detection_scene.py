@@ -64,8 +64,8 @@ _MOST_BEAMS = 140_000
 _MIX_OUTDOORS = {"idle": 0.31, "walk": 0.34, "captured": 0.07, "run": 0.03, "step": 0.02, "bend": 0.035}
 _MIX_OUTDOORS |= {"crouch": 0.035, "kneel": 0.01, "sit": 0.1, "cycle": 0.09, "push": 0.05, "sport": 0.02}
 _MIX_INDOORS = _MIX_OUTDOORS | {"idle": 0.36, "walk": 0.2, "sit": 0.25, "cycle": 0.004, "run": 0.0}
-# in training more of those who do not stand
-_TRAINING_LOW = {is_in: {"bend": 0.07, "crouch": 0.1, "kneel": 0.08, "sit": 0.3 if is_in else 0.16} for is_in in (0, 1)}
+# in training more of those who do not stand; who sits outdoors and indoors
+_TRAINING_MIX, _TRAINING_SITS = {"bend": 0.07, "crouch": 0.1, "kneel": 0.08}, (0.16, 0.3)
 # who sits, outdoors: what on, and how often
 _SEATS = (("moped", 0.3), ("wheelchair", 0.25), ("chair", 0.45))
 _MOUNTED = ("bicycle", "moped", "wheelchair")
@@ -332,7 +332,9 @@ def _draw_people(site: Site, is_smeared: bool, is_training: bool, rng: np.random
     area = float(np.prod(site.areas[:, [1, 3]] - site.areas[:, [0, 2]], axis=1).max())
     groups = rng.integers(4, 11) if not indoors else rng.integers(1 + is_training, int(np.clip(area / 12, 2, 7)) + 1)
     sizes = rng.choice([1, 2, 3, 4, 5], groups, p=[0.42, 0.27, 0.15, 0.09, 0.07])
-    mix = (_MIX_INDOORS if indoors else _MIX_OUTDOORS) | (_TRAINING_LOW[indoors] if is_training else {})
+    mix = _MIX_INDOORS if indoors else _MIX_OUTDOORS
+    if is_training:
+        mix = mix | _TRAINING_MIX | {"sit": _TRAINING_SITS[indoors]}
     bodies = draw_bodies(None, 0.0, int(sizes.sum()), int(rng.integers(2**31)), 0, moving=is_smeared, mix=mix)
     people: list[_Person] = []
     row = 0

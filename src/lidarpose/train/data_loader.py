@@ -24,7 +24,7 @@ from threadpoolctl import threadpool_limits
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from lidarpose.errors import InputError
-from lidarpose.sample import Sample
+from lidarpose.sample import LabeledSample
 from lidarpose.synth.bodies import PoseBank, smpl_rig
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.objects import draw_object
@@ -121,60 +121,60 @@ class SyntheticSource:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StoredSource:
-    """The samples of datasets, all of them once an epoch in an order of its own, each time augmented anew.
+class _OfDataset:
+    """What is shown of datasets: all once an epoch, in an order of its own, each time changed anew.
 
     dataset: see `InMemoryDataset.load`; strays, noise: see `disturbed`.
     """
 
     dataset: InMemoryDataset
     seed: int
-    augmentation: Augmentation
     strays: float = 0.0
     noise: float = 0.0
 
-    def example(self, index: int) -> Example:
-        epoch, place = divmod(index, len(self.dataset))
-        row = int(_order(self.seed, epoch, len(self.dataset))[place])
+    def _drawn(self, index: int, count: int) -> tuple[int, np.random.Generator]:
+        """Which of `count` things example `index` shows, and what it draws from."""
+        epoch, place = divmod(index, count)
         rng = np.random.default_rng([self.seed, RandomStream.STORED_AUGMENTATION, index])
+        return int(_order(self.seed, epoch, count)[place]), rng
+
+    def _sample(self, row: int, rng: np.random.Generator) -> LabeledSample:
         sample = self.dataset.sample(row)
-        if self.strays or self.noise:
-            sample = disturbed(sample, strays=self.strays, noise=self.noise, rng=rng)
-        return augmented(sample, self.augmentation, rng)
+        if not (self.strays or self.noise):
+            return sample
+        return disturbed(sample, strays=self.strays, noise=self.noise, rng=rng)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClipSource:
-    """Clips of datasets, all of them once an epoch in an order of its own.
+class StoredSource(_OfDataset):
+    """The samples of datasets."""
 
-    dataset: see `InMemoryDataset.load`; clips, skipped: see `InMemoryDataset.clips`; trans_center: see `clip_example`;
-    strays, noise: see `disturbed`.
-    """
+    augmentation: Augmentation
 
-    dataset: InMemoryDataset
+    def example(self, index: int) -> Example:
+        row, rng = self._drawn(index, len(self.dataset))
+        return augmented(self._sample(row, rng), self.augmentation, rng)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClipSource(_OfDataset):
+    """The clips of datasets. clips, skipped: see `InMemoryDataset.clips`; trans_center: see `clip_example`."""
+
     clips: np.ndarray
-    seed: int
     trans_center: bool
     skipped: Counter[str] = field(default_factory=Counter)
-    strays: float = 0.0
-    noise: float = 0.0
 
     def example(self, index: int) -> ClipExample:
-        epoch, place = divmod(index, len(self.clips))
-        rng = np.random.default_rng([self.seed, RandomStream.STORED_AUGMENTATION, index])
-        samples = self._samples(_order(self.seed, epoch, len(self.clips))[place])
-        if self.strays or self.noise:
-            samples = [disturbed(sample, strays=self.strays, noise=self.noise, rng=rng) for sample in samples]
+        clip, rng = self._drawn(index, len(self.clips))
+        samples = [self._sample(row, rng) for row in self.clips[clip]]
         return clip_example(samples, rng, trans_center=self.trans_center)
-
-    def _samples(self, clip: int) -> list[Sample]:
-        return [self.dataset.sample(row) for row in self.clips[clip]]
 
     def some(self, count: int) -> list[ClipExample]:
         """So many clips at most, evenly spread, to validate on: centered on their points."""
         rng = np.random.default_rng(self.seed)
         chosen = np.unique(np.linspace(0, len(self.clips) - 1, min(count, len(self.clips))).astype(int))
-        return [clip_example(self._samples(clip), rng, trans_center=self.trans_center, refined=0.0) for clip in chosen]
+        clips = [[self.dataset.sample(row) for row in self.clips[clip]] for clip in chosen]
+        return [clip_example(clip, rng, trans_center=self.trans_center, refined=0.0) for clip in clips]
 
 
 @lru_cache(maxsize=2)

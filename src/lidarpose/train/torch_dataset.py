@@ -20,7 +20,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from lidarpose.data.clips import consecutive, windows
 from lidarpose.data.shards import DatasetReader, open_dataset, pyarrow, to_arrow
-from lidarpose.errors import InputError
+from lidarpose.errors import InputError, check_int
 from lidarpose.io.files import file_error, listed
 from lidarpose.sample import CLIP_FRAMES, HIDDEN, SEEN, UNLABELED, LabeledSample, Pose, Sample
 from lidarpose.skeleton import BODY26
@@ -217,7 +217,7 @@ class SyntheticPeople(IterableDataset):
             raise InputError(
                 f"SyntheticPeople needs a seed >= 0 and 0 <= start <= stop, got {self.seed}, {self.start}, {self.stop}"
             )
-        _check_batch(self.batch)
+        check_int("batch", self.batch, least=1)
         # errors come here, not in a worker
         self._generator()
         if self.hard is not None:
@@ -247,7 +247,7 @@ class ShardPeople(IterableDataset):
     dataset: DatasetReader = field(init=False, repr=False)
 
     def __post_init__(self):
-        _check_batch(self.batch)
+        check_int("batch", self.batch, least=1)
         object.__setattr__(self, "dataset", open_dataset(self.folder))
 
     def __iter__(self) -> Iterator[Sample]:
@@ -255,11 +255,6 @@ class ShardPeople(IterableDataset):
         for number, row in enumerate(self.dataset.rows()):
             if number // self.batch % workers == worker:
                 yield self.dataset.sample(row)
-
-
-def _check_batch(batch: int) -> None:
-    if batch < 1:
-        raise InputError(f"batch must be 1 or more, got {batch}")
 
 
 def _worker() -> tuple[int, int]:

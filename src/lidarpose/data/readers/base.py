@@ -295,11 +295,12 @@ def labeled_sample(
     points: np.ndarray, joints: np.ndarray, tree: Skeleton = SMPL24, **labels: Any
 ) -> LabeledSample | Skipped:
     """The sample of points (n, 3) m and joints (J, 3) m of a skeleton, NaN where not labeled; labels: the other fields
-    of `LabeledSample`, by default all joints that are there count as seen. Skipped where a joint is out of reach."""
+    of `LabeledSample`, by default all joints that are there count as seen and the frame is SEQUENCE/FRAME. Skipped
+    where a joint is out of reach."""
+    labels.setdefault("frame_id", f"{labels['sequence']}/{labels['frame']}")
     is_labeled = ~np.isnan(joints).any(-1)
     if not within_reach(joints[is_labeled]).all():
-        where = f"{labels['frame_id']}/{labels['track']}: beyond {FARTHEST:g} m"
-        return Skipped("joints out of reach", where)
+        return Skipped("joints out of reach", f"{labels['frame_id']}/{labels['track']}: beyond {FARTHEST:g} m")
     points = points.astype(np.float32)
     labels.setdefault("joint_labels", np.where(is_labeled, SEEN, UNLABELED).astype(np.uint8))
     pose = Pose(joints=joints.astype(np.float32), skeleton=tree, frame="sensor")

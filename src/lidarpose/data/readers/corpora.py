@@ -14,6 +14,7 @@ from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -58,24 +59,14 @@ class _Entry:
         except OSError as error:
             raise file_error(path, f"cannot be read ({error.strerror or error})") from None
 
-    def sample(
-        self, points: np.ndarray, joints: np.ndarray, *, track: str, source: str, sensor_known: bool = True
-    ) -> LabeledSample | Skipped:
+    def sample(self, points: np.ndarray, joints: np.ndarray, **labels: Any) -> LabeledSample | Skipped:
+        """labels: track, source and what else a `LabeledSample` has."""
         if not len(points):
             return Skipped("empty cloud", self.where)
         if _apart(points, joints) > _NEAR:
             return Skipped("joints are not where the points are", self.where)
-        return base.labeled_sample(
-            points,
-            joints,
-            sequence=self.sequence,
-            frame=self.frame,
-            frame_id=f"{self.sequence}/{self.frame}",
-            track=track,
-            time=self.frame / _FPS,
-            source=source,
-            sensor_known=sensor_known,
-        )
+        where: dict[str, Any] = {"sequence": self.sequence, "frame": self.frame, "time": self.frame / _FPS}
+        return base.labeled_sample(points, joints, **where, **labels)
 
 
 class _Corpus(Reader):

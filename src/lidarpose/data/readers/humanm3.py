@@ -164,7 +164,6 @@ def _people(
             HUMAN15,
             box=box,
             source="humanm3",
-            frame_id=frame_id,
             sequence=sequence,
             frame=frame,
             track=track,

@@ -11,6 +11,7 @@ LidarCap sample/gen_dataset.py; jingyi-zhang/ASC_Lidar_human process.py, which m
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -97,7 +98,8 @@ class LidarHuman26M(Reader):
                 time = (frame - min(poses)) / _FPS
                 R = np.eye(3) if turn is None else turn
                 clip = {"rotations": base.turned_pose(labels[frame][1], R)} | clouds.around(frame, R)
-                yield _sample(cloud, joints[frame], labels[frame][2], part, frame, time, turn, clip)
+                where = {"sequence": part, "frame": frame, "frame_id": f"{part}/{cloud.stem}", "time": time}
+                yield _sample(cloud, joints[frame], labels[frame][2], turn, **where, **clip)
 
 
 def _labels(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -112,39 +114,21 @@ def _labels(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _sample(
-    path: Path,
-    joints: np.ndarray,
-    trans: np.ndarray,
-    part: str,
-    frame: int,
-    time: float,
-    turn: np.ndarray | None,
-    clip: dict,
+    path: Path, joints: np.ndarray, trans: np.ndarray, turn: np.ndarray | None, **known: Any
 ) -> LabeledSample | Skipped:
-    """turn: R_level_sensor, None to stay in the sensor's frame; clip: fields of clips, turned already."""
+    """turn: R_level_sensor, None to stay in the sensor's frame; known: other fields of the sample, turned already."""
     try:
         points = base.read_cloud(path)
     except InputError as error:
         return Skipped("cloud cannot be read", str(error))
     if not len(points):
-        return Skipped("empty cloud", f"{part}/{path.stem}")
+        return Skipped("empty cloud", known["frame_id"])
     source = "lidarhuman26m"
     if turn is not None:
         points, joints, trans = (x @ turn.T for x in (points, joints, trans))
         source += f", turned level by {np.degrees(np.arccos(np.clip(turn[2, 2], -1, 1))):.0f} deg"
-    return base.labeled_sample(
-        points,
-        joints,
-        sequence=part,
-        frame=frame,
-        frame_id=f"{part}/{path.stem}",
-        track="0",
-        time=time,
-        source=source,
-        centers={"trans": trans},
-        translation=trans,
-        **clip,
-    )
+    known |= {"track": "0", "source": source, "centers": {"trans": trans}, "translation": trans}
+    return base.labeled_sample(points, joints, **known)
 
 
 def up_of_people(joints: np.ndarray) -> tuple[np.ndarray, float] | None:

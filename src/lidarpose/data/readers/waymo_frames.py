@@ -256,7 +256,6 @@ class Frame:
             ring=ring.astype(np.int32),
             box=box,
             source=f"waymo/{_KINDS.get(person.kind, 'unknown')}",
-            frame_id=f"{self.sequence}/{self.timestamp}",
             joint_labels=person.labels,
             sequence=self.sequence,
             frame=self.timestamp,

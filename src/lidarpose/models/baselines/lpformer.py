@@ -43,7 +43,10 @@ class Lpformer(nn.Module):
         self.joint = nn.Parameter(torch.randn(joints, width))
         dropout = config.attention_dropout
         self.attention = nn.ModuleList(BareAttention(width, heads=8, dropout=dropout) for _ in range(4))
-        self.xy, self.z, self.visible = (_joint_head(width, size) for size in (2, 1, 2))
+        # no activation between the last two: as published
+        self.xy, self.z, self.visible = (
+            nn.Sequential(nn.Linear(width, 16), nn.ReLU(), nn.Linear(16, 8), nn.Linear(8, size)) for size in (2, 1, 2)
+        )
         self.parts = nn.Sequential(nn.Linear(width, width), nn.Linear(width, 16), nn.ReLU(), nn.Linear(16, joints + 1))
 
     def forward(self, points: Tensor, valid: Tensor, center: Tensor | None = None) -> LpformerOutputs:
@@ -132,8 +135,3 @@ def _conv(in_channels: int, out_channels: int, size: int) -> nn.Sequential:
 def _up(in_channels: int, out_channels: int) -> nn.Sequential:
     conv = nn.ConvTranspose3d(in_channels, out_channels, 2, stride=2)
     return nn.Sequential(conv, nn.BatchNorm3d(out_channels), nn.ReLU())
-
-
-def _joint_head(width: int, size: int) -> nn.Sequential:
-    # no activation between the last two: as published
-    return nn.Sequential(nn.Linear(width, 16), nn.ReLU(), nn.Linear(16, 8), nn.Linear(8, size))
