@@ -31,7 +31,7 @@ class Scan:
     points (n, 3) m; boxes: the people's, None for a crop of one person; origin: the sensor's position (3,) m or None;
     up: the input's up axis or direction, see `rotation_from_up`; warnings: of reading; source: a name for reports.
     Boxes stand along the input's own axis; where `up` is a direction, along z. Where people were searched for,
-    detected_rows holds of each box the rows (k,) of the person's points, which a box of a frame that leans cannot tell.
+    detected_rows holds of each box the rows (k,) of the person's points, which a box that leans does not give.
     In recordings, pelvises (N, 3) m: where those of the boxes' people are about; verified (N,) bool: whose score is of
     this scan; rejected (R, 3) m: places that turned out to hold nobody.
     """

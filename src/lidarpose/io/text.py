@@ -159,7 +159,7 @@ def _wrong_line(
     num_skipped: int = 0,
     where: str = "",
 ) -> FormatError:
-    """What to tell of lines that a library refused: the first one without numbers in `columns`, else its reason."""
+    """The error for lines that a library refused: the first one without numbers in `columns`, else its reason."""
     for number, line in enumerate(lines, num_skipped + 1):
         cells = _split(line.strip(), separator)
         if line.strip() and not all(i < len(cells) and _is_number(cells[i], decimal) for i in columns):

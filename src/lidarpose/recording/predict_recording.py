@@ -147,7 +147,7 @@ class FramePredictor:
         self.up, self.name, self.skeleton = up_text(up), name, skeleton
         self.boxes = None if boxes is None else FrameBoxes(boxes, calib=calib)
         self._origin = sensor_origin if sensor_origin is None else (as_origin(sensor_origin),)
-        # whether the frames are crops: None until the first one tells
+        # whether the frames are crops: None before the first one
         self._is_crop = True if crop else False if is_searched or boxes is not None else None
         self._search = search_options(*search, columns)
         self._model = model

@@ -9,6 +9,9 @@ from lidarpose.errors import InputError
 from lidarpose.sample import Pose
 from lidarpose.skeleton import Skeleton
 
+# what a track may hold of each joint besides its place
+_PER_JOINT = ("spread", "visible", "confidence")
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrackPoses:
@@ -31,7 +34,7 @@ class TrackPoses:
         shape = (len(self.times), len(self.skeleton))
         if self.joints.shape != (*shape, 3):
             raise InputError(f"TrackPoses.joints must be {(*shape, 3)}, got {self.joints.shape}")
-        for name in ("spread", "visible", "confidence"):
+        for name in _PER_JOINT:
             value = getattr(self, name)
             if value is not None and value.shape != shape:
                 raise InputError(f"TrackPoses.{name} must be {shape}, one a joint, got {value.shape}")
@@ -53,10 +56,10 @@ class TrackPoses:
         """From a pose a frame, None where the person was not seen."""
         seen = [pose for pose in poses if pose is not None]
         values: dict[str, Any] = {}
-        for name, tail in (("joints", (3,)), ("spread", ()), ("visible", ()), ("confidence", ())):
+        for name in ("joints", *_PER_JOINT):
             if name != "joints" and (not seen or any(getattr(pose, name) is None for pose in seen)):
                 continue
-            values[name] = np.full((len(poses), len(skeleton), *tail), np.nan)
+            values[name] = np.full((len(poses), len(skeleton)) + (3,) * (name == "joints"), np.nan)
             for row, pose in enumerate(poses):
                 if pose is not None:
                     values[name][row] = getattr(pose, name)
@@ -66,7 +69,7 @@ class TrackPoses:
         """The pose of a frame, None where there is none."""
         if not np.isfinite(self.joints[row]).all():
             return None
-        values = {name: getattr(self, name) for name in ("spread", "visible", "confidence")}
+        values = {name: getattr(self, name) for name in _PER_JOINT}
         of_frame: dict[str, Any] = {name: None if value is None else value[row] for name, value in values.items()}
         return Pose(joints=self.joints[row], skeleton=self.skeleton, **of_frame)
 

@@ -63,13 +63,9 @@ class DamagedFrame:
     error: str
 
 
-class Source(Protocol):
-    """Frames in order, one in memory at a time, as often as wanted.
-
-    `name` is that of the file or folder, `count` the number of frames if it is known before they are read, `warnings`
-    are lines about the source as a whole; some are only known after iterating. `frames(first)` begins with the frame
-    of this index, without reading those before; iterating is `frames(0)`.
-    """
+class _Named(Protocol):
+    """`name` is that of the file or folder, `count` the number of frames if it is known before they are read;
+    `warnings` are lines about the whole, some of which are only known after iterating."""
 
     @property
     def name(self) -> str: ...
@@ -78,7 +74,14 @@ class Source(Protocol):
     def count(self) -> int | None: ...
 
     @property
-    def warnings(self) -> tuple[str, ...]: ...
+    def warnings(self) -> Sequence[str]: ...
+
+
+class Source(_Named, Protocol):
+    """Frames in order, one in memory at a time, as often as wanted.
+
+    `frames(first)` begins with the frame of this index, without reading those before; iterating is `frames(0)`.
+    """
 
     def frames(self, first: int = 0) -> Iterator[Frame | DamagedFrame]: ...
 
@@ -108,21 +111,11 @@ class LazyFrame:
     read: Callable[[], Sweep]
 
 
-class Recording(Protocol):
+class Recording(_Named, Protocol):
     """What the reader of a format makes of a file or folder: frames not yet decoded, as often as wanted.
 
-    `warnings` may grow while frames are read. An InputError after the first frame ends the recording there, and is
-    told as a damaged frame.
+    An InputError after the first frame ends the recording there, and becomes a damaged frame.
     """
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def count(self) -> int | None: ...
-
-    @property
-    def warnings(self) -> Sequence[str]: ...
 
     def lazy_frames(self, first: int = 0) -> Iterator[LazyFrame]: ...
 

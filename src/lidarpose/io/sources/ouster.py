@@ -37,7 +37,7 @@ _PIXEL_BYTES = {
     "FUSA_RNG15_RFL8_NIR8_DUAL": 8,
 }
 _MAX_COLUMNS, _MAX_BEAMS, _MAX_PACKET, _MAX_NUMBER = 4096, 256, 65507, 1e9
-# of sensors before the metadata told it
+# of sensors whose metadata does not hold it
 _LIDAR_TO_SENSOR = (-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 36.18, 0, 0, 0, 1)
 _COLUMNS_PER_PACKET = 16
 # datagrams in which the port that the metadata names is looked for
@@ -141,7 +141,7 @@ class OusterFormat:
         self.starts = np.stack(starts, axis=-1) @ R.T / 1000 + self.origin
 
     def header(self, packet: bytes) -> tuple[int, int | None]:
-        """A packet's frame id, and the sensor's serial number where it tells it."""
+        """A packet's frame id, and the sensor's serial number where it holds it."""
         at, size, serial = (10, 2, None) if self.is_legacy else (4, 4, 11) if self.is_fusa else (2, 2, 7)
         frame_id = int.from_bytes(packet[at : at + size], "little")
         return frame_id, None if serial is None else int.from_bytes(packet[serial : serial + 5], "little")
@@ -189,7 +189,7 @@ class OusterRecording(PacketRecording):
         """Whose packets are read: those to the port that the metadata names, else the first."""
         sizes: Counter[int] = Counter()
         flow = None
-        # a capture that is cut off tells so at its end
+        # a capture that is cut off raises at its end
         with suppress(InputError):
             for k, datagram in enumerate(self.capture):
                 sizes[len(datagram.payload)] += 1
@@ -256,7 +256,7 @@ class OusterRecording(PacketRecording):
 
 
 def _flat(metadata: dict[str, Any]) -> dict[str, Any]:
-    """Keys of all sections as one; newer sensors sort into sections what older ones told at the top."""
+    """Keys of all sections as one; newer sensors sort into sections what older ones hold at the top."""
     sections = [_flat(value) for value in metadata.values() if isinstance(value, dict)]
     plain = {key: value for key, value in metadata.items() if not isinstance(value, dict)}
     return {key: value for section in (*sections, plain) for key, value in section.items()}

@@ -230,7 +230,7 @@ def _decoders() -> dict[str, Callable[[bytes, str], Any]]:
 
 
 def decode_cloud(cloud: Any) -> tuple[np.ndarray, np.ndarray | None]:
-    """The points (n, 3) of a PointCloud2, float64, and the ring (n,) of each if it is told.
+    """The points (n, 3) of a PointCloud2, float64, and the ring (n,) of each if it has one.
 
     Fields may lie anywhere in a point, in any number type and either byte order; rows may be padded.
 
