@@ -46,7 +46,7 @@ def run(folder: str | Path, *, seed: int, weights: str = DEFAULT) -> None:
     with ExitStack() as stack:
         for name, content in contents.items():
             stack.enter_context(atomic_path(folder / name)).write_bytes(content)
-    print(pandas.DataFrame(rows).to_string(index=False))
+    print(pandas.DataFrame(rows).to_string(index=False, justify="left"))
     print(f"open {folder / 'index.html'} to turn the people in 3D; pictures: {folder}/*.png")
 
 
