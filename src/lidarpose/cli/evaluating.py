@@ -74,7 +74,7 @@ _TITLES = {
 def add(commands) -> None:
     """Adds the commands to the parser's."""
     evaluate = add_command(commands, "evaluate", _evaluate, _EVALUATE)
-    evaluate.set_defaults(defaults={name: evaluate.get_default(name) for name in option_names(_OPTIONS)})
+    evaluate.set_defaults(defaults={name: evaluate.get_default(name) for name in option_names(_OPTIONS + _DETECTOR)})
     add_command(commands, "table", _table, _TABLE)
 
 
@@ -92,7 +92,7 @@ def _evaluate(options: argparse.Namespace) -> None:
             f"{wrong[0]} is of lidarpose evaluate detector, got the network {options.weights}: leave it out"
         )
     folder = evaluation.new_folder(options.weights) if options.out is None else evaluation.check_folder(options.out)
-    settings = {name: getattr(options, name) for name in options.defaults}
+    settings = {name: getattr(options, name) for name in option_names(_OPTIONS)}
     with ExitStack() as stack:
         progress = _progress(stack)
         run = evaluation.run(
@@ -111,8 +111,8 @@ def _evaluate_detector(options: argparse.Namespace) -> None:
     from lidarpose.eval.detector.evaluate_detector import run_detector, write_detector
     from lidarpose.eval.detector.labeled_scans import HELDOUT
 
-    for name, default in options.defaults.items():
-        if name not in ("limit", "seed") and getattr(options, name) != default:
+    for name in option_names(_OPTIONS):
+        if name not in ("limit", "seed") and getattr(options, name) != options.defaults[name]:
             raise InputError(f"{_flag(name)} is of networks, got the detector: leave it out")
     if set(options.datasets) - {HELDOUT}:
         raise InputError(
@@ -176,17 +176,15 @@ def _table(options: argparse.Namespace) -> None:
 
 def _command(options: argparse.Namespace) -> str:
     """What was asked for, as it would be typed."""
-    words = ["lidarpose", "evaluate", options.weights, *options.datasets]
-    changed = {
-        name: value for name, default in options.defaults.items() if (value := getattr(options, name)) != default
-    }
-    for name in option_names(_DETECTOR):
+    words, switches = ["lidarpose", "evaluate", options.weights, *options.datasets], []
+    for name, default in options.defaults.items():
         value = getattr(options, name)
-        changed |= {} if value is None else {name: value}
-    switches = [_flag(name) for name, value in changed.items() if value is True]
-    for name, value in changed.items():
-        for part in () if value is True else value if isinstance(value, list) else (value,):
-            words += [_flag(name), str(part)]
+        if value is True:
+            switches.append(_flag(name))
+        elif value != default:
+            words += [
+                word for part in (value if isinstance(value, list) else [value]) for word in (_flag(name), str(part))
+            ]
     return shlex.join([*words, *switches])
 
 
