@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.synth.environment import mesh as shapes
-from lidarpose.synth.environment.mesh import Mesh, shape
+from lidarpose.synth.environment.mesh import Mesh, grid, shape
 from lidarpose.synth.environment.things import car, draw_thing, facade
 
 Item = tuple[str, Mesh]
@@ -45,22 +45,12 @@ class Layout:
     things: float = 1.0
 
 
-def ground(xs: np.ndarray, ys: np.ndarray, z: np.ndarray | float = 0.0) -> Mesh:
-    """A grid of quads at z (X, Y) or one height."""
-    count = (len(xs), len(ys))
-    vertices = np.stack([*np.meshgrid(xs, ys, indexing="ij"), np.broadcast_to(z, count)], -1).reshape(-1, 3)
-    number = np.arange(len(vertices)).reshape(count)
-    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
-    faces = np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)], -2).reshape(-1, 3)
-    return Mesh(vertices.astype(np.float32), faces.astype(np.int32))
-
-
 _XS = np.concatenate([np.linspace(-70, -42, 5), np.arange(-38, 39, 2.5), np.linspace(42, 70, 5)])
 
 
 def _field(rng: np.random.Generator, rough: float) -> Mesh:
     """Open ground that is uneven by `rough` m."""
-    return ground(_XS, _XS, rng.normal(0, rough, (len(_XS), len(_XS))) if rough else 0.0)
+    return grid(_XS, _XS, rng.normal(0, rough, (len(_XS), len(_XS))) if rough else 0.0)
 
 
 # --- outdoors
@@ -74,7 +64,7 @@ def street(rng: np.random.Generator) -> Layout:
     inner = np.linspace(-road, road, 5)
     ys = np.concatenate([[-70, -40, -20, -front, -road - 0.02], inner, [road + 0.02, front, 20, 40, 70]])
     heights = np.where(np.abs(ys) > road + 0.01, kerb, 0.0)
-    items: list[Item] = [("ground", ground(_XS, ys, heights[None]))]
+    items: list[Item] = [("ground", grid(_XS, ys, heights[None]))]
     for side in (-1, 1):
         items += _fronts(side, front, kerb, rng)
         items += _parked(side, road, kerb, rng)
@@ -176,8 +166,8 @@ def path(rng: np.random.Generator) -> Layout:
 
 def _walls(wide: float, long: float, high: float, rng: np.random.Generator, *, windows: float = 0.5) -> list[Item]:
     """Four walls with doorways and windows, floor and ceiling; the inside is (wide, long) about the origin."""
-    items: list[Item] = [("ground", ground(np.array([-wide, wide]), np.array([-long, long])))]
-    items.append(("ceiling", ground(np.array([-wide, wide]), np.array([-long, long]), high)))
+    items: list[Item] = [("ground", grid(np.array([-wide, wide]), np.array([-long, long])))]
+    items.append(("ceiling", grid(np.array([-wide, wide]), np.array([-long, long]), high)))
     for turn, length, far in ((0, long, wide / 2), (1, wide, long / 2), (2, long, wide / 2), (3, wide, long / 2)):
         bays = max(1, int(length / 2.5))
         bay = length / bays
@@ -275,8 +265,8 @@ def car_park(rng: np.random.Generator) -> Layout:
 def corridor(rng: np.random.Generator) -> Layout:
     """A long corridor with niches, doors and glass; left out of training."""
     wide, long, high = rng.uniform(1.7, 4.0), rng.uniform(14, 38), rng.uniform(2.3, 3.2)
-    items: list[Item] = [("ground", ground(np.array([-9.0, 9.0]), np.array([-long, long])))]
-    items.append(("ceiling", ground(np.array([-9.0, 9.0]), np.array([-long, long]), high)))
+    items: list[Item] = [("ground", grid(np.array([-9.0, 9.0]), np.array([-long, long])))]
+    items.append(("ceiling", grid(np.array([-9.0, 9.0]), np.array([-long, long]), high)))
     for side in (-1, 1):
         for name, mesh in facade(long, high, rng, bars=0.0, niches=0.5):
             name = "wall" if name == "facade" else name

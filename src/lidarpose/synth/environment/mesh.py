@@ -79,6 +79,16 @@ def quad(half: float, slope: Vector) -> Mesh:
     return Mesh(np.array(corners, np.float32), QUAD_FACES)
 
 
+def grid(xs: np.ndarray, ys: np.ndarray, z: np.ndarray | float = 0.0) -> Mesh:
+    """A grid of quads at z (X, Y) or one height, m."""
+    count = (len(xs), len(ys))
+    vertices = np.stack([*np.meshgrid(xs, ys, indexing="ij"), np.broadcast_to(z, count)], -1).reshape(-1, 3)
+    number = np.arange(len(vertices)).reshape(count)
+    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+    faces = np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)], -2).reshape(-1, 3)
+    return Mesh(vertices.astype(np.float32), faces.astype(np.int32))
+
+
 def box(size: Vector) -> Mesh:
     """A box of size (3,) m standing on the origin."""
     return Mesh(_BOX_CORNERS * np.asarray(size, np.float32), _BOX_FACES)

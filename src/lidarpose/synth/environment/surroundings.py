@@ -105,10 +105,9 @@ def _draw_thing(
 
 def _draw_wall(a: float, b: float, c: float) -> tuple[Mesh, float, float, float]:
     long, high = 1.0 + 3.0 * a, 0.5 + 2.5 * b
-    opening = None
-    if high > 1.8 and c < 0.4:
-        opening = (-0.25 * long, (0.5 * c) * long, 0.0 if c < 0.1 else 0.9, 0.85 * high)
-    return shapes.wall(long, high, thick=0.15, opening=opening), 0.08, long, 0.15
+    opening = (-0.25 * long, (0.5 * c) * long, 0.0 if c < 0.1 else 0.9, 0.85 * high)
+    wall = shapes.wall(long, high, thick=0.15, opening=opening if high > 1.8 and c < 0.4 else None)
+    return wall, 0.08, long, 0.15
 
 
 def _draw_car(a: float, b: float, c: float) -> tuple[Mesh, float, float, float]:
@@ -260,9 +259,6 @@ def _grid() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     vertex's height varies, 1 at the feet; which vertices lie under or beside the feet."""
     at = np.linspace(-1, 1, _CELLS + 1)
     at = _WILD_HALF * np.sign(at) * np.abs(at) ** 1.7
-    x, y = np.meshgrid(at, at, indexing="ij")
-    number = np.arange((_CELLS + 1) ** 2).reshape(_CELLS + 1, _CELLS + 1)
-    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
-    faces = np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)], -2).reshape(-1, 3)
-    flat = np.stack([x, y, 0 * x], -1).reshape(-1, 3).astype(np.float32)
-    return flat, faces.astype(np.int32), 1 + 0.4 * np.abs(flat[:, :2]).sum(1), np.hypot(*flat[:, :2].T) < 0.6
+    plane = shapes.grid(at, at)
+    flat = plane.vertices
+    return flat, plane.faces, 1 + 0.4 * np.abs(flat[:, :2]).sum(1), np.hypot(*flat[:, :2].T) < 0.6
