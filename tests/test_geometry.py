@@ -11,11 +11,15 @@ from lidarpose.geometry import (
     UP_AXES,
     axis_angle_to_matrix,
     from_spherical,
+    inverse_transform,
+    quaternion_to_matrix,
+    rigid_transform,
     rotation_about,
     rotation_between,
     rotation_from_up,
     similarity_align,
     to_spherical,
+    transform_points,
     unit,
 )
 
@@ -169,3 +173,16 @@ def test_alignment_leaves_its_input_and_survives_a_single_place():
     np.testing.assert_allclose(aligned, np.broadcast_to(target.mean(1, keepdims=True), target.shape), atol=1e-9)
     np.testing.assert_array_equal(source, kept[0])
     np.testing.assert_array_equal(target, kept[1])
+
+
+@given(st.integers(0, 1000))
+def test_rigid_transforms_and_quaternions(seed):
+    rng = np.random.default_rng(seed)
+    axis_angle, t, points = rng.normal(size=3), rng.normal(size=3) * 100, rng.normal(size=(5, 3))
+    R = axis_angle_to_matrix(axis_angle)
+    T = rigid_transform(R, t)
+    np.testing.assert_allclose(transform_points(T, points), points @ R.T + t)
+    np.testing.assert_allclose(inverse_transform(T) @ T, np.eye(4), atol=1e-12)
+    half = np.linalg.norm(axis_angle) / 2
+    quaternion = np.array([np.cos(half), *(np.sin(half) * unit(axis_angle))])
+    np.testing.assert_allclose(quaternion_to_matrix(-7 * quaternion), R, atol=1e-12)

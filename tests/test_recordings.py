@@ -10,7 +10,7 @@ import pytest
 import lidarpose
 from lidarpose import Box, InputError
 from lidarpose.cli import main
-from lidarpose.geometry import rotation_about
+from lidarpose.geometry import UP_AXES, rigid_transform, rotation_about
 from lidarpose.io.sources.frame import Frame, FrameSource, IndexedRecording, Sweep
 from lidarpose.lidar.raycast import scan
 from lidarpose.recording import output, picture, tables
@@ -226,6 +226,18 @@ def test_tracks_of_a_moving_sensor_live_in_the_world(clouds, model):
         for track, at in places(line).items():
             start = first[track] @ frames[0].T_world_sensor[:3, :3].T + frames[0].T_world_sensor[:3, 3]
             assert np.hypot(*(at - start)[:2]) < 0.1 * FRAMES + 0.2
+
+
+@pytest.mark.parametrize("up", UP_AXES)
+def test_boxes_keep_their_heading_in_the_world(up):
+    """A box's yaw is about the input's up axis, in the world about z."""
+    R_level_input, R_world_level = UP_AXES[up], rotation_about("z", 0.4)
+    T_world_sensor = rigid_transform(R_world_level @ R_level_input, np.array([1.0, 2.0, 3.0]))
+    box = {"center": [4.0, 5.0, 6.0], "size": [0.5, 0.6, 1.8], "yaw": 0.3}
+    line = {"T_world_sensor": T_world_sensor.tolist(), "people": [{"joints": None, "box": box}]}
+    moved = in_world(line, up)["people"][0]["box"]
+    assert abs(moved["yaw"] - 0.7) < 1e-9
+    np.testing.assert_allclose(moved["center"], R_world_level @ R_level_input @ [4, 5, 6] + [1, 2, 3], atol=1e-4)
 
 
 def test_known_people_are_not_verified_again_and_keep_their_score(clouds, model, monkeypatch):
