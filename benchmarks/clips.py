@@ -3,8 +3,8 @@
     python benchmarks/clips.py --motion cmu_motion.npz:006,007 --store clips.npz --json docs/scores/clips.json
 
 Clips of 16 frames at 10 Hz of the scene preset `wild` (full difficulty, 14 sensors, 2.5 to 25 m), of people and motion
-that nothing was trained on: --motion FILE[:SUBJECTS], which may stand more than once and takes turns; without it
-activities of the prior. Sensors stand still. Poses are predicted once and kept in --store.
+that nothing was trained on: --motion FILE[:SUBJECTS] or `prior`, which may stand more than once and takes turns;
+without it activities of the prior. Sensors stand still. Poses are predicted once and kept in --store.
 
 MPJPE on the 15 joints of human15. Acceleration error: distance of second differences, mm a frame squared. Turned round:
 the way from right to left hips and shoulders is over 90 degrees off. Bone lengths: standard deviation over a clip, mean
@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.inference.predictor import load
+from lidarpose.inference.predictor import TTA, load
 from lidarpose.io.files import write_atomic
 from lidarpose.metrics import acceleration_errors, aligned_errors, interval, joint_errors
 from lidarpose.models import DEFAULT
@@ -36,19 +36,23 @@ from lidarpose.tracking.smoothing import smooth
 SEED = 77_001
 # weight of squared second differences in the plain solve: the best of 100, 300, 1000, 3000 on the clips for tuning
 STIFFNESS = 300.0
+_PRIOR = "prior"
 _VALUES = ("joints", "spread", "visible", "confidence")
 _PICKED = BODY26.map_to(HUMAN15)
 
 
-def make_clips(motion: list[str], count: int, seed: int, weights: str) -> dict[str, np.ndarray]:
+def make_clips(motion: list[str], count: int, seed: int, weights: str, looks: int) -> dict[str, np.ndarray]:
     """Truth (C, T, 26, 3) m and what the network says frame by frame, NaN where the person was not seen."""
-    banks = []
-    for spec in motion:
+    scenes = []
+    for spec in motion or [_PRIOR]:
         path, _, subjects = spec.partition(":")
-        banks.append(PoseBank.from_clips(path, tuple(subjects.split(",")) if subjects else None))
-    scenes = [Generator(scene="wild", bank=bank, captured=1.0, measure=False) for bank in banks]
-    scenes = scenes or [Generator(scene="wild", measure=False)]
-    model, clips = load(weights), []
+        if spec == _PRIOR:
+            scenes.append(Generator(scene="wild", measure=False))
+        else:
+            bank = PoseBank.from_clips(path, tuple(subjects.split(",")) if subjects else None)
+            scenes.append(Generator(scene="wild", bank=bank, captured=1.0, measure=False))
+    # clips are small batches, which further threads only delay
+    model, clips = load(weights, tta=looks, threads=1), []
     for index in range(count):
         people = scenes[index % len(scenes)].clip(seed, index)
         clouds = [np.asarray(person.sample.points, float) for person in people]
@@ -179,6 +183,7 @@ def hidden(clips: dict[str, np.ndarray], gap: int) -> list[list[float]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--motion", action="append", default=[], metavar="FILE[:SUBJECTS]")
+    parser.add_argument("--looks", type=int, default=TTA, help="transforms that each prediction is the mean of")
     parser.add_argument("--weights", default=DEFAULT)
     parser.add_argument("--clips", type=int, default=120)
     parser.add_argument("--seed", type=int, default=SEED)
@@ -191,7 +196,7 @@ def main() -> None:
         with np.load(options.store) as stored:
             clips = dict(stored)
     else:
-        clips = make_clips(options.motion, options.clips, options.seed, options.weights)
+        clips = make_clips(options.motion, options.clips, options.seed, options.weights, options.looks)
         if options.store:
             np.savez_compressed(options.store, **clips)
     report = run(clips)
