@@ -3,8 +3,8 @@
     python benchmarks/real.py FOLDER --json docs/scores/real.json
 
 FOLDER holds sweep_N.pcd, .bin or .ply, and beside each a sweep_N.json of boxes as `lidarpose predict` takes them.
-Prints for each person: points, distance, the angle between where the pose faces and where the box heads, and that of a
-single look, the share of points within 15 cm of the skeleton's bones, lean of the trunk, confidence; and, for a track
+Prints for each person: points, distance, the angle between where the pose faces and where the box heads, and that with
+`--tta 4`, the share of points within 15 cm of the skeleton's bones, lean of the trunk, confidence; and, for a track
 that two sweeps share, how far the pose moved against itself once both are put on one pelvis.
 """
 
@@ -37,13 +37,13 @@ def distance_to_bones(points: np.ndarray, joints: np.ndarray) -> np.ndarray:
     return np.linalg.norm(points[:, None] - nearest, axis=-1).min(1)
 
 
-def rows_of(model: Predictor, single: Predictor, folder: Path, least: int) -> Iterator[tuple[dict, PersonPose]]:
+def rows_of(model: Predictor, four: Predictor, folder: Path, least: int) -> Iterator[tuple[dict, PersonPose]]:
     """Each labeled person of `least` points and more, sweep by sweep: their figures and their pose."""
     for labels in sorted(folder.glob("sweep_*.json")):
         sweep = next(path for path in sorted(folder.glob(f"{labels.stem}.*")) if path.suffix != ".json")
         boxes = {"people": json.loads(labels.read_text())["people"]}
-        people = (lidarpose.predict(sweep, boxes=boxes, model=one) for one in (model, single))
-        for person, once in zip(*people, strict=True):
+        people = (lidarpose.predict(sweep, boxes=boxes, model=one) for one in (model, four))
+        for person, other in zip(*people, strict=True):
             if person.num_points < least or person.pose is None:
                 continue
             trunk = person.joints[SMPL24.index("neck")] - person.joints[SMPL24.index("pelvis")]
@@ -53,7 +53,7 @@ def rows_of(model: Predictor, single: Predictor, folder: Path, least: int) -> It
                 "points": int(person.num_points),
                 "distance": float(np.linalg.norm(person.box.center)),
                 "turn": turn(person),
-                "turn_single": turn(once),
+                "turn_of_four": turn(other),
                 "near": float((distance_to_bones(person.points, person.joints) < NEAR).mean()),
                 "lean": float(np.degrees(np.arccos(trunk[2] / np.linalg.norm(trunk)))),
                 "confidence": float(person.confidence.mean()),
@@ -84,15 +84,15 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--least", type=int, default=50, help="fewest points a person")
     parser.add_argument("--weights", default=DEFAULT)
-    parser.add_argument("--tta", type=int, default=TTA, help="looks at each person")
+    parser.add_argument("--tta", type=int, default=TTA, help="as of predict")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write people's figures")
     options = parser.parse_args()
-    models = (lidarpose.load(options.weights, tta=looks) for looks in (options.tta, 1))
+    models = (lidarpose.load(options.weights, tta=looks) for looks in (options.tta, 4))
     people = list(rows_of(*models, options.folder, options.least))
     for row, _ in people:
         print(
             f"{row['sweep']} {row['person']}  {row['points']:4d} points {row['distance']:5.1f} m"
-            f"  facing {row['turn']:5.0f} deg off the box, with one look {row['turn_single']:5.0f}"
+            f"  facing {row['turn']:5.0f} deg off the box, with one look {row['turn_of_four']:5.0f}"
             f"  {row['near']:4.0%} near bones  lean {row['lean']:3.0f} deg  confidence {row['confidence']:.2f}"
         )
     tracks = list(moved(people))

@@ -243,14 +243,14 @@ def real() -> str:
             str(one["points"]),
             f"{one['distance']:.1f}",
             f"{one['turn']:.0f} deg",
-            f"{one['turn_single']:.0f} deg",
+            f"{one['turn_of_four']:.0f} deg",
             f"{100 * one['near']:.0f} %",
             f"{one['lean']:.0f} deg",
             f"{one['confidence']:.2f}",
         )
         for one in _read("real")["people"]
     ]
-    header = ("sweep", "person", "points", "distance m", "facing relative to the box", "the same, `--tta 1`")
+    header = ("sweep", "person", "points", "distance m", "facing relative to the box", "the same, `--tta 4`")
     return table((*header, "points within 15 cm of a bone", "trunk lean", "confidence"), rows)
 
 

@@ -2,109 +2,56 @@
 
     python benchmarks/test_time.py tiny --limit 1000 --out docs/scores/test_time.json
 
-Passes: each but the first is about the pelvis of the one before. Transforms: the last pass is repeated with the
-person mirrored, turned by quarters, or shifted in the grid of voxels, and joints are averaged (`inference/tta.py`), or
-heatmaps are (as logarithms, brought to the mean vote). Rejection: the error of the most confident people and joints.
+The first pass finds the pelvis, about which the others are: with the person mirrored, turned by quarters, or shifted in
+the grid of voxels. Joints are averaged (`inference/tta.py`). Rejection: the error of the most confident people and
+joints.
 """
 
 import argparse
 import json
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from ablation_tables import figures
 
 from lidarpose import evaluation
-from lidarpose.inference.backend import Raw, estimates
-from lidarpose.inference.estimator import PASSES
 from lidarpose.inference.predictor import Predictor, load
-from lidarpose.inference.tta import TRANSFORMS, TTATransform, apply
+from lidarpose.inference.tta import IDENTITY, MIRRORED, TRANSFORMS, TTATransform
 from lidarpose.io.files import write_atomic
-from lidarpose.sample import Pose
-from lidarpose.skeleton import BODY26
-
-# a logarithm that stands for a bin out of the heatmap, or of next to no weight
-_LEAST = -12.0
-_FLIP = np.array(BODY26.flip)
 
 
 @dataclass(frozen=True)
 class Way:
+    """first: how people are shown in the pass that finds the pelvis; averaged: whether its answer counts; transforms:
+    of the passes after it."""
+
     what: str
-    passes: int = PASSES
-    transforms: tuple[TTATransform, ...] = (TTATransform(),)
-    heatmaps: bool = False
+    transforms: tuple[TTATransform, ...] = (IDENTITY,)
+    first: TTATransform = MIRRORED
+    averaged: bool = True
 
 
-_SYMMETRIES = tuple(TTATransform(turns, mirrored) for turns in range(4) for mirrored in (False, True))
-USUAL = Way("two passes, one prediction (`--tta 1`)")
+USUAL = Way("`--tta 1`, the first pass mirrored and averaged")
 WAYS = (
-    Way("one pass", passes=1),
+    Way("one pass about the pelvis, the first not averaged", first=IDENTITY, averaged=False),
+    Way("the first averaged, not mirrored", first=IDENTITY),
     USUAL,
-    Way("three passes", passes=3),
-    Way("and mirrored, joints averaged", transforms=_SYMMETRIES[:2]),
-    Way("and mirrored, heatmaps averaged", transforms=_SYMMETRIES[:2], heatmaps=True),
-    Way("four quarter rotations, joints averaged", transforms=_SYMMETRIES[::2]),
-    Way("four rotations, each mirrored too, joints averaged", transforms=_SYMMETRIES),
-    Way("`--tta 2`: rotated, mirrored and shifted", transforms=TRANSFORMS[:2]),
-    Way("`--tta 4`", transforms=TRANSFORMS[:4]),
-    Way("`--tta 8`", transforms=TRANSFORMS),
+    Way("four quarter rotations", tuple(TTATransform(turns) for turns in range(4))),
+    Way("`--tta 2`", TRANSFORMS[:2]),
+    Way("`--tta 4`", TRANSFORMS[:4]),
+    Way("`--tta 4`, the first not averaged", TRANSFORMS[:4], averaged=False),
+    Way("`--tta 8`", TRANSFORMS),
 )
 
 
-class Averaging(Predictor):
-    """A predictor of other passes and transforms."""
+class Shown(Predictor):
+    """A predictor of other passes."""
 
     def __init__(self, predictor: Predictor, way: Way):
         super().__init__(predictor.backend, name=predictor.model["name"], decode=predictor.model["decode"])
-        self._passes, self._tta, self.heatmaps = way.passes, way.transforms, way.heatmaps
-
-    def outputs(self, clouds, centers, origin, clip=None, *, transforms=TRANSFORMS[:1]) -> Pose:
-        if not self.heatmaps:
-            return super().outputs(clouds, centers, origin, clip, transforms=transforms)
-        raws = [self._raw(transform, clouds, centers, origin) for transform in transforms]
-        return estimates(_fused(raws), self._decoder, self.skeleton)
-
-    def _raw(
-        self, transform: TTATransform, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None
-    ) -> Raw:
-        """What the network says of people shown so, brought back before it is decoded: heatmaps turn exactly."""
-        R, heatmaps = transform.R_view_person, []
-        raw = self.backend.run(*apply(transform, clouds, centers, origin))
-        for axis in range(3):
-            source = int(np.abs(R[:, axis]).argmax())
-            heatmaps.append(raw.heatmaps[source][..., :: int(R[source, axis])])
-        values = {name: getattr(raw, name) for name in ("confidence", "log_spread", "visible")}
-        values |= {"vote": raw.vote @ R + transform.shift, "heatmaps": tuple(heatmaps)}
-        if transform.mirrored:
-            values = {k: tuple(h[:, _FLIP] for h in v) if k == "heatmaps" else v[:, _FLIP] for k, v in values.items()}
-        return replace(raw, **values)
-
-
-def _fused(raws: list[Raw]) -> Raw:
-    """One answer: the mean vote, and about it the mean of the heatmaps' logarithms."""
-    vote = np.mean([raw.vote for raw in raws], 0)
-    heatmaps = []
-    for axis in range(3):
-        sums = 0.0
-        for raw in raws:
-            logits = raw.heatmaps[axis].astype(float)
-            logits = logits - np.log(np.exp(logits - logits.max(-1, keepdims=True)).sum(-1, keepdims=True))
-            logits = np.maximum(logits - logits.max(-1, keepdims=True), _LEAST)
-            index = np.arange(logits.shape[-1]) + ((vote - raw.vote)[..., axis] / raw.step[axis])[..., None]
-            below = np.floor(index).astype(int)
-            share = index - below
-            sums = sums + (1 - share) * _bins(logits, below) + share * _bins(logits, below + 1)
-        heatmaps.append(sums / len(raws))
-    told = {name: np.mean([getattr(raw, name) for raw in raws], 0) for name in ("confidence", "log_spread", "visible")}
-    return replace(raws[0], vote=vote, heatmaps=tuple(heatmaps), **told)
-
-
-def _bins(logits: np.ndarray, index: np.ndarray) -> np.ndarray:
-    inside = (index >= 0) & (index < logits.shape[-1])
-    return np.where(inside, np.take_along_axis(logits, np.clip(index, 0, logits.shape[-1] - 1), -1), _LEAST)
+        self._first, self._tta, self._averaged = way.first, way.transforms, way.averaged
 
 
 def rejection(predictions) -> list[dict]:
@@ -132,7 +79,7 @@ def main() -> None:
     ways = []
     for way in WAYS:
         started = time.process_time()
-        done = evaluation.run(Averaging(model, way), ["bench"], limit=options.limit)
+        done = evaluation.run(Shown(model, way), ["bench"], limit=options.limit)
         seconds = time.process_time() - started
         if way is USUAL:
             kept = rejection(done.evaluations[0].predictions)

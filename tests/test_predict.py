@@ -584,9 +584,10 @@ def test_results_follow_the_schema(model, points, tmp_path, name):
     assert pose.picture(tmp_path / "pose.png") == (tmp_path / "pose.png").read_bytes()
 
 
-def test_a_file_is_looked_at_four_times(points, tmp_path):
+def test_files_and_clouds_are_posed_alike_by_default(points, tmp_path):
     np.save(tmp_path / "crop.npy", points)
-    assert lidarpose.predict(tmp_path / "crop.npy").model["tta"] == 4
+    (person,) = lidarpose.predict(tmp_path / "crop.npy", sensor_origin=(0, 0, 0), crop=True)
+    np.testing.assert_array_equal(person.joints, lidarpose.load().predict(points, sensor_origin=(0, 0, 0)).joints)
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason=f"the real sweeps are not at {REAL}")
@@ -631,7 +632,11 @@ def test_without_confidence_the_whole_cloud_is_the_answer(points):
     """Not the smallest of the candidates, which is seen first."""
 
     class Counting:
-        name, header, batch = "counting", SimpleNamespace(skeleton=SKELETONS["smpl24"], version="0", card={}), 8
+        name, header, batch = (
+            "counting",
+            SimpleNamespace(skeleton=SKELETONS["smpl24"], network="pose", version="0", card={}),
+            8,
+        )
 
         def run(self, clouds, view):
             vote = np.zeros((len(clouds), 24, 3), np.float32)

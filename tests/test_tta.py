@@ -1,5 +1,8 @@
 """Test-time augmentation: estimates are brought back to where the person is, and averaged."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,7 +10,9 @@ from hypothesis import strategies as st
 
 import lidarpose
 from lidarpose.errors import InputError
-from lidarpose.inference.tta import TRANSFORMS, TTATransform, apply, average, invert, tta_transforms
+from lidarpose.inference.backend import Raw
+from lidarpose.inference.estimator import PoseEstimator
+from lidarpose.inference.tta import IDENTITY, TRANSFORMS, TTATransform, apply, average, invert, tta_transforms
 from lidarpose.sample import Pose
 from lidarpose.skeleton import HUMAN15
 from lidarpose.synth.generator import Generator
@@ -83,16 +88,56 @@ def test_transforms_are_different_and_the_first_is_the_identity():
             lidarpose.load(tta=tta)
 
 
-def test_more_transforms_are_better_and_results_say_how_many():
+def people(count):
     generator = Generator(scene=scene_config("wild"), measure=False)
-    people = [generator.person(4711, k).sample for k in range(32)]
-    clouds, truth = [sample.points for sample in people], np.stack([sample.pose.joints for sample in people])
-    errors = {}
+    samples = [generator.person(4711, k).sample for k in range(count)]
+    return [sample.points for sample in samples], np.stack([sample.pose.joints for sample in samples])
+
+
+def error(model, clouds, truth):
+    joints = model.predict(clouds, sensor_origin=(0, 0, 0), skeleton="body26").to_numpy()
+    return np.linalg.norm(joints - truth, axis=-1).mean(), joints
+
+
+def test_more_passes_are_better_than_one_and_results_say_how_many():
+    """The pass that finds the pelvis counts too; alone is the one after it."""
+    clouds, truth = people(96)
+    alone = lidarpose.load()
+    alone._averaged, alone._first = False, IDENTITY
+    least, _ = error(alone, clouds, truth)
     for tta in (1, 4):
         model = lidarpose.load(tta=tta)
-        joints = model.predict(clouds, sensor_origin=(0, 0, 0), skeleton="body26").to_numpy()
-        errors[tta] = np.linalg.norm(joints - truth, axis=-1).mean()
-        assert model.model.get("tta", 1) == tta
-    assert errors[4] < errors[1]
-    alone = model.predict(people[1].points, sensor_origin=(0, 0, 0), skeleton="body26")
-    np.testing.assert_allclose(joints[1], alone.joints, atol=1e-5)
+        found, joints = error(model, clouds, truth)
+        assert found < least and model.model.get("tta", 1) == tta
+    one = model.predict(clouds[1], sensor_origin=(0, 0, 0), skeleton="body26")
+    np.testing.assert_allclose(joints[1], one.joints, atol=1e-5)
+
+
+def test_who_is_meant_of_two_is_the_one_at_the_middle_of_the_box():
+    """Asked only where the network sees two people; a lone person's pose is the same in any box."""
+    rng = np.random.default_rng(0)
+    clouds = [rng.normal((5, 0, 0), (0.2, 0.2, 0.5), (300, 3)), rng.normal((9, 0, 0), (0.2, 0.2, 0.5), (200, 3))]
+    boxes = np.array([[5.3, 0.3, 0.0], [9.2, 0.1, 0.1]])
+    estimator = PoseEstimator(TwoPeople(sure=(True, False)))
+    asked = estimator.poses(clouds, np.zeros(3), box_centers=boxes)
+    plain = estimator.poses(clouds, np.zeros(3))
+    # the answer is always the middle of what it is shown
+    np.testing.assert_allclose(asked[0].joints, np.broadcast_to([5.3, 0.3, 0.0], (15, 3)), atol=0.011)
+    np.testing.assert_array_equal(asked[1].joints, plain[1].joints)
+    assert np.linalg.norm(plain[0].joints[0] - boxes[0]) > 0.2
+
+
+class TwoPeople:
+    """A backend that puts everybody at the middle of the crop, and sees two people in the first cloud."""
+
+    name, batch = "fake", 64
+    header = SimpleNamespace(skeleton=HUMAN15, network="pose")
+
+    def __init__(self, sure):
+        self.sure = dict(zip((300, 200), sure, strict=True))
+
+    def run(self, clouds, view):
+        each = np.zeros((len(clouds), 15))
+        person = np.array([[9.0, 9.0 if self.sure[len(cloud)] else -9.0] for cloud in clouds])
+        raw = Raw.from_joints(np.zeros((len(clouds), 15, 3)))
+        return replace(raw, confidence=each, log_spread=each, visible=each, person=person)

@@ -9,7 +9,7 @@ one of them as `xyz`, (..., 3) meters in the sensor frame, z up, 0,0,0 where not
     for frames in ouster.sdk.open_source("OS-1-32-G_v2.1.1_1024x10.pcap"):
         xyz = ouster.sdk.core.XYZLut(frames[0].sensor_info, False)(frames[0])
 
-The boxes were placed by hand. The poses are those of the default weights with `--tta 4`, drawn as they are.
+The boxes were placed by hand. The poses are those of the default weights, drawn as they are.
 """
 
 import argparse
@@ -174,7 +174,7 @@ def main() -> None:
         parser.add_argument(name, type=Path, help=f"npz of the recording with the {name}")
     parser.add_argument("--out", type=Path, default=Path("docs/images/real.png"))
     args = parser.parse_args()
-    model = lidarpose.load(tta=4)
+    model = lidarpose.load()
     scans, poses = {}, {}
     for name, boxes in BOXES.items():
         scans[name] = read_points(getattr(args, name))

@@ -3,12 +3,19 @@ what it says of the cloud in tests/golden_poses.json.
 
 python benchmarks/heldout.py --motion cmu_motion.npz --weights RUN/model.safetensors --json scores.json
 python tools/ship_weights.py RUN/model.safetensors scores.json src/lidarpose/models/weights/tiny.safetensors
+python tools/ship_weights.py RUN/model.safetensors scores.json OUT --average OLD.safetensors 0.2
+
+The last one keeps a share of the weights that the run began with, which loses less of what they could (Wortsman et al.
+2022, Robust fine-tuning of zero-shot models). What the scores are of is made by the same command without scores: -.
 """
 
 import argparse
 import json
 import tempfile
 from pathlib import Path
+
+import torch
+from torch import nn
 
 from lidarpose.inference.predictor import load
 from lidarpose.io.files import write_atomic
@@ -18,14 +25,29 @@ from lidarpose.models.export import export
 GOLDEN = Path(__file__).parents[1] / "tests" / "golden_poses.json"
 
 
+def average(network: nn.Module, old: nn.Module, share: float) -> None:
+    """Keeps a share of an older network's weights, in place. What the older one has not stays."""
+    before = old.state_dict()
+    with torch.no_grad():
+        for name, value in network.state_dict().items():
+            if name in before:
+                value.lerp_(before[name], share)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model")
     parser.add_argument("scores")
     parser.add_argument("out")
+    parser.add_argument("--average", nargs=2, metavar=("OLD", "SHARE"), help="keep a share of older weights")
     parser.add_argument("--note", help="what the command does not tell of the training")
     options = parser.parse_args()
     network, header = load_checkpoint(options.model)
+    if options.average:
+        average(network, load_checkpoint(options.average[0])[0], float(options.average[1]))
+    if options.scores == "-":
+        save_checkpoint(options.out, network, card=header.card, half=True)
+        return
     with open(options.scores) as file:
         scores = json.load(file)
     measured = {}

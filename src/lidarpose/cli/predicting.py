@@ -62,7 +62,7 @@ $ lidarpose predict street.mcap --every 2 --format parquet
 --backend NAME  onnx or torch (default onnx for bundled weights and .onnx, torch for .safetensors and other devices)
 --device NAME = cpu  cpu (default), or cuda (backend torch)
 --decode NAME = window  how heatmaps are decoded: window (default), argmax or dark
---tta N = 4  test-time augmentation: average N predictions of each person, 1 to 8 (default 4)
+--tta N = 1  test-time augmentation: average N predictions of each person and the one that finds them, 1 (default) to 8
 """
 _DETECT = f"""
 find the people in a point file

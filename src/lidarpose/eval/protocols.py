@@ -196,8 +196,14 @@ class EvalSetup:
     def _predict_clean(self, samples: list[EvalSample], origin: np.ndarray | None) -> Iterator[dict]:
         clouds = [person.points for person in samples]
         model: Any = self.model
-        clips = self._clips(samples)
-        for person in model.predict(clouds, sensor_origin=origin, skeleton=model.skeleton.name, **clips):
+        name, clips = model.skeleton.name, self._clips(samples)
+        boxes = [person.sample.box for person in samples]
+        centers = [box.center for box in boxes if box is not None]
+        if hasattr(model, "predict_in") and not clips and len(centers) == len(boxes):
+            people = model.predict_in(clouds, np.stack(centers), origin, name)
+        else:
+            people = model.predict(clouds, sensor_origin=origin, skeleton=name, **clips)
+        for person in people:
             yield {} if person.pose is None else self._picked(person.pose, ())
 
     def _predict_dapt(self, samples: list[EvalSample], origin: np.ndarray | None) -> Iterator[dict]:

@@ -42,7 +42,7 @@ _CLEARLY_SURER = 0.6
 # a crop that is so far across is no crop of one person, m
 _WIDEST_CROP = 20.0
 # a crop shows nobody below, and two people above this probability
-_NOBODY, _TWO = 0.05, 0.8
+_NOBODY, _TWO = 0.05, 0.5
 # a half turn about x
 UPSIDE_DOWN = np.array([1.0, -1.0, -1.0])
 # joints that every skeleton has

@@ -11,26 +11,35 @@ import numpy as np
 
 from lidarpose.inference.backend import Backend, estimates
 from lidarpose.inference.inputs import Clips
-from lidarpose.inference.tta import TTATransform, apply, average, invert, tta_transforms
+from lidarpose.inference.tta import IDENTITY, MIRRORED, TTATransform, apply, average, invert, tta_transforms
+from lidarpose.models.config import NetworkConfig
 from lidarpose.models.decode import decoder
 from lidarpose.models.voxelize import WINDOW
 from lidarpose.progress import Progress
 from lidarpose.sample import MIN_POINTS, PER_JOINT, PER_PERSON, Pose, center_of
 
-# passes: the second is centered on the pelvis that the first estimated
-PASSES = 2
 # to which the center of the second pass is rounded, m: backends differ by less than a micrometer, which must not move a
 # point to another voxel
 _CENTER_DECIMALS = 2
 _CENTER_STEP = 10**-_CENTER_DECIMALS
+# a cloud shows two people above this probability
+_TWO_PEOPLE = 0.2
 
 
 class PoseEstimator:
-    """A network, and how its answers become poses. decode, tta: as of `load`."""
+    """A network, and how its answers become poses. decode, tta: as of `load`.
+
+    The first pass finds the pelvis, on which the others are centered. The package's own networks see the person
+    mirrored in it, and its answer is averaged with the others': nearly as good as a mirrored pass of its own. The
+    paper's networks are run as released.
+    """
 
     def __init__(self, backend: Backend, *, decode: str = "window", tta: int = 1):
         self.backend, self.header, self.skeleton = backend, backend.header, backend.header.skeleton
-        self._decoder, self._tta, self._passes = decoder(decode), tta_transforms(tta), PASSES
+        self._decoder, self._tta = decoder(decode), tta_transforms(tta)
+        # of the first pass: how a person is shown, and whether its answer counts
+        self._averaged = self.header.network == NetworkConfig.kind
+        self._first = MIRRORED if self._averaged else IDENTITY
         # the middle of a person: the pelvis, or half way between the hips where the skeleton has none
         root = ("pelvis",) if "pelvis" in self.skeleton.joints else ("left_hip", "right_hip")
         self._root = [self.skeleton.index(joint) for joint in root]
@@ -41,12 +50,10 @@ class PoseEstimator:
         centers: np.ndarray,
         origin: np.ndarray | None,
         clip: Clips | None = None,
-        *,
-        transforms: Sequence[TTATransform] = (TTATransform(),),
     ) -> Pose:
         """What the network says of clouds (n, 3) m seen about centers (B, 3), from a sensor at origin (3,) or None;
-        clip: of networks of clips, which of the clouds are frames of one person; the mean under all transforms."""
-        return average([self._transformed(transform, clouds, centers, origin, clip) for transform in transforms])
+        clip: of networks of clips, which of the clouds are frames of one person."""
+        return self._transformed(IDENTITY, clouds, centers, origin, clip)
 
     def _transformed(self, transform: TTATransform, clouds, centers, origin, clip) -> Pose:
         about, view = apply(transform, clouds, centers, origin)
@@ -62,17 +69,20 @@ class PoseEstimator:
         *,
         clips: Clips | None = None,
         centers: np.ndarray | None = None,
+        box_centers: np.ndarray | None = None,
         progress: bool = False,
     ) -> list[Pose | None]:
         """The pose of each cloud (n, 3) m, None where too little of it is near its middle, and, of clips, where it is
-        in none; centers (N, 3) m: about where the pelvises are, where they need not be found."""
+        in none; centers (N, 3) m: about where the pelvises are, where they need not be found; box_centers (N, 3) m:
+        who is meant where a cloud shows two people."""
         poses: list[Pose | None] = [None] * len(clouds)
         centers = None if centers is None else np.round(centers, _CENTER_DECIMALS)
         done = 0
         with Progress(len(clouds), unit="clouds", shown=progress) as shown:
             for rows, clip in self._batches(clouds, clips):
                 about = None if centers is None else centers[rows]
-                answers = self._batch([clouds[row] for row in rows], origin, clip, about)
+                boxes = None if box_centers is None else box_centers[rows]
+                answers = self._batch([clouds[row] for row in rows], origin, clip, about, boxes)
                 for row, pose in zip(rows, answers, strict=True):
                     poses[row] = pose
                 done += len(rows)
@@ -92,16 +102,25 @@ class PoseEstimator:
         yield from ((order[start : start + count], None) for start in range(0, len(order), count))
 
     def _batch(
-        self, clouds: list[np.ndarray], origin: np.ndarray | None, clip: Clips | None, centers: np.ndarray | None
+        self,
+        clouds: list[np.ndarray],
+        origin: np.ndarray | None,
+        clip: Clips | None,
+        centers: np.ndarray | None,
+        box_centers: np.ndarray | None,
     ) -> list[Pose | None]:
-        passes = self._passes if centers is None else 1
+        first = None
         if centers is None:
             centers = np.stack([center_of(points) for points in clouds])
-        for _ in range(passes - 1):
-            root = self.outputs(clouds, centers, origin, clip).joints[:, self._root].mean(1)
+            first = self._transformed(self._first, clouds, centers, origin, clip)
+            if box_centers is not None and first.second_person is not None:
+                centers, first = self._of_two(clouds, centers, box_centers, origin, first)
+            root = first.joints[:, self._root].mean(1)
             # an answer that is no number stays one
-            centers = centers + np.round(np.clip(root, -WINDOW / 2, WINDOW / 2) / _CENTER_STEP) * _CENTER_STEP
-        estimated = self.outputs(clouds, centers, origin, clip, transforms=self._tta)
+            shift = np.round(np.clip(root, -WINDOW / 2, WINDOW / 2) / _CENTER_STEP) * _CENTER_STEP
+            centers, first = centers + shift, replace(first, joints=first.joints - shift[:, None])
+        answers = [self._transformed(transform, clouds, centers, origin, clip) for transform in self._tta]
+        estimated = average([*answers, first] if first is not None and self._averaged else answers)
         poses: list[Pose | None] = []
         for k, points in enumerate(clouds):
             near = (np.abs(points - centers[k]) < WINDOW).all(1).sum()
@@ -112,3 +131,27 @@ class PoseEstimator:
             of_person: dict[str, Any] = {name: value[k] for name, value in values.items() if value is not None}
             poses.append(replace(estimated, joints=estimated.joints[k] + centers[k], **of_person))
         return poses
+
+    def _of_two(
+        self,
+        clouds: list[np.ndarray],
+        centers: np.ndarray,
+        box_centers: np.ndarray,
+        origin: np.ndarray | None,
+        first: Pose,
+    ) -> tuple[np.ndarray, Pose]:
+        """Centers and first answers, those of clouds that show two people about the centers of their boxes: who is
+        nearer to them is meant."""
+        assert first.second_person is not None
+        rows = np.flatnonzero(first.second_person > _TWO_PEOPLE)
+        if not len(rows):
+            return centers, first
+        centers = centers.copy()
+        centers[rows] = np.round(box_centers[rows], _CENTER_DECIMALS)
+        again = self._transformed(self._first, [clouds[row] for row in rows], centers[rows], origin, None)
+        changed: dict[str, Any] = {}
+        for name in ("joints", *PER_JOINT, *PER_PERSON):
+            if (value := getattr(first, name)) is not None:
+                changed[name] = value.copy()
+                changed[name][rows] = getattr(again, name)
+        return centers, replace(first, **changed)

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 BACKENDS = ("onnx", "torch")
 # default number of test-time augmentation passes
-TTA = 4
+TTA = 1
 
 
 def load(
@@ -69,9 +69,9 @@ def load(
     for other paths and devices. decode: how heatmaps are read, "window" (the mean about the mode), "argmax" or "dark"
     (the released DAPT code's); where two peaks are equally high, rounding decides. compile: by `torch.compile`, backend
     torch only. threads: of ONNX Runtime, None for all processors; backend onnx only. tta: test-time augmentation, the
-    number of transforms of each person (1 to 8), averaged. A person costs one pass to center the cloud and one for each
-    transform, so 1 takes two passes, 4 take five. Raises InputError for an unknown name, a file that is no checkpoint,
-    or a device that is not there; MissingExtra where torch is needed and not installed.
+    number of transforms of each person (1 to 8), averaged with the pass that centers the cloud. A person costs that
+    pass and one for each transform, so 1 takes two passes, 4 take five. Raises InputError for an unknown name, a file
+    that is no checkpoint, or a device that is not there; MissingExtra where torch is needed and not installed.
     """
     decoder(decode)
     tta_transforms(tta)
@@ -241,10 +241,24 @@ class Predictor(PoseEstimator):
         people = self._people(list(clouds), origin, wanted, False, centers=centers)
         return Poses(people=tuple(people), skeleton=wanted, model=self.model)
 
-    def _people(self, clouds, origin, wanted, progress, clips=None, centers=None) -> list[PersonPose]:
+    def predict_in(
+        self,
+        clouds: Sequence[np.ndarray],
+        box_centers: np.ndarray,
+        origin: np.ndarray | None,
+        skeleton: str | None = None,
+        progress: bool = False,
+    ) -> Poses:
+        """As `predict` of clouds (n, 3) m cut out by boxes with centers (N, 3) m: where a cloud shows two people, who
+        is nearer to the center is meant."""
+        wanted = self.in_skeleton(skeleton)
+        people = self._people(list(clouds), origin, wanted, progress, box_centers=box_centers)
+        return Poses(people=tuple(people), skeleton=wanted, model=self.model)
+
+    def _people(self, clouds, origin, wanted, progress, clips=None, centers=None, box_centers=None) -> list[PersonPose]:
         cleaned = [clean(cloud) for cloud in clouds]
         is_usable = np.array([not is_few(points) for points, _ in cleaned], bool)
-        best = self._best(cleaned, is_usable, origin, progress, clips, centers)
+        best = self._best(cleaned, is_usable, origin, progress, clips, centers, box_centers)
         poses: list[Pose | None] = [None] * len(clouds)
         doubtful: list[int] = []
         for i, (points, notes) in enumerate(cleaned):
@@ -277,7 +291,9 @@ class Predictor(PoseEstimator):
             for pose, (points, notes) in zip(poses, cleaned, strict=True)
         ]
 
-    def _best(self, cleaned, is_usable, origin, progress, clips, centers) -> dict[int, tuple[Pose, np.ndarray]]:
+    def _best(
+        self, cleaned, is_usable, origin, progress, clips, centers, box_centers
+    ) -> dict[int, tuple[Pose, np.ndarray]]:
         """By person the pose, where there is one, and what of the cloud (n, 3) m it is of: the surest candidate."""
         if clips is not None:
             # rows of clips are those of all clouds
@@ -287,8 +303,10 @@ class Predictor(PoseEstimator):
             usable = [(i, cleaned[i][0]) for i in np.flatnonzero(is_usable).tolist()]
             # a person's first candidate is the whole cloud
             parts = [(i, part) for i, cloud in usable for part in (candidates(cloud) if centers is None else [cloud])]
-            about = None if centers is None else centers[[i for i, _ in parts]]
-            answers = self.poses([part for _, part in parts], origin, centers=about, progress=progress)
+            rows = [i for i, _ in parts]
+            about, boxes = (None if each is None else each[rows] for each in (centers, box_centers))
+            clouds = [part for _, part in parts]
+            answers = self.poses(clouds, origin, centers=about, box_centers=boxes, progress=progress)
         best: dict[int, tuple[Pose, np.ndarray]] = {}
         for (i, part), pose in zip(parts, answers, strict=True):
             if pose is not None and (i not in best or _surer(pose, best[i][0])):

@@ -36,16 +36,18 @@ class TTATransform:
         return np.diag([1, -1, 1]) @ turn if self.mirrored else turn
 
 
-# no two shifts put the edges of fine voxels (6 cm) in the same place
+IDENTITY, MIRRORED = TTATransform(), TTATransform(0, True)
+# no two shifts put the edges of fine voxels (6 cm) in the same place; a network has seen people of all headings in the
+# sensor's frame alone, so that turned ones come last
 TRANSFORMS = (
-    TTATransform(),
-    TTATransform(2, True, (0.03, 0.08, -0.04)),
-    TTATransform(1, False, (-0.08, 0.03, 0.05)),
-    TTATransform(3, True, (0.05, -0.04, 0.03)),
-    TTATransform(2, False, (-0.05, -0.07, -0.03)),
+    IDENTITY,
+    TTATransform(0, True, (0.05, -0.04, 0.03)),
+    TTATransform(0, False, (0.03, 0.08, -0.04)),
     TTATransform(0, True, (0.07, -0.02, 0.04)),
-    TTATransform(3, False, (-0.02, 0.05, -0.05)),
-    TTATransform(1, True, (0.02, -0.05, 0.02)),
+    TTATransform(2, True, (-0.05, -0.07, -0.03)),
+    TTATransform(1, False, (-0.08, 0.03, 0.05)),
+    TTATransform(3, True, (-0.02, 0.05, -0.05)),
+    TTATransform(2, False, (0.02, -0.05, 0.02)),
 )
 
 

@@ -180,16 +180,11 @@ def verified(
         header: the detector's.
         least_score: people of a lower score are left out; near where tracks are expected, `WEAK_SCORE` is enough.
     """
-    least = np.full(len(detections), least_score)
     highest = _highest_score(detections, header)
-    expected = np.full(len(detections), -1)
+    expected, least = np.full(len(detections), -1), np.full(len(detections), least_score)
     if known is not None:
         expected = _expected(detections, highest >= least_score, known)
-        is_missed = ~np.isin(np.arange(len(known.tracks)), expected)
-        is_near = (_apart(detections.centers, known.tracks[is_missed]) < known.reach[is_missed]).any(1)
-        least[is_near] = min(least_score, WEAK_SCORE)
-        is_nobody = (_apart(detections.centers, known.rejected) < _SAME_PLACE).any(1)
-        least[is_nobody & ~is_near & (expected < 0)] = np.inf
+        least = _least_scores(detections, expected, least_score, known)
     possible = np.flatnonzero(highest >= least)
     near = dict(zip(possible.tolist(), _rows_near(detections.centers[possible], points), strict=True))
     posed = possible[expected[possible] < 0]
@@ -225,6 +220,18 @@ def verified(
         rows.append(near[i][inside])
         shown.append(i)
     return People(boxes=boxes, rows=rows, pelvises=pelvis[shown], verified=expected[shown] < 0, rejected=rejected)
+
+
+def _least_scores(detections: Detections, expected: np.ndarray, least_score: float, known: KnownPlaces) -> np.ndarray:
+    """(D,): what a detection's score must be: less where a known person is missed, infinite where it turned out to be
+    nobody."""
+    least = np.full(len(detections), least_score)
+    is_missed = ~np.isin(np.arange(len(known.tracks)), expected)
+    is_near = (_apart(detections.centers, known.tracks[is_missed]) < known.reach[is_missed]).any(1)
+    least[is_near] = min(least_score, WEAK_SCORE)
+    is_nobody = (_apart(detections.centers, known.rejected) < _SAME_PLACE).any(1)
+    least[is_nobody & ~is_near & (expected < 0)] = np.inf
+    return least
 
 
 def _expected(detections: Detections, is_sure: np.ndarray, known: KnownPlaces) -> np.ndarray:

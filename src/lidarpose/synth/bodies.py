@@ -161,8 +161,7 @@ def draw_bodies(
         bank: captured poses, or None; captured: share of the poses that comes from it.
         count: number of bodies.
         moving: False is faster; then nobody goes anywhere.
-        clothes, mix: see `SceneConfig` and `sample_rotations`.
-        rig: the body, None: the shipped one.
+        clothes, mix: see `SceneConfig` and `sample_rotations`; rig: the body, None: the shipped one.
     """
     rng = np.random.default_rng([seed, RandomStream.BLOCK, block])
     rig = load_rig() if rig is None else rig
@@ -177,8 +176,7 @@ def draw_bodies(
         step = np.where(chosen[:, None], way[:, 0] if moving else 0, step)
         kinds = np.where(chosen, "captured", kinds)
         places = np.where(chosen[:, None], bank.places[picked], np.nan)
-    rest = rig.draw_people(rng, count)
-    worn = clothing(rng, count, rig) * np.float32(clothes)
+    rest, worn = rig.draw_people(rng, count), clothing(rng, count, rig) * np.float32(clothes)
     vertices, joints, low, high = _dressed(rig, rest, worn, poses[:, 0], np.zeros((count, 3), np.float32))
     lift = low[:, 2].copy()
     for heights in (vertices[..., 2], joints[..., 2]):
