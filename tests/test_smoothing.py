@@ -218,7 +218,8 @@ def test_a_clip_of_clouds(clouds):
     assert not np.allclose(steady[3].joints, each[3].joints)
     first = model.predict_clip(given[:3], sensor_origin=(0, 0, 0), live=True)
     same = model.predict_clip(given, sensor_origin=(0, 0, 0), live=True)
-    np.testing.assert_array_equal(first.to_numpy(), same.to_numpy()[:3])
+    # what comes later changes nothing but the rounding of a batch of another size
+    np.testing.assert_allclose(first.to_numpy(), same.to_numpy()[:3], rtol=0, atol=1e-6)
     assert len(model.predict_clip([])) == 0
 
 
