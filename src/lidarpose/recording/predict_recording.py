@@ -32,7 +32,9 @@ class FramePoses:
     """The people of one frame.
 
     Args:
-        index, id, time: of the frame, see `Frame`.
+        index: of the frame, see `Frame`.
+        id: of the frame.
+        time: of the frame, s.
         poses: in the sensor's frame; with tracks the people's ids are those of their tracks. Nobody in a damaged frame.
         T_world_sensor: (4, 4) m, None where it is not known.
         error: why the frame could not be read or posed, None for a good one.
@@ -94,11 +96,9 @@ def predict_recording(
     Args:
         source: files, folders or recordings as `open_source` takes them, with columns, topic, meta, rate, start, end
             and every; or a source.
-        boxes: see `FrameBoxes`; with calib as in `predict`.
-        crop, find, min_score, max_range, max_people, background, sensor_origin, skeleton, up, model: as in `predict`.
-            Whether the frames are crops of one person is decided by the first one.
-        track: people are joined over time, and people known need no verification.
-        live: with tracks, whose poses are made steady by the past alone.
+        **posing: how frames are posed, see `PosingOptions`. boxes as of `FrameBoxes`; track: people are joined over
+            time, and people known need no verification; live: with tracks, whose poses are made steady by the past alone;
+            the others as in `predict`. Whether the frames are crops of one person is decided by the first one.
 
     Yields:
         `FramePoses`, of damaged frames too.

@@ -55,7 +55,8 @@ def open_source(
         topic: which of a recording's topics is read, where it has several with points; of nuScenes, the scene.
         meta: the JSON file of an Ouster sensor; None for the one of the recording's name beside it.
         rate: frames a second where there are no times, and instead of those that names tell; 10 by default.
-        start, end: s from the first frame.
+        start: s from the first frame.
+        end: the same.
         every: only each so many-th frame.
 
     Returns:
