@@ -97,8 +97,8 @@ def predict_recording(
         source: files, folders or recordings as `open_source` takes them, with columns, topic, meta, rate, start, end
             and every; or a source.
         **posing: how frames are posed, see `PosingOptions`. boxes as of `FrameBoxes`; track: people are joined over
-            time, and people known need no verification; live: with tracks, whose poses are made steady by the past alone;
-            the others as in `predict`. Whether the frames are crops of one person is decided by the first one.
+            time, and people known need no verification; live: with tracks, whose poses are made steady by the past
+            alone; the others as in `predict`. Whether the frames are crops of one person is decided by the first one.
 
     Yields:
         `FramePoses`, of damaged frames too.
