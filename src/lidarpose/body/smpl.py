@@ -135,11 +135,8 @@ class SmplBody:
         nose, ears = self._head_vertices
         points = np.stack([vertices[:, nose], vertices[:, ears].mean(1)], 1) - joints[:, None, _HEAD]
         posed, positions, global_rotations = self._posed(vertices, joints, local, root)
-        fingers = [self._fingers(wrist) for wrist in _HANDS]
-        # the thumb is the last finger of SMPL+H and SMPL-X
-        hands = [positions[:, bases[:-1] if len(bases) > 1 else bases].mean(1) for bases in fingers]
         head = positions[:, None, _HEAD] + points @ np.swapaxes(global_rotations[:, _HEAD], -1, -2)
-        body26 = np.concatenate([positions[:, :_SHARED], np.stack(hands, 1), head], 1)
+        body26 = np.concatenate([positions[:, :_SHARED], self._hands(positions), head], 1)
         return tuple((x @ _R_LEVEL_SMPL.T).astype(np.float32) for x in (posed, body26))
 
     # its name before 0.3
@@ -177,9 +174,8 @@ class SmplBody:
         the pelvis; linear in the vertices."""
         joints = self.regressor @ vertices
         nose, ears = self._head_vertices
-        fingers = [self._fingers(wrist) for wrist in _HANDS]
-        hands = [joints[bases[:-1] if len(bases) > 1 else bases].mean(0) for bases in fingers]
-        body26 = np.concatenate([joints[:_SHARED], np.stack(hands), vertices[nose, None], vertices[ears].mean(0)[None]])
+        head = np.stack([vertices[nose], vertices[ears].mean(0)])
+        body26 = np.concatenate([joints[:_SHARED], self._hands(joints[None])[0], head])
         return (vertices - joints[0]) @ _R_LEVEL_SMPL.T, (body26 - joints[0]) @ _R_LEVEL_SMPL.T
 
     def _posed(
@@ -229,6 +225,12 @@ class SmplBody:
         for wrist, hand in _HANDS.items():
             full[:, self._fingers(wrist)] = rotations[:, hand, None]
         return full
+
+    def _hands(self, joints: np.ndarray) -> np.ndarray:
+        """The hands (n, 2, 3) of joints (n, J, 3): the mean of the fingers' bases, without the thumb's."""
+        fingers = [self._fingers(wrist) for wrist in _HANDS]
+        # the thumb is the last finger of SMPL+H and SMPL-X
+        return np.stack([joints[:, bases[:-1] if len(bases) > 1 else bases].mean(1) for bases in fingers], 1)
 
     def _fingers(self, wrist: int) -> np.ndarray:
         return np.flatnonzero(self.parents == wrist)
