@@ -51,7 +51,9 @@ def test_a_score_that_so_many_false_people_pass():
 def test_the_default_score_lets_one_false_person_a_scan_pass():
     rng = np.random.default_rng(0)
     scans, labels = 100, rng.random(1500) < 0.3
-    features = np.column_stack([rng.normal(labels * 4.0, 2), rng.normal(size=(1500, 3)), rng.random(1500) < 0.1])
+    mounted = rng.random(1500) < 0.1
+    of_pose = rng.normal(size=(1500, 4))
+    features = np.column_stack([rng.normal(labels * 4.0, 2), of_pose[:, :3], mounted, of_pose[:, 3]])
     features[:5, 2] = np.nan
     header = fit(features, labels, scans)
     passing = (final_score(features, header) >= header["default_score"]) & ~labels

@@ -208,16 +208,16 @@ def test_a_map_is_thinned(scene, monkeypatch):
 
 
 def test_the_final_score_is_what_the_header_says():
-    features = np.array([[2.0, 0.8, -3.0, 5.0, 0.25], [np.nan, 0.5, -1.0, 4.0, 0.0]])
+    features = np.array([[2.0, 0.8, -3.0, 5.0, 0.25, 1.5], [np.nan, 0.5, -1.0, 4.0, 0.0, 2.0]])
     weights = {"bias": 0.5, "logit": 1.5, "confidence": 2.0, "log_spread": -1.0, "log_points": 0.1, "mounted": 0.7}
-    weights |= {"mounted_confidence": -1.0, "mounted_log_spread": 0.4}
-    logit = 0.5 + 3.0 + 1.6 + 3.0 + 0.5 + 0.175 - 0.2 - 0.3
+    weights |= {"mounted_confidence": -1.0, "mounted_log_spread": 0.4, "person": 0.6, "mounted_person": -0.8}
+    logit = 0.5 + 3.0 + 1.6 + 3.0 + 0.5 + 0.175 - 0.2 - 0.3 + 0.9 - 0.3
     header = {"verification": weights | {"calibration": [[0.0, 10.0], [0.0, 1.0]]}}
     np.testing.assert_allclose(verification.final_score(features, header), [logit / 10, 0])
     # without weights: the scorer's logit, less where the pose is unsure of somebody who stands
     header = {"calibration": [[-10.0, 10.0], [0.0, 1.0]]}
     spread = np.log([0.1, 0.3, 0.3])
-    rows = np.column_stack([np.zeros(3), np.ones(3), spread, np.ones(3), [0, 0, 1]])
+    rows = np.column_stack([np.zeros(3), np.ones(3), spread, np.ones(3), [0, 0, 1], np.zeros(3)])
     np.testing.assert_allclose(
         verification.final_score(rows, header), 0.5 - np.array([0, 0.075 * np.log(3), 0]), atol=1e-12
     )

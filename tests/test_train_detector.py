@@ -11,14 +11,16 @@ from training_runs import refused, train_until_killed
 
 from lidarpose.cli import main
 from lidarpose.geometry import axis_angle_to_matrix
+from lidarpose.models import bundled_path
 from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.detector.candidates import Candidates
-from lidarpose.models.detector.detector import open_detector
+from lidarpose.models.detector.detector import detector_path, open_detector
 from lidarpose.models.detector.detector_config import OUTPUT, OUTPUTS, DetectorConfig
 from lidarpose.models.detector.ground import estimate_up
 from lidarpose.models.detector.network import DetectorNet
 from lidarpose.models.detector.render import Augmentation
 from lidarpose.models.export import export, export_detector
+from lidarpose.models.onnx import open_network
 from lidarpose.sample import Box
 from lidarpose.synth.detection_scene import detection_scene
 from lidarpose.train import loop, run_dir, setup
@@ -161,8 +163,6 @@ def test_the_file_gives_what_the_network_gives(tmp_path):
 
 
 def test_a_pose_network_is_no_detector_and_a_detector_poses_nobody(tmp_path):
-    from lidarpose.models import bundled_path
-
     with refused("expected a detector, got a network of the kind pose"):
         open_detector(bundled_path("tiny", ".onnx"))
     from lidarpose.models.checkpoint import save_checkpoint
@@ -298,3 +298,17 @@ def test_people_missed_at_one_false_person_a_scan(quick_scans):
     # of people 9, 7, 5, 3, 1 and others 8, 6, ... in each of 3 scans the fourth false one, 6, lets 9 and 7 pass
     missed, joints = missed_people(objective, torch.nn.Linear(1, 1), examples, 1)
     assert missed == pytest.approx(60) and joints is None
+
+
+def test_a_run_begins_with_the_bundled_detector(tmp_path):
+    """Which is what the exported file of that name computes, to float16's precision."""
+    begun = setup.make_setup(replace(RECIPE, init="detector")).network()
+    session, _ = open_network(detector_path(), threads=1)
+    rng = np.random.default_rng(0)
+    arrays = {name: rng.normal(size=shape).astype(np.float32) for name, shape in CONFIG.shapes(5).items()}
+    with torch.inference_mode():
+        own = begun(*map(torch.as_tensor, arrays.values())).numpy()
+    np.testing.assert_allclose(own, session.run(None, arrays)[0], atol=1e-3)
+    for init, message in ((tmp_path / "none.safetensors", "none.safetensors"), (bundled_path("tiny"), "a detector")):
+        with refused(message):
+            setup.make_setup(replace(RECIPE, init=str(init)))

@@ -1,4 +1,4 @@
-"""`detect`: the people in a whole scan. The detector scores places where somebody may stand; the network `tiny` poses
+"""`detect`: the people in a whole scan. The detector scores places where somebody may stand; the default network poses
 the best of them, and how sure it is of a pose goes into the score.
 
 Legend: D detections, V those that were posed.

@@ -1,4 +1,5 @@
-"""Which detections are people: each is posed by the network `tiny`, and how sure it is of the pose goes into the score.
+"""Which detections are people: each is posed by the default network. How sure it is of the pose, and whether it sees a
+person at all, goes into the score.
 
 Legend: D detections.
 """
@@ -13,7 +14,7 @@ import numpy as np
 from lidarpose.geometry import rotation_about
 from lidarpose.inference.backend import Backend, OnnxBackend, estimates
 from lidarpose.inference.tta import TTATransform, apply
-from lidarpose.models import weights_path
+from lidarpose.models import DEFAULT, weights_path
 from lidarpose.models.decode import decoder
 from lidarpose.models.detector.detector import Detections
 from lidarpose.sample import MIN_POINTS, Box, Pose
@@ -31,8 +32,11 @@ _ROOM, _LEAST_ROOM, _HALF_BODY = 0.15, 0.1, 0.25
 # of two people whose pelvises are nearer than this the less certain one is the same person, m
 _SAME_PERSON = 0.3
 # what the final score is made of, by detection: the scorer's logit; means over the joints of confidence and of the log
-# of spread, m; log of 1 + the points of the column; probability that the person is mounted
-FEATURES = ("logit", "confidence", "log_spread", "log_points", "mounted")
+# of spread, m; log of 1 + the points of the column; probability that the person is mounted; log odds that the network
+# sees a person, 0 of a network that does not say
+FEATURES = ("logit", "confidence", "log_spread", "log_points", "mounted", "person")
+# those that mean something else where the person is mounted: riders are posed badly
+MOUNTED_FEATURES = ("confidence", "log_spread", "person")
 # weights of the features and of products with "mounted", for a detector without its own
 _WEIGHTS = {
     "bias": -1.5 * np.log(10),
@@ -41,9 +45,12 @@ _WEIGHTS = {
     "mounted": 1.5 * np.log(10),
     "mounted_log_spread": 1.5,
 }
-# what joints can be at best, and the fewest and most points, between which a score is bounded before anybody is posed:
-# the least mean spread of a person's joints seen is 0.022 m
+# log odds beyond this say no more
+_MOST_ODDS = 6.0
+# what joints can be at best, the fewest and most points, and the odds, between which a score is bounded before anybody
+# is posed: the least mean spread of a person's joints seen is 0.022 m
 _CONFIDENCES, _LOG_SPREADS, _LOG_POINTS = (0.0, 1.0), (np.log(0.012), 0.0), (np.log1p(MIN_POINTS), np.log1p(1e5))
+_ODDS = (-_MOST_ODDS, _MOST_ODDS)
 # a detection so near to where somebody is expected is that person, m, if no other is expected within the second
 # distance
 _EXPECTED, _ALONE = 0.5, 1.0
@@ -81,7 +88,7 @@ class KnownPlaces:
 
 @cache
 def _verifier() -> Backend:
-    return OnnxBackend(weights_path("tiny").with_suffix(".onnx"))
+    return OnnxBackend(weights_path(DEFAULT).with_suffix(".onnx"))
 
 
 def verification_features(
@@ -90,10 +97,10 @@ def verification_features(
     """What the final score of detections in points (n, 3) m, level, from a sensor at origin (3,) or None is made of.
 
     Args:
-        backend: what poses people; by default the bundled `tiny`.
+        backend: what poses people; by default the bundled default network.
 
     Returns:
-        features (D, 5) in the order of `FEATURES`, and the poses, joints (D, 26, 3) m in the frame of the points; of
+        features (D, 6) in the order of `FEATURES`, and the poses, joints (D, 26, 3) m in the frame of the points; of
         fewer than 5 points they are NaN.
     """
     every = np.arange(len(detections))
@@ -102,16 +109,23 @@ def verification_features(
 
 
 def final_score(features: np.ndarray, header: dict) -> np.ndarray:
-    """features (D, 5) -> (D,) in [0, 1]: the probability that a detection is a person, by the detector's header."""
+    """features (D, 6) -> (D,) in [0, 1]: the probability that a detection is a person, by the detector's header."""
     verification = header.get("verification") or {}
     weights = verification if "logit" in verification else _WEIGHTS
     value = dict(zip(FEATURES, features.T, strict=True))
-    value |= {f"mounted_{name}": value["mounted"] * value[name] for name in ("confidence", "log_spread")}
+    value |= {f"mounted_{name}": value["mounted"] * value[name] for name in MOUNTED_FEATURES}
     logit = np.full(len(features), float(weights.get("bias", 0.0)))
     for name, values in value.items():
         logit += weights.get(name, 0.0) * values
     logits, probabilities = verification.get("calibration") or header["calibration"]
     return np.nan_to_num(np.interp(logit, logits, probabilities))
+
+
+def inside_column(points: np.ndarray, center: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Which points (n, 3) m are posed of a detection with this center and box size (3,) m: (n,) bool."""
+    above = points[:, 2] - center[2]
+    inside = (above > -size[2] / 2 - _BELOW) & (above < size[2] / 2 + _ABOVE)
+    return inside & (np.hypot(*(points[:, :2] - center[:2]).T) < _COLUMN)
 
 
 def _posed(
@@ -121,23 +135,23 @@ def _posed(
     others what comes from points is NaN."""
     columns = [np.zeros((0, 3))] * len(detections)
     for i, cloud in zip(chosen.tolist(), clouds, strict=True):
-        center, size = detections.centers[i], detections.sizes[i]
-        above = cloud[:, 2] - center[2]
-        inside = (above > -size[2] / 2 - _BELOW) & (above < size[2] / 2 + _ABOVE)
-        columns[i] = cloud[inside & (np.hypot(*(cloud[:, :2] - center[:2]).T) < _COLUMN)]
+        columns[i] = cloud[inside_column(cloud, detections.centers[i], detections.sizes[i])]
     known = sorted((i for i, column in enumerate(columns) if len(column) >= MIN_POINTS), key=lambda i: len(columns[i]))
     skeleton = backend.header.skeleton
     joints = np.full((len(columns), len(skeleton), 3), np.nan)
     confidence, spread = np.full((2, *joints.shape[:2]), np.nan)
+    odds = np.full(len(columns), np.nan)
     for start in range(0, len(known), _BATCH):
         batch = known[start : start + _BATCH]
         clouds, view = apply(TTATransform(), [columns[i] for i in batch], detections.centers[batch], origin)
-        pose = estimates(backend.run(clouds, view), decoder("window"), skeleton)
+        raw = backend.run(clouds, view)
+        pose = estimates(raw, decoder("window"), skeleton)
         joints[batch] = pose.joints + detections.centers[batch][:, None]
         confidence[batch], spread[batch] = pose.confidence, pose.spread
+        odds[batch] = 0 if raw.person is None else np.clip(raw.person[:, 0], -_MOST_ODDS, _MOST_ODDS)
     points = np.log1p([len(column) for column in columns])
     with np.errstate(invalid="ignore"):
-        features = (detections.logit, confidence.mean(1), np.log(spread).mean(1), points, detections.mounted)
+        features = (detections.logit, confidence.mean(1), np.log(spread).mean(1), points, detections.mounted, odds)
     poses = Pose(joints=joints, skeleton=skeleton, confidence=confidence, spread=spread)
     return np.stack(features, -1).reshape(-1, len(FEATURES)), poses
 
@@ -145,9 +159,10 @@ def _posed(
 def _highest_score(detections: Detections, header: dict) -> np.ndarray:
     """(D,): what `final_score` can be at most, whatever the pose. The score's logit is linear in what is unknown."""
     highest = np.zeros(len(detections))
-    for unknown in product(_CONFIDENCES, _LOG_SPREADS, _LOG_POINTS):
-        columns = [detections.logit, *(np.full(len(detections), value) for value in unknown), detections.mounted]
-        highest = np.maximum(highest, final_score(np.stack(columns, -1), header))
+    for confidence, log_spread, log_points, odds in product(_CONFIDENCES, _LOG_SPREADS, _LOG_POINTS, _ODDS):
+        posed = np.broadcast_to([confidence, log_spread, log_points], (len(detections), 3))
+        columns = (detections.logit, posed, detections.mounted, np.full(len(detections), odds))
+        highest = np.maximum(highest, final_score(np.column_stack(columns), header))
     return highest
 
 

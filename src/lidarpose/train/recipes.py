@@ -248,6 +248,7 @@ class TrainDetector(Recipe):
     workers: int = _setting(1, "processes that make scans, of each process that trains")
     scenes: int = _setting(20_000, "scans that are made")
     uses: int = _setting(4, "how often each scan is shown, each time changed anew")
+    init: str = _setting("", "weights to begin with: detector (the bundled one), or a checkpoint", "NAME|FILE")
 
 
 # the released OneCycle schedule, AdamW on everything, neither mean of weights nor clipping

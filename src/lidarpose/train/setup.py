@@ -7,6 +7,7 @@ To train a further kind of network of `models.NETWORKS`: its sizes in `PRETRAINE
 import json
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from copy import deepcopy
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +20,7 @@ from torch import nn
 from lidarpose.data.shards import read_card
 from lidarpose.errors import InputError, check_name
 from lidarpose.io.files import file_error
-from lidarpose.models import NETWORKS, weights_path
+from lidarpose.models import DETECTOR_WEIGHTS, NETWORKS, weights_file, weights_path
 from lidarpose.models.baselines.baseline_config import (
     BaselineConfig,
     LidarcapConfig,
@@ -167,15 +168,23 @@ def make_setup(recipe: Recipe, *, on_cpu: bool = True) -> TrainSetup:
 
 def _detection(recipe: TrainDetector) -> TrainSetup:
     objective = DetectorObjective(config=DetectorConfig())
+    network: Callable[[], nn.Module] = objective.network
+    card: dict = {}
+    if recipe.init:
+        path = weights_file(DETECTOR_WEIGHTS) if recipe.init == "detector" else Path(recipe.init)
+        trained, header = load_checkpoint(path)
+        if header.config != objective.config:
+            raise file_error(path, f"expected a detector as train-detector makes it, got a network {header.network}")
+        network, card["init_card"] = partial(deepcopy, trained), header.card
     return TrainSetup(
         objective=objective,
         # a worker shows each scan again that it has made, for all usual numbers of workers
         source=CandidateSource(seed=recipe.seed, uses=recipe.uses, lag=_LAG * BATCHES * recipe.batch // recipe.uses),
         people=recipe.scenes * recipe.uses,
-        network=objective.network,
+        network=network,
         validation=partial(validation_scans, _VALIDATION_SEED),
         joints=None,
-        card={},
+        card=card,
         unit="scans",
         validate=missed_people,
         error_unit="missed",

@@ -10,7 +10,7 @@ import numpy as np
 from lidarpose.errors import InputError, check_int
 from lidarpose.eval.detector.detection_scores import match
 from lidarpose.eval.detector.evaluate_detector import run_detector
-from lidarpose.inference.verification import FEATURES, final_score, verification_features
+from lidarpose.inference.verification import FEATURES, MOUNTED_FEATURES, final_score, verification_features
 from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.detector.detector import Detector
 from lidarpose.models.detector.network import DetectorNet
@@ -74,14 +74,14 @@ def calibrate(folder: str | Path, scans: int, *, labeled: str | Path | None = No
 def fit(features: np.ndarray, is_person: np.ndarray, scans: int) -> dict:
     """The entries "calibration", "verification" and "default_score" of a header.
 
-    features: (D, 5) of detections in so many scans, see `inference.verification.FEATURES`, NaN of those that could not
+    features: (D, 6) of detections in so many scans, see `inference.verification.FEATURES`, NaN of those that could not
     be posed; is_person: (D,). The default score lets `FALSE` false people a scan pass.
     """
     posed = np.isfinite(features).all(1)
     own, labels = features[posed], is_person[posed]
-    # those who ride are posed badly, whatever their pose's spread
-    names = (*FEATURES, "mounted_confidence", "mounted_log_spread")
-    both = np.concatenate([own, own[:, 4:] * own[:, 1:3]], axis=1)
+    names = (*FEATURES, *(f"mounted_{name}" for name in MOUNTED_FEATURES))
+    column = FEATURES.index
+    both = np.column_stack([own, own[:, [column("mounted")]] * own[:, [column(name) for name in MOUNTED_FEATURES]]])
     bias, weights = logistic(both, labels)
     verification = {"bias": bias, **dict(zip(names, weights.tolist(), strict=True))}
     verification["calibration"] = monotone(bias + both @ weights, labels)

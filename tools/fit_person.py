@@ -1,0 +1,181 @@
+"""Fits the output of a network that says whether a crop shows a person, and a second one: also to what a detector takes
+for people in whole scans, its mistakes among them. Nothing else of the network changes.
+
+    python tools/fit_person.py crops CROPS.npz --scenes 1500 --samples 20000 --motion wide_motion.npz
+    python tools/fit_person.py fit CROPS.npz RUN/model.safetensors OUT.safetensors
+
+`crops` makes what is learned from: the detections in synthesized scans (family "train"), posed as `lidarpose.detect`
+poses them, and as many people as objects of the scene "wide", as pre-training shows them. `fit` trains the head anew on
+what the network makes of them. A network of later weights is fitted to the same crops. Needs lidarpose[train].
+"""
+
+import argparse
+import multiprocessing
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch.nn import functional as F
+
+from lidarpose.inference.tta import IDENTITY, apply
+from lidarpose.inference.verification import inside_column
+from lidarpose.io.files import atomic_path
+from lidarpose.models.checkpoint import load_checkpoint, save_checkpoint
+from lidarpose.models.detector.detector import Detector
+from lidarpose.models.onnx import voxelize_people
+from lidarpose.models.posenet import Batch, PoseNet
+from lidarpose.sample import MIN_POINTS
+from lidarpose.synth.detection_scene import detection_scene
+from lidarpose.train.data_loader import SyntheticSource
+
+SEED, RANGE, LIMIT = 9101, 40.0, 40
+# a detection nearer than this to a person is of that person; beyond the second distance, with at most this share of its
+# points on people, it is of nobody; others teach nothing, m
+OWN, OTHER, NOBODYS = 0.35, 0.7, 0.02
+# points of somebody else from which on a crop shows two, and their share
+SECOND, SECOND_SHARE = 15, 0.1
+MOST_POINTS = 1024
+EPOCHS, BATCH, RATE, HELD_OUT = 40, 512, 2e-3, 0.1
+
+Crop = tuple[np.ndarray, np.ndarray, np.ndarray, int]
+
+
+def scene_crops(index: int) -> list[Crop]:
+    """Points (n, 3) m about the center, view (5,), labels (2,), group 1, of the detections of a scene."""
+    scene = detection_scene(SEED, index)
+    detections = Detector(threads=1).detect(scene.points, scene.origin, max_range=RANGE, limit=LIMIT)
+    seen = np.flatnonzero(np.bincount(scene.person[scene.person >= 0], minlength=len(scene.boxes)) >= MIN_POINTS)
+    people = np.array([scene.boxes[row].center[:2] for row in seen]).reshape(-1, 2)
+    crops: list[Crop] = []
+    for center, size in zip(detections.centers, detections.sizes, strict=True):
+        inside = inside_column(scene.points, center, size)
+        if inside.sum() < MIN_POINTS:
+            continue
+        away = np.hypot(*(people - center[:2]).T)
+        owner = scene.person[inside]
+        if len(away) and away.min() < OWN:
+            others = int(((owner >= 0) & (owner != seen[away.argmin()])).sum())
+            known = not 0 < others < max(SECOND, SECOND_SHARE * inside.sum())
+            label = (1.0, float(others > 0) if known else np.nan)
+        elif away.min(initial=np.inf) > OTHER and (owner >= 0).mean() <= NOBODYS:
+            label = (0.0, 0.0)
+        else:
+            continue
+        (cloud,), view = apply(IDENTITY, [scene.points[inside]], center[None], scene.origin)
+        crops.append((cloud, view[0], np.array(label), 1))
+    return crops
+
+
+def sample_crops(index: int, *, source: SyntheticSource) -> list[Crop]:
+    """As `scene_crops`, group 0, of a person or an object."""
+    example = source.example(index)
+    return [(example.points, example.view, example.person, 0)]
+
+
+def make_crops(out: Path, scenes: int, samples: int, motion: str | None, workers: int) -> None:
+    captured = 0.6 if motion else 0.0
+    source = SyntheticSource(scene="wide", seed=SEED, motion=motion, captured=captured, objects=0.5)
+    rng = np.random.default_rng(SEED)
+    crops: list[Crop] = []
+    with multiprocessing.get_context("forkserver").Pool(workers) as pool:
+        for make, count in ((scene_crops, scenes), (partial(sample_crops, source=source), samples)):
+            for done, made in enumerate(pool.imap(make, range(count), chunksize=8)):
+                crops += made
+                if done % 200 == 0:
+                    print(f"{done} of {count}, {len(crops):,} crops", flush=True)
+    clouds = [c if len(c) <= MOST_POINTS else rng.permutation(c)[:MOST_POINTS] for c, *_ in crops]
+    _, view, label, group = zip(*crops, strict=True)
+    arrays = {"points": np.concatenate(clouds).astype(np.float32), "count": [len(cloud) for cloud in clouds]}
+    arrays |= {"view": np.stack(view), "label": np.stack(label), "group": group}
+    with atomic_path(out) as path, open(path, "wb") as file:
+        np.savez(file, **{name: np.asarray(value) for name, value in arrays.items()})
+
+
+@torch.inference_mode()
+def head_inputs(network: PoseNet, crops: dict[str, np.ndarray]) -> torch.Tensor:
+    """(K, F): what the network's head reads of each crop."""
+    inputs: list[torch.Tensor] = []
+    head = network.person
+
+    def remember(module, given):
+        anchors, voxels, valid, certainty = given
+        weight = valid.to(voxels.dtype)[..., None]
+        mean = (voxels * weight).sum(1) / weight.sum(1).clamp(min=1)
+        inputs.append(torch.cat([head.norm(torch.cat([anchors.mean(1), mean], -1)), *certainty], -1))
+
+    clouds = np.split(crops["points"], np.cumsum(crops["count"])[:-1])
+    order = np.argsort(crops["count"], kind="stable")
+    handle = head.register_forward_pre_hook(remember)
+    for start in range(0, len(order), 64):
+        rows = order[start : start + 64]
+        arrays = voxelize_people([clouds[k] for k in rows], crops["view"][rows].astype(np.float32), network.config)
+        network(Batch.from_arrays(arrays.arrays()))
+        if start % 6400 == 0:
+            print(f"{start:,} of {len(order):,} crops", flush=True)
+    handle.remove()
+    features = torch.cat(inputs)
+    return features[torch.as_tensor(np.argsort(order))]
+
+
+def fit(path: Path, model: Path, out: Path) -> None:
+    torch.manual_seed(0)
+    crops = dict(np.load(path, allow_pickle=False))
+    network, header = load_checkpoint(model)
+    x = head_inputs(network.eval(), crops).clone()
+    label, group = torch.as_tensor(crops["label"], dtype=torch.float32), torch.as_tensor(crops["group"])
+    # both groups count alike, and within each people and nobody
+    kind = 2 * group + label[:, 0].long()
+    weight = (1 / torch.bincount(kind, minlength=4).clamp(min=1))[kind]
+    weight = weight / weight.mean()
+    held = torch.rand(len(x)) < HELD_OUT
+    head = network.person
+    optimizer = torch.optim.AdamW([*head.hidden.parameters(), *head.out.parameters()], RATE, weight_decay=1e-3)
+    rows = torch.nonzero(~held)[:, 0]
+    steps = EPOCHS * -(-len(rows) // BATCH)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
+    for _ in range(EPOCHS):
+        for part in rows[torch.randperm(len(rows))].split(BATCH):
+            truth = label[part]
+            logit = head.out(head.hidden(x[part]))
+            missed = F.binary_cross_entropy_with_logits(logit, truth.nan_to_num(0), reduction="none")
+            loss = (missed * ~truth.isnan() * weight[part, None]).sum(1).mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            schedule.step()
+    with torch.no_grad():
+        logit = head.out(head.hidden(x))
+    for number, name in enumerate(("people and objects", "detections")):
+        own = held & (group == number)
+        print(f"{name}: AUROC of a person {auroc(logit[own, 0], label[own, 0]):.4f}, {int(own.sum()):,} crops held out")
+    save_checkpoint(out, network, card=header.card)
+
+
+def auroc(score: torch.Tensor, label: torch.Tensor) -> float:
+    from lidarpose.metrics import auroc as metric
+
+    return metric(score.numpy(), label.numpy().astype(bool))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    making = commands.add_parser("crops")
+    making.add_argument("out", type=Path)
+    making.add_argument("--scenes", type=int, default=1500)
+    making.add_argument("--samples", type=int, default=20_000)
+    making.add_argument("--motion")
+    making.add_argument("--workers", type=int, default=1)
+    fitting = commands.add_parser("fit")
+    for name in ("crops", "model", "out"):
+        fitting.add_argument(name, type=Path)
+    options = parser.parse_args()
+    if options.command == "crops":
+        make_crops(options.out, options.scenes, options.samples, options.motion, options.workers)
+    else:
+        fit(options.crops, options.model, options.out)
+
+
+if __name__ == "__main__":
+    main()
