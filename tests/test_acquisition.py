@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lidarpose.body.pose_prior.activities import KINDS, UNUSUAL, unusual_mix
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.lidar.presets import sensor
@@ -55,7 +56,7 @@ def walkers(count, last=MOST_FRAMES - 1):
 
 
 def test_people_without_conditions_are_those_of_the_same_scene_without_shares():
-    wide, wild = Generator(scene=WIDE), Generator(scene=WILD)
+    wide, wild = Generator(scene=replace(WIDE, unusual=0.0)), Generator(scene=WILD)
     held = 0
     for index in range(64):
         person, same = wide.person(SEED, index), wild.person(SEED, index)
@@ -71,6 +72,19 @@ def test_people_without_conditions_are_those_of_the_same_scene_without_shares():
     again = pickle.loads(pickle.dumps(wide))
     for index in (BLOCK + 1, 5):
         np.testing.assert_array_equal(again.person(SEED, index).sample.points, wide.person(SEED, index).sample.points)
+
+
+def test_unusual_poses_are_people_of_clips_and_accumulated_frames_too():
+    everybody = WIDE.changed(["unusual=1", "accumulated=0.5"])
+    usual = {name for name, weight in zip(KINDS, UNUSUAL, strict=True) if not weight}
+    generator = Generator(scene=everybody, measure=False)
+    people = [generator.person(SEED, index).sample for index in range(24)]
+    assert any("accumulated" in sample.conditions for sample in people)
+    for block in (generator._bodies(SEED, 0), *generator._acquisitions(SEED, 0)[1].values()):
+        assert not usual & set(block.kinds)
+    assert len(generator.clip(SEED, 2, frames=3)) == 3
+    shared = draw_bodies(None, 0.0, 2000, SEED, 0, moving=False, mix=unusual_mix(WIDE.unusual)).kinds
+    assert 0.25 < np.mean([kind not in usual for kind in shared]) < 0.35
 
 
 def test_every_share_is_as_often_as_it_says():

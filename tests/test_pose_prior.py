@@ -25,6 +25,8 @@ _SPEC.loader.exec_module(fit)
 A, KINDS = activities.ANGLE_INDEX, activities.KINDS
 SIDES = (("left", 1), ("right", -1))
 HZ = 40.0
+UNUSUAL = [name for name, weight in zip(KINDS, activities.UNUSUAL, strict=True) if weight]
+ON_FLOOR = [name for name in UNUSUAL if "rests_on" in activities.TABLES["activities"][name]]
 
 
 def drawn(n=1500, seed=0, **mix):
@@ -361,7 +363,13 @@ def out_of_balance(rotations):
 @pytest.mark.parametrize("kind", constraints.STATIC)
 def test_standing_and_kneeling_people_are_in_balance_on_both_feet(kind):
     rotations = drawn(600, **{kind: 1}).rotations
-    assert (out_of_balance(rotations) > 0.005).mean() < 0.01
+    off = out_of_balance(rotations)
+    if kind in UNUSUAL:
+        # joints at their limits keep a few from it
+        low = sole_points(rotations)[..., 2].min(2)
+        assert (off > 0.02).mean() < 0.05 and (np.abs(low[:, 0] - low[:, 1]) > 0.03).mean() < 0.05
+        return
+    assert (off > 0.005).mean() < 0.01
     if kind == "kneel":
         joints = joints_of(rotations)
         # a knee joint is 5 cm above the floor, an ankle joint 8 cm
@@ -449,3 +457,98 @@ def test_hands_stay_out_of_the_trunk():
     # the chest's frame is that of spine3
     hands = [np.einsum("nji,nj->in", rotations[:, J["spine3"]], p[:, J[f"{s}_wrist"]] - shoulders) for s, _ in SIDES]
     assert np.mean([(np.abs(x) < 0.06) & (np.abs(y) < 0.10) & (z < -0.05) for x, y, z in hands]) < 0.01
+
+
+# unusual poses
+
+
+def test_unusual_people_enter_by_their_share_alone():
+    assert activities.unusual_mix(0.0) is None and set(UNUSUAL) == set(BY_HAND)
+    assert not activities.SHARES[[KINDS.index(name) for name in UNUSUAL]].any()
+    share = np.bincount(drawn(20000, 0, **activities.unusual_mix(0.3)).kind, minlength=len(KINDS)) / 20000
+    want = 0.7 * activities.SHARES + 0.3 * activities.UNUSUAL / activities.UNUSUAL.sum()
+    np.testing.assert_allclose(share, want, atol=0.015)
+    assert all(drawn(50, kind, **activities.unusual_mix(1.0)).kind.min() >= KINDS.index("squat") for kind in range(3))
+
+
+@pytest.mark.parametrize("kind", UNUSUAL)
+def test_unusual_poses_are_possible(kind):
+    rotations = drawn(1500, 4, **{kind: 1}).rotations
+    angles = fit.angles_from_rotations(rotations)
+    legs = [A[f"{side}_{name}"] for side, _ in SIDES for name in ("hip", "abd", "rot", "knee", "ankle")]
+    low, high = activities.LIMITS[:, legs]
+    assert (angles[:, legs] > low - 1).all() and (angles[:, legs] < high + 1).all()
+    ends = capsule_ends(*body_frames(rotations))
+    assert (self_collision(ends).max(1) > 0.02).mean() < 0.01
+    gap = constraints.hovering(ends, np.full(len(rotations), KINDS.index(kind)))
+    assert (gap > 0.06).mean() < 0.01 and (kind in ON_FLOOR or not gap.any())
+    head, pelvis = body_frames(rotations)[1][:, [J["head"], J["pelvis"]], 2].T
+    height = np.stack([head, pelvis]) - constraints.undersides(ends)[..., 2].min(1)
+    if kind.startswith("lie_"):
+        assert np.percentile(height[1], 95) < 0.3 and (kind == "lie_down" or np.percentile(height[0], 95) < 0.45)
+    elif kind not in (*ON_FLOOR, "get_down"):
+        assert height[1].min() > 0.25
+    # so there is something to do
+    people = latents_of(300, 4, **{kind: 1})
+    raw = constraints.balanced(sampling._free_arms(sampling._angles(people).angles, 1), people.kind)
+    changed = np.abs(constraints.settled(raw, people.kind) - raw).max(1)
+    assert (changed > 1).mean() > 0.5 if kind in ON_FLOOR else not changed.any()
+
+
+@pytest.mark.parametrize("kind", constraints.ON_ONE_FOOT)
+def test_who_lifts_a_leg_stands_on_the_other(kind):
+    rotations = drawn(600, 2, **{kind: 1}).rotations
+    assert (out_of_balance(rotations) > 0.02).mean() < 0.02
+    low = np.sort(sole_points(rotations)[..., 2].min(2), axis=1)
+    assert np.median(low[:, 1] - low[:, 0]) > 0.12
+
+
+# a pose of each activity by hand, degrees, and how far (mm, mean of the joints) the nearest of 6,000 draws may be: none
+# of another activity is so near
+BY_HAND = {
+    "squat": ({"hip": 92, "knee": 142, "ankle": 25, "abd": 24, "rot": 12, "raise": 85, "out": 8, "elbow": 10}, 105),
+    "kick": ({"tilt": -14, "left_hip": 84, "left_knee": 14, "right_knee": 30, "right_hip": 6, "raise": 30, "elbow": 115,
+              "twist": 24}, 120),
+    "box": ({"tilt": 8, "left_hip": 42, "left_knee": 36, "right_hip": -4, "right_knee": 30, "left_raise": 86,
+             "left_elbow": 14, "right_raise": 40, "right_elbow": 126, "out": 10, "in": 16, "twist": -16}, 76),
+    "knee_raise": ({"bend": 30, "left_hip": 122, "left_knee": 112, "right_raise": 58, "right_elbow": 132, "twist": 36,
+                    "right_knee": 12}, 90),
+    "stoop": ({"tilt": 24, "bend": 48, "left_hip": 84, "left_knee": 76, "right_hip": 46, "right_knee": 92, "ankle": 14,
+               "raise": 84, "out": 14, "elbow": 14}, 74),
+    "reach_down": ({"tilt": 66, "bend": 38, "left_hip": 94, "left_knee": 32, "right_hip": 72, "right_knee": 20,
+                    "left_raise": 92, "right_raise": -20, "right_out": 20}, 120),
+    "hop": ({"tilt": 32, "bend": 26, "hip": 74, "knee": 78, "ankle": 10, "raise": -52, "out": 14, "elbow": 20}, 64),
+    "throw": ({"tilt": -4, "bend": -8, "left_hip": 22, "left_knee": 20, "right_hip": -12, "right_knee": 20,
+               "raise": 125, "out": 20, "elbow": 85}, 70),
+    "swing": ({"abd": 18, "knee": 8, "raise": 160, "out": 40, "elbow": 14}, 76),
+    "sneak": ({"tilt": 18, "bend": 26, "left_hip": 74, "left_knee": 72, "right_hip": 12, "right_knee": 34, "nod": -22,
+               "left_out": 14, "left_elbow": 24, "right_raise": 10, "right_out": 14, "right_elbow": 80}, 76),
+    "sit_floor": ({"tilt": -18, "bend": 24, "hip": 96, "knee": 44, "abd": 10, "raise": -32, "out": 18, "elbow": 9}, 40),
+    "get_down": ({"tilt": 8, "bend": 46, "left_hip": 98, "right_hip": 88, "knee": 118, "ankle": 25, "left_raise": 46,
+                  "right_raise": 10, "out": 30, "left_abd": 16}, 80),
+    "lie_down": ({"tilt": -70, "bend": 18, "hip": 38, "knee": 42, "abd": 8, "raise": -12, "out": 18, "elbow": 20}, 90),
+    "lie_side": ({"tilt": -18, "roll": 83, "bend": 18, "hip": 52, "knee": 60, "raise": 60, "elbow": 60}, 160),
+    "lie_front": ({"tilt": 89, "knee": 12, "ankle": -44, "abd": 8, "raise": 8, "out": 16, "elbow": 12}, 120),
+    "kneel_both": ({"tilt": 14, "bend": 12, "hip": 40, "knee": 106, "ankle": -50, "abd": 6, "raise": 28, "out": 16,
+                    "elbow": 18}, 72),
+    "all_fours": ({"tilt": 78, "bend": 5, "hip": 78, "knee": 74, "ankle": -50, "raise": 82, "out": 6, "elbow": 9}, 120),
+}  # fmt: skip
+
+
+@cache
+def unusual_draws():
+    prior = drawn(6000, 7, **activities.unusual_mix(1.0))
+    return joints_of(prior.rotations), prior.kind
+
+
+@pytest.mark.parametrize("kind", BY_HAND)
+def test_a_pose_by_hand_is_near_a_draw_of_its_activity_only(kind):
+    by_hand, most = BY_HAND[kind]
+    angles = np.zeros((1, 27))
+    for name, angle in by_hand.items():
+        angles[0, [i for i, full in enumerate(activities.ANGLES) if name in (full, full.partition("_")[2])]] = angle
+    target = joints_of(rotations_from_angles(angles))
+    joints, kinds = unusual_draws()
+    apart = 1e3 * np.linalg.norm(joints - target, axis=-1).mean(1)
+    own = kinds == KINDS.index(kind)
+    assert apart[own].min() < most < apart[~own].min()

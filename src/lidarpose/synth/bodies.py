@@ -207,10 +207,10 @@ def draw_bodies(
 
 def draw_moving_body(
     bank: PoseBank | None, captured: float, frames: int, rng: np.random.Generator, *, clothes: float = 1.0,
-    rig: Rig | None = None,
+    mix: dict[str, float] | None = None, rig: Rig | None = None,
 ) -> Bodies:  # fmt: skip
     """The frames of a person who moves, at `CLIP_HZ`: one of `draw_moving_bodies`."""
-    return draw_moving_bodies(bank, captured, 1, frames, rng, clothes=clothes, rig=rig)[0]
+    return draw_moving_bodies(bank, captured, 1, frames, rng, clothes=clothes, mix=mix, rig=rig)[0]
 
 
 def draw_moving_bodies(
@@ -222,6 +222,7 @@ def draw_moving_bodies(
     *,
     clothes: float = 1.0,
     to_last: bool = False,
+    mix: dict[str, float] | None = None,
     rig: Rig | None = None,
 ) -> list[Bodies]:
     """The frames of `count` people who move, at `CLIP_HZ`.
@@ -229,7 +230,7 @@ def draw_moving_bodies(
     Args:
         bank: captured poses, or None.
         captured: chance of a clip of the bank instead of the prior's.
-        clothes: see `SceneConfig`.
+        clothes, mix: see `SceneConfig` and `sample_clips`.
         to_last: the last frame is on the origin and faces +x, instead of the first.
         rig: the body, None: the shipped one.
     """
@@ -238,7 +239,7 @@ def draw_moving_bodies(
     motion: list[tuple[np.ndarray, np.ndarray, str, np.ndarray | None]]
     motion = [(*clip, "captured", None) for clip in clips if clip is not None]
     if drawn_count := clips.count(None):
-        drawn = sample_clips(rng, drawn_count, frames=frames + 1, hz=CLIP_HZ)
+        drawn = sample_clips(rng, drawn_count, frames=frames + 1, hz=CLIP_HZ, mix=mix)
         flat = drawn.translation * np.array([1, 1, 0], np.float32)
         motion += zip(drawn.rotations, flat, [KINDS[kind] for kind in drawn.kind], drawn.clearance, strict=True)
     people = rig.draw_people(rng, count)

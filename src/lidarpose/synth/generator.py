@@ -11,6 +11,7 @@ from typing import cast
 
 import numpy as np
 
+from lidarpose.body.pose_prior.activities import unusual_mix
 from lidarpose.body.rig import Rig
 from lidarpose.body.smpl import smpl_axis_angles
 from lidarpose.data.clips import window_points
@@ -97,13 +98,19 @@ class Generator:
         return cast("SceneConfig", self.scene)
 
     @cached_property
+    def _mix(self) -> dict[str, float] | None:
+        """What people who are not captured do."""
+        return unusual_mix(self.config.unusual)
+
+    @cached_property
     def _bodies(self) -> Callable[[int, int], Bodies]:
         """(seed, block) -> its bodies."""
         moving = bool(self.config.merged) or any(isinstance(sensor(name), RayPattern) for name in self.config.sensors)
         # neighbors share a block; two suffice for a reader that crosses from one to the next
         draw_block = partial(
-            draw_bodies, self.bank, self.captured, BLOCK, moving=moving, clothes=self.config.clothes, rig=self.rig
-        )
+            draw_bodies, self.bank, self.captured, BLOCK, moving=moving, clothes=self.config.clothes, mix=self._mix,
+            rig=self.rig,
+        )  # fmt: skip
         return lru_cache(maxsize=2)(draw_block)
 
     @cached_property
@@ -119,7 +126,7 @@ class Generator:
             rng = np.random.default_rng([seed, RandomStream.MOTION, block])
             moving = draw_moving_bodies(
                 self.bank, self.captured, len(rows), MOST_FRAMES, rng, clothes=self.config.clothes, to_last=True,
-                rig=self.rig,
+                mix=self._mix, rig=self.rig,
             )  # fmt: skip
             return draws, dict(zip(rows, moving, strict=True))
 
@@ -147,7 +154,9 @@ class Generator:
         frames = check_int("a clip's frames", frames, least=1)
         seed, index = check_int("seed", seed, least=0), check_int("index", index, least=0)
         rng = np.random.default_rng([seed, RandomStream.CLIP, index])
-        bodies = draw_moving_body(self.bank, self.captured, frames, rng, clothes=self.config.clothes, rig=self.rig)
+        bodies = draw_moving_body(
+            self.bank, self.captured, frames, rng, clothes=self.config.clothes, mix=self._mix, rig=self.rig
+        )
         block, row = self._bodies(seed, index // BLOCK), index % BLOCK
         return self._observe(bodies, range(frames), block, row, rng, hard, in_clip=True)
 

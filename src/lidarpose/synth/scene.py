@@ -91,6 +91,8 @@ class SceneConfig:
         clutter: things near the person.
         occluder: something in front.
         company: a second person in or before the crop.
+        unusual: share of people, of those not captured, who do what the default mix of poses has hardly any of: squat,
+            kick, throw, hop, pick something up, sit and lie on the floor and so on.
         carry: how often something is carried or used, relative to the street's habit.
         merged: the cloud of 2 to 4 sensors around the person, see `Acquisition`; this and the next five hold for single
             people only, clips have none of them.
@@ -119,6 +121,7 @@ class SceneConfig:
     clutter: float = 0.0
     occluder: float = 0.0
     company: float = 0.0
+    unusual: float = 0.0
     carry: float = 0.0
     merged: float = 0.0
     accumulated: float = 0.0
@@ -160,8 +163,8 @@ class SceneConfig:
 
 # fields that are between 0 and 1
 _SHARES = frozenset(
-    "clutter occluder company merged accumulated inverted integration sparse crowded recorded hard mask mask_keep "
-    "missing_part intensity_dropout beam_divergence dapt_compat loose cut".split()
+    "clutter occluder company unusual merged accumulated inverted integration sparse crowded recorded hard mask "
+    "mask_keep missing_part intensity_dropout beam_divergence dapt_compat loose cut".split()
 )
 
 
@@ -250,10 +253,11 @@ SCENES = {
 }
 
 
-# clouds of several scans, hung sensors, few rings and two people in one crop besides
+# unusual poses, clouds of several scans, hung sensors, few rings and two people in one crop besides
 SCENES["wide"] = replace(
     SCENES["wild"],
     name="wide",
+    unusual=0.3,
     merged=0.06,
     accumulated=0.06,
     inverted=0.08,

@@ -42,15 +42,17 @@ def _arm_odds(activity: dict) -> list[float]:
 
 
 # shares of the default mix (K,)
-SHARES = np.array([activity["share"] for activity in _ACTIVITIES])
-SHARES = SHARES / sum(activity["share"] for activity in _ACTIVITIES)
+SHARES = np.array([activity.get("share", 0.0) for activity in _ACTIVITIES])
+SHARES = SHARES / sum(activity.get("share", 0.0) for activity in _ACTIVITIES)
+# weights of the unusual kinds among themselves (K,)
+UNUSUAL = np.array([activity.get("unusual", 0.0) for activity in _ACTIVITIES])
 # start, end and spread of each kind's angles, (3, K, 27)
 KIND_RANGES = np.array([[_angle(a, *names) for names in zip(ANGLES, _PLAIN, strict=True)] for a in _ACTIVITIES], float)
 KIND_RANGES = np.ascontiguousarray(np.moveaxis(KIND_RANGES, -1, 0))
 # feet follow the floor, thighs are from the vertical: shares, (K,)
 FLAT_FOOT = np.array([activity.get("flat_foot", 1.0) for activity in _ACTIVITIES])
 UPRIGHT = np.array([activity.get("upright", 1.0) for activity in _ACTIVITIES])
-# how often a kind's poses pass through themselves (K,)
+# how often a kind's poses pass through themselves, or do not rest on what they should (K,)
 SELF_COLLISION = np.array([activity.get("self_collision", 0.01) for activity in _ACTIVITIES])
 # chances of the kinds of arm in each kind of activity, (K, A)
 ARM_ODDS = np.array([_arm_odds(activity) for activity in _ACTIVITIES])
@@ -71,6 +73,12 @@ _COLLAR_LIFTS = 3 * np.array([_J["left_collar"], _J["right_collar"]]) + 1
 _LIFT_SIGNS = np.array([1, -1], np.float32)
 _RAISED_OUT = np.array([[ANGLE_INDEX[f"{side}_raise"], ANGLE_INDEX[f"{side}_out"]] for side, _ in _SIDES])
 _INWARD = np.array([ANGLE_INDEX[f"{side}_in"] for side, _ in _SIDES])
+
+
+def unusual_mix(share: float) -> dict[str, float] | None:
+    """The default mix but for a `share` in [0, 1] of people in unusual poses; None where there are none."""
+    weights = (1 - share) * SHARES + share * UNUSUAL / UNUSUAL.sum()
+    return dict(zip(KINDS, weights.tolist(), strict=True)) if share else None
 
 
 def rotations_from_angles(angles: np.ndarray) -> np.ndarray:

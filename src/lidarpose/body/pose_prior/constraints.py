@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 
-from lidarpose.body.pose_prior.activities import ANGLE_INDEX, KINDS, LIMITS, TABLES, rotations_from_angles
+from lidarpose.body.pose_prior.activities import ANGLE_INDEX, KINDS, LIMITS, TABLES, UNUSUAL, rotations_from_angles
 from lidarpose.body.rig import mean_adult_joints
 from lidarpose.skeleton import SMPL24
 
@@ -24,7 +24,8 @@ _BEARING = 0.008
 
 
 def _capsules() -> tuple[np.ndarray, ...]:
-    """Joint (C,), ends (C, 2, 3) and radius (C,) m of the capsules; pairs (Q, 2) that could collide."""
+    """Joint (C,), ends (C, 2, 3) and radius (C,) m of the capsules; pairs (Q, 2) that could collide; what a kind of
+    activity rests on and what else is on the floor, (2, K, C) bool."""
     trunk, collisions = TABLES["capsules"]["trunk"], TABLES["collisions"]
     rows = {name: (_J[c["joint"]], c["start"], c["end"], c["radius"]) for name, c in trunk.items()}
     for side, mirror in (("left", [1, 1, 1]), ("right", [1, -1, 1])):
@@ -40,7 +41,9 @@ def _capsules() -> tuple[np.ndarray, ...]:
             if side == "left" or a != b:
                 pairs.append((index[f"{side}_{a}"], index[f"{other}_{b}"]))
     joint, start, end, radius = (np.array(column) for column in zip(*rows.values(), strict=True))
-    return joint, np.stack([start, end], 1).astype(np.float32), radius.astype(np.float32), np.array(pairs)
+    on_floor = [[TABLES["activities"][kind].get(word, ()) for kind in KINDS] for word in ("rests_on", "touches")]
+    rests = np.array([[[name in parts for name in rows] for parts in kinds] for kinds in on_floor])
+    return joint, np.stack([start, end], 1).astype(np.float32), radius.astype(np.float32), np.array(pairs), rests
 
 
 def _mass_of_joints() -> np.ndarray:
@@ -63,7 +66,8 @@ def _levels() -> list[tuple[np.ndarray, np.ndarray]]:
     return [(joints, parents[joints]) for joints in levels]
 
 
-_JOINT, _ENDS, _RADIUS, _PAIRS = _capsules()
+_JOINT, _ENDS, _RADIUS, _PAIRS, (_RESTS, _TOUCHES) = _capsules()
+_ON_FLOOR = _RESTS.any(1)
 _MASS_OF_JOINTS = _mass_of_joints()
 _LEVELS = _levels()
 
@@ -109,6 +113,16 @@ def self_collision(ends: np.ndarray) -> np.ndarray:
     """How deep parts that should not touch are in each other, (n, Q) m, negative where they are apart."""
     a, b = ends[:, _PAIRS[:, 0]], ends[:, _PAIRS[:, 1]]
     return _RADIUS[_PAIRS].sum(1) - _segment_distance(a, b)
+
+
+def hovering(ends: np.ndarray, kind: np.ndarray) -> np.ndarray:
+    """How far (n,) m what a pose of a kind (n,) should rest on is above the body's lowest point; 0 for kinds on their
+    feet."""
+    gap = np.zeros(len(kind), np.float32)
+    rows = np.flatnonzero(_ON_FLOOR[kind])
+    low = (ends[rows, ..., 2] - _RADIUS[:, None]).min(2)
+    gap[rows] = np.where(_RESTS[kind[rows]], low - low.min(1, keepdims=True), 0).max(1)
+    return gap
 
 
 def mass_center(joints: np.ndarray) -> np.ndarray:
@@ -183,9 +197,11 @@ def ground_offset(lowest: np.ndarray, clearance: np.ndarray | float = 0.0) -> np
     return np.asarray(clearance) - np.asarray(lowest)
 
 
-# kinds that stand on both feet or on a foot and a knee, and keep their balance
-STATIC = ("idle", "crouch", "bend", "kneel")
-_STATIC = np.array([name in STATIC for name in KINDS])
+# kinds that keep their balance: on both feet or on a foot and a knee, and on one foot
+STATIC = ("idle", "crouch", "bend", "kneel", "squat", "stoop", "reach_down", "get_down", "box")
+ON_ONE_FOOT = ("kick", "knee_raise")
+_STATIC, _ONE_FOOT = (np.array([name in names for name in KINDS]) for names in (STATIC, ON_ONE_FOOT))
+_AGAIN = _STATIC & (UNUSUAL > 0)
 _KNEEL = KINDS.index("kneel")
 _HIP, _KNEE, _ANKLE, _ABD = (
     np.array([ANGLE_INDEX[f"{side}_{name}"] for side in ("left", "right")]) for name in ("hip", "knee", "ankle", "abd")
@@ -196,18 +212,26 @@ _MARGIN = 0.03  # m: the center of mass stays so far inside the feet's outline
 _TOUCHING, _FADE = 0.03, 4.0
 # directions in which the outline of the feet is taken
 _AROUND = np.stack([f(np.arange(16) * np.pi / 8) for f in (np.cos, np.sin)]).astype(np.float32)
+# a folded leg's least length from hip to ankle, m, of the unusual kinds and of others
+_SHORTEST = np.array([0.18, 0.3], np.float32)
 # how far the center of mass goes when a kneeling body's trunk leans, m a radian: 2/3 of the mass, 0.4 m up
 _TRUNK_LEAN = 0.27
 
 
 def balanced(angles: np.ndarray, kind: np.ndarray) -> np.ndarray:
-    """The poses (n, 27) with those of the static kinds on both feet (or a foot and a knee) and in balance.
+    """The poses (n, 27) with those of the static kinds on both feet (or a foot and a knee), and all in balance.
 
     The body leans about its ankles (kneeling: its trunk about the hips) until its center of mass is over the outline
     of what it stands on; the leg that reaches lower bends more, or the front leg of a kneeling body reaches to the
-    ground. One linear step, whose error is millimeters.
+    ground. One linear step, whose error is millimeters; several for the unusual kinds, whose legs are bent far.
     """
-    rows = np.flatnonzero(_STATIC[kind])
+    for moves in (_STATIC | _ONE_FOOT, *[_AGAIN] * 2):
+        angles = _balance_once(angles, kind, np.flatnonzero(moves[kind]))
+    return angles
+
+
+def _balance_once(angles: np.ndarray, kind: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """A step of `balanced` for some rows."""
     if not len(rows):
         return angles
     part, kneel = angles[rows], kind[rows] == _KNEEL
@@ -219,7 +243,9 @@ def balanced(angles: np.ndarray, kind: np.ndarray) -> np.ndarray:
     # the lean changes the feet's heights too: the soles stay level to the front
     points[:, :8, 2] -= np.repeat(joints[:, _ANKLES, 0], 4, 1) * lean[:, :1]
     points[:, :8, 2] -= (points[:, :8, 1] - np.repeat(joints[:, _HIPS, 1], 4, 1)) * lean[:, 1:]
-    _level_feet(part, joints, points, kneel)
+    both = _STATIC[kind[rows]]
+    least = np.where(_AGAIN[kind[rows[both]]], _SHORTEST[0], _SHORTEST[1])
+    part[both] = _level_feet(part[both], joints[both], points[both], kneel[both], least[:, None])
     angles = angles.copy()
     angles[rows] = np.clip(part, LIMITS[0], LIMITS[1])
     return angles
@@ -254,8 +280,11 @@ def _bearing_points(part: np.ndarray, points: np.ndarray, kneel: np.ndarray) -> 
     return points
 
 
-def _level_feet(part: np.ndarray, joints: np.ndarray, points: np.ndarray, kneel: np.ndarray) -> None:
-    """Bends legs, in place, so that both feet, or the front foot and the other knee, are equally low."""
+def _level_feet(
+    part: np.ndarray, joints: np.ndarray, points: np.ndarray, kneel: np.ndarray, least: np.ndarray
+) -> np.ndarray:
+    """Bends legs, in place, so that both feet, or the front foot and the other knee, are equally low; least (n, 1) m
+    from hip to ankle."""
     rest = mean_adult_joints()[[_HIPS[0], _KNEES[0], _ANKLES[0]]]
     thigh, shank = np.linalg.norm(np.diff(rest, axis=0), axis=1).tolist()
     low = np.stack([points[:, :4, 2].min(1), points[:, 4:8, 2].min(1)], 1)
@@ -273,11 +302,12 @@ def _level_feet(part: np.ndarray, joints: np.ndarray, points: np.ndarray, kneel:
     reach = np.linalg.norm(leg, axis=-1)
     steep = np.maximum(-leg[..., 2] / reach, 0.5)
     knee, fold = _triangle(reach, thigh, shank)
-    new_knee, new_fold = _triangle(np.clip(reach - up / steep, 0.3, 0.9985 * (thigh + shank)), thigh, shank)
+    new_knee, new_fold = _triangle(np.clip(reach - up / steep, least, 0.9985 * (thigh + shank)), thigh, shank)
     knee, fold = np.where(up != 0, new_knee - knee, 0), np.where(up != 0, new_fold - fold, 0)
     part[:, _KNEE] += knee
     part[:, _HIP] += fold
     part[:, _ANKLE] += knee - fold
+    return part
 
 
 def _triangle(reach: np.ndarray, thigh: float, shank: float) -> tuple[np.ndarray, np.ndarray]:
@@ -298,3 +328,45 @@ def _lean(part: np.ndarray, way: np.ndarray, center: np.ndarray, joints: np.ndar
     part[:, _HIP] += np.where(kneel, degrees, 0)[:, None]
     part[:, _ABD] += np.degrees(left)[:, None] * np.array([-1, 1])
     return np.stack([np.where(kneel, 0, forward), left], 1)
+
+
+# the limbs: their capsules and the angles that move them, from the trunk outwards
+_LIMBS = len(TABLES["capsules"]["trunk"]) + np.arange(4 * 3).reshape(4, 3)
+_LIMB_ANGLES = np.array(
+    [[ANGLE_INDEX[f"{side}_{name}"] for name in names]
+     for side in ("left", "right") for names in (("raise", "out", "elbow"), ("hip", "knee", "ankle"))]
+)  # fmt: skip
+# steps to the floor, what keeps them small, m^2 a degree^2, and the longest, degrees
+_STEPS, _DAMPING, _LONGEST = 4, 1e-5, 20.0
+
+
+def settled(angles: np.ndarray, kind: np.ndarray) -> np.ndarray:
+    """The poses (n, 27) with those of kinds that rest on the floor fitted to it: no arm or leg is below what bears the
+    body, and what touches the floor is as low as that. Damped least squares, limb by limb."""
+    rows = np.flatnonzero(_ON_FLOOR[kind])
+    if not len(rows):
+        return angles
+    part, rests, touches = angles[rows], _RESTS[kind[rows]], _TOUCHES[kind[rows]][:, _LIMBS]
+    several = np.tile(rests, (4, 1))
+    for _ in range(_STEPS):
+        # as it is, and with each of a limb's three angles a degree larger
+        bent = np.tile(part, (4, 1, 1))
+        for k in range(3):
+            bent[1 + k, :, _LIMB_ANGLES[:, k]] += 1.0
+        height, *larger = _limb_heights(bent.reshape(-1, part.shape[1]), several).reshape(4, len(rows), 4, 3)
+        slope = np.stack(larger, -1) - height[..., None]
+        across = np.swapaxes(slope, -1, -2)
+        wrong = np.where(touches, height, np.minimum(height, 0))[..., None]
+        step = (across @ np.linalg.solve(slope @ across + _DAMPING * np.eye(3), wrong))[..., 0]
+        part[:, _LIMB_ANGLES] -= np.clip(step, -_LONGEST, _LONGEST)
+        part = np.clip(part, LIMITS[0], LIMITS[1])
+    angles = angles.copy()
+    angles[rows] = part
+    return angles
+
+
+def _limb_heights(angles: np.ndarray, rests: np.ndarray) -> np.ndarray:
+    """(n, 4, 3) m: how high the limbs' capsules are above the lowest part that the body rests on."""
+    ends = capsule_ends(*body_frames(rotations_from_angles(angles)))
+    low = (ends[..., 2] - _RADIUS[:, None]).min(2)
+    return low[:, _LIMBS] - np.where(rests, low, np.inf).min(1)[:, None, None]

@@ -4,8 +4,9 @@ A pose is 27 angles (`ANGLES`, degrees, the same sign on both sides of the body)
 activity, a kind of arm for each side, where between the two ends of its range the activity stands, noise, and for
 gaits a phase; `latents` says how they go on in time. The angles are kept inside the joints' ranges, left and right are
 exchanged in half of the poses, arms are pushed out of the trunk, standing people are set on both feet and balanced
-(`constraints.balanced`), one matrix product turns the angles into Euler angles of the 24 bones, and bodies that pass
-through themselves (`constraints.self_collision`) are replaced by spare ones.
+(`constraints.balanced`), those who are on the floor fitted to it (`constraints.settled`), one matrix product turns the
+angles into Euler angles of the 24 bones, and bodies that pass through themselves (`constraints.self_collision`) or do
+not rest on the ground with what they should (`constraints.hovering`) are replaced by spare ones.
 
 Frame of the result: x forward, y left, z up, facing +x, in the rest pose of `rig` (T-pose, every bone's axes along
 the body's).
@@ -43,8 +44,9 @@ _EARLY_FALL = 0.15  # clips of falls begin early in them
 _GEAR = (3.2, 1.8)
 _HIPS_DOWN = 0.095  # m from the pelvis down to the hips' middle
 _MOMENT = 0.05  # s: bodies roll over the ground in steps of at most this
-# bodies whose parts are deeper in each other than this, m, are refused; clips are checked every so many seconds
-_MOST_DEPTH, _CHECK_EVERY = 0.02, 0.2
+# bodies whose parts are deeper in each other than this, m, or whose support is farther from the ground, are refused;
+# clips are checked every so many seconds
+_MOST_DEPTH, _MOST_GAP, _CHECK_EVERY = 0.02, 0.06, 0.2
 # clips are refused as often as so many poses
 _CLIP_POSES = 2.5
 # people drawn to stand in for the refused: shares of all, of poses and of clips, and at least so many
@@ -166,8 +168,8 @@ def _kind_shares(mix: dict[str, float] | None) -> np.ndarray:
 
 
 def _draw_people(rng: np.random.Generator, n: int, shares: np.ndarray, times: np.ndarray) -> tuple[Latents, np.ndarray]:
-    """n people who do not pass through themselves at times (T,) s, the kinds in the shares (K,); and their rotations
-    (n, T, 24, 3, 3) with the yaw they have.
+    """n people who do not pass through themselves, and rest on the ground, at times (T,) s, the kinds in the shares
+    (K,); and their rotations (n, T, 24, 3, 3) with the yaw they have.
 
     Spares are drawn along, of the kinds that are often refused; each stands in for somebody who is. Where there are
     too few of them, the last stay as they are.
@@ -182,16 +184,19 @@ def _draw_people(rng: np.random.Generator, n: int, shares: np.ndarray, times: np
     if is_clip:
         latents.where[kind == _FALL, 0] *= _EARLY_FALL
     rotations = _poses(latents, times)[0]
-    collides = _depth(rotations) > _MOST_DEPTH
-    rows, refused, free = np.arange(n), np.flatnonzero(collides[:n]), n + np.flatnonzero(~collides[n:])
+    wrong = _is_wrong(rotations, kind)
+    rows, refused, free = np.arange(n), np.flatnonzero(wrong[:n]), n + np.flatnonzero(~wrong[n:])
     rows[refused[: len(free)]] = free[: len(refused)]
     return latents.take(rows), rotations[rows]
 
 
-def _depth(rotations: np.ndarray) -> np.ndarray:
-    """rotations (n, T, 24, 3, 3) -> (n,) m: how deep each body's parts are in each other at the worst moment."""
+def _is_wrong(rotations: np.ndarray, kind: np.ndarray) -> np.ndarray:
+    """rotations (n, T, 24, 3, 3) of the kinds (n,) -> (n,) bool: at some moment parts are too deep in each other, or
+    what the body rests on is in the air."""
     ends = constraints.capsule_ends(*constraints.body_frames(rotations.reshape(-1, 24, 3, 3)))
-    return constraints.self_collision(ends).max(1).reshape(rotations.shape[:2]).max(1, initial=-np.inf)
+    wrong = constraints.self_collision(ends).max(1) > _MOST_DEPTH
+    wrong |= constraints.hovering(ends, np.repeat(kind, rotations.shape[1])) > _MOST_GAP
+    return wrong.reshape(rotations.shape[:2]).any(1)
 
 
 def _poses(latents: Latents, times: np.ndarray) -> tuple[np.ndarray, Stride]:
@@ -201,6 +206,7 @@ def _poses(latents: Latents, times: np.ndarray) -> tuple[np.ndarray, Stride]:
         latents = latents.take(np.repeat(np.arange(n), moments)).at(np.tile(times, n))
     stride = _angles(latents)
     angles = constraints.balanced(_free_arms(stride.angles, moments), latents.kind)
+    angles = constraints.settled(angles, latents.kind)
     return rotations_from_angles(angles).reshape(n, moments, 24, 3, 3), stride
 
 

@@ -75,7 +75,7 @@ def draw_props(rng: np.random.Generator, *, kind: str, joints: np.ndarray) -> li
     if dressed:
         vertices, mesh, parts = skirt(points, u[4:8])
         props.append(Prop(name="skirt", mesh=mesh, where=vertices, face_part=parts))
-    if (u[9] < (_HELMETS if kind == "cycle" else _HATS)) and kind not in ("lie", "fall"):
+    if (u[9] < (_HELMETS if kind == "cycle" else _HATS)) and kind not in _HATLESS:
         mesh, edge = shape("cap" if kind == "cycle" or u[11] < 0.6 else "hat"), 0.25 + 0.3 * u[6]
         part = np.full(len(mesh.faces), _HEAD_PART)
         props.append(rigid_prop("hat", mesh, lambda p: hat_frame(p, edge), face_part=part))
@@ -444,8 +444,10 @@ _RIDES: dict[str, tuple[tuple[float, Callable[[Points, list[float]], Prop | None
 _CARRIES = {
     **dict.fromkeys(("walk", "idle"), 0.36),
     **{"step": 0.3, "captured": 0.15, "run": 0.12, "sport": 0.2, "lie": 0.0, "fall": 0.05},
+    **{"stoop": 0.3, "throw": 0.2, "kick": 0.1, "lie_down": 0.0, "lie_side": 0.0, "lie_front": 0.0, "all_fours": 0.0},
 }
 _OTHERS_CARRY = 0.12
 # skirts, dresses and long coats of those on their feet; hats; helmets of cyclists
 _DRESSED, _HATS, _HELMETS = 0.15, 0.12, 0.5
+_HATLESS = ("lie", "fall", "lie_down", "lie_side", "lie_front")
 _ON_FEET = ("walk", "idle", "step", "push")

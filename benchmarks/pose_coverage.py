@@ -1,0 +1,93 @@
+"""How near poses of the prior come to captured ones, by action or person.
+
+python benchmarks/pose_coverage.py MOTION.npz [MOTION.npz ...] [--poses 20000] [--unusual 0 0.3] [--people bd dg]
+
+MOTION: `joints` (F, 24, 3) m of SMPL's joints, z up, and `clip` and `clip_length`: names PERSON_ACTION_NUMBER or
+PERSON_NUMBER. All poses get the same bones, the hips' middle at the origin and one heading of the hips; the figure is
+the mean distance of 13 joints (head, hips, knees, ankles, shoulders, elbows, wrists) to the nearest of the poses drawn,
+mm. A column for each share of unusual poses (`SceneConfig.unusual`): 0 is what `wild` draws, 0.3 what `wide` does.
+"""
+
+import argparse
+
+import numpy as np
+
+from lidarpose.body.pose_prior.activities import unusual_mix
+from lidarpose.body.pose_prior.sampling import sample_rotations
+from lidarpose.body.rig import forward_kinematics, mean_adult_joints
+from lidarpose.geometry import rotation_about
+from lidarpose.skeleton import SMPL24
+
+# m: from the hips' middle to that of the shoulders, on to the head, and half the breadth of hips and shoulders
+CHEST, HEAD, HALF_HIPS, HALF_SHOULDERS = 0.50, 0.25, 0.09, 0.18
+THIGH, SHANK, UPPER_ARM, FOREARM = 0.42, 0.42, 0.28, 0.25
+
+
+def on_one_body(joints: np.ndarray) -> np.ndarray:
+    """joints (n, 24, 3) -> (n, 13, 3) float32 m."""
+    at = {name: joints[:, i].astype(float) for i, name in enumerate(SMPL24.joints)}
+
+    def way(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        return (end - start) / np.maximum(np.linalg.norm(end - start, axis=-1, keepdims=True), 1e-9)
+
+    hips, shoulders = ((at[f"left_{name}"] + at[f"right_{name}"]) / 2 for name in ("hip", "shoulder"))
+    chest = CHEST * way(hips, shoulders)
+    built = [chest + HEAD * way(shoulders, at["head"])]
+    for side, other in (("left", "right"), ("right", "left")):
+        for root, breadth, bones in (
+            (0 * chest, HALF_HIPS, (("hip", "knee", THIGH), ("knee", "ankle", SHANK))),
+            (chest, HALF_SHOULDERS, (("shoulder", "elbow", UPPER_ARM), ("elbow", "wrist", FOREARM))),
+        ):
+            first = bones[0][0]
+            built.append(root + breadth * way(at[f"{other}_{first}"], at[f"{side}_{first}"]))
+            for start, end, length in bones:
+                built.append(built[-1] + length * way(at[f"{side}_{start}"], at[f"{side}_{end}"]))
+    points = np.stack(built, 1)
+    left = points[:, 1]
+    return (points @ rotation_about("z", np.arctan2(left[:, 0], left[:, 1])).swapaxes(-1, -2)).astype(np.float32)
+
+
+def drawn_poses(count: int, unusual: float) -> np.ndarray:
+    rotations = sample_rotations(np.random.default_rng(0), count, mix=unusual_mix(unusual)).rotations
+    rest = mean_adult_joints()[None]
+    return on_one_body(forward_kinematics(SMPL24.parents, rest, rotations, np.zeros((count, 3)))[1])
+
+
+def nearest(poses: np.ndarray, frame: np.ndarray) -> float:
+    apart = poses - frame
+    return 1e3 * float(np.sqrt(np.einsum("njk,njk->nj", apart, apart)).mean(1).min())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("motion", nargs="+")
+    parser.add_argument("--poses", type=int, default=20000)
+    parser.add_argument("--unusual", type=float, nargs="+", default=[0.0, 0.3])
+    parser.add_argument("--people", nargs="+", help="of the motion, by default all")
+    parser.add_argument("--frames", type=int, default=60, help="most frames of a row, drawn at random")
+    options = parser.parse_args()
+    banks = [drawn_poses(options.poses, share) for share in options.unusual]
+    print(f"{'':40s}  frames" + "".join(f"{share:8.2f}" for share in options.unusual))
+    for path in options.motion:
+        with np.load(path, allow_pickle=False) as motion:
+            names, frames = np.repeat(motion["clip"], motion["clip_length"]), on_one_body(motion["joints"])
+        rows = np.array([str(name).rpartition("_")[0] for name in names])
+        people, total = np.array([row.partition("_")[0] for row in rows]), {}
+        for row in np.unique(rows):
+            person = row.partition("_")[0]
+            if options.people and person not in options.people:
+                continue
+            here = np.flatnonzero(rows == row)
+            picked = np.random.default_rng(0).permutation(here)[: options.frames]
+            mean = [np.mean([nearest(bank, frame) for frame in frames[picked]]) for bank in banks]
+            total.setdefault(person, []).append(np.multiply(mean, len(here)))
+            print(f"{row:40s}{len(here):8d}" + "".join(f"{value:8.1f}" for value in mean), flush=True)
+        for person, sums in total.items():
+            if len(sums) == 1:
+                continue
+            count = int((people == person).sum())
+            print(f"{person + ', all frames':40s}{count:8d}" + "".join(f"{v / count:8.1f}" for v in np.sum(sums, 0)))
+
+
+if __name__ == "__main__":
+    main()
