@@ -198,9 +198,9 @@ def progress(model: str) -> str:
         people, hours = people + run["people_seen"], hours + run["hours"]
         scores = run.get("scores", {})
         held_out = (scores.get(f"sensor known, {group}", "- -").split()[1] for group in ("all", _PLAIN))
-        rows.append(
-            (f"`{run['recipe']['size']}`", f"{people:,}", f"{hours:.1f}", f"{run['validation_mm']:.1f}", *held_out)
-        )
+        # a run that was stopped early has none
+        validation = f"{run['validation_mm']:.1f}" if "validation_mm" in run else "-"
+        rows.append((f"`{run['recipe']['size']}`", f"{people:,}", f"{hours:.1f}", validation, *held_out))
     return table(("", "people in total", "hours", "validation mm", "`heldout.py` mm", "`heldout.py` plain mm"), rows)
 
 
