@@ -44,12 +44,14 @@ def worker(file: str) -> None:
     """Times a step of the package that Python finds, for each line that comes in."""
     import lidarpose
     from lidarpose.inference import detection, verification
-    from lidarpose.models import DEFAULT, weights_path
+    from lidarpose.models import weights_path
     from lidarpose.models.detector.detector import Detector
 
     points = np.load(file)
     detector, predictor = Detector(threads=1), lidarpose.load("small", threads=1, tta=1)
-    verifier = verification.OnnxBackend(weights_path(DEFAULT).with_suffix(".onnx"), threads=1)
+    # until 0.2 and some time after detections were posed by tiny
+    name = getattr(verification, "VERIFIER", "tiny")
+    verifier = verification.OnnxBackend(weights_path(name).with_suffix(".onnx"), threads=1)
     # those of the package take all processors
     detection._detector, verification._verifier = lambda: detector, lambda: verifier
     origin = np.zeros(3)

@@ -20,6 +20,8 @@ from lidarpose.models.detector.detector import Detections
 from lidarpose.sample import MIN_POINTS, Box, Pose
 from lidarpose.viz.person_view import facing
 
+# what poses detections
+VERIFIER = DEFAULT
 # detections that are posed at once, of like size: a batch costs as much as if all were its largest
 _BATCH = 16
 # what is posed: a column so wide, and so far below and above the detection's box, m
@@ -88,7 +90,7 @@ class KnownPlaces:
 
 @cache
 def _verifier() -> Backend:
-    return OnnxBackend(weights_path(DEFAULT).with_suffix(".onnx"))
+    return OnnxBackend(weights_path(VERIFIER).with_suffix(".onnx"))
 
 
 def verification_features(
