@@ -251,7 +251,8 @@ def test_weights_go_on_by_the_names_of_joints(config, skeleton, tmp_path):
 def test_pretrain_predict_evaluate_and_finetune(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ["--workers", "0", "--pictures", "0", "--validate", "1000"]
-    assert not main(["pretrain", "run", "--model", "prn", "--people", "16", "--batch", "8", "--scene", "paper", *words])
+    narrow = ["--size", "prn-small", "--people", "16", "--batch", "8", "--scene", "paper"]
+    assert not main(["pretrain", "run", "--model", "prn", *narrow, *words])
     network, header = load_checkpoint("run/model.safetensors")
     assert header.network == "prn" and header.card["recipe"]["optimizer"] == "adam"
     (line,) = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
@@ -272,12 +273,13 @@ def test_pretrain_predict_evaluate_and_finetune(tmp_path, capsys, monkeypatch):
     folder = tmp_path / "people"
     assert not main(["synth", "--out", str(folder), "--count", "8", "--scene", "paper"])
     common = [str(folder), "--split", "all", "--epochs", "1", "--batch", "4", *words]
-    narrower = ["--model", "prn", "--init", "run/model.safetensors", "--options", "width_divisor=4", "--out", "no"]
-    assert main(["finetune", *common, *narrower]) == 2
-    assert "--init has weights for width_divisor=1" in capsys.readouterr().err
+    wider = ["--model", "prn", "--init", "run/model.safetensors", "--options", "width_divisor=1", "--out", "no"]
+    assert main(["finetune", *common, *wider]) == 2
+    assert "--init has weights for width_divisor=4" in capsys.readouterr().err
     assert not main(["finetune", *common, "--model", "prn", "--init", "run/model.safetensors", "--out", "second"])
     assert load_checkpoint("second/model.safetensors")[1].config.joints == BODY26.joints
-    assert not main(["finetune", *common, "--model", "prn", "--options", "resample_with_replacement", "--out", "third"])
+    options = ["--options", "resample_with_replacement,width_divisor=4"]
+    assert not main(["finetune", *common, "--model", "prn", *options, "--out", "third"])
     third = load_checkpoint("third/model.safetensors")[1]
     assert third.config.resample_with_replacement and third.card["init"] == "random"
     assert main(["finetune", *common, "--model", "lpformer", "--init", "run/model.safetensors", "--out", "no"]) == 2

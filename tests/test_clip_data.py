@@ -8,12 +8,12 @@ from shard_files import write_shard
 
 from lidarpose.body.rig import forward_kinematics
 from lidarpose.body.smpl import load_body
-from lidarpose.data.clips import MARGIN, MOST, consecutive, static_points, window_points, windows, without_person
+from lidarpose.data.clips import MARGIN, MOST, consecutive, static_points, window_points, without_person
 from lidarpose.data.prepare import reader
 from lidarpose.data.shards import person_row, read_rows, sample_of
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix, rotation_vector
-from lidarpose.sample import CLIP_FRAMES, LabeledSample, Sample
+from lidarpose.sample import CLIP_FRAMES, LabeledSample, Sample, clip_windows
 from lidarpose.skeleton import SMPL24
 from lidarpose.synth.generator import Generator
 
@@ -205,7 +205,7 @@ def test_runs_end_at_gaps_and_belong_to_one_track():
 @pytest.mark.parametrize("count", [16, 17, 31, 32, 1])
 def test_windows_do_not_overlap_and_the_last_frame_fills_the_last(count):
     rows = 100 + np.arange(count)
-    clips = windows(rows)
+    clips = clip_windows(rows)
     assert clips.shape == (-(-count // CLIP_FRAMES), CLIP_FRAMES)
     flat = clips.ravel()
     assert (flat[:count] == rows).all() and (flat[count:] == rows[-1]).all()

@@ -12,7 +12,6 @@ from training_runs import few_to_validate_on, refused  # noqa: F401 - a fixture
 from lidarpose import evaluation
 from lidarpose.body.rig import mean_adult_joints
 from lidarpose.cli import main
-from lidarpose.data.clips import windows
 from lidarpose.data.prepare import prepare
 from lidarpose.data.shards import DatasetCard, person_row, shard_path, shard_writer, write_card
 from lidarpose.eval import run
@@ -24,7 +23,7 @@ from lidarpose.inference.torch_backend import ClipBackend
 from lidarpose.models.baselines.baseline_config import CLOUDS, FRAME_POINTS, LidarcapConfig, NeConfig, pad_frames
 from lidarpose.models.baselines.lidarcap import rest_offsets
 from lidarpose.models.checkpoint import Header, build, save_checkpoint
-from lidarpose.sample import CLIP_FRAMES
+from lidarpose.sample import CLIP_FRAMES, clip_windows
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth.generator import Generator
 from lidarpose.train import loop, setup
@@ -117,7 +116,7 @@ def test_what_makes_no_clip_is_counted_by_its_reason(clips, tmp_path):
     dataset = InMemoryDataset.load([write_clips(tmp_path / "d", [longer, clips[1][:7], without])])
     rows, skipped = dataset.clips()
     assert dict(skipped) == {"frames without rotations": 3, "frames of fewer than 16 consecutive ones": 7}
-    assert (rows == windows(np.arange(20))).all() and rows.shape == (2, CLIP_FRAMES)
+    assert (rows == clip_windows(np.arange(20))).all() and rows.shape == (2, CLIP_FRAMES)
     source = make_setup(recipe(Pretrain, "lidarcap", shards=(str(tmp_path / "d"),)))
     assert source.frames == CLIP_FRAMES and sum("left out" in warning for warning in source.warnings) == 2
 

@@ -1,6 +1,7 @@
 """Networks as files that run elsewhere: the same answers at other sizes, and one line for every fault."""
 
 import json
+import shutil
 import warnings
 from dataclasses import replace
 
@@ -16,11 +17,11 @@ from lidarpose.errors import InputError, LidarPoseError, MissingExtra
 from lidarpose.inference.backend import OnnxBackend, exported_beside
 from lidarpose.inference.torch_backend import TorchBackend
 from lidarpose.io.files import content_digest
-from lidarpose.models import BUNDLED, bundled_path
+from lidarpose.models import BUNDLED, DEFAULT, bundled_path
 from lidarpose.models import export as exporting
 from lidarpose.models.checkpoint import DAMAGED, DIGEST, load_checkpoint, read_header, save_checkpoint
 from lidarpose.models.config import NetworkConfig
-from lidarpose.models.export import ArrayModule, check, export
+from lidarpose.models.export import check, export, module_to_onnx
 from lidarpose.models.onnx import (
     check_digest,
     expected_inputs,
@@ -30,7 +31,7 @@ from lidarpose.models.onnx import (
     output_names,
     voxelize_people,
 )
-from lidarpose.models.posenet import PoseNet
+from lidarpose.models.posenet import ArrayModule, PoseNet
 
 CARD = {"command": "none", "note": "random"}
 # every kind of layer, few of each: what is traced takes as long as there are layers
@@ -52,8 +53,17 @@ def stored_network(path, config, seed=0):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A checkpoint, its ONNX file, the graph of that before weights became float16, and its program."""
+    """A checkpoint and its ONNX file: bundled ones, since making one takes half a minute."""
     folder = tmp_path_factory.mktemp("export")
+    for suffix in (".safetensors", ".onnx"):
+        shutil.copy(bundled_path(DEFAULT, suffix), folder / f"net{suffix}")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """As `folder`, of a random network, with the graph before its weights became float16."""
+    folder = tmp_path_factory.mktemp("exported")
     path = stored_network(folder / "net.safetensors", SMALL)
     pack = exporting._pack
 
@@ -64,16 +74,24 @@ def folder(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(exporting, "_pack", packed)
         export(path, folder / "net.onnx")
-    export(path, folder / "net.pt2", format="torch")
     return folder
 
 
 @pytest.fixture(scope="module")
-def program(folder):
-    """What a user of the program has: the module, and what its file tells."""
+def program(tmp_path_factory):
+    """A network, what a user of its program has, and what the program's file tells."""
+    folder = tmp_path_factory.mktemp("program")
+    path = stored_network(folder / "net.safetensors", SMALL)
+    export(path, folder / "net.pt2", format="torch")
     entries = {"lidarpose": ""}
     module = torch.export.load(folder / "net.pt2", extra_files=entries).module()
-    return module, json.loads(entries["lidarpose"])
+    assert_no_path_of_this_machine(folder / "net.pt2")
+    return load_checkpoint(path)[0], module, json.loads(entries["lidarpose"])
+
+
+def assert_no_path_of_this_machine(path):
+    content = path.read_bytes()
+    assert b"lidarpose/models/posenet.py" not in content and str(path.parent).encode() not in content
 
 
 def people(*sizes, seed=1):
@@ -87,28 +105,62 @@ SIZES = [(1,), (5000, 1, 20, 0), (0,), (40, 40), (3, 700, 90, 8, 15, 2, 1)]
 
 
 @pytest.mark.parametrize("sizes", SIZES, ids=str)
-def test_onnx_and_a_program_of_torch_give_what_torch_gives(folder, program, sizes):
+def test_a_program_of_torch_gives_what_torch_gives(program, sizes):
+    network, module, entry = program
+    assert entry["config"]["size"] == "small"
+    arrays = voxelize_people(*people(*sizes), network.config).arrays()
+    tensors = [torch.as_tensor(array) for array in arrays.values()]
+    with torch.inference_mode():
+        expected = ArrayModule(network, tuple(arrays))(*tensors)
+        torch.testing.assert_close(tuple(module(*tensors)), expected, rtol=1e-4, atol=1e-5)
+
+
+class Halved(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.linear = torch.nn.Linear(8, 16)
+        torch.nn.init.constant_(self.linear.weight, 0.25)
+
+    def forward(self, x):
+        return self.linear(x).relu().sum(1), x / 2
+
+
+def test_a_module_becomes_onnx_of_free_length_that_tells_only_what_it_is_told():
+    module = Halved()
+    content = module_to_onnx(module, (torch.ones(3, 5, 8),), ({0: "rows"},), ["x"], ["sum", "half"], {"note": "a note"})
+    session = open_session(content, threads=1)
+    assert session.get_modelmeta().custom_metadata_map == {"note": "a note"}
+    assert [value.shape for value in session.get_inputs()] == [["rows", 5, 8]]
+    assert b"test_export.py" not in content
+    # weights of which half precision keeps all
+    assert onnx.TensorProto.FLOAT16 in {each.data_type for each in onnx.load_from_string(content).graph.initializer}
+    for rows in (1, 7):
+        x = torch.rand(rows, 5, 8)
+        for ours, due in zip(session.run(None, {"x": x.numpy()}), module(x), strict=True):
+            np.testing.assert_allclose(ours, due.detach(), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sizes", SIZES, ids=str)
+def test_onnx_gives_what_torch_gives(exported, sizes):
     clouds, view = people(*sizes)
-    network, header = load_checkpoint(folder / "net.safetensors")
-    ours = OnnxBackend(folder / "net.onnx", threads=1).run(clouds, view)
+    network, header = load_checkpoint(exported / "net.safetensors")
+    ours = OnnxBackend(exported / "net.onnx", threads=1).run(clouds, view)
     due = TorchBackend(network, header).run(clouds, view)
     for name in ("vote", "confidence", "log_spread", "visible", "person", "low", "step"):
         np.testing.assert_allclose(getattr(ours, name), getattr(due, name), rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(ours.heatmaps, due.heatmaps, rtol=1e-4, atol=1e-4)
     assert np.ptp(due.heatmaps[0]) > 0.1
-    arrays = voxelize_people(clouds, view, header.config).arrays()
-    tensors = [torch.as_tensor(array) for array in arrays.values()]
-    with torch.inference_mode():
-        expected = ArrayModule(network, tuple(arrays))(*tensors)
-        torch.testing.assert_close(tuple(program[0](*tensors)), expected, rtol=1e-4, atol=1e-5)
 
 
-def test_float16_weights_stay_float16(folder):
+@pytest.mark.slow
+def test_float16_weights_stay_float16(exported):
     """A smaller file, and not a bit of any output is lost."""
-    network, header = load_checkpoint(folder / "net.safetensors")
-    packed = (folder / "net.onnx").read_bytes()
+    network, header = load_checkpoint(exported / "net.safetensors")
+    packed = (exported / "net.onnx").read_bytes()
+    assert_no_path_of_this_machine(exported / "net.onnx")
     model = onnx.load_from_string(packed)
-    model.graph.ParseFromString((folder / "before.graph").read_bytes())
+    model.graph.ParseFromString((exported / "before.graph").read_bytes())
     whole = model.SerializeToString()
     parameters = sum(value.numel() for value in network.parameters())
     assert len(packed) < len(whole) - 1.5 * parameters
@@ -146,21 +198,27 @@ def test_weights_that_need_all_of_float32_keep_it():
     np.testing.assert_array_equal(open_session(model.SerializeToString(), threads=1).run(None, {})[0], half)
 
 
-def test_the_files_tell_what_they_are(folder, program):
+def assert_tells_what_it_is(folder):
     session, header, source = open_onnx(folder / "net.onnx", threads=1)
-    assert header == read_header(folder / "net.safetensors") and header.config == SMALL
+    config = header.config
+    assert header == read_header(folder / "net.safetensors") and config.convolution and config.person
     assert source == content_digest(folder / "net.safetensors", expected="a checkpoint")
-    assert [value.name for value in session.get_inputs()] == expected_inputs(SMALL)
-    assert "in_mid_neighbours" in expected_inputs(SMALL)
-    assert [value.name for value in session.get_outputs()] == list(output_names(SMALL))
+    assert [value.name for value in session.get_inputs()] == expected_inputs(config)
+    assert "in_mid_neighbours" in expected_inputs(config)
+    assert [value.name for value in session.get_outputs()] == list(output_names(config))
     shapes = {value.name: value.shape for value in [*session.get_inputs(), *session.get_outputs()]}
     assert shapes["in_fine_position"] == ["people", "fine_rows", 3] and shapes["in_view"] == ["people", 5]
     assert shapes["in_mid_neighbours"] == ["people", "mid_rows", 27] and shapes["part"] == ["people", "fine_rows", 25]
-    assert program[1]["config"]["size"] == "small"
-    for name in ("net.onnx", "net.pt2"):
-        content = (folder / name).read_bytes()
-        # no path of this machine
-        assert b"lidarpose/models/posenet.py" not in content and str(folder).encode() not in content
+    assert_no_path_of_this_machine(folder / "net.onnx")
+
+
+def test_the_bundled_file_tells_what_it_is(folder):
+    assert_tells_what_it_is(folder)
+
+
+@pytest.mark.slow
+def test_a_new_file_tells_what_it_is(exported):
+    assert_tells_what_it_is(exported)
 
 
 def test_an_exported_file_is_a_model_of_its_own(folder, capfd):
@@ -289,7 +347,7 @@ def test_the_twin_beside_a_checkpoint(folder, tmp_path):
     assert_one_line(path, "net.onnx beside it, which does not exist", "lidarpose export", read=exported_beside)
     (tmp_path / "net.onnx").write_bytes((folder / "net.onnx").read_bytes())
     assert exported_beside(path).header == read_header(path)
-    stored_network(path, SMALL, seed=3)
+    stored_network(path, SMALL)
     with pytest.raises(InputError, match="other weights than net.safetensors beside it: make it with"):
         exported_beside(path)
 

@@ -9,7 +9,7 @@ import pytest
 from training_runs import Killed, few_to_validate_on  # noqa: F401
 
 from lidarpose.cli import main
-from lidarpose.cli.paper import _problem
+from lidarpose.cli.command_line import make_parser
 from lidarpose.data.shards import open_dataset
 from lidarpose.errors import InputError
 from lidarpose.eval.scores import published, read_scores
@@ -167,7 +167,8 @@ def test_the_parser_knows_the_commands(name, tmp_path, data):
         steps_of = [list(cell.evaluation.all()) for cell in cells(TABLES[name], options) if cell.evaluation]
         assert steps_of
         for step in {step.name: step for steps_ in steps_of for step in steps_}.values():
-            assert _problem(step.command(tmp_path)) == ""
+            # ends the test with what it says against a command
+            make_parser().parse_args(step.command(tmp_path))
 
 
 def test_the_paper_s_protocol_on_real_sets(data):

@@ -34,6 +34,12 @@ def within_reach(points: np.ndarray) -> np.ndarray:
     return (np.abs(points) < FARTHEST).all(-1)
 
 
+def clip_windows(run: np.ndarray) -> np.ndarray:
+    """A run's rows (n,) as clips (c, `CLIP_FRAMES`) that do not overlap; the last one is filled with the last row.
+    Source: LiDARCap."""
+    return run[np.minimum(np.arange(-(-len(run) // CLIP_FRAMES) * CLIP_FRAMES), len(run) - 1)].reshape(-1, CLIP_FRAMES)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pose:
     """Joints in space, of one person or of many.

@@ -2,7 +2,9 @@
 
 import argparse
 import io
+from collections.abc import Callable
 from contextlib import redirect_stderr
+from functools import partial
 from pathlib import Path
 
 from lidarpose.cli.terminal import add_command, names, tell
@@ -38,13 +40,12 @@ $ lidarpose paper table3 --data waymo=prepared/waymo --size paper
 """
 
 
-def add(commands) -> None:
-    """Adds the command to the parser's."""
-    add_command(commands, "paper", _paper, _PAPER)
+def add(commands, execute: Callable[[list[str]], int]) -> None:
+    """Adds the command to the parser's. execute: runs another command, see `paper.steps.Execute`."""
+    add_command(commands, "paper", partial(_paper, commands, execute), _PAPER)
 
 
-def _paper(options: argparse.Namespace) -> None:
-    from lidarpose.cli import main
+def _paper(commands, execute: Callable[[list[str]], int], options: argparse.Namespace) -> None:
     from lidarpose.paper import figures
     from lidarpose.paper.report import plan, run_table, write_table
     from lidarpose.paper.steps import check_out
@@ -66,12 +67,12 @@ def _paper(options: argparse.Namespace) -> None:
     table, chosen = TABLES[options.name], names(options.rows or "")
     selected = cells(table, asked, chosen)
     if options.dry_run:
-        print(plan(table, selected, out, _problem), end="")
+        print(plan(table, selected, out, partial(_problem, commands)), end="")
         return
     if options.table_only:
         write_table(table, selected, asked, out)
     else:
-        run_table(table, asked, out, chosen, main, tell)
+        run_table(table, asked, out, chosen, execute, tell)
     print(out / f"{table.name}.md")
     if table.name.startswith("fig") and (path := figures.draw(table.name, selected, out)) is not None:
         print(path)
@@ -88,14 +89,12 @@ def _data(text: str | None) -> dict[str, str]:
     return folders
 
 
-def _problem(words: list[str]) -> str:
-    """What the command line's parser says against a command, "" for nothing."""
-    from lidarpose.cli import _parser
-
+def _problem(commands, words: list[str]) -> str:
+    """What a command's parser says against its words, "" for nothing."""
     errors = io.StringIO()
     try:
         with redirect_stderr(errors):
-            _parser().parse_args(words)
+            commands.choices[words[0]].parse_args(words[1:])
     except SystemExit:
         return errors.getvalue().strip().removeprefix("lidarpose: error: ")
     return ""

@@ -1,14 +1,14 @@
-"""`lidarpose predict` and `lidarpose detect`."""
+"""`lidarpose predict` of one scan, and `lidarpose detect`; folders and recordings are `cli.recordings`."""
 
 import argparse
 import os
 import sys
+from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from lidarpose.cli import recordings
 from lidarpose.cli.terminal import add_command, is_watched, tell
 from lidarpose.errors import InputError
 from lidarpose.models import DEFAULT, NAMES
@@ -50,8 +50,6 @@ $ lidarpose predict street.mcap --every 2 --format parquet
 [who is looked for, without boxes]
 --find  look for people in a file under 4 m across too
 {_SEARCH}
-[folders and recordings]
-{recordings.FRAMES}
 [output]
 --out PATH = .  a folder, a .json or .csv file (default: the current folder); - prints the JSON
 --picture  also draw STEM.poses.png, or FILE.png
@@ -88,32 +86,11 @@ def add(commands) -> None:
 
 def _predict(options: argparse.Namespace) -> None:
     from lidarpose.inference.predict_scan import predict
-    from lidarpose.inference.predictor import load
-    from lidarpose.io.files import atomic_path, check_apart, check_writable
+    from lidarpose.io.files import atomic_path
 
-    many = recordings.is_recording(options)
-    name = recordings.name_of(options.source) if many else Path(options.source[0]).stem
-    formats = (options.format,) if options.format else ("jsonl", "csv", "parquet") if many else ("json", "csv")
-    result = _result_path(options.out, name, "poses", *(f".{suffix}" for suffix in formats))
-    beside = result or Path(f"{name}.poses.json")
-    picture = beside.with_suffix(".png") if options.picture else None
-    page = beside.with_suffix(".html") if options.html else None
-    for path in filter(None, (result, picture, page)):
-        inputs = (options.boxes, options.calib, options.weights, *(options.background or ()))
-        check_apart(path, *options.source, *inputs)
-        # before the work
-        check_writable(path)
-    choices = {name: getattr(options, name) for name in ("backend", "device", "decode", "tta")}
-    asked = {name: getattr(options, name) for name in ("boxes", "calib", "crop", "find", "skeleton")} | _reading(
-        options
-    )
-    # loaded once the input has proved readable
-    asked["model"] = partial(load, options.weights, **choices)
-    if many:
-        recordings.predict_recording(options, result, picture, asked)
-        return
     file = Path(options.source[0])
-    poses = predict(options.source[0], **asked, progress=is_watched())
+    result, picture, page = output_paths(options, file.stem, ("json", "csv"))
+    poses = predict(options.source[0], **prediction_options(options), progress=is_watched())
     outputs: dict[Path, bytes] = {}
     if result is not None:
         as_csv = result.suffix.lower() == ".csv"
@@ -136,6 +113,34 @@ def _predict(options: argparse.Namespace) -> None:
         tell(f"nobody found{where}")
         return
     tell(f"{posed} of {len(poses)} people, {poses.timing_ms['per_person']:.0f} ms each{where}")
+
+
+def output_paths(
+    options: argparse.Namespace, name: str, formats: Sequence[str]
+) -> tuple[Path | None, Path | None, Path | None]:
+    """Where `predict` writes its result, in one of the formats, a picture and a page, None for what it does not write.
+    Raises InputError where one cannot be written, or is a file that is read."""
+    from lidarpose.io.files import check_apart, check_writable
+
+    result = _result_path(options.out, name, "poses", *(f".{suffix}" for suffix in formats))
+    beside = result or Path(f"{name}.poses.json")
+    picture = beside.with_suffix(".png") if options.picture else None
+    page = beside.with_suffix(".html") if options.html else None
+    for path in filter(None, (result, picture, page)):
+        inputs = (options.boxes, options.calib, options.weights, *(options.background or ()))
+        check_apart(path, *options.source, *inputs)
+        # before the work
+        check_writable(path)
+    return result, picture, page
+
+
+def prediction_options(options: argparse.Namespace) -> dict[str, Any]:
+    """Arguments of `lidarpose.predict`; the network is loaded once the input has proved readable."""
+    from lidarpose.inference.predictor import load
+
+    choices = {name: getattr(options, name) for name in ("backend", "device", "decode", "tta")}
+    given = {name: getattr(options, name) for name in ("boxes", "calib", "crop", "find", "skeleton")}
+    return given | _reading(options) | {"model": partial(load, options.weights, **choices)}
 
 
 def _detect(options: argparse.Namespace) -> None:

@@ -3,16 +3,18 @@
 import argparse
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from lidarpose._version import __version__
-from lidarpose.cli.terminal import option_names, tell
+from lidarpose.cli.predicting import output_paths, prediction_options
+from lidarpose.cli.terminal import add_options, option_names, tell
 from lidarpose.errors import InputError
 
-# options of folders and recordings
-FRAMES = """
+_FRAMES = """
+[folders and recordings]
 --track  join people over time, and make their poses steady
 --live  tracks made steady by the past alone, as they come
 --world  joints in the world's frame, where it is known
@@ -28,16 +30,32 @@ FRAMES = """
 _MOST_WARNINGS = 8
 
 
-def is_recording(options: argparse.Namespace) -> bool:
+def add(commands) -> None:
+    """Lets the parser's `predict` take folders and recordings too."""
+    parser = commands.choices["predict"]
+    add_options(parser, _FRAMES)
+    parser.set_defaults(run=partial(_predict, parser.get_default("run")))
+
+
+def _predict(predict_scan: Callable[[argparse.Namespace], None], options: argparse.Namespace) -> None:
+    if not _is_recording(options):
+        predict_scan(options)
+        return
+    formats = (options.format,) if options.format else ("jsonl", "csv", "parquet")
+    result, picture, _ = output_paths(options, _name_of(options.source), formats)
+    _predict_recording(options, result, picture, prediction_options(options))
+
+
+def _is_recording(options: argparse.Namespace) -> bool:
     """Whether the command is about many frames rather than one plain file."""
     from lidarpose.io.sources import is_single_scan
 
-    if any(getattr(options, name) not in (None, False) for name in option_names(FRAMES)):
+    if any(getattr(options, name) not in (None, False) for name in option_names(_FRAMES)):
         return True
     return not is_single_scan(options.source)
 
 
-def name_of(paths: Sequence[str]) -> str:
+def _name_of(paths: Sequence[str]) -> str:
     """What results are named after: the file's or folder's stem, of several files their folder's."""
     path = paths[0] if len(paths) == 1 else os.path.commonpath([os.path.abspath(path) for path in paths])
     if any(letter in path for letter in "*?[") and not os.path.exists(path):
@@ -47,7 +65,7 @@ def name_of(paths: Sequence[str]) -> str:
     return (name if os.path.isdir(path) else Path(name).stem) or "recording"
 
 
-def predict_recording(
+def _predict_recording(
     options: argparse.Namespace, result: Path | None, picture: Path | None, asked: dict[str, Any]
 ) -> None:
     """Poses all frames, and says what came of it. asked: as of `FramePredictor`."""

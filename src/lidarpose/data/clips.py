@@ -9,7 +9,6 @@ from collections.abc import Hashable, Iterable, Sequence
 import numpy as np
 
 from lidarpose.geometry import to_spherical
-from lidarpose.sample import CLIP_FRAMES
 
 # how far the window about a person reaches beyond the person, rad, and how many of its points are kept. Source: NE
 MARGIN, MOST = np.radians(1.0), 512
@@ -38,12 +37,6 @@ def consecutive(tracks: Sequence[Hashable], frames: Sequence[int]) -> list[np.nd
         steps = np.diff([frames[row] for row in ordered])
         runs += np.split(ordered, np.flatnonzero(steps > _GAP * np.median(steps)) + 1) if len(steps) else [ordered]
     return runs
-
-
-def windows(run: np.ndarray) -> np.ndarray:
-    """A run's rows (n,) as clips (c, `CLIP_FRAMES`) that do not overlap; the last one is filled with the last row.
-    Source: LiDARCap."""
-    return run[np.minimum(np.arange(-(-len(run) // CLIP_FRAMES) * CLIP_FRAMES), len(run) - 1)].reshape(-1, CLIP_FRAMES)
 
 
 # ---- what stands about a person

@@ -12,13 +12,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from lidarpose.data.clips import consecutive, windows
+from lidarpose.data.clips import consecutive
 from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.eval.dataset import EvalDataset, EvalSample
 from lidarpose.eval.predictions import Predictions, stack
 from lidarpose.eval.scores import Setting
 from lidarpose.inference.inputs import Clips
-from lidarpose.sample import PER_PERSON, UNLABELED, Box, LabeledSample
+from lidarpose.sample import PER_PERSON, UNLABELED, Box, LabeledSample, clip_windows
 from lidarpose.skeleton import Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
 
@@ -247,7 +247,7 @@ class EvalSetup:
         own = [person.sample for person in samples]
         around = {name: [getattr(sample, name) for sample in own] for name in ("background", "neighbors")}
         around = {name: [np.zeros((0, 3)) if own is None else own for own in clouds] for name, clouds in around.items()}
-        return {"clips": Clips(windows=np.concatenate([windows(run) for run in _runs(own)]), **around)}
+        return {"clips": Clips(windows=np.concatenate([clip_windows(run) for run in _runs(own)]), **around)}
 
     def _picked(self, estimates, index) -> dict:
         """Of a pose, or of person `index` of many: the scored joints."""

@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.data.clips import windows
 from lidarpose.errors import InputError
 from lidarpose.geometry import vector_of
 from lidarpose.io.files import FormatError, one_line
 from lidarpose.io.text import is_transposed, pick_xyz
-from lidarpose.sample import CLIP_FRAMES, FARTHEST, MIN_POINTS, center_of, within_reach
+from lidarpose.sample import CLIP_FRAMES, FARTHEST, MIN_POINTS, center_of, clip_windows, within_reach
 
 # frames a second of a clip without times
 CLIP_RATE = 10.0
@@ -51,7 +50,7 @@ class Clips:
     @classmethod
     def of_run(cls, count: int, **clouds: Sequence[np.ndarray]) -> "Clips":
         """So many clouds, all frames of one person in order of time."""
-        return cls(windows=windows(np.arange(count)), **clouds)
+        return cls(windows=clip_windows(np.arange(count)), **clouds)
 
     def around(self, rows: np.ndarray) -> dict[str, list[np.ndarray]]:
         """The clouds about the persons of some rows, by name."""

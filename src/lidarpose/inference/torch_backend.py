@@ -14,9 +14,8 @@ from lidarpose.inference.inputs import Clips
 from lidarpose.models import NETWORKS
 from lidarpose.models.baselines.baseline_config import pad_clouds, pad_frames
 from lidarpose.models.checkpoint import Header, load_checkpoint
-from lidarpose.models.export import ArrayModule
 from lidarpose.models.onnx import output_names, voxelize_people
-from lidarpose.models.posenet import PoseNet
+from lidarpose.models.posenet import ArrayModule, PoseNet
 from lidarpose.models.voxelize import WINDOW
 from lidarpose.sample import CLIP_FRAMES
 from lidarpose.skeleton import SMPL24

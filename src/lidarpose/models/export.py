@@ -26,7 +26,7 @@ from lidarpose.models.onnx import (
     voxelize_people,
     with_digest,
 )
-from lidarpose.models.posenet import Batch, PoseNet
+from lidarpose.models.posenet import ArrayModule, PoseNet
 
 # of each format, the suffix of its files
 FORMATS = {"onnx": ".onnx", "torch": ".pt2"}
@@ -37,21 +37,6 @@ _TRACED, _CHECKED = (300, 60, 700), ((1, 2000, 37, 0, 9), (1,))
 _TOLERANCE = 1e-3
 # an array of fewer numbers is not worth a node
 _WORTH = 64
-
-
-class ArrayModule(nn.Module):
-    """A network as a function of a pyramid's arrays, named `names`, one after the other, giving its
-    `output_names` in order."""
-
-    def __init__(self, network: PoseNet, names: tuple[str, ...]):
-        super().__init__()
-        self.network = network
-        self.names = names
-        self.outputs = output_names(network.config)
-
-    def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
-        out = self.network(Batch.from_arrays(dict(zip(self.names, tensors, strict=True)), tensors[0].device))
-        return tuple(getattr(out, name) for name in self.outputs)
 
 
 def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = "onnx") -> None:

@@ -29,6 +29,7 @@ from lidarpose.models.layers import (
     key_bias,
     membership,
 )
+from lidarpose.models.onnx import output_names
 from lidarpose.models.voxelize import VoxelLevel
 from lidarpose.skeleton import skeleton
 
@@ -197,6 +198,21 @@ class PoseNet(nn.Module):
         density = torch.cat([batch.fine.log_count[..., None], mid_of_fine.transpose(1, 2) @ parents], -1)
         # deviations inside a cell are a few centimeters: brought to order one
         return torch.cat([places.features(), batch.offset, batch.deviation / self.config.grid, density], -1)
+
+
+class ArrayModule(nn.Module):
+    """A network as a function of a pyramid's arrays, named `names`, one after the other, giving its
+    `output_names` in order."""
+
+    def __init__(self, network: PoseNet, names: tuple[str, ...]):
+        super().__init__()
+        self.network = network
+        self.names = names
+        self.outputs = output_names(network.config)
+
+    def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
+        out = self.network(Batch.from_arrays(dict(zip(self.names, tensors, strict=True)), tensors[0].device))
+        return tuple(getattr(out, name) for name in self.outputs)
 
 
 class _Stem(nn.Module):

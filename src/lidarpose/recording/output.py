@@ -19,8 +19,8 @@ from lidarpose.io.sources import Source
 from lidarpose.progress import Progress
 from lidarpose.recording.coordinates import in_world
 from lidarpose.recording.predict_recording import FramePoses, FramePredictor
+from lidarpose.recording.result_files import check_format, write_result
 from lidarpose.recording.steady_tracks import steadied
-from lidarpose.recording.tables import check_format, write_result
 
 
 class PartFile:

@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 from torch.utils.data import IterableDataset, get_worker_info
 
-from lidarpose.data.clips import consecutive, windows
+from lidarpose.data.clips import consecutive
 from lidarpose.data.shards import DatasetReader, open_dataset, pyarrow, to_arrow
 from lidarpose.errors import InputError, check_int
 from lidarpose.io.files import file_error, listed
-from lidarpose.sample import CLIP_FRAMES, HIDDEN, SEEN, UNLABELED, LabeledSample, Pose, Sample
+from lidarpose.sample import CLIP_FRAMES, HIDDEN, SEEN, UNLABELED, LabeledSample, Pose, Sample, clip_windows
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import PoseBank
 from lidarpose.synth.generator import Generator
@@ -121,7 +121,7 @@ class InMemoryDataset:
         own = stored[usable].tolist()
         runs = consecutive([tracks[k] for k in own], [frames[k] for k in own])
         skipped["frames of fewer than 16 consecutive ones"] = sum(len(run) for run in runs if len(run) < CLIP_FRAMES)
-        clips = [usable[windows(run)] for run in runs if len(run) >= CLIP_FRAMES]
+        clips = [usable[clip_windows(run)] for run in runs if len(run) >= CLIP_FRAMES]
         return np.concatenate([np.zeros((0, CLIP_FRAMES), int), *clips]), +skipped
 
     def without(self, sequences: Sequence[str]) -> "InMemoryDataset":

@@ -34,7 +34,6 @@ SEGMENT, TIME, LASER, OBJECT = (
 # segment and timestamp; and the laser
 FrameKey = tuple[str, int]
 LaserKey = tuple[str, int, int]
-Names = tuple[str, ...]
 # the values of the key columns, and the others by name
 Row = tuple[tuple, dict[str, Any]]
 _IMAGE_KEYS = (SEGMENT, TIME, LASER)

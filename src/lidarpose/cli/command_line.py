@@ -1,0 +1,108 @@
+"""The parser of all commands, and how a command ends. Heavy imports stay inside the commands."""
+
+import argparse
+import os
+import sys
+from contextlib import suppress
+
+import lidarpose.cli.datasets as datasets
+import lidarpose.cli.evaluating as evaluating
+import lidarpose.cli.paper as paper
+import lidarpose.cli.predicting as predicting
+import lidarpose.cli.recordings as recordings
+import lidarpose.cli.training as training
+import lidarpose.cli.weights as weights
+from lidarpose._version import __version__
+from lidarpose.cli.terminal import tell
+from lidarpose.errors import InputError, LidarPoseError, missing_extra
+from lidarpose.progress import set_quiet
+
+# options whose value may start with a minus sign, which argparse would take for another option
+_SIGNED = ("--sensor-origin", "--up")
+
+
+def run(arguments: list[str] | None = None) -> int:
+    """As `lidarpose.cli.main`."""
+    parser = make_parser()
+    options = parser.parse_args(_joined(sys.argv[1:] if arguments is None else arguments))
+    if options.command is None:
+        parser.print_help()
+        return 0
+    set_quiet(options.quiet)
+    with suppress(AttributeError, ValueError):
+        # names of files need not be text, nor has every terminal all letters; stderr does so by itself
+        sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
+    try:
+        options.run(options)
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        # whoever read our output has enough
+        _drop_output()
+    except ModuleNotFoundError as error:
+        extra = "export" if options.command == "export" else None
+        missing = missing_extra(error, f"`lidarpose {options.command}`", extra)
+        if not isinstance(missing, LidarPoseError):
+            raise
+        return _failed(missing)
+    except LidarPoseError as error:
+        return _failed(error)
+    except OSError as error:
+        if error.filename is not None or not error.strerror:
+            return _failed(error)
+        # what is written to files says which; this is the standard output
+        _drop_output()
+        return _failed(InputError(f"cannot write the output ({error.strerror}): send it elsewhere"))
+    except MemoryError as error:
+        reason = f" ({error})" if str(error) else ""
+        return _failed(InputError(f"the memory is full{reason}: give less at once, as fewer points or people"))
+    except KeyboardInterrupt as stopped:
+        # training says how to go on
+        return _ended(str(stopped) or "stopped", getattr(stopped, "status", 130))
+    return 0
+
+
+def _drop_output() -> None:
+    """What is left of the output goes nowhere, so that python does not complain at exit."""
+    with suppress(OSError, AttributeError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _ended(text: object, status: int) -> int:
+    """Says why the command ends; of several processes of a training one is enough to say it. Returns the status."""
+    if os.environ.get("RANK", "0") == "0":
+        tell(f"lidarpose: {text}", error=True)
+    return status
+
+
+def _failed(error: Exception) -> int:
+    return _ended(f"error: {error}", 2)
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str):
+        """One line, as for every other wrong input."""
+        self.exit(2, f"lidarpose: error: {message}; see {self.prog} --help\n")
+
+
+def _joined(arguments: list[str]) -> list[str]:
+    """`--sensor-origin -1,0,2` as `--sensor-origin=-1,0,2`, and `--up -y` as `--up=-y`."""
+    joined: list[str] = []
+    for argument in arguments:
+        if joined and joined[-1] in _SIGNED and argument.startswith("-") and argument[1:2] in tuple("0123456789.xyz"):
+            joined[-1] += f"={argument}"
+        else:
+            joined.append(argument)
+    return joined
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The parser of `lidarpose` with all its commands."""
+    parser = _Parser(prog="lidarpose", description="3D human pose from LiDAR.")
+    parser.add_argument("--version", action="version", version=f"lidarpose {__version__}")
+    commands = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND")
+    for module in (predicting, recordings, datasets, training, evaluating):
+        module.add(commands)
+    paper.add(commands, run)
+    weights.add(commands)
+    return parser
