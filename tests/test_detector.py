@@ -48,6 +48,22 @@ def test_people_are_found_once_each_where_they_stand(points):
     assert len(Detector(upright).detect(points, ORIGIN, limit=2)) == 2
 
 
+def test_two_who_touch_are_two_and_nobody_is_two(points):
+    """Candidates 0.4 m apart stay, those that are moved to the same place do not."""
+    pair = np.concatenate([plane(), column(6, 0), column(6, 0.4, seed=3)])
+
+    def still(arrays):
+        return upright(arrays) * [1, 0, 0, 1, 1, 1]
+
+    detections = Detector(still).detect(pair, ORIGIN)
+    assert [nearest(detections.centers, 6, y) < 0.15 for y in (0, 0.4)] == [True, True]
+    for scorer in (still, upright):
+        for cloud in (pair, points):
+            places = Detector(scorer).detect(cloud, ORIGIN).centers[:, :2]
+            gaps = np.linalg.norm(places[:, None] - places, axis=-1)
+            assert (gaps[~np.eye(len(gaps), dtype=bool)] >= 0.25).all()
+
+
 def test_a_scan_that_is_turned_or_unlocated_holds_the_same_people(points):
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     sure = [

@@ -8,12 +8,18 @@ import numpy as np
 import pytest
 
 from lidarpose.geometry import rotation_about
-from lidarpose.models.detector.candidates import SceneIndex, suppress
+from lidarpose.models.detector.candidates import SceneIndex, suppress, suppress_near
 from lidarpose.models.detector.ground import estimate_ground, estimate_up, without_ground
 from lidarpose.models.detector.proposals import columns, heights_above, propose
 from lidarpose.models.detector.render import Augmentation, draw_augmentation, render
 from lidarpose.synth.street import street
-from tests.reference.detector_reference import context_reference, fine_reference, range_reference, suppress_reference
+from tests.reference.detector_reference import (
+    context_reference,
+    fine_reference,
+    range_reference,
+    suppress_near_reference,
+    suppress_reference,
+)
 
 ORIGIN = np.zeros(3)
 
@@ -33,6 +39,13 @@ def column(x, y, *, ground=-1.8, height=1.75, count=150, radius=0.2, seed=1):
     z = ground + rng.uniform(0.02, height, count)
     radius = np.where(z > ground + height - 0.25, radius / 2, radius)
     return np.stack([x + radius * np.cos(angle), y + radius * np.sin(angle), z], 1)
+
+
+def sitter(x, y, *, ground=-1.8):
+    """Points of somebody who sits and looks along -x: body, lap and legs."""
+    lap = box([x - 0.4, y - 0.15, ground + 0.4], [x, y + 0.15, ground + 0.55], count=40)
+    legs = box([x - 0.45, y - 0.15, ground + 0.05], [x - 0.35, y + 0.15, ground + 0.45], count=30)
+    return np.concatenate([column(x, y, ground=ground + 0.45, height=0.85, count=80), lap, legs])
 
 
 def box(low, high, *, count=2000, seed=2):
@@ -153,14 +166,18 @@ def test_people_of_a_street_have_candidates(scene):
     ("points", "places"),
     [
         ([column(5, 0), column(5, 0.5, seed=3)], [(5, 0), (5, 0.5)]),
+        ([column(5, 0), column(5, 0.4, seed=3)], [(5, 0), (5, 0.4)]),
+        ([column(5, 0), column(5.4, 0.05, seed=3)], [(5, 0), (5.4, 0.05)]),
         ([column(5, 0), box([5.35, -4, -1.8], [5.6, 4, 1.5], count=6000)], [(5, 0)]),
         ([column(5, 0, height=0.95, count=40)], [(5, 0)]),
+        ([column(5, 0), box([5.25, -4, -1.8], [5.5, 4, 1.5], count=6000)], [(5, 0)]),
         ([column(9, 1, height=1.3, radius=0.3, count=30)], [(9, 1)]),
+        ([sitter(5, 0), box([4.8, -1, -1.8], [5.25, 1, -1.35], count=200)], [(5, 0)]),
         ([column(9, 1, count=7)], [(9, 1)]),
         # a head that looks over a hedge
         ([column(9, 1, ground=-0.4, height=0.25, count=15, radius=0.1)], [(9, 1)]),
     ],
-    ids=["pair", "wall", "child", "sitting", "few", "head"],
+    ids=["pair", "close", "behind", "wall", "child", "touching", "sitting", "bench", "few", "head"],
 )
 def test_candidates_stand_where_people_do(points, places):
     points = np.concatenate([plane(), *points])
@@ -404,3 +421,15 @@ def test_rows_are_those_of_the_column_and_suppression_is_by_shared_points(scene)
     assert 0 < len(kept) < len(rows)
     pair = [np.arange(10), np.arange(6, 20), np.arange(5), np.zeros(0, int)]
     assert suppress(pair, np.array([3.0, 2, 1, 0])).tolist() == [0, 1, 3]
+
+
+def test_of_places_too_near_to_each_other_the_weaker_goes():
+    rng = np.random.default_rng(0)
+    centers, strength = rng.uniform(0, 3, (200, 3)), rng.permutation(200)
+    kept = suppress_near(centers, strength, 0.25)
+    assert kept.tolist() == suppress_near_reference(centers, strength, 0.25)
+    assert 20 < len(kept) < 200
+    # one that goes takes nobody along
+    row = np.array([[0.0, 0], [0.2, 0], [0.4, 0]])
+    assert suppress_near(row, np.array([3.0, 2, 1]), 0.25).tolist() == [0, 2]
+    assert len(suppress_near(np.zeros((0, 3)), np.zeros(0), 0.25)) == 0

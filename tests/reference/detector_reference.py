@@ -45,6 +45,14 @@ def suppress_reference(rows: list[np.ndarray], strength: np.ndarray) -> list[int
     return kept
 
 
+def suppress_near_reference(centers: np.ndarray, strength: np.ndarray, radius: float) -> list[int]:
+    kept: list[int] = []
+    for k in sorted(range(len(centers)), key=lambda k: -strength[k]):
+        if all(math.dist(centers[k][:2], centers[other][:2]) >= radius for other in kept):
+            kept.append(k)
+    return kept
+
+
 def range_reference(points: np.ndarray, origin: np.ndarray, chosen: Candidates, k: int) -> np.ndarray:
     """Whether (28, 24) a return lies in each direction of candidate k's picture, by angles instead of tables."""
     seen = np.zeros((28, 24), bool)

@@ -288,3 +288,19 @@ def suppress(rows: Sequence[np.ndarray], strength: np.ndarray, *, most_shared: f
         if stays[first]:
             stays[second] = False
     return order[stays]
+
+
+def suppress_near(centers: np.ndarray, strength: np.ndarray, radius: float) -> np.ndarray:
+    """Indices of the candidates that stay, the strongest first, where of two nearer than `radius` the weaker goes.
+
+    centers: (K, 2 or 3) m, of which x and y count; strength (K,); radius m.
+    """
+    order = np.argsort(-np.asarray(strength), kind="stable")
+    x, y = np.asarray(centers, float)[order, :2].T
+    is_near = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2 < radius**2
+    stays = np.ones(len(order), bool)
+    # in the order of the stronger one: whether it stays is known when its pairs come
+    for first, second in np.argwhere(np.triu(is_near, 1)).tolist():
+        if stays[first]:
+            stays[second] = False
+    return order[stays]

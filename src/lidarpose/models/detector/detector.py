@@ -1,4 +1,4 @@
-"""The people of a whole scan: proposals, scored by a network, of which those that share points are one person."""
+"""The people of a whole scan: proposals, scored by a network, of which those that meet are one person."""
 
 import os
 from collections.abc import Callable
@@ -10,7 +10,7 @@ import numpy as np
 
 from lidarpose.io.files import file_error
 from lidarpose.models import weights_file
-from lidarpose.models.detector.candidates import CHUNK, SceneIndex, suppress
+from lidarpose.models.detector.candidates import CHUNK, SceneIndex, suppress_near
 from lidarpose.models.detector.detector_config import INPUTS, OUTPUT, DetectorConfig
 from lidarpose.models.detector.ground import estimate_ground, without_ground
 from lidarpose.models.detector.proposals import heights_above, propose
@@ -22,6 +22,8 @@ from lidarpose.models.onnx import check_names, open_network
 _BEYOND = 6.0
 # a detection's own points lie within this of its axis, m
 _OWN_RADIUS = 0.35
+# detections nearer than this are one person, m: the network moves those of one to the same place
+_SAME = 0.25
 # a box: side, side of somebody mounted, what is added to the height; and bounds of what the network says, m
 _SIDE, _MOUNTED_SIDE, _ROOM = 0.9, 1.1, 0.1
 _MOST_SHIFT, _MOST_FOOT, _HEIGHTS = 0.6, 1.0, (0.5, 2.3)
@@ -128,8 +130,7 @@ class Detector:
         centers[:, 0] += np.cos(yaw) * x - np.sin(yaw) * y
         centers[:, 1] += np.sin(yaw) * x + np.cos(yaw) * y
         centers[:, 2] += foot + height / 2
-        rows = scene.rows(centers, _OWN_RADIUS)
-        kept = suppress(rows, logit)[:limit]
+        kept = suppress_near(centers, logit, _SAME)[:limit]
         mounted = _sigmoid(mounted_logit[kept])
         side = np.where(mounted > 0.5, _MOUNTED_SIDE, _SIDE)
         return Detections(
@@ -139,7 +140,7 @@ class Detector:
             logit=logit[kept],
             score=self.probability(logit[kept]),
             mounted=mounted,
-            rows=[scan_rows[rows[k]] for k in kept],
+            rows=[scan_rows[own] for own in scene.rows(centers[kept], _OWN_RADIUS)],
             has_ground=has_ground,
         )
 

@@ -1,10 +1,10 @@
 """Places where a person may stand: columns that hold more points above the ground than what is around them.
 
 Points 0.3-2.1 m above the ground are counted on a grid of 10 cm. Peaks of the smoothed counts, drawn to the mean of
-the points around them, give one kind of candidate; peaks of the finer counts of each column's upper end, where two
-people side by side are still apart, give another. Nothing is clustered, so a person at a wall or a hedge has a
-candidate as good as one in the open. What is next to never a person is left out in the end, by a look at each column
-and the two rings around it.
+the points around them, give one kind of candidate; peaks of the counts of each column's upper end, where two people
+side by side are still apart, give another. Both are told apart from 0.3 m on. Nothing is clustered, so a person at a
+wall or a hedge has a candidate as good as one in the open. What is next to never a person is left out in the end, by a
+look at each column and the two rings around it.
 """
 
 import threading
@@ -26,11 +26,11 @@ _LEAST_TOP, _LEAST_PART, _LEAST_EXTENT = 0.6, 0.45, 0.25
 # a head or shoulder that looks over something may be as low as this where its top is that high over the ground, m
 _LEAST_HEAD, _HEAD_TOP = 0.08, 1.1
 # how counts are smoothed along both axes
-_BODY_KERNEL, _HEAD_KERNEL = (1, 2, 3, 2, 1), (1, 1, 1)
+_KERNEL = (1, 1, 1)
 # radii in cells of the disc and the two rings around it that a column is told by, and how many numbers that gives
 _RINGS, FEATURES = (3, 6, 9), 13
 # cells to each side: of the surroundings that a peak tops, of the mean shift, of a candidate's column, of the grid
-_PEAK, _SHIFT, _COLUMN, _MARGIN = 3, 4, 3, 16
+_PEAK, _SHIFT, _COLUMN, _MARGIN = 2, 2, 3, 16
 _SHIFTS = 2
 # of heads: points so far below the highest point within 0.3 m belong to it, m
 _HEAD = 0.3
@@ -39,6 +39,9 @@ _TALLEST = 2.05
 _EMPTY = np.float32(HIGH + 1)
 # a column is dropped this near to a head or to a stronger column, m
 _APART = 0.3
+
+# a column stays whose logit is above this: at 0, three in a thousand of those who have columns lose all of theirs
+_LEAST_LOGIT = 0.5
 
 # points whose heights are looked up in one go
 _PIECE = 16_384
@@ -58,7 +61,7 @@ def propose(points: np.ndarray, ground: Ground, *, limit: int = 600, heights: np
     xy, features = columns(points, heights_above(points, ground) if heights is None else heights)
     logit = _likeness(features)
     order = np.argsort(-logit, kind="stable")
-    xy = xy[order[logit[order] > 0][:limit]]
+    xy = xy[order[logit[order] > _LEAST_LOGIT][:limit]]
     return np.concatenate([xy, ground.at(xy)[:, None]], 1)
 
 
@@ -83,13 +86,13 @@ def columns(points: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, np.nda
 
 @cache
 def _weights() -> dict[str, np.ndarray]:
-    """A small perceptron's layers; it is positive where a column may be somebody."""
+    """A small perceptron's layers, and the logit below which next to nobody is."""
     with np.load(weights_file("proposals.npz"), allow_pickle=False) as file:
         return dict(file)
 
 
 def _likeness(features: np.ndarray) -> np.ndarray:
-    """Logits (K,) of features (K, `FEATURES`): negative for what is next to never a person, as most of a wall is."""
+    """Logits (K,) of features (K, `FEATURES`): low for what is next to never a person, as most of a wall is."""
     w = _weights()
     hidden = np.maximum((features - w["mean"]) / w["deviation"] @ w["hidden_weight"] + w["hidden_bias"], 0)
     return hidden @ w["weight"] + w["bias"] - w["least"]
@@ -134,7 +137,7 @@ def _peaks(x: np.ndarray, y: np.ndarray, heights: np.ndarray) -> tuple[np.ndarra
     np.maximum.at(depth, flat, _EMPTY - heights)
 
     occupied = np.flatnonzero(count > 0)
-    _smooth(grid, occupied, count[occupied], _BODY_KERNEL, width)
+    _smooth(grid, occupied, count[occupied], _KERNEL, width)
     body = _shifted(_maxima(grid, width), count, width)
     highest = top[occupied]
     for step in _disc(_COLUMN, width):
@@ -148,7 +151,7 @@ def _peaks(x: np.ndarray, y: np.ndarray, heights: np.ndarray) -> tuple[np.ndarra
     occupied = occupied[grid[occupied] > 0]
     heads = grid[occupied]
     grid[occupied] = 0
-    _smooth(grid, occupied, heads, _HEAD_KERNEL, width)
+    _smooth(grid, occupied, heads, _KERNEL, width)
     head = _positions(_maxima(grid, width), width)
 
     centers = np.concatenate([body, head])
