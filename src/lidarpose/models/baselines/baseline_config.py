@@ -137,7 +137,8 @@ class LidarcapConfig(BaselineConfig):
     then from the first on, of more some are drawn, perhaps twice, as published; else each point is there once;
     order_dependent_neighbors: neighborhoods depend on the order of the points, as its CUDA kernels'; trans_center: in
     training, frames are centered on SMPL's true trans, as published, so that where the pelvis is need not be learned;
-    else on the points, or on a guess of the pelvis."""
+    else on the points, or on a guess of the pelvis; stock_initialization: weights begin as PyTorch's layers make them,
+    as published; else rotations begin near none, and the layers of NE's encoders as copies of what they read."""
 
     kind: ClassVar[str] = "lidarcap"
     frames: ClassVar[int] = CLIP_FRAMES
@@ -149,6 +150,7 @@ class LidarcapConfig(BaselineConfig):
     resample_with_replacement: bool = False
     order_dependent_neighbors: bool = False
     trans_center: bool = False
+    stock_initialization: bool = False
 
     def __post_init__(self):
         super().__post_init__()

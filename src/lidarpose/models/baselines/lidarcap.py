@@ -59,7 +59,7 @@ class Lidarcap(nn.Module):
         self.embed = nn.Linear(width, width)
         self.recurrent = nn.GRU(width, width, num_layers=2, batch_first=True, bidirectional=True)
         self.joints = nn.Linear(2 * width, 3 * len(SMPL24))
-        self.rotations = StGcn(3 + width, divisor)
+        self.rotations = StGcn(3 + width, divisor, stock_initialization=config.stock_initialization)
 
     def forward(self, clouds: Clouds) -> ClipOutputs:
         """clouds: of B clips of T frames each."""
@@ -131,7 +131,7 @@ class SetAbstraction(nn.Module):
 class StGcn(nn.Module):
     """Spatial and temporal graph convolutions over SMPL's tree -> a rotation of each joint in each frame."""
 
-    def __init__(self, channels: int, divisor: int):
+    def __init__(self, channels: int, divisor: int, *, stock_initialization: bool = False):
         super().__init__()
         self.norm = nn.BatchNorm1d(channels * len(SMPL24))
         widths = (channels, 256 // divisor, 128 // divisor, 64 // divisor)
@@ -139,6 +139,9 @@ class StGcn(nn.Module):
             GraphLayer(widths[k], widths[k + 1], residual=k > 0) for k in range(len(widths) - 1)
         )
         self.output = nn.Conv2d(widths[-1], 6, 1)
+        if not stock_initialization:
+            # near no rotation, as most joints are near it: from any other, learning takes several times as long
+            self.output.bias = nn.Parameter(torch.eye(3)[:, :2].flatten())
 
     def forward(self, joints: Tensor, features: Tensor) -> Tensor:
         """joints (B, T, J, 3), features (B, T, C) -> (B, T, J, 3, 3)."""

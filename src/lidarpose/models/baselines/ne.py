@@ -11,7 +11,15 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lidarpose.models.baselines.baseline_config import CLOUDS, NeConfig
-from lidarpose.models.baselines.lidarcap import ClipOutputs, Clouds, PointNet2, StGcn, by_frame
+from lidarpose.models.baselines.lidarcap import (
+    ClipOutputs,
+    Clouds,
+    PointNet2,
+    StGcn,
+    by_frame,
+    forward_kinematics,
+    rest_offsets,
+)
 from lidarpose.sample import CLIP_FRAMES
 from lidarpose.skeleton import SMPL24
 
@@ -31,16 +39,22 @@ class Ne(nn.Module):
         divisor = config.width_divisor
         width, hidden = WIDTH // divisor, HIDDEN // divisor
         self.encoders = nn.ModuleDict({name: PointNet2(width, divisor, as_published=by_order) for name in CLOUDS})
-        self.neighbors = _transformer(width, hidden)
+        stock = config.stock_initialization
+        self.neighbors = _transformer(width, hidden, stock_initialization=stock)
         self.exchange = Exchange(width, hidden)
         self.norm = nn.LayerNorm(3 * width)
-        self.clip = _transformer(3 * width, hidden)
+        self.clip = _transformer(3 * width, hidden, stock_initialization=stock)
         self.joints = nn.Linear(3 * width, 3 * len(SMPL24))
         self.shrink = nn.Linear(3 * width, hidden, bias=False)
         # frames are its channels: clips have 16
         self.frame_norm = nn.BatchNorm1d(CLIP_FRAMES)
         self.widen = nn.Linear(hidden, hidden)
-        self.rotations = StGcn(3 + hidden, divisor)
+        self.rotations = StGcn(3 + hidden, divisor, stock_initialization=stock)
+        if not stock:
+            # joints begin near those of a person who stands: steps that bring them there from elsewhere are the same
+            # for all frames, and bring all frames to one answer
+            nn.init.constant_(self.clip.layers[-1].norm2.weight, 0.1)
+            self.joints.bias = nn.Parameter(_heights())
 
     def forward(self, clouds: Clouds) -> ClipOutputs:
         """clouds: each of `CLOUDS`, of B clips of 16 frames each."""
@@ -97,6 +111,28 @@ def drop_path(branch: Tensor, rate: float, training: bool) -> Tensor:
     return branch * keep / (1 - rate)
 
 
-def _transformer(width: int, hidden: int) -> nn.TransformerEncoder:
-    layer = nn.TransformerEncoderLayer(width, 4, hidden, dropout=0.1, activation="gelu", batch_first=True)
-    return nn.TransformerEncoder(layer, LAYERS, enable_nested_tensor=False)
+def _heights() -> Tensor:
+    """(72,) m: x, y = 0 and z of the mean adult's joints, standing, about the pelvis."""
+    standing = forward_kinematics(torch.eye(3).expand(len(SMPL24), 3, 3), rest_offsets(), SMPL24.parents)
+    # of SMPL's frame, y up
+    return F.pad(standing[:, 1:2], (2, 0)).flatten()
+
+
+def _transformer(width: int, hidden: int, *, stock_initialization: bool) -> nn.TransformerEncoder:
+    """Layers with the norm after the sum. As PyTorch makes them, copies of one layer that each average over the frames,
+    they begin with most of what tells frames apart lost, and a few steps lose the rest."""
+
+    def layer() -> nn.TransformerEncoderLayer:
+        return nn.TransformerEncoderLayer(width, 4, hidden, dropout=0.1, activation="gelu", batch_first=True)
+
+    encoder = nn.TransformerEncoder(layer(), LAYERS, enable_nested_tensor=False)
+    if stock_initialization:
+        return encoder
+    encoder.layers = nn.ModuleList(layer() for _ in range(LAYERS))
+    for own in encoder.layers:
+        attention: Any = own.self_attn
+        nn.init.zeros_(attention.out_proj.weight)
+        nn.init.zeros_(own.linear2.weight)
+        # of frames that are all zero, as without neighbors, a norm's gradient would be 300 times as large in each layer
+        nn.init.uniform_(attention.out_proj.bias, -(width**-0.5), width**-0.5)
+    return encoder
