@@ -246,11 +246,15 @@ def test_known_people_are_not_verified_again_and_keep_their_score(clouds, model,
     posed = []
     verify = verification._posed
     monkeypatch.setattr(
-        verification, "_posed", lambda d, chosen, *rest: posed.append(len(chosen)) or verify(d, chosen, *rest)
+        verification, "_posed", lambda d, chosen, *rest: posed.append(d.centers[chosen, :2]) or verify(d, chosen, *rest)
     )
     frames = list(lidarpose.predict_recording(moving_source(clouds), track=True, model=model))
-    # two people in each of the first frames; then places beside them, each once
-    assert posed[0] >= 2 and sum(posed[2:]) <= 2 < 2 * len(posed[2:])
+    assert len(posed[0]) >= 2
+    for places, frame in zip(posed[2:], frames[2:], strict=True):
+        # a place beside a person at most, none of the two people again
+        people = np.array([person.joints[0, :2] for person in frame.poses])
+        assert len(people) == 2 and len(places) <= 1
+        assert (np.linalg.norm(places[:, None] - people, axis=-1) > 0.4).all()
     scores = [{person.id: person.score for person in frame.poses} for frame in frames]
     assert all(line == scores[-1] for line in scores[2:])
 
