@@ -21,20 +21,20 @@ from torch.nn import functional as F
 from lidarpose.inference.tta import IDENTITY, apply
 from lidarpose.inference.verification import inside_column
 from lidarpose.io.files import atomic_path
+from lidarpose.metrics import auroc
 from lidarpose.models.checkpoint import load_checkpoint, save_checkpoint
 from lidarpose.models.detector.detector import Detector
 from lidarpose.models.onnx import voxelize_people
 from lidarpose.models.posenet import Batch, PoseNet
 from lidarpose.sample import MIN_POINTS
 from lidarpose.synth.detection_scene import detection_scene
+from lidarpose.train.augment import second_person_label
 from lidarpose.train.data_loader import SyntheticSource
 
 SEED, RANGE, LIMIT = 9101, 40.0, 40
 # a detection nearer than this to a person is of that person; beyond the second distance, with at most this share of its
 # points on people, it is of nobody; others teach nothing, m
 OWN, OTHER, NOBODYS = 0.35, 0.7, 0.02
-# points of somebody else from which on a crop shows two, and their share
-SECOND, SECOND_SHARE = 15, 0.1
 MOST_POINTS = 1024
 EPOCHS, BATCH, RATE, HELD_OUT = 40, 512, 2e-3, 0.1
 
@@ -56,8 +56,7 @@ def scene_crops(index: int) -> list[Crop]:
         owner = scene.person[inside]
         if len(away) and away.min() < OWN:
             others = int(((owner >= 0) & (owner != seen[away.argmin()])).sum())
-            known = not 0 < others < max(SECOND, SECOND_SHARE * inside.sum())
-            label = (1.0, float(others > 0) if known else np.nan)
+            label = (1.0, second_person_label(others, len(owner)))
         elif away.min(initial=np.inf) > OTHER and (owner >= 0).mean() <= NOBODYS:
             label = (0.0, 0.0)
         else:
@@ -96,17 +95,9 @@ def make_crops(out: Path, scenes: int, samples: int, motion: str | None, workers
 def head_inputs(network: PoseNet, crops: dict[str, np.ndarray]) -> torch.Tensor:
     """(K, F): what the network's head reads of each crop."""
     inputs: list[torch.Tensor] = []
-    head = network.person
-
-    def remember(module, given):
-        anchors, voxels, valid, certainty = given
-        weight = valid.to(voxels.dtype)[..., None]
-        mean = (voxels * weight).sum(1) / weight.sum(1).clamp(min=1)
-        inputs.append(torch.cat([head.norm(torch.cat([anchors.mean(1), mean], -1)), *certainty], -1))
-
     clouds = np.split(crops["points"], np.cumsum(crops["count"])[:-1])
     order = np.argsort(crops["count"], kind="stable")
-    handle = head.register_forward_pre_hook(remember)
+    handle = network.person.hidden.register_forward_pre_hook(lambda _, given: inputs.append(given[0]))
     for start in range(0, len(order), 64):
         rows = order[start : start + 64]
         arrays = voxelize_people([clouds[k] for k in rows], crops["view"][rows].astype(np.float32), network.config)
@@ -150,12 +141,6 @@ def fit(path: Path, model: Path, out: Path) -> None:
         own = held & (group == number)
         print(f"{name}: AUROC of a person {auroc(logit[own, 0], label[own, 0]):.4f}, {int(own.sum()):,} crops held out")
     save_checkpoint(out, network, card=header.card)
-
-
-def auroc(score: torch.Tensor, label: torch.Tensor) -> float:
-    from lidarpose.metrics import auroc as metric
-
-    return metric(score.numpy(), label.numpy().astype(bool))
 
 
 def main() -> None:

@@ -38,7 +38,7 @@ _SAME_PERSON = 0.3
 # sees a person, 0 of a network that does not say
 FEATURES = ("logit", "confidence", "log_spread", "log_points", "mounted", "person")
 # those that mean something else where the person is mounted: riders are posed badly
-MOUNTED_FEATURES = ("confidence", "log_spread", "person")
+_OF_MOUNTED = ("confidence", "log_spread", "person")
 # weights of the features and of products with "mounted", for a detector without its own
 _WEIGHTS = {
     "bias": -1.5 * np.log(10),
@@ -114,13 +114,17 @@ def final_score(features: np.ndarray, header: dict) -> np.ndarray:
     """features (D, 6) -> (D,) in [0, 1]: the probability that a detection is a person, by the detector's header."""
     verification = header.get("verification") or {}
     weights = verification if "logit" in verification else _WEIGHTS
-    value = dict(zip(FEATURES, features.T, strict=True))
-    value |= {f"mounted_{name}": value["mounted"] * value[name] for name in MOUNTED_FEATURES}
     logit = np.full(len(features), float(weights.get("bias", 0.0)))
-    for name, values in value.items():
+    for name, values in score_terms(features).items():
         logit += weights.get(name, 0.0) * values
     logits, probabilities = verification.get("calibration") or header["calibration"]
     return np.nan_to_num(np.interp(logit, logits, probabilities))
+
+
+def score_terms(features: np.ndarray) -> dict[str, np.ndarray]:
+    """What the logit of the final score is linear in, by name (D,): features (D, 6), and products with "mounted"."""
+    terms = dict(zip(FEATURES, features.T, strict=True))
+    return terms | {f"mounted_{name}": terms["mounted"] * terms[name] for name in _OF_MOUNTED}
 
 
 def inside_column(points: np.ndarray, center: np.ndarray, size: np.ndarray) -> np.ndarray:

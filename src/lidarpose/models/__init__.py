@@ -66,8 +66,6 @@ NETWORKS = {
 }
 
 BUNDLED = ("tiny", "small")
-# of the network that finds people
-DETECTOR_WEIGHTS = "detector.safetensors"
 # what is taken where nothing is named: the best whose two files are at most 6 MB
 DEFAULT = "small"
 # the same, for help texts

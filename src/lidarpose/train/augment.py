@@ -153,9 +153,13 @@ def example(sample: Sample, rng: np.random.Generator, *, refined: float = REFINE
 
 def people_in(sample: Sample) -> np.ndarray:
     """`Example.person` of a synthetic sample. A second person of a few points is neither there nor not."""
-    others = sample.second_person_points or 0
-    known = not 0 < others < max(_FEWEST_OF_SECOND, 0.1 * len(sample.points))
-    return np.array([1, float(others > 0) if known else np.nan], np.float32)
+    return np.array([1, second_person_label(sample.second_person_points or 0, len(sample.points))], np.float32)
+
+
+def second_person_label(others: int, count: int) -> float:
+    """Whether a crop of so many points shows a second person, on whom `others` of them are: 0, 1 or NaN for unclear."""
+    known = not 0 < others < max(_FEWEST_OF_SECOND, 0.1 * count)
+    return float(others > 0) if known else np.nan
 
 
 def object_example(sample: Sample, rng: np.random.Generator, *, refined: float = REFINED) -> Example:

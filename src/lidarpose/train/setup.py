@@ -20,7 +20,7 @@ from torch import nn
 from lidarpose.data.shards import read_card
 from lidarpose.errors import InputError, check_name
 from lidarpose.io.files import file_error
-from lidarpose.models import DETECTOR_WEIGHTS, NETWORKS, weights_file, weights_path
+from lidarpose.models import NETWORKS, weights_path
 from lidarpose.models.baselines.baseline_config import (
     BaselineConfig,
     LidarcapConfig,
@@ -31,6 +31,7 @@ from lidarpose.models.baselines.baseline_config import (
 from lidarpose.models.checkpoint import build, load_checkpoint
 from lidarpose.models.config import SIZES, NetworkConfig
 from lidarpose.models.dapt.dapt_config import CONFIGS, DaptConfig
+from lidarpose.models.detector.detector import detector_path
 from lidarpose.models.detector.detector_config import DetectorConfig
 from lidarpose.models.posenet import PoseNet, expand_weights
 from lidarpose.skeleton import HUMAN15, SMPL24, Skeleton, skeleton
@@ -171,7 +172,7 @@ def _detection(recipe: TrainDetector) -> TrainSetup:
     network: Callable[[], nn.Module] = objective.network
     card: dict = {}
     if recipe.init:
-        path = weights_file(DETECTOR_WEIGHTS) if recipe.init == "detector" else Path(recipe.init)
+        path = detector_path(".safetensors") if recipe.init == "detector" else Path(recipe.init)
         trained, header = load_checkpoint(path)
         if header.config != objective.config:
             raise file_error(path, f"expected a detector as train-detector makes it, got a network {header.network}")

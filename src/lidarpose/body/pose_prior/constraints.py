@@ -283,8 +283,8 @@ def _bearing_points(part: np.ndarray, points: np.ndarray, kneel: np.ndarray) -> 
 def _level_feet(
     part: np.ndarray, joints: np.ndarray, points: np.ndarray, kneel: np.ndarray, least: np.ndarray
 ) -> np.ndarray:
-    """Bends legs, in place, so that both feet, or the front foot and the other knee, are equally low; least (n, 1) m
-    from hip to ankle."""
+    """The poses (n, 27) with legs bent so that both feet, or the front foot and the other knee, are equally low, in
+    place too; least (n, 1) m from hip to ankle."""
     rest = mean_adult_joints()[[_HIPS[0], _KNEES[0], _ANKLES[0]]]
     thigh, shank = np.linalg.norm(np.diff(rest, axis=0), axis=1).tolist()
     low = np.stack([points[:, :4, 2].min(1), points[:, 4:8, 2].min(1)], 1)

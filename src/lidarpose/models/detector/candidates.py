@@ -282,12 +282,7 @@ def suppress(rows: Sequence[np.ndarray], strength: np.ndarray, *, most_shared: f
     stronger, weaker = np.divmod(pair, max(len(rows), 1))
     sizes = sizes[order]
     is_same = count > most_shared * np.minimum(sizes[stronger], sizes[weaker])
-    stays = np.ones(len(rows), bool)
-    # in the order of the stronger one: whether it stays is known when its pairs come
-    for first, second in zip(stronger[is_same].tolist(), weaker[is_same].tolist(), strict=True):
-        if stays[first]:
-            stays[second] = False
-    return order[stays]
+    return order[_that_stay(len(rows), np.stack([stronger[is_same], weaker[is_same]], 1))]
 
 
 def suppress_near(centers: np.ndarray, strength: np.ndarray, radius: float) -> np.ndarray:
@@ -298,9 +293,14 @@ def suppress_near(centers: np.ndarray, strength: np.ndarray, radius: float) -> n
     order = np.argsort(-np.asarray(strength), kind="stable")
     x, y = np.asarray(centers, float)[order, :2].T
     is_near = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2 < radius**2
-    stays = np.ones(len(order), bool)
+    return order[_that_stay(len(order), np.argwhere(np.triu(is_near, 1)))]
+
+
+def _that_stay(count: int, pairs: np.ndarray) -> np.ndarray:
+    """(count,) bool, by falling strength: who is in no pair (P, 2), ascending, with a stronger one that stays."""
+    stays = np.ones(count, bool)
     # in the order of the stronger one: whether it stays is known when its pairs come
-    for first, second in np.argwhere(np.triu(is_near, 1)).tolist():
-        if stays[first]:
-            stays[second] = False
-    return order[stays]
+    for stronger, weaker in pairs.tolist():
+        if stays[stronger]:
+            stays[weaker] = False
+    return stays

@@ -156,9 +156,9 @@ def _sigmoid(logit: np.ndarray) -> np.ndarray:
     return 0.5 * (1 + np.tanh(np.asarray(logit, float) / 2))
 
 
-def detector_path() -> Path:
-    """Where the package keeps the bundled detector."""
-    return weights_file("detector.onnx")
+def detector_path(suffix: str = ".onnx") -> Path:
+    """Where the package keeps the bundled detector, or with the suffix .safetensors its checkpoint."""
+    return weights_file(f"detector{suffix}")
 
 
 def open_detector(path: str | os.PathLike | None = None, *, threads: int | None = None) -> tuple[Any, dict]:

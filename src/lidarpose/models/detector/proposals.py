@@ -2,9 +2,9 @@
 
 Points 0.3-2.1 m above the ground are counted on a grid of 10 cm. Peaks of the smoothed counts, drawn to the mean of
 the points around them, give one kind of candidate; peaks of the counts of each column's upper end, where two people
-side by side are still apart, give another. Both are told apart from 0.3 m on. Nothing is clustered, so a person at a
-wall or a hedge has a candidate as good as one in the open. What is next to never a person is left out in the end, by a
-look at each column and the two rings around it.
+side by side are still apart, give another. Two who stand 0.3 m from each other are two in both. Nothing is clustered,
+so a person at a wall or a hedge has a candidate as good as one in the open. What is next to never a person is left out
+in the end, by a look at each column and the two rings around it.
 """
 
 import threading
@@ -25,8 +25,8 @@ LEAST_POINTS = 5
 _LEAST_TOP, _LEAST_PART, _LEAST_EXTENT = 0.6, 0.45, 0.25
 # a head or shoulder that looks over something may be as low as this where its top is that high over the ground, m
 _LEAST_HEAD, _HEAD_TOP = 0.08, 1.1
-# how counts are smoothed along both axes
-_KERNEL = (1, 1, 1)
+# counts are summed over so many cells to each side
+_SUMMED = 1
 # radii in cells of the disc and the two rings around it that a column is told by, and how many numbers that gives
 _RINGS, FEATURES = (3, 6, 9), 13
 # cells to each side: of the surroundings that a peak tops, of the mean shift, of a candidate's column, of the grid
@@ -137,7 +137,7 @@ def _peaks(x: np.ndarray, y: np.ndarray, heights: np.ndarray) -> tuple[np.ndarra
     np.maximum.at(depth, flat, _EMPTY - heights)
 
     occupied = np.flatnonzero(count > 0)
-    _smooth(grid, occupied, count[occupied], _KERNEL, width)
+    _smooth(grid, occupied, count[occupied], width)
     body = _shifted(_maxima(grid, width), count, width)
     highest = top[occupied]
     for step in _disc(_COLUMN, width):
@@ -151,7 +151,7 @@ def _peaks(x: np.ndarray, y: np.ndarray, heights: np.ndarray) -> tuple[np.ndarra
     occupied = occupied[grid[occupied] > 0]
     heads = grid[occupied]
     grid[occupied] = 0
-    _smooth(grid, occupied, heads, _KERNEL, width)
+    _smooth(grid, occupied, heads, width)
     head = _positions(_maxima(grid, width), width)
 
     centers = np.concatenate([body, head])
@@ -208,12 +208,10 @@ def _features(cells: np.ndarray, count: np.ndarray, top: np.ndarray, depth: np.n
     return np.stack(features, 1).astype(np.float32)
 
 
-def _smooth(grid: np.ndarray, cells: np.ndarray, values: np.ndarray, kernel: tuple[int, ...], width: int) -> None:
-    """Adds values (n,) at flat cells (n,), all different, spread by the kernel along both axes, to a grid (size,)."""
-    middle = len(kernel) // 2
-    for i, along in enumerate(kernel):
-        for j, across in enumerate(kernel):
-            grid[cells + ((i - middle) * width + j - middle)] += values * np.float32(along * across)
+def _smooth(grid: np.ndarray, cells: np.ndarray, values: np.ndarray, width: int) -> None:
+    """Adds values (n,) at flat cells (n,), all different, to the square around each in a grid (size,)."""
+    for step in _square(_SUMMED, width):
+        grid[cells + step] += values
 
 
 def _maxima(grid: np.ndarray, width: int) -> np.ndarray:

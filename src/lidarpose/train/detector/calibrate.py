@@ -10,7 +10,7 @@ import numpy as np
 from lidarpose.errors import InputError, check_int
 from lidarpose.eval.detector.detection_scores import match
 from lidarpose.eval.detector.evaluate_detector import run_detector
-from lidarpose.inference.verification import FEATURES, MOUNTED_FEATURES, final_score, verification_features
+from lidarpose.inference.verification import final_score, score_terms, verification_features
 from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.detector.detector import Detector
 from lidarpose.models.detector.network import DetectorNet
@@ -79,12 +79,11 @@ def fit(features: np.ndarray, is_person: np.ndarray, scans: int) -> dict:
     """
     posed = np.isfinite(features).all(1)
     own, labels = features[posed], is_person[posed]
-    names = (*FEATURES, *(f"mounted_{name}" for name in MOUNTED_FEATURES))
-    column = FEATURES.index
-    both = np.column_stack([own, own[:, [column("mounted")]] * own[:, [column(name) for name in MOUNTED_FEATURES]]])
-    bias, weights = logistic(both, labels)
-    verification = {"bias": bias, **dict(zip(names, weights.tolist(), strict=True))}
-    verification["calibration"] = monotone(bias + both @ weights, labels)
+    terms = score_terms(own)
+    table = np.column_stack(list(terms.values()))
+    bias, weights = logistic(table, labels)
+    verification = {"bias": bias, **dict(zip(terms, weights.tolist(), strict=True))}
+    verification["calibration"] = monotone(bias + table @ weights, labels)
     header = {"calibration": monotone(features[:, 0], is_person), "verification": verification}
     return header | {"default_score": passing_score(final_score(own, header)[~labels], scans)}
 
