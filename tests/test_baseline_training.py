@@ -182,7 +182,10 @@ def test_attention_of_the_first_rows_alone_is_that_of_all():
         (lambda: LpformerConfig(attention_dropout=1), "attention_dropout must be a probability below 1, got 1"),
         (lambda: LpformerConfig(second_softmax=1), "second_softmax must be true or false, got 1"),
         (lambda: _with_options(PRN, ("grid=32",)), "unknown option of prn 'grid'"),
-        (lambda: Pretrain(model="prn", size="tiny"), "the model prn has the size prn or prn-small, got tiny"),
+        (
+            lambda: Pretrain(model="prn", size="tiny"),
+            "the model prn has the size prn or prn-small or prn-tiny, got tiny",
+        ),
         (lambda: Pretrain(model="best"), "unknown model 'best'"),
         (lambda: Pretrain(betas=(0.9, 1.0)), "betas must be two numbers"),
     ],

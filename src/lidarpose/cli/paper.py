@@ -30,7 +30,8 @@ $ lidarpose paper table3 --data waymo=prepared/waymo --size paper
 --hours H  of a row's training in all: longer ones are made shorter, their schedule too
 --seeds K = 1  seeds 0 ... K-1 of each cell (default 1)
 --workers N = 1  of each command (default 1)
---size NAME = paper-small  widths of all networks: paper-small (default): reduced ones; or paper: as published
+--size NAME = paper-small  widths of all networks: paper-small (default) and paper-tiny: reduced ones; paper: as
+ published
 [data]
 --data NAME=DIR,...  prepared real sets to learn from and to score on: waymo, humanm3, lidarhuman26m, sloper4d; to
  pre-train on: lipd, freemotion, noisemotion; raw poses: freemotion-poses, lidarhuman26m-poses

@@ -114,6 +114,9 @@ def is_done(step: Step, out: Path) -> bool:
 def run_steps(step: Step, out: Path, execute: Execute, tell: Callable[[str], None]) -> None:
     """Runs what is not done of a step and those before it. Raises StepFailed with the command's own message,
     KeyboardInterrupt where it was stopped."""
+    if is_done(step, out):
+        # what it was made from may be gone
+        return
     for part in step.all():
         if not is_done(part, out):
             tell(part.line(out))

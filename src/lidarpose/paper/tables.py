@@ -13,7 +13,7 @@ from pathlib import Path
 from lidarpose.data.shards import CARD
 from lidarpose.errors import InputError, check_name
 from lidarpose.paper.steps import Step
-from lidarpose.train.recipes import PAPER, SMALL_PAPER
+from lidarpose.train.recipes import PAPER, SMALL_PAPER, TINY_PAPER
 
 # real sets of a table's columns, and what else a row may read
 REAL = ("waymo", "humanm3", "lidarhuman26m", "sloper4d")
@@ -26,7 +26,9 @@ _SEEDS = {"train": 1_000_003, "test": 1_000_033}
 _SENSORS = "waymo-top,os1-128,hdl-64e,vlp-32c"
 _CLIP = 16
 # published rates and schedules are those of the full sizes and of many more steps
-_RATES = {PAPER: (), SMALL_PAPER: ("--rate", "2e-3")}
+_RATES = {PAPER: (), SMALL_PAPER: ("--rate", "2e-3"), TINY_PAPER: ("--rate", "2e-3")}
+# by the size of the paper's network: what the baselines' sizes end in, and our own network's
+_WIDTHS = {PAPER: ("", "small"), SMALL_PAPER: ("-small", "small"), TINY_PAPER: ("-tiny", "tiny")}
 _ONE_CYCLE = (*_RATES[SMALL_PAPER], "--schedule", "cosine", "--warmup", "0.04")
 _KEPT = ("0.5", "0.6", "0.7", "0.8", "0.9")
 # r_keep of the recipe, which needs no option
@@ -253,7 +255,7 @@ def _published(*values: float | None) -> dict[str, float]:
 
 def _methods(options: Options) -> list[Row]:
     """Table 1."""
-    prn = ("--neck", "prn")
+    prn, own = ("--neck", "prn"), _WIDTHS[options.size][1]
     return [
         _of_clips(options, "LiDARCap", 79.31, 101.89),
         _of_clips(options, "NE", 72.23, 96.80),
@@ -261,16 +263,15 @@ def _methods(options: Options) -> list[Row]:
         Row(name="PRN as published", finetune=_baseline(options, "prn")),
         Row(name="PRN", finetune=_random(options, *prn), published=_published(68.48, 70.56, 80.01, 48.76)),
         _dapt(options, _published(51.59, 59.76, 73.47, 28.01)),
-        Row(name="ours", finetune=(), pretrain=("--size", "small", "--scene", "paper", *_motion(options))),
+        Row(name="ours", finetune=(), pretrain=("--size", own, "--scene", "paper", *_motion(options))),
     ]
 
 
 def _baseline(options: Options, model: str) -> tuple[str, ...]:
     """Options of a baseline's training, at the width that goes with the size of the paper's network; the reduced ones
     by the cycle of rates that the paper's network has."""
-    if options.size == PAPER:
-        return ("--model", model, "--size", model)
-    return ("--model", model, "--size", f"{model}-small", *_ONE_CYCLE)
+    cycle = () if options.size == PAPER else _ONE_CYCLE
+    return ("--model", model, "--size", f"{model}{_WIDTHS[options.size][0]}", *cycle)
 
 
 def _of_clips(options: Options, name: str, *published: float) -> Row:

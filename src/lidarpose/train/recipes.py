@@ -16,14 +16,14 @@ from lidarpose.models import DEFAULT
 SCHEDULES = ("plateau", "cosine", "constant")
 OPTIMIZERS = ("adamw", "adam")
 PRECISIONS = ("auto", "float32", "bf16")
-# the paper's network, and one of the same design for CPUs, besides the sizes of the package's own
-PAPER, SMALL_PAPER = "paper", "paper-small"
+# the paper's network, and two of the same design for CPUs, besides the sizes of the package's own
+PAPER, SMALL_PAPER, TINY_PAPER = "paper", "paper-small", "paper-tiny"
 # the networks of --model, and their sizes, the first one by default
 MODELS: dict[str, tuple[str, ...]] = {
     "ours": ("tiny", "small", "base"),
-    "dapt": (PAPER, SMALL_PAPER),
+    "dapt": (PAPER, SMALL_PAPER, TINY_PAPER),
     # as published, and narrower ones for CPUs
-    **{name: (name, f"{name}-small") for name in ("prn", "lpformer", "lidarcap", "ne")},
+    **{name: (name, f"{name}-small", f"{name}-tiny") for name in ("prn", "lpformer", "lidarcap", "ne")},
 }
 # instead of weights: fine-tuning begins with none
 RANDOM = "random"
@@ -145,7 +145,7 @@ class Pretrain(PoseRecipe):
     model: str = _setting("", f"{_MODEL} (default: the one that --size is of)")
     size: str = _setting(
         "",
-        "of the network: tiny (default), small, base; paper, paper-small; prn, prn-small, ... (lidarpose models)",
+        "of the network: tiny (default), small, base; paper, paper-small, ...; prn, prn-small, ... (lidarpose models)",
     )
     options: tuple[str, ...] = _setting((), _OPTIONS)
     neck: str = _setting("mde", "of the paper's network: mde, finest or prn (docs/train.md)")

@@ -39,7 +39,7 @@ from lidarpose.train.augment import Augmentation, ClipExample, Example, augmenta
 from lidarpose.train.data_loader import BATCHES, ClipSource, MixedSource, Source, StoredSource, SyntheticSource
 from lidarpose.train.detector.candidate_source import CandidateSource, validation_scans
 from lidarpose.train.objectives.baseline_objective import with_joints
-from lidarpose.train.objectives.dapt_objective import finetuning_config, pretraining_config, small
+from lidarpose.train.objectives.dapt_objective import REDUCED, finetuning_config, pretraining_config
 from lidarpose.train.objectives.dapt_transfer import transferred
 from lidarpose.train.objectives.detector_objective import DetectorObjective, missed_people
 from lidarpose.train.objectives.objective import Objective
@@ -47,7 +47,6 @@ from lidarpose.train.recipes import (
     MODELS,
     PAPER,
     RANDOM,
-    SMALL_PAPER,
     Finetune,
     PoseRecipe,
     Pretrain,
@@ -78,16 +77,20 @@ Config = NetworkConfig | DaptConfig | BaselineConfig
 PRETRAINED: dict[str, tuple[Any, Skeleton]] = {
     **{size: (config, SMPL24) for size, config in SIZES.items()},
     PAPER: (pretraining_config(), HUMAN15),
-    SMALL_PAPER: (small(pretraining_config()), HUMAN15),
+    **{size: (reduced(pretraining_config()), HUMAN15) for size, reduced in REDUCED.items()},
     "prn": (PrnConfig(), HUMAN15),
     "lpformer": (LpformerConfig(), HUMAN15),
     "lidarcap": (LidarcapConfig(), SMPL24),
     "ne": (NeConfig(), SMPL24),
-    # each sees 200,000 people within an hour or two of one core
+    # each sees 200,000 people within one or two hours of one core, of the tiny ones within one
     "prn-small": (PrnConfig(width_divisor=4, most_points=128), HUMAN15),
+    "prn-tiny": (PrnConfig(width_divisor=8, most_points=128, attention_dropout=0.0), HUMAN15),
     "lpformer-small": (LpformerConfig(width_divisor=4, most_points=128, grid=16, attention_dropout=0.0), HUMAN15),
+    "lpformer-tiny": (LpformerConfig(width_divisor=8, most_points=128, grid=16, attention_dropout=0.0), HUMAN15),
     "lidarcap-small": (LidarcapConfig(width_divisor=8, most_points=128), SMPL24),
+    "lidarcap-tiny": (LidarcapConfig(width_divisor=8, most_points=64), SMPL24),
     "ne-small": (NeConfig(width_divisor=8, most_points=128), SMPL24),
+    "ne-tiny": (NeConfig(width_divisor=8, most_points=64), SMPL24),
 }
 
 
@@ -250,12 +253,14 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
 def _switched(recipe: Pretrain, config: NetworkConfig | DaptConfig) -> DaptConfig:
     """The paper's network with the neck and the head that the recipe names."""
     if not isinstance(config, DaptConfig):
-        raise InputError(f"neck, head and drop_path are of the paper's network: add --size {PAPER} or {SMALL_PAPER}")
+        raise InputError(
+            f"neck, head and drop_path are of the paper's network: add --size {' or '.join(MODELS['dapt'])}"
+        )
     if recipe.head == "heatmaps":
         if recipe.neck == "prn":
             raise InputError("the neck prn has coordinates and no heatmaps: leave --head away")
         heatmaps = finetuning_config("humanm3")
-        config = small(heatmaps) if recipe.size == SMALL_PAPER else heatmaps
+        config = REDUCED[recipe.size](heatmaps) if recipe.size in REDUCED else heatmaps
     drop_path = config.drop_path if recipe.drop_path is None else recipe.drop_path
     return _with_neck(replace(config, drop_path=drop_path), recipe.neck)
 
@@ -427,7 +432,7 @@ def _finetuned(
     trained: None for random weights."""
     own = PRETRAINED[recipe.size][0] if trained is None else trained.config
     if recipe.neck != "mde" and not isinstance(own, DaptConfig):
-        raise InputError(f"neck is of the paper's network: give --size {PAPER} or {SMALL_PAPER}")
+        raise InputError(f"neck is of the paper's network: give --size {' or '.join(MODELS['dapt'])}")
     if isinstance(own, BaselineConfig):
         named = own if isinstance(own, LidarcapConfig) else replace(own, joints=joints.joints)
         config = _with_options(named, recipe.options)

@@ -56,12 +56,14 @@ class BaselineConfig(Config):
 @dataclass(frozen=True, kw_only=True)
 class PrnConfig(BaselineConfig):
     """PRN, the pose network of LiDAR-HMR. resample_with_replacement: `most_points` points are drawn, some of them
-    several times, in evaluation too, as published; else each point is there once, and of more that many stay."""
+    several times, in evaluation too, as published; else each point is there once, and of more that many stay;
+    attention_dropout: share of the attention's weights dropped."""
 
     kind: ClassVar[str] = "prn"
     layers: ClassVar[int] = 100
 
     resample_with_replacement: bool = False
+    attention_dropout: float = probability(0.1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -36,7 +36,8 @@ class Lpformer(nn.Module):
         self.config = config
         self.grid = config.grid
         joints, divisor = len(config.joints), config.width_divisor
-        self.volume = V2V(divisor)
+        # on CPUs twice as fast as channels first where channels are few
+        self.volume = V2V(divisor).to(memory_format=torch.channels_last_3d)
         widths = [6 + 32 // divisor, 1024 // divisor, 512 // divisor, 256 // divisor]
         self.token = nn.Sequential(*map(nn.Linear, widths, widths[1:]))
         width = widths[-1]

@@ -30,7 +30,7 @@ def farthest_points(points: Tensor, valid: Tensor, count: int, *, as_published: 
     Args:
         points: (B, N, 3) m.
         valid: (B, N); a cloud of fewer points than `count` repeats its first choice.
-        count: how many.
+        count: how many; as many as N: all points, in their order.
         as_published: begin at point 0 and never choose a point within 3.2 cm of the origin, as the CUDA kernel of
             PointNet++ does; else begin at the point farthest from the mean, whatever the order of the points.
     """
@@ -42,6 +42,8 @@ def farthest_points(points: Tensor, valid: Tensor, count: int, *, as_published: 
         weight = valid[..., None].to(points.dtype)
         mean = (points * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp(min=1)
         chosen = _masked(square_distances(points, mean)[..., 0], usable).argmax(1)
+        if count == points.shape[1]:
+            return torch.where(valid, torch.arange(count, device=points.device), chosen[:, None])
     nearest = torch.full(valid.shape, _FAR, dtype=points.dtype, device=points.device)
     nearest = _masked(nearest, usable)
     indices = [chosen]

@@ -44,7 +44,10 @@ class Rows:
         """Cells of `grid` m, counted from each person's minimum, as rows at their points' mean; and each row's cell."""
         low = segment_reduce(self.xyz, self.person, len(self.count), "amin")
         cell = ((self.xyz - low[self.person]) / grid).floor().long()
-        _, inverse = torch.unique(torch.cat([self.person[:, None], cell], 1), dim=0, return_inverse=True)
+        # in the order of (person, x, y, z): rows as one number each, since torch.unique of rows is slow on CPUs
+        x, y, z = cell.amax(0) + 1
+        key = ((self.person * x + cell[:, 0]) * y + cell[:, 1]) * z + cell[:, 2]
+        _, inverse = torch.unique(key, return_inverse=True)
         cells = int(inverse.max()) + 1
         person = self.person.new_zeros(cells).scatter_(0, inverse, self.person)
         xyz = segment_reduce(self.xyz, inverse, cells, "mean")

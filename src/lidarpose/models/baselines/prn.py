@@ -46,7 +46,8 @@ class Prn(nn.Module):
         width = channels + 3
         self.joint = nn.Embedding(joints, 32)
         self.embed = nn.Linear(32 + 3, channels)
-        self.attention = nn.ModuleList(BareAttention(width, heads=3) for _ in range(2))
+        dropout = config.attention_dropout
+        self.attention = nn.ModuleList(BareAttention(width, heads=3, dropout=dropout) for _ in range(2))
         # no activation between the last two: as published
         self.output = nn.Sequential(nn.Linear(width, 16), nn.ReLU(), nn.Linear(16, 8), nn.Linear(8, 3))
 
@@ -125,13 +126,13 @@ class PrnNeck(nn.Module):
     Background is part 0. Of its training no configuration is published; see docs/paper.md for ours.
     """
 
-    def __init__(self, channels: int, joints: int):
+    def __init__(self, channels: int, joints: int, heads: int = 4, dropout: float = 0.1):
         super().__init__()
         self.vote = VoteHead(channels, joints, background=0)
         self.joint = nn.Parameter(torch.zeros(joints, channels))
         self.embed = nn.Linear(channels + 3, channels)
         self.token = nn.Linear(channels + 3, channels)
-        layer = nn.TransformerEncoderLayer(channels, 4, 4 * channels, dropout=0.1, batch_first=True)
+        layer = nn.TransformerEncoderLayer(channels, heads, 4 * channels, dropout, batch_first=True)
         self.layers = nn.TransformerEncoder(layer, 3, enable_nested_tensor=False)
         self.norm = nn.LayerNorm(channels)
         self.output = nn.Sequential(nn.Linear(channels, 16), nn.ReLU(), nn.Linear(16, 8), nn.Linear(8, 3))

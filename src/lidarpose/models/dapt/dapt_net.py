@@ -121,7 +121,7 @@ class DaptNet(nn.Module):
         if config.bins:
             heads["query"] = HeatmapHead(width, config)
         if config.neck == "prn":
-            heads["prn"] = PrnNeck(width, len(config.joints))
+            heads["prn"] = PrnNeck(width, len(config.joints), config.anchor_heads, config.anchor_dropout)
         elif config.coordinates:
             # the released files hold one of the two heads of an anchor, under one name
             heads["coordinate" if config.bins else "query"] = coordinate_head(width, 3)

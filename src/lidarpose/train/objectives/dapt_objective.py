@@ -18,6 +18,7 @@ from lidarpose.skeleton import BODY26
 from lidarpose.train.augment import UNKNOWN_PART, Example
 from lidarpose.train.objectives.dapt_losses import DaptTargets, finetuning, pretraining, prn
 from lidarpose.train.objectives.objective import Share, alone, in_body26, majority_part
+from lidarpose.train.recipes import SMALL_PAPER, TINY_PAPER
 
 STAGES = ("pretrain", "finetune")
 # outputs of heads
@@ -153,6 +154,29 @@ def small(config: DaptConfig) -> DaptConfig:
         grid=0.04,
         drop_path=0.1,
     )
+
+
+def tiny(config: DaptConfig) -> DaptConfig:
+    """The same with a hundredth of the weights: levels of 6, 12 and 24 cm; two heads in the neck, where nothing
+    is dropped, for which attention on CPUs has no fast way."""
+    return replace(
+        small(config),
+        name=f"tiny-{config.name}",
+        encoder_depths=(1, 1, 1),
+        encoder_channels=(16, 32, 64),
+        encoder_heads=(1, 2, 4),
+        decoder_channels=(32, 48),
+        decoder_heads=(2, 3),
+        anchor_channels=(32, 48, 48),
+        anchor_heads=2,
+        anchor_dropout=0.0,
+        grid=0.06,
+        drop_path=0.05,
+    )
+
+
+# by the name of a reduced size
+REDUCED = {SMALL_PAPER: small, TINY_PAPER: tiny}
 
 
 def nearest_joints(points: np.ndarray, joints: np.ndarray) -> np.ndarray:
