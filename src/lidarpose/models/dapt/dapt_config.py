@@ -37,11 +37,11 @@ class DaptConfig(Config):
     in meters for x, y and z, both empty where there are no heatmaps; encoder_*: one entry a level; decoder_*: one entry
     a level but the last; anchor_channels: width of the anchors after each level's exchange, the last where they begin;
     anchor_heads, anchor_dropout: of the neck's layers; neck: "mde", anchors read every level of the decoder (the
-    paper's network); "finest", four layers read the finest level alone (Table 3 without MDE), anchors and layers as wide
-    as it; "prn", no anchors, voxels vote and attention refines (`PrnNeck`), coordinates come from there; patch: voxels
-    within which attention is full; grid: edge of a voxel of level 0, meters; strides: how many times wider the next level's
-    voxels are; orders: curves for people of more than `patch` voxels; drop_path: the last block's; parts: classes of
-    the part head, 0 for no such head; coordinates: a head that reads x, y, z off each anchor (the paper's
+    paper's network); "finest", four layers read the finest level alone (Table 3 without MDE), anchors and layers as
+    wide as it; "prn", no anchors, voxels vote and attention refines (`PrnNeck`), coordinates come from there; patch:
+    voxels within which attention is full; grid: edge of a voxel of level 0, meters; strides: how many times wider the
+    next level's voxels are; orders: curves for people of more than `patch` voxels; drop_path: the last block's; parts:
+    classes of the part head, 0 for no such head; coordinates: a head that reads x, y, z off each anchor (the paper's
     pre-training); auxiliary: a head that reads all joints off the bottleneck (the released fine-tuning); legacy: True
     for the released weights, which need the data flow that they were trained with (see `dapt_net`).
     """
