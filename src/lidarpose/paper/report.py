@@ -13,12 +13,11 @@ from lidarpose.eval.dataset import EvalSample, open_eval_dataset
 from lidarpose.eval.scores import COLUMNS, FILE, Result, read_scores
 from lidarpose.io.files import write_atomic
 from lidarpose.models.checkpoint import load_checkpoint, runs_of
-from lidarpose.paper.steps import Execute, Step, StepFailed, check_out, is_done, last_entry, run_steps
+from lidarpose.paper.steps import CELLS, RUNS, Execute, Step, StepFailed, check_out, is_done, last_entry, run_steps
 from lidarpose.paper.tables import Cell, Options, Table, Target, cells, row_key
 from lidarpose.sample import center_of
 
 SCHEMA = "lidarpose.paper/1"
-CELLS = "cells"
 # a network that is not so much better than the mean pose, as a share of its error, has not learned enough to compare
 _UNDERTRAINED = 0.2
 _LEGEND = (
@@ -34,12 +33,14 @@ def run_table(
     table: Table, options: Options, out: Path, chosen: Sequence[str], execute: Execute, tell: Any
 ) -> dict[str, Any]:
     """Runs what is not done of a table, cell by cell, and writes it anew after each; returns it. A cell that fails is
-    reported and written as failed, and the others go on."""
+    reported and written as failed, and the others go on. A cell whose figures are there is done, wherever it was."""
     check_out(out)
+    # at once: another process may begin another table in the same folder
+    (out / RUNS).mkdir(parents=True, exist_ok=True)
     selected = cells(table, options, chosen)
     failed: dict[int, str] = {}
     for k, cell in enumerate(selected):
-        if cell.evaluation is not None:
+        if cell.evaluation is not None and not _path(cell.evaluation, out).is_file():
             try:
                 run_steps(cell.evaluation, out, execute, tell)
             except StepFailed as error:
@@ -78,14 +79,19 @@ def _entry(table: Table, cell: Cell, out: Path, failure: str) -> dict[str, Any]:
         return entry | {"state": "not possible", "reason": cell.why}
     if failure:
         return entry | {"state": "failed", "reason": failure}
-    if not is_done(cell.evaluation, out):
-        return entry | {"state": "not run", "reason": "its command was not run, or not to its end"}
-    path = out / CELLS / f"{cell.evaluation.name}.json"
+    path = _path(cell.evaluation, out)
     if path.is_file():
         return entry | json.loads(path.read_text())
+    if not is_done(cell.evaluation, out):
+        return entry | {"state": "not run", "reason": "its command was not run, or not to its end"}
     figures = {"state": "done"} | _figures(cell, cell.evaluation, out)
     write_atomic(path, json.dumps(figures, indent=1) + "\n")
     return entry | figures
+
+
+def _path(evaluation: Step, out: Path) -> Path:
+    """Where a cell's figures are, once it is done."""
+    return out / CELLS / f"{evaluation.name}.json"
 
 
 def _figures(cell: Cell, evaluation: Step, out: Path) -> dict[str, Any]:
@@ -152,17 +158,26 @@ def _offset(person: EvalSample, result: Result) -> np.ndarray:
 def markdown(content: dict[str, Any]) -> str:
     """A table as a page: the figures, what each cell cost, and the commands."""
     entries = content["cells"]
+    lines = [f"# {content['title']}", "", f"Target: {content['target']}. {_LEGEND}", "", *result_lines(content)]
+    lines += ["", "## Cells", "", *cost_lines(entries)]
+    return "\n".join([*lines, "", "## Commands", "", *_commands(entries)]) + "\n"
+
+
+def result_lines(content: dict[str, Any]) -> list[str]:
+    """A table's rows and columns, as the paper has them."""
+    entries = content["cells"]
     columns, rows = (list(dict.fromkeys(entry[name] for entry in entries)) for name in ("column", "row"))
-    lines = [f"# {content['title']}", "", f"Target: {content['target']}. {_LEGEND}", ""]
-    lines += _grid(["", *columns])
+    lines = _grid(["", *columns])
     for row in rows:
         own = [[e for e in entries if (e["row"], e["column"]) == (row, column)] for column in columns]
         lines.append(_line([row, *map(_cell_text, own)]))
-    lines += ["", "## Cells", ""]
+    return lines
+
+
+def cost_lines(entries: list[dict[str, Any]]) -> list[str]:
+    """What each cell reached and cost."""
     heads = "row, column, seed, MPJPE, PA, PCK-3, PCK-5, mean pose, people seen, hours, people/s in training, size"
-    lines += _grid([*heads.split(", "), "parameters", "state"])
-    lines += [_line(_cost(entry)) for entry in entries]
-    return "\n".join([*lines, "", "## Commands", "", *_commands(entries)]) + "\n"
+    return [*_grid([*heads.split(", "), "parameters", "state"]), *(_line(_cost(entry)) for entry in entries)]
 
 
 def plan(table: Table, selected: Sequence[Cell], out: Path, problem: Any) -> str:

@@ -25,7 +25,8 @@ from lidarpose.io.files import write_atomic
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.run_dir import CONFIG, LENGTHS, LOG, MODEL, read_config
 
-RUNS = "runs"
+# folders of a table's own folder: of the steps, and of the figures of cells that are done
+RUNS, CELLS = "runs", "cells"
 # the kinds of training, by command
 KINDS: dict[str, type[Pretrain] | type[Finetune]] = {"pretrain": Pretrain, "finetune": Finetune}
 # how long a training is watched before its speed is known: at most so many seconds, or this share of its hours
@@ -114,9 +115,6 @@ def is_done(step: Step, out: Path) -> bool:
 def run_steps(step: Step, out: Path, execute: Execute, tell: Callable[[str], None]) -> None:
     """Runs what is not done of a step and those before it. Raises StepFailed with the command's own message,
     KeyboardInterrupt where it was stopped."""
-    if is_done(step, out):
-        # what it was made from may be gone
-        return
     for part in step.all():
         if not is_done(part, out):
             tell(part.line(out))
@@ -248,5 +246,6 @@ def _shortened(step: Step, folder: Path, fit: float) -> list[str]:
 
 def check_out(out: Path) -> None:
     """Raises InputError for a folder that holds something else."""
-    if out.is_file() or out.is_dir() and any(out.iterdir()) and not (out / RUNS).is_dir():
+    known = any((out / name).is_dir() for name in (RUNS, CELLS))
+    if out.is_file() or out.is_dir() and any(out.iterdir()) and not known:
         raise InputError(f"{out}: expected a new or empty folder, or one of lidarpose paper: name another by --out")

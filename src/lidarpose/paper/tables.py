@@ -126,8 +126,8 @@ class Table:
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """A method. pretrain: options of its pre-training, None for none; finetune: its options besides --init; stands: why
-    the row cannot be run, "" where it can; clips: it needs clips; published: MPJPE mm by real set."""
+    """A method. pretrain: options of its pre-training, None for none; finetune: its options besides --init; why: it
+    cannot be run, "" where it can; clips: it needs clips; published: MPJPE mm by real set."""
 
     name: str
     finetune: tuple[str, ...]
