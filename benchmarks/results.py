@@ -4,7 +4,8 @@
     python benchmarks/results.py                              # docs/scores -> the tables of the pages
     python benchmarks/results.py --check                      # exit code 1 where they differ
 
-docs/scores/NAME.json is what `lidarpose evaluate NAME bench` wrote, NAME-2.json of bench-2, NAME-unknown.json with
+docs/scores/paper is what `lidarpose paper` wrote, NAME.json what `lidarpose evaluate NAME bench` wrote, NAME-2.json of
+bench-2, NAME-unknown.json with
 `--sensor-unknown`,
 stability/NAME.json what it writes besides with `--stability`; the others are what the benchmarks of their names wrote.
 
@@ -31,6 +32,7 @@ from lidarpose.eval.scores import BASELINE, MetricRow, Scores, published, read_s
 from lidarpose.io.files import content_digest, write_atomic
 from lidarpose.models import BUNDLED, DEFAULT, bundled_path
 from lidarpose.models.checkpoint import read_header, runs_of
+from lidarpose.paper import report
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -329,6 +331,13 @@ def tracks() -> str:
     return table(("boxes", "numbered by", "IDF1", "HOTA", "MOTA", "recall", "precision", "switches"), rows)
 
 
+def paper(name: str) -> str:
+    """A table of the paper on synthesized people, and what its finished cells cost; see `lidarpose paper`."""
+    content = _read(f"paper/{name}")
+    finished = [cell for cell in content["cells"] if cell["state"] == "done"]
+    return "\n".join([*report.result_lines(content), "", *report.cost_lines(finished), ""])
+
+
 def tables() -> dict[str, Callable[[], str]]:
     """What makes each table, by name."""
     every = [run | _labels(run["variant"]) for run in _read(RUNS)]
@@ -351,6 +360,7 @@ def tables() -> dict[str, Callable[[], str]]:
         own = ("all", "points", "mounted, all") if group == "points" else (group, f"{group}, 50 points and more")
         made |= {f"detector {name} by {group}": partial(detector, name, *own) for name in ("heldout", "real")}
     made |= {"visibility": visibility, "real": real, "tracks": tracks}
+    made |= {f"paper {path.stem}": partial(paper, path.stem) for path in sorted((SCORES / "paper").glob("*.json"))}
     made["headline"] = partial(headline, *BUNDLED)
     made |= {"readme": readme, "conditions": conditions}
     made |= {

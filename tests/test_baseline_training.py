@@ -223,6 +223,7 @@ def test_all_networks_are_listed(capsys):
     assert counts["lidarcap"] == (24, 16, 34_925_854) and counts["ne"] == (24, 16, 129_720_766)
     # narrower ones for CPUs
     assert counts["prn-small"][2] == 120_606 and counts["lpformer-small"][2] == 309_493
+    assert counts["prn-tiny"][2] == 36_348 and counts["lpformer-tiny"][2] == 80_581
     assert counts["lidarcap-small"][2] == 576_798 and counts["ne-small"][2] == 2_072_910
     assert {"ours", "dapt"} < {row["name"] for row in rows} and {"tiny", "paper", "paper-small"} <= counts.keys()
     assert not main(["models"])
