@@ -25,7 +25,8 @@ _FRAME = """
 --columns N  values per point in a .bin: 4 for KITTI, 5 for nuScenes
 """
 _SEARCH = """
---min-score P  least probability that it is a person, 0 to 1 (default: about one false person a scan)
+--min-score P  least probability that it is a person, 0 to 1 (default: the detector's, about one false person a
+ scan)
 --range M  how far from the sensor, m (default 40)
 --max-people N  only the N surest
 --background FILE+  what stands still about a fixed sensor: a file of static points, several scans, or a folder of scans
