@@ -13,7 +13,8 @@ from lidarpose.cli.terminal import add_command, is_watched, tell
 from lidarpose.errors import InputError
 from lidarpose.models import DEFAULT, NAMES
 
-_FILES = ".pcd .ply .las .laz .bin .npy .npz .csv .xyz .txt"
+# io.point_cloud.SUFFIXES, which a help text does not import
+_FILES = ".pcd .ply .las .laz .npy .npz .csv .xyz .txt .bin"
 # characters of an id in a warning
 _LONGEST_ID = 40
 # what a user who names it expects as a file

@@ -131,7 +131,7 @@ class Scores:
 
     def to_json(self) -> str:
         """One line of text a row."""
-        head = {"schema": SCHEMA, "unit": {"mm": "millimetres", "%": "percent"}}
+        head = {"schema": SCHEMA, "unit": {"mm": "millimeters", "%": "percent"}}
         head |= {name: getattr(self, name) for name in _HEAD}
         results = []
         for result in self.results:
