@@ -197,6 +197,7 @@ BAD = {
     "a number": (changed(size=1), ["people[1].size", "got 1"]),
     "null": (changed(size=None), ["people[1].size", "null"]),
     "object": (changed(center={"x": 1, "y": 2, "z": 3}), ["people[1].center", '"x"']),
+    "poses": ({"people": [{"id": 0, "box": PERSON}]}, ["people[0]", "got a pose", "lidarpose detect"]),
     "nested": (changed(center=[[1, 2, 3]]), ["people[1].center"]),
     "nan": (changed(center=[1, math.nan, 3]), ["people[1].center", "finite", "NaN"]),
     "infinite": (changed(size=[1, math.inf, 3]), ["people[1].size", "finite"]),

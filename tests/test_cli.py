@@ -190,6 +190,11 @@ def test_info_is_short_long_or_json(capsys):
         for label, score in entry["scores"].items():
             assert f"{label}: {score}" in printed["-v"]
         assert entry["last_run"]["command"] in printed["-v"] and entry["last_run"]["command"] not in printed[""]
+        label, score = next(iter(entry["scores"].items()))
+        assert f"{label}: {score} ({entry['scores']['measured on']})\n" in printed[""]
+    detector = facts["detector"]
+    counts = f"{detector['calibrated_on']} synthesized and {detector['labeled_scans']} real scans"
+    assert f"default --min-score {detector['default_score']:.2f}, calibrated on {counts}\n" in printed[""]
 
 
 def test_info_counts_the_people_of_all_runs(monkeypatch, capsys):

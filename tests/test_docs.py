@@ -12,6 +12,10 @@ import pytest
 
 import lidarpose
 from lidarpose.cli import main
+from lidarpose.cli.command_line import make_parser
+from lidarpose.cli.predicting import _FILES
+from lidarpose.io.point_cloud import SUFFIXES
+from lidarpose.models.detector.detector import open_detector
 
 ROOT = Path(__file__).parents[1]
 SOURCE = Path(lidarpose.__file__).parent
@@ -25,10 +29,7 @@ PAGES = [
 ]
 NAMED = sorted(set(re.findall(r"`([\w/]+\.py): ([\w.]+)", (DOCS / "method.md").read_text())))
 FLAG = re.compile(r"(?<![\w-])--[a-z][a-z0-9_-]*")
-COMMANDS = (
-    "predict", "demo", "synth", "prepare", "sensors", "view", "pretrain", "finetune", "evaluate", "table", "info",
-    "models", "export", "import", "paper", "train-detector",
-)  # fmt: skip
+COMMANDS = next(action.choices for action in make_parser()._actions if action.dest == "command")
 LINK = re.compile(r"\[[^]]*\]\((?!https?:)([^)#]*)(#[^)]*)?\)")
 
 
@@ -156,6 +157,14 @@ def flags():
 @pytest.mark.parametrize("page", [p for p in PAGES if p.stem != "log"], ids=named)
 def test_flags_that_pages_name_are_there(page, flags):
     assert set(FLAG.findall(page.read_text("utf-8"))) <= flags
+
+
+def test_help_and_pages_list_every_point_format_and_the_default_score():
+    assert tuple(_FILES.split()) == SUFFIXES
+    use = (DOCS / "use.md").read_text("utf-8")
+    for suffix in SUFFIXES:
+        assert f"`{suffix}`" in use and f"`{suffix}`" in (ROOT / "README.md").read_text("utf-8")
+    assert f"The default, {open_detector()[1]['default_score']:.2f}, is" in use
 
 
 @pytest.mark.slow

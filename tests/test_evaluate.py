@@ -3,6 +3,7 @@
 import itertools
 import json
 import shutil
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -245,11 +246,18 @@ def test_splits_that_are_scored_by_default(sets, tmp_path):
 
 
 @given(total=st.integers(1, 400), limit=st.none() | st.integers(1, 500))
-def test_a_limit_is_spread_evenly(total, limit):
+def test_a_limit_takes_one_of_each_equal_share(total, limit):
     rows = spread(total, limit)
-    assert len(rows) == min(total, limit or total) and len(set(rows.tolist())) == len(rows)
-    assert rows.min() >= 0 and rows.max() < total
-    assert len(rows) == 1 or np.ptp(np.diff(rows)) <= 1
+    assert len(rows) == min(total, limit or total)
+    edges = np.arange(len(rows) + 1) * total // len(rows)
+    assert (edges[:-1] <= rows).all() and (rows < edges[1:]).all()
+    np.testing.assert_array_equal(rows, spread(total, limit))
+
+
+def test_a_limit_is_not_in_step_with_the_sensors_of_the_bench():
+    people = list(open_eval_dataset("bench", limit=40))
+    of_sensor = Counter(person.info.sensor for person in people)
+    assert len(of_sensor) == 8 and max(of_sensor.values()) <= 10
 
 
 # ---- what counts

@@ -81,7 +81,8 @@ def match_reference(centers, scores, people, wanted):
         for only_wanted in (True, False):
             best = None
             for p in range(len(people)):
-                away = np.hypot(*(centers[d] - people[p]))
+                # by the same arithmetic: of places 1e-163 apart only the squares are equal
+                away = np.linalg.norm(centers[d] - people[p : p + 1], axis=1)[0]
                 usable = p not in of_person and away <= MATCH_RADIUS and (wanted[p] or not only_wanted)
                 if usable and (best is None or away < best[0]):
                     best = (away, p)

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from lidarpose import metrics
 from lidarpose.errors import InputError
+from lidarpose.eval.metric_rows import METRICS, SUMMARIES
 from lidarpose.geometry import axis_angle_to_matrix, similarity_align
 
 REFERENCE = Path(__file__).parent / "parity" / "metrics.npz"
@@ -356,11 +357,13 @@ def test_dapt_compat_alignment_takes_joints_without_label():
 def test_the_docs_name_what_is_there_and_their_example_runs():
     assert all(hasattr(metrics, name) for name in metrics.__all__) and metrics.__all__ == sorted(metrics.__all__)
     text = (Path(__file__).parents[1] / "docs" / "evaluate.md").read_text("utf-8")
+    for name in (*METRICS, *SUMMARIES):
+        assert re.search(rf"`{name.partition('@')[0]}[`@]", text), name
     text = text[text.index("\n## Metrics") :]
     (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     names = {}
     exec(code, names)
     assert 40 < names["score"] < 60 and names["score"].people == 60
     named = set(re.findall(r"(?:`|metrics\.)(\w+)\(", text)) | set(re.findall(r"`(\w+_\w+)`", text))
-    known = {*metrics.__all__, "dapt_compat"}
+    known = {*metrics.__all__, "dapt_compat", "turned_round"}
     assert len(named) > 12 and named <= known, named - known

@@ -53,7 +53,9 @@ def test_a_folder_is_read_by_the_numbers_of_its_names(tmp_path):
     frames = list(source)
     assert [frame.index for frame in frames] == [0, 1, 2] and np.allclose([f.time for f in frames], [0, 0.1, 0.2])
     assert np.array_equal(frames[1].points, POINTS * 2.0) and frames[1].points.dtype == np.float64
-    assert source.warnings == ("has no times: taken as 10 frames a second (give rate for another)",)
+    assert source.warnings == (
+        "has no times: taken as 10 frames a second (rate, on the command line --rate, for another)",
+    )
     assert not open_source(tmp_path, rate=20).warnings
 
 

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
+from lidarpose.inference.detection import MAX_RANGE, MOST_POSED
 from lidarpose.inference.tta import IDENTITY, apply
 from lidarpose.inference.verification import inside_column
 from lidarpose.io.files import atomic_path
@@ -31,7 +32,7 @@ from lidarpose.synth.detection_scene import detection_scene
 from lidarpose.train.augment import second_person_label
 from lidarpose.train.data_loader import SyntheticSource
 
-SEED, RANGE, LIMIT = 9101, 40.0, 40
+SEED = 9101
 # a detection nearer than this to a person is of that person; beyond the second distance, with at most this share of its
 # points on people, it is of nobody; others teach nothing, m
 OWN, OTHER, NOBODYS = 0.35, 0.7, 0.02
@@ -44,7 +45,7 @@ Crop = tuple[np.ndarray, np.ndarray, np.ndarray, int]
 def scene_crops(index: int) -> list[Crop]:
     """Points (n, 3) m about the center, view (5,), labels (2,), group 1, of the detections of a scene."""
     scene = detection_scene(SEED, index)
-    detections = Detector(threads=1).detect(scene.points, scene.origin, max_range=RANGE, limit=LIMIT)
+    detections = Detector(threads=1).detect(scene.points, scene.origin, max_range=MAX_RANGE, limit=MOST_POSED)
     seen = np.flatnonzero(np.bincount(scene.person[scene.person >= 0], minlength=len(scene.boxes)) >= MIN_POINTS)
     people = np.array([scene.boxes[row].center[:2] for row in seen]).reshape(-1, 2)
     crops: list[Crop] = []

@@ -12,7 +12,7 @@ NAMES = "<!-- public names -->"
 
 def on_page_markdown(markdown: str, **_) -> str:
     if README in markdown:
-        markdown = markdown.replace(README, site_links((ROOT / "README.md").read_text("utf-8")))
+        markdown = site_links((ROOT / "README.md").read_text("utf-8"))
     if NAMES in markdown:
         homes = lidarpose._HOMES
         entries = (f"::: {homes[name]}.{name}\n    options:\n      heading: lidarpose.{name}\n" for name in homes)

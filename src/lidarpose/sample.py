@@ -19,6 +19,8 @@ FARTHEST = 1e9
 CONFIDENCE_RADIUS = 0.1
 # fewer points than this say nothing about a pose
 MIN_POINTS = 5
+# points of a second person from which on a crop is said to show two
+FEWEST_OF_SECOND = 15
 # frames of a clip. Source: LiDARCap; NE, whose layers hold as many
 CLIP_FRAMES = 16
 # what a pose may say of each joint

@@ -13,7 +13,8 @@ from lidarpose.cli.terminal import add_command, is_watched, tell
 from lidarpose.errors import InputError
 from lidarpose.models import DEFAULT, NAMES
 
-_FILES = ".pcd .ply .las .laz .bin .npy .npz .csv .xyz .txt"
+# io.point_cloud.SUFFIXES, which a help text does not import
+_FILES = ".pcd .ply .las .laz .npy .npz .csv .xyz .txt .bin"
 # characters of an id in a warning
 _LONGEST_ID = 40
 # what a user who names it expects as a file
@@ -25,7 +26,8 @@ _FRAME = """
 --columns N  values per point in a .bin: 4 for KITTI, 5 for nuScenes
 """
 _SEARCH = """
---min-score P  least probability that it is a person, 0 to 1 (default: about one false person a scan)
+--min-score P  least probability that it is a person, 0 to 1 (default: the detector's, about one false person a
+ scan)
 --range M  how far from the sensor, m (default 40)
 --max-people N  only the N surest
 --background FILE+  what stands still about a fixed sensor: a file of static points, several scans, or a folder of scans

@@ -117,7 +117,8 @@ def _print_lines(options: argparse.Namespace, source, steps) -> None:
 
 
 def _report(source, steps, summary, outputs: str = "") -> None:
-    for line in [*source.warnings, *summary.warning_lines(_MOST_WARNINGS)]:
+    about = [f"{source.name}: {line}" for line in source.warnings]
+    for line in [*about, *summary.warning_lines(_MOST_WARNINGS)]:
         tell(f"lidarpose: warning: {line}")
     tell(summary.text(steps.is_tracked) + outputs)
 

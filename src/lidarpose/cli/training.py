@@ -95,16 +95,24 @@ def _train(options: argparse.Namespace) -> None:
 
     kind: type[Recipe] = options.kind
     name = kind.kind
-    if getattr(options, "calibrate", None) is not None:
-        from lidarpose.train.detector.calibrate import calibrate
-
-        print(calibrate(options.folder or latest(name), options.calibrate, labeled=options.scans))
-        return
     changes: dict[str, Any] = {
         field.name: _parsed(field, text)
         for field in fields(kind)
         if (text := getattr(options, f"set_{field.name}", None)) is not None
     }
+    if getattr(options, "calibrate", None) is not None:
+        from lidarpose.train.detector.calibrate import calibrate
+
+        others = [*changes, *(key for key in ("resume", "recipe", "device", "tracker") if getattr(options, key))]
+        if others:
+            other = f"--{others[0].replace('_', '-')}"
+            raise InputError(f"--calibrate trains nothing: expected only --scans beside it, got {other}: leave it out")
+        print(calibrate(options.folder or latest(name), options.calibrate, labeled=options.scans))
+        return
+    if getattr(options, "scans", None) is not None:
+        raise InputError(
+            "--scans is for --calibrate: expected both, got --scans alone: add --calibrate N or leave it out"
+        )
     if kind is Pretrain and (settings := scene_changes(options)):
         changes["set"] = settings
     if kind is Finetune and options.data:

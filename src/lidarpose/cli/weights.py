@@ -41,6 +41,8 @@ $ lidarpose import dapt_waymo.safetensors waymo.safetensors --config waymo
 <out> OUT  the checkpoint to write (.safetensors)
 --config NAME  waymo, humanm3, lidarhuman26m, sloper4d, pretrain or paper (default: as the file says)
 """
+# of the detector's header
+_CALIBRATION = ("default_score", "calibrated_on", "labeled_scans")
 
 
 def add(commands) -> None:
@@ -57,10 +59,12 @@ def _info(options: argparse.Namespace) -> None:
 
 
 def installed() -> dict[str, Any]:
-    """Versions, threads, torch and its device, and of each bundled network its size, training and scores."""
+    """Versions, threads, torch and its device, of each bundled network its size, training and scores, and of what finds
+    people how it is calibrated."""
     import onnxruntime
 
     from lidarpose.models.checkpoint import parameter_count, read_header, runs_of
+    from lidarpose.models.detector.detector import open_detector
     from lidarpose.models.onnx import usable_threads
 
     weights = {}
@@ -80,6 +84,7 @@ def installed() -> dict[str, Any]:
             "last_run": {key: card[key] for key in ("command", "people_seen", "hours", "note") if key in card},
             "scores": card.get("scores", {}),
         }
+    _, detector = open_detector()
     return {
         "lidarpose": __version__,
         "python": platform.python_version(),
@@ -87,6 +92,7 @@ def installed() -> dict[str, Any]:
         "threads": usable_threads(),
         "torch": _torch(),
         "weights": weights,
+        "detector": {name: detector[name] for name in ("version", *_CALIBRATION) if name in detector},
     }
 
 
@@ -109,8 +115,11 @@ def _lines(facts: dict[str, Any], *, verbose: bool) -> Iterator[str]:
             )
             if "note" in run:
                 yield f"           {run['note']}"
+        measured = entry["scores"].get("measured on")
         for label, score in scores if verbose else scores[:1]:
-            yield f"  score    {label}: {score}"
+            yield f"  score    {label}: {score}" + (f" ({measured})" if measured and not verbose else "")
+    least, *scans = (facts["detector"].get(name, 0) for name in _CALIBRATION)
+    yield f"detector   default --min-score {least:.2f}, calibrated on {scans[0]} synthesized and {scans[1]} real scans"
     if not verbose:
         yield "more       lidarpose info --verbose: training and all scores; --json: the same for programs"
 

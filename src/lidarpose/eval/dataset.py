@@ -149,9 +149,11 @@ def count_skipped(skipped: Skipped, reason: str, where: object, count: int = 1) 
 
 
 def spread(total: int, limit: int | None) -> np.ndarray:
-    """Indices of `limit` of `total` people, each in the middle of an equal share; of everybody without a limit."""
+    """Indices of `limit` of `total` people, one of each equal share; of everybody without a limit. Drawn, always alike:
+    equal steps would fall in step with the order of a dataset, as with the sensors of a bench."""
     count = total if limit is None else min(limit, total)
-    return (2 * np.arange(count) + 1) * total // (2 * max(count, 1))
+    edges = np.arange(count + 1) * total // max(count, 1)
+    return np.random.default_rng(0).integers(edges[:-1], edges[1:])
 
 
 # ---- folders

@@ -1,11 +1,7 @@
 """Predictions -> rows of metrics: for each metric and each group of people or joints its mean and interval.
 
 Everything that scores.json says can be computed again from poses.parquet. A row's interval is drawn with a generator of
-its own name, so that no row depends on what else is reported. To add a metric:
-
-1. write a function: `Predictions` -> (N, J) values, one a joint, or (N,), one a person; NaN: nothing to score
-2. add it to `METRICS` with its unit and the sections (see `_groups`) in which it is reported
-3. define it in docs/evaluate.md
+its own name, so that no row depends on what else is reported. How to add a metric: CONTRIBUTING.md.
 """
 
 import zlib
@@ -22,13 +18,11 @@ from lidarpose.eval.metrics.aggregate import Score, joint_groups, mean
 from lidarpose.eval.metrics.joint_errors import PCK3, PCK5, TORSO, acceleration_errors, aligned_errors, joint_hits
 from lidarpose.eval.predictions import Predictions
 from lidarpose.eval.scores import RELEASED, MetricRow, Setting, number
-from lidarpose.sample import CONFIDENCE_RADIUS, HIDDEN, SEEN, UNLABELED
+from lidarpose.sample import CONFIDENCE_RADIUS, FEWEST_OF_SECOND, HIDDEN, SEEN, UNLABELED
 
 # people of fewer points do not tell where they face
 PLENTY = 100
 _REPEATS = 1000
-# points from which on a second person is said to be in a crop
-FEWEST_OF_SECOND = 15
 # frames count as evenly apart where two steps differ by less than this share
 _EVEN = 0.2
 # joints of each half of the body, without their sides. Source: Haque et al. 2016, whose torso is in neither
@@ -78,7 +72,8 @@ def _box_size(p: Predictions) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Metric:
-    """A metric that is a mean over people or joints. values: Predictions -> (N, J) or (N,); sections: see `_groups`."""
+    """A metric that is a mean over people or joints. values: Predictions -> (N, J) or (N,), NaN: nothing to score;
+    sections: where it is reported, see `_groups`."""
 
     values: Callable[[Predictions], np.ndarray]
     unit: str

@@ -193,7 +193,7 @@ class Run:
 
 
 def evaluate(model: Model | str | os.PathLike, dataset: str | os.PathLike, **options: Any) -> Result:
-    """One dataset's result; `options` as of `run`."""
+    """One dataset's result, in millimeters and percent; `options` and errors as of `run`."""
     return run(model, [dataset], **options).scores.results[0]
 
 
@@ -313,8 +313,14 @@ def check_folder(folder: str | os.PathLike) -> Path:
 
 
 def write(run: Run, folder: str | os.PathLike) -> list[Path]:
-    """Writes scores.json, poses.parquet, pictures and, where there are studies, stability.json into a new or empty
-    folder, all of them or none, and returns their paths. Raises InputError where the folder holds something."""
+    """Writes scores.json, poses.parquet, pictures and, where there are studies, stability.json; returns their paths.
+
+    Args:
+        folder: a new or empty one, in which all of them are written or none.
+
+    Raises:
+        InputError: the folder holds something.
+    """
     from lidarpose.eval import charts
 
     folder, scores = check_folder(folder), run.scores

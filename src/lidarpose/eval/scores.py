@@ -131,7 +131,7 @@ class Scores:
 
     def to_json(self) -> str:
         """One line of text a row."""
-        head = {"schema": SCHEMA, "unit": {"mm": "millimetres", "%": "percent"}}
+        head = {"schema": SCHEMA, "unit": {"mm": "millimeters", "%": "percent"}}
         head |= {name: getattr(self, name) for name in _HEAD}
         results = []
         for result in self.results:
@@ -214,9 +214,15 @@ def published() -> dict[str, Any]:
 
 
 def table(paths: str | PathLike | Sequence[str | PathLike], *, format: str = "markdown") -> str:
-    """The table of scores.json files, or of folders that hold one; ours come from these files alone, and results of
-    different protocols stand in different blocks. Raises InputError for an unknown format and for a file that is
-    none."""
+    """The paper's Table 1 and the results of scores.json files; results of different protocols in different blocks.
+
+    Args:
+        paths: the files, or folders that hold one; our figures come from these alone.
+        format: "markdown" or "json".
+
+    Raises:
+        InputError: an unknown format, or a file that is none.
+    """
     if format not in FORMATS:
         raise InputError(f"expected a table's format, {' or '.join(FORMATS)}, got {format!r}")
     entries = [entry for path in listed(paths) for entry in _entries(str(path), read_scores(path))]

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 # how far from the sensor people are searched, m
 MAX_RANGE = 40.0
 # detections that may be posed
-_POSED = 40
+MOST_POSED = 40
 # a scan of more points is thinned: what is farther away than this beyond the range first, m
 _MOST_POINTS, _BEYOND = 1_500_000, 15.0
 _CHUNK = 4_000_000
@@ -170,7 +170,7 @@ def detect_places(scan: Scan, search: Search) -> Places:
                 f"only {share:.0%} of the points lie on the background: is it of this sensor, in this frame?"
             )
     detector = search.detector or _detector()
-    detections = detector.detect(level, origin, max_range=search.max_range, limit=_POSED, moving=moving)
+    detections = detector.detect(level, origin, max_range=search.max_range, limit=MOST_POSED, moving=moving)
     if not (detections.has_ground or wrong):
         warnings.append("no ground was found, and people are searched without it: is the up axis right?")
     scan = replace(scan, warnings=tuple(warnings))

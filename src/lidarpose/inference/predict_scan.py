@@ -43,16 +43,22 @@ def predict(
 ) -> Poses:
     """Poses of the people in a point file, in the file's own frame.
 
-    boxes: whatever `read_boxes` takes (a JSON file, a KITTI label, rows, a `Box` or several), their length and width
-    level, their height and yaw along and about the up axis (the file's z where `up` is a direction); calib: of a KITTI
-    label, None for `../calib/N.txt` beside it; crop: the file is one person already; find: people are searched for,
-    with min_score, max_range (None: 40 m), max_people and background as in `detect`. With neither, a file of less than
-    4 m across is taken as a crop, and in any other people are searched for. sensor_origin: (x, y, z) m in the file's
-    frame, or "unknown"; None means unknown for a crop and 0, 0, 0 else. skeleton: a name, or None for smpl24, or for
-    the network's own where it has other joints. up: the file's up axis, "z", "y" or "x", with a minus where it points
-    down ("-y": cameras), or for a sensor mounted askew the direction that is up, (x, y, z) or "x,y,z" in the file's
-    frame. columns: values a row of a .bin; model: a predictor, what `load` takes (with its defaults), or a function
-    that gives the predictor when it is needed. Raises InputError, one line that says what to do.
+    Args:
+        boxes: whatever `read_boxes` takes (a JSON file, a KITTI label, rows, a `Box` or several), their length and
+            width level, their height and yaw along and about the up axis (the file's z where `up` is a direction).
+        calib: of a KITTI label, None for `../calib/N.txt` beside it.
+        crop: the file is one person already.
+        find: people are searched for, with min_score, max_range (None: 40 m), max_people and background as in `detect`.
+            Without boxes, crop and find a file of less than 4 m across is taken as a crop, any other is searched.
+        sensor_origin: (x, y, z) m in the file's frame, or "unknown"; None means unknown for a crop and 0, 0, 0 else.
+        skeleton: a name, or None for smpl24, or for the network's own where it has other joints.
+        up: the file's up axis, "z", "y" or "x", with a minus where it points down ("-y": cameras), or for a sensor
+            mounted askew the direction that is up, (x, y, z) or "x,y,z" in the file's frame.
+        columns: values a row of a .bin.
+        model: a predictor, what `load` takes (with its defaults), or a function that gives the predictor when needed.
+
+    Raises:
+        InputError: one line that says what to do.
     """
     options = (min_score, max_range, max_people, background)
     check_choice(boxes, crop, find or any(option is not None for option in options))

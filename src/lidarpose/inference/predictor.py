@@ -65,13 +65,21 @@ def load(
 ) -> "Predictor":
     """The bundled network, or the checkpoint or exported file at a path, ready to predict.
 
-    backend: "onnx" (ONNX Runtime, on the CPU) or "torch"; None takes onnx for bundled weights and .onnx files, torch
-    for other paths and devices. decode: how heatmaps are read, "window" (the mean about the mode), "argmax" or "dark"
-    (the released DAPT code's); where two peaks are equally high, rounding decides. compile: by `torch.compile`, backend
-    torch only. threads: of ONNX Runtime, None for all processors; backend onnx only. tta: test-time augmentation, the
-    number of transforms of each person (1 to 8), averaged with the pass that centers the cloud. A person costs that
-    pass and one for each transform, so 1 takes two passes, 4 take five. Raises InputError for an unknown name, a file
-    that is no checkpoint, or a device that is not there; MissingExtra where torch is needed and not installed.
+    Args:
+        weights: a name of bundled weights, or a path.
+        device: "cpu", or "cuda" by backend torch.
+        backend: "onnx" (ONNX Runtime, on the CPU) or "torch"; None takes onnx for bundled weights and .onnx files,
+            torch for other paths and devices.
+        decode: how heatmaps are read, "window" (the mean about the mode), "argmax" or "dark" (the released DAPT
+            code's); where two peaks are equally high, rounding decides.
+        compile: by `torch.compile`, backend torch only.
+        threads: of ONNX Runtime, None for all processors; backend onnx only.
+        tta: test-time augmentation, the number of transforms of each person (1 to 8), averaged with the pass that
+            centers the cloud. A person costs that pass and one for each transform, so 1 takes two passes, 4 take five.
+
+    Raises:
+        InputError: an unknown name, a file that is no checkpoint, or a device that is not there. MissingExtra: torch is
+            needed and not installed.
     """
     decoder(decode)
     tta_transforms(tta)
@@ -169,14 +177,21 @@ class Predictor(PoseEstimator):
     ) -> PersonPose | Poses:
         """One cloud (n, 3+) -> `PersonPose`; a list of clouds, or one with boxes or find -> `Poses`, in their order.
 
-        points: x, y, z in meters, z up, any frame, each cloud one person, ground and clutter allowed; more columns are
-        ignored, those of tables and records are taken by name. boxes: the people of a whole scan, as in
-        `lidarpose.predict`; find: they are searched for, as by `lidarpose.detect`, whose result is for `boxes` where
-        anything about the search is to be chosen. sensor_origin (3,) m: where the sensor stood in that frame, or
-        "unknown"; None means 0, 0, 0 with boxes and find, and unknown without. skeleton: see `in_skeleton`. clips:
-        which of a list's clouds are frames of one person, for networks of clips, by default none: a cloud then fills a
-        clip. A cloud of under 5 different points gets a result without joints and a warning. Raises InputError for
-        arrays of another shape or type.
+        Args:
+            points: x, y, z in meters, z up, any frame, each cloud one person, ground and clutter allowed; more columns
+                are ignored, those of tables and records are taken by name. A cloud of under 5 different points gets a
+                result without joints and a warning.
+            boxes: the people of a whole scan, as in `lidarpose.predict`.
+            find: they are searched for, as by `lidarpose.detect`, whose result is for `boxes` where anything about the
+                search is to be chosen.
+            sensor_origin: (3,) m, where the sensor stood in that frame, or "unknown"; None means 0, 0, 0 with boxes and
+                find, and unknown without.
+            skeleton: see `in_skeleton`.
+            clips: which of a list's clouds are frames of one person, for networks of clips, by default none: a cloud
+                then fills a clip.
+
+        Raises:
+            InputError: arrays of another shape or type.
         """
         wanted = self.in_skeleton(skeleton)
         if clips is not None and getattr(self.backend, "frames", 1) == 1:
@@ -211,11 +226,16 @@ class Predictor(PoseEstimator):
     ) -> Poses:
         """One person through frames: steady poses, as many as clouds, whose ids are the frames' numbers.
 
-        clouds: (n, 3+) m each, of one person in a frame of coordinates that stays where it is, as in `predict`; one
-        without points is a frame in which the person was not seen, whose joints are filled in within gaps of up to 2 s.
-        times (T,) s, each later than the one before; None: ten frames a second. live: each pose from its own frame and
-        those before only, as it would come from a running sensor. Raises InputError as `predict` does, and for other
-        times.
+        Args:
+            clouds: (n, 3+) m each, of one person in a frame of coordinates that stays where it is, as in `predict`; one
+                without points is a frame in which the person was not seen, whose joints are filled in within gaps of up
+                to 2 s.
+            times: (T,) s, each later than the one before; None: ten frames a second.
+            sensor_origin: as in `predict`, in that frame.
+            live: each pose from its own frame and those before only, as it would come from a running sensor.
+
+        Raises:
+            InputError: as `predict` does, and for other times.
         """
         wanted = self.in_skeleton(skeleton)
         if not _is_many(clouds):

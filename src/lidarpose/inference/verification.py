@@ -40,7 +40,7 @@ FEATURES = ("logit", "confidence", "log_spread", "log_points", "mounted", "perso
 # those that mean something else where the person is mounted: riders are posed badly
 _OF_MOUNTED = ("confidence", "log_spread", "person")
 # weights of the features and of products with "mounted", for a detector without its own
-_WEIGHTS = {
+_FALLBACK_WEIGHTS = {
     "bias": -1.5 * np.log(10),
     "logit": 1.0,
     "log_spread": -1.5,
@@ -113,7 +113,7 @@ def verification_features(
 def final_score(features: np.ndarray, header: dict) -> np.ndarray:
     """features (D, 6) -> (D,) in [0, 1]: the probability that a detection is a person, by the detector's header."""
     verification = header.get("verification") or {}
-    weights = verification if "logit" in verification else _WEIGHTS
+    weights = verification if "logit" in verification else _FALLBACK_WEIGHTS
     logit = np.full(len(features), float(weights.get("bias", 0.0)))
     for name, values in score_terms(features).items():
         logit += weights.get(name, 0.0) * values

@@ -226,6 +226,10 @@ def _box(entry: object, where: str) -> Box:
     if not isinstance(entry, dict):
         expected = '{"center": [x, y, z], "size": [l, w, h]} or [x, y, z, l, w, h, yaw]'
         raise FormatError(f"{where}: expected {expected}, got {_show(entry)}")
+    if "box" in entry and "center" not in entry:
+        raise FormatError(
+            f"{where}: expected a box, got a pose with its box: give the file that `lidarpose detect` writes"
+        )
     center = _triple(entry, "center", where, meaning="[x, y, z]")
     size = _triple(entry, "size", where, meaning="[length, width, height]")
     if min(size) <= 0:

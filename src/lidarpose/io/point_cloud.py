@@ -82,14 +82,17 @@ def read_points(path: str | os.PathLike, *, columns: int | None = None) -> Cloud
     .pcd (ascii, binary, binary_compressed), .ply (the vertices; ascii, binary of either byte order), .las, .laz (all
     point formats), .npy ((n, 3+) or records with x, y, z), .npz (`points`, else `xyz`, else its only (n, 3+) array),
     .csv .xyz .txt (with or without a header; commas, semicolons, tabs or blanks; # starts a comment), .bin (rows of
-    `columns` float32).
+    `columns` float32). Points that are NaN or infinite are dropped with a warning; `predict` and `detect` also drop
+    those beyond 1e9 m and, if there is more than one of them, at 0,0,0.
 
-    columns: values a row of a .bin, x y z first; other formats ignore it. Where it is None, rows have 4 (KITTI) or,
-    where the size or the values say so, 5 (nuScenes) or 3, which a warning tells; `.pcd.bin`, nuScenes' own suffix,
-    means 5.
+    Args:
+        columns: values a row of a .bin, x y z first; other formats ignore it. Where it is None, rows have 4 (KITTI) or,
+            where the size or the values say so, 5 (nuScenes) or 3, which a warning tells; `.pcd.bin`, nuScenes' own
+            suffix, means 5.
 
-    Raises InputError of one line that names the file, what was expected, what came and what to do; MissingExtra for
-    .laz without the extra `recordings`.
+    Raises:
+        InputError: one line that names the file, what was expected, what came and what to do, also for a file without
+            one finite point. MissingExtra: .laz without the extra `recordings`.
     """
     if columns is not None:
         columns = check_int("columns", columns, least=3, hint=" (x y z first)")

@@ -42,11 +42,14 @@ _WORTH = 64
 def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = "onnx") -> None:
     """Writes the checkpoint at `weights` as a file of another format, computing in float32, whole or not at all.
 
-    format: "onnx", a self-contained file that ONNX Runtime and this package run without torch, no larger than the
-    checkpoint where that keeps float16; or "torch", a program (.pt2) for `torch.export.load`. Both take any number of
-    people and points; `onnx_file` tells the inputs. Raises InputError for a file that is no checkpoint of this
-    package's own networks and for an `out` that ends in another suffix than `FORMATS` says, MissingExtra without
-    onnx.
+    Args:
+        format: "onnx", a self-contained file that ONNX Runtime and this package run without torch, no larger than the
+            checkpoint where that keeps float16; or "torch", a program (.pt2) for `torch.export.load`. Both take any
+            number of people and points; `models/onnx.py` tells the inputs.
+
+    Raises:
+        InputError: a file that is no checkpoint of this package's own networks, and an `out` that ends in another
+            suffix than `FORMATS` says. MissingExtra: without onnx.
     """
     check_name("format", format, FORMATS)
     check_apart(out, weights)

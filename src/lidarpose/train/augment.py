@@ -13,7 +13,7 @@ from lidarpose.errors import check_name
 from lidarpose.eval.protocols import jittered, released_view
 from lidarpose.geometry import rotation_about
 from lidarpose.models.voxelize import view_features
-from lidarpose.sample import LabeledSample, Pose, Sample, center_of
+from lidarpose.sample import FEWEST_OF_SECOND, LabeledSample, Pose, Sample, center_of
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth.noise import half_space_keep, jitter, noise_clusters, random_keep
 
@@ -21,8 +21,6 @@ from lidarpose.synth.noise import half_space_keep, jitter, noise_clusters, rando
 REFINED, PELVIS_ERROR = 0.5, 0.06
 # the same of a pelvis where nobody is, m
 _OBJECT_ERROR = 0.15
-# points of a second person from which on a crop is said to show two
-_FEWEST_OF_SECOND = 15
 # how often the sensor's position is kept from the network
 BLIND = 0.3
 # a joint of which the body's surface is seen within this distance is visible, m: hips lie 12 cm deep
@@ -158,7 +156,7 @@ def people_in(sample: Sample) -> np.ndarray:
 
 def second_person_label(others: int, count: int) -> float:
     """Whether a crop of so many points shows a second person, on whom `others` of them are: 0, 1 or NaN for unclear."""
-    known = not 0 < others < max(_FEWEST_OF_SECOND, 0.1 * count)
+    known = not 0 < others < max(FEWEST_OF_SECOND, 0.1 * count)
     return float(others > 0) if known else np.nan
 
 

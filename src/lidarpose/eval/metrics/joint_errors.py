@@ -36,7 +36,11 @@ def mpjpe(
 ) -> Score:
     """Mean per-joint position error in millimeters, not aligned.
 
-    average: "person" or "joint", see `mean`. dapt_compat: people without a label count as free of error.
+    Args:
+        pred, true: (n, J, 3) m in one frame.
+        visible: (n, J), which joints have a label; None: all whose truth is not NaN.
+        dapt_compat: people without a label count as free of error.
+        average: "person" or "joint", see `mean`.
     """
     return _mean(joint_errors(pred, true, visible), average, dapt_compat or legacy, empty=0.0)
 
@@ -52,8 +56,12 @@ def pa_mpjpe(
 ) -> Score:
     """`mpjpe` after each person's prediction was moved onto the truth by its best similarity (Procrustes).
 
-    The similarity is that of the labeled joints; people with fewer than three are skipped. dapt_compat: that of all
-    joints, labeled or not, and for two or three people at once that of their transposed arrays.
+    The similarity is that of the labeled joints; people with fewer than three are skipped.
+
+    Args:
+        pred, true, visible, average: as of `mpjpe`.
+        dapt_compat: the similarity of all joints, labeled or not, and for two or three people at once that of their
+            transposed arrays.
     """
     table = aligned_errors(pred, true, visible, dapt_compat or legacy)
     return _mean(table, average, dapt_compat or legacy, empty=0.0)
@@ -72,7 +80,11 @@ def pck(
 ) -> Score:
     """Percentage of correct keypoints: joints nearer to the truth than threshold times torso, meters.
 
-    By default PCK-3; `threshold=0.5` is PCK-5. dapt_compat: NaN as soon as one person has no label.
+    Args:
+        pred, true, visible, average: as of `mpjpe`.
+        dapt_compat: NaN as soon as one person has no label.
+        threshold: a share of the torso; by default PCK-3, 0.5 is PCK-5.
+        torso: m, the same for everybody.
     """
     table = joint_hits(pred, true, visible, threshold=threshold, torso=torso)
     return _mean(table, average, dapt_compat or legacy, empty=np.nan)

@@ -227,7 +227,8 @@ class FrameSource:
         self._first_time = first.time
         self._notes: list[str] = []
         if first.time is None and recording.count != 1 and rate is None:
-            self._notes.append(f"has no times: taken as {DEFAULT_RATE:g} frames a second (give rate for another)")
+            another = "rate, on the command line --rate, for another"
+            self._notes.append(f"has no times: taken as {DEFAULT_RATE:g} frames a second ({another})")
         self._num_back = 0
 
     @property

@@ -37,7 +37,7 @@ class Lpformer(nn.Module):
         self.grid = config.grid
         joints, divisor = len(config.joints), config.width_divisor
         # on CPUs twice as fast as channels first where channels are few
-        self.volume = V2V(divisor).to(memory_format=torch.channels_last_3d)
+        self.volume = V2V(divisor).to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
         widths = [6 + 32 // divisor, 1024 // divisor, 512 // divisor, 256 // divisor]
         self.token = nn.Sequential(*map(nn.Linear, widths, widths[1:]))
         width = widths[-1]

@@ -24,10 +24,14 @@ _PICKLES = (".pth", ".pt", ".bin", ".ckpt", ".pkl")
 def import_dapt(path: str | os.PathLike, config: DaptConfig | dict | str | None = None) -> DaptNet:
     """The released network in evaluation mode, float32 on the CPU, with the data flow that it was trained with.
 
-    config: a `DaptConfig`, its entries or the authors' constructor arguments as a dict (`DaptConfig.from_dict`), or a
-    name (waymo, humanm3, lidarhuman26m, sloper4d, pretrain); None reads the file's header, entry "config". The legacy
-    data flow is on unless a `DaptConfig` or a dict says otherwise. Names of tensors may all begin with "module.".
-    Raises InputError, one line that names the file and the tensor, for all that does not fit.
+    Args:
+        path: the weights as .safetensors. Names of tensors may all begin with "module.".
+        config: a `DaptConfig`, its entries or the authors' constructor arguments as a dict (`DaptConfig.from_dict`), or
+            a name (waymo, humanm3, lidarhuman26m, sloper4d, pretrain); None reads the file's header, entry "config".
+            The legacy data flow is on unless a `DaptConfig` or a dict says otherwise.
+
+    Raises:
+        InputError: one line that names the file and the tensor, for all that does not fit.
     """
     path = Path(path)
     if path.suffix.lower() in _PICKLES:

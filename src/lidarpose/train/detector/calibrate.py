@@ -10,6 +10,7 @@ import numpy as np
 from lidarpose.errors import InputError, check_int
 from lidarpose.eval.detector.detection_scores import match
 from lidarpose.eval.detector.evaluate_detector import run_detector
+from lidarpose.inference.detection import MAX_RANGE, MOST_POSED
 from lidarpose.inference.verification import final_score, score_terms, verification_features
 from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.detector.detector import Detector
@@ -22,10 +23,6 @@ from lidarpose.train.run_dir import MODEL
 DETECTOR = "detector.onnx"
 # a seed of which neither a run nor a bench has scans
 _SEED = 2**31 - 11
-# detections of a scan that are posed, the strongest ones
-_VERIFIED = 40
-# people are looked for up to this range, m
-_RANGE = 40.0
 # false people a scan at the default score
 FALSE = 1.0
 # of the logistic, on standardized features; of the piecewise linear curve, its knots at most
@@ -55,7 +52,7 @@ def calibrate(folder: str | Path, scans: int, *, labeled: str | Path | None = No
             scene = detection_scene(_SEED, number, family="heldout")
             seen = np.unique(scene.person[scene.person >= 0])
             people = np.array([scene.boxes[row].center for row in seen]).reshape(-1, 3)
-            detections = detector.detect(scene.points, scene.origin, max_range=_RANGE, limit=_VERIFIED)
+            detections = detector.detect(scene.points, scene.origin, max_range=MAX_RANGE, limit=MOST_POSED)
             features, _ = verification_features(detections, scene.points, scene.origin)
             # the strongest first
             own = match(detections.centers[:, :2], detections.logit, people[:, :2], np.ones(len(people), bool))
@@ -65,7 +62,7 @@ def calibrate(folder: str | Path, scans: int, *, labeled: str | Path | None = No
     card = header.card | fit(features, is_person, scans) | {"calibrated_on": scans}
     export_detector(network, out, card=card)
     if labeled is not None:
-        (result,), _ = run_detector(weights=out, heldout=False, folders=[labeled], max_range=_RANGE)
+        (result,), _ = run_detector(weights=out, heldout=False, folders=[labeled], max_range=MAX_RANGE)
         card |= {"default_score": max(card["default_score"], result.thresholds[f"{FALSE:g}"])}
         export_detector(network, out, card=card | {"labeled_scans": result.scans})
     return out
