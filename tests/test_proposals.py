@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lidarpose.geometry import rotation_about
-from lidarpose.models.detector.candidates import SceneIndex, suppress, suppress_near
+from lidarpose.models.detector.candidates import SceneIndex, suppress_near
 from lidarpose.models.detector.ground import estimate_ground, estimate_up, without_ground
 from lidarpose.models.detector.proposals import columns, heights_above, propose
 from lidarpose.models.detector.render import Augmentation, draw_augmentation, render
@@ -18,7 +18,6 @@ from tests.reference.detector_reference import (
     fine_reference,
     range_reference,
     suppress_near_reference,
-    suppress_reference,
 )
 
 ORIGIN = np.zeros(3)
@@ -407,7 +406,7 @@ def test_dense_places_cost_no_more_than_thinned_ones():
     assert height.max() > 1.7 and np.diff(np.sort(height)).max() < 0.1
 
 
-def test_rows_are_those_of_the_column_and_suppression_is_by_shared_points(scene):
+def test_rows_are_those_of_the_column(scene):
     _, points, ground = scene
     places, _ = columns(points, heights_above(points, ground))
     centers = np.concatenate([places, ground.at(places)[:, None]], 1)
@@ -415,12 +414,6 @@ def test_rows_are_those_of_the_column_and_suppression_is_by_shared_points(scene)
     for center, own in zip(centers[::10], rows[::10], strict=True):
         near = (np.hypot(*(points[:, :2] - center[:2]).T) < 0.35) & (heights_above(points, ground) < 3.2)
         assert len(np.setxor1d(own, np.flatnonzero(near))) <= 1
-    strength = np.random.default_rng(0).permutation(len(rows))
-    kept = suppress(rows, strength)
-    assert kept.tolist() == suppress_reference(rows, strength)
-    assert 0 < len(kept) < len(rows)
-    pair = [np.arange(10), np.arange(6, 20), np.arange(5), np.zeros(0, int)]
-    assert suppress(pair, np.array([3.0, 2, 1, 0])).tolist() == [0, 1, 3]
 
 
 def test_of_places_too_near_to_each_other_the_weaker_goes():

@@ -63,7 +63,7 @@ def some_candidates(rng, is_person, *, centers=None, yaw=0.0):
     )
 
 
-def an_example(number, *, with_rows=False, count=10):
+def an_example(number, *, count=10):
     """A scan of people and boxes in turn."""
     rng = np.random.default_rng(number)
     is_person = np.arange(count) % 2 == 0
@@ -74,16 +74,16 @@ def an_example(number, *, with_rows=False, count=10):
         height=np.full(count, 1.75, np.float32),
         mounted=np.zeros(count, bool),
     )
-    rows = [np.arange(5) + 5 * k for k in range(count)] if with_rows else None
-    return DetectorExample(candidates=some_candidates(rng, is_person), labels=labels, rows=rows)
+    centers = 2.0 * np.arange(count)[:, None] * [1, 0, 0]
+    return DetectorExample(candidates=some_candidates(rng, is_person, centers=centers), labels=labels)
 
 
 @pytest.fixture
 def quick_scans(monkeypatch):
     """Scans that take no time, and a small network."""
 
-    def scan(seed, number, *, family="train", with_rows=False):
-        return an_example(number + 1000 * (family == "heldout"), with_rows=with_rows)
+    def scan(seed, number, *, family="train"):
+        return an_example(number + 1000 * (family == "heldout"))
 
     monkeypatch.setattr(candidate_source, "scan_example", scan)
     monkeypatch.setattr(candidate_source, "VALIDATION", 3)
@@ -298,11 +298,15 @@ def test_people_missed_at_one_false_person_a_scan(quick_scans):
     examples = candidate_source.validation_scans(0)
     logits = iter([np.array(values) for values in ([9.0, 8, 7, 6, 5, 4, 3, 2, 1, 0],) * 3])
     objective = SimpleNamespace(
-        collate=lambda examples: None, scores=lambda *args, **kwargs: np.repeat(next(logits)[:, None], 6, 1)
+        collate=lambda examples: None, scores=lambda *args, **kwargs: np.pad(next(logits)[:, None], ((0, 0), (0, 5)))
     )
     # of people 9, 7, 5, 3, 1 and others 8, 6, ... in each of 3 scans the fourth false one, 6, lets 9 and 7 pass
     missed, joints = missed_people(objective, torch.nn.Linear(1, 1), examples, 1)
     assert missed == pytest.approx(60) and joints is None
+    # all moved to one place are one person: the strongest
+    together = [replace(one, candidates=replace(one.candidates, centers=np.zeros((10, 3)))) for one in examples]
+    logits = iter([np.arange(10.0)] * 3)
+    assert missed_people(objective, torch.nn.Linear(1, 1), together, 1)[0] == 100
 
 
 def test_a_run_begins_with_the_bundled_detector(tmp_path):

@@ -34,17 +34,6 @@ def context_reference(points: np.ndarray, heights: np.ndarray, center: np.ndarra
     return context
 
 
-def suppress_reference(rows: list[np.ndarray], strength: np.ndarray) -> list[int]:
-    kept: list[int] = []
-    for k in sorted(range(len(rows)), key=lambda k: -strength[k]):
-        shared = [
-            len(np.intersect1d(rows[k], rows[other])) / max(min(len(rows[k]), len(rows[other])), 1) for other in kept
-        ]
-        if all(share <= 0.5 for share in shared):
-            kept.append(k)
-    return kept
-
-
 def suppress_near_reference(centers: np.ndarray, strength: np.ndarray, radius: float) -> list[int]:
     kept: list[int] = []
     for k in sorted(range(len(centers)), key=lambda k: -strength[k]):

@@ -19,8 +19,8 @@ from lidarpose.inference.detection import Search, find_people
 from lidarpose.inference.predictor import Predictor, load
 from lidarpose.inference.scan import Scan
 from lidarpose.io.files import atomic_path
-from lidarpose.models.detector.candidates import SceneIndex, suppress
-from lidarpose.models.detector.detector import Detector
+from lidarpose.models.detector.candidates import suppress_near
+from lidarpose.models.detector.detector import SAME, Detector
 from lidarpose.models.detector.ground import estimate_ground, without_ground
 from lidarpose.models.detector.proposals import propose
 from lidarpose.sample import Box
@@ -65,7 +65,7 @@ def _baseline(predictor: Predictor | None, points: np.ndarray, origin: np.ndarra
     if predictor is not None and boxes:
         poses = predictor.predict(points, boxes=boxes, sensor_origin="unknown" if origin is None else origin)
         scores = np.array([np.exp(-person.spread.mean() / _SPREAD) if person.has_pose else 0.0 for person in poses])
-    kept = suppress(SceneIndex(points, ground, origin).rows(centers), scores)
+    kept = suppress_near(centers, scores, SAME)
     return [boxes[k] for k in kept], scores[kept]
 
 

@@ -3,7 +3,7 @@
 `render` makes the network's inputs of them, and says what these are.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -256,33 +256,6 @@ def _draw_maps(cells: np.ndarray, heights: np.ndarray, shape: tuple[int, ...]) -
     maps[:, 1] = np.bitwise_count(filled) * (255 / _BAND_SLICES)
     maps[:, 2], maps[:, 3] = log_bytes(count), log_bytes(near)
     return maps.view(np.uint32).ravel()
-
-
-def suppress(rows: Sequence[np.ndarray], strength: np.ndarray, *, most_shared: float = 0.5) -> np.ndarray:
-    """Indices of the candidates that stay, the strongest first, where of two that share points the weaker goes.
-
-    rows: of each candidate (K) the rows of its points; strength (K,). A candidate goes that shares more than
-    `most_shared` of the points of the one of the two that has fewer, with a stronger one that stays. Two people side by
-    side share few points however near they stand. A candidate without points shares none.
-    """
-    sizes = np.array([len(own) for own in rows], np.int64)
-    order = np.argsort(-np.asarray(strength), kind="stable")
-    rank = np.empty(len(rows), np.int64)
-    rank[order] = np.arange(len(rows))
-    # all pairs of owners of a point, the points' owners lying side by side, the strongest first
-    row = np.concatenate([np.zeros(0, np.int64), *rows])
-    owner = np.repeat(rank, sizes)
-    sorting = np.lexsort((owner, row))
-    row, owner = row[sorting], owner[sorting]
-    pairs, lag = [np.zeros(0, np.int64)], 1
-    while (shared := row[lag:] == row[:-lag]).any():
-        pairs.append(owner[:-lag][shared] * len(rows) + owner[lag:][shared])
-        lag += 1
-    pair, count = np.unique(np.concatenate(pairs), return_counts=True)
-    stronger, weaker = np.divmod(pair, max(len(rows), 1))
-    sizes = sizes[order]
-    is_same = count > most_shared * np.minimum(sizes[stronger], sizes[weaker])
-    return order[_that_stay(len(rows), np.stack([stronger[is_same], weaker[is_same]], 1))]
 
 
 def suppress_near(centers: np.ndarray, strength: np.ndarray, radius: float) -> np.ndarray:

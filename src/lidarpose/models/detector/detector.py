@@ -23,7 +23,7 @@ _BEYOND = 6.0
 # a detection's own points lie within this of its axis, m
 _OWN_RADIUS = 0.35
 # detections nearer than this are one person, m: the network moves those of one to the same place
-_SAME = 0.25
+SAME = 0.25
 # a box: side, side of somebody mounted, what is added to the height; and bounds of what the network says, m
 _SIDE, _MOUNTED_SIDE, _ROOM = 0.9, 1.1, 0.1
 _MOST_SHIFT, _MOST_FOOT, _HEIGHTS = 0.6, 1.0, (0.5, 2.3)
@@ -122,20 +122,15 @@ class Detector:
         fine = np.empty((min(len(places), CHUNK), SLICES, SIDE, SIDE), np.float32)
         pieces = (render(piece, fine=fine[: len(piece)]) for piece in scene.pieces(places))
         scores = [np.asarray(self._score(inputs), float) for inputs in pieces]
-        logit, x, y, foot, height, mounted_logit = np.concatenate([np.zeros((0, 6)), *scores]).T
-        yaw = scene.yaws(places)
-        x, y = (np.clip(shift, -_MOST_SHIFT, _MOST_SHIFT) for shift in (x, y))
-        foot, height = np.clip(foot, -_MOST_FOOT, _MOST_FOOT), np.clip(height, *_HEIGHTS)
-        centers = places.astype(float)
-        centers[:, 0] += np.cos(yaw) * x - np.sin(yaw) * y
-        centers[:, 1] += np.sin(yaw) * x + np.cos(yaw) * y
-        centers[:, 2] += foot + height / 2
-        kept = suppress_near(centers, logit, _SAME)[:limit]
-        mounted = _sigmoid(mounted_logit[kept])
+        outputs = np.concatenate([np.zeros((0, 6)), *scores])
+        centers, heights = predicted_boxes(places, scene.yaws(places), outputs)
+        logit = outputs[:, 0]
+        kept = suppress_near(centers, logit, SAME)[:limit]
+        mounted = _sigmoid(outputs[kept, 5])
         side = np.where(mounted > 0.5, _MOUNTED_SIDE, _SIDE)
         return Detections(
             centers=centers[kept],
-            sizes=np.stack([side, side, height[kept] + _ROOM], 1),
+            sizes=np.stack([side, side, heights[kept] + _ROOM], 1),
             yaws=np.zeros(len(kept)),
             logit=logit[kept],
             score=self.probability(logit[kept]),
@@ -150,6 +145,20 @@ class Detector:
             return _sigmoid(logit)
         logits, probabilities = self.header["calibration"]
         return np.interp(logit, logits, probabilities)
+
+
+def predicted_boxes(places: np.ndarray, yaw: np.ndarray, outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the network puts people, within bounds: centers (K, 3) and heights (K,) m.
+
+    places: (K, 3) m of candidates, on the ground; yaw: (K,) rad of their view frames; outputs: (K, 6), see `Scorer`.
+    """
+    x, y = np.clip(outputs[:, 1:3], -_MOST_SHIFT, _MOST_SHIFT).T
+    foot, height = np.clip(outputs[:, 3], -_MOST_FOOT, _MOST_FOOT), np.clip(outputs[:, 4], *_HEIGHTS)
+    centers = places.astype(float)
+    centers[:, 0] += np.cos(yaw) * x - np.sin(yaw) * y
+    centers[:, 1] += np.sin(yaw) * x + np.cos(yaw) * y
+    centers[:, 2] += foot + height / 2
+    return centers, height
 
 
 def _sigmoid(logit: np.ndarray) -> np.ndarray:

@@ -60,13 +60,11 @@ class Labels:
 
 @dataclass(frozen=True, kw_only=True)
 class DetectorExample:
-    """Candidates of a scan with their labels, as they are or as an augmentation changes them; rows: of the scan's
-    points at each, for suppression."""
+    """Candidates of a scan with their labels, as they are or as an augmentation changes them."""
 
     candidates: Candidates
     labels: Labels
     augmentation: Augmentation | None = None
-    rows: list[np.ndarray] | None = None
 
     @property
     def size(self) -> int:
@@ -147,7 +145,7 @@ class CandidateSource:
         return kept[number]
 
 
-def scan_example(seed: int, number: int, *, family: str = "train", with_rows: bool = False) -> DetectorExample:
+def scan_example(seed: int, number: int, *, family: str = "train") -> DetectorExample:
     """All candidates of a scene, found as in any scan: leveled first where it is tilted."""
     scene = detection_scene(seed, number, family=family)
     rng = np.random.default_rng([seed, RandomStream.CANDIDATES, number, 0])
@@ -160,15 +158,13 @@ def scan_example(seed: int, number: int, *, family: str = "train", with_rows: bo
     heights = heights_above(points, ground)
     centers = propose(points, ground, heights=heights)
     centers = centers[_distance(centers, scene) < RANGE]
-    index = SceneIndex(points, ground, origin, heights=heights)
-    candidates, rows = index.candidates(centers), index.rows(centers) if with_rows else None
-    labels = labels_of(candidates, scene)
-    return DetectorExample(candidates=candidates, labels=labels, rows=rows)
+    candidates = SceneIndex(points, ground, origin, heights=heights).candidates(centers)
+    return DetectorExample(candidates=candidates, labels=labels_of(candidates, scene))
 
 
 def validation_scans(seed: int) -> list[DetectorExample]:
     """All candidates of `VALIDATION` scans of the family "heldout"."""
-    return [scan_example(seed, number, family="heldout", with_rows=True) for number in range(VALIDATION)]
+    return [scan_example(seed, number, family="heldout") for number in range(VALIDATION)]
 
 
 def leveled(scene: DetectionScene, up: np.ndarray) -> DetectionScene:

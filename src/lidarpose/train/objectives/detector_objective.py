@@ -12,7 +12,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lidarpose.models.detector.candidates import suppress
+from lidarpose.models.detector.candidates import suppress_near
+from lidarpose.models.detector.detector import SAME, predicted_boxes
 from lidarpose.models.detector.detector_config import INPUTS, DetectorConfig
 from lidarpose.models.detector.network import DetectorNet
 from lidarpose.models.detector.render import render
@@ -117,9 +118,10 @@ def missed_people(
     false: list[np.ndarray] = []
     best: list[np.ndarray] = []
     for example in examples:
-        logit = objective.scores(network, objective.collate([example]), device=device)[:, 0]
-        person = example.labels.person
-        rows = suppress(example.rows or [], logit)
+        outputs = objective.scores(network, objective.collate([example]), device=device)
+        logit, person, candidates = outputs[:, 0], example.labels.person, example.candidates
+        centers, _ = predicted_boxes(candidates.centers, candidates.yaw, outputs)
+        rows = suppress_near(centers, logit, SAME)
         false.append(logit[rows][person[rows] == NOBODY])
         people = np.unique(person[person >= 0])
         best.append(np.array([logit[rows][person[rows] == number].max(initial=-np.inf) for number in people]))
