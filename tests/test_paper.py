@@ -23,7 +23,7 @@ from lidarpose.skeleton import BODY26, HUMAN15
 from lidarpose.train import loop, run_dir
 
 _ROWS = ["scratch", "laser-masking"]
-_TABLE = ["paper", "table4", "--people", "64", "--rows", ",".join(_ROWS), "--out"]
+_TABLE = ["paper", "table4", "--people", "64", "--size", "paper-tiny", "--rows", ",".join(_ROWS), "--out"]
 
 
 def _content(out, name="table4"):
@@ -75,7 +75,7 @@ def test_a_cell_states_what_it_cost_and_the_mean_pose(finished):
     out, _, _ = finished
     scratch, masked = _content(out)["cells"]
     assert (scratch["people_seen"], masked["people_seen"]) == (64, 128)
-    assert scratch["parameters"] == masked["parameters"] > 1e6 and scratch["size"] == "paper-small"
+    assert scratch["parameters"] == masked["parameters"] > 4e5 and scratch["size"] == "paper-tiny"
     assert scratch["people_scored"] == 16 and scratch["undertrained"] and scratch["mean_pose"] == masked["mean_pose"]
     assert [command.split()[1] for command in masked["commands"]] == [
         "synth",
@@ -113,7 +113,7 @@ def test_a_table_of_what_is_there(finished, capsys):
 
 def test_the_hardest_people_side_by_side(finished):
     out, _, _ = finished
-    selected = cells(TABLES["table4"], Options(people=64), _ROWS)
+    selected = cells(TABLES["table4"], Options(people=64, size="paper-tiny"), _ROWS)
     assert figures.draw("fig5", selected, out).read_bytes().startswith(b"\x89PNG")
     assert figures.draw("fig5", cells(TABLES["fig5"], Options(people=96)), out) is None
 
