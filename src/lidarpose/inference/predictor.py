@@ -178,17 +178,17 @@ class Predictor(PoseEstimator):
         """One cloud (n, 3+) -> `PersonPose`; a list of clouds, or one with boxes or find -> `Poses`, in their order.
 
         Args:
-            points: x, y, z in meters, z up, any frame, each cloud one person, ground and clutter allowed; more columns
-                are ignored, those of tables and records are taken by name. A cloud of under 5 different points gets a
-                result without joints and a warning.
-            boxes: the people of a whole scan, as in `lidarpose.predict`.
-            find: they are searched for, as by `lidarpose.detect`, whose result is for `boxes` where anything about the
-                search is to be chosen.
-            sensor_origin: (3,) m, where the sensor stood in that frame, or "unknown"; None means 0, 0, 0 with boxes and
-                find, and unknown without.
-            skeleton: see `in_skeleton`.
-            clips: which of a list's clouds are frames of one person, for networks of clips, by default none: a cloud
-                then fills a clip.
+            points (arrays): x, y, z in meters, z up, any frame, each cloud one person, ground and clutter allowed;
+                more columns are ignored, those of tables and records are taken by name. A cloud of under 5 different
+                points gets a result without joints and a warning.
+            boxes (as in `lidarpose.predict`): the people of a whole scan.
+            find (bool): they are searched for, as by `lidarpose.detect`, whose result is for `boxes` where anything
+                about the search is to be chosen.
+            sensor_origin (array or str): (3,) m, where the sensor stood in that frame, or "unknown"; None means
+                0, 0, 0 with boxes and find, and unknown without.
+            skeleton (str): see `in_skeleton`.
+            clips (slices): which of a list's clouds are frames of one person, for networks of clips, by default none:
+                a cloud then fills a clip.
 
         Raises:
             InputError: arrays of another shape or type.

@@ -37,7 +37,8 @@ def mpjpe(
     """Mean per-joint position error in millimeters, not aligned.
 
     Args:
-        pred, true: (n, J, 3) m in one frame.
+        pred: (n, J, 3) m.
+        true: (n, J, 3) m, in the same frame.
         visible: (n, J), which joints have a label; None: all whose truth is not NaN.
         dapt_compat: people without a label count as free of error.
         average: "person" or "joint", see `mean`.
@@ -59,7 +60,10 @@ def pa_mpjpe(
     The similarity is that of the labeled joints; people with fewer than three are skipped.
 
     Args:
-        pred, true, visible, average: as of `mpjpe`.
+        pred: (n, J, 3) m.
+        true: (n, J, 3) m.
+        visible: as of `mpjpe`.
+        average: as of `mpjpe`.
         dapt_compat: the similarity of all joints, labeled or not, and for two or three people at once that of their
             transposed arrays.
     """
@@ -81,7 +85,10 @@ def pck(
     """Percentage of correct keypoints: joints nearer to the truth than threshold times torso, meters.
 
     Args:
-        pred, true, visible, average: as of `mpjpe`.
+        pred: (n, J, 3) m.
+        true: (n, J, 3) m, in the same frame.
+        visible: as of `mpjpe`.
+        average: as of `mpjpe`.
         dapt_compat: NaN as soon as one person has no label.
         threshold: a share of the torso; by default PCK-3, 0.5 is PCK-5.
         torso: m, the same for everybody.
