@@ -5,9 +5,8 @@
     python benchmarks/results.py --check                      # exit code 1 where they differ
 
 docs/scores/paper is what `lidarpose paper` wrote, NAME.json what `lidarpose evaluate NAME bench` wrote, NAME-2.json of
-bench-2, NAME-unknown.json with
-`--sensor-unknown`,
-stability/NAME.json what it writes besides with `--stability`; the others are what the benchmarks of their names wrote.
+bench-2, NAME-unknown.json with `--sensor-unknown`, stability/NAME.json what it writes besides with `--stability`; the
+others are what the benchmarks of their names wrote.
 
 A table stands between `<!-- table NAME -->` and `<!-- end -->`; the words around it are left as they are.
 """

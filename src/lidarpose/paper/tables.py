@@ -13,7 +13,7 @@ from pathlib import Path
 from lidarpose.data.shards import CARD
 from lidarpose.errors import InputError, check_name
 from lidarpose.paper.steps import Step
-from lidarpose.train.recipes import PAPER, SMALL_PAPER, TINY_PAPER
+from lidarpose.train.recipes import MODELS, PAPER, SMALL_PAPER, TINY_PAPER
 
 # real sets of a table's columns, and what else a row may read
 REAL = ("waymo", "humanm3", "lidarhuman26m", "sloper4d")
@@ -26,10 +26,8 @@ _SEEDS = {"train": 1_000_003, "test": 1_000_033}
 _SENSORS = "waymo-top,os1-128,hdl-64e,vlp-32c"
 _CLIP = 16
 # published rates and schedules are those of the full sizes and of many more steps
-_RATES = {PAPER: (), SMALL_PAPER: ("--rate", "2e-3"), TINY_PAPER: ("--rate", "2e-3")}
-# by the size of the paper's network: what the baselines' sizes end in, and our own network's
-_WIDTHS = {PAPER: ("", "small"), SMALL_PAPER: ("-small", "small"), TINY_PAPER: ("-tiny", "tiny")}
-_ONE_CYCLE = (*_RATES[SMALL_PAPER], "--schedule", "cosine", "--warmup", "0.04")
+_FASTER = ("--rate", "2e-3")
+_ONE_CYCLE = (*_FASTER, "--schedule", "cosine", "--warmup", "0.04")
 _KEPT = ("0.5", "0.6", "0.7", "0.8", "0.9")
 # r_keep of the recipe, which needs no option
 _RECIPE_KEEP = "0.6"
@@ -55,7 +53,7 @@ class Options:
     def __post_init__(self):
         if self.people < 1 or self.seeds < 1 or self.workers < 1 or self.hours is not None and not self.hours > 0:
             raise InputError("expected --people, --seeds and --workers of at least 1 and --hours above 0")
-        check_name("size of the paper's network", self.size, _RATES)
+        check_name("size of the paper's network", self.size, MODELS["dapt"])
         for name, folder in self.data.items():
             check_name("dataset", name, (*REAL, *CORPORA, *POSES))
             if name not in POSES and not (Path(folder) / CARD).is_file():
@@ -222,7 +220,7 @@ def _stand_in(name: str, title: str, options: Options) -> Target:
 def _paper(options: Options, *more: str) -> tuple[str, ...]:
     """Options of a training of the paper's network; fine-tuning on synthesized people is centered on the points, as
     everybody's there, where the paper's own is centered on labels."""
-    return ("--recipe", "paper", *_RATES[options.size], *more)
+    return ("--recipe", "paper", *(() if options.size == PAPER else _FASTER), *more)
 
 
 def _pretrained(options: Options, *more: str, motion: tuple[str, ...] | None = None) -> tuple[str, ...]:
@@ -255,7 +253,7 @@ def _published(*values: float | None) -> dict[str, float]:
 
 def _methods(options: Options) -> list[Row]:
     """Table 1."""
-    prn, own = ("--neck", "prn"), _WIDTHS[options.size][1]
+    prn, own = ("--neck", "prn"), "tiny" if options.size == TINY_PAPER else "small"
     return [
         _of_clips(options, "LiDARCap", 79.31, 101.89),
         _of_clips(options, "NE", 72.23, 96.80),
@@ -271,7 +269,7 @@ def _baseline(options: Options, model: str) -> tuple[str, ...]:
     """Options of a baseline's training, at the width that goes with the size of the paper's network; the reduced ones
     by the cycle of rates that the paper's network has."""
     cycle = () if options.size == PAPER else _ONE_CYCLE
-    return ("--model", model, "--size", f"{model}{_WIDTHS[options.size][0]}", *cycle)
+    return ("--model", model, "--size", model + options.size.removeprefix(PAPER), *cycle)
 
 
 def _of_clips(options: Options, name: str, *published: float) -> Row:
