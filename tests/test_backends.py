@@ -56,8 +56,8 @@ def ties(model, clouds, centers, origin):
 
 def test_backends_agree_on_people_of_all_sizes(models):
     # each once: single points about themselves are all one person, whose ties would count as often
-    sizes = np.unique(np.geomspace(1, 5000, 290).round().astype(int))
-    assert len(sizes) >= 200
+    sizes = np.unique(np.geomspace(1, 5000, 140).round().astype(int))
+    assert len(sizes) >= 100
     clouds = [blob(size, seed) for seed, size in enumerate(sizes)]
     equal = 0
     # together with others of about their size: rows are padded to the largest
@@ -78,7 +78,7 @@ def test_backends_agree_on_people_of_all_sizes(models):
 
 def test_backends_agree_to_the_end(models):
     # the second pass is centered on what the first one found: differences must not grow
-    clouds = [blob(size, seed) for seed, size in enumerate((5, 6, 9, 17, 40, 99, 300, 1200, 5000) * 4)]
+    clouds = [blob(size, seed) for seed, size in enumerate((5, 6, 9, 17, 40, 99, 300, 1200, 5000) * 2)]
     ours, due = (models[name].predict(clouds, sensor_origin=(0, 0, 0)) for name in ("onnx", "torch"))
     for a, b in zip(ours, due, strict=True):
         assert np.abs(a.joints - b.joints).max() < 1e-4 and a.warnings == b.warnings

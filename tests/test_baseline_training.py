@@ -255,7 +255,7 @@ def test_weights_go_on_by_the_names_of_joints(config, skeleton, tmp_path):
 def test_pretrain_predict_evaluate_and_finetune(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ["--workers", "0", "--pictures", "0", "--validate", "1000"]
-    narrow = ["--size", "prn-small", "--people", "16", "--batch", "8", "--scene", "paper"]
+    narrow = ["--size", "prn-tiny", "--people", "16", "--batch", "8", "--scene", "paper"]
     assert not main(["pretrain", "run", "--model", "prn", *narrow, *words])
     network, header = load_checkpoint("run/model.safetensors")
     assert header.network == "prn" and header.card["recipe"]["optimizer"] == "adam"
@@ -279,7 +279,7 @@ def test_pretrain_predict_evaluate_and_finetune(tmp_path, capsys, monkeypatch):
     common = [str(folder), "--split", "all", "--epochs", "1", "--batch", "4", *words]
     wider = ["--model", "prn", "--init", "run/model.safetensors", "--options", "width_divisor=1", "--out", "no"]
     assert main(["finetune", *common, *wider]) == 2
-    assert "--init has weights for width_divisor=4" in capsys.readouterr().err
+    assert "--init has weights for width_divisor=8" in capsys.readouterr().err
     assert not main(["finetune", *common, "--model", "prn", "--init", "run/model.safetensors", "--out", "second"])
     assert load_checkpoint("second/model.safetensors")[1].config.joints == BODY26.joints
     options = ["--options", "resample_with_replacement,width_divisor=4"]

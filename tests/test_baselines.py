@@ -176,7 +176,7 @@ def test_ne_exchanges_over_frames_and_as_published_over_the_batch(across_batch):
     points, valid = points.unflatten(0, (2, CLIP_FRAMES)), valid.unflatten(0, (2, CLIP_FRAMES))
     clouds = {name: (points + k, valid) for k, name in enumerate(CLOUDS)}
     torch.manual_seed(0)
-    network = Ne(NeConfig(exchange_across_batch=across_batch)).eval()
+    network = Ne(NeConfig(exchange_across_batch=across_batch, width_divisor=8)).eval()
     both = network(clouds)
     alone = network({name: (points[:1], valid[:1]) for name, (points, valid) in clouds.items()})
     assert both.rotations.shape == (2, CLIP_FRAMES, 24, 3, 3)

@@ -37,7 +37,7 @@ from lidarpose.train.setup import PRETRAINED, make_setup
 from lidarpose.train.torch_dataset import InMemoryDataset
 from lidarpose.train.validation import draw_examples, update_batch_norms, validate
 
-CONFIGS = {"lidarcap": LidarcapConfig(), "ne": NeConfig()}
+CONFIGS = {"lidarcap": LidarcapConfig(width_divisor=4), "ne": NeConfig(width_divisor=4)}
 # points of a cloud, that tests take seconds
 FEW = 24
 
@@ -182,7 +182,7 @@ def test_losses_vanish_at_the_truth(name, clips):
 def test_a_run_on_clips_is_evaluated_and_predicts(name, folder, clips, tmp_path, monkeypatch):
     monkeypatch.setattr(setup, "VALIDATION", CLIP_FRAMES)
     few = {"batch": 32, "workers": 0, "pictures": 1}
-    wanted = recipe(Pretrain, name, size=f"{name}-small", shards=(str(folder),), scene="paper", people=40, **few)
+    wanted = recipe(Pretrain, name, size=f"{name}-tiny", shards=(str(folder),), scene="paper", people=40, **few)
     assert (wanted.optimizer, wanted.rate, wanted.decay, wanted.ema) == ("adam", 1e-4, 1e-4, 0)
     assert recipe(Pretrain, "ne").batch == 8 * CLIP_FRAMES
     path = loop.train(wanted, tmp_path / "run", device="cpu", draw=draw_examples)
@@ -199,7 +199,7 @@ def test_a_run_on_clips_is_evaluated_and_predicts(name, folder, clips, tmp_path,
     assert all(torch.equal(value, before[key]) for key, value in went_on.items())
     # and by command, from random weights
     monkeypatch.chdir(tmp_path)
-    words = ["--model", name, "--size", f"{name}-small", "--split", "all", "--epochs", "1", "--batch", "32"]
+    words = ["--model", name, "--size", f"{name}-tiny", "--split", "all", "--epochs", "1", "--batch", "32"]
     assert not main(["finetune", str(folder), *words, "--workers", "0", "--pictures", "0", "--out", "tuned"])
     assert not main(["evaluate", "tuned/model.safetensors", str(folder), "--out", "scores"])
     assert json.loads((tmp_path / "scores/scores.json").read_text())["results"][0]["counts"]["people"] == 32

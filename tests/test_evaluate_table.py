@@ -109,7 +109,7 @@ def run(*arguments):
 
 def test_evaluate_and_table_from_the_command_line(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert run("evaluate", "tiny", "bench", "--limit", "25", "--seed", "3") == 0
+    assert run("evaluate", "tiny", "bench", "--limit", "12", "--seed", "3") == 0
     shown = capsys.readouterr()
     assert {path.name for path in (tmp_path / "evaluation/tiny").iterdir()} == {
         "scores.json", "poses.parquet", "lidarpose-bench-1-errors.png", "lidarpose-bench-1-reliability.png",
@@ -117,12 +117,12 @@ def test_evaluate_and_table_from_the_command_line(tmp_path, monkeypatch, capsys)
     }  # fmt: skip
     # the headline first, then once how it was found
     headline, setting, *rows = shown.out.splitlines()
-    assert "clean · points alone · no split · 25 of 2,000 people" in setting
+    assert "clean · points alone · no split · 12 of 2,000 people" in setting
     assert not any("points alone · no split" in row for row in rows) and sum("MPJPE" in row for row in rows) > 10
     made = evaluation.read_scores(tmp_path / "evaluation/tiny")
-    assert made.command == "lidarpose evaluate tiny bench --limit 25 --seed 3" and made.seed == 3
+    assert made.command == "lidarpose evaluate tiny bench --limit 12 --seed 3" and made.seed == 3
     assert headline.startswith(f"lidarpose-bench-1: MPJPE {made.results[0].line('mpjpe').value:.1f} mm [")
-    assert ", 25 of 25 people · tiny" in headline
+    assert ", 12 of 12 people · tiny" in headline
 
     assert run("table", "evaluation/tiny") == 0
     assert f"{made.results[0].line('mpjpe').value:.2f} [" in capsys.readouterr().out

@@ -389,7 +389,7 @@ def test_pretraining_on_shards(synthetic, tmp_path):
     assert read_header(tmp_path / "run" / run_dir.MODEL).card["recipe"]["shards"] == ["people"]
 
 
-@pytest.mark.parametrize("name, epochs", [("humanm3", 16), ("lidarhuman26m", 40), ("sloper4d", 60), ("waymo", 40)])
+@pytest.mark.parametrize("name, epochs", [("humanm3", 6), ("lidarhuman26m", 20), ("sloper4d", 30), ("waymo", 20)])
 def test_from_raw_files_to_scores(datasets, name, epochs, tmp_path, capsys, monkeypatch):
     """Raw files, prepare, a few steps, evaluate: the joints come out where they went in, and the steps pay."""
     monkeypatch.chdir(tmp_path)
@@ -417,7 +417,7 @@ PAPER = ["--recipe", "paper", "--batch", "4", "--workers", "0", "--pictures", "0
 
 def two_stages(people, neck, *words):
     """Both stages of the paper's network from the command line, evaluated."""
-    assert not main(["pretrain", "first", "--size", "paper-small", "--neck", neck, "--people", "16", *PAPER])
+    assert not main(["pretrain", "first", "--size", "paper-tiny", "--neck", neck, "--people", "16", *PAPER])
     tuned = ["finetune", str(people), "--out", "second", "--init", "first/model.safetensors", "--epochs", "1"]
     assert not main([*tuned, *words, *PAPER])
     assert not main(["evaluate", "second/model.safetensors", str(people), "--protocol", "dapt"])
@@ -448,14 +448,14 @@ def test_necks_from_the_command_line_and_coordinates_in_both_stages(datasets, tm
     log = [json.loads(line) for line in (tmp_path / "second" / run_dir.LOG).read_text().splitlines()]
     assert "regression" in log[-1] and ("vote" in log[-1]) == (neck == "prn")
     # random weights have the neck that is asked for, and so for a dataset without pre-training
-    scratch = {"init": "random", "size": "paper-small", "neck": neck, "head": "coordinates", "augment": "paper"}
+    scratch = {"init": "random", "size": "paper-tiny", "neck": neck, "head": "coordinates", "augment": "paper"}
     setup = make_setup(Finetune(data=(str(datasets["humanm3"]),), mix=0.0, **scratch))
     assert setup.network().state_dict().keys() == trained.state_dict().keys()
 
 
 def test_a_run_on_a_dataset_is_taken_up(datasets, tmp_path):
     data = (str(datasets["lidarhuman26m"]),)
-    recipe = Finetune(data=data, init="tiny", epochs=6, batch=2, scene="paper", **SHORT)
+    recipe = Finetune(data=data, init="tiny", epochs=3, batch=2, scene="paper", **SHORT)
     loop.train(recipe, tmp_path / "whole")
     train_until_killed(recipe, tmp_path / "run", "_chunk", 2)
     # the dataset may have moved meanwhile

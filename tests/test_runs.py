@@ -17,7 +17,7 @@ import torch
 from motion_files import a_clip, write_amass
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
-from training_runs import FEW, few_to_validate_on, refused, train_until_killed  # noqa: F401 - a fixture
+from training_runs import BATCHES, FEW, few_to_validate_on, refused, train_until_killed  # noqa: F401 - a fixture
 
 from lidarpose.cli import main
 from lidarpose.errors import InputError
@@ -27,16 +27,15 @@ from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.config import preset
 from lidarpose.models.posenet import PoseNet
 from lidarpose.train import loop, run_dir, setup
-from lidarpose.train.data_loader import BATCHES, SyntheticSource, lanes_of
+from lidarpose.train.data_loader import SyntheticSource, lanes_of
 from lidarpose.train.loop import Interrupted, StopRequest
 from lidarpose.train.objectives.posenet_objective import PoseNetObjective
 from lidarpose.train.optim import optimizers, rate_factor
 from lidarpose.train.recipes import Pretrain
 
-# three chunks of `BATCHES` batches
-RECIPE = Pretrain(
-    scene="paper", people=3 * BATCHES * 2, batch=2, workers=0, seed=5, easy=0.15, pictures=0, validate=1000
-)
+# people of a chunk; a run of three chunks
+CHUNK = BATCHES * 2
+RECIPE = Pretrain(scene="paper", people=3 * CHUNK, batch=2, workers=0, seed=5, easy=0.15, pictures=0, validate=1000)
 TINY = preset("tiny")
 
 
@@ -107,7 +106,7 @@ def test_an_unbroken_run(unbroken):
     assert config["schema"] == run_dir.SCHEMA and config["kind"] == "pretrain"
     assert config["recipe"] == json.loads(json.dumps(RECIPE.to_dict()))
     _, header = load_checkpoint(unbroken / run_dir.MODEL)
-    assert header.card["people_seen"] == 48 and header.card["recipe"]["seed"] == 5
+    assert header.card["people_seen"] == RECIPE.people and header.card["recipe"]["seed"] == 5
     lines = log_of(unbroken)
     assert lines[-1]["vote"] < lines[0]["vote"]
     # at the end at the latest
@@ -161,12 +160,12 @@ def test_a_run_keeps_its_recipe(unbroken, change):
 def test_a_run_may_become_shorter_and_longer(tmp_path):
     folder = tmp_path / "run"
     train_until_killed(RECIPE, folder, "_step", BATCHES)
-    loop.train(replace(RECIPE, people=28, workers=1), folder, resume=True)
-    assert people_of(folder) == [16, 28]
-    loop.train(replace(RECIPE, people=48), folder, resume=True)
-    with pytest.raises(InputError, match="the run has seen 48 people already, got 16 in all"):
-        loop.train(replace(RECIPE, people=16), folder, resume=True)
-    assert people_of(folder)[-1] == 48
+    loop.train(replace(RECIPE, people=CHUNK + 4, workers=1), folder, resume=True)
+    assert people_of(folder) == [CHUNK, CHUNK + 4]
+    loop.train(RECIPE, folder, resume=True)
+    with pytest.raises(InputError, match=f"the run has seen {RECIPE.people} people already, got {CHUNK} in all"):
+        loop.train(replace(RECIPE, people=CHUNK), folder, resume=True)
+    assert people_of(folder)[-1] == RECIPE.people
 
 
 def test_a_longer_run_sees_everybody(monkeypatch, tmp_path):
@@ -177,17 +176,17 @@ def test_a_longer_run_sees_everybody(monkeypatch, tmp_path):
     monkeypatch.setattr(setup, "VALIDATION", 0)
     loop.train(replace(RECIPE, people=6), folder)
     assert sorted(set(seen)) == list(range(6))
-    loop.train(replace(RECIPE, people=32), folder, resume=True)
-    assert set(seen) >= set(range(32))
-    assert people_of(folder) == [16, 32]
+    loop.train(replace(RECIPE, people=2 * CHUNK), folder, resume=True)
+    assert set(seen) >= set(range(2 * CHUNK))
+    assert people_of(folder) == [CHUNK, 2 * CHUNK]
 
 
 def started(recipe, folder, environment=None, **options):
     """A process that trains, and saves after every chunk."""
     code = (
         "import sys, json, torch; torch.set_num_threads(1)\n"
-        "from lidarpose.train import loop, setup; from lidarpose.train.recipes import Pretrain\n"
-        f"loop.SAVE_EVERY, setup.VALIDATION = -1.0, {FEW}\n"
+        "from lidarpose.train import data_loader, loop, setup; from lidarpose.train.recipes import Pretrain\n"
+        f"loop.SAVE_EVERY, setup.VALIDATION = -1.0, {FEW}; loop.BATCHES = data_loader.BATCHES = {BATCHES}\n"
         "loop.train(Pretrain(**json.loads(sys.argv[1])), sys.argv[2])"
     )
     words = [sys.executable, "-c", code, json.dumps(recipe.to_dict()), str(folder)]
@@ -197,7 +196,7 @@ def started(recipe, folder, environment=None, **options):
 
 def test_killed_for_good_with_workers_and_taken_up(tmp_path):
     """SIGKILL: nothing is tidied, and the workers end by themselves."""
-    recipe = replace(RECIPE, workers=1, people=40 * BATCHES * 2)
+    recipe = replace(RECIPE, workers=1, people=40 * CHUNK)
     process = started(recipe, tmp_path / "run", start_new_session=True)
     deadline = time.monotonic() + 120
     while len(run_dir.read_log(tmp_path / "run")) < 2:
@@ -214,10 +213,10 @@ def test_killed_for_good_with_workers_and_taken_up(tmp_path):
         assert time.monotonic() < deadline, "a worker lives on"
         time.sleep(0.1)
     done = max(line["people"] for line in run_dir.read_log(tmp_path / "run"))
-    longer = replace(recipe, people=max(done + 2 * BATCHES * 2, 48), workers=0)
+    longer = replace(recipe, people=max(done + 2 * CHUNK, RECIPE.people), workers=0)
     loop.train(longer, tmp_path / "run", resume=True)
     assert not [path.name for path in (tmp_path / "run").iterdir() if path.name.startswith(".")]
-    assert people_of(tmp_path / "run") == list(range(16, longer.people + 1, 16))
+    assert people_of(tmp_path / "run") == list(range(CHUNK, longer.people + 1, CHUNK))
 
 
 def test_what_a_kill_leaves_is_no_obstacle(tmp_path, unbroken):
@@ -250,7 +249,7 @@ def test_a_dead_worker_is_one_line(tmp_path, monkeypatch, where, name):
 
 def test_a_run_has_one_process_at_a_time(monkeypatch, copy):
     monkeypatch.setattr(run_dir, "LOCK_WAIT", 0.0)
-    longer = replace(RECIPE, people=RECIPE.people + 2 * BATCHES * 2)
+    longer = replace(RECIPE, people=RECIPE.people + 2 * CHUNK)
     before = {p.name: p.read_bytes() for p in copy.iterdir()}
     with run_dir.lock(copy):
         with refused("another process trains there: stop it"):
@@ -355,11 +354,11 @@ def test_a_run_that_is_told_to_stop_saves_and_goes_on_to_the_same_losses(monkeyp
         return original(*args, **kwargs)
 
     monkeypatch.setattr(PoseNetObjective, "terms", interrupted)
-    message = f"stopped after 16 samples, saved: go on with lidarpose pretrain {re.escape(str(folder))} --resume"
+    message = f"stopped after {CHUNK} samples, saved: go on with lidarpose pretrain {re.escape(str(folder))} --resume"
     with pytest.raises(Interrupted, match=message) as stop:
         loop.train(RECIPE, folder)
     assert stop.value.status == 128 + number and signal.getsignal(number) is not None
-    assert people_of(folder) == [16]
+    assert people_of(folder) == [CHUNK]
     assert_resumes_to(unbroken, folder)
 
 
@@ -385,7 +384,7 @@ def steep(value):
 
 @pytest.mark.parametrize(
     "step, poison",
-    [(BATCHES + 4, lambda value: value * float("nan")), *((k, steep) for k in (BATCHES + 3, 2 * BATCHES, 3 * BATCHES))],
+    [(BATCHES + 2, lambda value: value * float("nan")), *((k, steep) for k in (BATCHES + 1, 2 * BATCHES, 3 * BATCHES))],
 )
 def test_what_is_not_finite_stops_the_run_and_never_reaches_what_is_saved(tmp_path, unbroken, step, poison):
     """Neither a loss nor a gradient, not even that of the last step of a chunk, or of the run, whose loss is good."""
@@ -398,14 +397,14 @@ def test_what_is_not_finite_stops_the_run_and_never_reaches_what_is_saved(tmp_pa
 
     chunk, batch = divmod(step - 1, BATCHES)
     message = (
-        f"its gradient is not finite in batch {batch} of the 8 from person {16 * chunk} on: start in another folder "
+        f"its gradient is not finite in batch {batch} of the {BATCHES} from person {CHUNK * chunk} on: start in another folder "
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(PoseNetObjective, "terms", poisoned)
         patch.setattr(loop, "SAVE_EVERY", -1.0)
         with refused(f"{message}with a lower --rate; state.safetensors is kept"):
             loop.train(RECIPE, folder)
-    assert people_of(folder) == [16, 32][:chunk]
+    assert people_of(folder) == [CHUNK, 2 * CHUNK][:chunk]
     for name in (run_dir.STATE, run_dir.MODEL):
         assert all(value.isfinite().all() for value in load_file(folder / name).values() if value.is_floating_point())
     # the state is as good as new
@@ -413,7 +412,7 @@ def test_what_is_not_finite_stops_the_run_and_never_reaches_what_is_saved(tmp_pa
 
 
 def test_an_absurd_rate_stops_the_run(tmp_path):
-    with refused("not finite in batch [0-9] of the 8 from person 0 on"):
+    with refused(f"not finite in batch [0-9] of the {BATCHES} from person 0 on"):
         loop.train(replace(RECIPE, rate=1e30), tmp_path / "run")
 
 
@@ -489,7 +488,7 @@ def test_wrong_words_are_one_line_and_leave_no_folder(tmp_path, monkeypatch, cap
 @pytest.mark.slow
 def test_two_processes_take_the_same_steps_as_one(tmp_path):
     """As torch's and Accelerate's launchers would have it."""
-    recipe = replace(RECIPE, people=64, batch=4, seed=3, rate=2e-4, muon_rate=2e-3)
+    recipe = replace(RECIPE, people=4 * CHUNK, batch=4, seed=3, rate=2e-4, muon_rate=2e-3)
     port = str(29000 + os.getpid() % 3000)
     common = {"MASTER_ADDR": "127.0.0.1", "WORLD_SIZE": "2", "MASTER_PORT": port, "ACCELERATE_USE_CPU": "true"}
     for process in [started(recipe, tmp_path / "two", common | {"RANK": k, "LOCAL_RANK": k}) for k in "01"]:
@@ -498,7 +497,7 @@ def test_two_processes_take_the_same_steps_as_one(tmp_path):
     loop.train(recipe, tmp_path / "one")
     within = {"losses": {"rel": 2e-3, "abs": 2e-4}, "weights": {"atol": 3e-4, "rtol": 1e-2}}
     assert_close(tmp_path / "two", tmp_path / "one", [run_dir.MODEL], **within)
-    assert people_of(tmp_path / "two") == [32, 64]
+    assert people_of(tmp_path / "two") == [2 * CHUNK, 4 * CHUNK]
 
 
 def test_a_batch_that_cannot_be_shared_out_is_refused():
@@ -529,7 +528,7 @@ def test_a_run_s_rates_follow_its_schedule(monkeypatch, tmp_path):
     monkeypatch.setattr(loop._Run, "_step", recorded)
     monkeypatch.setattr(setup, "VALIDATION", 0)
     loop.train(RECIPE, tmp_path / "run")
-    due = [rate_factor(k / 24, RECIPE) for k in range(24)]
+    due = [rate_factor(k / (3 * BATCHES), RECIPE) for k in range(3 * BATCHES)]
     np.testing.assert_allclose(rates, np.outer(due, [RECIPE.rate, RECIPE.muon_rate]))
 
 
@@ -546,11 +545,11 @@ def test_the_best_validation_is_kept_across_a_resume(monkeypatch, tmp_path):
         card = load_checkpoint(folder / run_dir.BEST)[1].card
         return card["validation_mm"], card["people_seen"]
 
-    often = replace(RECIPE, validate=16)
+    often = replace(RECIPE, validate=CHUNK)
     loop.train(often, folder)
-    assert best() == (40.0, 32)
-    loop.train(replace(often, people=often.people + 16), folder, resume=True)
-    assert not errors and best() == (40.0, 32)
+    assert best() == (40.0, 2 * CHUNK)
+    loop.train(replace(often, people=often.people + CHUNK), folder, resume=True)
+    assert not errors and best() == (40.0, 2 * CHUNK)
 
 
 def test_another_seed_begins_with_other_weights(tmp_path, monkeypatch):

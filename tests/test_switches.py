@@ -132,14 +132,14 @@ def people(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("size, recipe", [("tiny", "default"), ("paper-small", "paper")])
+@pytest.mark.parametrize("size, recipe", [("tiny", "default"), ("paper-tiny", "paper")])
 def test_fine_tuning_begins_at_random(people, tmp_path, monkeypatch, size, recipe):
     monkeypatch.chdir(tmp_path)
     words = ["finetune", str(people), "--out", "run", "--init", "random", "--size", size, "--recipe", recipe]
     assert not main([*words, "--split", "all", "--epochs", "2", "--mix", "0", *_SHORT])
     header = load_checkpoint("run/model.safetensors")[1]
     assert header.card["init"] == "random" and header.card["init_card"] == {}
-    if size == "paper-small":
+    if size == "paper-tiny":
         assert header.config.bins and not header.config.coordinates and len(header.config.joints) == 15
     assert not main(["evaluate", "run/model.safetensors", str(people), "--out", "scores"])
     assert not main(["finetune", "--out", "run", "--resume", "--epochs", "3"])

@@ -247,7 +247,7 @@ def test_a_handful_of_candidates_is_learned_by_heart():
     arrays["center"] = rng.uniform(-0.3, 0.3, arrays["center"].shape).astype(np.float32)
     network = objective.network()
     optimizer = torch.optim.AdamW(network.parameters(), lr=3e-3)
-    for _ in range(250):
+    for _ in range(150):
         optimizer.zero_grad()
         terms = objective.terms(network, arrays)
         total(terms).backward()

@@ -101,12 +101,12 @@ def error(model, clouds, truth):
 
 def test_more_passes_are_better_than_one_and_results_say_how_many():
     """The pass that finds the pelvis counts too; alone is the one after it."""
-    clouds, truth = people(96)
-    alone = lidarpose.load()
+    clouds, truth = people(64)
+    alone = lidarpose.load("tiny")
     alone._averaged, alone._first = False, IDENTITY
     least, _ = error(alone, clouds, truth)
     for tta in (1, 4):
-        model = lidarpose.load(tta=tta)
+        model = lidarpose.load("tiny", tta=tta)
         found, joints = error(model, clouds, truth)
         assert found < least and model.model.get("tta", 1) == tta
     one = model.predict(clouds[1], sensor_origin=(0, 0, 0), skeleton="body26")

@@ -6,16 +6,20 @@ import pytest
 
 from lidarpose.errors import InputError
 from lidarpose.eval import charts
-from lidarpose.train import loop, run_dir, setup
+from lidarpose.train import data_loader, loop, run_dir, setup
 
 FEW = 16
+# batches a chunk, half of what they are
+BATCHES = 4
 
 
 @pytest.fixture(scope="module", autouse=True)
 def few_to_validate_on():
-    """So that a run of seconds is not all validation, nor its evaluation all pictures."""
+    """So that a run of several chunks takes a second, and is not all validation, nor its evaluation all pictures."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(setup, "VALIDATION", FEW)
+        for module in (data_loader, loop):
+            patch.setattr(module, "BATCHES", BATCHES)
         for draw in ("draw_errors", "draw_worst"):
             patch.setattr(charts, draw, lambda *_: b"")
         yield
