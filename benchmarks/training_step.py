@@ -1,6 +1,7 @@
-"""Where the time of training goes: a person made, and a step's forward, backward and optimizer, in milliseconds.
+"""Where the time of training goes: a person made, and a step's forward, backward and optimizers, in milliseconds, in
+float32 and bf16 by turns.
 
-    python benchmarks/training_step.py --threads 1
+    python benchmarks/training_step.py --threads 1 --size small
 
 Quote ratios of one run, not the times themselves.
 """
@@ -12,7 +13,7 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from lidarpose.models.config import preset
+from lidarpose.models.config import SIZES, preset
 from lidarpose.models.posenet import Batch, PoseNet, Targets
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
@@ -29,9 +30,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--people", type=int, default=64)
+    parser.add_argument("--size", choices=SIZES, default="tiny")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    recipe, config = Pretrain(), preset("tiny")
+    config = preset(options.size)
     generator = Generator(scene=scene_config("wild"), measure=False)
     generator.person(0, 0)
     made_in: dict[int, list[float]] = {1: [], 2: []}
@@ -47,24 +49,31 @@ def main() -> None:
     arrays = PoseNetObjective(config=config).collate([example(person.sample, rng) for person in people])
     batch = Batch.from_arrays(arrays)
     targets = Targets.from_arrays(arrays)
-    network = PoseNet(config)
-    made = optimizers(network, recipe)
-    rows = []
+    networks = {}
+    for precision in ("float32", "bf16"):
+        network = PoseNet(config)
+        networks[precision] = network, optimizers(network, Pretrain(size=options.size))
+    rows: dict[str, list[np.ndarray]] = {precision: [] for precision in networks}
     for _ in range(ROUNDS + 1):
-        times = [time.perf_counter()]
-        loss = total(losses(network(batch), targets))
-        times.append(time.perf_counter())
-        loss.backward()
-        times.append(time.perf_counter())
-        for optimizer in made:
-            optimizer.step()
+        for precision, (network, made) in networks.items():
+            times = [time.perf_counter()]
+            with torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
+                loss = total(losses(network(batch), targets))
             times.append(time.perf_counter())
-            optimizer.zero_grad()
-        rows.append(np.diff(times) * 1e3)
+            loss.backward()
+            times.append(time.perf_counter())
+            for optimizer in made:
+                optimizer.step()
+                times.append(time.perf_counter())
+                optimizer.zero_grad()
+            rows[precision].append(np.diff(times) * 1e3)
     names = ["forward and loss", "backward", *(type(optimizer).__name__ for optimizer in made)]
     # the first round warms up
-    for name, value in zip(names, np.min(rows[1:], axis=0), strict=True):
-        print(f"{name}: {value:.1f} ms a step of {options.people} people")
+    least = {precision: np.min(values[1:], axis=0) for precision, values in rows.items()}
+    for name, single, half in zip(names, *least.values(), strict=True):
+        print(f"{name}: {single:.1f} ms a step of {options.people} people, {half:.1f} in bf16")
+    single, half = (values.sum() for values in least.values())
+    print(f"a step in float32 takes {single / half:.2f} times as long as in bf16")
 
 
 if __name__ == "__main__":

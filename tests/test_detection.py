@@ -83,7 +83,8 @@ def test_a_file_alone_is_searched_and_boxes_do_the_same(model, scene, file):
     assert {"read", "find", "load", "crop", "predict", "per_person"} == set(poses.timing_ms)
     # files of boxes keep what was found, to the last bit of the joints
     lidarpose.detect(file).save("people.json")
-    for boxes in ("people.json", lidarpose.detect(file)):
+    poses.save("poses.json")
+    for boxes in ("people.json", "poses.json", lidarpose.detect(file)):
         again = lidarpose.predict(file, boxes=boxes, model=model)
         np.testing.assert_array_equal(again.to_numpy(), poses.to_numpy())
         assert [person.score for person in again] == [person.score for person in poses]

@@ -20,6 +20,7 @@ from lidarpose.models.layers import (
     CrossAttention,
     RotaryEmbedding,
     VoteHead,
+    attend,
     bin_centers,
     decode,
     encode,
@@ -220,6 +221,26 @@ def test_a_convolution_is_a_dense_one_on_a_full_grid():
     grid = layer.narrow(layer.norm(rows)).view(1, 4, 4, 4, 3).movedim(-1, 1)
     dense = torch.nn.functional.conv3d(grid, kernel, layer.mix.bias, padding=1).movedim(1, -1).reshape(1, 64, 5)
     torch.testing.assert_close(layer(rows, torch.as_tensor(tables.mid.neighbors)), rows + dense, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("mask", [None, "bool", "bias"])
+def test_attention_in_half_precision_is_that_in_single(mask):
+    """On a CPU it is the very same, gradients too, of inputs that bfloat16 can hold."""
+    torch.manual_seed(0)
+    inputs = [torch.randn(2, 3, 5, 8).bfloat16().float().requires_grad_() for _ in range(3)]
+    valid = torch.arange(5)[None] < torch.tensor([[3], [5]])
+    given = {None: None, "bool": valid[:, None, None], "bias": key_bias(valid, torch.float32)}[mask]
+    weight = (inputs[0] @ inputs[1].mT / 8**0.5).masked_fill(~(valid | (mask is None))[:, None, None], -1e4).softmax(-1)
+    found = {}
+    for half in (False, True):
+        with torch.autocast("cpu", torch.bfloat16, enabled=half):
+            cast = [value.bfloat16() for value in inputs] if half else inputs
+            mixed = attend(*cast, given if given is None or mask == "bool" or not half else given.bfloat16())
+        assert mixed.dtype == torch.float32
+        torch.testing.assert_close(mixed, weight @ inputs[2])
+        found[half] = torch.autograd.grad(mixed.square().sum(), inputs)
+    # the gradients come back through a cast
+    torch.testing.assert_close(found[True], found[False], atol=2e-2, rtol=1e-2)
 
 
 def test_attention_sees_distances_not_places():

@@ -86,7 +86,7 @@ def read_boxes(source: str | os.PathLike | _Content, *, calib: str | os.PathLike
             `{"people": [...]}` or the bare list, of which each entry is a `Box`, a row [x, y, z, l, w, h, yaw] or a
             dict: `center` [x, y, z], `size` [length, width, height], `yaw` about z (0 where it is absent), and as id
             `id`, else `track`, else None, and `score` (0 to 1) and `mounted` (true or false) where they are that; other
-            keys are ignored. An array (n, 7) has such rows.
+            keys are ignored. A pose stands for its `box`, as in what `predict` writes. An array (n, 7) has such rows.
         calib: KITTI's calibration file; None for `../calib/N.txt` beside a label.
 
     Returns:
@@ -227,9 +227,10 @@ def _box(entry: object, where: str) -> Box:
         expected = '{"center": [x, y, z], "size": [l, w, h]} or [x, y, z, l, w, h, yaw]'
         raise FormatError(f"{where}: expected {expected}, got {_show(entry)}")
     if "box" in entry and "center" not in entry:
-        raise FormatError(
-            f"{where}: expected a box, got a pose with its box: give the file that `lidarpose detect` writes"
-        )
+        # of somebody who was posed
+        if not isinstance(entry["box"], dict):
+            raise FormatError(f"{where}.box: expected a box, got {_show(entry['box'])}: a cloud of one person has none")
+        entry, where = {**entry, **entry["box"]}, f"{where}.box"
     center = _triple(entry, "center", where, meaning="[x, y, z]")
     size = _triple(entry, "size", where, meaning="[length, width, height]")
     if min(size) <= 0:

@@ -69,6 +69,18 @@ def key_bias(valid: Tensor, dtype: torch.dtype) -> Tensor:
     return torch.where(valid, 0.0, -1e4).to(dtype)[:, None, None, :]
 
 
+def attend(query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None = None, *, dropout: float = 0.0) -> Tensor:
+    """torch's scaled_dot_product_attention, always in float32 on a CPU: its gradient in bfloat16 takes ten times as
+    long there."""
+    if query.device.type != "cpu" or not torch.is_autocast_enabled("cpu"):
+        return F.scaled_dot_product_attention(query, key, value, attn_mask=mask, dropout_p=dropout)
+    if mask is not None and mask.dtype != torch.bool:
+        mask = mask.float()
+    with torch.autocast("cpu", enabled=False):
+        query, key, value = query.float(), key.float(), value.float()
+        return F.scaled_dot_product_attention(query, key, value, attn_mask=mask, dropout_p=dropout)
+
+
 class Attention(nn.Module):
     """Queries, keys, values and outputs of multi-head attention with rotary places."""
 
@@ -97,7 +109,7 @@ class SelfAttention(Attention):
         if places is not None:
             query, key = places.rotate(query, self.frequencies), places.rotate(key, self.frequencies)
         query, key, value = (x.transpose(1, 2) for x in (query, key, value))
-        mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=bias)
+        mixed = attend(query, key, value, bias)
         return self.out(mixed.transpose(1, 2).flatten(-2))
 
 

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from lidarpose.models.baselines.baseline_config import PrnConfig
 from lidarpose.models.baselines.point_transformer_v2 import EMBEDDING, PointTransformerV2, Rows, segment_reduce
+from lidarpose.models.layers import attend
 
 # a point votes where body is this likely and one joint is
 VOTES = 0.6
@@ -114,9 +115,7 @@ class BareAttention(nn.Module):
             for layer, rows in ((self.query, own), (self.key, x), (self.value, x))
         )
         dropout = self.dropout if self.training else 0.0
-        attended = nn.functional.scaled_dot_product_attention(
-            query, key, value, attn_mask=valid[:, None, None], dropout_p=dropout
-        )
+        attended = attend(query, key, value, valid[:, None, None], dropout=dropout)
         return own + attended.transpose(1, 2).flatten(2)
 
 

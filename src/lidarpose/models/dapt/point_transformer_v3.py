@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lidarpose.models.dapt.voxel_tables import Level, Neighbors
+from lidarpose.models.layers import attend
 
 # of the released code's batch norms
 _EPS, _MOMENTUM = 1e-3, 0.01
@@ -108,8 +109,7 @@ class PatchAttention(nn.Module):
         """qkv (Q, K, 3, H, D), mask (Q, K) True = to be read, None for all -> (Q, K, H * D)."""
         query, key, value = qkv.permute(2, 0, 3, 1, 4)
         mask = None if mask is None else mask[:, None, None]
-        mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=mask)
-        return mixed.transpose(1, 2).flatten(2)
+        return attend(query, key, value, mask).transpose(1, 2).flatten(2)
 
 
 class Perceptron(nn.Module):
