@@ -396,7 +396,8 @@ def test_what_is_not_finite_stops_the_run_and_never_reaches_what_is_saved(tmp_pa
         return terms | {"vote": terms["vote"] + poison(terms["vote"])} if len(calls) == step else terms
 
     chunk, batch = divmod(step - 1, BATCHES)
-    message = f"its gradient is not finite in batch {batch} of the {BATCHES} from person {CHUNK * chunk} on: start in another folder "
+    where = f"batch {batch} of the {BATCHES} from person {CHUNK * chunk} on"
+    message = f"its gradient is not finite in {where}: start in another folder "
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(PoseNetObjective, "terms", poisoned)
         patch.setattr(loop, "SAVE_EVERY", -1.0)
