@@ -56,8 +56,8 @@ def ties(model, clouds, centers, origin):
 
 def test_backends_agree_on_people_of_all_sizes(models):
     # each once: single points about themselves are all one person, whose ties would count as often
-    sizes = np.unique(np.geomspace(1, 5000, 140).round().astype(int))
-    assert len(sizes) >= 100
+    sizes = np.unique(np.geomspace(1, 5000, 290).round().astype(int))
+    assert len(sizes) >= 200
     clouds = [blob(size, seed) for seed, size in enumerate(sizes)]
     equal = 0
     # together with others of about their size: rows are padded to the largest

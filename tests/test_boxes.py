@@ -198,6 +198,7 @@ BAD = {
     "null": (changed(size=None), ["people[1].size", "null"]),
     "object": (changed(center={"x": 1, "y": 2, "z": 3}), ["people[1].center", '"x"']),
     "pose of a crop": ({"people": [{"id": 0, "box": None}]}, ["people[0].box", "got null", "has none"]),
+    "pose, id": ({"people": [{"id": 1.5, "box": PERSON}]}, ["people[0].id", "whole number"]),
     "pose": ({"people": [{"id": 0, "box": {"center": [0, 0]}}]}, ["people[0].box.center", "three finite numbers"]),
     "nested": (changed(center=[[1, 2, 3]]), ["people[1].center"]),
     "nan": (changed(center=[1, math.nan, 3]), ["people[1].center", "finite", "NaN"]),

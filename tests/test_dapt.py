@@ -158,7 +158,7 @@ NECKS = {
 
 
 @pytest.mark.parametrize("config", NECKS.values(), ids=NECKS)
-@pytest.mark.parametrize("n", [1, 40, 700])
+@pytest.mark.parametrize("n", [1, 2, 40, 700])
 def test_batch_mates_do_not_matter(config, n):
     net, one = network(config), person(n)
     alone = net.outputs([one])

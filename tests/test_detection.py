@@ -244,7 +244,7 @@ def test_a_background_is_not_searched(scene, tmp_path, fake):
         boxes = lidarpose.detect(points, background=given)
         assert found_at([found.center for found in boxes], joints) == [False] + [True] * 4
         assert boxes.warnings == () and len(fake.calls[-1]["points"]) == len(points)
-    assert len(lidarpose.detect(points, background=static, min_score=0.0)) < len(plain)
+        assert len(lidarpose.detect(points, background=given, min_score=0.0)) < len(plain)
     poses = lidarpose.predict(tmp_path / "recording" / "0.npy", background=tmp_path / "static.npy", model="tiny")
     assert len(poses) == 0
     other = lidarpose.detect(points, background=static + [0, 0, 9.0])

@@ -226,11 +226,12 @@ def _box(entry: object, where: str) -> Box:
     if not isinstance(entry, dict):
         expected = '{"center": [x, y, z], "size": [l, w, h]} or [x, y, z, l, w, h, yaw]'
         raise FormatError(f"{where}: expected {expected}, got {_show(entry)}")
+    id = _id(entry, where)
     if "box" in entry and "center" not in entry:
         # of somebody who was posed
         if not isinstance(entry["box"], dict):
             raise FormatError(f"{where}.box: expected a box, got {_show(entry['box'])}: a cloud of one person has none")
-        entry, where = {**entry, **entry["box"]}, f"{where}.box"
+        entry, where = entry | entry["box"], f"{where}.box"
     center = _triple(entry, "center", where, meaning="[x, y, z]")
     size = _triple(entry, "size", where, meaning="[length, width, height]")
     if min(size) <= 0:
@@ -248,7 +249,7 @@ def _box(entry: object, where: str) -> Box:
         center=np.array(center),
         size=np.array(size),
         yaw=yaw,
-        id=_id(entry, where),
+        id=id,
         score=score if score is not None and 0 <= score <= 1 else None,
         mounted=mounted if isinstance(mounted, bool) else None,
     )
