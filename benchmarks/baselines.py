@@ -16,10 +16,11 @@ import torch
 
 from lidarpose.train.augment import ClipExample
 from lidarpose.train.data_loader import SyntheticSource
+from lidarpose.train.networks import PRETRAINED
 from lidarpose.train.objectives.objective import total
 from lidarpose.train.optim import optimizers
 from lidarpose.train.recipes import MODELS, Pretrain, recipe
-from lidarpose.train.setup import PRETRAINED, objective_of
+from lidarpose.train.setup import objective_of
 
 ROUNDS = 2
 

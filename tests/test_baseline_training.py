@@ -19,10 +19,10 @@ from lidarpose.models.voxelize import view_features
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14
 from lidarpose.train.augment import Example
 from lidarpose.train.data_loader import SyntheticSource
+from lidarpose.train.networks import PRETRAINED, _with_options, networks
 from lidarpose.train.objectives.baseline_objective import BaselineObjective, point_labels, with_joints
 from lidarpose.train.objectives.objective import total
 from lidarpose.train.recipes import Finetune, Pretrain, recipe
-from lidarpose.train.setup import PRETRAINED, _with_options, networks
 from lidarpose.train.validation import update_batch_norms, validate
 
 PRN, LPFORMER = PrnConfig(), LpformerConfig(grid=32)

@@ -18,7 +18,7 @@ from lidarpose.models.baselines.point_ops import ball_query, farthest_points, ne
 from lidarpose.models.baselines.prn import Prn, PrnNeck
 from lidarpose.sample import CLIP_FRAMES
 from lidarpose.skeleton import SMPL24, WAYMO14
-from lidarpose.train.setup import PRETRAINED
+from lidarpose.train.networks import PRETRAINED
 
 # numbers of parameters, counted layer by layer from the authors' code
 PARAMETERS = {

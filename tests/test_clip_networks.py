@@ -29,11 +29,12 @@ from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth.generator import Generator
 from lidarpose.train import loop, setup
 from lidarpose.train.augment import clip_example
+from lidarpose.train.networks import PRETRAINED
 from lidarpose.train.objectives.baseline_objective import ClipObjective
 from lidarpose.train.objectives.objective import total
 from lidarpose.train.optim import optimizers, set_rates
 from lidarpose.train.recipes import Finetune, Pretrain, recipe
-from lidarpose.train.setup import PRETRAINED, make_setup
+from lidarpose.train.setup import make_setup
 from lidarpose.train.torch_dataset import InMemoryDataset
 from lidarpose.train.validation import draw_examples, update_batch_norms, validate
 

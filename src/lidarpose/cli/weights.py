@@ -125,7 +125,7 @@ def _lines(facts: dict[str, Any], *, verbose: bool) -> Iterator[str]:
 
 
 def _models(options: argparse.Namespace) -> None:
-    from lidarpose.train.setup import networks
+    from lidarpose.train.networks import networks
 
     rows = networks()
     if options.json:

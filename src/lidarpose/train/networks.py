@@ -1,0 +1,194 @@
+"""What a recipe means for the network: its configuration, and the weights that it begins with."""
+
+import json
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import fields, replace
+from functools import partial
+from typing import Any
+
+import torch
+from torch import nn
+
+from lidarpose.errors import InputError, check_name
+from lidarpose.io.files import file_error
+from lidarpose.models import weights_path
+from lidarpose.models.baselines.baseline_config import (
+    BaselineConfig,
+    LidarcapConfig,
+    LpformerConfig,
+    NeConfig,
+    PrnConfig,
+)
+from lidarpose.models.checkpoint import build, load_checkpoint
+from lidarpose.models.config import SIZES, NetworkConfig
+from lidarpose.models.dapt.dapt_config import CONFIGS, DaptConfig
+from lidarpose.models.posenet import PoseNet, expand_weights
+from lidarpose.skeleton import HUMAN15, SMPL24, Skeleton
+from lidarpose.train.objectives.baseline_objective import with_joints
+from lidarpose.train.objectives.dapt_objective import REDUCED, finetuning_config, pretraining_config
+from lidarpose.train.objectives.dapt_transfer import transferred
+from lidarpose.train.recipes import MODELS, PAPER, RANDOM, Finetune, Pretrain
+
+Config = NetworkConfig | DaptConfig | BaselineConfig
+
+# by size: the configuration of a network before fine-tuning, and the skeleton in which its people are drawn
+PRETRAINED: dict[str, tuple[Any, Skeleton]] = {
+    **{size: (config, SMPL24) for size, config in SIZES.items()},
+    PAPER: (pretraining_config(), HUMAN15),
+    **{size: (reduced(pretraining_config()), HUMAN15) for size, reduced in REDUCED.items()},
+    "prn": (PrnConfig(), HUMAN15),
+    "lpformer": (LpformerConfig(), HUMAN15),
+    "lidarcap": (LidarcapConfig(), SMPL24),
+    "ne": (NeConfig(), SMPL24),
+    # each sees 200,000 people within one or two hours of one core, of the tiny ones within one
+    "prn-small": (PrnConfig(width_divisor=4, most_points=128), HUMAN15),
+    "prn-tiny": (PrnConfig(width_divisor=8, most_points=128, attention_dropout=0.0), HUMAN15),
+    "lpformer-small": (LpformerConfig(width_divisor=4, most_points=128, grid=16, attention_dropout=0.0), HUMAN15),
+    "lpformer-tiny": (LpformerConfig(width_divisor=8, most_points=128, grid=16, attention_dropout=0.0), HUMAN15),
+    "lidarcap-small": (LidarcapConfig(width_divisor=8, most_points=128), SMPL24),
+    "lidarcap-tiny": (LidarcapConfig(width_divisor=8, most_points=64), SMPL24),
+    "ne-small": (NeConfig(width_divisor=8, most_points=128), SMPL24),
+    "ne-tiny": (NeConfig(width_divisor=8, most_points=64), SMPL24),
+}
+
+
+def networks() -> list[dict[str, Any]]:
+    """name, size, joints, frames and parameters of every network, without its weights, a model's by parameters."""
+    rows = []
+    for name, sizes in MODELS.items():
+        for size in sizes:
+            config = PRETRAINED[size][0]
+            with torch.device("meta"):
+                parameters = sum(value.numel() for value in build(config).parameters())
+            frames = getattr(config, "frames", 1)
+            counts = {"joints": len(config.joints), "frames": frames, "parameters": parameters}
+            rows.append({"name": name, "size": size} | counts)
+    return sorted(rows, key=lambda row: (list(MODELS).index(row["name"]), row["parameters"]))
+
+
+def pretraining_network(recipe: Pretrain) -> tuple[Any, Skeleton]:
+    """The configuration of a network to pre-train, and the skeleton in which its people are drawn."""
+    check_name("network size", recipe.size, PRETRAINED)
+    config, joints = PRETRAINED[recipe.size]
+    config = _with_options(config, recipe.options)
+    if recipe.objects:
+        if not isinstance(config, NetworkConfig):
+            raise InputError(
+                f"objects are for the package's own networks, of which {recipe.size} is none: leave them away"
+            )
+        config = replace(config, person=True)
+        if recipe.shards:
+            raise InputError("objects are made during training, shards have none: leave either away")
+    if (recipe.neck, recipe.head, recipe.drop_path) != ("mde", "coordinates", None):
+        config = _with_neck_and_head(recipe, config)
+    return config, joints
+
+
+def expanded_network(init: str, config: Config) -> tuple[Callable[[], nn.Module], dict]:
+    """What makes a network of this configuration that begins as the weights named, and their card."""
+    if not isinstance(config, NetworkConfig):
+        raise InputError("init is for the package's own networks: the paper's begin at random")
+    path = weights_path(init)
+    smaller, header = load_checkpoint(path)
+    if not isinstance(smaller, PoseNet):
+        raise file_error(path, "holds a network of the paper: --init names one of the package's own")
+    # tried at once, so that an error comes before a folder is made
+    expand_weights(smaller, config)
+    return partial(expand_weights, smaller, config), header.card
+
+
+def initial_network(recipe: Finetune) -> tuple[Any, dict]:
+    """The network that fine-tuning goes on from, None for random weights, and what the card says of it."""
+    if recipe.init == RANDOM:
+        check_name("network size", recipe.size, PRETRAINED)
+        return None, {"init": RANDOM, "init_card": {}}
+    path = weights_path(recipe.init)
+    trained, header = load_checkpoint(path)
+    if not trained.config.joints:
+        raise file_error(path, f"holds the network {header.network}, which poses nobody: name a checkpoint of another")
+    if recipe.model and header.network != PRETRAINED[MODELS[recipe.model][0]][0].kind:
+        raise file_error(path, f"holds the network {header.config.name}, not {recipe.model}: name a checkpoint of it")
+    return trained, {"init": path.name, "init_card": header.card}
+
+
+def finetuned_network(
+    recipe: Finetune, trained: Any, joints: Skeleton, dataset: str
+) -> tuple[Config, Callable[[], nn.Module]]:
+    """The configuration for a dataset's joints, and what makes the network with the weights that it begins with.
+    trained: None for random weights."""
+    own = PRETRAINED[recipe.size][0] if trained is None else trained.config
+    if recipe.neck != "mde" and not isinstance(own, DaptConfig):
+        raise InputError(f"neck is of the paper's network: give --size {' or '.join(MODELS['dapt'])}")
+    if isinstance(own, BaselineConfig):
+        named = own if isinstance(own, LidarcapConfig) else replace(own, joints=joints.joints)
+        config = _with_options(named, recipe.options)
+        if trained is not None and config.width_divisor != own.width_divisor:
+            raise InputError(f"--init has weights for width_divisor={own.width_divisor}: leave that option away")
+        return config, partial(build, config) if trained is None else partial(with_joints, trained, config)
+    own = _with_options(own, recipe.options)
+    if isinstance(own, NetworkConfig):
+        if not recipe.keep_anchors and trained is not None:
+            raise InputError(
+                "keep_anchors=false is for the paper's network, and --init names one of the package's own: name a "
+                "checkpoint of pretrain --recipe paper, or leave --recipe paper and --keep-anchors away"
+            )
+        return own, partial(PoseNet, own) if trained is None else lambda: trained
+    if not dataset:
+        # synthesized people have every joint; the paper's network those that it is pre-trained on
+        joints = HUMAN15
+    fitting = [c for c in CONFIGS.values() if c.bins and set(c.joints) == set(joints.joints)]
+    if not fitting:
+        raise InputError(f"the paper's network has no configuration for the joints of {joints.name}")
+    like = next((c for c in fitting if c.name == dataset), fitting[0])
+    if trained is None:
+        own = _with_neck(replace(own, bins=(), ranges=(), coordinates=True), recipe.neck)
+    # the paper fine-tunes by heatmaps alone, Table 3 by coordinates too; the neck prn knows no others
+    coordinates = recipe.head == "coordinates" or own.neck == "prn"
+    bins, ranges = ((), ()) if coordinates else (like.bins, like.ranges)
+    same = (own.joints, own.bins, own.ranges) == (like.joints, bins, ranges)
+    if trained is not None and recipe.keep_anchors and same and not (coordinates and own.parts):
+        # a network of this dataset already, as released ones are
+        return own, lambda: trained
+    heads: dict[str, Any] = {"parts": 0, "coordinates": coordinates, "auxiliary": False}
+    config = replace(own, name=like.name, joints=like.joints, bins=bins, ranges=ranges, **heads)
+    if trained is None:
+        return config, partial(build, config)
+    return config, partial(transferred, trained, config, keep_anchors=recipe.keep_anchors)
+
+
+def _with_options(config: Any, options: tuple[str, ...]) -> Any:
+    """A configuration with options NAME=VALUE (JSON or text), or NAME for true, of a baseline. Raises InputError for
+    unknown ones."""
+    if not options:
+        return config
+    if not isinstance(config, BaselineConfig):
+        raise InputError(f"options are of the baselines' networks, {config.name} has none: leave --options away")
+    known = [field.name for field in fields(config) if field.name != "joints"]
+    changes: dict[str, Any] = {}
+    for option in options:
+        name, _, value = option.partition("=")
+        check_name(f"option of {config.name}", name, known)
+        changes[name] = value or True
+        with suppress(ValueError):
+            changes[name] = json.loads(value)
+    return replace(config, **changes)
+
+
+def _with_neck_and_head(recipe: Pretrain, config: NetworkConfig | DaptConfig) -> DaptConfig:
+    """The paper's network with the neck and the head that the recipe names."""
+    if not isinstance(config, DaptConfig):
+        raise InputError(
+            f"neck, head and drop_path are of the paper's network: add --size {' or '.join(MODELS['dapt'])}"
+        )
+    if recipe.head == "heatmaps":
+        if recipe.neck == "prn":
+            raise InputError("the neck prn has coordinates and no heatmaps: leave --head away")
+        heatmaps = finetuning_config("humanm3")
+        config = REDUCED[recipe.size](heatmaps) if recipe.size in REDUCED else heatmaps
+    drop_path = config.drop_path if recipe.drop_path is None else recipe.drop_path
+    return _with_neck(replace(config, drop_path=drop_path), recipe.neck)
+
+
+def _with_neck(config: DaptConfig, neck: str) -> DaptConfig:
+    return replace(config, neck=neck, parts=0 if neck == "prn" else config.parts)
