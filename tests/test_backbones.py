@@ -1,31 +1,17 @@
 """The networks that benchmarks measure beside this package's own do what they say."""
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
+from scripts import load_script
 
 from lidarpose.models.config import preset
 from lidarpose.models.posenet import PoseNet
 
-PATH = Path(__file__).parents[1] / "benchmarks" / "backbones.py"
-spec = importlib.util.spec_from_file_location("backbones", PATH)
-backbones = sys.modules["backbones"] = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(backbones)
-
+pytestmark = pytest.mark.usefixtures("one_thread")
+backbones = load_script("benchmarks/backbones.py")
 KINDS = (backbones.Draft, backbones.GroupedViT, backbones.PointNet2)
 SIZES = (1, 40, 300)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module", params=KINDS, ids=lambda kind: kind.__name__)

@@ -11,7 +11,7 @@ from lidarpose.body.rig import clothing
 from lidarpose.geometry import rotation_about
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth import bodies
-from lidarpose.synth.bodies import PoseBank, draw_bodies, draw_moving_body
+from lidarpose.synth.bodies import PoseBank, draw_bodies, draw_moving_bodies
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import SCENES
 
@@ -77,7 +77,7 @@ def test_clips_are_captured_as_often_as_asked_for_and_jumps_leave_the_ground(sha
     # four times as many frames a second as a clip has
     bank = PoseBank.of_motion(motion(frames=160, fps=40.0, jump=0.5))
     for seed in range(3):
-        somebody = draw_moving_body(bank, share, 9, np.random.default_rng(seed))
+        somebody = draw_moving_bodies(bank, share, 1, 9, np.random.default_rng(seed))[0]
         aside = np.abs(np.diff(somebody.joints[:, 0, 1]))
         high = somebody.vertices[..., 2].min(1)
         if share:
@@ -95,7 +95,7 @@ def test_clips_are_captured_as_often_as_asked_for_and_jumps_leave_the_ground(sha
 def test_a_clip_s_boxes_turn_with_the_person(turn):
     bank = PoseBank.of_motion(motion(turn=turn))
     for seed in range(3):
-        somebody = draw_moving_body(bank, 1.0, 8, np.random.default_rng(seed))
+        somebody = draw_moving_bodies(bank, 1.0, 1, 8, np.random.default_rng(seed))[0]
         across = somebody.joints[:, JOINTS["left_hip"], :2] - somebody.joints[:, JOINTS["right_hip"], :2]
         facing = np.arctan2(-across[:, 0], across[:, 1])
         assert abs(facing[-1] - facing[0]) == pytest.approx(0.7 * abs(turn), abs=0.05)

@@ -480,19 +480,6 @@ def test_a_full_output_is_one_line(crop):
     assert "Traceback" not in done.stderr
 
 
-def test_without_numba_predict_works_and_demo_names_the_extra(crop, tmp_path):
-    code = (
-        "import sys; sys.modules['numba'] = None\n"
-        "from lidarpose.cli import main\n"
-        f"assert main(['predict', {str(crop)!r}, '--picture']) == 0\n"
-        "sys.exit(main(['demo']))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
-    assert done.returncode == 2 and "Traceback" not in done.stderr
-    assert done.stderr.splitlines()[-1].endswith("in the clone, pip install '.[synth]'")
-    assert not (tmp_path / "lidarpose-demo").exists() and (tmp_path / "crop.poses.png").exists()
-
-
 def test_python_m_is_the_same_program():
     done = subprocess.run([sys.executable, "-m", "lidarpose", "predict", "no.pcd"], capture_output=True, text=True)
     assert done.returncode == 2 and done.stderr.count("\n") == 1

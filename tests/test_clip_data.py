@@ -104,11 +104,6 @@ def test_rows_with_damaged_columns_are_refused(clip):
 # ---- readers
 
 
-@pytest.fixture(scope="module")
-def smpl(tmp_path_factory):
-    return files.write_smpl(tmp_path_factory.mktemp("smpl") / "SMPL_NEUTRAL.npz")
-
-
 @pytest.mark.parametrize("name", ["lidarhuman26m", "sloper4d"])
 def test_readers_give_rotations_in_the_sensor_s_frame(name, tmp_path, smpl):
     mounted = {"R_sensor_level": axis_angle_to_matrix([0.0, 0.5, 0.0])} if name == "lidarhuman26m" else {}

@@ -49,14 +49,7 @@ TINY = DaptConfig(
 )
 SIZES = ("encoder_depths", "encoder_channels", "encoder_heads", "decoder_depths", "decoder_channels", "decoder_heads")
 SIZES += ("anchor_channels", "strides")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
@@ -710,19 +703,14 @@ def test_import_with_a_wrong_configuration(config, message):
 
 
 def test_import_of_files_that_are_none(tmp_path):
-    pickle, cut, whole = tmp_path / "dapt.pth", tmp_path / "cut.safetensors", WEIGHTS.read_bytes()
+    pickle, cut = tmp_path / "dapt.pth", tmp_path / "cut.safetensors"
     pickle.write_bytes(b"\x80\x04.")
-    for path, message in (
-        (pickle, r"dapt.pth: .* pickle.*weights_only=True.*safetensors"),
-        (tmp_path / "none.safetensors", "does not exist: check the path"),
-        (tmp_path, "is a folder"),
-    ):
-        with pytest.raises(InputError, match=message):
-            import_dapt(path)
-    for content in (whole[: len(whole) // 2], whole[:100], b"", b"not a file of tensors at all"):
-        cut.write_bytes(content)
-        with pytest.raises(InputError, match="cut.safetensors: .*(ends at byte|is something else|is empty)"):
-            import_dapt(cut)
+    with pytest.raises(InputError, match=r"dapt.pth: .* pickle.*weights_only=True.*safetensors"):
+        import_dapt(pickle)
+    # what else may be wrong with a file is said as for any checkpoint
+    cut.write_bytes(WEIGHTS.read_bytes()[:100])
+    with pytest.raises(InputError, match="cut.safetensors: .*ends at byte"):
+        import_dapt(cut)
     for entry, message in (({}, "no configuration: name one of paper, waymo"), ({"config": "{"}, "not JSON")):
         save_file(load_file(WEIGHTS), cut, entry)
         with pytest.raises(InputError, match=message):

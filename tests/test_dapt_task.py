@@ -52,14 +52,7 @@ FINEST = DaptObjective(config=replace(PRETRAIN.config, neck="finest", parts=0), 
 PRN = DaptObjective(config=replace(FINEST.config, neck="prn"), stage="pretrain")
 TASKS = {"pretrain": PRETRAIN, "finetune": FINETUNE, "finest": FINEST, "prn": PRN}
 BOTH = pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def person(n, seed=0, labelled=None, size=(0.2, 0.3, 0.6)):

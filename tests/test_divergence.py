@@ -1,4 +1,4 @@
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from raycast_meshes import body, ground, join
 from reference.raycast_reference import cast_ray_list_reference, merge_echoes_reference, window_ranges, window_rays
 
 from lidarpose.lidar.presets import sensor
-from lidarpose.lidar.raycast import Hits, footprint, scan, scan_divergent
+from lidarpose.lidar.raycast import footprint, scan
 from lidarpose.lidar.scan_kernels import strongest_echo
 from lidarpose.synth.environment.mesh import box
 
@@ -26,7 +26,7 @@ def person(distance: float, height: float, seed: int = 0):
 def test_same_as_reference(name, sub_beams):
     s = sensor(name)
     vertices, faces = person(7.0, s.height)
-    got = scan_divergent(vertices, faces, s, divergence=0.006, sub_beams=sub_beams, pulse=0.4)
+    got = scan(vertices, faces, s, divergence=0.006, sub_beams=sub_beams, pulse=0.4)
     beams = window_rays(got, s).reshape(-1, 3)
     pick = np.random.default_rng(0).permutation(len(beams))[:400]
     offsets, weights = footprint(0.006, sub_beams)
@@ -45,14 +45,11 @@ def test_same_as_reference(name, sub_beams):
     assert np.abs(seen[hit] - want[hit]).max() < 1e-4 and (seen_face[hit] == want_face[hit]).mean() > 0.99
 
 
-def test_no_divergence_is_the_plain_scan():
+def test_one_sub_beam_is_the_axis_of_the_beam_but_for_the_window():
     s = sensor("pandar64")
     vertices, faces = person(6.0, s.height)
-    got = scan_divergent(vertices, faces, s, divergence=0.0, margin=0.01)
     want = scan(vertices, faces, s, margin=0.01)
-    assert all(np.array_equal(getattr(got, f.name), getattr(want, f.name)) for f in fields(Hits))
-    # one sub-beam is the beam's axis, but for the window
-    single = scan_divergent(vertices, faces, s, divergence=0.003, sub_beams=1)
+    single = scan(vertices, faces, s, divergence=0.003, sub_beams=1)
     kept = np.isin(single.column + single.column0, want.column + want.column0)
     assert len(single.points) >= len(want.points)
     assert np.abs(single.points[kept][:50] - want.points[:50]).max() < 1e-5
@@ -68,7 +65,7 @@ def test_footprint_is_even_and_whole():
 def test_silhouettes_grow_by_half_the_divergence():
     s = replace(sensor("os1-128"), range_max=200.0)
     pole = wall(15.0, (-0.02, 0.02))
-    thin, wide = scan(*pole, s, margin=0.01), scan_divergent(*pole, s, divergence=0.006, sub_beams=5)
+    thin, wide = scan(*pole, s, margin=0.01), scan(*pole, s, divergence=0.006, sub_beams=5)
     assert len(np.unique(thin.column)) == 1 and len(np.unique(wide.column)) == 3
     # on the beams' axes, at the pole's range
     assert 0.02 < np.abs(wide.points[:, 1]).max() < 0.02 + 15 * 0.003
@@ -79,7 +76,7 @@ def test_silhouettes_grow_by_half_the_divergence():
 def test_edges_mix_what_the_pulse_cannot_tell_apart(gap, mixed):
     s = sensor("os1-128")
     vertices, faces = join(wall(10.0, (-0.5, 0.003)), wall(10.0 + gap, (-0.5, 0.5)))
-    x = scan_divergent(vertices, faces, s, divergence=0.003, sub_beams=5).points[:, 0]
+    x = scan(vertices, faces, s, divergence=0.003, sub_beams=5).points[:, 0]
     between = (x > 10.02) & (x < 10 + gap - 0.02)
     assert between.any() == mixed and (x < 10.01).any() and (x > 10 + gap - 0.01).any()
     # nothing is mixed by rays without width
@@ -153,7 +150,7 @@ def test_origins_at_one_height_are_one_sensor():
 
 def test_divergent_beams_of_several_origins():
     body = box_at(1.1)
-    lines, wide = scan(body.vertices, body.faces, AV2), scan_divergent(body.vertices, body.faces, AV2, divergence=0.003)
+    lines, wide = scan(body.vertices, body.faces, AV2), scan(body.vertices, body.faces, AV2, divergence=0.003)
     assert len(lines.points) < len(wide.points) < 1.2 * len(lines.points)
     far = body.moved(np.array([0, 0, 500.0]))
     assert len(scan(far.vertices, far.faces, AV2).points) == 0

@@ -9,6 +9,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from scripts import load_script
 
 import lidarpose
 from lidarpose.cli import main
@@ -35,13 +36,6 @@ LINK = re.compile(r"\[[^]]*\]\((?!https?:)([^)#]*)(#[^)]*)?\)")
 
 def named(page):
     return page.relative_to(ROOT).as_posix()
-
-
-def imported(path):
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def anchors(page):
@@ -106,7 +100,7 @@ def test_the_readme_is_short_and_begins_with_the_picture():
 
 
 def test_the_readme_on_a_package_index_has_no_relative_links():
-    index_readme = imported(ROOT / "setup.py").index_readme
+    index_readme = load_script(ROOT / "setup.py").index_readme
     readme = (ROOT / "README.md").read_text("utf-8")
     alone = index_readme(readme, None)
     assert not LINK.search(alone) and "![" not in alone and "lidarpose predict sweep.pcd" in alone
@@ -117,7 +111,7 @@ def test_the_readme_on_a_package_index_has_no_relative_links():
 
 
 def test_the_site_begins_with_the_readme_and_lists_every_public_name():
-    hooks = imported(ROOT / "tools" / "mkdocs_hooks.py")
+    hooks = load_script(ROOT / "tools" / "mkdocs_hooks.py")
     start = hooks.on_page_markdown((DOCS / "index.md").read_text("utf-8"))
     for target, _ in LINK.findall(start):
         assert (DOCS / target).is_file(), target

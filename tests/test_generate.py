@@ -14,7 +14,7 @@ from lidarpose.lidar.presets import sensor
 from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import center_of
 from lidarpose.skeleton import BODY26, SMPL24
-from lidarpose.synth.bodies import draw_bodies, draw_moving_body
+from lidarpose.synth.bodies import draw_bodies, draw_moving_bodies
 from lidarpose.synth.generator import BLOCK, LEAST_POINTS, Generator
 from lidarpose.synth.scene import SCENES
 
@@ -234,7 +234,7 @@ def test_feet_stay_where_they_stand_however_long_the_legs(which, monkeypatch):
     monkeypatch.setattr("lidarpose.body.rig.sample_people", lambda rng, n: SimpleNamespace(coefficients=one))
     slides, walks = [], 0
     for seed in range(60):
-        somebody = draw_moving_body(None, 0.0, 8, np.random.default_rng(seed))
+        somebody = draw_moving_bodies(None, 0.0, 1, 8, np.random.default_rng(seed))[0]
         if somebody.kinds[0] == "walk":
             walks += 1
             feet = somebody.joints[:, [BODY26.index("left_foot"), BODY26.index("right_foot")], :2]

@@ -28,11 +28,6 @@ LABELS, CLOUDS = "ITOP_side_test_labels.h5", "ITOP_side_test_point_cloud.h5"
 
 
 @pytest.fixture(scope="module")
-def smpl(tmp_path_factory):
-    return files.write_smpl(tmp_path_factory.mktemp("smpl") / "SMPL_NEUTRAL.npz")
-
-
-@pytest.fixture(scope="module")
 def raw(tmp_path_factory, smpl):
     """Both views, their second frames unchecked, and what must come out."""
     root = tmp_path_factory.mktemp("itop")

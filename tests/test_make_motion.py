@@ -1,17 +1,13 @@
 """tools/make_motion.py: an archive's files become the file of captured motion that training takes."""
 
-import importlib.util
-from pathlib import Path
-
 import motion_files as files
 import numpy as np
 import pytest
+from scripts import load_script
 
 from lidarpose.body.mocap import load_motion
 
-_SPEC = importlib.util.spec_from_file_location("make_motion", Path(__file__).parents[1] / "tools/make_motion.py")
-make_motion = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(make_motion)
+make_motion = load_script("tools/make_motion.py")
 
 
 def write_archive(folder):

@@ -1,12 +1,10 @@
 """Meshes of scenes: closed, outward, of their sizes, moved without touching their parts; beams pass where they can."""
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scripts import load_script
 from walkers import piece_volumes
 
 from lidarpose.lidar.raycast import cast_rays
@@ -43,12 +41,7 @@ OPEN = {"pole", "wheeled bin", "sign", "traffic cone", "lattice fence", "foliage
 
 @pytest.fixture(scope="module")
 def maker():
-    """tools/make_meshes.py."""
-    path = Path(__file__).parents[1] / "tools/make_meshes.py"
-    spec = importlib.util.spec_from_file_location("make_meshes", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script("tools/make_meshes.py")
 
 
 @pytest.mark.parametrize("name", SIZED)

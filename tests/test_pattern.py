@@ -127,12 +127,7 @@ def test_a_depth_camera_sees_a_grid_on_a_plane_and_all_at_once():
 def brute(vertices, faces, pattern, frame, moved):
     """All rays of the frame against the triangles as each ray finds them."""
     rays = pattern.frame(frame)
-    distance = np.full(len(rays.time), np.inf)
-    for t in np.unique(rays.time):
-        at = np.flatnonzero(rays.time == t)
-        there = vertices + t * (moved - vertices)
-        distance[at] = cast_ray_list_reference(there, faces, rays.directions[at])[0]
-    return distance
+    return cast_ray_list_reference(vertices, faces, rays.directions, moved=moved, time=rays.time)[0]
 
 
 def small(name, count):

@@ -1,6 +1,5 @@
 """The pose prior: single poses, clips of people who go on, balance, contact with the ground and with themselves."""
 
-import importlib.util
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -10,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from motion_files import J, check_rotations, joints_of
+from scripts import load_script
 
 from lidarpose.body import rig
 from lidarpose.body.pose_prior import activities, constraints, gait, latents, sampling
@@ -19,9 +19,7 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix, rotation_about
 from lidarpose.skeleton import SMPL24
 
-_SPEC = importlib.util.spec_from_file_location("fit_motion", Path(__file__).parents[1] / "tools/fit_motion.py")
-fit = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(fit)
+fit = load_script("tools/fit_motion.py")
 A, KINDS = activities.ANGLE_INDEX, activities.KINDS
 SIDES = (("left", 1), ("right", -1))
 HZ = 40.0

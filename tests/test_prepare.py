@@ -29,11 +29,6 @@ from lidarpose.skeleton import HUMAN15, WAYMO14
 
 
 @pytest.fixture(scope="module")
-def smpl(tmp_path_factory):
-    return files.write_smpl(tmp_path_factory.mktemp("smpl") / "SMPL_NEUTRAL.npz")
-
-
-@pytest.fixture(scope="module")
 def raw(tmp_path_factory, smpl):
     """HumanM3 and what must come out."""
     root = tmp_path_factory.mktemp("humanm3")

@@ -20,7 +20,7 @@ from reference.raycast_reference import (
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.lidar.presets import SENSORS, sensor
-from lidarpose.lidar.raycast import cast_ray_list, cast_rays, scan, scan_divergent, scan_pattern
+from lidarpose.lidar.raycast import cast_ray_list, cast_rays, scan, scan_pattern
 from lidarpose.lidar.raycast_kernels import raster
 from lidarpose.lidar.sensor import Sensor
 
@@ -53,7 +53,7 @@ def test_the_first_cast_compiles_once(dtype):
     vertices.setflags(write=False)
     s = sensor("vlp-16")
     hits = scan(vertices, faces, s)
-    assert len(hits.points) and len(scan_divergent(vertices, faces, s, divergence=0.003).points)
+    assert len(hits.points) and len(scan(vertices, faces, s, divergence=0.003).points)
     cast_rays(vertices, faces, FULL_TURN, ALL_ELEVATIONS)
     assert len(raster.signatures) == 1
 
@@ -250,7 +250,7 @@ CORNERS, QUAD = ground(1, -1)
 GRID = partial(cast_rays, azimuth=[0.1], elevation=[0.1])
 RAYS = partial(cast_ray_list, directions=[[1.0, 0, 0]])
 SCAN = partial(scan, sensor=sensor("vlp-16"))
-WIDE = partial(scan_divergent, sensor=sensor("vlp-16"), divergence=0.003)
+WIDE = partial(scan, sensor=sensor("vlp-16"), divergence=0.003)
 
 
 @pytest.mark.parametrize(

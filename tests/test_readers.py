@@ -26,11 +26,6 @@ WRITERS = {
 }
 
 
-@pytest.fixture(scope="module")
-def smpl(tmp_path_factory):
-    return files.write_smpl(tmp_path_factory.mktemp("smpl") / "SMPL_NEUTRAL.npz")
-
-
 def made(name, smpl):
     return reader(name, smpl if READERS[name][2] else None)
 

@@ -181,7 +181,7 @@ WALKER = Place(feet=np.array([5.0, 2.0, -1.5]), yaw=0.7, distance=5.4)
 
 def test_who_passes_by_does_what_people_do_in_streets(monkeypatch):
     kinds = iter(["sit", "cycle", "lie", "run", "walk"])
-    monkeypatch.setattr(module, "draw_moving_body", lambda *arguments: replace(goer(), kinds=(next(kinds),) * 3))
+    monkeypatch.setattr(module, "draw_moving_bodies", lambda *arguments: [replace(goer(), kinds=(next(kinds),) * 3)])
     assert module._draw_pedestrian(4, RNG(0)).kinds[0] == "run"
 
 

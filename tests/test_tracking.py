@@ -42,6 +42,17 @@ def test_the_plain_assignment_is_scipys(seed, rows, columns, ties):
         np.testing.assert_array_equal(own, theirs)
 
 
+@pytest.mark.parametrize("n, m", [(40, 60), (60, 40), (50, 50)])
+def test_assignments_of_crowds_are_the_cheapest(n, m):
+    rng = np.random.default_rng(n)
+    # a hidden assignment that prices prove to be the cheapest: reduced costs are 0 on it, and not below elsewhere
+    extra, order = rng.uniform(0.01, 1, (n, m)), rng.permutation(max(n, m))
+    pairs = [(i, order[i]) for i in range(n)] if n <= m else [(order[j], j) for j in range(m)]
+    extra[tuple(np.transpose(pairs))] = 0.0
+    found = assign_plain(extra + rng.normal(size=(n, 1) if n <= m else (1, m)))
+    np.testing.assert_array_equal(np.transpose(found), sorted(pairs))
+
+
 def test_only_pairs_that_pay_are_made():
     costs = np.array([[-1.0, -3.0, np.inf], [np.inf, -2.5, np.inf], [2.0, np.inf, 5.0]])
     rows, columns = assign(costs)

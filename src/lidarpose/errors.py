@@ -1,7 +1,7 @@
 """Errors that a user can act on: one line that says what was expected, what came, and what to do."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from math import isfinite
 from numbers import Integral
 from typing import Any
@@ -79,3 +79,17 @@ def check_name(kind: str, name: object, known: Iterable[str]) -> None:
     """Raises `unknown_name` unless `name` is one of a closed list of names; what is no text is none of them."""
     if not isinstance(name, str) or name not in known:
         raise unknown_name(kind, name, known)
+
+
+# ---- words of messages
+
+
+def first_names(names: Sequence[str], most: int = 3) -> str:
+    """ "a, b, c and 2 more"."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
+
+
+def counted(number: int, one: str, many: str | None = None) -> str:
+    """ "1 frame", "1,200 frames"; many: the plural where it is not one more s."""
+    return f"{number:,} {one if number == 1 else many or one + 's'}"

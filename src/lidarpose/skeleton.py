@@ -73,6 +73,12 @@ class Skeleton:
             raise unknown_name(f"joint of {self.name}", joint, self.joints) from None
 
     @cached_property
+    def middle(self) -> tuple[int, ...]:
+        """The joints whose mean is the middle of a person: the pelvis, or both hips where there is none."""
+        names = ("pelvis",) if "pelvis" in self.joints else ("left_hip", "right_hip")
+        return tuple(self.index(name) for name in names)
+
+    @cached_property
     def bones(self) -> tuple[tuple[int, int], ...]:
         """Pairs (parent, child) to draw, `extra_bones` last."""
         return tuple((p, j) for j, p in enumerate(self.parents) if p >= 0) + self.extra_bones

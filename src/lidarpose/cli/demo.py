@@ -1,7 +1,6 @@
 """`lidarpose demo`: people that three LiDARs see, predicted with the bundled weights, beside the truth."""
 
 import time
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +8,7 @@ import numpy as np
 
 from lidarpose.errors import check_int
 from lidarpose.inference.predictor import TTA, Predictor, load
-from lidarpose.io.files import atomic_path, check_writable
+from lidarpose.io.files import check_writable, write_all_atomic
 from lidarpose.models import DEFAULT
 
 SENSORS = ("vlp-32c", "os1-128", "hdl-64e")
@@ -43,9 +42,7 @@ def run(folder: str | Path, *, seed: int, weights: str = DEFAULT) -> None:
         generator = Generator(scene=replace(scene, sensors=(name,), distance=(3.0, 20.0)))
         people += [generator.person(seed, k * PEOPLE_EACH + i) for i in range(PEOPLE_EACH)]
     rows, contents = _report(model, people)
-    with ExitStack() as stack:
-        for name, content in contents.items():
-            stack.enter_context(atomic_path(folder / name)).write_bytes(content)
+    write_all_atomic({folder / name: content for name, content in contents.items()})
     print(pandas.DataFrame(rows).to_string(index=False, justify="left"))
     print(f"open {folder / 'index.html'} to turn the people in 3D; pictures: {folder}/*.png")
 

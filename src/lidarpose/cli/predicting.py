@@ -4,13 +4,12 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
-from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from lidarpose.cli.terminal import add_command, is_watched, tell
-from lidarpose.errors import InputError
+from lidarpose.errors import InputError, counted, first_names
 from lidarpose.models import DEFAULT, NAMES
 
 # io.point_cloud.SUFFIXES, which a help text does not import
@@ -88,7 +87,7 @@ def add(commands) -> None:
 
 def _predict(options: argparse.Namespace) -> None:
     from lidarpose.inference.predict_scan import predict
-    from lidarpose.io.files import atomic_path
+    from lidarpose.io.files import write_all_atomic
 
     file = Path(options.source[0])
     result, picture, page = output_paths(options, file.stem, ("json", "csv"))
@@ -101,10 +100,7 @@ def _predict(options: argparse.Namespace) -> None:
         outputs[picture] = poses.picture(title=file.name)
     if page is not None:
         outputs[page] = poses.html(title=file.name).encode("utf-8", "replace")
-    # all of them or none
-    with ExitStack() as stack:
-        for path, content in outputs.items():
-            stack.enter_context(atomic_path(path)).write_bytes(content)
+    write_all_atomic(outputs)
     if result is None:
         print(poses.to_json(), end="")
     for line in _warnings(poses):
@@ -160,7 +156,7 @@ def _detect(options: argparse.Namespace) -> None:
         boxes.save(result)
     for line in boxes.warnings:
         tell(f"lidarpose: warning: {line}")
-    outcome = f"{len(boxes)} {'person' if len(boxes) == 1 else 'people'} found" if boxes else "nobody found"
+    outcome = f"{counted(len(boxes), 'person', 'people')} found" if boxes else "nobody found"
     tell(outcome + (f" -> {result}" if result else ""))
 
 
@@ -194,7 +190,6 @@ def _result_path(out: str, name: str, what: str, *suffixes: str) -> Path | None:
 
 def _warnings(poses) -> list[str]:
     """The input's warnings, and each of the people's once with the ids of those it is about."""
-    from lidarpose.inference.results import first_names
     from lidarpose.io.files import shorten
 
     shared: dict[str, list[str]] = {}

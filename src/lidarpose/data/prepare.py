@@ -29,7 +29,7 @@ from lidarpose.data.shards import (
 )
 from lidarpose.data.splits import SplitRule, split_rule
 from lidarpose.data.writer import Counts, lock_dataset, make_shards, open_folder
-from lidarpose.errors import InputError, check_int, check_name
+from lidarpose.errors import InputError, check_int, check_name, first_names
 from lidarpose.io.files import file_error, one_line
 from lidarpose.progress import Progress
 from lidarpose.sample import HIDDEN, SEEN, UNLABELED, LabeledSample
@@ -278,9 +278,9 @@ def _warnings(summary: dict[str, Any], absent: dict[str, list[str]], rule: Split
         lines.append(f"{problem}: labels and clouds of different releases?")
     empty = [part["part"] for part in summary["parts"] if not part["people"]]
     if empty and summary["people"]:
-        lines.append(f"nobody in {_first_five(empty)}")
+        lines.append(f"nobody in {first_names(empty, 5)}")
     if rule is not None:
-        lines += [f"of {split} by {rule.name} {_first_five(names)} are not there" for split, names in absent.items()]
+        lines += [f"of {split} by {rule.name} {first_names(names, 5)} are not there" for split, names in absent.items()]
         if rule.leaks:
             lines.append(f"the split {rule.name} leaks: {rule.leaks}")
     return lines
@@ -293,8 +293,3 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
     for reason, count in summary["skipped"].items():
         lines.append(f"skipped {count:,}: {reason} (first: {summary['skipped_first'][reason]})")
     return lines + [f"warning: {line}" for line in summary["warnings"]]
-
-
-def _first_five(names: list[str]) -> str:
-    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-    return f"{', '.join(names[:5])}{more}"

@@ -200,7 +200,7 @@ class EvalSetup:
         boxes = [person.sample.box for person in samples]
         centers = [box.center for box in boxes if box is not None]
         if hasattr(model, "predict_in") and not clips and len(centers) == len(boxes):
-            people = model.predict_in(clouds, np.stack(centers), origin, name)
+            people = model.predict_in(clouds, origin, name, box_centers=np.stack(centers))
         else:
             people = model.predict(clouds, sensor_origin=origin, skeleton=name, **clips)
         for person in people:

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lidarpose.inference.results import Poses, first_names
+from lidarpose.errors import first_names
+from lidarpose.inference.results import Poses
 from lidarpose.sample import MIN_POINTS, Box, Pose
 
 if TYPE_CHECKING:

@@ -40,9 +40,7 @@ class PoseEstimator:
         # of the first pass: how a person is shown, and whether its answer counts
         self._averaged = self.header.network == NetworkConfig.kind
         self._first = MIRRORED if self._averaged else IDENTITY
-        # the middle of a person: the pelvis, or half way between the hips where the skeleton has none
-        root = ("pelvis",) if "pelvis" in self.skeleton.joints else ("left_hip", "right_hip")
-        self._root = [self.skeleton.index(joint) for joint in root]
+        self._middle = list(self.skeleton.middle)
 
     def outputs(
         self,
@@ -115,7 +113,7 @@ class PoseEstimator:
             first = self._transformed(self._first, clouds, centers, origin, clip)
             if box_centers is not None and first.second_person is not None:
                 centers, first = self._of_two(clouds, centers, box_centers, origin, first)
-            root = first.joints[:, self._root].mean(1)
+            root = first.joints[:, self._middle].mean(1)
             # an answer that is no number stays one
             shift = np.round(np.clip(root, -WINDOW / 2, WINDOW / 2) / _CENTER_STEP) * _CENTER_STEP
             centers, first = centers + shift, replace(first, joints=first.joints - shift[:, None])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal, TypedDict, Unpack, overload
 
 import numpy as np
 
-from lidarpose.errors import InputError, check_int, check_name, missing_extra
+from lidarpose.errors import InputError, check_int, check_name, first_names, missing_extra
 from lidarpose.inference.backend import Backend, OnnxBackend, exported_beside
 from lidarpose.inference.checks import (
     UPSIDE_DOWN,
@@ -29,7 +29,7 @@ from lidarpose.inference.inputs import (
     is_few,
     only_returns,
 )
-from lidarpose.inference.results import PersonPose, Poses, first_names
+from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.inference.scan import Scan, pose_scan
 from lidarpose.inference.tta import tta_transforms
 from lidarpose.io.boxes import read_boxes
@@ -252,27 +252,25 @@ class Predictor(PoseEstimator):
         ]
         return Poses(people=tuple(frames), skeleton=wanted, model=self.model)
 
-    def predict_about(
-        self, clouds: Sequence[np.ndarray], centers: np.ndarray, origin: np.ndarray | None, skeleton: str | None = None
-    ) -> Poses:
-        """As `predict` of clouds (n, 3) m, each of one person alone whose pelvis is nearly known, centers (N, 3) m: the
-        pass that would find it is spared."""
-        wanted = self.in_skeleton(skeleton)
-        people = self._people(list(clouds), origin, wanted, False, centers=centers)
-        return Poses(people=tuple(people), skeleton=wanted, model=self.model)
-
     def predict_in(
         self,
         clouds: Sequence[np.ndarray],
-        box_centers: np.ndarray,
         origin: np.ndarray | None,
         skeleton: str | None = None,
         progress: bool = False,
+        *,
+        pelvises: np.ndarray | None = None,
+        box_centers: np.ndarray | None = None,
     ) -> Poses:
-        """As `predict` of clouds (n, 3) m cut out by boxes with centers (N, 3) m: where a cloud shows two people, who
-        is nearer to the center is meant."""
+        """As `predict` of clouds (n, 3) m, of which more is known.
+
+        Args:
+            pelvises: (N, 3) m, nearly, where each cloud shows one person alone: the pass that finds them is spared.
+            box_centers: (N, 3) m of the boxes that cut the clouds out: where a cloud shows two people, who is nearer to
+                the center is meant.
+        """
         wanted = self.in_skeleton(skeleton)
-        people = self._people(list(clouds), origin, wanted, progress, box_centers=box_centers)
+        people = self._people(list(clouds), origin, wanted, progress, centers=pelvises, box_centers=box_centers)
         return Poses(people=tuple(people), skeleton=wanted, model=self.model)
 
     def _people(self, clouds, origin, wanted, progress, clips=None, centers=None, box_centers=None) -> list[PersonPose]:

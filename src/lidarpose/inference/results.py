@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, cast, overload
 
 import numpy as np
 
+from lidarpose.errors import counted
 from lidarpose.geometry import UP_AXES, rotation_from_up
 from lidarpose.io.boxes import people_json
 from lidarpose.io.files import write_atomic
@@ -323,7 +324,7 @@ class Poses(Sequence):
 
         R_level_input = rotation_from_up(self.up)
         posed = [person.pose.joints for person in upright if person.pose is not None]
-        label = f"{len(upright)} {'person' if len(upright) == 1 else 'people'} found" if upright else "nobody found"
+        label = f"{counted(len(upright), 'person', 'people')} found" if upright else "nobody found"
         return ScanPanel(
             points=points @ R_level_input.T,
             boxes=[box for person in upright if (box := person.box or _box_around(person))],
@@ -357,12 +358,6 @@ def _label(person: PersonPose) -> str:
     """The id, and the score where there is one."""
     words = [] if person.id is None else [str(person.id)]
     return " · ".join(words if person.score is None else [*words, f"score {person.score:.2f}"])
-
-
-def first_names(names: Sequence[str], most: int = 3) -> str:
-    """ "a, b, c and 2 more"."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
 
 
 def _rounded(values: np.ndarray | None, digits: int) -> list:

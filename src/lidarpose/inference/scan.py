@@ -113,10 +113,10 @@ def pose_scan(scan: Scan, predictor: Predictor, *, skeleton: str | None = None, 
         scan = replace(scan, origin=None)
     origin = None if scan.origin is None else scan.R_level_input @ scan.origin
     if scan.pelvises is not None and clouds:
-        level = predictor.predict_about(clouds, scan.pelvises @ scan.R_level_input.T, origin, skeleton)
+        level = predictor.predict_in(clouds, origin, skeleton, pelvises=scan.pelvises @ scan.R_level_input.T)
     elif scan.boxes:
         box_centers = np.stack([scan.R_level_input @ box.center for box in scan.boxes])
-        level = predictor.predict_in(clouds, box_centers, origin, skeleton, progress)
+        level = predictor.predict_in(clouds, origin, skeleton, progress, box_centers=box_centers)
     else:
         level = predictor.predict(clouds, sensor_origin=origin, skeleton=skeleton, progress=progress)
     predict_ms = (time.perf_counter() - cropped) * 1e3

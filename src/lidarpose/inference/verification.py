@@ -94,12 +94,10 @@ def _verifier() -> Backend:
 
 
 def verification_features(
-    detections: Detections, points: np.ndarray, origin: np.ndarray | None, backend: Backend | None = None
+    detections: Detections, points: np.ndarray, origin: np.ndarray | None
 ) -> tuple[np.ndarray, Pose]:
-    """What the final score of detections in points (n, 3) m, level, from a sensor at origin (3,) or None is made of.
-
-    Args:
-        backend: what poses people; by default the bundled default network.
+    """What the final score of detections in points (n, 3) m, level, from a sensor at origin (3,) or None is made of,
+    with poses by the bundled default network.
 
     Returns:
         features (D, 6) in the order of `FEATURES`, and the poses, joints (D, 26, 3) m in the frame of the points; of
@@ -107,7 +105,7 @@ def verification_features(
     """
     every = np.arange(len(detections))
     clouds = [points[rows] for rows in _rows_near(detections.centers, points)]
-    return _posed(detections, every, clouds, origin, backend or _verifier())
+    return _posed(detections, every, clouds, origin, _verifier())
 
 
 def final_score(features: np.ndarray, header: dict) -> np.ndarray:

@@ -11,8 +11,8 @@ import re
 import reprlib
 import secrets
 import stat
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from lidarpose.errors import InputError, MissingExtra
@@ -238,6 +238,13 @@ def write_atomic(path: str | os.PathLike, data: bytes | str) -> None:
     content = data.encode("utf-8") if isinstance(data, str) else data
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(content)
+
+
+def write_all_atomic(contents: Mapping[Path, bytes]) -> None:
+    """Writes several files, all of them or none. Raises InputError as `atomic_path` does."""
+    with ExitStack() as stack:
+        for path, content in contents.items():
+            stack.enter_context(atomic_path(path)).write_bytes(content)
 
 
 def is_unused(folder: Path, names: str) -> bool:

@@ -132,6 +132,9 @@ def scan(
     faces: np.ndarray,
     sensor: Sensor,
     *,
+    divergence: float = 0.0,
+    sub_beams: int = 3,
+    pulse: float = PULSE,
     window_vertices: np.ndarray | None = None,
     margin: float = 0.0,
 ) -> Hits:
@@ -144,39 +147,18 @@ def scan(
     ends. A coarse mesh needs a `margin`, or a finer one as `window_vertices`. A body around the sensor gets the whole
     turn.
 
+    Beams with a width take about sub_beams times as long. A hit's face is then that of the nearest surface in the
+    returned echo, the window reaches half the divergence farther, and the footprint in azimuth is that at the horizon.
+
     Args:
         vertices: (V, 3) m in the sensor's frame: the body, and whatever may hide it or stand behind it.
         faces: (F, 3) indices.
         sensor: a spinning sensor; one with several origins is cast origin by origin.
-        window_vertices: (M, 3) m, the body alone; all vertices if not given.
-        margin: rad that the window is wider on each side.
-
-    Raises InputError.
-    """
-    return scan_divergent(vertices, faces, sensor, divergence=0.0, window_vertices=window_vertices, margin=margin)
-
-
-def scan_divergent(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    sensor: Sensor,
-    *,
-    divergence: float,
-    sub_beams: int = 3,
-    pulse: float = PULSE,
-    window_vertices: np.ndarray | None = None,
-    margin: float = 0.0,
-) -> Hits:
-    """`scan` with beams of a width. Takes about sub_beams times as long.
-
-    A hit's face is that of the nearest surface in the returned echo. The window reaches half the divergence farther
-    than without. In azimuth the footprint is that at the horizon.
-
-    Args:
-        divergence: full, rad; 0.0015 to 0.003 for most sensors; 0 is `scan` itself.
+        divergence: of a beam, full, rad; 0.0015 to 0.003 for most sensors; 0: a beam is its axis.
         sub_beams: along a side of the footprint.
         pulse: m, how far apart in range two echoes must be to be told apart.
-        vertices, faces, sensor, window_vertices, margin: as in `scan`.
+        window_vertices: (M, 3) m, the body alone; all vertices if not given.
+        margin: rad that the window is wider on each side.
 
     Raises InputError.
     """
@@ -195,7 +177,7 @@ def scan_divergent(
         parts = []
         for height, single, _ in sensor.origins:
             origin = np.array([0, 0, height])
-            parts.append(scan_divergent(vertices - origin, faces, single, window_vertices=body - origin, **options))
+            parts.append(scan(vertices - origin, faces, single, window_vertices=body - origin, **options))
         return _join_origins(sensor, parts)
     window = (0, 0, 0, 0)
     if len(body):

@@ -252,7 +252,7 @@ def scan_window(vertices, faces, beams, window, offsets, tangents, weights, puls
     """Points (n, 3), face, column and ring (n,) that the beams of a window (column0, columns, row0, rows) return.
 
     vertices (V, 3) float64, faces (F, 3) int32; sub-beams at offsets (S,) rad of azimuth and of tangents (E, S), of
-    weights (S, S); pulse m as in `raycast.scan_divergent`. A single sub-beam is the beam's axis.
+    weights (S, S); pulse m as in `raycast.scan`. A single sub-beam is the beam's axis.
     """
     column0, _, row0, _ = window
     cast_inverse_x, cast_face, scale = _cast_grid(vertices, faces, beams, window, offsets, tangents)

@@ -23,7 +23,7 @@ from typing import Any
 from lidarpose.errors import InputError, LidarPoseError
 from lidarpose.io.files import write_atomic
 from lidarpose.train.recipes import Finetune, Pretrain
-from lidarpose.train.run_dir import CONFIG, LENGTHS, LOG, MODEL, read_config
+from lidarpose.train.run_dir import CONFIG, LENGTHS, MODEL, read_config, read_log
 
 # folders of a table's own folder: of the steps, and of the figures of cells that are done
 RUNS, CELLS = "runs", "cells"
@@ -216,13 +216,9 @@ class _Watch:
 
 
 def last_entry(folder: Path) -> dict[str, Any] | None:
-    """The last line of a run's log; None before the first."""
-    try:
-        lines = (folder / LOG).read_text().splitlines()
-        return json.loads(lines[-1]) if lines else None
-    except (OSError, ValueError):
-        # not begun, or just being written
-        return None
+    """The last whole line of a run's log; None before the first."""
+    lines = read_log(folder)
+    return lines[-1] if lines else None
 
 
 def _people(folder: Path) -> int:

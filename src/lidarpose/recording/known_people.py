@@ -167,7 +167,4 @@ def _trusted(number: Any) -> Any:
 
 def _pelvis(pose: Pose | None) -> np.ndarray | None:
     """(3,) m, or half way between the hips where the skeleton has none."""
-    if pose is None:
-        return None
-    names = ("pelvis",) if "pelvis" in pose.skeleton.joints else ("left_hip", "right_hip")
-    return pose.joints[[pose.skeleton.index(name) for name in names]].mean(0)
+    return None if pose is None else pose.joints[list(pose.skeleton.middle)].mean(0)

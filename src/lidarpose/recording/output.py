@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from lidarpose.errors import counted
 from lidarpose.io.files import check_writable, file_error
 from lidarpose.io.sources import Source
 from lidarpose.progress import Progress
@@ -128,7 +129,7 @@ class Summary:
         """Lines for the user, at most so many, the first about damaged frames."""
         lines = [] if self.first_error is None else [f"{self.damaged:,} damaged, first {self.first_error}"]
         for kind, count in self.warned.most_common(most - 1):
-            lines.append(f"{count:,} {'frame' if count == 1 else 'frames'}: {self.warnings[kind]}")
+            lines.append(f"{counted(count, 'frame')}: {self.warnings[kind]}")
         return lines
 
     def text(self, is_tracked: bool) -> str:
@@ -136,11 +137,6 @@ class Summary:
         parts = [counted(self.frames, "frame"), counted(self.people, "person", "people")]
         parts += [counted(len(self.tracks), "track")] if is_tracked else []
         return ", ".join(parts + ([f"{self.damaged:,} damaged"] if self.damaged else []))
-
-
-def counted(number: int, one: str, many: str | None = None) -> str:
-    """ "1 frame", "2 frames"."""
-    return f"{number:,} {one if number == 1 else many or one + 's'}"
 
 
 def write_recording(

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from lidarpose.errors import counted
 from lidarpose.geometry import transform_points
 from lidarpose.io.sources import Frame, Source
 from lidarpose.recording.coordinates import FixedFrame, moved_yaw
-from lidarpose.recording.output import counted
 from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import Skeleton
 from lidarpose.viz.bird_eye import ScanPanel, draw_scans

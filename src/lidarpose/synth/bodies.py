@@ -10,7 +10,6 @@ from lidarpose.body.mocap import load_motion
 from lidarpose.body.mocap.motion import Motion, facing_x
 from lidarpose.body.mocap.smpl_poses import load_betas
 from lidarpose.body.pose_prior.activities import KINDS
-from lidarpose.body.pose_prior.constraints import ground_offset
 from lidarpose.body.pose_prior.sampling import sample_clips, sample_rotations
 from lidarpose.body.rig import RestBody, Rig, clothing, load_rig, mean_adult_joints, pose_bodies
 from lidarpose.body.smpl import load_body
@@ -205,14 +204,6 @@ def draw_bodies(
     )
 
 
-def draw_moving_body(
-    bank: PoseBank | None, captured: float, frames: int, rng: np.random.Generator, *, clothes: float = 1.0,
-    mix: dict[str, float] | None = None, rig: Rig | None = None,
-) -> Bodies:  # fmt: skip
-    """The frames of a person who moves, at `CLIP_HZ`: one of `draw_moving_bodies`."""
-    return draw_moving_bodies(bank, captured, 1, frames, rng, clothes=clothes, mix=mix, rig=rig)[0]
-
-
 def draw_moving_bodies(
     bank: PoseBank | None,
     captured: float,
@@ -278,7 +269,7 @@ def _moving_body(
     if clearance is None:
         # the body is not as tall as who was captured: what is little above the lowest frame stands on the ground
         clearance = np.maximum(lowest - lowest.min() - _JUMP, 0)
-    rise = ground_offset(lowest, clearance)[:, None, None] * np.array([0, 0, 1], np.float32)
+    rise = (clearance - lowest)[:, None, None] * np.array([0, 0, 1], np.float32)
     vertices, joints = vertices + rise, joints + rise
     turned = vertices[:frames] @ rotation_about("z", yaw[:frames]).astype(np.float32)
     return Bodies(

@@ -23,7 +23,7 @@ from lidarpose.sample import CLIP_FRAMES, Box, PersonInfo, Pose, Sample, center_
 from lidarpose.skeleton import BODY26
 from lidarpose.synth import noise
 from lidarpose.synth.acquisition import ACQUISITION_DRAWS, MOST_FRAMES, SINGLE_SCAN, Acquisition, draw_acquisition
-from lidarpose.synth.bodies import CLIP_HZ, Bodies, PoseBank, draw_bodies, draw_moving_bodies, draw_moving_body
+from lidarpose.synth.bodies import CLIP_HZ, Bodies, PoseBank, draw_bodies, draw_moving_bodies
 from lidarpose.synth.environment.mesh import Mesh
 from lidarpose.synth.environment.surroundings import ground, occluder, surroundings
 from lidarpose.synth.place import Place, draw_place, recorded_place
@@ -154,9 +154,9 @@ class Generator:
         frames = check_int("a clip's frames", frames, least=1)
         seed, index = check_int("seed", seed, least=0), check_int("index", index, least=0)
         rng = np.random.default_rng([seed, RandomStream.CLIP, index])
-        bodies = draw_moving_body(
-            self.bank, self.captured, frames, rng, clothes=self.config.clothes, mix=self._mix, rig=self.rig
-        )
+        bodies = draw_moving_bodies(
+            self.bank, self.captured, 1, frames, rng, clothes=self.config.clothes, mix=self._mix, rig=self.rig
+        )[0]
         block, row = self._bodies(seed, index // BLOCK), index % BLOCK
         return self._observe(bodies, range(frames), block, row, rng, hard, in_clip=True)
 

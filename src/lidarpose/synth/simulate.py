@@ -10,7 +10,7 @@ import numpy as np
 from lidarpose.data.clips import MARGIN
 from lidarpose.geometry import rotation_about
 from lidarpose.lidar.ray_pattern import RayPattern
-from lidarpose.lidar.raycast import Hits, scan_divergent, scan_pattern
+from lidarpose.lidar.raycast import Hits, scan, scan_pattern
 from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import Box
 from lidarpose.synth.acquisition import SINGLE_SCAN, Acquisition
@@ -227,9 +227,7 @@ def _cast(scene: Scene, meshes: list[Mesh], frame: int, *, margin: float = 0.0) 
     margin += scene.config.margin + np.arctan2(scene.config.around, place.distance)
     if isinstance(sensor, Sensor):
         body, divergence = mesh.vertices[:body_vertices], scene.conditions.divergence
-        hits = scan_divergent(
-            mesh.vertices, mesh.faces, sensor, divergence=divergence, window_vertices=body, margin=margin
-        )
+        hits = scan(mesh.vertices, mesh.faces, sensor, divergence=divergence, window_vertices=body, margin=margin)
         return hits, mesh
     hits = scan_pattern(
         mesh.vertices,

@@ -20,7 +20,7 @@ from lidarpose.lidar.raycast import scan, scan_pattern
 from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import Box, Pose, Sample, center_of
 from lidarpose.skeleton import BODY26
-from lidarpose.synth.bodies import Bodies, draw_moving_body
+from lidarpose.synth.bodies import Bodies, draw_moving_bodies
 from lidarpose.synth.environment import mesh as shapes
 from lidarpose.synth.environment.mesh import Mesh, shape, union
 from lidarpose.synth.place import Place
@@ -255,7 +255,7 @@ def _draw_walkers(plan: StreetPlan, count: int, frames: int, rng: np.random.Gene
 def _draw_pedestrian(frames: int, rng: np.random.Generator) -> Bodies:
     """Somebody who does what people do in streets: nobody sits without a seat."""
     for _ in range(_KIND_TRIES):
-        bodies = draw_moving_body(None, 0.0, frames, rng)
+        bodies = draw_moving_bodies(None, 0.0, 1, frames, rng)[0]
         if bodies.kinds[0] in _STREET_KINDS:
             break
     return bodies

@@ -191,12 +191,6 @@ def walked_way(pace: np.ndarray, strides: np.ndarray, course: np.ndarray) -> np.
     return way
 
 
-def ground_offset(lowest: np.ndarray, clearance: np.ndarray | float = 0.0) -> np.ndarray:
-    """Height m of the pelvis above flat ground, of bodies whose lowest vertex is at z = `lowest` (...) m seen from the
-    pelvis and `clearance` (...) m above the ground: 0 for who stands, more for a runner between two steps."""
-    return np.asarray(clearance) - np.asarray(lowest)
-
-
 # kinds that keep their balance: on both feet or on a foot and a knee, and on one foot
 STATIC = ("idle", "crouch", "bend", "kneel", "squat", "stoop", "reach_down", "get_down", "box")
 ON_ONE_FOOT = ("kick", "knee_raise")

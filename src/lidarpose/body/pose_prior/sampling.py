@@ -77,7 +77,7 @@ class PosePrior:
 class DrawnClips:
     """People in motion. rotations (n, F, 24, 3, 3) float32, local, the first frame facing +x; translation (n, F, 3)
     float32 m, the way of the pelvis since the first frame on flat ground (z: on the mean adult); clearance (n, F)
-    float32 m, how far the lowest point is above the ground (`constraints.ground_offset`); kind (n,) indices into
+    float32 m, how far the lowest point is above the ground; kind (n,) indices into
     `KINDS`."""
 
     rotations: np.ndarray

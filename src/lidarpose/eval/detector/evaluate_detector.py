@@ -3,7 +3,6 @@
 import json
 import os
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from lidarpose.eval.detector.labeled_scans import ScanSet, heldout_scans, labele
 from lidarpose.inference.detection import Search, find_people
 from lidarpose.inference.predictor import Predictor, load
 from lidarpose.inference.scan import Scan
-from lidarpose.io.files import atomic_path
+from lidarpose.io.files import write_all_atomic
 from lidarpose.models.detector.candidates import suppress_near
 from lidarpose.models.detector.detector import SAME, Detector
 from lidarpose.models.detector.ground import estimate_ground, without_ground
@@ -123,7 +122,5 @@ def write_detector(
             files[pictures / f"{scans.name}-false.png"] = draw_false(result, scans)
             files[pictures / f"{scans.name}-missed.png"] = draw_missed(result, scans)
     written = {path: content for path, content in files.items() if content}
-    with ExitStack() as stack:
-        for path, content in written.items():
-            stack.enter_context(atomic_path(path)).write_bytes(content)
+    write_all_atomic(written)
     return list(written)

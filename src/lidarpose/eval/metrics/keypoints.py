@@ -15,6 +15,7 @@ from lidarpose.errors import InputError
 from lidarpose.eval.metrics.aggregate import Score, as_flags, as_numbers, as_skeleton, check_positive, mean
 from lidarpose.eval.metrics.joint_errors import checked_poses, joint_errors
 from lidarpose.skeleton import WAYMO14, Skeleton
+from lidarpose.tracking.assignment import assign_plain
 
 # spread of each joint in units of the box's scale; twice COCO's sigmas, the head's center by the same method
 SIGMAS = {"nose": 0.052, "head_center": 0.158, "shoulder": 0.158, "elbow": 0.144, "wrist": 0.124}
@@ -273,7 +274,8 @@ def match_people(
     near = np.linalg.norm(pred[None] - np.where(labeled[..., None], true, np.inf)[:, None], axis=-1) < penalty
     near_label = (near & predicted[None]).any((0, 2))
     inside = np.where(~has_label[:, None] & ~near_label, (distance < _WITHIN).sum(-1), 0)
-    excused = np.array([p for g, p in assign(-inside.astype(float)) if inside[g, p] > 0], int)
+    rows, columns = assign_plain(-inside)
+    excused = columns[inside[rows, columns] > 0]
 
     free = np.any(predicted, axis=1)
     free[excused] = False
@@ -284,8 +286,9 @@ def match_people(
     # joints that neither has count as free of error, so that the mean is over all J
     total = np.nan_to_num(cost).mean(-1)
     total[distance[np.ix_(people, candidates)].min(-1, initial=np.inf) > penalty] = penalty
-    pairs = np.array([(g, p) for g, p in assign(total) if total[g, p] < penalty], int).reshape(-1, 2)
-    pairs = np.stack([people[pairs[:, 0]], candidates[pairs[:, 1]]], -1)
+    rows, columns = assign_plain(total)
+    near_enough = total[rows, columns] < penalty
+    pairs = np.stack([people[rows[near_enough]], candidates[columns[near_enough]]], -1)
     missed, extra = np.setdiff1d(people, pairs[:, 0]), np.setdiff1d(candidates, pairs[:, 1])
     return Matches(pairs, missed, extra, np.sort(excused))
 
@@ -307,42 +310,3 @@ def distance_to_boxes(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     c, s = np.cos(boxes[:, 6]).reshape(tail), np.sin(boxes[:, 6]).reshape(tail)
     local = np.stack([c * x + s * y, c * y - s * x, z], -1)
     return np.linalg.norm(np.maximum(np.abs(local) - boxes[:, 3:6].reshape(*tail, 3) / 2, 0), axis=-1)
-
-
-def assign(cost: ArrayLike) -> np.ndarray:
-    """The assignment of least total cost: cost (n, m) finite -> (min(n, m), 2) of (row, column), rows rising.
-
-    The Hungarian method (Kuhn 1955) by shortest augmenting paths (Jonker & Volgenant 1987).
-    """
-    cost = np.asarray(cost, float)
-    if cost.ndim != 2 or not np.isfinite(cost).all():
-        raise InputError(f"costs must be (rows, columns) of finite numbers, got shape {cost.shape}")
-    if cost.shape[0] > cost.shape[1]:
-        swapped = assign(cost.T)[:, ::-1]
-        return swapped[np.argsort(swapped[:, 0])]
-    n, m = cost.shape
-    row_price, column_price = np.zeros(n), np.zeros(m + 1)
-    # row_of[m] is the row that is being added, as if it had a column of its own
-    row_of = np.full(m + 1, -1)
-    for start in range(n):
-        row_of[m] = start
-        column, reached, before = m, np.zeros(m + 1, bool), np.full(m, m)
-        length = np.full(m, np.inf)
-        # Dijkstra over columns: reduced costs are never negative, and lengths are from the last column that was reached
-        while row_of[column] >= 0:
-            reached[column] = True
-            row = row_of[column]
-            reduced = cost[row] - row_price[row] - column_price[:m]
-            shorter = ~reached[:m] & (reduced < length)
-            length[shorter], before[shorter] = reduced[shorter], column
-            column = int(np.argmin(np.where(reached[:m], np.inf, length)))
-            step = length[column]
-            row_price[row_of[reached]] += step
-            column_price[reached] -= step
-            length -= step
-        while column < m:
-            row_of[column] = row_of[before[column]]
-            column = before[column]
-    columns = np.flatnonzero(row_of[:m] >= 0)
-    pairs = np.stack([row_of[columns], columns], -1)
-    return pairs[np.argsort(pairs[:, 0])]
