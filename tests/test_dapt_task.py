@@ -2,6 +2,7 @@
 
 import math
 import pickle
+import re
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
@@ -26,6 +27,7 @@ from lidarpose.train.objectives.dapt_losses import DaptTargets, finetuning, log_
 from lidarpose.train.objectives.dapt_objective import DaptObjective, finetuning_config, pretraining_config, small
 from lidarpose.train.objectives.dapt_transfer import transferred
 from lidarpose.train.objectives.objective import alone, total
+from lidarpose.train.optim import optimizers, rate_factor, set_rates
 from lidarpose.train.recipes import Pretrain
 from lidarpose.train.setup import TrainSetup
 from lidarpose.train.validation import update_batch_norms, validate
@@ -622,11 +624,15 @@ def test_statistics_that_run_along_are_stale_and_are_estimated_anew_before_every
     assert anew < 0.6 * stale
 
 
-def test_a_killed_run_of_the_papers_network_ends_with_the_same_statistics(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("task", "times"), [(PRETRAIN, 1.0), (FINETUNE, 10.0)], ids=("pretrain", "finetune"))
+def test_a_killed_run_of_the_papers_network_ends_with_the_same_statistics(tmp_path, monkeypatch, task, times):
     """Three chunks, the last one of four steps: statistics are of the last whole one."""
     monkeypatch.setattr(loop, "SAVE_EVERY", -1.0)
-    setup = setup_of(replace(PRETRAIN, config=replace(PRETRAIN.config, drop_path=0.1)))
-    loop.train(SHORT, tmp_path / "whole", setup=setup)
+    setup, recipe = (
+        setup_of(replace(task, config=replace(task.config, drop_path=0.1))),
+        replace(SHORT, heatmap_rate=times),
+    )
+    loop.train(recipe, tmp_path / "whole", setup=setup)
     halted = tmp_path / "halted"
     calls = []
 
@@ -639,8 +645,8 @@ def test_a_killed_run_of_the_papers_network_ends_with_the_same_statistics(tmp_pa
     with monkeypatch.context() as patch:
         patch.setattr(loop._Run, "_save", once)
         with pytest.raises(KeyboardInterrupt):
-            loop.train(SHORT, halted, setup=setup)
-    loop.train(SHORT, halted, setup=setup, resume=True)
+            loop.train(recipe, halted, setup=setup)
+    loop.train(recipe, halted, setup=setup, resume=True)
     for name in (run_dir.MODEL, run_dir.STATE, run_dir.BEST):
         one, other = (load_file(folder / name) for folder in (tmp_path / "whole", halted))
         assert one.keys() == other.keys()
@@ -654,6 +660,23 @@ def test_a_killed_run_of_the_papers_network_ends_with_the_same_statistics(tmp_pa
     for name, value in net.state_dict().items():
         assert torch.equal(value, model[name]), name
         assert torch.equal(value, state[f"network.{name}"]) is False or not name.endswith(NORMS), name
+
+
+@pytest.mark.parametrize("task", [FINETUNE, FINEST], ids=["heatmaps", "coordinates"])
+def test_the_last_layers_of_heatmaps_learn_at_a_rate_of_their_own(task):
+    net = network(task)
+    recipe = replace(SHORT, heatmap_rate=10.0)
+    (alike,), (made,) = optimizers(net, SHORT), optimizers(net, recipe)
+    assert [len(group["params"]) for group in alike.param_groups] == [len(list(net.parameters()))]
+    names = {id(value): name for name, value in net.named_parameters()}
+    set_rates([made], recipe, 0.5)
+    due = {
+        name: 10.0 if re.fullmatch(r"heads\.query\.fcs\.[012]\.fc2\.(weight|bias)", name) else 1.0
+        for name in names.values()
+    }
+    got = {names[id(p)]: group["lr"] for group in made.param_groups for p in group["params"]}
+    assert got == pytest.approx({name: times * recipe.rate * rate_factor(0.5, recipe) for name, times in due.items()})
+    assert sum(times > 1 for times in due.values()) == (6 if task is FINETUNE else 0)
 
 
 def test_statistics_are_of_all_processes_people(tmp_path):

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from lidarpose.models.dapt.dapt_net import DaptNet
 from lidarpose.models.posenet import PoseNet
 from lidarpose.train.recipes import PoseRecipe, Recipe
 
@@ -17,6 +18,8 @@ _ENDS = (
     *("anchors", "stem.voxel", "stem.view", "place", "anchor_view", "level_joints", "vote.residual", "part"),
     *("joint.heatmap", "joint.certainty", "person"),
 )
+# the layers of the paper's network that end in heatmaps, an axis each
+_HEATMAPS = tuple(f"heads.query.fcs.{axis}.fc2." for axis in range(3))
 # Newton-Schulz iteration of Muon
 _COEFFICIENTS, _ITERATIONS, _EPS = (3.4445, -4.775, 2.0315), 5, 1e-7
 
@@ -28,7 +31,7 @@ def optimizers(network: nn.Module, recipe: Recipe) -> list[torch.optim.Optimizer
     if not (isinstance(network, PoseNet) and isinstance(recipe, PoseRecipe) and recipe.muon_rate):
         kind = torch.optim.Adam if recipe.optimizer == "adam" else torch.optim.AdamW
         # the paper's: torch's own settings
-        return [kind(network.parameters(), betas=betas or (0.9, 0.999), **settings)]
+        return [kind(_groups(network, recipe), betas=betas or (0.9, 0.999), **settings)]
     hidden: list[nn.Parameter] = []
     other: list[nn.Parameter] = []
     for name, value in network.named_parameters():
@@ -37,6 +40,18 @@ def optimizers(network: nn.Module, recipe: Recipe) -> list[torch.optim.Optimizer
         torch.optim.AdamW(other, betas=betas or (0.9, 0.98), **settings),
         Muon(hidden, lr=recipe.muon_rate, weight_decay=recipe.decay, momentum=0.95),
     ]
+
+
+def _groups(network: nn.Module, recipe: Recipe) -> list[dict[str, Any]]:
+    """All parameters, those with a rate of their own apart, which is `times` the recipe's."""
+    times = recipe.heatmap_rate if isinstance(recipe, PoseRecipe) and isinstance(network, DaptNet) else 1.0
+    if times == 1:
+        return [{"params": list(network.parameters())}]
+    named = dict(network.named_parameters())
+    heatmaps = [value for name, value in named.items() if name.startswith(_HEATMAPS)]
+    others = [value for name, value in named.items() if not name.startswith(_HEATMAPS)]
+    groups: list[dict[str, Any]] = [{"params": others}, {"params": heatmaps, "lr": times * recipe.rate, "times": times}]
+    return [group for group in groups if group["params"]]
 
 
 def rate_factor(done: float, recipe: Recipe) -> float:
@@ -60,7 +75,7 @@ def set_rates(optimizers: list[torch.optim.Optimizer], recipe: Recipe, done: flo
     for optimizer in optimizers:
         rate = recipe.muon_rate if isinstance(optimizer, Muon) and isinstance(recipe, PoseRecipe) else recipe.rate
         for group in optimizer.param_groups:
-            group["lr"] = rate * factor
+            group["lr"] = rate * factor * group.get("times", 1.0)
 
 
 @torch.no_grad()

@@ -123,6 +123,9 @@ class PoseRecipe(Recipe):
     """What pre-training and fine-tuning have in common."""
 
     muon_rate: float = _setting(0.02, "peak learning rate of Muon for hidden matrices; 0: AdamW for all", "RATE")
+    heatmap_rate: float = _setting(
+        1.0, "of the paper's network: rate of the last layer of its heatmaps, in times of the rate"
+    )
     bone: float = _setting(0.0, "weight of the error of bones' lengths")
     symmetry: float = _setting(0.0, "weight of the difference of left and right bones")
     pictures: int = _setting(6, "validation people drawn at every validation")

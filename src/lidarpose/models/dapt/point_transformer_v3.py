@@ -198,7 +198,7 @@ class Pooling(nn.Module):
         self.norm = nn.Sequential(RowNorm(out_channels))
 
     def forward(self, rows: Tensor, children: Tensor) -> Tensor:
-        return F.gelu(self.norm(self.proj(rows)[children].amax(1)))
+        return F.gelu(self.norm(self.proj(rows)[children].max(1).values))
 
 
 class Unpooling(nn.Module):
