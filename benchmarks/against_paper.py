@@ -10,12 +10,15 @@ ours, whichever is better.
 
 import argparse
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from ablation_tables import figures
 from ablations import arguments, each, record
+from torch import nn
 
 from lidarpose import evaluation
 from lidarpose.inference.predictor import load
@@ -35,22 +38,36 @@ from lidarpose.train.setup import make_setup
 
 @dataclass(frozen=True)
 class Way:
-    """How the paper's network learns: scene, rates of both stages, whether anchors are kept between them, changes."""
+    """How the paper's network learns: scene, rates of both stages, whether anchors are kept between them, changes;
+    one_stage: all people teach heatmaps, at the second rate."""
 
     what: str
     scene: str = "paper"
     rates: tuple[float, float] = (3e-4, 5e-4)
     anchors: bool = False
     recipe: dict | None = None
+    one_stage: bool = False
 
 
-_FASTER = {"rates": (2e-3, 2e-3), "anchors": True, "recipe": {"ema": 0.99, "clip": 1.0}}
+_FASTER: dict[str, Any] = {"rates": (2e-3, 2e-3), "anchors": True, "recipe": {"ema": 0.99, "clip": 1.0}}
+_HEATMAPS = {"heatmap_rate": 10.0}
 WAYS = {
     "paper": Way("the paper's network and recipe"),
     "paper, faster": Way(
         "the paper's network, rates of 2e-3, anchors kept, gradients clipped, mean of weights", **_FASTER
     ),
     "paper, wild": Way("the same, on our people", scene="wild", **_FASTER),
+    "paper, heatmaps": Way(
+        "the paper's network, the same rates, ten times that in the last layer of heatmaps",
+        **_FASTER | {"recipe": _FASTER["recipe"] | _HEATMAPS},
+    ),
+    "paper, one stage": Way(
+        "the paper's network, heatmaps alone in one stage and one cycle, the same rates, on our people",
+        scene="wild",
+        rates=(0.0, 2e-3),
+        recipe={"warmup": 0.1, "clip": 35.0, "decay": 0.01} | _HEATMAPS,
+        one_stage=True,
+    ),
 }
 
 
@@ -73,21 +90,20 @@ def run(options: argparse.Namespace, name: str, seed: int, folder: Path) -> dict
     way, people = WAYS[name], options.people
     started, used = time.perf_counter(), time.process_time()
     subjects = tuple(options.subjects.split(","))
-    changes = {"size": "paper-small", "motion": options.motion, "subjects": subjects, "people": people // 2}
+    changes = {"size": "paper-small", "motion": options.motion, "subjects": subjects}
+    changes |= {"people": people if way.one_stage else people // 2}
     changes |= {"workers": 0, "pictures": 0, "validate": people, "scene": way.scene} | (way.recipe or {})
     changes |= {"strays": 0.2, "noise": 0.15} if way.scene == "wild" else {}
-    first = DaptObjective(config=sized(pretraining_config()), stage="pretrain")
     settings = recipe(Pretrain, "paper", **changes, seed=seed, rate=way.rates[0])
-    own = replace(make_setup(settings), objective=first, network=first.network)
-    model = train(settings, folder / "pretrain", setup=own)
+    second = DaptObjective(config=sized(finetuning_config("humanm3")), stage="finetune")
+    begun: Callable[[], nn.Module] = second.network
+    if not way.one_stage:
+        first = DaptObjective(config=sized(pretraining_config()), stage="pretrain")
+        own = replace(make_setup(settings), objective=first, network=first.network)
+        trained, _ = load_checkpoint(train(settings, folder / "pretrain", setup=own))
+        begun = partial(transferred, trained, second.config, keep_anchors=way.anchors)
     # other people than those of the first half
     settings = replace(settings, seed=seed + 1_000, rate=way.rates[1])
-    second = DaptObjective(config=sized(finetuning_config("humanm3")), stage="finetune")
-    trained, _ = load_checkpoint(model)
-
-    def begun():
-        return transferred(trained, second.config, keep_anchors=way.anchors)
-
     own = replace(make_setup(settings), objective=second, network=begun)
     model = train(settings, folder / "finetune", setup=own)
     taken = {"seconds": time.perf_counter() - started, "processor_seconds": time.process_time() - used}
