@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from dataset_files import write_sloper4d
 from training_runs import Killed, few_to_validate_on  # noqa: F401
 
 from lidarpose.cli import main
 from lidarpose.cli.command_line import make_parser
+from lidarpose.data.prepare import prepare
 from lidarpose.data.shards import open_dataset
 from lidarpose.errors import InputError
 from lidarpose.eval.scores import published, read_scores
@@ -179,7 +181,9 @@ def test_the_paper_s_protocol_on_real_sets(data):
         lines[cell.row, cell.column] = [" ".join(step.command(Path("o"))) for step in own]
     assert not lines["NE", "waymo"] and lines["NE", "sloper4d"] and lines["LiDARCap", "lidarhuman26m"]
     for (row, column), (*_, tuned, scored) in ((key, own) for key, own in lines.items() if own):
-        assert ("--interval 5" in tuned) == (column in ("humanm3", "lidarhuman26m"))
+        # clips are of all frames
+        thinned = column in ("humanm3", "lidarhuman26m") and row not in ("LiDARCap", "NE")
+        assert ("--interval 5" in tuned) == thinned
         assert "--protocol dapt" in scored and ("--decode dark" in scored) == (row == "DAPT")
         assert "--rate" not in tuned and "--epochs" not in tuned
     assert "--recipe paper --size paper" in lines["DAPT", "waymo"][0] and "--motion raw" in lines["DAPT", "waymo"][0]
@@ -187,6 +191,14 @@ def test_the_paper_s_protocol_on_real_sets(data):
     some = Options(data={name: data[name] for name in ("waymo", "lipd")})
     reasons = {cell.row: cell.why for cell in cells(TABLES["table2"], some)}
     assert reasons["LIPD"] == "" and "--data freemotion=DIR" in reasons["FreeMotion"]
+
+
+def test_a_set_that_the_protocol_refuses_is_refused_before_anything_is_trained(tmp_path, smpl):
+    write_sloper4d(tmp_path / "raw", smpl)
+    prepare("sloper4d", tmp_path / "raw", tmp_path / "set", smpl=smpl)
+    options = Options(data={"sloper4d": str(tmp_path / "set")}, people=64)
+    with pytest.raises(InputError, match="run lidarpose prepare sloper4d RAW OUT --split-by dapt into another folder"):
+        run_table(TABLES["table1"], options, tmp_path / "out", [], lambda words: pytest.fail(str(words)), print)
 
 
 @pytest.mark.parametrize("size, suffix", [("paper", ""), ("paper-small", "-small"), ("paper-tiny", "-tiny")])

@@ -10,11 +10,12 @@ import numpy as np
 from lidarpose._version import __version__
 from lidarpose.errors import LidarPoseError
 from lidarpose.eval.dataset import EvalSample, open_eval_dataset
+from lidarpose.eval.protocols import check_protocol
 from lidarpose.eval.scores import COLUMNS, FILE, Result, read_scores
 from lidarpose.io.files import write_atomic
 from lidarpose.models.checkpoint import load_checkpoint, runs_of
 from lidarpose.paper.steps import CELLS, RUNS, Execute, Step, StepFailed, check_out, is_done, last_entry, run_steps
-from lidarpose.paper.tables import Cell, Options, Table, Target, cells, row_key
+from lidarpose.paper.tables import PROTOCOL, Cell, Options, Table, Target, cells, row_key
 from lidarpose.sample import center_of
 
 SCHEMA = "lidarpose.paper/1"
@@ -38,6 +39,9 @@ def run_table(
     # at once: another process may begin another table in the same folder
     (out / RUNS).mkdir(parents=True, exist_ok=True)
     selected = cells(table, options, chosen)
+    for name in options.real:
+        # before hours of training, not after them
+        check_protocol(PROTOCOL, open_eval_dataset(options.data[name]))
     failed: dict[int, str] = {}
     for k, cell in enumerate(selected):
         if cell.evaluation is not None and not _path(cell.evaluation, out).is_file():

@@ -15,6 +15,8 @@ from lidarpose.errors import InputError, check_name
 from lidarpose.paper.steps import Step
 from lidarpose.train.recipes import MODELS, PAPER, SMALL_PAPER, TINY_PAPER
 
+# of the paper's figures
+PROTOCOL = "dapt"
 # real sets of a table's columns, and what else a row may read
 REAL = ("waymo", "humanm3", "lidarhuman26m", "sloper4d")
 CORPORA = ("lipd", "freemotion", "noisemotion")
@@ -76,7 +78,7 @@ class Options:
 @dataclass(frozen=True, kw_only=True)
 class Target:
     """A column: what is learned from and what is scored, a step or a folder; learn, score: options of finetune and
-    evaluate; clips: of consecutive frames with rotations."""
+    evaluate; thinned: of finetune, where a network reads single frames; clips: of consecutive frames with rotations."""
 
     name: str
     title: str
@@ -85,6 +87,7 @@ class Target:
     learn: tuple[str, ...]
     score: tuple[str, ...]
     clips: bool
+    thinned: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,7 +176,8 @@ def _cell(row: Row, target: Target, seed: int, score: tuple[str, ...], options: 
     if row.pretrain is not None:
         first = Step(("pretrain", *row.pretrain, "--people", str(options.people), *run), hours)
         begin = ("--init", first)
-    tuned = Step(("finetune", target.train, *row.finetune, *begin, *target.learn, *run), hours)
+    learn = target.learn if row.clips else (*target.learn, *target.thinned)
+    tuned = Step(("finetune", target.train, *row.finetune, *begin, *learn, *run), hours)
     # as the released code decodes heatmaps
     dark = ("--decode", "dark") if options.real and row.heatmaps else ()
     words = ("evaluate", tuned, target.test, *target.score, *dark, *score)
@@ -196,8 +200,8 @@ def _real(name: str, folder: str) -> Target:
     """Paper: implementation details. HumanM3 and LiDARHuman26M are thinned out by 5."""
     thinned = ("--interval", "5") if name in ("humanm3", "lidarhuman26m") else ()
     clips = name in ("lidarhuman26m", "sloper4d")
-    score = ("--protocol", "dapt")
-    return Target(name=name, title=name, train=folder, test=folder, learn=thinned, score=score, clips=clips)
+    score = ("--protocol", PROTOCOL)
+    return Target(name=name, title=name, train=folder, test=folder, learn=(), thinned=thinned, score=score, clips=clips)
 
 
 def _stand_in(name: str, title: str, options: Options) -> Target:
