@@ -20,6 +20,7 @@ from lidarpose.inference.checks import flat_axis, lies, rows_inside, unit_warnin
 from lidarpose.inference.inputs import MAX_POINTS, as_origin, candidates, clean
 from lidarpose.inference.predictor import Predictor
 from lidarpose.io.boxes import read_boxes
+from lidarpose.io.point_cloud import Cloud
 from lidarpose.models import bundled_path
 from lidarpose.sample import Box
 from lidarpose.skeleton import SKELETONS
@@ -92,9 +93,10 @@ def test_an_easy_person_stands_on_their_feet(model, standing):
         lambda p: pd.DataFrame({"intensity": 0.5, "z": p[:, 2], "x": p[:, 0], "Y": p[:, 1]}),
         lambda p: pd.DataFrame(p),
         lambda p: records(p),
+        lambda p: Cloud(points=p.astype(float)),
     ],
     ids="float64 big-endian rows tuples row-arrays fortran strided four-columns torch torch-grad table plain-table "
-    "records".split(),
+    "records read-from-file".split(),
 )
 def test_every_kind_of_array_is_the_same_person(model, points, kind):
     np.testing.assert_allclose(model.predict(kind(points)).joints, model.predict(points).joints, atol=1e-4)

@@ -266,8 +266,8 @@ def flat_along_another_axis(scan: Scan) -> str | None:
 
 def everybody_lies(scan: Scan, people: Poses) -> str | None:
     """Everybody lies down, as where another axis is up. people: in the level frame."""
-    posed = [person for person in people if person.pose is not None]
-    if not posed or not all(lies(person.pose, person.points) for person in posed):
+    posed = [(person.pose, person.points) for person in people if person.pose is not None]
+    if not posed or not all(lies(pose, points) for pose, points in posed):
         return None
     others = ", or ".join(_option(other) for other in "zyx" if other != scan.upright_axis)
     who = "the person lies" if len(posed) == 1 else f"all {len(posed)} people lie"

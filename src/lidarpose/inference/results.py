@@ -172,7 +172,7 @@ class PersonPose:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Poses(Sequence):
+class Poses(Sequence[PersonPose]):
     """The people of one call, in the order of the boxes or arrays. A sequence of `PersonPose`.
 
     warnings concern the whole input; timing_ms: what took how long; up: the frame's up axis, which pictures need. Where
