@@ -142,7 +142,7 @@ class PersonPose:
         return self.alone().to_json()
 
     def save(self, path: str | Path) -> None:
-        """Writes `to_json` to a file, whole or not at all."""
+        """As `Poses.save`."""
         self.alone().save(path)
 
     def picture(self, path: str | Path | None = None) -> Picture:
@@ -272,8 +272,9 @@ class Poses(Sequence[PersonPose]):
         return people_json(document | last)
 
     def save(self, path: str | Path) -> None:
-        """Writes `to_json` to a file, whole or not at all."""
-        write_atomic(path, self.to_json())
+        """Writes `to_json`, or `to_dataframe` to a .csv, whole or not at all."""
+        as_csv = str(path).lower().endswith(".csv")
+        write_atomic(path, self.to_dataframe().to_csv(index=False) if as_csv else self.to_json())
 
     def picture(self, path: str | Path | None = None, *, title: str = "") -> Picture:
         """Everybody from the front and the side on one PNG; also written to `path` where given.
