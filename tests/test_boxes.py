@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hostile_files import KITTI, npy, refusal
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -79,6 +80,14 @@ def test_found_boxes_are_read_as_they_were_written(tmp_path):
     assert json.loads((tmp_path / "boxes.json").read_text())["warnings"] == ["odd"]
 
 
+def test_some_of_the_boxes_found_are_saved_alike(tmp_path):
+    found = Boxes([Box(center=[i, 0, 0], size=[1, 1, 2], id=i) for i in range(3)], source="a.pcd", detector="1")
+    found[1:].save(tmp_path / "boxes.json")
+    whole = found.to_dict()
+    assert json.loads((tmp_path / "boxes.json").read_text()) == whole | {"people": whole["people"][1:]}
+    assert found[1].id == 1 and found[-1] is found[2]
+
+
 def test_scores_of_other_detectors_may_be_anything():
     for score in (12.5, -1, "high", None, math.nan, [1], True):
         assert read_boxes([{**PERSON, "score": score, "mounted": "no"}])[0].score is None
@@ -105,7 +114,8 @@ def test_rows_of_seven_numbers(tmp_path, monkeypatch):
     (tmp_path / "boxes.json").write_text(json.dumps(rows.tolist()))
     (tmp_path / "people.json").write_text(json.dumps({"people": rows.tolist()}))
     files = [tmp_path / name for name in ("boxes.npy", "boxes.json", "people.json")]
-    for source in (rows, rows.astype("f4"), rows.tolist(), {"people": rows}, tuple(rows), *files):
+    tensor = torch.tensor(rows, requires_grad=True)
+    for source in (rows, rows.astype("f4"), rows.tolist(), tensor, {"people": rows}, tuple(rows), *files):
         boxes = read_boxes(source)
         np.testing.assert_allclose([fields(box) for box in boxes], rows, rtol=1e-6)
         assert [box.id for box in boxes] == [None, None]
@@ -211,6 +221,7 @@ BAD = {
     "nan yaw": (changed(yaw=math.nan), ["people[1].yaw", "NaN"]),
     "degrees": (changed(yaw=90), ["people[1].yaw", "got 90", "pi / 180"]),
     "id twice": (changed(), ["people[1].id", 'got "a", which people[0] has too']),
+    "ids of one text": ([{**PERSON, "id": 1}, {**PERSON, "id": "1"}], ["people[1].id", 'got "1", which people[0]']),
     "seven with text": ([ROW, [1, 2, 3, 4, 5, "6", 7]], ["people[1].size"]),
     "six numbers": ([ROW[:6]], ["people[0]", "[x, y, z, l, w, h, yaw]"]),
     "row alone": (ROW, ["people[0]", "got 10.0"]),

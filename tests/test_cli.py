@@ -19,6 +19,7 @@ from hostile_files import CALIBRATION, KITTI
 from safetensors.numpy import save_file
 
 import lidarpose
+from lidarpose import progress
 from lidarpose.cli import demo, main
 from lidarpose.errors import InputError
 from lidarpose.inference import predictor
@@ -411,8 +412,16 @@ BAD_COMMANDS = {
     "unknown option": ("predict CROP --picure", "--picure"),
     "demo seed": ("demo --seed -1 --out DIR/d", "seed"),
     "demo weights": ("demo --weights tyni --out DIR/d", "did you mean tiny"),
-    "demo into a file": ("demo --out CROP", "cannot write"),
+    "demo into a file": ("demo --out CROP", "expected a folder, got"),
     "out of another kind": ("predict CROP --out DIR/x.parquet", "expected a folder or a file .json or .csv"),
+    **{
+        f"a folder named as a file: {words.split()[0]}": (f"{words} DIR/x.csv", "expected a folder, got")
+        for words in (
+            *("demo --out", "synth -n 2 --out", "prepare waymo raw", "pretrain", "finetune people --out"),
+            *("train-detector", "evaluate small bench --out", "paper table1 --out"),
+        )
+    },
+    "out of an unknown kind": ("predict CROP --out DIR/x.tsv", "expected a folder or a file .json or .csv"),
     "out is a file": ("predict CROP --out CROP", "got .npy"),
     "out below a file": ("predict CROP --out CROP/deep", "cannot write"),
     "out of a long name": (f"predict CROP --out {'x' * 300}.json", "choose a shorter name"),
@@ -565,6 +574,13 @@ def test_help_and_version(capsys):
         assert f"\n  lidarpose {command}" in text[text.index("\nexample") :]
         # no empty default, no metavar of one letter
         assert "()" not in text and " V\n" not in text and "--quiet" in text
+
+
+def test_without_a_terminal_lines_say_how_far_the_prediction_is(crop, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(progress, "LINE_EVERY", 0.001)
+    words = ("predict", crop, "--crop", "--out", tmp_path / "a.json")
+    assert run(*words) == 0 and "of 1 clouds" in capsys.readouterr().err
+    assert run(*words, "--quiet") == 0 and capsys.readouterr().err == ""
 
 
 def test_quiet_prints_errors_only(crop, tmp_path, capsys):

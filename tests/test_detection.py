@@ -159,6 +159,11 @@ def test_units_are_told_before_anyone_is_found(scene, factor, word):
     assert word in warning
 
 
+def test_one_person_is_no_scan_in_kilometers():
+    standing = np.random.default_rng(0).normal([8, 0, 0], [0.08, 0.12, 0.4], (500, 3))
+    assert not any("kilometers" in warning for warning in lidarpose.detect(standing).warnings)
+
+
 def test_axes_are_told(scene):
     (warning,) = lidarpose.detect(scene[0] @ UP_AXES["y"]).warnings
     assert "hardly the input's up axis: try up y" in warning

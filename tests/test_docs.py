@@ -3,6 +3,7 @@
 import contextlib
 import importlib.util
 import io
+import json
 import os
 import re
 import tomllib
@@ -161,8 +162,37 @@ def test_help_and_pages_list_every_point_format_and_the_default_score():
     assert f"The default, {open_detector()[1]['default_score']:.2f}, is" in use
 
 
+# what an editor is to know of the public names
+SURFACE = """
+from typing import assert_type
+
+import numpy as np
+
+import lidarpose
+
+model = lidarpose.load()
+cloud = lidarpose.read_points("person.ply")
+points = np.zeros((10, 3))
+clouds: list[np.ndarray] = [points]
+boxes = lidarpose.detect(points)
+assert_type(model.predict(points), lidarpose.PersonPose)
+assert_type(model.predict(cloud, find=False), lidarpose.PersonPose)
+assert_type(model.predict([[0.0, 0.0, 1.0]]), lidarpose.PersonPose)
+assert_type(model.predict(clouds), lidarpose.Poses)
+assert_type(model.predict([]), lidarpose.Poses)
+assert_type(model.predict(points, boxes=boxes), lidarpose.Poses)
+assert_type(model.predict(points, find=True), lidarpose.Poses)
+people = lidarpose.predict("sweep.pcd", sensor_origin=points[0])
+lidarpose.predict("sweep.pcd", boxes=boxes, sensor_origin=[0, 0, 1.8])
+assert_type([person for person in people], list[lidarpose.PersonPose])
+assert_type(people["a"], lidarpose.PersonPose)
+assert_type(people[1:], lidarpose.Poses)
+assert_type(float(people[0].joints[0, 0]), float)
+"""
+
+
 @pytest.mark.slow
-def test_python_blocks_of_pages_pass_type_checking(tmp_path, monkeypatch):
+def test_python_blocks_of_pages_and_the_public_names_pass_type_checking(tmp_path, monkeypatch):
     api = pytest.importorskip("mypy.api")
     files = []
     for page in PAGES:
@@ -170,6 +200,11 @@ def test_python_blocks_of_pages_pass_type_checking(tmp_path, monkeypatch):
         for number, block in enumerate(blocks):
             files.append(tmp_path / f"{page.stem.lower()}_{number}.py")
             files[-1].write_text(block, "utf-8")
+    notebook = json.loads((ROOT / "examples" / "03_notebook.ipynb").read_text("utf-8"))
+    cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    for name, code in (("notebook.py", "\n".join(cells)), ("surface.py", SURFACE)):
+        files.append(tmp_path / name)
+        files[-1].write_text(code, "utf-8")
     assert {"readme_0.py", "use_0.py"} <= {file.name for file in files}
     monkeypatch.setenv("MYPYPATH", str(SOURCE.parent))
     config = ["--config-file", str(ROOT / "pyproject.toml"), "--follow-imports", "silent", "--cache-dir", os.devnull]

@@ -199,7 +199,7 @@ def test_a_frame_that_was_leveled_is_noted_where_it_is_compared_with_the_release
     "name, options, words",
     [
         ("sloper4d", {"protocol": "dapt"}, "--split-by dapt into another folder"),
-        ("leaking", {}, "use --protocol dapt"),
+        ("leaking", {}, "use protocol dapt"),
         ("humanm3", {"split": "val"}, "nobody in the split 'val'; there are test, train"),
         ("humanm3", {"skeleton": "smpl24"}, "has no spine1"),
         ("humanm3", {"protocol": "clear"}, "did you mean clean"),
@@ -240,7 +240,7 @@ def test_splits_that_are_scored_by_default(sets, tmp_path):
     assert everybody.split == "all" and everybody.count == 24
     assert open_eval_dataset("bench").split == "none"
     prepare("humanm3", sets / "a", tmp_path / "x", split="train")
-    with pytest.raises(InputError, match="only in train: say --split"):
+    with pytest.raises(InputError, match="only in train: say split"):
         open_eval_dataset(tmp_path / "x")
     assert open_eval_dataset(tmp_path / "x", split="train").count == 8
 
@@ -474,7 +474,7 @@ def test_what_cannot_be_written_or_perturbed_is_an_error_before_anybody_is_predi
         assert words in capsys.readouterr().err
     # of a single person of the bench nobody is clean
     assert main(["evaluate", "tiny", "bench", "--limit", "1", "--stability", "--out", str(tmp_path / "new")]) == 2
-    assert "score more people, or leave --stability out" in capsys.readouterr().err
+    assert "score more people, or leave stability out" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 

@@ -128,6 +128,7 @@ def test_evaluate_and_table_from_the_command_line(tmp_path, monkeypatch, capsys)
     assert f"{made.results[0].line('mpjpe').value:.2f} [" in capsys.readouterr().out
     assert run("table", "evaluation/tiny", "--format", "json", "--out", "table.json") == 0
     assert json.loads((tmp_path / "table.json").read_text())["evaluated"]
+    assert run("table", "evaluation/tiny", "--out", "table.csv") == 2 and not (tmp_path / "table.csv").exists()
     capsys.readouterr()
 
     # the same folder is not written twice

@@ -20,6 +20,7 @@ from lidarpose.inference.checks import flat_axis, lies, rows_inside, unit_warnin
 from lidarpose.inference.inputs import MAX_POINTS, as_origin, candidates, clean
 from lidarpose.inference.predictor import Predictor
 from lidarpose.io.boxes import read_boxes
+from lidarpose.io.point_cloud import Cloud
 from lidarpose.models import bundled_path
 from lidarpose.sample import Box
 from lidarpose.skeleton import SKELETONS
@@ -92,9 +93,10 @@ def test_an_easy_person_stands_on_their_feet(model, standing):
         lambda p: pd.DataFrame({"intensity": 0.5, "z": p[:, 2], "x": p[:, 0], "Y": p[:, 1]}),
         lambda p: pd.DataFrame(p),
         lambda p: records(p),
+        lambda p: Cloud(points=p.astype(float)),
     ],
     ids="float64 big-endian rows tuples row-arrays fortran strided four-columns torch torch-grad table plain-table "
-    "records".split(),
+    "records read-from-file".split(),
 )
 def test_every_kind_of_array_is_the_same_person(model, points, kind):
     np.testing.assert_allclose(model.predict(kind(points)).joints, model.predict(points).joints, atol=1e-4)
@@ -680,7 +682,7 @@ def test_people_by_id_and_slices(poses):
         named["c"]
 
 
-def test_results_as_arrays_and_as_a_table(poses):
+def test_results_as_arrays_and_as_a_table(poses, tmp_path):
     joints = poses.to_numpy()
     assert joints.shape == (3, 24, 3) and np.isnan(joints[1]).all() and not poses[1].has_pose
     np.testing.assert_array_equal(joints[0], poses[0].joints)
@@ -689,6 +691,10 @@ def test_results_as_arrays_and_as_a_table(poses):
     assert list(table.person.unique()) == [0, 2] and len(table) == 48
     np.testing.assert_array_equal(table[["x", "y", "z"]].to_numpy()[24:], poses[2].joints)
     np.testing.assert_array_equal(table.confidence[:24], poses[0].confidence)
+    poses.save(tmp_path / "poses.csv")
+    read = pd.read_csv(tmp_path / "poses.csv")
+    assert list(read) == list(table) and list(read.joint) == list(table.joint)
+    np.testing.assert_allclose(read[["x", "y", "z"]], table[["x", "y", "z"]])
 
 
 def test_boxes_of_points_in_memory_and_of_a_file_give_the_same(model, points, tmp_path):
@@ -709,6 +715,11 @@ def test_one_box_in_centimeters_among_boxes_in_metres_is_noticed(model, points):
     assert line.startswith("box c is unlike the others: it is 180 m tall: are the units")
     assert people["c"].has_pose and people["c"].warnings == ()
     assert not any("unlike" in line for line in model.predict(points, boxes=[meters, meters]).warnings)
+    # of two, neither is in between
+    (line,) = model.predict(np.concatenate([points, STREET]), boxes=[meters, wrong]).warnings
+    assert line.startswith("box c is unlike the others: it is 180 m tall")
+    (line,) = model.predict(np.concatenate([points, STREET]), boxes=[wrong, wrong | {"id": "d"}, meters]).warnings
+    assert line.startswith("a person's box is 180 m tall")
 
 
 STREET = np.random.default_rng(0).uniform([-200, -200, -2], [200, 200, -1.9], (3000, 3))
@@ -718,7 +729,7 @@ STREET = np.random.default_rng(0).uniform([-200, -200, -2], [200, 200, -1.9], (3
     "change, words",
     [
         *((lambda p, scale=scale: p * scale, "taller than a person: expected meters") for scale in (1 / 0.3048, 2, 10)),
-        (lambda p: p * [1, -1, -1], "try --up -z"),
+        (lambda p: p * [1, -1, -1], "try up -z"),
         (lambda p: np.concatenate([p, STREET]), "expected a crop of one person"),
         # wider than tall
         (lambda p: np.concatenate([p, p + [0, 1.7, 0]]) / 0.3048, "taller than a person: expected meters"),
@@ -734,6 +745,6 @@ def test_all_who_may_be_upside_down_are_looked_at_in_one_batch(model, points, mo
     batches, run = [], model.backend.run
     monkeypatch.setattr(model.backend, "run", lambda clouds, view: batches.append(len(clouds)) or run(clouds, view))
     people = model.predict([points * [1, -1, -1]] * 3)
-    assert ["--up -z" in person.warnings[-1] for person in people] == [True] * 3
+    assert ["try up -z" in person.warnings[-1] for person in people] == [True] * 3
     # two passes as they are, two turned over
     assert batches == [3] * 4

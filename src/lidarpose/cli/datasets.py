@@ -44,13 +44,13 @@ $ lidarpose synth --out streets -n 20 --scenes --sensor os1-128
 """
 _PREPARE = f"""
 write a real dataset's people as Parquet shards
-Reads the raw files of a public dataset and writes OUT/dataset.json and Parquet shards. After an interruption the same
+Reads the raw files of a public dataset and writes DIR/dataset.json and Parquet shards. After an interruption the same
  command continues.
 $ lidarpose prepare waymo RAW waymo
 $ lidarpose prepare sloper4d RAW sloper4d --smpl SMPL_NEUTRAL.pkl
 <dataset> NAME  humanm3, lidarhuman26m, sloper4d, waymo, itop, lipd, freemotion or noisemotion
 <root> RAW  folder of the dataset's raw files
-<out> OUT  a new folder, or the one of an interrupted run
+<out> DIR  a new folder, or the one of an interrupted run
 --split NAME  write only the people of train, val or test
 --split-by NAME  a published split (default: RAW/train.txt, val.txt and test.txt if present, else the usual one)
 --smpl FILE|DIR  your SMPL model, for lidarhuman26m, sloper4d, freemotion, noisemotion

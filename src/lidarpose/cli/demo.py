@@ -10,6 +10,7 @@ from lidarpose.errors import check_int
 from lidarpose.inference.predictor import TTA, Predictor, load
 from lidarpose.io.files import check_writable, write_all_atomic
 from lidarpose.models import DEFAULT
+from lidarpose.progress import Progress
 
 SENSORS = ("vlp-32c", "os1-128", "hdl-64e")
 PEOPLE_EACH = 4
@@ -37,10 +38,13 @@ def run(folder: str | Path, *, seed: int, weights: str = DEFAULT) -> None:
     model = load(weights, tta=TTA)
     print("synthesizing people (the first time compiles the ray caster: some ten seconds) ...", flush=True)
     scene = scene_config("wild").eased(_HARD)
-    people = []
-    for k, name in enumerate(SENSORS):
-        generator = Generator(scene=replace(scene, sensors=(name,), distance=(3.0, 20.0)))
-        people += [generator.person(seed, k * PEOPLE_EACH + i) for i in range(PEOPLE_EACH)]
+    people: list = []
+    with Progress(len(SENSORS) * PEOPLE_EACH, unit="people") as bar:
+        for name in SENSORS:
+            generator = Generator(scene=replace(scene, sensors=(name,), distance=(3.0, 20.0)))
+            for _ in range(PEOPLE_EACH):
+                people.append(generator.person(seed, len(people)))
+                bar.update(len(people))
     rows, contents = _report(model, people)
     write_all_atomic({folder / name: content for name, content in contents.items()})
     print(pandas.DataFrame(rows).to_string(index=False, justify="left"))

@@ -59,6 +59,7 @@ $ lidarpose table evaluation/small
 --format NAME = markdown  markdown (default) or json
 --out FILE  write to FILE (default: print)
 """
+_TABLE_SUFFIXES = {"markdown": (".md", ".markdown", ".txt"), "json": (".json",)}
 # groups of rows that the terminal shows; the others are in scores.json
 _SHOWN = ("condition", "family", "sensor", "plain", "joints", "body", "joint", "distance, m", "points", "hidden share")
 # metrics of these groups that it shows, besides those of everybody
@@ -162,7 +163,7 @@ def _detector_lines(result) -> Iterator[str]:
 
 def _table(options: argparse.Namespace) -> None:
     from lidarpose import evaluation
-    from lidarpose.io.files import check_apart, write_atomic
+    from lidarpose.io.files import check_apart, check_suffix, write_atomic
 
     if options.out is not None:
         check_apart(options.out, *map(evaluation.scores_path, options.scores))
@@ -170,6 +171,7 @@ def _table(options: argparse.Namespace) -> None:
     if options.out is None:
         print(text, end="")
     else:
+        check_suffix(options.out, *_TABLE_SUFFIXES[options.format])
         write_atomic(options.out, text)
         print(options.out)
 

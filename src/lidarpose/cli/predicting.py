@@ -1,14 +1,13 @@
 """`lidarpose predict` of one scan, and `lidarpose detect`; folders and recordings are `cli.recordings`."""
 
 import argparse
-import os
 import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from lidarpose.cli.terminal import add_command, is_watched, tell
+from lidarpose.cli.terminal import add_command, is_file_name, tell
 from lidarpose.errors import InputError, counted, first_names
 from lidarpose.models import DEFAULT, NAMES
 
@@ -16,8 +15,6 @@ from lidarpose.models import DEFAULT, NAMES
 _FILES = ".pcd .ply .las .laz .npy .npz .csv .xyz .txt .bin"
 # characters of an id in a warning
 _LONGEST_ID = 40
-# what a user who names it expects as a file
-_NO_FOLDERS = "bin csv html json jsonl npy npz parquet pcd pdf pkl ply png txt xml yaml yml"
 
 _FRAME = """
 --sensor-origin X,Y,Z  sensor position, or unknown (default: ORIGIN)
@@ -91,7 +88,7 @@ def _predict(options: argparse.Namespace) -> None:
 
     file = Path(options.source[0])
     result, picture, page = output_paths(options, file.stem, ("json", "csv"))
-    poses = predict(options.source[0], **prediction_options(options), progress=is_watched())
+    poses = predict(options.source[0], **prediction_options(options), progress=True)
     outputs: dict[Path, bytes] = {}
     if result is not None:
         as_csv = result.suffix.lower() == ".csv"
@@ -177,14 +174,12 @@ def _result_path(out: str, name: str, what: str, *suffixes: str) -> Path | None:
         if sys.stdout is None:
             raise InputError("--out - prints to the standard output, which is closed: name a file")
         return None
-    # os.path says no where a name is too long, which is an error when it is written
-    if not out.endswith(("/", os.sep)) and not os.path.isdir(out):
+    if is_file_name(out):
         suffix = Path(out).suffix.lower()
         if suffix in suffixes:
             return Path(out)
-        if suffix[1:] in _NO_FOLDERS.split():
-            files = " or ".join(suffixes)
-            raise InputError(f"--out {out}: expected a folder or a file {files}, got {suffix}: name one")
+        files = " or ".join(suffixes)
+        raise InputError(f"--out {out}: expected a folder or a file {files}, got {suffix}: name one")
     return Path(out) / f"{name}.{what}{suffixes[0]}"
 
 

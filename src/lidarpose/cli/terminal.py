@@ -1,9 +1,11 @@
 """How options are written, and how the command line speaks."""
 
 import argparse
+import os
 import re
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from lidarpose.io.files import one_line
@@ -17,8 +19,30 @@ class _Help(argparse.HelpFormatter):
         return text if text.startswith("example") else super()._fill_text(text, width, indent)
 
 
+# what a user who names it expects as a file
+_SUFFIXES = (
+    "bin csv gz html jpg json jsonl las laz md mp4 npy npz onnx parquet pcd pdf pkl ply png pt safetensors tsv txt "
+    "xlsx xml xyz yaml yml zip"
+)
+
+
+def is_file_name(text: str) -> bool:
+    """Whether a path that is not there yet has a file's suffix and no / behind it."""
+    # os.path says no where a name is too long, which is an error when it is written
+    is_folder = text.endswith(("/", os.sep)) or os.path.isdir(text)
+    return not is_folder and Path(text).suffix[1:].lower() in _SUFFIXES.split()
+
+
+def folder(text: str) -> str:
+    """An argument that is the name of a folder, there or to be made."""
+    if is_file_name(text):
+        raise argparse.ArgumentTypeError(f"expected a folder, got {text}: name one, or put / behind it")
+    return text
+
+
 # the metavar of an option tells its type; others are text
-_TYPES = {"N": int, "K": int} | dict.fromkeys(("P", "M", "S", "HZ", "H", "SHARE"), float)
+_TYPES: dict[str, Callable] = {"N": int, "K": int, "DIR": folder, "RUN": folder}
+_TYPES |= dict.fromkeys(("P", "M", "S", "HZ", "H", "SHARE"), float)
 # stands for a change of the scene
 KEEP = "--keep R  laser mask: every sample keeps a share R of its patches, the paper's r_keep; as --set keep=R"
 
@@ -96,8 +120,3 @@ def tell(text: str, *, error: bool = False) -> None:
     --quiet only errors are printed."""
     if sys.stderr is not None and (error or not is_quiet()):
         print(one_line(text), file=sys.stderr)
-
-
-def is_watched() -> bool:
-    """Whether somebody sees stderr as it comes, so that a bar is worth drawing."""
-    return sys.stderr is not None and sys.stderr.isatty() and not is_quiet()

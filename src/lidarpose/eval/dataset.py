@@ -164,18 +164,18 @@ def _open_folder(folder: Path, split: str | None, limit: int | None) -> EvalData
     card = dataset.card
     synthetic = card.people != "labelled"
     if synthetic and split not in (None, EVERYBODY):
-        raise file_error(folder, f"holds synthetic people, which have no splits, got {split!r}: leave --split out")
+        raise file_error(folder, f"holds synthetic people, which have no splits, got {split!r}: leave split out")
     rows = _stored_rows(dataset, damaged)
     splits = sorted(rows["split"].dropna().unique())
     if split is None:
         split = next((name for name in _DEFAULT_SPLITS if name in splits), EVERYBODY)
         if split == EVERYBODY and splits:
-            raise file_error(folder, f"has nobody in test or val, only in {', '.join(splits)}: say --split NAME")
+            raise file_error(folder, f"has nobody in test or val, only in {', '.join(splits)}: say split NAME")
     chosen = rows if split == EVERYBODY else rows[rows["split"] == split]
     total = len(chosen)
     if not total:
         known = ", ".join(splits) or "no splits"
-        raise file_error(folder, f"has nobody in the split {split!r}; there are {known}: say one with --split")
+        raise file_error(folder, f"has nobody in the split {split!r}; there are {known}: say one as split")
     chosen = chosen.iloc[spread(total, limit)]
     source, _, leaks = str(card.about.get("split", "")).partition("; LEAKS: ")
     own = skeleton(card.skeleton)
@@ -306,7 +306,7 @@ def _open_bench(which: str, split: str | None, limit: int | None) -> EvalDataset
     """lidarpose-bench: its people alone, and without a limit the frames of its clips for motion."""
     name = BENCHES[which].name
     if split not in (None, EVERYBODY):
-        raise InputError(f"{name} is one test set without splits, got {split!r}: leave --split out")
+        raise InputError(f"{name} is one test set without splits, got {split!r}: leave split out")
     bench = load_bench(which)
     total = len(bench.people)
     limit = limit if limit is not None and limit < total else None

@@ -81,16 +81,16 @@ def check_protocol(protocol: str, dataset: EvalDataset) -> None:
     if protocol == "clean":
         if split_by == "dapt":
             raise InputError(
-                f"{name} was split by dapt, where neighboring frames are in train and test: use --protocol dapt, or "
+                f"{name} was split by dapt, where neighboring frames are in train and test: use protocol dapt, or "
                 f"run lidarpose prepare {kind} RAW OUT again without --split-by dapt"
             )
         return
     if kind in _OWN_CROP:
         raise InputError(
-            f"the protocol dapt centers on labels of real datasets, {name} is synthetic: use --protocol clean"
+            f"the protocol dapt centers on labels of real datasets, {name} is synthetic: use protocol clean"
         )
     if kind not in DAPT:
-        raise InputError(f"the released code evaluates {', '.join(DAPT)}, not {kind}: use --protocol clean for {name}")
+        raise InputError(f"the released code evaluates {', '.join(DAPT)}, not {kind}: use protocol clean for {name}")
     if split_by != (wanted := DAPT[kind].split):
         raise InputError(
             f"{name} was split by {split_by or 'nothing'}, the protocol dapt is by {wanted}: run lidarpose prepare "
@@ -289,7 +289,7 @@ def eval_setup(
     seed = check_int("seed", seed, least=0)
     check_protocol(protocol, dataset)
     if protocol == "dapt" and model.model.get("tta", 1) > 1:
-        raise InputError("the protocol dapt predicts each person once, as the released code does: leave --tta out")
+        raise InputError("the protocol dapt predicts each person once, as the released code does: leave tta out")
     wanted = dataset.scored
     if skeleton is not None:
         wanted = skeleton_of(skeleton)

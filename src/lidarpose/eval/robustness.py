@@ -243,9 +243,7 @@ def people_to_perturb(setup: EvalSetup) -> list[CroppedPerson]:
         if cropped is not None and len(cropped.points)
     ]
     if not people:
-        raise InputError(
-            f"none of the {_who(setup)} has a point to perturb: score more people, or leave --stability out"
-        )
+        raise InputError(f"none of the {_who(setup)} has a point to perturb: score more people, or leave stability out")
     return people
 
 

@@ -114,9 +114,9 @@ def exported_beside(path: str | os.PathLike, *, threads: int | None = None) -> O
     path = Path(path)
     header = read_header(path)
     if header.network != "pose":
-        raise file_error(path, "a network of the paper does not run as ONNX: leave --backend away, or say torch")
+        raise file_error(path, "a network of the paper does not run as ONNX: leave backend away, or say torch")
     beside = path.with_suffix(".onnx")
-    make = f"make it with `lidarpose export {path} --out {beside}`, or use --backend torch"
+    make = f"make it with `lidarpose export {path} --out {beside}`, or use backend torch"
     if not beside.is_file():
         raise file_error(path, f"ONNX Runtime needs {beside.name} beside it, which does not exist: {make}")
     backend = OnnxBackend(beside, threads=threads)

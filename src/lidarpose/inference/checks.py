@@ -118,7 +118,7 @@ def upside_down_warning(pose: Pose, turned: Pose | None) -> str | None:
         return None
     if turned.spread.mean() > _CLEARLY_SURER * pose.spread.mean():
         return None
-    return "upside down the person is found with more certainty: does the up axis point down? try --up -z"
+    return "upside down the person is found with more certainty: does the up axis point down? try up -z"
 
 
 def lies(pose: Pose, points: np.ndarray) -> bool:
@@ -141,10 +141,10 @@ def lies(pose: Pose, points: np.ndarray) -> bool:
 def box_units(scan: Scan, people: Poses) -> str | None:
     """All boxes, or some of them, have sizes of other units than meters."""
     boxes = scan.boxes or []
-    if warning := unit_warning(np.median([box.size for box in boxes], axis=0), what="a person's box"):
-        return warning
     warnings = [(str(person.id), unit_warning(box.size, what="it")) for person, box in zip(people, boxes, strict=True)]
     warnings = [(name, warning) for name, warning in warnings if warning]
+    if 2 * len(warnings) > len(boxes):
+        return unit_warning(np.median([box.size for box in boxes], axis=0), what="a person's box") or warnings[0][1]
     if not warnings:
         return None
     return f"box {first_names([name for name, _ in warnings])} is unlike the others: {warnings[0][1]}"
@@ -222,9 +222,9 @@ def origin_warning(scan: Scan) -> str | None:
 def scan_unit_warning(points: np.ndarray, count: int) -> str | None:
     """What is likely wrong where the points (n, 3) of a whole scan of `count` points, z up, are not in meters."""
     low, high = np.percentile(points, _MOST, axis=0)
-    across = float((high - low)[:2].max())
-    if across < _SMALLEST_SCAN:
-        return f"the points reach over {across:.2g} m: are the units kilometers? multiply all coordinates by 1000"
+    across, largest = float((high - low)[:2].max()), float((high - low).max())
+    if largest < _SMALLEST_SCAN:
+        return f"the points reach over {largest:.2g} m: are the units kilometers? multiply all coordinates by 1000"
     if across > _LONGEST_SCAN and count < _SPARSEST * across**2:
         unit, factor = ("millimeters", 1000) if across > _LONG_IN_MILLIMETERS else ("centimeters", 100)
         return f"the points reach over {across:,.0f} m: are the units {unit}? divide all coordinates by {factor}"
@@ -266,8 +266,8 @@ def flat_along_another_axis(scan: Scan) -> str | None:
 
 def everybody_lies(scan: Scan, people: Poses) -> str | None:
     """Everybody lies down, as where another axis is up. people: in the level frame."""
-    posed = [person for person in people if person.pose is not None]
-    if not posed or not all(lies(person.pose, person.points) for person in posed):
+    posed = [(person.pose, person.points) for person in people if person.pose is not None]
+    if not posed or not all(lies(pose, points) for pose, points in posed):
         return None
     others = ", or ".join(_option(other) for other in "zyx" if other != scan.upright_axis)
     who = "the person lies" if len(posed) == 1 else f"all {len(posed)} people lie"

@@ -34,7 +34,7 @@ def predict(
     max_range: float | None = None,
     max_people: int | None = None,
     background: "str | os.PathLike | Sequence | np.ndarray | None" = None,
-    sensor_origin: tuple[float, float, float] | str | None = None,
+    sensor_origin: "np.ndarray | Sequence[float] | str | None" = None,
     skeleton: str | None = None,
     up: str | Sequence[float] = "z",
     columns: int | None = None,

@@ -4,7 +4,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypedDict, Unpack, overload
+from typing import TYPE_CHECKING, Literal, Protocol, TypedDict, Unpack, overload
 
 import numpy as np
 
@@ -118,6 +118,15 @@ def _torch_backend(path: Path, device: str, compile: bool) -> Backend:
     return torch_backend(path, device=device, compile=compile)
 
 
+class _Array(Protocol):
+    """An array of numpy, torch or pandas. Unlike `ArrayLike` no list is one, which would leave the overloads open."""
+
+    def __array__(self) -> np.ndarray: ...
+
+
+_Cloud = _Array | Sequence[Sequence[float]]
+
+
 class _Options(TypedDict, total=False):
     sensor_origin: "np.ndarray | Sequence[float] | str | None"
     skeleton: str | None
@@ -148,25 +157,28 @@ class Predictor(PoseEstimator):
         return f"Predictor({self.model['name']!r}, {self.skeleton.name}, {self.backend.name}, tta={len(self._tta)})"
 
     @overload
-    def predict(  # type: ignore[overload-overlap]
+    def predict(
         self,
-        points: "Sequence[ArrayLike]",
+        points: Sequence[_Cloud],
         *,
         boxes: None = None,
+        find: Literal[False] = False,
         clips: Clips | None = None,
         **options: Unpack[_Options],
     ) -> Poses: ...
 
     @overload
-    def predict(self, points: "ArrayLike", *, boxes: None = None, **options: Unpack[_Options]) -> PersonPose: ...
+    def predict(
+        self, points: _Cloud, *, boxes: None = None, find: Literal[False] = False, **options: Unpack[_Options]
+    ) -> PersonPose: ...
 
     @overload
-    def predict(self, points: "ArrayLike", *, find: Literal[True], **options: Unpack[_Options]) -> Poses: ...
+    def predict(self, points: _Cloud, *, find: Literal[True], **options: Unpack[_Options]) -> Poses: ...
 
     @overload
     def predict(
         self,
-        points: "ArrayLike",
+        points: _Cloud,
         *,
         boxes: "str | os.PathLike | dict | Box | list | tuple | np.ndarray",
         **options: Unpack[_Options],

@@ -142,7 +142,7 @@ class PersonPose:
         return self.alone().to_json()
 
     def save(self, path: str | Path) -> None:
-        """Writes `to_json` to a file, whole or not at all."""
+        """As `Poses.save`."""
         self.alone().save(path)
 
     def picture(self, path: str | Path | None = None) -> Picture:
@@ -172,7 +172,7 @@ class PersonPose:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Poses(Sequence):
+class Poses(Sequence[PersonPose]):
     """The people of one call, in the order of the boxes or arrays. A sequence of `PersonPose`.
 
     warnings concern the whole input; timing_ms: what took how long; up: the frame's up axis, which pictures need. Where
@@ -272,8 +272,9 @@ class Poses(Sequence):
         return people_json(document | last)
 
     def save(self, path: str | Path) -> None:
-        """Writes `to_json` to a file, whole or not at all."""
-        write_atomic(path, self.to_json())
+        """Writes `to_json`, or `to_dataframe` to a .csv, whole or not at all."""
+        as_csv = str(path).lower().endswith(".csv")
+        write_atomic(path, self.to_dataframe().to_csv(index=False) if as_csv else self.to_json())
 
     def picture(self, path: str | Path | None = None, *, title: str = "") -> Picture:
         """Everybody from the front and the side on one PNG; also written to `path` where given.

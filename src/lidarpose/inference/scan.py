@@ -113,7 +113,7 @@ def pose_scan(scan: Scan, predictor: Predictor, *, skeleton: str | None = None, 
         scan = replace(scan, origin=None)
     origin = None if scan.origin is None else scan.R_level_input @ scan.origin
     if scan.pelvises is not None and clouds:
-        level = predictor.predict_in(clouds, origin, skeleton, pelvises=scan.pelvises @ scan.R_level_input.T)
+        level = predictor.predict_in(clouds, origin, skeleton, progress, pelvises=scan.pelvises @ scan.R_level_input.T)
     elif scan.boxes:
         box_centers = np.stack([scan.R_level_input @ box.center for box in scan.boxes])
         level = predictor.predict_in(clouds, origin, skeleton, progress, box_centers=box_centers)

@@ -10,7 +10,7 @@ import math
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsIndex, overload
 
 import numpy as np
 
@@ -43,6 +43,18 @@ class Boxes(list[Box]):
     ):
         super().__init__(boxes)
         self.source, self.warnings, self.detector = source, tuple(warnings), detector
+
+    @overload
+    def __getitem__(self, index: SupportsIndex) -> Box: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> "Boxes": ...
+
+    def __getitem__(self, index):
+        found = super().__getitem__(index)
+        if not isinstance(index, slice):
+            return found
+        return Boxes(found, source=self.source, warnings=self.warnings, detector=self.detector)
 
     def to_dict(self) -> dict:
         """The document of the schema lidarpose.boxes/1, which `read_boxes` reads."""
@@ -86,7 +98,8 @@ def read_boxes(source: str | os.PathLike | _Content, *, calib: str | os.PathLike
             `{"people": [...]}` or the bare list, of which each entry is a `Box`, a row [x, y, z, l, w, h, yaw] or a
             dict: `center` [x, y, z], `size` [length, width, height], `yaw` about z (0 where it is absent), and as id
             `id`, else `track`, else None, and `score` (0 to 1) and `mounted` (true or false) where they are that; other
-            keys are ignored. A pose stands for its `box`, as in what `predict` writes. An array (n, 7) has such rows.
+            keys are ignored. A pose stands for its `box`, as in what `predict` writes. An array or tensor (n, 7)
+            has such rows.
         calib: KITTI's calibration file; None for `../calib/N.txt` beside a label.
 
     Returns:
@@ -96,13 +109,17 @@ def read_boxes(source: str | os.PathLike | _Content, *, calib: str | os.PathLike
         InputError: one line that names the file, the entry (counted from 0, as in JSON paths) and the key. Two entries
             of one id are an error, since results are told apart by it.
     """
+    if hasattr(source, "detach"):
+        # a torch tensor, perhaps on a device
+        source = source.detach().cpu().numpy()
     try:
         content = source if isinstance(source, _Content) else _load_file(source, calib)
         boxes = [_box(entry, f"people[{i}]") for i, entry in enumerate(_entries(content))]
-        first: dict[str | int, int] = {}
+        first: dict[str, int] = {}
         for i, box in enumerate(boxes):
-            if box.id is not None and first.setdefault(box.id, i) != i:
-                came = f"{_show(box.id)}, which people[{first[box.id]}] has too"
+            # a table and `poses["1"]` do not tell 1 from "1"
+            if box.id is not None and first.setdefault(str(box.id), i) != i:
+                came = f"{_show(box.id)}, which people[{first[str(box.id)]}] has too"
                 raise FormatError(f"people[{i}].id: expected an id of its own, got {came}: rename one or leave it out")
     except FormatError as problem:
         raise file_error("boxes" if isinstance(source, _Content) else source, problem) from None

@@ -75,6 +75,10 @@ class Cloud:
     fields: tuple[str, ...] = ("x", "y", "z")
     warnings: tuple[str, ...] = ()
 
+    def __array__(self, dtype=None, copy=None) -> np.ndarray:
+        """The points, so that the cloud itself can be predicted."""
+        return np.array(self.points, dtype, copy=copy)
+
 
 def read_points(path: str | os.PathLike, *, columns: int | None = None) -> Cloud:
     """Reads a point cloud; the suffix says the format.

@@ -71,7 +71,7 @@ class PosingOptions(TypedDict, total=False):
     max_range: float | None
     max_people: int | None
     background: "str | os.PathLike | Sequence | np.ndarray | None"
-    sensor_origin: tuple[float, float, float] | str | None
+    sensor_origin: "np.ndarray | Sequence[float] | str | None"
     skeleton: str | None
     up: str | Sequence[float]
     track: bool
@@ -131,7 +131,7 @@ class FramePredictor:
         max_range: float | None = None,
         max_people: int | None = None,
         background: "str | os.PathLike | Sequence | np.ndarray | None" = None,
-        sensor_origin: tuple[float, float, float] | str | None = None,
+        sensor_origin: "np.ndarray | Sequence[float] | str | None" = None,
         skeleton: str | None = None,
         up: str | Sequence[float] = "z",
         columns: int | None = None,
