@@ -1,10 +1,13 @@
 """Writing in one step: the old content or the new one, nothing left behind, one line when the disk refuses."""
 
 import errno
+import io
 import os
 import random
 import re
 import stat
+import tracemalloc
+import zipfile
 from unittest import mock
 
 import numpy as np
@@ -16,6 +19,7 @@ from lidarpose.errors import InputError
 from lidarpose.io import files
 from lidarpose.io.files import LOCK, atomic_path, check_suffix, file_error, is_unused, locked, read_bytes, write_atomic
 from lidarpose.io.npz import read_npz
+from lidarpose.io.point_cloud import read_points
 
 
 def tree(folder):
@@ -181,6 +185,28 @@ def test_npz_of_zeros_is_bounded(tmp_path, monkeypatch):
         read_npz(tmp_path / "a.npz", ["zeros"], expected="an npz")
     monkeypatch.setenv("LIDARPOSE_MAX_UNPACKED", str(2**28))
     assert read_npz(tmp_path / "a.npz", ["zeros"], expected="an npz")[0]["zeros"].shape == (2**24,)
+
+
+# the fields of an archive's table that announce how large a member is, packed and unpacked
+@pytest.mark.parametrize("compression, field", [("DEFLATED", 24), ("DEFLATED", 20), ("BZIP2", 24), ("LZMA", 20)])
+def test_npz_that_announces_another_size_is_bounded(tmp_path, monkeypatch, compression, field):
+    array = io.BytesIO()
+    monkeypatch.setenv("LIDARPOSE_MAX_UNPACKED", "1000000")
+    np.save(array, np.zeros((2**20, 3)))
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", getattr(zipfile, f"ZIP_{compression}")) as archive:
+        archive.writestr("points.npy", array.getvalue())
+    content = bytearray((tmp_path / "a.npz").read_bytes())
+    start = content.rfind(b"PK\x01\x02") + field
+    content[start : start + 4] = (1000 if field == 24 else 2**31).to_bytes(4, "little")
+    (tmp_path / "a.npz").write_bytes(content)
+    tracemalloc.start()
+    try:
+        for read in (lambda path: read_npz(path, ["points"], expected="an npz"), read_points):
+            with pytest.raises(InputError, match="a.npz: expected"):
+                read(tmp_path / "a.npz")
+        assert tracemalloc.get_traced_memory()[1] < 2**24
+    finally:
+        tracemalloc.stop()
 
 
 def test_messages_are_printable_lines():

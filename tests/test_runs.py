@@ -292,6 +292,16 @@ def without_one(ending):
     return rewritten(without)
 
 
+def with_steps(step):
+    return rewritten(lambda tensors: tensors | {name: step.clone() for name in tensors if name.endswith(".step")})
+
+
+def with_a_flipped_bit(path):
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 64
+    path.write_bytes(content)
+
+
 def with_recipe(**change):
     def rewrite(path):
         config = json.loads(path.read_text())
@@ -323,6 +333,11 @@ DAMAGE = [
         for change in PROGRESS
     ),
     *((run_dir.STATE, without_one(f".{name}"), f"memory is damaged .*{name}") for name in ("step", "exp_avg")),
+    *(
+        (run_dir.STATE, with_steps(step), "memory is damaged .*step of parameter 0 ")
+        for step in (torch.zeros(3), torch.tensor(torch.nan))
+    ),
+    (run_dir.STATE, with_a_flipped_bit, "digest"),
     *(
         (run_dir.CONFIG, with_recipe(**{k: v}), f"{k} must be")
         for k, v in (("batch", None), ("rate", "fast"), ("seed", -1))

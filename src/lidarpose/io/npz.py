@@ -7,7 +7,7 @@ import io
 import math
 import os
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import IO, Literal
 
@@ -15,6 +15,11 @@ import numpy as np
 
 from lidarpose.io.files import FormatError, check_unpacked, file_error, read_bytes, shorten
 from lidarpose.io.text import check_bytes
+
+# how numpy compresses
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+# bytes of a header, of which numpy reads 10,000
+_LONGEST_HEADER = 2**14
 
 
 def read_npz(
@@ -35,10 +40,11 @@ def read_npz(
     data = read_bytes(path, expected=expected)
     try:
         with open_npz(data) as (archive, members):
-            known = {name: members[name] for name in wanted if name in members}
-            check_unpacked(sum(m.compress_size for m in known.values()), sum(m.file_size for m in known.values()))
+            known = [name for name in wanted if name in members]
+            contents = unpack(archive, [members[name] for name in known], len(data))
             # copied, since what lies in a file's bytes cannot be written to
-            return {name: load_array(archive.read(m)).copy() for name, m in known.items()}, sorted(members)
+            arrays = {name: load_array(content).copy() for name, content in zip(known, contents, strict=True)}
+            return arrays, sorted(members)
     except FormatError as problem:
         raise file_error(path, problem) from None
     except MemoryError:
@@ -51,6 +57,10 @@ def open_npz(data: bytes):
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             arrays = [member for member in archive.infolist() if member.filename.endswith(".npy")]
+            # numpy writes no others, and zipfile unpacks them without bounds
+            if other := [member for member in arrays if member.compress_type not in _METHODS]:
+                came = f"another compression of {shorten(other[0].filename)}"
+                raise FormatError("an npz that is stored or deflated", came, "save it with numpy.savez_compressed")
             yield archive, {member.filename.removesuffix(".npy"): member for member in arrays}
     except (FormatError, MemoryError):
         raise
@@ -60,6 +70,23 @@ def open_npz(data: bytes):
         raise FormatError(
             "an npz of plain arrays", f"a damaged or cut off one ({reason})", "was it copied completely?"
         ) from None
+
+
+def unpack(archive: zipfile.ZipFile, members: list[zipfile.ZipInfo], size: int) -> Iterator[bytes]:
+    """The content of each member of an archive of `size` bytes, of no more bytes than are announced; raises
+    FormatError where those are too many."""
+    packed = min(size, sum(member.compress_size for member in members))
+    check_unpacked(packed, sum(member.file_size for member in members))
+    for member in members:
+        with archive.open(member) as file:
+            # read() would unpack everything before it looks at the announced size
+            yield file.read(max(member.file_size, 1))
+
+
+def member_header(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> tuple[tuple[int, ...], np.dtype]:
+    """(shape, dtype) of a member, of which no more is unpacked."""
+    with archive.open(member) as file:
+        return array_header(io.BytesIO(file.read(_LONGEST_HEADER)))[:2]
 
 
 def array_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype, Literal["C", "F"]]:

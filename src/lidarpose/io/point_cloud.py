@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarpose.errors import MissingExtra, check_int
-from lidarpose.io.files import FormatError, check_unpacked, file_error, read_bytes, shorten
+from lidarpose.io.files import FormatError, file_error, read_bytes, shorten
 from lidarpose.io.las import parse_las
-from lidarpose.io.npz import array_header, load_array, open_npz
+from lidarpose.io.npz import load_array, member_header, open_npz, unpack
 from lidarpose.io.pcd_ply import parse_pcd, parse_ply
 from lidarpose.io.text import FEW_ROWS, is_transposed, numbered, parse_text, pick_xyz
 
@@ -221,16 +221,14 @@ def _parse_npz(data: bytes):
     with open_npz(data) as (archive, members):
         keys = [key for key in ("points", "xyz") if key in members]
         for key, member in members.items() if not keys else ():
-            with archive.open(member) as file:
-                shape, dtype, _ = array_header(file)
+            shape, dtype = member_header(archive, member)
             if (len(shape) == 2 and shape[1] >= 3 and dtype.kind in "fiu") or (dtype.names and len(shape) == 1):
                 keys.append(key)
         if not keys or len(keys) > 1 and keys[0] not in ("points", "xyz"):
             came = shorten(", ".join(members)) or "no array"
             raise FormatError("'points', 'xyz' or one (n, 3+) array alone", came, "save it with points=")
-        member = members[keys[0]]
-        check_unpacked(member.compress_size, member.file_size)
-        return _points_of(load_array(archive.read(member)), f"the array {shorten(keys[0])!r}")
+        (content,) = unpack(archive, [members[keys[0]]], len(data))
+        return _points_of(load_array(content), f"the array {shorten(keys[0])!r}")
 
 
 def _points_of(array: np.ndarray, what: str):

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from lidarpose._version import __version__
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error, is_unused, locked, read_bytes, write_atomic
+from lidarpose.models.checkpoint import SafetensorsFile, with_digest
 from lidarpose.train.optim import Muon
 from lidarpose.train.recipes import FREE, AnyRecipe, Recipe
 
@@ -169,7 +170,7 @@ def save_state(
         for index, memory in optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{k}.{index}.{name}": torch.as_tensor(value) for name, value in memory.items()}
     tensors = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
-    write_atomic(path, to_bytes(tensors, metadata={"progress": json.dumps(progress)}))
+    write_atomic(path, with_digest(to_bytes(tensors, metadata={"progress": json.dumps(progress)})))
 
 
 def load_state(
@@ -182,6 +183,7 @@ def load_state(
         content = path.read_bytes()
         tensors = load(content)
         header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
+        SafetensorsFile(path=path, header=header, content=content).check_digest()
         # states of 0.1 lack the last validation
         progress = {"validation": None} | json.loads(header["__metadata__"]["progress"])
         for entry, types in _PROGRESS.items():
@@ -213,9 +215,11 @@ def _memory(tensors: dict[str, Tensor], optimizer: torch.optim.Optimizer) -> dic
     for index, parameter in enumerate(p for group in optimizer.param_groups for p in group["params"]):
         # a parameter without a gradient so far has no memory
         for kind in MEMORY[type(optimizer)] if index in memory else ():
-            shape = memory[index][kind].shape
-            if kind != "step" and shape != parameter.shape:
-                raise ValueError(f"{kind} of parameter {index} has the shape {tuple(shape)}")
+            value = memory[index][kind]
+            if value.shape != (() if kind == "step" else parameter.shape):
+                raise ValueError(f"{kind} of parameter {index} has the shape {tuple(value.shape)}")
+            if kind == "step" and not 0 <= value.item() < inf:
+                raise ValueError(f"step of parameter {index} is {value.item()}")
     return memory
 
 
