@@ -143,7 +143,7 @@ def _scan_data(scan: ScanPanel, limit: int) -> dict:
     return data | {"labeled": scan.labeled}
 
 
-# a letter a part: n = not body, else the body side's
+# a letter a part: n = background, else the body side's
 _PART_SIDES = np.array(["n"] + [side(joint)[0] for joint in SMPL24.joints])
 
 
