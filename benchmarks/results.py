@@ -266,7 +266,7 @@ def clips() -> str:
         turned = f"{way['turned_clips_of_these']} of {way['clips_mostly_right']}"
         rows.append((*cells, f"{way['pa_mpjpe']:.1f}", turned, f"{way['bone_deviation']:.1f}"))
     header = ("", "MPJPE mm", "acceleration error, mm a frame squared", "PA-MPJPE mm")
-    return table((*header, "clips with a frame turned round", "bone lengths, deviation mm"), rows)
+    return table((*header, "clips with a flipped frame", "bone lengths, deviation mm"), rows)
 
 
 def moved() -> str:

@@ -16,7 +16,7 @@ import numpy as np
 import pandas
 import pytest
 from hostile_files import CALIBRATION, KITTI
-from safetensors.numpy import save_file
+from safetensors.numpy import load_file, save_file
 
 import lidarpose
 from lidarpose import progress
@@ -24,6 +24,7 @@ from lidarpose.cli import demo, main
 from lidarpose.errors import InputError
 from lidarpose.inference import predictor
 from lidarpose.models import BUNDLED, DEFAULT, bundled_path
+from lidarpose.models.checkpoint import DIGEST, SafetensorsFile
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
 from lidarpose.viz import contact_sheet
@@ -295,6 +296,17 @@ def test_what_is_read_is_never_written_over(crop, boxes, tmp_path, capsys):
         assert [path.read_bytes() for path in files] == before
     # printed, the result harms nobody
     assert run("predict", crop, "--boxes", default, "--out", "-") == 0
+
+
+def test_a_warning_of_a_file_is_a_line_without_our_source(crop, tmp_path, out):
+    file = SafetensorsFile.open(bundled_path("tiny"))
+    metadata = {name: text for name, text in file.metadata.items() if name != DIGEST}
+    save_file(load_file(bundled_path("tiny")), tmp_path / "older.safetensors", metadata=metadata)
+    command = [sys.executable, "-m", "lidarpose", "predict", crop, "--crop", "--out", out]
+    command += ["--weights", tmp_path / "older.safetensors"]
+    first = subprocess.run(command, capture_output=True, text=True).stderr.splitlines()[0]
+    assert re.fullmatch("lidarpose: warning: .*older.safetensors: has no digest, so damage .*", first)
+    assert subprocess.run([*command, "--quiet"], capture_output=True, text=True).stderr == ""
 
 
 def test_an_id_cannot_forge_a_line(crop, tmp_path, out, capsys):

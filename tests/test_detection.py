@@ -311,7 +311,10 @@ def test_the_commands(file, capsys, fake, tmp_path):
     np.save("static.npy", np.load(file))
     capsys.readouterr()
     assert main(["predict", file, *fast, "--background", "static.npy", "--picture", "--sensor-origin", "0,0,0.1"]) == 0
-    assert capsys.readouterr().err.strip() == "nobody found -> sweep.poses.json and sweep.poses.png"
+    line = capsys.readouterr().err.strip()
+    assert line.startswith(
+        "nobody found -> sweep.poses.json and sweep.poses.png; if somebody is there: points need meters"
+    )
     assert json.loads((tmp_path / "sweep.poses.json").read_text())["people"] == []
     for wrong, words in (
         (["detect", file, "--out", "boxes.csv"], "a folder or a file .json, got .csv"),

@@ -133,6 +133,13 @@ def test_ground_moves_with_the_points(scene):
     assert np.median(np.abs(turned.at(xy @ R[:2, :2].T) - ground.at(xy))) < 0.02
 
 
+def test_a_slope_at_the_bound_is_counted():
+    x, y = (values.ravel().astype(float) for values in np.meshgrid(np.arange(-10, 11), np.arange(-10, 11)))
+    points = np.stack([x, y, np.nextafter(0.9, 0) * x], 1).repeat(3, axis=0)
+    up = estimate_up(points)
+    assert up is not None and np.allclose(up, [-0.669, 0, 0.743], atol=1e-3)
+
+
 @pytest.mark.parametrize("degrees", [0, 6, 18, 30])
 def test_a_tilted_cloud_is_told_from_a_level_one(scene, degrees):
     points = scene[1]

@@ -1,6 +1,7 @@
 """`lidarpose view`: people of a dataset on a sheet and on a page, streets from above; scans from above in general."""
 
 import io
+import json
 import re
 import shutil
 
@@ -189,8 +190,12 @@ def test_view_of_streets_shows_them_from_above(tmp_path, monkeypatch):
         assert [box.id for box in shown.boxes] == [box.id for box in frames[0].boxes]
         ways = np.array([[box.center[:2] for box in frame.boxes] for frame in frames])
         np.testing.assert_allclose(np.stack(shown.tracks, 1), ways, atol=1e-5)
-    # a page shows their people
+    # a page shows them too, with the true poses, and then their people
     page = draw_dataset(tmp_path / "s", html=True, out=tmp_path / "s.html").read_text()
+    data = json.loads(re.search(r'id="data">(.*?)</script>', page)[1])
+    assert [len(scan["poses"]) for scan in data["scans"]] == [len(shown.poses.joints) for shown in panels]
+    assert all(scan["labeled"] for scan in data["scans"])
+    assert page.index('data-person="scan0"') < page.index('data-person="scan2"') < page.index('data-person="0"')
     assert re.search(r"<strong>#\d frame 0 track \d vlp-16</strong>", page)
     for path in (tmp_path / "s").glob("frames*"):
         path.unlink()

@@ -340,9 +340,9 @@ def test_report_shows_a_scan_about_its_people():
     wide, far = rng.uniform((-5, -8, -1), (20, 12, 2), (60_000, 3)), rng.uniform(50, 60, (1000, 3))
     points = np.concatenate([wide, near, far, [[np.nan, 0, 0]]])
     scan = ScanPanel(points=points, boxes=boxes, poses=Pose(joints=joints, skeleton=BODY26), label=EVIL)
-    page = Reader(text := render_report([], title="", summary=[], scan=scan))
+    page = Reader(text := render_report([], title="", summary=[], scans=[scan]))
     assert EVIL in page.texts["strong"] and len(text) < 500_000
-    shown = json.loads(page.texts["script"][0])["scan"]
+    shown = json.loads(page.texts["script"][0])["scans"][0]
     center = np.median([box.center for box in boxes], axis=0)
     drawn = np.reshape(shown["points"], (-1, 3)) / 1000 + center
     assert 20_000 <= len(drawn) <= 40_000 and drawn.max() < 40
@@ -350,7 +350,7 @@ def test_report_shows_a_scan_about_its_people():
     assert shown["poses"][1]["joints"][4] is None
     np.testing.assert_allclose(np.array(shown["poses"][0]["joints"]) / 1000 + center, joints[0], atol=6e-4)
     nobody = replace(scan, boxes=(), poses=None)
-    assert "canvas" in Reader(render_report([], title="", summary=[], scan=nobody)).tags
+    assert "canvas" in Reader(render_report([], title="", summary=[], scans=[nobody])).tags
 
 
 def test_report_is_small_and_thins_what_is_too_much():

@@ -153,7 +153,7 @@ class Sample:
     """One person as a LiDAR saw it.
 
     points (n, 3) float32 m in the sensor's frame, n = 0 is legal; center (3,) m, the origin of the person's own
-    frame, which has the sensor's axes; part (n,) uint8, 0 = not body, 1 + j = the bone of SMPL-24's joint j;
+    frame, which has the sensor's axes; part (n,) uint8, 0 = background, 1 + j = the bone of SMPL-24's joint j;
     ring (n,) int, the beam; pose in the sensor's frame; source tells where the sample came from; second_person_points:
     how many points are somebody else's, None where that is not known.
 

@@ -49,7 +49,7 @@ class Rig:
     """A body that can be posed: the shipped one, or one of the user's SMPL file (`body.smpl`). Arrays are read-only,
     C-contiguous.
 
-    faces (F, 3) int32, counter-clockwise seen from outside; face_part (F,) uint8 = 1 + SMPL joint (0 is "not body");
+    faces (F, 3) int32, counter-clockwise seen from outside; face_part (F,) uint8 = 1 + SMPL joint (0 is background);
     weight_index, weight (V, 4) int32, float32: the joints that move a vertex, strongest first, unused ones 0;
     parents (24,) int32; template (V, 3) and morphs (S, V, 3) m, m a unit of coefficient; joint_template (26, 3) and
     joint_morphs (S, 26, 3) likewise, in BODY26's order. The table of N sampled people: coefficients (N, S),

@@ -3,6 +3,7 @@
 import argparse
 import os
 import sys
+import warnings
 from contextlib import suppress
 
 import lidarpose.cli.datasets as datasets
@@ -15,7 +16,8 @@ import lidarpose.cli.weights as weights
 from lidarpose._version import __version__
 from lidarpose.cli.terminal import tell
 from lidarpose.errors import InputError, LidarPoseError, missing_extra
-from lidarpose.progress import set_quiet
+from lidarpose.io.files import one_line
+from lidarpose.progress import is_quiet, set_quiet
 
 # options whose value may start with a minus sign, which argparse would take for another option
 _SIGNED = ("--sensor-origin", "--up")
@@ -29,6 +31,7 @@ def run(arguments: list[str] | None = None) -> int:
         parser.print_help()
         return 0
     set_quiet(options.quiet)
+    warnings.formatwarning = _warning_line
     with suppress(AttributeError, ValueError):
         # names of files need not be text, nor has every terminal all letters; stderr does so by itself
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
@@ -60,6 +63,11 @@ def run(arguments: list[str] | None = None) -> int:
         # training says how to go on
         return _ended(str(stopped) or "stopped", getattr(stopped, "status", 130))
     return 0
+
+
+def _warning_line(message: Warning | str, *place: object, **line: object) -> str:
+    """A warning as the commands print theirs, in place of Python's two lines of our source code."""
+    return "" if is_quiet() else f"lidarpose: warning: {one_line(str(message))}\n"
 
 
 def _drop_output() -> None:

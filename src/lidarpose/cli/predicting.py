@@ -13,6 +13,8 @@ from lidarpose.models import DEFAULT, NAMES
 
 # io.point_cloud.SUFFIXES, which a help text does not import
 _FILES = ".pcd .ply .las .laz .npy .npz .csv .xyz .txt .bin"
+# what to try where somebody should have been found
+_NOBODY = "if somebody is there: points need meters and z up (--up), and a lower --min-score finds more"
 # characters of an id in a warning
 _LONGEST_ID = 40
 
@@ -105,7 +107,7 @@ def _predict(options: argparse.Namespace) -> None:
     posed = sum(person.has_pose for person in poses)
     where = f" -> {' and '.join(map(str, outputs))}" if outputs else ""
     if not poses and poses.scan is not None:
-        tell(f"nobody found{where}")
+        tell(f"nobody found{where}; {_NOBODY}")
         return
     tell(f"{posed} of {len(poses)} people, {poses.timing_ms['per_person']:.0f} ms each{where}")
 
@@ -154,7 +156,7 @@ def _detect(options: argparse.Namespace) -> None:
     for line in boxes.warnings:
         tell(f"lidarpose: warning: {line}")
     outcome = f"{counted(len(boxes), 'person', 'people')} found" if boxes else "nobody found"
-    tell(outcome + (f" -> {result}" if result else ""))
+    tell(outcome + (f" -> {result}" if result else "") + ("" if boxes else f"; {_NOBODY}"))
 
 
 def _reading(options: argparse.Namespace) -> dict[str, Any]:

@@ -6,7 +6,7 @@ one synthetic person in one frame:
     index, frame, track     number of the person, clip or street in the dataset; frame of it; person in a street
     points                  x, y, z of all points one after the other, m: reshape to (n, 3); the level frame at the
                             sensor, x forward, y left, z up
-    part, ring              one a point: 0 = not body, 1 + j = the bone of SMPL-24's joint j; the beam
+    part, ring              one a point: 0 = background, 1 + j = the bone of SMPL-24's joint j; the beam
     joints                  x, y, z of the joints named in dataset.json, m
     center                  origin of the person's own frame, computed from the points
     box_center, box_size, box_yaw    a detector's box: m, m, rad

@@ -13,7 +13,7 @@ made them once). A row is one person in one frame:
     family              of 2: what is done, in one word for all sources
     sensor, kind, distance, visible, clutter, upright      as in `sample.PersonInfo`
     origin              (3,) m in the level frame at the sensor; points_mm: x, y, z of all points from it, millimeters
-    part                one a point: 0 = not body, 1 + j = the bone of SMPL-24's joint j
+    part                one a point: 0 = background, 1 + j = the bone of SMPL-24's joint j
     joints              x, y, z of body26's joints, m, in the level frame at the sensor, which stands at its origin
     box                 center (3), size (3), yaw of the detector's box: m, rad
 """

@@ -298,9 +298,10 @@ class Poses(Sequence[PersonPose]):
 
         title = title or (self.source or "lidarpose")
         panels, scan = self._panels()
+        scans = [] if scan is None else [scan]
         if path is not None:
-            return write_report(path, panels, title=title, summary=[], scan=scan)
-        return render_report(panels, title=title, summary=[], scan=scan)
+            return write_report(path, panels, title=title, summary=[], scans=scans)
+        return render_report(panels, title=title, summary=[], scans=scans)
 
     def _panels(self) -> "tuple[list[Panel], ScanPanel | None]":
         """What is drawn: everybody, and the scan where people were searched for."""

@@ -90,7 +90,7 @@ class Outputs:
     """Raw results in the person's frame.
 
     vote (B, J, 3) m; heatmap (B, J, 3, W) logits about the vote, or about the origin where the network has no votes
-    (vote is then zero), W = 0 where it has no heatmaps; part (B, N, P) logits of each fine voxel, 0 = not body;
+    (vote is then zero), W = 0 where it has no heatmaps; part (B, N, P) logits of each fine voxel, 0 = background;
     confidence (B, J) logit of an error under 10 cm; log_spread (B, J) log of the expected error in m; visible (B, J)
     logit of the joint being seen; level_joints: one (B, J, 3) m a coarser level, read off its anchors; has_votes:
     whether the network votes at all; person (B, 2) logits of a person and of a second one in the crop, where the

@@ -1,6 +1,6 @@
 """What goes wrong with points, laser grids and boxes, in numpy: each a pure function of its arguments and a generator.
 
-Legend: n points; parts are 0 for what is not body, 1 + j for the bone of SMPL-24's joint j.
+Legend: n points; parts are 0 for background, 1 + j for the bone of SMPL-24's joint j.
 """
 
 from dataclasses import replace

@@ -14,7 +14,7 @@ from lidarpose.skeleton import Skeleton
 _SURE = 6.0
 # what confidence is taken for where the network does not say
 _CONFIDENCE = 0.6
-# cost of a frame turned round against the one before: nobody turns about in a tenth of a second
+# cost of a frame flipped against the one before: nobody turns about in a tenth of a second
 _TURN = 40.0
 # what is across the body
 _ACROSS = ("hip", "shoulder")

@@ -30,7 +30,7 @@ _FREEDOM = 2.0
 class LiveFilter:
     """One person's poses, made steady frame by frame: `update` takes a frame's pose and gives the steady one.
 
-    The model is that of `smooth`, of which this is the half that looks back; only a frame that is turned round is not
+    The model is that of `smooth`, of which this is the half that looks back; only a frame that is flipped is not
     turned back, but hardly counts. skeleton: of all the poses.
     """
 

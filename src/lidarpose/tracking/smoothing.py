@@ -78,7 +78,7 @@ def steady_spread(variance: np.ndarray, certainty: np.ndarray) -> np.ndarray:
 
 
 def settled(track: TrackPoses) -> TrackPoses:
-    """A track whose facing is settled: left and right are exchanged in the frames that were turned round."""
+    """A track whose facing is settled: left and right are exchanged in the frames that were flipped."""
     rows = np.flatnonzero(track.seen)
     variance = known_spread(track.spread, track.seen, len(track.skeleton))[rows] ** 2
     confidence = None if track.confidence is None else track.confidence[rows]

@@ -43,7 +43,7 @@ _Sample = TypeVar("_Sample", bound=Sample)
 class Example:
     """One person in their own frame, z up, as a training step shows them.
 
-    points (n, 3) float32 m; part (n,) int: 0 = not body, 1 + j = the bone of SMPL-24's joint j, -1 = not known; joints
+    points (n, 3) float32 m; part (n,) int: 0 = background, 1 + j = the bone of SMPL-24's joint j, -1 = unknown; joints
     (26, 3) float32 m of body26, NaN where there is no label; visible (26,) float32: 1 seen, 0 not, NaN not known;
     view (5,): `voxelize.view_features`; seed: of what is drawn when the example is collated; person (2,) float32:
     whether somebody is there, and a second one besides, 1, 0 or NaN as of joints.

@@ -29,7 +29,7 @@ class ScanPanel:
     Args:
         points: (n, 3).
         boxes: of people; an id is printed beside its box, the side that a box faces is marked.
-        poses: joints (P, J, 3).
+        poses: joints (P, J, 3); labeled: whether they are the true ones.
         tracks: positions (F, 2) or (F, 3) of people over time.
         places: (K, 2) or (K, 3), of people whom nobody knows apart.
         label: printed above.
@@ -39,6 +39,7 @@ class ScanPanel:
     points: np.ndarray
     boxes: Sequence[Box] = ()
     poses: Pose | None = None
+    labeled: bool = False
     tracks: Sequence[np.ndarray] = ()
     places: np.ndarray | None = None
     label: str = ""

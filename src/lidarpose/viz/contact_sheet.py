@@ -21,7 +21,7 @@ def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out
     Args:
         folder: the dataset's.
         count: how many people, or at most 12 streets, evenly spread over the shards that are there.
-        html: a page with 3D views instead of a picture; of streets, too, it shows the people.
+        html: a page with 3D views instead of a picture; of streets the streets and then the people.
         out: the file; by default the folder's name with .png or .html in the current folder.
 
     Returns:
@@ -43,15 +43,17 @@ def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out
         title += f", scene {settings['scene']}"
     if (written := len(dataset.written())) < dataset.card.shards:
         title += f", {written:,} of {dataset.card.shards:,} shards written so far"
-    if "frames" in dataset.card.tables and not html:
-        streets = _spread(dataset, "frames", min(count, MAX_SCANS))
-        draw_scans([_street_panel(rows, dataset) for rows in streets], path, title=title)
-        return path
+    streets: list[ScanPanel] = []
+    if "frames" in dataset.card.tables:
+        streets = [_street_panel(rows, dataset) for rows in _spread(dataset, "frames", min(count, MAX_SCANS))]
+        if not html:
+            draw_scans(streets, path, title=title)
+            return path
     samples = [(row["index"], dataset.sample(row)) for (row,) in _spread(dataset, dataset.card.people, count)]
     panels = [_panel(index, sample, dataset) for index, sample in samples]
     if html:
         summary = [_summary_row(panel.label, sample) for panel, (_, sample) in zip(panels, samples, strict=True)]
-        write_report(path, panels, title=title, summary=summary)
+        write_report(path, panels, title=title, summary=summary, scans=streets)
     else:
         draw_people(panels, path, title=title)
     return path
@@ -96,6 +98,7 @@ def _street_panel(rows: list[dict], dataset: DatasetReader) -> ScanPanel:
             for track, box in zip(first["track"].tolist(), boxes[0], strict=True)
         ],
         poses=Pose(joints=joints, skeleton=skeleton(dataset.card.skeleton)) if len(joints) else None,
+        labeled=True,
         tracks=list(boxes[:, :, :2].swapaxes(0, 1)),
         label=f"#{first['index']} {first['sensor']}: {counted(len(joints), 'people')}, {len(rows)} frames",
     )

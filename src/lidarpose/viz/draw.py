@@ -336,7 +336,7 @@ def _depth_colors(depth: np.ndarray) -> np.ndarray:
 
 
 def _part_colors(part: np.ndarray) -> np.ndarray:
-    """part (n,), 0 = not body, 1 + j = SMPL-24's joint j -> (n, 3) in [0, 1]: the body side's two shades in turn."""
+    """part (n,), 0 = background, 1 + j = SMPL-24's joint j -> (n, 3) in [0, 1]: the body side's two shades in turn."""
     from matplotlib.colors import to_rgb
 
     level = [0] * len(SMPL24)

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Sequence
 from html import escape
 from importlib import resources
 from numbers import Integral, Real
@@ -30,13 +31,14 @@ from lidarpose.viz.person_view import (
 
 MAX_POINTS = 60_000  # of all people together: about 0.9 MB of text
 _FEWEST_POINTS = 150  # a person keeps these, however many people there are
-# of a scan: most points, half of them so many m about its people; and how far about all of them the scan is shown, m
-_SCAN_POINTS, _NEAR, _SCAN_REACH = 40_000, 1.0, 15.0
+# of all scans, and of each at least: points, half of them so many m about its people; and how far about all of them the
+# scan is shown, m
+_SCAN_POINTS, _FEWEST_SCAN_POINTS, _NEAR, _SCAN_REACH = 40_000, 15_000, 1.0, 15.0
 _SCHEMA = 1
 
 
 def write_report(
-    path: str | Path, people: list[Panel], *, title: str, summary: list[dict], scan: ScanPanel | None = None
+    path: str | Path, people: list[Panel], *, title: str, summary: list[dict], scans: Sequence[ScanPanel] = ()
 ) -> str:
     """Writes the report to `path`, whole or not at all, and returns its text.
 
@@ -46,23 +48,22 @@ def write_report(
         title: above all.
         summary: rows of the table on top: the columns are the rows' keys in order of appearance, a column of numbers is
             aligned to the right.
-        scan: all of it with everybody in it, shown first.
+        scans: whole ones with everybody in them, shown first.
 
     Raises:
         InputError: a path of another suffix, or one that cannot be written.
     """
     check_suffix(path, ".html", ".htm")
-    text = render_report(people, title=title, summary=summary, scan=scan)
+    text = render_report(people, title=title, summary=summary, scans=scans)
     write_atomic(path, text.encode("utf-8", "replace"))
     return text
 
 
-def render_report(people: list[Panel], *, title: str, summary: list[dict], scan: ScanPanel | None = None) -> str:
+def render_report(people: list[Panel], *, title: str, summary: list[dict], scans: Sequence[ScanPanel] = ()) -> str:
     """The text of `write_report`'s file; the same input gives the same text."""
     people = list(people)
     skeletons = {pose.skeleton.name: pose.skeleton for p in people for pose in (p.pose, p.truth) if pose is not None}
-    if scan is not None and scan.poses is not None:
-        skeletons[scan.poses.skeleton.name] = scan.poses.skeleton
+    skeletons |= {scan.poses.skeleton.name: scan.poses.skeleton for scan in scans if scan.poses is not None}
     limit = max(_FEWEST_POINTS, MAX_POINTS // max(len(people), 1))
     drawn = [_person_data(p, limit) for p in people]
     data = {
@@ -70,13 +71,12 @@ def render_report(people: list[Panel], *, title: str, summary: list[dict], scan:
         "unit": "mm",
         "skeletons": {name: _skeleton_data(s) for name, s in skeletons.items()},
         "people": drawn,
-        "scan": None if scan is None else _scan_data(scan),
+        "scans": [_scan_data(scan, max(_FEWEST_SCAN_POINTS, _SCAN_POINTS // len(scans))) for scan in scans],
     }
     # inside a script element only "<" could end the element early
     blob = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-    cards = [_card(i, p, len(d["points"]) // 3) for i, (p, d) in enumerate(zip(people, drawn, strict=True))]
-    if scan is not None:
-        cards.insert(0, _scan_card(scan))
+    cards = [_scan_card(f"scan{i}", scan) for i, scan in enumerate(scans)]
+    cards += [_card(i, p, len(d["points"]) // 3) for i, (p, d) in enumerate(zip(people, drawn, strict=True))]
     fields = {
         "TITLE": escape(title),
         "VERSION": escape(__version__),
@@ -119,8 +119,8 @@ def _person_data(person: Panel, limit: int) -> dict:
     return data
 
 
-def _scan_data(scan: ScanPanel) -> dict:
-    """As of a person, but with everybody's pose, about the middle of all."""
+def _scan_data(scan: ScanPanel, limit: int) -> dict:
+    """As of a person, but with everybody's pose, about the middle of all; of at most `limit` points."""
     points = scan.points[within_reach(scan.points)]
     centers = np.array([box.center for box in scan.boxes])
     if len(centers):
@@ -130,7 +130,7 @@ def _scan_data(scan: ScanPanel) -> dict:
     for box in scan.boxes:
         near |= box.contains(points, margin=_NEAR)
     rows = [np.flatnonzero(near), np.flatnonzero(~near)]
-    rows = [own[thinned(len(own), _SCAN_POINTS // 2)] for own in rows]
+    rows = [own[thinned(len(own), limit // 2)] for own in rows]
     points = points[np.sort(np.concatenate(rows))]
     if not len(centers):
         centers = points if len(points) else np.zeros((1, 3))
@@ -139,10 +139,11 @@ def _scan_data(scan: ScanPanel) -> dict:
     if scan.poses is not None:
         poses = [Pose(joints=joints, skeleton=scan.poses.skeleton) for joints in scan.poses.joints]
     drawn = [data for pose in poses if (data := _pose_data(pose, center)) is not None]
-    return {"points": _millimeters(points, center), "facing": None, "pose": None, "truth": None, "poses": drawn}
+    data = {"points": _millimeters(points, center), "facing": None, "pose": None, "truth": None, "poses": drawn}
+    return data | {"labeled": scan.labeled}
 
 
-# a letter a part: n = not body, else the body side's
+# a letter a part: n = background, else the body side's
 _PART_SIDES = np.array(["n"] + [side(joint)[0] for joint in SMPL24.joints])
 
 
@@ -168,8 +169,8 @@ def _card(i: int, person: Panel, drawn: int) -> str:
     return _figure(str(i), "card", person.label, describe(person), [note for note in notes if note])
 
 
-def _scan_card(scan: ScanPanel) -> str:
-    return _figure("scan", "card scan", scan.label, f"{len(scan.points):,} points, not all are drawn", [])
+def _scan_card(key: str, scan: ScanPanel) -> str:
+    return _figure(key, "card scan", scan.label, f"{len(scan.points):,} points, not all are drawn", [])
 
 
 def _figure(key: str, kind: str, label: str, caption: str, notes: list[str]) -> str:

@@ -20,7 +20,7 @@ class Panel:
         pose, truth: predicted and true pose of one person in the points' frame, joints (J, 3) m; a joint that is not
             finite is left out.
         label: the name above the caption.
-        part: (n,) int, 0 = not body, 1 + j = the bone of SMPL-24's joint j: colors the points by side.
+        part: (n,) int, 0 = background, 1 + j = the bone of SMPL-24's joint j: colors the points by side.
         box: drawn in pictures.
         distance: m, printed; by default that of the person from the frame's origin, none for NaN.
         caption: the line under the person, by default the number of points, the distance and the mean confidence.
@@ -78,7 +78,7 @@ def facing_of(person: Panel) -> np.ndarray | None:
 def project(points: np.ndarray, *, seen_from: np.ndarray) -> np.ndarray:
     """points (..., 3) m as somebody sees them who looks level at them: (..., 3) m = (right, up, towards the viewer).
 
-    seen_from (3,) is the level unit direction from the points to the viewer. Seen from where a person looks to, the
+    seen_from (3,) is the level unit direction from the points to the viewer. Seen from where a person faces, the
     person's left side is on the picture's right.
     """
     x, y, _ = seen_from
@@ -87,7 +87,7 @@ def project(points: np.ndarray, *, seen_from: np.ndarray) -> np.ndarray:
 
 def view_directions(forward: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """The two `seen_from` of a person who looks `forward`: the front, and the person's right (so that the person
-    looks to the picture's right). Without a direction: from +x and from -y."""
+    faces the picture's right). Without a direction: from +x and from -y."""
     x, y, _ = (1.0, 0.0, 0.0) if forward is None else forward
     return np.array([x, y, 0.0]), np.array([y, -x, 0.0])
 

@@ -72,7 +72,7 @@ class Prn(nn.Module):
 
 class VoteHead(nn.Module):
     """Parts and offsets of points, from their features beside the maximum and mean of the person's; and the joints that
-    they vote for. background: which of the parts is not body."""
+    they vote for. background: which of the parts that is."""
 
     def __init__(self, channels: int, joints: int, *, background: int):
         super().__init__()

@@ -17,7 +17,7 @@ WAYMO_JOINTS = tuple(
     """nose left_shoulder left_elbow left_wrist left_hip left_knee left_ankle
     right_shoulder right_elbow right_wrist right_hip right_knee right_ankle head_center""".split()
 )
-# SMPL's 24 parts and 0 = not body
+# SMPL's 24 parts and 0 = background
 PARTS = 25
 # space-filling curves, see `voxel_tables`
 CURVES = ("z", "z-trans", "hilbert", "hilbert-trans")

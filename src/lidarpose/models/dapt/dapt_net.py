@@ -82,7 +82,7 @@ class DaptOutputs:
     """Raw results in the person's frame; None where the network has no such head.
 
     anchors (B, J, A) after the neck; logits_x, logits_y, logits_z (B, J, W) heatmaps; inter (B, J, 3) m, the
-    auxiliary head's joints; points (M, C) features of the voxels of level 0; parts (M, P) logits, 0 = not body, of
+    auxiliary head's joints; points (M, C) features of the voxels of level 0; parts (M, P) logits, 0 = background, of
     the neck prn's (M, J + 1) the joint nearest; coordinates (B, J, 3) m, the coordinate head's joints or prn's refined
     ones; voted (B, J, 3) m, prn's before; low, step: where bin 0 lies and how far apart bins are, m.
     """

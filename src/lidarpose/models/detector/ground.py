@@ -247,7 +247,8 @@ def _common_plane(floors: _Floors, origin: np.ndarray | None) -> np.ndarray | No
     if len(planes_all) < 3:
         return None
     bins = 2 * round(_STEEPEST / _SLOPE_BIN)
-    row, column = ((planes_all[:, :2] + _STEEPEST) * (bins / (2 * _STEEPEST))).astype(np.int64).T
+    # a sum may be rounded up to the last bin's end
+    row, column = ((planes_all[:, :2] + _STEEPEST) * (bins / (2 * _STEEPEST))).astype(np.int64).clip(max=bins - 1).T
     counts = np.bincount(row * bins + column, weights_all, minlength=bins * bins).reshape(bins, bins)
     counts = _box_sum(counts, 1)
     likeliest = np.argsort(-counts, axis=None)[: _SLOPES * 9 : 9]

@@ -85,7 +85,7 @@ def distance_loss(joints: Tensor, targets: DaptTargets, people: Tensor) -> Tenso
 
 
 def segmentation_loss(logits: Tensor, part: Tensor, voxels: Tensor) -> Tensor:
-    """Paper: Eq. 8, the cross entropy of P = K + 1 classes, 0 = not body among them, a point a voxel.
+    """Paper: Eq. 8, the cross entropy of P = K + 1 classes, 0 = background among them, a point a voxel.
 
     logits (M, P); part (M,), -1 where it is not known; voxels: how many are. The paper's sum over a cloud's points is a
     mean over `voxels` here, as in the released code, so that its weight does not depend on how many points a person

@@ -53,7 +53,8 @@
   }
 
   function makeView(canvas) {
-    const scan = canvas.dataset.person === "scan", person = scan ? data.scan : data.people[+canvas.dataset.person];
+    const key = canvas.dataset.person, scan = key.startsWith("scan");
+    const person = scan ? data.scans[+key.slice(4)] : data.people[+key];
     const start = scan ? ABOVE : {...START, turn: START.turn + (person.facing || 0)};
     const view = {canvas, person, span: bounds(person), ...start, touched: scan, visible: true, hover: null};
     const fingers = new Map();
@@ -144,7 +145,8 @@
       pen.setLineDash([]);
     }
     const poses = person.poses || (person.pose ? [person.pose] : []);
-    if (toggles.pose.checked) for (const pose of poses) drawPose(view, pose, pen, place, line);
+    const toggle = person.labeled ? toggles.truth : toggles.pose;
+    if (toggle.checked) for (const pose of poses) drawPose(view, pose, pen, place, line);
   }
 
   function drawGround(view, pen, place, line) {
@@ -284,7 +286,7 @@
   for (const view of views) { observer.observe(view.canvas); resized.observe(view.canvas); }
   // what nobody has needs no legend
   for (const words of document.querySelectorAll("[data-if]")) {
-    words.hidden = !data.people.some((person) => person[words.dataset.if]);
+    words.hidden = ![...data.people, ...data.scans].some((shown) => words.dataset.if.split(" ").some((key) => shown[key]));
   }
   readColors();
   views.forEach(draw);
