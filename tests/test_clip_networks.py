@@ -269,7 +269,7 @@ def test_two_clips_are_learned_by_heart(size, monkeypatch):
     for module in network.modules():
         if isinstance(module, torch.nn.MultiheadAttention):
             module.dropout = 0.0
-    arrays, steps = objective.collate(examples), 1000
+    arrays, steps = objective.collate(examples), 1300
     made_by = optimizers(network, rates)
     for step in range(steps):
         set_rates(made_by, rates, step / steps)
