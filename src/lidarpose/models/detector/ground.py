@@ -249,8 +249,7 @@ def _common_plane(floors: _Floors, origin: np.ndarray | None) -> np.ndarray | No
     bins = 2 * round(_STEEPEST / _SLOPE_BIN)
     # a sum may be rounded up to the last bin's end
     row, column = ((planes_all[:, :2] + _STEEPEST) * (bins / (2 * _STEEPEST))).astype(np.int64).clip(max=bins - 1).T
-    counts = np.bincount(row * bins + column, weights_all, minlength=bins * bins).reshape(bins, bins)
-    counts = _box_sum(counts, 1)
+    counts = _box_sum(np.bincount(row * bins + column, weights_all, minlength=bins * bins).reshape(bins, bins), 1)
     likeliest = np.argsort(-counts, axis=None)[: _SLOPES * 9 : 9]
     peaks = np.stack(np.unravel_index(likeliest[counts.flat[likeliest] > 0], counts.shape), 1)
     slopes = np.concatenate([(peaks + 0.5) * (2 * _STEEPEST / bins) - _STEEPEST, np.zeros((1, 2))])
