@@ -51,10 +51,10 @@ class Boxes(list[Box]):
     def __getitem__(self, index: slice) -> "Boxes": ...
 
     def __getitem__(self, index):
-        found = super().__getitem__(index)
+        chosen = super().__getitem__(index)
         if not isinstance(index, slice):
-            return found
-        return Boxes(found, source=self.source, warnings=self.warnings, detector=self.detector)
+            return chosen
+        return Boxes(chosen, source=self.source, warnings=self.warnings, detector=self.detector)
 
     def to_dict(self) -> dict:
         """The document of the schema lidarpose.boxes/1, which `read_boxes` reads."""

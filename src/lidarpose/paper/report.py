@@ -39,9 +39,10 @@ def run_table(
     # at once: another process may begin another table in the same folder
     (out / RUNS).mkdir(parents=True, exist_ok=True)
     selected = cells(table, options, chosen)
-    for name in options.real:
-        # before hours of training, not after them
-        check_protocol(PROTOCOL, open_eval_dataset(options.data[name]))
+    # before hours of training, not after them
+    for test in {cell.target.test for cell in selected if cell.evaluation is not None}:
+        if isinstance(test, str):
+            check_protocol(PROTOCOL, open_eval_dataset(test))
     failed: dict[int, str] = {}
     for k, cell in enumerate(selected):
         if cell.evaluation is not None and not _path(cell.evaluation, out).is_file():
