@@ -189,7 +189,10 @@ def _cell(row: Row, target: Target, seed: int, score: tuple[str, ...], options: 
 
 def _targets(table: Table, options: Options) -> list[Target]:
     if options.real:
-        return [_real(name, options.data[name]) for name in options.real if name in table.columns]
+        targets = [_real(name, options.data[name]) for name in options.real if name in table.columns]
+        if not targets:
+            raise InputError(f"{table.name} scores on {' or '.join(table.columns)}: name one by --data")
+        return targets
     targets = [_stand_in("people", "synthesized people", options)]
     if not table.single and {"lidarhuman26m", "sloper4d"} <= set(table.columns):
         targets.append(_stand_in("clips", "synthesized clips", options))
