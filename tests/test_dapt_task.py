@@ -244,6 +244,12 @@ def test_parts_against_counting(seed, n, size):
         assert part == (-1 if not known else min(set(known), key=lambda p: (-known.count(p), p)))
 
 
+@given(st.integers(0, 2**32 - 1), st.integers(0, 60), st.sampled_from([0.3, 5.0, 2000.0]))
+def test_size_counts_occupied_cells(seed, n, reach):
+    example = replace(person(5), points=np.random.default_rng(seed).uniform(-reach, reach, (n, 3)).astype(np.float32))
+    assert example.size == len({tuple(cell) for cell in np.floor(example.points * 10).tolist()})
+
+
 def test_voxels_of_the_neck_prn_are_their_nearest_joint_s():
     people = [person(60, 1, labelled=5, size=0.1), person(0, 2), person(40, 3, labelled=0)]
     arrays = PRN.collate(people)
