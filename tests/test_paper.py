@@ -287,6 +287,28 @@ def test_a_stopped_step_stops_the_table(tmp_path):
     assert asked == [["synth", "-n", "3", "--out", str(step.folder(tmp_path))]]
 
 
+def test_an_evaluation_that_was_killed_while_its_files_were_put_in_place_is_done_again(tmp_path):
+    step, asked = Step(("evaluate", "weights", "set")), []
+    folder = step.folder(tmp_path)
+    folder.mkdir(parents=True)
+    for name in ("set-errors.png", ".0123456789abcdef-scores.json"):
+        (folder / name).write_text("")
+
+    def execute(words):
+        assert not folder.exists()
+        asked.append(words)
+        return 0
+
+    run_steps(step, tmp_path, execute, print)
+    assert len(asked) == 1
+    # all files are there, and the process was killed before it noted so
+    (tmp_path / "runs" / f"{step.name}.json").unlink()
+    folder.mkdir()
+    (folder / "poses.parquet").write_text("")
+    run_steps(step, tmp_path, execute, print)
+    assert len(asked) == 1 and steps.is_done(step, tmp_path)
+
+
 def test_a_training_that_takes_longer_than_its_hours_is_made_shorter(tmp_path):
     words = ("pretrain", "--size", "tiny", "--people", "200000", "--batch", "4", "--workers", "0", "--pictures", "0")
     step = Step(words, hours=0.0005)

@@ -11,7 +11,7 @@ from lidarpose.eval.charts import compare_ends, compare_stability
 from lidarpose.eval.dataset import open_eval_dataset
 from lidarpose.eval.predictions import read_poses
 from lidarpose.io.files import write_atomic
-from lidarpose.paper.steps import Step, is_done
+from lidarpose.paper.steps import POSES, Step, is_done
 from lidarpose.paper.tables import Cell
 from lidarpose.sample import Pose
 from lidarpose.skeleton import SMPL24
@@ -46,7 +46,7 @@ def draw(name: str, cells: Sequence[Cell], out: Path) -> Path | None:
 
 def _side_by_side(done: dict[str, Cell], out: Path) -> bytes:
     """The hardest people, a row a person, a column a method."""
-    paths = {row: cell.evaluation.product(out) / "poses.parquet" for row, cell in done.items() if cell.evaluation}
+    paths = {row: cell.evaluation.product(out) / POSES for row, cell in done.items() if cell.evaluation}
     predictions = {row: next(iter(read_poses(path).values())) for row, path in paths.items()}
     places = [{(s, r): k for k, (s, r) in enumerate(zip(p.shard, p.row, strict=True))} for p in predictions.values()]
     everywhere = sorted(set.intersection(*map(set, places)))
