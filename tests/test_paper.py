@@ -3,10 +3,11 @@
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from dataset_files import write_sloper4d
+from dataset_files import write_lidarhuman26m, write_sloper4d
 from training_runs import Killed, few_to_validate_on  # noqa: F401
 
 from lidarpose.cli import main
@@ -17,11 +18,12 @@ from lidarpose.errors import InputError
 from lidarpose.eval.scores import published, read_scores
 from lidarpose.models.checkpoint import read_header
 from lidarpose.paper import figures, report, steps
-from lidarpose.paper.report import markdown, run_table
+from lidarpose.paper.report import markdown, mean_pose_error, run_table
 from lidarpose.paper.steps import Step, StepFailed, run_steps
-from lidarpose.paper.tables import REAL, TABLES, Options, cells, row_key
+from lidarpose.paper.tables import REAL, TABLES, Options, _targets, cells, row_key
 from lidarpose.sample import center_of
-from lidarpose.skeleton import BODY26, HUMAN15
+from lidarpose.skeleton import BODY26, HUMAN15, SMPL24
+from lidarpose.synth.bodies import PoseBank
 from lidarpose.train import loop, run_dir
 
 _ROWS = ["scratch", "laser-masking"]
@@ -186,11 +188,42 @@ def test_the_paper_s_protocol_on_real_sets(data):
         assert ("--interval 5" in tuned) == thinned
         assert "--protocol dapt" in scored and ("--decode dark" in scored) == (row == "DAPT")
         assert "--rate" not in tuned and "--epochs" not in tuned
+        # crops and centers to learn from are those that are scored by
+        wanted = "--options trans_center=true" if row in ("LiDARCap", "NE") else "--augment paper"
+        assert ("--recipe paper" in tuned) == (row in ("PRN", "DAPT")) and (
+            wanted in tuned or "--recipe paper" in tuned
+        )
     assert "--recipe paper --size paper" in lines["DAPT", "waymo"][0] and "--motion raw" in lines["DAPT", "waymo"][0]
     assert all(cell.evaluation for cell in cells(TABLES["table2"], options))
     some = Options(data={name: data[name] for name in ("waymo", "lipd")})
     reasons = {cell.row: cell.why for cell in cells(TABLES["table2"], some)}
     assert reasons["LIPD"] == "" and "--data freemotion=DIR" in reasons["FreeMotion"]
+
+
+def test_poses_of_lidarhuman26m_s_test_sequences_are_not_learned_from(tmp_path, data, smpl):
+    raw = tmp_path / "raw"
+    write_lidarhuman26m(raw, smpl, sequences=("5", "7", "24", "8"))
+    options = Options(data=data | {"lidarhuman26m-poses": str(raw)}, size="paper")
+    for table, row in (("table1", "dapt"), ("table1", "ours"), ("table2", "lidarh26m"), ("table4", "pre-training")):
+        first = cells(TABLES[table], options, [row])[0].training[0]
+        words = first.command(tmp_path)
+        subjects = words[words.index("--subjects") + 1].split(",")
+        assert set(PoseBank.from_clips(raw, tuple(subjects)).clips.names) == {"labels/3d/pose/5", "labels/3d/pose/8"}
+
+
+def test_the_mean_pose_is_about_the_center_that_the_protocol_gives(tmp_path, smpl):
+    write_sloper4d(tmp_path / "raw", smpl, frames=40)
+    prepare("sloper4d", tmp_path / "raw", tmp_path / "set", smpl=smpl, split_by="dapt")
+    (target,) = _targets(TABLES["fig5"], Options(data={"sloper4d": str(tmp_path / "set")}))
+    setting = SimpleNamespace(dataset="set", kind="sloper4d", joints=HUMAN15.joints, protocol="dapt")
+    people = {split: list(open_dataset(tmp_path / "set").samples(split)) for split in ("train", "test")}
+    own = {
+        split: np.array([p.joints[SMPL24.map_to(HUMAN15)] - p.centers["trans"] for p in some])
+        for split, some in people.items()
+    }
+    wanted = 1e3 * np.linalg.norm(own["test"] - own["train"].mean(0), axis=-1).mean()
+    found = mean_pose_error(target, SimpleNamespace(setting=setting), tmp_path)
+    assert found == pytest.approx(wanted, abs=0.1)
 
 
 def test_a_set_that_the_protocol_refuses_is_refused_before_anything_is_trained(tmp_path, smpl):
