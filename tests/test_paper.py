@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -25,6 +26,7 @@ from lidarpose.sample import center_of
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24
 from lidarpose.synth.bodies import PoseBank
 from lidarpose.train import loop, run_dir
+from lidarpose.viz.person_view import facing, facing_of
 
 _ROWS = ["scratch", "laser-masking"]
 _TABLE = ["paper", "table4", "--people", "64", "--size", "paper-tiny", "--rows", ",".join(_ROWS), "--out"]
@@ -115,11 +117,26 @@ def test_a_table_of_what_is_there(finished, capsys):
     assert main([*_TABLE, str(out), "--table-only"]) == 0
 
 
-def test_the_hardest_people_side_by_side(finished):
+def test_the_hardest_people_side_by_side(finished, monkeypatch):
     out, _, _ = finished
     selected = cells(TABLES["table4"], Options(people=64, size="paper-tiny"), _ROWS)
-    assert figures.draw("fig5", selected, out).read_bytes().startswith(b"\x89PNG")
-    assert figures.draw("fig5", cells(TABLES["fig5"], Options(people=96)), out) is None
+    (path,) = figures.draw("fig5", selected, out)
+    assert path.name == "fig5.png" and path.read_bytes().startswith(b"\x89PNG")
+    drawn = []
+    monkeypatch.setattr(figures, "draw_people", lambda panels, **_: drawn.extend(panels) or b"x")
+    figures.draw("fig5", selected, out)
+    assert len(drawn) == 2 * figures.HARDEST
+    # methods of one row are seen from one side, which is the true person's
+    for one, other in zip(drawn[::2], drawn[1::2], strict=True):
+        np.testing.assert_array_equal(facing_of(one), facing_of(other))
+        np.testing.assert_array_equal(facing_of(one), facing(one.truth))
+    assert figures.draw("fig5", cells(TABLES["fig5"], Options(people=96)), out) == []
+    # a picture a column
+    clips = [replace(cell, column="clips") for cell in selected]
+    assert [path.name for path in figures.draw("fig5", [*selected, *clips], out)] == [
+        "fig5-people.png",
+        "fig5-clips.png",
+    ]
 
 
 # --- the tables as data
@@ -308,6 +325,18 @@ def test_a_step_that_fails_is_a_cell_that_says_so_and_the_others_go_on(tmp_path)
     assert "failed: unrecognized arguments" in (tmp_path / "out" / "table4.md").read_text()
 
 
+def test_cells_that_were_copied_are_done_but_a_figure_needs_what_it_is_drawn_of(tmp_path):
+    asked = []
+    for name in ("table1", "fig5"):
+        cell = cells(TABLES[name], Options(people=64), ["dapt"])[0]
+        path = report._path(cell.evaluation, tmp_path)
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(json.dumps(_entry()))
+        chosen = replace(TABLES[name], columns=("waymo",))
+        run_table(chosen, Options(people=64), tmp_path, ["dapt"], lambda words: asked.append(words[0]) or 0, print)
+        assert asked == ([] if name == "table1" else ["synth", "pretrain", "finetune", "synth", "evaluate"])
+
+
 def test_a_stopped_step_stops_the_table(tmp_path):
     step = Step(("synth", "-n", "3"))
     with pytest.raises(KeyboardInterrupt):
@@ -412,13 +441,13 @@ def test_curves_and_ends_of_several_networks(tmp_path, name):
         folder.mkdir(parents=True)
         (folder / "stability.json").write_text(json.dumps({"studies": [_study(scale)]}))
         steps._note(cell.evaluation, tmp_path, done=True)
-    path = figures.draw(name, selected, tmp_path)
+    (path,) = figures.draw(name, selected, tmp_path)
     assert path == tmp_path / f"{name}.png" and path.read_bytes().startswith(b"\x89PNG")
     assert path.read_bytes() != _drawn_alone(name, selected[:1], tmp_path)
 
 
 def _drawn_alone(name, selected, out):
-    return figures.draw(name, selected, out).read_bytes()
+    return figures.draw(name, selected, out)[0].read_bytes()
 
 
 def test_one_body_at_many_places(tmp_path, monkeypatch, capsys):

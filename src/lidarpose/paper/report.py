@@ -47,7 +47,7 @@ def run_table(
             check_protocol(PROTOCOL, open_eval_dataset(test))
     failed: dict[int, str] = {}
     for k, cell in enumerate(selected):
-        if cell.evaluation is not None and not _path(cell.evaluation, out).is_file():
+        if cell.evaluation is not None and not _is_there(table, cell.evaluation, out):
             try:
                 run_steps(cell.evaluation, out, execute, tell)
             except StepFailed as error:
@@ -55,6 +55,11 @@ def run_table(
                 tell(f"{cell.row}, {cell.column}: failed: {error}")
         content = write_table(table, selected, options, out, failed)
     return content
+
+
+def _is_there(table: Table, evaluation: Step, out: Path) -> bool:
+    """Whether a cell's figures are there, and what a picture is drawn of, which is not copied with them."""
+    return _path(evaluation, out).is_file() and (not table.name.startswith("fig") or is_done(evaluation, out))
 
 
 def write_table(
