@@ -16,6 +16,7 @@ from lidarpose.cli.command_line import make_parser
 from lidarpose.data.prepare import prepare
 from lidarpose.data.shards import open_dataset
 from lidarpose.errors import InputError
+from lidarpose.eval import charts
 from lidarpose.eval.scores import published, read_scores
 from lidarpose.models.checkpoint import read_header
 from lidarpose.paper import figures, report, steps
@@ -444,6 +445,22 @@ def test_curves_and_ends_of_several_networks(tmp_path, name):
     (path,) = figures.draw(name, selected, tmp_path)
     assert path == tmp_path / f"{name}.png" and path.read_bytes().startswith(b"\x89PNG")
     assert path.read_bytes() != _drawn_alone(name, selected[:1], tmp_path)
+
+
+def test_amounts_keep_their_places_where_a_network_has_no_pose(monkeypatch):
+    monkeypatch.setattr(charts, "png_of", lambda figure, _: figure)
+    whole, gap = _study(1), _study(2)
+    for curve in gap["curves"]:
+        curve["points"][1]["mpjpe"] = None
+    figure = charts.compare_stability({"whole": whole, "gap": gap})
+    for axes in figure.axes:
+        (one, other), labels = axes.lines, [label.get_text() for label in axes.get_xticklabels()]
+        assert labels == ["0", "1", "2", "3", "9"]
+        np.testing.assert_array_equal(one.get_xdata(), other.get_xdata())
+        np.testing.assert_array_equal(other.get_ydata(), [200, np.nan, 240, 260, np.nan])
+        # which names are of which lines stands below, where no line runs
+        assert axes.get_legend() is None
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["whole", "gap"]
 
 
 def _drawn_alone(name, selected, out):
