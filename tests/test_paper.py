@@ -2,11 +2,13 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from dataset_files import write_sloper4d
+from dataset_files import write_lidarhuman26m, write_sloper4d
 from training_runs import Killed, few_to_validate_on  # noqa: F401
 
 from lidarpose.cli import main
@@ -14,15 +16,18 @@ from lidarpose.cli.command_line import make_parser
 from lidarpose.data.prepare import prepare
 from lidarpose.data.shards import open_dataset
 from lidarpose.errors import InputError
+from lidarpose.eval import charts
 from lidarpose.eval.scores import published, read_scores
 from lidarpose.models.checkpoint import read_header
 from lidarpose.paper import figures, report, steps
-from lidarpose.paper.report import markdown, run_table
+from lidarpose.paper.report import markdown, mean_pose_error, run_table
 from lidarpose.paper.steps import Step, StepFailed, run_steps
-from lidarpose.paper.tables import REAL, TABLES, Options, cells, row_key
+from lidarpose.paper.tables import REAL, TABLES, Options, _targets, cells, row_key
 from lidarpose.sample import center_of
-from lidarpose.skeleton import BODY26, HUMAN15
+from lidarpose.skeleton import BODY26, HUMAN15, SMPL24
+from lidarpose.synth.bodies import PoseBank
 from lidarpose.train import loop, run_dir
+from lidarpose.viz.person_view import facing, facing_of
 
 _ROWS = ["scratch", "laser-masking"]
 _TABLE = ["paper", "table4", "--people", "64", "--size", "paper-tiny", "--rows", ",".join(_ROWS), "--out"]
@@ -113,11 +118,26 @@ def test_a_table_of_what_is_there(finished, capsys):
     assert main([*_TABLE, str(out), "--table-only"]) == 0
 
 
-def test_the_hardest_people_side_by_side(finished):
+def test_the_hardest_people_side_by_side(finished, monkeypatch):
     out, _, _ = finished
     selected = cells(TABLES["table4"], Options(people=64, size="paper-tiny"), _ROWS)
-    assert figures.draw("fig5", selected, out).read_bytes().startswith(b"\x89PNG")
-    assert figures.draw("fig5", cells(TABLES["fig5"], Options(people=96)), out) is None
+    (path,) = figures.draw("fig5", selected, out)
+    assert path.name == "fig5.png" and path.read_bytes().startswith(b"\x89PNG")
+    drawn = []
+    monkeypatch.setattr(figures, "draw_people", lambda panels, **_: drawn.extend(panels) or b"x")
+    figures.draw("fig5", selected, out)
+    assert len(drawn) == 2 * figures.HARDEST
+    # methods of one row are seen from one side, which is the true person's
+    for one, other in zip(drawn[::2], drawn[1::2], strict=True):
+        np.testing.assert_array_equal(facing_of(one), facing_of(other))
+        np.testing.assert_array_equal(facing_of(one), facing(one.truth))
+    assert figures.draw("fig5", cells(TABLES["fig5"], Options(people=96)), out) == []
+    # a picture a column
+    clips = [replace(cell, column="clips") for cell in selected]
+    assert [path.name for path in figures.draw("fig5", [*selected, *clips], out)] == [
+        "fig5-people.png",
+        "fig5-clips.png",
+    ]
 
 
 # --- the tables as data
@@ -186,11 +206,42 @@ def test_the_paper_s_protocol_on_real_sets(data):
         assert ("--interval 5" in tuned) == thinned
         assert "--protocol dapt" in scored and ("--decode dark" in scored) == (row == "DAPT")
         assert "--rate" not in tuned and "--epochs" not in tuned
+        # crops and centers to learn from are those that are scored by
+        wanted = "--options trans_center=true" if row in ("LiDARCap", "NE") else "--augment paper"
+        assert ("--recipe paper" in tuned) == (row in ("PRN", "DAPT")) and (
+            wanted in tuned or "--recipe paper" in tuned
+        )
     assert "--recipe paper --size paper" in lines["DAPT", "waymo"][0] and "--motion raw" in lines["DAPT", "waymo"][0]
     assert all(cell.evaluation for cell in cells(TABLES["table2"], options))
     some = Options(data={name: data[name] for name in ("waymo", "lipd")})
     reasons = {cell.row: cell.why for cell in cells(TABLES["table2"], some)}
     assert reasons["LIPD"] == "" and "--data freemotion=DIR" in reasons["FreeMotion"]
+
+
+def test_poses_of_lidarhuman26m_s_test_sequences_are_not_learned_from(tmp_path, data, smpl):
+    raw = tmp_path / "raw"
+    write_lidarhuman26m(raw, smpl, sequences=("5", "7", "24", "8"))
+    options = Options(data=data | {"lidarhuman26m-poses": str(raw)}, size="paper")
+    for table, row in (("table1", "dapt"), ("table1", "ours"), ("table2", "lidarh26m"), ("table4", "pre-training")):
+        first = cells(TABLES[table], options, [row])[0].training[0]
+        words = first.command(tmp_path)
+        subjects = words[words.index("--subjects") + 1].split(",")
+        assert set(PoseBank.from_clips(raw, tuple(subjects)).clips.names) == {"labels/3d/pose/5", "labels/3d/pose/8"}
+
+
+def test_the_mean_pose_is_about_the_center_that_the_protocol_gives(tmp_path, smpl):
+    write_sloper4d(tmp_path / "raw", smpl, frames=40)
+    prepare("sloper4d", tmp_path / "raw", tmp_path / "set", smpl=smpl, split_by="dapt")
+    (target,) = _targets(TABLES["fig5"], Options(data={"sloper4d": str(tmp_path / "set")}))
+    setting = SimpleNamespace(dataset="set", kind="sloper4d", joints=HUMAN15.joints, protocol="dapt")
+    people = {split: list(open_dataset(tmp_path / "set").samples(split)) for split in ("train", "test")}
+    own = {
+        split: np.array([p.joints[SMPL24.map_to(HUMAN15)] - p.centers["trans"] for p in some])
+        for split, some in people.items()
+    }
+    wanted = 1e3 * np.linalg.norm(own["test"] - own["train"].mean(0), axis=-1).mean()
+    found = mean_pose_error(target, SimpleNamespace(setting=setting), tmp_path)
+    assert found == pytest.approx(wanted, abs=0.1)
 
 
 def test_a_set_that_the_protocol_refuses_is_refused_before_anything_is_trained(tmp_path, smpl):
@@ -275,6 +326,18 @@ def test_a_step_that_fails_is_a_cell_that_says_so_and_the_others_go_on(tmp_path)
     assert "failed: unrecognized arguments" in (tmp_path / "out" / "table4.md").read_text()
 
 
+def test_cells_that_were_copied_are_done_but_a_figure_needs_what_it_is_drawn_of(tmp_path):
+    asked = []
+    for name in ("table1", "fig5"):
+        cell = cells(TABLES[name], Options(people=64), ["dapt"])[0]
+        path = report._path(cell.evaluation, tmp_path)
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(json.dumps(_entry()))
+        chosen = replace(TABLES[name], columns=("waymo",))
+        run_table(chosen, Options(people=64), tmp_path, ["dapt"], lambda words: asked.append(words[0]) or 0, print)
+        assert asked == ([] if name == "table1" else ["synth", "pretrain", "finetune", "synth", "evaluate"])
+
+
 def test_a_stopped_step_stops_the_table(tmp_path):
     step = Step(("synth", "-n", "3"))
     with pytest.raises(KeyboardInterrupt):
@@ -285,6 +348,28 @@ def test_a_stopped_step_stops_the_table(tmp_path):
     for _ in range(2):
         run_steps(step, tmp_path, lambda words: asked.append(words) or 0, print)
     assert asked == [["synth", "-n", "3", "--out", str(step.folder(tmp_path))]]
+
+
+def test_an_evaluation_that_was_killed_while_its_files_were_put_in_place_is_done_again(tmp_path):
+    step, asked = Step(("evaluate", "weights", "set")), []
+    folder = step.folder(tmp_path)
+    folder.mkdir(parents=True)
+    for name in ("set-errors.png", ".0123456789abcdef-scores.json"):
+        (folder / name).write_text("")
+
+    def execute(words):
+        assert not folder.exists()
+        asked.append(words)
+        return 0
+
+    run_steps(step, tmp_path, execute, print)
+    assert len(asked) == 1
+    # all files are there, and the process was killed before it noted so
+    (tmp_path / "runs" / f"{step.name}.json").unlink()
+    folder.mkdir()
+    (folder / "poses.parquet").write_text("")
+    run_steps(step, tmp_path, execute, print)
+    assert len(asked) == 1 and steps.is_done(step, tmp_path)
 
 
 def test_a_training_that_takes_longer_than_its_hours_is_made_shorter(tmp_path):
@@ -357,13 +442,29 @@ def test_curves_and_ends_of_several_networks(tmp_path, name):
         folder.mkdir(parents=True)
         (folder / "stability.json").write_text(json.dumps({"studies": [_study(scale)]}))
         steps._note(cell.evaluation, tmp_path, done=True)
-    path = figures.draw(name, selected, tmp_path)
+    (path,) = figures.draw(name, selected, tmp_path)
     assert path == tmp_path / f"{name}.png" and path.read_bytes().startswith(b"\x89PNG")
     assert path.read_bytes() != _drawn_alone(name, selected[:1], tmp_path)
 
 
+def test_amounts_keep_their_places_where_a_network_has_no_pose(monkeypatch):
+    monkeypatch.setattr(charts, "png_of", lambda figure, _: figure)
+    whole, gap = _study(1), _study(2)
+    for curve in gap["curves"]:
+        curve["points"][1]["mpjpe"] = None
+    figure = charts.compare_stability({"whole": whole, "gap": gap})
+    for axes in figure.axes:
+        (one, other), labels = axes.lines, [label.get_text() for label in axes.get_xticklabels()]
+        assert labels == ["0", "1", "2", "3", "9"]
+        np.testing.assert_array_equal(one.get_xdata(), other.get_xdata())
+        np.testing.assert_array_equal(other.get_ydata(), [200, np.nan, 240, 260, np.nan])
+        # which names are of which lines stands below, where no line runs
+        assert axes.get_legend() is None
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["whole", "gap"]
+
+
 def _drawn_alone(name, selected, out):
-    return figures.draw(name, selected, out).read_bytes()
+    return figures.draw(name, selected, out)[0].read_bytes()
 
 
 def test_one_body_at_many_places(tmp_path, monkeypatch, capsys):

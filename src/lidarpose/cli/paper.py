@@ -75,7 +75,7 @@ def _paper(commands, execute: Callable[[list[str]], int], options: argparse.Name
     else:
         run_table(table, asked, out, chosen, execute, tell)
     print(out / f"{table.name}.md")
-    if table.name.startswith("fig") and (path := figures.draw(table.name, selected, out)) is not None:
+    for path in figures.draw(table.name, selected, out) if table.name.startswith("fig") else ():
         print(path)
 
 

@@ -102,18 +102,19 @@ def draw_stability(study: Stability) -> bytes:
 def compare_stability(studies: dict[str, dict[str, Any]], names: Sequence[str] = ("jitter", "clusters")) -> bytes:
     """Curves of several networks in one chart. Paper: Figure 7. studies: name of a network -> a study of
     stability.json; names: of its curves."""
-    figure = _figure(5.2 * len(names), 4.2, "points perturbed: MPJPE in mm", _of_whom(studies))
+    figure = _figure(5.2 * len(names), 4.2, "points perturbed: MPJPE in mm", _of_whom(studies, "who"))
     for axes, name in zip(np.ravel(figure.subplots(1, len(names))), names, strict=True):
         for (network, study), color in zip(studies.items(), cycle(_PALETTE), strict=False):
             curve = next(curve for curve in study["curves"] if curve["name"] == name)
-            points = [point for point in curve["points"] if point["mpjpe"] is not None]
-            at, values = range(len(points)), [point["mpjpe"] for point in points]
-            axes.plot(at, values, "o-", color=color, ms=4, lw=1.5, label=network)
-            axes.set_xticks(at, [point["label"] for point in points], fontsize=8)
+            # a gap where nobody has a pose: amounts keep their places
+            values = [np.nan if point["mpjpe"] is None else point["mpjpe"] for point in curve["points"]]
+            axes.plot(values, "o-", color=color, ms=4, lw=1.5, label=network)
+            axes.set_xticks(range(len(values)), [point["label"] for point in curve["points"]], fontsize=8)
             title = curve["title"]
         axes.set_ylim(0, None)
-        _styled(axes, title, legend=True)
-        axes.legend(fontsize=8, loc="lower right", frameon=False)
+        _styled(axes, title)
+    # below, where no curve runs
+    figure.legend(*axes.get_legend_handles_labels(), fontsize=8, frameon=False, ncols=3, loc="outside lower center")
     return png_of(figure, None)
 
 
@@ -134,10 +135,10 @@ def compare_ends(studies: dict[str, dict[str, Any]]) -> bytes:
     return png_of(figure, None)
 
 
-def _of_whom(studies: dict[str, dict[str, Any]]) -> str:
-    """The people and the protocol of studies, which are the same for all."""
+def _of_whom(studies: dict[str, dict[str, Any]], who: str = "") -> str:
+    """The dataset, or the people who were perturbed, and the protocol of studies, which are the same for all."""
     first = next(iter(studies.values()))
-    return f"{first['setting']['dataset']}: {first['who']} · {first['setting']['protocol']}"
+    return f"{first[who] if who else first['setting']['dataset']} · protocol {first['setting']['protocol']}"
 
 
 def draw_worst(p: Predictions, setting: Setting, worst: Sequence[tuple[EvalSample, int]]) -> bytes:

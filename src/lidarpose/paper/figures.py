@@ -11,7 +11,7 @@ from lidarpose.eval.charts import compare_ends, compare_stability
 from lidarpose.eval.dataset import open_eval_dataset
 from lidarpose.eval.predictions import read_poses
 from lidarpose.io.files import write_atomic
-from lidarpose.paper.steps import Step, is_done
+from lidarpose.paper.steps import POSES, Step, is_done
 from lidarpose.paper.tables import Cell
 from lidarpose.sample import Pose
 from lidarpose.skeleton import SMPL24
@@ -19,6 +19,7 @@ from lidarpose.synth.bodies import PoseBank
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
 from lidarpose.viz.draw import Panel, draw_people
+from lidarpose.viz.person_view import facing
 
 # people side by side: those of the largest errors, averaged over the methods
 HARDEST = 6
@@ -28,25 +29,32 @@ _DISTANCES, _KEPT = (5.0, 8.0, 12.0, 16.0, 20.0), (1.0, 0.8, 0.6, 0.4)
 _STANDS, _TRIED = 1.5, 100
 
 
-def draw(name: str, cells: Sequence[Cell], out: Path) -> Path | None:
-    """Draws fig5, fig7 or fig8 of the cells that are done, of the first seed and column; None where there are none."""
-    firsts = [cell for cell in cells if cell.seed == 0 and cell.column == cells[0].column]
-    done = {cell.row: cell for cell in firsts if cell.evaluation and is_done(cell.evaluation, out)}
-    if not done:
-        return None
+def draw(name: str, cells: Sequence[Cell], out: Path) -> list[Path]:
+    """Draws fig5, fig7 or fig8 of the cells that are done, of the first seed, a picture a column; returns their
+    paths."""
+    columns = list(dict.fromkeys(cell.column for cell in cells))
+    paths = []
+    for column in columns:
+        firsts = [cell for cell in cells if cell.seed == 0 and cell.column == column]
+        done = {cell.row: cell for cell in firsts if cell.evaluation and is_done(cell.evaluation, out)}
+        if done:
+            paths.append(out / (f"{name}.png" if len(columns) == 1 else f"{name}-{column}.png"))
+            write_atomic(paths[-1], _picture(name, done, out))
+    return paths
+
+
+def _picture(name: str, done: dict[str, Cell], out: Path) -> bytes:
+    """A figure of one column, of its cells that are done."""
     if name == "fig5":
-        content = _side_by_side(done, out)
-    else:
-        paths = {row: cell.evaluation.product(out) / "stability.json" for row, cell in done.items() if cell.evaluation}
-        studies = {row: json.loads(path.read_text())["studies"][0] for row, path in paths.items()}
-        content = (compare_stability if name == "fig7" else compare_ends)(studies)
-    write_atomic(out / f"{name}.png", content)
-    return out / f"{name}.png"
+        return _side_by_side(done, out)
+    paths = {row: cell.evaluation.product(out) / "stability.json" for row, cell in done.items() if cell.evaluation}
+    studies = {row: json.loads(path.read_text())["studies"][0] for row, path in paths.items()}
+    return (compare_stability if name == "fig7" else compare_ends)(studies)
 
 
 def _side_by_side(done: dict[str, Cell], out: Path) -> bytes:
     """The hardest people, a row a person, a column a method."""
-    paths = {row: cell.evaluation.product(out) / "poses.parquet" for row, cell in done.items() if cell.evaluation}
+    paths = {row: cell.evaluation.product(out) / POSES for row, cell in done.items() if cell.evaluation}
     predictions = {row: next(iter(read_poses(path).values())) for row, path in paths.items()}
     places = [{(s, r): k for k, (s, r) in enumerate(zip(p.shard, p.row, strict=True))} for p in predictions.values()]
     everywhere = sorted(set.intersection(*map(set, places)))
@@ -62,10 +70,11 @@ def _side_by_side(done: dict[str, Cell], out: Path) -> bytes:
     for key in hardest:
         for k, (row, p) in enumerate(predictions.items()):
             at = places[k][key]
-            poses = [Pose(joints=joints[at].astype(float), skeleton=p.skeleton) for joints in (p.pred, p.true)]
+            pose, truth = (Pose(joints=joints[at].astype(float), skeleton=p.skeleton) for joints in (p.pred, p.true))
+            # from the same side in every column, whichever way a method turned the person
+            panel = Panel(points=clouds[key], pose=pose, truth=truth, forward=facing(truth))
             label = f"{row}: {mean[k, everywhere.index(key)]:.0f} mm"
-            distance = float(p.distance[at])
-            panels.append(Panel(points=clouds[key], pose=poses[0], truth=poses[1], label=label, distance=distance))
+            panels.append(replace(panel, label=label, distance=float(p.distance[at])))
     return draw_people(panels, title=f"{target.title}: the hardest people", per_row=len(predictions))
 
 

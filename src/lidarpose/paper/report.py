@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 
 from lidarpose._version import __version__
+from lidarpose.data.shards import CARD
 from lidarpose.errors import LidarPoseError
 from lidarpose.eval.dataset import EvalSample, open_eval_dataset
-from lidarpose.eval.protocols import check_protocol
+from lidarpose.eval.metrics import aggregate
+from lidarpose.eval.protocols import DAPT, check_protocol
 from lidarpose.eval.scores import COLUMNS, FILE, Result, read_scores
-from lidarpose.io.files import write_atomic
+from lidarpose.io.files import content_digest, write_atomic
 from lidarpose.models.checkpoint import load_checkpoint, runs_of
 from lidarpose.paper.steps import CELLS, RUNS, Execute, Step, StepFailed, check_out, is_done, last_entry, run_steps
 from lidarpose.paper.tables import PROTOCOL, Cell, Options, Table, Target, cells, row_key
@@ -23,8 +25,8 @@ SCHEMA = "lidarpose.paper/1"
 _UNDERTRAINED = 0.2
 _LEGEND = (
     "MPJPE in mm, the mean over seeds; in brackets the 95 % interval over people, of several seeds the least and the "
-    "greatest. *undertrained*: not 20 % better than the mean pose about the points' center; nothing can be concluded "
-    "from it."
+    "greatest. *undertrained*: not 20 % better than the mean pose about the protocol's center; nothing can be "
+    "concluded from it."
 )
 # people of whom the mean pose is taken at most
 _MEAN_POSE = 5_000
@@ -45,7 +47,7 @@ def run_table(
             check_protocol(PROTOCOL, open_eval_dataset(test))
     failed: dict[int, str] = {}
     for k, cell in enumerate(selected):
-        if cell.evaluation is not None and not _path(cell.evaluation, out).is_file():
+        if cell.evaluation is not None and not _is_there(table, cell.evaluation, out):
             try:
                 run_steps(cell.evaluation, out, execute, tell)
             except StepFailed as error:
@@ -53,6 +55,11 @@ def run_table(
                 tell(f"{cell.row}, {cell.column}: failed: {error}")
         content = write_table(table, selected, options, out, failed)
     return content
+
+
+def _is_there(table: Table, evaluation: Step, out: Path) -> bool:
+    """Whether a cell's figures are there, and what a picture is drawn of, which is not copied with them."""
+    return _path(evaluation, out).is_file() and (not table.name.startswith("fig") or is_done(evaluation, out))
 
 
 def write_table(
@@ -134,26 +141,31 @@ def _value(result: Result, name: str) -> float | None:
 
 def mean_pose_error(target: Target, result: Result, out: Path) -> float:
     """MPJPE in mm, over the scored joints of the people scored, of the mean skeleton of those learned from, about the
-    center of a person's points."""
-    name = f"mean-pose-{result.setting.dataset}-{len(result.setting.joints)}.json"
-    path = out / CELLS / name
+    center that the protocol gives: of labels, or of a person's points."""
+    folders = [str(part.product(out)) if isinstance(part, Step) else part for part in (target.train, target.test)]
+    # real sets may have been prepared anew
+    card = None if isinstance(target.test, Step) else content_digest(Path(folders[1]) / CARD, expected="a dataset")[:8]
+    name = filter(None, (result.setting.dataset, str(len(result.setting.joints)), card))
+    path = out / CELLS / f"mean-pose-{'-'.join(name)}.json"
     if not path.is_file():
-        folders = [str(part.product(out)) if isinstance(part, Step) else part for part in (target.train, target.test)]
         split = None if isinstance(target.train, Step) else "train"
         learned = [_offset(person, result) for person in open_eval_dataset(folders[0], split=split, limit=_MEAN_POSE)]
         scored = [_offset(person, result) for person in open_eval_dataset(folders[1], split=None)]
         mean = np.nanmean(learned, 0)
-        error = 1e3 * float(np.nanmean(np.linalg.norm(np.array(scored) - mean, axis=-1)))
+        errors = 1e3 * np.linalg.norm(np.array(scored) - mean, axis=-1)
+        error = aggregate.mean(errors)
         write_atomic(path, json.dumps({"mpjpe": round(error, 1), "people": len(scored)}) + "\n")
     return json.loads(path.read_text())["mpjpe"]
 
 
 def _offset(person: EvalSample, result: Result) -> np.ndarray:
-    """(J, 3) m: the scored joints from the center of the points, NaN without a label or points."""
-    sample = person.sample
-    columns = [sample.skeleton.index(joint) for joint in result.setting.joints]
+    """(J, 3) m: the scored joints from the protocol's center, NaN without a label or points."""
+    sample, setting = person.sample, result.setting
+    columns = [sample.skeleton.index(joint) for joint in setting.joints]
     known = (sample.joint_labels[columns] > 0)[:, None]
     center = center_of(person.points) if len(person.points) else np.full(3, np.nan)
+    if setting.protocol == PROTOCOL:
+        center = sample.centers.get(DAPT[setting.kind].center, np.full(3, np.nan))
     return np.where(known, sample.joints[columns] - center, np.nan)
 
 

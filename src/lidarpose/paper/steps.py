@@ -10,6 +10,7 @@ import io
 import json
 import os
 import shlex
+import shutil
 import signal
 import sys
 import threading
@@ -27,6 +28,8 @@ from lidarpose.train.run_dir import CONFIG, LENGTHS, MODEL, read_config, read_lo
 
 # folders of a table's own folder: of the steps, and of the figures of cells that are done
 RUNS, CELLS = "runs", "cells"
+# of an evaluation's files the one that is put in place last
+POSES = "poses.parquet"
 # the kinds of training, by command
 KINDS: dict[str, type[Pretrain] | type[Finetune]] = {"pretrain": Pretrain, "finetune": Finetune}
 # how long a training is watched before its speed is known: at most so many seconds, or this share of its hours
@@ -134,9 +137,12 @@ def _note(step: Step, out: Path, **entries: Any) -> None:
 
 def _run(step: Step, out: Path, execute: Execute) -> None:
     folder = step.folder(out)
-    if step.kind == "evaluate" and folder.is_dir() and any(folder.iterdir()):
-        # written all at once: the process ended before it could be noted
-        return
+    if step.kind == "evaluate":
+        if (folder / POSES).is_file():
+            # put in place last: the process ended before it could be noted
+            return
+        # what a killed process had not put in place: the command takes an empty folder only
+        shutil.rmtree(folder, ignore_errors=True)
     words = step.command(out)
     if step.kind in KINDS and (folder / CONFIG).is_file():
         where = [str(folder)] if step.kind == "pretrain" else ["--out", str(folder)]

@@ -11,6 +11,7 @@ from itertools import product
 from pathlib import Path
 
 from lidarpose.data.shards import CARD
+from lidarpose.data.splits import split_rule
 from lidarpose.errors import InputError, check_name
 from lidarpose.paper.steps import Step
 from lidarpose.train.recipes import MODELS, PAPER, SMALL_PAPER, TINY_PAPER
@@ -21,6 +22,10 @@ PROTOCOL = "dapt"
 REAL = ("waymo", "humanm3", "lidarhuman26m", "sloper4d")
 CORPORA = ("lipd", "freemotion", "noisemotion")
 POSES = ("freemotion-poses", "lidarhuman26m-poses")
+# where LiDARHuman26M's raw folder has a folder of poses a sequence
+_SEQUENCES = "labels/3d/pose"
+# on real sets everybody learns from the crops and about the centers that the protocol scores by
+_RELEASED, _RELEASED_CLIPS = ("--augment", "paper"), ("--options", "trans_center=true")
 # people of the stand-in: to learn from at most, to be scored on at most, and their seeds, which nothing else has
 _TRAIN, _TEST = 10_000, 2_000
 _SEEDS = {"train": 1_000_003, "test": 1_000_033}
@@ -243,11 +248,19 @@ def _pretrained(options: Options, *more: str, motion: tuple[str, ...] | None = N
 def _motion(options: Options) -> tuple[str, ...]:
     """Where poses of pre-training come from: LiDARHuman26M's where they are, else the first file of motion."""
     if source := options.data.get("lidarhuman26m-poses"):
-        return ("--motion", source, "--captured", "1")
+        return ("--motion", source, *_learned(source), "--captured", "1")
     if not options.motion:
         return ()
     subjects = ("--subjects", options.subjects) if options.subjects else ()
     return ("--motion", options.motion[0], *subjects, "--captured", "1")
+
+
+def _learned(raw: str) -> tuple[str, ...]:
+    """--subjects of LiDARHuman26M's raw folder, where it has sequences of the split test: the others."""
+    sequences = sorted(path.name for path in (Path(raw) / _SEQUENCES).glob("*") if path.is_dir())
+    rule = split_rule("lidarhuman26m", Path(raw)) if sequences else None
+    learned = [f"{_SEQUENCES}/{name}" for name in sequences if rule is not None and rule.of_part(name) != "test"]
+    return ("--subjects", ",".join(learned)) if len(learned) < len(sequences) else ()
 
 
 def _tuned(options: Options, *more: str) -> tuple[str, ...]:
@@ -267,27 +280,30 @@ def _published(*values: float | None) -> dict[str, float]:
 def _methods(options: Options) -> list[Row]:
     """Table 1."""
     prn, own = ("--neck", "prn"), "tiny" if options.size == TINY_PAPER else "small"
+    released = _RELEASED if options.real else ()
+    lpformer = _baseline(options, "lpformer", *released)
     return [
         _of_clips(options, "LiDARCap", 79.31, 101.89),
         _of_clips(options, "NE", 72.23, 96.80),
-        Row(name="LPFormer", finetune=_baseline(options, "lpformer"), published=_published(61.60, 83.69, 95.72, 49.31)),
-        Row(name="PRN as published", finetune=_baseline(options, "prn")),
+        Row(name="LPFormer", finetune=lpformer, published=_published(61.60, 83.69, 95.72, 49.31)),
+        Row(name="PRN as published", finetune=_baseline(options, "prn", *released)),
         Row(name="PRN", finetune=_random(options, *prn), published=_published(68.48, 70.56, 80.01, 48.76)),
         _dapt(options, _published(51.59, 59.76, 73.47, 28.01)),
-        Row(name="ours", finetune=(), pretrain=("--size", own, "--scene", "paper", *_motion(options))),
+        Row(name="ours", finetune=released, pretrain=("--size", own, "--scene", "paper", *_motion(options))),
     ]
 
 
-def _baseline(options: Options, model: str) -> tuple[str, ...]:
+def _baseline(options: Options, model: str, *more: str) -> tuple[str, ...]:
     """Options of a baseline's training, at the width that goes with the size of the paper's network; the reduced ones
     by the cycle of rates that the paper's network has."""
     cycle = () if options.size == PAPER else _ONE_CYCLE
-    return ("--model", model, "--size", model + options.size.removeprefix(PAPER), *cycle)
+    return ("--model", model, "--size", model + options.size.removeprefix(PAPER), *cycle, *more)
 
 
 def _of_clips(options: Options, name: str, *published: float) -> Row:
     printed = _published(None, None, *published)
-    return Row(name=name, finetune=_baseline(options, name.lower()), clips=True, published=printed)
+    released = _RELEASED_CLIPS if options.real else ()
+    return Row(name=name, finetune=_baseline(options, name.lower(), *released), clips=True, published=printed)
 
 
 def _dapt(options: Options, published: dict[str, float], name: str = "DAPT") -> Row:
@@ -316,8 +332,9 @@ def _corpora(options: Options) -> list[Row]:
         ("lidarhuman26m-poses", "LiDARH26M†", 51.6, None, 73.4),
     ):
         folder, has_points = options.data.get(name, ""), name in CORPORA
-        own = _pretrained(options, "--shards", folder, motion=()) if has_points else poses(folder)
-        what = "prepared with --split train" if has_points else "the raw files of its poses"
+        learned = _learned(folder) if name == "lidarhuman26m-poses" else ()
+        own = _pretrained(options, "--shards", folder, motion=()) if has_points else poses(folder, *learned)
+        what = "as prepared, with --split train if it has a split" if has_points else "the raw files of its poses"
         why = "" if folder else f"needs --data {name}=DIR, {what}"
         rows.append(Row(name=title, finetune=tuned, pretrain=own, why=why, published=_published(*printed)))
     return rows

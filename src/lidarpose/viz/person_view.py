@@ -24,6 +24,8 @@ class Panel:
         box: drawn in pictures.
         distance: m, printed; by default that of the person from the frame's origin, none for NaN.
         caption: the line under the person, by default the number of points, the distance and the mean confidence.
+        forward: (3,) where the person looks, see `facing`, which the views follow; by default as the pose has it, else
+            the truth.
     """
 
     points: np.ndarray
@@ -34,6 +36,7 @@ class Panel:
     box: Box | None = None
     distance: float | None = None
     caption: str = ""
+    forward: np.ndarray | None = None
 
     def __post_init__(self):
         if self.points.ndim != 2 or self.points.shape[1] != 3:
@@ -70,8 +73,8 @@ def facing(pose: Pose | None) -> np.ndarray | None:
 
 
 def facing_of(person: Panel) -> np.ndarray | None:
-    """`facing` of the predicted pose, else of the true one."""
-    forward = facing(person.pose)
+    """What the panel says, else `facing` of the predicted pose, else of the true one."""
+    forward = facing(person.pose) if person.forward is None else person.forward
     return facing(person.truth) if forward is None else forward
 
 
