@@ -21,6 +21,8 @@ PROTOCOL = "dapt"
 REAL = ("waymo", "humanm3", "lidarhuman26m", "sloper4d")
 CORPORA = ("lipd", "freemotion", "noisemotion")
 POSES = ("freemotion-poses", "lidarhuman26m-poses")
+# the user's SMPL file, the body of people synthesized of those poses
+SMPL = "smpl"
 # people of the stand-in: to learn from at most, to be scored on at most, and their seeds, which nothing else has
 _TRAIN, _TEST = 10_000, 2_000
 _SEEDS = {"train": 1_000_003, "test": 1_000_033}
@@ -43,8 +45,8 @@ _RECIPE_KEEP = "0.6"
 class Options:
     """What was asked for. people: budget of a stage of training; hours: of a row's training in all; size: of the
     paper's network, and by it the baselines' widths, published or reduced; seeds; data: name -> folder, see `REAL`,
-    `CORPORA` and `POSES`; motion: files of captured motion, subjects of the first one to learn from and held_out ones
-    for the target; workers: of each command."""
+    `CORPORA`, `POSES` and `SMPL`; motion: files of captured motion, subjects of the first one to learn from and
+    held_out ones for the target; workers: of each command."""
 
     people: int = 200_000
     hours: float | None = None
@@ -61,8 +63,8 @@ class Options:
             raise InputError("expected --people, --seeds and --workers of at least 1 and --hours above 0")
         check_name("size of the paper's network", self.size, MODELS["dapt"])
         for name, folder in self.data.items():
-            check_name("dataset", name, (*REAL, *CORPORA, *POSES))
-            if name not in POSES and not (Path(folder) / CARD).is_file():
+            check_name("dataset", name, (*REAL, *CORPORA, *POSES, SMPL))
+            if name not in (*POSES, SMPL) and not (Path(folder) / CARD).is_file():
                 raise InputError(f"{name}={folder} is no prepared dataset: run lidarpose prepare first")
         if (self.subjects or self.held_out) and not self.motion:
             raise InputError("--subjects and --held-out are of captured motion: name its file by --motion")
@@ -240,10 +242,16 @@ def _pretrained(options: Options, *more: str, motion: tuple[str, ...] | None = N
     return _paper(options, "--size", options.size, *poses, *more)
 
 
+def _corpus(options: Options, source: str, *subjects: str) -> tuple[str, ...]:
+    """Pre-training on the poses of a corpus alone, on the user's SMPL body where there is one."""
+    body = ("--body", options.data[SMPL]) if SMPL in options.data else ()
+    return ("--motion", source, *subjects, "--captured", "1", *body)
+
+
 def _motion(options: Options) -> tuple[str, ...]:
     """Where poses of pre-training come from: LiDARHuman26M's where they are, else the first file of motion."""
     if source := options.data.get("lidarhuman26m-poses"):
-        return ("--motion", source, "--captured", "1")
+        return _corpus(options, source)
     if not options.motion:
         return ()
     subjects = ("--subjects", options.subjects) if options.subjects else ()
@@ -298,7 +306,7 @@ def _corpora(options: Options) -> list[Row]:
     """Table 2. The stand-in has no corpora: poses of each file of motion, and those of the procedural prior."""
 
     def poses(source: str, *subjects: str) -> tuple[str, ...]:
-        return _pretrained(options, motion=("--motion", source, *subjects, "--captured", "1"))
+        return _pretrained(options, motion=_corpus(options, source, *subjects))
 
     tuned = _tuned(options)
     rows = [Row(name="w/o", finetune=_random(options), published=_published(59.2, None, 76.5))]
