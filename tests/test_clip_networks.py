@@ -352,6 +352,22 @@ def test_frames_that_show_nothing_have_no_pose_and_harm_no_other(predictor, clip
     np.testing.assert_allclose(poses[0].joints, same[0].joints, atol=1e-4)
 
 
+@pytest.mark.parametrize(
+    "clips, told",
+    [
+        (Clips.of_run(20), "each of the 4 clouds in one of them"),
+        (Clips.of_run(3), "each of the 4 clouds in one of them"),
+        (Clips(windows=np.arange(4)[None]), "windows of 16 rows"),
+        (Clips(windows=np.repeat([[0, 1, 2, 3], [0, 1, 2, 3]], 4, axis=1)), "in one of them"),
+        (Clips.of_run(4, background=[np.zeros((5, 3))] * 3), "clouds of background as clouds, 4, got 3"),
+        (Clips.of_run(4, neighbors=[np.zeros((5, 2))] * 4), r"neighbors\[0\] must be \(n, 3\)"),
+    ],
+)
+def test_clips_that_do_not_fit_the_clouds_are_refused(predictor, clips, told):
+    with refused(told):
+        predictor.predict([np.random.default_rng(k).normal(0, 0.3, (20, 3)) for k in range(4)], clips=clips)
+
+
 def test_networks_of_single_frames_take_no_clips():
     with refused("reads single frames"):
         load("tiny").predict([np.zeros((10, 3))] * CLIP_FRAMES, clips=Clips.of_run(CLIP_FRAMES))
