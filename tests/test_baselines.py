@@ -15,7 +15,9 @@ from lidarpose.models.baselines.lidarcap import (
 from lidarpose.models.baselines.lpformer import V2V, Lpformer
 from lidarpose.models.baselines.ne import Ne
 from lidarpose.models.baselines.point_ops import ball_query, farthest_points, nearest_neighbors
-from lidarpose.models.baselines.prn import Prn, PrnNeck
+from lidarpose.models.baselines.point_transformer_v2 import Rows
+from lidarpose.models.baselines.prn import Prn, PrnNeck, VoteHead
+from lidarpose.models.checkpoint import build
 from lidarpose.sample import CLIP_FRAMES
 from lidarpose.skeleton import SMPL24, WAYMO14
 from lidarpose.train.networks import PRETRAINED
@@ -131,41 +133,118 @@ def test_graph_is_normalized_and_splits_by_the_root():
 # ---- order and padding
 
 
-def _run(name: str, points: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-    """Joints of the network `name` with fixed weights, in evaluation mode; clips show the cloud in every frame."""
+def _network(name: str) -> torch.nn.Module:
+    """The network `name` with fixed weights, in evaluation mode, whose every branch has a part in the answer."""
     torch.manual_seed(3)
+    configs = {"prn": PrnConfig(), "lpformer": LpformerConfig(grid=32)}
+    network = PointNet2(64) if name == "pointnet++" else build(configs.get(name) or PRETRAINED[name][0])
     if name.startswith("prn"):
-        return Prn(PRETRAINED[name][0]).eval()(points, valid).joints
-    if name == "lpformer":
-        return Lpformer(LpformerConfig(grid=32)).eval()(points, valid).joints
-    if name == "lpformer-small":
-        return Lpformer(PRETRAINED[name][0]).eval()(points, valid).joints
-    encoder = PointNet2(64).eval()
-    return encoder(points, valid)
+        # random parts are so unsure that no point would vote
+        network.vote.parts[-1].weight.mul_(100)
+    if name.startswith("lpformer"):
+        # its volume begins as good as empty
+        network.volume.last.weight.mul_(1000)
+    # before their batch norms have seen anybody, deep layers answer with next to nothing
+    for module in network.modules():
+        if isinstance(module, torch.nn.modules.batchnorm._BatchNorm):
+            module.momentum = 1.0
+    _run(network.train(), *_cloud(9, (60, 50, 40)))
+    return network.eval()
+
+
+def _run(network: torch.nn.Module, points: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+    """Joints (B, J, 3), and features (B, C) of a part of a network; clips show a cloud in every frame, NE also upside
+    down and shifted as what is about the person."""
+    if not hasattr(network, "decode"):
+        outputs = network(points, valid)
+        return getattr(outputs, "joints", outputs)
+    frames, shown = (x[:, None].expand(-1, CLIP_FRAMES, *x.shape[1:]) for x in (points, valid))
+    clouds = {
+        name: (sign * frames + shift, shown) for name, sign, shift in zip(CLOUDS, (1, -1, 1), (0, 0, 1), strict=True)
+    }
+    outputs = network(clouds)
+    assert outputs.joints.shape == (len(points), CLIP_FRAMES, 24, 3)
+    assert outputs.rotations.shape == (len(points), CLIP_FRAMES, 24, 3, 3)
+    return outputs.posed()
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("name", ["prn", "prn-small", "lpformer", "lpformer-small", "pointnet++"])
+@pytest.mark.parametrize(
+    "name", ["prn", "prn-small", "lpformer", "lpformer-small", "pointnet++", "lidarcap-small", "ne-small"]
+)
 def test_order_and_padding_change_nothing(name):
+    network = _network(name)
     points, valid = _cloud(4, (150, 90, 8))
-    expected = _run(name, points, valid)
+    expected = _run(network, points, valid)
+    assert len(expected) == 3 and expected.isfinite().all()
+    assert name == "pointnet++" or expected.shape[-2:] == ((24 if hasattr(network, "decode") else 15), 3)
+    # sums in another order differ by so much
+    near = 2e-5 * float(expected.abs().max())
+    # people are told apart
+    assert (expected[0] - expected[1]).abs().max() > 100 * near
     order = torch.randperm(150, generator=torch.Generator().manual_seed(5))
-    assert torch.allclose(_run(name, points[:, order], valid[:, order]), expected, atol=2e-6)
+    assert torch.allclose(_run(network, points[:, order], valid[:, order]), expected, atol=near)
     more = torch.cat([points, torch.full((3, 40, 3), 0.2)], 1)
     wide = torch.cat([valid, torch.zeros(3, 40, dtype=torch.bool)], 1)
-    assert torch.allclose(_run(name, more, wide), expected, atol=2e-6)
+    assert torch.allclose(_run(network, more, wide), expected, atol=near)
     # nor do batch mates
-    assert torch.allclose(_run(name, points[2:, :8], valid[2:, :8]), expected[2:], atol=2e-6)
+    assert torch.allclose(_run(network, points[2:, :8], valid[2:, :8]), expected[2:], atol=near)
 
 
 @torch.no_grad()
-def test_clips_have_rotations_of_every_frame_and_clips_do_not_mix():
+def test_points_that_are_sure_vote():
+    torch.manual_seed(0)
+    head = VoteHead(6, 3, background=3).eval()
+    head.parts[-1].weight.mul_(100)
+    xyz, features, person = torch.randn(40, 3), torch.randn(40, 6), torch.arange(40) // 30
+    voted, parts, offsets = head(features, Rows(xyz=xyz, person=person, count=torch.tensor([30, 10])))
+    share, votes = parts.softmax(1), 0
+    for k in range(2):
+        for joint in range(3):
+            own = [m for m in range(40) if person[m] == k and share[m, 3] < 0.6 and share[m].max() > 0.6]
+            own = [m for m in own if share[m, :3].max() > 0.6]
+            weight = share[own, joint]
+            expected = (weight[:, None] * (xyz + offsets)[own]).sum(0) / (weight.sum() + 1e-8)
+            assert torch.allclose(voted[k, joint], expected, atol=1e-5)
+            votes += len(own)
+    assert 0 < votes < 3 * 40
+    # nobody votes: the middle
+    head.parts[-1].weight.zero_()
+    assert not head(features, Rows(xyz=xyz, person=person, count=torch.tensor([30, 10])))[0].any()
+
+
+@torch.no_grad()
+def test_weights_fit_every_grid_and_a_point_reads_its_own_cell():
+    torch.manual_seed(0)
+    networks = {grid: Lpformer(LpformerConfig(grid=grid, width_divisor=8)).eval() for grid in (64, 32)}
+    networks[32].load_state_dict(networks[64].state_dict())
+    points, valid = _cloud(8, (30, 12))
+    for grid, network in networks.items():
+        joints = network(points, valid).joints
+        assert joints.shape == (2, 15, 3) and joints.isfinite().all()
+        assert network.occupancy(points, valid).shape == (2, 1, grid, grid, grid)
+    # a volume that says where a cell is: x, y and z of its middle
+    network, middle = networks[32], (torch.arange(32) + 0.5) / 16 - 1
+    z, y, x = torch.meshgrid(middle, middle, middle, indexing="ij")
+    known, read = torch.stack([x, y, z, z * 0])[None].expand(2, -1, -1, -1, -1), {}
+    network.volume = torch.nn.Identity()
+    network.volume.forward = lambda occupied: known * occupied.amax().clamp(1, 1)
+    network.token.register_forward_pre_hook(lambda _, given: read.update(tokens=given[0]))
+    inside = points.clamp(-0.9, 0.9)
+    network(inside, valid)
+    assert torch.allclose(read["tokens"][..., 6:9], inside, atol=1e-5)
+    cells = network.occupancy(inside, valid)[0, 0].nonzero()
+    expected = {tuple(((p + 1) * 16).floor().long().flip(0).tolist()) for p in inside[0, :30]}
+    assert {tuple(cell) for cell in cells.tolist()} == expected
+
+
+@torch.no_grad()
+def test_clips_do_not_mix():
     points, valid = _cloud(6, (40,) * 2 * CLIP_FRAMES)
     points, valid = points.unflatten(0, (2, CLIP_FRAMES)), valid.unflatten(0, (2, CLIP_FRAMES))
     torch.manual_seed(0)
     network = Lidarcap(LidarcapConfig()).eval()
     both, first = network({"person": (points, valid)}), network({"person": (points[:1], valid[:1])})
-    assert both.joints.shape == (2, CLIP_FRAMES, 24, 3) and both.rotations.shape == (2, CLIP_FRAMES, 24, 3, 3)
     assert torch.allclose(both.rotations[:1], first.rotations, atol=1e-5)
 
 

@@ -14,8 +14,9 @@ from lidarpose.body.rig import mean_adult_joints
 from lidarpose.cli import main
 from lidarpose.data.prepare import prepare
 from lidarpose.data.shards import DatasetCard, person_row, shard_path, shard_writer, write_card
-from lidarpose.eval import run
-from lidarpose.eval.protocols import EvalSetup
+from lidarpose.eval import robustness, run
+from lidarpose.eval.dataset import open_eval_dataset
+from lidarpose.eval.protocols import EvalSetup, eval_setup
 from lidarpose.geometry import UP_AXES
 from lidarpose.inference.inputs import Clips
 from lidarpose.inference.predictor import Predictor, load
@@ -215,6 +216,10 @@ def test_settings_that_clips_cannot_have_are_refused(folder, tmp_path):
         make_setup(recipe(Pretrain, "lidarcap"))
     with refused("batch counts frames, so a clip counts 16: give a multiple, got 24"):
         loop.train(recipe(Pretrain, "lidarcap", shards=(str(folder),), batch=24), tmp_path / "run", device="cpu")
+    with refused("head is of the paper's network, lidarcap has none"):
+        make_setup(recipe(Finetune, "lidarcap", data=(str(folder),), split="all", head="coordinates"))
+    with refused("keep_anchors is of the paper's network"):
+        make_setup(recipe(Finetune, "lidarcap", data=(str(folder),), split="all", keep_anchors=False))
     with refused("leave --mix at 0 and --augment at none"):
         make_setup(recipe(Finetune, "ne", data=(str(folder),), split="all", mix=0.25))
     with refused("the joints of lidarcap are SMPL's 24"):
@@ -347,6 +352,22 @@ def test_frames_that_show_nothing_have_no_pose_and_harm_no_other(predictor, clip
     np.testing.assert_allclose(poses[0].joints, same[0].joints, atol=1e-4)
 
 
+@pytest.mark.parametrize(
+    "clips, told",
+    [
+        (Clips.of_run(20), "each of the 4 clouds in one of them"),
+        (Clips.of_run(3), "each of the 4 clouds in one of them"),
+        (Clips(windows=np.arange(4)[None]), "windows of 16 rows"),
+        (Clips(windows=np.repeat([[0, 1, 2, 3], [0, 1, 2, 3]], 4, axis=1)), "in one of them"),
+        (Clips.of_run(4, background=[np.zeros((5, 3))] * 3), "clouds of background as clouds, 4, got 3"),
+        (Clips.of_run(4, neighbors=[np.zeros((5, 2))] * 4), r"neighbors\[0\] must be \(n, 3\)"),
+    ],
+)
+def test_clips_that_do_not_fit_the_clouds_are_refused(predictor, clips, told):
+    with refused(told):
+        predictor.predict([np.random.default_rng(k).normal(0, 0.3, (20, 3)) for k in range(4)], clips=clips)
+
+
 def test_networks_of_single_frames_take_no_clips():
     with refused("reads single frames"):
         load("tiny").predict([np.zeros((10, 3))] * CLIP_FRAMES, clips=Clips.of_run(CLIP_FRAMES))
@@ -363,6 +384,28 @@ def test_evaluation_shows_true_windows(predictor, folder, clips):
     names = list(result.predictions.skeleton.joints)
     expected = np.concatenate(by_clip)[:, [SMPL24.index(name) for name in names]]
     np.testing.assert_allclose(result.predictions.pred, expected, atol=1e-3)
+
+
+def test_people_who_are_drawn_from_clips_stand_alone(predictor, folder, clips, monkeypatch):
+    """Frames that lie apart are no window, however evenly they are spread; a study of stability draws, too."""
+    result = evaluation.run(predictor, [folder], limit=8).evaluations[0].predictions
+    samples = [sample for clip in clips for sample in clip]
+    assert len(result.row) == 8
+    for row, pred in zip(result.row, result.pred, strict=True):
+        around = {name: [getattr(samples[row], name)] for name in CLOUDS[1:]}
+        clip = Clips(windows=np.zeros((1, CLIP_FRAMES), int), **around)
+        (alone,) = predictor.predict([samples[row].points], sensor_origin=(0, 0, 0), clips=clip)
+        expected = alone.joints[[SMPL24.index(name) for name in result.skeleton.joints]]
+        np.testing.assert_allclose(pred, expected, atol=1e-3)
+    monkeypatch.setattr(robustness, "PEOPLE", 8)
+    monkeypatch.setattr(robustness, "PERTURBATIONS", {})
+    monkeypatch.setattr(robustness, "_sensor_curve", lambda *_: None)
+    asked, clips_of = [], EvalSetup._clips
+    monkeypatch.setattr(EvalSetup, "_clips", lambda *given: asked.append(clips_of(*given)) or asked[-1])
+    setup = eval_setup(predictor, open_eval_dataset(folder))
+    robustness.study(setup, result)
+    (given,) = asked
+    assert len(given["clips"].windows) == 8 and (np.ptp(given["clips"].windows, axis=1) == 0).all()
 
 
 @pytest.mark.parametrize("gap", [0, 5])

@@ -213,6 +213,16 @@ def test_the_paper_s_protocol_on_real_sets(data):
         )
     assert "--recipe paper --size paper" in lines["DAPT", "waymo"][0] and "--motion raw" in lines["DAPT", "waymo"][0]
     assert all(cell.evaluation for cell in cells(TABLES["table2"], options))
+    # people of a corpus's poses are of the user's SMPL file where there is one, others of the shipped body
+    assert "--body" not in lines["DAPT", "waymo"][0]
+    with_smpl = Options(data=data | {"smpl": "SMPL.npz"}, size="paper")
+    bodies = {
+        cell.row: "--body SMPL.npz" in " ".join(cell.training[0].command(Path("o")))
+        for cell in cells(TABLES["table2"], with_smpl)
+    }
+    assert {row for row, has_body in bodies.items() if has_body} == {"FreeMotion†", "LiDARH26M†"}
+    (dapt,) = cells(TABLES["table3"], with_smpl, ["anchors-mde-heatmaps"])
+    assert "--body SMPL.npz" in " ".join(dapt.training[0].command(Path("o")))
     some = Options(data={name: data[name] for name in ("waymo", "lipd")})
     reasons = {cell.row: cell.why for cell in cells(TABLES["table2"], some)}
     assert reasons["LIPD"] == "" and "--data freemotion=DIR" in reasons["FreeMotion"]

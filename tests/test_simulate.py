@@ -12,6 +12,7 @@ from lidarpose.lidar.presets import sensor
 from lidarpose.sample import Pose, Sample
 from lidarpose.skeleton import BODY26
 from lidarpose.synth import generator, noise
+from lidarpose.synth import simulate as simulate_module
 from lidarpose.synth.environment.mesh import Mesh, box, quad
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.place import Place
@@ -132,6 +133,39 @@ def test_the_window_has_the_scene_s_margin():
         return np.ptp(np.arctan2(points[:, 1], points[:, 0]))
 
     assert width(0.05) - width(0.0) == pytest.approx(0.1, abs=0.006)
+
+
+def test_the_paper_s_window_is_about_body_and_ground(monkeypatch):
+    """Eq. 3: all beams between the least and greatest angles of the vertices of both, and the mask's patches too."""
+    asked = []
+    real = simulate_module.laser_mask
+    monkeypatch.setattr(
+        simulate_module, "laser_mask", lambda *window, **how: asked.append(window) or real(*window, **how)
+    )
+    device, windows = sensor("dapt64"), {}
+    for config in (PLAIN, PLAIN.changed(("ground_window=1",))):
+        where = scene(config=config, keep=0.999)
+        ground = quad(1.0, np.array([0.05, 0.02])).moved(where.place.feet)
+        where = replace(where, background=[ground])
+        scan(where, ground)
+        both = np.concatenate([body(where).vertices, ground.vertices if config.ground_window else ground.vertices[:0]])
+        low, high = (
+            end(np.stack([np.arctan2(both[:, 1], both[:, 0]), np.arctan2(both[:, 2], np.hypot(*both[:, :2].T))]), 1)
+            for end in (np.min, np.max)
+        )
+        columns = (high[0] - low[0]) / device.azimuth_step
+        rows = np.count_nonzero((device.elevations >= low[1]) & (device.elevations <= high[1]))
+        (window,) = asked
+        assert abs(window[0] - columns) <= 1 and window[1] == rows
+        windows[config.ground_window] = asked.pop()
+    assert windows[1.0][0] > 1.5 * windows[0.0][0]
+    # nothing else changes: the body is seen as before, more of the ground
+    alone, paper = (
+        Generator(scene=PAPER.changed(("keep=1", f"ground_window={k}")), measure=False).person(SEED, 2).sample
+        for k in (0, 1)
+    )
+    assert np.count_nonzero(alone.part) == np.count_nonzero(paper.part) > 20
+    assert np.count_nonzero(paper.part == 0) > 1.5 * np.count_nonzero(alone.part == 0)
 
 
 # --- people and what is about them

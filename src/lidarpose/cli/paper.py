@@ -34,7 +34,8 @@ $ lidarpose paper table3 --data waymo=prepared/waymo --size paper
  published
 [data]
 --data NAME=DIR,...  prepared real sets to learn from and to score on: waymo, humanm3, lidarhuman26m, sloper4d; to
- pre-train on: lipd, freemotion, noisemotion; raw poses: freemotion-poses, lidarhuman26m-poses
+ pre-train on: lipd, freemotion, noisemotion; raw poses: freemotion-poses, lidarhuman26m-poses;
+ smpl=FILE: your SMPL file, the body of people in these poses (default: the shipped body)
 --motion FILE,FILE  captured motion for synthesis; each is a row of table2, the first one is everywhere else
 --subjects A,B  subjects of the first file to learn from
 --held-out A,B  its subjects whom the stand-in's target shows

@@ -233,7 +233,7 @@ class EvalSetup:
     def may_part(self, samples: Sequence[EvalSample], person: EvalSample) -> bool:
         """Whether the clips of these samples are the same without and with the person who comes next."""
         sequence = person.sample.sequence
-        if self._frames == 1 or samples[-1].sample.sequence != sequence:
+        if self._frames == 1 or self.dataset.limit is not None or samples[-1].sample.sequence != sequence:
             return True
         own = [other.sample for other in samples if other.sample.sequence == sequence]
         # a track's last run may go on
@@ -241,13 +241,15 @@ class EvalSetup:
         return all(length % self._frames == 0 for length in last.values())
 
     def _clips(self, samples: Sequence[EvalSample]) -> dict[str, Clips]:
-        """What a network of clips reads besides clouds: which people are frames that follow each other."""
+        """What a network of clips reads besides clouds: which people are frames that follow each other; of people who
+        are drawn from a dataset none, however few frames lie between them."""
         if self._frames == 1:
             return {}
         own = [person.sample for person in samples]
+        runs = _runs(own) if self.dataset.limit is None else np.arange(len(own))[:, None]
         around = {name: [getattr(sample, name) for sample in own] for name in ("background", "neighbors")}
         around = {name: [np.zeros((0, 3)) if own is None else own for own in clouds] for name, clouds in around.items()}
-        return {"clips": Clips(windows=np.concatenate([clip_windows(run) for run in _runs(own)]), **around)}
+        return {"clips": Clips(windows=np.concatenate([clip_windows(run) for run in runs]), **around)}
 
     def _picked(self, estimates, index) -> dict:
         """Of a pose, or of person `index` of many: the scored joints."""

@@ -261,6 +261,9 @@ def study(
         progress: progress(done, 0) is called as people are predicted.
     """
     people = people_to_perturb(setup) if people is None else people
+    if setup.dataset.count > PEOPLE:
+        # a draw of it, as by a limit
+        setup = replace(setup, dataset=replace(setup.dataset, limit=PEOPLE))
     done = 0
 
     def advance(count: int) -> None:

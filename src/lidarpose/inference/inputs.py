@@ -52,6 +52,25 @@ class Clips:
         """So many clouds, all frames of one person in order of time."""
         return cls(windows=clip_windows(np.arange(count)), **clouds)
 
+    def checked(self, count: int) -> "Clips":
+        """The same, of so many clouds. Raises InputError where these are not each in one window, or other clouds are
+        not as many."""
+        windows = np.asarray(self.windows)
+        rows = [row for window in windows for row in np.unique(window).tolist()]
+        if windows.ndim != 2 or windows.shape[1] != CLIP_FRAMES or sorted(rows) != list(range(count)):
+            raise InputError(
+                f"clips: expected windows of {CLIP_FRAMES} rows, each of the {count} clouds in one of them, as "
+                f"Clips.of_run({count}) has them, got {reprlib.repr(windows.tolist())}"
+            )
+        around = {}
+        for name in ("background", "neighbors"):
+            if (given := getattr(self, name)) is None:
+                continue
+            if len(given) != count:
+                raise InputError(f"clips: expected as many clouds of {name} as clouds, {count}, got {len(given)}")
+            around[name] = [as_points(cloud, f"{name}[{i}]") for i, cloud in enumerate(given)]
+        return replace(self, windows=windows, **around)
+
     def around(self, rows: np.ndarray) -> dict[str, list[np.ndarray]]:
         """The clouds about the persons of some rows, by name."""
         clouds = {"background": self.background, "neighbors": self.neighbors}

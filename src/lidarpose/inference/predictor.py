@@ -199,7 +199,7 @@ class Predictor(PoseEstimator):
             sensor_origin (array or str): (3,) m, where the sensor stood in that frame, or "unknown"; None means
                 0, 0, 0 with boxes and find, and unknown without.
             skeleton (str): see `in_skeleton`.
-            clips (slices): which of a list's clouds are frames of one person, for networks of clips, by default none:
+            clips (Clips): which of a list's clouds are frames of one person, for networks of clips, by default none:
                 a cloud then fills a clip.
 
         Raises:
@@ -224,6 +224,7 @@ class Predictor(PoseEstimator):
         if not _is_many(points):
             return self._people([as_points(points)], origin, wanted, False)[0]
         clouds = [as_points(cloud, f"points[{i}]") for i, cloud in enumerate(points)]
+        clips = None if clips is None else clips.checked(len(clouds))
         people = self._people(clouds, origin, wanted, progress, clips)
         return Poses(people=tuple(people), skeleton=wanted, model=self.model)
 

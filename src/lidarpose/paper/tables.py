@@ -22,6 +22,8 @@ PROTOCOL = "dapt"
 REAL = ("waymo", "humanm3", "lidarhuman26m", "sloper4d")
 CORPORA = ("lipd", "freemotion", "noisemotion")
 POSES = ("freemotion-poses", "lidarhuman26m-poses")
+# the user's SMPL file, the body of people synthesized of those poses
+SMPL = "smpl"
 # where LiDARHuman26M's raw folder has a folder of poses a sequence
 _SEQUENCES = "labels/3d/pose"
 # on real sets everybody learns from the crops and about the centers that the protocol scores by
@@ -48,8 +50,8 @@ _RECIPE_KEEP = "0.6"
 class Options:
     """What was asked for. people: budget of a stage of training; hours: of a row's training in all; size: of the
     paper's network, and by it the baselines' widths, published or reduced; seeds; data: name -> folder, see `REAL`,
-    `CORPORA` and `POSES`; motion: files of captured motion, subjects of the first one to learn from and held_out ones
-    for the target; workers: of each command."""
+    `CORPORA`, `POSES` and `SMPL`; motion: files of captured motion, subjects of the first one to learn from and
+    held_out ones for the target; workers: of each command."""
 
     people: int = 200_000
     hours: float | None = None
@@ -66,8 +68,8 @@ class Options:
             raise InputError("expected --people, --seeds and --workers of at least 1 and --hours above 0")
         check_name("size of the paper's network", self.size, MODELS["dapt"])
         for name, folder in self.data.items():
-            check_name("dataset", name, (*REAL, *CORPORA, *POSES))
-            if name not in POSES and not (Path(folder) / CARD).is_file():
+            check_name("dataset", name, (*REAL, *CORPORA, *POSES, SMPL))
+            if name not in (*POSES, SMPL) and not (Path(folder) / CARD).is_file():
                 raise InputError(f"{name}={folder} is no prepared dataset: run lidarpose prepare first")
         if (self.subjects or self.held_out) and not self.motion:
             raise InputError("--subjects and --held-out are of captured motion: name its file by --motion")
@@ -247,20 +249,29 @@ def _pretrained(options: Options, *more: str, motion: tuple[str, ...] | None = N
 
 def _motion(options: Options) -> tuple[str, ...]:
     """Where poses of pre-training come from: LiDARHuman26M's where they are, else the first file of motion."""
-    if source := options.data.get("lidarhuman26m-poses"):
-        return ("--motion", source, *_learned(source), "--captured", "1")
-    if not options.motion:
-        return ()
-    subjects = ("--subjects", options.subjects) if options.subjects else ()
-    return ("--motion", options.motion[0], *subjects, "--captured", "1")
+    if "lidarhuman26m-poses" in options.data:
+        return _corpus(options, "lidarhuman26m-poses")
+    return _captured(options.motion[0], options.subjects) if options.motion else ()
 
 
-def _learned(raw: str) -> tuple[str, ...]:
-    """--subjects of LiDARHuman26M's raw folder, where it has sequences of the split test: the others."""
+def _corpus(options: Options, name: str) -> tuple[str, ...]:
+    """The poses of a corpus alone, on the user's SMPL body where there is one."""
+    source = options.data.get(name, "")
+    body = ("--body", options.data[SMPL]) if SMPL in options.data else ()
+    return (*_captured(source, _learned(source) if name == "lidarhuman26m-poses" else ""), *body)
+
+
+def _captured(source: str, subjects: str) -> tuple[str, ...]:
+    """Captured motion of these subjects alone, "" for all."""
+    return ("--motion", source, *(("--subjects", subjects) if subjects else ()), "--captured", "1")
+
+
+def _learned(raw: str) -> str:
+    """The subjects of LiDARHuman26M's raw folder that are not of the split test; "" where none is."""
     sequences = sorted(path.name for path in (Path(raw) / _SEQUENCES).glob("*") if path.is_dir())
     rule = split_rule("lidarhuman26m", Path(raw)) if sequences else None
     learned = [f"{_SEQUENCES}/{name}" for name in sequences if rule is not None and rule.of_part(name) != "test"]
-    return ("--subjects", ",".join(learned)) if len(learned) < len(sequences) else ()
+    return ",".join(learned) if len(learned) < len(sequences) else ""
 
 
 def _tuned(options: Options, *more: str) -> tuple[str, ...]:
@@ -312,17 +323,13 @@ def _dapt(options: Options, published: dict[str, float], name: str = "DAPT") -> 
 
 def _corpora(options: Options) -> list[Row]:
     """Table 2. The stand-in has no corpora: poses of each file of motion, and those of the procedural prior."""
-
-    def poses(source: str, *subjects: str) -> tuple[str, ...]:
-        return _pretrained(options, motion=("--motion", source, *subjects, "--captured", "1"))
-
     tuned = _tuned(options)
     rows = [Row(name="w/o", finetune=_random(options), published=_published(59.2, None, 76.5))]
     if not options.real:
         rows.append(Row(name="procedural prior", finetune=tuned, pretrain=_pretrained(options, motion=())))
         for k, source in enumerate(options.motion):
-            subjects = ("--subjects", options.subjects) if options.subjects and k == 0 else ()
-            rows.append(Row(name=f"poses of {Path(source).stem}", finetune=tuned, pretrain=poses(source, *subjects)))
+            own = _pretrained(options, motion=_captured(source, options.subjects if k == 0 else ""))
+            rows.append(Row(name=f"poses of {Path(source).stem}", finetune=tuned, pretrain=own))
         return rows
     for name, title, *printed in (
         ("lipd", "LIPD", 58.7, None, 75.6),
@@ -332,8 +339,8 @@ def _corpora(options: Options) -> list[Row]:
         ("lidarhuman26m-poses", "LiDARH26M†", 51.6, None, 73.4),
     ):
         folder, has_points = options.data.get(name, ""), name in CORPORA
-        learned = _learned(folder) if name == "lidarhuman26m-poses" else ()
-        own = _pretrained(options, "--shards", folder, motion=()) if has_points else poses(folder, *learned)
+        source = ("--shards", folder) if has_points else _corpus(options, name)
+        own = _pretrained(options, motion=source)
         what = "as prepared, with --split train if it has a split" if has_points else "the raw files of its poses"
         why = "" if folder else f"needs --data {name}=DIR, {what}"
         rows.append(Row(name=title, finetune=tuned, pretrain=own, why=why, published=_published(*printed)))

@@ -88,6 +88,8 @@ class SceneConfig:
         slope: standard deviation of the ground's tilt, rad.
         margin: how much farther than the body beams are cast, rad.
         around: the same, m.
+        ground_window: 1: the window of beams, and with it the laser mask, is about the body and the ground, as in the
+            paper's Eq. 3; 0: about the body alone, as in the released code.
         clutter: things near the person.
         occluder: something in front.
         company: a second person in or before the crop.
@@ -118,6 +120,7 @@ class SceneConfig:
     slope: float
     margin: float = 0.0
     around: float = 0.0
+    ground_window: float = 0.0
     clutter: float = 0.0
     occluder: float = 0.0
     company: float = 0.0
@@ -164,7 +167,7 @@ class SceneConfig:
 # fields that are between 0 and 1
 _SHARES = frozenset(
     "clutter occluder company unusual merged accumulated inverted integration sparse crowded recorded hard mask "
-    "mask_keep missing_part intensity_dropout beam_divergence dapt_compat loose cut".split()
+    "ground_window mask_keep missing_part intensity_dropout beam_divergence dapt_compat loose cut".split()
 )
 
 

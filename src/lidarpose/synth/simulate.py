@@ -192,7 +192,8 @@ def simulate_scan(scene: Scene, meshes: list[Mesh], rng: np.random.Generator, *,
     """What the scene's sensor returns.
 
     Args:
-        meshes: all triangles in the level frame; the window of beams is about the first one, the body.
+        meshes: all triangles in the level frame; the window of beams is about the first one, the body, or about body
+            and ground where the scene says so.
         frame: how many frames after a pattern's first one.
     """
     sensor = scene.sensor
@@ -221,9 +222,15 @@ def scan_background(scene: Scene, body: Mesh, frame: int) -> np.ndarray:
 
 def _cast(scene: Scene, meshes: list[Mesh], frame: int, *, margin: float = 0.0) -> tuple[Hits, Mesh]:
     """The hits, and all meshes as one, in the sensor's frame. margin rad: beams beyond those of the scene."""
-    mesh, place, sensor = union(meshes), scene.place, scene.sensor
+    place, sensor, framed = scene.place, scene.sensor, 1
+    if scene.config.ground_window:
+        # what the window is about comes first; the ground is the first thing of the background
+        ground = [mesh for mesh in meshes[1:] if mesh is scene.background[0]]
+        meshes = [meshes[0], *ground, *(mesh for mesh in meshes[1:] if mesh is not scene.background[0])]
+        framed += len(ground)
+    mesh = union(meshes)
     mesh = replace(mesh, vertices=place.to_sensor(mesh.vertices))
-    body_vertices = len(meshes[0].vertices)
+    body_vertices = sum(len(mesh.vertices) for mesh in meshes[:framed])
     margin += scene.config.margin + np.arctan2(scene.config.around, place.distance)
     if isinstance(sensor, Sensor):
         body, divergence = mesh.vertices[:body_vertices], scene.conditions.divergence

@@ -118,8 +118,10 @@ def finetuned_network(
     """The configuration for a dataset's joints, and what makes the network with the weights that it begins with.
     trained: None for random weights."""
     own = PRETRAINED[recipe.size][0] if trained is None else trained.config
-    if recipe.neck != "mde" and not isinstance(own, DaptConfig):
-        raise InputError(f"neck is of the paper's network: give --size {' or '.join(MODELS['dapt'])}")
+    usual = {"neck": "mde", "head": "heatmaps"} | ({"keep_anchors": True} if isinstance(own, BaselineConfig) else {})
+    for name, value in usual.items():
+        if getattr(recipe, name) != value and not isinstance(own, DaptConfig):
+            raise InputError(f"{name} is of the paper's network, {own.name} has none: leave it away")
     if isinstance(own, BaselineConfig):
         named = own if isinstance(own, LidarcapConfig) else replace(own, joints=joints.joints)
         config = _with_options(named, recipe.options)

@@ -122,7 +122,7 @@ class BareAttention(nn.Module):
 class PrnNeck(nn.Module):
     """The neck of the DAPT repository: votes and three layers of stock attention on features (M, C) of a backbone.
 
-    Background is part 0. Of its training no configuration is published; see docs/paper.md for ours.
+    Background is part 0. Of its training no configuration is published; see docs/method.md for ours.
     """
 
     def __init__(self, channels: int, joints: int, heads: int = 4, dropout: float = 0.1):
