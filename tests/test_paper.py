@@ -2,6 +2,8 @@
 
 import json
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -358,6 +360,29 @@ def test_a_stopped_step_stops_the_table(tmp_path):
     for _ in range(2):
         run_steps(step, tmp_path, lambda words: asked.append(words) or 0, print)
     assert asked == [["synth", "-n", "3", "--out", str(step.folder(tmp_path))]]
+
+
+def test_two_tables_in_one_folder_share_a_step(tmp_path):
+    step, began, go_on = Step(("synth", "-n", "3")), threading.Event(), threading.Event()
+    asked, told = [], []
+
+    def execute(words):
+        asked.append(words)
+        began.set()
+        return 0 if go_on.wait(60) else 1
+
+    def tell(line):
+        told.append(line)
+        if "another process" in line:
+            go_on.set()
+
+    with ThreadPoolExecutor(2) as pool:
+        first = pool.submit(run_steps, step, tmp_path, execute, tell)
+        assert began.wait(60)
+        # waits, and finds it done
+        pool.submit(run_steps, step, tmp_path, execute, tell).result(60)
+        first.result(60)
+    assert len(asked) == 1 and told[1] == f"{step.name}: another process is at it, waiting for its end"
 
 
 def test_an_evaluation_that_was_killed_while_its_files_were_put_in_place_is_done_again(tmp_path):

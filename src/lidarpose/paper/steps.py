@@ -15,13 +15,13 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import redirect_stderr
+from contextlib import contextmanager, redirect_stderr, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from lidarpose.errors import InputError, LidarPoseError
+from lidarpose.errors import InputError, LidarPoseError, MissingExtra
 from lidarpose.io.files import write_atomic
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.run_dir import CONFIG, LENGTHS, MODEL, read_config, read_log
@@ -116,13 +116,38 @@ def is_done(step: Step, out: Path) -> bool:
 
 
 def run_steps(step: Step, out: Path, execute: Execute, tell: Callable[[str], None]) -> None:
-    """Runs what is not done of a step and those before it. Raises StepFailed with the command's own message,
-    KeyboardInterrupt where it was stopped."""
+    """Runs what is not done of a step and those before it, and waits for what another process is at. Raises StepFailed
+    with the command's own message, KeyboardInterrupt where it was stopped."""
     for part in step.all():
-        if not is_done(part, out):
-            tell(part.line(out))
-            _run(part, out, execute)
-            _note(part, out, done=True, command=part.line(out))
+        if is_done(part, out):
+            continue
+        with _alone(part, out, tell):
+            if not is_done(part, out):
+                tell(part.line(out))
+                _run(part, out, execute)
+                _note(part, out, done=True, command=part.line(out))
+
+
+@contextmanager
+def _alone(step: Step, out: Path, tell: Callable[[str], None]) -> Iterator[None]:
+    """Keeps other processes from a step. A process that was killed keeps nobody out; the lock's file stays."""
+    try:
+        from filelock import FileLock, Timeout
+    except ImportError:
+        raise MissingExtra("running the paper's tables", "train") from None
+    (out / RUNS).mkdir(parents=True, exist_ok=True)
+    lock = FileLock(out / RUNS / f".{step.name}.lock")
+    # a file system without locks goes without
+    with suppress(NotImplementedError):
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            tell(f"{step.name}: another process is at it, waiting for its end")
+            lock.acquire()
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def _state(step: Step, out: Path) -> dict[str, Any]:
