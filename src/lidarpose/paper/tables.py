@@ -339,8 +339,8 @@ def _corpora(options: Options) -> list[Row]:
         ("lidarhuman26m-poses", "LiDARH26M†", 51.6, None, 73.4),
     ):
         folder, has_points = options.data.get(name, ""), name in CORPORA
-        source = ("--shards", folder) if has_points else _corpus(options, name)
-        own = _pretrained(options, motion=source)
+        shown = ("--shards", folder) if has_points else _corpus(options, name)
+        own = _pretrained(options, motion=shown)
         what = "as prepared, with --split train if it has a split" if has_points else "the raw files of its poses"
         why = "" if folder else f"needs --data {name}=DIR, {what}"
         rows.append(Row(name=title, finetune=tuned, pretrain=own, why=why, published=_published(*printed)))
