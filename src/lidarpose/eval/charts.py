@@ -102,7 +102,8 @@ def draw_stability(study: Stability) -> bytes:
 def compare_stability(studies: dict[str, dict[str, Any]], names: Sequence[str] = ("jitter", "clusters")) -> bytes:
     """Curves of several networks in one chart. Paper: Figure 7. studies: name of a network -> a study of
     stability.json; names: of its curves."""
-    figure = _figure(5.2 * len(names), 4.2, "points perturbed: MPJPE in mm", _of_whom(studies, "who"))
+    first = next(iter(studies.values()))
+    figure = _figure(5.2 * len(names), 4.2, "points perturbed: MPJPE in mm", _scored(first["who"], first))
     for axes, name in zip(np.ravel(figure.subplots(1, len(names))), names, strict=True):
         for (network, study), color in zip(studies.items(), cycle(_PALETTE), strict=False):
             curve = next(curve for curve in study["curves"] if curve["name"] == name)
@@ -121,7 +122,9 @@ def compare_stability(studies: dict[str, dict[str, Any]], names: Sequence[str] =
 def compare_ends(studies: dict[str, dict[str, Any]]) -> bytes:
     """Errors of end joints over the worst people, of several networks: means, and quartiles as lines. Paper: Figure 8.
     studies: as of `compare_stability`."""
-    figure = _figure(9.6, 4.4, "end joints of each network's worst people: error in mm", _of_whom(studies))
+    first = next(iter(studies.values()))
+    of_whom = _scored(first["setting"]["dataset"], first)
+    figure = _figure(9.6, 4.4, "end joints of each network's worst people: error in mm", of_whom)
     axes, width = figure.subplots(), 0.8 / max(len(studies), 1)
     for k, ((network, study), color) in enumerate(zip(studies.items(), cycle(_PALETTE), strict=False)):
         ends = study["ends"]
@@ -135,10 +138,9 @@ def compare_ends(studies: dict[str, dict[str, Any]]) -> bytes:
     return png_of(figure, None)
 
 
-def _of_whom(studies: dict[str, dict[str, Any]], who: str = "") -> str:
-    """The dataset, or the people who were perturbed, and the protocol of studies, which are the same for all."""
-    first = next(iter(studies.values()))
-    return f"{first[who] if who else first['setting']['dataset']} · protocol {first['setting']['protocol']}"
+def _scored(who: str, study: dict[str, Any]) -> str:
+    """Who was scored, and how: the protocol is that of all studies in a chart."""
+    return f"{who} · protocol {study['setting']['protocol']}"
 
 
 def draw_worst(p: Predictions, setting: Setting, worst: Sequence[tuple[EvalSample, int]]) -> bytes:

@@ -11,9 +11,10 @@ import re
 import reprlib
 import secrets
 import stat
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from lidarpose.errors import InputError, MissingExtra
 
@@ -272,21 +273,11 @@ def locked(folder: Path, names: str, *, busy: str, wait: float = 0.0) -> Iterato
         InputError: Where the folder is in use, or cannot be written.
         MissingExtra: Without filelock.
     """
-    try:
-        from filelock import FileLock, Timeout
-    except ImportError:
-        raise MissingExtra("writing a dataset or a run", "synth") from None
-    check_writable(folder / LOCK)
+    lock = _file_lock(folder / LOCK)
     is_new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder / LOCK)
-    try:
-        with suppress(NotImplementedError):
-            lock.acquire(timeout=wait)
-    except Timeout:
-        raise file_error(folder, busy) from None
-    except OSError as error:
-        raise _write_error(folder / LOCK, folder, error) from None
+    if not _acquired(lock, wait):
+        raise file_error(folder, busy)
     try:
         _remove_leftovers(folder, names)
         yield
@@ -299,6 +290,52 @@ def locked(folder: Path, names: str, *, busy: str, wait: float = 0.0) -> Iterato
         if is_new:
             with suppress(OSError):
                 folder.rmdir()
+
+
+@contextmanager
+def taking_turns(path: Path, on_busy: Callable[[], None]) -> Iterator[None]:
+    """Keeps other processes from what a file in a folder that is there stands for, and waits until they are done. The
+    file stays; else as `locked`.
+
+    Args:
+        on_busy: Called before another process is waited for.
+
+    Raises:
+        InputError: Where the file cannot be written.
+        MissingExtra: Without filelock.
+    """
+    lock = _file_lock(path)
+    if not _acquired(lock, 0.0):
+        on_busy()
+        _acquired(lock, -1)
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _file_lock(path: Path) -> Any:
+    try:
+        from filelock import FileLock
+    except ImportError:
+        raise MissingExtra("writing a dataset or a run", "synth") from None
+    check_writable(path)
+    return FileLock(path)
+
+
+def _acquired(lock: Any, wait: float) -> bool:
+    """Whether a lock is held within so many seconds, below 0 for any number; True where the file system knows none."""
+    from filelock import Timeout
+
+    try:
+        with suppress(NotImplementedError):
+            lock.acquire(timeout=wait)
+    except Timeout:
+        return False
+    except OSError as error:
+        path = Path(lock.lock_file)
+        raise _write_error(path, path.parent, error) from None
+    return True
 
 
 def _remove_leftovers(folder: Path, names: str) -> None:

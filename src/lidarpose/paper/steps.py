@@ -15,14 +15,14 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stderr, suppress
+from contextlib import redirect_stderr
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-from lidarpose.errors import InputError, LidarPoseError, MissingExtra
-from lidarpose.io.files import write_atomic
+from lidarpose.errors import InputError, LidarPoseError
+from lidarpose.io.files import taking_turns, write_atomic
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.run_dir import CONFIG, LENGTHS, MODEL, read_config, read_log
 
@@ -121,33 +121,13 @@ def run_steps(step: Step, out: Path, execute: Execute, tell: Callable[[str], Non
     for part in step.all():
         if is_done(part, out):
             continue
-        with _alone(part, out, tell):
+        waiting = f"{part.name}: another process is at it, waiting for its end"
+        (out / RUNS).mkdir(parents=True, exist_ok=True)
+        with taking_turns(out / RUNS / f".{part.name}.lock", partial(tell, waiting)):
             if not is_done(part, out):
                 tell(part.line(out))
                 _run(part, out, execute)
                 _note(part, out, done=True, command=part.line(out))
-
-
-@contextmanager
-def _alone(step: Step, out: Path, tell: Callable[[str], None]) -> Iterator[None]:
-    """Keeps other processes from a step. A process that was killed keeps nobody out; the lock's file stays."""
-    try:
-        from filelock import FileLock, Timeout
-    except ImportError:
-        raise MissingExtra("running the paper's tables", "train") from None
-    (out / RUNS).mkdir(parents=True, exist_ok=True)
-    lock = FileLock(out / RUNS / f".{step.name}.lock")
-    # a file system without locks goes without
-    with suppress(NotImplementedError):
-        try:
-            lock.acquire(timeout=0)
-        except Timeout:
-            tell(f"{step.name}: another process is at it, waiting for its end")
-            lock.acquire()
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 def _state(step: Step, out: Path) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 
+from lidarpose.data.readers.lidarhuman26m import POSE_FOLDER
 from lidarpose.data.shards import CARD
 from lidarpose.data.splits import split_rule
 from lidarpose.errors import InputError, check_name
@@ -24,8 +25,6 @@ CORPORA = ("lipd", "freemotion", "noisemotion")
 POSES = ("freemotion-poses", "lidarhuman26m-poses")
 # the user's SMPL file, the body of people synthesized of those poses
 SMPL = "smpl"
-# where LiDARHuman26M's raw folder has a folder of poses a sequence
-_SEQUENCES = "labels/3d/pose"
 # on real sets everybody learns from the crops and about the centers that the protocol scores by
 _RELEASED, _RELEASED_CLIPS = ("--augment", "paper"), ("--options", "trans_center=true")
 # people of the stand-in: to learn from at most, to be scored on at most, and their seeds, which nothing else has
@@ -268,9 +267,9 @@ def _captured(source: str, subjects: str) -> tuple[str, ...]:
 
 def _learned(raw: str) -> str:
     """The subjects of LiDARHuman26M's raw folder that are not of the split test; "" where none is."""
-    sequences = sorted(path.name for path in (Path(raw) / _SEQUENCES).glob("*") if path.is_dir())
+    sequences = sorted(path.name for path in (Path(raw) / POSE_FOLDER).glob("*") if path.is_dir())
     rule = split_rule("lidarhuman26m", Path(raw)) if sequences else None
-    learned = [f"{_SEQUENCES}/{name}" for name in sequences if rule is not None and rule.of_part(name) != "test"]
+    learned = [f"{POSE_FOLDER}/{name}" for name in sequences if rule is not None and rule.of_part(name) != "test"]
     return ",".join(learned) if len(learned) < len(sequences) else ""
 
 

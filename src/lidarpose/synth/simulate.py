@@ -222,15 +222,14 @@ def scan_background(scene: Scene, body: Mesh, frame: int) -> np.ndarray:
 
 def _cast(scene: Scene, meshes: list[Mesh], frame: int, *, margin: float = 0.0) -> tuple[Hits, Mesh]:
     """The hits, and all meshes as one, in the sensor's frame. margin rad: beams beyond those of the scene."""
-    place, sensor, framed = scene.place, scene.sensor, 1
-    if scene.config.ground_window:
-        # what the window is about comes first; the ground is the first thing of the background
-        ground = [mesh for mesh in meshes[1:] if mesh is scene.background[0]]
-        meshes = [meshes[0], *ground, *(mesh for mesh in meshes[1:] if mesh is not scene.background[0])]
-        framed += len(ground)
+    place, sensor = scene.place, scene.sensor
+    # the ground is the first thing of the background; what the window is about comes first
+    ground = scene.background[:1] if scene.config.ground_window else []
+    framed = {id(mesh) for mesh in (meshes[0], *ground)}
+    meshes = sorted(meshes, key=lambda mesh: id(mesh) not in framed)
+    body_vertices = sum(len(mesh.vertices) for mesh in meshes if id(mesh) in framed)
     mesh = union(meshes)
     mesh = replace(mesh, vertices=place.to_sensor(mesh.vertices))
-    body_vertices = sum(len(mesh.vertices) for mesh in meshes[:framed])
     margin += scene.config.margin + np.arctan2(scene.config.around, place.distance)
     if isinstance(sensor, Sensor):
         body, divergence = mesh.vertices[:body_vertices], scene.conditions.divergence

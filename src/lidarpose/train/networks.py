@@ -118,9 +118,10 @@ def finetuned_network(
     """The configuration for a dataset's joints, and what makes the network with the weights that it begins with.
     trained: None for random weights."""
     own = PRETRAINED[recipe.size][0] if trained is None else trained.config
-    usual = {"neck": "mde", "head": "heatmaps"} | ({"keep_anchors": True} if isinstance(own, BaselineConfig) else {})
-    for name, value in usual.items():
-        if getattr(recipe, name) != value and not isinstance(own, DaptConfig):
+    # of anchors the package's own networks say below what to do instead
+    foreign = ("neck", "head", "keep_anchors") if isinstance(own, BaselineConfig) else ("neck", "head")
+    for name in () if isinstance(own, DaptConfig) else foreign:
+        if getattr(recipe, name) != getattr(Finetune, name):
             raise InputError(f"{name} is of the paper's network, {own.name} has none: leave it away")
     if isinstance(own, BaselineConfig):
         named = own if isinstance(own, LidarcapConfig) else replace(own, joints=joints.joints)

@@ -25,7 +25,7 @@ from lidarpose.skeleton import SMPL24
 
 # frames a second of the LiDAR
 _FPS = 10.0
-_POSE, _SEGMENT, _SCANS = "labels/3d/pose", "labels/3d/segment", "pointclouds"
+POSE_FOLDER, _SEGMENT, _SCANS = "labels/3d/pose", "labels/3d/segment", "pointclouds"
 # fewer frames say too little
 LEAST_FRAMES = 100
 # what the estimate may err by, rad: where people turn round, and where they all face about one way, so that leaning
@@ -58,17 +58,17 @@ class LidarHuman26M(Reader):
 
     def parts(self, root: Path) -> list[str]:
         """The sequences, by number. Raises InputError where poses or clouds are missing altogether."""
-        for name in (_POSE, _SEGMENT):
+        for name in (POSE_FOLDER, _SEGMENT):
             if not (root / name).is_dir():
                 raise self.wrong_root(root, f"got no {name}")
-        names = {path.name for folder in (_POSE, _SEGMENT) for path in (root / folder).iterdir() if path.is_dir()}
+        names = {path.name for folder in (POSE_FOLDER, _SEGMENT) for path in (root / folder).iterdir() if path.is_dir()}
         if not names:
-            raise self.wrong_root(root, f"got no sequence in {_POSE}")
+            raise self.wrong_root(root, f"got no sequence in {POSE_FOLDER}")
         return sorted(names, key=lambda name: (int(name) if name.isdecimal() else -1, name))
 
     def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         """The person of a sequence, frame by frame."""
-        poses = base.numbered(root / _POSE / part, ".json")
+        poses = base.numbered(root / POSE_FOLDER / part, ".json")
         labels, damaged = {}, {}
         for frame, paths in poses.items():
             try:
