@@ -35,7 +35,7 @@ _CLUTTER = 60
 _MOST_CLUTTER, _NOISE = 200, (0.005, 0.08)
 _PELVIS = BODY26.index("pelvis")
 _HIPS = [BODY26.index("left_hip"), BODY26.index("right_hip")]
-_FLIP_PART = np.array([-1, 0, *(1 + np.array(SMPL24.flip))], np.int16)
+FLIP_PART = np.array([-1, 0, *(1 + np.array(SMPL24.flip))], np.int16)
 _Sample = TypeVar("_Sample", bound=Sample)
 
 
@@ -193,7 +193,7 @@ def augmented(sample: LabeledSample, kind: Augmentation, rng: np.random.Generato
     R = np.diag([*np.where(mirrors, -1.0, 1.0), 1.0]) @ R
     if mirrors.sum() == 1:
         flip = list(BODY26.flip)
-        joints, visible, part = joints[flip], visible[flip], _FLIP_PART[part + 1]
+        joints, visible, part = joints[flip], visible[flip], FLIP_PART[part + 1]
     points, joints, toward = points @ R.T, joints @ R.T, view[:3] @ R.T
     view = np.concatenate([toward / max(float(np.linalg.norm(toward)), 1e-9), view[3:]]).astype(np.float32)
     if rng.random() < kind.drop:

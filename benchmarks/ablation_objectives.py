@@ -1,0 +1,235 @@
+"""What could be worth more than people: other losses and other ways of choosing people, for `ablations.py`.
+
+Legend: B people, J joints, N fine voxels, K voxels near a joint.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from lidarpose.models import bundled_path
+from lidarpose.models.checkpoint import load_checkpoint
+from lidarpose.models.config import NetworkConfig
+from lidarpose.models.layers import VoteHead
+from lidarpose.models.posenet import Batch, Outputs, PoseNet, Targets
+from lidarpose.skeleton import BODY26
+from lidarpose.train.augment import FLIP_PART, Example
+from lidarpose.train.objectives.baseline_objective import point_labels
+from lidarpose.train.objectives.objective import Share, alone, at_least_one
+from lidarpose.train.objectives.posenet_objective import PoseNetObjective, losses
+
+# voxels that refine a joint
+NEAR = 16
+# m: voxels farther from a joint look as far as this; what is padding lies farther than FAR
+WIDEST, FAR = 2.0, 1e3
+# weights of the losses of `PointJoints`, as its counterparts in `posenet_objective` are weighted
+LABEL, OFFSET = 0.25, 2.0
+# weight of the distance between a person's pose and that of their mirror image
+CONSISTENCY = 2.0
+# of a batch, the people who count twice
+HARDEST = 0.25
+# terms on joints, which a teacher's joints may stand in for
+_OF_JOINTS = ("joints", "level", "vote", "heatmap")
+_FLIP = list(BODY26.flip)
+_ACROSS = np.array([1, -1, 1], np.float32)
+
+
+@dataclass(frozen=True, kw_only=True)
+class VariantObjective(PoseNetObjective):
+    """`PoseNetObjective` of a network that may lack something, or have something more."""
+
+    made: Callable[[NetworkConfig], nn.Module] = PoseNet
+
+    def network(self) -> nn.Module:
+        return self.made(self.config)
+
+
+# ---- every point's own joint, and joints refined by the points near them
+
+
+class LocalVoteHead(VoteHead):
+    """Votes, moved by what the voxels nearest to them say: local refinement of each joint.
+
+    After the refinement of PRN (LiDAR-HMR), whose points vote for the joint nearest to them.
+    """
+
+    def __init__(self, channels: int, voxel_channels: int, joints: int):
+        super().__init__(channels, voxel_channels, joints)
+        self.near_voxel = nn.Linear(voxel_channels, voxel_channels)
+        self.near_place = nn.Linear(4, voxel_channels)
+        self.near_anchor = nn.Linear(channels, voxel_channels)
+        self.near_mix = nn.Sequential(nn.SiLU(), nn.Linear(voxel_channels, voxel_channels), nn.SiLU())
+        self.near_score = nn.Linear(voxel_channels, 1)
+        self.near_offset = nn.Linear(voxel_channels, 3)
+        nn.init.zeros_(self.near_offset.weight)
+        nn.init.zeros_(self.near_offset.bias)
+
+    def forward(self, anchors: Tensor, voxels: Tensor, position: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
+        vote, features = super().forward(anchors, voxels, position, bias)
+        start = vote.detach()
+        # padding is far off
+        distance, index = (torch.cdist(start, position) - bias[:, 0]).topk(min(NEAR, position.shape[1]), largest=False)
+        people, n, _ = position.shape
+        rows = (index + n * torch.arange(people, device=index.device)[:, None, None]).flatten()
+        offset = position.flatten(0, 1)[rows].view(*index.shape, 3) - start[:, :, None]
+        place = 10 * torch.cat([offset, distance[..., None]], -1).clamp(-WIDEST, WIDEST)
+        voxel = self.near_voxel(voxels).flatten(0, 1)[rows].view(*index.shape, -1)
+        hidden = self.near_mix(voxel + self.near_place(place) + self.near_anchor(anchors)[:, :, None])
+        score = self.near_score(hidden).squeeze(-1).masked_fill(distance > FAR, -1e4)
+        pooled = (score.softmax(-1)[..., None] * hidden).sum(-2)
+        return vote + self.near_offset(pooled), features + pooled
+
+
+def with_point_joints(config: NetworkConfig) -> PoseNet:
+    """A network whose fine voxels also say which joint is nearest to them, and where it is."""
+    network = PoseNet(config)
+    joints = len(network.skeleton)
+    network.part = nn.Linear(config.channels[0], config.parts + joints + 1 + 3)
+    return network
+
+
+def with_local_refinement(config: NetworkConfig) -> PoseNet:
+    """`with_point_joints`, its votes refined by the voxels near them."""
+    network = with_point_joints(config)
+    fine, mid, _ = config.channels
+    network.vote = LocalVoteHead(mid, fine, len(network.skeleton))
+    return network
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointJoints(VariantObjective):
+    """Of networks `with_point_joints`: the cross entropy of each voxel's joint and the distance to it besides."""
+
+    def terms(
+        self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
+    ) -> dict[str, Tensor]:
+        batch, targets = Batch.from_arrays(arrays, device), Targets.from_arrays(arrays, device)
+        outputs = network(batch)
+        count = outputs.vote.shape[1]
+        part, label, offset = outputs.part.float().split([self.config.parts, count + 1, 3], -1)
+        terms = losses(replace(outputs, part=part), targets, share=share)
+        true = torch.where(targets.known[..., None], targets.joints, 0.0)
+        own, to_joint = point_labels(batch.fine.position, batch.fine.valid, true, targets.known)
+        # things near a joint are nobody's
+        own = own.masked_fill((targets.part == 0) & batch.fine.valid, count).masked_fill(targets.part < 0, -1)
+        cross = F.cross_entropy(label.flatten(0, 1), own.flatten(), ignore_index=-1, reduction="sum")
+        is_body = (own >= 0) & (own < count)
+        missed = ((offset - to_joint).norm(dim=-1) * is_body).sum()
+        return terms | {
+            "label": LABEL * cross / at_least_one(share((own >= 0).sum())),
+            "offset": OFFSET * missed / at_least_one(share(is_body.sum())),
+        }
+
+
+# ---- hard examples
+
+
+@dataclass(frozen=True, kw_only=True)
+class HardestPeople(VariantObjective):
+    """Half of the loss is that of the quarter of a batch with the largest errors."""
+
+    def terms(
+        self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
+    ) -> dict[str, Tensor]:
+        outputs, targets = network(Batch.from_arrays(arrays, device)), Targets.from_arrays(arrays, device)
+        missed = (outputs.joints().detach().float() - targets.joints).norm(dim=-1).where(targets.known, 0.0).sum(1)
+        hardest = missed.topk(max(round(HARDEST * len(missed)), 1)).indices
+        everybody = losses(outputs, targets, share=share)
+        hard = losses(of_people(outputs, hardest), of_people(targets, hardest), share=share)
+        mixed = {name: (value + hard[name]) / 2 for name, value in everybody.items()}
+        return mixed | {"mpjpe": everybody["mpjpe"]}
+
+
+def of_people(tensors: Any, rows: Tensor) -> Any:
+    """`Outputs` or `Targets` of these people of a batch."""
+
+    def taken(value: Any) -> Any:
+        if isinstance(value, tuple):
+            return tuple(map(taken, value))
+        return value[rows] if isinstance(value, Tensor) else value
+
+    return replace(tensors, **{field.name: taken(getattr(tensors, field.name)) for field in fields(tensors)})
+
+
+# ---- a person and their mirror image
+
+
+@dataclass(frozen=True, kw_only=True)
+class MirroredPairs(VariantObjective):
+    """Every other person of a batch is left out for the mirror image of the one before; the poses of both are drawn
+    to each other. As many people pass through the network as without it."""
+
+    def collate(self, examples: list[Example]) -> dict[str, np.ndarray]:
+        kept = examples[::2]
+        return super().collate([*kept, *map(mirrored, kept)])
+
+    def terms(
+        self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
+    ) -> dict[str, Tensor]:
+        outputs, targets = network(Batch.from_arrays(arrays, device)), Targets.from_arrays(arrays, device)
+        straight, image = outputs.joints().float().chunk(2)
+        image = image[:, _FLIP] * torch.as_tensor(_ACROSS, device=image.device)
+        known = targets.known.float().chunk(2)[0]
+        apart = ((straight - image).norm(dim=-1) * known).sum() / at_least_one(share(known.sum()))
+        return losses(outputs, targets, share=share) | {"consistency": CONSISTENCY * apart}
+
+
+def mirrored(example: Example) -> Example:
+    """The person across the plane y = 0 of their own frame."""
+    return replace(
+        example,
+        points=example.points * _ACROSS,
+        part=FLIP_PART[example.part + 1],
+        joints=example.joints[_FLIP] * _ACROSS,
+        visible=example.visible[_FLIP],
+        view=example.view * np.array([1, -1, 1, 1, 1], np.float32),
+    )
+
+
+# ---- a teacher
+
+
+@dataclass(frozen=True, kw_only=True)
+class Taught(VariantObjective):
+    """Half of the losses on joints are distances to those of a bundled network, the mean of two looks: the person and
+    their mirror image."""
+
+    teacher: str = "small"
+
+    def collate(self, examples: list[Example]) -> dict[str, np.ndarray]:
+        config = _teacher(self.teacher).config
+        assert config.grid == self.config.grid
+        own = PoseNetObjective(config=config).collate(examples)
+        image = PoseNetObjective(config=config).collate([mirrored(example) for example in examples])
+        return own | {_IMAGE + name: value for name, value in image.items()}
+
+    def terms(
+        self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
+    ) -> dict[str, Tensor]:
+        teacher, targets = _teacher(self.teacher).to(device), Targets.from_arrays(arrays, device)
+        image = {name.removeprefix(_IMAGE): value for name, value in arrays.items() if name.startswith(_IMAGE)}
+        batch = Batch.from_arrays(arrays, device)
+        with torch.no_grad():
+            other = teacher(Batch.from_arrays(image, device)).joints().float()[:, _FLIP]
+            taught = (teacher(batch).joints().float() + other * torch.as_tensor(_ACROSS, device=device)) / 2
+        outputs: Outputs = network(batch)
+        terms = losses(outputs, targets, share=share)
+        copied = losses(outputs, replace(targets, joints=taught), share=share)
+        return terms | {name: (terms[name] + copied[name]) / 2 for name in _OF_JOINTS if name in terms}
+
+
+# prefix of the arrays of mirror images
+_IMAGE = "image."
+
+
+@lru_cache(maxsize=1)
+def _teacher(name: str) -> PoseNet:
+    network = load_checkpoint(bundled_path(name))[0]
+    assert isinstance(network, PoseNet)
+    return network.eval().requires_grad_(False)

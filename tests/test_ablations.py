@@ -1,0 +1,132 @@
+"""The losses and the choices of people that benchmarks/ablations.py tries."""
+
+import numpy as np
+import pytest
+import torch
+from test_results import benchmark
+
+from lidarpose.models.config import preset
+from lidarpose.skeleton import BODY26
+from lidarpose.synth.generator import Generator
+from lidarpose.train.augment import example
+from lidarpose.train.objectives.objective import total
+from lidarpose.train.recipes import Pretrain, recipe
+
+
+@pytest.fixture(scope="module")
+def ablations():
+    return benchmark("ablations")
+
+
+@pytest.fixture(scope="module")
+def objectives():
+    return benchmark("ablation_objectives")
+
+
+@pytest.fixture(scope="module")
+def people():
+    generator = Generator(scene="wild", measure=False)
+    return [example(generator.person(5, k).sample, np.random.default_rng(k)) for k in range(8)]
+
+
+NAMES = ("point joints", "local refinement", "hardest people", "mirrored pairs", "taught")
+
+
+def terms_of(objective, people):
+    torch.manual_seed(0)
+    return objective.terms(objective.network(), objective.collate(people))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_new_loss_reaches_all_weights(ablations, people, name):
+    variant = ablations.VARIANTS[name]
+    objective = variant.objective(config=preset("tiny"), made=variant.network)
+    torch.manual_seed(0)
+    network = objective.network()
+    total(objective.terms(network, objective.collate(people))).backward()
+    for weight, value in network.named_parameters():
+        assert value.grad is not None and value.grad.isfinite().all(), weight
+
+
+def test_a_mirrored_person_twice_is_the_person(objectives, people):
+    one = people[0]
+    image = objectives.mirrored(one)
+    assert np.array_equal(
+        image.joints[BODY26.index("left_wrist")], one.joints[BODY26.index("right_wrist")] * [1, -1, 1]
+    )
+    again = objectives.mirrored(image)
+    for name in ("points", "part", "joints", "visible", "view"):
+        assert np.array_equal(getattr(again, name), getattr(one, name)), name
+
+
+def test_mirrored_pairs_ask_for_the_mirror_image_of_the_pose(objectives, people):
+    objective = objectives.MirroredPairs(config=preset("tiny"))
+    arrays = objective.collate(people)
+    joints = torch.as_tensor(arrays["joints"])
+
+    class Perfect:
+        def __init__(self, answer):
+            self.answer = answer
+
+        def __call__(self, batch):
+            torch.manual_seed(0)
+            outputs = objective.network()(batch)
+            return objectives.replace(outputs, vote=self.answer, heatmap=outputs.heatmap[..., :0])
+
+    found = objective.terms(Perfect(joints), arrays)
+    assert found["consistency"] == pytest.approx(0, abs=1e-6) and found["mpjpe"] == pytest.approx(0, abs=1e-6)
+    moved = joints.clone()
+    moved[: len(joints) // 2, :, 1] += 0.1
+    # each of the two is drawn to the other: 0.1 m apart
+    found = objective.terms(Perfect(moved), arrays)["consistency"]
+    assert found == pytest.approx(0.1 * objectives.CONSISTENCY, rel=1e-4)
+
+
+def test_the_worst_people_weigh_more(objectives, people):
+    config = preset("tiny")
+    plain = terms_of(objectives.VariantObjective(config=config), people)
+    found = terms_of(objectives.HardestPeople(config=config), people)
+    assert found["mpjpe"] == plain["mpjpe"]
+    assert found["joints"] > plain["joints"]
+
+
+def test_things_near_a_joint_are_nobodys_and_unknown_points_teach_nothing(objectives, people):
+    config = preset("tiny")
+    objective = objectives.PointJoints(config=config, made=objectives.with_point_joints)
+    arrays = objective.collate(people)
+    torch.manual_seed(0)
+    network = objective.network()
+    nobody = objective.terms(network, arrays | {"part": np.where(arrays["part"] > 0, 0, arrays["part"])})
+    unknown = objective.terms(network, arrays | {"part": np.full_like(arrays["part"], -1)})
+    assert nobody["offset"] == 0 and nobody["label"] > 0
+    assert unknown["offset"] == 0 and unknown["label"] == 0
+
+
+def test_local_refinement_begins_as_the_votes_alone(objectives, people):
+    config = preset("tiny")
+    objective = objectives.PointJoints(config=config, made=objectives.with_local_refinement)
+    arrays = objective.collate(people)
+    network = objective.network().eval()
+    rough = objectives.VoteHead.forward
+    seen = {}
+
+    def kept(self, *inputs):
+        seen["vote"], features = rough(self, *inputs)
+        return seen["vote"], features
+
+    with pytest.MonkeyPatch.context() as patch, torch.no_grad():
+        patch.setattr(objectives.VoteHead, "forward", kept)
+        refined = network(objectives.Batch.from_arrays(arrays)).vote
+    assert torch.equal(refined, seen["vote"])
+
+
+def test_hard_activities_come_more_often_than_they_are_drawn(ablations):
+    settings = recipe(Pretrain, people=1024, seed=3, workers=0, pictures=0)
+    job = ablations.job(ablations.VARIANTS["hard kinds"], settings)
+    base = ablations.job(ablations.VARIANTS["base"], settings)
+    # twice as many people are drawn, and as many steps of the curriculum
+    assert job.source.easy == 2 * base.source.easy
+    weights = {k: ablations.KIND_WEIGHTS.get(job.source.kind(k), 1.5) for k in range(512)}
+    shown = [job.source.chosen(k) for k in range(256)]
+    assert all(k // 2 == index for index, k in enumerate(shown))
+    assert np.mean([weights[k] for k in shown]) > np.mean(list(weights.values()))
