@@ -289,6 +289,7 @@ class Predictor(PoseEstimator):
     def _people(self, clouds, origin, wanted, progress, clips=None, centers=None, box_centers=None) -> list[PersonPose]:
         cleaned = [clean(cloud) for cloud in clouds]
         is_usable = np.array([not is_few(points) for points, _ in cleaned], bool)
+        in_box = centers is not None or box_centers is not None
         best = self._best(cleaned, is_usable, origin, progress, clips, centers, box_centers)
         poses: list[Pose | None] = [None] * len(clouds)
         doubtful: list[int] = []
@@ -304,7 +305,7 @@ class Predictor(PoseEstimator):
                 continue
             pose, part = best[i]
             poses[i] = wanted_pose = pose.to(wanted)
-            notes += filter(None, (unit, company_warning(pose), _range_warning(wanted_pose)))
+            notes += filter(None, (unit, company_warning(pose, in_box=in_box), _range_warning(wanted_pose)))
             if unit:
                 continue
             if warning := oversize_warning(points, pose):
