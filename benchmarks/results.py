@@ -168,6 +168,19 @@ def second_bench(group: str) -> str:
     return table((group, *(f"`{model}`, mm" for model in BUNDLED), "people"), rows)
 
 
+def persons() -> str:
+    """How well networks that say whether somebody is there tell so, on lidarpose-bench-2."""
+    wanted = {
+        "`person`: people before objects": "person_auroc",
+        "`second_person`: crops of two people before those of one": "second_person_auroc",
+    }
+    lines = {(model, line.figure): line for model in BUNDLED for line in own_lines(_scored(f"{model}-2").results[0])}
+    models = [model for model in BUNDLED if (model, "person_auroc") in lines]
+    # one decimal would round to more than it is
+    rows = [(what, *(f"{lines[model, figure].value:.2f}" for model in models)) for what, figure in wanted.items()]
+    return table(("AUROC, %", *(f"`{model}`" for model in models)), rows)
+
+
 def card(model: str) -> str:
     """How a bundled model was made, as its file says."""
     path = bundled_path(model)
@@ -182,7 +195,7 @@ def card(model: str) -> str:
         ("seed", str(card["recipe"]["seed"])),
         ("people seen", _in_all(runs, "people_seen", ",")),
         ("hours", _in_all(runs, "hours", ".2f")),
-        ("captured motion", f"{card['motion']}, subjects {', '.join(card['recipe']['subjects'])}"),
+        ("captured motion", f"{card['motion']}, subjects {', '.join(card['recipe']['subjects']) or 'all'}"),
     ]
     stages = [f"{run['recipe']['init']} ({before['people_seen']:,} people)" for run, before in pairwise(runs)]
     if stages:
@@ -365,6 +378,7 @@ def tables() -> dict[str, Callable[[], str]]:
     made |= {
         f"bench-2 by {group}": partial(second_bench, group) for group in ("condition", "poses", "family", "sensor")
     }
+    made["bench-2 persons"] = persons
     made["stability"] = lambda: table(("", "undisturbed", *5 * ("",)), disturbed.curves(DEFAULT))
     made["stability sensors"] = lambda: table(("sensor", "points", "MPJPE mm"), disturbed.sensors(DEFAULT))
     made["stability ends"] = lambda: table(("", "mean, mm", "deviation"), disturbed.ends(DEFAULT))

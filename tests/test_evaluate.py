@@ -125,6 +125,24 @@ def test_clean_shows_what_lies_in_a_displaced_box(sets):
     assert (setting.protocol, setting.centring, setting.split) == ("clean", "points alone", "test")
 
 
+@pytest.mark.parametrize("name", ["humanm3", "waymo"])
+def test_clean_tells_the_center_of_the_displaced_box_alone(sets, name):
+    """By which a network chooses between two people: that of the labeled box would tell where the true joints are."""
+
+    class Asked(Fake):
+        def predict_in(self, points, origin, skeleton=None, progress=False, *, box_centers):
+            self.centers += list(box_centers)
+            return self.predict(points, sensor_origin=origin, skeleton=skeleton)
+
+    model = Asked(standing)
+    evaluated(sets, name, model, seed=3)
+    people = [person for person in open_eval_dataset(sets / name) if person.sample.box is not None]
+    assert len(model.centers) == len(people) > 1
+    for center, person in zip(model.centers, people, strict=True):
+        box = jittered(person.sample.box, np.random.default_rng([3, person.shard, person.row]))
+        np.testing.assert_array_equal(center, box.center)
+
+
 def test_clean_uses_no_label_of_who_was_segmented(sets):
     model = Fake(standing)
     setting = evaluated(sets, "lidarhuman26m", model).result.setting

@@ -101,6 +101,15 @@ def test_views_are_not_mixed(raw, prepared, tmp_path):
     assert summary["splits"] == {"test": 2} and summary["sources"] == {"itop/top": 2}
 
 
+def test_whoever_has_one_split_alone_is_not_told_that_the_other_is_missing(tmp_path, smpl):
+    files.write_itop(tmp_path / "raw", smpl, parts=("side/test",), frames=1)
+    warnings = {
+        split: prepare("itop", tmp_path / "raw", tmp_path / f"{split}", split=split)["warnings"]
+        for split in ("test", None)
+    }
+    assert warnings == {"test": [], None: ["of train by side side/train are not there"]}
+
+
 def scored(out, shift=0.0, joints=ITOP14.joints):
     """The result of a network that knows the truth, but that `joints` are off by `shift` m."""
     dataset = open_eval_dataset(out)
@@ -178,7 +187,7 @@ def test_frames_that_cannot_be_used_are_counted(tmp_path, smpl):
             if "data" in file:
                 file["data"][0] = np.zeros((76800, 3))
             else:
-                file["real_world_coordinates"][2] = np.nan
+                file["real_world_coordinates"][2] = np.inf
     people, records = everything(tmp_path)
     assert [person.frame for person in people] == [10, 10]
     assert [record.reason for record in records if isinstance(record, Skipped)] == [

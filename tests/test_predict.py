@@ -12,6 +12,7 @@ import pytest
 import torch
 
 import lidarpose
+from lidarpose.cli import main
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about
 from lidarpose.inference import inputs as people_module
@@ -565,6 +566,39 @@ def test_load_takes_names_and_paths(points, tmp_path, monkeypatch):
     for weights in (copy, str(copy), "mine.safetensors", Path("odd.name"), "odd.name", "tiny"):
         joints = lidarpose.load(weights, tta=1).predict(points).joints
         np.testing.assert_allclose(joints, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("meant", [0, 1])
+def test_two_people_in_a_crop_are_flagged_and_the_flag_says_who_is_meant(model, standing, tmp_path, meant):
+    apart = np.array([0, 0.7, 0])
+    both = np.concatenate([standing.sample.points, standing.sample.points + apart])
+    pelvises = standing.sample.pose.joints[0] + [np.zeros(3), apart]
+    center = 0.9 * pelvises[meant] + 0.1 * pelvises[1 - meant]
+    box = {"center": center.tolist(), "size": (2 * np.abs(both - center).max(0) + 0.1).tolist()}
+    boxed = model.predict(both, boxes=[box], sensor_origin=(0, 0, 0))[0]
+    for person, who in (
+        (boxed, "the center of the box"),
+        (model.predict(both, sensor_origin=(0, 0, 0)), "their middle"),
+    ):
+        assert person.second_person > 0.5 and person.person > 0.5
+        assert person.warnings == (f"the points look like two people: the pose is of the one nearer to {who}",)
+    assert np.linalg.norm(boxed.joints[0] - pelvises[meant]) < 0.1
+    boxed.save(tmp_path / "two.json")
+    (entry,) = json.loads((tmp_path / "two.json").read_text())["people"]
+    assert entry["second_person"] == round(boxed.second_person, 4) and entry["warnings"] == list(boxed.warnings)
+
+
+def test_a_crop_without_anybody_is_flagged(model, tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    wall = np.column_stack([np.full(400, 6.0), rng.uniform(-0.5, 0.5, 400), rng.uniform(-1, 1, 400)])
+    person = model.predict(wall, sensor_origin=(0, 0, 0))
+    assert person.person < 0.05
+    assert any("look unlike a person" in line and f"{person.person:.2f}" in line for line in person.warnings)
+    np.save(tmp_path / "wall.npy", wall)
+    assert main(["predict", str(tmp_path / "wall.npy"), "--crop", "--out", str(tmp_path / "wall.json")]) == 0
+    assert "look unlike a person" in capsys.readouterr().err
+    (entry,) = json.loads((tmp_path / "wall.json").read_text())["people"]
+    assert entry["person"] < 0.05 and any("unlike a person" in line for line in entry["warnings"])
 
 
 @pytest.mark.parametrize("name", ["smpl24", "human15", "waymo14"])

@@ -46,6 +46,16 @@ def test_every_bundled_model_has_a_card(results):
         card = (BENCHMARKS.parent / "docs" / "cards" / f"{name}.md").read_text()
         for table in (f"{name} card", f"{name} by sensor", f"{name} by distance, m", f"{name} by all+condition"):
             assert f"<!-- table {table} -->" in card, table
+        # of whom it learned
+        assert re.search(r"^\| captured motion \| \S+, subjects (all|[0-9a-z, ]+) \|$", card, re.MULTILINE)
+
+
+def test_networks_that_say_whether_somebody_is_there_have_figures_of_it(results):
+    said = {x.figure: x.value for x in results.own_lines(results._scored("small-2").results[0])}
+    for page in ("results.md", "cards/small.md"):
+        text = (BENCHMARKS.parent / "docs" / page).read_text("utf-8")
+        for name in ("person", "second_person"):
+            assert re.search(rf"^\| `{name}`: .* \| {said[f'{name}_auroc']:.2f} \|$", text, re.MULTILINE), (page, name)
 
 
 def test_the_headline_and_the_conditions_are_those_of_the_scores(results):

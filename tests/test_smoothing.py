@@ -223,6 +223,17 @@ def test_a_clip_of_clouds(clouds):
     assert len(model.predict_clip([])) == 0
 
 
+@pytest.mark.parametrize("live", [False, True])
+def test_a_clip_says_of_each_frame_whether_a_person_is_there(clouds, live):
+    model = load("small")
+    given = [*clouds[:3], np.zeros((0, 3)), *clouds[4:6]]
+    each = model.predict(given, sensor_origin=(0, 0, 0))
+    steady = model.predict_clip(given, sensor_origin=(0, 0, 0), live=live)
+    for k, (own, person) in enumerate(zip(each, steady, strict=True)):
+        assert (person.person, person.second_person) == (own.person, own.second_person)
+        assert (person.person is None) == (k == 3) and person.has_pose
+
+
 def test_times_that_are_none():
     assert clip_times(None, 3).tolist() == [0, 0.1, 0.2] and clip_times((0, 0.5, 7), 3).tolist() == [0, 0.5, 7]
     for times in ([0, 1], [0, 1, 1], [0, 1, np.nan], "abc"):

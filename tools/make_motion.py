@@ -6,8 +6,9 @@ FOLDER (several may be given) is searched for .amc beside its .asf, .bvh and .np
 `lidarpose.body.mocap.motion`: SMPL's 24 joints in meters, z up, at 10 frames a second. Positions are those of the mean
 adult body playing the motion; retargeting them once more moves a joint by 4 mm on average.
 
-The bundled weights learned from all trials of subjects 2 and 5 of the CMU database; the bench's captured poses are of
-subjects 6 and 7. Nothing is downloaded here. Archives, and what a clip of theirs is called:
+The bundled weights learned from subjects 2, 5, 13 and 14 of the CMU database, bd and dg of HDM05 and eight people of
+ReActIdle. The benches have poses of CMU 6 and 7, HDM05 bk and ReActIdle 014 and 015: leave these out of training.
+Nothing is downloaded here. Archives, and what a clip of theirs is called:
 
     CMU         mocap.cs.cmu.edu, subjects/02/02.asf and 02_01.amc          002_01
     HDM05       resources.mpi-inf.mpg.de/HDM05, HDM_bd.asf and              bd_squat1Reps_001

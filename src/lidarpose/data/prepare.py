@@ -112,6 +112,8 @@ def prepare(
     parts = list(source.parts(root))
     rule = split_rule(name, root, split_by, parts)
     absent = rule.absent(parts) if rule is not None else {}
+    # of a split that is asked for alone, nobody misses the others
+    absent = {of: names for of, names in absent.items() if split in (None, of)}
     parts = _parts_of(name, parts, rule, split)
     card = _card(source, parts, rule, split)
     missing = open_folder(out, card)

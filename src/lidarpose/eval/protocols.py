@@ -197,7 +197,8 @@ class EvalSetup:
         clouds = [person.points for person in samples]
         model: Any = self.model
         name, clips = model.skeleton.name, self._clips(samples)
-        boxes = [person.sample.box for person in samples]
+        # the boxes that cut, not those that labels made
+        boxes = [self.crop(person)[1] for person in samples]
         centers = [box.center for box in boxes if box is not None]
         if hasattr(model, "predict_in") and not clips and len(centers) == len(boxes):
             people = model.predict_in(clouds, origin, name, box_centers=np.stack(centers))

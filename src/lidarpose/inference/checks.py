@@ -98,12 +98,13 @@ def oversize_warning(points: np.ndarray, pose: Pose) -> str | None:
     )
 
 
-def company_warning(pose: Pose) -> str | None:
-    """The points show nobody, or more people than the one whose pose it is."""
+def company_warning(pose: Pose, *, in_box: bool = False) -> str | None:
+    """The points show nobody, or more people than the one whose pose it is; in_box: a box says who is meant."""
     if pose.person is not None and pose.person < _NOBODY:
         return f"the points look unlike a person (person {float(pose.person):.2f}): is somebody in this crop?"
     if pose.second_person is not None and pose.second_person > _TWO:
-        return "the points look like two people: the pose is of the one nearer to their middle"
+        middle = "the center of the box" if in_box else "their middle"
+        return f"the points look like two people: the pose is of the one nearer to {middle}"
     return None
 
 

@@ -38,7 +38,7 @@ from lidarpose.models import BUNDLED, DEFAULT, weights_path
 from lidarpose.models.checkpoint import read_header
 from lidarpose.models.decode import decoder
 from lidarpose.models.voxelize import WINDOW
-from lidarpose.sample import MIN_POINTS, Box, Pose
+from lidarpose.sample import MIN_POINTS, PER_PERSON, Box, Pose
 from lidarpose.skeleton import SMPL24, Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
 from lidarpose.tracking.clip import TrackPoses
@@ -260,7 +260,7 @@ class Predictor(PoseEstimator):
         track = TrackPoses.of_poses(seconds, [person.pose for person in people], wanted)
         steady = follow(track) if live else smooth(track).poses()
         frames = [
-            replace(person, id=i, pose=pose, warnings=_steady_warnings(person, pose))
+            replace(person, id=i, pose=_with_own(person, pose), warnings=_steady_warnings(person, pose))
             for i, (person, pose) in enumerate(zip(people, steady, strict=True))
         ]
         return Poses(people=tuple(frames), skeleton=wanted, model=self.model)
@@ -289,6 +289,7 @@ class Predictor(PoseEstimator):
     def _people(self, clouds, origin, wanted, progress, clips=None, centers=None, box_centers=None) -> list[PersonPose]:
         cleaned = [clean(cloud) for cloud in clouds]
         is_usable = np.array([not is_few(points) for points, _ in cleaned], bool)
+        in_box = centers is not None or box_centers is not None
         best = self._best(cleaned, is_usable, origin, progress, clips, centers, box_centers)
         poses: list[Pose | None] = [None] * len(clouds)
         doubtful: list[int] = []
@@ -304,7 +305,7 @@ class Predictor(PoseEstimator):
                 continue
             pose, part = best[i]
             poses[i] = wanted_pose = pose.to(wanted)
-            notes += filter(None, (unit, company_warning(pose), _range_warning(wanted_pose)))
+            notes += filter(None, (unit, company_warning(pose, in_box=in_box), _range_warning(wanted_pose)))
             if unit:
                 continue
             if warning := oversize_warning(points, pose):
@@ -357,6 +358,14 @@ def _range_warning(pose: Pose) -> str | None:
         return None
     names = [name for name, inside in zip(pose.skeleton.joints, pose.in_range, strict=True) if not inside]
     return f"at the end of the heatmap's range, so perhaps farther out than given: {first_names(names)}"
+
+
+def _with_own(person: PersonPose, pose: Pose | None) -> Pose | None:
+    """A steady pose with what the network says of its frame as a whole, which is not smoothed; of a frame that was
+    filled in nothing is said."""
+    if pose is None or person.pose is None:
+        return pose
+    return replace(pose, **{name: getattr(person.pose, name) for name in PER_PERSON})
 
 
 def _steady_warnings(person: PersonPose, pose: Pose | None) -> tuple[str, ...]:

@@ -85,6 +85,10 @@ class Generator:
             raise InputError(f"Generator.captured must be a share in [0, 1], got {self.captured}")
         if self.config.recorded and not self.captured:
             raise InputError("recorded=1 keeps the places of captured motion: name its file by --motion")
+        several = [name for name in ("accumulated", "integration") if getattr(self.config, name)]
+        if self.config.recorded and several:
+            wanted = " and ".join(f"{name}=0" for name in several)
+            raise InputError(f"recorded=1 keeps the places of single frames, several together have none: set {wanted}")
         # at once: an unknown sensor is an error here
         self._bodies  # noqa: B018
 

@@ -80,6 +80,8 @@ class Itop(Reader):
         with _opened(root, part) as (labels, clouds):
             path = labels.filename
             joints = base.numbers(path, labels["real_world_coordinates"][:], (-1, 15, 3), "joints", finite=False)
+            # no arithmetic with what is infinite
+            joints = np.where(np.isfinite(joints), joints, np.nan)
             is_valid, is_visible = labels["is_valid"][:] > 0, labels["visible_joints"][:] > 0
             R_level_camera, source = _R_LEVEL_CAMERA[view], f"itop/{view}"
             if is_mirrored(np.delete(joints[is_valid] @ R_level_camera.T, _TORSO, 1)):
