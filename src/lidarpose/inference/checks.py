@@ -103,8 +103,9 @@ def company_warning(pose: Pose, *, in_box: bool = False) -> str | None:
     if pose.person is not None and pose.person < _NOBODY:
         return f"the points look unlike a person (person {float(pose.person):.2f}): is somebody in this crop?"
     if pose.second_person is not None and pose.second_person > _TWO:
-        middle = "the center of the box" if in_box else "their middle"
-        return f"the points look like two people: the pose is of the one nearer to {middle}"
+        if in_box:
+            return "the points look like two people: the pose is of the one nearer to the center of the box"
+        return "the points look like two people, and the pose is of one of them: a box about somebody says who is meant"
     return None
 
 
