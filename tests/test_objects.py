@@ -6,12 +6,18 @@ import numpy as np
 import pytest
 
 from lidarpose.errors import InputError
+from lidarpose.lidar.presets import sensor
 from lidarpose.sample import Sample
 from lidarpose.skeleton import BODY26
+from lidarpose.synth.acquisition import Acquisition
+from lidarpose.synth.environment.mesh import Mesh
 from lidarpose.synth.environment.things import THINGS
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.objects import LEAST_POINTS, draw_object
-from lidarpose.synth.scene import scene_config
+from lidarpose.synth.place import draw_place
+from lidarpose.synth.scene import NoiseConfig, scene_config
+from lidarpose.synth.simulate import ScanConditions, Scene, simulate_still
+from lidarpose.synth.views import with_views
 from lidarpose.train.augment import people_in
 from lidarpose.train.data_loader import SyntheticSource
 from lidarpose.train.recipes import Finetune, Pretrain
@@ -40,6 +46,46 @@ def test_objects_are_crops_of_things_without_a_person(left_out):
         assert sample.box.contains(sample.points).all()
         assert (sample.box.size <= [1.2, 1.2, 2.2]).all()
     assert len(kinds) >= (4 if left_out else 10)
+
+
+@pytest.mark.parametrize("name", ["merged", "accumulated", "inverted", "sparse"])
+def test_objects_are_seen_by_as_many_sensors_and_frames_as_people(name):
+    config = WILD.changed((f"{name}=1",))
+    for index in range(4):
+        sample, _ = draw_object(config, 1, index)
+        assert sample.conditions == (name,)
+        assert np.linalg.norm(sample.box.center[:2]) < config.distance[1]
+    # nobody is beside a thing, and what is drawn for it is drawn apart
+    sample, kind = draw_object(WILD.changed(("crowded=1",)), 1, 0)
+    same, other = draw_object(WILD, 1, 0)
+    assert not sample.conditions and kind == other
+    np.testing.assert_array_equal(sample.points, same.points)
+
+
+@pytest.mark.parametrize(("frames", "sensors"), [(5, ("os1-64",)), (1, ("os1-64", "hdl-32e", "os0-128"))])
+def test_a_thing_that_stands_still_is_in_one_place_for_all_scans(frames, sensors):
+    config = replace(scene_config("paper"), sensors=sensors[:1], slope=0.0, noise=NoiseConfig())
+    acquisition = Acquisition(sensors=sensors, frames=frames, speed=10.0, distance=(6.0, 8.0))
+    rng = np.random.default_rng(2)
+    place = draw_place(acquisition.placing(config), sensor(sensors[0]), 2.0, 0.5, 1.0, rng)
+    ground = Mesh(np.zeros((3, 3), np.float32), np.zeros((0, 3), np.int32))
+    scene = Scene(
+        config=config, sensor=sensor(sensors[0]), place=place, conditions=ScanConditions(),
+        background=[ground], props=[], acquisition=acquisition,
+    )  # fmt: skip
+    scene = with_views(scene, acquisition.placing(config), 2.0, 0.5, 1.0, rng)
+    views = (replace(view, scene=replace(view.scene, conditions=ScanConditions())) for view in scene.views)
+    scene = replace(scene, views=tuple(views))
+    # an upright disk, its middle 1 m above the feet
+    angle = np.linspace(0, 2 * np.pi, 25)[:-1]
+    upright = place.feet + np.column_stack([0.8 * np.cos(angle), np.zeros(24), 1.0 + 0.8 * np.sin(angle)])
+    faces = np.array([(0, k, k + 1) for k in range(1, 23)], np.int32)
+    disk = Mesh(upright.astype(np.float32), faces, np.ones(len(faces), np.uint8))
+    alone = simulate_still(replace(scene, views=()), disk, np.random.default_rng(0))
+    every = simulate_still(scene, disk, np.random.default_rng(0))
+    assert len(every.points) > 1.5 * len(alone.points) > 30
+    assert np.abs(every.points[:, 1] - place.feet[1]).max() < 0.02
+    assert (np.linalg.norm(every.points - place.feet - [0, 0, 1.0], axis=1) < 0.83).all()
 
 
 def test_sensors_that_reach_nothing_are_an_error():

@@ -1,6 +1,6 @@
 """How a person's cloud is acquired: one scan of an upright sensor, or several of several ones, or otherwise."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -39,6 +39,10 @@ class Acquisition:
     crowded: bool = False
     distance: tuple[float, float] | None = None
     conditions: tuple[str, ...] = ()
+
+    def placing(self, config: SceneConfig) -> SceneConfig:
+        """The scene as far as it says where somebody stands."""
+        return replace(config, distance=self.distance, median_points=0) if self.distance else config
 
 
 SINGLE_SCAN = Acquisition()

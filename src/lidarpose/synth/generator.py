@@ -23,7 +23,7 @@ from lidarpose.sample import CLIP_FRAMES, Box, PersonInfo, Pose, Sample, center_
 from lidarpose.skeleton import BODY26
 from lidarpose.synth import noise
 from lidarpose.synth.acquisition import ACQUISITION_DRAWS, MOST_FRAMES, SINGLE_SCAN, Acquisition, draw_acquisition
-from lidarpose.synth.bodies import CLIP_HZ, Bodies, PoseBank, draw_bodies, draw_moving_bodies
+from lidarpose.synth.bodies import Bodies, PoseBank, draw_bodies, draw_moving_bodies
 from lidarpose.synth.environment.mesh import Mesh
 from lidarpose.synth.environment.surroundings import ground, occluder, surroundings
 from lidarpose.synth.place import Place, draw_place, recorded_place
@@ -32,13 +32,13 @@ from lidarpose.synth.scene import RandomStream, SceneConfig, scene_config
 from lidarpose.synth.simulate import (
     Scan,
     Scene,
-    View,
     count_alone,
     draw_conditions,
     scan_background,
     simulate,
     simulate_scan,
 )
+from lidarpose.synth.views import with_views
 
 # people whose poses and shapes are drawn together
 BLOCK = 256
@@ -214,9 +214,7 @@ def _draw_scene(
     device = sensor(sensors[0])
     low, high = bodies.extent[first]
     height, reach = high[2], max(-low[0], -low[1], high[0], high[1])
-    placing = config
-    if acquisition.distance:
-        placing = replace(config, distance=acquisition.distance, median_points=0)
+    placing = acquisition.placing(config)
     place = draw_place(placing, device, height, reach, nearer, rng, acquisition.inverted)
     if config.recorded and bodies.places is not None and np.isfinite(bodies.places[first]).all():
         place = recorded_place(place, bodies.places[first])
@@ -240,50 +238,7 @@ def _draw_scene(
         still=still,
         acquisition=acquisition,
     )
-    if len(acquisition.sensors) > 1:
-        return replace(scene, views=_merged_views(scene, placing, height, reach, nearer, rng))
-    return replace(scene, views=_earlier_views(scene)) if acquisition.frames > 1 else scene
-
-
-# sensors that are merged stand so far off equal angles around the person, rad
-_OFF_ANGLE = 0.4
-# a sensor that drives does not come nearer than this to the person, m
-_BESIDE_LANE = 1.5
-
-
-def _merged_views(
-    scene: Scene, placing: SceneConfig, height: float, reach: float, nearer: float, rng: np.random.Generator
-) -> tuple[View, ...]:
-    """The other sensors around a person, each turned, mounted and disturbed on its own, up to a tenth of a second
-    before or after the first one. Arguments: as of `draw_place`."""
-    names, feet, views = scene.acquisition.sensors, scene.place.feet, []
-    for k, name in enumerate(names[1:], 1):
-        device = sensor(name)
-        own = draw_place(placing, device, height, reach, nearer, rng, scene.acquisition.inverted)
-        angle, lag = rng.uniform(-1, 1, 2).tolist()
-        # from there the person is seen in this direction of the first sensor's frame
-        heading = np.arctan2(feet[1], feet[0]) + 2 * np.pi * k / len(names) + _OFF_ANGLE * angle
-        turn = rotation_about("z", heading - np.arctan2(own.feet[1], own.feet[0]))
-        mount = turn.T if own.R_sensor_level is None else own.R_sensor_level @ turn.T
-        seen = scene.seen_from(
-            feet - turn @ own.feet,
-            place=replace(scene.place, R_sensor_level=mount),
-            sensor=device,
-            conditions=draw_conditions(scene.config, device, rng),
-        )
-        views.append(View(scene=seen, at=feet - turn @ own.feet, lag=lag))
-    return tuple(views)
-
-
-def _earlier_views(scene: Scene) -> tuple[View, ...]:
-    """The frames before the last, seen from where the sensor was."""
-    feet, views = scene.place.feet, []
-    # it does not drive through the person
-    forward = -1 if feet[0] < 0 and abs(feet[1]) < _BESIDE_LANE else 1
-    for earlier in range(1, scene.acquisition.frames):
-        at = np.array([-forward * scene.acquisition.speed * earlier / CLIP_HZ, 0, 0])
-        views.append(View(scene=scene.seen_from(at), at=at, earlier=earlier))
-    return tuple(views)
+    return with_views(scene, placing, height, reach, nearer, rng)
 
 
 # part of a second person's points until they are counted

@@ -3,18 +3,22 @@
 What a network learns from, and is judged by, that says whether a crop shows a person.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from lidarpose.errors import InputError, check_int
 from lidarpose.lidar.presets import sensor
 from lidarpose.sample import Box, Sample, center_of
 from lidarpose.synth import noise
+from lidarpose.synth.acquisition import ACQUISITION_DRAWS, SINGLE_SCAN, Acquisition, draw_acquisition
 from lidarpose.synth.environment.mesh import Mesh
 from lidarpose.synth.environment.surroundings import ground, surroundings
 from lidarpose.synth.environment.things import THINGS, draw_thing
 from lidarpose.synth.place import draw_place
 from lidarpose.synth.scene import RandomStream, SceneConfig
-from lidarpose.synth.simulate import Scene, draw_conditions, simulate_scan
+from lidarpose.synth.simulate import Scene, draw_conditions, simulate_still
+from lidarpose.synth.views import with_views
 
 # fewest points of an object's crop, and how often it is drawn again, each time nearer to the sensor
 LEAST_POINTS = 15
@@ -30,7 +34,7 @@ _REACH = 1.0
 
 
 def draw_object(config: SceneConfig, seed: int, index: int, *, left_out: bool = False) -> tuple[Sample, str]:
-    """Object `index` of `seed`, seen as the scene's people are.
+    """Object `index` of `seed`, seen as the scene's people are: by several sensors or frames where they are, too.
 
     Args:
         config: scenes: sensors, distances, surroundings, noise.
@@ -44,12 +48,16 @@ def draw_object(config: SceneConfig, seed: int, index: int, *, left_out: bool = 
     """
     seed, index = check_int("seed", seed, least=0), check_int("index", index, least=0)
     rng = np.random.default_rng([seed, RandomStream.OBJECT, index])
+    acquisition = SINGLE_SCAN
+    if config.varied:
+        draws = np.random.default_rng([seed, RandomStream.OBJECT_ACQUISITION, index]).random(ACQUISITION_DRAWS)
+        acquisition = draw_acquisition(replace(config, crowded=0.0), draws)
     weights = {name: thing.outdoors + thing.indoors for name, thing in THINGS.items() if thing.left_out is left_out}
     share = np.array(list(weights.values())) / sum(weights.values())
     for attempt in range(_TRIES):
         alone = rng.random() < _CLUTTER and not attempt
         name = "clutter" if alone else str(rng.choice(list(weights), p=share))
-        sample = _draw_sample(config, name, 0.85**attempt, rng)
+        sample = _draw_sample(config, name, acquisition, 0.85**attempt, rng)
         if len(sample.points) >= LEAST_POINTS:
             return sample, name
     raise InputError(
@@ -58,20 +66,24 @@ def draw_object(config: SceneConfig, seed: int, index: int, *, left_out: bool = 
     )
 
 
-def _draw_sample(config: SceneConfig, name: str, nearer: float, rng: np.random.Generator) -> Sample:
+def _draw_sample(
+    config: SceneConfig, name: str, acquisition: Acquisition, nearer: float, rng: np.random.Generator
+) -> Sample:
     """A crop about a thing, perhaps without points."""
-    device = sensor(config.sensors[rng.integers(len(config.sensors))])
+    (first,) = acquisition.sensors[:1] or (config.sensors[rng.integers(len(config.sensors))],)
+    device, placing = sensor(first), acquisition.placing(config)
     thing = draw_thing(name, rng) if name in THINGS else Mesh(np.zeros((3, 3), np.float32), np.zeros((0, 3), np.int32))
     low, high = thing.vertices.min(0), thing.vertices.max(0)
     reach = float(min(max(-low[0], -low[1], high[0], high[1], 0.2), _REACH))
-    place = draw_place(config, device, float(np.clip(high[2], 0.5, 2.0)), reach, nearer, rng)
+    height = float(np.clip(high[2], 0.5, 2.0))
+    place = draw_place(placing, device, height, reach, nearer, rng, acquisition.inverted)
     own = Mesh(place.of_body(thing.vertices), thing.faces, np.ones(len(thing.faces), np.uint8))
     background = [ground(config, place.feet, rng), *surroundings(config, place.feet, reach, rng)]
     scene = Scene(
         config=config, sensor=device, place=place, conditions=draw_conditions(config, device, rng),
-        background=background, props=[],
+        background=background, props=[], acquisition=acquisition,
     )  # fmt: skip
-    scan = simulate_scan(scene, [own, *background], rng)
+    scan = simulate_still(with_views(scene, placing, height, reach, nearer, rng), own, rng)
     points, ring = scan.points, scan.ring
     middle = place.feet + [0, 0, 1.0]
     returned = scan.points[scan.part > 0]
@@ -91,7 +103,7 @@ def _draw_sample(config: SceneConfig, name: str, nearer: float, rng: np.random.G
         part=np.zeros(len(points), np.uint8),
         ring=ring,
         box=box,
-        source=f"synth/{config.name}/{device.name}",
+        source="/".join(("synth", config.name, device.name, *filter(None, ["+".join(acquisition.conditions)]))),
     )
 
 

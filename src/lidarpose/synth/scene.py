@@ -34,6 +34,7 @@ class RandomStream(IntEnum):
     ACQUISITION = 13
     MOTION = 14
     OBJECT = 15
+    OBJECT_ACQUISITION = 16
 
 
 @dataclass(frozen=True, kw_only=True)

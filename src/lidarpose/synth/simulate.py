@@ -1,6 +1,6 @@
 """What a sensor returns of a person's scene: its triangles, the cast, and the sensor's noise."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from math import pi
 from typing import Any, cast
@@ -178,8 +178,20 @@ def _between(ends: tuple[float, float], share: float) -> float:
 
 def simulate(scene: Scene, bodies: Bodies, row: int, rng: np.random.Generator, *, frame: int = 0) -> Scan:
     """The cloud of body `row`: what the scene's sensor returns, and all that is added to it."""
+    return _added_up(scene.scans(bodies, row, frame), rng)
+
+
+def simulate_still(scene: Scene, thing: Mesh, rng: np.random.Generator) -> Scan:
+    """The same of a thing that does not move."""
+    others = ((view.scene, thing.moved(-view.at), -view.earlier, view.at) for view in scene.views)
+    scans = [(scene, thing, 0, np.zeros(3)), *others]
+    return _added_up(((seen, [mesh, *seen.background], number, at) for seen, mesh, number, at in scans), rng)
+
+
+def _added_up(seen_from: Iterable[tuple[Scene, list[Mesh], int, np.ndarray]], rng: np.random.Generator) -> Scan:
+    """Scans as in `Scene.scans` in the frame of the first one."""
     scans: list[Scan] = []
-    for seen, meshes, number, at in scene.scans(bodies, row, frame):
+    for seen, meshes, number, at in seen_from:
         scan = simulate_scan(seen, meshes, rng, frame=number)
         scans.append(replace(scan, points=scan.points + at.astype(np.float32)) if scans else scan)
     if len(scans) == 1:

@@ -1,0 +1,61 @@
+"""The scans that are added to a scene's own: of other sensors around the person, or of earlier frames."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from lidarpose.geometry import rotation_about
+from lidarpose.lidar.presets import sensor
+from lidarpose.synth.bodies import CLIP_HZ
+from lidarpose.synth.place import draw_place
+from lidarpose.synth.scene import SceneConfig
+from lidarpose.synth.simulate import Scene, View, draw_conditions
+
+# sensors that are merged stand so far off equal angles around the person, rad
+_OFF_ANGLE = 0.4
+# a sensor that drives does not come nearer than this to the person, m
+_BESIDE_LANE = 1.5
+
+
+def with_views(
+    scene: Scene, placing: SceneConfig, height: float, reach: float, nearer: float, rng: np.random.Generator
+) -> Scene:
+    """The scene with the scans that its acquisition adds. Arguments: as of `draw_place`."""
+    if len(scene.acquisition.sensors) > 1:
+        return replace(scene, views=_merged_views(scene, placing, height, reach, nearer, rng))
+    return replace(scene, views=_earlier_views(scene)) if scene.acquisition.frames > 1 else scene
+
+
+def _merged_views(
+    scene: Scene, placing: SceneConfig, height: float, reach: float, nearer: float, rng: np.random.Generator
+) -> tuple[View, ...]:
+    """The other sensors around a person, each turned, mounted and disturbed on its own, up to a tenth of a second
+    before or after the first one. Arguments: as of `draw_place`."""
+    names, feet, views = scene.acquisition.sensors, scene.place.feet, []
+    for k, name in enumerate(names[1:], 1):
+        device = sensor(name)
+        own = draw_place(placing, device, height, reach, nearer, rng, scene.acquisition.inverted)
+        angle, lag = rng.uniform(-1, 1, 2).tolist()
+        # from there the person is seen in this direction of the first sensor's frame
+        heading = np.arctan2(feet[1], feet[0]) + 2 * np.pi * k / len(names) + _OFF_ANGLE * angle
+        turn = rotation_about("z", heading - np.arctan2(own.feet[1], own.feet[0]))
+        mount = turn.T if own.R_sensor_level is None else own.R_sensor_level @ turn.T
+        seen = scene.seen_from(
+            feet - turn @ own.feet,
+            place=replace(scene.place, R_sensor_level=mount),
+            sensor=device,
+            conditions=draw_conditions(scene.config, device, rng),
+        )
+        views.append(View(scene=seen, at=feet - turn @ own.feet, lag=lag))
+    return tuple(views)
+
+
+def _earlier_views(scene: Scene) -> tuple[View, ...]:
+    """The frames before the last, seen from where the sensor was."""
+    feet, views = scene.place.feet, []
+    # it does not drive through the person
+    forward = -1 if feet[0] < 0 and abs(feet[1]) < _BESIDE_LANE else 1
+    for earlier in range(1, scene.acquisition.frames):
+        at = np.array([-forward * scene.acquisition.speed * earlier / CLIP_HZ, 0, 0])
+        views.append(View(scene=scene.seen_from(at), at=at, earlier=earlier))
+    return tuple(views)
