@@ -40,6 +40,11 @@ def test_rows_by_hand():
     assert 200 < rows["acceleration", "all", "frames in a row"].value < 450
     # one of three people of 100 points and more
     assert rows["turned_round", "points", "100 and more"].value == pytest.approx(100 / 3)
+    assert rows["turned_round", "points", "20 to 100"].value == 0
+    # of 50, 50, 250 mm and what a mirrored person is off: the third of four and a part of the way to the fourth
+    people = np.sort(four()[0].errors().mean(1))
+    worst = rows["mpjpe_p95", "all", "all"]
+    assert worst.value == pytest.approx(people[2] + 0.85 * (people[3] - people[2])) and worst.people == 4
     # 11 of 15 joints of the flipped one are 5 cm off, as all of two others are: 41 of 60 within 10 cm
     assert rows["calibration_error", "all", "all"].value == pytest.approx(100 * (0.75 - 41 / 60), abs=1e-3)
     spans = {group: {of: x.people for (f, g, of), x in rows.items() if (f, g) == ("mpjpe", group)}

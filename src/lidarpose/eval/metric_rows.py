@@ -20,8 +20,8 @@ from lidarpose.eval.predictions import Predictions
 from lidarpose.eval.scores import RELEASED, MetricRow, Setting, number
 from lidarpose.sample import CONFIDENCE_RADIUS, FEWEST_OF_SECOND, HIDDEN, SEEN, UNLABELED
 
-# people of fewer points do not tell where they face
-PLENTY = 100
+# people of fewer points often do not tell where they face, those of fewer than `FEW` hardly ever
+PLENTY, FEW = 100, 20
 _REPEATS = 1000
 # frames count as evenly apart where two steps differ by less than this share
 _EVEN = 0.2
@@ -125,9 +125,21 @@ def _of_confidence(p: Predictions, setting: Setting, metric: Callable) -> Score 
     return Score(value, people=people.sum(), joints=known.sum(), skipped=(p.posed & ~people).sum())
 
 
+def _p95(p: Predictions, setting: Setting) -> Score | None:
+    """The 95th percentile of people's mean errors."""
+    error = p.errors()
+    known = ~np.isnan(error)
+    people = known.any(1)
+    if not people.any():
+        return None
+    value = np.percentile(np.nanmean(error[people], axis=1), 95)
+    return Score(value, people=people.sum(), joints=known.sum(), skipped=(p.posed & ~people).sum())
+
+
 # metrics of everybody at once, without an interval: (Predictions, Setting) -> Score or None, unit
 SUMMARIES: dict[str, tuple[Callable[[Predictions, Setting], Score | None], str]] = {
     "pem": (_pem, "mm"),
+    "mpjpe_p95": (_p95, "mm"),
     "calibration_error": (partial(_of_confidence, metric=aggregate.calibration_error), "%"),
     "auroc": (partial(_of_confidence, metric=aggregate.auroc), "%"),
 }
@@ -142,9 +154,11 @@ def _groups(section: str, p: Predictions, setting: Setting) -> Iterator[tuple[st
     if section == "all":
         yield "all", "all", everybody, None
     elif section == "dense":
-        dense = p.points >= PLENTY
-        if not np.isnan(facing_flipped(p)[dense]).all():
-            yield "points", f"{PLENTY} and more", dense, None
+        known = ~np.isnan(facing_flipped(p))
+        dense, sparse = p.points >= PLENTY, (p.points >= FEW) & (p.points < PLENTY)
+        for of, rows in ((f"{PLENTY} and more", dense), (f"{FEW} to {PLENTY}", sparse)):
+            if known[rows].any():
+                yield "points", of, rows, None
     elif section == "joints":
         for name, joints in joint_groups(p.skeleton).items():
             if name != "all":
