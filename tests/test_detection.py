@@ -153,6 +153,19 @@ def test_a_tilted_sensor_is_told(model, scene):
     assert sum(found_at(poses.to_numpy()[:, 0] @ tilt, joints)) >= 4
 
 
+@pytest.mark.parametrize("up", ["y", "-y", "x"])
+def test_boxes_of_a_tilted_sensor_face_as_people_do_whatever_axis_is_up(scene, up):
+    level = lidarpose.detect(scene[0])
+    tilt = rotation_about("y", np.radians(20.0))
+    boxes = lidarpose.detect(scene[0] @ tilt.T @ UP_AXES[up], up=up)
+    off = []
+    for found in boxes:
+        near = min(level, key=lambda other: np.linalg.norm(tilt @ other.center - UP_AXES[up] @ found.center))
+        forward = tilt @ [np.cos(near.yaw), np.sin(near.yaw), 0]
+        off.append(np.abs((found.yaw - np.arctan2(forward[1], forward[0]) + np.pi) % (2 * np.pi) - np.pi))
+    assert len(boxes) >= 4 and np.median(off) < np.radians(25)
+
+
 @pytest.mark.parametrize(("factor", "word"), [(1000, "millimeters"), (100, "centimeters"), (0.001, "kilometers")])
 def test_units_are_told_before_anyone_is_found(scene, factor, word):
     (warning,) = lidarpose.detect(scene[0] * factor).warnings

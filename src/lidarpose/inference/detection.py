@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lidarpose.errors import InputError, check_int
-from lidarpose.geometry import rotation_from_up
+from lidarpose.geometry import rotation_about, rotation_from_up
 from lidarpose.inference.background import is_static, read_background
 from lidarpose.inference.checks import flat_along_another_axis, scan_unit_warning, unlikely_origin
 from lidarpose.inference.inputs import as_origin, as_points, only_returns
@@ -274,13 +274,14 @@ def _in_input(box: Box, scan: Scan, given: Scan) -> Box:
     """A level box as a box of the input, along the axis that `given` says is up. In a frame that leans it is larger, so
     that it still holds the person."""
     R_boxes_level = given.R_boxes_input @ scan.R_level_input.T
-    center, size = R_boxes_level @ box.center, box.size
+    center, size, yaw = R_boxes_level @ box.center, box.size, box.yaw
     if not np.allclose(R_boxes_level, np.eye(3)):
-        c, s = np.cos(box.yaw), np.sin(box.yaw)
-        R_level_own = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-        size = np.abs(R_level_own.T @ R_boxes_level @ R_level_own) @ box.size
+        # the level frame of a tilted sensor is turned about its up axis, too, where the input's is not z
+        forward = R_boxes_level @ [np.cos(box.yaw), np.sin(box.yaw), 0]
+        yaw = float(np.arctan2(forward[1], forward[0]))
+        size = np.abs(rotation_about("z", yaw).T @ R_boxes_level @ rotation_about("z", box.yaw)) @ box.size
     center = given.R_boxes_input.T @ center
-    return rounded(replace(box, center=center, size=size))
+    return rounded(replace(box, center=center, size=size, yaw=yaw))
 
 
 def _is_number(value: object) -> bool:
