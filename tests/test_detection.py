@@ -223,6 +223,23 @@ def test_a_map_is_thinned(scene, monkeypatch):
     assert not any("thinned" in warning for warning in whole.warnings) and whole
 
 
+def test_around_a_sensor_that_cannot_stand_at_zero_all_of_a_map_is_searched(scene, fake, monkeypatch):
+    """Whether it is thinned or not, and what is up is told as of an unknown sensor."""
+    points, _ = scene
+    moved, bare = np.array([70.0, 0, 1.5]), np.array([-70.0, 0, 1.5])
+    empty = points[points[:, 2] < -1.45]
+    wide = np.concatenate([points + moved, empty + bare, empty + [0, 0, 1.5]])
+    monkeypatch.setattr(detection, "_MOST_POINTS", len(wide) - 1000)
+    boxes = lidarpose.detect(wide)
+    assert any("no ground below it" in warning for warning in boxes.warnings)
+    assert any("thinned" in warning for warning in boxes.warnings) and len(boxes) >= 4
+    # a single point at zero is no surroundings
+    lidarpose.detect(np.concatenate([wide + [5e5, 5e6, 0], np.zeros((1, 3))]))
+    assert fake.calls[-1]["origin"] is None and len(fake.calls[-1]["points"]) > 1000
+    tilted = points @ rotation_about("y", np.radians(20.0)).T + [5e5, 5e6, 0]
+    assert any("leans by" in warning for warning in lidarpose.detect(tilted).warnings)
+
+
 # ---- the final score
 
 

@@ -139,7 +139,7 @@ class Places:
 
 def detect_places(scan: Scan, search: Search) -> Places:
     """The first half of `find_people`, which depends on no other frame."""
-    count = len(scan.points)
+    whole, count = scan, len(scan.points)
     given, notes = _thinned(scan, search)
     scan, warnings = given, [*scan.warnings, *notes]
     if len(scan.points) < MIN_POINTS:
@@ -160,8 +160,9 @@ def detect_places(scan: Scan, search: Search) -> Places:
         level = _leveled(scan)
         origin = None if scan.origin is None else scan.R_level_input @ scan.origin
     if origin is not None and (warning := unlikely_origin(level, origin)):
-        warnings += [] if wrong else [warning]
-        scan, origin = replace(scan, origin=None), None
+        # from the beginning: of an unknown sensor other points are kept, and what is up is told by others
+        own = whole.warnings if wrong else (*whole.warnings, warning)
+        return detect_places(replace(whole, origin=None, warnings=own), search)
     moving = None
     if search.background is not None:
         moving = ~is_static(scan.points, search.background)
@@ -232,7 +233,7 @@ def _thinned(scan: Scan, search: Search) -> tuple[Scan, list[str]]:
         for start in starts:
             piece = slice(start, start + _CHUNK)
             inside[piece] = np.linalg.norm(points[piece] - scan.origin, axis=1) < reach
-        if not inside.any():
+        if np.count_nonzero(inside) < MIN_POINTS:
             inside[:] = True
     number, notes = np.count_nonzero(inside), []
     if number <= _MOST_POINTS:
