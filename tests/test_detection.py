@@ -172,6 +172,15 @@ def test_units_are_told_before_anyone_is_found(scene, factor, word):
     assert word in warning
 
 
+def test_a_tilted_scan_is_not_in_other_units(scene):
+    """However tall it is in the frame of its sensor."""
+    x, y = np.meshgrid(np.arange(-45.0, 45, 0.5), np.arange(-15.0, 15, 0.5))
+    road = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -1.5)])
+    street = np.concatenate([scene[0], *[road] * 3]) @ rotation_about("y", np.radians(30.0)).T
+    (warning,) = lidarpose.detect(street).warnings
+    assert "leans by" in warning
+
+
 def test_one_person_is_no_scan_in_kilometers():
     standing = np.random.default_rng(0).normal([8, 0, 0], [0.08, 0.12, 0.4], (500, 3))
     assert not any("kilometers" in warning for warning in lidarpose.detect(standing).warnings)

@@ -149,7 +149,7 @@ def detect_places(scan: Scan, search: Search) -> Places:
     # what else looks odd follows from wrong axes or units
     some = slice(None, None, -(-len(level) // _ENOUGH))
     few = replace(scan, points=scan.points[some])
-    if wrong := flat_along_another_axis(few) or scan_unit_warning(level[some], count):
+    if wrong := flat_along_another_axis(few):
         warnings.append(wrong)
     origin = None if scan.origin is None else scan.R_level_input @ scan.origin
     up = estimate_up(_near(level, origin, search), origin)
@@ -159,6 +159,9 @@ def detect_places(scan: Scan, search: Search) -> Places:
         scan = replace(scan, up=up_text(up @ scan.R_level_input))
         level = _leveled(scan)
         origin = None if scan.origin is None else scan.R_level_input @ scan.origin
+    # level: a scan that leans is as tall as one in other units
+    if not wrong and (wrong := scan_unit_warning(level[some], count)):
+        warnings.append(wrong)
     if origin is not None and (warning := unlikely_origin(level, origin)):
         # from the beginning: of an unknown sensor other points are kept, and what is up is told by others
         own = whole.warnings if wrong else (*whole.warnings, warning)
