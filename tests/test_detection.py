@@ -268,6 +268,16 @@ def test_the_final_score_is_what_the_header_says():
     )
 
 
+def test_a_detector_that_is_not_calibrated_scores_as_its_network_does(scene, fake, monkeypatch):
+    """As `lidarpose evaluate detector --detector` meets it after an export."""
+    rows = np.column_stack([[-2.0, 0.0, 3.0, np.nan], np.zeros(4), np.full(4, np.log(0.1)), np.zeros((4, 3))])
+    scores = verification.final_score(rows, {})
+    np.testing.assert_allclose(scores, [*(1 / (1 + np.exp(-rows[:3, 0]))), 0])
+    monkeypatch.setattr(fake, "header", {"version": "raw"})
+    searched = detection.find_people(detection.Scan(points=scene[0]), detection.Search(min_score=0.0, detector=fake))
+    assert len(searched.boxes) >= len(PLACES)
+
+
 # ---- background
 
 
