@@ -338,6 +338,10 @@ def test_boxes_and_crops_are_not_searched(model, file, fake, scene):
     near = scene[0][np.linalg.norm(scene[0][:, :2] - PLACES[0], axis=1) < 1.5]
     np.save("small.npy", near)
     assert lidarpose.predict("small.npy", model=model)[0].box is None and not fake.calls
+    # and options of a search that is not made are told
+    for option in ({"min_score": 0.5}, {"background": file}):
+        (person,) = lidarpose.predict("small.npy", **option, model=model)
+        assert person.box is None and any("find looks for people" in warning for warning in person.warnings)
     assert lidarpose.predict("small.npy", find=True, sensor_origin="unknown", model=model)[0].box is not None
 
 
