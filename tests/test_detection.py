@@ -153,6 +153,19 @@ def test_a_tilted_sensor_is_told(model, scene):
     assert sum(found_at(poses.to_numpy()[:, 0] @ tilt, joints)) >= 4
 
 
+def test_arrows_of_a_tilted_scan_show_where_people_face(model, scene):
+    tilt = rotation_about("y", np.radians(20.0)) @ rotation_about("z", 2.5)
+    poses = model.predict(scene[0] @ tilt.T, find=True)
+    _, above = poses._panels()
+    assert len(above.boxes) == len(poses) >= 4
+    for drawn, person in zip(above.boxes, poses, strict=True):
+        # the left hip is left of the arrow
+        R_level_input = rotation_from_up(poses.up)
+        hips = [R_level_input @ person.joints[person.skeleton.index(f"{side}_hip")] for side in ("left", "right")]
+        assert (hips[0] - hips[1])[:2] @ [-np.sin(drawn.yaw), np.cos(drawn.yaw)] > 0
+        assert drawn.contains(person.points @ R_level_input.T).all()
+
+
 @pytest.mark.parametrize("up", ["y", "-y", "x"])
 def test_boxes_of_a_tilted_sensor_face_as_people_do_whatever_axis_is_up(scene, up):
     level = lidarpose.detect(scene[0])
