@@ -1,12 +1,19 @@
 """What a detector's scores mean: fitted on the scans of another family than that of training."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+import lidarpose.train.detector.calibrate as module
 from lidarpose.eval.detector.detection_scores import match
+from lidarpose.geometry import rotation_about
 from lidarpose.inference.verification import final_score
+from lidarpose.models.checkpoint import save_checkpoint
+from lidarpose.models.detector.detector_config import DetectorConfig
+from lidarpose.models.detector.network import DetectorNet
+from lidarpose.synth.detection_scene import detection_scene
 from lidarpose.train.detector.calibrate import fit, logistic, monotone, passing_score
 
 
@@ -60,3 +67,25 @@ def test_the_default_score_lets_one_false_person_a_scan_pass():
     assert 60 <= passing.sum() <= 100
     assert set(header) == {"calibration", "verification", "default_score"}
     assert json.loads(json.dumps(header)) == header
+
+
+def test_scores_are_fitted_on_level_scans_as_detection_sees_them(tmp_path, monkeypatch):
+    scene = detection_scene(3, 12)
+    R = rotation_about("y", np.radians(20.0))
+    tilted = replace(scene, points=(scene.points @ R.T).astype(np.float32), origin=R @ scene.origin, up=R @ scene.up)
+    monkeypatch.setattr(module, "detection_scene", lambda *args, **named: tilted)
+    seen = []
+    real = module.Detector.detect
+
+    def detect(self, points, origin, **options):
+        seen.append(points)
+        return real(self, points, origin, **options)
+
+    monkeypatch.setattr(module.Detector, "detect", detect)
+    monkeypatch.setattr(module, "fit", lambda features, is_person, scans: {"default_score": 0.5})
+    network = DetectorNet(DetectorConfig(channels=(8, 8, 16), coarse_channels=(4, 8), hidden=16))
+    save_checkpoint(tmp_path / module.MODEL, network, card={})
+    module.calibrate(tmp_path, 1)
+    # within what a slope is told from
+    off = np.linalg.norm(seen[0] - scene.points, axis=1)
+    assert np.median(off / np.maximum(np.linalg.norm(scene.points, axis=1), 1)) < 0.05

@@ -153,10 +153,45 @@ def test_a_tilted_sensor_is_told(model, scene):
     assert sum(found_at(poses.to_numpy()[:, 0] @ tilt, joints)) >= 4
 
 
+def test_arrows_of_a_tilted_scan_show_where_people_face(model, scene):
+    tilt = rotation_about("y", np.radians(20.0)) @ rotation_about("z", 2.5)
+    poses = model.predict(scene[0] @ tilt.T, find=True)
+    _, above = poses._panels()
+    assert len(above.boxes) == len(poses) >= 4
+    for drawn, person in zip(above.boxes, poses, strict=True):
+        # the left hip is left of the arrow
+        R_level_input = rotation_from_up(poses.up)
+        hips = [R_level_input @ person.joints[person.skeleton.index(f"{side}_hip")] for side in ("left", "right")]
+        assert (hips[0] - hips[1])[:2] @ [-np.sin(drawn.yaw), np.cos(drawn.yaw)] > 0
+        assert drawn.contains(person.points @ R_level_input.T).all()
+
+
+@pytest.mark.parametrize("up", ["y", "-y", "x"])
+def test_boxes_of_a_tilted_sensor_face_as_people_do_whatever_axis_is_up(scene, up):
+    level = lidarpose.detect(scene[0])
+    tilt = rotation_about("y", np.radians(20.0))
+    boxes = lidarpose.detect(scene[0] @ tilt.T @ UP_AXES[up], up=up)
+    off = []
+    for found in boxes:
+        near = min(level, key=lambda other: np.linalg.norm(tilt @ other.center - UP_AXES[up] @ found.center))
+        forward = tilt @ [np.cos(near.yaw), np.sin(near.yaw), 0]
+        off.append(np.abs((found.yaw - np.arctan2(forward[1], forward[0]) + np.pi) % (2 * np.pi) - np.pi))
+    assert len(boxes) >= 4 and np.median(off) < np.radians(25)
+
+
 @pytest.mark.parametrize(("factor", "word"), [(1000, "millimeters"), (100, "centimeters"), (0.001, "kilometers")])
 def test_units_are_told_before_anyone_is_found(scene, factor, word):
     (warning,) = lidarpose.detect(scene[0] * factor).warnings
     assert word in warning
+
+
+def test_a_tilted_scan_is_not_in_other_units(scene):
+    """However tall it is in the frame of its sensor."""
+    x, y = np.meshgrid(np.arange(-45.0, 45, 0.5), np.arange(-15.0, 15, 0.5))
+    road = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -1.5)])
+    street = np.concatenate([scene[0], *[road] * 3]) @ rotation_about("y", np.radians(30.0)).T
+    (warning,) = lidarpose.detect(street).warnings
+    assert "leans by" in warning
 
 
 def test_one_person_is_no_scan_in_kilometers():
@@ -210,6 +245,23 @@ def test_a_map_is_thinned(scene, monkeypatch):
     assert not any("thinned" in warning for warning in whole.warnings) and whole
 
 
+def test_around_a_sensor_that_cannot_stand_at_zero_all_of_a_map_is_searched(scene, fake, monkeypatch):
+    """Whether it is thinned or not, and what is up is told as of an unknown sensor."""
+    points, _ = scene
+    moved, bare = np.array([70.0, 0, 1.5]), np.array([-70.0, 0, 1.5])
+    empty = points[points[:, 2] < -1.45]
+    wide = np.concatenate([points + moved, empty + bare, empty + [0, 0, 1.5]])
+    monkeypatch.setattr(detection, "_MOST_POINTS", len(wide) - 1000)
+    boxes = lidarpose.detect(wide)
+    assert any("no ground below it" in warning for warning in boxes.warnings)
+    assert any("thinned" in warning for warning in boxes.warnings) and len(boxes) >= 4
+    # a single point at zero is no surroundings
+    lidarpose.detect(np.concatenate([wide + [5e5, 5e6, 0], np.zeros((1, 3))]))
+    assert fake.calls[-1]["origin"] is None and len(fake.calls[-1]["points"]) > 1000
+    tilted = points @ rotation_about("y", np.radians(20.0)).T + [5e5, 5e6, 0]
+    assert any("leans by" in warning for warning in lidarpose.detect(tilted).warnings)
+
+
 # ---- the final score
 
 
@@ -227,6 +279,16 @@ def test_the_final_score_is_what_the_header_says():
     np.testing.assert_allclose(
         verification.final_score(rows, header), 0.5 - np.array([0, 0.075 * np.log(3), 0]), atol=1e-12
     )
+
+
+def test_a_detector_that_is_not_calibrated_scores_as_its_network_does(scene, fake, monkeypatch):
+    """As `lidarpose evaluate detector --detector` meets it after an export."""
+    rows = np.column_stack([[-2.0, 0.0, 3.0, np.nan], np.zeros(4), np.full(4, np.log(0.1)), np.zeros((4, 3))])
+    scores = verification.final_score(rows, {})
+    np.testing.assert_allclose(scores, [*(1 / (1 + np.exp(-rows[:3, 0]))), 0])
+    monkeypatch.setattr(fake, "header", {"version": "raw"})
+    searched = detection.find_people(detection.Scan(points=scene[0]), detection.Search(min_score=0.0, detector=fake))
+    assert len(searched.boxes) >= len(PLACES)
 
 
 # ---- background
@@ -289,6 +351,10 @@ def test_boxes_and_crops_are_not_searched(model, file, fake, scene):
     near = scene[0][np.linalg.norm(scene[0][:, :2] - PLACES[0], axis=1) < 1.5]
     np.save("small.npy", near)
     assert lidarpose.predict("small.npy", model=model)[0].box is None and not fake.calls
+    # and options of a search that is not made are told
+    for option in ({"min_score": 0.5}, {"background": file}):
+        (person,) = lidarpose.predict("small.npy", **option, model=model)
+        assert person.box is None and any("find looks for people" in warning for warning in person.warnings)
     assert lidarpose.predict("small.npy", find=True, sensor_origin="unknown", model=model)[0].box is not None
 
 

@@ -79,6 +79,21 @@ def test_a_scan_that_is_turned_or_unlocated_holds_the_same_people(points):
         assert all(nearest(other, *center[:2]) < 0.15 for center in sure[0])
 
 
+def test_a_stray_point_far_away_changes_nothing(points):
+    """Where the sensor is unknown; what is around it is looked at in cells that grow with the extent."""
+    shown = []
+
+    def remembering(arrays):
+        shown.append(arrays["context"].copy())
+        return upright(arrays)
+
+    for stray in ([], [[1e5, 1e5, 0]], [[-3e6, 0, 5.0]]):
+        detections = Detector(remembering).detect(np.concatenate([points, np.reshape(stray, (-1, 3))]), None)
+        assert (detections.logit > 0).sum() == 4
+    np.testing.assert_array_equal(shown[0], shown[1])
+    np.testing.assert_array_equal(shown[0], shown[2])
+
+
 def test_moving_points_alone_are_searched_and_the_others_still_seen(points):
     is_moving = np.hypot(points[:, 0] - 5, points[:, 1]) < 0.3
     detections = Detector(upright).detect(points, ORIGIN, moving=is_moving)

@@ -353,6 +353,7 @@ def test_missed_people_are_drawn(tmp_path, monkeypatch):
         (["detector", "bench"], "expected heldout or nothing as the detector's dataset, got bench: use --scans"),
         (["detector", "--protocol", "dapt"], "--protocol is of networks, got the detector: leave it out"),
         (["detector", "--method", "yolo"], "method"),
+        (["detector", "--limit", "0"], "limit must be a whole number of at least 1, got 0"),
         (["small", "bench", "--range", "20"], "--range is of lidarpose evaluate detector, got the network small"),
         (["small"], "expected a dataset to evaluate on"),
         (["detector", "--scans", "."], "expected labeled scans"),

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lidarpose.errors import InputError, check_int
-from lidarpose.geometry import rotation_from_up
+from lidarpose.geometry import rotation_about, rotation_from_up
 from lidarpose.inference.background import is_static, read_background
 from lidarpose.inference.checks import flat_along_another_axis, scan_unit_warning, unlikely_origin
 from lidarpose.inference.inputs import as_origin, as_points, only_returns
@@ -139,7 +139,7 @@ class Places:
 
 def detect_places(scan: Scan, search: Search) -> Places:
     """The first half of `find_people`, which depends on no other frame."""
-    count = len(scan.points)
+    whole, count = scan, len(scan.points)
     given, notes = _thinned(scan, search)
     scan, warnings = given, [*scan.warnings, *notes]
     if len(scan.points) < MIN_POINTS:
@@ -149,7 +149,7 @@ def detect_places(scan: Scan, search: Search) -> Places:
     # what else looks odd follows from wrong axes or units
     some = slice(None, None, -(-len(level) // _ENOUGH))
     few = replace(scan, points=scan.points[some])
-    if wrong := flat_along_another_axis(few) or scan_unit_warning(level[some], count):
+    if wrong := flat_along_another_axis(few):
         warnings.append(wrong)
     origin = None if scan.origin is None else scan.R_level_input @ scan.origin
     up = estimate_up(_near(level, origin, search), origin)
@@ -159,9 +159,13 @@ def detect_places(scan: Scan, search: Search) -> Places:
         scan = replace(scan, up=up_text(up @ scan.R_level_input))
         level = _leveled(scan)
         origin = None if scan.origin is None else scan.R_level_input @ scan.origin
+    # level: a scan that leans is as tall as one in other units
+    if not wrong and (wrong := scan_unit_warning(level[some], count)):
+        warnings.append(wrong)
     if origin is not None and (warning := unlikely_origin(level, origin)):
-        warnings += [] if wrong else [warning]
-        scan, origin = replace(scan, origin=None), None
+        # from the beginning: of an unknown sensor other points are kept, and what is up is told by others
+        own = whole.warnings if wrong else (*whole.warnings, warning)
+        return detect_places(replace(whole, origin=None, warnings=own), search)
     moving = None
     if search.background is not None:
         moving = ~is_static(scan.points, search.background)
@@ -232,7 +236,7 @@ def _thinned(scan: Scan, search: Search) -> tuple[Scan, list[str]]:
         for start in starts:
             piece = slice(start, start + _CHUNK)
             inside[piece] = np.linalg.norm(points[piece] - scan.origin, axis=1) < reach
-        if not inside.any():
+        if np.count_nonzero(inside) < MIN_POINTS:
             inside[:] = True
     number, notes = np.count_nonzero(inside), []
     if number <= _MOST_POINTS:
@@ -274,13 +278,14 @@ def _in_input(box: Box, scan: Scan, given: Scan) -> Box:
     """A level box as a box of the input, along the axis that `given` says is up. In a frame that leans it is larger, so
     that it still holds the person."""
     R_boxes_level = given.R_boxes_input @ scan.R_level_input.T
-    center, size = R_boxes_level @ box.center, box.size
+    center, size, yaw = R_boxes_level @ box.center, box.size, box.yaw
     if not np.allclose(R_boxes_level, np.eye(3)):
-        c, s = np.cos(box.yaw), np.sin(box.yaw)
-        R_level_own = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-        size = np.abs(R_level_own.T @ R_boxes_level @ R_level_own) @ box.size
+        # the level frame of a tilted sensor is turned about its up axis, too, where the input's is not z
+        forward = R_boxes_level @ [np.cos(box.yaw), np.sin(box.yaw), 0]
+        yaw = float(np.arctan2(forward[1], forward[0]))
+        size = np.abs(rotation_about("z", yaw).T @ R_boxes_level @ rotation_about("z", box.yaw)) @ box.size
     center = given.R_boxes_input.T @ center
-    return rounded(replace(box, center=center, size=size))
+    return rounded(replace(box, center=center, size=size, yaw=yaw))
 
 
 def _is_number(value: object) -> bool:

@@ -73,6 +73,9 @@ def predict(
     )
     scan = read_scan(scan, path, columns)
     find = find or boxes is None and not crop and is_wide(scan)
+    if not find and any(option is not None for option in options):
+        note = f"taken as one person, since under {CROP_SIZE:g} m across, and not searched: find looks for people"
+        scan = replace(scan, warnings=(*scan.warnings, note))
     if sensor_origin is None and (find or boxes is not None):
         scan = replace(scan, origin=np.zeros(3))
     read = time.perf_counter()

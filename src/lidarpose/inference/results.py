@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, cast, overload
 import numpy as np
 
 from lidarpose.errors import counted
-from lidarpose.geometry import UP_AXES, rotation_from_up
+from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
 from lidarpose.io.boxes import people_json
 from lidarpose.io.files import write_atomic
 from lidarpose.sample import PER_JOINT, Box, Pose
@@ -349,11 +349,17 @@ def _upright(person: PersonPose, up: str) -> PersonPose:
 
 
 def _box_around(person: PersonPose) -> Box | None:
-    """The extent of a person's points."""
+    """The extent of a person's points, z up, the way the pose faces."""
+    from lidarpose.viz.person_view import facing
+
     if not person.num_points:
         return None
-    low, high = person.points.min(0), person.points.max(0)
-    return Box(center=(low + high) / 2, size=high - low + 0.1, id=person.id)
+    forward = None if person.pose is None else facing(person.pose)
+    yaw = 0.0 if forward is None else float(np.arctan2(forward[1], forward[0]))
+    R_level_own = rotation_about("z", yaw)
+    own = person.points @ R_level_own
+    low, high = own.min(0), own.max(0)
+    return Box(center=R_level_own @ ((low + high) / 2), size=high - low + 0.1, yaw=yaw, id=person.id)
 
 
 def _label(person: PersonPose) -> str:

@@ -115,8 +115,10 @@ def final_score(features: np.ndarray, header: dict) -> np.ndarray:
     logit = np.full(len(features), float(weights.get("bias", 0.0)))
     for name, values in score_terms(features).items():
         logit += weights.get(name, 0.0) * values
-    logits, probabilities = verification.get("calibration") or header["calibration"]
-    return np.nan_to_num(np.interp(logit, logits, probabilities))
+    calibration = verification.get("calibration") or header.get("calibration")
+    # of a network that is not calibrated yet as it comes
+    probability = 0.5 * (1 + np.tanh(logit / 2)) if calibration is None else np.interp(logit, *calibration)
+    return np.nan_to_num(probability)
 
 
 def score_terms(features: np.ndarray) -> dict[str, np.ndarray]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose._version import __version__
-from lidarpose.errors import check_name
+from lidarpose.errors import check_int, check_name
 from lidarpose.eval.detector.detection_pictures import draw_false, draw_missed
 from lidarpose.eval.detector.detection_scores import Detect, DetectorResult, score_detector
 from lidarpose.eval.detector.labeled_scans import ScanSet, heldout_scans, labeled_scans
@@ -92,6 +92,8 @@ def run_detector(
         limit: so many scans of each set, evenly spread.
     """
     check_name("method", method, METHODS)
+    if limit is not None:
+        check_int("limit", limit, least=1)
     sets = [heldout_scans(limit)] if heldout else []
     sets += [labeled_scans(folder, limit) for folder in folders]
     default = None

@@ -20,6 +20,9 @@ from lidarpose.models.onnx import check_names, open_network
 
 # what lies farther than this beyond the range, m, is left out: a candidate at its end still has its surroundings
 _BEYOND = 6.0
+# of an unknown sensor there is no range: points so far, m, from nearly all others, percents, are stray ones, which
+# would make the cells of all that is looked at larger
+_STRAY, _NEARLY_ALL = 100.0, (0.1, 99.9)
 # a detection's own points lie within this of its axis, m
 _OWN_RADIUS = 0.35
 # detections nearer than this are one person, m: the network moves those of one to the same place
@@ -101,6 +104,9 @@ class Detector:
         if origin is not None and max_range is not None:
             squared = (columns[0] - origin[0]) ** 2 + (columns[1] - origin[1]) ** 2
             rows = np.flatnonzero(squared < (max_range + _BEYOND) ** 2)
+        else:
+            rows = np.flatnonzero(_is_near_others(columns[0]) & _is_near_others(columns[1]))
+        if len(rows) < len(points):
             columns = [values[rows] for values in columns]
         # x after x in memory: every step reads one axis at a time
         points = np.ascontiguousarray(columns).T
@@ -159,6 +165,17 @@ def predicted_boxes(places: np.ndarray, yaw: np.ndarray, outputs: np.ndarray) ->
     centers[:, 1] += np.sin(yaw) * x + np.cos(yaw) * y
     centers[:, 2] += foot + height / 2
     return centers, height
+
+
+def _is_near_others(values: np.ndarray) -> np.ndarray:
+    """Coordinates (n,) m of points -> (n,) bool: False for stray ones."""
+    if not len(values):
+        return np.zeros(0, bool)
+    # enough of them tell
+    some = values[:: -(-len(values) // 20_000)]
+    low = np.percentile(some, _NEARLY_ALL[0], method="higher")
+    high = np.percentile(some, _NEARLY_ALL[1], method="lower")
+    return (values > low - _STRAY) & (values < high + _STRAY)
 
 
 def _sigmoid(logit: np.ndarray) -> np.ndarray:
