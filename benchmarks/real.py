@@ -21,8 +21,8 @@ from lidarpose.inference.predictor import TTA, Predictor
 from lidarpose.inference.results import PersonPose
 from lidarpose.io.files import write_atomic
 from lidarpose.models import DEFAULT
+from lidarpose.sample import facing
 from lidarpose.skeleton import SMPL24
-from lidarpose.viz.person_view import facing
 
 # a limb's half thickness with clothes and the noise of a range, m
 NEAR = 0.15

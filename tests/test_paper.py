@@ -25,11 +25,11 @@ from lidarpose.paper import figures, report, steps
 from lidarpose.paper.report import markdown, mean_pose_error, run_table
 from lidarpose.paper.steps import Step, StepFailed, run_steps
 from lidarpose.paper.tables import REAL, TABLES, Options, _targets, cells, row_key
-from lidarpose.sample import center_of
+from lidarpose.sample import center_of, facing
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24
 from lidarpose.synth.bodies import PoseBank
 from lidarpose.train import loop, run_dir
-from lidarpose.viz.person_view import facing, facing_of
+from lidarpose.viz.person_view import facing_of
 
 _ROWS = ["scratch", "laser-masking"]
 _TABLE = ["paper", "table4", "--people", "64", "--size", "paper-tiny", "--rows", ",".join(_ROWS), "--out"]

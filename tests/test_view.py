@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
-from lidarpose.sample import Box, Pose
+from lidarpose.sample import Box, Pose, facing
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14, Skeleton
 from lidarpose.viz import draw
 from lidarpose.viz.bird_eye import ScanPanel
 from lidarpose.viz.draw import draw_people, shortened
 from lidarpose.viz.html import MAX_POINTS, render_report, write_report
-from lidarpose.viz.person_view import Panel, bone_sides, describe, facing, project, side, thinned, view_directions
+from lidarpose.viz.person_view import Panel, bone_sides, describe, project, side, thinned, view_directions
 
 BLUE, ORANGE = (0x00, 0x72, 0xB2), (0xE0, 0x70, 0x00)
 

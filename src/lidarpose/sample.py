@@ -89,6 +89,27 @@ class Pose:
         return replace(self, joints=self.joints[..., pick, :], skeleton=skeleton, **picked)
 
 
+def facing(pose: Pose | None) -> np.ndarray | None:
+    """Where a person looks, on the ground: (3,) of length 1 with z = 0.
+
+    Taken from the left-right axis of hips and shoulders, by name. None without a pose, or where the axis is unknown
+    or stands upright, as of somebody who lies on the side.
+    """
+    if pose is None:
+        return None
+    names = pose.skeleton.joints
+    axis = np.zeros(3)
+    for joint in ("hip", "shoulder"):
+        if f"left_{joint}" in names and f"right_{joint}" in names:
+            across = pose.joints[names.index(f"left_{joint}")] - pose.joints[names.index(f"right_{joint}")]
+            if np.isfinite(across).all():
+                axis = axis + across
+    length = np.hypot(axis[0], axis[1])
+    if length < 0.3 * np.linalg.norm(axis) or length < 0.02:
+        return None
+    return np.array([axis[1], -axis[0], 0.0]) / length
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Box:
     """A person's box: center (3,) m, size (length, width, height) m, yaw rad about z. It may only crop.

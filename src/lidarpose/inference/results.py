@@ -12,7 +12,7 @@ from lidarpose.errors import counted
 from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
 from lidarpose.io.boxes import people_json
 from lidarpose.io.files import write_atomic
-from lidarpose.sample import PER_JOINT, Box, Pose
+from lidarpose.sample import PER_JOINT, Box, Pose, facing
 from lidarpose.skeleton import Skeleton
 
 if TYPE_CHECKING:
@@ -350,8 +350,6 @@ def _upright(person: PersonPose, up: str) -> PersonPose:
 
 def _box_around(person: PersonPose) -> Box | None:
     """The extent of a person's points, z up, the way the pose faces."""
-    from lidarpose.viz.person_view import facing
-
     if not person.num_points:
         return None
     forward = None if person.pose is None else facing(person.pose)

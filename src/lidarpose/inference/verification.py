@@ -17,8 +17,7 @@ from lidarpose.inference.tta import TTATransform, apply
 from lidarpose.models import DEFAULT, weights_path
 from lidarpose.models.decode import decoder
 from lidarpose.models.detector.detector import Detections
-from lidarpose.sample import MIN_POINTS, Box, Pose
-from lidarpose.viz.person_view import facing
+from lidarpose.sample import MIN_POINTS, Box, Pose, facing
 
 # what poses detections
 VERIFIER = DEFAULT

@@ -13,13 +13,12 @@ from lidarpose.eval.predictions import read_poses
 from lidarpose.io.files import write_atomic
 from lidarpose.paper.steps import POSES, Step, is_done
 from lidarpose.paper.tables import Cell
-from lidarpose.sample import Pose
+from lidarpose.sample import Pose, facing
 from lidarpose.skeleton import SMPL24
 from lidarpose.synth.bodies import PoseBank
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
 from lidarpose.viz.draw import Panel, draw_people
-from lidarpose.viz.person_view import facing
 
 # people side by side: those of the largest errors, averaged over the methods
 HARDEST = 6

@@ -7,7 +7,7 @@ import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
-from lidarpose.sample import MIN_POINTS, Box, Pose
+from lidarpose.sample import MIN_POINTS, Box, Pose, facing
 from lidarpose.skeleton import Skeleton
 
 
@@ -49,27 +49,6 @@ class Panel:
                     f"Panel.{name} must hold one person, joints ({len(pose.skeleton)}, 3), got {pose.joints.shape}: "
                     "draw people one by one"
                 )
-
-
-def facing(pose: Pose | None) -> np.ndarray | None:
-    """Where a person looks, on the ground: (3,) of length 1 with z = 0.
-
-    Taken from the left-right axis of hips and shoulders, by name. None without a pose, or where the axis is unknown
-    or stands upright, as of somebody who lies on the side.
-    """
-    if pose is None:
-        return None
-    names = pose.skeleton.joints
-    axis = np.zeros(3)
-    for joint in ("hip", "shoulder"):
-        if f"left_{joint}" in names and f"right_{joint}" in names:
-            across = pose.joints[names.index(f"left_{joint}")] - pose.joints[names.index(f"right_{joint}")]
-            if np.isfinite(across).all():
-                axis = axis + across
-    length = np.hypot(axis[0], axis[1])
-    if length < 0.3 * np.linalg.norm(axis) or length < 0.02:
-        return None
-    return np.array([axis[1], -axis[0], 0.0]) / length
 
 
 def facing_of(person: Panel) -> np.ndarray | None:
