@@ -149,7 +149,11 @@ def test_a_tilted_sensor_is_told(model, scene):
     points, joints = scene
     tilt = rotation_about("y", np.radians(20.0))
     poses = model.predict(points @ tilt.T, find=True)
-    assert any("leans by 20 degrees" in warning or "leans by 19" in warning for warning in poses.warnings)
+    (warning,) = (warning for warning in poses.warnings if "leans by" in warning)
+    assert "leans by 20 degrees" in warning or "leans by 19" in warning
+    # what it says to give is what was found
+    told = np.array([float(value) for value in warning.rpartition("up=")[2].split(",")])
+    assert np.linalg.norm(told) == pytest.approx(1, abs=2e-3) and told @ tilt[:, 2] > np.cos(np.radians(2))
     assert sum(found_at(poses.to_numpy()[:, 0] @ tilt, joints)) >= 4
 
 
@@ -316,6 +320,8 @@ def test_a_background_is_not_searched(scene, tmp_path, fake):
     assert len(poses) == 0
     other = lidarpose.detect(points, background=static + [0, 0, 9.0])
     assert any("of this sensor" in warning for warning in other.warnings) and len(other) == len(PLACES)
+    itself = lidarpose.detect(points, background=points)
+    assert len(itself) == 0 and "learned from this scan alone?" in itself.warnings[0]
 
 
 # ---- mistakes, and the command line
@@ -377,7 +383,8 @@ def test_the_commands(file, capsys, fake, tmp_path):
     np.save("static.npy", np.load(file))
     capsys.readouterr()
     assert main(["predict", file, *fast, "--background", "static.npy", "--picture", "--sensor-origin", "0,0,0.1"]) == 0
-    line = capsys.readouterr().err.strip()
+    warning, line = capsys.readouterr().err.strip().splitlines()
+    assert "learned from this scan alone?" in warning
     assert line.startswith(
         "nobody found -> sweep.poses.json and sweep.poses.png; if somebody is there: points need meters"
     )

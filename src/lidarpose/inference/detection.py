@@ -155,7 +155,11 @@ def detect_places(scan: Scan, search: Search) -> Places:
     up = estimate_up(_near(level, origin, search), origin)
     if up is not None:
         degrees = np.degrees(np.arccos(np.clip(up[2] / np.linalg.norm(up), -1, 1)))
-        warnings.append(f"the ground leans by {degrees:.0f} degrees, which is taken for a tilt of the sensor (up)")
+        direction = np.round(up @ scan.R_level_input, 3)
+        warnings.append(
+            f"the ground leans by {degrees:.0f} degrees, which is taken for a tilt of the sensor: say it by "
+            f"up={','.join(f'{value:g}' for value in direction)}"
+        )
         scan = replace(scan, up=up_text(up @ scan.R_level_input))
         level = _leveled(scan)
         origin = None if scan.origin is None else scan.R_level_input @ scan.origin
@@ -172,6 +176,11 @@ def detect_places(scan: Scan, search: Search) -> Places:
         if (share := 1 - moving.mean()) < _LEAST_STATIC:
             warnings.append(
                 f"only {share:.0%} of the points lie on the background: is it of this sensor, in this frame?"
+            )
+        elif not moving.any():
+            warnings.append(
+                "all points lie on the background, so nobody is looked for: was it learned from this scan alone? "
+                "record for ten seconds or more"
             )
     detector = search.detector or _detector()
     detections = detector.detect(level, origin, max_range=search.max_range, limit=MOST_POSED, moving=moving)

@@ -155,6 +155,8 @@ class Generator:
         """Clip `index` of `seed`: one person who moves, `frames` samples at 10 Hz; things and sensor stay where they
         are. Frames in which nothing of the person is seen have samples without points. Samples have what networks of
         clips need: the pose's rotations, the pelvis, and the two clouds about the person."""
+        if self.config.recorded:
+            raise InputError("clips have no recorded places: set recorded=0")
         frames = check_int("a clip's frames", frames, least=1)
         seed, index = check_int("seed", seed, least=0), check_int("index", index, least=0)
         rng = np.random.default_rng([seed, RandomStream.CLIP, index])

@@ -25,6 +25,7 @@ from lidarpose.models.dapt.dapt_config import DaptConfig
 from lidarpose.models.detector.detector import detector_path
 from lidarpose.models.detector.detector_config import DetectorConfig
 from lidarpose.skeleton import Skeleton, skeleton
+from lidarpose.synth.scene import scene_config
 from lidarpose.train.augment import Augmentation, ClipExample, Example, augmentation, augmented
 from lidarpose.train.data_loader import BATCHES, ClipSource, MixedSource, Source, StoredSource, SyntheticSource
 from lidarpose.train.detector.candidate_source import CandidateSource, validation_scans
@@ -167,6 +168,8 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
     is_clip = isinstance(config, LidarcapConfig)
     if is_clip and not recipe.shards:
         raise InputError(f"{config.name} learns from clips: name a folder of lidarpose synth --clips by --shards")
+    if is_clip and scene_config(recipe.scene).changed(recipe.set).recorded:
+        raise InputError(f"{config.name} is validated on clips, which have no recorded places: leave recorded=1 away")
     if not recipe.shards:
         return setup
     for folder in recipe.shards:
