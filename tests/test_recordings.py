@@ -19,6 +19,7 @@ from lidarpose.recording.frame_boxes import FrameBoxes
 from lidarpose.recording.predict_recording import FramePredictor
 from lidarpose.synth.bodies import draw_bodies
 from lidarpose.synth.environment.mesh import Mesh, quad, union
+from lidarpose.viz.bird_eye import draw_scans
 from lidarpose.viz.draw import draw_people
 
 FRAMES, DAMAGED = 7, 4
@@ -351,13 +352,20 @@ def test_the_command_line(drive, folder, tmp_path, monkeypatch, capsys):
 
 
 def test_of_a_recording_of_one_frame_the_people_are_drawn(drive, tmp_path, monkeypatch):
-    drawn = []
+    drawn, above = [], []
     monkeypatch.setattr(picture, "draw_people", lambda panels: drawn.extend(panels) or draw_people(panels))
+    monkeypatch.setattr(
+        picture, "draw_scans", lambda panels, **words: above.extend(panels) or draw_scans(panels, **words)
+    )
     command = ["predict", str(drive), "--track", "--picture", "--out", str(tmp_path / "a.jsonl")]
     assert main([*command, "--end", "0.1"]) == 0 and not drawn
     assert main([*command, "--end", "0.05"]) == 0
     (line,) = (json.loads(text) for text in open(tmp_path / "a.jsonl"))
     assert len(drawn) == len(line["people"]) == 2
+    # from above with the numbers of their cards; of two frames only their ways
+    assert [len(panel.tracks) for panel in above] == [2, 2] and above[0].poses is None
+    assert [box.id for box in above[1].boxes] == [person["id"] for person in line["people"]]
+    np.testing.assert_allclose(above[1].poses.joints, [person["joints"] for person in line["people"]], atol=1e-9)
     for panel, person in zip(drawn, line["people"], strict=True):
         assert panel.label == f"{person['id']} · score {person['score']:.2f}"
         np.testing.assert_allclose(panel.pose.joints, person["joints"], atol=1e-9)

@@ -65,16 +65,24 @@ class WaysPicture:
         if not boxes and None in ways:
             people = counted(len(ways[None]), "person", "people")
         points = self._points(source)
+        is_single = len(self._frames) == 1
+        poses = None
+        if is_single:
+            # as of a scan: the numbers are those of the cards
+            boxes = [person["box"] for person in self._people if person["box"] is not None]
+            joints = [person["joints"] for person in self._people if person["joints"] is not None]
+            poses = Pose(joints=np.stack(joints), skeleton=skeleton) if joints else None
         panel = ScanPanel(
             points=points,
             boxes=boxes,
+            poses=poses,
             tracks=[way for id, way in ways.items() if id is not None],
-            places=ways.get(None),
+            places=None if is_single else ways.get(None),
             label=f"{people} in {counted(len(self._frames), 'frame')}",
             sensor=self._to_fixed[-1][:2, 3].tolist() if self._to_fixed else None,
         )
         above = draw_scans([panel], title=title)
-        cards = list(self._cards(points, skeleton)) if len(self._frames) == 1 else []
+        cards = list(self._cards(points, skeleton)) if is_single else []
         return stack_pictures([above, draw_people(cards)]) if cards else above
 
     def _cards(self, points: np.ndarray, skeleton: Skeleton) -> Iterator[Panel]:
