@@ -122,7 +122,7 @@ VARIANTS = {
     "local refinement": Variant(
         "losses", "the same, and votes refined by the 16 nearest voxels", with_local_refinement, objective=PointJoints
     ),
-    "hardest people": Variant("losses", "the worst quarter of a batch counts twice", objective=HardestPeople),
+    "hardest people": Variant("losses", "the worst quarter of a batch counts five times", objective=HardestPeople),
     "hard kinds": Variant("losses", "hard activities drawn more often", kinds=True),
     "mirrored pairs": Variant(
         "losses", "half the people, each with their mirror image, which must agree", objective=MirroredPairs
