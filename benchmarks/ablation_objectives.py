@@ -32,7 +32,7 @@ WIDEST, FAR = 2.0, 1e3
 LABEL, OFFSET = 0.25, 2.0
 # weight of the distance between a person's pose and that of their mirror image
 CONSISTENCY = 2.0
-# of a batch, the people who count twice
+# share of a batch whose loss is added to that of all
 HARDEST = 0.25
 # terms on joints, which a teacher's joints may stand in for
 _OF_JOINTS = ("joints", "level", "vote", "heatmap")
@@ -132,7 +132,8 @@ class PointJoints(VariantObjective):
 
 @dataclass(frozen=True, kw_only=True)
 class HardestPeople(VariantObjective):
-    """Half of the loss is that of the quarter of a batch with the largest errors."""
+    """The mean of the loss of a batch and of that of the quarter of its people with the largest errors, each of whom
+    weighs five times as much as another."""
 
     def terms(
         self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone

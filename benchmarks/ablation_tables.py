@@ -27,7 +27,7 @@ FIGURES = {
     "company": ("condition", "company", "mpjpe"),
     "crop": ("condition", "crop", "mpjpe"),
     "occluded": ("condition", "occluded", "mpjpe"),
-    "turned round": ("points", None, "turned_round"),
+    "turned round": ("points", "100 and more", "turned_round"),
     "PA": ("all", "all", "pa_mpjpe"),
 }
 _SHOWN = ("plain", "clean", "cluttered", "company", "occluded", "turned round")

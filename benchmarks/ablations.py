@@ -122,7 +122,7 @@ VARIANTS = {
     "local refinement": Variant(
         "losses", "the same, and votes refined by the 16 nearest voxels", with_local_refinement, objective=PointJoints
     ),
-    "hardest people": Variant("losses", "the worst quarter of a batch counts twice", objective=HardestPeople),
+    "hardest people": Variant("losses", "the worst quarter of a batch counts five times", objective=HardestPeople),
     "hard kinds": Variant("losses", "hard activities drawn more often", kinds=True),
     "mirrored pairs": Variant(
         "losses", "half the people, each with their mirror image, which must agree", objective=MirroredPairs
@@ -211,11 +211,19 @@ def job(variant: Variant, settings: Pretrain) -> TrainSetup:
     if variant.kinds:
         # of twice as many people
         values["easy"] *= 2
+    # the pairs or the teacher's arrays of an objective are of training alone
+    plain = VariantObjective(config=config, made=variant.network)
     network = objective.network
     if settings.init:
         network = partial(expand_weights, load_checkpoint(settings.init)[0], config)
     source = HardKindsSource if variant.kinds else SceneSource
-    return replace(usual, objective=objective, source=source(config=variant.scene, **values), network=network)
+    return replace(
+        usual,
+        objective=objective,
+        source=source(config=variant.scene, **values),
+        network=network,
+        validate=lambda _, *given: usual.validate(plain, *given),
+    )
 
 
 def run(options: argparse.Namespace, name: str, seed: int, folder: Path) -> dict:

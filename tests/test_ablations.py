@@ -82,6 +82,17 @@ def test_mirrored_pairs_ask_for_the_mirror_image_of_the_pose(objectives, people)
     assert found == pytest.approx(0.1 * objectives.CONSISTENCY, rel=1e-4)
 
 
+def test_mirrored_pairs_are_validated_on_the_people_as_they_are(ablations, people):
+    """Of whom `collate` of training leaves out every other one."""
+    settings = recipe(Pretrain, people=64, workers=0, pictures=0)
+    mirrored, base = (ablations.job(ablations.VARIANTS[name], settings) for name in ("mirrored pairs", "base"))
+    torch.manual_seed(0)
+    network = base.network().eval()
+    # an odd number of them too
+    found, expected = (job.validate(job.objective, network, people[:7], 4) for job in (mirrored, base))
+    assert found[0] == expected[0] and np.array_equal(found[1], expected[1])
+
+
 def test_the_worst_people_weigh_more(objectives, people):
     config = preset("tiny")
     plain = terms_of(objectives.VariantObjective(config=config), people)

@@ -18,6 +18,7 @@ from lidarpose.synth.place import draw_place
 from lidarpose.synth.scene import NoiseConfig, scene_config
 from lidarpose.synth.simulate import ScanConditions, Scene, simulate_still
 from lidarpose.synth.views import with_views
+from lidarpose.train import data_loader
 from lidarpose.train.augment import people_in
 from lidarpose.train.data_loader import SyntheticSource
 from lidarpose.train.recipes import Finetune, Pretrain
@@ -60,6 +61,24 @@ def test_objects_are_seen_by_as_many_sensors_and_frames_as_people(name):
     same, other = draw_object(WILD, 1, 0)
     assert not sample.conditions and kind == other
     np.testing.assert_array_equal(sample.points, same.points)
+
+
+def test_in_training_things_are_seen_in_several_scans_as_often_as_people(monkeypatch):
+    """Not always, while people are still easy: several scans would tell that nobody is there."""
+    merged = WILD.changed(("merged=1",))
+    easy, _ = draw_object(merged, 1, 0, hard=0.0)
+    np.testing.assert_array_equal(easy.points, draw_object(WILD, 1, 0)[0].points)
+    assert not easy.conditions and draw_object(merged, 1, 0, hard=1.0)[0].conditions == ("merged",)
+    drawn = []
+    monkeypatch.setattr(
+        data_loader, "draw_object", lambda *args, hard: drawn.append(hard) or draw_object(*args, hard=hard)
+    )
+    for index in (0, 10, 40):
+        SyntheticSource(scene="wild", seed=3, objects=1.0, easy=20.0, set=("sparse=0.5",)).example(index)
+    assert drawn[0] == 0 and 0 < drawn[1] < 0.5 and 0 < drawn[2] < 1
+    # where nothing varies, what is drawn for a thing is as before
+    SyntheticSource(scene="wild", seed=3, objects=1.0, easy=20.0).example(10)
+    assert drawn[3] is None
 
 
 @pytest.mark.parametrize(("frames", "sensors"), [(5, ("os1-64",)), (1, ("os1-64", "hdl-32e", "os0-128"))])

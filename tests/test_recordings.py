@@ -351,6 +351,17 @@ def test_the_command_line(drive, folder, tmp_path, monkeypatch, capsys):
     assert [line["frame"] for line in lines] == [0, 1] and lines[1]["people"][0]["track"] == 0
 
 
+def test_warnings_that_differ_in_numbers_and_their_signs_are_one():
+    """As of a tilted sensor, whose direction jitters about an axis."""
+    summary = output.Summary()
+    for up in ("-0.342,0.003,0.94", "-0.341,-0.002,0.94", "-0.342,0,0.94", "0.342,0.003,-0.94"):
+        summary.add({"people": [], "error": None, "warnings": [f"the ground leans by 20 degrees: say it by up={up}"]})
+    (line,) = summary.warning_lines(8)
+    assert line.startswith("4 frames: ") and line.endswith("up=-0.342,0.003,0.94")
+    summary.add({"people": [], "error": None, "warnings": ["under 5 points"]})
+    assert len(summary.warning_lines(8)) == 2
+
+
 def test_of_a_recording_of_one_frame_the_people_are_drawn(drive, tmp_path, monkeypatch):
     drawn, above = [], []
     monkeypatch.setattr(picture, "draw_people", lambda panels: drawn.extend(panels) or draw_people(panels))

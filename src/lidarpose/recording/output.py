@@ -121,7 +121,7 @@ class Summary:
             self.first_error = self.first_error or f"frame {line['frame']} ({line['id']}): {line['error']}"
         kinds = {}
         for text in (text for person in (line, *line["people"]) for text in person["warnings"]):
-            kinds[re.sub(r"[\d.,]+", "0", text)] = text
+            kinds[re.sub(r"(-?[\d.,]+)+", "0", text)] = text
         self.warnings = kinds | self.warnings
         self.warned.update(kinds.keys())
 

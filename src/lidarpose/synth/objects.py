@@ -33,12 +33,16 @@ _CLUTTER, _MOST_CLUTTER = 0.05, 200
 _REACH = 1.0
 
 
-def draw_object(config: SceneConfig, seed: int, index: int, *, left_out: bool = False) -> tuple[Sample, str]:
+def draw_object(
+    config: SceneConfig, seed: int, index: int, *, left_out: bool = False, hard: float | None = None
+) -> tuple[Sample, str]:
     """Object `index` of `seed`, seen as the scene's people are: by several sensors or frames where they are, too.
 
     Args:
         config: scenes: sensors, distances, surroundings, noise.
         left_out: a thing of the kinds that training never sees, or else of the others.
+        hard: the difficulty in [0, 1] at which the ways of scanning are drawn, as of `Generator.person`; None: the
+            scene's. All else is as difficult as the scene.
 
     Returns:
         The sample (level frame at the sensor, parts 0, no pose) and the kind of thing, a name of `THINGS` or "clutter".
@@ -51,7 +55,8 @@ def draw_object(config: SceneConfig, seed: int, index: int, *, left_out: bool = 
     acquisition = SINGLE_SCAN
     if config.varied:
         draws = np.random.default_rng([seed, RandomStream.OBJECT_ACQUISITION, index]).random(ACQUISITION_DRAWS)
-        acquisition = draw_acquisition(replace(config, crowded=0.0), draws)
+        eased = config if hard is None else config.eased(hard)
+        acquisition = draw_acquisition(replace(eased, crowded=0.0), draws)
     weights = {name: thing.outdoors + thing.indoors for name, thing in THINGS.items() if thing.left_out is left_out}
     share = np.array(list(weights.values())) / sum(weights.values())
     for attempt in range(_TRIES):

@@ -103,15 +103,21 @@ class SyntheticSource:
 
     def example(self, index: int) -> Example:
         rng = np.random.default_rng([self.seed, RandomStream.SYNTHETIC_AUGMENTATION, index])
+        scene = self._generator.config
         if self.objects and rng.random() < self.objects:
-            thing, _ = draw_object(self._generator.config, self.seed, index)
+            # several scans are as frequent as of people, of whom they depend on the difficulty
+            hard = self._difficulty(index, rng) if scene.varied else None
+            thing, _ = draw_object(scene, self.seed, index, hard=hard)
             return object_example(thing, rng, refined=self.refined)
-        hard = min(index / self.easy, 1.0) if self.easy else 1.0
-        if self.scene not in _OF_ONE_DIFFICULTY:
-            hard *= np.sqrt(rng.random())
+        hard = self._difficulty(index, rng)
         sample = self._generator.person(self.seed, index, hard=hard).sample
         shown = example(disturbed(sample, strays=self.strays, noise=self.noise, rng=rng), rng, refined=self.refined)
         return replace(shown, person=people_in(sample)) if self.objects else shown
+
+    def _difficulty(self, index: int, rng: np.random.Generator) -> float:
+        """Of example `index`, in [0, 1]."""
+        hard = min(index / self.easy, 1.0) if self.easy else 1.0
+        return hard if self.scene in _OF_ONE_DIFFICULTY else hard * np.sqrt(rng.random())
 
     def clip(self, index: int, *, trans_center: bool) -> ClipExample:
         """A clip of somebody as difficult as the scene is."""
