@@ -66,9 +66,10 @@ class LocalVoteHead(VoteHead):
         self.near_anchor = nn.Linear(channels, voxel_channels)
         self.near_mix = nn.Sequential(nn.SiLU(), nn.Linear(voxel_channels, voxel_channels), nn.SiLU())
         self.near_score = nn.Linear(voxel_channels, 1)
-        self.near_offset = nn.Linear(voxel_channels, 3)
-        nn.init.zeros_(self.near_offset.weight)
-        nn.init.zeros_(self.near_offset.bias)
+        self.near_offset, self.near_feature = nn.Linear(voxel_channels, 3), nn.Linear(voxel_channels, voxel_channels)
+        for layer in (self.near_offset, self.near_feature):
+            nn.init.zeros_(layer.weight)
+            nn.init.zeros_(layer.bias)
 
     def forward(self, anchors: Tensor, voxels: Tensor, position: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
         vote, features = super().forward(anchors, voxels, position, bias)
@@ -83,7 +84,7 @@ class LocalVoteHead(VoteHead):
         hidden = self.near_mix(voxel + self.near_place(place) + self.near_anchor(anchors)[:, :, None])
         score = self.near_score(hidden).squeeze(-1).masked_fill(distance > FAR, -1e4)
         pooled = (score.softmax(-1)[..., None] * hidden).sum(-2)
-        return vote + self.near_offset(pooled), features + pooled
+        return vote + self.near_offset(pooled), features + self.near_feature(pooled)
 
 
 def with_point_joints(config: NetworkConfig) -> PoseNet:
@@ -100,6 +101,18 @@ def with_local_refinement(config: NetworkConfig) -> PoseNet:
     fine, mid, _ = config.channels
     network.vote = LocalVoteHead(mid, fine, len(network.skeleton))
     return network
+
+
+@torch.no_grad()
+def grown(network: PoseNet, made: Callable[[NetworkConfig], PoseNet]) -> PoseNet:
+    """A network of one of the two kinds above that answers as a trained one does; what is new is random."""
+    larger = made(network.config)
+    state = larger.state_dict()
+    for name, value in network.state_dict().items():
+        # of each voxel's outputs the parts come first
+        state[name][: len(value)] = value
+    larger.load_state_dict(state)
+    return larger.train()
 
 
 @dataclass(frozen=True, kw_only=True)

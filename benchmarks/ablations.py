@@ -31,6 +31,7 @@ from ablation_objectives import (
     PointJoints,
     Taught,
     VariantObjective,
+    grown,
     with_local_refinement,
     with_point_joints,
 )
@@ -190,7 +191,8 @@ def _remembered(source: SceneSource) -> dict[int, Example]:
 
 def keeps_network(variant: Variant) -> bool:
     """Whether trained weights of the usual network, perhaps grown, are such a one's too."""
-    return variant.network is PoseNet and not set(variant.config) - {"blocks", "channels"}
+    is_usual = variant.network in (PoseNet, with_point_joints, with_local_refinement)
+    return is_usual and not set(variant.config) - {"blocks", "channels"}
 
 
 def configuration(variant: Variant, init: str) -> NetworkConfig:
@@ -215,7 +217,10 @@ def job(variant: Variant, settings: Pretrain) -> TrainSetup:
     plain = VariantObjective(config=config, made=variant.network)
     network = objective.network
     if settings.init:
-        network = partial(expand_weights, load_checkpoint(settings.init)[0], config)
+        trained = load_checkpoint(settings.init)[0]
+        network = partial(expand_weights, trained, config)
+        if variant.network is not PoseNet:
+            network = partial(grown, trained, variant.network)
     source = HardKindsSource if variant.kinds else SceneSource
     return replace(
         usual,

@@ -131,6 +131,17 @@ def test_local_refinement_begins_as_the_votes_alone(objectives, people):
     assert torch.equal(refined, seen["vote"])
 
 
+def test_local_refinement_goes_on_from_trained_weights(objectives, people):
+    trained = objectives.load_checkpoint(objectives.bundled_path("tiny"))[0]
+    larger = objectives.grown(trained, objectives.with_local_refinement).eval()
+    objective = objectives.VariantObjective(config=trained.config)
+    batch = objectives.Batch.from_arrays(objective.collate(people))
+    with torch.no_grad():
+        before, after = trained(batch), larger(batch)
+    assert torch.equal(before.joints(), after.joints()) and torch.equal(before.confidence, after.confidence)
+    assert torch.equal(before.part, after.part[..., : trained.config.parts])
+
+
 def test_hard_activities_come_more_often_than_they_are_drawn(ablations):
     settings = recipe(Pretrain, people=1024, seed=3, workers=0, pictures=0)
     job = ablations.job(ablations.VARIANTS["hard kinds"], settings)

@@ -62,10 +62,12 @@ class WaysPicture:
             if id is not None
         ]
         people = counted(len(boxes), "track")
-        if not boxes and None in ways:
+        is_single = len(self._frames) == 1
+        if is_single:
+            people = counted(len(self._people), "person", "people")
+        elif not boxes and None in ways:
             people = counted(len(ways[None]), "person", "people")
         points = self._points(source)
-        is_single = len(self._frames) == 1
         poses = None
         if is_single:
             # as of a scan: the numbers are those of the cards
