@@ -118,10 +118,13 @@ VARIANTS = {
     "deeper": Variant("size", "2 + 3 + 2 blocks instead of 1 + 1 + 1", config={"blocks": (2, 3, 2)}),
     # worth more than people?
     "point joints": Variant(
-        "losses", "every voxel says which joint is nearest, and where", with_point_joints, objective=PointJoints
+        "losses", "every voxel says which joint is nearest to it, and where", with_point_joints, objective=PointJoints
     ),
     "local refinement": Variant(
-        "losses", "the same, and votes refined by the 16 nearest voxels", with_local_refinement, objective=PointJoints
+        "losses",
+        "local refinement: besides, votes are moved by the 16 nearest voxels",
+        with_local_refinement,
+        objective=PointJoints,
     ),
     "hardest people": Variant("losses", "the worst quarter of a batch counts five times", objective=HardestPeople),
     "hard kinds": Variant("losses", "hard activities drawn more often", kinds=True),
