@@ -36,6 +36,8 @@ CONSISTENCY = 2.0
 HARDEST = 0.25
 # terms on joints, which a teacher's joints may stand in for
 _OF_JOINTS = ("joints", "level", "vote", "heatmap")
+# prefix of the arrays of mirror images
+_IMAGE = "image."
 _FLIP = list(BODY26.flip)
 _ACROSS = np.array([1, -1, 1], np.float32)
 
@@ -188,7 +190,7 @@ class MirroredPairs(VariantObjective):
     ) -> dict[str, Tensor]:
         outputs, targets = network(Batch.from_arrays(arrays, device)), Targets.from_arrays(arrays, device)
         straight, image = outputs.joints().float().chunk(2)
-        image = image[:, _FLIP] * torch.as_tensor(_ACROSS, device=image.device)
+        image = mirrored_joints(image)
         known = targets.known.float().chunk(2)[0]
         apart = ((straight - image).norm(dim=-1) * known).sum() / at_least_one(share(known.sum()))
         return losses(outputs, targets, share=share) | {"consistency": CONSISTENCY * apart}
@@ -204,6 +206,11 @@ def mirrored(example: Example) -> Example:
         visible=example.visible[_FLIP],
         view=example.view * np.array([1, -1, 1, 1, 1], np.float32),
     )
+
+
+def mirrored_joints(joints: Tensor) -> Tensor:
+    """joints (B, J, 3) m across the same plane."""
+    return joints[:, _FLIP] * torch.as_tensor(_ACROSS, device=joints.device)
 
 
 # ---- a teacher
@@ -230,16 +237,12 @@ class Taught(VariantObjective):
         image = {name.removeprefix(_IMAGE): value for name, value in arrays.items() if name.startswith(_IMAGE)}
         batch = Batch.from_arrays(arrays, device)
         with torch.no_grad():
-            other = teacher(Batch.from_arrays(image, device)).joints().float()[:, _FLIP]
-            taught = (teacher(batch).joints().float() + other * torch.as_tensor(_ACROSS, device=device)) / 2
+            looks = teacher(batch).joints(), mirrored_joints(teacher(Batch.from_arrays(image, device)).joints())
+            taught = (looks[0].float() + looks[1].float()) / 2
         outputs: Outputs = network(batch)
         terms = losses(outputs, targets, share=share)
         copied = losses(outputs, replace(targets, joints=taught), share=share)
         return terms | {name: (terms[name] + copied[name]) / 2 for name in _OF_JOINTS if name in terms}
-
-
-# prefix of the arrays of mirror images
-_IMAGE = "image."
 
 
 @lru_cache(maxsize=1)

@@ -94,6 +94,11 @@ def _interval(line: MetricRow) -> str:
     return "" if line.low is None else f"[{line.low:.1f}, {line.high:.1f}]"
 
 
+def _cell(line: MetricRow) -> str:
+    """The value, and its interval where there is one."""
+    return f"{line.value:.1f} {_interval(line)}".rstrip()
+
+
 def headline(*models: str) -> str:
     """The bundled models side by side."""
     wanted = {
@@ -113,7 +118,7 @@ def headline(*models: str) -> str:
         for model in models:
             lines = (x for x in own_lines(_scored(model).results[0]) if x.figure == figure)
             line = next(x for x in lines if of in (x.group, x.of))
-            cells.append(f"{line.value:.1f} {_interval(line)}".rstrip())
+            cells.append(_cell(line))
         rows.append((name, *cells))
     return table(("lidarpose-bench", *(f"`{model}`" for model in models)), rows)
 
@@ -166,9 +171,7 @@ def second_bench(group: str) -> str:
     lines.sort(key=lambda line: (line.group != "all", line.value))
     rows = []
     for line in lines:
-        cells = [
-            f"{(own := score[line.group, line.of]).value:.1f} {_interval(own)}".rstrip() for score in scores.values()
-        ]
+        cells = [_cell(score[line.group, line.of]) for score in scores.values()]
         rows.append((changed.WORDS.get(line.of, line.of), *cells, f"{line.people:,}"))
     return table((group, *(f"{name}, mm" for name in scores), "people"), rows)
 

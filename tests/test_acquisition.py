@@ -20,7 +20,7 @@ from lidarpose.synth.noise import box_of_two
 from lidarpose.synth.place import draw_place
 from lidarpose.synth.scene import SCENES
 from lidarpose.synth.simulate import simulate
-from lidarpose.synth.views import _earlier_views as earlier_views
+from lidarpose.synth.views import with_views
 from lidarpose.train.augment import Augmentation, augmented, disturbed
 
 SEED = 11
@@ -208,7 +208,8 @@ def test_a_sensor_that_drives_does_not_come_through_the_person():
     (bodies,) = walkers(1)
     scene = drawn(CLEAN, Acquisition(sensors=("os1-64",), frames=5, speed=15.0), bodies, MOST_FRAMES - 1)
     for feet in ([-3.0, 0.2, -1.0], [3.0, 0.2, -1.0], [-3.0, 2.0, -1.0]):
-        views = earlier_views(replace(scene, place=replace(scene.place, feet=np.array(feet))))
+        moved = replace(scene, place=replace(scene.place, feet=np.array(feet)))
+        views = with_views(moved, CLEAN, 1.8, 0.5, 1.0, np.random.default_rng(0)).views
         assert min(view.scene.place.distance for view in views) > 1.5
 
 

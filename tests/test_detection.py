@@ -152,8 +152,8 @@ def test_a_tilted_sensor_is_told(model, scene):
     (warning,) = (warning for warning in poses.warnings if "leans by" in warning)
     assert "leans by 20 degrees" in warning or "leans by 19" in warning
     # what it says to give is what was found
-    told = np.array([float(value) for value in warning.rpartition("up=")[2].split(",")])
-    assert np.linalg.norm(told) == pytest.approx(1, abs=2e-3) and told @ tilt[:, 2] > np.cos(np.radians(2))
+    suggested = np.array([float(value) for value in warning.rpartition("up=")[2].split(",")])
+    assert np.linalg.norm(suggested) == pytest.approx(1, abs=2e-3) and suggested @ tilt[:, 2] > np.cos(np.radians(2))
     assert sum(found_at(poses.to_numpy()[:, 0] @ tilt, joints)) >= 4
 
 

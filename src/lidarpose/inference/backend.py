@@ -18,7 +18,7 @@ from lidarpose.errors import InputError
 from lidarpose.io.files import content_digest, file_error
 from lidarpose.models.checkpoint import Header, read_header
 from lidarpose.models.config import BIN, NetworkConfig
-from lidarpose.models.decode import Decoder, out_of_range
+from lidarpose.models.decode import Decoder, out_of_range, sigmoid
 from lidarpose.models.onnx import input_name, open_onnx, output_names, voxelize_people
 from lidarpose.sample import CONFIDENCE_RADIUS, PER_PERSON, Pose
 from lidarpose.skeleton import Skeleton
@@ -138,17 +138,17 @@ def estimates(raw: Raw, decoder: Decoder, skeleton: Skeleton) -> Pose:
         in_range = ~np.any([out_of_range(heatmap) for heatmap in raw.heatmaps], axis=0)
     if joints.size and not np.isfinite(joints).any():
         raise InputError("the network answers with no numbers: its weights are damaged, get the file again")
-    confidence = None if raw.confidence is None else _probability(raw.confidence)
+    confidence = None if raw.confidence is None else sigmoid(raw.confidence)
     spread = None if raw.log_spread is None else np.exp(np.minimum(raw.log_spread.astype(float), _LARGEST_LOG_SPREAD))
     if confidence is None and raw.heatmaps is not None:
         confidence, spread = _from_heatmaps(raw, raw.heatmaps, joints - raw.vote)
-    of_person = {} if raw.person is None else dict(zip(PER_PERSON, _probability(raw.person).T, strict=True))
+    of_person = {} if raw.person is None else dict(zip(PER_PERSON, sigmoid(raw.person).T, strict=True))
     return Pose(
         joints=joints,
         skeleton=skeleton,
         confidence=confidence,
         spread=spread,
-        visible=None if raw.visible is None else _probability(raw.visible),
+        visible=None if raw.visible is None else sigmoid(raw.visible),
         in_range=in_range,
         **of_person,
     )
@@ -168,8 +168,3 @@ def _from_heatmaps(raw: Raw, heatmaps: tuple[np.ndarray, ...], offset: np.ndarra
         share = share * np.clip((weight * (np.abs(distance) < CONFIDENCE_RADIUS)).sum(-1), 0, 1)
         square = square + (weight * distance**2).sum(-1)
     return share, np.sqrt(square)
-
-
-def _probability(logit: np.ndarray) -> np.ndarray:
-    # as a logistic function, without overflow
-    return 0.5 * (1 + np.tanh(0.5 * logit.astype(float)))

@@ -45,15 +45,14 @@ from lidarpose.tracking.clip import TrackPoses
 from lidarpose.tracking.live import follow
 from lidarpose.tracking.smoothing import smooth
 
-# an answer may be somebody's from this share of the surest one's confidence on; answers this near, m, are of one person
-_SURE, _SAME = 0.6, 0.3
-
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 BACKENDS = ("onnx", "torch")
 # default number of test-time augmentation passes
 TTA = 1
+# an answer may be somebody's from this share of the surest one's confidence on; answers this near, m, are of one person
+_SURE, _SAME = 0.6, 0.3
 
 
 def load(
@@ -342,34 +341,34 @@ class Predictor(PoseEstimator):
             about, boxes = (None if each is None else each[rows] for each in (centers, box_centers))
             clouds = [part for _, part in parts]
             answers = self.poses(clouds, origin, centers=about, box_centers=boxes, progress=progress)
-        found: dict[int, list[tuple[Pose, np.ndarray]]] = {}
+        answered: dict[int, list[tuple[Pose, np.ndarray]]] = {}
         for (i, part), pose in zip(parts, answers, strict=True):
             if pose is not None:
-                found.setdefault(i, []).append((pose, part))
-        return {i: _meant(some, None if box_centers is None else box_centers[i]) for i, some in found.items()}
+                answered.setdefault(i, []).append((pose, part))
+        return {i: _meant(some, None if box_centers is None else box_centers[i]) for i, some in answered.items()}
 
 
-def _meant(found: list[tuple[Pose, np.ndarray]], box_center: np.ndarray | None) -> tuple[Pose, np.ndarray]:
+def _meant(answers: list[tuple[Pose, np.ndarray]], box_center: np.ndarray | None) -> tuple[Pose, np.ndarray]:
     """Of the answers about candidates of a crop, that of the whole cloud first, the one that is meant: the surest, in a
-    box the surest of whoever is nearest to its center. Whoever else is found stands beside them as a second person.
+    box the surest of whoever is nearest to its center. Whoever else is there stands beside them as a second person.
 
     Of a network without confidence the first.
     """
-    sure = [0.0 if pose.confidence is None else float(pose.confidence.mean()) for pose, _ in found]
-    if len(found) == 1 or not any(sure):
-        return found[0]
-    middles = np.stack([pose.joints[list(pose.skeleton.middle)].mean(0)[:2] for pose, _ in found])
+    sure = [0.0 if pose.confidence is None else float(pose.confidence.mean()) for pose, _ in answers]
+    if len(answers) == 1 or not any(sure):
+        return answers[0]
+    middles = np.stack([pose.joints[list(pose.skeleton.middle)].mean(0)[:2] for pose, _ in answers])
     able = np.array(sure) > _SURE * max(sure)
     near = able
     if box_center is not None:
         away = np.where(able, np.linalg.norm(middles - box_center[:2], axis=1), np.inf)
         near = able & (np.linalg.norm(middles - middles[away.argmin()], axis=1) < _SAME)
     best = int(np.where(near, sure, -1.0).argmax())
-    pose, part = found[best]
+    pose, part = answers[best]
     if pose.second_person is None or pose.person is None:
         return pose, part
     beside = np.linalg.norm(middles - middles[best], axis=1) > _SAME
-    others = [answer.person for (answer, _), is_other in zip(found, beside & able, strict=True) if is_other]
+    others = [pose_beside.person for (pose_beside, _), is_other in zip(answers, beside & able, strict=True) if is_other]
     return replace(pose, second_person=np.max([pose.second_person, *others])), part
 
 

@@ -15,7 +15,7 @@ from lidarpose.geometry import rotation_about
 from lidarpose.inference.backend import Backend, OnnxBackend, estimates
 from lidarpose.inference.tta import TTATransform, apply
 from lidarpose.models import DEFAULT, weights_path
-from lidarpose.models.decode import decoder
+from lidarpose.models.decode import decoder, sigmoid
 from lidarpose.models.detector.detector import Detections
 from lidarpose.sample import MIN_POINTS, Box, Pose, facing
 
@@ -116,7 +116,7 @@ def final_score(features: np.ndarray, header: dict) -> np.ndarray:
         logit += weights.get(name, 0.0) * values
     calibration = verification.get("calibration") or header.get("calibration")
     # of a network that is not calibrated yet as it comes
-    probability = 0.5 * (1 + np.tanh(logit / 2)) if calibration is None else np.interp(logit, *calibration)
+    probability = sigmoid(logit) if calibration is None else np.interp(logit, *calibration)
     return np.nan_to_num(probability)
 
 

@@ -74,6 +74,11 @@ def window(
     return low + (weight * index).sum(-1) / weight.sum(-1) * step
 
 
+def sigmoid(logit: np.ndarray) -> np.ndarray:
+    """logit (...) -> (...) float64 in [0, 1]: a probability from its log odds."""
+    return 0.5 * (1 + np.tanh(np.asarray(logit, float) / 2))
+
+
 def out_of_range(logits: np.ndarray) -> np.ndarray:
     """logits (..., W) -> (...) bool: the mode lies in an outermost bin, so the truth may lie beyond the heatmap."""
     logits = _checked(logits)

@@ -56,24 +56,23 @@ class WaysPicture:
     def draw(self, source: Source, skeleton: Skeleton, *, title: str) -> bytes:
         """The PNG; the source is read again for the points of some frames."""
         ways = {id: np.array(places) for id, places in self._ways.items()}
-        boxes = [
-            Box(center=way[-1], size=np.array([0.8, 0.8, 1.8]), yaw=self._yaws.get(id, 0.0), id=id)
-            for id, way in ways.items()
-            if id is not None
-        ]
-        people = counted(len(boxes), "track")
+        points, poses = self._points(source), None
         is_single = len(self._frames) == 1
-        if is_single:
-            people = counted(len(self._people), "person", "people")
-        elif not boxes and None in ways:
-            people = counted(len(ways[None]), "person", "people")
-        points = self._points(source)
-        poses = None
         if is_single:
             # as of a scan: the numbers are those of the cards
             boxes = [person["box"] for person in self._people if person["box"] is not None]
             joints = [person["joints"] for person in self._people if person["joints"] is not None]
             poses = Pose(joints=np.stack(joints), skeleton=skeleton) if joints else None
+            people = counted(len(self._people), "person", "people")
+        else:
+            boxes = [
+                Box(center=way[-1], size=np.array([0.8, 0.8, 1.8]), yaw=self._yaws.get(id, 0.0), id=id)
+                for id, way in ways.items()
+                if id is not None
+            ]
+            people = counted(len(boxes), "track")
+            if not boxes and None in ways:
+                people = counted(len(ways[None]), "person", "people")
         panel = ScanPanel(
             points=points,
             boxes=boxes,

@@ -10,6 +10,7 @@ import numpy as np
 
 from lidarpose.io.files import file_error
 from lidarpose.models import weights_file
+from lidarpose.models.decode import sigmoid
 from lidarpose.models.detector.candidates import CHUNK, SceneIndex, suppress_near
 from lidarpose.models.detector.detector_config import INPUTS, OUTPUT, DetectorConfig
 from lidarpose.models.detector.ground import estimate_ground, without_ground
@@ -132,7 +133,7 @@ class Detector:
         centers, heights = predicted_boxes(places, scene.yaws(places), outputs)
         logit = outputs[:, 0]
         kept = suppress_near(centers, logit, SAME)[:limit]
-        mounted = _sigmoid(outputs[kept, 5])
+        mounted = sigmoid(outputs[kept, 5])
         side = np.where(mounted > 0.5, _MOUNTED_SIDE, _SIDE)
         return Detections(
             centers=centers[kept],
@@ -148,7 +149,7 @@ class Detector:
     def probability(self, logit: np.ndarray) -> np.ndarray:
         """Of a person at a logit (D,), by the calibration in the file."""
         if "calibration" not in self.header:
-            return _sigmoid(logit)
+            return sigmoid(logit)
         logits, probabilities = self.header["calibration"]
         return np.interp(logit, logits, probabilities)
 
@@ -176,10 +177,6 @@ def _is_near_others(values: np.ndarray) -> np.ndarray:
     low = np.percentile(some, _NEARLY_ALL[0], method="higher")
     high = np.percentile(some, _NEARLY_ALL[1], method="lower")
     return (values > low - _STRAY) & (values < high + _STRAY)
-
-
-def _sigmoid(logit: np.ndarray) -> np.ndarray:
-    return 0.5 * (1 + np.tanh(np.asarray(logit, float) / 2))
 
 
 def detector_path(suffix: str = ".onnx") -> Path:

@@ -14,12 +14,11 @@ from lidarpose.inference.detection import MAX_RANGE, MOST_POSED
 from lidarpose.inference.verification import final_score, score_terms, verification_features
 from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.detector.detector import Detector
-from lidarpose.models.detector.ground import estimate_up
 from lidarpose.models.detector.network import DetectorNet
 from lidarpose.models.export import export_detector
 from lidarpose.progress import Progress
 from lidarpose.synth.detection_scene import detection_scene
-from lidarpose.train.detector.candidate_source import leveled
+from lidarpose.train.detector.candidate_source import as_detected
 from lidarpose.train.run_dir import MODEL
 
 DETECTOR = "detector.onnx"
@@ -52,9 +51,7 @@ def calibrate(folder: str | Path, scans: int, *, labeled: str | Path | None = No
     with Progress(scans, unit="scans") as bar:
         for number in range(scans):
             scene = detection_scene(_SEED, number, family="heldout")
-            # as before detection
-            up = estimate_up(scene.points, scene.origin)
-            scene = scene if up is None else leveled(scene, up)
+            scene = as_detected(scene, scene.origin)
             seen = np.unique(scene.person[scene.person >= 0])
             people = np.array([scene.boxes[row].center for row in seen]).reshape(-1, 3)
             detections = detector.detect(scene.points, scene.origin, max_range=MAX_RANGE, limit=MOST_POSED)

@@ -150,8 +150,7 @@ def scan_example(seed: int, number: int, *, family: str = "train") -> DetectorEx
     scene = detection_scene(seed, number, family=family)
     rng = np.random.default_rng([seed, RandomStream.CANDIDATES, number, 0])
     is_blind = rng.random() < BLIND
-    up = estimate_up(scene.points, None if is_blind else scene.origin)
-    scene = scene if up is None else leveled(scene, up)
+    scene = as_detected(scene, None if is_blind else scene.origin)
     origin = None if is_blind else scene.origin
     points = scene.points[_distance(scene.points, scene) < RANGE + _BEYOND]
     ground = estimate_ground(points, origin) or without_ground(points, origin)
@@ -165,6 +164,12 @@ def scan_example(seed: int, number: int, *, family: str = "train") -> DetectorEx
 def validation_scans(seed: int) -> list[DetectorExample]:
     """All candidates of `VALIDATION` scans of the family "heldout"."""
     return [scan_example(seed, number, family="heldout") for number in range(VALIDATION)]
+
+
+def as_detected(scene: DetectionScene, origin: np.ndarray | None) -> DetectionScene:
+    """The scene as people are looked for in it: leveled where its sensor, at origin (3,) m or unknown, is tilted."""
+    up = estimate_up(scene.points, origin)
+    return scene if up is None else leveled(scene, up)
 
 
 def leveled(scene: DetectionScene, up: np.ndarray) -> DetectionScene:
