@@ -57,6 +57,11 @@ def file(scene, tmp_path, monkeypatch):
     return "sweep.npy"
 
 
+def alone(points):
+    """Which of points (n, 3) m are of nobody."""
+    return np.min(np.linalg.norm(points[:, None, :2] - PLACES, axis=2), axis=1) > 1
+
+
 def found_at(centers, joints):
     """Which of the people (P, 26, 3) have a center (D, 3) within 0.3 m, seen from above."""
     middles = joints[:, :, :2].mean(1)
@@ -204,10 +209,33 @@ def test_one_person_is_no_scan_in_kilometers():
 
 
 def test_axes_are_told(scene):
-    (warning,) = lidarpose.detect(scene[0] @ UP_AXES["y"]).warnings
+    # nobody is in them with any axis up
+    empty = scene[0][alone(scene[0])]
+    (warning,) = lidarpose.detect(empty @ UP_AXES["y"]).warnings
     assert "hardly the input's up axis: try up y" in warning
-    (warning,) = lidarpose.detect(scene[0] * [1, -1, -1], sensor_origin="unknown").warnings
+    (warning,) = lidarpose.detect(empty * [1, -1, -1], sensor_origin="unknown").warnings
     assert "no ground was found" in warning and "up axis" in warning
+
+
+@pytest.mark.parametrize("up", ["y", "-y", "x", "-x"])
+def test_the_axis_with_which_people_are_found_is_told(scene, file, up):
+    near = scene[0][np.abs(scene[0][:, :2]).max(1) < 6]
+    for points in (scene[0], near):
+        boxes = lidarpose.detect(points @ UP_AXES[up])
+        (warning,) = boxes.warnings
+        number = len(lidarpose.detect(points @ UP_AXES[up], up=up))
+        assert not boxes and number >= 3
+        assert warning == f"nobody is found with up z, but {number} people with up {up}: try up {up}"
+    np.save(file, near @ UP_AXES[up])
+    assert lidarpose.predict(file).warnings == (warning,)
+
+
+def test_no_other_axis_is_offered_where_nobody_is(scene, fake):
+    empty = scene[0][alone(scene[0])]
+    assert lidarpose.detect(empty).warnings == () and len(fake.calls) == 1
+    # in a room nothing tells what is up
+    near = empty[np.abs(empty[:, :2]).max(1) < 6]
+    assert lidarpose.detect(near).warnings == () and len(fake.calls) >= 6
 
 
 def test_the_sensor_stands_at_zero_unless_it_cannot(scene, fake):
@@ -417,8 +445,7 @@ def test_the_bundled_detector_finds_people_and_poses_them(bundled, scene, file, 
     assert sum(found_at(poses.to_numpy()[:, 0], joints)) >= 4 and len(poses) <= 6
     assert 0 < detection._detector().header["default_score"] < 1
     # the wall and the ground alone
-    alone = np.min(np.linalg.norm(points[:, None, :2] - PLACES[None], axis=2), axis=1) > 1
-    assert len(lidarpose.detect(points[alone])) <= 1
+    assert len(lidarpose.detect(points[alone(points)])) <= 1
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="needs real sweeps")

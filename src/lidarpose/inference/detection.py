@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lidarpose.errors import InputError, check_int
-from lidarpose.geometry import rotation_about, rotation_from_up
+from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
 from lidarpose.inference.background import is_static, read_background
-from lidarpose.inference.checks import flat_along_another_axis, scan_unit_warning, unlikely_origin
+from lidarpose.inference.checks import flat_along_another_axis, flat_axis, scan_unit_warning, unlikely_origin
 from lidarpose.inference.inputs import as_origin, as_points, only_returns
 from lidarpose.inference.scan import Scan, read_scan, up_text
 from lidarpose.inference.verification import KnownPlaces, rounded, verified
@@ -104,7 +104,7 @@ def detect(
     else:
         cloud, notes = only_returns(as_points(points))
         scan = replace(scan, points=cloud, warnings=tuple(notes))
-    searched = find_people(scan, search)
+    searched = search_alone(scan, search)
     return Boxes(searched.boxes or [], source=searched.source, warnings=searched.warnings, detector=detector_version())
 
 
@@ -124,6 +124,27 @@ def find_people(scan: Scan, search: Search, known: KnownPlaces | None = None) ->
     known: of a recording's frames before; with it the scan has `pelvises`, `verified` and `rejected`, too.
     """
     return verify_people(detect_places(scan, search), search, known)
+
+
+def search_alone(scan: Scan, search: Search) -> Scan:
+    """`find_people` of a scan that is no frame of a recording. Where nobody is found, but people are with another axis
+    up, a warning says so in place of what else looks odd."""
+    places = detect_places(scan, search)
+    searched = verify_people(places, search)
+    if searched.boxes or places.detections is None:
+        return searched
+    if places.detections.has_ground and flat_axis(places.scan.points) == scan.upright_axis:
+        # outdoors: the axis is right
+        return searched
+    thinned, _ = _thinned(scan, search)
+    others = [up for up in UP_AXES if up != scan.up]
+    found = {up: find_people(replace(thinned, up=up), search).boxes or [] for up in others}
+    best = max(others, key=lambda up: sum(box.score or 0.0 for box in found[up]))
+    if not (number := len(found[best])):
+        return searched
+    people = "a person" if number == 1 else f"{number} people"
+    hint = f"nobody is found with up {scan.up}, but {people} with up {best}: try up {best}"
+    return replace(searched, warnings=(*scan.warnings, hint))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -9,7 +9,7 @@ import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, rotation_from_up
-from lidarpose.inference.detection import Places, Search, detect_places, search_options, verify_people
+from lidarpose.inference.detection import Places, Search, search_alone, search_options, verify_people
 from lidarpose.inference.inputs import as_origin
 from lidarpose.inference.predictor import Predictor, load
 from lidarpose.inference.results import Poses
@@ -103,7 +103,7 @@ def predict_scan(
     crop; then everybody is posed.
 
     Args:
-        scan: or one in which people were detected already.
+        scan: or a frame of a recording in which people were detected already.
         model: loads the network, once people were searched for.
         known: as of `find_people`.
 
@@ -113,8 +113,7 @@ def predict_scan(
     started = time.perf_counter()
     times = {}
     if search is not None:
-        places = detect_places(scan, search) if isinstance(scan, Scan) else scan
-        scan = verify_people(places, search, known)
+        scan = search_alone(scan, search) if isinstance(scan, Scan) else verify_people(scan, search, known)
         times["find"] = time.perf_counter() - started
     assert isinstance(scan, Scan)
     searched = time.perf_counter()
