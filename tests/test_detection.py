@@ -162,6 +162,28 @@ def test_a_tilted_sensor_is_told(model, scene):
     assert sum(found_at(poses.to_numpy()[:, 0] @ tilt, joints)) >= 4
 
 
+@pytest.mark.parametrize("axis", ["z", "-y"])
+def test_boxes_of_a_tilted_scan_say_what_is_up(model, scene, tmp_path, axis):
+    tilt = rotation_about("y", np.radians(20.0))
+    path = tmp_path / "sweep.npy"
+    points = scene[0] @ tilt.T @ UP_AXES[axis]
+    np.save(path, points)
+    found = lidarpose.predict(path, model=model, up=axis)
+    boxes = lidarpose.detect(path, up=axis)
+    assert found.up == boxes.up and len(boxes.up.split(",")) == 3 and boxes[:2].up == boxes.up
+    boxes.save(tmp_path / "sweep.boxes.json")
+    found.save(tmp_path / "sweep.poses.json")
+    # without a word about the axis
+    for given in (boxes, tmp_path / "sweep.boxes.json", tmp_path / "sweep.poses.json"):
+        again = lidarpose.predict(path, boxes=given, model=model)
+        assert again.up == found.up
+        errors = np.linalg.norm(again.to_numpy() - found.to_numpy(), axis=-1).mean(1)
+        assert len(again) == len(found) and np.median(errors) < 0.03
+    np.testing.assert_array_equal(model.predict(points, boxes=boxes).to_numpy(), again.to_numpy())
+    # but what is said counts
+    assert lidarpose.predict(path, boxes=boxes, up="z", model=model).up == "z"
+
+
 def test_arrows_of_a_tilted_scan_show_where_people_face(model, scene):
     tilt = rotation_about("y", np.radians(20.0)) @ rotation_about("z", 2.5)
     poses = model.predict(scene[0] @ tilt.T, find=True)

@@ -144,6 +144,13 @@ def rotation_from_up(up: str | Sequence[float]) -> np.ndarray:
     return rotation_between(direction / np.abs(direction).max(), np.array([0.0, 0.0, 1.0]))
 
 
+def upright_axis(up: str | Sequence[float]) -> str:
+    """The axis, a key of `UP_AXES`, that is nearest to what is up, as of `rotation_from_up`."""
+    upright = rotation_from_up(up)[2]
+    axis = int(np.abs(upright).argmax())
+    return "-" * bool(upright[axis] < 0) + "xyz"[axis]
+
+
 def vector_of(given: Any) -> np.ndarray | None:
     """Three finite numbers or the text "x,y,z" as (3,) float64; None for anything else."""
     try:

@@ -20,7 +20,7 @@ _LONGEST_ID = 40
 
 _FRAME = """
 --sensor-origin X,Y,Z  sensor position, or unknown (default: ORIGIN)
---up AXIS = z  what is up: z (default), y or x, -y where y points down (cameras), or a direction x,y,z
+--up AXIS  what is up: z (default), y or x, -y where y points down (cameras), or a direction x,y,z
 --columns N  values per point in a .bin: 4 for KITTI, 5 for nuScenes
 """
 _SEARCH = """
@@ -166,6 +166,8 @@ def _reading(options: argparse.Namespace) -> dict[str, Any]:
     # one file is of static points, or a folder; several are scans
     background = background[0] if background and len(background) == 1 else background
     reading = {name: getattr(options, name) for name in names}
+    if options.up is None:
+        del reading["up"]
     return reading | {"max_range": options.range, "background": background}
 
 

@@ -90,7 +90,8 @@ def detect(
 
     Returns:
         `Boxes` in the frame of the points, each with `score`, the probability that it is a person, and `mounted`,
-        whether the person rides or sits in a wheelchair; `warnings` say what looks wrong about the scan.
+        whether the person rides or sits in a wheelchair; `warnings` say what looks wrong about the scan, and `up` is
+        what is up after all, of a tilted sensor a direction.
 
     Raises:
         InputError: a file that cannot be read, or an option of another type.
@@ -105,7 +106,13 @@ def detect(
         cloud, notes = only_returns(as_points(points))
         scan = replace(scan, points=cloud, warnings=tuple(notes))
     searched = search_alone(scan, search)
-    return Boxes(searched.boxes or [], source=searched.source, warnings=searched.warnings, detector=detector_version())
+    return Boxes(
+        searched.boxes or [],
+        source=searched.source,
+        warnings=searched.warnings,
+        detector=detector_version(),
+        up=searched.up,
+    )
 
 
 def search_options(

@@ -36,7 +36,7 @@ def predict(
     background: "str | os.PathLike | Sequence | np.ndarray | None" = None,
     sensor_origin: "np.ndarray | Sequence[float] | str | None" = None,
     skeleton: str | None = None,
-    up: str | Sequence[float] = "z",
+    up: str | Sequence[float] | None = None,
     columns: int | None = None,
     model: "Predictor | str | os.PathLike | Callable[[], Predictor]" = DEFAULT,
     progress: bool = False,
@@ -45,7 +45,7 @@ def predict(
 
     Args:
         boxes: whatever `read_boxes` takes (a JSON file, a KITTI label, rows, a `Box` or several), their length and
-            width level, their height and yaw along and about the up axis (the file's z where `up` is a direction).
+            width level, their height and yaw along and about the up axis, or the axis nearest to a direction `up`.
         calib: of a KITTI label, None for `../calib/N.txt` beside it.
         crop: the file is one person already.
         find: people are searched for, with min_score, max_range (None: 40 m), max_people and background as in `detect`.
@@ -53,7 +53,8 @@ def predict(
         sensor_origin: (x, y, z) m in the file's frame, or "unknown"; None means unknown for a crop and 0, 0, 0 else.
         skeleton: a name, or None for smpl24, or for the network's own where it has other joints.
         up: the file's up axis, "z", "y" or "x", with a minus where it points down ("-y": cameras), or for a sensor
-            mounted askew the direction that is up, (x, y, z) or "x,y,z" in the file's frame.
+            mounted askew the direction that is up, (x, y, z) or "x,y,z" in the file's frame. None: as `detect` and
+            `predict` wrote into a file of boxes, else z.
         columns: values a row of a .bin.
         model: a predictor, what `load` takes (with its defaults), or a function that gives the predictor when needed.
 
@@ -64,13 +65,11 @@ def predict(
     check_choice(boxes, crop, find or any(option is not None for option in options))
     _check_path(path)
     started = time.perf_counter()
+    given = None if boxes is None else read_boxes(boxes, calib=calib)
+    if up is None:
+        up = "z" if given is None else given.up
     rotation_from_up(up)
-    scan = Scan(
-        points=np.zeros((0, 3)),
-        boxes=None if boxes is None else read_boxes(boxes, calib=calib),
-        origin=as_origin(sensor_origin),
-        up=up_text(up),
-    )
+    scan = Scan(points=np.zeros((0, 3)), boxes=given, origin=as_origin(sensor_origin), up=up_text(up))
     scan = read_scan(scan, path, columns)
     find = find or boxes is None and not crop and is_wide(scan)
     if not find and any(option is not None for option in options):

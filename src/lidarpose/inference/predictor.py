@@ -195,7 +195,7 @@ class Predictor(PoseEstimator):
             points (arrays): x, y, z in meters, z up, any frame, each cloud one person, ground and clutter allowed;
                 more columns are ignored, those of tables and records are taken by name. A cloud of under 5 different
                 points gets a result without joints and a warning.
-            boxes (as in `lidarpose.predict`): the people of a whole scan.
+            boxes (as in `lidarpose.predict`): the people of a whole scan; where they say what is up, it need not be z.
             find (bool): they are searched for, as by `lidarpose.detect`, whose result is for `boxes` where anything
                 about the search is to be chosen.
             sensor_origin (array or str): (3,) m, where the sensor stood in that frame, or "unknown"; None means
@@ -216,7 +216,8 @@ class Predictor(PoseEstimator):
             cloud, notes = only_returns(as_points(points))
             origin = np.zeros(3) if sensor_origin is None else as_origin(sensor_origin)
             given = None if boxes is None else read_boxes(boxes)
-            scan = Scan(points=cloud, boxes=given, origin=origin, warnings=tuple(notes))
+            up = "z" if given is None else given.up
+            scan = Scan(points=cloud, boxes=given, origin=origin, up=up, warnings=tuple(notes))
             if find:
                 from lidarpose.inference.detection import Search, find_people
 

@@ -254,6 +254,7 @@ class Poses(Sequence[PersonPose]):
             "source": self.source,
             "frame": "input",
             "unit": "m",
+            "up": self.up,
             "skeleton": {
                 "name": self.skeleton.name,
                 "joints": list(self.skeleton.joints),

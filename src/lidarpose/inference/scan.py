@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lidarpose.geometry import UP_AXES, rotation_from_up
+from lidarpose.geometry import UP_AXES, rotation_from_up, upright_axis
 from lidarpose.inference.checks import check_scan, origin_warning, rows_inside, unit_warning
 from lidarpose.inference.inputs import only_returns
 from lidarpose.inference.results import PersonPose, Poses
@@ -30,8 +30,8 @@ class Scan:
 
     points (n, 3) m; boxes: the people's, None for a crop of one person; origin: the sensor's position (3,) m or None;
     up: the input's up axis or direction, see `rotation_from_up`; warnings: of reading; source: a name for reports.
-    Boxes stand along the input's own axis; where `up` is a direction, along z. Where people were searched for,
-    detected_rows holds of each box the rows (k,) of the person's points, which a box that leans does not give.
+    Boxes stand along the input's own axis, where `up` is a direction the one nearest to it. Where people were searched
+    for, detected_rows holds of each box the rows (k,) of the person's points, which a box that leans does not give.
     In recordings, pelvises (N, 3) m: where those of the boxes' people are about; verified (N,) bool: whose score is of
     this scan; rejected (R, 3) m: places that turned out to hold nobody.
     """
@@ -53,12 +53,12 @@ class Scan:
 
     @property
     def upright_axis(self) -> str:
-        """The input's axis that is nearest to upright."""
-        return "xyz"[int(np.abs(self.R_level_input[2]).argmax())]
+        """The input's axis that is nearest to upright, "x", "y" or "z"."""
+        return upright_axis(self.up)[-1]
 
     @property
     def R_boxes_input(self) -> np.ndarray:
-        return UP_AXES.get(self.up, UP_AXES["z"])
+        return UP_AXES[upright_axis(self.up)]
 
     def level_boxes(self) -> list[Box]:
         """The boxes with z up, in the frame of `box_points`."""

@@ -15,6 +15,7 @@ from typing import Any, SupportsIndex, overload
 import numpy as np
 
 from lidarpose.errors import InputError
+from lidarpose.geometry import UP_AXES, rotation_from_up
 from lidarpose.io.files import FormatError, file_error, read_bytes, shorten, write_atomic
 from lidarpose.io.npz import load_array
 from lidarpose.sample import FARTHEST, Box, box_id
@@ -35,14 +36,20 @@ SCHEMA = "lidarpose.boxes/1"
 
 
 class Boxes(list[Box]):
-    """People found in a scan, surest first: a list of `Box`, each with a score. source: the file; warnings: lines
-    about the scan; detector: the version of what found them."""
+    """People's boxes in a scan, found ones surest first: a list of `Box`. source: the file; warnings: lines about the
+    scan; detector: the version of what found them; up: the scan's up axis or direction, see `rotation_from_up`."""
 
     def __init__(
-        self, boxes: Iterable[Box] = (), *, source: str | None = None, warnings: Iterable[str] = (), detector: str = ""
+        self,
+        boxes: Iterable[Box] = (),
+        *,
+        source: str | None = None,
+        warnings: Iterable[str] = (),
+        detector: str = "",
+        up: str = "z",
     ):
         super().__init__(boxes)
-        self.source, self.warnings, self.detector = source, tuple(warnings), detector
+        self.source, self.warnings, self.detector, self.up = source, tuple(warnings), detector, up
 
     @overload
     def __getitem__(self, index: SupportsIndex) -> Box: ...
@@ -54,7 +61,7 @@ class Boxes(list[Box]):
         chosen = super().__getitem__(index)
         if not isinstance(index, slice):
             return chosen
-        return Boxes(chosen, source=self.source, warnings=self.warnings, detector=self.detector)
+        return Boxes(chosen, source=self.source, warnings=self.warnings, detector=self.detector, up=self.up)
 
     def to_dict(self) -> dict:
         """The document of the schema lidarpose.boxes/1, which `read_boxes` reads."""
@@ -64,6 +71,7 @@ class Boxes(list[Box]):
             "source": self.source,
             "frame": "input",
             "unit": "m",
+            "up": self.up,
             "detector": self.detector,
             "people": people,
             "warnings": list(self.warnings),
@@ -89,7 +97,7 @@ def people_json(document: dict) -> str:
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
-def read_boxes(source: str | os.PathLike | _Content, *, calib: str | os.PathLike | None = None) -> list[Box]:
+def read_boxes(source: str | os.PathLike | _Content, *, calib: str | os.PathLike | None = None) -> Boxes:
     """The boxes of people, in the frame of the points, meters and radians.
 
     Args:
@@ -103,7 +111,8 @@ def read_boxes(source: str | os.PathLike | _Content, *, calib: str | os.PathLike
         calib: KITTI's calibration file; None for `../calib/N.txt` beside a label.
 
     Returns:
-        A `Box` for each entry, in order. No people is legal.
+        A `Box` for each entry, in order, and with them `up`, which `detect` and `predict` write: what is up in the
+        scan. No people is legal.
 
     Raises:
         InputError: one line that names the file, the entry (counted from 0, as in JSON paths) and the key. Two entries
@@ -121,9 +130,22 @@ def read_boxes(source: str | os.PathLike | _Content, *, calib: str | os.PathLike
             if box.id is not None and first.setdefault(str(box.id), i) != i:
                 came = f"{_show(box.id)}, which people[{first[str(box.id)]}] has too"
                 raise FormatError(f"people[{i}].id: expected an id of its own, got {came}: rename one or leave it out")
+        up = _up(content)
     except FormatError as problem:
         raise file_error("boxes" if isinstance(source, _Content) else source, problem) from None
-    return boxes
+    return Boxes(boxes, up=up)
+
+
+def _up(content: object) -> str:
+    """What is up by a document; z where it does not say."""
+    up = content.up if isinstance(content, Boxes) else content.get("up", "z") if isinstance(content, dict) else "z"
+    try:
+        if isinstance(up, str):
+            rotation_from_up(up)
+            return up
+    except InputError:
+        pass
+    raise FormatError(f'up: expected {", ".join(UP_AXES)} or a direction "x,y,z", got {_show(up)}')
 
 
 def _entries(content: object) -> list | tuple:

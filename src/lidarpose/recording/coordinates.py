@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.geometry import UP_AXES, rigid_transform, transform_points
+from lidarpose.geometry import UP_AXES, rigid_transform, transform_points, upright_axis
 
 
 class FixedFrame:
@@ -24,7 +24,7 @@ class FixedFrame:
 
 def upright(up: str) -> np.ndarray:
     """(3, 3): turns a frame with that axis up into the one in which its boxes stand along z."""
-    return UP_AXES.get(up, UP_AXES["z"])
+    return UP_AXES[upright_axis(up)]
 
 
 def moved_yaw(yaw: float, T: np.ndarray, R_from: np.ndarray | None = None, R_to: np.ndarray | None = None) -> float:
