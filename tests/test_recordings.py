@@ -241,6 +241,16 @@ def test_boxes_keep_their_heading_in_the_world(up):
     np.testing.assert_allclose(moved["center"], R_world_level @ R_level_input @ [4, 5, 6] + [1, 2, 3], atol=1e-4)
 
 
+def test_the_first_frame_says_with_which_axis_people_are_found(clouds, model, tmp_path):
+    for k, points in enumerate(clouds[:3]):
+        np.save(tmp_path / f"{k}.npy", points @ UP_AXES["-y"])
+    first, *others = lidarpose.predict_recording(tmp_path, model=model)
+    assert not len(first.poses) and any(line.endswith("try up -y") for line in first.poses.warnings)
+    assert not any("nobody is found" in line for frame in others for line in frame.poses.warnings)
+    frames = list(lidarpose.predict_recording(tmp_path, model=model, up="-y"))
+    assert [len(frame.poses) for frame in frames] == [2, 2, 2]
+
+
 def test_known_people_are_not_verified_again_and_keep_their_score(clouds, model, monkeypatch):
     from lidarpose.inference import verification
 

@@ -134,24 +134,28 @@ def find_people(scan: Scan, search: Search, known: KnownPlaces | None = None) ->
 
 
 def search_alone(scan: Scan, search: Search) -> Scan:
-    """`find_people` of a scan that is no frame of a recording. Where nobody is found, but people are with another axis
-    up, a warning says so in place of what else looks odd."""
+    """`find_people` of a scan that is no frame of a recording, with `other_up_axis` where nobody is found."""
     places = detect_places(scan, search)
     searched = verify_people(places, search)
-    if searched.boxes or places.detections is None:
+    if searched.boxes or not (hint := other_up_axis(places, search)):
         return searched
-    if places.detections.has_ground and flat_axis(places.scan.points) == scan.upright_axis:
+    # what else looks odd follows from the axis
+    return replace(searched, warnings=(*scan.warnings, hint))
+
+
+def other_up_axis(places: "Places", search: Search) -> str | None:
+    """A scan in which nobody was found -> a line for the user where people are found with another axis up."""
+    given, detections = places.given, places.detections
+    if detections is None or detections.has_ground and flat_axis(places.scan.points) == given.upright_axis:
         # outdoors: the axis is right
-        return searched
-    thinned, _ = _thinned(scan, search)
-    others = [up for up in UP_AXES if up != scan.up]
-    found = {up: find_people(replace(thinned, up=up), search).boxes or [] for up in others}
+        return None
+    others = [up for up in UP_AXES if up != given.up]
+    found = {up: find_people(replace(given, up=up), search).boxes or [] for up in others}
     best = max(others, key=lambda up: sum(box.score or 0.0 for box in found[up]))
     if not (number := len(found[best])):
-        return searched
+        return None
     people = "a person" if number == 1 else f"{number} people"
-    hint = f"nobody is found with up {scan.up}, but {people} with up {best}: try up {best}"
-    return replace(searched, warnings=(*scan.warnings, hint))
+    return f"nobody is found with up {given.up}, but {people} with up {best}: try up {best}"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -197,7 +201,7 @@ def detect_places(scan: Scan, search: Search) -> Places:
     if origin is not None and (warning := unlikely_origin(level, origin)):
         # from the beginning: of an unknown sensor other points are kept, and what is up is told by others
         own = whole.warnings if wrong else (*whole.warnings, warning)
-        return detect_places(replace(whole, origin=None, warnings=own), search)
+        return replace(detect_places(replace(whole, origin=None, warnings=own), search), given=given)
     moving = None
     if search.background is not None:
         moving = ~is_static(scan.points, search.background)

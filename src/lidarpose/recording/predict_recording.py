@@ -11,7 +11,7 @@ import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_from_up
-from lidarpose.inference.detection import Places, detect_places, least_score, search_options
+from lidarpose.inference.detection import Places, detect_places, least_score, other_up_axis, search_options
 from lidarpose.inference.inputs import as_origin, only_returns
 from lidarpose.inference.predict_scan import check_choice, is_wide, predict_scan, predictor_of
 from lidarpose.inference.predictor import Predictor
@@ -149,6 +149,8 @@ class FramePredictor:
         self._origin = sensor_origin if sensor_origin is None else (as_origin(sensor_origin),)
         # whether the frames are crops: None before the first one
         self._is_crop = True if crop else False if is_searched or boxes is not None else None
+        # whether any frame was searched
+        self._was_searched = False
         self._search = search_options(*search, columns)
         self._model = model
         self._loaded: Predictor | None = None
@@ -225,6 +227,10 @@ class FramePredictor:
             )
         except InputError as error:
             return of_frame(poses=nobody, error=str(error))
+        if isinstance(prepared, Places) and not self._was_searched:
+            self._was_searched = True
+            if not len(poses) and (hint := other_up_axis(prepared, self._search)):
+                poses = replace(poses, warnings=(*poses.warnings, hint))
         if people is not None:
             poses = people.update(time, scan, poses, T_fixed_sensor)
         return of_frame(poses=replace(poses, source=self.name))
@@ -248,11 +254,12 @@ class FramePredictor:
         """What the frames so far said, as JSON holds it."""
         people = None if self.people is None else self.people.state()
         boxes_used = self.boxes is not None and self.boxes.was_used
-        return {"is_crop": self._is_crop, "boxes_used": boxes_used, "people": people}
+        searched = {"is_crop": self._is_crop, "was_searched": self._was_searched}
+        return searched | {"boxes_used": boxes_used, "people": people}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Goes on where the predictor whose `state()` this is would."""
-        self._is_crop = state["is_crop"]
+        self._is_crop, self._was_searched = state["is_crop"], state["was_searched"]
         if self.boxes is not None:
             self.boxes.was_used = state["boxes_used"]
         if self.people is not None:
