@@ -310,6 +310,19 @@ def detector(dataset: str, *groups: str) -> str:
     return table(header, [(*key, *(own[at] for at in result["thresholds"])) for key, own in cells.items()])
 
 
+def found_boxes() -> str:
+    """Poses in boxes that were found beside those in labeled ones; see `lidarpose evaluate detector`."""
+    result = next(one for one in _read("detector")["results"] if one["dataset"] == "heldout")
+    figures = {name: f"mpjpe_{name}" for name in ("found", "given", "difference")}
+    rows = []
+    for at, words in (("1", "one false person a scan"), ("default", "the default score")):
+        of = {row["figure"]: row for row in result["rows"] if row["at"] == at}
+        cells = [of[figure] for figure in figures.values()]
+        values = [f"{cell['value']:.1f} [{cell['low']:.1f}, {cell['high']:.1f}]" for cell in cells]
+        rows.append((words, f"{cells[0]['count']:,}", *values))
+    return table(("people found at", "people", "MPJPE in found boxes, mm", "in labeled boxes", "difference"), rows)
+
+
 def calibration() -> str:
     """Whether confidence and visibility can be taken at their word; see calibration.py."""
     rows = [(one["what"], f"{one['ece']:.3f}", f"{one['auroc']:.3f}") for one in _read("calibration")["stated"]]
@@ -379,7 +392,7 @@ def tables() -> dict[str, Callable[[], str]]:
     for group in ("points", "kind", "sensor", "activity", "condition", "distance, m"):
         own = ("all", "points", "mounted, all") if group == "points" else (group, f"{group}, 50 points and more")
         made |= {f"detector {name} by {group}": partial(detector, name, *own) for name in ("heldout", "real")}
-    made |= {"visibility": visibility, "real": real, "tracks": tracks}
+    made |= {"visibility": visibility, "real": real, "tracks": tracks, "found boxes": found_boxes}
     made |= {f"paper {path.stem}": partial(paper, path.stem) for path in sorted((SCORES / "paper").glob("*.json"))}
     made["headline"] = partial(headline, *BUNDLED)
     made |= {"readme": readme, "conditions": conditions}
