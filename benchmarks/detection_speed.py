@@ -5,7 +5,7 @@
 Scans are files of points around a sensor at 0, 0, 0; without any, a street of the generator's seen by 128 beams, some
 100,000 points, and with --million the same ten times over with 1 cm of noise. One thread. A row is a step:
 
-- detector: proposals and scorer, from points to scored places;
+- detector: from points to scored places: thinning, leveling, proposals and scorer;
 - detect: `lidarpose.detect`, with the poses that verify people;
 - predict: `lidarpose.predict` of the ten surest people by `small` at one look, with detection.
 
@@ -44,6 +44,7 @@ def worker(file: str) -> None:
     """Times a step of the package that Python finds, for each line that comes in."""
     import lidarpose
     from lidarpose.inference import detection, verification
+    from lidarpose.inference.scan import Scan
     from lidarpose.models import weights_path
     from lidarpose.models.detector.detector import Detector
 
@@ -61,7 +62,7 @@ def worker(file: str) -> None:
         return predictor.predict(points, boxes=boxes, sensor_origin=origin)
 
     steps = {
-        "detector": lambda: detector.detect(points, origin),
+        "detector": lambda: detection.detect_places(Scan(points=points, origin=origin), detection.Search()),
         "detect": lambda: lidarpose.detect(points, sensor_origin=origin),
         "predict": predict,
     }

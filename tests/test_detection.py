@@ -286,17 +286,27 @@ def test_nothing_to_find_is_no_error(model):
 def test_a_map_is_thinned(scene, monkeypatch):
     points, _ = scene
     far = np.random.default_rng(0).uniform((100, 100, -2), (900, 900, 2), (20_000, 3))
-    monkeypatch.setattr(detection, "_MOST_POINTS", len(points) - 1000)
+    wide = np.concatenate([far, points])
     monkeypatch.setattr(detection, "_CHUNK", 777)
-    # what is out of reach goes first
-    assert (
-        len(detection.find_people(detection.Scan(points=np.concatenate([far, points])), detection.Search()).points)
-        == len(points) - 1000
-    )
-    boxes = lidarpose.detect(np.concatenate([far, points]))
-    assert any("thinned" in warning for warning in boxes.warnings) and len(boxes) >= 4
-    whole = lidarpose.detect(np.concatenate([far, points[::2]]))
-    assert not any("thinned" in warning for warning in whole.warnings) and whole
+    monkeypatch.setattr(detection, "_MOST_POINTS", len(wide) // 2)
+    # of an unknown sensor evenly
+    unknown = detection.find_people(detection.Scan(points=wide), detection.Search())
+    assert abs(len(unknown.points) - len(wide) / 2) < 500 and any("thinned" in line for line in unknown.warnings)
+    # around a known one what is out of reach goes first, without a word
+    known = detection.Scan(points=wide, origin=np.zeros(3))
+    monkeypatch.setattr(detection, "_MOST_AROUND", len(points))
+    searched = detection.find_people(known, detection.Search())
+    np.testing.assert_array_equal(searched.points, points[np.linalg.norm(points, axis=1) < 55])
+    # then what is dense: who is far keeps all points
+    monkeypatch.setattr(detection, "_MOST_AROUND", len(points) // 2)
+    searched = detection.find_people(known, detection.Search())
+    assert abs(len(searched.points) - len(points) / 2) < 500 and searched.warnings == () and len(searched.boxes) >= 4
+    distance, kept = np.linalg.norm(points, axis=1), np.linalg.norm(searched.points, axis=1)
+    assert (kept > 15).sum() == ((distance > 15) & (distance < 55)).sum() > 1000
+    assert 0 < (kept < 6).sum() < 0.4 * (distance < 6).sum()
+    # and with a note what people have few points of
+    monkeypatch.setattr(detection, "_MOST_AROUND", 200)
+    assert any("thinned" in line for line in detection.find_people(known, detection.Search()).warnings)
 
 
 def test_around_a_sensor_that_cannot_stand_at_zero_all_of_a_map_is_searched(scene, fake, monkeypatch):

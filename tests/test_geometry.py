@@ -9,6 +9,7 @@ from hypothesis.extra.numpy import arrays
 from lidarpose.errors import InputError
 from lidarpose.geometry import (
     UP_AXES,
+    Strips,
     axis_angle_to_matrix,
     from_spherical,
     inverse_transform,
@@ -21,6 +22,7 @@ from lidarpose.geometry import (
     to_spherical,
     transform_points,
     unit,
+    upright_axis,
 )
 
 quick = settings(max_examples=60, deadline=None)
@@ -186,3 +188,24 @@ def test_rigid_transforms_and_quaternions(seed):
     half = np.linalg.norm(axis_angle) / 2
     quaternion = np.array([np.cos(half), *(np.sin(half) * unit(axis_angle))])
     np.testing.assert_allclose(quaternion_to_matrix(-7 * quaternion), R, atol=1e-12)
+
+
+@given(
+    x=arrays(float, st.integers(0, 200), elements=st.floats(-1e6, 1e6)),
+    low=st.floats(-2e6, 2e6),
+    size=st.floats(0, 1e6),
+)
+def test_strips_hold_all_rows_between(x, low, size):
+    rows = Strips(x).rows(low, low + size)
+    assert len(np.unique(rows)) == len(rows)
+    assert set(np.flatnonzero((x >= low) & (x <= low + size))) <= set(rows.tolist())
+
+
+def test_strips_leave_most_rows_out():
+    x = 5e5 + np.random.default_rng(0).uniform(0, 1000, 10_000)
+    assert len(Strips(x).rows(5e5 + 500, 5e5 + 501)) < 100
+
+
+@pytest.mark.parametrize(("up", "axis"), [("-y", "-y"), ("0.3,0,0.9", "z"), ("0.3,-0.9,0.1", "-y"), ((-2, 1, 0), "-x")])
+def test_the_upright_axis_is_the_nearest_one(up, axis):
+    assert upright_axis(up) == axis

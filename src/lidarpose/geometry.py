@@ -117,6 +117,7 @@ def from_spherical(distance: np.ndarray, azimuth: np.ndarray, elevation: np.ndar
     return np.stack([x, y, z], -1)
 
 
+_LAST_STRIP = 65_535
 # rows are the level frame's x, y, z in coordinates of an input whose up axis is the key: right-handed, forward kept
 # where the convention has a usual one (y up: z towards the viewer, as in graphics; x up: z forward; -y up: z forward
 # and x to the right, as in cameras; -z up: x forward, as in aircraft)
@@ -158,6 +159,28 @@ def vector_of(given: Any) -> np.ndarray | None:
     except (TypeError, ValueError, OverflowError):
         return None
     return vector if vector.shape == (3,) and np.isfinite(vector).all() else None
+
+
+class Strips:
+    """Points by strips along one axis, so that nobody who asks for a place has to look at all of millions of them.
+
+    Args:
+        x: (n,) m, finite; of more than 65,536 strips the last one holds the rest.
+        width: of a strip, m.
+    """
+
+    def __init__(self, x: np.ndarray, *, width: float = 2.5):
+        self._start, self._width = x.min() if len(x) else 0.0, width
+        strip = np.minimum((x - self._start) / width, _LAST_STRIP).astype(np.uint16)
+        # 16 bits sort in linear time
+        self._order = np.argsort(strip, kind="stable")
+        self._ends = np.concatenate([[0], np.cumsum(np.bincount(strip, minlength=_LAST_STRIP + 1))])
+
+    def rows(self, low: float, high: float) -> np.ndarray:
+        """The rows (k,) of all points between low and high m, and of some around, by strips."""
+        ends = (np.array([low, high]) - self._start) / self._width
+        first, last = np.clip(ends, 0, _LAST_STRIP).astype(int)
+        return self._order[self._ends[first] : self._ends[last + 1]]
 
 
 def similarity_align(source: np.ndarray, target: np.ndarray) -> np.ndarray:

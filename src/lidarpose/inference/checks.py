@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidarpose.errors import first_names
+from lidarpose.geometry import Strips
 from lidarpose.inference.results import Poses
 from lidarpose.sample import MIN_POINTS, Box, Pose
 
@@ -51,8 +52,8 @@ _TRUNK = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 # points of a whole person, less than so far across, that lies spread at least so far along, m, and so many times as far
 # as upwards: so spread 97 of 100 synthetic people who were laid down, and none that stood
 _TIGHT, _LONG, _LONG_TO_TALL = 2.0, 0.25, 1.5
-# a sweep's extent leaves out the farthest percents; level, it is so long, m, and so many times what it is upright
-_MOST, _STREET, _FLATTER = (10, 90), 10.0, 3.0
+# a sweep's extent leaves out the farthest percents, and so many points tell it; level, it is so long, m, and so many times what it is upright
+_MOST, _ENOUGH, _STREET, _FLATTER = (10, 90), 25_000, 10.0, 3.0
 # a scan that is so long and has so few points a square meter is in other units, and in millimeters from so far on; a
 # whole room is larger than the smallest, m
 _LONGEST_SCAN, _SPARSEST, _LONG_IN_MILLIMETERS, _SMALLEST_SCAN = 500.0, 0.1, 10_000.0, 0.5
@@ -251,7 +252,7 @@ def flat_axis(points: np.ndarray) -> str | None:
 
     None where no axis stands out, as in a small room.
     """
-    low, high = np.percentile(points, _MOST, axis=0)
+    low, high = np.percentile(points[:: max(1, len(points) // _ENOUGH)], _MOST, axis=0)
     spread = high - low
     axis = int(np.argmin(spread))
     others = np.delete(spread, axis)
@@ -277,18 +278,13 @@ def everybody_lies(scan: Scan, people: Poses) -> str | None:
 
 
 def rows_inside(boxes: list[Box], points: np.ndarray) -> list[np.ndarray]:
-    """points (n, 3) m, z up -> of each `Box` the rows (k,) of the points in it, ascending.
-
-    Sorted along x once, so that no box has to look at all of millions of points.
-    """
-    order = np.argsort(points[:, 0])
-    x = points[order, 0]
-    rows = []
+    """points (n, 3) m, z up -> of each `Box` the rows (k,) of the points in it, ascending."""
+    strips, rows = Strips(points[:, 0]), []
     for box in boxes:
         # twice what a corner reaches, whatever the yaw
         reach = np.hypot(*box.size[:2])
-        first, last = np.searchsorted(x, (box.center[0] - reach, box.center[0] + reach))
-        near = np.sort(order[first:last])
+        near = strips.rows(box.center[0] - reach, box.center[0] + reach)
+        near = np.sort(near[np.abs(points[near, 1] - box.center[1]) < reach])
         rows.append(near[box.contains(points[near])])
     return rows
 

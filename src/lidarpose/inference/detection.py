@@ -32,9 +32,10 @@ if TYPE_CHECKING:
 MAX_RANGE = 40.0
 # detections that may be posed
 MOST_POSED = 40
-# a scan of more points is thinned: what is farther away than this beyond the range first, m
-_MOST_POINTS, _BEYOND = 1_500_000, 15.0
-_CHUNK = 4_000_000
+# a scan of more points is thinned, of an unknown sensor and of a known one; what is farther away than this beyond the
+# range goes first, m; points looked at in one go, and bins of their distances
+_MOST_POINTS, _MOST_AROUND, _BEYOND = 1_500_000, 400_000, 15.0
+_CHUNK, _DISTANCES = 1_000_000, 4096
 # points that tell how far a scan reaches
 _ENOUGH = 25_000
 # and which way is up
@@ -266,35 +267,54 @@ def _detector() -> Detector:
 
 
 def _thinned(scan: Scan, search: Search) -> tuple[Scan, list[str]]:
-    """The scan with at most `_MOST_POINTS` points, those near the sensor where its place is known, and a note."""
-    points, count = scan.points, len(scan.points)
-    if count <= _MOST_POINTS:
+    """The scan with about `_MOST_AROUND` points, and a note where more than what is dense is thinned.
+
+    Around a sensor what is beyond the range goes, and of what is nearer than some distance so much that nobody has
+    fewer points than a person has who stands there. Of an unknown sensor `_MOST_POINTS` stay, drawn evenly.
+    """
+    points, origin, count = scan.points, scan.origin, len(scan.points)
+    if count <= (_MOST_POINTS if origin is None else _MOST_AROUND):
         return scan, []
-    # masks, not rows: of 10^8 points these alone would take a gigabyte
-    inside, starts = np.ones(count, bool), range(0, count, _CHUNK)
-    if scan.origin is not None:
-        reach = search.max_range + _BEYOND
-        for start in starts:
-            piece = slice(start, start + _CHUNK)
-            inside[piece] = np.linalg.norm(points[piece] - scan.origin, axis=1) < reach
-        if np.count_nonzero(inside) < MIN_POINTS:
-            inside[:] = True
-    number, notes = np.count_nonzero(inside), []
-    if number <= _MOST_POINTS:
-        rows = np.flatnonzero(inside)
-    else:
-        # drawn in equal shares: a fixed step would keep single beams of organized clouds
-        step = np.random.default_rng(0).random(_MOST_POINTS)
-        drawn = ((np.arange(_MOST_POINTS) + step) * (number / _MOST_POINTS)).astype(np.int64)
-        chosen, before = [], 0
-        for start in starts:
-            own = start + np.flatnonzero(inside[start : start + _CHUNK])
-            first, last = np.searchsorted(drawn, (before, before + len(own)))
-            chosen.append(own[drawn[first:last] - before])
-            before += len(own)
-        rows = np.concatenate(chosen)
+    # pieces and shares, not rows: of 10^8 points these alone would take a gigabyte
+    pieces = [slice(start, start + _CHUNK) for start in range(0, count, _CHUNK)]
+    reach, share = (search.max_range + _BEYOND) ** 2, _MOST_POINTS / count
+    number, dense = count, 0.0
+    if origin is not None:
+        squared = [np.histogram(_squared(points[piece], origin), _DISTANCES, (0, reach))[0] for piece in pieces]
+        number = int(np.sum(squared))
+        if number >= MIN_POINTS:
+            share, dense = 1.0, _dense_below(np.sum(squared, 0), reach) if number > _MOST_AROUND else 0.0
+    rng, chosen = np.random.default_rng(0), []
+    for piece in pieces:
+        kept = np.full(len(points[piece]), share)
+        if origin is not None and number >= MIN_POINTS:
+            distance = _squared(points[piece], origin)
+            kept = np.where(distance < reach, distance / max(dense, 1e-9), 0.0)
+        chosen.append(piece.start + np.flatnonzero(rng.random(len(kept)) < kept))
+    rows = np.concatenate(chosen)
+    notes = []
+    if share < 1 or dense > search.max_range**2:
         notes = [f"thinned from {number:,} to {len(rows):,} points to search them: give one scan at a time, or a part"]
     return replace(scan, points=points[rows]), notes
+
+
+def _squared(points: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """(n,) m2: squared distances of points (n, 3) from origin (3,)."""
+    away = points - origin
+    return np.einsum("ni,ni->n", away, away)
+
+
+def _dense_below(histogram: np.ndarray, reach: float) -> float:
+    """The squared distance, m2, up to which points are kept in proportion to theirs, so that `_MOST_AROUND` are.
+
+    histogram: of all squared distances up to reach.
+    """
+    edges = np.linspace(0, reach, len(histogram) + 1)
+    middles = (edges[1:] + edges[:-1]) / 2
+    below = np.cumsum(histogram * middles)
+    kept = below / edges[1:] + histogram.sum() - np.cumsum(histogram)
+    enough = np.flatnonzero(kept <= _MOST_AROUND)
+    return float(edges[1 + enough[0]] if len(enough) else below[-1] / _MOST_AROUND)
 
 
 def _leveled(scan: Scan) -> np.ndarray:

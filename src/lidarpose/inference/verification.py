@@ -11,7 +11,7 @@ from itertools import product
 
 import numpy as np
 
-from lidarpose.geometry import rotation_about
+from lidarpose.geometry import Strips, rotation_about
 from lidarpose.inference.backend import Backend, OnnxBackend, estimates
 from lidarpose.inference.tta import TTATransform, apply
 from lidarpose.models import DEFAULT, weights_path
@@ -292,15 +292,9 @@ def rounded(box: Box) -> Box:
 
 def _rows_near(centers: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
     """Of each center the rows (k,) of the points (n, 3) m about it, ascending."""
-    # sorted by strips along x; of maps of more strips the last one holds the rest
-    start = points[:, 0].min(initial=0)
-    strip = np.minimum((points[:, 0] - start) / _AROUND, 65_535).astype(np.uint16)
-    order = np.argsort(strip, kind="stable")
-    ends = np.concatenate([[0], np.cumsum(np.bincount(strip, minlength=65_536))])
-    rows = []
+    strips, rows = Strips(points[:, 0]), []
     for x, y in centers[:, :2]:
-        first, last = np.clip([(x - _AROUND - start) / _AROUND, (x + _AROUND - start) / _AROUND], 0, 65_535).astype(int)
-        near = order[ends[first] : ends[last + 1]]
+        near = strips.rows(x - _AROUND, x + _AROUND)
         near = near[np.abs(points[near, 1] - y) < _AROUND]
         rows.append(np.sort(near[np.abs(points[near, 0] - x) < _AROUND]))
     return rows
