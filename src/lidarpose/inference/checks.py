@@ -52,7 +52,8 @@ _TRUNK = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 # points of a whole person, less than so far across, that lies spread at least so far along, m, and so many times as far
 # as upwards: so spread 97 of 100 synthetic people who were laid down, and none that stood
 _TIGHT, _LONG, _LONG_TO_TALL = 2.0, 0.25, 1.5
-# a sweep's extent leaves out the farthest percents, and so many points tell it; level, it is so long, m, and so many times what it is upright
+# a sweep's extent leaves out the farthest percents, and so many points tell it; level, it is so long, m, and so many
+# times what it is upright
 _MOST, _ENOUGH, _STREET, _FLATTER = (10, 90), 25_000, 10.0, 3.0
 # a scan that is so long and has so few points a square meter is in other units, and in millimeters from so far on; a
 # whole room is larger than the smallest, m
