@@ -225,14 +225,14 @@ def origin_warning(scan: Scan) -> str | None:
 
 def scan_unit_warning(points: np.ndarray, count: int) -> str | None:
     """What is likely wrong where the points (n, 3) of a whole scan of `count` points, z up, are not in meters."""
-    low, high = np.percentile(points, _MOST, axis=0)
-    across, largest = float((high - low)[:2].max()), float((high - low).max())
+    extent = _extent(points)
+    across, largest = float(extent[:2].max()), float(extent.max())
     if largest < _SMALLEST_SCAN:
         return f"the points reach over {largest:.2g} m: are the units kilometers? multiply all coordinates by 1000"
     if across > _LONGEST_SCAN and count < _SPARSEST * across**2:
         unit, factor = ("millimeters", 1000) if across > _LONG_IN_MILLIMETERS else ("centimeters", 100)
         return f"the points reach over {across:,.0f} m: are the units {unit}? divide all coordinates by {factor}"
-    return unit_warning(high - low, what="the scan")
+    return unit_warning(extent, what="the scan")
 
 
 def unlikely_origin(points: np.ndarray, origin: np.ndarray) -> str | None:
@@ -253,11 +253,10 @@ def flat_axis(points: np.ndarray) -> str | None:
 
     None where no axis stands out, as in a small room.
     """
-    low, high = np.percentile(points[:: max(1, len(points) // _ENOUGH)], _MOST, axis=0)
-    spread = high - low
-    axis = int(np.argmin(spread))
-    others = np.delete(spread, axis)
-    return "xyz"[axis] if others.min() > max(_STREET, _FLATTER * spread[axis]) else None
+    extent = _extent(points)
+    axis = int(np.argmin(extent))
+    others = np.delete(extent, axis)
+    return "xyz"[axis] if others.min() > max(_STREET, _FLATTER * extent[axis]) else None
 
 
 def flat_along_another_axis(scan: Scan) -> str | None:
@@ -295,6 +294,12 @@ def _heights(boxes: list[Box], points: np.ndarray, rows: list[np.ndarray]) -> np
     return np.concatenate(
         [(points[own, 2] - box.center[2]) / box.size[2] for box, own in zip(boxes, rows, strict=True)]
     )
+
+
+def _extent(points: np.ndarray) -> np.ndarray:
+    """(3,) m: how far most of a scan's points (n, 3) m reach along each axis, by enough of them."""
+    low, high = np.percentile(points[:: -(-len(points) // _ENOUGH)], _MOST, axis=0)
+    return high - low
 
 
 def _place(point: np.ndarray) -> str:

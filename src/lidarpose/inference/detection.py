@@ -36,9 +36,7 @@ MOST_POSED = 40
 # range goes first, m; points looked at in one go, and bins of their distances
 _MOST_POINTS, _MOST_AROUND, _BEYOND = 1_500_000, 400_000, 15.0
 _CHUNK, _DISTANCES = 1_000_000, 4096
-# points that tell how far a scan reaches
-_ENOUGH = 25_000
-# and which way is up
+# points that tell which way is up
 _ENOUGH_FOR_UP = 250_000
 # less of a scan on its background, as a share, and it is the background of something else
 _LEAST_STATIC = 0.2
@@ -180,9 +178,8 @@ def detect_places(scan: Scan, search: Search) -> Places:
         return Places(given=given, scan=scan, level=scan.points, detections=None)
     level = _leveled(scan)
     # what else looks odd follows from wrong axes or units
-    some = slice(None, None, -(-len(level) // _ENOUGH))
-    few = replace(scan, points=scan.points[some])
-    if wrong := flat_along_another_axis(few):
+    # what else looks odd follows from wrong axes or units
+    if wrong := flat_along_another_axis(scan):
         warnings.append(wrong)
     origin = None if scan.origin is None else scan.R_level_input @ scan.origin
     up = estimate_up(_near(level, origin, search), origin)
@@ -197,7 +194,7 @@ def detect_places(scan: Scan, search: Search) -> Places:
         level = _leveled(scan)
         origin = None if scan.origin is None else scan.R_level_input @ scan.origin
     # level: a scan that leans is as tall as one in other units
-    if not wrong and (wrong := scan_unit_warning(level[some], count)):
+    if not wrong and (wrong := scan_unit_warning(level, count)):
         warnings.append(wrong)
     if origin is not None and (warning := unlikely_origin(level, origin)):
         # from the beginning: of an unknown sensor other points are kept, and what is up is told by others
