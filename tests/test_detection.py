@@ -304,6 +304,10 @@ def test_a_map_is_thinned(scene, monkeypatch):
     distance, kept = np.linalg.norm(points, axis=1), np.linalg.norm(searched.points, axis=1)
     assert (kept > 15).sum() == ((distance > 15) & (distance < 55)).sum() > 1000
     assert 0 < (kept < 6).sum() < 0.4 * (distance < 6).sum()
+    # a sensor that is nowhere near is no middle
+    monkeypatch.setattr(detection, "_MOST_POINTS", len(wide))
+    away = detection._thinned(detection.Scan(points=points, origin=np.full(3, 1e5)), detection.Search())
+    assert len(away[0].points) == len(points) and away[1] == []
     # and with a note what people have few points of
     monkeypatch.setattr(detection, "_MOST_AROUND", 200)
     assert any("thinned" in line for line in detection.find_people(known, detection.Search()).warnings)

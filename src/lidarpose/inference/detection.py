@@ -272,25 +272,22 @@ def _thinned(scan: Scan, search: Search) -> tuple[Scan, list[str]]:
     points, origin, count = scan.points, scan.origin, len(scan.points)
     if count <= (_MOST_POINTS if origin is None else _MOST_AROUND):
         return scan, []
-    # pieces and shares, not rows: of 10^8 points these alone would take a gigabyte
+    # in pieces: of 10^8 points a row of numbers more would take a gigabyte
     pieces = [slice(start, start + _CHUNK) for start in range(0, count, _CHUNK)]
-    reach, share = (search.max_range + _BEYOND) ** 2, _MOST_POINTS / count
-    number, dense = count, 0.0
+    reach, number, dense = (search.max_range + _BEYOND) ** 2, count, None
     if origin is not None:
-        squared = [np.histogram(_squared(points[piece], origin), _DISTANCES, (0, reach))[0] for piece in pieces]
-        number = int(np.sum(squared))
-        if number >= MIN_POINTS:
-            share, dense = 1.0, _dense_below(np.sum(squared, 0), reach) if number > _MOST_AROUND else 0.0
+        by_distance = sum(np.histogram(_squared(points[piece], origin), _DISTANCES, (0, reach))[0] for piece in pieces)
+        if (around := int(np.sum(by_distance))) >= MIN_POINTS:
+            number, dense = around, _dense_below(np.asarray(by_distance), reach)
     rng, chosen = np.random.default_rng(0), []
     for piece in pieces:
-        kept = np.full(len(points[piece]), share)
-        if origin is not None and number >= MIN_POINTS:
-            distance = _squared(points[piece], origin)
-            kept = np.where(distance < reach, distance / max(dense, 1e-9), 0.0)
-        chosen.append(piece.start + np.flatnonzero(rng.random(len(kept)) < kept))
-    rows = np.concatenate(chosen)
-    notes = []
-    if share < 1 or dense > search.max_range**2:
+        kept: np.ndarray | float = _MOST_POINTS / count
+        if origin is not None and dense is not None:
+            squared = _squared(points[piece], origin)
+            kept = np.where(squared < reach, squared / dense, 0.0)
+        chosen.append(piece.start + np.flatnonzero(rng.random(len(points[piece])) < kept))
+    rows, notes = np.concatenate(chosen), []
+    if len(rows) < number and (dense is None or dense > search.max_range**2):
         notes = [f"thinned from {number:,} to {len(rows):,} points to search them: give one scan at a time, or a part"]
     return replace(scan, points=points[rows]), notes
 
@@ -301,17 +298,16 @@ def _squared(points: np.ndarray, origin: np.ndarray) -> np.ndarray:
     return np.einsum("ni,ni->n", away, away)
 
 
-def _dense_below(histogram: np.ndarray, reach: float) -> float:
-    """The squared distance, m2, up to which points are kept in proportion to theirs, so that `_MOST_AROUND` are.
+def _dense_below(by_distance: np.ndarray, reach: float) -> float:
+    """The squared distance, m2, up to which points stay in proportion to their own, so that `_MOST_AROUND` stay.
 
-    histogram: of all squared distances up to reach.
+    by_distance: histogram of all squared distances up to reach, m2.
     """
-    edges = np.linspace(0, reach, len(histogram) + 1)
-    middles = (edges[1:] + edges[:-1]) / 2
-    below = np.cumsum(histogram * middles)
-    kept = below / edges[1:] + histogram.sum() - np.cumsum(histogram)
+    edges = np.linspace(0, reach, len(by_distance) + 1)
+    inside = np.cumsum(by_distance * (edges[1:] + edges[:-1]) / 2)
+    kept = inside / edges[1:] + by_distance.sum() - np.cumsum(by_distance)
     enough = np.flatnonzero(kept <= _MOST_AROUND)
-    return float(edges[1 + enough[0]] if len(enough) else below[-1] / _MOST_AROUND)
+    return float(edges[1 + enough[0]] if len(enough) else inside[-1] / _MOST_AROUND)
 
 
 def _leveled(scan: Scan) -> np.ndarray:
