@@ -88,6 +88,14 @@ def test_some_of_the_boxes_found_are_saved_alike(tmp_path):
     assert found[1].id == 1 and found[-1] is found[2]
 
 
+def test_what_is_up_is_read_from_files_of_ours_alone():
+    ours = Boxes([], up="0.1,0.2,0.97").to_dict()
+    assert read_boxes(ours).up == "0.1,0.2,0.97" and read_boxes({"people": []}).up == "z"
+    assert read_boxes({"people": [], "up": [0, 0, 9]}).up == "z"
+    for up in ("w", [0, 1, 0], None, "0,0,0"):
+        assert "up: expected z, y, x" in refusal(read_boxes, ours | {"up": up})
+
+
 def test_scores_of_other_detectors_may_be_anything():
     for score in (12.5, -1, "high", None, math.nan, [1], True):
         assert read_boxes([{**PERSON, "score": score, "mounted": "no"}])[0].score is None

@@ -137,8 +137,10 @@ def read_boxes(source: str | os.PathLike | _Content, *, calib: str | os.PathLike
 
 
 def _up(content: object) -> str:
-    """What is up by a document; z where it does not say."""
-    up = content.up if isinstance(content, Boxes) else content.get("up", "z") if isinstance(content, dict) else "z"
+    """What is up by a document of ours; z where it does not say."""
+    up: object = content.up if isinstance(content, Boxes) else "z"
+    if isinstance(content, dict) and str(content.get("schema")).startswith("lidarpose."):
+        up = content.get("up", "z")
     try:
         if isinstance(up, str):
             rotation_from_up(up)
