@@ -310,8 +310,8 @@ def detector(dataset: str, *groups: str) -> str:
     return table(header, [(*key, *(own[at] for at in result["thresholds"])) for key, own in cells.items()])
 
 
-def found_boxes() -> str:
-    """Poses in boxes that were found beside those in labeled ones; see `lidarpose evaluate detector`."""
+def detected_boxes() -> str:
+    """Poses in boxes of the detector beside those in labeled ones; see `lidarpose evaluate detector`."""
     result = next(one for one in _read("detector")["results"] if one["dataset"] == "heldout")
     figures = {name: f"mpjpe_{name}" for name in ("found", "given", "difference")}
     rows = []
@@ -392,7 +392,7 @@ def tables() -> dict[str, Callable[[], str]]:
     for group in ("points", "kind", "sensor", "activity", "condition", "distance, m"):
         own = ("all", "points", "mounted, all") if group == "points" else (group, f"{group}, 50 points and more")
         made |= {f"detector {name} by {group}": partial(detector, name, *own) for name in ("heldout", "real")}
-    made |= {"visibility": visibility, "real": real, "tracks": tracks, "found boxes": found_boxes}
+    made |= {"visibility": visibility, "real": real, "tracks": tracks, "detected boxes": detected_boxes}
     made |= {f"paper {path.stem}": partial(paper, path.stem) for path in sorted((SCORES / "paper").glob("*.json"))}
     made["headline"] = partial(headline, *BUNDLED)
     made |= {"readme": readme, "conditions": conditions}

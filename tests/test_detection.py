@@ -168,17 +168,17 @@ def test_boxes_of_a_tilted_scan_say_what_is_up(model, scene, tmp_path, axis):
     path = tmp_path / "sweep.npy"
     points = scene[0] @ tilt.T @ UP_AXES[axis]
     np.save(path, points)
-    found = lidarpose.predict(path, model=model, up=axis)
+    searched = lidarpose.predict(path, model=model, up=axis)
     boxes = lidarpose.detect(path, up=axis)
-    assert found.up == boxes.up and len(boxes.up.split(",")) == 3 and boxes[:2].up == boxes.up
+    assert searched.up == boxes.up and len(boxes.up.split(",")) == 3 and boxes[:2].up == boxes.up
     boxes.save(tmp_path / "sweep.boxes.json")
-    found.save(tmp_path / "sweep.poses.json")
+    searched.save(tmp_path / "sweep.poses.json")
     # without a word about the axis
     for given in (boxes, tmp_path / "sweep.boxes.json", tmp_path / "sweep.poses.json"):
         again = lidarpose.predict(path, boxes=given, model=model)
-        assert again.up == found.up
-        errors = np.linalg.norm(again.to_numpy() - found.to_numpy(), axis=-1).mean(1)
-        assert len(again) == len(found) and np.median(errors) < 0.03
+        assert again.up == searched.up
+        errors = np.linalg.norm(again.to_numpy() - searched.to_numpy(), axis=-1).mean(1)
+        assert len(again) == len(searched) and np.median(errors) < 0.03
     np.testing.assert_array_equal(model.predict(points, boxes=boxes).to_numpy(), again.to_numpy())
     # but what is said counts
     assert lidarpose.predict(path, boxes=boxes, up="z", model=model).up == "z"
@@ -240,7 +240,7 @@ def test_axes_are_told(scene):
 
 
 @pytest.mark.parametrize("up", ["y", "-y", "x", "-x"])
-def test_the_axis_with_which_people_are_found_is_told(scene, file, up):
+def test_a_warning_names_the_axis_with_which_people_are_detected(scene, file, up):
     near = scene[0][np.abs(scene[0][:, :2]).max(1) < 6]
     for points in (scene[0], near):
         boxes = lidarpose.detect(points @ UP_AXES[up])

@@ -241,7 +241,7 @@ def test_boxes_keep_their_heading_in_the_world(up):
     np.testing.assert_allclose(moved["center"], R_world_level @ R_level_input @ [4, 5, 6] + [1, 2, 3], atol=1e-4)
 
 
-def test_the_first_frame_says_with_which_axis_people_are_found(clouds, model, tmp_path):
+def test_the_first_frame_names_the_axis_with_which_people_are_detected(clouds, model, tmp_path):
     for k, points in enumerate(clouds[:3]):
         np.save(tmp_path / f"{k}.npy", points @ UP_AXES["-y"])
     first, *others = lidarpose.predict_recording(tmp_path, model=model)

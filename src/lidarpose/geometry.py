@@ -117,7 +117,6 @@ def from_spherical(distance: np.ndarray, azimuth: np.ndarray, elevation: np.ndar
     return np.stack([x, y, z], -1)
 
 
-_LAST_STRIP = 65_535
 # rows are the level frame's x, y, z in coordinates of an input whose up axis is the key: right-handed, forward kept
 # where the convention has a usual one (y up: z towards the viewer, as in graphics; x up: z forward; -y up: z forward
 # and x to the right, as in cameras; -z up: x forward, as in aircraft)
@@ -152,6 +151,12 @@ def upright_axis(up: str | Sequence[float]) -> str:
     return "-" * bool(upright[axis] < 0) + "xyz"[axis]
 
 
+def rotation_of_boxes(up: str | Sequence[float]) -> np.ndarray:
+    """R_boxes_input (3, 3): turns an input into the frame in which its boxes stand along z. They stand along the axis
+    that is nearest to what is up, as of `rotation_from_up`."""
+    return UP_AXES[upright_axis(up)]
+
+
 def vector_of(given: Any) -> np.ndarray | None:
     """Three finite numbers or the text "x,y,z" as (3,) float64; None for anything else."""
     try:
@@ -159,6 +164,10 @@ def vector_of(given: Any) -> np.ndarray | None:
     except (TypeError, ValueError, OverflowError):
         return None
     return vector if vector.shape == (3,) and np.isfinite(vector).all() else None
+
+
+# strips are numbered by 16 bits, which sort in linear time
+_LAST_STRIP = 65_535
 
 
 class Strips:
@@ -172,7 +181,6 @@ class Strips:
     def __init__(self, x: np.ndarray, *, width: float = 2.5):
         self._start, self._width = x.min() if len(x) else 0.0, width
         strip = np.minimum((x - self._start) / width, _LAST_STRIP).astype(np.uint16)
-        # 16 bits sort in linear time
         self._order = np.argsort(strip, kind="stable")
         self._ends = np.concatenate([[0], np.cumsum(np.bincount(strip, minlength=_LAST_STRIP + 1))])
 

@@ -149,9 +149,9 @@ def other_up_axis(places: "Places", search: Search) -> str | None:
         # outdoors: the axis is right
         return None
     others = [up for up in UP_AXES if up != given.up]
-    found = {up: find_people(replace(given, up=up), search).boxes or [] for up in others}
-    best = max(others, key=lambda up: sum(box.score or 0.0 for box in found[up]))
-    if not (number := len(found[best])):
+    boxes = {up: find_people(replace(given, up=up), search).boxes or [] for up in others}
+    best = max(others, key=lambda up: sum(box.score or 0.0 for box in boxes[up]))
+    if not (number := len(boxes[best])):
         return None
     people = "a person" if number == 1 else f"{number} people"
     return f"nobody is found with up {given.up}, but {people} with up {best}: try up {best}"
@@ -279,14 +279,14 @@ def _thinned(scan: Scan, search: Search) -> tuple[Scan, list[str]]:
         by_distance = sum(np.histogram(_squared(points[piece], origin), _DISTANCES, (0, reach))[0] for piece in pieces)
         if (around := int(np.sum(by_distance))) >= MIN_POINTS:
             number, dense = around, _dense_below(np.asarray(by_distance), reach)
-    rng, chosen = np.random.default_rng(0), []
+    rng, parts = np.random.default_rng(0), []
     for piece in pieces:
-        kept: np.ndarray | float = _MOST_POINTS / count
+        share: np.ndarray | float = _MOST_POINTS / count
         if origin is not None and dense is not None:
             squared = _squared(points[piece], origin)
-            kept = np.where(squared < reach, squared / dense, 0.0)
-        chosen.append(piece.start + np.flatnonzero(rng.random(len(points[piece])) < kept))
-    rows, notes = np.concatenate(chosen), []
+            share = np.where(squared < reach, squared / dense, 0.0)
+        parts.append(piece.start + np.flatnonzero(rng.random(len(points[piece])) < share))
+    rows, notes = np.concatenate(parts), []
     if len(rows) < number and (dense is None or dense > search.max_range**2):
         notes = [f"thinned from {number:,} to {len(rows):,} points to search them: give one scan at a time, or a part"]
     return replace(scan, points=points[rows]), notes
@@ -305,8 +305,8 @@ def _dense_below(by_distance: np.ndarray, reach: float) -> float:
     """
     edges = np.linspace(0, reach, len(by_distance) + 1)
     inside = np.cumsum(by_distance * (edges[1:] + edges[:-1]) / 2)
-    kept = inside / edges[1:] + by_distance.sum() - np.cumsum(by_distance)
-    enough = np.flatnonzero(kept <= _MOST_AROUND)
+    number = inside / edges[1:] + by_distance.sum() - np.cumsum(by_distance)
+    enough = np.flatnonzero(number <= _MOST_AROUND)
     return float(edges[1 + enough[0]] if len(enough) else inside[-1] / _MOST_AROUND)
 
 

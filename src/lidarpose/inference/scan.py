@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lidarpose.geometry import UP_AXES, rotation_from_up, upright_axis
+from lidarpose.geometry import rotation_from_up, rotation_of_boxes, upright_axis
 from lidarpose.inference.checks import check_scan, origin_warning, rows_inside, unit_warning
 from lidarpose.inference.inputs import only_returns
 from lidarpose.inference.results import PersonPose, Poses
@@ -58,7 +58,7 @@ class Scan:
 
     @property
     def R_boxes_input(self) -> np.ndarray:
-        return UP_AXES[upright_axis(self.up)]
+        return rotation_of_boxes(self.up)
 
     def level_boxes(self) -> list[Box]:
         """The boxes with z up, in the frame of `box_points`."""

@@ -9,6 +9,7 @@ import json
 import math
 import os
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, SupportsIndex, overload
 
@@ -141,12 +142,10 @@ def _up(content: object) -> str:
     up: object = content.up if isinstance(content, Boxes) else "z"
     if isinstance(content, dict) and str(content.get("schema")).startswith("lidarpose."):
         up = content.get("up", "z")
-    try:
+    with suppress(InputError):
         if isinstance(up, str):
             rotation_from_up(up)
             return up
-    except InputError:
-        pass
     raise FormatError(f'up: expected {", ".join(UP_AXES)} or a direction "x,y,z", got {_show(up)}')
 
 

@@ -5,14 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.geometry import UP_AXES, rigid_transform, transform_points, upright_axis
+from lidarpose.geometry import rigid_transform, rotation_of_boxes, transform_points
 
 
 class FixedFrame:
     """The fixed frame as frames come. up: of the points, as in `predict`."""
 
     def __init__(self, up: str):
-        self.R_upright = upright(up)
+        self.R_upright = rotation_of_boxes(up)
         self.T_world_sensor: np.ndarray | None = None
 
     def from_sensor(self, T_world_sensor: np.ndarray | list | None) -> np.ndarray:
@@ -22,14 +22,9 @@ class FixedFrame:
         return rigid_transform(self.R_upright, np.zeros(3)) if self.T_world_sensor is None else self.T_world_sensor
 
 
-def upright(up: str) -> np.ndarray:
-    """(3, 3): turns a frame with that axis up into the one in which its boxes stand along z."""
-    return UP_AXES[upright_axis(up)]
-
-
 def moved_yaw(yaw: float, T: np.ndarray, R_from: np.ndarray | None = None, R_to: np.ndarray | None = None) -> float:
-    """The yaw of a box moved by T (4, 4), rad. R_from, R_to (3, 3): as of `upright`, of both frames; None where z is
-    up."""
+    """The yaw of a box moved by T (4, 4), rad. R_from, R_to (3, 3): as of `rotation_of_boxes`, of both frames; None
+    where z is up."""
     heading = np.array([np.cos(yaw), np.sin(yaw), 0.0])
     heading = T[:3, :3] @ (heading if R_from is None else R_from.T @ heading)
     x, y, _ = heading if R_to is None else R_to @ heading
@@ -47,7 +42,7 @@ def in_world(line: dict[str, Any], up: str = "z") -> dict[str, Any]:
         if person["joints"] is not None:
             moved["joints"] = moved_points(T, person["joints"])
         if (box := person["box"]) is not None:
-            yaw = moved_yaw(box["yaw"], T, upright(up))
+            yaw = moved_yaw(box["yaw"], T, rotation_of_boxes(up))
             moved["box"] = box | {"center": moved_points(T, box["center"]), "yaw": yaw}
         people.append(person | moved)
     return line | {"people": people, "coordinates": "world"}
