@@ -171,6 +171,30 @@ def test_merged_sensors_stand_around_and_see_the_same_body():
     np.testing.assert_allclose(scan.points[scan.part == 0, 2], scene.place.feet[2], atol=1e-3)
 
 
+def test_merged_sensors_that_turn_twice_as_fast_give_two_scans():
+    block = draw_bodies(None, 0.0, 8, SEED, 0)
+    names = ("os1-64", "vlp-32c", "livox-mid360")
+    once, twice = (
+        drawn(replace(CLEAN, double_rate=share), Acquisition(sensors=names, distance=(3.0, 15.0)), block, 2)
+        for share in (0.0, 1.0)
+    )
+    assert [view.scene.sensor.name for view in once.views] == ["vlp-32c", "livox-mid360"]
+    assert [view.scene.sensor.name for view in twice.views] == ["vlp-32c", "vlp-32c", "livox-mid360"]
+    first, second, rosette = twice.views
+    assert abs(first.lag - second.lag) == pytest.approx(0.5) and max(abs(first.lag), abs(second.lag)) <= 1
+    assert (
+        first.scene.sensor is second.scene.sensor
+        and first.scene.sensor.columns * 2 == once.views[0].scene.sensor.columns
+    )
+    assert rosette.scene.sensor is once.views[1].scene.sensor
+    # so that there are about as many points on the person, in two moments
+    counts = []
+    for scene in (once, twice):
+        scene = replace(scene, views=tuple(view for view in scene.views if view.scene.sensor.name == "vlp-32c"))
+        counts.append((simulate(scene, block, 2, np.random.default_rng(0)).part > 0).sum())
+    assert counts[1] == pytest.approx(counts[0], rel=0.3)
+
+
 def test_a_sensor_that_lags_sees_the_person_move():
     block = draw_bodies(None, 0.0, 64, SEED, 0)
     row = block.kinds.index("walk")

@@ -91,6 +91,30 @@ def test_clips_are_captured_as_often_as_asked_for_and_jumps_leave_the_ground(sha
         np.testing.assert_array_equal(somebody.moved(0)[1], somebody.joints[1])
 
 
+def test_captured_clips_are_played_faster_and_slower():
+    bank = PoseBank.of_motion(motion(frames=60))
+    own = bank.clip(9, np.random.default_rng(0))
+    np.testing.assert_array_equal(own[0], bank.clip(9, np.random.default_rng(0), tempo=0.0)[0])
+    pace = np.linalg.norm(np.diff(own[1][:, :2], axis=0), axis=1).mean()
+    speeds = []
+    for seed in range(60):
+        rotations, place = bank.clip(9, np.random.default_rng(seed), tempo=0.4)
+        assert rotations.shape == (9, 24, 3, 3) and place.shape == (9, 3)
+        np.testing.assert_allclose(
+            rotations @ rotations.swapaxes(-1, -2), np.broadcast_to(np.eye(3), rotations.shape), atol=1e-5
+        )
+        steps = np.linalg.norm(np.diff(place[:, :2], axis=0), axis=1)
+        # somebody who moves evenly still does
+        np.testing.assert_allclose(steps, steps.mean(), rtol=1e-3)
+        speeds.append(steps.mean() / pace)
+    assert np.exp(-0.41) < min(speeds) < 0.75 and 1.3 < max(speeds) < np.exp(0.41)
+    # as long as the whole clip: nothing is left to play faster
+    whole = bank.clips.length[0]
+    assert all(len(bank.clip(whole, np.random.default_rng(seed), tempo=0.4)[0]) == whole for seed in range(8))
+    moved = {draw_moving_bodies(bank, 1.0, 1, 8, np.random.default_rng(2), tempo=t)[0].joints[-1, 0, 1] for t in (0, 1)}
+    assert len(moved) == 2
+
+
 @pytest.mark.parametrize("turn", [0.8, -0.8])
 def test_a_clip_s_boxes_turn_with_the_person(turn):
     bank = PoseBank.of_motion(motion(turn=turn))

@@ -30,6 +30,15 @@ def test_the_score_of_a_box_is_that_of_its_person():
     assert person.to_dict()["score"] == 0.8765 and person.to_dict()["mounted"] is False
     table = person.to_dataframe()
     assert table.columns[-1] == "score" and (table["score"] == 0.87654).all()
+    assert table["person_probability"].isna().all() and table["second_person"].isna().all()
+
+
+def test_tables_hold_whether_it_is_a_person_beside_the_person_s_number():
+    pose = Pose(joints=np.zeros((24, 3)), skeleton=SMPL24, person=0.25, second_person=0.75)
+    person = PersonPose(pose=pose, skeleton=SMPL24, points=np.zeros((7, 3)))
+    table = Poses(people=(person, person), skeleton=SMPL24).to_dataframe()
+    assert (table["person_probability"] == 0.25).all() and (table["second_person"] == 0.75).all()
+    assert table["person"].tolist() == [0] * 24 + [1] * 24
 
 
 def test_pictures_stand_upright_whatever_the_axes(monkeypatch):

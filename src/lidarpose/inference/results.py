@@ -12,7 +12,7 @@ from lidarpose.errors import counted
 from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
 from lidarpose.io.boxes import people_json
 from lidarpose.io.files import write_atomic
-from lidarpose.sample import PER_JOINT, Box, Pose, facing
+from lidarpose.sample import JOINT_COLUMNS, PER_JOINT, Box, Pose, facing
 from lidarpose.skeleton import Skeleton
 
 if TYPE_CHECKING:
@@ -233,7 +233,8 @@ class Poses(Sequence[PersonPose]):
 
     def to_dataframe(self) -> "pandas.DataFrame":
         """A row for each joint of each person who has a pose: person (place in this sequence), id, joint, x, y, z (m),
-        confidence, spread (m), visible, in_range, score; NaN for what is not known."""
+        confidence, spread (m), visible, in_range, person_probability (`PersonPose.person`), second_person, score; NaN
+        for what is not known."""
         import pandas
 
         rows = []
@@ -241,11 +242,11 @@ class Poses(Sequence[PersonPose]):
             if person.pose is None:
                 continue
             values = [getattr(person.pose, name) for name in PER_JOINT]
+            once = [np.nan if x is None else x for x in (person.person, person.second_person, person.score)]
             for j, joint in enumerate(self.skeleton.joints):
                 known = [np.nan if value is None else value[j] for value in values]
-                score = np.nan if person.score is None else person.score
-                rows.append((number, person.id, joint, *person.pose.joints[j], *known, score))
-        return pandas.DataFrame(rows, columns=["person", "id", "joint", "x", "y", "z", *PER_JOINT, "score"])
+                rows.append((number, person.id, joint, *person.pose.joints[j], *known, *once))
+        return pandas.DataFrame(rows, columns=["person", "id", *JOINT_COLUMNS])
 
     def to_dict(self) -> dict:
         """The document of the schema lidarpose.poses/1; "warnings" beside it concern the whole input."""

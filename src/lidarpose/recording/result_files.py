@@ -8,12 +8,12 @@ from typing import Any
 
 from lidarpose.errors import missing_extra
 from lidarpose.io.files import atomic_path, file_error
-from lidarpose.sample import PER_JOINT
+from lidarpose.sample import JOINT_COLUMNS
 
 FORMATS = ("jsonl", "csv", "parquet")
 # frames whose rows are written at a time
 _ROWS_OF = 200
-_COLUMNS = ("frame", "frame_id", "time", "person", "id", "track", "filled", "joint", "x", "y", "z", *PER_JOINT, "score")
+_COLUMNS = ("frame", "frame_id", "time", "person", "id", "track", "filled", *JOINT_COLUMNS)
 
 
 def write_result(path: Path, lines: Iterable[dict[str, Any]]) -> None:
@@ -85,6 +85,7 @@ def _rows(line: dict[str, Any]) -> Iterator[tuple]:
             continue
         of_person = (number, person["id"], person["track"], person["filled"])
         known = [person[name] or [None] * len(joints) for name in ("confidence", "spread", "visible")]
+        once = (person["person"], person["second_person"], person["score"])
         for j, name in enumerate(joints):
-            values = (*(value[j] for value in known), name not in person["out_of_range"], person["score"])
+            values = (*(value[j] for value in known), name not in person["out_of_range"], *once)
             yield line["frame"], line["id"], line["time"], *of_person, name, *person["joints"][j], *values

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import ceil
 from pathlib import Path
 
 import numpy as np
@@ -87,14 +88,20 @@ class PoseBank:
         motion = motion.resampled(_MOST_HZ) if motion.fps > _MOST_HZ else motion
         return cls.of_motion(motion.of(subjects) if subjects else motion)
 
-    def clip(self, frames: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray] | None:
+    def clip(
+        self, frames: int, rng: np.random.Generator, *, tempo: float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray] | None:
         """Rotations (frames, 24, 3, 3) and the pelvis's place (frames, 3) m at `CLIP_HZ`, beginning over the origin,
-        facing +x; None where no clip is so long."""
-        windows = self.clips.windows(frames)
+        facing +x; None where no clip is so long. tempo: see `SceneConfig`; where no clip is long enough to be played
+        faster, it is played as it was."""
+        speed = np.exp(rng.uniform(-tempo, tempo)) if tempo else 1.0
+        windows = self.clips.windows(ceil((frames - 1) * speed) + 1)
+        if not len(windows):
+            speed, windows = 1.0, self.clips.windows(frames)
         if not len(windows):
             return None
-        picked = windows[rng.integers(len(windows))][None]
-        rotations, place = facing_x(self.clips.rotations[picked], self.clips.translation[picked])
+        cut = self.clips.cut(windows[rng.integers(len(windows))]).resampled(CLIP_HZ / speed)
+        rotations, place = facing_x(cut.rotations[None, :frames], cut.translation[None, :frames])
         rotations, (place,) = _vary(rotations, rng, place)
         return rotations[0], place[0]
 
@@ -212,6 +219,7 @@ def draw_moving_bodies(
     rng: np.random.Generator,
     *,
     clothes: float = 1.0,
+    tempo: float = 0.0,
     to_last: bool = False,
     mix: dict[str, float] | None = None,
     rig: Rig | None = None,
@@ -221,12 +229,15 @@ def draw_moving_bodies(
     Args:
         bank: captured poses, or None.
         captured: chance of a clip of the bank instead of the prior's.
-        clothes, mix: see `SceneConfig` and `sample_clips`.
+        clothes, tempo, mix: see `SceneConfig` and `sample_clips`.
         to_last: the last frame is on the origin and faces +x, instead of the first.
         rig: the body, None: the shipped one.
     """
     rig = load_rig() if rig is None else rig
-    clips = [bank.clip(frames + 1, rng) if bank is not None and rng.random() < captured else None for _ in range(count)]
+    clips = [
+        bank.clip(frames + 1, rng, tempo=tempo) if bank is not None and rng.random() < captured else None
+        for _ in range(count)
+    ]
     motion: list[tuple[np.ndarray, np.ndarray, str, np.ndarray | None]]
     motion = [(*clip, "captured", None) for clip in clips if clip is not None]
     if drawn_count := clips.count(None):

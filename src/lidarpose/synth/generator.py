@@ -129,8 +129,8 @@ class Generator:
             rows = [row for row in range(BLOCK) if draw_acquisition(full, draws[row]).frames > 1]
             rng = np.random.default_rng([seed, RandomStream.MOTION, block])
             moving = draw_moving_bodies(
-                self.bank, self.captured, len(rows), MOST_FRAMES, rng, clothes=self.config.clothes, to_last=True,
-                mix=self._mix, rig=self.rig,
+                self.bank, self.captured, len(rows), MOST_FRAMES, rng, clothes=self.config.clothes,
+                tempo=self.config.tempo, to_last=True, mix=self._mix, rig=self.rig,
             )  # fmt: skip
             return draws, dict(zip(rows, moving, strict=True))
 
@@ -161,8 +161,9 @@ class Generator:
         seed, index = check_int("seed", seed, least=0), check_int("index", index, least=0)
         rng = np.random.default_rng([seed, RandomStream.CLIP, index])
         bodies = draw_moving_bodies(
-            self.bank, self.captured, 1, frames, rng, clothes=self.config.clothes, mix=self._mix, rig=self.rig
-        )[0]
+            self.bank, self.captured, 1, frames, rng, clothes=self.config.clothes, tempo=self.config.tempo,
+            mix=self._mix, rig=self.rig,
+        )[0]  # fmt: skip
         block, row = self._bodies(seed, index // BLOCK), index % BLOCK
         return self._observe(bodies, range(frames), block, row, rng, hard, in_clip=True)
 

@@ -97,8 +97,11 @@ class SceneConfig:
         unusual: share of people, of those not captured, who do what the default mix of poses has hardly any of: squat,
             kick, throw, hop, pick something up, sit and lie on the floor and so on.
         carry: how often something is carried or used, relative to the street's habit.
-        merged: the cloud of 2 to 4 sensors around the person, see `Acquisition`; this and the next five hold for single
+        tempo: captured motion of clips and accumulated frames is played at exp(-tempo) to exp(tempo) times its speed.
+        merged: the cloud of 2 to 4 sensors around the person, see `Acquisition`; this and the next six hold for single
             people only, clips have none of them.
+        double_rate: of the spinning sensors that are merged with the first one, the share that turns twice as fast:
+            two scans of half as many columns, half a period apart.
         accumulated: 2 to 5 frames of somebody who moves in one cloud.
         inverted: sensors mounted upside down, 2 to 5 m above the ground.
         integration: rosettes that collect 0.1, 0.2 or 0.5 s, each as often.
@@ -127,7 +130,9 @@ class SceneConfig:
     company: float = 0.0
     unusual: float = 0.0
     carry: float = 0.0
+    tempo: float = 0.0
     merged: float = 0.0
+    double_rate: float = 0.0
     accumulated: float = 0.0
     inverted: float = 0.0
     integration: float = 0.0
@@ -167,8 +172,9 @@ class SceneConfig:
 
 # fields that are between 0 and 1
 _SHARES = frozenset(
-    "clutter occluder company unusual merged accumulated inverted integration sparse crowded recorded hard mask "
-    "ground_window mask_keep missing_part intensity_dropout beam_divergence dapt_compat loose cut".split()
+    "clutter occluder company unusual tempo merged double_rate accumulated inverted integration sparse crowded "
+    "recorded hard mask ground_window mask_keep missing_part intensity_dropout beam_divergence dapt_compat loose "
+    "cut".split()
 )
 
 

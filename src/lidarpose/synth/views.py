@@ -6,6 +6,7 @@ import numpy as np
 
 from lidarpose.geometry import rotation_about
 from lidarpose.lidar.presets import sensor
+from lidarpose.lidar.sensor import Sensor
 from lidarpose.synth.bodies import CLIP_HZ
 from lidarpose.synth.place import draw_place
 from lidarpose.synth.scene import SceneConfig
@@ -30,7 +31,7 @@ def _merged_views(
     scene: Scene, placing: SceneConfig, height: float, reach: float, nearer: float, rng: np.random.Generator
 ) -> tuple[View, ...]:
     """The other sensors around a person, each turned, mounted and disturbed on its own, up to a tenth of a second
-    before or after the first one. Arguments: as of `draw_place`."""
+    before or after the first one, some at twice its rate. Arguments: as of `draw_place`."""
     names, feet, views = scene.acquisition.sensors, scene.place.feet, []
     for k, name in enumerate(names[1:], 1):
         device = sensor(name)
@@ -39,6 +40,10 @@ def _merged_views(
         # from there the person is seen in this direction of the first sensor's frame
         heading = np.arctan2(feet[1], feet[0]) + 2 * np.pi * k / len(names) + _OFF_ANGLE * angle
         turn = rotation_about("z", heading - np.arctan2(own.feet[1], own.feet[0]))
+        rate = scene.config.double_rate
+        doubled = isinstance(device, Sensor) and rate > 0 and rng.random() < rate
+        if doubled and device.columns % 2 == 0:
+            device = replace(device, azimuth_step=2 * device.azimuth_step)
         mount = turn.T if own.R_sensor_level is None else own.R_sensor_level @ turn.T
         seen = scene.seen_from(
             feet - turn @ own.feet,
@@ -46,7 +51,8 @@ def _merged_views(
             sensor=device,
             conditions=draw_conditions(scene.config, device, rng),
         )
-        views.append(View(scene=seen, at=feet - turn @ own.feet, lag=lag))
+        view = View(scene=seen, at=feet - turn @ own.feet, lag=lag)
+        views += [view, replace(view, lag=lag - 0.5 if lag > 0 else lag + 0.5)] if doubled else [view]
     return tuple(views)
 
 

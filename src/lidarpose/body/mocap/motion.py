@@ -125,6 +125,11 @@ class Motion(_ClipTable):
         frame, last = self._last_frames()
         return frame[frame + frames - 1 <= last, None] + np.arange(frames)
 
+    def cut(self, frames: np.ndarray) -> "Motion":
+        """One clip of the frames (n,), as of a row of `windows`."""
+        clip = {"rotations": self.rotations[frames], "translation": self.translation[frames]}
+        return replace(self, **clip, names=("",), length=np.array([len(frames)]))
+
     def pairs(self, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """All poses that have one `dt` >= 0 seconds later in their clip, with that one.
 
