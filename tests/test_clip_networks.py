@@ -12,8 +12,10 @@ from training_runs import few_to_validate_on, refused  # noqa: F401 - a fixture
 from lidarpose import evaluation
 from lidarpose.body.rig import mean_adult_joints
 from lidarpose.cli import main
+from lidarpose.data.dataset_card import DatasetCard, write_card
 from lidarpose.data.prepare import prepare
-from lidarpose.data.shards import DatasetCard, person_row, shard_path, shard_writer, write_card
+from lidarpose.data.shards import shard_path, shard_writer
+from lidarpose.data.tables import person_row
 from lidarpose.eval import robustness, run
 from lidarpose.eval.dataset import open_eval_dataset
 from lidarpose.eval.protocols import EvalSetup, eval_setup

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from pyarrow import parquet
 from shard_files import sample, write_shard
 
-from lidarpose.data.shards import TABLES, DatasetCard, person_row, write_card
+from lidarpose.data.dataset_card import DatasetCard, write_card
+from lidarpose.data.tables import TABLES, person_row
 from lidarpose.errors import InputError
 from lidarpose.io.boxes import read_boxes
 from lidarpose.io.pickles import load_pickle

@@ -13,7 +13,9 @@ from shard_files import sample, write_shard
 
 from lidarpose.cli import main
 from lidarpose.data import shards
-from lidarpose.data.shards import DatasetCard, open_dataset, person_row, read_card, read_rows, write_card
+from lidarpose.data.dataset_card import DatasetCard, read_card, write_card
+from lidarpose.data.shards import open_dataset, read_rows
+from lidarpose.data.tables import TABLES, person_row
 from lidarpose.data.writer import check_settings
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.sample import PersonInfo
@@ -62,7 +64,7 @@ def test_samples_come_back_as_they_were(folder, people):
 
 def test_pandas_reads_them(folder, people):
     table = pd.concat([pd.read_parquet(path) for path in sorted(folder.glob("*.parquet"))])
-    assert list(table.columns) == list(shards.TABLES["people"])
+    assert list(table.columns) == list(TABLES["people"])
     np.testing.assert_array_equal(table["points"].iloc[3].reshape(-1, 3), people[3].points)
     assert table["sensor"].tolist()[1:] == ["os1-64"] * 3
     card = json.loads((folder / "dataset.json").read_text())
@@ -170,7 +172,7 @@ def test_every_fact_is_a_column_and_older_shards_may_lack_one(tmp_path, people):
     write_shard(path, "people", [person_row(people[0], index=0, facts=FACTS)])
     row = next(read_rows(path, "people"))
     names = [fact.name for fact in fields(PersonInfo)]
-    assert [name for name in shards.TABLES["people"] if name in names] == names
+    assert [name for name in TABLES["people"] if name in names] == names
     for name in names:
         assert row[name] == pytest.approx(getattr(FACTS, name))
     parquet.write_table(parquet.read_table(path).drop_columns(["kind"]), path)

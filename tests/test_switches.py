@@ -12,8 +12,8 @@ from training_runs import few_to_validate_on  # noqa: F401 - a fixture
 from lidarpose.body.mocap import load_motion
 from lidarpose.body.rig import heading
 from lidarpose.cli import main
+from lidarpose.data.dataset_card import read_card
 from lidarpose.data.prepare import prepare
-from lidarpose.data.shards import read_card
 from lidarpose.errors import InputError
 from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.skeleton import BODY26

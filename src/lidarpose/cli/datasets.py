@@ -85,7 +85,7 @@ def _demo(options: argparse.Namespace) -> None:
 
 
 def _synth(options: argparse.Namespace) -> None:
-    from lidarpose.data.shards import counted
+    from lidarpose.data.dataset_card import counted
     from lidarpose.synth.shard_job import Job, write_dataset
 
     if options.clips and options.scenes:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose._version import __version__
-from lidarpose.data.shards import CARD
+from lidarpose.data.dataset_card import CARD
 from lidarpose.errors import LidarPoseError
 from lidarpose.eval.dataset import EvalSample, open_eval_dataset
 from lidarpose.eval.metrics import aggregate

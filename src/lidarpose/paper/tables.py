@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 
+from lidarpose.data.dataset_card import CARD
 from lidarpose.data.readers.lidarhuman26m import POSE_FOLDER
-from lidarpose.data.shards import CARD
 from lidarpose.data.splits import split_rule
 from lidarpose.errors import InputError, check_name
 from lidarpose.paper.steps import Step

@@ -41,8 +41,9 @@ def _merged_views(
         heading = np.arctan2(feet[1], feet[0]) + 2 * np.pi * k / len(names) + _OFF_ANGLE * angle
         turn = rotation_about("z", heading - np.arctan2(own.feet[1], own.feet[0]))
         rate = scene.config.double_rate
-        doubled = isinstance(device, Sensor) and rate > 0 and rng.random() < rate
-        if doubled and device.columns % 2 == 0:
+        # a table of an odd number of columns has no half
+        doubled = isinstance(device, Sensor) and device.columns % 2 == 0 and rate > 0 and rng.random() < rate
+        if doubled and isinstance(device, Sensor):
             device = replace(device, azimuth_step=2 * device.azimuth_step)
         mount = turn.T if own.R_sensor_level is None else own.R_sensor_level @ turn.T
         seen = scene.seen_from(

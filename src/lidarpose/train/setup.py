@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from torch import nn
 
-from lidarpose.data.shards import read_card
+from lidarpose.data.dataset_card import read_card
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
 from lidarpose.models import NETWORKS

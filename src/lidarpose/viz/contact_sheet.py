@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.shards import CARD, DatasetReader, counted, open_dataset
+from lidarpose.data.dataset_card import CARD, counted
+from lidarpose.data.shards import DatasetReader, open_dataset
 from lidarpose.errors import InputError
 from lidarpose.io.files import check_apart, file_error
 from lidarpose.sample import Box, LabeledSample, PersonInfo, Pose

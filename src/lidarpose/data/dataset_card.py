@@ -1,0 +1,106 @@
+"""dataset.json: what a dataset is of, and how it was made."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lidarpose._version import __version__
+from lidarpose.data.tables import TABLES
+from lidarpose.errors import InputError
+from lidarpose.io.files import file_error, read_bytes, write_atomic
+from lidarpose.skeleton import BODY26, skeleton
+
+SCHEMA = 1
+CARD = "dataset.json"
+SENSOR_FRAME = "level frame at the sensor: x forward, y left, z up"
+# singular of what a dataset counts
+_SINGULAR = {"people": "person", "clips": "clip", "streets": "street", "parts": "part"}
+
+
+def counted(count: int, what: str) -> str:
+    """ "1 street", "1,200 people"."""
+    return f"{count:,} {_SINGULAR.get(what, what) if count == 1 else what}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetCard:
+    """What dataset.json says: settings, all that decides the content; count of persons, clips, streets or parts;
+    per_shard; tables; skeleton's name; version of the package that wrote it; frame of points and joints; about: of a
+    real dataset, its license, quirks and parts; summary: what a finished one holds."""
+
+    settings: dict[str, Any]
+    count: int
+    per_shard: int
+    tables: tuple[str, ...]
+    skeleton: str = BODY26.name
+    version: str = __version__
+    frame: str = SENSOR_FRAME
+    about: dict[str, Any] = field(default_factory=dict)
+    summary: dict[str, Any] | None = None
+
+    @property
+    def people(self) -> str:
+        """The table of people: "people" of synthetic ones, "labelled" of real ones."""
+        return "labelled" if "labelled" in self.tables else "people"
+
+    @property
+    def writer(self) -> str:
+        """The command that writes such a dataset."""
+        return "lidarpose prepare" if self.people == "labelled" else "lidarpose synth"
+
+    @property
+    def shards(self) -> int:
+        """How many shards a table has."""
+        return -(-self.count // self.per_shard)
+
+    def size(self, shard: int) -> int:
+        """How many persons, clips or streets a shard holds."""
+        return min(self.per_shard, self.count - shard * self.per_shard)
+
+    def to_json(self) -> str:
+        content = {
+            **{"schema": SCHEMA, "version": self.version, "count": self.count, "per_shard": self.per_shard},
+            **{"tables": self.tables, "unit": "m", "frame": self.frame, "skeleton": self.skeleton},
+            **{"joints": skeleton(self.skeleton).joints, "settings": self.settings},
+            **({"about": self.about} if self.about else {}),
+            **({} if self.summary is None else {"summary": self.summary}),
+        }
+        return json.dumps(content, indent=2) + "\n"
+
+
+_CARD_TYPES: dict[str, Callable[[Any], Any]] = {
+    **{"settings": dict, "count": int, "per_shard": int, "tables": lambda names: tuple(map(str, names))},
+    **{"skeleton": str, "version": str, "frame": str, "about": dict, "summary": dict},
+}
+_OPTIONAL = ("frame", "about", "summary")
+
+
+def read_card(folder: str | Path) -> DatasetCard:
+    """The card of a dataset's folder. Raises InputError where it is missing, damaged or of another schema."""
+    path = Path(folder) / CARD
+    if not path.is_file():
+        raise file_error(folder, f"is no dataset: {CARD} is missing; write one with lidarpose synth or prepare")
+    try:
+        content = json.loads(read_bytes(path, expected="a dataset's card"))
+        if content["schema"] != SCHEMA:
+            version = content.get("version", "of the version that wrote it")
+            problem = f"is of schema {content['schema']!r}, this lidarpose reads {SCHEMA}: install lidarpose {version}"
+            raise file_error(path, problem)
+        names = [name for name in _CARD_TYPES if name in content or name not in _OPTIONAL]
+        card = DatasetCard(**{name: _CARD_TYPES[name](content[name]) for name in names})
+    except InputError:
+        raise
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+        problem = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+        raise file_error(path, f"is not a dataset's card ({problem})") from None
+    if card.count < 1 or card.per_shard < 1 or not set(card.tables) <= set(TABLES):
+        raise file_error(path, "is not a dataset's card: count, per_shard or tables make no sense")
+    skeleton(card.skeleton)
+    return card
+
+
+def write_card(folder: str | Path, card: DatasetCard) -> None:
+    """Writes dataset.json, whole or not at all."""
+    write_atomic(Path(folder) / CARD, card.to_json())
