@@ -10,8 +10,8 @@ from lidarpose.body.rig import forward_kinematics
 from lidarpose.body.smpl import load_body
 from lidarpose.data.clips import MARGIN, MOST, consecutive, static_points, window_points, without_person
 from lidarpose.data.prepare import reader
+from lidarpose.data.rows import person_row, sample_of
 from lidarpose.data.shards import read_rows
-from lidarpose.data.tables import person_row, sample_of
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix, rotation_vector
 from lidarpose.sample import CLIP_FRAMES, LabeledSample, Sample, clip_windows

@@ -14,8 +14,8 @@ from lidarpose.body.rig import mean_adult_joints
 from lidarpose.cli import main
 from lidarpose.data.dataset_card import DatasetCard, write_card
 from lidarpose.data.prepare import prepare
+from lidarpose.data.rows import person_row
 from lidarpose.data.shards import shard_path, shard_writer
-from lidarpose.data.tables import person_row
 from lidarpose.eval import robustness, run
 from lidarpose.eval.dataset import open_eval_dataset
 from lidarpose.eval.protocols import EvalSetup, eval_setup

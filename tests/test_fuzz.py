@@ -17,7 +17,7 @@ from pyarrow import parquet
 from shard_files import sample, write_shard
 
 from lidarpose.data.dataset_card import DatasetCard, write_card
-from lidarpose.data.tables import TABLES, person_row
+from lidarpose.data.rows import TABLES, person_row
 from lidarpose.errors import InputError
 from lidarpose.io.boxes import read_boxes
 from lidarpose.io.pickles import load_pickle

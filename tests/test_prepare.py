@@ -21,9 +21,9 @@ from shard_files import write_shard
 from lidarpose.data import writer
 from lidarpose.data.prepare import READERS, PartWriter, prepare, summary_lines
 from lidarpose.data.readers.humanm3 import HumanM3
+from lidarpose.data.rows import labeled_row, sample_of
 from lidarpose.data.shards import open_dataset, read_rows
 from lidarpose.data.splits import _published, split_rule
-from lidarpose.data.tables import labeled_row, sample_of
 from lidarpose.errors import InputError
 from lidarpose.sample import SEEN, UNLABELED, Box, LabeledSample, Pose, center_of
 from lidarpose.skeleton import HUMAN15, WAYMO14

@@ -14,8 +14,8 @@ from shard_files import sample, write_shard
 from lidarpose.cli import main
 from lidarpose.data import shards
 from lidarpose.data.dataset_card import DatasetCard, read_card, write_card
+from lidarpose.data.rows import TABLES, person_row
 from lidarpose.data.shards import open_dataset, read_rows
-from lidarpose.data.tables import TABLES, person_row
 from lidarpose.data.writer import check_settings
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.sample import PersonInfo

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lidarpose._version import __version__
-from lidarpose.data.tables import TABLES
+from lidarpose.data.rows import TABLES
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error, read_bytes, write_atomic
 from lidarpose.skeleton import BODY26, skeleton

@@ -17,9 +17,9 @@ import numpy as np
 
 from lidarpose.data.dataset_card import CARD, DatasetCard, write_card
 from lidarpose.data.readers.base import Reader, Skipped
+from lidarpose.data.rows import labeled_row
 from lidarpose.data.shards import DatasetReader, open_dataset, read_rows, shard_path, shard_writer
 from lidarpose.data.splits import SplitRule, split_rule
-from lidarpose.data.tables import labeled_row
 from lidarpose.data.writer import Counts, lock_dataset, make_shards, open_folder
 from lidarpose.errors import InputError, check_int, check_name, first_names
 from lidarpose.io.files import file_error, one_line

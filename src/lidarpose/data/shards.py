@@ -1,4 +1,4 @@
-"""Datasets of people as Parquet shards: a folder with dataset.json and numbered .parquet files, see `data.tables`.
+"""Datasets of people as Parquet shards: a folder with dataset.json and numbered .parquet files, see `data.rows`.
 
 Any reader of Parquet opens the shards (pandas, DuckDB, Hugging Face datasets, Ray, ...).
 """
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.data.dataset_card import DatasetCard, read_card
-from lidarpose.data.tables import TABLES, Column, check_lengths, sample_of
+from lidarpose.data.rows import TABLES, Column, check_lengths, sample_of
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.io.files import atomic_path, file_error
 from lidarpose.sample import LabeledSample

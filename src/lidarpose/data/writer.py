@@ -19,8 +19,8 @@ from functools import partial
 from pathlib import Path
 
 from lidarpose.data.dataset_card import CARD, DatasetCard, read_card
+from lidarpose.data.rows import TABLES
 from lidarpose.data.shards import rows_of_shard, shard_path
-from lidarpose.data.tables import TABLES
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error, is_unused, locked
 

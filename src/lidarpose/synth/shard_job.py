@@ -10,8 +10,8 @@ import numpy as np
 
 from lidarpose.body.mocap import digest as motion_digest
 from lidarpose.data.dataset_card import CARD, DatasetCard, write_card
+from lidarpose.data.rows import person_row
 from lidarpose.data.shards import shard_path, shard_writer
-from lidarpose.data.tables import person_row
 from lidarpose.data.writer import Counts, lock_dataset, make_shards, open_folder
 from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.io.files import content_digest, file_error

@@ -40,6 +40,7 @@ def _merged_views(
         # from there the person is seen in this direction of the first sensor's frame
         heading = np.arctan2(feet[1], feet[0]) + 2 * np.pi * k / len(names) + _OFF_ANGLE * angle
         turn = rotation_about("z", heading - np.arctan2(own.feet[1], own.feet[0]))
+        at = feet - turn @ own.feet
         rate, lags = scene.config.double_rate, [lag]
         # a table of an odd number of columns has no half
         if isinstance(device, Sensor) and device.columns % 2 == 0 and rate > 0 and rng.random() < rate:
@@ -47,12 +48,12 @@ def _merged_views(
             lags.append(lag - 0.5 if lag > 0 else lag + 0.5)
         mount = turn.T if own.R_sensor_level is None else own.R_sensor_level @ turn.T
         seen = scene.seen_from(
-            feet - turn @ own.feet,
+            at,
             place=replace(scene.place, R_sensor_level=mount),
             sensor=device,
             conditions=draw_conditions(scene.config, device, rng),
         )
-        views += [View(scene=seen, at=feet - turn @ own.feet, lag=own_lag) for own_lag in lags]
+        views += [View(scene=seen, at=at, lag=own_lag) for own_lag in lags]
     return tuple(views)
 
 

@@ -1,4 +1,4 @@
-"""The tables of datasets: their columns, and samples as rows.
+"""Rows of datasets: the columns of their tables, and samples as rows.
 
 A row of people-*.parquet is one synthetic person in one frame:
 
