@@ -168,7 +168,8 @@ def test_recall_at_so_many_false_people_is_what_counting_says():
     assert result.row("recall", "0.3", "sensor, 50 points and more", "a")["value"] == 80
     assert result.row("recall", "0.3", "distance, m", "0 to 10")["value"] == 40
     assert result.row("recall", "0.3", "activity", "walk")["value"] == 40
-    assert result.thresholds["0.3"] == pytest.approx(0.8) and result.thresholds["default"] == 0.69
+    assert result.thresholds["0.3"] == pytest.approx(0.78) and result.thresholds["0.3"] > 0.93 - 0.05 * 3
+    assert result.thresholds["default"] == 0.69
     assert result.row("recall", "default")["value"] == 100 * 6 / 20
     assert result.row("false_people", "0.3")["value"] == 0.3
     assert result.row("false_people", "0.3", "sensor", "a")["value"] == 0.6

@@ -129,8 +129,8 @@ class DetectorResult:
 
     changed: scans that are not as they were frozen; people, detections: rows as of `score_scan`, people with pose
     errors `mpjpe_found` and `mpjpe_given`, mm; boxes: of each scan's detections; rows: the figures; thresholds:
-    operating point -> score; reliability: by bins of the score its mean, the share of people and the number of
-    detections; things: what false people are, at `REFERENCE`.
+    operating point -> the least score that passes; reliability: by bins of the score its mean, the share of people and
+    the number of detections; things: what false people are, at `REFERENCE`.
     """
 
     dataset: str
@@ -237,7 +237,8 @@ def _figures(
     rows: list[dict[str, Any]] = []
     thresholds: dict[str, float] = {}
     for at, bounds in above.items():
-        thresholds[at] = float(detections.score[detections.score > bounds[0]].min())
+        # just above the false person that is one too many
+        thresholds[at] = max(0.0, float(np.nextafter(bounds[0], 1)))
         hits = (people.score.to_numpy() > bounds[:, None]) * person_weights
         # draws without anybody of a group are NaN
         with np.errstate(invalid="ignore"):
@@ -250,8 +251,6 @@ def _figures(
     counted = detections[(detections.status == FALSE) | (detections.status == PERSON) & ~detections.mounted]
     precision = 100 * average_precision(counted, on_foot, weights)
     rows.append(_row("average_precision", **_with_interval(precision, count), unit="%", count=len(on_foot)))
-    # where nothing is above, nothing but certainty is; the default is what it is
-    thresholds = {at: 1.0 if np.isnan(score) else score for at, score in thresholds.items()}
     return rows, thresholds | ({} if default_score is None else {"default": default_score})
 
 
